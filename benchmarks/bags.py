@@ -20,7 +20,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from magtwin.files import shipped
-from magtwin.io.bags.rosbag import read_bag, write_bag
+from magtwin.io.bags import read_bag, write_bag
 from magtwin.twin import open_twin, scan, simulate
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)

@@ -12,10 +12,10 @@ most. Without --net a network of the paper's shape whose units are as often 0 as
 
 One: pose and signals to the total field. The release's way, written anew: scipy's RegularGridInterpolator
 over four headings and the first once more, a list of twenty numbers through StandardScaler.transform, the
-network in eager torch, StandardScaler.inverse_transform. magtwin's is `magtwin.learn.inference.reader.Reader`. They
-take turns in rounds of readings, as a robot's node has the processor's caches for itself, and then reading by
-reading, where each finds the caches full of the other's weights.
-"""
+network in eager torch, StandardScaler.inverse_transform. magtwin's is
+`magtwin.learn.inference.reader.Reader`. They take turns in rounds of readings, as a robot's node has the
+processor's caches for itself, and then reading by reading, where each finds the caches full of the other's
+weights."""
 
 import argparse
 import itertools

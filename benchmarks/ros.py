@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from magtwin.files import shipped
-from magtwin.io.bags.messages import COMMAND, MAGNITUDE, TF, TF_STATIC, Qos
+from magtwin.io.bags.topics import COMMAND, MAGNITUDE, TF, TF_STATIC, Qos
 from magtwin.ros.bus import Message, open_bus
 from magtwin.ros.diagnostics import KIND, from_message
 from magtwin.ros.follow import command_bytes

@@ -36,11 +36,8 @@ from typing import Any
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 """Options of numba for every compiled function: no fused and no reordered sums, so that no bit changes."""
 
-NUMBA_SHARE = 20
-"""Opening a module is this many times cheaper if numba is already imported."""
-
-MOST_THREADS = 8
-"""Most threads that share a loop; beyond, memory limits the speed."""
+NUMBA_SHARE = 20  # Opening a module is this many times cheaper if numba is already imported
+MOST_THREADS = 8  # Most threads that share a loop; beyond, memory limits the speed
 
 
 class Loops:

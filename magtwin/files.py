@@ -62,7 +62,9 @@ def check_free(path: str | os.PathLike[str], *, force: bool = False) -> Path:
     """
     path = Path(path)
     if path.exists() and not force:
-        raise InputError(f"{path}: exists already; give --force to replace it, or another name")
+        raise InputError(
+            f"{path}: exists already; give `force=True` to replace it, or another name", parameter="force"
+        )
     return path
 
 

@@ -1,7 +1,7 @@
-"""Gymnasium environments: `magtwin/MagNav-v0`, a robot that is commanded by what its sensors read.
+"""Gymnasium environments: `magtwin/MagNav-v0`, a robot that a policy commands from its sensor readings.
 
-Importing this module registers it. `gymnasium.make` gives one robot, `gymnasium.make_vec` as many as wanted,
-which step together in arrays; `docs/gym.md` shows both. Needs the extra `gym`.
+Importing this module registers it. `gymnasium.make` gives one robot, `gymnasium.make_vec` many that step
+together in arrays; `docs/gym.md` shows both. Needs the extra `gym`.
 """
 
 import math
@@ -53,7 +53,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "b_map_nt": (0.0, 1e6),
     "b_total_nt": (0.0, 1e6),
 }
-"""Signals that can be observed, columns of a Run, and the bounds of their numbers in their own units."""
+"""Observable signals (columns of a Run) and the bounds of their values, in their units."""
 
 SIGNALS = (
     "b_measured_nt",
@@ -68,27 +68,27 @@ SIGNALS = (
     "battery_fraction",
     "lidar_on",
 )
-"""What is observed unless said otherwise, in this order: what a robot knows without motion capture."""
+"""Default observation, in this order: what a robot measures without motion capture."""
 
 SEARCH_M = 0.3
-"""How far ahead and behind on its path a robot is looked for after a step, from where it was [m]."""
+"""Distance along the path, ahead and behind, in which a robot is searched after a step [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Transition:
-    """What a reward is given for: a step of robots, arrays with a robot a row."""
+    """A step of robots, for which a reward is given; arrays with one robot a row."""
 
     before: dict[str, NDArray[Any]]
-    """Columns before the step, as `magtwin.sim.runs.stepped.SteppedRobots.columns`."""
+    """Columns before the step; see `magtwin.sim.runs.stepped.SteppedRobots.columns`."""
 
     after: dict[str, NDArray[Any]]
-    """Columns after it."""
+    """Columns after the step."""
 
     action: Array
     """Commanded forward speed [m/s] and yaw rate [rad/s], shape (N, 2)."""
 
     progress_m: Array
-    """Way gained along the path [m], shape (N,)."""
+    """Progress along the path [m], shape (N,)."""
 
     off_path_m: Array
     """Distance from the path after the step [m], shape (N,)."""
@@ -101,16 +101,15 @@ Reward = Callable[[Transition], NDArray[Any]]
 
 
 def progress(step: Transition) -> Array:
-    """The reward unless another is given: way gained along the path less the distance from it times time.
+    """Default reward: progress along the path, minus the distance from it times the length of the step [m].
 
-    In metres: a robot that drives on the path earns its length, one that stands a metre away loses a metre a
-    second.
+    A robot that drives on the path earns its length. One that stands a metre away loses a metre a second.
     """
     return step.progress_m - step.off_path_m * step.step_s
 
 
 class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
-    """Robots of a scene that step together, each in the lab by itself."""
+    """Robots of a scene that step together, each alone in the lab."""
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - Gymnasium's
 
@@ -132,27 +131,26 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         session: Literal["drawn", "survey"] = "drawn",
         render_mode: None = None,
     ) -> None:
-        """Open a scene for robots.
+        """Open a scene for several robots.
 
         Args:
             num_envs: How many robots.
-            scene: The file of a stage, a `Scene`, or what `magtwin.open_twin` gave.
-            network: As for `magtwin.open_twin`, where `scene` is a file.
-            magnetometer: As for `magtwin.open_twin`, where `scene` is a file.
-            model_error: As for `magtwin.simulate`; each episode is a session of its own to it.
-            path: What the robots begin on and are rewarded by: a path, its name, a CSV file, or
+            scene: The file of a stage, a `Scene`, or a `Twin`.
+            network: As for `magtwin.open_twin`, if `scene` is a file.
+            magnetometer: As for `magtwin.open_twin`, if `scene` is a file.
+            model_error: As for `magtwin.simulate`; each episode counts as a session.
+            path: Where the robots begin and what they are rewarded for: a path, its name, a CSV file, or
                 points in world [m], shape (N, 2).
-            signals: Columns that are observed, of `BOUNDS`, one after the other.
+            signals: Columns of `BOUNDS` that are observed, in this order.
             reward: From a step of N robots to N rewards.
             step_s: Time between commands [s], a multiple of 0.02.
             duration_s: Time after which an episode is truncated [s].
             end_on_bump: Whether touching an obstacle, or the floor's border, ends an episode.
-            random_start: Whether robots begin anywhere on the path; otherwise at its first point.
-            session: "drawn": each episode is a session of its own, as `magtwin.sim.session.draw_session`
-                draws it: charge, IMU zero, LiDAR's phase, wheels, odometry and the robot's own field.
-                "survey": the robot as it was when the map was surveyed, in every episode. A Twin that is in
-                a session already stays in it.
-            render_mode: None: a Run is looked at in Rerun.
+            random_start: Whether robots begin anywhere on the path. Default: at its first point.
+            session: "drawn": each episode is a new session, from `magtwin.sim.session.draw_session`: charge,
+                IMU zero, LiDAR's phase, wheels, odometry and the robot's own field. "survey": the robot as
+                in the survey of the map. A Twin that is in a session stays in it.
+            render_mode: Must be None.
 
         Raises:
             InputError: No scene is given, or one of these is out of range.
@@ -171,10 +169,10 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         if twin.magnetometer:
             _check_network(twin.magnetometer)
         robot = twin.scene.robot
-        way = drive_input(path, room_of(twin))
-        if not isinstance(way, Path):
-            raise InputError(f"path must be one to drive along, got {way!r}")
-        self.path = way
+        line = drive_input(path, room_of(twin))
+        if not isinstance(line, Path):
+            raise InputError(f"path must be a path to drive along, got {line!r}", parameter="path")
+        self.path = line
         check_on_floor(self.path, twin.scene.lab.floor_m, robot.footprint_radius_m)
         check_clear(self.path, twin.obstacles, robot.footprint_radius_m)
         if not callable(reward):
@@ -216,19 +214,19 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         """Begin an episode of every robot.
 
         Args:
-            seed: That of the first robot, the next one's is one more; or one for each. None goes on with the
-                robots' generators.
-            options: None are known.
+            seed: Seed of the first robot, increased by one for each of the others; or a seed for each. None
+                continues the robots' generators.
+            options: Not used.
 
         Returns:
-            Observations, shape (num_envs, F), and as info the true pose and whether the robot touches.
+            Observations, shape (num_envs, F), and infos: the true pose, and whether the robot bumps.
         """
         if seed is None or isinstance(seed, int | np.integer):
             seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
         else:
             seeds = list(seed)
         if len(seeds) != self.num_envs:
-            raise InputError(f"seeds must be as many as robots, {self.num_envs}, got {len(seeds)}")
+            raise InputError(f"give one seed for each of the {self.num_envs} robots, got {len(seeds)}")
         for i, own in enumerate(seeds):
             if own is not None or self._rngs[i] is None:
                 self._rngs[i] = seeding.np_random(None if own is None else operator.index(own))[0]
@@ -241,13 +239,13 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
     ) -> tuple[
         NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
     ]:
-        """Command every robot for `step_s`; one whose episode was over begins anew instead.
+        """Command every robot for `step_s`; a robot whose episode is over begins again instead.
 
         Args:
             actions: Forward speed [m/s] and yaw rate [rad/s] of each, shape (num_envs, 2).
 
         Returns:
-            Observations, rewards, which episodes were ended by a bump, which by time, and infos as `reset`.
+            Observations, rewards, episodes ended by a bump, episodes ended by time, and infos as `reset`.
         """
         if not self._begun:
             raise gymnasium.error.ResetNeeded("call reset before step")
@@ -269,7 +267,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         return self._observations(), np.where(again, 0.0, rewards), ended, truncated, self._infos()
 
     def _begin(self, which: NDArray[np.intp]) -> None:
-        """Put robots on the path."""
+        """Place robots on the path."""
         rngs: list[np.random.Generator] = [rng for i in which if (rng := self._rngs[i]) is not None]
         for i, rng in zip(which, rngs, strict=True):
             self._s[i] = rng.uniform(0.0, self.path.length) if self.random_start else 0.0
@@ -288,7 +286,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         return np.clip(np.concatenate(parts, axis=1).astype(np.float32), box.low, box.high)
 
     def _infos(self) -> dict[str, Any]:
-        """The truth, in the arrays of Gymnasium's vector infos."""
+        """True poses and bumps, in Gymnasium's form of vector infos."""
         columns, known = self.stepped.columns, np.ones(self.num_envs, bool)
         infos: dict[str, Any] = {
             "p_world_base": columns["p_world_base"].copy(),
@@ -299,7 +297,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
 
 
 class MagNavEnv(gymnasium.Env[Any, Any]):
-    """One robot of a scene; arguments are those of `MagNavVectorEnv` but for `num_envs`."""
+    """One robot of a scene; arguments are those of `MagNavVectorEnv` without `num_envs`."""
 
     metadata = {"render_modes": []}  # noqa: RUF012 - Gymnasium's
 
@@ -321,14 +319,14 @@ class MagNavEnv(gymnasium.Env[Any, Any]):
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Command the robot for `step_s`; as `MagNavVectorEnv.step`."""
-        self.robots._over[:] = False  # who steps on after the end of an episode drives on
-        one = np.asarray(action, float)[None]
-        observations, rewards, ended, truncated, infos = self.robots.step(one)
+        self.robots._over[:] = False  # a step after the end of an episode drives on
+        actions = np.asarray(action, float)[None]
+        observations, rewards, ended, truncated, infos = self.robots.step(actions)
         return observations[0], float(rewards[0]), bool(ended[0]), bool(truncated[0]), _first(infos)
 
 
 def _predictions(network: "NeuralMagnetometer") -> Predict:
-    """What a network predicts of a table of robots, and the standard deviations of its errors."""
+    """A function from a table of robots to a network's predictions and their standard deviations."""
 
     def predictions(table: Run) -> tuple[Array, Array]:
         (read,) = network.read([table], outside=False)
@@ -338,7 +336,7 @@ def _predictions(network: "NeuralMagnetometer") -> Predict:
 
 
 def _check_network(network: "NeuralMagnetometer") -> None:
-    """Refuse a network that reads columns that MagNav does not simulate."""
+    """Refuse a network whose inputs are not simulated here."""
     if missing := sorted(network.columns - SENSED):
         raise InputError(
             f"{network.name}: reads {', '.join(missing)}, which MagNav does not simulate; give a network of "
@@ -352,12 +350,12 @@ def _first(infos: dict[str, Any]) -> dict[str, Any]:
 
 
 def _on_path(path: Path, s: Array, p_xy: Array) -> tuple[Array, Array]:
-    """Where robots are on a path, near where they were, to a centimetre; and how far from it.
+    """Arc lengths of robots on a path, to a centimetre, and their distances from it [m], each (N,).
 
     Args:
         path: The path.
-        s: Where they were, along it [m], shape (N,); goes on with further laps of a closed path.
-        p_xy: Where they are [m], shape (N, 2).
+        s: Arc lengths before the step, which grow over the laps of a closed path [m], shape (N,).
+        p_xy: Places of the robots [m], shape (N, 2).
     """
     tried = s[:, None] + np.linspace(-SEARCH_M, SEARCH_M, 61)
     if not path.closed:

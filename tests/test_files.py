@@ -118,7 +118,7 @@ def test_a_folder_is_replaced_whole(tmp_path):
 
 def test_nothing_is_overwritten_unasked(tmp_path):
     (tmp_path / "a.txt").touch()
-    with pytest.raises(InputError, match=r"a.txt: exists already; give --force"):
+    with pytest.raises(InputError, match=r"a.txt: exists already; give `force=True`"):
         check_free(tmp_path / "a.txt")
     assert check_free(tmp_path / "a.txt", force=True) == tmp_path / "a.txt"
 

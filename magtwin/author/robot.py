@@ -1,4 +1,4 @@
-"""Robot: an asset with drive, battery and sensors, from a URDF and what a URDF cannot say."""
+"""A robot asset with drive, battery and sensors, made from a URDF and settings."""
 
 import os
 from collections.abc import Callable
@@ -40,17 +40,17 @@ _DEFAULTS = RobotSpec(name="", asset=Path())
 
 @dataclass(frozen=True, kw_only=True)
 class RobotSettings(Spec):
-    """What a URDF cannot say of a robot; a robot.toml, or [robot] of a scene's TOML, holds its fields.
+    """Settings of a robot beyond its URDF: the keys of robot.toml, or of [robot] in a scene's TOML.
 
-    What is None is taken from the URDF's own tags where it has them, else it is the default of its
-    spec, on the base where the URDF has no link of the default's name.
+    A value of None comes from the URDF's own tags. If it has none, the default of the spec applies, on the
+    base if the URDF has no link with the default name.
     """
 
     name: str = ""
-    """Name that the URDF must give the robot; "" takes any."""
+    """Name of the robot in the URDF; "" accepts any."""
 
     footprint_radius_m: float | None = None
-    """Radius of the circle that must stay clear of walls [m]; that of the robot's shape unless given."""
+    """Radius of the circle that must stay free of obstacles [m]. Default: from the robot's shape."""
 
     drive: DriveSpec | None = None
     battery: BatterySpec = field(default_factory=BatterySpec)
@@ -61,7 +61,7 @@ class RobotSettings(Spec):
     mocap: MocapSpec = field(default_factory=MocapSpec)
 
     conversion: Options = DEFAULTS
-    """How the URDF is converted."""
+    """Options of the URDF conversion."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -83,17 +83,17 @@ def build_robot(
     Args:
         urdf: The description, see `convert_urdf`.
         settings: RobotSettings, or a TOML with their fields; sensors name their links.
-        out: Root layer to write, `.usda`; `read_robot` gives its spec.
-        options: How the URDF is converted, in place of what the settings say.
-        force: Whether files that are there are replaced.
-        thumbnail: Draws the asset, see `convert_with_report`.
+        out: Root layer to write, `.usda`; `load_robot` reads its spec.
+        options: Options of the conversion; they replace those of the settings.
+        force: Whether to replace existing files.
+        thumbnail: Function that draws the asset, see `convert_with_report`.
 
     Returns:
-        What became of the URDF.
+        The report of the conversion.
 
     Raises:
-        InputError: The URDF or the settings cannot be used (file, line and key are given), or a file
-            is there already; nothing is written.
+        InputError: The URDF or the settings are wrong (the text has file, line and key), or a file exists;
+            nothing is written.
     """
     where = "" if isinstance(settings, RobotSettings) else f"{settings}: "
     given = settings if isinstance(settings, RobotSettings) else read_settings(settings)
@@ -117,19 +117,19 @@ def build_robot(
 
 
 def read_settings(settings: str | os.PathLike[str]) -> RobotSettings:
-    """The settings of a TOML.
+    """The settings of a robot.toml.
 
     Raises:
-        InputError: The file is missing or not TOML, or a key or value is wrong; the line is given.
+        InputError: The file is missing or not TOML, or a key or value is wrong; the text has the line.
     """
     return from_table(RobotSettings, read_toml(settings), settings)
 
 
 def read_description(asset: str | os.PathLike[str]) -> str:
-    """The URDF that an asset was converted from, its root base_link, if `urdf_of` finds it; else "".
+    """Text of the URDF that an asset was converted from, with base_link as its root; "" if it is missing.
 
     Raises:
-        InputError: It is none that can be read.
+        InputError: The URDF cannot be read.
     """
     source = urdf_of(asset)
     if source is None:
@@ -137,14 +137,12 @@ def read_description(asset: str | os.PathLike[str]) -> str:
     try:
         text = source.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
-        raise InputError(
-            f"{source}: is not UTF-8, which ROS says descriptions in; save it as that"
-        ) from error
+        raise InputError(f"{source}: is not UTF-8, as ROS descriptions must be; save it as UTF-8") from error
     return reroot(text, BASE_LINK, source)
 
 
 def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
-    """Author what settings say at a converted robot's prim and on its links; notes of what was guessed."""
+    """Author the settings on a converted robot; returns notes of what was guessed."""
     stage, links, notes = robot.GetStage(), _links(robot), list[str]()
     robot.CreateAttribute("isaac:robotType", Sdf.ValueTypeNames.Token, custom=False).Set("Wheeled")
     radius = settings.footprint_radius_m
@@ -160,11 +158,11 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
     define_platform(robot, settings.platform)
     define_mocap(robot, settings.mocap)
     define_battery(stage, _free(links, _base(robot), "battery"), settings.battery)
-    told: tuple[tuple[str, Any, Any, Any], ...] = (
+    sensors: tuple[tuple[str, Any, Any, Any], ...] = (
         ("imu", settings.imu, ImuSpec(), define_imu),
         ("lidar", settings.lidar, LidarSpec(), define_lidar),
     )
-    for name, given, spec, define in told:
+    for name, given, spec, define in sensors:
         if given is None and prims_with(robot, name):
             continue
         if given is None and spec.link not in links:
@@ -173,21 +171,21 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
             define(stage, _free(links, base, name), replace(spec, link=base.name))
         else:
             path = _mount(links, name, given or spec)
-            notes += _make_way(robot, name, path)
+            notes += _replace_sensors(robot, name, path)
             define(stage, path, replace(given or spec, link=path.GetParentPath().name))
     if settings.magnetometer is not None or not prims_with(robot, "magnetometer"):
         magnetometer = settings.magnetometer or MagnetometerSpec()
         path = _mount(links, "magnetometer", magnetometer)
-        notes += _make_way(robot, "magnetometer", path)
+        notes += _replace_sensors(robot, "magnetometer", path)
         define_magnetometer(stage, path, replace(magnetometer, link=path.GetParentPath().name))
     return notes
 
 
-def _make_way(robot: Usd.Prim, noun: str, path: Sdf.Path) -> list[str]:
-    """Let the settings' sensor at `path` be the robot's only one of its kind; notes of what gave way.
+def _replace_sensors(robot: Usd.Prim, noun: str, path: Sdf.Path) -> list[str]:
+    """Make the settings' sensor at `path` the robot's only one of its kind; returns notes of what changed.
 
-    One of the URDF's tags on the same link is the same device and goes; one on another link stays for
-    other simulators.
+    A sensor of the URDF's tags on the same link is the same device and is removed. One on another link stays
+    for other simulators.
     """
     stage, notes = robot.GetStage(), []
     for prim in prims_with(robot, noun):
@@ -195,7 +193,7 @@ def _make_way(robot: Usd.Prim, noun: str, path: Sdf.Path) -> list[str]:
             continue
         where = f"{noun} {prim.GetName()!r} of link {prim.GetParent().GetName()!r}"
         if prim.GetParent().GetPath() == path.GetParentPath():
-            notes.append(f"{where}: the settings say what it is, not the URDF's tags")
+            notes.append(f"{where}: the settings replace the URDF's tags")
             stage.RemovePrim(prim.GetPath())
             continue
         notes.append(f"{where} is not simulated here: the settings name another")
@@ -206,7 +204,7 @@ def _make_way(robot: Usd.Prim, noun: str, path: Sdf.Path) -> list[str]:
 
 
 def _links(robot: Usd.Prim) -> dict[str, Sdf.Path]:
-    """Paths of a robot's links by name, the URDF's and USD's, those that only name a place included."""
+    """Paths of a robot's links by their URDF and USD names, including links without a body."""
     named = ("IsaacLinkAPI", "IsaacSiteAPI")
     return {
         name: prim.GetPath()
@@ -229,6 +227,6 @@ def _mount(links: dict[str, Sdf.Path], name: str, spec: MountSpec) -> Sdf.Path:
 
 
 def _free(links: dict[str, Sdf.Path], link: Sdf.Path, name: str) -> Sdf.Path:
-    """Path of a sensor on a link, called `name` unless a frame on that link is, which must not move."""
+    """Path of a sensor on a link, called `name` unless a frame on the link has that name."""
     names = (name, *(f"{name}_{i}" for i in range(2, len(links) + 3)))
     return next(path for n in names if (path := link.AppendChild(n)) not in links.values())

@@ -1,4 +1,4 @@
-"""A Scene as layered USD: authored from its spec or its TOML, and read back from the composed stage."""
+"""A Scene authored as a folder of USD layers."""
 
 import os
 import shutil
@@ -44,7 +44,7 @@ from magtwin.usd.sources import LOOKS, SOURCES, define_sources
 
 EARTH = WORLD.AppendChild("Earth")
 TAKEN = (LAB.name, PHYSICS_SCENE.name, MAP.name, EARTH.name, SOURCES.name, FURNITURE.name)
-"""Children of /World that a robot's name must leave alone."""
+"""Children of /World that cannot be names of robots."""
 
 PARTS: dict[str, Callable[..., Usd.Prim]] = {
     "magnetometer": define_magnetometer,
@@ -52,7 +52,7 @@ PARTS: dict[str, Callable[..., Usd.Prim]] = {
     "lidar": define_lidar,
     "battery": define_battery,
 }
-"""What a robot carries as prims of their own."""
+"""Parts of a robot that are separate prims."""
 
 
 def author_scene(
@@ -60,23 +60,22 @@ def author_scene(
 ) -> Path:
     """Write a scene as a folder of layers.
 
-    `<name>.usda` places each robot and says what differs from its asset; it stands over `room.usda`,
-    `furniture.usda` and `magnetics.usda` (the Earth's field and sources), where there are any, and the
-    map's layer.
+    `<name>.usda` places each robot, with what differs from its asset. Its sublayers are `room.usda`,
+    `furniture.usda`, `magnetics.usda` (the Earth's field and sources) and the map.
 
     Args:
         scene: What to author.
         folder: Folder to make.
-        by_reference: Whether map, robot and weights stay where they are and are named by relative paths.
-            Otherwise they are copied into the folder, which can then be moved anywhere.
-        force: Whether a folder that exists is replaced.
+        by_reference: Whether map, robot and weights stay where they are, named by relative paths. By default
+            they are copied into the folder, which can then be moved anywhere.
+        force: Whether to replace an existing folder.
 
     Returns:
         The root layer, `folder/<name>.usda`.
 
     Raises:
-        InputError: The folder exists, a file is missing, is not what it should be or not what its
-            checksum says, or a name cannot name a file or a prim.
+        InputError: The folder exists; a file is missing, of another kind, or differs from its checksum; or a
+            name is not valid for a file or a prim.
     """
     _check(scene)
     with output(folder, force=force) as aside:
@@ -93,18 +92,18 @@ def author_scene(
         root.subLayerPaths = [relative_asset(root, layer) for layer in sublayers]
         for robot in placed.robots:
             _define_robot(stage, robot, scene.map_sha256)
-        del stage  # what follows is right only at the layer's later place
+        del stage  # _settle makes paths right for the final folder
         _settle(root, aside, Path(folder).resolve())
         root.Save()
     return Path(folder) / f"{scene.name}.usda"
 
 
 def _check(scene: Scene) -> None:
-    """Refuse what would come out broken, before anything is written, by the names that the caller knows."""
+    """Refuse a scene that cannot be authored, before anything is written."""
     check_name(scene.name)
     for placed in scene.robots:
         if check_prim_name(placed.robot.name, "robot") in TAKEN:
-            raise InputError(f"robot {placed.robot.name!r} has the name of a part of the scene; rename it")
+            raise InputError(f"robot {placed.robot.name!r} has a name that scenes reserve; rename it")
     check_things(scene)
     load_map(scene.map_layer)
     check_map(scene)
@@ -117,26 +116,30 @@ def _check(scene: Scene) -> None:
 
 
 def check_things(scene: Scene) -> None:
-    """Refuse sources and furniture that cannot stand on one stage, or whose field cannot be computed."""
+    """Refuse sources and furniture with equal or reserved names, or whose field cannot be computed.
+
+    Raises:
+        InputError: Two have the same name, or a susceptibility needs the Earth's field.
+    """
     for what, things in (("sources", scene.sources), ("pieces of furniture", scene.furniture)):
         names = [thing.name for thing in things]
         if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise InputError(f"two {what} are called {twice[0]!r}; give each a name of its own")
+            raise InputError(f"two {what} are called {twice[0]!r}; give each its own name")
     if any(source.name == LOOKS for source in scene.sources):
-        raise InputError(f"source {LOOKS!r} has the name of the materials beside it; rename it")
+        raise InputError(f"source {LOOKS!r} has the name of the scope of materials; rename it")
     for source in scene.magnets:
         if source.susceptibility and scene.earth is None:
-            body_of(source)  # refuses
+            body_of(source)  # raises
 
 
 def _with_copies(scene: Scene, folder: Path) -> Scene:
-    """The scene on copies of its files in `folder`; what several robots share is copied once."""
+    """The scene with its files copied to `folder`, each file once."""
     copies: dict[Path, Path] = {}
 
     def once(file: Path, kind: str, name: str, copy: Callable[[Path, Path], Path]) -> Path:
         source = file.resolve()
         if source not in copies:
-            # Files of further robots have a folder of their own, as others may have their names.
+            # Files of further robots have their own folder, since names can repeat.
             place = folder / kind / name if (folder / kind).exists() else folder / kind
             copies[source] = copy(source, place)
         return copies[source]
@@ -168,9 +171,9 @@ def _copied(file: Path, folder: Path) -> Path:
 
 
 def _copied_asset(asset: Path, folder: Path) -> Path:
-    """A USD file copied with every file that it names, in the same arrangement, its picture and its URDF.
+    """A USD file copied with every file that it names, its thumbnail and its URDF.
 
-    The URDF is what live robots and bags say of it; the meshes that it names stay behind: the asset has them.
+    ROS publishes the URDF. Its meshes are not copied, since the asset has them.
     """
     asset = asset.resolve()
     layers, assets, unresolved = UsdUtils.ComputeAllDependencies(str(asset))
@@ -190,7 +193,7 @@ def _copied_asset(asset: Path, folder: Path) -> Path:
 
 
 def _part(scene: Scene, folder: Path, name: str) -> Path:
-    """A layer of a scene, under a name that its root layer does not have."""
+    """File of a layer, not that of the root layer."""
     taken = scene.name.casefold() == name
     return folder / (f"{name}_layer.usda" if taken else f"{name}.usda")
 
@@ -206,7 +209,7 @@ def _write_magnetics(scene: Scene, folder: Path) -> list[Path]:
     if scene.earth is None and not scene.sources:
         return []
     path = _part(scene, folder, "magnetics")
-    with new_stage(path, "What makes the magnetic field: the Earth and magnetised things") as stage:
+    with new_stage(path, "The sources of the magnetic field: the Earth and magnetised things") as stage:
         if scene.earth is not None:
             define_earth(stage, EARTH, scene.earth)
         if scene.sources:
@@ -218,13 +221,13 @@ def _write_furniture(scene: Scene, folder: Path) -> list[Path]:
     if not scene.furniture:
         return []
     path = _part(scene, folder, "furniture")
-    with new_stage(path, "Furniture and columns, and how they are magnetised") as stage:
+    with new_stage(path, "Furniture and columns, with their magnetization") as stage:
         define_furniture(stage, scene.furniture)
     return [path]
 
 
 def _define_robot(stage: Usd.Stage, placed: PlacedRobot, map_sha256: str) -> None:
-    """A robot by reference, where it starts, with overs for what differs from its asset."""
+    """A robot by reference at its start, with overs for what differs from its asset."""
     robot, root = placed.robot, stage.GetRootLayer()
     prim = UsdGeom.Xform.Define(stage, WORLD.AppendChild(robot.name)).GetPrim()
     prim.GetReferences().AddReference(relative_asset(root, robot.asset))
@@ -245,7 +248,7 @@ def _define_robot(stage: Usd.Stage, placed: PlacedRobot, map_sha256: str) -> Non
 
 
 def _settle(layer: Sdf.Layer, aside: Path, final: Path) -> None:
-    """Make paths that leave the folder `aside`, where the layer is written, right for `final`, its place."""
+    """Correct paths out of the temporary folder `aside` for the final folder."""
     aside = aside.resolve()
 
     def settled(path: str) -> str:

@@ -1,4 +1,4 @@
-"""A scene as a TOML file: what its tables hold, and the Scene that follows from them."""
+"""A scene as a TOML file: its tables, and the Scene made from them."""
 
 import os
 from collections.abc import Callable, Mapping
@@ -6,18 +6,9 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from magtwin.author.furniture import FurnitureTable, check_names, placed_furniture
 from magtwin.author.robot import RobotSettings, build_robot
-from magtwin.author.room import (
-    FurnitureTable,
-    asset_named,
-    check_name,
-    check_names,
-    check_start,
-    lab_of,
-    no_map,
-    obstacles_in,
-    placed_furniture,
-)
+from magtwin.author.room import asset_named, check_name, check_start, lab_of, no_map, obstacles_in
 from magtwin.author.scene import check_things
 from magtwin.errors import InputError
 from magtwin.files import existing, from_table, read_toml, refused_at, sha256
@@ -36,72 +27,73 @@ from magtwin.usd.robot import load_robot
 
 @dataclass(frozen=True, kw_only=True)
 class _RobotTable(RobotSettings):
-    """The robot: an asset, or a URDF and what a URDF cannot say. For several robots, write [[robot]] each."""
+    """The robot: an asset, or a URDF with further settings. For several robots, write one [[robot]] each."""
 
     name: str = ""
-    """Name of its prim, required for each of several robots. With urdf, the name that the URDF must give."""
+    """Name of the prim, required if there are several robots. With urdf, it must be the URDF's robot name."""
 
     start: Vec3 | None = None
-    """Where it stands at first: x [m], y [m] and yaw [rad]. By default that of the scene or, of several
-    robots, where its path begins. Refused inside of furniture; the refusal names the nearest free place."""
+    """Start: x [m], y [m] and yaw [rad]. Default: the scene's start; with several robots, the first point of
+    its path. A start inside furniture is an error, which names the nearest free place."""
 
     path: str = ""
-    """What it drives unless told otherwise: the name of a path, "random", or a CSV file of x,y. Default:
-    figure8."""
+    """Default path: the name of a path, "random", or a CSV file of x,y. Default: figure8."""
 
     asset: Path | None = None
-    """Robot that ships, by its name ("turtlebot4"), or USD file made by `magtwin robot`."""
+    """Name of a robot that ships with magtwin ("turtlebot4"), or USD file made by `magtwin robot`."""
 
     urdf: Path | None = None
-    """URDF or xacro file to convert, in place of an asset."""
+    """URDF or xacro file to convert, instead of an asset."""
 
     network: Path | None = None
     """Weights that predict the robot's disturbance, for a neural magnetometer."""
 
     kind: Literal["physical", "neural", "map-only"] | None = None
-    """What its magnetometer reads: the exact field, the map and the network's prediction, or the map. By
-    default neural with a network, else physical."""
+    """Magnetometer: it reads the exact field, the map plus the network's prediction, or the map. Default:
+    neural with a network, else physical."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _EarthTable(EarthFieldSpec):
-    """The Earth's field, uniform over the room. It follows from place and date by the IGRF-14, to 2030."""
+    """The Earth's field, uniform over the room. By default computed from place and date with the IGRF-14, up
+    to 2030.
+    """
 
     b_world_nt: Vec3 = ZERO3
-    """Field in world axes [nT], where it was measured. Unless measured is true, it must be the model's within
-    1 nT."""
+    """Field in world axes [nT], if it was measured. Unless measured is true, it must agree with the model
+    within 1 nT."""
 
     @property
     def spec(self) -> EarthFieldSpec:
-        """What it says, its field filled in or checked."""
+        """The spec, with its field computed or checked."""
         return checked(EarthFieldSpec(**vars(self)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class _SourcesTable:
-    """Furniture and sources in a file of their own."""
+    """Furniture and sources in another file."""
 
     file: Path
-    """TOML with [[furniture]] and [[source]] tables, which are added to those of the scene."""
+    """TOML with [[furniture]] and [[source]] tables to add to those of the scene."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneFile:
-    """A scene's TOML; docs/scenes.md is made from it."""
+    """A scene's TOML; docs/scenes.md is generated from this class."""
 
     name: str
-    """Name of the scene and of its root layer: any that a file can have on every system."""
+    """Name of the scene and of its root layer: any file name that is valid on every system."""
 
     robot: tuple[_RobotTable, ...]
 
     map: Path | None = None
-    """USD layer of the magnetic map. By default the scene is surveyed, see above."""
+    """USD layer of the magnetic map. Default: the scene is surveyed, see above."""
 
     start: Vec3 = ZERO3
-    """Where the robot stands at first: x [m], y [m] and yaw [rad]. A path begins where it begins."""
+    """Start of the robot: x [m], y [m] and yaw [rad]. A path starts at its own first point."""
 
     seed: int = 0
-    """Seed of the magnetization of furniture that gives none, and of the survey's noise."""
+    """Seed of the default magnetization of furniture, and of the survey's noise."""
 
     lab: LabSpec = field(default_factory=LabSpec)
     earth: _EarthTable | None = None
@@ -117,7 +109,7 @@ class SceneFile:
 
 @dataclass(frozen=True, kw_only=True)
 class _SourceFile:
-    """A TOML of what is magnetised, one [[source]] or [[furniture]] each."""
+    """A TOML with [[source]] and [[furniture]] tables."""
 
     source: tuple[SourceSpec, ...] = ()
     furniture: tuple[FurnitureTable, ...] = ()
@@ -132,22 +124,21 @@ def scene_from_toml(
     inputs_of: Callable[[Path], tuple[str, ...]] = lambda weights: (),
     survey_of: Callable[[Scene, SurveySpec, int, Obstacles], Path] | None = None,
 ) -> Scene:
-    """The scene that a TOML describes, as scenes/lab.toml does; docs/scenes.md has every key.
+    """Read a scene from a TOML such as scenes/lab.toml; docs/scenes.md lists every key.
 
     Args:
-        path: The TOML; files that it names are taken from its folder.
-        map_layer: Map to use in place of the one that it names. The Earth's field, sources and furniture stay
-            as the TOML has them; `magtwin.twin.scene_from_toml` refuses a map that contradicts them.
-        network: Weights to use in place of those that it names.
-        workshop: Folder in which the asset is built of a robot that the TOML names by its URDF; a
-            self-contained scene copies it from there.
-        inputs_of: Gives the names of the inputs of a weights file, which this room cannot read; see
-            `magtwin.twin.scene_from_toml`. Without it the scene leaves them open.
-        survey_of: Surveys a scene that names no map, whose `map_layer` is not there yet, and gives the map
-            layer; called with the scene, how to survey it, the seed and what stands in the room.
+        path: The TOML. Relative file names in it are relative to its folder.
+        map_layer: Map that replaces the TOML's. The Earth's field, sources and furniture do not change;
+            `magtwin.twin.scene_from_toml` refuses a map that contradicts them.
+        network: Weights that replace the TOML's.
+        workshop: Folder for the asset of a robot that the TOML gives as a URDF.
+        inputs_of: Function from a weights file to the names of its inputs, see
+            `magtwin.twin.scene_from_toml`. By default the scene names no inputs.
+        survey_of: Function that surveys a scene without a map and returns the map layer. It gets the scene,
+            the survey, the seed and the obstacles.
 
     Raises:
-        InputError: A key is misspelt or missing, or a file is not there; with file and line.
+        InputError: A key is unknown or missing, or a file is missing; the text has file and line.
     """
     table = read_toml(path)
     alone = isinstance(table.get("robot"), dict)  # [robot], not [[robot]]
@@ -172,17 +163,17 @@ def scene_from_toml(
     check_names(pieces, path)
     standing = obstacles_in(lab, pieces)
     robots: list[PlacedRobot] = []
-    for number, (one, keys) in enumerate(zip(given.robot, table["robot"], strict=True)):
-        where = f"{path}: [robot]" if alone else f"{path}: [[robot]] {one.name!r}"
-        robot = _robot(one, keys, where, workshop, named=not alone)
-        robot = _with_network(robot, one, network, where, inputs_of)
-        way = _way(one.path, Path(path).parent, where)
-        start, of_robot = one.start, True
+    for number, (robot_table, keys) in enumerate(zip(given.robot, table["robot"], strict=True)):
+        where = f"{path}: [robot]" if alone else f"{path}: [[robot]] {robot_table.name!r}"
+        robot = _robot(robot_table, keys, where, workshop, named=not alone)
+        robot = _with_network(robot, robot_table, network, where, inputs_of)
+        drives = _path(robot_table.path, Path(path).parent, where)
+        start, of_robot = robot_table.start, True
         if start is None:
             of_robot = not (alone or (not robots and "start" in table))
             room = Room(lab.floor_m, robot.footprint_radius_m, standing)
-            start = _beginning(way, room) if of_robot else given.start
-        robots.append(PlacedRobot(robot=robot, start=start, path=way))
+            start = _path_start(drives, room) if of_robot else given.start
+        robots.append(PlacedRobot(robot=robot, start=start, path=drives))
         try:
             check_start(robots[-1], lab, standing)
         except InputError as error:
@@ -219,22 +210,22 @@ def _robot(
     *,
     named: bool,
 ) -> RobotSpec:
-    """The robot of a table of a scene's TOML, built from its URDF where it names one, under its name."""
+    """The robot of a table: its asset, or one built from its URDF."""
     if named and not table.name:
-        raise InputError(f'{where} needs name = "NAME", that of its prim')
+        raise InputError(f'{where} needs name = "NAME", the name of its prim')
     if table.asset is not None and table.urdf is None:
         known = {"asset", "network", "kind", "start", "path", *(["name"] if named else [])}
         if others := sorted(set(keys) - known):
-            raise InputError(f"{where} {others[0]} goes with urdf; the asset says it already")
+            raise InputError(f"{where} {others[0]} goes with urdf; an asset has it already")
         robot = load_robot(asset_named(table.asset, keys["asset"], where))
         return replace(robot, name=table.name) if named else robot
     if table.urdf is None or table.asset is not None:
-        raise InputError(f'{where} needs asset = "FILE.usda" or urdf = "FILE.urdf", one of the two')
+        raise InputError(f'{where} needs asset = "FILE.usda" or urdf = "FILE.urdf", and not both')
     if workshop is None:
-        raise InputError(f"{where} names a URDF; name a workshop, a folder to build the robot in")
+        raise InputError(f"{where} names a URDF; give `workshop=DIR`, a folder to build the robot in")
     settings = RobotSettings(**{f.name: getattr(table, f.name) for f in fields(RobotSettings)})
     if named:
-        settings = replace(settings, name="")  # takes any of the URDF's own
+        settings = replace(settings, name="")  # accept any name in the URDF
     folder = Path(workshop) / table.name if named else Path(workshop)
     asset = folder / f"{table.urdf.name.split('.')[0]}.usda"
     asset.parent.mkdir(parents=True, exist_ok=True)
@@ -253,7 +244,7 @@ def _with_network(
     where: str,
     inputs_of: Callable[[Path], tuple[str, ...]],
 ) -> RobotSpec:
-    """A robot with the weights of its table, or those given in their place, and the kind that it says."""
+    """The robot with the weights and the kind of its table; `network` replaces the weights."""
     weights = Path(network).resolve() if network is not None else table.network
     if weights is not None:
         weights = existing(weights, "weights file")
@@ -268,12 +259,12 @@ def _with_network(
     if table.kind is not None and network is None:
         robot = replace(robot, magnetometer=replace(robot.magnetometer, kind=table.kind))
     if robot.magnetometer.kind == "neural" and robot.magnetometer.network is None:
-        raise InputError(f'{where} kind = "neural" needs network = "FILE" beside it')
+        raise InputError(f'{where} kind = "neural" needs network = "FILE"')
     return robot
 
 
-def _way(path: str, folder: Path, where: str) -> str | Path:
-    """What a robot is said to drive: a name, or a file from the TOML's folder; refused if it is neither."""
+def _path(path: str, folder: Path, where: str) -> str | Path:
+    """The default path of a robot: a name, or a file in the TOML's folder."""
     if path in ("", "random"):
         return path
     file = (folder / path).resolve()
@@ -285,11 +276,11 @@ def _way(path: str, folder: Path, where: str) -> str | Path:
     return path if named else file
 
 
-def _beginning(way: str | Path, room: Room) -> Vec3:
-    """Where a path begins and whither it goes, so that robots of one scene do not stand in each other."""
-    if way in ("", "random"):
+def _path_start(drives: str | Path, room: Room) -> Vec3:
+    """Position and heading at the start of a path, so that robots do not start inside each other."""
+    if drives in ("", "random"):
         return ZERO3
-    path = path_in(room, way)
+    path = path_in(room, drives)
     x, y = path.p_xy[0].tolist()
     return x, y, float(path.heading(0.0))
 
@@ -308,12 +299,12 @@ def read_sources(
 
     Args:
         path: The TOML.
-        seed: Seed of the magnetization of furniture that gives none.
-        lab: Room whose slab the furniture must stand on; None does not check.
+        seed: Seed of the default magnetization of furniture.
+        lab: Room whose slab the furniture must stand on. None skips the check.
 
     Raises:
-        InputError: A key is misspelt or missing, a figure is out of range, or a piece stands beside the
-            slab; with file and line.
+        InputError: A key is unknown or missing, a value is out of range, or a piece does not stand on the
+            slab; the text has file and line.
     """
-    listed = from_table(_SourceFile, read_toml(path), path)
-    return listed.source, placed_furniture(listed.furniture, lab, path, seed=seed)
+    tables = from_table(_SourceFile, read_toml(path), path)
+    return tables.source, placed_furniture(tables.furniture, lab, path, seed=seed)

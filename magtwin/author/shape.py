@@ -1,4 +1,4 @@
-"""What a robot's shape tells that nobody has said: its footprint, its wheels, and where the floor is."""
+"""Defaults from a robot's shape: footprint, wheels, and height above the floor."""
 
 import math
 from dataclasses import dataclass, replace
@@ -9,43 +9,43 @@ from magtwin.spec.drive import DriveSpec
 from magtwin.usd.attributes import read_pose, write_pose
 
 ALIKE_M = 0.01
-"""How far two wheels of an axle may be from mirror images of each other [m]."""
+"""Largest deviation of two wheels of an axle from mirror images [m]."""
 
 OFF = 0.02
-"""Part by which a figure must differ from the robot's shape for that to be taken in its place."""
+"""Relative difference above which the robot's shape replaces a default."""
 
 SUNK_M = 1e-3
-"""Distance between wheels and floor up to which a robot stands on it [m]."""
+"""Largest distance between wheels and floor of a robot that stands on it [m]."""
 
 _DEFAULTS = DriveSpec()
 
 
 @dataclass(frozen=True)
 class Wheel:
-    """A body on a joint that turns without end."""
+    """A body on a joint without limits."""
 
     joint: str
     x: float
     y: float
     z: float
-    """Its middle in the robot's axes [m]."""
+    """Centre in the robot's axes [m]."""
     radius_m: float
 
     @property
     def lowest_m(self) -> float:
-        """Height of its lowest point [m]."""
+        """Height of the lowest point [m]."""
         return self.z - self.radius_m
 
 
 def drive_of(robot: Usd.Prim, given: DriveSpec) -> tuple[DriveSpec, list[str]]:
-    """A drive with what the robot's shape tells in place of defaults; and notes of that.
+    """The drive, with values from the robot's shape instead of defaults, and notes of these.
 
-    Wheels that no setting names are the only two that mirror each other. Their distance and radius are taken
-    from the shape where the settings leave them at the default, which is a TurtleBot 4's.
+    Wheels that the settings do not name are the only two that mirror each other. Their separation and radius
+    come from the shape if the settings have the defaults, those of a TurtleBot 4.
 
     Args:
         robot: The robot's prim, converted.
-        given: What the settings say.
+        given: The drive of the settings.
     """
     wheels = {wheel.joint: wheel for wheel in wheels_of(robot)}
     names = given.left_wheel_joint, given.right_wheel_joint
@@ -69,9 +69,9 @@ def drive_of(robot: Usd.Prim, given: DriveSpec) -> tuple[DriveSpec, list[str]]:
 
 
 def stand_on_floor(robot: Usd.Prim, drive: DriveSpec) -> list[str]:
-    """Raise or lower a robot's bodies so that its wheels touch the floor, z = 0 of its prim; a note of that.
+    """Raise or lower a robot's bodies so that its wheels touch the floor, z = 0 of its prim; returns a note.
 
-    A URDF whose root is not at the floor, such as a base_link between the wheels, would stand in it.
+    A URDF whose root is not at the floor, such as a base_link between the wheels, needs this.
     """
     wheels = {wheel.joint: wheel for wheel in wheels_of(robot)}
     lowest = [wheels[n].lowest_m for n in (drive.left_wheel_joint, drive.right_wheel_joint) if n in wheels]
@@ -82,12 +82,12 @@ def stand_on_floor(robot: Usd.Prim, drive: DriveSpec) -> list[str]:
         if body.HasAPI(UsdPhysics.RigidBodyAPI):
             (x, y, z), q = read_pose(body)
             write_pose(body, (x, y, z + up), q)
-    way = "raised" if up > 0 else "lowered"
-    return [f"the robot is {way} by {abs(up):g} m, so that its wheels stand on the floor"]
+    moved = "raised" if up > 0 else "lowered"
+    return [f"the robot is {moved} by {abs(up):g} m, so that its wheels stand on the floor"]
 
 
 def wheels_of(robot: Usd.Prim) -> list[Wheel]:
-    """The bodies of a robot that turn without end."""
+    """The bodies of a robot on joints without limits."""
     found = []
     for prim in Usd.PrimRange(robot):
         joint = UsdPhysics.RevoluteJoint(prim)
@@ -104,9 +104,9 @@ def wheels_of(robot: Usd.Prim) -> list[Wheel]:
 
 
 def footprint_of(robot: Usd.Prim) -> float | None:
-    """Radius of the circle about the robot's origin that holds its shape seen from above [m], to the mm.
+    """Radius of the smallest circle about the robot's origin that contains its shape from above [m].
 
-    None of a robot without shapes.
+    Rounded up to 1 mm; None if the robot has no shapes.
     """
     box = _box(robot, robot)
     if box.IsEmpty():
@@ -117,7 +117,7 @@ def footprint_of(robot: Usd.Prim) -> float | None:
 
 
 def _axles(wheels: list[Wheel]) -> list[tuple[Wheel, Wheel]]:
-    """Wheels that mirror each other, left and right."""
+    """Pairs of wheels that mirror each other, left and right."""
     return [
         (left, right)
         for left in wheels
@@ -128,7 +128,7 @@ def _axles(wheels: list[Wheel]) -> list[tuple[Wheel, Wheel]]:
 
 
 def _box(robot: Usd.Prim, prim: Usd.Prim) -> Gf.Range3d:
-    """The box about what is below a prim, along the robot's axes."""
+    """The bounding box of everything below a prim, along the robot's axes."""
     purposes = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render, UsdGeom.Tokens.guide]
     boxes, places = UsdGeom.BBoxCache(Usd.TimeCode.Default(), purposes), UsdGeom.XformCache()
     bound = boxes.ComputeWorldBound(prim)

@@ -284,7 +284,7 @@ def teleop(
     """
     from magtwin.cli.runs.drive import device
     from magtwin.files import existing
-    from magtwin.io.bags.raw import RawBagWriter
+    from magtwin.io.bags import RawBagWriter
     from magtwin.ros.record import Recorder
     from magtwin.ros.teleop import Teleop
     from magtwin.sim.motion.manual import HELP, Hand, Keyboard
@@ -332,7 +332,7 @@ def record(
     topic
         Topic to record. May be repeated. Default: all of the robot's.
     """
-    from magtwin.io.bags.raw import RawBagWriter
+    from magtwin.io.bags import RawBagWriter
     from magtwin.ros.record import Recorder
 
     writer = RawBagWriter(out, force=force)

@@ -1,8 +1,7 @@
-"""Attached: files that no package may hold, a network above all, as bytes in a layer, and back.
+"""Files attached to a layer as bytes: a .usdz may hold no networks, only layers, pictures and sounds.
 
-A .usdz holds layers, pictures and sounds. What else a stage names goes into it as a prim a file, below the
-scope `Files` of the default prim: the bytes as one array, the checksum, and the properties that named the
-file, which name nothing meanwhile. A program with usd-core alone gets it back:
+Each file becomes a prim below the scope `Files` of the default prim, with its bytes, its checksum and a
+relationship to the properties that named it; these are empty meanwhile. To get a file with usd-core alone:
 
     Path("net.safetensors").write_bytes(bytes(prim.GetAttribute("magtwin:file:bytes").Get()))
 """
@@ -18,26 +17,26 @@ from magtwin.errors import InputError
 from magtwin.export.contents import kind_of, named_files
 from magtwin.files import sha256
 from magtwin.usd.layers import open_stage, relative_asset
-from magtwin.usd.schema import place as said
+from magtwin.usd.schema import place as prim_place
 
 SCOPE = "Files"
 """Name of the scope, below the default prim."""
 
 KINDS = ("weights", "paths")
-"""Files that are attached, by `contents.KINDS`."""
+"""Kinds of files to attach, see `contents.KINDS`."""
 
 NAME, BYTES, SHA256, OF = (f"magtwin:file:{name}" for name in ("name", "bytes", "sha256", "of"))
 
 
 def attach(root: Path, *more: Path) -> None:
-    """Take files of a stage's folder into a layer beside the root layer, `files.usdc`, its sublayer.
+    """Move files of a stage's folder into a new sublayer of the root layer, `files.usdc`.
 
     Args:
-        root: Root layer; a folder of layers below which all that is named lies.
-        more: Files below that folder to attach though no property names them.
+        root: Root layer; its folder contains all files.
+        more: Further files of that folder to attach, which no property names.
 
     Raises:
-        InputError: The stage has no default prim for them to stand below, or a prim called as their scope.
+        InputError: The stage has no default prim, or a prim has the path of the scope.
     """
     stage = open_stage(root)
     named = {file.resolve(): list[Sdf.Path]() for file in more}
@@ -53,7 +52,7 @@ def attach(root: Path, *more: Path) -> None:
         raise InputError(f"{root}: has no default prim to attach files below; set one")
     scope, meta = default.GetPath().AppendChild(SCOPE), stage.GetRootLayer()
     if stage.GetPrimAtPath(scope):
-        raise InputError(f"{root} <{scope}>: is where files are attached; rename that prim")
+        raise InputError(f"{root} <{scope}>: is the scope of attached files; rename that prim")
     layers = [layer for layer in stage.GetUsedLayers() if layer.realPath]
     for layer in layers:
         if any(kind_of(file.path) in KINDS for file in named_files(layer)):
@@ -62,7 +61,7 @@ def attach(root: Path, *more: Path) -> None:
     names = ("files.usdc", *(f"files_{i}.usdc" for i in range(2, 99)))
     place = next(path for path in map(root.with_name, names) if not path.exists())
     files = Sdf.Layer.CreateNew(str(place))
-    files.documentation = "Files that no package may hold, as bytes"
+    files.documentation = "Files as bytes, which a package may not hold otherwise"
     files.customLayerData = {"creator": "magtwin"}
     for key in ("metersPerUnit", "upAxis", "kilogramsPerUnit"):
         if meta.pseudoRoot.HasInfo(key):
@@ -105,27 +104,25 @@ def _define(layer: Sdf.Layer, scope: Sdf.Path, named: dict[Path, list[Sdf.Path]]
 
 
 def detach(root: Path) -> tuple[Path, ...]:
-    """Write the files that are attached to a stage beside its root layer, and name them as they were named.
+    """Write a stage's attached files beside its root layer, and restore the properties that named them.
 
     Returns:
-        Those that nothing named.
+        Files that no property named.
 
     Raises:
-        InputError: A file is damaged, or its name or kind is none that magtwin attaches.
+        InputError: A file is damaged, or has a name or kind that magtwin does not attach.
     """
     stage = open_stage(root)
-    found, unnamed = _found(stage), []
-    for prim in found:
+    prims, unnamed = _file_prims(stage), []
+    for prim in prims:
         name, data = str(prim.GetAttribute(NAME).Get() or ""), _bytes(prim)
         if Path(name).name != name or "\\" in name or kind_of(name) not in KINDS:
-            raise InputError(f"{said(prim)}: {NAME} {name!r} is no name of a file that is attached")
+            raise InputError(f"{prim_place(prim)}: {NAME} {name!r} is not a valid name of an attached file")
         if hashlib.sha256(data).hexdigest() != prim.GetAttribute(SHA256).Get():
-            raise InputError(
-                f"{said(prim)}: the bytes of {name} are not those that its checksum was taken of"
-            )
+            raise InputError(f"{prim_place(prim)}: the bytes of {name} do not match their checksum")
         file = root.parent / kind_of(name) / name
         if file.exists():
-            raise InputError(f"{said(prim)}: a second file {name}; rename one")
+            raise InputError(f"{prim_place(prim)}: a second file {name}; rename one")
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(data)
         targets = prim.GetRelationship(OF).GetTargets()
@@ -134,15 +131,15 @@ def detach(root: Path) -> tuple[Path, ...]:
         for path in targets:
             attribute = stage.GetAttributeAtPath(path)
             if not attribute or attribute.GetTypeName() != Sdf.ValueTypeNames.Asset:
-                raise InputError(f"{said(prim)}: {OF} names {path}, which names no file")
+                raise InputError(f"{prim_place(prim)}: {OF} names {path}, which is no asset attribute")
             layer = next((spec.layer for spec in attribute.GetPropertyStack()), stage.GetRootLayer())
             with Usd.EditContext(stage, layer):
                 attribute.Set(Sdf.AssetPath(relative_asset(layer, file)))
-    if not found:
+    if not prims:
         return ()
     handles = stage.GetLayerStack(includeSessionLayers=False)
-    layers = [Sdf.Layer.FindOrOpen(layer.identifier) for layer in handles]  # which keeps them
-    _remove(layers, found[0].GetParent().GetPath())
+    layers = [Sdf.Layer.FindOrOpen(layer.identifier) for layer in handles]  # keeps them open
+    _remove(layers, prims[0].GetParent().GetPath())
     for layer in layers:
         if layer.dirty:
             layer.Save()
@@ -150,15 +147,15 @@ def detach(root: Path) -> tuple[Path, ...]:
 
 
 def attached_sha256(attribute: Usd.Attribute) -> str:
-    """The SHA-256 of the bytes that are attached for what an attribute names; "" where there are none."""
-    for prim in _found(attribute.GetStage()):
+    """SHA-256 of the file attached for an attribute; "" if there is none."""
+    for prim in _file_prims(attribute.GetStage()):
         if attribute.GetPath() in prim.GetRelationship(OF).GetTargets():
             return hashlib.sha256(_bytes(prim)).hexdigest()
     return ""
 
 
-def _found(stage: Usd.Stage) -> list[Usd.Prim]:
-    """The prims that hold files."""
+def _file_prims(stage: Usd.Stage) -> list[Usd.Prim]:
+    """The prims of attached files."""
     default = stage.GetDefaultPrim()
     scope = default.GetChild(SCOPE) if default else Usd.Prim()
     return [prim for prim in scope.GetChildren() if prim.HasAttribute(BYTES)] if scope else []
@@ -170,7 +167,7 @@ def _bytes(prim: Usd.Prim) -> bytes:
 
 
 def _remove(layers: list[Sdf.Layer], scope: Sdf.Path) -> None:
-    """Take a scope out of the layers that have it, and the layers that had nothing else off the disk."""
+    """Remove a scope from its layers, and delete layers that are then empty."""
     for layer in layers:
         if not layer.GetPrimAtPath(scope):
             continue
@@ -188,5 +185,5 @@ def _remove(layers: list[Sdf.Layer], scope: Sdf.Path) -> None:
 
 
 def _is_empty(layer: Sdf.Layer) -> bool:
-    """Whether nothing is left in a layer but its default prim, unsaid."""
+    """Whether a layer is empty apart from its default prim."""
     return not layer.subLayerPaths and not any(p.nameChildren or p.properties for p in layer.rootPrims)

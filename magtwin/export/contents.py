@@ -1,4 +1,4 @@
-"""Contents: every file that a stage is made of, brought into one folder, each named relative to it."""
+"""The files of a stage, copied into one folder with relative names."""
 
 import os
 import re
@@ -24,15 +24,15 @@ KINDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "sounds": (".m4a", ".mp3", ".wav"),
     }
 )
-"""What a stage names beside layers, by the folder that it comes to lie in. Nothing else is carried: a stage
-of a stranger's could otherwise put any file of this machine into what is handed on."""
+"""Suffixes of files other than layers, by their folder in the export. Other files are not exported: an
+untrusted stage could otherwise leak any file of this machine."""
 
 THUMBNAIL = Path(".thumbs", "256x256")
-"""Where the picture of a layer lies beside it."""
+"""Folder of a layer's thumbnail, relative to the layer."""
 
 
 def kind_of(file: str | os.PathLike[str]) -> str:
-    """What a file is by its suffix: a key of `KINDS`, or "" for none."""
+    """Kind of a file by its suffix: a key of `KINDS`, or ""."""
     suffix = Path(file).suffix.lower()
     return next((kind for kind, suffixes in KINDS.items() if suffix in suffixes), "")
 
@@ -40,23 +40,22 @@ def kind_of(file: str | os.PathLike[str]) -> str:
 def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> Path:
     """Copy a stage and every file that it names, in any variant, into a folder.
 
-    What lies below the stage's own folder stays as it was arranged. Other layers come into a folder called as
-    theirs was, other files into one by their kind. A layer whose names stay right keeps its bytes, and so
-    its checksum.
+    Files below the stage's folder keep their arrangement. Other layers are copied to a folder named
+    after their own, other files to a folder by kind. A layer whose paths stay valid keeps its bytes.
 
     Args:
         root: The stage's root layer.
-        folder: Folder that exists and is empty.
-        within: Folder that the stage may not reach out of; anywhere unless given.
+        folder: An existing empty folder.
+        within: Folder that must contain all files. None allows any.
 
     Returns:
         The root layer's copy.
 
     Raises:
-        InputError: A file that is named is not there, is of no kind that is carried or lies outside of
-            `within`; or the stage cannot be opened. Says the layer and the prim.
+        InputError: A file is missing, of a kind that is not exported, or outside `within`; or the stage
+            cannot be opened. The text has layer and prim.
     """
-    open_stage(root)  # refuses
+    open_stage(root)  # raises if a layer is missing
     root = root.resolve()
     layers, assets, lost = dependencies(root)
     files = {Path(layer.realPath).resolve(): layer for layer in layers}
@@ -64,8 +63,7 @@ def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> P
     for name in lost:
         if not _is_library(name):
             raise InputError(
-                f"{_namer(layers, name)}: names {name}, which is not there; put it there, or take the name "
-                "out"
+                f"{_namer(layers, name)}: names {name}, which does not exist; add the file or remove the name"
             )
     for file in (*files, *others):
         _check_carried(file, layers, within)
@@ -78,12 +76,12 @@ def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> P
 
 
 def dependencies(root: Path) -> tuple[list[Sdf.Layer], list[str], list[str]]:
-    """A stage's layers, in any variant, the other files that they name, and names of what is not there."""
-    heard = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
+    """Layers of a stage in any variant, other files that they name, and names of missing files."""
+    diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
     try:
         layers, assets, lost = UsdUtils.ComputeAllDependencies(str(root))
     finally:
-        heard.TakeUncoalescedDiagnostics()
+        diagnostics.TakeUncoalescedDiagnostics()
     return layers, assets, lost
 
 
@@ -132,12 +130,12 @@ _ASSETS = (Sdf.ValueTypeNames.Asset, Sdf.ValueTypeNames.AssetArray)
 
 
 def _is_library(name: str) -> bool:
-    """Whether a name is of a material that Omniverse itself brings, such as OmniPBR.mdl."""
+    """Whether a name is a material of Omniverse, such as OmniPBR.mdl."""
     return Path(name).suffix == ".mdl" and "/" not in name
 
 
 def _check_carried(file: Path, layers: Iterable[Sdf.Layer], within: Path | None) -> None:
-    """Refuse a file that must not be handed on."""
+    """Refuse a file that must not be exported."""
     if "[" in file.as_posix() or file.suffix == ".usdz":
         raise InputError(
             f"{_namer(layers, str(file))}: names {file}, a part of a package; unpack that with "
@@ -145,12 +143,13 @@ def _check_carried(file: Path, layers: Iterable[Sdf.Layer], within: Path | None)
         )
     if within is not None and not file.is_relative_to(within.resolve()):
         raise InputError(
-            f"{_namer(layers, str(file))}: names {file}, outside of its package; it must bring all it names"
+            f"{_namer(layers, str(file))}: names {file}, outside its package"
+            "; a package must contain all of its files"
         )
     if file.suffix not in SUFFIXES and not kind_of(file):
         raise InputError(
             f"{_namer(layers, str(file))}: names {file}, which is no layer, texture, network or path, so it "
-            "is not handed on; take the name out"
+            "is not exported; remove the name"
         )
 
 
@@ -169,7 +168,7 @@ def _resolved(layer: Sdf.Layer, asset: str) -> Path:
 
 
 def _places(root: Path, layers: Iterable[Path], others: Iterable[Path]) -> dict[Path, Path]:
-    """Where in the folder each file comes to lie."""
+    """Place of each file in the folder."""
     everything = sorted({*layers, *others}, key=lambda file: (len(file.parts), file))
     inside = {file.relative_to(root.parent).parts[0] for file in everything if root.parent in file.parents}
     groups = {root.parent: Path()}
@@ -188,14 +187,14 @@ def _places(root: Path, layers: Iterable[Path], others: Iterable[Path]) -> dict[
 
 
 def _copy_layer(file: Path, layer: Sdf.Layer, folder: Path, places: Mapping[Path, Path]) -> None:
-    """Copy a layer, with what it names as it lies now."""
+    """Copy a layer, with its asset paths changed to the new places."""
     place = places[file]
     changed = False
 
     def moved(asset: str) -> str:
         nonlocal changed
         target = places.get(_resolved(layer, asset)) if asset else None
-        if target is None and "<UDIM>" in asset:  # stands for several files of one folder
+        if target is None and "<UDIM>" in asset:  # a pattern for several files of one folder
             target = _udim(_resolved(layer, asset), places)
         if target is None:
             return asset
@@ -217,7 +216,7 @@ def _copy_layer(file: Path, layer: Sdf.Layer, folder: Path, places: Mapping[Path
 
 
 def _udim(pattern: Path, places: Mapping[Path, Path]) -> Path | None:
-    """Where the tiles of a texture come to lie, as a pattern."""
+    """The new place of a texture's tiles, as a pattern."""
     begin, end = pattern.name.split("<UDIM>")
     for file, place in places.items():
         if file.parent == pattern.parent and file.name.startswith(begin) and file.name.endswith(end):

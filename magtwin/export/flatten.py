@@ -1,4 +1,4 @@
-"""Flatten: a stage as one layer without references, variants or instances, for viewers that know none."""
+"""Flatten a stage to one layer without references, variants or instances, for simple viewers."""
 
 from pathlib import Path
 
@@ -9,14 +9,14 @@ from magtwin.usd.layers import open_stage, relative_asset
 
 
 def flatten(root: Path, out: Path) -> None:
-    """Write a stage as a single layer; textures are named where they lie.
+    """Write a stage as a single layer.
 
-    Variants come as they are selected. Instances become plain prims, for readers that do not show
-    prototypes. Time samples, and every attribute of magtwin's, stay.
+    Selected variants stay. Instances become plain prims, for viewers that do not show prototypes. Time
+    samples and all attributes stay.
 
     Args:
         root: Root layer of the stage.
-        out: Layer to write, below the folder of `root`, so that what it names stays right.
+        out: Layer to write.
 
     Raises:
         InputError: The stage cannot be opened.
@@ -24,7 +24,7 @@ def flatten(root: Path, out: Path) -> None:
     stage = open_stage(root)
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         instances = [prim for prim in stage.TraverseAll() if prim.IsInstance()]
-        while instances:  # an instance can hold others, which show once it is none
+        while instances:  # instances can be nested
             for prim in instances:
                 prim.SetInstanceable(False)
             instances = [prim for prim in stage.TraverseAll() if prim.IsInstance()]
@@ -38,6 +38,6 @@ def flatten(root: Path, out: Path) -> None:
 
 
 def _beside(layer: Sdf.Layer, asset: str) -> str:
-    """An asset path that flattening made absolute, relative again."""
+    """An asset path, made relative again after flattening."""
     path = Path(asset)
     return relative_asset(layer, path) if kind_of(asset) and path.is_absolute() else asset

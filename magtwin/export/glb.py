@@ -1,9 +1,8 @@
-"""GLB: a stage as binary glTF 2.0 (Khronos Group), metres and Y up, for web pages and whatever shows no USD.
+"""A stage as binary glTF 2.0 (Khronos Group), in metres with Y up, for web pages and other viewers.
 
-A node a body and a place between it and the root, with the stage's own names; what stands still is gathered
-below the child of the default prim that it belongs to. Sensors are nodes without a mesh, their attributes in
-`extras`; the map's values are an accessor that its node's `extras` name. A stage that moves brings an
-animation.
+Each body is a node with its own name. Shapes that stand still are merged below the child of the default prim
+that they belong to. Sensors are nodes without a mesh, with their attributes in `extras`; the `extras` of the
+map name the accessor of its values. Time samples become an animation.
 """
 
 import json
@@ -23,19 +22,19 @@ from magtwin.usd.schema import NOUNS, attribute_name, prims_with
 from magtwin.version import __version__
 
 CREASE = np.deg2rad(40.0)
-"""Faces that meet at a smaller angle are shaded as one surface; ours."""
+"""Faces that meet at a smaller angle are shaded smoothly."""
 
 Y_UP = (-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
-"""Turn (xyzw) that takes Z up to Y up: (x, y, z) to (x, z, -y)."""
+"""Rotation (xyzw) from Z up to Y up: (x, y, z) to (x, z, -y)."""
 
 UNLIT = "KHR_materials_unlit"
-"""Extension for the floor's colours, which mean nT and not how they are lit."""
+"""Extension for the colours of the floor, which show nT and must not be lit."""
 
-TOLD = ("magnetometer", "imu", "lidar", "battery", "robot", "anomalyMap", "earth", "lab")
-"""Nouns whose prims become nodes even where they show nothing."""
+NOUNS_SHOWN = ("magnetometer", "imu", "lidar", "battery", "robot", "anomalyMap", "earth", "lab")
+"""Nouns whose prims become nodes even without a shape."""
 
 MOST_NUMBERS = 64
-"""Numbers of an attribute that go into `extras`."""
+"""Most numbers of an attribute in `extras`."""
 
 _TYPES = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4"}
 _COMPONENTS = {"f4": 5126, "u4": 5125, "u1": 5121}
@@ -43,35 +42,34 @@ _VERTICES, _INDICES = 34962, 34963
 
 
 def write_glb(stage_file: Path, out: Path) -> None:
-    """Write what a stage shows.
+    """Write the visible shapes of a stage.
 
-    Surfaces have the colour and roughness of their material, or their own colours; textures stay behind, and
-    metals are painted: a page with nothing around for them to mirror would show them black. Variants come as
-    they are selected.
+    Surfaces have the colour and roughness of their material, or their own colours, but no textures. Metals
+    are not metallic, since a page without an environment would show them black. Variants stay as selected.
 
     Args:
         stage_file: Root layer, in metres with Z up.
         out: The .glb file to make.
 
     Raises:
-        InputError: The stage cannot be opened, or shows nothing.
+        InputError: The stage cannot be opened, or has no visible surface.
     """
     stage = open_stage(stage_file)
     shapes = [shape for shape in read_shapes(stage) if len(shape.faces)]
     if not shapes:
-        raise InputError(f"{stage_file}: shows no surface, so there is nothing to write")
+        raise InputError(f"{stage_file}: has no visible surface")
     scene = _Scene(stage)
     for home, own in _gathered(stage, shapes).items():
         scene.show(home, own)
-    for noun in TOLD:
+    for noun in NOUNS_SHOWN:
         for prim in prims_with(stage.GetPseudoRoot(), noun):
-            scene.tell(prim)
+            scene.add_extras(prim)
     scene.animate()
     out.write_bytes(scene.glb())
 
 
 def _gathered(stage: Usd.Stage, shapes: Iterable[Shape]) -> dict[Sdf.Path, list[Shape]]:
-    """Shapes by the prim whose node has them: the body that carries them, or a part of what stands still."""
+    """Shapes by the prim of their node: their body, or a child of the default prim."""
     homes: dict[Sdf.Path, list[Shape]] = {}
     for shape in shapes:
         prim = stage.GetPrimAtPath(shape.prim)
@@ -84,7 +82,7 @@ def _gathered(stage: Usd.Stage, shapes: Iterable[Shape]) -> dict[Sdf.Path, list[
 
 
 class _Scene:
-    """A glTF in the making."""
+    """A glTF that is being built."""
 
     def __init__(self, stage: Usd.Stage) -> None:
         self.stage, self.rest = stage, UsdGeom.XformCache()
@@ -113,7 +111,7 @@ class _Scene:
         return self.index[path]
 
     def _pose(self, path: Sdf.Path, cache: UsdGeom.XformCache) -> tuple[NDArray, NDArray]:
-        """Place [m] and turn (xyzw) of a prim's frame in that of its parent, scales left out."""
+        """Position [m] and orientation (xyzw) of a prim in its parent, without scales."""
         here, above = (self._frame(p, cache) for p in (path, path.GetParentPath()))
         local = here * above.GetInverse()
         q = local.ExtractRotationQuat().GetNormalized()
@@ -126,7 +124,7 @@ class _Scene:
         return cache.GetLocalToWorldTransform(prim).RemoveScaleShear()
 
     def show(self, home: Sdf.Path, shapes: list[Shape]) -> None:
-        """Give a node its mesh: a primitive a material, in the node's own frame."""
+        """Add a mesh to a node, with one primitive per material."""
         groups: dict[int, list[Shape]] = {}
         for shape in shapes:
             groups.setdefault(self._material(shape), []).append(shape)
@@ -175,12 +173,12 @@ class _Scene:
             self.parts["materials"].append(said)
         return self.materials[key]
 
-    def tell(self, prim: Usd.Prim) -> None:
-        """Write what magtwin says of a prim into its node."""
+    def add_extras(self, prim: Usd.Prim) -> None:
+        """Write magtwin's attributes of a prim to the extras of its node."""
         extras = self.nodes[self.node(prim.GetPath())].setdefault("extras", {})
         for attribute in prim.GetAuthoredAttributes():
             if attribute.GetNamespace().startswith("magtwin:"):
-                value = _said(attribute.Get())
+                value = _json_value(attribute.Get())
                 if value is not None:
                     extras[attribute.GetName()] = value
         if prim.HasAPI(NOUNS["anomalyMap"]):
@@ -191,11 +189,11 @@ class _Scene:
             for name, array in numbers.items():
                 extras[attribute_name("anomalyMap", name)] = {"accessor": self._accessor(array)}
             for child in prim.GetChildren():
-                if colours := _said_of_colours(child):
+                if colours := _colour_scale(child):
                     extras["colours"] = colours
 
     def animate(self) -> None:
-        """Move the nodes of prims that move, as their time samples say."""
+        """Animate the nodes of prims with time samples."""
         moving = [
             prim
             for prim in self.stage.Traverse()
@@ -216,7 +214,7 @@ class _Scene:
                 clocks[clock.tobytes()] = self._accessor(clock, limits=True)
             q = np.array([q for _, q in poses])
             flips = np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0))
-            q[1:] *= flips[:, None]  # the shorter way from one to the next
+            q[1:] *= flips[:, None]  # the shorter rotation
             node = self.node(prim.GetPath())
             for path, values in (("translation", np.array([p for p, _ in poses])), ("rotation", q)):
                 if np.ptp(values, axis=0).max() > 1e-9:
@@ -276,11 +274,11 @@ class _Scene:
 
 
 def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float64]:
-    """Unit normals of the corners of triangles: the mean, by area, of the faces that meet there smoothly.
+    """Unit normals of the corners of triangles: the area-weighted mean of the faces that meet there smoothly.
 
     Args:
-        points: Vertices, shape (V, 3); those in one place count as one.
-        faces: Corners of the triangles, counter-clockwise seen from outside, shape (F, 3).
+        points: Vertices, shape (V, 3); equal ones are merged.
+        faces: Corners of the triangles, counter-clockwise from outside, shape (F, 3).
 
     Returns:
         Normals, shape (3 F, 3), in order of the faces; an edge of more than `CREASE` stays sharp.
@@ -305,20 +303,20 @@ def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float64]:
 
 
 def _roughness(prim: Usd.Prim) -> float:
-    """Roughness of the material that a prim wears; UsdPreviewSurface's own without."""
+    """Roughness of a prim's material; default: that of UsdPreviewSurface."""
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
     shader = material.ComputeSurfaceSource()[0] if material else None
     value = shader.GetInput("roughness").Get() if shader and shader.GetInput("roughness") else None
     return 0.5 if value is None else round(float(value), 6)
 
 
-def _said_of_colours(prim: Usd.Prim) -> dict[str, Any]:
+def _colour_scale(prim: Usd.Prim) -> dict[str, Any]:
     metadata: Mapping[str, Any] = prim.GetCustomDataByKey("magtwin") or {}
-    return {key: _said(value) for key, value in metadata.items()} if "colourMap" in metadata else {}
+    return {key: _json_value(value) for key, value in metadata.items()} if "colourMap" in metadata else {}
 
 
-def _said(value: Any) -> Any:
-    """A value as JSON has it; None for what is no number, text or short list of them."""
+def _json_value(value: Any) -> Any:
+    """A value for JSON; None unless it is a number, text or short list of them."""
     if isinstance(value, bool | int | str):
         return value
     if isinstance(value, float):
@@ -336,7 +334,7 @@ def _said(value: Any) -> Any:
 
 
 def _plain(numbers: Iterable[float]) -> list[float]:
-    """Numbers for JSON, to nine digits, which is what single precision holds."""
+    """Numbers for JSON, to nine digits, as single precision needs."""
     return [float(f"{float(x):.9g}") + 0.0 for x in numbers]
 
 

@@ -1,10 +1,9 @@
-"""Isaac Sim: what a scene needs there beside what every USD has, ROS 2 topics above all.
+"""Action Graphs for Isaac Sim: each robot's ROS 2 topics.
 
-An Action Graph a robot publishes clock, odometry, inertial unit, pose, battery, joints and scan, and drives
-the robot by the commands that come in, on the topics and in the frames of `magtwin.io.bags.messages`. Isaac
-Sim
-has no magnetometer: whoever reads these topics has what the network reads, and computes the field. None of
-this has been run in Isaac Sim; the graph is held against its nodes' definitions, see `magtwin.export.ogn`.
+The graph of a robot publishes clock, odometry, IMU, pose, battery, joints and scan, and drives the robot by
+commands, on the topics and in the frames of `magtwin.io.bags.topics`. Isaac Sim has no magnetometer; these
+topics are the inputs of the network. The graph was not run in Isaac Sim, but is checked against the
+definitions of its nodes, see `magtwin.export.ogn`.
 """
 
 import math
@@ -26,10 +25,10 @@ from magtwin.usd.schema import only_prim_with, place, prims_with
 from magtwin.usd.sensors import BASE, IMU_TYPE, LIDAR_TYPE
 
 GRAPHS = WORLD.AppendChild("Graphs")
-"""Scope of the graphs, each called as its robot."""
+"""Scope of the graphs; each has the name of its robot."""
 
 ROBOT = "robot"
-"""Namespace of the topics of a robot that is alone."""
+"""Namespace of the topics of a single robot."""
 
 ROBOT_API, LINKS, JOINTS = "IsaacRobotAPI", "isaac:physics:robotLinks", "isaac:physics:robotJoints"
 
@@ -39,18 +38,18 @@ SENSORS = "isaacsim.sensors.physics."
 BREAK = "omni.graph.nodes.BreakVector"
 
 FRAMES_HZ = 60.0
-"""Frames a second of Isaac Sim's playback, unless told otherwise."""
+"""Default frame rate of Isaac Sim's playback [Hz]."""
 
 DISCHARGING = 2
 """POWER_SUPPLY_STATUS_DISCHARGING of sensor_msgs/BatteryState."""
 
 DEFAULT_QOS, SENSOR_QOS, CLOCK_QOS = "qos", "sensor_qos", "clock_qos"
-"""Nodes that say how topics are offered."""
+"""Nodes with the QoS of topics."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Parts:
-    """Prims of a robot that its graph names."""
+    """Prims of a robot for its graph."""
 
     root: Sdf.Path
     base: Sdf.Path
@@ -61,17 +60,17 @@ class _Parts:
 def author_graph(stage: Usd.Stage, scene: Scene) -> list[Usd.Prim]:
     """Author an Action Graph for each robot of a scene.
 
-    The topics of a robot that is alone are /robot/odom and so on; of several, each has its own name there.
+    A single robot has topics such as /robot/odom; several robots have their own names instead of robot.
 
     Args:
         stage: The scene's stage; written to in its edit target.
-        scene: Its robots, by their names in the stage.
+        scene: The scene, with the robots' names on the stage.
 
     Returns:
         The graphs' prims.
 
     Raises:
-        InputError: A robot is not in the stage, is none to Isaac Sim, or lacks a sensor.
+        InputError: A robot is not on the stage, lacks Isaac Sim's robot schema, or lacks a sensor.
     """
     robots = {prim.GetName(): prim for prim in prims_with(stage.GetPseudoRoot(), "robot")}
     alone, graphs = len(scene.robots) == 1, []
@@ -109,7 +108,7 @@ def _author(graph: Graph, robot: RobotSpec, parts: _Parts, namespace: str, *, cl
 
 
 def _qos(graph: Graph) -> None:
-    """As `magtwin.io.bags.messages` offers its topics."""
+    """QoS as in `magtwin.io.bags.topics`."""
     kind = f"{BRIDGE}ROS2QoSProfile"
     reliable, best = {"reliability": "reliable"}, {"reliability": "bestEffort"}
     graph.node(DEFAULT_QOS, kind, createProfile="Default for publishers/subscribers", depth=10, **reliable)
@@ -118,7 +117,7 @@ def _qos(graph: Graph) -> None:
 
 
 def _published(graph: Graph, node: str, qos: str, after: str = "tick.tick", *, stamp: bool = True) -> None:
-    """Connect what every node that talks to ROS 2 takes."""
+    """Connect the inputs of every ROS 2 node."""
     graph.connect(after, f"{node}.execIn")
     graph.connect("context.context", f"{node}.context")
     graph.connect(f"{qos}.qosProfile", f"{node}.qosProfile")
@@ -127,7 +126,7 @@ def _published(graph: Graph, node: str, qos: str, after: str = "tick.tick", *, s
 
 
 def _odometry(graph: Graph, parts: _Parts, topic: str) -> None:
-    """Pose from where the robot began, and velocities in its own axes: exact, with no wheel that slips."""
+    """Exact pose relative to the start, and velocities in the robot's axes, without wheel slip."""
     graph.node("odometry", f"{CORE}IsaacComputeOdometry", chassisPrim=parts.base)
     graph.node(
         "publish_odometry",
@@ -135,7 +134,7 @@ def _odometry(graph: Graph, parts: _Parts, topic: str) -> None:
         topicName=topic,
         odomFrameId="odom",
         chassisFrameId=BASE,
-        publishRawVelocities=True,  # they are in the robot's axes already, and would be turned twice
+        publishRawVelocities=True,  # they are in the robot's axes already
     )
     graph.connect("tick.tick", "odometry.execIn")
     _published(graph, "publish_odometry", SENSOR_QOS, "odometry.execOut")
@@ -154,7 +153,7 @@ def _imu(graph: Graph, parts: _Parts, topic: str, frame: str) -> None:
 
 
 def _pose(graph: Graph, parts: _Parts, topic: str) -> None:
-    """What motion capture sees: Isaac Sim has no node for it, so its message is put together from numbers."""
+    """Pose of motion capture: Isaac Sim has no publisher for it, so the message is built from numbers."""
     graph.node("pose", f"{CORE}IsaacReadWorldPose", prim=parts.base)
     graph.node("place", f"{BREAK}3")
     graph.node("turn", f"{BREAK}4")
@@ -168,7 +167,7 @@ def _pose(graph: Graph, parts: _Parts, topic: str) -> None:
 
 
 def _battery(graph: Graph, spec: BatterySpec, topic: str) -> None:
-    """The pack as it is at the start, with the electronics' load on it: Isaac Sim discharges none."""
+    """The battery at the start of a run, with the load of the electronics: it does not discharge."""
     charge = spec.initial_fraction
     current = float(current_a(spec, spec.load_w, charge))
     unknown = math.nan
@@ -183,7 +182,7 @@ def _battery(graph: Graph, spec: BatterySpec, topic: str) -> None:
         SENSOR_QOS,
         after="seldom.execOut",
         voltage=float(open_voltage(spec, charge)) - spec.resistance_ohm * current,
-        current=-current,  # ROS counts what flows in
+        current=-current,  # ROS counts current into the battery
         percentage=charge,
         **dict.fromkeys(("temperature", "charge", "capacity", "design_capacity"), unknown),
         power_supply_status=DISCHARGING,
@@ -201,7 +200,7 @@ def _message(
     after: str = "tick.tick",
     **values: Any,
 ) -> None:
-    """A node that publishes a message with a header, of which Isaac Sim has no publisher of its own."""
+    """A generic publisher of a message with a header."""
     values |= {"topicName": topic, "header:frame_id": frame}
     graph.node(node, f"{BRIDGE}ROS2Publisher", message=message, **values)
     _published(graph, node, qos, after, stamp=False)
@@ -268,16 +267,20 @@ def _drive(graph: Graph, robot: RobotSpec, parts: _Parts, topic: str) -> None:
 
 
 def frame_of(mount: MountSpec, name: str) -> str:
-    """The frame that a sensor's messages name: its link, or a frame of its own where it stands aslant."""
+    """Frame of a sensor's messages: its link, or its own frame if its pose differs from the link's."""
     straight = (mount.p_link_sensor, mount.q_link_sensor_xyzw) == (ZERO3, IDENTITY_XYZW)
     return mount.link if straight else name
 
 
 def _parts(root: Usd.Prim) -> _Parts:
-    """The prims that Isaac Sim needs of a robot; refused where one is missing."""
+    """The prims of a robot that Isaac Sim needs.
+
+    Raises:
+        InputError: One is missing.
+    """
     if ROBOT_API not in root.GetMetadata("apiSchemas").GetAppliedItems():
         raise InputError(
-            f"{place(root)}: has no {ROBOT_API}, so it is no robot to Isaac Sim; convert it from its URDF "
+            f"{place(root)}: has no {ROBOT_API}, so Isaac Sim does not see a robot; convert its URDF "
             "with `magtwin robot`"
         )
     links = root.GetRelationship(LINKS).GetForwardedTargets()
@@ -296,7 +299,7 @@ def _parts(root: Usd.Prim) -> _Parts:
 
 
 def _child(mount: Usd.Prim, kind: str) -> Usd.Prim:
-    found = [prim for prim in mount.GetChildren() if prim.GetTypeName() == kind]
-    if len(found) != 1:
-        raise InputError(f"{place(mount)}: has {len(found)} children of type {kind}; it needs one")
-    return found[0]
+    children = [prim for prim in mount.GetChildren() if prim.GetTypeName() == kind]
+    if len(children) != 1:
+        raise InputError(f"{place(mount)}: has {len(children)} children of type {kind}; it needs one")
+    return children[0]

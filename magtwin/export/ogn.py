@@ -1,7 +1,7 @@
-"""OmniGraph: the node types that Isaac Sim's graphs are made of, and graphs of them as USD prims.
+"""OmniGraph: the node types of Isaac Sim's graphs, and graphs as USD prims.
 
-`ogn.toml` holds what is known of each type, with where it was read. Nothing is authored that it does not
-have: a misspelt attribute, or a connection of types that do not go together, is found here, not in Isaac Sim.
+`ogn.toml` has the definition of each node type, with its source. A misspelt attribute, or a connection of
+types that do not match, is an error here rather than in Isaac Sim.
 """
 
 import re
@@ -19,7 +19,7 @@ from magtwin.errors import InputError, hint
 TABLE = Path(__file__).with_name("ogn.toml")
 
 ROLES = ("vector", "quat", "point", "normal", "color")
-"""Roles that OmniGraph lets go with plain tuples: vectord[3] fits double[3]."""
+"""Roles that OmniGraph treats as plain tuples: vectord[3] fits double[3]."""
 
 _BASES = {"d": "double", "f": "float", "h": "half"}
 _SHAPE = re.compile(r"(?P<base>[a-z]+(?:64)?)(?P<tuple>\[\d\])?(?P<array>\[\])?")
@@ -45,28 +45,28 @@ _USD = {
     "token": Sdf.ValueTypeNames.Token,
     "token[]": Sdf.ValueTypeNames.TokenArray,
 }
-"""Type of a USD attribute by OmniGraph's name; for one of several kinds OmniGraph writes a token."""
+"""USD type by OmniGraph's name of a kind. A choice of several kinds is a token."""
 
 Kind = str | tuple[str, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
 class NodeType:
-    """What is known of a type of node."""
+    """The definition of a node type."""
 
     name: str
     version: int
 
     inputs: dict[str, Kind]
-    """Kind of each input by its name: OmniGraph's name of a type, or several that it takes one of."""
+    """Kind of each input by its name: OmniGraph's name of a type, or several alternatives."""
 
     outputs: dict[str, Kind]
 
     tokens: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """Values that an input may have, where it is a choice."""
+    """Allowed values of an input that is a choice."""
 
     source: str = ""
-    """Where this was read: version and file."""
+    """Source of the definition: version and file."""
 
 
 @cache
@@ -80,7 +80,7 @@ def node_types() -> dict[str, NodeType]:
             inputs=_kinds(given.get("inputs", {})),
             outputs=_kinds(given.get("outputs", {})),
             tokens={key: tuple(values) for key, values in given.get("tokens", {}).items()},
-            source=f"{_said(table['sources'][given['source']])}: {given['file']}",
+            source=f"{_source(table['sources'][given['source']])}: {given['file']}",
         )
         for name, given in table["nodes"].items()
     }
@@ -88,101 +88,96 @@ def node_types() -> dict[str, NodeType]:
 
 @cache
 def message_fields(message: str) -> dict[str, Kind]:
-    """Inputs that a ROS2Publisher makes for a message, geometry_msgs/msg/PoseStamped; none unless known."""
+    """Inputs of a ROS2Publisher for a message such as geometry_msgs/msg/PoseStamped; empty if unknown."""
     return _kinds(_table()["messages"].get(message, {}))
 
 
 def fits(given: Kind, taken: Kind) -> bool:
     """Whether an output of one kind may be connected to an input of another.
 
-    Base type, tuple and array must be the same; roles need not be, as a vectord[3] goes into what takes a
-    double[3]. Of several kinds one must fit.
+    Base type, tuple and array must be equal, but not the role: a vectord[3] fits a double[3]. One of several
+    alternatives must fit.
     """
     sides = [{_shape(k) for k in ((kind,) if isinstance(kind, str) else kind)} for kind in (given, taken)]
     return bool(sides[0] & sides[1])
 
 
 def ports(node: Usd.Prim) -> dict[str, Kind] | None:
-    """Kinds of a node's inputs and outputs by name, `inputs:execIn`; None where its type is not known.
+    """Kinds of a node's inputs and outputs by name (`inputs:execIn`), with those of its message.
 
-    Those that a ROS2Publisher makes for its message are among them, where the message is known.
+    None if the node's type is unknown.
     """
     known = node_types().get(node.GetAttribute("node:type").Get())
     if known is None:
         return None
-    inputs = dict(known.inputs)
-    if "messageName" in inputs:
-        parts = (
-            node.GetAttribute(f"inputs:message{part}").Get() for part in ("Package", "Subfolder", "Name")
-        )
-        inputs |= message_fields("/".join(map(str, parts)))
+    inputs = known.inputs | (_fields(node) if "messageName" in known.inputs else {})
     named = {"inputs": inputs, "outputs": known.outputs}
     return {f"{space}:{name}": kind for space, kinds in named.items() for name, kind in kinds.items()}
 
 
 def _fields(node: Usd.Prim) -> dict[str, Kind]:
-    """Inputs that a node has for its message."""
+    """Inputs of a node for its message."""
     parts = (node.GetAttribute(f"inputs:message{part}").Get() for part in ("Package", "Subfolder", "Name"))
     return message_fields("/".join(map(str, parts)))
 
 
 def faults(node: Usd.Prim) -> list[str]:
-    """What of a node its definition does not have, a sentence each; none of a type that is not known."""
+    """Differences of a node from its definition, one sentence each; none if its type is unknown."""
     kinds = ports(node)
     if kinds is None:
         return []
-    known, found = node_types()[node.GetAttribute("node:type").Get()], []
+    known, texts = node_types()[node.GetAttribute("node:type").Get()], []
     version = node.GetAttribute("node:typeVersion").Get()
     if version != known.version:
-        found.append(f"is of version {version} of {known.name}, known is {known.version}")
+        texts.append(f"is version {version} of {known.name}, not {known.version}")
     for prop in node.GetAuthoredProperties():
         name = prop.GetName()
         if not name.startswith(("inputs:", "outputs:")):
             continue
         if name not in kinds:
             if "inputs:messageName" in kinds and not _fields(node):
-                continue  # a message of which nothing is known
-            found.append(f"{known.name} has no {name}; {hint(name, kinds)}")
+                continue  # an unknown message
+            texts.append(f"{known.name} has no {name}; {hint(name, kinds)}")
         elif isinstance(prop, Usd.Attribute):
             if (
                 isinstance(kinds[name], str)
                 and kinds[name] in _USD
                 and prop.GetTypeName() != _usd_type(kinds[name])
             ):
-                found.append(f"{name} is a {prop.GetTypeName()}, {known.name} has a {_words(kinds[name])}")
-            found += [text for path in prop.GetConnections() if (text := _unfit(prop, path, kinds[name]))]
-    return found
+                texts.append(f"{name} is a {prop.GetTypeName()}, {known.name} has a {_words(kinds[name])}")
+            texts += [text for path in prop.GetConnections() if (text := _unfit(prop, path, kinds[name]))]
+    return texts
 
 
 def _unfit(attribute: Usd.Attribute, path: Sdf.Path, taken: Kind) -> str:
-    """What is wrong with one connection of an attribute, "" for nothing."""
+    """What is wrong with one connection of an attribute, or ""."""
     source = attribute.GetStage().GetPrimAtPath(path.GetPrimPath())
     if source and source.GetTypeName() == "OmniGraph":
         return ""  # a variable of the graph
     if not source or source.GetTypeName() != "OmniGraphNode":
-        return f"{attribute.GetName()} is fed by <{path}>, which is no node's"
+        return f"{attribute.GetName()} is connected to <{path}>, which is on no node"
     given = ports(source)
     if given is None:
         return ""
     if not path.name.startswith("outputs:") or path.name not in given:
-        return f"{attribute.GetName()} is fed by <{path}>, which is no output"
+        return f"{attribute.GetName()} is connected to <{path}>, which is no output"
     if not fits(given[path.name], taken):
         return f"{attribute.GetName()} takes {_words(taken)}, <{path}> is {_words(given[path.name])}"
     return ""
 
 
 class Graph:
-    """An Action Graph that is being authored in a stage's edit target."""
+    """An Action Graph, authored in a stage's edit target."""
 
     def __init__(self, stage: Usd.Stage, path: Sdf.Path) -> None:
         """Define the graph's prim.
 
         Raises:
-            InputError: Something else is there already.
+            InputError: Another prim has the path.
         """
         there = stage.GetPrimAtPath(path)
         if there and there.IsDefined() and there.GetTypeName() != "OmniGraph":
-            raise InputError(f"<{path}>: is taken by a {there.GetTypeName() or 'prim'}; rename that")
+            raise InputError(f"<{path}>: is a {there.GetTypeName() or 'prim'} already; rename it")
         self.stage, self.path = stage, path
         self._kinds: dict[str, Mapping[str, Kind]] = {}
         prim = stage.DefinePrim(path, "OmniGraph")
@@ -201,13 +196,13 @@ class Graph:
         """Define a node.
 
         Args:
-            name: Of its prim.
+            name: Name of its prim.
             kind: Its type, one of `node_types`.
-            message: Type of message that a ROS2Publisher publishes, whose fields become inputs.
-            **values: Of its inputs; of a target, the path or paths of prims.
+            message: Message type of a ROS2Publisher; its fields become inputs.
+            **values: Values of its inputs; for a target, the path or paths of prims.
 
         Raises:
-            InputError: There is no such type, it has no such input, or the input no such value.
+            InputError: The type, an input or a value is unknown.
         """
         types = node_types()
         if kind not in types:
@@ -233,15 +228,15 @@ class Graph:
             if key not in inputs:
                 raise InputError(f"{kind} has no input {key!r}; {hint(key, inputs)}")
             if key in known.tokens and value not in known.tokens[key]:
-                raise InputError(f"{kind}: {key} {value!r} is none; {hint(str(value), known.tokens[key])}")
+                raise InputError(f"{kind}: {key} cannot be {value!r}; {hint(str(value), known.tokens[key])}")
             self._set(prim, key, inputs[key], value)
         return prim
 
     def connect(self, given: str, taken: str) -> None:
-        """Connect an output to an input, each as NODE.ATTRIBUTE with no namespace: tick.tick, clock.execIn.
+        """Connect an output to an input, each as NODE.ATTRIBUTE without namespace: tick.tick, clock.execIn.
 
         Raises:
-            InputError: One of them is not there, or their types do not go together.
+            InputError: One of them does not exist, or their types do not match.
         """
         output, input_ = self._end(given, "outputs"), self._end(taken, "inputs")
         if not fits(output[2], input_[2]):
@@ -287,7 +282,7 @@ def _kinds(given: Mapping[str, str | list[str]]) -> dict[str, Kind]:
     return {name: kind if isinstance(kind, str) else tuple(kind) for name, kind in given.items()}
 
 
-def _said(source: Mapping[str, str]) -> str:
+def _source(source: Mapping[str, str]) -> str:
     at = f" at {source['commit']}" if "commit" in source else ""
     return f"{source['name']} {source['version']}, {source['repository']}{at}"
 
@@ -302,10 +297,10 @@ def _usd_type(kind: Kind) -> Sdf.ValueTypeName:
 
 def _shape(kind: str) -> tuple[str, str, str]:
     """Base type, tuple and array of a kind, without its role."""
-    found = _SHAPE.fullmatch(kind)
-    if found is None:
+    match = _SHAPE.fullmatch(kind)
+    if match is None:
         raise InputError(f"{kind!r} is no type of OmniGraph")
-    base, count, array = found["base"], found["tuple"] or "", found["array"] or ""
+    base, count, array = match["base"], match["tuple"] or "", match["array"] or ""
     role = next((r for r in ROLES if base.startswith(r)), "")
     if role:
         base = _BASES[base.removeprefix(role)]

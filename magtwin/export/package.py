@@ -1,4 +1,4 @@
-"""Package: a stage with all that it needs, as other programs take it: a folder, a .usdz, a layer, a .glb."""
+"""Export a stage with all that it needs: as a folder, a .usdz, a layer or a .glb."""
 
 import json
 import os
@@ -38,42 +38,42 @@ from magtwin.version import __version__
 Profile = Literal["omniverse", "isaac", "newton", "viewer"]
 PROFILES: dict[str, str] = {
     "omniverse": "the stage with its layers, variants and instances",
-    "isaac": "that, robots in Isaac Sim's asset structure 3.0, an Action Graph a robot for ROS 2",
-    "newton": "that of omniverse, with the network as ONNX for whoever steps Newton",
-    "viewer": "one layer, nothing in it that a simple viewer may not know",
+    "isaac": "as omniverse, with Isaac Sim's asset structure 3.0 and a ROS 2 Action Graph for each robot",
+    "newton": "as omniverse, with an example that steps Newton and evaluates the network",
+    "viewer": "one layer for simple viewers, without variants and instances",
 }
-"""What each profile makes."""
+"""Contents of each profile."""
 
 KINDS = {"": "folder", ".usdz": "package", ".usd": "layer", ".usdc": "layer", ".glb": "web"}
-"""What is made, by the suffix of where to."""
+"""Kind of export by the suffix of the output."""
 
 NETWORK, NETWORK_SHA256 = (attribute_name("magnetometer", name) for name in ("network", "network_sha256"))
 PLUGIN = Path("plugin", "magtwin")
 GENERATED = ("plugInfo.json", "generatedSchema.usda")
-"""What a program needs to know magtwin's schemas, and where it lies."""
+"""Files of the schema plugin."""
 
 README = "README.md"
 
 SCRIPTS = Path(__file__).resolve().parent / "scripts"
-"""Examples of what to do with an export, which need no magtwin; those called as a profile go with it."""
+"""Examples that need no magtwin; the ones whose names begin with the profile are exported too."""
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What an export made."""
+    """The result of an export."""
 
     files: tuple[Path, ...]
-    """What was asked for, then the folder that lies beside it, if any."""
+    """The output, then the folder beside it, if any."""
 
     root: Path
-    """What to open: a layer, a package or a .glb."""
+    """File to open: a layer, a package or a .glb."""
 
     profile: str
     licences: dict[str, str]
-    """By file, as it is called in the export."""
+    """Licence by file name in the export."""
 
     notes: tuple[str, ...] = ()
-    """What may need a look."""
+    """Warnings."""
 
     def report(self) -> Report:
         """The files with their sizes, profile, licences and notes."""
@@ -100,35 +100,36 @@ def export_scene(
     force: bool = False,
     progress: Callable[[str], object] = lambda step: None,
 ) -> Exported:
-    """Write a stage with all that it needs, so that it can be moved anywhere.
+    """Write a stage with everything that it needs, so that it can be moved anywhere.
 
     Args:
         scene_file: Root layer of a scene or of any other stage, or a .usdz.
         out: What to make: a folder (no suffix), a package .usdz, one layer .usd or .usdc, or a .glb. Beside
             a package lies a folder `<name>_magtwin` with the schema plugin, README.md and the network.
-        profile: For whom, see `PROFILES`; omniverse for folders and packages, viewer for the others, unless
-            given.
-        animation: A run that plays over the stage; in a folder as a layer of its own, `<name>_run.usdc`.
-        to_onnx: Writes a network as ONNX, which then lies beside its weights: called with the weights and the
-            file to make. What it refuses becomes a note.
-        thumbnail: Draws a folder's stage: called with its root layer and the PNG to make, 256 pixels square.
-            What it refuses becomes a note.
-        trusted: Whether the stage was made here. Otherwise it is first read in a process of its own, as a
-            damaged layer can end its reader; that takes a second.
-        force: Whether what exists is replaced.
-        progress: Called with what is done next.
+        profile: A key of `PROFILES`. Default: omniverse for folders and packages, else viewer.
+        animation: A run that plays over the stage; in a folder it is a separate layer, `<name>_run.usdc`.
+        to_onnx: Function of weights and output that writes a network as ONNX beside its weights. If it raises
+            InputError, the export has a note.
+        thumbnail: Function of root layer and output that draws a PNG of 256 x 256 pixels. If it raises
+            InputError, the export has a note.
+        trusted: Whether the stage was made here. Otherwise another process reads it first, since a damaged
+            layer can crash its reader; that takes a second.
+        force: Whether to replace existing files.
+        progress: Function that is called with the name of each step.
 
     Raises:
-        InputError: The stage cannot be opened, names what is not there, is not what its checksums say, or
-            is not in metres with Z up; or `out` exists, or cannot hold what
-            the stage has. Nothing is written.
+        InputError: The stage cannot be opened, names missing files, differs from its checksums, or is not in
+            metres with Z up; or `out` exists, or cannot hold the stage. Nothing is written.
     """
     scene_file, out = Path(scene_file), Path(out)
     kind = KINDS.get(out.suffix) or _no_kind(out)
     name: str = profile or ("omniverse" if kind in ("folder", "package") else "viewer")
     find("profile", name, PROFILES)
     if kind in ("layer", "web") and name != "viewer":
-        raise InputError(f"{out}: {out.suffix} is for viewers; give a folder or a .usdz for --profile {name}")
+        raise InputError(
+            f"{out}: {out.suffix} is for viewers; give a folder or a .usdz for `profile='{name}'`",
+            parameter="profile",
+        )
     beside = out.with_name(f"{out.stem}_magtwin") if kind == "package" and name != "viewer" else None
     for target in filter(None, (out, beside)):
         check_free(target, force=force)
@@ -139,8 +140,8 @@ def export_scene(
         )
     for target in filter(None, (out, beside)):
         if target.resolve() in (scene_file.resolve(), *scene_file.resolve().parents):
-            raise InputError(f"{target}: is or holds the stage that is exported; name another place")
-    with TemporaryDirectory() as scratch, _told_of(Path(scratch, "stage"), scene_file):
+            raise InputError(f"{target}: is or contains the exported stage; give another output")
+    with TemporaryDirectory() as scratch, _renamed(Path(scratch, "stage"), scene_file):
         work = _Work(Path(scratch, "stage"), scene_file, name, progress)
         work.gather(trusted=trusted)
         work.check()
@@ -148,7 +149,7 @@ def export_scene(
             work.onnx_of(to_onnx)
         if name == "isaac":
             work.for_isaac()
-        work.tell_origin()
+        work.write_origin()
         if animation is not None:
             work.animate(animation)
         with ExitStack() as outputs:
@@ -173,8 +174,8 @@ def _no_kind(out: Path) -> str:
 
 
 @contextmanager
-def _told_of(copy: Path, scene_file: Path) -> Iterator[None]:
-    """Refusals of the copy that is worked on name the stage that was given."""
+def _renamed(copy: Path, scene_file: Path) -> Iterator[None]:
+    """Make errors about the working copy name the original stage."""
     try:
         yield
     except InputError as error:
@@ -187,7 +188,7 @@ def _told_of(copy: Path, scene_file: Path) -> Iterator[None]:
 
 
 class _Work:
-    """A copy of a stage, made ready step by step."""
+    """A working copy of a stage, prepared step by step."""
 
     def __init__(
         self, folder: Path, scene_file: Path, profile: str, progress: Callable[[str], object]
@@ -203,7 +204,7 @@ class _Work:
 
     def gather(self, *, trusted: bool) -> None:
         """Copy the stage and all that it names into the folder."""
-        self.progress("Gathering what the stage names")
+        self.progress("Gathering files")
         self.folder.mkdir()
         if self.source.suffix == ".usdz":
             package = self.folder.with_name("package")
@@ -233,7 +234,7 @@ class _Work:
         )
 
     def check(self) -> None:
-        """Refuse a scene, map or network that is not what its checksums say."""
+        """Check the scene, and map and networks against their checksums; collect licences."""
         self.progress("Checking map and network")
         stage = open_stage(self.root)
         world = stage.GetPseudoRoot()
@@ -251,10 +252,10 @@ class _Work:
             if not named or not named.path:
                 continue
             file = Path(named.resolvedPath)
-            checksum, seen = prim.GetAttribute(NETWORK_SHA256).Get(), sha256(file)
-            if checksum and checksum.lower() != seen:
+            checksum, actual = prim.GetAttribute(NETWORK_SHA256).Get(), sha256(file)
+            if checksum and checksum.lower() != actual:
                 raise InputError(
-                    f"{place(prim)}: its network {named.path} has SHA-256 {seen}, the stage was made with "
+                    f"{place(prim)}: its network {named.path} has SHA-256 {actual}, the stage was made with "
                     f"{checksum}; put that network back, or make the scene anew"
                 )
             if file not in self.networks:
@@ -272,11 +273,11 @@ class _Work:
         return file.resolve().relative_to(self.folder.resolve()).as_posix()
 
     def onnx_of(self, write: Callable[[Path, Path], object]) -> None:
-        """Lay networks as ONNX beside their weights."""
+        """Write networks as ONNX beside their weights."""
         for weights in self.networks:
             out = weights.with_suffix(".onnx")
             try:
-                if not out.exists():  # of a package that was unpacked
+                if not out.exists():  # a package may contain it
                     self.progress(f"Writing {weights.stem} as ONNX")
                     write(weights, out)
                 self.onnx.append(out)
@@ -287,20 +288,20 @@ class _Work:
         """Give robots Isaac Sim's asset structure, and the scene its Action Graphs."""
         if self.scene is None:
             raise InputError(
-                f"{self.source}: is no scene of magtwin's, with lab, robot and magnetometer, which --profile "
-                "isaac is for; take --profile omniverse"
+                f"{self.source}: has no lab, robot and magnetometer, which profile isaac needs; use "
+                "`profile='omniverse'`"
             )
-        self.progress("Authoring what Isaac Sim needs")
+        self.progress("Authoring for Isaac Sim")
         for asset in {placed.robot.asset for placed in self.scene.robots}:
             structure(asset)
         stage = open_stage(self.root)
         author_graph(stage, self.scene)
         stage.GetRootLayer().Save()
 
-    def tell_origin(self) -> None:
-        """Write into the root layer what it was made from, by what, and under which licences."""
+    def write_origin(self) -> None:
+        """Write source, version and licences to the metadata of the root layer."""
         layer = Sdf.Layer.FindOrOpen(str(self.root))
-        said = {
+        origin = {
             "version": __version__,
             "profile": self.profile,
             "source": self.source.name,
@@ -309,12 +310,12 @@ class _Work:
         }
         metadata = dict(layer.customLayerData)
         metadata["creator"] = metadata.get("creator", "magtwin")
-        metadata["magtwin"] = {**dict(metadata.get("magtwin", {})), "export": said}
+        metadata["magtwin"] = {**dict(metadata.get("magtwin", {})), "export": origin}
         layer.customLayerData = metadata
         layer.Save()
 
     def animate(self, run: Run) -> None:
-        """Lay a run over the stage."""
+        """Write a run over the stage."""
         self.progress("Writing the run")
         self.run, self.plays = self.root.with_name(f"{self.root.stem}_run.usdc"), True
         write_animation(run, self.run, self.root)
@@ -323,7 +324,7 @@ class _Work:
         layer.Save()
 
     def flat(self) -> None:
-        """Become one layer, with the files that it names."""
+        """Replace the stage by one layer and the files that it names."""
         self.progress("Flattening the stage")
         flat = self.folder.with_name("flat") / f"{self.source.stem}.usdc"
         flat.parent.mkdir()
@@ -339,7 +340,8 @@ class _Work:
         for file in self.folder.rglob("*"):
             if file.is_file() and file != self.root:
                 raise InputError(
-                    f"{self.source}: {self._relative(file)} cannot lie in a layer; give a folder or a .usdz"
+                    f"{self.source}: {self._relative(file)} cannot be part of a layer; "
+                    "give a folder or a .usdz"
                 )
         if out.suffix == ".usd":
             self.root = self.root.rename(self.root.with_suffix(".usd"))
@@ -351,7 +353,7 @@ class _Work:
             beside.mkdir()
             for file in [*self.networks, *self.onnx]:
                 copied(file, beside / "weights" / file.name)
-            self._explain(beside, out.name, attached=True)
+            self._write_readme(beside, out.name, attached=True)
         attach(self.root, *self.onnx)
         if self.profile == "viewer":
             self.flat()
@@ -361,24 +363,24 @@ class _Work:
         """Write a folder."""
         if self.profile == "viewer":
             self.flat()
-        self._explain(self.folder, self.root.name, attached=False)
+        self._write_readme(self.folder, self.root.name, attached=False)
         shutil.move(self.folder, out)
         if thumbnail is not None:
             self.progress("Drawing its thumbnail")
             picture = out / THUMBNAIL / f"{self.root.name}.png"
             picture.parent.mkdir(parents=True, exist_ok=True)
-            picture.unlink(missing_ok=True)  # of a folder that was exported before
+            picture.unlink(missing_ok=True)  # an old one
             try:
                 thumbnail(out / self.root.name, picture)
-            except InputError as error:  # there is nothing to draw, or nothing to draw with
+            except InputError as error:  # nothing to draw, or no renderer
                 self.notes.append(f"no thumbnail was drawn: {str(error).replace(f'{out}{os.sep}', '')}")
                 if not any(picture.parent.iterdir()):
                     shutil.rmtree(picture.parents[1])
 
-    def _explain(self, folder: Path, root: str, *, attached: bool) -> None:
+    def _write_readme(self, folder: Path, root: str, *, attached: bool) -> None:
         """Write the README page and the schema plugin to a folder."""
         viewer = self.profile == "viewer"
-        run = root if attached or self.run is None else self.run.name  # what plays it
+        run = root if attached or self.run is None else self.run.name  # file that plays the run
         if not viewer:
             for name in GENERATED:
                 copied(SCHEMA / name, folder / PLUGIN / name)

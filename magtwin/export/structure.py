@@ -1,4 +1,4 @@
-"""Structure: a robot's single layer taken apart into the layers of Isaac Sim's asset structure 3.0."""
+"""Split a robot's layer into the layers of Isaac Sim's asset structure 3.0."""
 
 import os
 from pathlib import Path
@@ -11,7 +11,7 @@ from magtwin.usd.layers import open_stage
 
 
 def structure(asset: Path) -> None:
-    """Take a robot's asset apart in place, as `magtwin robot` lays one out; one that is stays as it is.
+    """Split a robot's asset in place, unless it has the structure already.
 
     The asset composes to the same stage. Its triangles move to `payloads/geometries.usdc`.
 
@@ -28,8 +28,8 @@ def structure(asset: Path) -> None:
         return
     if not layer.defaultPrim or len(named) > 1 or folder.exists() or asset.suffix != ".usda":
         raise InputError(
-            f"{asset}: is no robot in one text layer and one of meshes, which Isaac Sim's structure is made "
-            "from; convert its URDF with `magtwin robot`"
+            f"{asset}: is not a robot in one text layer and one layer of meshes, as Isaac Sim's structure "
+            "needs; convert its URDF with `magtwin robot`"
         )
     folder.mkdir()
     if named:
@@ -46,7 +46,7 @@ def structure(asset: Path) -> None:
 
 
 def _move(layer: Path, place: Path) -> None:
-    """Move a layer; what it names stays where it lies."""
+    """Move a layer, and adapt its relative paths."""
 
     def moved(name: str) -> str:
         if not name.startswith(("./", "../")):

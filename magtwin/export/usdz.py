@@ -1,7 +1,7 @@
-"""USDZ: one file of a folder of layers and textures, by OpenUSD's "Usdz File Format Specification", and back.
+"""Packages: write and read .usdz files, by OpenUSD's "Usdz File Format Specification".
 
-A package is a ZIP archive, nothing in it compressed, the data of each entry at a multiple of 64 bytes, the
-first entry the layer to open. It may hold layers, pictures and sounds, no other kind of file.
+A package is a ZIP archive without compression. The data of each entry start at a multiple of 64 bytes. The
+first entry is the layer to open. It may hold only layers, pictures and sounds.
 """
 
 import shutil
@@ -13,31 +13,31 @@ from magtwin.errors import InputError
 from magtwin.usd.layers import SUFFIXES
 
 ALLOWED = (*SUFFIXES, ".png", ".jpg", ".jpeg", ".exr", ".avif", ".m4a", ".mp3", ".wav")
-"""Suffixes of what a package may hold."""
+"""Suffixes of files that a package may hold."""
 
 ALIGNMENT = 64
-"""Bytes; so that USD maps a layer's arrays into memory without a copy."""
+"""Alignment of entries [bytes], so that USD can map arrays into memory."""
 
 MOST_BYTES = 2**32 - 1
-"""Size of a ZIP archive without the extension of 64 bits, which a package must not have."""
+"""Largest size of a ZIP archive without ZIP64, which a package must not use."""
 
 _HEADER = 30
 _PADDING = 0x1986
-"""Bytes of an entry's header before its name; what the extra field that pads it is called."""
+"""Bytes of an entry's header before its name, and the identifier of the extra field that pads it."""
 
 _DAY = (1980, 1, 1, 0, 0, 0)
-"""The first day that ZIP knows: the same folder makes the same bytes on any other."""
+"""The first date of ZIP, so that the same folder always makes the same bytes."""
 
 
 def pack(root: Path, out: Path) -> None:
-    """Write the folder of a stage as a package.
+    """Write a stage's folder as a package.
 
     Args:
-        root: The layer to open first; everything below its folder goes in, hidden files left out.
+        root: The layer to open; all files of its folder are packed, except hidden ones.
         out: The .usdz file to make.
 
     Raises:
-        InputError: A file is of no kind that a package may hold, or it would be too large.
+        InputError: A file is of another kind, or the package would be too large.
     """
     folder = root.parent
     files = sorted(f for f in folder.rglob("*") if f.is_file() and not _is_hidden(f.relative_to(folder)))
@@ -61,18 +61,18 @@ def pack(root: Path, out: Path) -> None:
 
 
 def unpack(package: Path, folder: Path) -> Path:
-    """Write what a package holds into a folder.
+    """Unpack a package into a folder.
 
     Args:
         package: The .usdz file.
-        folder: Folder that exists and is empty.
+        folder: An existing empty folder.
 
     Returns:
         The layer to open.
 
     Raises:
-        InputError: The file is no such package or is damaged, or an entry would lie outside of the folder
-            or is of no kind that a package may hold.
+        InputError: The file is no package or is damaged, or an entry is outside the folder or of another
+            kind.
     """
     try:
         with zipfile.ZipFile(package) as archive:
@@ -82,15 +82,15 @@ def unpack(package: Path, folder: Path) -> Path:
                 place = folder / entry.filename
                 place.parent.mkdir(parents=True, exist_ok=True)
                 with archive.open(entry) as source, open(place, "xb") as file:
-                    shutil.copyfileobj(source, file)  # refuses what is not as its checksum says
+                    shutil.copyfileobj(source, file)  # checks the CRC
     except (zipfile.BadZipFile, EOFError, NotImplementedError, struct.error, OSError) as error:
-        said = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise InputError(f"{package}: damaged, or no .usdz: {said}; copy or write it again") from error
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise InputError(f"{package}: damaged, or no .usdz: {reason}; copy or write it again") from error
     return folder / entries[0].filename
 
 
 def _check(package: Path, entries: list[zipfile.ZipInfo]) -> None:
-    """Refuse a package before anything of it is written."""
+    """Check a package before anything is written."""
     if not entries or PurePosixPath(entries[0].filename).suffix.lower() not in SUFFIXES:
         raise InputError(f"{package}: no .usdz: its first entry is no layer; write it again")
     seen: set[str] = set()
@@ -100,8 +100,8 @@ def _check(package: Path, entries: list[zipfile.ZipInfo]) -> None:
         climbs = path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name or "\0" in name
         if climbs or entry.orig_filename != name:
             raise InputError(
-                f"{package}: its entry {entry.orig_filename!r} would lie outside of it; do not open it, it "
-                "was made to write elsewhere"
+                f"{package}: its entry {entry.orig_filename!r} would be written outside its folder; the "
+                "package may be malicious"
             )
         if path.as_posix().lower() in seen:
             raise InputError(f"{package}: holds {name!r} twice; write it again")

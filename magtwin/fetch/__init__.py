@@ -1,7 +1,7 @@
-"""The originals, from where their owners publish them, each file checked against its SHA-256.
+"""Fetch original data from their publishers; each file is checked against its SHA-256.
 
-magtwin ships nothing of them. Each source is a table beside this file: name, checksum, and path in a
-repository at a pinned commit.
+magtwin ships none of them. Each source is a table beside this file: name, checksum, and path in a repository
+at a pinned commit.
 """
 
 from collections.abc import Callable
@@ -17,16 +17,16 @@ _GITHUB = "https://raw.githubusercontent.com"
 
 @dataclass(frozen=True)
 class Source:
-    """A table of files, and where they are published."""
+    """A table of published files."""
 
     table: str
-    """File beside this module: name, SHA-256, path below `base_url`, a line each."""
+    """File beside this module; each line has name, SHA-256, and path below `base_url`."""
 
     base_url: str
-    """Address that the paths of the table are appended to."""
+    """Address to which the paths are appended."""
 
     licence: str
-    """SPDX identifier of its licence."""
+    """SPDX identifier of the licence."""
 
     def files(self) -> list[tuple[str, str, str]]:
         """Name, SHA-256 and path of each file."""
@@ -56,7 +56,7 @@ SOURCES = {
         ),
     ),
 }
-"""What can be fetched, by name: the APRILab survey, network and paths; the TurtleBot 4's description."""
+"""Sources by name: the APRILab survey, network and paths; the TurtleBot 4's description."""
 
 
 def fetch(
@@ -67,20 +67,20 @@ def fetch(
     force: bool = False,
     progress: Callable[[int, int, str], None] = lambda done, total, file: None,
 ) -> list[Path]:
-    """Fetch a source into a folder of its own.
+    """Fetch a source into a new folder.
 
     Args:
         name: An entry of SOURCES.
-        dest: Folder to make; nothing is left of it when a file is missing or wrong.
-        base_url: Address to take the files from instead, a mirror with the same paths.
-        force: Whether a folder that exists is replaced.
-        progress: Called with files done, files in all, and the name of the next file.
+        dest: Folder to make; it is removed if a file is missing or wrong.
+        base_url: Address of a mirror with the same paths. Default: the publisher.
+        force: Replace an existing folder.
+        progress: Called with the number of files done, the number of all files, and the next file name.
 
     Returns:
         The files written.
 
     Raises:
-        InputError: No such source, no connection, a file that is not there, or a wrong checksum.
+        InputError: The source is unknown, a file cannot be fetched, or its checksum is wrong.
     """
     import pooch
 

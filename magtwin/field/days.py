@@ -5,8 +5,7 @@ from collections.abc import Sequence
 
 from magtwin.errors import InputError
 
-ORIGIN = datetime.date(2000, 1, 1)
-"""Day 0 of `day_number`."""
+ORIGIN = datetime.date(2000, 1, 1)  # Day 0 of `day_number`
 
 
 def parse_day(day: str | datetime.date, what: str = "date") -> datetime.date:

@@ -12,8 +12,7 @@ Array = NDArray[np.float64]
 
 TURN = 2 * np.pi
 
-MOST_NODES = 50_000_000
-"""Larger grids (0.4 GB of values) are refused: the spacing is probably a typo."""
+MOST_NODES = 50_000_000  # Larger grids (0.4 GB of values) are refused: the spacing is probably a typo
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

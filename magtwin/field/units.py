@@ -11,20 +11,13 @@ from magtwin.errors import InputError
 Array = NDArray[np.float64]
 Unit = Literal["nT", "uT", "T", "mG", "G"]
 
+# Bounds of a survey's mean [nT]. The Earth's field is 22,000 to 67,000 nT; a building bends it.
 LEAST_MEAN_NT, GREATEST_MEAN_NT = 10_000.0, 100_000.0
-"""Bounds of a survey's mean [nT]. The Earth's field is 22,000 to 67,000 nT; a building bends it."""
-
+# Range of the median of readings from which their unit is deduced [nT]: the Earth's field and some steel
 INDOORS_NT = 18_000.0, 75_000.0
-"""Range of the median of readings from which their unit is deduced [nT]: the Earth's field and some steel."""
-
-USUAL_NT = 50_000.0
-"""Magnitude that a suggested scale would give [nT]."""
-
-NT_PER: dict[str, float] = {"nT": 1.0, "uT": 1e3, "T": 1e9, "mG": 1e2, "G": 1e5}
-"""nT per unit."""
-
-MIXED = 0.01
-"""Share of readings in another unit from which they count as mixed units, not as outliers."""
+USUAL_NT = 50_000.0  # Magnitude that a suggested scale would give [nT]
+NT_PER: dict[str, float] = {"nT": 1.0, "uT": 1e3, "T": 1e9, "mG": 1e2, "G": 1e5}  # nT per unit
+MIXED = 0.01  # Share of readings in another unit from which they count as mixed units, not as outliers
 
 
 def _four(value: float) -> str:
@@ -83,8 +76,7 @@ def check_unit(
     could = {other: number * factor for other, factor in NT_PER.items()}
     could = {other: value for other, value in could.items() if LEAST_MEAN_NT <= value <= GREATEST_MEAN_NT}
     advice = " or ".join(
-        f"were it {other}, it would be {value:,.0f} nT, so say --unit {other}"
-        for other, value in could.items()
+        f"in {other} it would be {value:,.0f} nT: give --unit {other}" for other, value in could.items()
     )
     if not any(INDOORS_NT[0] <= value <= INDOORS_NT[1] for value in could.values()):
         no_unit = "no usual unit makes it the Earth's field"

@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, find
-from magtwin.field.maps.difference import TOLD, MapDifference
+from magtwin.field.maps.difference import LISTED, MapDifference
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
 from magtwin.figures.canvas import INK, Array, colour_bar, label, new_figure, save
@@ -333,7 +333,7 @@ def _between_headings(field: AnomalyMap, layers: Array, headings: Array) -> Arra
 def _draw_regions(ax: Axes, difference: MapDifference) -> None:
     """A numbered box around each region that the report lists."""
     dx, dy = difference.grid.cell_m
-    for number, region in enumerate(difference.regions[:TOLD], 1):
+    for number, region in enumerate(difference.regions[:LISTED], 1):
         x0, x1, y0, y1 = region.extent_m
         corner = (x0 - dx / 2, y0 - dy / 2)
         ax.add_patch(Rectangle(corner, x1 - x0 + dx, y1 - y0 + dy, fill=False, ec=INK, lw=1.2))

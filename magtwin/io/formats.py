@@ -1,15 +1,27 @@
-"""Formats: the one table from a file's name to what reads and writes a Run in it."""
+"""Formats: which functions read and write a Run, by the suffix of the file.
+
+**To add a format**, write a reader `read(path) -> Run` and a writer `write(run, path, *, force)` in a
+module of this folder, and add a line to `FORMATS`. Without a fork, register it in your own code or by an
+entry point:
+
+    from magtwin.io.formats import FORMATS, Format
+
+    FORMATS.register(".h5")(Format("HDF5", read=read_h5, write=write_h5))
+
+    [project.entry-points."magtwin.formats"]
+    ".h5" = "my_package:HDF5"    # a Format
+"""
 
 import importlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from magtwin.errors import InputError, hint
 from magtwin.files import existing
+from magtwin.registry import Registry
 from magtwin.run.run import Run, check_clock
 
 if TYPE_CHECKING:
@@ -17,99 +29,87 @@ if TYPE_CHECKING:
     from magtwin.sim.sensors.lidar import Scans
     from magtwin.twin import Twin
 
+Function = Callable[..., Any]
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class Format:
     """A kind of file that holds a Run."""
 
     name: str
-    """What people call it."""
+    """Its name, for messages."""
 
-    module: str
-    """Where its two functions stand; imported when a file of the kind is met."""
+    read: Function | str
+    """The reader, `read(path, **options) -> Run`, or "module:function", which is imported when needed."""
 
-    read: str
-    """Name of the reader, `read(path) -> Run`."""
-
-    write: str
-    """Name of the writer, `write(run, path, *, force, ...)`; "" of a format that is only read."""
+    write: Function | str | None = None
+    """The writer, `write(run, path, *, force, **options)`, likewise. None: the format is only read."""
 
     reads: frozenset[str] = frozenset()
-    """Options that the reader takes."""
+    """Options of the reader."""
 
     takes: frozenset[str] = frozenset()
-    """What else the writer takes: of `twin`, `planned`, `scans`, which a format that cannot hold them is not
-    given, and of the options, which it refuses."""
-
-    def reader(self) -> Callable[..., Run]:
-        """The function that reads it."""
-        return getattr(importlib.import_module(self.module), self.read)
-
-    def writer(self) -> Callable[..., None]:
-        """The function that writes it."""
-        return getattr(importlib.import_module(self.module), self.write)
+    """Arguments of the writer: of `twin`, `planned`, `scans` and `scene_file`, which other formats are not
+    given, and options, which other formats refuse."""
 
 
-_TABLES = "magtwin.io.tables"
 _NAMED = frozenset(("columns",))
-_PARQUET = Format("Parquet", _TABLES, "read_parquet", "write_parquet", reads=_NAMED)
-_BAG = Format(
-    "rosbag2",
-    "magtwin.io.bags.rosbag",
-    "read_bag",
-    "write_bag",
+PARQUET = Format(
+    name="Parquet",
+    read="magtwin.io.tables:read_parquet",
+    write="magtwin.io.tables:write_parquet",
+    reads=_NAMED,
+)
+CSV = Format(name="CSV", read="magtwin.io.tables:read_csv", write="magtwin.io.tables:write_csv", reads=_NAMED)
+NPZ = Format(name="npz", read="magtwin.io.tables:read_npz", write="magtwin.io.tables:write_npz")
+RERUN = Format(
+    name="Rerun",
+    read="magtwin.io.rerun.file:read_run",
+    write="magtwin.io.rerun.file:write_rrd",
+    takes=frozenset(("twin", "planned", "scans")),
+)
+RELEASE = Format(name="released package", read="magtwin.io.release:read_release")
+BAG = Format(
+    name="rosbag2",
+    read="magtwin.io.bags.reader:read_bag",
+    write="magtwin.io.bags.writer:write_bag",
     reads=frozenset(("topics", "unit")),
     takes=frozenset(("twin", "scans", "storage", "units")),
 )
-_USD = Format(
-    "USD",
-    "magtwin.usd.animation",
-    "read_animation",
-    "write_animation",
+USD = Format(
+    name="USD",
+    read="magtwin.usd.animation:read_animation",
+    write="magtwin.usd.animation:write_animation",
     takes=frozenset(("scene_file", "fps")),
 )
 
-FORMATS: Mapping[str, Format] = MappingProxyType(
-    {
-        ".parquet": _PARQUET,
-        ".csv": Format("CSV", _TABLES, "read_csv", "write_csv", reads=_NAMED),
-        ".npz": Format("npz", _TABLES, "read_npz", "write_npz"),
-        ".rrd": Format(
-            "Rerun",
-            "magtwin.io.rerun.file",
-            "read_run",
-            "write_rrd",
-            takes=frozenset(("twin", "planned", "scans")),
-        ),
-        ".json": Format("released package", "magtwin.io.release", "read_release", ""),
-        ".mcap": _BAG,
-        ".db3": _BAG,
-        ".usd": _USD,
-        ".usda": _USD,
-        ".usdc": _USD,
-    }
+_SUFFIXES = {".parquet": "PARQUET", ".csv": "CSV", ".npz": "NPZ", ".rrd": "RERUN", ".json": "RELEASE"}
+_SUFFIXES |= {".mcap": "BAG", ".db3": "BAG", ".usd": "USD", ".usda": "USD", ".usdc": "USD"}
+
+FORMATS: Registry[Format] = Registry(
+    "run format", "formats", {suffix: f"{__name__}:{name}" for suffix, name in _SUFFIXES.items()}
 )
-"""Formats by the end of a file's name. A name without one is that of a rosbag2 folder."""
+"""Formats by suffix. A name without a suffix is a rosbag2 folder."""
 
 
 def read_run(path: str | os.PathLike[str], **options: Any) -> Run:
-    """The run that a file holds, whatever its format.
+    """Read a run from a file of any format.
 
     Args:
-        path: A file whose name ends as one of `FORMATS`; or a folder: a bag's, the part files of a Parquet
-            file that was never finished, or the one that `magtwin run --out` makes.
-        options: Of single formats: `topics` and `unit` of a robot's own bag, `columns` of a table that
+        path: A file with a suffix of `FORMATS`, or a folder: a bag, the parts of an unfinished Parquet
+            file, or the output of `magtwin run --out`.
+        options: Options of single formats: `topics` and `unit` of a robot's bag, `columns` of a table that
             another program wrote.
 
     Raises:
-        InputError: The file is missing, of no known kind, damaged, holds no run, or its format has no such
-            option.
+        InputError: The file is missing, of unknown format, damaged, or holds no run; or its format has no
+            such option.
     """
     path = existing(path, "run")
-    file, format_ = _found(path) if path.is_dir() else (path, format_of(path))
+    file, format_ = _in_folder(path) if path.is_dir() else (path, format_of(path))
     if unknown := sorted(options.keys() - format_.reads):
-        raise InputError(f"{path}: {format_.name} is read without {unknown[0]}; drop it")
-    run = format_.reader()(file, **options)
+        raise InputError(f"{path}: {format_.name} has no option {unknown[0]!r}; drop it")
+    run = _function(format_.read)(file, **options)
     check_clock(run, str(path))
     return run
 
@@ -124,26 +124,26 @@ def write_run(
     force: bool = False,
     **options: Any,
 ) -> None:
-    """Write a run in the format that its name ends in; `FORMATS` says which hold what.
+    """Write a run in the format of the file's suffix.
 
     Args:
-        run: What happened.
-        path: The file to make, or the folder of a bag where the name has no ending.
-        twin: What it happened in; without it, a file holds what the run alone knows.
-        planned: The path that was to be driven, for those that show it.
-        scans: What the LiDAR saw, for those that hold it.
-        force: Whether what exists is replaced.
-        options: Of single formats: `storage` and `units` of bags, `fps` of USD.
+        run: The run.
+        path: The file to make. A name without a suffix is the folder of a bag.
+        twin: The twin of the run. Without it, a file holds only the run.
+        planned: The path that was to be driven, for formats that show it.
+        scans: The LiDAR's scans, for formats that hold them.
+        force: Replace an existing file.
+        options: Options of single formats: `storage` and `units` of bags, `fps` of USD.
 
     Raises:
-        InputError: The name ends in no known way, the format has no such option, the run has no clock that
-            ascends, the file exists and `force` was not given, or it cannot be written.
+        InputError: The suffix is unknown, the format has no such option, the run's clock does not ascend, the
+            file exists and `force` is not set, or it cannot be written.
     """
     path = Path(path)
     format_ = format_of(path)
     if not format_.write:
-        kinds = ", ".join(suffix for suffix, one in FORMATS.items() if one.write)
-        raise InputError(f"{path}: a recording of the {format_.name} is read, not written; write {kinds}")
+        kinds = ", ".join(suffix for suffix, other in FORMATS.items() if other.write)
+        raise InputError(f"{path}: a {format_.name} is only read; write {kinds}")
     if unknown := sorted(options.keys() - format_.takes):
         raise InputError(f"{path}: {format_.name} has no option {unknown[0]!r}; drop it")
     check_clock(run, "the run to write")
@@ -155,30 +155,37 @@ def write_run(
     scene_file = None if twin is None else twin.scene_file
     known = {"twin": twin, "planned": planned, "scans": scans, "scene_file": scene_file}
     given = {name: value for name, value in known.items() if name in format_.takes}
-    format_.writer()(run, path, force=force, **given, **options)
+    _function(format_.write)(run, path, force=force, **given, **options)
 
 
 def format_of(path: Path) -> Format:
-    """The format that a file's name asks for; a bag's folder where it has no ending.
+    """The format of a file by its suffix; a bag if it has none.
 
     Raises:
-        InputError: It ends in no known way.
+        InputError: The suffix is unknown.
     """
     if not path.suffix:
-        return _BAG
+        return BAG
     if path.suffix not in FORMATS:
-        raise InputError(f"{path}: no known kind of run file; {hint(path.suffix, FORMATS)}")
+        raise InputError(f"{path}: unknown format of a run; {hint(path.suffix, dict.fromkeys(FORMATS))}")
     return FORMATS[path.suffix]
 
 
-def _found(folder: Path) -> tuple[Path, Format]:
-    """What is to be read in a folder, and as what."""
+def _function(function: Function | str) -> Function:
+    if not isinstance(function, str):
+        return function
+    module, _, name = function.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def _in_folder(folder: Path) -> tuple[Path, Format]:
+    """The file to read in a folder, and its format."""
     if (folder / "metadata.yaml").exists() or any(folder.glob("*.db3")) or any(folder.glob("*.mcap")):
-        return folder, _BAG
+        return folder, BAG
     if (folder / "run.parquet").is_file():
-        return folder / "run.parquet", _PARQUET
+        return folder / "run.parquet", PARQUET
     if any(folder.glob("*.parquet")):
-        return folder, _PARQUET
+        return folder, PARQUET
     raise InputError(
         f"{folder}: a folder without a run; name a file ({', '.join(FORMATS)}), or a folder with a bag, "
         "Parquet parts or run.parquet"

@@ -1,4 +1,4 @@
-"""Provenance: a run made once more from what its metadata say, and whether it is the same."""
+"""Provenance: reproduce a run from its metadata and compare it with the original."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -24,42 +24,42 @@ CAUSES: Mapping[str, str] = {
     "network_sha256": "the network changed",
     "path_sha256": "the path changed",
     "commands_sha256": "the commands changed",
-    "replay_sha256": "the run that was driven once more changed",
+    "replay_sha256": "the replayed run changed",
 }
-"""Metadata that decide a run's columns, and what it means where they differ, likeliest cause first."""
+"""Metadata that determine a run's columns, and the cause if they differ, likeliest first."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """How a column differs between a run and its repetition."""
+    """Difference of a column between a run and its reproduction."""
 
     column: str
     rows: int
-    """Rows that differ."""
+    """Number of rows that differ."""
     first: int
     """The first of them."""
     greatest: float
-    """Greatest absolute difference, in the column's unit; nan where one is known and the other is not."""
+    """Largest absolute difference in the column's unit; nan if only one of the values is known."""
 
 
 @dataclass(frozen=True)
 class Repeat:
-    """A run made once more."""
+    """A reproduced run."""
 
     original: Run
     again: Run
     causes: tuple[str, ...]
-    """Metadata that differ and decide the columns, each with what was and what is."""
+    """Differing metadata that determine the columns, with old and new value."""
     differences: tuple[Difference, ...]
-    """Columns of the original that are not the same to the bit."""
+    """Columns that are not bit-identical."""
 
     @property
     def equal(self) -> bool:
-        """Whether every column of the original came out again, to the bit."""
+        """Whether all columns of the original are bit-identical."""
         return not self.differences
 
     def report(self, title: str) -> Report:
-        """Columns that differ, and the verdict; the metadata say what changed since."""
+        """The differing columns and the verdict; the metadata list what changed."""
         figures = []
         for d in self.differences:
             note = f"{d.rows} of {self.original.rows} rows, from row {d.first + 1} on"
@@ -72,7 +72,7 @@ class Repeat:
 
 
 def repeat_of(file: str | FilePath, scene: str | FilePath | None = None) -> Repeat:
-    """Make the run of a file once more, and compare it with what such a file would keep of it.
+    """Reproduce the run of a file, and compare it at the precision of the file's format.
 
     Raises:
         InputError: The file holds no run; or as for `repeat`.
@@ -81,23 +81,23 @@ def repeat_of(file: str | FilePath, scene: str | FilePath | None = None) -> Repe
 
     file = FilePath(file)
     run = read_run(file)
-    found = repeat(run, scene, near=file)
-    if found.equal:
-        return found
-    return replace(found, differences=differences(run, as_kept(found.again, file)))
+    result = repeat(run, scene, near=file)
+    if result.equal:
+        return result
+    return replace(result, differences=differences(run, as_kept(result.again, file)))
 
 
 def repeat(run: Run, scene: str | FilePath | None = None, *, near: str | FilePath | None = None) -> Repeat:
-    """Make a run once more, from what its metadata say, and compare.
+    """Reproduce a run from its metadata and report whether the columns match.
 
     Args:
         run: A run that `simulate`, `sweep` or a command made.
-        scene: Where its scene lies now; None looks where the metadata say.
-        near: The run's own file: files that its metadata name are looked for in its folder too.
+        scene: The scene file. Default: the one in the metadata.
+        near: The run's file; files that its metadata name are also searched for in its folder.
 
     Raises:
-        InputError: The metadata do not say enough, a file is not there, or the run is of something that was
-            made in Python and is no longer at hand.
+        InputError: The metadata are incomplete, a file is missing, or the run used objects from Python that
+            are not in a file.
     """
     return _compared(run, made_again(run, scene, near=near))
 
@@ -111,23 +111,23 @@ def made_again(
     seed: int | None = None,
     progress: Callable[[int, int, str], Any] | None = None,
 ) -> Run:
-    """A run made once more, from what its metadata say; or what it drove, driven by another engine.
+    """Reproduce a run from its metadata, or drive the same with another engine or seed.
 
     Args:
         run: As for `repeat`.
         scene: As for `repeat`.
         near: As for `repeat`.
-        engine: "kinematic" or "newton", in place of the run's own.
-        seed: Of all noise, in place of the run's own.
+        engine: "kinematic" or "newton". Default: the run's engine.
+        seed: Seed of all noise. Default: the run's seed.
         progress: As for `magtwin.twin.engine_named`.
 
     Raises:
-        InputError: As for `repeat`; or the engine is not known or not installed.
+        InputError: As for `repeat`; or the engine is unknown or not installed.
     """
     metadata = run.metadata
     if "seed" not in metadata and seed is None:
         raise InputError(
-            "the run does not say its seed, so it cannot be repeated; was it recorded elsewhere?"
+            "the metadata hold no seed, so the run cannot be reproduced; was it recorded elsewhere?"
         )
     twin = twin_of(run, scene, near=near, check=False)
     twin = in_session_of(twin, metadata)
@@ -137,7 +137,7 @@ def made_again(
         asked = float(metadata["asked_duration_s"]) if "asked_duration_s" in metadata else None
         speed = float(metadata.get("speed_m_s", 0.2))
     except (KeyError, ValueError) as error:
-        raise InputError(f"the metadata of the run do not say how it was made: {error}") from error
+        raise InputError(f"the metadata of the run are incomplete: {error}") from error
     moved_by: Any = engine or metadata.get("engine", "kinematic")
     options: dict[str, Any] = {
         "lidar": metadata.get("lidar", "schedule"),
@@ -146,11 +146,9 @@ def made_again(
     if isinstance(what, Path):
         options["controller"] = metadata.get("controller", "follower")
     if engine is None and moved_by not in ("kinematic", "newton", "replay"):
-        raise InputError(
-            f"the run was moved by an engine of its maker's own, {moved_by!r}, which is not here"
-        )
+        raise InputError(f"the run used a custom engine, {moved_by!r}, which is not available")
     name = str(metadata.get("robot", ""))
-    if engine is None and name and twin.scene.others:  # beside others, which drive what the scene says
+    if engine is None and name and twin.scene.others:  # beside others, which drive their scene's paths
         return simulate_robots(
             twin,
             {name: what},
@@ -176,7 +174,7 @@ def made_again(
 
 
 def _compared(run: Run, again: Run) -> Repeat:
-    """A run, and what came out when it was made once more."""
+    """Compare a run with its reproduction."""
     causes = (
         [f"the run was made from another: {run.metadata['derived']}"] if "derived" in run.metadata else []
     )
@@ -189,7 +187,7 @@ def _compared(run: Run, again: Run) -> Repeat:
 
 
 def as_kept(run: Run, file: FilePath) -> Run:
-    """What a file of the same format keeps of a run; a bag, say, keeps a battery in single precision."""
+    """A run at the precision of a file format; a bag, for example, keeps a battery in single precision."""
     import tempfile
 
     from magtwin.io.formats import read_run, write_run
@@ -203,15 +201,15 @@ def as_kept(run: Run, file: FilePath) -> Run:
 def map_of(
     run: Run, scene: str | FilePath | None = None, *, near: str | FilePath | None = None
 ) -> AnomalyMap:
-    """The map that a run read, where its scene is at hand and the map is what it was.
+    """The map of a run, if its scene is available and the map is unchanged.
 
     Args:
         run: The run.
-        scene: Where its scene lies now; None looks where the metadata say.
-        near: The run's own file: files that its metadata name are looked for in its folder too.
+        scene: As for `repeat`.
+        near: As for `repeat`.
 
     Raises:
-        InputError: The scene is not there, or its map is another.
+        InputError: The scene is missing, or its map changed.
     """
     from magtwin.files import sha256
     from magtwin.usd.maps import load_map
@@ -219,12 +217,12 @@ def map_of(
 
     layer = read_scene(scene_of(run, scene, near=near), check_network=False).map_layer
     if "map_sha256" in run.metadata and run.metadata["map_sha256"] != sha256(layer):
-        raise InputError(f"{layer}: is not the map that the run read")
+        raise InputError(f"{layer}: is not the map of the run")
     return load_map(layer)
 
 
 def planned_of(run: Run, *, near: str | FilePath | None = None) -> NDArray[np.float64] | None:
-    """The path that a run was to drive [m], shape (M, 2); none where it is not at hand, or drove none."""
+    """The planned path of a run [m], shape (M, 2); None if it is not available."""
     try:
         path = _driven(run, near)
     except InputError:
@@ -235,7 +233,7 @@ def planned_of(run: Run, *, near: str | FilePath | None = None) -> NDArray[np.fl
 
 
 def differences(run: Run, again: Run) -> tuple[Difference, ...]:
-    """The columns of a run that another does not have to the bit; nan is nan."""
+    """Columns that are not bit-identical in another run; nan equals nan."""
     found = []
     for name, a in run.items():
         b = again.columns.get(name)
@@ -255,7 +253,7 @@ def differences(run: Run, again: Run) -> tuple[Difference, ...]:
 
 
 def _same(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:
-    """Rows that are the same, shape (N,)."""
+    """Equal rows, shape (N,)."""
     same = (a == b) | ((a != a) & (b != b))
     if a.dtype.kind == "f" and b.dtype.kind == "f":
         same &= (a != 0) | (np.signbit(a) == np.signbit(b))  # -0 is not 0
@@ -263,7 +261,7 @@ def _same(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def _driven(run: Run, near: str | FilePath | None) -> Any:
-    """What was driven: a path, commands, a run, or "random" where a driver went where they liked."""
+    """What was driven: a path, commands, a run, or "random"."""
     from magtwin.sim.motion.commands import read_commands
 
     metadata = run.metadata
@@ -272,22 +270,22 @@ def _driven(run: Run, near: str | FilePath | None) -> Any:
             file = str(metadata[f"{kind}_file"])
             place = locate(file, near)
             if place is None:
-                raise InputError(f"{file}: the file that the run drove is not there; put it back")
+                raise InputError(f"{file}: the file that the run drove is missing; put it back")
             return _placed(read(place), run)
     name = str(metadata.get("path", ""))
     if "replay_sha256" in metadata or "commands_sha256" in metadata:
         raise InputError(
-            f"the run drove {name!r}, which came from no file; it cannot be repeated from its metadata"
+            f"the run drove {name!r}, which is in no file; it cannot be reproduced from its metadata"
         )
     if name == "random":
         return name
     if name not in PATHS and name not in CASES:
-        raise InputError(f"the run drove the path {name!r}, which came from no file; it cannot be repeated")
+        raise InputError(f"the run drove the path {name!r}, which is in no file; it cannot be reproduced")
     return _placed(path_named(name), run)
 
 
 def _placed(driven: Any, run: Run) -> Any:
-    """A path as the run drove it: scaled and moved as its metadata tell."""
+    """A path scaled and moved as in the run's metadata."""
     placing = str(run.metadata.get("path_placing", ""))
     if not placing or not isinstance(driven, Path):
         return driven
@@ -295,7 +293,7 @@ def _placed(driven: Any, run: Run) -> Any:
         numbers = tuple(map(float, placing.split()))
         return driven.placed(numbers)  # type: ignore[arg-type]
     except ValueError as error:
-        raise InputError(f"the run's fact path_placing is not four numbers: {placing!r}") from error
+        raise InputError(f"metadata path_placing must be four numbers, got {placing!r}") from error
 
 
 def _read_run(file: FilePath) -> Run:

@@ -1,4 +1,4 @@
-"""Recorder: a run that goes on, appended block by block to files and a live viewer at once."""
+"""Recorder: append a growing run, block by block, to files and live viewers."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -14,58 +14,58 @@ from magtwin.errors import InputError
 from magtwin.run.run import Run
 
 PARTIAL = ".partial"
-"""What stands before the ending of a file's name until the run in it has ended."""
+"""Inserted before the suffix of a file until its run has ended."""
 
 FLUSH_S = 0.5
-"""How long files wait for their next rows [s]: what a process that is killed loses at most."""
+"""Time between writes to files [s], which is the most that a killed process loses."""
 
 TICK_S = 0.05
-"""Time between blocks of a run that is emitted in step with the clock [s]."""
+"""Time between blocks of a run that is played in real time [s]."""
 
 
 def partial_of(path: Path) -> Path:
-    """Where a file lies until it is complete: run.partial.rrd for run.rrd."""
+    """Path of a file until it is complete: run.partial.rrd for run.rrd."""
     return path.with_name(f"{path.stem}{PARTIAL}{path.suffix}")
 
 
 class Sink(Protocol):
-    """What takes a run as it comes, such as RrdWriter, ParquetParts, BagWriter."""
+    """Takes a growing run, such as RrdWriter, ParquetParts, BagWriter."""
 
     def append(self, run: Run) -> None:
-        """Take the next rows, with the metadata; whatever happens, they can be read from then on."""
+        """Take the next rows, with the metadata; from then on they are readable, whatever happens."""
 
     def close(self) -> None:
-        """Complete what was written, and give it its name: no rows come any more."""
+        """Complete the output and give it its name."""
 
     def abort(self) -> None:
-        """Let go of it: what was written stays as it is, and where nothing was, nothing does."""
+        """Leave the output as it is, or nothing if nothing was written."""
 
 
 class Recorder:
-    """A run on its way into several sinks at once.
+    """Writes a growing run to several sinks.
 
-    The end of the `with` block completes them. Any fault leaves the files as they are, under names that
-    tell that they are unfinished; they can be read up to their last rows.
+    The end of the `with` block completes them. An error leaves the files under their partial names, readable
+    up to their last rows.
     """
 
     def __init__(self, files: Sequence[Sink], viewers: Sequence[Sink] = ()) -> None:
-        """Begin.
+        """Start.
 
         Args:
-            files: Those that are given rows every `FLUSH_S`, for what each block costs them.
-            viewers: Those that are given every block at once.
+            files: Sinks that get rows every `FLUSH_S`.
+            viewers: Sinks that get every block at once.
         """
         self._files, self._viewers = list(files), list(viewers)
         self._waiting: list[Run] = []
         self._flushed = time.monotonic()
         self.rows = 0
-        """Rows appended so far."""
+        """Number of rows so far."""
 
     def append(self, run: Run) -> None:
-        """The next rows, a slice of the run: its columns and metadata.
+        """Append the next rows of the run.
 
         Raises:
-            InputError: A sink cannot take them; the text says which and why.
+            InputError: A sink cannot take them.
         """
         if not run.rows:
             return
@@ -77,7 +77,7 @@ class Recorder:
             self.flush()
 
     def flush(self) -> None:
-        """Give the files what they have not got yet.
+        """Write all waiting rows to the files.
 
         Raises:
             InputError: As for `append`.
@@ -111,25 +111,25 @@ class Recorder:
         self._abort(sinks)
 
     def _abort(self, sinks: Sequence[Sink]) -> None:
-        """Let go of what cannot be completed any more."""
+        """Leave sinks that cannot be completed."""
         for sink in sinks:
             with suppress(InputError, OSError, RuntimeError):
                 sink.abort()
 
 
 def in_step(run: Run, pace: float = 1.0, *, stop: Event | None = None) -> Iterator[Run]:
-    """A run in blocks, each at its time on the clock.
+    """A run in blocks, each at its time.
 
     Args:
-        run: What happened.
-        pace: Simulated seconds a second of the clock, above 0; inf waits for nothing.
-        stop: Ends it when set, at once.
+        run: The run.
+        pace: Simulated seconds per second, above 0; inf does not wait.
+        stop: Ends it at once when set.
 
     Raises:
         InputError: The pace is not above 0.
     """
     if not pace > 0:
-        raise InputError(f"pace must be above 0 simulated seconds a second, got {pace:g}")
+        raise InputError(f"pace must be above 0 simulated seconds per second, got {pace:g}")
     stop = stop or Event()
     t, begun, sent = run["t"], time.monotonic(), 0
     while sent < run.rows and not stop.is_set():

@@ -1,10 +1,9 @@
-"""Recordings of the released package: what its node keeps with `save_json`, read as a Run.
+"""Recordings of the released package, which its node writes with `save_json`, read as a Run.
 
-Such a file is a list of frames, a JSON object each, one for every message that came, with the latest of
-everything by then:
+Such a file is a list of frames, one JSON object for every message, with the latest value of everything:
 
     timestamp                wall clock [s]
-    nn_magnetic_magnitude    what the magnetometer read [nT]; 0.0 in a frame that carries no reading
+    nn_magnetic_magnitude    reading of the magnetometer [nT]; 0.0 in a frame without a reading
     map_magnetic_magnitude   the map there [nT]
     pose_data                motion capture: x, y [m], yaw [rad]
     odom                     linear velocity xyz [m/s], angular velocity xyz [rad/s]
@@ -12,18 +11,17 @@ everything by then:
     battery_data             voltage [V], charge 0 to 1
     lidar                    0 or 1
 
-It begins with a bracket and a frame ends in a comma, the last one too; a node that was killed leaves no
-bracket at the end, or half a frame. Such files are read all the same, frame by frame, so that their size does
-not matter but for the rows that are kept.
+Every frame ends in a comma, also the last one. A killed node leaves no closing bracket, or half a frame; such
+files are read too.
 """
 
-import io
 import json
 import math
 import os
 import re
 from array import array
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -35,14 +33,11 @@ from magtwin.files import existing, sha256
 from magtwin.frames import canonical, quat_from_yaw, wrap_angle
 from magtwin.run.run import COLUMNS, Run
 
-CHUNK = 1 << 16
-"""Characters that are read at a time."""
-
-LONGEST_FRAME = 1 << 16
-"""Characters; a frame of the release has about 600."""
+_BETWEEN = re.compile(r"[\s,]*")
+"""Characters between frames."""
 
 _STUMP = re.compile(r"[A-Za-z-]{0,9}\s*")
-"""What may stand at the end of half a frame."""
+"""An incomplete word or sign at the end of half a frame."""
 
 _SHAPES: dict[str, tuple[int, ...]] = {
     "timestamp": (),
@@ -54,19 +49,19 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "battery_data": (2,),
     "lidar": (),
 }
-"""Keys of a frame: a number, some numbers, or lists of so many."""
+"""Shape of each entry of a frame: a number, so many numbers, or lists of so many numbers."""
 
 _WIDTH = 25
-"""Numbers of a frame."""
+"""Numbers in a frame."""
 
 
 def read_release(path: str | os.PathLike[str]) -> Run:
-    """The run that the released node's `save_json` recorded.
+    """Read a recording of the released node's `save_json`.
 
-    A row is a frame with a reading; what it holds beside is the latest that was known by then, so that
-    nothing of the future is in it. t is the wall clock less that of the first reading, whose time is the fact
-    `start_s`. What has not been heard of yet is nan (the node writes nothing, or an empty list). Frames
-    between two readings count for what they tell; two at one time are one, the later.
+    Each frame with a reading is a row; its other values are the latest ones before it. t is the wall clock
+    since the first reading, whose time is `start_s` in the metadata. Values that are not known yet, which
+    the node leaves out or writes as empty lists, are nan. Of two readings at the same time the later one
+    counts.
 
     Args:
         path: The file.
@@ -74,11 +69,11 @@ def read_release(path: str | os.PathLike[str]) -> Run:
     Returns:
         A Run with b_measured_nt, b_map_nt, mocap_p, mocap_q_xyzw (z is 0: it is not recorded), p_world_base,
         q_world_base_xyzw, yaw, odom_v, odom_w, imu_q_xyzw, imu_w, imu_a, battery_v, battery_fraction,
-        lidar_on. Its metadata say how many frames there were, and whether the end was missing.
+        lidar_on. The metadata hold the number of frames and how the file ended.
 
     Raises:
-        InputError: The file is missing or no such list, a frame is not as above (the text names it and
-            its place), its clock goes back, or none carries a reading.
+        InputError: The file is missing or not such a list, a frame is not as above (the text gives its number
+            and position), its clock goes back, or no frame has a reading.
     """
     path = existing(path, "recording")
     if path.is_dir():
@@ -94,7 +89,7 @@ def read_release(path: str | os.PathLike[str]) -> Run:
                 f"{row[0]!r} s; was it set while recording? cut the file in two there"
             )
         if row[1] == 0.0 or math.isnan(row[1]):
-            continue  # a message of another sensor, whose news the next reading holds too
+            continue  # a message of another sensor; the next reading holds its values too
         if row[0] == last:
             del table[-_WIDTH:]
             kept -= 1
@@ -140,12 +135,12 @@ def _columns(rows: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
 
 
 def _numbers(frame: dict[str, Any], where: str) -> list[float]:
-    """The numbers of a frame in the order of `_SHAPES`; nan where it has none yet."""
+    """The numbers of a frame in the order of `_SHAPES`; nan if not known yet."""
     row: list[float] = []
     for key, shape in _SHAPES.items():
         if key not in frame:
             known = list(frame)[:20]
-            raise InputError(f"{where}: no {key!r} in it, as `save_json` writes; {hint(key, known)}")
+            raise InputError(f"{where}: no {key!r} in it, which `save_json` writes; {hint(key, known)}")
         value = frame[key]
         if not shape:
             row.append(_number(value, key, where))
@@ -154,23 +149,23 @@ def _numbers(frame: dict[str, Any], where: str) -> list[float]:
         elif value is None or value == []:
             row += [math.nan] * sum(shape)
         elif not isinstance(value, list) or len(value) != len(shape):
-            raise InputError(f"{where}: {key} must be {len(shape)} lists of numbers, got {_said(value)}")
+            raise InputError(f"{where}: {key} must be {len(shape)} lists of numbers, got {_quoted(value)}")
         else:
             for part, width in zip(value, shape, strict=True):
                 row += _some(part, width, key, where)
     if not math.isfinite(row[0]):
-        raise InputError(f"{where}: timestamp must be a time [s], got {_said(frame['timestamp'])}")
+        raise InputError(f"{where}: timestamp must be a time [s], got {_quoted(frame['timestamp'])}")
     if row[-1] not in (0.0, 1.0) and not math.isnan(row[-1]):
-        raise InputError(f"{where}: lidar must be 0 or 1, got {_said(frame['lidar'])}")
+        raise InputError(f"{where}: lidar must be 0 or 1, got {_quoted(frame['lidar'])}")
     return row
 
 
-def _some(value: Any, count: int, key: str, where: str) -> list[float]:
+def _some(value: Any, size: int, key: str, where: str) -> list[float]:
     if value is None or value == []:
-        return [math.nan] * count
-    if not isinstance(value, list) or len(value) != count:
-        raise InputError(f"{where}: {key} must be {count} numbers here, got {_said(value)}")
-    return [_number(one, key, where) for one in value]
+        return [math.nan] * size
+    if not isinstance(value, list) or len(value) != size:
+        raise InputError(f"{where}: {key} must be {size} numbers here, got {_quoted(value)}")
+    return [_number(number, key, where) for number in value]
 
 
 def _number(value: Any, key: str, where: str) -> float:
@@ -183,19 +178,19 @@ def _number(value: Any, key: str, where: str) -> float:
             number = math.inf
         if not math.isinf(number):
             return number
-    raise InputError(f"{where}: {key} must be a finite number, got {_said(value)}")
+    raise InputError(f"{where}: {key} must be a finite number, got {_quoted(value)}")
 
 
-def _said(value: Any) -> str:
-    """What a refusal quotes."""
+def _quoted(value: Any) -> str:
+    """A value, shortened for messages."""
     text = json.dumps(value, default=str)
     return text if len(text) <= 60 else text[:60] + " ..."
 
 
 class _Frames:
-    """The frames of a file, as they come: number from 1, the character that it begins at, what it says.
+    """The frames of a file: number from 1, position of the first character, content.
 
-    The list is taken apart by hand, as its commas are not JSON's; each frame is JSON.
+    The list is split by hand, as its commas are not JSON's; each frame is JSON.
     """
 
     def __init__(self, path: Path) -> None:
@@ -204,64 +199,43 @@ class _Frames:
         """How the file ended: whole, or where it was cut."""
 
     def __iter__(self) -> Iterator[tuple[int, int, dict[str, Any]]]:
-        decoder = json.JSONDecoder()
-        with open(self.path, encoding="utf-8-sig", newline="") as file:
-            text, at, number, gone = self._more(file), 0, 0, 0
-            begun = text.lstrip()
-            if not begun.startswith("["):
-                seen = _said(begun[:20]) if begun else "nothing"
-                raise InputError(f"{self.path}: a recording of the release begins with '[', this with {seen}")
-            at = text.index("[") + 1
-            while True:
-                while True:  # to the next frame
-                    while at < len(text) and text[at] in " \t\r\n,":
-                        at += 1
-                    if at < len(text):
-                        break
-                    gone, text, at = gone + len(text), self._more(file), 0
-                    if not text:
-                        self.end = "without its bracket"
-                        return
-                if text[at] == "]":
-                    rest = (text[at + 1 :] + file.read(CHUNK)).strip()
-                    if rest:
-                        raise InputError(
-                            f"{self.path}: goes on after the end of its list, with {_said(rest[:20])}; are "
-                            "these two recordings? cut them apart"
-                        )
-                    return
-                if text[at] != "{":
-                    raise self._refused(
-                        number + 1, gone + at, f"a frame begins with '{{', this with {text[at]!r}"
-                    )
-                while True:  # the whole of it
-                    try:
-                        frame, stop = decoder.raw_decode(text, at)
-                        break
-                    except (ValueError, RecursionError) as error:
-                        more = self._more(file) if len(text) - at < LONGEST_FRAME else None
-                        if more == "" and _is_cut(error, text):
-                            self.end = f"within frame {number + 1}"
-                            return
-                        if not more:
-                            raise self._refused(number + 1, gone + at, f"not JSON: {error}") from error
-                        gone, text, at = gone + at, text[at:] + more, 0
-                number += 1
-                yield number, gone + at, frame
-                at = stop
-
-    def _more(self, file: io.TextIOWrapper) -> str:
         try:
-            return file.read(CHUNK)
+            text = self.path.read_text(encoding="utf-8-sig")
         except UnicodeDecodeError as error:
             raise InputError(f"{self.path}: not a text file ({error}); a recording is JSON") from error
-
-    def _refused(self, number: int, place: int, text: str) -> InputError:
-        return InputError(f"{self.path}, frame {number} (at character {place}): {text}")
+        begin = text.lstrip()[:20]
+        if not begin.startswith("["):
+            seen = _quoted(begin) if begin else "nothing"
+            raise InputError(f"{self.path}: a recording of the release begins with '[', this with {seen}")
+        decoder, at = json.JSONDecoder(), text.index("[") + 1
+        for number in count(1):
+            at = _BETWEEN.match(text, at).end()  # type: ignore[union-attr]
+            where = f"{self.path}, frame {number} (at character {at})"
+            if at == len(text):
+                self.end = "without its bracket"
+                return
+            if text[at] == "]":
+                if rest := text[at + 1 :].strip():
+                    raise InputError(
+                        f"{self.path}: goes on after the end of its list, with {_quoted(rest[:20])}; are "
+                        "these two recordings? cut them apart"
+                    )
+                return
+            if text[at] != "{":
+                raise InputError(f"{where}: a frame begins with '{{', this with {text[at]!r}")
+            try:
+                frame, end = decoder.raw_decode(text, at)
+            except (ValueError, RecursionError) as error:
+                if _is_cut(error, text):
+                    self.end = f"within frame {number}"
+                    return
+                raise InputError(f"{where}: not JSON: {error}") from error
+            yield number, at, frame
+            at = end
 
 
 def _is_cut(error: Exception, text: str) -> bool:
-    """Whether JSON went wrong because it ended: within a text, or with the beginning of a number or word."""
+    """Whether JSON is incomplete: it ends within a text, a number or a word."""
     if not isinstance(error, json.JSONDecodeError):
         return False
     return error.msg.startswith("Unterminated string") or bool(_STUMP.fullmatch(text, error.pos))

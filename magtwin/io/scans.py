@@ -1,4 +1,4 @@
-"""Scans: those of a run as a Parquet file, a row each."""
+"""Scans of a run as a Parquet file, one per row."""
 
 import os
 
@@ -13,11 +13,11 @@ from magtwin.sim.sensors.lidar import Scans
 
 _VECTORS = {"p_world_lidar": 3, "q_world_lidar_xyzw": 4}
 _DOCS = {
-    "t": ("s", "moment of the scan"),
-    "arrival": ("s", "when it arrived"),
-    "p_world_lidar": ("m", "where the LiDAR was at that moment"),
-    "q_world_lidar_xyzw": ("", "its axes"),
-    "ranges_m": ("m", "range along each ray, evenly from -pi anticlockwise; inf: nothing, -inf: too near"),
+    "t": ("s", "time of the scan"),
+    "arrival": ("s", "time of arrival"),
+    "p_world_lidar": ("m", "position of the LiDAR at that time"),
+    "q_world_lidar_xyzw": ("", "its orientation"),
+    "ranges_m": ("m", "range along each ray, evenly from -pi anticlockwise; inf: no return, -inf: too near"),
 }
 
 
@@ -28,12 +28,12 @@ def write_scans(scans: Scans, path: str | os.PathLike[str], *, force: bool = Fal
     length; unit and meaning are on each Arrow field.
 
     Args:
-        scans: What the LiDAR saw.
+        scans: The scans.
         path: The file to make.
-        force: Whether one that exists is replaced.
+        force: Replace an existing file.
 
     Raises:
-        InputError: The file exists and `force` was not given.
+        InputError: The file exists and `force` is not set.
     """
     columns, fields = [], []
     for name, (unit, doc) in _DOCS.items():
@@ -48,10 +48,10 @@ def write_scans(scans: Scans, path: str | os.PathLike[str], *, force: bool = Fal
 
 
 def read_scans(path: str | os.PathLike[str]) -> Scans:
-    """The scans that `write_scans` wrote, to the last bit.
+    """Read scans that `write_scans` wrote, to the last bit.
 
     Raises:
-        InputError: The file is missing, is not Parquet, was cut short, or holds no scans.
+        InputError: The file is missing, is not Parquet, is truncated, or holds no scans.
     """
     path = existing(path, "Parquet file of scans")
     check_parquet(path)

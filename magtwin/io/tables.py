@@ -1,8 +1,7 @@
-"""Tables: a Run as Parquet, CSV or npz, whole files or, while it goes on, Parquet part after part.
+"""Tables: a Run as Parquet, CSV or npz; Parquet also part by part, while a run goes on.
 
-All three give a Run back to the last bit. Parquet is the one to keep: small, typed, every column with its
-unit and frame. CSV is for spreadsheets and eyes: what it says of the run stands in lines that begin with #.
-npz is for numpy alone: the columns of the Run as they are.
+All three give a Run back to the last bit. Parquet is small and typed, with unit and frame of every column.
+CSV is for spreadsheets; its metadata are in lines that begin with #. npz is for numpy.
 """
 
 import io
@@ -36,23 +35,23 @@ from magtwin.run.run import COLUMNS, Run, check_clock
 
 _MAGIC = b"PAR1"
 _ABOUT = "magtwin"
-"""Name of the member of an npz that tells of the run, and first word of a CSV's first line."""
+"""Name of the member of an npz with the metadata, and first word of a CSV."""
 
 _CSV_LINE = 1 << 20
-"""Bytes that a line of a CSV may have; a header of ten thousand columns has fewer."""
+"""Longest line of a CSV [bytes]; a header of ten thousand columns is shorter."""
 
 
 def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool = False) -> None:
     """Write a run as Parquet; the same run gives the same bytes.
 
     Args:
-        run: The run; it must have a column `t`, which ascends.
+        run: The run; its clock `t` must ascend.
         path: The file to make.
-        force: Whether one that exists is replaced.
+        force: Replace an existing file.
 
     Raises:
-        InputError: The file exists and `force` was not given, or cannot be written, or a column cannot
-            stand in a table.
+        InputError: The file exists and `force` is not set, or cannot be written, or a column cannot stand
+            in a table.
     """
     table = table_of(run)
     split = {f.name: "BYTE_STREAM_SPLIT" for f in table.schema if pa.types.is_floating(f.type)}
@@ -61,14 +60,13 @@ def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool = False
 
 
 def read_parquet(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None = None) -> Run:
-    """The run that `write_parquet` wrote, to the last bit; or that a folder of parts holds.
+    """Read a run that `write_parquet` wrote, to the last bit, or a folder of parts.
 
-    A file that another program wrote is read too where it has the column names: without the metadata
-    it just brings no metadata.
+    A file of another program is read too if it has the column names of a Run.
 
     Args:
-        path: The file; or the folder that a `ParquetParts` left when its program ended before its time.
-        columns: What another program's file calls a Run's columns, as for `read_csv`.
+        path: The file, or the folder that an unfinished `ParquetParts` left.
+        columns: Other names of columns, as for `read_csv`.
 
     Raises:
         InputError: The file is missing, is not Parquet, was cut short, lacks a column, or holds no run.
@@ -92,13 +90,13 @@ def _read_parts(path: Path) -> Run:
     tables = [_table(part) for part in parts]
     for part, table in zip(parts, tables, strict=True):
         if table.schema != tables[0].schema:
-            raise InputError(f"{part}: has other columns than {parts[0].name}; it is of another run")
-    metadata = tables[-1].schema.metadata  # what is known last
+            raise InputError(f"{part}: has other columns than {parts[0].name}; it belongs to another run")
+    metadata = tables[-1].schema.metadata  # the latest
     return run_of(pa.concat_tables(tables).replace_schema_metadata(metadata), path)
 
 
 def check_parquet(path: Path) -> None:
-    """Refuse what does not begin and end as Parquet files do."""
+    """Refuse files that do not begin and end like Parquet."""
     if path.is_dir():
         raise InputError(f"{path}: a folder, not a Parquet file; name the file in it")
     with open(path, "rb") as file:
@@ -121,30 +119,30 @@ def _table(path: Path) -> pa.Table:
 
 
 class ParquetParts:
-    """A Parquet file that grows: each block becomes a file of its own, and at the end all become one.
+    """A Parquet file that grows: each block becomes a separate file, and at the end all become one.
 
-    Until then the blocks lie in a folder beside it, `F.parquet.parts`, whole and readable at any time by
-    `read_parquet`; a program that is killed loses the block that it had not yet given. The one file has
-    the bytes that `write_parquet` gives for the whole run.
+    Until then the blocks lie in the folder `F.parquet.parts`, which `read_parquet` reads at any time; a
+    killed program loses at most the current block. The final file has the bytes that `write_parquet` writes
+    for the whole run.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Begin a file.
+        """Start a file.
 
         Args:
             path: The Parquet file to make at the end.
-            force: Whether what exists of it is replaced, parts that another program left included.
+            force: Replace an existing file, and the parts of an unfinished one.
 
         Raises:
-            InputError: It exists and `force` was not given, or its folder cannot be written.
+            InputError: It exists and `force` is not set, or its folder cannot be written.
         """
         self.path = check_free(path, force=force)
         self.folder = Path(f"{self.path}.parts")
-        """Where the parts lie."""
+        """Folder of the parts."""
         if self.folder.exists() and not force:
             raise InputError(
-                f"{self.folder}: parts of a run that did not end; magtwin convert reads them; then give "
-                "--force to replace them, or another name"
+                f"{self.folder}: parts of a run that did not end; magtwin convert reads them; give --force "
+                "to replace them, or another name"
             )
         self._force, self._count, self._last = force, 0, -np.inf
         try:
@@ -154,10 +152,10 @@ class ParquetParts:
             raise InputError(f"{self.folder}: cannot be written ({error.strerror})") from error
 
     def append(self, run: Run) -> None:
-        """Add the rows of a block; it is on the disk when this returns.
+        """Add the rows of a block, and write them to the disk.
 
         Raises:
-            InputError: Its clock does not run on from the block before, or the disk is full.
+            InputError: It does not begin after the previous block, or the disk is full.
         """
         if not run.rows:
             return
@@ -170,13 +168,13 @@ class ParquetParts:
         self._count, self._last = self._count + 1, run["t"][-1]
 
     def close(self) -> None:
-        """Make the one file of all parts, and remove them; without a part nothing is left."""
+        """Join all parts into one file and remove them. Nothing is left if there are none."""
         if self._count:
             write_parquet(read_parquet(self.folder), self.path, force=self._force)
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def abort(self) -> None:
-        """Leave the parts that there are, for whoever wants them; without one nothing is left."""
+        """Leave the parts as they are. Nothing is left if there are none."""
         if not self._count:
             shutil.rmtree(self.folder, ignore_errors=True)
 
@@ -193,16 +191,16 @@ class ParquetParts:
 
 
 def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) -> None:
-    """Write a run as CSV: lines beginning with # that tell of it, a line of names, a line a row.
+    """Write a run as CSV: metadata in lines that begin with #, a line of names, one line per row.
 
-    Numbers are in the fewest digits that give the same bits back, flags are true and false. pandas reads
+    Numbers have the fewest digits that give the same bits back; flags are true and false. pandas reads
     it with `read_csv(F, comment="#")` (before pandas 3, with `float_precision="round_trip"` beside), DuckDB
     with `read_csv('F', comment='#')`, polars with `read_csv(F, comment_prefix="#")`.
 
     Args:
-        run: The run; it must have a column `t`, which ascends.
+        run: The run; its clock `t` must ascend.
         path: The file to make.
-        force: Whether one that exists is replaced.
+        force: Replace an existing file.
 
     Raises:
         InputError: As for `write_parquet`.
@@ -212,8 +210,8 @@ def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
     lines.append(f"# rows {table.num_rows}")
     lines.append(f"# facts {_line_safe(metadata_to_json(run))}")
     for field in table.schema:
-        said = {key.decode(): text.decode() for key, text in field.metadata.items()}
-        lines.append(f"# column {field.name} {_line_safe(_json({'type': str(field.type), **said}))}")
+        about = {key.decode(): text.decode() for key, text in field.metadata.items()}
+        lines.append(f"# column {field.name} {_line_safe(_json({'type': str(field.type), **about}))}")
     for name in table.column_names:
         if not name.isprintable() or set(name) & set('",# '):
             raise InputError(f"column {name!r} cannot stand in a CSV file; use letters, digits and _")
@@ -224,18 +222,18 @@ def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
 
 
 def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None = None) -> Run:
-    """The run that `write_csv` wrote, to the last bit.
+    """Read a run that `write_csv` wrote, to the last bit.
 
-    A file that another program wrote is read too where its columns have the names of a Run's, a vector's
-    as `odom_p_x`.
+    A file of another program is read too if its columns have the names of a Run; vectors are split as in
+    `odom_p_x`.
 
     Args:
         path: The file.
-        columns: What another program's file calls a Run's columns: its names by those of a Run, a vector's
-            as `odom_p_x`. A p_world_base given without its z lies on the floor.
+        columns: Names in the file by names of a Run, such as `{"odom_p_x": "x"}`. A p_world_base without z
+            lies on the floor.
 
     Raises:
-        InputError: The file is missing, is no CSV of numbers, was cut short, lacks a column, or holds no
+        InputError: The file is missing, is not a CSV of numbers, is truncated, lacks a column, or holds no
             run.
     """
     path = existing(path, "CSV file")
@@ -273,8 +271,8 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
         raise InputError(f"{path}: not a CSV file of a run: {_short(reason)}") from error
     if rows not in ("", str(table.num_rows)):
         raise InputError(
-            f"{path}: holds {table.num_rows} rows where its line '# rows' says {rows[:20]!r}: cut short, or "
-            "edited; copy it again, or take that line out"
+            f"{path}: holds {table.num_rows} rows, but its line '# rows' says {rows[:20]!r}: cut short, or "
+            "edited; copy it again, or remove that line"
         )
     fields = [f.with_metadata(said.get(f.name) or None) for f in table.schema]
     table = table.cast(pa.schema(fields, metadata={FACTS: metadata}))
@@ -282,7 +280,7 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
 
 
 def _renamed(names: Sequence[str], columns: Mapping[str, str], path: Path) -> list[str]:
-    """Names of columns, those that are called otherwise by a Run's own."""
+    """Names of columns, renamed to those of a Run."""
     known, own = {name: name for name in names}, {}
     for name, theirs in columns.items():
         try:
@@ -293,7 +291,7 @@ def _renamed(names: Sequence[str], columns: Mapping[str, str], path: Path) -> li
 
 
 def _on_the_floor(table: pa.Table) -> pa.Table:
-    """A table whose positions have a z: 0 where x and y stand alone."""
+    """A table with z = 0 if the positions have only x and y."""
     x, y, z = (f"p_world_base_{axis}" for axis in "xyz")
     if not {x, y} <= set(table.column_names) or z in table.column_names:
         return table
@@ -301,27 +299,27 @@ def _on_the_floor(table: pa.Table) -> pa.Table:
 
 
 def _csv_head(file: io.BufferedReader, path: Path) -> tuple[list[str], list[str], int]:
-    """The lines of a CSV that begin with #, the names of its columns, and how many lines these are."""
+    """The lines of a CSV that begin with #, its column names, and the number of these lines."""
     about: list[str] = []
     for count, line in enumerate(iter(lambda: file.readline(_CSV_LINE), b""), 1):
         try:
             text = line.decode("utf-8-sig" if count == 1 else "utf-8").rstrip("\r\n")
         except UnicodeDecodeError as error:
-            raise InputError(f"{path}: line {count} is not text in UTF-8; it is no CSV file") from error
+            raise InputError(f"{path}: line {count} is not UTF-8; this is not a CSV file") from error
         if len(line) == _CSV_LINE or "\0" in text:
-            raise InputError(f"{path}: line {count} is no line of a CSV file")
+            raise InputError(f"{path}: line {count} is not a line of a CSV file")
         if text.startswith("#"):
             about.append(text)
         elif text.strip():
             other = next((sign for sign in (";", "\t") if sign in text and "," not in text), None)
             if other is not None:
-                raise InputError(f"{path}: its columns are separated by {other!r}; save it with commas")
+                raise InputError(f"{path}: columns are separated by {other!r}; save it with commas")
             return about, [name.strip().strip('"') for name in text.split(",")], count
-    raise InputError(f"{path}: has no line of column names; it is empty, or cut short")
+    raise InputError(f"{path}: no line of column names; the file is empty, or cut short")
 
 
 def _csv_about(lines: list[str], path: Path) -> tuple[str, str, dict[str, dict[str, str]]]:
-    """What a CSV says of the number of its rows, "" if nothing, its metadata in JSON, and of its columns."""
+    """The number of rows ("" if missing), the metadata as JSON, and the metadata of columns in a CSV."""
     rows, metadata, said = "", "{}", {}
     for number, line in enumerate(lines, 1):
         kind, _, rest = line[1:].strip().partition(" ")
@@ -340,9 +338,9 @@ def _texts(text: str, where: str) -> dict[str, str]:
     try:
         said = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{where}: what it says of a column is not JSON: {error}") from error
+        raise InputError(f"{where}: metadata of a column are not JSON: {error}") from error
     if not isinstance(said, dict) or not all(isinstance(value, str) for value in said.values()):
-        raise InputError(f"{where}: what it says of a column must be an object of texts, got {text[:40]!r}")
+        raise InputError(f"{where}: metadata of a column must be an object of texts, got {text[:40]!r}")
     return said
 
 
@@ -351,7 +349,7 @@ def _json(value: Any) -> str:
 
 
 def _line_safe(text: str) -> str:
-    """JSON on one line for every reader: those that also end lines at other signs included."""
+    """JSON on one line, also for readers that end lines at other characters."""
     return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
 
 
@@ -364,23 +362,22 @@ def _is_flag(name: str) -> bool:
 
 
 def write_npz(run: Run, path: str | os.PathLike[str], *, force: bool = False) -> None:
-    """Write a run as npz: an array a column, and `magtwin`, a text in JSON with metadata, units and frames.
+    """Write a run as npz: one array per column, and `magtwin`, a JSON text with metadata, units and frames.
 
-    The arrays are not compressed, so that they are read as fast as the disk is; nothing is pickled. The
-    same run gives the same bytes.
+    Arrays are not compressed, for speed, and nothing is pickled. The same run gives the same bytes.
 
     Args:
-        run: The run; it must have a column `t`, which ascends.
+        run: The run; its clock `t` must ascend.
         path: The file to make.
-        force: Whether one that exists is replaced.
+        force: Replace an existing file.
 
     Raises:
         InputError: As for `write_parquet`.
     """
     check_clock(run, "the run to write")
-    run.members()  # refuses what is no number
+    run.members()  # refuses other than numbers
     if _ABOUT in run:
-        raise InputError(f"column {_ABOUT!r} has the name of what tells of the run; rename it")
+        raise InputError(f"column {_ABOUT!r} has the name that npz uses for metadata; rename it")
     columns = {
         name: {**said_of(run.spec(name), name), "parts": ",".join(run.spec(name).parts)} for name in run
     }
@@ -390,14 +387,14 @@ def write_npz(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
 
 
 def read_npz(path: str | os.PathLike[str]) -> Run:
-    """The run that `write_npz` wrote, to the last bit; or any npz whose arrays have the names of a Run's.
+    """Read a run that `write_npz` wrote, to the last bit, or any npz with array names of a Run.
 
     Args:
         path: The file.
 
     Raises:
-        InputError: The file is missing, is no npz, is damaged or cut short, holds pickled objects, which
-            could run anything and are not read, or holds no run.
+        InputError: The file is missing, is not npz, is damaged or truncated, holds pickled objects, which are
+            never read, or holds no run.
     """
     path = existing(path, "npz file")
     if path.is_dir():
@@ -431,7 +428,7 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
 
 
 def _array(archive: zipfile.ZipFile, name: str, path: Path) -> NDArray[Any]:
-    """An array of an npz; memory is taken for what is there, not for what a header claims."""
+    """An array of an npz; memory is allocated for its bytes, not for what its header claims."""
     data = archive.read(name)
     file = io.BytesIO(data)
     try:
@@ -452,11 +449,11 @@ def _array(archive: zipfile.ZipFile, name: str, path: Path) -> NDArray[Any]:
 
 
 def _npz_about(about: NDArray[Any], path: Path) -> tuple[Any, dict[str, dict[str, str]]]:
-    """Metadata, and what is said of columns."""
+    """Metadata of the run and of its columns."""
     try:
         told = json.loads(str(about))
         metadata, columns = told.get("facts", {}), told.get("columns", {})
         said = {str(name): _texts(json.dumps(text), str(path)) for name, text in columns.items()}
     except (ValueError, AttributeError, RecursionError) as error:
-        raise InputError(f"{path}: array {_ABOUT!r} tells nothing of a run ({error})") from error
+        raise InputError(f"{path}: array {_ABOUT!r} holds no metadata of a run ({error})") from error
     return metadata_from_json(json.dumps(metadata), path), said

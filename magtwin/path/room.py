@@ -147,8 +147,8 @@ def _what_fits(path: Path, floor_m: tuple[float, float], footprint_radius_m: flo
         scale = float(np.min(room / (high - low)))
     if scale >= 1:
         x, y = np.clip(0.0, high - room / 2, low + room / 2) * -1.0 + 0.0
-        return f"moved by ({x:.2f}, {y:.2f}) m it fits: give --fit, or move its points"
-    return f"scaled by {math.floor(scale * 100) / 100:g} it fits: give --fit, or enlarge the floor"
+        return f"moved by ({x:.2f}, {y:.2f}) m it fits: give `fit=True`, or move its points"
+    return f"scaled by {math.floor(scale * 100) / 100:g} it fits: give `fit=True`, or enlarge the floor"
 
 
 def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> None:
@@ -172,7 +172,8 @@ def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> 
         raise InputError(
             f"path {path.name} runs into {obstacles.names[which[i]]}: {s[i]:.3f} m along it, at "
             f"({p[i, 0]:.3f}, {p[i, 1]:.3f}) m, a robot of radius {footprint_radius_m:g} m is "
-            f"{footprint_radius_m - distance[i]:.3f} m too near; give --fit, or move the path or the obstacle"
+            f"{footprint_radius_m - distance[i]:.3f} m too near; give `fit=True`, or move the path or the "
+            "obstacle"
         )
 
 

@@ -1,8 +1,8 @@
-"""Bus: what a node needs of ROS 2, whoever carries it.
+"""Bus: the interface of a node to ROS 2.
 
-Two carry it: rclpy, where it can be imported, and cyclonedds, which meets any ROS 2 on the network over DDS
-from any Python. Both are handed messages as bytes, which `magtwin.io.bags.cdr` makes of fields by the one
-table of types, `magtwin.io.bags.messages.TYPES`; so a node says and hears the same with either.
+There are two backends: rclpy, if it can be imported, and cyclonedds, which reaches any ROS 2 over the network
+from any Python. Both take and give messages as CDR bytes of `magtwin.io.bags.cdr`, so a node behaves the same
+with either.
 """
 
 import importlib
@@ -15,8 +15,9 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from magtwin.errors import InputError, find
-from magtwin.io.bags.cdr import Messages, decode, encode, leaves
-from magtwin.io.bags.messages import TYPES, Qos
+from magtwin.io.bags.cdr import Messages, decode, encode
+from magtwin.io.bags.topics import Qos
+from magtwin.io.bags.types import layout
 from magtwin.ros.parameters import Parameter
 
 Backend = Literal["auto", "rclpy", "cyclonedds"]
@@ -25,22 +26,12 @@ BACKENDS: Mapping[str, tuple[str, str]] = {
     "rclpy": ("magtwin.ros.rclpy_bus", "RclpyBus"),
     "cyclonedds": ("magtwin.ros.dds", "DdsBus"),
 }
-"""Modules and classes of those that carry a bus, the first that can be imported being taken."""
+"""Module and class of each backend; the first one that can be imported is the default."""
 
 MISSING = (
     "no ROS 2 can be imported: source an installation (source /opt/ros/jazzy/setup.bash), or install "
-    "cyclonedds, which meets ROS 2 over the network (pip install 'magtwin[ros]')"
+    "cyclonedds, which reaches ROS 2 over the network (pip install 'magtwin[ros]')"
 )
-
-NS = 10**9
-"""Nanoseconds in a second."""
-
-
-def form_of(kind: str, fields: Mapping[str, Any] | None = None) -> str:
-    """Leaves of a type of messages; those with parts of their own (`transforms`) come along in `fields`."""
-    if fields is not None and "form" in fields:
-        return str(fields["form"])
-    return find("type of messages", kind, TYPES)
 
 
 def to_bytes(kind: str, fields: Mapping[str, Any]) -> bytes:
@@ -48,49 +39,45 @@ def to_bytes(kind: str, fields: Mapping[str, Any]) -> bytes:
 
     Args:
         kind: Its type, such as `sensor_msgs/msg/Imu`.
-        fields: By the leaves' names, as `magtwin.io.bags.cdr.encode` takes them; `form` in place of the
-        table's
-            leaves, where parts are counted.
+        fields: Values by leaf name, as for `magtwin.io.bags.cdr.encode`.
     """
-    return encode(leaves(form_of(kind, fields)), fields, 1).tobytes()
+    return encode(layout(kind, fields), fields, 1).tobytes()
 
 
 @dataclass(frozen=True)
 class Message:
-    """A message as it came in."""
+    """A received message."""
 
     kind: str
     data: bytes
-    """CDR, its header included."""
+    """CDR, with its header."""
 
     sent_ns: int
-    """When it was sent, by the sender's wall clock [ns]."""
+    """Wall time of the sender [ns]."""
 
     received_ns: int
-    """When it was taken in, by ours [ns]."""
+    """Wall time of receipt [ns]."""
 
-    def read(self, wanted: Iterable[str], form: str | None = None) -> dict[str, Any]:
-        """What stands in some leaves: numbers, arrays, strings; stamps as whole nanoseconds.
+    def read(self, wanted: Iterable[str], counts: Mapping[str, int] | None = None) -> dict[str, Any]:
+        """Values of some leaves: numbers, arrays, strings; stamps in whole nanoseconds.
 
         Args:
             wanted: Names of the leaves.
-            form: Leaves in place of the table's, where parts are counted.
+            counts: Lengths of sequences of structures, as for `magtwin.io.bags.types.layout`.
 
         Raises:
             InputError: It is too short for its type, or not plain CDR.
         """
         buffer = np.frombuffer(self.data, np.uint8)
-        one = Messages(np.zeros(1, np.int64), buffer, np.zeros(1, np.int64), np.array([len(buffer)]))
-        return {
-            name: value[0] for name, value in decode(leaves(form or TYPES[self.kind]), one, wanted).items()
-        }
+        message = Messages(np.zeros(1, np.int64), buffer, np.zeros(1, np.int64), np.array([len(buffer)]))
+        return {name: value[0] for name, value in decode(layout(self.kind, counts), message, wanted).items()}
 
 
-Heard = Callable[[Message], None]
+Handler = Callable[[Message], None]
 
 
 class Publisher(Protocol):
-    """Where messages of one topic go."""
+    """Sends messages of one topic."""
 
     topic: str
     kind: str
@@ -99,24 +86,24 @@ class Publisher(Protocol):
         """Send a message, in CDR."""
 
     def subscribers(self) -> int:
-        """How many listen."""
+        """Number of subscribers."""
 
 
 class Subscription(Protocol):
-    """Where messages of one topic come from."""
+    """Receives messages of one topic."""
 
     topic: str
     kind: str
 
     def publishers(self) -> int:
-        """How many send."""
+        """Number of publishers."""
 
 
 class Timer(Protocol):
-    """What is called in even steps of the bus's clock."""
+    """Something called at a regular interval."""
 
     def cancel(self) -> None:
-        """Call it no more."""
+        """Do not call it again."""
 
 
 class Bus(Protocol):
@@ -126,53 +113,53 @@ class Bus(Protocol):
     backend: str
 
     def publisher(self, topic: str, kind: str, qos: Qos) -> Publisher:
-        """Offer a topic; its name is namespaced and remapped by the bus's `Names`."""
+        """Advertise a topic; `Names` resolves its name."""
 
-    def subscribe(self, topic: str, kind: str, heard: Heard, qos: Qos) -> Subscription:
-        """Have `heard` called for each message of a topic, in the thread that spins."""
+    def subscribe(self, topic: str, kind: str, handler: Handler, qos: Qos) -> Subscription:
+        """Call `handler` for each message of a topic, in the thread that spins."""
 
     def service(self, name: str, called: Callable[[], None]) -> bool:
-        """Offer a service without arguments (std_srvs/srv/Empty); whether that can be done here.
+        """Offer a service without arguments (std_srvs/srv/Empty); whether the backend can.
 
-        DDS alone cannot: each middleware of ROS 2 has its own way of telling whom an answer is for.
+        cyclonedds cannot: each ROS 2 middleware addresses answers in a different way.
         """
 
     def settable(
         self, table: Mapping[str, Parameter], values: Mapping[str, Any], changed: Callable[[str, Any], None]
     ) -> bool:
-        """Let others read a node's parameters, and set them while it runs; whether that can be done here.
+        """Let others read and set the parameters of a node while it runs; whether the backend can.
 
-        DDS alone cannot, for the reason that it has no services. `use_sim_time` is the bus's own.
+        cyclonedds cannot, as it has no services. `use_sim_time` belongs to the bus.
 
         Args:
-            table: What can be set, with ranges.
-            values: What it is set to.
-            changed: Called with name and value of what others set, if it may be; in the thread that spins.
+            table: The parameters.
+            values: Their values.
+            changed: Called with name and value of each valid change, in the thread that spins.
         """
 
     def knows(self, kind: str) -> bool:
-        """Whether messages of a type can be said and heard here."""
+        """Whether messages of a type can be sent and received."""
 
     def resolve(self, topic: str) -> str:
-        """The name of a topic on the network."""
+        """The full name of a topic on the network."""
 
     def types(self, topic: str) -> tuple[str, ...]:
-        """Types in which others offer a topic, as far as they have been discovered."""
+        """Types in which a topic is published, as far as discovered."""
 
     def publishers(self, topic: str) -> int:
-        """How many offer a topic, this node among them, as far as they have been discovered."""
+        """Number of publishers of a topic, including this node, as far as discovered."""
 
     def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> Timer:
-        """Have `due` called each `period_s` of the bus's clock, or the wall's, in the thread that spins."""
+        """Call `due` every `period_s` of the bus's clock, or of wall time, in the thread that spins."""
 
     def now_ns(self) -> int:
-        """Time on the bus's clock [ns]: wall time, or /clock's in sim time (0 before the first)."""
+        """Time of the bus's clock [ns]: wall time, or /clock (0 before its first message)."""
 
     def due_wall_ns(self) -> int:
-        """When the timer that is being called was due, by the wall, as far as that is known [ns]."""
+        """Wall time at which the current timer was due, as far as known [ns]."""
 
     def spin_once(self, timeout_s: float) -> None:
-        """Take in what has come, waiting for it at most `timeout_s`; timers that are due are called."""
+        """Handle messages, after waiting for them at most `timeout_s`, and call timers that are due."""
 
     def close(self) -> None:
         """Leave the network."""
@@ -180,19 +167,19 @@ class Bus(Protocol):
 
 @dataclass(frozen=True)
 class Names:
-    """How a node's names are found on the network: its namespace, and what is called otherwise."""
+    """Names of a node on the network: its namespace and its remaps."""
 
     namespace: str = "/robot"
-    """Where relative names stand; "" is the root."""
+    """Namespace of relative names; "" is the root."""
 
     remaps: Mapping[str, str] = field(default_factory=dict)
-    """By the name that a node uses, with or without its namespace, the one that it has on the network."""
+    """Name on the network, by the name that the node uses, with or without its namespace."""
 
     def resolve(self, name: str) -> str:
-        """The name of a topic on the network, from the root.
+        """The full name of a topic on the network.
 
         A relative name (`odom`) is in the namespace, `/clock` is global. `/robot/...` of
-        `magtwin.io.bags.messages.TOPICS` counts as relative.
+        `magtwin.io.bags.topics.TOPICS` counts as relative.
         """
         relative = name.removeprefix("/robot/")
         whole = relative if relative.startswith("/") else f"{self._space}/{relative}"
@@ -212,7 +199,7 @@ def names_of(namespace: str = "robot", remaps: Iterable[str] = ()) -> Names:
     """Names from a command line: `remaps` of the form a:=b.
 
     Raises:
-        InputError: One is not of that form, or not a name of ROS.
+        InputError: A remap has another form, or a name is not a ROS name.
     """
     table = {}
     for remap in remaps:
@@ -221,7 +208,7 @@ def names_of(namespace: str = "robot", remaps: Iterable[str] = ()) -> Names:
             raise InputError(f"a remap is a name:=another, such as odom:=/vicon/odom; got {remap!r}")
         table[left] = right
     if namespace and not _is_name(namespace):
-        raise InputError(f"namespace {namespace!r} is none of ROS: letters, digits, _ and / are")
+        raise InputError(f"namespace {namespace!r} is not a ROS name: use letters, digits, _ and /")
     return Names(namespace, table)
 
 
@@ -231,7 +218,7 @@ def _is_name(name: str) -> bool:
 
 
 def available() -> tuple[str, ...]:
-    """Names of the backends that can be imported here, the preferred one first."""
+    """Names of the backends that can be imported, the preferred one first."""
     return tuple(name for name in BACKENDS if importlib.util.find_spec(name) is not None)
 
 
@@ -253,15 +240,15 @@ def open_bus(
         domain: The domain; None takes ROS_DOMAIN_ID, or 0.
 
     Raises:
-        InputError: The backend cannot be imported, or the domain is none.
+        InputError: The backend cannot be imported, or the domain is out of range.
     """
     if not name.isidentifier():
         raise InputError(f"a node's name has letters, digits and _; got {name!r}")
     if domain is None:
-        told = os.environ.get("ROS_DOMAIN_ID", "0") or "0"
-        if not told.isdigit():
-            raise InputError(f"ROS_DOMAIN_ID must be a whole number from 0 to 232, it is {told!r}")
-        domain = int(told)
+        text = os.environ.get("ROS_DOMAIN_ID", "0") or "0"
+        if not text.isdigit():
+            raise InputError(f"ROS_DOMAIN_ID must be a whole number from 0 to 232, got {text!r}")
+        domain = int(text)
     if not 0 <= domain <= 232:
         raise InputError(f"a domain of ROS must be from 0 to 232, got {domain}")
     opened = _backend(backend)
@@ -270,22 +257,22 @@ def open_bus(
 
 
 def _backend(name: Backend) -> Any:
-    """The class of who carries a bus: of that name, or the first that can be imported."""
-    there = available()
-    if name != "auto" and name not in there:
+    """The class of a backend: of that name, or the first that can be imported."""
+    installed = available()
+    if name != "auto" and name not in installed:
         find("backend", name, BACKENDS)
-        raise InputError(MISSING if not there else f"{name} cannot be imported here; {there[0]} can")
+        raise InputError(f"{name} cannot be imported; {installed[0]} can" if installed else MISSING)
     broken = []
-    for one in there if name == "auto" else (name,):
-        module, kind = BACKENDS[one]
+    for candidate in installed if name == "auto" else (name,):
+        module, kind = BACKENDS[candidate]
         try:
             return getattr(importlib.import_module(module), kind)
         except ImportError as error:
-            broken.append(f"{one} is installed but cannot be imported: {str(error).splitlines()[0]}")
+            broken.append(f"{candidate} is installed but cannot be imported: {str(error).splitlines()[0]}")
     raise InputError("; ".join(broken) or MISSING)
 
 
 def localhost_only() -> bool:
-    """Whether the environment asks to stay on this machine, by the variables of ROS 2."""
+    """Whether the environment variables of ROS 2 restrict it to this machine."""
     reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
     return os.environ.get("ROS_LOCALHOST_ONLY", "") == "1" or reach == "LOCALHOST"

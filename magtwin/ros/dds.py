@@ -1,8 +1,8 @@
-"""DdsBus: a node over cyclonedds, a DDS that meets any ROS 2 on the network from any Python.
+"""DdsBus: a node over cyclonedds, which reaches any ROS 2 on the network from any Python.
 
-It follows ROS 2's own mapping: `/robot/odom` is the DDS topic `rt/robot/odom`, QoS is what ROS calls it, and
-messages are plain CDR. Such a node sends and hears like any other, but is not in `ros2 node list`, nor can
-it be asked for parameters: those are rclpy's own doing.
+It follows the mapping of ROS 2: `/robot/odom` is the DDS topic `rt/robot/odom`, QoS profiles are DDS
+policies, and messages are plain CDR. Such a node sends and receives like any other, but `ros2 node list`
+does not show it, and it has no parameters.
 """
 
 import os
@@ -29,22 +29,22 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic as DdsTopic
 
 from magtwin.errors import InputError
-from magtwin.io.bags.messages import CLOCK, TYPES, Qos
-from magtwin.ros.bus import Heard, Message, Names, localhost_only
+from magtwin.io.bags.cdr import NS
+from magtwin.io.bags.topics import CLOCK, Qos
+from magtwin.io.bags.types import typestore
+from magtwin.ros.bus import Handler, Message, Names, localhost_only
 from magtwin.ros.clock import Alarm, Clock
 from magtwin.ros.parameters import Parameter
-from magtwin.ros.types import PARTED, raw, ros_name, struct_of
-
-NS = 10**9
+from magtwin.ros.types import raw, ros_name, struct_of
 
 MOST_TAKEN = 256
-"""Messages of a topic that are taken at a time."""
+"""Messages of a topic taken at a time."""
 
 CLOCK_DEPTH = 1000
-"""Messages of /clock that may wait, so that each other message is dated by the one before it."""
+"""Queue of /clock, so that each other message gets the time before it."""
 
 _COMMON = (
-    "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"  # Kilted's is other
+    "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"  # differs in Kilted
     "<Tracing><Verbosity>none</Verbosity></Tracing>"
 )
 _HERE = (
@@ -56,11 +56,11 @@ _HERE = (
 _ANYWHERE = "<Discovery><ParticipantIndex>auto</ParticipantIndex></Discovery>"
 
 _DOMAINS: dict[int, Domain] = {}
-"""Domains that were configured, which must be so before their first participant, and live as long as it."""
+"""Configured domains; they must be configured before the first participant and outlive it."""
 
 
 def qos_of(qos: Qos) -> DdsQos:
-    """What ROS calls a topic's quality of service, as DDS policies."""
+    """DDS policies of a quality of service."""
     reliable = Policy.Reliability.Reliable(max_blocking_time=NS // 10)
     return DdsQos(
         reliable if qos.reliable else Policy.Reliability.BestEffort,
@@ -81,18 +81,18 @@ class DdsPublisher:
         self._writer.write(raw(self.kind, data))
 
     def subscribers(self) -> int:
-        """How many listen."""
+        """Number of subscribers."""
         return len(self._writer.get_matched_subscriptions())
 
 
 class DdsSubscription:
     """As `magtwin.ros.bus.Subscription`."""
 
-    def __init__(self, topic: str, kind: str, reader: DataReader[Any], heard: Heard) -> None:
-        self.topic, self.kind, self.reader, self.heard = topic, kind, reader, heard
+    def __init__(self, topic: str, kind: str, reader: DataReader[Any], handler: Handler) -> None:
+        self.topic, self.kind, self.reader, self.handler = topic, kind, reader, handler
 
     def publishers(self) -> int:
-        """How many send."""
+        """Number of publishers."""
         return len(self.reader.get_matched_publications())
 
 
@@ -123,21 +123,21 @@ class DdsBus:
         self._offered: dict[Any, tuple[str, str]] = {}
         self.clock = Clock(sim_time=sim_time)
         if sim_time:
-            self.subscribe(CLOCK.name, CLOCK.kind, self._told, replace(CLOCK.qos, depth=CLOCK_DEPTH))
+            self.subscribe(CLOCK.name, CLOCK.kind, self._tick, replace(CLOCK.qos, depth=CLOCK_DEPTH))
 
     def publisher(self, topic: str, kind: str, qos: Qos) -> DdsPublisher:
         """As for `Bus`."""
         whole = self._names.resolve(topic)
         writer: DataWriter[Any] = DataWriter(self._participant, self._topic(whole, kind), qos_of(qos))
         publisher = DdsPublisher(whole, kind, writer)
-        self._publishers.append(publisher)  # what is latched goes with its writer
+        self._publishers.append(publisher)  # its latched message lives as long as its writer
         return publisher
 
-    def subscribe(self, topic: str, kind: str, heard: Heard, qos: Qos) -> DdsSubscription:
+    def subscribe(self, topic: str, kind: str, handler: Handler, qos: Qos) -> DdsSubscription:
         """As for `Bus`."""
         whole = self._names.resolve(topic)
         reader: DataReader[Any] = DataReader(self._participant, self._topic(whole, kind), qos_of(qos))
-        subscription = DdsSubscription(whole, kind, reader, heard)
+        subscription = DdsSubscription(whole, kind, reader, handler)
         fresh = ReadCondition(reader, SampleState.NotRead | ViewState.Any | InstanceState.Any)
         self._waiting.attach(fresh)
         self._conditions.append(fresh)
@@ -155,8 +155,8 @@ class DdsBus:
         return False
 
     def knows(self, kind: str) -> bool:
-        """As for `Bus`: all of the table, and those with parts of their own."""
-        return kind in TYPES or kind in PARTED
+        """As for `Bus`: the types of ROS 2 Humble."""
+        return kind in typestore().fielddefs
 
     def resolve(self, topic: str) -> str:
         """As for `Bus`."""
@@ -195,7 +195,7 @@ class DdsBus:
     def close(self) -> None:
         """As for `Bus`."""
         for subscription in self._subscriptions:
-            subscription.heard = _deaf
+            subscription.handler = _ignore
         self._conditions.clear()
         self._subscriptions.clear()
         self._publishers.clear()
@@ -203,7 +203,7 @@ class DdsBus:
         del self._waiting, self._participant
 
     def _offers_of(self, topic: str) -> list[str]:
-        """The type of each that offers a topic now; "" for one that is none of ROS."""
+        """The type of each publisher of a topic; "" if it is not a ROS type."""
         if self._offers is None:
             self._offers = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         while taken := self._offers.take(N=MOST_TAKEN):
@@ -221,31 +221,32 @@ class DdsBus:
             known = kind, DdsTopic(self._participant, f"rt{whole}", struct_of(kind))
             self._topics[whole] = known
         if known[0] != kind:
-            raise InputError(f"topic {whole} has messages of {known[0]} in this node, not also of {kind}")
+            raise InputError(f"topic {whole} is a {known[0]} in this node and cannot also be a {kind}")
         return known[1]
 
     def _take(self) -> None:
-        """Hand on all messages that have come, in the order in which they were sent."""
-        come: list[tuple[int, int, DdsSubscription, bytes]] = []
-        for subscription in reversed(self._subscriptions):  # /clock, the first one, last: it dates the others
+        """Handle all received messages in the order of sending."""
+        received: list[tuple[int, int, DdsSubscription, bytes]] = []
+        for subscription in reversed(
+            self._subscriptions
+        ):  # /clock, the first one, last: it gives the others their time
             while taken := subscription.reader.take(N=MOST_TAKEN):
                 for sample in taken:
                     if sample.sample_info.valid_data:
-                        come.append(
-                            (sample.sample_info.source_timestamp, len(come), subscription, sample.cdr)
-                        )
+                        sent_ns = sample.sample_info.source_timestamp
+                        received.append((sent_ns, len(received), subscription, sample.cdr))
                 if len(taken) < MOST_TAKEN:
                     break
-        come.sort(key=lambda one: one[:2])
+        received.sort(key=lambda entry: entry[:2])
         now = time.time_ns()
-        for sent_ns, _, subscription, data in come:
-            subscription.heard(Message(subscription.kind, data, sent_ns, now))
+        for sent_ns, _, subscription, data in received:
+            subscription.handler(Message(subscription.kind, data, sent_ns, now))
 
-    def _told(self, message: Message) -> None:
-        with suppress(InputError):  # no clock is told by what is none
+    def _tick(self, message: Message) -> None:
+        with suppress(InputError):  # a damaged message
             self.clock.tell(int(message.read(["clock"])["clock"]), message.sent_ns)
-        self.clock.run_due()  # at each tick, with what was heard before it, even where several come at once
+        self.clock.run_due()  # at each tick, even if several arrive at once
 
 
-def _deaf(message: Message) -> None:
-    """What hears after a bus was closed."""
+def _ignore(message: Message) -> None:
+    """Handler of a closed bus."""

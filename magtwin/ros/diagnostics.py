@@ -1,18 +1,18 @@
-"""Diagnostics: how a node fares, on /diagnostics, as ROS's own monitors read it."""
+"""Diagnostics: the state of a node, on /diagnostics, for ROS monitors."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 
-from magtwin.io.bags.messages import Qos, diagnostics
+from magtwin.io.bags.topics import Qos
 from magtwin.ros.bus import Bus, Message, to_bytes
 
 Level = Literal["ok", "warn", "error", "stale"]
 
 LEVELS: Mapping[str, int] = {"ok": 0, "warn": 1, "error": 2, "stale": 3}
-"""Numbers of levels in diagnostic_msgs/msg/DiagnosticStatus."""
+"""Values of levels in diagnostic_msgs/msg/DiagnosticStatus."""
 
 KIND = "diagnostic_msgs/msg/DiagnosticArray"
 TOPIC = "/diagnostics"
@@ -21,12 +21,12 @@ REPORT_S = 1.0
 """Time between diagnostics [s]."""
 
 WATCH_S = 1.5
-"""Wall time after which a clock that did not move stands still [s]."""
+"""Wall time after which an unchanged clock counts as stopped [s]."""
 
 
 @dataclass(frozen=True)
 class Status:
-    """How one thing fares."""
+    """The state of one part of a node."""
 
     name: str
     level: Level
@@ -34,72 +34,87 @@ class Status:
     values: Mapping[str, str] = field(default_factory=dict)
 
 
+def status_of(
+    name: str,
+    problems: Iterable[tuple[Any, str]],
+    *,
+    fine: str,
+    level: Level = "ok",
+    words: Sequence[str] = (),
+    values: Mapping[str, str],
+) -> Status:
+    """A status with a warning for each problem that is present.
+
+    Args:
+        name: Of the part.
+        problems: For each problem whether it is present, and its text.
+        fine: Text without problems.
+        level: Level before the problems; they raise "ok" to "warn".
+        words: Texts before those of the problems.
+        values: Further values.
+    """
+    texts = [text for present, text in problems if present]
+    if texts and level == "ok":
+        level = "warn"
+    return Status(name, level, "; ".join([*words, *texts]) or fine, values)
+
+
 def to_fields(statuses: Sequence[Status], stamp_ns: int, hardware: str = "") -> dict[str, Any]:
     """Fields of a DiagnosticArray."""
-    fields: dict[str, Any] = {
-        "form": diagnostics([len(status.values) for status in statuses]),
-        "header.stamp": np.int64(stamp_ns),
-        "count": len(statuses),
-    }
+    fields: dict[str, Any] = {"header.stamp": np.int64(stamp_ns), "status": len(statuses)}
     for k, status in enumerate(statuses):
-        fields |= {
-            f"{k}.level": LEVELS[status.level],
-            f"{k}.name": status.name,
-            f"{k}.message": status.message,
-            f"{k}.hardware_id": hardware,
-            f"{k}.values": len(status.values),
-        }
+        parts = {"level": LEVELS[status.level], "name": status.name, "message": status.message}
+        parts |= {"hardware_id": hardware, "values": len(status.values)}
         for n, (key, value) in enumerate(status.values.items()):
-            fields |= {f"{k}.{n}.key": key, f"{k}.{n}.value": value}
+            parts |= {f"values.{n}.key": key, f"values.{n}.value": value}
+        fields |= {f"status.{k}.{name}": value for name, value in parts.items()}
     return fields
 
 
 def from_message(message: Message) -> list[Status]:
-    """What a DiagnosticArray says."""
-    names, counts = list(LEVELS), list[int]()
-    total = int(message.read(["count"], diagnostics([]))["count"])
+    """The statuses of a DiagnosticArray."""
+    counts = {"status": 0}
+    total = int(message.read(["status"], counts)["status"])
     for k in range(total):
-        form = diagnostics([*counts, 0])
-        counts.append(int(message.read([f"{k}.values"], form)[f"{k}.values"]))
-    form = diagnostics(counts)
-    wanted = [f"{k}.{part}" for k in range(total) for part in ("level", "name", "message")]
-    wanted += [f"{k}.{n}.{part}" for k in range(total) for n in range(counts[k]) for part in ("key", "value")]
-    read = message.read(wanted, form) if wanted else {}
-    return [
-        Status(
-            read[f"{k}.name"],
-            names[int(read[f"{k}.level"])],  # type: ignore[arg-type]
-            read[f"{k}.message"],
-            {read[f"{k}.{n}.key"]: read[f"{k}.{n}.value"] for n in range(counts[k])},
-        )
-        for k in range(total)
-    ]
+        name = f"status.{k}.values"
+        counts |= {"status": k + 1, name: 0}
+        counts[name] = int(message.read([name], counts)[name])
+    names = list(LEVELS)
+    statuses = []
+    for k in range(total):
+        keys = [f"status.{k}.values.{n}" for n in range(counts[f"status.{k}.values"])]
+        parts = [f"status.{k}.{part}" for part in ("level", "name", "message")]
+        read = message.read([*parts, *(f"{key}.{part}" for key in keys for part in ("key", "value"))], counts)
+        level: Any = names[int(read[parts[0]])]
+        values = {read[f"{key}.key"]: read[f"{key}.value"] for key in keys}
+        statuses.append(Status(read[parts[1]], level, read[parts[2]], values))
+    return statuses
 
 
 class Reporter:
-    """Where a node's diagnostics go."""
+    """Publishes the diagnostics of a node."""
 
     def __init__(self, bus: Bus) -> None:
-        """Offer /diagnostics."""
+        """Advertise /diagnostics."""
         self._bus, self._publisher = bus, bus.publisher(TOPIC, KIND, Qos())
         self._watched_ns = -1
 
     def each(self, report: Callable[[str], None]) -> None:
-        """Have `report` called each `REPORT_S` of the node's clock, and by the wall while that stands still.
+        """Call `report` every `REPORT_S` of the node's clock, and by wall time while that clock stands still.
 
-        It is given what is wrong with the clock; "" for nothing.
+        Its argument is the problem of the clock, "" if there is none.
         """
 
         def watch() -> None:
             now = self._bus.now_ns()
             if now == self._watched_ns:
-                report("/clock stands still" if now else "nobody says /clock")
+                report("/clock stands still" if now else "nobody publishes /clock")
             self._watched_ns = now
 
         self._bus.timer(REPORT_S, lambda: report(""))
         self._bus.timer(WATCH_S, watch, wall=True)
 
     def report(self, statuses: Sequence[Status], stamp_ns: int) -> None:
-        """Say how things fare; names are put behind the node's."""
+        """Publish statuses; their names are prefixed with the node's."""
         named = [Status(f"{self._bus.name}: {s.name}", s.level, s.message, s.values) for s in statuses]
         self._publisher.publish(to_bytes(KIND, to_fields(named, stamp_ns, self._bus.name)))

@@ -1,4 +1,4 @@
-"""Follow: a robot driven along a path over ROS, by where it says it is, with `simulate`'s controllers."""
+"""Follow: drive a robot along a path over ROS, with the controllers of `simulate`."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -10,9 +10,10 @@ import numpy as np
 
 from magtwin.errors import InputError, find
 from magtwin.frames import yaw_from_quat
-from magtwin.io.bags.messages import COMMAND, ODOMETRY, POSE, Topic
+from magtwin.io.bags.cdr import NS
+from magtwin.io.bags.topics import COMMAND, ODOMETRY, POSE, Topic
 from magtwin.path import Path
-from magtwin.ros.bus import NS, Bus, to_bytes
+from magtwin.ros.bus import Bus, to_bytes
 from magtwin.ros.diagnostics import Reporter, Status
 from magtwin.ros.inputs import Input
 from magtwin.sim.motion.controllers import Guide, guide_along
@@ -22,7 +23,7 @@ from magtwin.sim.motion.plan import NODE_M
 from magtwin.spec.drive import DriveSpec
 
 ESTIMATE = replace(POSE, name="/robot/estimate/pose")
-"""Where a localizer thinks that the robot is."""
+"""The pose by a localizer."""
 
 SOURCES: Mapping[str, tuple[Topic, str, str]] = MappingProxyType(
     {
@@ -31,43 +32,43 @@ SOURCES: Mapping[str, tuple[Topic, str, str]] = MappingProxyType(
         "odometry": (ODOMETRY, "odom_p", "odom_q_xyzw"),
     }
 )
-"""What tells where the robot is, with the columns of position and orientation; odometry begins at 0."""
+"""Sources of the pose, with the columns of position and orientation; odometry starts at 0."""
 
 MAX_AGE_S = 0.3
-"""Age at which a pose is not driven by any more [s]."""
+"""Age at which a pose is stale [s]."""
 
 COASTED_M = 0.3
-"""Way that a robot may drive on after its pose is lost [m]."""
+"""Distance that a robot may coast after its pose is lost [m]."""
 
 BEGINS_M = 0.1
-"""Distance from the first point of a path within which a robot begins it where it stands [m]."""
+"""Distance from the first point of a path at which a robot starts it where it stands [m]."""
 
 STAND_S = 1.0
-"""For how long a stand is commanded at the end [s]."""
+"""Time for which standing is commanded at the end [s]."""
 
 LOOK_S = 0.5
-"""Time between looks for topics that were not offered before [s]."""
+"""Time between searches for new topics [s]."""
 
 BACK_S = 0.2
-"""A clock that went back by more began anew [s]."""
+"""A clock that went back by more than this was restarted [s]."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a drive has come."""
+    """Progress of a drive."""
 
     laps: int
-    """How often the path's end was reached."""
+    """Number of times that the end was reached."""
 
     off_m: float
-    """Distance from the path at the last step [m]; nan before the path was reached."""
+    """Distance from the path at the last step [m]; nan before the path is reached."""
 
     rms_m: float
-    """Root mean square of that since the path was reached first [m]; nan before."""
+    """RMS distance since the path was reached [m]; nan before."""
 
 
 class Follower:
-    """The node. It stands where it does not know where it is, and drives on when it does."""
+    """The node; the robot stands while its pose is unknown."""
 
     def __init__(
         self,
@@ -84,22 +85,21 @@ class Follower:
         stamped_commands: bool = False,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
-        """Plan the path, and look for the robot.
+        """Plan the path, and search for the robot.
 
         Args:
-            path: Where to drive.
-            drive: The robot's limits, and its motors' lag.
+            path: The path.
+            drive: The robot's limits, and the lag of its motors.
             bus: The node.
             speed: Wanted forward speed [m/s].
             controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`; "release" steers with the
-            gain of the
-                released package.
+                gain of the released package.
             source: A name of `SOURCES`.
-            laps: How often to drive it; an open path is driven back and forth.
-            continuous: Drive on without an end.
-            flip: Drive it from its end to its beginning.
-            stamped_commands: Whether commands are TwistStamped, and not Twist.
-            say: Takes lines for people.
+            laps: Number of laps; an open path is driven back and forth.
+            continuous: Drive without end.
+            flip: Drive from the end to the beginning.
+            stamped_commands: Send TwistStamped, not Twist.
+            say: Called with messages for the user.
 
         Raises:
             InputError: The path cannot be driven at that speed, or a name is unknown.
@@ -120,12 +120,12 @@ class Follower:
         self._kind = "geometry_msgs/msg/TwistStamped" if stamped_commands else COMMAND.kind
         self._commands = bus.publisher(COMMAND.name, self._kind, COMMAND.qos)
         self._reporter = Reporter(bus)
-        self._told, self._stand_s = "", STAND_S
+        self._state, self._stand_s = "", STAND_S
         self._last = (0.0, 0.0)
         self._begin_ns: int | None = None
         self._laps, self._squares, self._count, self._off = 0, 0.0, 0, math.nan
         self.done = False
-        """Whether the end was reached and the robot told to stand."""
+        """Whether the end was reached and the robot stands."""
         self._look()
         bus.timer(1 / CONTROL_RATE_HZ, self._step)
         bus.timer(LOOK_S, self._look)
@@ -133,12 +133,12 @@ class Follower:
 
     @property
     def progress(self) -> Progress:
-        """How far the drive has come."""
+        """Progress of the drive."""
         rms = math.sqrt(self._squares / self._count) if self._count else math.nan
         return Progress(self._laps, self._off, rms)
 
     def stop(self) -> None:
-        """Tell the robot to stand, as before this node leaves."""
+        """Command the robot to stand; call it before the node ends."""
         self._command(0.0, 0.0)
 
     def _guided(self, path: Path) -> Guide:
@@ -149,7 +149,7 @@ class Follower:
         self._twist.look()
 
     def _step(self) -> None:
-        """A command, by the newest pose."""
+        """Send a command, by the newest pose."""
         now = self._bus.now_ns()
         if now < self._now_ns - BACK_S * NS:
             self._restart()
@@ -161,14 +161,14 @@ class Follower:
             return
         fresh = self._pose.fresh(now)
         if fresh is None:
-            self._tell(f"standing: {self._pose.missing(now)}")
+            self._announce(f"standing: {self._pose.missing(now)}")
             if self._last != (0.0, 0.0):
                 self._command(0.0, 0.0)
             return
         x, y = fresh[self._p][0, :2].tolist()
-        if self._told.startswith("standing"):
+        if self._state.startswith("standing"):
             self._rejoin(x, y)
-        self._tell("driving")
+        self._announce("driving")
         if self._begin_ns is None:
             self._begin_ns = now
             self._begin_here(x, y)
@@ -182,8 +182,8 @@ class Follower:
             self._lap()
 
     def _restart(self) -> None:
-        """Time began anew, and the robot with it."""
-        self._say("time jumped back: the path is driven from its beginning")
+        """Start again, after a restart of time."""
+        self._say("time jumped back: driving the path from its beginning")
         self._pose.forget()
         self._twist.forget()
         self.path, self._left = self._begins, self._wanted
@@ -192,10 +192,10 @@ class Follower:
         self._laps, self._squares, self._count, self._off = 0, 0.0, 0, math.nan
 
     def _begin_here(self, x: float, y: float) -> None:
-        """Take the beginning of the path for reached if the robot stands there.
+        """Count the beginning of the path as reached if the robot stands near it.
 
-        Markers that were put on a few centimetres off turn with the robot, so that a robot which turns on the
-        spot never sees itself closer than that.
+        Markers a few centimetres off centre move when the robot turns on the spot, so it would never see
+        itself closer than that.
         """
         guide = self._guide
         begins = guide.law != RELEASE and guide.node == 0 and guide.table.shape[1] > 1
@@ -203,7 +203,7 @@ class Follower:
             guide.node = 1
 
     def _rejoin(self, x: float, y: float) -> None:
-        """Go on where the robot stands now: it drove on for a while before it stood."""
+        """Continue where the robot stands now; it coasted before it stood."""
         guide = self._guide
         if guide.law == RELEASE or not guide.node:
             return
@@ -216,7 +216,7 @@ class Follower:
 
     def _measure(self, x: float, y: float) -> None:
         _, off = self.path.nearest(np.array([[x, y]]))
-        if self._guide.node > 0:  # on its way to the beginning it is on no path
+        if self._guide.node > 0:  # not on the way to the beginning
             self._off = float(off[0])
             self._squares += self._off**2
             self._count += 1
@@ -238,32 +238,32 @@ class Follower:
         self._last = (v, w)
         self._commands.publish(command_bytes(self._kind, v, w, self._bus.now_ns()))
 
-    def _tell(self, text: str) -> None:
-        if text != self._told:
-            self._told = text
+    def _announce(self, text: str) -> None:
+        if text != self._state:
+            self._state = text
             self._say(text)
 
     def _report(self, clock: str) -> None:
         now, at = self._bus.now_ns(), self.progress
         fares = not clock and (self._guide.done or self._pose.fresh(now) is not None)
         level: Any = "ok" if fares else "error"
-        said = clock or ("at the end" if self._guide.done else self._told)
+        message = clock or ("at the end" if self._guide.done else self._state)
         if (others := self._bus.publishers(COMMAND.name) - 1) > 0:
             level = "warn" if fares else level
-            said += f"; {others} others command the robot too"
+            message += f"; {others} others command the robot too"
         values = {
             "path": self.path.name,
             "laps": str(at.laps),
             "off the path [m]": f"{at.off_m:.3f}",
             "RMS off the path [m]": f"{at.rms_m:.3f}",
         }
-        status = Status("drive", level, said, values)
+        status = Status("drive", level, message, values)
         self._reporter.report([status, self._pose.status(now)], now)
 
 
 def command_bytes(kind: str, v: float, w: float, now_ns: int) -> bytes:
     """A command of forward speed [m/s] and yaw rate [rad/s], as a Twist or a TwistStamped."""
-    linear, angular = COMMAND.leaves[kind]
+    linear, angular = COMMAND.leaves(kind)
     fields: dict[str, Any] = {linear: [v, 0.0, 0.0], angular: [0.0, 0.0, w]}
     if kind.endswith("Stamped"):
         fields |= {"header.stamp": np.int64(now_ns), "header.frame_id": "base_link"}

@@ -1,9 +1,9 @@
-"""The magnetometer as a node: what a robot's sensors say, through map and network, to what it would read.
+"""The magnetometer as a node: predicts its readings from map, network and the robot's other sensors.
 
-It runs against any source of its inputs: the real robot, Isaac Sim, magtwin's own simulator. At each step of
-its rate it joins, of every input, the newest message whose stamp is not ahead of its clock, as a Run of
-magtwin does. It gives a reading only where all of them are fresh and the map knows the place; else it says on
-/diagnostics what is missing, and goes on as soon as that is there again.
+It runs with any source of its inputs: the real robot, Isaac Sim, or magtwin's simulator. At each step it
+joins the newest message of every input whose stamp is not ahead of its clock, as a Run does. It publishes a
+reading only if all of them are fresh and the map covers the place. Otherwise it reports on /diagnostics
+what is missing, and resumes when that is back.
 """
 
 import time
@@ -16,7 +16,9 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.frames import canonical, into_base, yaw_from_quat
-from magtwin.io.bags.messages import (
+from magtwin.io.bags.cdr import NS
+from magtwin.io.bags.sender import sender_of
+from magtwin.io.bags.topics import (
     BATTERY,
     COMMAND,
     IMU,
@@ -26,10 +28,9 @@ from magtwin.io.bags.messages import (
     SCAN,
     TOTAL_FIELD,
     Topic,
-    sender_of,
 )
-from magtwin.ros.bus import NS, Bus, Timer, to_bytes
-from magtwin.ros.diagnostics import Reporter, Status
+from magtwin.ros.bus import Bus, Timer, to_bytes
+from magtwin.ros.diagnostics import Level, Reporter, status_of
 from magtwin.ros.inputs import Input, Scanning, newest_sent_ns
 from magtwin.ros.network import Following
 from magtwin.ros.parameters import Parameter
@@ -41,39 +42,41 @@ if TYPE_CHECKING:
 
 PARAMETERS: Mapping[str, Parameter] = MappingProxyType(
     {
-        "rate_hz": Parameter(135.0, "readings a second [Hz]", 1.0, 1000.0),
-        "units": Parameter("T", "unit of the field: T, or nT as APRILab's robot has it", words=("T", "nT")),
-        "use_sim_time": Parameter(False, "whether time is /clock's"),
+        "rate_hz": Parameter(135.0, "rate of readings [Hz]", 1.0, 1000.0),
+        "units": Parameter("T", "unit of the field: T, or nT like APRILab's robot", words=("T", "nT")),
+        "use_sim_time": Parameter(False, "use the time of /clock"),
         "max_age_s": Parameter(0.5, "age at which pose, odometry and IMU are stale [s]", 0.01, 60.0),
         "battery_max_age_s": Parameter(30.0, "age at which the battery's state is stale [s]", 0.1, 3600.0),
         "lidar": Parameter(
-            "scan", "whether the LiDAR spins: as scans come, on or off", words=("scan", "on", "off")
+            "scan",
+            "whether the LiDAR spins: while scans arrive, always (on) or never (off)",
+            words=("scan", "on", "off"),
         ),
         "outside": Parameter(
-            "silent", "beyond the map: no reading, or the map's border's", words=("silent", "clamp")
+            "silent", "outside the map: no reading, or the reading at its border", words=("silent", "clamp")
         ),
     }
 )
-"""What the node can be set to."""
+"""Parameters of the node."""
 
 INPUTS: tuple[Topic, ...] = (POSE, ODOMETRY, IMU, BATTERY, COMMAND)
-"""What it can hear, beside scans."""
+"""Its possible inputs, beside scans."""
 
 _ALWAYS = frozenset(("mocap_p", "mocap_q_xyzw"))
-"""Columns that are read whatever the network reads: the map's."""
+"""Columns that are always read, for the map."""
 
 MADE = frozenset(("t", "yaw", "b_map_nt", "b_map_gradient_nt_m", "lidar_on"))
-"""Columns that it makes of those."""
+"""Columns that the node derives."""
 
 LOOK_S = 0.5
-"""Time between looks for topics that were not offered before [s]."""
+"""Time between searches for new topics [s]."""
 
 BACK_S = 0.2
-"""A clock that went back by more began anew [s]."""
+"""A clock that went back by more than this was restarted [s]."""
 
 
 class Magnetometer:
-    """The node. It hears and says nothing but when the bus spins."""
+    """The node; it works only while the bus spins."""
 
     def __init__(
         self,
@@ -83,45 +86,45 @@ class Magnetometer:
         *,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
-        """Offer its topics, and look for its inputs.
+        """Advertise its topics, and search for its inputs.
 
         Args:
-            twin: Gives map, network and the sensor's frame; whatever else is in the scene is not read.
-            bus: The node, whose clock is that of `use_sim_time`.
+            twin: Gives map, network and the sensor's frame.
+            bus: The node, whose clock follows `use_sim_time`.
             settings: Values of `PARAMETERS`.
-            say: Takes lines for people.
+            say: Called with messages for the user.
 
         Raises:
-            InputError: The scene's magnetometer is physical, or its network reads what no input tells.
+            InputError: The scene's magnetometer is physical, or its network reads columns that no input has.
         """
         spec = twin.scene.robot.magnetometer
         if twin.magnetometer is None and spec.kind != "map-only":
             raise InputError(
                 f"the magnetometer of scene {twin.scene.name!r} is {spec.kind}, which needs the lab itself; "
-                "robots' sensors tell it to a network: name weights, or a scene with a neural magnetometer"
+                "this node needs a network: name weights, or a scene with a neural magnetometer"
             )
         self._twin, self._bus, self._settings, self._say = twin, bus, dict(settings), say
         needed = (twin.magnetometer.columns if twin.magnetometer else frozenset()) - MADE
-        told = {column for topic in INPUTS for column in _columns_of(topic)}
-        if beyond := sorted(needed - told):
+        known = {column for topic in INPUTS for column in topic.needs}
+        if beyond := sorted(needed - known):
             raise InputError(
-                f"the network reads {', '.join(beyond)}, which no topic of this node tells; train it without"
+                f"the network reads {', '.join(beyond)}, which no input of this node has; train it without"
             )
-        chosen = [topic for topic in INPUTS if topic is POSE or needed & _columns_of(topic)]
-        read = needed | ({"imu_q_xyzw"} if "imu_a" in needed else frozenset())  # which frees it of gravity
+        chosen = [topic for topic in INPUTS if topic is POSE or needed & set(topic.needs)]
+        read = needed | ({"imu_q_xyzw"} if "imu_a" in needed else frozenset())  # to subtract gravity
         self.inputs = {
             topic.name: Input(bus, topic, max_age_s=settings["max_age_s"], wanted=read | _ALWAYS)
             for topic in chosen
         }
         if COMMAND.name in self.inputs:
-            self.inputs[COMMAND.name].silence = "no commands: the robot is taken to stand"
+            self.inputs[COMMAND.name].silence = "no commands: the robot is assumed to stand"
         self._needed = needed
         self._scans: Scanning | None = None
         if twin.magnetometer and "lidar_on" in twin.magnetometer.columns:
             lidar = twin.scene.robot.lidar
             self._scans = Scanning(bus, SCAN, gap_s=lidar.latency_s + 2.5 / max(lidar.scan_rate_hz, 0.1))
         self._network = Following(twin.magnetometer) if twin.magnetometer else None
-        self._reader: Reader | None = None  # where a row tells all, and nothing is asked of the map's border
+        self._reader: Reader | None = None  # if no context and no map border is needed
         self._magnitude = bus.publisher(MAGNITUDE.name, MAGNITUDE.kind, MAGNITUDE.qos)
         self._total = bus.publisher(TOTAL_FIELD.name, TOTAL_FIELD.kind, TOTAL_FIELD.qos)
         self._reporter = Reporter(bus)
@@ -131,8 +134,7 @@ class Magnetometer:
         self._missing = ""
         self._reported_ns = 0
         self.latencies_s: deque[float] = deque(maxlen=10_000)
-        """From when its step was due, or the newest message of an input was sent if that was later, to when a
-        reading went out [s], of the last readings."""
+        """Latency of the last readings [s], from when the step was due or its newest input was sent."""
         self._timer: Timer | None = None
         self._rate, self._units = 0.0, "T"
         self._adopt()
@@ -142,17 +144,17 @@ class Magnetometer:
         self._reporter.each(self._report)
 
     def _set(self, name: str, value: Any) -> None:
-        """A setting that is changed while the node runs."""
+        """Change a setting while the node runs."""
         self._settings[name] = value
-        self._say(f"{name} is {value} now")
+        self._say(f"{name} is now {value}")
         self._adopt()
 
     def _adopt(self) -> None:
-        """Do as the settings say."""
+        """Apply the settings."""
         settings, robot = self._settings, self._twin.scene.robot
-        for one in self.inputs.values():
-            one.max_age_s = settings["battery_max_age_s" if one.topic is BATTERY else "max_age_s"]
-        self._who = sender_of(robot, unit=settings["units"], rate_hz=settings["rate_hz"])
+        for source in self.inputs.values():
+            source.max_age_s = settings["battery_max_age_s" if source.topic is BATTERY else "max_age_s"]
+        self._sender = sender_of(robot, unit=settings["units"], rate_hz=settings["rate_hz"])
         if settings["rate_hz"] != self._rate:
             if self._timer is not None:
                 self._timer.cancel()
@@ -173,27 +175,27 @@ class Magnetometer:
                 self._say("fields are published in nT, as APRILab's robot does; ROS means tesla")
 
     def _look(self) -> None:
-        for one in self.inputs.values():
-            one.look()
+        for source in self.inputs.values():
+            source.look()
         if self._scans is not None and self._settings["lidar"] == "scan":
             self._scans.look()
 
     def _read(self) -> None:
-        """A step: a reading, if all that it takes is there."""
+        """One step: publish a reading, if its inputs are there."""
         now = self._bus.now_ns()
         if now < self._last_ns:
             if now > self._last_ns - BACK_S * NS:
-                return  # a clock that is set back a little: what was said stays said
+                return  # a small step back: keep what was published
             self._restart()
         if now == self._last_ns or not now:
             return
         columns: dict[str, Any] = {}
-        for one in self.inputs.values():
-            fresh = one.fresh(now)
-            if fresh is None and one.topic is COMMAND:
-                fresh = {"v_cmd": np.zeros(1), "w_cmd": np.zeros(1)}  # a robot that is told nothing stands
+        for source in self.inputs.values():
+            fresh = source.fresh(now)
+            if fresh is None and source.topic is COMMAND:
+                fresh = {"v_cmd": np.zeros(1), "w_cmd": np.zeros(1)}  # a robot without commands stands
             if fresh is None:
-                self._skip(one.missing(now))
+                self._skip(source.missing(now))
                 return
             columns |= fresh
         reading = self._reading(now, columns)
@@ -215,16 +217,16 @@ class Magnetometer:
         self._published += 1
 
     def _reading(self, now: int, columns: dict[str, Any]) -> "Reading":
-        """What map and network say of this step; the sd has the sensor's noise in it, 0 where unknown."""
+        """Map and prediction at this step; the sd includes the sensor's noise, and is 0 if unknown."""
         from magtwin.learn.inference.reader import Reading
 
-        told = self._settings["lidar"]
-        spins = told == "on" or (told == "scan" and self._scans is not None and self._scans.on(now))
+        lidar = self._settings["lidar"]
+        spins = lidar == "on" or (lidar == "scan" and self._scans is not None and self._scans.on(now))
         if self._reader is not None:
             signals = {name: column[0] for name, column in columns.items()} | {"lidar_on": float(spins)}
             x, y = columns["mocap_p"][0, :2].tolist()
-            found = self._reader.read((x, y), float(yaw_from_quat(columns["mocap_q_xyzw"])[0]), signals)
-            return found._replace(b_sd_nt=self._with_noise(found.b_sd_nt))
+            reading = self._reader.read((x, y), float(yaw_from_quat(columns["mocap_q_xyzw"])[0]), signals)
+            return reading._replace(b_sd_nt=self._with_noise(reading.b_sd_nt))
         rows = self._rows(now, columns, spins)
         b_map = float(rows["b_map_nt"][0])
         if self._network is None or not np.isfinite(b_map):
@@ -237,7 +239,7 @@ class Magnetometer:
         return float(np.hypot(sd_nt, self._noise_nt)) if np.isfinite(sd_nt) else 0.0
 
     def _rows(self, now: int, columns: dict[str, Any], spins: bool) -> Run:
-        """One row of a Run, of what the network and the map read."""
+        """One row of a Run, with the inputs of network and map."""
         yaw = yaw_from_quat(columns["mocap_q_xyzw"])
         xy = columns["mocap_p"][:, :2]
         outside: Literal["clamp", "nan"] = "clamp" if self._settings["outside"] == "clamp" else "nan"
@@ -257,7 +259,7 @@ class Magnetometer:
         columns = {"b_measured_nt": np.array([total_nt]), "b_sd_nt": np.array([sd_nt])}
         stamp = np.array([now])
         for publisher, topic in ((self._magnitude, MAGNITUDE), (self._total, TOTAL_FIELD)):
-            fields = topic.write(columns, stamp, self._who)
+            fields = topic.write(columns, stamp, self._sender)
             publisher.publish(to_bytes(topic.kind, fields))
 
     def _skip(self, why: str) -> None:
@@ -267,11 +269,11 @@ class Magnetometer:
         self._missing = why
 
     def _restart(self) -> None:
-        """Time began anew: nothing that was heard counts any more."""
+        """Forget all inputs, after a restart of time."""
         self._resets += 1
-        self._say("time jumped back: what was heard before is forgotten")
-        for one in self.inputs.values():
-            one.forget()
+        self._say("time jumped back: earlier inputs are dropped")
+        for source in self.inputs.values():
+            source.forget()
         if self._twin.magnetometer is not None:
             self._network = Following(self._twin.magnetometer)
         self._last_ns = 0
@@ -282,24 +284,16 @@ class Magnetometer:
         rate = (self._published - self._published_before) / span if 0 < span < 60 else 0.0
         self._published_before = self._published
         self._reported_ns = now
-        level: Any = "ok"
-        words = []
-        if clock or self._missing:
-            level = "error"
-            words.append(f"no reading: {clock or self._missing}")
-        elif 0 < span < 60 and rate < 0.9 * self._rate:
-            level = "warn"
-            words.append(f"{rate:.0f} readings a second in place of {self._rate:g}")
-        troubles = (
-            (self._outside, "poses were outside the map"),
-            (self._strange, "readings were beyond what the network was trained on"),
-            (self._resets, "times time jumped back"),
-            (self._bus.publishers(MAGNITUDE.name) - 1, f"others say {self._magnitude.topic} too"),
+        silent = clock or self._missing
+        slow = not silent and 0 < span < 60 and rate < 0.9 * self._rate
+        others = self._bus.publishers(MAGNITUDE.name) - 1
+        problems = (
+            (slow, f"{rate:.0f} readings a second in place of {self._rate:g}"),
+            (self._outside, f"{self._outside} poses were outside the map"),
+            (self._strange, f"{self._strange} readings were outside the network's training range"),
+            (self._resets, f"time jumped back {self._resets} times"),
+            (others > 0, f"{others} others publish {self._magnitude.topic} too"),
         )
-        for count, text in troubles:
-            if count > 0:
-                level = "warn" if level == "ok" else level
-                words.append(f"{count} {text}")
         half, most = 1e3 * np.percentile(self.latencies_s or [np.nan], (50, 99))
         values = {
             "rate [Hz]": f"{rate:.1f}",
@@ -309,16 +303,15 @@ class Magnetometer:
             "outside map": str(self._outside),
             "out of distribution": str(self._strange),
             "time jumps": str(self._resets),
-            "units": self._who.unit,
+            "units": self._sender.unit,
         }
-        statuses = [Status("readings", level, "; ".join(words) or "reading", values)]
-        statuses += [one.status(now) for one in self.inputs.values()]
+        level: Level = "error" if silent else "ok"
+        words = [f"no reading: {silent}"] if silent else []
+        statuses = [
+            status_of("readings", problems, fine="reading", level=level, words=words, values=values),
+            *(source.status(now) for source in self.inputs.values()),
+        ]
         if self._scans is not None and self._settings["lidar"] == "scan":
             statuses.append(self._scans.status(now))
         self._reporter.report(statuses, now)
         self._skipped = self._outside = self._strange = self._resets = 0
-
-
-def _columns_of(topic: Topic) -> frozenset[str]:
-    """Columns that a topic's messages give."""
-    return frozenset(topic.carries or topic.needs)

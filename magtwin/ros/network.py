@@ -1,4 +1,4 @@
-"""A network that reads rows as they come, a few at a time."""
+"""A network that reads rows as they come."""
 
 from typing import TYPE_CHECKING, Any
 

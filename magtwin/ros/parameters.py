@@ -1,4 +1,4 @@
-"""Parameters: what a node is set to, each with its range, from a command line as ROS has it: name:=value."""
+"""Parameters of a node, each with its range; on the command line name:=value, as in ROS."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -12,17 +12,17 @@ class Parameter:
     """A number, a word or a flag."""
 
     default: Any
-    """Its value unless it is set, which also tells its type."""
+    """Default, which also defines the type."""
 
     doc: str
-    """What it is, with its unit."""
+    """Meaning and unit."""
 
     low: float | None = None
     high: float | None = None
-    """Its range, the ends included; none for any."""
+    """Inclusive range; None means no limit."""
 
     words: tuple[str, ...] = ()
-    """What it may be; none for anything."""
+    """Allowed words; empty allows any."""
 
 
 def settings(table: Mapping[str, Parameter], given: Iterable[str]) -> dict[str, Any]:
@@ -30,11 +30,11 @@ def settings(table: Mapping[str, Parameter], given: Iterable[str]) -> dict[str, 
 
     Args:
         table: Parameters by name.
-        given: Those that are set, as `rate_hz:=50`.
+        given: Parameters to set, such as `rate_hz:=50`.
 
     Raises:
-        InputError: One is not of that form or not a parameter's, or a value is of the wrong kind or out of
-            its range.
+        InputError: The form is wrong, a parameter is unknown, or a value has the wrong type or is out of its
+            range.
     """
     values = {name: parameter.default for name, parameter in table.items()}
     for text in given:
@@ -46,7 +46,7 @@ def settings(table: Mapping[str, Parameter], given: Iterable[str]) -> dict[str, 
 
 
 def _value(name: str, parameter: Parameter, text: str) -> Any:
-    """The value that a text of a command line stands for."""
+    """The value of a text from the command line."""
     kind = type(parameter.default)
     if kind is bool:
         if text.lower() not in ("true", "false"):
@@ -62,10 +62,10 @@ def _value(name: str, parameter: Parameter, text: str) -> Any:
 
 
 def checked(name: str, parameter: Parameter, value: Any) -> Any:
-    """A value of a parameter's kind, if it is one that the parameter may have.
+    """The value, if the parameter allows it.
 
     Raises:
-        InputError: It is out of the range, or none of the words.
+        InputError: It is out of range, or not an allowed word.
     """
     if parameter.words and value not in parameter.words:
         raise InputError(f"parameter {name} is {' or '.join(parameter.words)}, got {value!r}")

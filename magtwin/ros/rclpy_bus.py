@@ -1,4 +1,4 @@
-"""RclpyBus: a node by rclpy, of a sourced installation of ROS 2 or of its wheels."""
+"""RclpyBus: a node over rclpy, from a sourced installation of ROS 2 or from its wheels."""
 
 import importlib
 import time
@@ -15,16 +15,16 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from magtwin.errors import InputError
-from magtwin.io.bags.messages import Qos
-from magtwin.ros.bus import Heard, Message, Names
+from magtwin.io.bags.topics import Qos
+from magtwin.ros.bus import Handler, Message, Names
 from magtwin.ros.parameters import Parameter, checked
 
 MOST_AT_ONCE = 256
-"""Callbacks that are run before `spin_once` gives back."""
+"""Callbacks that run before `spin_once` returns."""
 
 
 def qos_of(qos: Qos) -> QoSProfile:
-    """A topic's quality of service as rclpy has it."""
+    """The rclpy profile of a quality of service."""
     return QoSProfile(
         depth=qos.depth,
         history=HistoryPolicy.KEEP_LAST,
@@ -34,7 +34,7 @@ def qos_of(qos: Qos) -> QoSProfile:
 
 
 def class_of(kind: str) -> Any:
-    """Rclpy's class of a type of messages.
+    """The rclpy class of a message type.
 
     Raises:
         InputError: Its package is not installed.
@@ -44,19 +44,21 @@ def class_of(kind: str) -> Any:
         return getattr(importlib.import_module(f"{package}.{space}"), name)
     except ImportError as error:
         raise InputError(
-            f"the ROS package {package} is not installed, so there are no messages {kind}; install "
-            f"ros-jazzy-{package.replace('_', '-')} or that of your distribution, or take cyclonedds"
+            f"the ROS package {package} is not installed, which has {kind}; install "
+            f"ros-jazzy-{package.replace('_', '-')} or that of your distribution, or use cyclonedds"
         ) from error
 
 
 def _descriptor(parameter: Parameter) -> Any:
-    """What `ros2 param describe` tells of a parameter."""
-    told = ParameterDescriptor(description=parameter.doc, additional_constraints=" or ".join(parameter.words))
+    """Description of a parameter for `ros2 param describe`."""
+    descriptor = ParameterDescriptor(
+        description=parameter.doc, additional_constraints=" or ".join(parameter.words)
+    )
     if parameter.low is not None and parameter.high is not None:
-        told.floating_point_range = [
+        descriptor.floating_point_range = [
             FloatingPointRange(from_value=float(parameter.low), to_value=float(parameter.high))
         ]
-    return told
+    return descriptor
 
 
 class RclpyPublisher:
@@ -66,11 +68,11 @@ class RclpyPublisher:
         self.topic, self.kind, self._publisher = topic, kind, publisher
 
     def publish(self, data: bytes) -> None:
-        """Send a message; rclpy takes bytes as one that is serialized."""
+        """Send a message; rclpy takes bytes as a serialized message."""
         self._publisher.publish(data)
 
     def subscribers(self) -> int:
-        """How many listen."""
+        """Number of subscribers."""
         return int(self._publisher.get_subscription_count())
 
 
@@ -81,7 +83,7 @@ class RclpySubscription:
         self.topic, self.kind, self._node = topic, kind, node
 
     def publishers(self) -> int:
-        """How many send."""
+        """Number of publishers."""
         return int(self._node.count_publishers(self.topic))
 
 
@@ -110,19 +112,19 @@ class RclpyBus:
         whole = self._names.resolve(topic)
         return RclpyPublisher(whole, kind, self._node.create_publisher(class_of(kind), whole, qos_of(qos)))
 
-    def subscribe(self, topic: str, kind: str, heard: Heard, qos: Qos) -> RclpySubscription:
+    def subscribe(self, topic: str, kind: str, handler: Handler, qos: Qos) -> RclpySubscription:
         """As for `Bus`."""
         whole = self._names.resolve(topic)
 
-        def come(data: bytes, info: Mapping[str, Any]) -> None:
+        def receive(data: bytes, info: Mapping[str, Any]) -> None:
             self._calls += 1
-            heard(Message(kind, bytes(data), int(info["source_timestamp"]), time.time_ns()))
+            handler(Message(kind, bytes(data), int(info["source_timestamp"]), time.time_ns()))
 
-        self._node.create_subscription(class_of(kind), whole, come, qos_of(qos), raw=True)
+        self._node.create_subscription(class_of(kind), whole, receive, qos_of(qos), raw=True)
         return RclpySubscription(whole, kind, self._node)
 
     def service(self, name: str, called: Callable[[], None]) -> bool:
-        """As for `Bus`; not where std_srvs is not installed."""
+        """As for `Bus`; needs std_srvs."""
         try:
             kind = importlib.import_module("std_srvs.srv").Empty
         except ImportError:
@@ -143,14 +145,14 @@ class RclpyBus:
         own = {name: parameter for name, parameter in table.items() if name != "use_sim_time"}
 
         def wanted(asked: list[Any]) -> Any:
-            known = [one for one in asked if one.name in own]
+            known = [parameter for parameter in asked if parameter.name in own]
             try:
-                for one in known:
-                    checked(one.name, own[one.name], one.value)
+                for parameter in known:
+                    checked(parameter.name, own[parameter.name], parameter.value)
             except InputError as error:
                 return SetParametersResult(successful=False, reason=str(error))
-            for one in known:
-                changed(one.name, one.value)
+            for parameter in known:
+                changed(parameter.name, parameter.value)
             return SetParametersResult(successful=True)
 
         for name, parameter in own.items():
@@ -159,7 +161,7 @@ class RclpyBus:
         return True
 
     def knows(self, kind: str) -> bool:
-        """As for `Bus`: those whose package is installed."""
+        """As for `Bus`: types of installed packages."""
         try:
             return class_of(kind) is not None
         except InputError:
@@ -184,7 +186,7 @@ class RclpyBus:
 
         def call() -> None:
             self._calls += 1
-            self._due_ns = time.time_ns()  # rclpy does not tell when it was due
+            self._due_ns = time.time_ns()  # rclpy does not report when it was due
             due()
 
         clock = Clock(clock_type=ClockType.STEADY_TIME) if wall else None

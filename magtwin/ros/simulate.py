@@ -1,32 +1,32 @@
-"""The simulator as a node: a twin's robot in real time, that says and takes what the real one does."""
+"""The simulator as a node: a twin's robot in real time, with the topics of the real one."""
 
 import heapq
 import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.io.bags.cdr import encode, leaves
-from magtwin.io.bags.messages import (
+from magtwin.io.bags.cdr import NS, encode
+from magtwin.io.bags.sender import Unit, sender_for
+from magtwin.io.bags.stream import Sent, Stream
+from magtwin.io.bags.topics import (
     COMMAND,
     IMU,
     MAGNITUDE,
     SCAN,
     TOTAL_FIELD,
-    TYPES,
     VECTOR,
     Qos,
     Topic,
-    Unit,
 )
-from magtwin.io.bags.writer import Said, Stream, sender_for
-from magtwin.ros.bus import NS, Bus, Message, Publisher
-from magtwin.ros.diagnostics import Reporter, Status
+from magtwin.io.bags.types import layout
+from magtwin.ros.bus import Bus, Message, Publisher
+from magtwin.ros.diagnostics import Reporter, status_of
 from magtwin.ros.network import Following
 from magtwin.ros.topics import READ, SAMPLED, TICKS
 from magtwin.run.run import Run
@@ -36,43 +36,42 @@ from magtwin.sim.sensors.clock import Samples
 from magtwin.twin import Session, Twin, in_session, model_error_of
 
 RESET = "/robot/reset"
-"""Topic (std_msgs/Empty), and with rclpy service (std_srvs/Empty), that puts the robot back to its start and
-the time to 0."""
+"""Topic (std_msgs/Empty), and with rclpy service (std_srvs/Empty), that resets robot and time."""
 
 LEAD_S = 0.006
-"""How long before its begin a control step is computed, so that its first message is not late [s]."""
+"""Time by which a control step is computed ahead, so that its first message is not late [s]."""
 
 SLIP_S = 0.1
-"""Delay after which a machine that is too slow gives up real time [s]."""
+"""Delay after which a slow machine gives up real time [s]."""
 
 MOST_HZ = 1000.0
-"""Readings a second that can be said one by one [Hz], the magnetometer node's own limit."""
+"""Highest rate of readings [Hz], that of the magnetometer node."""
 
 WARM = 5
-"""Steps of another robot that are made beforehand: they open libraries, and tell which topics there are."""
+"""Steps of a second robot at the start, which load libraries and show which topics there are."""
 
 REPORT_S = 1.0
-"""Time between diagnostics, by the wall [s]."""
+"""Wall time between diagnostics [s]."""
 
 Say = Callable[[str], None]
 
 
 @dataclass
 class Pace:
-    """How sim time goes with the wall's."""
+    """Relation of simulated time to wall time."""
 
     speed: float
-    """Sim time for each wall time."""
+    """Simulated seconds per second."""
 
     begin_s: float
-    """Wall time at which sim time was 0 [s]."""
+    """Wall time of simulated time 0 [s]."""
 
     def due_s(self, t: float) -> float:
-        """Wall time of a sim time [s]."""
+        """Wall time of a simulated time [s]."""
         return self.begin_s + t / self.speed
 
     def slip(self, t: float, now_s: float) -> bool:
-        """Give up time that was lost, if that is much; whether it was."""
+        """Give up a delay above `SLIP_S`; whether there was one."""
         behind = now_s - self.due_s(t)
         if behind < SLIP_S:
             return False
@@ -81,7 +80,7 @@ class Pace:
 
 
 class Simulator:
-    """A robot that is simulated in real time; the same commands in the same steps give the same messages."""
+    """A robot simulated in real time; the same commands in the same steps give the same messages."""
 
     def __init__(
         self,
@@ -99,24 +98,24 @@ class Simulator:
         magnetometer: bool = True,
         say: Say = lambda text: None,
     ) -> None:
-        """Offer its topics; `run` begins.
+        """Advertise its topics; `run` starts it.
 
         Args:
-            twin: What is simulated.
-            bus: The node; its own clock is not used.
+            twin: The twin.
+            bus: The node; its clock is not used.
             seed: Seed of all noise.
             session: As for `magtwin.simulate`.
-            speed: Sim time for each wall time.
-            rate_hz: Readings of the magnetometer a second [Hz]; None takes the scene's.
-            units: Unit of fields: "T", as ROS has them, or "nT", as APRILab's robot publishes them.
+            speed: Simulated seconds per second.
+            rate_hz: Rate of the magnetometer [Hz]. Default: the scene's.
+            units: Unit of magnetic fields: "T", as in ROS, or "nT", as APRILab's robot publishes them.
             lidar: Whether the LiDAR follows its schedule, or stays on or off.
-            stamps: Whether messages are stamped by sim time, from 0 on, or by the wall's.
-            stamped_commands: Whether cmd_vel is a TwistStamped, and not a Twist.
-            magnetometer: Whether it says what its magnetometer reads, or leaves that to another node.
-            say: Takes lines for people.
+            stamps: Stamp messages with simulated time, from 0 on, or with wall time.
+            stamped_commands: cmd_vel is a TwistStamped, not a Twist.
+            magnetometer: Publish the magnetometer's readings; else another node does.
+            say: Called with messages for the user.
 
         Raises:
-            InputError: The robot would begin in an obstacle, or an option is out of range.
+            InputError: The robot starts in an obstacle, or an option is out of range.
         """
         if not 0 < speed <= 100:
             raise InputError(f"speed must be above 0 and at most 100 times real time, got {speed!r}")
@@ -128,7 +127,7 @@ class Simulator:
         self._reads = magnetometer
         self._units: Unit = units
         self.online = self._online()
-        self._who = sender_for(twin, units, self.online.rate_hz)
+        self._sender = sender_for(twin, units, self.online.rate_hz)
         self._publishers: dict[str, Publisher] = {}
         self._events: list[tuple[int, int, Publisher, bytes]] = []
         self._count = 0
@@ -147,22 +146,22 @@ class Simulator:
             if bus.knows(topic.kind):
                 self._publishers[topic.name] = bus.publisher(topic.name, topic.kind, topic.qos)
             else:
-                say(f"{topic.name} is left out: no {topic.kind} is installed here")
+                say(f"{topic.name} is left out: {topic.kind} is not installed")
         self._begin_ns = 0
         self._reset = False
         if units == "nT":
             say("fields are published in nT, as APRILab's robot does; ROS means tesla")
 
     def reset(self) -> None:
-        """Put the robot back to its start and time to 0, before the next step."""
+        """Put the robot back to its start, and time to 0, before the next step."""
         self._reset = True
 
     def run(self, until: Callable[[], bool] = lambda: False, *, duration_s: float | None = None) -> None:
         """Simulate.
 
         Args:
-            until: Asked at each step; an end where it says so.
-            duration_s: How long, in sim time [s]; None goes on.
+            until: Ends the run when true; called at each step.
+            duration_s: Simulated duration [s]. Default: no end.
         """
         pace = self._begun()
         reported, factor_from = time.monotonic(), (time.monotonic(), 0.0)
@@ -205,11 +204,11 @@ class Simulator:
         return Pace(self._speed, time.monotonic() + LEAD_S)
 
     def _tell(self, rows: Run) -> None:
-        """Have what was read in a step published when its time comes."""
+        """Queue the messages of a step."""
         if self._stream is None:
             self._stream = self._streamed(rows)
-        for said in self._stream.messages(rows):
-            self._queue(said)
+        for sent in self._stream.messages(rows):
+            self._queue(sent)
         if rows.rows:
             self._moved = rows["odom_v"][-1:]
         for name, parts in self.online.samples().items():
@@ -218,27 +217,29 @@ class Simulator:
         scans = self.online.scans()
         if len(scans.t):
             moments, came = (np.rint(t * NS).astype(np.int64) for t in (scans.t, scans.arrival))
-            fields = SCAN.write({"ranges_m": scans.ranges_m}, moments, self._who)
-            self._queue((SCAN, came, TYPES[SCAN.kind], fields))
+            fields = SCAN.write({"ranges_m": scans.ranges_m}, moments, self._sender)
+            self._queue((SCAN, came, fields))
 
     def _streamed(self, rows: Run) -> Stream:
         silent = () if self._reads else (MAGNITUDE, VECTOR, TOTAL_FIELD)
         topics = [topic for topic in READ if topic not in silent]
-        return Stream(rows, self._who, None, topics=topics, whole=True)
+        return Stream(rows, self._sender, None, topics=topics, whole=True)
 
     def _sampled(self, topic: Topic, samples: Samples) -> None:
-        """Have samples published when they arrive; those of before the beginning are known to nobody."""
+        """Queue samples at their arrival; those before the start are dropped."""
         taken = samples.t >= 0
         if topic.lost:
             taken &= ~samples.columns[topic.lost]
         columns = {name: values[taken] for name, values in samples.columns.items()}
-        if topic is IMU and self._moved is not None:  # it shakes with the speed, and tells how much
+        if (
+            topic is IMU and self._moved is not None
+        ):  # its noise depends on the speed, and so do its covariances
             columns["odom_v"] = np.repeat(self._moved, taken.sum(), axis=0)
         stamps, arrivals = (np.rint(t[taken] * NS).astype(np.int64) for t in (samples.t, samples.arrival))
-        self._queue((topic, arrivals, TYPES[topic.kind], topic.write(columns, stamps, self._who)))
+        self._queue((topic, arrivals, topic.write(columns, stamps, self._sender)))
 
-    def _queue(self, said: Said) -> None:
-        topic, times, form, fields = said
+    def _queue(self, sent: Sent) -> None:
+        topic, times, fields = sent
         publisher = self._publishers.get(topic.name)
         if publisher is None or not len(times):
             return
@@ -247,12 +248,14 @@ class Simulator:
                 name: value + self._begin_ns if name.endswith("stamp") or name == "clock" else value
                 for name, value in fields.items()
             }
-        for t, data in zip(times.tolist(), encode(leaves(form), fields, len(times)), strict=True):
+        for t, data in zip(
+            times.tolist(), encode(layout(topic.kind, fields), fields, len(times)), strict=True
+        ):
             self._count += 1
             heapq.heappush(self._events, (t, self._count, publisher, data.tobytes()))
 
     def _publish_until(self, pace: Pace, due_s: float) -> None:
-        """Publish what falls due before a wall time, each message in its time, and hear what comes."""
+        """Publish messages until a wall time, each at its time, and receive others meanwhile."""
         while True:
             next_s = pace.due_s(self._events[0][0] / NS) if self._events else math.inf
             left = min(next_s, due_s) - time.monotonic()
@@ -266,7 +269,7 @@ class Simulator:
                 return
 
     def _commanded(self, message: Message) -> None:
-        linear, angular = COMMAND.leaves[self._kind]
+        linear, angular = COMMAND.leaves(self._kind)
         try:
             read = message.read([linear, angular])
             v, w = float(read[linear][0]), float(read[angular][2])
@@ -280,24 +283,16 @@ class Simulator:
 
     def _report(self, factor: float) -> None:
         senders = self._input.publishers()
-        level: Any = "ok"
-        words = []
-        if self._slips:
-            level = "warn"
-            words.append(f"slower than {self._speed:g} x real time")
-        if senders > 1:
-            level = "warn"
-            words.append(f"{senders} publishers on {self._input.topic}: the last command wins")
-        if self._refused:
-            level = "warn"
-            words.append(f"{self._refused} commands were not finite")
-        if others := [kind for kind in self._bus.types(COMMAND.name) if kind != self._kind]:
-            level = "warn"
-            words.append(f"commands come as {', '.join(others)} and are not heard; {self._kind} is")
-        for topic in (TICKS, MAGNITUDE) if self._reads else (TICKS,):
-            if (count := self._bus.publishers(topic.name)) > 1:
-                level = "warn"
-                words.append(f"{count} publishers on {self._bus.resolve(topic.name)}")
+        others = [kind for kind in self._bus.types(COMMAND.name) if kind != self._kind]
+        topics = (TICKS, MAGNITUDE) if self._reads else (TICKS,)
+        counts = {self._bus.resolve(topic.name): self._bus.publishers(topic.name) for topic in topics}
+        problems = [
+            (self._slips, f"slower than {self._speed:g} x real time"),
+            (senders > 1, f"{senders} publishers on {self._input.topic}: the last command wins"),
+            (self._refused, f"{self._refused} commands were not finite"),
+            (others, f"commands of type {', '.join(others)} are ignored; {self._kind} is expected"),
+            *((count > 1, f"{count} publishers on {name}") for name, count in counts.items()),
+        ]
         values = {
             "sim time [s]": f"{self.online.t:.2f}",
             "real-time factor": f"{factor:.3f}",
@@ -307,5 +302,5 @@ class Simulator:
             "resets": str(self._resets),
         }
         stamp = self._begin_ns + round(self.online.t * NS)
-        self._reporter.report([Status("simulator", level, "; ".join(words) or "running", values)], stamp)
+        self._reporter.report([status_of("simulator", problems, fine="running", values=values)], stamp)
         self._slips = self._refused = 0

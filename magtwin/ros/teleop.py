@@ -1,39 +1,39 @@
-"""Teleop: a robot driven by hand over ROS."""
+"""Teleop: drive a robot by hand over ROS."""
 
 import os
 import select
 from collections.abc import Callable
 
-from magtwin.io.bags.messages import COMMAND
+from magtwin.io.bags.topics import COMMAND
 from magtwin.ros.bus import Bus
 from magtwin.ros.follow import command_bytes
 from magtwin.sim.motion.manual import Hand
 
 RATE_HZ = 20.0
-"""Commands a second, far above what a robot's timeout asks for [Hz]."""
+"""Rate of commands, far above what a robot's timeout requires [Hz]."""
 
 
 class Teleop:
-    """The node: what a hand says last is commanded again and again."""
+    """The node: repeats the last command of a hand."""
 
     def __init__(self, bus: Bus, hand: Hand, source: int, *, stamped_commands: bool = False) -> None:
-        """Offer commands.
+        """Advertise commands.
 
         Args:
             bus: The node.
-            hand: Who drives.
-            source: Descriptor of the terminal or gamepad that tells of it.
-            stamped_commands: Whether commands are TwistStamped, and not Twist.
+            hand: The keyboard or gamepad.
+            source: File descriptor of the terminal or gamepad.
+            stamped_commands: Send TwistStamped, not Twist.
         """
         self._bus, self._hand, self._source = bus, hand, source
         self._kind = "geometry_msgs/msg/TwistStamped" if stamped_commands else COMMAND.kind
         self._commands = bus.publisher(COMMAND.name, self._kind, COMMAND.qos)
         self.sent = 0
-        """Commands so far."""
+        """Number of commands so far."""
         self._timer = bus.timer(1 / RATE_HZ, self._command)
 
     def run(self, step: Callable[[], None] = lambda: None) -> None:
-        """Drive until the hand has done; `step` is called often."""
+        """Drive until the hand ends it; `step` is called often."""
         while not self._hand.done:
             if select.select([self._source], [], [], 0.0)[0]:
                 self._hand.feed(os.read(self._source, 1024))
@@ -41,11 +41,11 @@ class Teleop:
             self._bus.spin_once(1 / RATE_HZ / 4)
 
     def listeners(self) -> int:
-        """How many hear the commands."""
+        """Number of subscribers of the commands."""
         return self._commands.subscribers()
 
     def stop(self) -> None:
-        """Tell the robot to stand, as before this node leaves."""
+        """Command the robot to stand; call it before the node ends."""
         self._timer.cancel()
         self._commands.publish(command_bytes(self._kind, 0.0, 0.0, self._bus.now_ns()))
 

@@ -1,9 +1,9 @@
-"""Topics of a live robot, in the order in which it says them where it says several at one time."""
+"""Topics of a live robot, in the order in which messages of one time are sent."""
 
 from collections.abc import Mapping
 from dataclasses import replace
 
-from magtwin.io.bags.messages import (
+from magtwin.io.bags.topics import (
     BATTERY,
     CLOCK,
     COMMAND,
@@ -24,16 +24,16 @@ from magtwin.io.bags.messages import (
 )
 
 TICKS = replace(CLOCK, sent="each")
-"""/clock at each reading, so that timers in sim time are as fine as those."""
+"""/clock at each reading, so that timers in simulated time are as fine as the readings."""
 
 SAMPLED: Mapping[str, Topic] = {"odometry": ODOMETRY, "imu": IMU, "mocap": POSE, "battery": BATTERY}
-"""What is said sample by sample, when each arrives, stamped by when it was taken; by the sensors' names."""
+"""Topics that are sent sample by sample on arrival, stamped with the sampling time; by sensor name."""
 
 READ = (TICKS, JOINTS, TF, MAGNITUDE, VECTOR, TOTAL_FIELD)
-"""What is said of readings of the magnetometer."""
+"""Topics that are sent at readings of the magnetometer."""
 
 LIVE = (*READ, *SAMPLED.values(), SCAN, TF_STATIC, DESCRIPTION, NAMES, READING)
-"""What a simulated robot says."""
+"""Topics of a simulated robot."""
 
 RECORDED = (*LIVE, COMMAND)
-"""What is recorded unless others are named."""
+"""Topics that are recorded by default."""

@@ -1,10 +1,9 @@
-"""Arrow: a Run as an Arrow table, which Parquet and CSV are written from, and back.
+"""Arrow: a Run as an Arrow table, for Parquet and CSV, and back.
 
-A vector column of a Run becomes one table column a part (`p_world_base_x`, `p_world_base_y`, ...), not
-a column of lists: pandas then holds plain float64 (lists would be Python objects), SQL in DuckDB and
-expressions in polars need no indexing, one part can be read alone, and byte-stream-split coding works.
-What a flat table cannot say stands in the metadata: on every Arrow field `column`, `part`, `unit`,
-`frame`, `doc` and `interpolation`; on the table `magtwin_facts`, the Run's metadata in JSON.
+A vector column of a Run becomes one table column per part (`p_world_base_x`, `p_world_base_y`, ...), not a
+column of lists. So pandas holds plain float64, SQL in DuckDB and expressions in polars need no indexing, a
+part can be read alone, and byte-stream-split encoding works. Arrow fields have the metadata `column`, `part`,
+`unit`, `frame`, `doc` and `interpolation`; the table has `magtwin_facts`, the Run's metadata as JSON.
 """
 
 import json
@@ -26,7 +25,7 @@ def table_of(run: Run) -> pa.Table:
     """A run as a table.
 
     Raises:
-        InputError: It has no clock or one that does not ascend, or a column cannot stand in a table.
+        InputError: Its clock is missing or does not ascend, or a column cannot stand in a table.
     """
     check_clock(run, "the run to write")
     flat = run.members()
@@ -44,11 +43,11 @@ def table_of(run: Run) -> pa.Table:
 
 
 def run_of(table: pa.Table, path: Path) -> Run:
-    """The run that a table holds; what another program wrote too, where it has the column names.
+    """The run in a table, which may also be from another program that uses the column names of a Run.
 
     Args:
-        table: With the metadata of `table_of`, or without, and then without metadata.
-        path: Where it was read, for refusals.
+        table: With or without the metadata of `table_of`.
+        path: Its file, for error messages.
 
     Raises:
         InputError: It holds no run.
@@ -72,14 +71,14 @@ def run_of(table: pa.Table, path: Path) -> Run:
 
 
 def said_of(spec: Column, name: str, part: str = "") -> dict[str, str]:
-    """What is said of a table column beside its values."""
-    said = {"column": name, "part": part, "unit": spec.unit, "frame": spec.frame, "doc": spec.doc}
-    said["interpolation"] = spec.interpolation if name not in COLUMNS else ""
-    return {key: text for key, text in said.items() if text}
+    """Metadata of a table column."""
+    texts = {"column": name, "part": part, "unit": spec.unit, "frame": spec.frame, "doc": spec.doc}
+    texts["interpolation"] = spec.interpolation if name not in COLUMNS else ""
+    return {key: text for key, text in texts.items() if text}
 
 
 def spec_said(said: dict[str, str], parts: tuple[str, ...]) -> Column:
-    """What a column holds, as `said_of` said it; a rule that is unknown is "linear"."""
+    """The description of a column from its metadata; an unknown interpolation is "linear"."""
     rule: Any = said.get("interpolation", "linear")
     unit, frame, doc = (said.get(key, "") for key in ("unit", "frame", "doc"))
     return Column(unit, frame, doc, len(parts) or 1, parts, rule if rule in RULES else "linear")
@@ -89,19 +88,19 @@ def metadata_to_json(run: Run) -> str:
     """The metadata of a run as a JSON object.
 
     Raises:
-        InputError: One is no text, number or truth value.
+        InputError: A value is not a text, number or bool.
     """
     for key, value in run.metadata.items():
         if not isinstance(value, str | int | float | bool):
-            raise InputError(f"fact {key!r} must be a text, a number, or true or false, got {value!r}")
+            raise InputError(f"metadata {key!r} must be a text, a number, or true or false, got {value!r}")
     return json.dumps(dict(run.metadata), ensure_ascii=False)
 
 
 def metadata_from_json(text: str | bytes, path: Path) -> dict[str, str | int | float | bool]:
-    """The metadata that `metadata_to_json` wrote.
+    """The metadata from `metadata_to_json`.
 
     Raises:
-        InputError: They are not JSON, or no object of texts, numbers and truth values.
+        InputError: The text is not a JSON object of texts, numbers and bools.
     """
     try:
         metadata = json.loads(text)
@@ -112,7 +111,7 @@ def metadata_from_json(text: str | bytes, path: Path) -> dict[str, str | int | f
     for key, value in metadata.items():
         if not isinstance(value, str | int | float | bool):
             raise InputError(
-                f"{path}: fact {key!r} must be a text, a number, or true or false, got {value!r}"
+                f"{path}: metadata {key!r} must be a text, a number, or true or false, got {value!r}"
             )
     return metadata
 
@@ -122,7 +121,7 @@ def _metadata(table: pa.Table, name: str) -> dict[bytes, bytes]:
 
 
 def _members(schema: pa.Schema, path: Path) -> dict[str, list[str]]:
-    """For each column of the Run the table columns that hold it, in the order of its parts."""
+    """Table columns of each column of the Run, in the order of its parts."""
     known = {f"{name}_{part}": name for name, column in COLUMNS.items() for part in column.parts}
     members: dict[str, list[str]] = {}
     for field in schema:
@@ -145,12 +144,12 @@ def _numpy(table: pa.Table, name: str, path: Path) -> NDArray[Any]:
         raise InputError(f"{path}: column {name!r} must hold numbers or flags, got {kind}")
     if column.null_count:
         row = column.is_null().to_numpy().argmax()
-        raise InputError(f"{path}: column {name!r}, row {row}: no value; write nan where nothing is known")
+        raise InputError(f"{path}: column {name!r}, row {row}: no value; write nan for unknown values")
     return column.to_numpy()
 
 
 def _check_flags(values: NDArray[Any], name: str, path: Path) -> None:
-    """Refuse numbers other than 0 and 1 where flags belong."""
+    """Refuse flags other than 0 and 1."""
     if COLUMNS[name].unit == "bool" and values.dtype.kind != "b":
         wrong = (values != 0) & (values != 1)
         if wrong.any():

@@ -1,4 +1,4 @@
-"""Comparison: two runs laid over each other, and how far they are apart in pose and in field."""
+"""Comparison: two runs aligned, and their differences in pose and field."""
 
 import json
 import math
@@ -19,38 +19,38 @@ Array = NDArray[np.float64]
 Align = Literal["time", "path", "none"]
 
 POSITIONS = ("p_world_base", "mocap_p", "odom_p")
-"""Columns of position, the best first; the first that both runs have is compared."""
+"""Columns of position, best first; the first one in both runs is compared."""
 
 HEADINGS = {"p_world_base": "q_world_base_xyzw", "mocap_p": "mocap_q_xyzw", "odom_p": "odom_q_xyzw"}
-"""The orientation that goes with each."""
+"""Orientation column of each."""
 
 FIELDS = ("b_measured_nt", "b_total_nt", "b_truth_nt", "b_map_nt", "b_disturbance_nt")
-"""Columns of the field that are compared where both runs have them."""
+"""Columns of the field that are compared if both runs have them."""
 
 GRID = 4000
-"""Places at which two runs are compared to find the shift between them."""
+"""Grid points at which two runs are compared to find their shift."""
 
 LEAST_OVERLAP = 0.5
-"""Share of the shorter run that must lie over the longer one."""
+"""Fraction of the shorter run that must overlap the longer one."""
 
 SAME_M = 0.01
-"""Root mean square distances that differ by less are as good as each other: the longer overlap wins [m]."""
+"""RMS distances that differ by less count as equal, and the longer overlap wins [m]."""
 
 STEP_M = 0.01
-"""Driven path is counted in steps of this length, so that noise of a standing robot counts for none [m]."""
+"""Step in which driven length is measured, so that noise of a standing robot adds nothing [m]."""
 
 GAP_S, GAP_M = 1.0, 0.25
-"""Gaps between readings across which nothing is interpolated [s], [m]."""
+"""Gaps between readings that are not interpolated [s], [m]."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How one quantity of two runs differs, B less A."""
+    """Difference of one quantity between two runs, B - A."""
 
     name: str
     unit: str
     count: int
-    """Places at which both are known."""
+    """Readings at which both are known."""
     mean: float
     rms: float
     mae: float
@@ -58,19 +58,19 @@ class Agreement:
     greatest: float
     """Greatest absolute difference."""
     correlation: float | None = None
-    """Pearson's, of the two quantities themselves; none for what is only known as a difference."""
+    """Pearson correlation of the two quantities; None if only their difference is known."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison(Summarized):
-    """Run B laid over run A, at the readings of A over which B lies."""
+    """Run B aligned to run A, at the readings of A that B covers."""
 
     align: Align
     shift: float
-    """What is added to B's clock [s], or to its driven length [m], to lay it over A."""
+    """Added to B's clock [s], or driven length [m], to align it to A."""
 
     at: Array
-    """Time on A's clock [s], or length that A has driven [m], shape (N,)."""
+    """Time on A's clock [s], or driven length of A [m], shape (N,)."""
 
     rows: NDArray[np.intp]
     """Rows of A, shape (N,)."""
@@ -85,7 +85,7 @@ class Comparison(Summarized):
     """B's heading less A's, in [-pi, pi) [rad], shape (N,); empty without headings."""
 
     fields: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
-    """Columns of A and of B at the same places [nT], each of shape (N,)."""
+    """Columns of A and of B at these readings [nT], each of shape (N,)."""
 
     @property
     def unit(self) -> str:
@@ -93,27 +93,27 @@ class Comparison(Summarized):
         return "m" if self.align == "path" else "s"
 
     def agreements(self) -> tuple[Agreement, ...]:
-        """Each quantity that both runs have, in figures; what is nowhere known in both is left out."""
+        """Differences of each quantity that is known in both runs."""
         poses = (
             ("along-track", "m", self.along_m),
             ("cross-track", "m", self.cross_m),
             ("heading", "deg", np.degrees(self.heading_rad)),
         )
-        found = [agreement(name, unit, difference) for name, unit, difference in poses]
-        for name, (a, b) in self.fields.items():
-            found.append(agreement(name, "nT", b - a, _correlation(a, b)))
-        return tuple(one for one in found if one is not None)
+        differences = [agreement(*pose) for pose in poses]
+        fields = self.fields.items()
+        differences += [agreement(name, "nT", b - a, _correlation(a, b)) for name, (a, b) in fields]
+        return tuple(difference for difference in differences if difference is not None)
 
     def summary(self) -> dict[str, Any]:
-        """The comparison in plain figures, for JSON."""
+        """The comparison as plain data, for JSON."""
         return {
             "align": self.align,
             "shift": self.shift,
             "shift_unit": self.unit,
             "readings": len(self.at),
             "agreements": {
-                one.name: {k: v for k, v in vars(one).items() if k != "name" and v is not None}
-                for one in self.agreements()
+                a.name: {k: v for k, v in vars(a).items() if k != "name" and v is not None}
+                for a in self.agreements()
             },
         }
 
@@ -122,10 +122,10 @@ class Comparison(Summarized):
         return json.dumps(self.summary(), indent=2)
 
     def _summary(self) -> Summary:
-        """How B was laid over A, and how each quantity agrees."""
+        """The alignment, and the difference of each quantity."""
         agreements = [
-            (one.name, f"mean {one.mean:.4g}, rms {one.rms:.4g}, largest {one.greatest:.4g} {one.unit}")
-            for one in self.agreements()
+            (a.name, f"mean {a.mean:.4g}, rms {a.rms:.4g}, largest {a.greatest:.4g} {a.unit}")
+            for a in self.agreements()
         ]
         by = (
             "as they are"
@@ -146,50 +146,49 @@ ERRORS: Mapping[str, tuple[str, tuple[str, ...], str]] = MappingProxyType(
         "total": ("b_measured_nt", ("b_truth_nt",), "error of the reading"),
     }
 )
-"""Errors of a run by source: a column, those that are subtracted from it, and what it means. Runs without
-`b_model_error_nt` have none."""
+"""Errors by source: a column, the columns subtracted from it, and the meaning. Runs without
+`b_model_error_nt` have no model error."""
 
 
 def errors_of(run: Run) -> dict[str, Agreement]:
-    """The errors of a run in figures, by the names of `ERRORS`; those that are nowhere known are left out."""
-    found = {}
+    """The known errors of a run, by the names of `ERRORS`."""
+    errors = {}
     for name, (seen, others, _) in ERRORS.items():
         others = tuple(other for other in others if other != DRAWN or DRAWN in run)
         if not {seen, *others} <= set(run) or (seen == DRAWN and not run[DRAWN].any()):
             continue
-        one = agreement(name, "nT", sum((-run[other] for other in others), run[seen]))
-        if one is not None:
-            found[name] = one
-    return found
+        error = agreement(name, "nT", sum((-run[other] for other in others), run[seen]))
+        if error is not None:
+            errors[name] = error
+    return errors
 
 
 def compare(a: Run, b: Run, *, align: Align = "time") -> Comparison:
-    """Lay run B over run A and take their differences.
+    """Align run B to run A and take their differences.
 
-    Aligned by time, B's clock is shifted by the one offset tau that minimises the mean square distance of
-    the positions, sum |p_A(t) - p_B(t - tau)|^2 / n over the overlap: by cross-correlation on a grid, then
-    by Gauss-Newton steps. Aligned by path, the same is done with the driven length in place of the time, so
-    that runs of different speeds lie over each other place by place. B is interpolated linearly.
+    By time, B's clock is shifted by the offset tau that minimises the mean square distance of the positions,
+    sum |p_A(t) - p_B(t - tau)|^2 / n over the overlap: first by cross-correlation on a grid, then by
+    Gauss-Newton steps. By path, driven length takes the place of time, so that runs of different speeds are
+    compared place by place. B is interpolated linearly.
 
     Args:
-        a: The run whose readings, and whose axes, differences are given at and in.
+        a: The reference run; differences are given at its readings and in its axes.
         b: The other run.
-        align: "time", "path", or "none" for clocks as they are.
+        align: "time", "path", or "none" for unshifted clocks.
 
     Raises:
-        InputError: A run has fewer than two readings, one lacks what is to be compared, or they do not lie
-            over each other.
+        InputError: A run has fewer than two readings, nothing can be compared, or the runs do not overlap.
     """
     for name, run in (("first", a), ("second", b)):
         if run.rows < 2:
             raise InputError(f"the {name} run has {run.rows} readings; two or more are needed to compare")
         if "t" not in run or not (np.diff(run["t"]) > 0).all():
-            raise InputError(f"the {name} run has no time that goes on from reading to reading")
+            raise InputError(f"the {name} run has no time that ascends from reading to reading")
     position = next((name for name in POSITIONS if _known(a, name) and _known(b, name)), None)
     if position is None and align != "none":
         raise InputError(
             f"runs are aligned by their positions, and no column of {', '.join(POSITIONS)} is known in both; "
-            "compare them as their clocks stand (align none)"
+            "compare them with unshifted clocks (align none)"
         )
     fields = [name for name in FIELDS if name in a and name in b]
     if position is None and not fields:
@@ -206,7 +205,7 @@ def compare(a: Run, b: Run, *, align: Align = "time") -> Comparison:
         unit = "m" if align == "path" else "s"
         spans = [f"{track.place[0]:g} to {track.place[-1]:g} {unit}" for track in (track_a, track_b)]
         advice = "; align them by time, which finds the offset" if align == "none" else ""
-        raise InputError(f"the runs do not lie over each other: {spans[0]} and {spans[1]}{advice}")
+        raise InputError(f"the runs do not overlap: {spans[0]} and {spans[1]}{advice}")
     rows, wanted = track_a.rows[over], wanted[over]
     none = np.empty(0)
     along, cross, heading = none, none, none
@@ -232,35 +231,35 @@ def compare(a: Run, b: Run, *, align: Align = "time") -> Comparison:
 
 @dataclass(frozen=True, eq=False)
 class Traversals:
-    """One path driven twice, as in Figure 8 of the paper: with the clocks as they stand, and laid over."""
+    """One path driven twice, as in Figure 8 of the paper, with and without alignment."""
 
     a: Run
     b: Run
-    """Both with their own start at 0 s."""
+    """Both start at 0 s."""
 
     recorded: Comparison
-    """Second by second from each run's own start."""
+    """Compared by time since the start."""
 
     timed: Comparison
-    """With B's clock moved to where the positions lie closest."""
+    """B's clock shifted so that the positions are closest."""
 
     placed: Comparison
-    """Place by place, whatever the speeds."""
+    """Compared place by place."""
 
     def summary(self) -> dict[str, Any]:
-        """The three comparisons in plain figures, for JSON."""
+        """The three comparisons as plain data, for JSON."""
         return {name: getattr(self, name).summary() for name in ("recorded", "timed", "placed")}
 
 
 def traversals(a: Run, b: Run) -> Traversals:
-    """Lay two drives of one path over each other, with and without alignment.
+    """Compare two drives of one path, with and without alignment.
 
-    Two robots that drive one path at speeds of their own drift apart, so that fields compared second by
-    second differ though each may be right where it is; place by place they are compared as fields.
+    Two robots at different speeds drift apart, so their fields differ at equal times even if each is right at
+    its place. Alignment by path compares them place by place.
 
     Args:
-        a: The run whose readings differences are given at.
-        b: Another: by another engine, with another seed, or recorded.
+        a: The reference run.
+        b: Another run: by another engine, with another seed, or recorded.
 
     Raises:
         InputError: As for `compare`.
@@ -274,13 +273,13 @@ _HOW: tuple[Align, ...] = ("none", "time", "path")
 
 @dataclass(frozen=True, eq=False)
 class _Track:
-    """The readings of a run that can be laid over another's, in order of where they were taken."""
+    """The readings of a run that can be aligned, in order of their place."""
 
     rows: NDArray[np.intp]
     place: Array
     """Time [s] or driven length [m] of each, ascending."""
     p_xy: Array
-    """Position of each [m], shape (N, 2); no columns without positions."""
+    """Position of each [m], shape (N, 2), or (N, 0) without positions."""
 
     @classmethod
     def of(cls, run: Run, position: str | None, align: Align, which: str) -> "_Track":
@@ -299,22 +298,22 @@ class _Track:
                 if align == "path"
                 else "its positions are unknown"
             )
-            raise InputError(f"the {which} run cannot be laid over the other: {what}")
+            raise InputError(f"the {which} run cannot be aligned: {what}")
         return cls(rows, place, p_xy[rows])
 
     def at(self, place: Array, values: NDArray[Any]) -> Array:
-        """A column between its readings, linearly."""
+        """A column, interpolated linearly."""
         return np.interp(place, self.place, values[self.rows])
 
 
 def driven_m(p_xy: Array) -> Array:
-    """Length driven until each of many positions, counted in steps of `STEP_M`.
+    """Driven length at each position, measured in steps of `STEP_M`.
 
     Args:
         p_xy: Positions in order of time [m], shape (N, 2).
 
     Returns:
-        Length [m], shape (N,); within a step, and at rest, it grows evenly from reading to reading.
+        Length [m], shape (N,); interpolated over the readings of a step.
     """
     corners, (x0, y0) = [0], p_xy[0].tolist()
     for i, (x, y) in enumerate(p_xy.tolist()):
@@ -326,7 +325,7 @@ def driven_m(p_xy: Array) -> Array:
 
 
 def _shift(a: _Track, b: _Track) -> float:
-    """What is to be added to B's places for its positions to lie over A's."""
+    """Shift of B's places that aligns its positions to A's."""
     span = max(a.place[-1] - a.place[0], b.place[-1] - b.place[0])
     step = span / GRID
     curve_a, curve_b = (_on_grid(track, step) for track in (a, b))
@@ -353,18 +352,18 @@ def _shift(a: _Track, b: _Track) -> float:
 
 
 def _on_grid(track: _Track, step: float) -> Array:
-    """Positions at even places, from the first on, shape (N, 2)."""
+    """Positions at equal steps, shape (N, 2)."""
     count = int((track.place[-1] - track.place[0]) / step + 1e-9) + 1
     places = track.place[0] + step * np.arange(count)
     return np.column_stack([np.interp(places, track.place, track.p_xy[:, k]) for k in (0, 1)])
 
 
 def _best_lag(a: Array, b: Array, size_m: float) -> int:
-    """Places by which B lies later than A where their mean square distance is least.
+    """Lag of B in grid points at which the mean square distance is least.
 
     sum |a_i - b_(i-k)|^2 = sum |a_i|^2 + sum |b_j|^2 - 2 sum a_i . b_(i-k), the last by FFT.
     """
-    centre = a.mean(axis=0)  # near the origin nothing cancels
+    centre = a.mean(axis=0)  # avoids cancellation
     a, b = a - centre, b - centre
     lags = np.arange(-(len(b) - 1), len(a))
     size = len(a) + len(b) - 1
@@ -385,7 +384,7 @@ def _best_lag(a: Array, b: Array, size_m: float) -> int:
 
 
 def _yaw(run: Run, position: str) -> Array | None:
-    """Heading that goes with a position [rad], shape (N,); none where it is not known."""
+    """Heading [rad], shape (N,); None if unknown."""
     if position == "p_world_base" and _known(run, "yaw"):
         return run["yaw"]
     name = HEADINGS[position]
@@ -393,18 +392,18 @@ def _yaw(run: Run, position: str) -> Array | None:
 
 
 def _direction(run: Run, position: str) -> Array:
-    """Direction of travel [rad], shape (N,), for runs that do not say where the robot faces."""
+    """Direction of travel [rad], shape (N,), for runs without a heading."""
     step = np.gradient(run[position][:, :2], axis=0)
     return np.arctan2(step[:, 1], step[:, 0])
 
 
 def _known(run: Run, name: str) -> bool:
-    """Whether a column is there and anywhere known."""
+    """Whether a column exists and is finite in some row."""
     return name in run and bool(np.isfinite(run[name]).reshape(run.rows, -1).all(axis=1).any())
 
 
 def agreement(name: str, unit: str, difference: Array, correlation: float | None = None) -> Agreement | None:
-    """A difference in figures; none where it is nowhere known."""
+    """Statistics of a difference; None if it is nowhere known."""
     known = difference[np.isfinite(difference)]
     if not len(known):
         return None
@@ -422,7 +421,7 @@ def agreement(name: str, unit: str, difference: Array, correlation: float | None
 
 
 def _correlation(a: Array, b: Array) -> float | None:
-    """Pearson's correlation where both are known; none where one does not change."""
+    """Pearson correlation where both are known; None if one is constant."""
     known = np.isfinite(a) & np.isfinite(b)
     if np.count_nonzero(known) < 3 or min(np.ptp(a[known]), np.ptp(b[known])) == 0:
         return None

@@ -1,8 +1,7 @@
-"""Resampling: a signal known at some instants, read at others.
+"""Resampling: a signal at other times.
 
-Every rule takes the values at the instants that are known and where each wanted instant lies between them,
-as `bracket` finds it. None reads a value that is not there: a wanted instant that is a known one gives its
-value to the bit, and what lies between a known value and nan is nan.
+A rule takes the values at known times, and the position of each wanted time between them as found by
+`bracket`. At a known time it gives the known value to the bit. Between a value and nan it gives nan.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,19 +18,19 @@ Array = NDArray[np.float64]
 Interpolation = Literal["linear", "hold", "angle", "quaternion"]
 
 MOST_ROWS = 50_000_000
-"""Most instants of a grid."""
+"""Largest number of times in a grid."""
 
 
 def bracket(t: Array, at: Array) -> tuple[NDArray[np.intp], Array]:
-    """Where instants lie among known ones.
+    """Position of times among known times.
 
     Args:
-        t: Known instants, ascending [s], shape (N,).
-        at: Wanted ones, none before the first or after the last [s], shape (M,).
+        t: Known times, ascending [s], shape (N,).
+        at: Wanted times within them [s], shape (M,).
 
     Returns:
-        Index of the last known instant that is not after each, and the share of the way from there to
-        the next, in [0, 1), both of shape (M,).
+        Index of the last known time not after each wanted one, and the fraction of the way to the next, in
+        [0, 1); both of shape (M,).
     """
     before = np.searchsorted(t, at, side="right") - 1
     step = t[np.minimum(before + 1, len(t) - 1)] - t[before]
@@ -39,35 +38,35 @@ def bracket(t: Array, at: Array) -> tuple[NDArray[np.intp], Array]:
 
 
 def hold(values: NDArray[Any], before: NDArray[np.intp], share: Array) -> NDArray[Any]:
-    """The latest value known at each instant: of flags, commands, and sensors that speak less often."""
+    """The last value before each time, for flags, commands and slow sensors."""
     return values[before]
 
 
 def linear(values: NDArray[Any], before: NDArray[np.intp], share: Array) -> Array:
-    """Values on the straight line between neighbours."""
+    """Linear interpolation."""
     a, b, s = _neighbours(values, before, share)
     with np.errstate(invalid="ignore"):  # inf - inf
         return np.where(s > 0, a + s * (b - a), a)
 
 
 def angle(values: NDArray[Any], before: NDArray[np.intp], share: Array) -> Array:
-    """Angles on the shorter way round between neighbours, in [-pi, pi) [rad]."""
+    """Angles along the shorter arc, in [-pi, pi) [rad]."""
     a, b, s = _neighbours(values, before, share)
     return np.where(s > 0, wrap_angle(a + s * wrap_angle(b - a)), a)
 
 
 def quaternion(values: NDArray[Any], before: NDArray[np.intp], share: Array) -> Array:
-    """Turns at constant rate between neighbours (Shoemake 1985), the shorter way round.
+    """Slerp along the shorter arc (Shoemake 1985).
 
     q(s) = (sin((1 - s) a) q0 + sin(s a) q1) / sin(a), cos(a) = q0 . q1
 
-    where a is half the angle between them; q1 is taken with the sign that makes a at most pi / 2.
+    where a is half the angle between them; the sign of q1 makes a at most pi / 2.
     """
     q0, q1, s = _neighbours(values, before, share)
     dot = np.sum(q0 * q1, axis=-1, keepdims=True)
     q1, dot = np.where(dot < 0, -q1, q1), np.clip(np.abs(dot), 0, 1)
     a = np.arccos(dot)
-    small = a < 1e-6  # there sine and angle are one, and the line between them an arc
+    small = a < 1e-6  # sin(a) = a here, so the arc is a line
     sin_a = np.where(small, 1.0, np.sin(a))
     w0 = np.where(small, 1 - s, np.sin((1 - s) * a) / sin_a)
     w1 = np.where(small, s, np.sin(s * a) / sin_a)
@@ -78,11 +77,11 @@ def quaternion(values: NDArray[Any], before: NDArray[np.intp], share: Array) -> 
 RULES: Mapping[str, Callable[[NDArray[Any], NDArray[np.intp], Array], NDArray[Any]]] = MappingProxyType(
     {"linear": linear, "hold": hold, "angle": angle, "quaternion": quaternion}
 )
-"""Rules by their names."""
+"""Rules by name."""
 
 
 def grid(start_s: float, end_s: float, rate_hz: float) -> Array:
-    """Instants from `start_s` on, `rate_hz` a second, none after `end_s` [s].
+    """Times from `start_s` to at most `end_s` [s], at a rate [Hz].
 
     Raises:
         InputError: The rate is not above 0, not finite, or gives more than `MOST_ROWS`.
@@ -101,7 +100,7 @@ def check_instants(t: ArrayLike, what: str) -> Array:
     """`t` as an array of shape (N,), if it is finite and strictly ascending.
 
     Raises:
-        InputError: It is not; the text names the first row that is wrong.
+        InputError: It is not; the message names the first wrong row.
     """
     t = np.asarray(t)
     if t.ndim != 1 or t.dtype.kind not in "fiu":
@@ -120,7 +119,7 @@ def check_instants(t: ArrayLike, what: str) -> Array:
 
 
 def _neighbours(values: NDArray[Any], before: NDArray[np.intp], share: Array) -> tuple[Array, Array, Array]:
-    """The values on either side, and the share with as many axes as they have."""
+    """The values before and after, and the fraction with their number of axes."""
     values = np.asarray(values, float)
     a, b = values[before], values[np.minimum(before + 1, len(values) - 1)]
     return a, b, share.reshape(-1, *(1,) * (values.ndim - 1))

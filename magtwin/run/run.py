@@ -1,8 +1,9 @@
-"""Run: what happened, one table on one clock, with unit and frame on every column."""
+"""Run: a table of what happened, on one clock, with unit and frame of every column."""
 
 import fnmatch
 import importlib
 import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -29,25 +30,25 @@ Metadata = Mapping[str, str | int | float | bool]
 
 @dataclass(frozen=True)
 class Column:
-    """What a column of a Run holds."""
+    """Description of a column of a Run."""
 
     unit: str
-    """SI unit, "nT" for fields, "" for numbers without one, "bool" for flags."""
+    """SI unit, "nT" for magnetic fields, "" for dimensionless numbers, "bool" for flags."""
 
     frame: str
-    """Frame its vectors are given in, "" where none applies."""
+    """Frame of its vectors, "" if none applies."""
 
     doc: str
-    """What it is, in a line."""
+    """Meaning, in one line."""
 
     width: int = 1
-    """Numbers a row: 1 gives an array of shape (N,), more gives (N, width)."""
+    """Numbers per row: 1 gives shape (N,), more gives (N, width)."""
 
     parts: tuple[str, ...] = ()
-    """Names of the numbers of a row, such as x, y, z; as many as `width` where width > 1."""
+    """Names of the numbers of a row, such as x, y, z; `width` names if width > 1."""
 
     interpolation: Interpolation = "linear"
-    """How it is read between two rows; "hold" where only what was known by then counts."""
+    """How values between two rows are found; "hold" takes the last row before."""
 
 
 _XYZ, _XYZW = ("x", "y", "z"), ("x", "y", "z", "w")
@@ -80,33 +81,33 @@ COLUMNS: Mapping[str, Column] = MappingProxyType(
             "", "world", "motion capture's orientation of base_link, w >= 0", 4, _XYZW, interpolation="hold"
         ),
         "battery_v": Column("V", "", "battery voltage", interpolation="hold"),
-        "battery_a": Column("A", "", "battery current, above 0 when it is discharged", interpolation="hold"),
+        "battery_a": Column("A", "", "battery current, above 0 while discharging", interpolation="hold"),
         "battery_fraction": Column("", "", "charge left, 0 to 1", interpolation="hold"),
         "lidar_on": Column("bool", "", "whether the LiDAR spins", interpolation="hold"),
         "b_map_nt": Column("nT", "", "anomaly map at the true pose"),
         "b_map_gradient_nt_m": Column(
-            "nT/m", "base_link", "what the anomaly map changes by along base_link's axes", 2, _PLANE
+            "nT/m", "base_link", "gradient of the anomaly map along the axes of base_link", 2, _PLANE
         ),
         "b_disturbance_nt": Column("nT", "", "disturbance by the network, by physics, or none"),
         "b_total_nt": Column("nT", "", "b_map_nt + b_disturbance_nt"),
         "b_model_error_nt": Column(
-            "nT", "", "error drawn for a network's prediction; 0 without a network, or where none is drawn"
+            "nT", "", "error drawn for a network's prediction; 0 without a network or if none is drawn"
         ),
-        "b_noise_nt": Column("nT", "", "the sensor's own error; nan where it gave no reading"),
+        "b_noise_nt": Column("nT", "", "the sensor's error; nan if it gave no reading"),
         "b_measured_nt": Column(
             "nT", "", "b_total_nt + b_model_error_nt + b_noise_nt, in steps of the sensor's resolution"
         ),
-        "b_sd_nt": Column("nT", "", "predicted standard deviation of b_measured_nt; nan where unknown"),
-        "b_vector_nt": Column("nT", "magnetometer", "exact field vector; nan where unknown", 3, _XYZ),
+        "b_sd_nt": Column("nT", "", "predicted standard deviation of b_measured_nt; nan if unknown"),
+        "b_vector_nt": Column("nT", "magnetometer", "exact field vector; nan if unknown", 3, _XYZ),
         "b_vector_measured_nt": Column(
             "nT",
             "magnetometer",
-            "latest reading of each vector axis; nan where there is none",
+            "latest reading of each vector axis; nan if there is none",
             3,
             _XYZ,
             interpolation="hold",
         ),
-        "b_truth_nt": Column("nT", "", "exact field magnitude at the sensor; nan where unknown"),
+        "b_truth_nt": Column("nT", "", "exact field magnitude at the sensor; nan if unknown"),
         "flag_bump": Column("bool", "", "the footprint touched an obstacle", interpolation="hold"),
         "flag_outside_map": Column(
             "bool", "", "the pose lies outside the map, or on masked nodes", interpolation="hold"
@@ -120,38 +121,38 @@ COLUMNS: Mapping[str, Column] = MappingProxyType(
         "flag_lost_lock": Column("bool", "", "the magnetometer lost lock", interpolation="hold"),
     }
 )
-"""Every column that magtwin itself writes, in the order of the table. A localizer adds `est_*`.
+"""Every column that magtwin writes, in the order of the table. A localizer adds `est_*`.
 
-Every error has an address, as where all are known
+Errors have separate columns. Where all are known,
 
     b_total_nt = b_map_nt + b_disturbance_nt
     b_measured_nt = b_total_nt + b_model_error_nt + b_noise_nt
     b_truth_nt = |b_vector_nt|, and = b_total_nt of a physical magnetometer
 
-So b_total_nt - b_truth_nt is the error of a neural or a map-only magnetometer's model, b_truth_nt - b_map_nt
-what the map does not know, b_noise_nt the sensor's, and b_vector_measured_nt - b_vector_nt its vector axes'.
-b_model_error_nt is a draw of such an error, with the standard deviation that the network gives: a reading is
-as far from the mean as the network was from recordings that it never saw.
+So b_total_nt - b_truth_nt is the error of a neural or map-only magnetometer's model, b_truth_nt - b_map_nt is
+what the map lacks, b_noise_nt is the sensor's error, and b_vector_measured_nt - b_vector_nt that of its
+vector axes. b_model_error_nt is a random draw of a model error, with the standard deviation that the network
+predicts. Readings are thus as far from the mean as the network was from held-out recordings.
 """
 
 
 @dataclass(frozen=True, repr=False)
 class Run(Summarized, Mapping[str, NDArray[Any]]):
-    """A table of equally long columns, and the metadata under which it came about.
+    """A table of columns of equal length, and metadata.
 
-    A mapping from column name to array: `run["b_total_nt"]` has shape (N,), `run["p_world_base"]`
-    has shape (N, 3). `bool` columns have dtype bool, all others float64. Runs are not changed in
-    place: every method that changes something gives a new one, which shares the arrays that it can.
+    A mapping from column name to array: `run["b_total_nt"]` has shape (N,), `run["p_world_base"]` has shape
+    (N, 3). `bool` columns have dtype bool, all others float64. Runs are immutable: methods return a new Run,
+    which shares unchanged arrays.
     """
 
     columns: Mapping[str, NDArray[Any]]
     """Arrays by column name, in the order of the table; all (N,) or (N, width)."""
 
     metadata: Metadata = field(default_factory=dict)
-    """What produced the run: scene, path, seed, network, map, versions."""
+    """Origin of the run: scene, path, seed, network, map, versions."""
 
     specs: Mapping[str, Column] = field(default_factory=dict)
-    """What columns of the user's own hold, of those that `COLUMNS` does not know."""
+    """Descriptions of custom columns, which are not in `COLUMNS`."""
 
     def __post_init__(self) -> None:
         arrays = {name: _column(name, values) for name, values in self.columns.items()}
@@ -160,14 +161,14 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
             raise InputError(f"columns of a Run must be equally long, got {rows}")
         object.__setattr__(self, "columns", MappingProxyType(arrays))
         object.__setattr__(self, "metadata", MappingProxyType(dict(self.metadata)))
-        own = {name: spec for name, spec in self.specs.items() if name in arrays and name not in COLUMNS}
-        for name, spec in own.items():
+        custom = {name: spec for name, spec in self.specs.items() if name in arrays and name not in COLUMNS}
+        for name, spec in custom.items():
             parts = arrays[name].shape[1] if arrays[name].ndim == 2 else 0
             if len(spec.parts) != parts:
                 raise InputError(
-                    f"column {name!r} has rows of {parts or 'no'} parts, and its spec names {len(spec.parts)}"
+                    f"column {name!r} has rows of {parts or 'no'} parts, but its spec names {len(spec.parts)}"
                 )
-        object.__setattr__(self, "specs", MappingProxyType(own))
+        object.__setattr__(self, "specs", MappingProxyType(custom))
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         return find("column", name, self.columns)
@@ -176,11 +177,11 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         return iter(self.columns)
 
     def __len__(self) -> int:
-        """Number of columns, as for any mapping; rows are counted by `rows`."""
+        """Number of columns, as for any mapping; see also `rows`."""
         return len(self.columns)
 
     def _ipython_key_completions_(self) -> list[str]:
-        """Names of the columns, which IPython and Jupyter offer after `run["`."""
+        """Column names, for completion in IPython and Jupyter."""
         return list(self.columns)
 
     @property
@@ -190,11 +191,11 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
 
     @property
     def duration_s(self) -> float:
-        """Time from the first reading to the last [s]."""
+        """Time between the first and the last reading [s]."""
         return float(self["t"][-1] - self["t"][0]) if self.rows else 0.0
 
     def spec(self, name: str) -> Column:
-        """What a column holds; for one that nobody described, what its values and its name tell."""
+        """Description of a column; guessed from name and values if the column has none."""
         values = self[name]
         known = COLUMNS.get(name) or self.specs.get(name)
         if known is not None:
@@ -208,7 +209,7 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         return Column(unit, "", "", width, parts, interpolation="hold" if whole else "linear")
 
     def with_columns(self, **columns: NDArray[Any]) -> "Run":
-        """This run with columns added, or replaced in their place."""
+        """This run with columns added or replaced."""
         return Run({**self.columns, **columns}, self.metadata, self.specs)
 
     def with_metadata(self, **metadata: str | int | float | bool) -> "Run":
@@ -216,38 +217,36 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         return Run(self.columns, {**self.metadata, **metadata}, self.specs)
 
     def with_specs(self, **specs: Column) -> "Run":
-        """This run with columns of the user's own described."""
+        """This run with descriptions of custom columns added or replaced."""
         return Run(self.columns, self.metadata, {**self.specs, **specs})
 
     def take(self, rows: "slice | NDArray[Any]") -> "Run":
-        """Some of the rows: a slice, indices, or a mask of shape (N,)."""
+        """Some rows, by a slice, indices, or a mask of shape (N,)."""
         return Run({name: values[rows] for name, values in self.items()}, self.metadata, self.specs)
 
     def select(self, *names: str) -> "Run":
-        """The columns of these names, in this order, behind the clock `t`, which always stays.
+        """Some columns in the given order, after the clock `t`, which is always kept.
 
         Args:
             names: Names, or patterns such as "b_*".
 
         Raises:
-            UnknownNameError: No column has the name, or fits the pattern.
+            UnknownNameError: No column has that name or matches the pattern.
         """
         kept = dict.fromkeys(["t"])
         for name in names:
-            if name not in self and (found := fnmatch.filter(self, name)):
-                kept |= dict.fromkeys(found)
+            if name not in self and (matches := fnmatch.filter(self, name)):
+                kept |= dict.fromkeys(matches)
             else:
                 find("column", name, self.columns)
                 kept[name] = None
         return self._derived(f"select({', '.join(names)})", {name: self[name] for name in kept})
 
     def between(self, start_s: float | None = None, end_s: float | None = None) -> "Run":
-        """The rows from `start_s` on and before `end_s` [s of `t`]; none is the run's own start or end.
-
-        As the end is left out, slices that follow each other hold every row once.
+        """The rows with start_s <= t < end_s. Default: the start and the end of the run.
 
         Raises:
-            InputError: The times are not ascending numbers, or no row lies between them.
+            InputError: `start_s` is not before `end_s`, or no row lies between them.
         """
         t = check_instants(self["t"], "the run")
         start, end = -math.inf if start_s is None else start_s, math.inf if end_s is None else end_s
@@ -266,23 +265,23 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         rate_hz: float | None = None,
         interpolation: Mapping[str, Interpolation] | None = None,
     ) -> "Run":
-        """The run at other instants, each column read as its `Column.interpolation` says.
+        """The run at other times, each column by its `Column.interpolation`.
 
-        Poses, fields and speeds are linear, yaw goes the shorter way round, orientations are slerped; flags,
-        commands and sensors slower than the magnetometer hold what was known by then. These are values at
-        instants, not averages: fewer a second than a signal swings needs a filter before.
+        Poses, fields and speeds are interpolated linearly, yaw along the shorter arc, orientations by slerp.
+        Flags, commands and sensors slower than the magnetometer hold their last value. These are values at
+        instants, not averages: filter a signal first to sample it below twice its bandwidth.
 
         Args:
-            t: Instants [s], shape (M,); or
-            rate_hz: how many a second, from the first row on [Hz].
-            interpolation: For columns by name, another rule: "linear", "hold", "angle" or "quaternion".
+            t: Times [s], shape (M,); or
+            rate_hz: Rate from the first row on [Hz].
+            interpolation: Other rules by column name: "linear", "hold", "angle" or "quaternion".
 
         Raises:
-            InputError: Neither or both of `t` and `rate_hz` are given, instants do not ascend, lie outside
-                the run (nothing is extrapolated), or a rule does not fit its column.
+            InputError: Neither or both of `t` and `rate_hz` are given; times do not ascend or lie outside of
+                the run (nothing is extrapolated); or a rule does not fit its column.
         """
         if (t is None) == (rate_hz is None):
-            raise InputError("resample needs t or rate_hz, one of the two")
+            raise InputError("resample needs either t or rate_hz")
         clock = check_instants(self["t"], "the run")
         if not len(clock):
             raise InputError("a run of no rows cannot be resampled")
@@ -299,17 +298,17 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         return self._derived(f"resample({how})", columns)
 
     def join(self, other: "Run", suffix: str = "_2") -> "Run":
-        """The columns of another run beside this one's, causally on this one's clock.
+        """Add the columns of another run, held causally on this run's clock.
 
-        Each row gets the latest that the other knew by then. Metadata of the other get the suffix too.
+        Each row gets the other run's last values before it. Names of columns and metadata get the suffix.
 
         Args:
-            other: A run that begins no later, and ends no more than one of its own steps earlier; see
-                `between`, and `with_columns` to shift its `t`.
-            suffix: What the other's names get at their end.
+            other: A run that covers this one, up to one of its own steps at the end. `between` cuts a run,
+                `with_columns` can shift its `t`.
+            suffix: Suffix of the other run's names.
 
         Raises:
-            InputError: It does not cover this run, or a name would be there twice.
+            InputError: It does not cover this run, or a name would exist twice.
         """
         clock, theirs = check_instants(self["t"], "the run"), check_instants(other["t"], "the run to join")
         if not len(clock) or not len(theirs):
@@ -331,15 +330,15 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
 
     @staticmethod
     def concat(runs: "Sequence[Run]", *, offset: bool = False) -> "Run":
-        """Runs one after the other, as one; metadata in which they differ are left out.
+        """Concatenate runs; only metadata that are equal in all of them are kept.
 
         Args:
-            runs: At least one, all of the same columns.
-            offset: Whether each is shifted to begin one step after the last one ended. Otherwise their
-                times must run on.
+            runs: At least one run, all with the same columns.
+            offset: Shift each run to begin one step after the previous one. Otherwise each must begin after
+                the previous one ends.
 
         Raises:
-            InputError: There is none, their columns differ, or times do not run on.
+            InputError: There is no run, their columns differ, or times overlap.
         """
         if not runs:
             raise InputError("concat needs at least one run")
@@ -348,7 +347,9 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         for i, run in enumerate(runs):
             if set(run) != set(first):
                 name = sorted(set(run) ^ set(first))[0]
-                raise InputError(f"runs 0 and {i}: column {name!r} is in one alone; select what they share")
+                raise InputError(
+                    f"runs 0 and {i}: column {name!r} is in only one of them; select the shared columns"
+                )
             for name in first:
                 if run[name].shape[1:] != first[name].shape[1:]:
                     shapes = f"{first[name].shape[1:]} and {run[name].shape[1:]}"
@@ -371,21 +372,21 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         return Run(columns, shared, first.specs)._derived(f"concat({len(runs)} runs)")
 
     def flat(self) -> dict[str, NDArray[Any]]:
-        """Every number of a row on its own: columns (N,) by name, a vector's as `odom_p_x`, `odom_p_y`, ...
+        """Scalar columns of shape (N,) by name; a vector is split into `odom_p_x`, `odom_p_y`, ...
 
         Raises:
-            InputError: A column has other shapes or kinds than numbers and flags, or two come to one name.
+            InputError: A column does not hold numbers or flags, or two columns would have the same name.
         """
         return {name: values for name, (_, _, values) in self.members().items()}
 
     def members(self) -> dict[str, tuple[str, str, NDArray[Any]]]:
-        """Of each name in `flat`: the column that it comes from, its part ("" for a scalar), the values."""
+        """For each name in `flat`: its column, its part ("" for a scalar), and its values."""
         flat: dict[str, tuple[str, str, NDArray[Any]]] = {}
         for name, values in self.items():
             if values.ndim not in (1, 2) or values.dtype.kind not in "bfiu":
                 raise InputError(
-                    f"column {name!r} cannot stand in a table: numbers or flags of shape (N,) or (N, width) "
-                    f"can, got {values.dtype} of shape {values.shape}"
+                    f"column {name!r} cannot stand in a table: it needs numbers or flags of shape (N,) or "
+                    f"(N, width), got {values.dtype} of shape {values.shape}"
                 )
             parts = self.spec(name).parts if values.ndim == 2 else ()
             rows = {f"{name}_{part}": (name, part, values[:, i]) for i, part in enumerate(parts)}
@@ -396,9 +397,9 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         return flat
 
     def to_pandas(self) -> "pd.DataFrame":
-        """A DataFrame with the columns of `flat`, one row a reading.
+        """A DataFrame with the columns of `flat`, one row per reading.
 
-        `attrs["units"]` and `attrs["frames"]` give the unit and the frame of every column,
+        `attrs["units"]` and `attrs["frames"]` hold the unit and the frame of every column,
         `attrs["metadata"]` the run's metadata.
 
         Raises:
@@ -414,7 +415,7 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         return frame
 
     def to_polars(self) -> "pl.DataFrame":
-        """A polars DataFrame with the columns of `flat`, one row a reading.
+        """A polars DataFrame with the columns of `flat`, one row per reading.
 
         Raises:
             InputError: polars is not installed, or a column cannot stand in a table.
@@ -422,10 +423,10 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         return _optional("polars").DataFrame(self.flat())
 
     def to_xarray(self) -> "xr.Dataset":
-        """A Dataset along the coordinate `t` [s]; vectors keep a second dimension of named parts.
+        """A Dataset with the coordinate `t` [s]; vectors have a second dimension of named parts.
 
-        The dimensions of parts are called after them (`x_y_z`, `left_right`); `units`, `frame` and
-        `long_name` are attributes of each variable, the run's metadata those of the dataset.
+        That dimension is named after the parts (`x_y_z`, `left_right`). `units`, `frame` and `long_name` are
+        attributes of each variable; the run's metadata are attributes of the dataset.
 
         Raises:
             InputError: xarray is not installed, or the run has no column `t`.
@@ -459,8 +460,23 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         """
         return importlib.import_module("magtwin").plot(self, anomaly_map=anomaly_map)  # loads io when called
 
+    def save(self, path: "str | os.PathLike[str]", **options: Any) -> None:
+        """Write the run to a file in the format of its suffix; `magtwin.load_run` gives it back.
+
+        Args:
+            path: The file to make, such as run.parquet, .mcap, .rrd, .csv, .npz or .usdc. A name without a
+                suffix is the folder of a bag.
+            options: `twin`, `scans`, `planned`, `force` and options of single formats, as for
+                `magtwin.save_run`.
+
+        Raises:
+            InputError: The suffix is unknown, the run's clock does not ascend, or the file exists and `force`
+                is not set.
+        """
+        importlib.import_module("magtwin").save_run(self, path, **options)  # loads io when called
+
     def report(self, title: str = "Run") -> Report:
-        """What happened, in a few figures; columns that the run does not have are passed over."""
+        """The run in a few figures; missing columns are skipped."""
         figures = [Figure("duration", self.duration_s, "s"), Figure("readings", self.rows)]
         if "p_world_base" in self:
             steps = np.diff(self["p_world_base"][:, :2], axis=0)
@@ -487,13 +503,13 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         return Report(title, tuple(figures), dict(self.metadata), self._verdict())
 
     def _verdict(self) -> str:
-        """How well a network predicted the exact field of a simulated run; "" where none did."""
+        """How well a network predicted the exact field of a simulated run; "" without a network."""
         tally = Tally()
         self.add_to(tally)
         return tally.verdict("the exact field of this run, one session", holds=HOLDS_ONE)
 
     def add_to(self, tally: Tally) -> None:
-        """Add the errors of a simulated run's network against the exact field, where it has both."""
+        """Add the errors of a simulated run's network against the exact field, if it has both."""
         wanted = {"b_sd_nt", "b_total_nt", "b_map_nt", "b_truth_nt"}
         if self.metadata.get("magnetometer") != "neural" or not wanted <= set(self):
             return
@@ -502,11 +518,10 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         tally.add(self["b_total_nt"] - truth, self["b_map_nt"] + mean - truth, self["b_sd_nt"])
 
     def _derived(self, step: str, columns: Mapping[str, NDArray[Any]] | None = None) -> "Run":
-        """What a step made of this run, and the fact that it did."""
-        told = "; ".join(text for text in (str(self.metadata.get("derived", "")), step) if text)
-        return Run(
-            self.columns if columns is None else columns, {**self.metadata, "derived": told}, self.specs
-        )
+        """This run after a step, which is noted in its metadata."""
+        derived = "; ".join(filter(None, (str(self.metadata.get("derived", "")), step)))
+        columns = self.columns if columns is None else columns
+        return Run(columns, {**self.metadata, "derived": derived}, self.specs)
 
     def _summary(self) -> Summary:
         return run_summary(
@@ -516,13 +531,13 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         )
 
     def _span(self) -> str:
-        """From when to when it goes, for refusals."""
+        """Its time span, for error messages."""
         t = self["t"]
         return f"the run goes from {t[0]:g} to {t[-1]:g} s" if len(t) else "the run has no rows"
 
 
 def check_clock(run: Run, what: str) -> None:
-    """Refuse a run without a clock, or with one that does not ascend; `what` says whose it is."""
+    """Refuse a run without a clock or whose clock does not ascend; `what` names it in the message."""
     if "t" not in run.columns:
         known = ", ".join(list(run.columns)[:5]) or "none"
         raise InputError(f"{what}: not a Run: column 't' is missing (columns: {known}, ...)")
@@ -530,7 +545,7 @@ def check_clock(run: Run, what: str) -> None:
 
 
 def _resampled(run: Run, at: NDArray[Any], rules: Mapping[str, str]) -> dict[str, NDArray[Any]]:
-    """Columns of a run at instants that it covers [s], shape (M,)."""
+    """Columns of a run at times within it [s], shape (M,)."""
     before, share = bracket(run["t"], at)
     columns = {}
     for name, values in run.items():
@@ -553,7 +568,7 @@ def _optional(module: str) -> Any:
 
 
 def _column(name: str, values: NDArray[Any]) -> NDArray[Any]:
-    """`values` in the dtype and shape that COLUMNS gives `name`; names unknown to it stay as they are."""
+    """Values in the dtype and shape of `COLUMNS`; custom columns are unchanged."""
     spec = COLUMNS.get(name)
     if spec is None:
         return np.asarray(values)

@@ -1,4 +1,4 @@
-"""What a Run shows of itself: size, origin, path, range of the field, and flags."""
+"""The summary of a Run: size, origin, path, range of the field, and flags."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -18,7 +18,7 @@ def run_summary(
 
     Args:
         columns: Arrays by column name, shape (N,) or (N, width).
-        metadata: What produced the run.
+        metadata: The run's metadata.
         described: Name, unit, frame and meaning of each column.
     """
     flags = _flags(columns)
@@ -48,7 +48,7 @@ def _title(columns: Columns) -> str:
 
 
 def _origin(metadata: Mapping[str, Any]) -> str:
-    """Scene, path, robot and seed of a run, as far as its metadata name them."""
+    """Scene, path, robot and seed, as far as the metadata hold them."""
     parts = [
         f"{name} {metadata[name]}"
         for name in ("scene", "path", "robot", "seed", "session")
@@ -62,7 +62,7 @@ def _origin(metadata: Mapping[str, Any]) -> str:
 
 
 def _driven(columns: Columns) -> str:
-    """Length and extent of what was driven, by the best position that the run has."""
+    """Length and extent of the drive, by the best position column."""
     for name in ("p_world_base", "mocap_p", "odom_p"):
         p = columns.get(name, np.array([]))
         p = p[np.isfinite(p).all(axis=1)] if p.ndim == 2 else np.empty((0, 3))
@@ -74,7 +74,7 @@ def _driven(columns: Columns) -> str:
 
 
 def _field_range(columns: Columns) -> str:
-    """Range and mean of the reading, or of the best field that the run has."""
+    """Range and mean of the reading, or of the best field column."""
     for name in ("b_measured_nt", "b_total_nt", "b_truth_nt", "b_map_nt"):
         values = columns.get(name, np.array([]))
         known = values[np.isfinite(values)]
@@ -85,7 +85,7 @@ def _field_range(columns: Columns) -> str:
 
 
 def _flags(columns: Columns) -> str:
-    """Flags that are set, and in how many rows."""
+    """Flags that are set, with their number of rows."""
     raised = {
         n: int(v.sum()) for n, v in columns.items() if n.startswith("flag_") and v.dtype == bool and v.any()
     }

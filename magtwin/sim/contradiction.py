@@ -1,4 +1,4 @@
-"""Contradiction: how far a map is from the field that a scene's Earth and magnetised things make."""
+"""Contradiction: the difference between a map and the field of a scene's Earth and magnetised things."""
 
 from dataclasses import dataclass
 
@@ -7,19 +7,18 @@ import numpy as np
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.sim.interference import ambient_gradient_nt_m
-from magtwin.sim.room_survey import in_steel
-from magtwin.sim.survey import field_at_rest_nt, sensor_height_m
+from magtwin.sim.survey import field_at_rest_nt, in_steel, sensor_height_m
 from magtwin.spec.scene import Scene
 
 LEAST_NT = 500.0
-"""Difference (rms) up to which a map and sources always agree [nT]: a fit's error, a change of hard iron."""
+"""Difference (rms) up to which a map and sources always agree [nT]: fit error, change of hard iron."""
 
 PART = 0.3
-"""Difference (rms) up to which they agree, as a part of the map's own standard deviation: a coarse survey of
-the same field errs by a fifth of it, the map of another room by 1.4 times it."""
+"""Difference (rms) up to which they agree, as a share of the map's standard deviation. A coarse survey of the
+same field has 0.2, the map of another room 1.4."""
 
 MOST_NODES = 20_000
-"""Nodes that are compared; of a larger map every second one, every third one, and so on."""
+"""Most nodes that are compared; a larger map is thinned."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,11 +29,11 @@ class Contradiction:
     """Root mean square [nT]."""
 
     largest_nt: float
-    """The difference with the largest magnitude, with its sign [nT]."""
+    """Largest difference, with its sign [nT]."""
 
     x_m: float
     y_m: float
-    """Where it is largest, in world [m]."""
+    """Place of the largest difference in world [m]."""
 
     yaw: float
     """Heading there [rad]."""
@@ -43,11 +42,11 @@ class Contradiction:
     """Root mean square up to which map and sources agree [nT]."""
 
     nodes: int
-    """How many nodes were compared."""
+    """Number of nodes compared."""
 
     @property
     def agrees(self) -> bool:
-        """Whether the map can be one of these sources."""
+        """Whether the map can be a map of these sources."""
         return self.rms_nt <= self.allowed_nt
 
     def __str__(self) -> str:
@@ -58,10 +57,10 @@ class Contradiction:
 
 
 def contradiction_nt(scene: Scene, anomaly_map: AnomalyMap) -> Contradiction:
-    """Compare a map with the exact field of a scene, as its robot at rest would read it at each node.
+    """Compare a map with the exact field that the scene's robot reads at rest at each node.
 
-    Nodes at which the robot would stand in something magnetised, or at which its magnetometer would lose
-    lock, are left out: a survey has no reading there, and a map has filled them from their neighbours.
+    Nodes where the robot would stand in something magnetised or lose lock are left out, because a survey has
+    no reading there.
 
     Args:
         scene: A scene with the Earth's field; its own map is not read.
@@ -105,7 +104,7 @@ def contradiction_nt(scene: Scene, anomaly_map: AnomalyMap) -> Contradiction:
 
 
 def _in_lock(scene: Scene, p_xy: np.ndarray, height_m: float, asked: np.ndarray) -> np.ndarray:
-    """Whether the magnetometer keeps lock at points (N, 2), shape (N,); true where that is not asked."""
+    """Whether the magnetometer keeps lock at points (N, 2), shape (N,); true if not `asked`."""
     steepest = scene.robot.magnetometer.gradient_max_nt_m
     kept = np.ones(len(p_xy), bool)
     if steepest and asked.any():
@@ -115,27 +114,27 @@ def _in_lock(scene: Scene, p_xy: np.ndarray, height_m: float, asked: np.ndarray)
 
 
 def check_agrees(scene: Scene, anomaly_map: AnomalyMap, where: str) -> Contradiction | None:
-    """Refuse a scene whose map is not of its Earth and sources.
+    """Refuse a scene whose map contradicts its Earth and sources.
 
     Args:
-        scene: The scene. Without the Earth's field, or without sources and furniture, it has nothing that a
-            map could contradict: there the map is the truth.
+        scene: The scene. Without the Earth's field, or without sources and furniture, the map is the truth.
         anomaly_map: Its map.
-        where: What to call the two, such as "lab.toml with the map F.usdc".
+        where: Name of the two for the text, such as "lab.toml with the map F.usdc".
 
     Returns:
-        The difference, if it is small enough; None if there is nothing to contradict.
+        The difference if it is small enough; None if there is nothing to contradict.
 
     Raises:
         InputError: They differ by more than `contradiction_nt` allows.
     """
     if scene.earth is None or not scene.magnets:
         return None
-    found = contradiction_nt(scene, anomaly_map)
-    if not found.agrees:
+    difference = contradiction_nt(scene, anomaly_map)
+    if not difference.agrees:
         raise InputError(
-            f"{where}: the map differs from the field of the scene's Earth, sources and furniture by {found} "
-            f"({found.allowed_nt:,.0f} nT rms would do); if the map is right, remove the sources and the "
-            "furniture (or their magnetization); if they are, survey them: magtwin map survey"
+            f"{where}: the map differs from the field of the scene's Earth, sources and furniture by "
+            f"{difference} ({difference.allowed_nt:,.0f} nT rms is allowed); if the map is right, remove the "
+            "sources and the furniture (or their magnetization); if they are right, survey them: "
+            "magtwin map survey"
         )
-    return found
+    return difference

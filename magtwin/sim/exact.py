@@ -1,17 +1,17 @@
-"""ExactField: what the simulation takes for the true field of a lab, and what a magnetometer there reads.
+"""ExactField: the true field of a simulated lab, and the field at a magnetometer in it.
 
-Where a scene has the Earth's field and magnetised things, these make the field. Where it has only a survey,
-the fitted map is the field. A map is a magnitude, so the direction of the field comes from the harmonic fit,
-else from the scene's [earth], else it is assumed: `DIP` below the horizon, towards world +y.
+If a scene has the Earth's field and magnetised things, they make the field. If it has only a survey, the
+fitted map is the field. A map is a magnitude, so the direction of the field comes from the harmonic fit, or
+else from the scene's [earth], or else it is assumed: `DIP` below the horizon, towards world +y.
 
-A map that depends on the heading was read by a robot that turned: it holds the permanent and induced field
-of that robot, as it was in the session of the survey. The robot of the scene is taken to be that robot. It
-adds what was not there when it stood and surveyed: the change of its permanent field since
+A map that depends on the heading was surveyed by a robot that turned. It contains the permanent and induced
+field of that robot in the session of the survey, and the robot of the scene is taken to be that robot. It
+adds only what was absent during the survey: the change of its permanent field since
 (`PlatformFieldSpec.hard_iron_change_nt`), eddy currents, motors, LiDAR, supply current and the iron in its
 wheels. So at rest, in the session of the survey, it reads exactly the map.
 
-A map that is alike in all headings, or has one, cannot tell the robot from the lab. It is taken to be the
-field of the lab at the sensor, and the robot adds its whole platform field.
+A map that is the same for all headings, or has only one, is taken as the field of the lab at the sensor, and
+the robot adds its whole platform field.
 """
 
 from collections.abc import Mapping
@@ -39,15 +39,14 @@ from magtwin.spec.scene import Scene
 Array = NDArray[np.float64]
 
 DIP = np.radians(60.0)
-"""Dip of the field where nothing tells its direction [rad]: that of magnetic latitude 41 deg north."""
-
+"""Assumed dip of a field of unknown direction [rad]: that of magnetic latitude 41 deg north."""
 
 OFF_HEIGHT_M = 0.03
-"""Difference of the sensor's height from the map's from which a run says so [m]: iron in a floor 0.5 m below
-makes a field that changes by a sixth in it."""
+"""Difference of the sensor's height from the map's that is noted in a run [m]: the field of iron 0.5 m below
+changes by a sixth over it."""
 
 ROUNDING_NT = 1e-9
-"""What a magnitude loses when it becomes a vector and a magnitude again, at most [nT]."""
+"""Largest rounding error of a magnitude that was a vector in between [nT]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -57,11 +56,11 @@ class ExactField:
     scene: Scene
     anomaly_map: AnomalyMap
     outside: Outside = "nan"
-    """What the map reads outside its extent."""
+    """Reading of the map outside its extent."""
 
     @cached_property
     def of(self) -> Literal["sources", "map", "none"]:
-        """What makes it: Earth and sources, the map, or nothing, with a constant map and no Earth.
+        """The origin of the field: Earth and sources, the map, or none (a constant map and no Earth).
 
         Earth without sources over a constant map is a uniform field, and counts as sources.
         """
@@ -73,13 +72,13 @@ class ExactField:
 
     @cached_property
     def holds_robot(self) -> bool:
-        """Whether the map holds the robot as it surveyed: its values depend on the heading."""
+        """Whether the map contains the surveying robot: its values depend on the heading."""
         values = np.where(self.anomaly_map.valid, self.anomaly_map.values_nt, np.nan)
         return bool(np.any(np.abs(values - values[:1]) > CONSTANT_NT))
 
     @property
     def metadata(self) -> Mapping[str, str]:
-        """What a run is to say of its truth; empty where Earth and sources make it."""
+        """Metadata of a run on its true field; empty if Earth and sources make it."""
         if self.of != "map":
             return {}
         if self.holds_robot:
@@ -89,19 +88,19 @@ class ExactField:
         else:
             added = "the whole platform field from the robot's spec, as a map without headings holds none"
         if self.anomaly_map.harmonic is not None:
-            way = "from the harmonic fit"
+            direction = "from the harmonic fit"
         elif self.scene.earth is not None:
-            way = "that of [earth]"
+            direction = "that of [earth]"
         else:
-            way = f"assumed {np.degrees(DIP):.0f} deg down towards +y, as there is no [earth]"
-        told = f"the fitted map; {added}; direction of the field {way}"
+            direction = f"assumed {np.degrees(DIP):.0f} deg down towards +y, as there is no [earth]"
+        text = f"the fitted map; {added}; direction of the field {direction}"
         at, sensor = self.anomaly_map.height_m, self.scene.robot.base_height_m
         sensor += self.scene.robot.p_base_magnetometer[2]
         if at is not None and abs(sensor - at) > OFF_HEIGHT_M:
-            told += (
+            text += (
                 f"; it holds {at:.3g} m above the floor, and the sensor is at {sensor:.3g} m (map continue)"
             )
-        return {"truth": told}
+        return {"truth": text}
 
     def at_sensor_nt(
         self,
@@ -123,11 +122,11 @@ class ExactField:
             true: The motion at these times.
             lidar_on: Whether the LiDAR spins, shape (N,).
             supply_a: Current drawn from the battery [A], shape (N,).
-            at_rest_nt: What the map gives at each pose [nT], shape (N,), where the caller has looked it up;
-                a map of one heading is looked up at the sensor instead.
+            at_rest_nt: The map at each pose [nT], shape (N,), if the caller has looked it up. A map of one
+                heading is looked up at the sensor instead.
 
         Returns:
-            Field in base_link axes [nT], shape (N, 3); nan where the map is, or where there is no truth.
+            Field in base_link axes [nT], shape (N, 3); nan where the map is nan or nothing is known.
         """
         if self.of == "none":
             return np.full((len(true.pose), 3), np.nan)
@@ -144,7 +143,7 @@ class ExactField:
         return own_field_nt(robot, motion, t, b_base, b_rate, true=true, lidar_on=lidar_on, supply_a=supply_a)
 
     def magnitude_nt(self, vector_nt: Array, at_rest_nt: Array) -> Array:
-        """Magnitudes of vectors (N, 3) [nT], shape (N,); the map's own to the bit if nothing is added."""
+        """Magnitudes of vectors (N, 3) [nT], shape (N,); the exact bytes of the map if nothing is added."""
         x, y, z = vector_nt.T
         size = np.sqrt(x * x + y * y + z * z)
         if self.of != "map":
@@ -154,10 +153,7 @@ class ExactField:
     def _mapped(
         self, scene: Scene, true: Moment, at_rest_nt: Array | None, *, eddy: bool
     ) -> tuple[Array, Array | float]:
-        """The map at the robot as a vector (N, 3) [nT], and its rate of change [nT/s], in base_link axes.
-
-        The rate is for eddy currents; 0.0 without them.
-        """
+        """The map as a vector [nT], and its rate of change for eddy currents [nT/s], in base_link axes."""
         field, robot, yaw = self.anomaly_map, scene.robot, true.pose[:, 2]
         cos, sin = np.cos(yaw), np.sin(yaw)
         place = true.pose[:, :2] if self.holds_robot else sensor_places(robot, true.pose)[:, :2]
@@ -186,11 +182,11 @@ class ExactField:
         return b_base, np.nan_to_num(rate)
 
     def _ambient(self, scene: Scene, true: Moment, cos: Array, sin: Array) -> Array:
-        """The field without the robot, of any length, in world axes, shape (N, 3)."""
+        """Direction of the field without the robot, of any length, in world axes, shape (N, 3)."""
         harmonic = self.anomaly_map.harmonic
         if harmonic is None:
-            way = self.scene.earth.b_world_nt if self.scene.earth else (0.0, np.cos(DIP), -np.sin(DIP))
-            return np.broadcast_to(np.asarray(way, float), (len(cos), 3))
+            uniform = self.scene.earth.b_world_nt if self.scene.earth else (0.0, np.cos(DIP), -np.sin(DIP))
+            return np.broadcast_to(np.asarray(uniform, float), (len(cos), 3))
         from magtwin.field.sources.compiled_dipoles import dipole_field_nt  # compiled, as simulations are
 
         if self.holds_robot:
@@ -204,10 +200,10 @@ class ExactField:
 
 
 def check_truth(scene: Scene, anomaly_map: AnomalyMap) -> None:
-    """Refuse a physical magnetometer where neither sources nor a map make a field.
+    """Refuse a physical magnetometer without a field: a constant map and no Earth's field.
 
     Raises:
-        InputError: The map is constant, and there is no Earth's field.
+        InputError: The scene is one of these.
     """
     physical = scene.robot.magnetometer.kind == "physical"
     if physical and ExactField(scene=scene, anomaly_map=anomaly_map).of == "none":
@@ -218,7 +214,7 @@ def check_truth(scene: Scene, anomaly_map: AnomalyMap) -> None:
 
 
 def check_field(scene: Scene, anomaly_map: AnomalyMap) -> None:
-    """Refuse a scene whose field is constant: no magnetometer can tell one place from another.
+    """Refuse a scene whose field is constant, because all places in it are alike to a magnetometer.
 
     Raises:
         InputError: The map is constant, and nothing on the stage is magnetised.
@@ -236,10 +232,10 @@ def check_field(scene: Scene, anomaly_map: AnomalyMap) -> None:
 
 
 def check_read(run: Run, anomaly_map: AnomalyMap) -> None:
-    """Refuse a run that read no field, or one field all along, because it was driven off the map.
+    """Refuse a run that was driven off the map, so that its readings are nan or constant.
 
     Raises:
-        InputError: Every reading is nan, or all are the nearest value of a map that the robot never met.
+        InputError: Every reading is nan, or all are the nearest value of a map that the robot never reached.
     """
     if not {"p_world_base", "b_map_nt", "b_total_nt"} <= set(run) or not run.rows:
         return

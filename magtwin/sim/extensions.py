@@ -9,8 +9,8 @@ Each kind has a protocol, a registry, and a decorator that registers an entry un
 | controller | `motion.controllers.Controller` | `@controller("mine")` | `simulate(..., controller="mine")` |
 | engine | `motion.engine.Engine` | `@engine("mine")` | `simulate(..., engine="mine")` |
 
-Functions and objects can be given in place of names. An installed package registers an entry by an entry
-point of group `magtwin.sensors`, `magtwin.interference`, `magtwin.controllers` or `magtwin.engines`.
+Functions and objects can be given in place of names. Installed packages register entries by entry points of
+the groups `magtwin.sensors`, `magtwin.interference`, `magtwin.controllers` and `magtwin.engines`.
 
     @sensor("speedometer")
     class Speedometer:
@@ -37,6 +37,8 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.registry import Registry
 from magtwin.run.run import COLUMNS, Column
+from magtwin.sim.motion.controllers import CUSTOM_CONTROLLERS
+from magtwin.sim.motion.engine import ENGINES
 from magtwin.sim.motion.sampling import Moving
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
@@ -83,6 +85,10 @@ INTERFERENCE: Registry[Interference] = Registry("interference term", "interferen
 
 sensor = SENSORS.register
 interference = INTERFERENCE.register
+controller = CUSTOM_CONTROLLERS.register
+"""Registers a `magtwin.sim.motion.controllers.ControllerFactory`, such as a controller's class."""
+engine = ENGINES.register
+"""Registers a `magtwin.sim.motion.engine.Engine`."""
 
 
 def start_sensors(

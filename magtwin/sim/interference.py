@@ -1,4 +1,4 @@
-"""Fields at the magnetometer: the lab's, and what the robot adds to it."""
+"""Fields at the magnetometer: the lab's field, and the field that the robot adds."""
 
 import math
 from collections.abc import Sequence
@@ -26,14 +26,13 @@ from magtwin.spec.sensors import BatterySpec
 Array = NDArray[np.float64]
 
 TORQUE_S = 0.05
-"""Time over which a wheel's acceleration is taken [s]: as long as its motor's current takes to follow."""
+"""Time over which a wheel's acceleration is averaged [s]: the lag of its motor's current."""
 
 CREEP = 0.05
-"""Rate of a wheel from which its friction is whole [rad/s]; below, it is in proportion."""
+"""Rate of a wheel below which its friction falls in proportion [rad/s]."""
 
 MANY = 20_000
-"""Points at one height from which on their field is looked up, as `level_field_nt` does: so many take as long
-as the floor of a lab."""
+"""Number of points at one height for which the table of `level_field_nt` pays."""
 
 DRAWN = (
     "hard_iron_nt",
@@ -49,14 +48,14 @@ DRAWN = (
     "caster_phase",
     "lidar_phase",
 )
-"""Figures of a platform by which one day differs from another."""
+"""Figures of a platform that differ between sessions."""
 
 NEAREST_M = 1e-3
-"""Distance from the middle of a wheel within which no magnetometer can be [m]."""
+"""Least distance of a magnetometer from the middle of a wheel [m]."""
 
 
 def ambient_field_nt(scene: Scene, p_world: ArrayLike) -> Array:
-    """The lab's field without the robot: the Earth's, uniform, and that of every source.
+    """The lab's field without the robot: the uniform field of the Earth, and that of every source.
 
     Args:
         scene: A scene whose Earth's field is known.
@@ -66,7 +65,7 @@ def ambient_field_nt(scene: Scene, p_world: ArrayLike) -> Array:
         Field in world axes [nT], shape (..., 3).
 
     Raises:
-        InputError: The scene has no Earth's field, so only its map is known; or a shape is not as above.
+        InputError: The scene has no Earth's field, or a shape is wrong.
     """
     earth, bodies = _known(scene)
     p = np.asarray(p_world, float)
@@ -77,7 +76,7 @@ def ambient_field_nt(scene: Scene, p_world: ArrayLike) -> Array:
 
 
 def level_field_nt(scene: Scene, p_xy: ArrayLike, height_m: float) -> tuple[Array, Array]:
-    """`ambient_field_nt` at one height, to 1e-3 nT, and how it changes along x and y: for robots that drive.
+    """`ambient_field_nt` at one height, to 1e-3 nT, and its slopes along x and y, for robots that drive.
 
     Args:
         scene: A scene whose Earth's field is known.
@@ -99,8 +98,8 @@ def level_field_nt(scene: Scene, p_xy: ArrayLike, height_m: float) -> tuple[Arra
 def level_gradient_nt_m(scene: Scene, p_xy: ArrayLike, height_m: float) -> Array:
     """`ambient_gradient_nt_m` at one height.
 
-    How the field changes upwards follows from how it does along x and y, as curl B = 0 and div B = 0 outside
-    of what is magnetised.
+    The vertical slopes follow from those along x and y, because curl B = 0 and div B = 0 outside of
+    magnetised things.
 
     Args:
         scene: A scene whose Earth's field is known.
@@ -123,7 +122,7 @@ def level_gradient_nt_m(scene: Scene, p_xy: ArrayLike, height_m: float) -> Array
 
 
 def ambient_gradient_nt_m(scene: Scene, p_world: ArrayLike) -> Array:
-    """How steep the lab's field is: the size of the gradient of its magnitude, |grad |B||.
+    """Steepness of the lab's field: |grad |B||.
 
     Args:
         scene: A scene whose Earth's field is known.
@@ -146,13 +145,13 @@ def ambient_gradient_nt_m(scene: Scene, p_world: ArrayLike) -> Array:
 
 
 def _known(scene: Scene) -> tuple[Array, Bodies]:
-    """The Earth's field [nT] (3,), and everything that is magnetised."""
+    """The Earth's field [nT] (3,), and all magnetised things."""
     earth = _known_earth(scene)
     return np.array(earth.b_world_nt), _bodies(scene.magnets, earth)
 
 
 def _known_earth(scene: Scene) -> EarthFieldSpec:
-    """The Earth's field, where it is known."""
+    """The Earth's field; refuse a scene without it."""
     if scene.earth is None:
         raise InputError(
             f"scene {scene.name!r} has no Earth's field, so its exact field is not known; "
@@ -163,7 +162,7 @@ def _known_earth(scene: Scene) -> EarthFieldSpec:
 
 @lru_cache(maxsize=8)
 def _bodies(magnets: tuple[SourceSpec, ...], earth: EarthFieldSpec) -> Bodies:
-    """What is magnetised, ready to be evaluated."""
+    """Magnetised things, ready to be evaluated."""
     points = [source for source in magnets if source.shape == "point"]
     return Bodies(
         [body_of(source, earth.b_world_nt) for source in magnets if source.shape != "point"],
@@ -174,7 +173,7 @@ def _bodies(magnets: tuple[SourceSpec, ...], earth: EarthFieldSpec) -> Bodies:
 
 @lru_cache(maxsize=8)
 def _plane(magnets: tuple[SourceSpec, ...], earth: EarthFieldSpec, height_m: float) -> Plane:
-    """Where a robot's magnetometer comes by."""
+    """Table of the field at the height of a robot's magnetometer."""
     return Plane(_bodies(magnets, earth), height_m)
 
 
@@ -188,20 +187,20 @@ def platform_field_nt(
     lidar_angle: ArrayLike = 0.0,
     battery_a: ArrayLike = 0.0,
 ) -> Array:
-    """The field at the magnetometer, the robot's own part included but for iron that turns.
+    """The field at the magnetometer with the robot's own part, except for iron that turns.
 
     B = (1 + S) b + h + E db/dt + m_l T_l + m_r T_r + on (l + l_c cos a + l_s sin a) + c i: induced, permanent
-    and eddy parts after Tolles and Lawson (1950), then the motors, whose currents are in proportion to their
-    torques T, the LiDAR and its motor, and the supply current. A robot at rest is what the defaults say.
+    and eddy parts after Tolles and Lawson (1950), then the motors, whose currents are proportional to their
+    torques T, the LiDAR and its motor, and the supply current. The defaults are those of a robot at rest.
 
     Args:
         platform: S, h, E, m_l, m_r, l, l_c, l_s and c.
         b_body: Ambient field b in base_link axes [nT], shape (N, 3).
-        b_rate: Its rate of change in base_link axes, turning of the robot included [nT/s], shape (N, 3).
+        b_rate: Its rate of change in base_link axes, with the turning of the robot [nT/s], shape (N, 3).
         motor_nm: Torques T of the left and right wheel [N m], shape (N, 2); see `wheel_torques_nm`.
         lidar_on: Whether the LiDAR spins, shape (N,).
         lidar_angle: Angle a of its motor [rad], shape (N,).
-        battery_a: Supply current above that at rest with a full pack i [A], shape (N,); see `rest_current_a`.
+        battery_a: Supply current i above `rest_current_a` [A], shape (N,).
 
     Returns:
         Field in base_link axes [nT], shape (N, 3).
@@ -226,26 +225,26 @@ def platform_field_nt(
 
 
 def _times(rows: Array, matrix: Array) -> Array:
-    """Rows (..., K) times a matrix (K, 3), or one each: no work for the threads that `@` wakes."""
+    """Rows (..., K) times a matrix (K, 3), or one matrix for each row; faster than `@` for so few columns."""
     return np.einsum("...k,kj->...j" if matrix.ndim == 2 else "nk,nkj->nj", rows, matrix)
 
 
 def turning_iron_nt(robot: RobotSpec, wheel_angle: ArrayLike) -> Array:
-    """Field of the iron in wheels and caster, dipoles that turn with them about base_link's y.
+    """Field of the iron in wheels and caster: dipoles that turn with them about base_link's y.
 
-    The wheels stand beside base_link's origin, at half their separation and at their radius above the
-    floor. A moment is up at the angle 0 and forwards a quarter turn on. The caster is taken to roll
-    straight on, by the mean way of the wheels: on curves its axis turns too, which is left out.
+    The wheels are beside base_link's origin, at half their separation and at their radius above the floor. A
+    moment points up at the angle 0 and forwards a quarter turn later. The caster rolls straight on, by the
+    mean distance of the wheels; that its axis turns on curves is neglected.
 
     Args:
-        robot: Its platform, the size of its drive, and where its magnetometer is.
+        robot: Its platform, drive and magnetometer.
         wheel_angle: Angles turned by the left and right wheel since the start [rad], shape (N, 2).
 
     Returns:
         Field in base_link axes [nT], shape (N, 3).
 
     Raises:
-        InputError: The magnetometer is in the middle of one of them.
+        InputError: The magnetometer is in the middle of a wheel or of the caster.
     """
     platform, angle = robot.platform, np.asarray(wheel_angle, float)
     rolled = (angle[:, 0] + angle[:, 1]) * (robot.drive.wheel_radius_m / platform.caster_radius_m / 2)
@@ -267,7 +266,7 @@ def turning_iron_nt(robot: RobotSpec, wheel_angle: ArrayLike) -> Array:
 
 @lru_cache(maxsize=64)
 def _unit_fields(robot: str, p_base_magnetometer: Vec3, p_base: Vec3) -> Array:
-    """Field at the magnetometer of 1 A m2 at a place in base_link, up and forwards [nT], shape (2, 3)."""
+    """Field at the magnetometer of 1 A m2 at `p_base`, pointing up and forwards [nT], shape (2, 3)."""
     apart = np.subtract(p_base_magnetometer, p_base)
     if not np.linalg.norm(apart) > NEAREST_M:
         raise InputError(
@@ -281,10 +280,10 @@ def _unit_fields(robot: str, p_base_magnetometer: Vec3, p_base: Vec3) -> Array:
 def wheel_torques_nm(
     battery: BatterySpec, drive: DriveSpec, rate: ArrayLike, acceleration: ArrayLike
 ) -> Array:
-    """Torque at each wheel: r (F / 2 sign w + m r / 2 dw/dt), half the robot's drag and inertia each.
+    """Torque at each wheel: r (F / 2 sign w + m r / 2 dw/dt), half of the robot's drag and inertia.
 
-    That is what `magtwin.sim.sensors.battery` takes power for. The drag goes to nought in proportion below
-    `CREEP`.
+    The power that `magtwin.sim.sensors.battery` draws is for this torque. Below `CREEP` the drag is
+    proportional to w.
 
     Args:
         battery: Drag F [N] and mass m [kg].
@@ -301,7 +300,7 @@ def wheel_torques_nm(
 
 
 def rest_current_a(battery: BatterySpec) -> float:
-    """Supply current of a robot that stands with a full pack and its LiDAR off [A], as when it surveys."""
+    """Supply current of a resting robot with a full pack and its LiDAR off [A], as in a survey."""
     if battery.model == "linear":
         return battery.load_w / battery.voltage_full_v
     return float(current_a(battery, battery.load_w, 1.0))
@@ -313,8 +312,7 @@ def field_at_sensor_nt(
     """Exact field at the magnetometer of a robot that drives: the lab's, and its own.
 
     The rate of the ambient field in base_link axes is d/dt (R^T B) = R^T dB/dt - w x R^T B, with
-    dB/dt = (u . grad) B for the magnetometer's velocity u: that of the twist which holds from t on,
-    whatever other times are asked.
+    dB/dt = (u . grad) B for the magnetometer's velocity u, that of the twist from t on.
 
     Args:
         scene: A scene whose Earth's field is known.
@@ -381,13 +379,13 @@ def own_field_nt(
 
 
 def lidar_angle(robot: RobotSpec, t: ArrayLike) -> Array:
-    """Angle of the LiDAR's motor at times [s], whether it spins or not [rad]: its rate, from its phase on."""
+    """Angle of the LiDAR's motor at times [s], as if it always spun [rad]."""
     turned = 2 * math.pi * robot.lidar.scan_rate_hz * np.asarray(t, float)
     return np.asarray(turned + robot.platform.lidar_phase)
 
 
 def sensor_places(robot: RobotSpec, pose: Array) -> Array:
-    """Where the magnetometer is for poses x, y, yaw of base_link (N, 3): points in world [m], (N, 3)."""
+    """Places of the magnetometer in world [m], (N, 3), for poses x, y, yaw of base_link (N, 3)."""
     x, y, yaw = pose.T
     cos, sin = np.cos(yaw), np.sin(yaw)
     px, py, pz = robot.p_base_magnetometer
@@ -397,23 +395,23 @@ def sensor_places(robot: RobotSpec, pose: Array) -> Array:
 
 
 def draw_platform(platform: PlatformFieldSpec, rng: np.random.Generator) -> PlatformFieldSpec:
-    """The platform as it is on one day.
+    """The platform in one session.
 
-    Its permanent field has changed since the survey by `hard_iron_drift_nt`, and differs from day to day by
-    `hard_iron_std_nt` along each axis; what its currents make differs by the factor 1 + `current_std` N, with
-    one standard normal N each for motors, LiDAR and battery; wheels, caster and LiDAR begin at any angle.
+    The permanent field has drifted since the survey by `hard_iron_drift_nt`, and varies between sessions by
+    `hard_iron_std_nt` along each axis. The field of currents varies by the factor 1 + `current_std` N, with a
+    standard normal N each for motors, LiDAR and battery. Wheels, caster and LiDAR begin at any angle.
 
-    So a map that was surveyed on one day errs on another by a constant and by a wave over heading. Of the
-    TurtleBot 4 in Florida, where the field dips by 58 deg, the drift makes 690 nT and a wave of 130 nT, and
-    the 90 nT that days differ by each way another 77 nT and a wave of 70 nT (root mean squares).
+    So in another session than that of its survey a map errs by a constant and by a wave over heading. For the
+    TurtleBot 4 in Florida, where the field dips by 58 deg, the drift makes 690 nT and a wave of 130 nT; the
+    90 nT between sessions make 77 nT and a wave of 70 nT (root mean squares).
 
     Args:
-        platform: The platform as its asset has it: that of the mean day, and of the survey.
-        rng: Source of the day.
+        platform: The platform of the asset, in the session of the survey.
+        rng: Source of the session.
 
     Returns:
-        The platform with these figures drawn; its own drift and spreads are 0 then: it is that of the day.
-        `hard_iron_change_nt` is what changed since the survey.
+        The platform with these figures drawn, its drift and spreads 0. `hard_iron_change_nt` is the change
+        since the survey.
     """
     hard_iron = np.add(platform.hard_iron_nt, platform.hard_iron_drift_nt)
     hard_iron += platform.hard_iron_std_nt * rng.standard_normal(3)
@@ -444,20 +442,20 @@ def draw_platform(platform: PlatformFieldSpec, rng: np.random.Generator) -> Plat
 
 
 def platforms_of_rows(platforms: Sequence[PlatformFieldSpec]) -> PlatformFieldSpec:
-    """Robots' platforms as one, for readings of which each is another robot's.
+    """Platforms of many robots as one, for readings that each belong to another robot.
 
     Args:
-        platforms: As `draw_platform` gives them for one robot on several days, one for each reading.
+        platforms: Those of one robot in several sessions, from `draw_platform`; one for each reading.
 
     Returns:
-        The first, with arrays of one row or number a robot where they differ by what is drawn.
+        The first platform, with arrays of a row or number per robot for the figures in `DRAWN`.
     """
     rows = {name: np.array([getattr(one, name) for one in platforms]) for name in DRAWN}
     return replace(platforms[0], **rows)  # type: ignore[arg-type]
 
 
 def _torques(robot: RobotSpec, motion: Moving, t: Array, true: Moment) -> Array:
-    """Torques of the wheels at times, their accelerations over `TORQUE_S` before [N m], shape (N, 2)."""
+    """Torques of the wheels, with their accelerations over the last `TORQUE_S` [N m], shape (N, 2)."""
     if not (np.any(robot.platform.left_motor_nt_nm) or np.any(robot.platform.right_motor_nt_nm)):
         return np.zeros((len(t), 2))
     before = moment_at(motion, t - TORQUE_S)

@@ -1,9 +1,8 @@
-"""Session: what differs from one day of driving to the next, drawn for a data set.
+"""Session: what differs between sessions of driving, from switching the robot on to switching it off.
 
-A robot that is switched on and driven several times keeps its IMU's zero, its odometry's error and its
-LiDAR's rhythm for all of these runs, and its charge goes on from run to run. The spreads are such that
-runs over the named paths have the means and scales of the 20 signals that the real robot's network was
-trained on (its scalers, over 73 min of driving); each says what it was taken from.
+In a session the IMU's zero, the odometry's error and the LiDAR's schedule stay the same. The spreads are
+chosen so that runs over the named paths have the means and scales of the 20 signals on which the real robot's
+network was trained (its scalers, over 73 min of driving).
 """
 
 from collections.abc import Mapping
@@ -19,40 +18,40 @@ from magtwin.spec.robot import RobotSpec
 YAW_ZERO = (np.pi, 0.3)
 """Mean and standard deviation of the heading at which the IMU is switched on [rad].
 
-The real disturbance has the same rank correlation with heading in [0, 360) deg and with the quaternion's
-z, 0.31: both order the headings alike, which they do for an IMU whose zero faces -x and for no other."""
+The real disturbance has the same rank correlation, 0.31, with heading in [0, 360) deg and with the
+quaternion's z. That holds only for an IMU whose zero faces -x."""
 
 CHARGE_SPENT = 0.135
-"""Mean of the charge that is missing at the start, exponentially distributed.
+"""Mean of the missing charge at the start, exponentially distributed.
 
-The real charge is 0.857 +- 0.140: what is missing has a mean like its spread, as an exponential
-distribution has, and not as an even one between full and empty."""
+The real charge is 0.857 +- 0.140: the mean of the missing charge is like its spread, as in an exponential
+distribution."""
 
 LEAST_CHARGE = 0.3
-"""No session begins with less charge: the robot would be docked."""
+"""Least charge at the start of a session; with less, a robot is docked."""
 
 GYRO_BIAS_STD = 1e-4
-"""Standard deviation of each axis's bias that is left when the IMU has found its zero [rad/s]; ours."""
+"""Standard deviation of the gyroscope bias after the IMU found its zero, each axis [rad/s]; assumed."""
 
 SPEEDS = (0.2, 0.3)
-"""Least and most wanted speed [m/s]: with stops and corners the real 0.233 +- 0.066 m/s, and below v_max."""
+"""Least and largest wanted speed [m/s]: with stops and corners the real 0.233 +- 0.066 m/s."""
 
 _STREAMS = ("battery", "imu", "lidar", "drive", "platform")
-"""Who draws, each from a child generator of its own; append only: the order is the seed."""
+"""Who draws, each from its own child generator. Append only: the order is part of the seed."""
 
 
 def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
-    """The robot as it is on one day: charge, IMU, LiDAR's phase, wheels and odometry, and its own field.
+    """The robot in one session: charge, IMU, LiDAR's phase, wheels and odometry, and its own field.
 
     Args:
-        robot: The robot as its asset has it.
+        robot: The robot of the asset.
         rng: Source of the session.
 
     Returns:
         The robot with `initial_fraction`, `yaw_zero`, `gyro_bias`, `phase_s`, `wheel_errors` and
-        `odometry_scale` drawn, and its platform by `magtwin.sim.interference.draw_platform`. What a run
-        draws of wheels and odometry otherwise, it no longer does: their standard deviations are 0. Motion
-        capture is as it has become since the survey.
+        `odometry_scale` drawn, and its platform from `magtwin.sim.interference.draw_platform`. The standard
+        deviations from which a run would draw wheels and odometry are 0. Motion capture has drifted since the
+        survey.
     """
     drive, imu, lidar, mocap = robot.drive, robot.imu, robot.lidar, robot.mocap
     draws = dict(zip(_STREAMS, rng.spawn(len(_STREAMS)), strict=True))
@@ -89,13 +88,13 @@ def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
 
 
 def session_of(robot: RobotSpec, seed: int, session: int, *, which: int = 0) -> RobotSpec:
-    """The robot as it is in one session of a data set, which a seed and the session's number decide.
+    """The robot in a numbered session of a data set.
 
     Args:
-        robot: The robot as its asset has it.
+        robot: The robot of the asset.
         seed: Seed of the data set.
         session: Number of the session, from 0.
-        which: Place of the robot in a scene of several, from 0.
+        which: Index of the robot in its scene.
     """
     key = (0, session, which) if which else (0, session)
     return draw_session(
@@ -106,13 +105,13 @@ def session_of(robot: RobotSpec, seed: int, session: int, *, which: int = 0) -> 
 def offset_generator(
     session: Mapping[str, str | int | float | bool], seed: int, *, which: int = 0
 ) -> np.random.Generator:
-    """Source of a session's part of the model error: the same session, the same part.
+    """Generator of the part of the model error that is constant in a session.
 
     Args:
-        session: Metadata of the session, `session_seed` and `session`; without them each seed is a session of
-            its own.
+        session: Metadata of the session, `session_seed` and `session`. Without them each seed is its own
+            session.
         seed: Seed of the run.
-        which: Place of the robot in a scene of several, from 0.
+        which: Index of the robot in its scene.
     """
     entropy, key = seed, (3, 0, which)
     if "session_seed" in session:
@@ -121,6 +120,6 @@ def offset_generator(
 
 
 def draw_speed(drive: DriveSpec, rng: np.random.Generator) -> float:
-    """A wanted speed for a run [m/s], as the real robot's runs had, within the drive's."""
+    """A wanted speed for a run [m/s], as in the real robot's runs, within the drive's limit."""
     slowest, fastest = (min(speed, drive.v_max) for speed in SPEEDS)
     return float(rng.uniform(slowest, fastest))

@@ -1,7 +1,8 @@
-"""Survey of the twin: what the robot itself would read of the lab, and the map that it would make."""
+"""Survey of the twin: the readings that the robot would take in the lab, and the map that it would make."""
 
 import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -9,14 +10,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.grid import Grid
+from magtwin.field.maps.holes import filled
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.sources.magnets import body_of
 from magtwin.field.survey.readings import Readings
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
 from magtwin.sim.interference import ambient_field_nt, ambient_gradient_nt_m, platform_field_nt
 from magtwin.sim.sensors.magnetometer import lost_in, rounded, stuck_nt
+from magtwin.spec.lab import SurveySpec
+from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
+
+FLOOR_M = 0.01
+"""Height up to which the robot drives over things [m]."""
 
 QUARTERS = (0.0, np.pi / 2, np.pi, 3 * np.pi / 2)
 
@@ -26,14 +34,14 @@ def field_at_rest_nt(
 ) -> Array:
     """Exact field magnitude at the magnetometer of a robot that stands with its LiDAR off.
 
-    |(1 + S) R(yaw)^T B(p_base + R(yaw) p_lever) + h|: the map's field without its grid, so a run's
-    exact field minus this is what moving, the motors, the LiDAR and the battery add.
+    |(1 + S) R(yaw)^T B(p_base + R(yaw) p_lever) + h|: the map's field without its grid. A run's exact field
+    minus this is the part of motion, motors, LiDAR and battery.
 
     Args:
         scene: A scene whose Earth's field is known.
         p_world_base: Positions of base_link [m], shape (..., 3), or (..., 2) for a robot on the floor.
         yaw: Headings [rad], shape (...); the two shapes are broadcast.
-        height_m: Height of the magnetometer above the floor [m]; the robot's own unless given.
+        height_m: Height of the magnetometer above the floor [m]. Default: the robot's.
 
     Returns:
         Field magnitude [nT], shape (...).
@@ -48,7 +56,7 @@ def field_at_rest_nt(
 
 
 def _sensor_places(scene: Scene, p: Array, yaw: Array, height_m: float | None) -> Array:
-    """Where the magnetometer is in world [m] for base_link at points (..., 2) or (..., 3), headings (...)."""
+    """Places of the magnetometer in world [m] for base_link at points (..., 2 or 3), headings (...)."""
     if p.shape[-1] == 2:
         p = np.concatenate([p, np.full((*p.shape[:-1], 1), scene.robot.base_height_m)], axis=-1)
     shape = np.broadcast_shapes(p.shape[:-1], yaw.shape)
@@ -60,7 +68,7 @@ def _sensor_places(scene: Scene, p: Array, yaw: Array, height_m: float | None) -
 
 
 def sensor_height_m(scene: Scene) -> float:
-    """Height of the magnetometer above the floor, the robot standing on it [m]."""
+    """Height of the magnetometer above the floor on which the robot stands [m]."""
     return scene.robot.base_height_m + scene.robot.p_base_magnetometer[2]
 
 
@@ -80,29 +88,28 @@ def survey_readings(
     progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
     blocked: Callable[[Array], NDArray[np.bool_]] | None = None,
 ) -> Readings:
-    """What the robot reads that stands at each node of a grid in each heading.
+    """Readings of the robot at each node of a grid, in each heading.
 
-    base_link is on the node, so the magnetometer is beside it by its lever arm, turned with the
-    heading; the motors rest, the LiDAR is off and the battery is full. Nodes are visited along x, row by
-    row, and where the field is too steep for the magnetometer it latches: until it finds lock again, it
-    reads one value over and over, as nobody tells it that it is wrong.
+    base_link stands on the node, so the magnetometer is beside it by its lever arm, turned with the heading.
+    The motors rest, the LiDAR is off and the battery is full. Nodes are visited along x, row by row. If the
+    field is too steep, the magnetometer loses lock and repeats one stuck value until it finds lock again.
 
     Args:
         scene: A scene whose Earth's field is known; its map is not read.
-        rng: Where the sensor's noise and the robot's errors are drawn from.
+        rng: Source of the sensor's noise and the robot's errors.
         spacing_m: Distance between nodes [m]; the grid is centred on the floor and stays on it.
         headings_rad: Headings, ascending in [0, 2 pi) [rad].
-        readings: Readings whose mean a node gives; each has the sensor's noise and resolution.
-        height_m: Height of the magnetometer above the floor [m]; the robot's own unless given.
-        heading_error_rad: Standard deviation of the robot's heading about the node's [rad]. What is
-            recorded is the heading that it has.
-        position_error_m: Standard deviation of where the robot stands about the node, along x and y [m].
-            What is recorded is the node.
+        readings: Readings that are averaged at a node; each has the sensor's noise and resolution.
+        height_m: Height of the magnetometer above the floor [m]. Default: the robot's.
+        heading_error_rad: Standard deviation of the robot's heading about the node's [rad]. The robot's
+            heading is recorded.
+        position_error_m: Standard deviation of the robot's place about the node, along x and y [m]. The node
+            is recorded.
         source: What the scene was made from.
         licence: SPDX name of the survey's licence.
         created: Day of the survey, YYYY-MM-DD.
         progress: Called with headings done, headings in all, and what is being done.
-        blocked: For nodes of shape (Y, X, 2), whether the robot cannot stand there. Default: it can.
+        blocked: From nodes of shape (Y, X, 2) to whether the robot cannot stand there. Default: none.
 
     Returns:
         A row for each node, in the order of `Grid.poses`, with magnitudes; `good` where the robot can stand.
@@ -131,7 +138,7 @@ def _visit(
     created: str = "",
     blocked: Callable[[Array], NDArray[np.bool_]] | None = None,
 ) -> tuple[Readings, NDArray[np.bool_]]:
-    """The readings, and the nodes without one, shape (H, Y, X): lock was lost, or something stands there."""
+    """The readings, and the nodes without one, shape (H, Y, X): lock was lost, or the node is blocked."""
     if readings < 1:
         raise InputError(f"readings must be at least 1, got {readings!r}")
     for name, sd in {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}.items():
@@ -139,14 +146,14 @@ def _visit(
             raise InputError(f"{name} must not be below 0, got {sd!r}")
     if position_error_m > spacing_m > 0:
         raise InputError(
-            f"position_error_m {position_error_m!r} is beyond the spacing of {spacing_m!r} m; such a robot "
-            "does not find its nodes"
+            f"position_error_m {position_error_m!r} is above the spacing of {spacing_m!r} m; the robot "
+            "would not find its nodes"
         )
     if heading_error_rad > np.pi / 2:
         raise InputError(f"heading_error_rad must not be above pi/2, got {heading_error_rad!r}")
     height = sensor_height_m(scene) if height_m is None else height_m
     if not 0 <= height < np.inf:
-        raise InputError(f"height_m is a height above the floor, 0 m or more, got {height!r}")
+        raise InputError(f"height_m must be a height above the floor, 0 m or more, got {height!r}")
     x, y = scene.lab.floor_m
     grid = Grid.over((-x / 2, x / 2, -y / 2, y / 2), spacing_m, np.asarray(headings_rad, float))
     node, nominal = grid.poses()
@@ -155,7 +162,7 @@ def _visit(
         stands = node + position_error_m * rng.standard_normal(node.shape)
     if heading_error_rad:
         yaw = nominal + heading_error_rad * rng.standard_normal(nominal.shape)
-    sensor, latch = scene.robot.magnetometer, rng.spawn(1)[0]
+    sensor, stuck = scene.robot.magnetometer, rng.spawn(1)[0]
     exact, lost, stood = np.zeros(grid.shape), np.zeros(grid.shape, bool), np.ones(grid.shape, bool)
     for k in range(len(grid.headings_rad)):
         progress(k, len(grid.headings_rad), "")
@@ -171,9 +178,10 @@ def _visit(
     progress(len(grid.headings_rad), len(grid.headings_rad), "")
     total = np.zeros_like(exact)
     for _ in range(readings):
-        total += _read(exact, sensor.noise_std_nt, sensor.resolution_nt, rng)
+        noise = sensor.noise_std_nt * rng.standard_normal(exact.shape)
+        total += rounded(exact + noise, sensor.resolution_nt)
     if lost.any():
-        value = rounded(stuck_nt(sensor, lost.ravel(), latch), sensor.resolution_nt).reshape(grid.shape)
+        value = rounded(stuck_nt(sensor, lost.ravel(), stuck), sensor.resolution_nt).reshape(grid.shape)
         total[lost] = value[lost] * readings
     read = Readings(
         good=stood.ravel(),
@@ -204,23 +212,22 @@ def survey(
     name: str | None = None,
     **options: Any,
 ) -> AnomalyMap:
-    """Map the lab as the robot would, by `survey_readings`: the values at the nodes are its readings.
+    """Map the lab as the robot would: the values at the nodes are those of `survey_readings`.
 
-    The variance of a node is that of the sensor's noise and resolution, and the mean square by which
-    the field where the robot stands, looking where it does, misses that of the node.
+    The variance of a node is that of the sensor's noise and resolution, plus the mean square by which the
+    field at the robot's actual pose differs from that at the node.
 
     Args:
-        scene: As there.
-        rng: As there.
-        readings: As there.
-        heading_error_rad: As there; the map takes each heading for the node's own.
-        position_error_m: As there.
-        name: Name of the map; that of the scene unless given.
-        options: The others of `survey_readings`; and `blocked`, which tells for nodes of shape (Y, X, 2) at
-            which of them the robot cannot stand.
+        scene: As for `survey_readings`.
+        rng: As for `survey_readings`.
+        readings: As for `survey_readings`.
+        heading_error_rad: As for `survey_readings`; the map takes each heading as the node's.
+        position_error_m: As for `survey_readings`.
+        name: Name of the map. Default: the scene's.
+        options: The other arguments of `survey_readings`.
 
     Returns:
-        The map, with its variance; nodes at which the sensor had lost lock or that are blocked are not valid.
+        The map, with its variance. Nodes that are blocked or where lock was lost are not valid.
 
     Raises:
         InputError: As for `survey_readings`.
@@ -260,11 +267,11 @@ def survey(
 def pose_error_nt2(
     scene: Scene, grid: Grid, height_m: float, *, heading_error_rad: float, position_error_m: float
 ) -> Array:
-    """Mean square of what a robot that stands and looks a little off a node reads off the node's field.
+    """Mean square error of readings whose pose is a little off the node.
 
     E[(B(node + e) - B(node))^2] over normal errors e, by a rule of degree 5 (McNamee and Stenger 1967;
-    2 n^2 + 1 points for n errors), which is exact where B bends as a parabola does. The vector field around
-    a node is one for all headings: quadratic in x and y, through 3 x 3 points.
+    2 n^2 + 1 points for n errors), which is exact for a parabola. The vector field around a node is the same
+    for all headings: quadratic in x and y, through 3 x 3 points.
 
     Args:
         scene: A scene whose Earth's field is known.
@@ -284,7 +291,7 @@ def pose_error_nt2(
     around = _parabola(scene, grid, height_m, float(np.hypot(*lever)) + 2 * position_error_m)
 
     def field(off: Array, yaw: float) -> Array:
-        """Magnitude with base_link `off` its nodes [nT], shape (Y, X)."""
+        """Magnitude with base_link at an offset from its nodes [nT], shape (Y, X)."""
         c, s = np.cos(yaw), np.sin(yaw)
         dx, dy = off[0] + c * lever[0] - s * lever[1], off[1] + s * lever[0] + c * lever[1]
         world = np.tensordot([1, dx, dy, dx * dx / 2, dx * dy, dy * dy / 2], around, axes=1)
@@ -323,7 +330,7 @@ def _parabola(scene: Scene, grid: Grid, height_m: float, step: float) -> Array:
 
 
 def _rule(n: int) -> list[tuple[Array, float]]:
-    """Points and weights of degree 5 for n standard normals, without the middle, where nothing is missed."""
+    """Points and weights of degree 5 for n standard normals, without the middle, which has no error."""
     axes, root = np.eye(n), np.sqrt(3)
     points = [(sign * root * axis, (4 - n) / 18) for axis in axes for sign in (1, -1)]
     for i, j in itertools.combinations(range(n), 2):
@@ -340,7 +347,7 @@ def _frame(scene: Scene) -> str:
 
 
 def _datum(scene: Scene) -> str:
-    """Where a scene's world lies, in words."""
+    """Place of a scene's world, in words."""
     where = "origin amid the floor, heights above it"
     if scene.earth is None:
         return where
@@ -349,5 +356,145 @@ def _datum(scene: Scene) -> str:
     return f"{where}; {degrees}, {earth.height_m:g} m above the WGS 84 ellipsoid"
 
 
-def _read(exact: Array, noise_std_nt: float, resolution_nt: float, rng: np.random.Generator) -> Array:
-    return rounded(exact + noise_std_nt * rng.standard_normal(exact.shape), resolution_nt)
+@dataclass(frozen=True, eq=False)
+class Surveyed:
+    """The map of a furnished room, in which a robot cannot stand at every node."""
+
+    field: AnomalyMap
+    """The map, with a value at every node."""
+
+    filled: int
+    """Nodes filled from their neighbours, over all headings: the robot cannot stand there, or loses lock."""
+
+    magnets: int
+    """Number of magnetised things."""
+
+    def __str__(self) -> str:
+        field = self.field
+        headings, rows, columns = field.values_nt.shape
+        low, high = field.values_nt.min() / 1000, field.values_nt.max() / 1000
+        holes = f"; {self.filled} nodes in or beside steel are filled from their neighbours" * (
+            self.filled > 0
+        )
+        return (
+            f"surveyed by its own robot: {columns} x {rows} nodes {field.cell_m[0]:g} m apart, {headings} "
+            f"headings, {field.height_m:.3g} m above the floor, {low:.2f} to {high:.2f} uT{holes}"
+            + "; nothing is magnetised, so the field is the same everywhere"
+            * (not self.magnets)
+        )
+
+
+def survey_room(
+    scene: Scene,
+    spec: SurveySpec,
+    *,
+    seed: int,
+    obstacles: Obstacles,
+    source: str = "",
+    progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
+) -> Surveyed:
+    """Survey a scene, and fill the nodes that the robot cannot reach.
+
+    Args:
+        scene: A scene whose Earth's field is known; its map is not read.
+        spec: Grid and errors of the survey.
+        seed: Seed of the sensor's noise and of the robot's errors.
+        obstacles: What stands in the room.
+        source: File that the scene was made from.
+        progress: As for `survey_readings`.
+
+    Returns:
+        The map, and the number of filled nodes.
+
+    Raises:
+        InputError: As for `survey`, or a heading has no reading at all.
+    """
+    field = survey(
+        scene,
+        rng=np.random.default_rng([seed, 1]),
+        spacing_m=spec.spacing_m,
+        headings_rad=np.radians(spec.headings_deg).tolist(),
+        readings=spec.readings,
+        height_m=spec.height_m,
+        heading_error_rad=float(np.radians(spec.heading_error_deg)),
+        position_error_m=spec.position_error_m,
+        source=source,
+        created=scene.earth.date if scene.earth is not None else "",
+        progress=progress,
+        blocked=blocked_by(scene, obstacles),
+    )
+    whole = filled(field)
+    holes = int(np.count_nonzero(~field.valid))
+    # a map layer holds 32 bit numbers
+    values, variance = (
+        None if array is None else array.astype(np.float32).astype(float)
+        for array in (whole.values_nt, whole.variance_nt2)
+    )
+    assert values is not None
+    parameters = {**field.parameters, "seed": seed, "filled_nodes": holes}
+    return Surveyed(
+        replace(whole, values_nt=values, variance_nt2=variance, parameters=parameters),
+        holes,
+        len(scene.magnets),
+    )
+
+
+def blocked_by(scene: Scene, obstacles: Obstacles) -> Callable[[Array], NDArray[np.bool_]]:
+    """Which nodes the robot cannot stand at, because of obstacles or magnetised things.
+
+    Walls at the border of the floor do not count, because the map is needed up to them.
+
+    Args:
+        scene: The scene.
+        obstacles: What stands in it.
+
+    Returns:
+        A function from nodes [m], shape (..., 2), to whether each is blocked, shape (...).
+    """
+    half = np.array(scene.lab.floor_m) / 2
+    inner = [
+        k for k, o in enumerate(obstacles.outlines) if np.all(np.abs(_nearest_to_middle(o)) < half - 1e-6)
+    ]
+    standing = Obstacles(
+        tuple(obstacles.names[k] for k in inner), tuple(obstacles.outlines[k] for k in inner)
+    )
+    radius = scene.robot.footprint_radius_m
+
+    def blocked(nodes: Array) -> NDArray[np.bool_]:
+        p = nodes.reshape(-1, 2)
+        distance, _ = standing.clearance(p, reach_m=radius)
+        inside = in_steel(scene, p, sensor_height_m(scene))
+        return np.asarray((distance < radius) | inside).reshape(nodes.shape[:-1])
+
+    return blocked
+
+
+def in_steel(scene: Scene, p: Array, height_m: float) -> NDArray[np.bool_]:
+    """Whether a robot at points (N, 2) of the floor would stand in something magnetised, shape (N,).
+
+    Args:
+        scene: The scene.
+        p: Places of its base [m].
+        height_m: Height of the robot [m]. Things lower than `FLOOR_M` are no obstacle.
+    """
+    radius = scene.robot.footprint_radius_m
+    inside = np.zeros(len(p), bool)
+    for source in scene.magnets:
+        if source.shape == "point":
+            continue
+        body = body_of(replace(source, susceptibility=0.0))
+        middle = body.p_world + body.rotation @ body.middle
+        half = np.abs(body.rotation) @ (body.size_m / 2)
+        near = np.flatnonzero(np.all(np.abs(p - middle[:2]) < half[:2] + radius, axis=1))
+        low, high = middle[2] - half[2], middle[2] + half[2]
+        if high <= FLOOR_M or low >= height_m or not len(near):
+            continue
+        for z in np.linspace(max(low, FLOOR_M), min(high, height_m), 5):
+            at = np.column_stack([p[near], np.full(len(near), z)])
+            inside[near] |= body.clearance(at) < radius
+    return inside
+
+
+def _nearest_to_middle(outline: Array) -> Array:
+    """The point of an outline's box nearest to the origin, shape (2,)."""
+    return np.clip(0.0, outline.min(axis=0), outline.max(axis=0))

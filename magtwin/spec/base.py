@@ -1,8 +1,7 @@
-"""What every spec has: the base class, and the types of its fields.
+"""The base class of all specs, and the types of their fields.
 
-A spec is plain data between `usd/`, which authors and reads it, and `sim/`, which runs it. Every field
-stands for one attribute of a prim and is checked when the spec is made. Lengths are metres, angles radians,
-fields nT.
+A spec is plain data: `usd/` reads and authors it, `sim/` runs it. Each field is one attribute of a prim, and
+is checked when the spec is made. Lengths are metres, angles radians, fields nT.
 """
 
 import math
@@ -31,11 +30,11 @@ ZERO9: Matrix3 = (0.0,) * 9  # type: ignore[assignment]
 
 
 UNIT_TOLERANCE = 1e-6
-"""How far the square of a unit quaternion's length may be from 1: single precision passes."""
+"""Largest error of the squared length of a unit quaternion; single precision passes."""
 
 
 class Spec:
-    """What every spec has: all of its numbers are finite."""
+    """Base class of all specs: every number is finite."""
 
     def __post_init__(self) -> None:
         for f in fields(self):  # type: ignore[arg-type]
@@ -44,10 +43,10 @@ class Spec:
             finite = all(abs(x) < math.inf for x in numbers if isinstance(x, int | float))
             self._require(f.name, finite, "be finite", value)
 
-    def _require(self, name: str, holds: bool, what: str, seen: Any) -> None:
+    def _require(self, name: str, holds: bool, what: str, value: Any) -> None:
         if not holds:
             kind = type(self).__name__.lstrip("_")
-            raise InputError(f"{name} of {kind} must {what}, got {seen!r}")
+            raise InputError(f"{name} of {kind} must {what}, got {value!r}")
 
     def _above_zero(self, *names: str) -> None:
         for name in names:

@@ -7,7 +7,7 @@ from magtwin.spec.base import Spec, Vec2, Vec3
 
 @dataclass(frozen=True, kw_only=True)
 class DriveSpec(Spec):
-    """A differential drive: its size, its limits and its odometry."""
+    """A differential drive: dimensions, limits and odometry."""
 
     left_wheel_joint: str = "left_wheel_joint"
     """Name of the left wheel's joint."""
@@ -34,49 +34,52 @@ class DriveSpec(Spec):
     """Highest yaw acceleration [rad/s2]."""
 
     wheel_rate_max: float = 12.87
-    """Highest rate of a wheel [rad/s]: a Create 3's rim at 0.46 m/s, its top speed with safety off."""
+    """Highest rate of a wheel [rad/s]. Default: that of a Create 3 at 0.46 m/s, its top speed with safety
+    off."""
 
     motor_lag_s: float = 0.04
-    """Time constant of the motors' first-order lag [s]; 0 for none. Ours: that of small geared motors."""
+    """Time constant of the motors' first-order lag [s]; 0 disables it. Default: typical of small geared
+    motors."""
 
     slip_s2_m: float = 0.011
-    """Slip of the wheels along their way, for each m/s2 of acceleration [s2/m]; ours: 1 % at 0.9 m/s2."""
+    """Longitudinal slip of the wheels per m/s2 of acceleration [s2/m]. Default, an estimate: 1 % at 0.9
+    m/s2."""
 
     yaw_slip: float = 0.01
-    """Share of a yaw rate that the wheels' scrubbing takes [1]; ours."""
+    """Fraction of the yaw rate that is lost as the wheels scrub [1]; an estimate."""
 
     wheel_radius_error_std: float = 0.002
-    """Relative standard deviation of the wheels' radius about the nominal one, drawn once a run; ours."""
+    """Relative standard deviation of the wheel radius, drawn once per run; an estimate."""
 
     wheel_separation_error_std: float = 0.003
-    """Relative standard deviation of their separation about the nominal one, drawn once a run; ours."""
+    """Relative standard deviation of the wheel separation, drawn once per run; an estimate."""
 
     wheel_errors: Vec2 = (0.0, 0.0)
-    """Relative error of radius and separation that the session's runs share, beside what each run draws."""
+    """Relative error of radius and separation in all runs of the session, in addition to that of each run."""
 
     command_timeout_s: float = 0.5
-    """The robot stops when no command came for this long [s]."""
+    """The robot stops if no command arrives for this time [s]."""
 
     odometry_rate_hz: float = 62.0
-    """Odometry samples a second [Hz]."""
+    """Odometry rate [Hz]."""
 
     odometry_latency_s: float = 0.012
-    """Time that a sample of odometry takes to arrive [s]."""
+    """Delay of an odometry sample [s]."""
 
     odometry_jitter_s: float = 0.003
-    """Mean of the further delay of each sample, exponentially distributed [s]."""
+    """Mean additional delay of a sample, exponentially distributed [s]."""
 
     odometry_scale: Vec2 = (1.0, 1.0)
-    """Factor by which odometry mistakes the travel of the left and the right wheel."""
+    """Measured over true travel of the left and the right wheel."""
 
     odometry_noise_std: float = 0.002
-    """Relative standard deviation of the wheels' scale, drawn once a run: what makes odometry drift."""
+    """Relative standard deviation of the wheels' scale, drawn once per run; it makes odometry drift."""
 
     odometry_v_noise_std: Vec3 = (0.003, 0.00275, 0.000135)
-    """Standard deviation of the noise of the linear velocity, each axis [m/s]."""
+    """Standard deviation of the linear velocity's noise along each axis [m/s]."""
 
     odometry_w_noise_std: Vec3 = (0.011, 0.028, 0.01)
-    """Standard deviation of the noise of the angular velocity, each axis [rad/s]."""
+    """Standard deviation of the angular velocity's noise about each axis [rad/s]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -104,8 +107,8 @@ class DriveSpec(Spec):
             "wheel_separation_error_std",
         )
         self._require("yaw_slip", 0 <= self.yaw_slip < 1, "be at least 0 and below 1", self.yaw_slip)
-        whole = f"be below 1 at a_max {self.a_max!r}, where all of the way would be slip"
+        whole = f"be below 1 when multiplied by a_max {self.a_max!r}"
         self._require("slip_s2_m", self.slip_s2_m * self.a_max < 1, whole, self.slip_s2_m)
         self._require("wheel_errors", min(self.wheel_errors) > -1, "be above -1", self.wheel_errors)
         left, right = self.left_wheel_joint, self.right_wheel_joint
-        self._require("right_wheel_joint", left != right, "be another joint than the left wheel's", right)
+        self._require("right_wheel_joint", left != right, "differ from left_wheel_joint", right)

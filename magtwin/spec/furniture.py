@@ -1,7 +1,6 @@
-"""Furniture and parts of a building: the parts that they consist of, and how their steel is magnetised."""
+"""Furniture and parts of a building: the parts of each kind, and their steel."""
 
-import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
@@ -18,47 +17,48 @@ Face = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Part:
-    """A box, an upright cylinder or a mesh, in its piece's axes: x its front, z up, the origin amid its
-    footprint.
+    """A box, an upright cylinder or a mesh, in the axes of its piece.
 
-    Hollow sections and bent sheets are taken as solid: a magnetization is that of the whole section.
+    x is the front of the piece, z is up, the origin is the middle of its footprint. Hollow sections and bent
+    sheets count as solid, so a magnetization is the mean over the whole section.
     """
 
     name: str
     p: Vec3
-    """Its middle [m]."""
+    """Centre [m]."""
 
     size_m: Vec3
     """Sides of a box; diameter, diameter and height of a cylinder [m]."""
 
     look: str
-    """What it is made of, a name of `magtwin.usd.looks`."""
+    """Material, a name of `magtwin.usd.looks`."""
 
     shape: str = "cuboid"
     """"cuboid", "cylinder" or "mesh"."""
 
     fill: float = 1.0
-    """Factor on a magnetization that is drawn: a wide hollow section holds less steel than a slim tube."""
+    """Fraction of the volume that is steel; it scales a magnetization that is drawn. Computed for a generic
+    part."""
 
     vertices_m: tuple[Vec3, ...] = ()
-    """Vertices of a mesh about its middle [m], in single precision."""
+    """Vertices of a mesh about its centre [m], in single precision."""
 
     faces: tuple[Face, ...] = ()
     """Corners of a mesh's triangles, counter-clockwise from outside."""
 
     @property
     def steel(self) -> bool:
-        """Whether it can be magnetised."""
+        """Whether the part can be magnetised."""
         return self.look in STEEL
 
     @property
     def along(self) -> int:
-        """Its longest side, 0 to 2, which steel is magnetised along: there it demagnetises least."""
+        """Index of the longest side, along which the steel is magnetised: there it demagnetises least."""
         return self.size_m.index(max(self.size_m))
 
 
 STEEL = ("Steel", "PaintedSteel", "Door", "Chrome", "Enamel")
-"""Looks of what can be magnetised."""
+"""Looks of parts that can be magnetised."""
 
 MATERIALS: Mapping[str, str] = MappingProxyType(
     {
@@ -71,20 +71,13 @@ MATERIALS: Mapping[str, str] = MappingProxyType(
         "aluminium": "Aluminium",
     }
 )
-"""Look of each material that a box, cylinder or mesh can have; only the steels make a field."""
+"""Look of each material of a box, cylinder or mesh. Only the steels are magnetised."""
 
 GENERIC = ("box", "cylinder", "mesh")
-"""Kinds of one part, whose material and size are given."""
+"""Kinds of one part, with a material and a size."""
 
 BODY = "body"
 """Name of that part."""
-
-WALL_M = 0.002
-"""Thickness of the steel of a generic piece, for the magnetization that is drawn [m]: most are hollow."""
-
-DRAWN_A_M = (500.0, 5000.0)
-"""Least and greatest magnetization that is drawn for a steel part [A/m], of either sign: what desks, chairs
-and cabinets usually have."""
 
 
 def _desk() -> Iterator[Part]:
@@ -183,7 +176,7 @@ KINDS: Mapping[str, Callable[[], Iterator[Part]]] = MappingProxyType(
         "shelf": _shelf,
     }
 )
-"""What makes the parts of each kind that is not generic."""
+"""Functions that make the parts of each kind, without the generic ones."""
 
 
 def parts_of(
@@ -198,20 +191,20 @@ def parts_of(
 
     Args:
         kind: A name of `KINDS` or `GENERIC`.
-        material: What a generic piece is made of, a name of `MATERIALS`.
-        size_m: Sides of the box about a generic piece [m]; that of a mesh follows from its vertices.
+        material: Material of a generic piece, a name of `MATERIALS`.
+        size_m: Sides of the bounding box of a box or cylinder [m].
         vertices_m: Vertices of a mesh [m].
         faces: Corners of its triangles.
 
     Raises:
-        UnknownNameError: No such kind or material; the text names the nearest one.
-        InputError: A generic piece has no material or size, or another kind has one.
+        UnknownNameError: There is no such kind or material; the text has the nearest name.
+        InputError: A generic piece lacks material or size, or another kind has one.
     """
     if kind not in GENERIC:
         make = find("furniture", kind, {**KINDS, **dict.fromkeys(GENERIC)})
         for name, value in (("material", material), ("size_m", any(size_m)), ("faces", faces)):
             if value:
-                raise InputError(f"{name} is for {', '.join(GENERIC)}; a {kind} has its own")
+                raise InputError(f"{name} is for {', '.join(GENERIC)}, not for a {kind}")
         assert make is not None
         return tuple(make())
     if not material:
@@ -220,32 +213,26 @@ def parts_of(
     if kind == "mesh":
         return (_mesh_part(look, size_m, vertices_m, faces),)
     if faces or vertices_m:
-        raise InputError(f"vertices and faces go with a mesh, not with a {kind}")
+        raise InputError(f"vertices and faces are for a mesh, not for a {kind}")
     if not min(size_m) > 0:
         raise InputError(f"size_m of a {kind} must be its three sides, above 0 m, got {size_m}")
     if kind == "cylinder" and size_m[0] != size_m[1]:
         raise InputError(f"size_m of a cylinder must be as wide in y as in x, got {size_m}")
-    inner = [max(side - 2 * WALL_M, 0.0) / side for side in size_m]
     shape = "cuboid" if kind == "box" else "cylinder"
-    steel = 1 - inner[0] * inner[1] * inner[2]
-    return (Part(BODY, (0.0, 0.0, size_m[2] / 2), size_m, look, shape, fill=steel),)
+    return (Part(BODY, (0.0, 0.0, size_m[2] / 2), size_m, look, shape),)
 
 
 def _mesh_part(look: str, size_m: Vec3, vertices_m: tuple[Vec3, ...], faces: tuple[Face, ...]) -> Part:
-    """The part of a mesh: it stands on the floor, its footprint about the origin."""
+    """The part of a mesh, standing on the floor with its footprint about the origin."""
     if not (vertices_m and faces):
         raise InputError("a mesh needs vertices_m and faces; a TOML gives them by file")
     if any(size_m):
-        raise InputError("size_m is for a box or cylinder; a mesh has that of its vertices")
+        raise InputError("size_m is for a box or cylinder; leave it out for a mesh")
     points = np.array(vertices_m, np.float32).astype(float)
     low, high = points.min(axis=0), points.max(axis=0)
     middle = (low + high) / 2
     if np.abs(middle).max() > 1e-6 * (high - low).max():  # rounding; a mesh that was centred stays as it is
         points = (points - middle).astype(np.float32).astype(float)
-    corner = points[np.array(faces)]
-    across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    volume = abs(float(np.einsum("fi,fi->", corner[:, 0], across)) / 6)
-    shell = WALL_M * float(np.linalg.norm(across, axis=1).sum()) / 2
     x, y, z = (float(side) for side in high - low)
     return Part(
         BODY,
@@ -253,66 +240,42 @@ def _mesh_part(look: str, size_m: Vec3, vertices_m: tuple[Vec3, ...], faces: tup
         (x, y, z),
         look,
         "mesh",
-        fill=min(1.0, shell / volume) if volume else 1.0,
         vertices_m=tuple(map(tuple, points.tolist())),
         faces=faces,
     )
 
 
-def drawn_magnetization(name: str, parts: Iterable[Part], *, seed: int = 0) -> tuple[float, ...]:
-    """Magnetization of a piece's steel parts where none is given, each along its longest side.
-
-    Uniform in `DRAWN_A_M`, of random sign, times the part's `fill`, to 1 A/m. Each piece draws from a
-    stream of its own, from the seed and its name: adding, removing or moving a piece changes no other.
-
-    Args:
-        name: Name of the piece.
-        parts: Its parts.
-        seed: Seed of the scene.
-
-    Returns:
-        One number for each steel part, in order [A/m].
-    """
-    words = np.frombuffer(hashlib.sha256(name.encode()).digest(), "<u4").tolist()
-    rng = np.random.default_rng([seed, *words])
-    drawn = []
-    for part in parts:
-        if part.steel:
-            size = rng.uniform(*DRAWN_A_M) * rng.choice((-1.0, 1.0)) * part.fill
-            drawn.append(float(np.copysign(max(round(abs(size)), 1), size)))
-    return tuple(drawn)
-
-
 @dataclass(frozen=True, kw_only=True)
 class FurnitureSpec(Spec):
-    """A piece of furniture or of the building; `magtwin.spec.furniture` says what each kind consists of."""
+    """A piece of furniture or of the building."""
 
     name: str
     """Name of its prim."""
 
     kind: str
-    """What it is, a name of `magtwin.spec.furniture.KINDS`, or "box", "cylinder" or "mesh"."""
+    """A name of `KINDS` ("desk", "cabinet"), or "box", "cylinder" or "mesh"."""
 
     p_world: Vec3
-    """Where it stands: the middle of its footprint, on the floor [m]."""
+    """Position of the middle of its footprint [m]."""
 
     q_world_xyzw: Quat = IDENTITY_XYZW
-    """Its axes in world: x is its front, z up."""
+    """Its axes in world: x is the front, z is up."""
 
     magnetization: tuple[float, ...] = ()
-    """Magnetization of its steel parts, each along its longest side, in their order [A/m]; () for none."""
+    """Magnetization of each steel part along its longest side, in order [A/m]; () means none."""
 
     susceptibility: float = 0.0
     """Volume susceptibility of its steel parts [1]."""
 
     material: str = ""
-    """What a box, cylinder or mesh is made of, a name of `magtwin.spec.furniture.MATERIALS`."""
+    """Material of a box, cylinder or mesh, a name of `MATERIALS`."""
 
     size_m: Vec3 = ZERO3
-    """Size of a box along its own x, y and z, or diameter, diameter and height of a cylinder [m]."""
+    """Size of a box along x, y and z, or diameter, diameter and height of a cylinder [m]."""
 
     vertices_m: tuple[Vec3, ...] = ()
-    """Vertices of a mesh about the middle of its box [m], in single precision; it stands on the floor."""
+    """Vertices of a mesh about the centre of its bounding box [m], in single precision; it stands on the
+    floor."""
 
     faces: tuple[tuple[int, int, int], ...] = ()
     """Corners of a mesh's triangles, counter-clockwise from outside."""
@@ -323,7 +286,11 @@ class FurnitureSpec(Spec):
         self._not_negative("susceptibility")
         steel = [part.name for part in self.parts if part.steel]
         fits = len(self.magnetization) in (0, len(steel))
-        what = f"have one number for each of {', '.join(steel)}" if steel else "be left out: it has no steel"
+        what = (
+            f"have one number for each of {', '.join(steel)}"
+            if steel
+            else "be left out: the piece has no steel"
+        )
         self._require("magnetization", fits, what, self.magnetization)
         if not any(self.magnetization):
             object.__setattr__(self, "magnetization", ())
@@ -333,7 +300,7 @@ class FurnitureSpec(Spec):
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """What it consists of."""
+        """The parts of the piece."""
         return parts_of(
             self.kind,
             material=self.material,
@@ -343,10 +310,10 @@ class FurnitureSpec(Spec):
         )
 
     def sources(self, *, in_world: bool = True) -> tuple[SourceSpec, ...]:
-        """Its steel, a source each, named after the piece and the part.
+        """One source for each steel part, named after the piece and the part.
 
         Args:
-            in_world: Whether they stand where it does; otherwise they are in its own axes.
+            in_world: Whether positions and axes are in world; otherwise they are in the axes of the piece.
         """
         steel = [part for part in self.parts if part.steel]
         turn = self.q_world_xyzw if in_world else IDENTITY_XYZW
@@ -371,5 +338,5 @@ class FurnitureSpec(Spec):
 
 @lru_cache(maxsize=1024)
 def steel_of(piece: FurnitureSpec) -> tuple[SourceSpec, ...]:
-    """`piece.sources()`, kept, as every run of a furnished lab asks for them."""
+    """`piece.sources()`, cached because every run of a furnished lab needs them."""
     return tuple(piece.sources())

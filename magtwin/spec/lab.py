@@ -7,22 +7,22 @@ from magtwin.spec.base import Spec
 
 @dataclass(frozen=True, kw_only=True)
 class LabSpec(Spec):
-    """A room: a floor centred on the world's origin, low walls, posts of a motion-capture frame."""
+    """A room: a floor centred on the world's origin, low walls, and posts for motion capture."""
 
     floor_m: tuple[float, float] = (6.0, 3.5)
     """Size of the floor in x and y [m]."""
 
     wall_height_m: float = 0.3
-    """Height of the walls [m]; 0 for none."""
+    """Height of the walls [m]; 0 means no walls."""
 
     wall_thickness_m: float = 0.05
-    """Thickness of the walls, outside the floor [m]."""
+    """Thickness of the walls, which stand outside the floor [m]."""
 
     post_height_m: float = 2.2
-    """Height of the motion-capture posts, one at each corner and amid each long wall [m]; 0 for none."""
+    """Height of the posts, one at each corner and one in the middle of each long wall [m]; 0 means none."""
 
     apron_m: float = 0.2
-    """Width of the slab outside of the walls, which furniture may stand on [m]."""
+    """Width of the slab outside the walls; furniture may stand on it [m]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -33,25 +33,25 @@ class LabSpec(Spec):
 
 @dataclass(frozen=True, kw_only=True)
 class SurveySpec(Spec):
-    """How the robot surveys a room without a map: it stands at each node of a grid in each heading."""
+    """A survey of a room without a map: the robot stands at each node of a grid in each heading."""
 
     spacing_m: float = 0.25
     """Distance between nodes [m]."""
 
     headings_deg: tuple[float, ...] = (0.0, 90.0, 180.0, 270.0)
-    """Headings in which it stands at each node, ascending [deg]."""
+    """Headings at each node, ascending [deg]."""
 
     readings: int = 135
-    """Readings whose mean a node gives."""
+    """Readings averaged at each node and heading."""
 
     height_m: float | None = None
-    """Height of the sensor above the floor [m]; by default the robot's own."""
+    """Height of the sensor above the floor [m]. Default: the robot's."""
 
     heading_error_deg: float = 0.0
-    """Standard deviation of its heading about the node's [deg]."""
+    """Standard deviation of the heading [deg]."""
 
     position_error_m: float = 0.0
-    """Standard deviation of where it stands about the node, along x and y [m]."""
+    """Standard deviation of the position along x and y [m]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

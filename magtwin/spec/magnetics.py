@@ -25,80 +25,79 @@ SHAPES = ("cuboid", "cylinder", "sphere", "mesh")
 class PlatformFieldSpec(Spec):
     """The robot's own magnetic field at its magnetometer, in base_link axes.
 
-    B = (1 + S) b + h + E db/dt + (terms of motors, LiDAR, electronics and iron that turns), b the ambient
-    field in base_link axes: the permanent, induced and eddy parts of Tolles and Lawson (1950), then what an
-    aircraft need not mind. `magtwin.sim.interference` says how each enters.
+    B = (1 + S) b + h + E db/dt + terms of motors, LiDAR, electronics and turning iron, with b the ambient
+    field in base_link axes. The first three are the permanent, induced and eddy terms of Tolles and Lawson
+    (1950). `magtwin.sim.interference` computes all of them.
     """
 
     hard_iron_nt: Vec3 = ZERO3
-    """Permanent part h [nT]."""
+    """Permanent field h (hard iron) [nT]."""
 
     soft_iron: Matrix3 = ZERO9
-    """Induced part S, by rows [nT per nT]."""
+    """Induced field S (soft iron), by rows [nT per nT]."""
 
     eddy_s: Matrix3 = ZERO9
     """Eddy-current part E, by rows [nT per nT/s]."""
 
     left_motor_nt_nm: Vec3 = ZERO3
-    """Field of the left motor for each N m of torque at its wheel, which its current is in proportion to
+    """Field of the left motor per N m of torque at its wheel, since current is proportional to torque
     [nT/(N m)]."""
 
     right_motor_nt_nm: Vec3 = ZERO3
-    """Field of the right motor for each N m of torque at its wheel [nT/(N m)]."""
+    """Field of the right motor per N m of torque at its wheel [nT/(N m)]."""
 
     lidar_nt: Vec3 = ZERO3
     """Steady field of the LiDAR and its supply while it is on [nT]."""
 
     lidar_cos_nt: Vec3 = ZERO3
-    """Field of the LiDAR's turning motor when its angle is 0 [nT]; at angle a it is cos(a) of this."""
+    """Field of the LiDAR's motor, the part in proportion to the cosine of its angle [nT]."""
 
     lidar_sin_nt: Vec3 = ZERO3
-    """Field of the LiDAR's turning motor a quarter turn on [nT]; at angle a it is sin(a) of this."""
+    """Field of the LiDAR's motor, the part in proportion to the sine of its angle [nT]."""
 
     lidar_phase: float = 0.0
     """Angle of the LiDAR's motor at the start of a run [rad]."""
 
     battery_nt: Vec3 = ZERO3
-    """Field of the supply current, for each ampere above that at rest with a full pack [nT/A]."""
+    """Field per ampere of supply current above that at rest with a full pack [nT/A]."""
 
     left_wheel_moment: float = 0.0
-    """Magnetic moment of the left wheel's iron across its axle [A m2]: it turns with the wheel."""
+    """Magnetic moment of the left wheel's iron across its axle [A m2]; it turns with the wheel."""
 
     left_wheel_phase: float = 0.0
-    """Angle from up, forwards, at which that moment is at the start of a run [rad]."""
+    """Angle of that moment at the start of a run, from up towards forward [rad]."""
 
     right_wheel_moment: float = 0.0
     """Magnetic moment of the right wheel's iron across its axle [A m2]."""
 
     right_wheel_phase: float = 0.0
-    """Angle from up, forwards, at which that moment is at the start of a run [rad]."""
+    """Angle of that moment at the start of a run, from up towards forward [rad]."""
 
     caster_moment: float = 0.0
-    """Magnetic moment of the caster's iron across the way [A m2]; it rolls as the robot drives."""
+    """Magnetic moment of the caster's iron, across its axle [A m2]; it rolls as the robot drives."""
 
     caster_phase: float = 0.0
-    """Angle from up, forwards, at which that moment is at the start of a run [rad]."""
+    """Angle of that moment at the start of a run, from up towards forward [rad]."""
 
     p_base_caster: Vec3 = ZERO3
-    """Middle of the caster in base_link [m]."""
+    """Centre of the caster in base_link [m]."""
 
     caster_radius_m: float = 0.01
-    """Radius that the caster rolls on [m]."""
+    """Rolling radius of the caster [m]."""
 
     hard_iron_change_nt: Vec3 = ZERO3
-    """Part of h that came after the survey of the map [nT]; 0 in the survey's session. A map that this robot
-    surveyed holds h without it."""
+    """Change of h since the survey of the map [nT]; 0 in the survey's session. A map that this robot surveyed
+    contains h without the change."""
 
     hard_iron_drift_nt: Vec3 = ZERO3
-    """Mean change of h from the day of a survey to the days of driving that follow [nT]: handling, docking
-    and tools magnetise or demagnetise."""
+    """Mean change of h between the survey and later sessions [nT]: handling, docking and tools magnetise or
+    demagnetise the robot."""
 
     hard_iron_std_nt: float = 0.0
-    """Standard deviation of each part of h from one day of driving to another [nT]."""
+    """Standard deviation of each component of h between sessions [nT]."""
 
     current_std: float = 0.0
-    """Relative standard deviation of what motors, LiDAR and battery add, from one day to another: wires lie
-    otherwise."""
+    """Relative standard deviation of the fields of motors, LiDAR and battery between sessions: wires move."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -108,7 +107,7 @@ class PlatformFieldSpec(Spec):
 
 @dataclass(frozen=True, kw_only=True)
 class EarthFieldSpec(Spec):
-    """The Earth's field in the lab, uniform over it."""
+    """The Earth's field, uniform over the lab."""
 
     b_world_nt: Vec3
     """Field in world axes [nT]."""
@@ -123,27 +122,27 @@ class EarthFieldSpec(Spec):
     """Height above the WGS 84 ellipsoid [m]."""
 
     date: str
-    """Date of the field, YYYY-MM-DD."""
+    """Date, YYYY-MM-DD."""
 
     north_deg: float = 0.0
-    """Angle from the world's y to true north, counter-clockwise seen from above [deg]."""
+    """Angle from the world's +y to true north, counter-clockwise from above [deg]."""
 
     measured: bool = False
-    """Whether the field was measured, so that it may differ from the model's."""
+    """Whether the field was measured; a measured field may differ from the model."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._within("latitude_deg", -90, 90)
         self._within("longitude_deg", -180, 360)
         self._within("north_deg", -360, 360)
-        self._require("date", _is_day(self.date), "be a day as YYYY-MM-DD", self.date)
+        self._require("date", _is_date(self.date), "be a date YYYY-MM-DD", self.date)
         first, last = SPAN
         if not self.measured:
             within = first <= datetime.date.fromisoformat(self.date) <= last
             self._require("date", within, f"lie in {MODEL}'s span, {first} to {last}", self.date)
 
 
-def _is_day(text: str) -> bool:
+def _is_date(text: str) -> bool:
     try:
         return datetime.date.fromisoformat(text).isoformat() == text
     except ValueError:
@@ -152,38 +151,37 @@ def _is_day(text: str) -> bool:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class SourceSpec(Summarized, Spec):
-    """A magnetised thing: a point dipole, or a uniformly magnetised body of some shape."""
+    """A magnetised thing: a point dipole, or a uniformly magnetised body."""
 
     name: str
-    """Name of its prim: letters, digits and _, no digit first."""
+    """Name of its prim: letters, digits and _, not starting with a digit."""
 
     p_world: Vec3
-    """Where it is: the middle of all but a mesh [m]."""
+    """Position: the centre, or the origin of a mesh [m]."""
 
     m_world: Vec3 = ZERO3
-    """Dipole moment of a point, in world axes [A m2]."""
+    """Dipole moment of a point in world axes [A m2]."""
 
     shape: str = "point"
     """"point", "cuboid", "cylinder", "sphere" or "mesh"."""
 
     q_world_xyzw: Quat = IDENTITY_XYZW
-    """Axes of a body in world; a cylinder's axis is its own z."""
+    """Axes of a body in world. The axis of a cylinder is z."""
 
     size_m: Vec3 = ZERO3
-    """Sides of the box about a body along its own axes [m]; follows from the vertices of a mesh."""
+    """Size of the body's bounding box along its own axes [m]; computed for a mesh."""
 
     magnetization: Vec3 = ZERO3
     """Remanent magnetization of a body in its own axes [A/m]."""
 
     susceptibility: float = 0.0
-    """Volume susceptibility of a body's material [1]; see
-    `magtwin.field.sources.bodies.induced_magnetization`."""
+    """Volume susceptibility of the material [1]: the Earth's field induces more magnetization."""
 
     vertices_m: tuple[Vec3, ...] = ()
-    """Vertices of a mesh in its own axes [m], in single precision, as USD has them."""
+    """Vertices of a mesh in its own axes [m], in single precision as in USD."""
 
     faces: tuple[tuple[int, int, int], ...] = ()
-    """Corners of a mesh's triangles, counter-clockwise seen from outside."""
+    """Corners of a mesh's triangles, counter-clockwise from outside."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -196,31 +194,31 @@ class SourceSpec(Summarized, Spec):
         if self.shape == "point":
             self._check_point()
             return
-        self._require("m_world", self.m_world == ZERO3, f"not be given for a {self.shape}", self.m_world)
+        self._require("m_world", self.m_world == ZERO3, f"be left out for a {self.shape}", self.m_world)
         if self.shape == "mesh":
             vertices = np.asarray(np.asarray(self.vertices_m, np.float32), float).reshape(-1, 3)
             check_mesh(vertices, np.asarray(self.faces, int).reshape(-1, 3), f"source {self.name!r}")
             object.__setattr__(self, "vertices_m", tuple(map(tuple, vertices.tolist())))
             object.__setattr__(self, "size_m", tuple(np.ptp(vertices, axis=0).tolist()))
         else:
-            self._require("vertices_m", not (self.vertices_m or self.faces), "go with shape mesh", "some")
             self._require(
-                "size_m", min(self.size_m) > 0, "be above 0 m each way: no volume, no field", self.size_m
+                "vertices_m", not (self.vertices_m or self.faces), "be given for shape mesh only", "some"
             )
+            self._require("size_m", min(self.size_m) > 0, "be above 0 m each way", self.size_m)
         x, y, z = self.size_m
         if self.shape == "cylinder":
-            self._require("size_m", x == y, "be as wide in y as in x for a cylinder", self.size_m)
+            self._require("size_m", x == y, "be equal in x and y for a cylinder", self.size_m)
         if self.shape == "sphere":
-            self._require("size_m", x == y == z, "be alike each way for a sphere", self.size_m)
+            self._require("size_m", x == y == z, "be equal each way for a sphere", self.size_m)
 
     def _check_point(self) -> None:
         for name, none in {"size_m": ZERO3, "magnetization": ZERO3, "susceptibility": 0.0}.items():
             seen = getattr(self, name)
-            self._require(
-                name, seen == none, "be given with a shape: a point has no volume, only m_world", seen
-            )
+            self._require(name, seen == none, "be left out for a point, which has only m_world", seen)
         turned = self.q_world_xyzw != IDENTITY_XYZW
         self._require(
-            "q_world_xyzw", not turned, "not turn a point, whose m_world is in world axes", "a turn"
+            "q_world_xyzw", not turned, "be left out for a point: m_world is in world axes", "a rotation"
         )
-        self._require("vertices_m", not (self.vertices_m or self.faces), "go with shape mesh", "some")
+        self._require(
+            "vertices_m", not (self.vertices_m or self.faces), "be given for shape mesh only", "some"
+        )

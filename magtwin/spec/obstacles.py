@@ -1,4 +1,4 @@
-"""Obstacles: what stands on a floor, for footprints to stop at and for LiDARs to see."""
+"""Obstacles: solid things on the floor, which stop robots and which LiDARs see."""
 
 import functools
 from collections.abc import Sequence
@@ -13,22 +13,21 @@ from magtwin.summary import Summarized, Summary, listed
 Array = NDArray[np.float64]
 
 LEVEL_M = 1e-9
-"""Vertices nearer than this to a line through two others make no corner [m]."""
+"""A vertex nearer than this to the line through its neighbours is no corner [m]."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Obstacles(Summarized):
     """Solid things in world, each with its outline on the floor and its surface.
 
-    The outline is convex: a thing that is not is seen from above as its hull. Arrays are copied at
-    birth and cannot be written to.
+    Outlines are convex: of another shape, the convex hull counts. Arrays are copies and read-only.
     """
 
     names: tuple[str, ...] = ()
-    """What each is called: the path of its prim."""
+    """Name of each: the path of its prim."""
 
     outlines: tuple[Array, ...] = ()
-    """Corners of each outline in world x and y [m], anticlockwise, shape (K, 2)."""
+    """Corners of each outline in world x and y [m], counter-clockwise, shape (K, 2)."""
 
     triangles: Array = field(default_factory=lambda: np.empty((0, 3, 3)))
     """Surfaces of all of them in world [m], shape (T, 3, 3)."""
@@ -50,15 +49,15 @@ class Obstacles(Summarized):
         return len(self.names)
 
     def clearance(self, p_xy: ArrayLike, *, reach_m: float = np.inf) -> tuple[Array, NDArray[np.intp]]:
-        """How far points are from the nearest outline.
+        """Distance of points from the nearest outline.
 
         Args:
             p_xy: Points in world [m], shape (N, 2).
-            reach_m: Distance beyond which no obstacle counts [m]: a short one is faster.
+            reach_m: Ignore obstacles beyond this distance [m]; a small value is faster.
 
         Returns:
-            Distance [m], below 0 inside an outline, inf where nothing is within reach; and the index of
-            the nearest obstacle, -1 for none; each of shape (N,).
+            Distance [m], negative inside an outline, inf if nothing is within reach; and the index of the
+            nearest obstacle, -1 if there is none; each of shape (N,).
         """
         p = np.asarray(p_xy, float)
         nearest, which = np.full(len(p), np.inf), np.full(len(p), -1)
@@ -76,8 +75,8 @@ class Obstacles(Summarized):
 
     @functools.cached_property
     def edges(self) -> tuple[Array, NDArray[np.intp]]:
-        """All outlines as edges for a compiled loop: x0, y0, x1, y1 [m], shape (E, 4), and where the edges of
-        each outline begin, shape (O + 1,).
+        """All outlines as edges for a compiled loop: x0, y0, x1, y1 [m], shape (E, 4), and the index of the
+        first edge of each outline, shape (O + 1,).
         """
         sides = [np.hstack([o, np.roll(o, -1, axis=0)]) for o in self.outlines]
         begins = np.concatenate([[0], np.cumsum([len(s) for s in sides])]).astype(np.intp)
@@ -102,7 +101,7 @@ def _distance(p: Array, outline: Array) -> Array:
 
 
 def _hull(name: str, points: ArrayLike) -> Array:
-    """Convex hull of points (K, 2), anticlockwise, by Andrew's monotone chain (1979)."""
+    """Convex hull of points (K, 2), counter-clockwise, by Andrew's monotone chain (1979)."""
     p = np.asarray(points, float)
     if p.ndim != 2 or p.shape[1] != 2 or not np.isfinite(p).all():
         raise InputError(f"obstacle {name!r}: its outline must be finite, of shape (K, 2), got {p.shape}")

@@ -1,4 +1,4 @@
-"""A robot: its asset, drive, sensors and magnetic field; and its place in a scene."""
+"""A robot: its USD asset, drive, sensors and magnetic field; and its place in a scene."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +13,7 @@ from magtwin.summary import Summarized, Summary
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class RobotSpec(Summarized, Spec):
-    """A robot: the USD asset that shows it, and what the simulator needs to drive it."""
+    """A robot: its USD asset, and all that the simulator needs."""
 
     name: str
     """Name of its prim."""
@@ -22,25 +22,25 @@ class RobotSpec(Summarized, Spec):
     """USD file of the articulation."""
 
     footprint_radius_m: float = 0.171
-    """Radius of the circle that must stay clear of walls [m]."""
+    """Radius of the circle that must stay free of obstacles [m]."""
 
     base_height_m: float = 0.0
-    """Height of base_link above the floor that the robot stands on [m]; read from the asset."""
+    """Height of base_link above the floor [m]; read from the asset."""
 
     p_base_magnetometer: Vec3 = ZERO3
-    """Magnetometer's origin in base_link at rest, through the links between [m]; read from the asset."""
+    """Magnetometer's origin in base_link at rest [m]; read from the asset."""
 
     q_base_magnetometer_link_xyzw: Quat = IDENTITY_XYZW
-    """Axes of the link that carries the magnetometer, in base_link; read from the asset."""
+    """Axes of the magnetometer's link in base_link; read from the asset."""
 
     q_base_imu_link_xyzw: Quat = IDENTITY_XYZW
-    """Axes of the link that carries the IMU, in base_link; read from the asset."""
+    """Axes of the IMU's link in base_link; read from the asset."""
 
     p_base_lidar: Vec3 = ZERO3
     """LiDAR's origin in base_link at rest [m]; read from the asset."""
 
     q_base_lidar_link_xyzw: Quat = IDENTITY_XYZW
-    """Axes of the link that carries the LiDAR, in base_link; read from the asset."""
+    """Axes of the LiDAR's link in base_link; read from the asset."""
 
     drive: DriveSpec = field(default_factory=DriveSpec)
     battery: BatterySpec = field(default_factory=BatterySpec)
@@ -71,7 +71,7 @@ class RobotSpec(Summarized, Spec):
         return _product(self.q_base_lidar_link_xyzw, self.lidar.q_link_sensor_xyzw)
 
     def _summary(self) -> Summary:
-        """Name and magnetometer; drive; other sensors; the field that it makes itself."""
+        """Name and magnetometer; drive; other sensors; asset."""
         sensor, drive = self.magnetometer, self.drive
         network = "" if sensor.network is None else f" ({sensor.network.name})"
         x, y, z = self.p_base_magnetometer
@@ -103,13 +103,12 @@ def _product(a: Quat, b: Quat) -> Quat:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class PlacedRobot(Summarized, Spec):
-    """A robot in a scene: what it is, where it begins, and what it drives."""
+    """A robot in a scene, with its start and its default path."""
 
     robot: RobotSpec
 
     start: Vec3 = ZERO3
-    """First x [m], y [m] and yaw [rad] in world, where a path does not say."""
+    """Start: x [m], y [m] and yaw [rad] in world. A path starts at its own first point."""
 
     path: str | Path = ""
-    """What it drives unless told otherwise: a name of `magtwin.path.PATHS`, "random", or a CSV file; "" for
-    what whoever runs the scene takes."""
+    """Default path: a name of `magtwin.path.PATHS`, "random", or a CSV file; "" for the caller's default."""

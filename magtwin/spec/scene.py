@@ -14,9 +14,9 @@ from magtwin.summary import Summarized, Summary, listed
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Scene(Summarized, Spec):
-    """A lab, its magnetic map, and a robot in it, or several.
+    """A lab, its magnetic map, and one or more robots.
 
-    What is asked of a scene is asked of its first robot, `robot`; `led_by` makes another one the first.
+    `robot`, `start` and `path` are those of the first robot; `led_by` makes another robot the first.
     """
 
     name: str
@@ -26,33 +26,33 @@ class Scene(Summarized, Spec):
     """USD layer of the anomaly map."""
 
     map_sha256: str = ""
-    """Checksum of the map layer's file, lower-case hex; "" means that any file will do."""
+    """SHA-256 of the map layer, lower-case hex; "" accepts any file."""
 
     robot: RobotSpec
     lab: LabSpec = field(default_factory=LabSpec)
     earth: EarthFieldSpec | None = None
-    """Earth's field; none where only a survey is known."""
+    """Earth's field; None if only a survey is known."""
 
     sources: tuple[SourceSpec, ...] = ()
-    """Magnetised things in the lab; with `earth` and `furniture` they make the exact field known."""
+    """Magnetised things in the lab. With `earth` and `furniture`, they define the exact field."""
 
     furniture: tuple[FurnitureSpec, ...] = ()
-    """Furniture and parts of the building, whose steel is magnetised too."""
+    """Furniture and parts of the building; their steel is magnetised too."""
 
     start: Vec3 = ZERO3
-    """Robot's first x [m], y [m] and yaw [rad] in world, where a path does not say."""
+    """Start of the robot, see `PlacedRobot`."""
 
     path: str | Path = ""
-    """What the robot drives unless told otherwise; see `PlacedRobot`."""
+    """Default path of the robot, see `PlacedRobot`."""
 
     others: tuple[PlacedRobot, ...] = ()
-    """Further robots in the lab, each of a name of its own."""
+    """Further robots in the lab, each with its own name."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         names = [placed.robot.name for placed in self.robots]
         twice = next((name for name in names if names.count(name) > 1), "")
-        self._require("others", not twice, "be robots of names of their own", f"{twice!r} twice")
+        self._require("others", not twice, "have different names", f"{twice!r} twice")
 
     @property
     def robots(self) -> tuple[PlacedRobot, ...]:
@@ -60,19 +60,19 @@ class Scene(Summarized, Spec):
         return (PlacedRobot(robot=self.robot, start=self.start, path=self.path), *self.others)
 
     def led_by(self, name: str) -> "Scene":
-        """The scene with the robot of that name as its first, the others after it in their order.
+        """The scene with the robot called `name` as the first robot.
 
         Raises:
-            UnknownNameError: No robot is called so; the text names the nearest one.
+            UnknownNameError: There is no such robot; the text has the nearest name.
         """
         placed = find("robot", name, {placed.robot.name: placed for placed in self.robots})
         rest = tuple(other for other in self.robots if other.robot.name != name)
         return replace(self, robot=placed.robot, start=placed.start, path=placed.path, others=rest)
 
     def _summary(self) -> Summary:
-        """Name and floor; robots; map; what makes the field; what is driven."""
+        """Name and floor; robots; map; field; paths; furniture."""
         width, depth = self.lab.floor_m
-        robots = [f"{one.robot.name} ({one.robot.magnetometer.kind} magnetometer)" for one in self.robots]
+        robots = [f"{p.robot.name} ({p.robot.magnetometer.kind} magnetometer)" for p in self.robots]
         field = "no Earth's field" if self.earth is None else f"Earth's field of {self.earth.date}"
         return Summary(
             f"Scene {self.name}: floor {width:g} x {depth:g} m",
@@ -83,12 +83,12 @@ class Scene(Summarized, Spec):
                     "field",
                     f"{field}, {len(self.sources):,} sources, {len(self.furniture):,} pieces of furniture",
                 ),
-                ("path", listed([str(one.path) or "not set" for one in self.robots])),
-                ("furniture", listed([one.name for one in self.furniture], 200)),
+                ("path", listed([str(placed.path) or "not set" for placed in self.robots])),
+                ("furniture", listed([piece.name for piece in self.furniture], 200)),
             ),
         )
 
     @property
     def magnets(self) -> tuple[SourceSpec, ...]:
-        """Everything that is magnetised: the sources, and the steel of the furniture."""
+        """All magnetised things: the sources, and the steel of the furniture."""
         return (*self.sources, *(source for piece in self.furniture for source in steel_of(piece)))

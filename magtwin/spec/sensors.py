@@ -1,4 +1,4 @@
-"""The sensors of a robot: magnetometer, IMU, LiDAR and battery; and motion capture, which sees it."""
+"""The sensors of a robot: magnetometer, IMU, LiDAR, battery; and the motion capture of the lab."""
 
 import math
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ MOST_RAYS = 100_000
 
 
 MAGNETOMETER_KINDS = ("physical", "neural", "map-only")
-"""What a magnetometer reads: the exact field; the map and what a network predicts; the map alone."""
+"""A magnetometer reads the exact field; the map and a network's prediction; or the map alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MountSpec(Spec):
-    """Where a sensor sits: a pose on a link of the robot."""
+    """The pose of a sensor on a link of the robot."""
 
     link: str
     """Name of the robot link that carries the sensor."""
@@ -37,58 +37,58 @@ class MountSpec(Spec):
 
 @dataclass(frozen=True, kw_only=True)
 class MagnetometerSpec(MountSpec):
-    """A scalar magnetometer, whose vector axes are measured in turn; see
-    `magtwin.sim.sensors.magnetometer`.
-    """
+    """A scalar magnetometer with vector axes, see `magtwin.sim.sensors.magnetometer`."""
 
     link: str = "magnetometer_link"
     """Name of the robot link that carries the sensor."""
 
     kind: Literal["physical", "neural", "map-only"] = "physical"
-    """"physical": the disturbance is the exact field less the map; "neural": `network` predicts it;
-    "map-only": there is none."""
+    """"physical": the disturbance is the exact field minus the map; "neural": `network` predicts it;
+    "map-only": no disturbance."""
 
     rate_hz: float = 135.0
-    """Readings a second [Hz]."""
+    """Output rate [Hz]."""
 
     noise_density_nt: float = 0.002
     """White noise, one-sided amplitude density [nT/sqrt(Hz)]."""
 
     flicker_corner_hz: float = 0.0
-    """Frequency at which 1/f noise is as strong as white noise [Hz]; 0 for none."""
+    """Frequency at which 1/f noise equals white noise [Hz]; 0 disables it."""
 
     resolution_nt: float = 1.664e-4
-    """Smallest step of a reading [nT]; 0 for none."""
+    """Smallest step of a reading [nT]; 0 disables rounding."""
 
     bandwidth_hz: float = 0.0
-    """Corner of the first-order low-pass that the field goes through [Hz]; 0 for none."""
+    """Corner frequency of the first-order low-pass [Hz]; 0 disables it."""
 
     clock_offset_s: float = 0.0
-    """How far its clock is ahead [s]: a reading stamped t is of the field at t less this."""
+    """Offset of its clock [s]: a reading with stamp t shows the field at t minus the offset."""
 
     heading_error_nt: float = 0.0
-    """Error of a reading along the optical axis, its own z; falls with the cosine of the angle to it [nT]."""
+    """Heading error: error with the field along the optical axis (z); it falls with the cosine of the angle
+    [nT]."""
 
     dead_zone_axis: float = 0.0
-    """Angle between field and optical axis, either way, within which lock is lost [rad]."""
+    """The sensor loses lock if the field is within this angle of the optical axis, in either direction
+    [rad]."""
 
     dead_zone_plane: float = 0.0
-    """Angle between field and the plane across the optical axis within which lock is lost [rad]."""
+    """The sensor loses lock if the field is within this angle of the plane across the optical axis [rad]."""
 
     gradient_max_nt_m: float = 0.0
-    """Gradient of the field's magnitude above which lock is lost [nT/m]; 0 for never."""
+    """The sensor loses lock above this gradient of the magnitude [nT/m]; 0 disables it."""
 
     gradient_relock_nt_m: float = 0.0
-    """Gradient below which lock is found again [nT/m]; not above `gradient_max_nt_m`."""
+    """The sensor locks again below this gradient [nT/m]; at most `gradient_max_nt_m`."""
 
     stuck_nt: float = 35_650.0
-    """What is read while lock is lost [nT]."""
+    """Mean reading of a sensor that is stuck, having lost lock [nT]."""
 
     stuck_std_nt: float = 50.0
-    """Standard deviation of that from one loss to the next [nT]; during one it stays the same."""
+    """Standard deviation of that reading between losses of lock [nT]; during one loss it is constant."""
 
     dropout_share: float = 0.0
-    """Share of readings that are missing."""
+    """Fraction of readings that are missing."""
 
     vector_noise_density_nt: float = 0.03
     """White noise of the vector axes, one-sided amplitude density [nT/sqrt(Hz)]."""
@@ -97,16 +97,16 @@ class MagnetometerSpec(MountSpec):
     """Bias of each vector axis [nT]."""
 
     vector_scale: Vec3 = ZERO3
-    """Relative error of each vector axis's scale."""
+    """Relative scale error of each vector axis."""
 
     vector_misalignment: Matrix3 = ZERO9
-    """Where each vector axis points, by rows: its own unit vector and this [rad], brought to unit length."""
+    """Misalignment of each vector axis, by rows: added to its unit vector [rad], then normalised."""
 
     network: Path | None = None
-    """Weights that predict the disturbance where `kind` is "neural"."""
+    """Weights that predict the disturbance if `kind` is "neural"."""
 
     network_sha256: str = ""
-    """Checksum of the weights file, lower-case hex; "" means that any file will do."""
+    """SHA-256 of the weights file, lower-case hex; "" accepts any file."""
 
     inputs: tuple[str, ...] = ()
     """Names of the network's inputs, in order."""
@@ -135,62 +135,61 @@ class MagnetometerSpec(MountSpec):
 
     @property
     def noise_std_nt(self) -> float:
-        """Standard deviation of the white noise of one reading at its own rate [nT]."""
+        """Standard deviation of the white noise of one reading [nT]: density times sqrt(rate / 2)."""
         return self.noise_density_nt * math.sqrt(self.rate_hz / 2)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImuSpec(MountSpec):
-    """An inertial unit that gives orientation, rates and acceleration with gravity removed."""
+    """An inertial unit with orientation, angular rates, and acceleration without gravity."""
 
     link: str = "imu_link"
 
     rate_hz: float = 62.0
-    """Samples a second [Hz]."""
+    """Sample rate [Hz]."""
 
     latency_s: float = 0.008
-    """Time that a sample takes to arrive [s]."""
+    """Delay of a sample [s]."""
 
     jitter_s: float = 0.002
-    """Mean of the further delay of each sample, exponentially distributed [s]."""
+    """Mean additional delay of a sample, exponentially distributed [s]."""
 
     yaw_zero: float = 0.0
-    """World heading of base_link at which the orientation's yaw is 0 [rad]: where it was switched on."""
+    """World heading at which its yaw is 0 [rad]: the heading at switch-on."""
 
     tilt: Vec2 = (-0.009, 0.0002)
-    """Roll and pitch by which the sensor is not quite level on its robot [rad]."""
+    """Roll and pitch of the sensor on the robot [rad]."""
 
     level_error: Vec2 = (0.0048, -0.0036)
-    """Roll and pitch, about axes that do not turn with the robot, by which what the sensor takes for level
-    is off [rad]: the floor slopes a little. With `tilt` it gives the orientation's x and y the means and the
-    rank correlations with the disturbance that the published ones have."""
+    """Roll and pitch of the floor, about axes that do not turn with the robot [rad]. With `tilt`, it gives
+    the orientation's x and y the means, and the rank correlations with the disturbance, of published data."""
 
     tilt_std: float = 0.0095
-    """Standard deviation of the roll and pitch that wander, by floor and casters [rad]."""
+    """Standard deviation of the roll and pitch that wander because of floor and casters [rad]."""
 
     tilt_time_s: float = 20.0
-    """Time in which the wandering tilt forgets itself [s]."""
+    """Correlation time of the wandering tilt [s]."""
 
     orientation_noise_std: float = 0.001
     """Standard deviation of each small angle of the orientation [rad]."""
 
     gyro_noise_std: float = 0.002
-    """Standard deviation of a rate sample, each axis, of a robot that stands [rad/s]."""
+    """Standard deviation of a rate sample of each axis at rest [rad/s]."""
 
     gyro_bias: Vec3 = ZERO3
     """Bias of the rates at the start of a run [rad/s]."""
 
     gyro_bias_walk: float = 2e-5
-    """How fast the bias walks: its standard deviation after 1 s [rad/s]."""
+    """Random walk of the bias: its standard deviation after 1 s [rad/s]."""
 
     gyro_vibration: Vec3 = (0.052, 0.16, 0.05)
-    """Standard deviation of the rates by vibration, for each m/s of speed [rad/m]."""
+    """Standard deviation of the rates by vibration, per m/s of speed [rad/m]."""
 
     accel_noise_std: float = 0.02
-    """Standard deviation of an acceleration sample, each axis, of a robot that stands [m/s2]."""
+    """Standard deviation of an acceleration sample of each axis at rest [m/s2]."""
 
     accel_vibration: Vec3 = (1.7, 1.1, 4.1)
-    """Standard deviation of the acceleration by vibration, for each m/s of speed [1/s]."""
+    """Standard deviation of the acceleration by vibration, per m/s of speed [1/s]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -211,39 +210,39 @@ class ImuSpec(MountSpec):
 
 @dataclass(frozen=True, kw_only=True)
 class LidarSpec(MountSpec):
-    """A spinning planar LiDAR; its motor and current disturb the field while it is on."""
+    """A spinning planar LiDAR. Its motor and current disturb the field while it is on."""
 
     link: str = "rplidar_link"
 
     scan_rate_hz: float = 7.5
-    """Turns a second [Hz]."""
+    """Scan rate [Hz]."""
 
     rays: int = 720
-    """Rays of a scan, evenly all the way round."""
+    """Rays of a scan, evenly spaced over a full turn."""
 
     range_min_m: float = 0.15
-    """Nearest range [m]."""
+    """Smallest range [m]."""
 
     range_max_m: float = 12.0
-    """Farthest range [m]."""
+    """Largest range [m]."""
 
     range_noise_std_m: float = 0.01
     """Standard deviation of a range [m]."""
 
     latency_s: float = 0.14
-    """Time that a scan takes to arrive [s]: a whole turn, and what comes after it."""
+    """Delay of a scan [s]: one turn, and the processing after it."""
 
     jitter_s: float = 0.005
-    """Mean of the further delay of each scan, exponentially distributed [s]."""
+    """Mean additional delay of a scan, exponentially distributed [s]."""
 
     on_s: float = 20.0
-    """Time on in each cycle of the schedule, which begins off [s]; 0 means always off."""
+    """Time on in each cycle; a cycle starts off [s]. 0 means always off."""
 
     off_s: float = 40.0
-    """Time off in each cycle of the schedule [s]; 0 means always on."""
+    """Time off in each cycle [s]. 0 means always on."""
 
     phase_s: float = 0.0
-    """How far into a cycle a run begins [s]."""
+    """Time within a cycle at which a run starts [s]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -258,55 +257,56 @@ class LidarSpec(MountSpec):
 
 @dataclass(frozen=True, kw_only=True)
 class BatterySpec(Spec):
-    """A battery and what it feeds; `magtwin.sim.sensors.battery.discharge` says what becomes of it."""
+    """A battery and its loads; see `magtwin.sim.sensors.battery.Battery`."""
 
     model: Literal["power", "linear"] = "power"
-    """"power": it gives what electronics, LiDAR and motors draw, and sags; "linear": it falls evenly."""
+    """"power": electronics, LiDAR and motors discharge it, and its voltage sags; "linear": the voltage falls
+    linearly."""
 
     capacity_wh: float = 26.0
     """Energy of a full pack [Wh]."""
 
     load_w: float = 15.0
-    """Power of the electronics [W]; of the linear model all power."""
+    """Power of the electronics [W]; in the linear model, the total power."""
 
     lidar_w: float = 2.3
     """Power of the LiDAR while it is on [W]."""
 
     drag_n: float = 2.0
-    """Force that the robot drives against [N]."""
+    """Rolling resistance [N]."""
 
     mass_kg: float = 3.945
     """Mass that its wheels accelerate [kg]."""
 
     motor_efficiency: float = 0.4
-    """Work of the wheels for each joule that the motors draw, above 0 to 1."""
+    """Mechanical power of the wheels over electrical power of the motors, above 0, at most 1."""
 
     initial_fraction: float = 1.0
-    """Charge at the start of a run, 0 to 1."""
+    """State of charge at the start of a run, 0 to 1."""
 
     voltage_empty_v: float = 12.44
-    """Voltage at charge 0, no load on it [V]."""
+    """Voltage at charge 0 without load [V]."""
 
     voltage_full_v: float = 16.24
-    """Voltage at charge 1, no load on it [V]."""
+    """Voltage at charge 1 without load [V]."""
 
     discharge: tuple[float, ...] = (0.0, 0.28, 0.4, 0.47, 0.52, 0.57, 0.63, 0.71, 0.8, 0.9, 1.0)
-    """Voltage at evenly spaced charges from 0 to 1, as a share of the way from empty to full."""
+    """Voltage at evenly spaced charges from 0 to 1, scaled so that empty is 0 and full is 1."""
 
     resistance_ohm: float = 0.12
-    """Inner resistance [ohm], which makes the voltage sag under load."""
+    """Internal resistance [ohm]."""
 
     voltage_noise_std_v: float = 0.02
     """Standard deviation of a voltage sample [V]."""
 
     rate_hz: float = 0.5
-    """Samples a second [Hz]."""
+    """Sample rate [Hz]."""
 
     latency_s: float = 0.05
-    """Time that a sample takes to arrive [s]."""
+    """Delay of a sample [s]."""
 
     jitter_s: float = 0.01
-    """Mean of the further delay of each sample, exponentially distributed [s]."""
+    """Mean additional delay of a sample, exponentially distributed [s]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -324,44 +324,44 @@ class BatterySpec(Spec):
 
 @dataclass(frozen=True, kw_only=True)
 class MocapSpec(Spec):
-    """How the lab's motion capture sees a robot."""
+    """Motion capture of a robot."""
 
     rate_hz: float = 120.0
-    """Poses a second [Hz]."""
+    """Pose rate [Hz]."""
 
     latency_s: float = 0.01
-    """Time that a pose takes to arrive [s]."""
+    """Delay of a pose [s]."""
 
     jitter_s: float = 0.001
-    """Mean of the further delay of each pose, exponentially distributed [s]."""
+    """Mean additional delay of a pose, exponentially distributed [s]."""
 
     p_noise_std_m: float = 0.0005
-    """Standard deviation of a position, each axis [m]."""
+    """Standard deviation of a position along each axis [m]."""
 
     angle_noise_std: float = 0.003
     """Standard deviation of each small angle of an orientation [rad]."""
 
     dropout_every_s: float = 60.0
-    """Mean time in which the markers are seen, between two dropouts [s]; 0 for no dropouts."""
+    """Mean time between dropouts [s]; 0 disables them."""
 
     dropout_s: float = 0.2
-    """Mean length of a dropout [s]; 0 for no dropouts."""
+    """Mean duration of a dropout [s]; 0 disables them."""
 
     offset_m: tuple[float, float] = (0.0, 0.0)
-    """Where base_link lies forward and left of where it is taken to be [m]: markers are put on by hand."""
+    """Forward and left offset of base_link from the measured point [m]: markers are attached by hand."""
 
     offset_drift_m: tuple[float, float] = (0.0, 0.0)
-    """What `offset_m` has changed by since the survey [m]: the markers were put on anew."""
+    """Change of `offset_m` since the survey [m]: the markers were attached again."""
 
     latency_drift_s: float = 0.0
-    """What `latency_s` has changed by since the survey [s]."""
+    """Change of `latency_s` since the survey [s]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._above_zero("rate_hz")
         if self.latency_s + self.latency_drift_s < 0:
             raise InputError(
-                f"latency_drift_s of motion capture takes its latency of {self.latency_s} s below 0, "
+                f"latency_drift_s of MocapSpec must not make the latency of {self.latency_s} s negative, "
                 f"got {self.latency_drift_s}"
             )
         self._not_negative("latency_s", "jitter_s", "p_noise_std_m", "angle_noise_std")

@@ -66,7 +66,7 @@ def scene_from_toml(
         return load_predictor(weights).features
 
     def survey_of(scene: Scene, spec: SurveySpec, seed: int, obstacles: Obstacles) -> FilePath:
-        from magtwin.sim.room_survey import survey_room
+        from magtwin.sim.survey import survey_room
         from magtwin.usd.maps import save_map
 
         source = f"{FilePath(path).name} sha256:{sha256(path)}"

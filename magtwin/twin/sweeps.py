@@ -94,7 +94,8 @@ def sweep(
             magnetometer is not the twin's, or `simulate` would refuse a run.
     """
     from magtwin.sim.exact import check_field, check_read
-    from magtwin.sim.runs.batch import BLOCK, Conditions, Job, Runs
+    from magtwin.sim.runs.batch import BLOCK, Job, Runs
+    from magtwin.sim.runs.sensing import Conditions
 
     twin = opened(twin, network, magnetometer, model_error, "sweep")
     check_field(twin.scene, twin.field)

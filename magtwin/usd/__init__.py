@@ -1,4 +1,4 @@
-"""Authoring and reading USD. Importing this room registers magtwin's schemas with USD."""
+"""Authoring and reading USD. Importing this package registers magtwin's schemas with USD."""
 
 from magtwin.usd.schema import register
 

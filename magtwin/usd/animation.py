@@ -1,11 +1,9 @@
-"""Animation: a Run as a layer of time samples over its scene, which any viewer of USD plays, and back.
+"""A Run as a USD layer of time samples over its scene, which any USD viewer plays.
 
-The layer moves the robot and turns its wheels, and gives what the sensors read on their prims. Time code 0 is
-the run's first row, and `timeCodesPerSecond` of them are a second. Beside what is played, the prim `Run`
-holds every column whole, one array each, at full rate and to the last bit: those are what `read_animation`
-reads, and what the samples' rate does not touch.
-
-Samples are authored on the layer itself: a stage would compose anew for each.
+The layer moves the robot, turns its wheels, and samples the sensors' readings on their prims. Time code 0 is
+the run's first row. The prim `Run` also holds every column as one exact array at full rate;
+`read_animation` reads these. Samples are authored on the layer itself, since a stage would recompose for
+each.
 """
 
 import json
@@ -37,7 +35,7 @@ from magtwin.usd.schema import attribute_name, only_prim_with, place, prims_with
 from magtwin.usd.sensors import JOINT_FIELDS
 
 FPS = 30.0
-"""Frames a second unless told otherwise."""
+"""Default frame rate [Hz]."""
 
 MOST_FPS = 10_000.0
 
@@ -49,7 +47,7 @@ POSES = (
     ("mocap_p", "mocap_q_xyzw"),
     ("odom_p", "odom_q_xyzw"),
 )
-"""Where the robot is: the truth, or what came nearest to it in a recording without."""
+"""Columns of the robot's pose, best first."""
 
 READINGS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -68,13 +66,13 @@ READINGS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "robot": ("flag_bump", "flag_pose_lost"),
     }
 )
-"""Columns that are sampled on the prim of a sensor: `b_total_nt` as `magtwin:magnetometer:bTotalNt`."""
+"""Columns sampled on the prim of each sensor: `b_total_nt` as `magtwin:magnetometer:bTotalNt`."""
 
 _BARE = WORLD.AppendChild("robot")
-"""What stands for the robot where there is no scene."""
+"""Robot of a run without a scene."""
 
 _CRATE = b"PXR-USDC"
-"""What a binary USD file begins with."""
+"""First bytes of a binary USD file."""
 
 _PROBE = """
 import sys
@@ -83,10 +81,10 @@ from pxr import Sdf
 layer = Sdf.Layer.OpenAsAnonymous(sys.argv[1])
 layer.Traverse("/", lambda path: path.IsPropertyPath() and layer.GetObjectAtPath(path).GetInfo("default"))
 """
-"""Takes every value out of a layer."""
+"""Script that reads every value of a layer."""
 
 PATIENCE_S = 60.0
-"""How long that may take, and a second more a megabyte [s]."""
+"""Time limit of that script, plus 1 s per megabyte [s]."""
 
 _FACTS = "magtwinFacts"
 _KINDS = {
@@ -105,7 +103,7 @@ _KINDS = {
 
 @dataclass(frozen=True)
 class _Stand:
-    """Where in a scene a robot's prims are."""
+    """Prims of a robot in a scene."""
 
     world: Sdf.Path = WORLD
     robot: Sdf.Path = _BARE
@@ -113,7 +111,7 @@ class _Stand:
     """Origin of the base link in the robot's root [m]."""
     q_root_base_xyzw: Quat = (0.0, 0.0, 0.0, 1.0)
     wheels: tuple[tuple[Sdf.Path, Vec3, Quat, Vec3], ...] = ()
-    """Of the left and the right wheel: prim, place [m] and turn in its parent, and axis in its own frame."""
+    """Left and right wheel: prim, position [m] and orientation in its parent, and axis in its own frame."""
     sensors: Mapping[str, Sdf.Path] = field(
         default_factory=lambda: {"magnetometer": _BARE.AppendChild("magnetometer"), "robot": _BARE}
     )
@@ -129,23 +127,21 @@ def write_animation(
 ) -> None:
     """Write a run as a layer of time samples over its scene.
 
-    Poses and readings are sampled `fps` times a second, as `Run.resample` reads them; flags and the battery
-    where they change.
-    Bodies are moved by their transforms: to look at, not for a physics engine to simulate.
+    Poses and readings are resampled at `fps` with `Run.resample`; flags and the battery are sampled when they
+    change. Bodies are moved by their transforms: for viewing, not for a physics engine.
 
     Args:
-        run: What happened; the robot is where `p_world_base` has it, or else motion capture or odometry. In a
-            scene of several, it is the one that its fact `robot` names, or the first.
-        path: The .usd, .usda or .usdc file to make; the first and last are small, text is not.
-        scene_file: The stage that it happened in, which becomes a sublayer, named relative to `path`. One
-            that plays another robot's run goes on playing it. Without a stage, bare Xforms called robot
-            and magnetometer stand for them.
-        fps: Frames a second; none samples at every row.
-        force: Whether a file that exists is replaced.
+        run: The run. The pose is `p_world_base`, or else motion capture or odometry. Among several robots of
+            a scene, the metadata `robot` selects one; default: the first.
+        path: The .usd, .usda or .usdc file to make; text is large.
+        scene_file: The stage of the run, which becomes a sublayer. It may itself play another robot's run.
+            Without a stage, Xforms called robot and magnetometer are authored.
+        fps: Frame rate [Hz]; None samples every row.
+        force: Whether to replace an existing file.
 
     Raises:
-        InputError: The file exists and `force` was not given, cannot be written or is a part of the scene;
-            the run has no clock or no pose, or a column cannot stand in USD; or the scene has no robot.
+        InputError: The file exists and `force` was not given, cannot be written or is part of the scene; the
+            run has no clock or no pose, or a column that USD cannot hold; or the scene has no robot.
     """
     path = Path(path)
     if path.suffix not in SUFFIXES:
@@ -183,10 +179,10 @@ def write_animation(
 
 
 def read_animation(path: str | os.PathLike[str]) -> Run:
-    """The run that `write_animation` wrote, to the last bit; its scene need not be there.
+    """The exact run that `write_animation` wrote; its scene need not exist.
 
     Raises:
-        InputError: The file is missing, is not USD, is cut short, or plays no run of magtwin's.
+        InputError: The file is missing, not USD, truncated, or holds no run.
     """
     _check_decodes(path)
     layer = _open_layer(path)
@@ -201,17 +197,17 @@ def read_animation(path: str | os.PathLike[str]) -> Run:
 
 
 def is_animation(path: str | os.PathLike[str]) -> bool:
-    """Whether a USD file plays a run of magtwin's.
+    """Whether a USD file holds a run.
 
     Raises:
-        InputError: The file is missing, or is not USD.
+        InputError: The file is missing or not USD.
     """
     layer = _open_layer(path)
     return bool(layer.GetAttributeAtPath(_run_path(layer).AppendProperty("magtwin:run:t")))
 
 
 def _check_decodes(path: str | os.PathLike[str]) -> None:
-    """Refuse a binary file in which bytes were changed, so that USD's own reader ends its process."""
+    """Refuse a damaged binary file, on which USD's reader would end the process."""
     path = existing(path, "USD file")
     if path.is_dir():
         return
@@ -224,12 +220,12 @@ def _check_decodes(path: str | os.PathLike[str]) -> None:
         done = subprocess.run(command, capture_output=True, check=False, timeout=patience)
     except subprocess.TimeoutExpired as error:
         raise InputError(f"{path}: damaged: USD does not come to its end; copy it again") from error
-    if done.returncode not in (0, 1):  # what Python itself refuses is said when it is read here
+    if done.returncode not in (0, 1):  # another error is raised when the file is read here
         raise InputError(f"{path}: damaged: USD cannot decode it; copy it again, or write it again")
 
 
 def _open_layer(path: str | os.PathLike[str]) -> Sdf.Layer:
-    """A layer as it is on disk now, and nothing that it names."""
+    """A layer, read from disk, without the files that it names."""
     path = existing(path, "USD file")
     if path.is_dir():
         raise InputError(f"{path}: a folder; give a USD file in it")
@@ -243,7 +239,7 @@ def _open_layer(path: str | os.PathLike[str]) -> Sdf.Layer:
 
 
 def _read(layer: Sdf.Layer, path: str | os.PathLike[str]) -> Run:
-    """The run of a layer, with whatever faults its file has."""
+    """The run of a layer."""
     prim = layer.GetPrimAtPath(_run_path(layer))
     if not prim:
         raise InputError(f"{path}: plays no run: it has no prim {_run_path(layer)} that holds one")
@@ -254,10 +250,10 @@ def _read(layer: Sdf.Layer, path: str | os.PathLike[str]) -> Run:
             continue
         columns[name] = _array(attribute, path)
         if name not in COLUMNS:
-            specs[name] = _spec_said(attribute)
+            specs[name] = _column_spec(attribute)
     metadata = json.loads(layer.customLayerData.get(_FACTS, "{}"))
     try:
-        return Run(columns, {key: value for key, value in metadata.items() if _is_fact(value)}, specs)
+        return Run(columns, {key: value for key, value in metadata.items() if _is_metadata(value)}, specs)
     except InputError as error:
         raise InputError(f"{path}: holds a damaged run: {error}") from error
 
@@ -270,11 +266,14 @@ def _run_path(layer: Sdf.Layer) -> Sdf.Path:
 
 
 def _frames(run: Run, at: NDArray[np.float64]) -> Run:
-    """What is played of a run, at the instants of the frames [s]."""
+    """The poses and readings of a run at the times of the frames [s]."""
     pose = _pose_columns(run)
     sampled = (n for names in READINGS.values() for n in names if COLUMNS[n].interpolation != "hold")
     wanted = [name for name in (*pose, "wheel_angle", *sampled) if name in run]
-    rules: Any = {pose[0]: "linear", pose[1]: "quaternion"}  # of a recording: it moved between the fixes
+    rules: Any = {
+        pose[0]: "linear",
+        pose[1]: "quaternion",
+    }  # it moves between recorded poses
     return run.select(*wanted).resample(at, interpolation=rules)
 
 
@@ -283,11 +282,11 @@ def _pose_columns(run: Run) -> tuple[str, str]:
         if p in run and q in run and np.isfinite(run[p]).all(axis=1).any():
             return p, q
     known = "; ".join(" and ".join(pair) for pair in POSES)
-    raise InputError(f"the run says nowhere where the robot is; it needs {known}")
+    raise InputError(f"the run has no pose of the robot; it needs {known}")
 
 
 def _stand(stage: Usd.Stage, name: str) -> _Stand:
-    """Where a scene's robot is, and how it is made; the first of them where `name` is ""."""
+    """The prims of a scene's robot; the first robot if `name` is ""."""
     root = stage.GetPseudoRoot()
     robots = {prim.GetName(): prim for prim in prims_with(root, "robot")}
     prim = find("robot", name, robots) if name else next(iter(robots.values()), None)
@@ -297,17 +296,18 @@ def _stand(stage: Usd.Stage, name: str) -> _Stand:
     if not default or prim.GetParent() != default:
         raise InputError(f"{place(prim)}: the robot must stand directly under the default prim of its scene")
     if prim.IsInstance() or prim.IsInstanceProxy():
-        raise InputError(f"{place(prim)}: the robot is an instance, whose wheels cannot turn; make it none")
+        raise InputError(
+            f"{place(prim)}: the robot is an instance, whose wheels cannot turn; make it not instanceable"
+        )
     cache = UsdGeom.XformCache()
     if cache.GetLocalToWorldTransform(default) != Gf.Matrix4d(1):
-        raise InputError(f"{place(default)}: is moved or scaled; magtwin plays runs in scenes that are not")
+        raise InputError(f"{place(default)}: is moved or scaled; place it at the origin")
     to_root = cache.ComputeRelativeTransform(_base(prim), prim)[0].RemoveScaleShear()
     turn, offset = to_root.ExtractRotationQuat(), to_root.ExtractTranslation()
     sensors = {}
     for noun in READINGS:
-        found = prims_with(prim, noun)
-        if found:
-            sensors[noun] = found[0].GetPath()
+        if prims := prims_with(prim, noun):
+            sensors[noun] = prims[0].GetPath()
     x, y, z = map(float, offset)
     return _Stand(
         world=default.GetPath(),
@@ -320,7 +320,7 @@ def _stand(stage: Usd.Stage, name: str) -> _Stand:
 
 
 def _base(robot: Usd.Prim) -> Usd.Prim:
-    """The body of a robot whose pose a run tells: base_link, or its root where there is none."""
+    """The body whose pose is in a run: base_link, or else the root."""
     return next((prim for prim in Usd.PrimRange(robot) if prim.GetName() == BASE_LINK), robot)
 
 
@@ -331,26 +331,26 @@ def _wheel(robot: Usd.Prim, joint_field: str, stage: Usd.Stage) -> tuple[Sdf.Pat
         (link.axis_link for link in read_links(stage).values() if link.joint == joint.GetName()), None
     )
     if axis is None:
-        raise InputError(f"{place(joint)}: is no revolute joint between two bodies; a wheel turns on one")
+        raise InputError(f"{place(joint)}: is no revolute joint between two bodies, as a wheel needs")
     return body.GetPath(), *read_pose(body), axis
 
 
 def _check_apart(path: Path, stage: Usd.Stage) -> None:
-    """Refuse to replace a part of the scene by what plays in it."""
+    """Refuse to replace a layer of the scene."""
     for layer in stage.GetUsedLayers():
         if layer.realPath and Path(layer.realPath).resolve() == path.resolve():
             raise InputError(f"{path}: is a part of the scene; give another name")
 
 
 def _relative(scene_file: Path, path: Path) -> str:
-    """The scene's file, as seen from the place that the layer will have."""
+    """The scene's file relative to the final place of the layer."""
     relative = Path(os.path.relpath(scene_file.resolve(), path.resolve().parent)).as_posix()
     return relative if relative.startswith("../") else f"./{relative}"
 
 
 def _describe(layer: Sdf.Layer, run: Run, stand: _Stand, rate: float, end: float) -> None:
     stage = Usd.Stage.Open(layer)
-    describe_stage(stage, "A run of magtwin's: its robot moved, its sensors read; play it over time")
+    describe_stage(stage, "A run of magtwin: poses of the robot and readings of its sensors over time")
     layer.customLayerData = {"creator": "magtwin", _FACTS: json.dumps(dict(run.metadata), ensure_ascii=False)}
     layer.defaultPrim = stand.world.name
     layer.startTimeCode, layer.endTimeCode = 0.0, float(end)
@@ -358,14 +358,14 @@ def _describe(layer: Sdf.Layer, run: Run, stand: _Stand, rate: float, end: float
 
 
 def _define_bare(layer: Sdf.Layer, stand: _Stand) -> None:
-    """The Xforms that stand for a scene which is not there."""
+    """The Xforms of a run without a scene."""
     for path in (stand.world, stand.robot, stand.sensors["magnetometer"]):
         spec = Sdf.CreatePrimInLayer(layer, path)
         spec.specifier, spec.typeName = Sdf.SpecifierDef, "Xform"
 
 
 def _animate(layer: Sdf.Layer, stand: _Stand, frames: Run, codes: list[float]) -> None:
-    """The robot's root and wheels, moved."""
+    """Author the motion of the robot's root and wheels."""
     p_name, q_name = _pose_columns(frames)
     known = np.isfinite(frames[p_name]).all(axis=1) & np.isfinite(frames[q_name]).all(axis=1)
     p, q = frames[p_name][known], frames[q_name][known]
@@ -382,7 +382,7 @@ def _animate(layer: Sdf.Layer, stand: _Stand, frames: Run, codes: list[float]) -
 
 
 def _move(layer: Sdf.Layer, path: Sdf.Path, codes: list[float], p: Any, q: NDArray[np.float64]) -> None:
-    """Place an Xform at each time code; `p` is an array, or one place for all of them."""
+    """Author the pose of an Xform at each time code; `p` is an array, or one constant position."""
     prim = Sdf.CreatePrimInLayer(layer, path)
     translate = Sdf.AttributeSpec(prim, "xformOp:translate", Sdf.ValueTypeNames.Double3)
     orient = Sdf.AttributeSpec(prim, "xformOp:orient", Sdf.ValueTypeNames.Quatd)
@@ -396,7 +396,7 @@ def _move(layer: Sdf.Layer, path: Sdf.Path, codes: list[float], p: Any, q: NDArr
 
 
 def sample(layer: Sdf.Layer, path: Sdf.Path, codes: list[float], values: Iterable[Any]) -> None:
-    """Author samples of an attribute, as fast as Python calls a function, and tell nobody until the last."""
+    """Author samples of an attribute in one change block."""
     with Sdf.ChangeBlock():
         deque(map(layer.SetTimeSample, repeat(path), codes, values), maxlen=0)
 
@@ -404,7 +404,7 @@ def sample(layer: Sdf.Layer, path: Sdf.Path, codes: list[float], values: Iterabl
 def _sample_readings(
     layer: Sdf.Layer, stand: _Stand, run: Run, frames: Run, codes: list[float], rate: float
 ) -> None:
-    """What sensors read, on their prims: at every frame, or, if it is held, where it changes."""
+    """Author the readings on the prims of their sensors: at every frame, or when a held value changes."""
     t, kinds = run["t"], Sdf.ValueTypeNames
     for noun, names in READINGS.items():
         for name in names:
@@ -427,16 +427,16 @@ def _sample_readings(
 
 
 def _store(layer: Sdf.Layer, path: Sdf.Path, run: Run) -> None:
-    """Every column of a run as an array."""
+    """Author every column of a run as an array."""
     prim = Sdf.CreatePrimInLayer(layer, path)
     prim.specifier, prim.typeName = Sdf.SpecifierDef, "Scope"
-    prim.documentation = "Every column of the run, a row a reading; rows of vectors lie one after the other"
+    prim.documentation = "Every column of the run; rows of vectors are flattened"
     for number, (name, values) in enumerate(run.items()):
         kind = _KINDS.get(values.dtype.str[1:])
         if kind is None or values.ndim > 2 or not Sdf.Path.IsValidIdentifier(name):
             raise InputError(
-                f"column {name!r} cannot stand in USD: numbers or flags can, under a name of letters, digits "
-                f"and _, got {values.dtype} of shape {values.shape}"
+                f"column {name!r} cannot be written to USD: it needs numbers or flags, and a name of letters,"
+                f" digits and _, got {values.dtype} of shape {values.shape}"
             )
         spec = run.spec(name)
         attribute = Sdf.AttributeSpec(
@@ -452,7 +452,7 @@ def _store(layer: Sdf.Layer, path: Sdf.Path, run: Run) -> None:
 
 
 def _number(attribute: Sdf.PropertySpec) -> float:
-    """Where in the order of the table a column stands."""
+    """Position of a column in the table."""
     number = attribute.customData.get("number")
     return float(number) if isinstance(number, int) else np.inf
 
@@ -470,7 +470,7 @@ def _array(attribute: Sdf.AttributeSpec, path: str | os.PathLike[str]) -> NDArra
     return values.reshape(-1, width) if parts else values
 
 
-def _spec_said(attribute: Sdf.AttributeSpec) -> Column:
+def _column_spec(attribute: Sdf.AttributeSpec) -> Column:
     said = {key: str(value) for key, value in attribute.customData.items()}
     parts = tuple(filter(None, said.get("parts", "").split(",")))
     rule: Any = said.get("interpolation", "linear")
@@ -478,5 +478,5 @@ def _spec_said(attribute: Sdf.AttributeSpec) -> Column:
     return Column(unit, frame, attribute.documentation, len(parts) or 1, parts, rule)
 
 
-def _is_fact(value: Any) -> bool:
+def _is_metadata(value: Any) -> bool:
     return isinstance(value, str | int | float | bool)

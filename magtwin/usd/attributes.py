@@ -1,7 +1,7 @@
-"""Between plain data and a prim: fields of a spec as attributes, a pose as a transform, a link as a target.
+"""Specs as attributes of a prim, and poses as transforms.
 
-What is written is read back to the bit. A value is authored even where it equals the schema's fallback,
-which a reader without the schema does not see; over a layer that gives it already, it is not said again.
+Values are read back exactly as they were written. A value is authored even if it equals the schema's
+fallback, since a reader may not have the schema; it is not authored again over a layer that has it.
 """
 
 from dataclasses import fields
@@ -19,27 +19,27 @@ from magtwin.usd.schema import attribute_name, place, require_api
 S = TypeVar("S")
 
 
-def write_figures(prim: Usd.Prim, noun: str, spec: Any, *, skip: Any = ()) -> Usd.Prim:
-    """Write each field of a spec, but those in `skip`, to the attribute that stands for it.
+def write_spec(prim: Usd.Prim, noun: str, spec: Any, *, skip: Any = ()) -> Usd.Prim:
+    """Write each field of a spec, except those in `skip`, to its attribute.
 
-    None, "" and () are left to the fallback, unless a weaker layer gives another value.
+    None, "" and () are not authored, unless a weaker layer has another value.
     """
     for field in fields(spec):
         if field.name in skip:
             continue
         attribute = prim.GetAttribute(attribute_name(noun, field.name))
         value = getattr(spec, field.name)
-        unsaid = value not in (None, "", ()) and not attribute.HasAuthoredValue()
-        if unsaid or plain_value(attribute) != (value.resolve() if isinstance(value, Path) else value):
+        missing = value not in (None, "", ()) and not attribute.HasAuthoredValue()
+        if missing or plain_value(attribute) != (value.resolve() if isinstance(value, Path) else value):
             attribute.Set(_usd_value(attribute, value))
     return prim
 
 
-def read_figures(cls: type[S], prim: Usd.Prim, noun: str, **known: Any) -> S:
-    """A spec from the attributes of `prim`, for those fields that are not in `known`.
+def read_spec(cls: type[S], prim: Usd.Prim, noun: str, **known: Any) -> S:
+    """A spec from the attributes of `prim`; `known` gives the other fields.
 
     Raises:
-        InputError: The prim has not the schema, or a value is missing, of another type or out of range.
+        InputError: The prim lacks the schema, or a value is missing, of another type or out of range.
     """
     require_api(prim, noun)
     values = dict(known)
@@ -53,9 +53,9 @@ def read_figures(cls: type[S], prim: Usd.Prim, noun: str, **known: Any) -> S:
 
 
 def write_pose(prim: Usd.Prim, p: Vec3, q_xyzw: Quat | None = None) -> None:
-    """Place an Xform in its parent: a position [m] and, unless none, a turn, both in double precision.
+    """Set the pose of an Xform in its parent: position [m] and optional orientation, in double precision.
 
-    Other transform ops are dropped from the order.
+    Other transform ops are removed from the order.
     """
     want = [("xformOp:translate", Sdf.ValueTypeNames.Double3, Gf.Vec3d(p))]
     if q_xyzw is not None:
@@ -74,10 +74,10 @@ def write_pose(prim: Usd.Prim, p: Vec3, q_xyzw: Quat | None = None) -> None:
 
 
 def read_pose(prim: Usd.Prim) -> tuple[Vec3, Quat]:
-    """Position [m] and turn (xyzw) of an Xform in its parent.
+    """Position [m] and orientation (xyzw) of an Xform in its parent.
 
-    What `write_pose` wrote comes back to the bit; any other rigid transform comes back as it composes,
-    its turn brought to unit length where it is in less than double precision.
+    A pose of `write_pose` is read back exactly. Another rigid transform is composed, and its quaternion is
+    normalised if it is not in double precision.
     """
     xformable = UsdGeom.Xformable(prim)
     ops = {op.GetOpName(): op.Get() for op in xformable.GetOrderedXformOps()}
@@ -111,10 +111,12 @@ def check_prim_name(name: str, what: str) -> str:
     """`name` if a prim can have it.
 
     Raises:
-        InputError: It has signs other than letters, digits and _, or begins with a digit.
+        InputError: It has characters other than letters, digits and _, or starts with a digit.
     """
     if not Sdf.Path.IsValidIdentifier(name):
-        raise InputError(f"{what} {name!r} cannot name a prim; use letters, digits and _, no digit first")
+        raise InputError(
+            f"{what} {name!r} cannot name a prim; use letters, digits and _, not starting with a digit"
+        )
     return name
 
 
@@ -137,7 +139,7 @@ def plain_value(attribute: Usd.Attribute) -> Any:
     """An attribute's value as plain Python: numbers, text, tuples, a Path (which need not exist) or None.
 
     Raises:
-        InputError: The layers give a value of another type than the schema does.
+        InputError: The value is not of the type in the schema.
     """
     value, kind = attribute.Get(), attribute.GetTypeName()
     if not isinstance(value, kind.type.pythonClass or type(kind.defaultValue)):
@@ -154,7 +156,7 @@ def plain_value(attribute: Usd.Attribute) -> Any:
 
 
 def _anchored(attribute: Usd.Attribute, value: Sdf.AssetPath) -> Path:
-    """The file that an asset path names, whether it is there or not."""
+    """The file that an asset path names, which need not exist."""
     if value.resolvedPath:
         return Path(value.resolvedPath).resolve()
     layer = attribute.GetPropertyStack()[0].layer

@@ -1,4 +1,4 @@
-"""The Earth's field as a prim: where the lab stands and when, and the field that follows from it."""
+"""The Earth's field as a prim: place and date of the lab, and the field computed from them."""
 
 import dataclasses
 
@@ -8,31 +8,31 @@ from magtwin.errors import InputError
 from magtwin.field.sources.earth import earth_field_nt
 from magtwin.spec.base import ZERO3
 from magtwin.spec.magnetics import EarthFieldSpec
-from magtwin.usd.attributes import read_figures, write_figures
+from magtwin.usd.attributes import read_spec, write_spec
 from magtwin.usd.schema import apply_api, attribute_name, place
 
 DERIVED_FROM = attribute_name("earth", "derived_from")
 DIGITS = 1
-"""Digits after the point to which a derived field is kept [nT], as those of the coefficients."""
+"""Decimal places of a computed field [nT], as those of the model's coefficients."""
 
 AGREES_NT = 1.0
-"""Difference that a field which is given may have from the model's and not be called measured [nT]."""
+"""Largest difference from the model of a field that is not marked as measured [nT]."""
 
 
 def define_earth(stage: Usd.Stage, path: str | Sdf.Path, spec: EarthFieldSpec) -> Usd.Prim:
-    """Author the Earth's field as an Xform of its own; returns its prim."""
-    prim = write_figures(apply_api(UsdGeom.Xform.Define(stage, path).GetPrim(), "earth"), "earth", spec)
+    """Author the Earth's field as an Xform; returns its prim."""
+    prim = write_spec(apply_api(UsdGeom.Xform.Define(stage, path).GetPrim(), "earth"), "earth", spec)
     prim.GetAttribute(DERIVED_FROM).Set("" if spec.measured else _inputs(spec))
     return prim
 
 
 def read_earth(prim: Usd.Prim) -> EarthFieldSpec:
-    """The spec of an authored Earth's field, computed anew where the prim's place, day or north were changed.
+    """The spec of an authored Earth's field, computed again if its place, date or north was changed.
 
     Raises:
-        InputError: It is none, or a figure is out of range.
+        InputError: The prim is no Earth's field, or a value is out of range.
     """
-    spec = read_figures(EarthFieldSpec, prim, "earth")
+    spec = read_spec(EarthFieldSpec, prim, "earth")
     if spec.measured or prim.GetAttribute(DERIVED_FROM).Get() == _inputs(spec):
         return spec
     try:
@@ -42,10 +42,10 @@ def read_earth(prim: Usd.Prim) -> EarthFieldSpec:
 
 
 def derived(spec: EarthFieldSpec) -> EarthFieldSpec:
-    """The spec with the IGRF's field of its place, day and north, to 0.1 nT.
+    """The spec with the field of the IGRF at its place, date and north, rounded to 0.1 nT.
 
     Raises:
-        InputError: The model does not reach there.
+        InputError: Place or date is outside the model.
     """
     x, y, z = earth_field_nt(
         spec.latitude_deg, spec.longitude_deg, spec.height_m, spec.date, north_deg=spec.north_deg
@@ -55,10 +55,10 @@ def derived(spec: EarthFieldSpec) -> EarthFieldSpec:
 
 
 def checked(spec: EarthFieldSpec) -> EarthFieldSpec:
-    """The spec with its field derived where it gives none, and held against the model's where it does.
+    """The spec with a field: computed if it has none, otherwise compared with the model.
 
     Raises:
-        InputError: The field that it gives is not the model's, and is not said to be measured.
+        InputError: The field differs from the model and is not marked as measured.
     """
     if spec.measured:
         return spec
@@ -67,13 +67,13 @@ def checked(spec: EarthFieldSpec) -> EarthFieldSpec:
         return model
     if max(abs(a - b) for a, b in zip(spec.b_world_nt, model.b_world_nt, strict=True)) > AGREES_NT:
         raise InputError(
-            f"b_world_nt {list(spec.b_world_nt)} is not the IGRF-14's field of that place, day and north, "
-            f"{list(model.b_world_nt)}; leave it out, or say measured = true"
+            f"b_world_nt {list(spec.b_world_nt)} is not the IGRF-14's field of that place, date and north, "
+            f"{list(model.b_world_nt)}; leave it out, or set measured = true"
         )
     return spec
 
 
 def _inputs(spec: EarthFieldSpec) -> str:
-    """What the field follows from, as `derivedFrom` says it."""
+    """The inputs of the computed field, as the attribute `derivedFrom` has them."""
     numbers = (spec.latitude_deg, spec.longitude_deg, spec.height_m, spec.date, spec.north_deg)
     return " ".join(str(number) for number in numbers)

@@ -1,4 +1,4 @@
-"""Furniture on a stage: what each piece looks like, what of it collides, and what of it is magnetised."""
+"""Furniture on a stage: looks, colliders and magnetised parts."""
 
 from dataclasses import replace
 from typing import Any
@@ -19,8 +19,8 @@ from magtwin.usd.sources import (
     SOURCES,
     define_source,
     define_triangles,
-    placement,
     read_source,
+    read_transform,
     source_prims,
 )
 
@@ -60,7 +60,7 @@ def define_furniture(stage: Usd.Stage, furniture: tuple[FurnitureSpec, ...]) -> 
 
 
 def _define_part(stage: Usd.Stage, piece: Sdf.Path, part: Part, source: SourceSpec | None) -> Usd.Prim:
-    """One part, with the source that it is where it is steel."""
+    """One part; a steel part is a source."""
     path, look = piece.AppendChild(part.name), piece.AppendChild(LOOKS).AppendChild(part.look)
     if source is not None:
         return define_source(stage, piece, _named(source, part.name), look=part.look)
@@ -84,10 +84,10 @@ def _define_part(stage: Usd.Stage, piece: Sdf.Path, part: Part, source: SourceSp
 
 
 def read_magnets(stage: Usd.Stage) -> tuple[tuple[SourceSpec, ...], tuple[FurnitureSpec, ...]]:
-    """Every magnetised thing of a stage: sources, wherever they stand, and furniture whose steel is its own.
+    """Every magnetised thing of a stage: its sources, and its furniture.
 
-    A piece of furniture that was moved or turned is that piece at its new place. One of which a part was
-    moved, scaled, added or magnetised in its own way comes back as the sources that it consists of.
+    A piece that was moved or turned as a whole is read at its new place. A piece with a part that was moved,
+    scaled, added or magnetised differently is read as separate sources.
 
     Raises:
         InputError: A source is part of a robot, or as for `read_source`.
@@ -104,8 +104,8 @@ def read_magnets(stage: Usd.Stage) -> tuple[tuple[SourceSpec, ...], tuple[Furnit
     for prim in prims:
         if robot := next((r for r in robots if prim.GetPath().HasPrefix(r)), None):
             raise InputError(
-                f"{place(prim)}: a magnetic source on the robot {robot}, which carries it about; say it as "
-                "the robot's platform field"
+                f"{place(prim)}: a magnetic source on the robot {robot}, which moves; author it as the "
+                "robot's platform field"
             )
         if prim.GetPath() not in taken:
             sources.append(read_source(prim, name=_name(prim, names)))
@@ -114,36 +114,36 @@ def read_magnets(stage: Usd.Stage) -> tuple[tuple[SourceSpec, ...], tuple[Furnit
 
 
 def _whole(root: Usd.Prim, prims: list[Usd.Prim]) -> FurnitureSpec | None:
-    """The piece of furniture at a prim; none where its steel is not as that kind's."""
+    """The piece of furniture at a prim; None if its steel parts are not those of its kind."""
     own = [prim for prim in prims if prim.GetPath().HasPrefix(root.GetPath())]
-    p, q, scale = placement(root)
+    p, q, scale = read_transform(root)
     if max(abs(s - 1) for s in scale) > 1e-9 or any(prim.GetParent() != root for prim in own):
         return None
     kind = plain_value(root.GetAttribute(KIND))
     if kind not in GENERIC:
-        parts_of(kind)  # refuses a kind that magtwin does not know
+        parts_of(kind)  # raises if the kind is unknown
     try:
         bare = FurnitureSpec(
             name=root.GetName(), kind=kind, p_world=p, q_world_xyzw=q, **_generic(root, kind)
         )
         along = {part.name: part.along for part in bare.parts if part.steel}
-        found = [read_source(prim, local=True) for prim in own]
-        strength = tuple(source.magnetization[along.get(source.name, 0)] for source in found)
+        steel = [read_source(prim, local=True) for prim in own]
+        strength = tuple(source.magnetization[along.get(source.name, 0)] for source in steel)
         spec = replace(
             bare,
             magnetization=strength if any(strength) else (),
-            susceptibility=found[0].susceptibility if found else 0.0,
+            susceptibility=steel[0].susceptibility if steel else 0.0,
         )
     except InputError:  # it has more parts, or fewer
         return None
     wanted = [
         _named(source, source.name.removeprefix(f"{spec.name}_")) for source in spec.sources(in_world=False)
     ]
-    return spec if found == wanted else None
+    return spec if steel == wanted else None
 
 
 def _generic(root: Usd.Prim, kind: str) -> dict[str, Any]:
-    """Material and size of a generic piece, or vertices and faces; nothing for the other kinds."""
+    """Material and size of a generic piece, or vertices and faces; empty for other kinds."""
     if kind not in GENERIC:
         return {}
     given: dict[str, Any] = {"material": plain_value(root.GetAttribute(MATERIAL))}
@@ -167,7 +167,7 @@ def _named(source: SourceSpec, name: str) -> SourceSpec:
 
 
 def _name(prim: Usd.Prim, taken: set[str]) -> str:
-    """What a source is called: its prim under /World/Sources, else the prims down to it; each name once."""
+    """Unique name of a source: its prim's below /World/Sources, else the path of prims down to it."""
     path = prim.GetPath()
     anchor = SOURCES if path.GetParentPath() == SOURCES else WORLD if path.HasPrefix(WORLD) else Sdf.Path("/")
     name = path.MakeRelativePath(anchor).pathString.replace("/", "_")

@@ -1,4 +1,4 @@
-"""Shape and Link: what a stage shows, as triangles, and the bodies that carry it."""
+"""Shapes and links of a stage: triangles that a viewer shows, and the rigid bodies that carry them."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -14,13 +14,13 @@ from magtwin.spec.base import ZERO3, Quat, Vec3
 from magtwin.usd.layers import open_stage
 
 SEGMENTS = 32
-"""Sides of the polygon that stands for a circle."""
+"""Sides of the polygon that approximates a circle."""
 
 GREY = (0.5, 0.5, 0.5, 1.0)
-"""Colour of what has none."""
+"""Colour of a shape without one."""
 
 SHOWN = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
-"""Purposes of what a viewer shows."""
+"""USD purposes that a viewer shows."""
 
 BASE_LINK = "base_link"
 """Name of the link whose frame is the robot's, as in REP-105."""
@@ -28,33 +28,33 @@ BASE_LINK = "base_link"
 
 @dataclass(frozen=True)
 class Shape:
-    """Triangles of one colour (or coloured by vertex), in the frame of the body that carries them."""
+    """Triangles of one colour, or coloured by vertex, in the frame of their body."""
 
     prim: str
     """Path of the gprim, or of the GeomSubset of a mesh with several materials."""
 
     link: str
-    """Name of the rigid body that carries it; "" for what stands still."""
+    """Name of the rigid body that carries it; "" if it stands still."""
 
     vertices: NDArray[np.float32]
-    """Vertices in the link's frame, in world where nothing carries it [m], shape (V, 3)."""
+    """Vertices in the link's frame, or in world if nothing carries it [m], shape (V, 3)."""
 
     faces: NDArray[np.int32]
-    """Corners of the triangles, counter-clockwise seen from outside, shape (F, 3)."""
+    """Corners of the triangles, counter-clockwise from outside, shape (F, 3)."""
 
     colour: tuple[float, float, float, float]
-    """Red, green, blue, opacity, 0 to 1, linear, as USD has them."""
+    """Red, green, blue, opacity, 0 to 1, linear."""
 
     vertex_colours: NDArray[np.float32] | None = None
-    """Red, green, blue of each vertex, 0 to 1, linear, shape (V, 3); none where one colour does."""
+    """Red, green, blue of each vertex, 0 to 1, linear, shape (V, 3); None for a single colour."""
 
 
 @dataclass(frozen=True)
 class Link:
-    """A rigid body: where it rests, and the joint that moves it."""
+    """A rigid body: its pose at rest, and the joint that moves it."""
 
     name: str
-    """Name of its prim; its path where another body has the name already."""
+    """Name of its prim, or its path if another body has the name."""
 
     p_base_link: Vec3
     """Origin in the base link of its robot, at rest [m]."""
@@ -63,55 +63,53 @@ class Link:
     """Axes in the base link of its robot, at rest."""
 
     axis_link: Vec3 | None = None
-    """Axis that the link turns about, in the link's own frame, unit length; none if it does not turn."""
+    """Axis of rotation in the link's frame, unit length; None if it does not turn."""
 
     joint: str = ""
-    """Name of the joint that holds it to its parent; "" for a base."""
+    """Name of the joint to its parent; "" for a base."""
 
     p_world_link: Vec3 = ZERO3
-    """Origin in world, as the stage stands [m]."""
+    """Origin in world on the stage [m]."""
 
     q_world_link_xyzw: Quat = IDENTITY_XYZW
-    """Axes in world, as the stage stands."""
+    """Axes in world on the stage."""
 
     base: str = ""
-    """Name of the base of its robot; its own where no joint holds it."""
+    """Name of the base of its robot; its own name if it has no joint."""
 
 
 @dataclass(frozen=True)
 class ColourScale:
-    """What the colours of a stage's heat-map mean."""
+    """The colour scale of a stage's heat map."""
 
     name: str
-    """Name of the colour map, matplotlib's."""
+    """Name of matplotlib's colour map."""
 
     least: float
-    """Value of its first colour."""
+    """Value of the first colour."""
 
     greatest: float
-    """Value of its last colour."""
+    """Value of the last colour."""
 
     unit: str
     """Unit of both."""
 
     prim: str = ""
-    """Path of the heat-map's mesh."""
+    """Path of the heat map's mesh."""
 
 
 def read_shapes(stage: Usd.Stage | str | os.PathLike[str], *, purposes: Sequence[str] = SHOWN) -> list[Shape]:
-    """Everything that a viewer shows of a stage, as triangles, in order of the prims.
+    """All visible shapes of a stage as triangles, in order of the prims.
 
-    Meshes, cubes, spheres, cylinders, cones, capsules and planes, those in instances included, that
-    are visible and of one of the purposes: colliders (guide) and proxies stay out unless asked for.
-    Subdivision surfaces come as their control mesh.
+    Meshes, cubes, spheres, cylinders, cones, capsules and planes count, also inside instances. Colliders
+    (purpose guide) and proxies are left out by default. Subdivision surfaces become their control mesh.
 
     Args:
         stage: A stage, or the path of a USD file.
-        purposes: USD's purposes of what is wanted.
+        purposes: USD purposes to read.
 
     Raises:
-        InputError: The file is missing or is not USD, or a mesh contradicts itself; the text names
-            the prim.
+        InputError: The file is missing or not USD, or a mesh is inconsistent; the text names the prim.
     """
     stage = stage if isinstance(stage, Usd.Stage) else open_stage(stage)
     shapes: list[Shape] = []
@@ -123,11 +121,11 @@ def read_shapes(stage: Usd.Stage | str | os.PathLike[str], *, purposes: Sequence
 def read_vertices(
     stage: Usd.Stage, *, purposes: Sequence[str] = SHOWN
 ) -> dict[Sdf.Path, tuple[str, NDArray[np.float32]]]:
-    """The vertices alone of what `read_shapes` reads, which is quicker.
+    """The vertices of the shapes that `read_shapes` reads, which is faster.
 
     Returns:
-        By path of the gprim, the name of the body that carries it, "" for none, and the vertices of its faces
-        in that body's frame, else in world [m], shape (V, 3).
+        By path of the gprim: the name of its body ("" for none), and the vertices of its faces in the body's
+        frame or else in world [m], shape (V, 3).
     """
     found = {}
     for gprim, solid, to_frame, name in _shown(stage, purposes):
@@ -141,15 +139,15 @@ def read_vertices(
 def read_triangles(
     stage: Usd.Stage, *, purposes: Sequence[str], wanted: Callable[[Usd.Prim, bool], bool]
 ) -> dict[Sdf.Path, NDArray[np.float64]]:
-    """The triangles alone of what `read_shapes` reads, of those gprims that are wanted.
+    """The triangles of the shapes that `read_shapes` reads, without colours.
 
     Args:
         stage: A stage.
-        purposes: USD's purposes of what is wanted.
-        wanted: Whether a gprim is, from its prim and whether a rigid body carries it.
+        purposes: USD purposes to read.
+        wanted: Function of a prim, and of whether a rigid body carries it: whether to read it.
 
     Returns:
-        By path of the gprim, its triangles in its body's frame, else in world [m], shape (T, 3, 3).
+        By path of the gprim: its triangles in its body's frame or else in world [m], shape (T, 3, 3).
     """
     found = {}
     for gprim, solid, to_frame, _ in _shown(stage, purposes, wanted):
@@ -159,16 +157,16 @@ def read_triangles(
 
 
 def read_links(stage: Usd.Stage | str | os.PathLike[str]) -> dict[str, Link]:
-    """The rigid bodies of a stage by name, with their rest poses in their robot's base.
+    """The rigid bodies of a stage by name, with their poses at rest in the base of their robot.
 
-    A robot's base is its body called `base_link`, or else the body that its tree of joints starts
-    from. Bodies that no joint holds are their own base.
+    The base is the body called `base_link`, or else the root of the tree of joints. A body without a joint is
+    its own base.
 
     Args:
         stage: A stage, or the path of a USD file.
 
     Raises:
-        InputError: The file is missing or is not USD, or joints go round in a circle.
+        InputError: The file is missing or not USD, or joints form a loop.
     """
     stage = stage if isinstance(stage, Usd.Stage) else open_stage(stage)
     cache, bodies = UsdGeom.XformCache(), _bodies(stage)
@@ -196,7 +194,7 @@ def read_links(stage: Usd.Stage | str | os.PathLike[str]) -> dict[str, Link]:
 
 
 def read_colour_scale(stage: Usd.Stage) -> ColourScale | None:
-    """The scale of the first visible heat-map of a stage; none where there is none."""
+    """The scale of the first visible heat map of a stage; None if there is none."""
     for prim in _prims(stage):
         metadata = prim.GetCustomDataByKey("magtwin") or {}
         if "colourMap" in metadata and UsdGeom.Imageable(prim).ComputeVisibility() != "invisible":
@@ -208,7 +206,7 @@ def read_colour_scale(stage: Usd.Stage) -> ColourScale | None:
 
 
 def _prims(stage: Usd.Stage) -> Iterator[Usd.Prim]:
-    """Every prim, those inside instances included."""
+    """Every prim, also inside instances."""
     return iter(stage.Traverse(Usd.TraverseInstanceProxies()))
 
 
@@ -216,8 +214,8 @@ def _shown(
     stage: Usd.Stage,
     purposes: Sequence[str],
     wanted: Callable[[Usd.Prim, bool], bool] = lambda prim, carried: True,
-) -> Iterator[tuple[UsdGeom.Gprim, "_Solid", NDArray, str]]:
-    """Visible gprims with a surface, the map to the frame of their body (4, 4), and its name."""
+) -> Iterator[tuple[UsdGeom.Gprim, "Solid", NDArray, str]]:
+    """Visible gprims with a surface, their transform to the frame of their body (4, 4), and its name."""
     cache, bodies = UsdGeom.XformCache(), _bodies(stage)
     for prim in _prims(stage):
         gprim = UsdGeom.Gprim(prim)
@@ -236,7 +234,7 @@ def _shown(
 
 
 def _bodies(stage: Usd.Stage) -> dict:
-    """Names of the rigid bodies by path, each name once."""
+    """Unique names of the rigid bodies by path."""
     names: dict = {}
     for prim in _prims(stage):
         if prim.HasAPI(UsdPhysics.RigidBodyAPI):
@@ -264,12 +262,12 @@ def _joints(stage: Usd.Stage, bodies: dict) -> Iterator[tuple]:
 
 
 def _root(path, above: dict):  # type: ignore[no-untyped-def]
-    """The body that the tree of joints over a body starts from."""
+    """The root of the tree of joints above a body."""
     seen = [path]
     while path in above:
         path = above[path][1]
         if path in seen:
-            raise InputError(f"{path}: its joints go round in a circle: {' -> '.join(map(str, seen))}")
+            raise InputError(f"{path}: its joints form a loop: {' -> '.join(map(str, seen))}")
         seen.append(path)
     return path
 
@@ -302,7 +300,7 @@ def _is_shown(gprim: UsdGeom.Gprim, purposes: Sequence[str]) -> bool:
 
 
 @dataclass(frozen=True)
-class _Solid:
+class Solid:
     """Points of a gprim, and the triangles between them, each with the face that it was cut from."""
 
     points: NDArray[np.float64]
@@ -314,11 +312,14 @@ class _Solid:
     """Index of the face that each triangle is a part of, shape (F,)."""
 
 
-def _solid(gprim: UsdGeom.Gprim) -> _Solid | None:
-    """A gprim in its own space, or none for kinds that have no surface (points, curves)."""
+def _solid(gprim: UsdGeom.Gprim) -> Solid | None:
+    """A gprim in its own space; None for kinds without a surface (points, curves)."""
     prim = gprim.GetPrim()
     if prim.IsA(UsdGeom.Mesh):
-        return _mesh(UsdGeom.Mesh(prim))
+        try:
+            return mesh_solid(UsdGeom.Mesh(prim))
+        except InputError as error:
+            raise InputError(f"{prim.GetPath()}: {error}") from error
     get = {name: prim.GetAttribute(name).Get() for name in ("radius", "height", "size", "width", "length")}
     axis = prim.GetAttribute("axis").Get()
     kind = prim.GetTypeName()
@@ -341,8 +342,12 @@ def _solid(gprim: UsdGeom.Gprim) -> _Solid | None:
     return None
 
 
-def _mesh(mesh: UsdGeom.Mesh) -> _Solid:
-    """A mesh's polygons cut into fans of triangles, holes left out."""
+def mesh_solid(mesh: UsdGeom.Mesh) -> Solid:
+    """A mesh's polygons as fans of triangles, without holes.
+
+    Raises:
+        InputError: Its indices, counts and points do not fit together.
+    """
     points = np.array(mesh.GetPointsAttr().Get() or np.empty((0, 3)), float)
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [], int)
     corners = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [], int)
@@ -350,8 +355,8 @@ def _mesh(mesh: UsdGeom.Mesh) -> _Solid:
         len(corners) and not 0 <= corners.min() <= corners.max() < len(points)
     ):
         raise InputError(
-            f"{mesh.GetPath()}: its {counts.sum()} corners, {len(corners)} indices and {len(points)} points "
-            "contradict each other; export the mesh again"
+            f"its {counts.sum()} corners, {len(corners)} indices and {len(points)} points do not fit together"
+            "; export the mesh again"
         )
     cuts = np.maximum(counts - 2, 0)
     origin = np.repeat(np.arange(len(counts)), cuts)
@@ -361,13 +366,13 @@ def _mesh(mesh: UsdGeom.Mesh) -> _Solid:
     if mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded:
         triangles = triangles[:, ::-1]
     kept = ~np.isin(origin, np.array(mesh.GetHoleIndicesAttr().Get() or [], int))
-    return _Solid(points, triangles[kept], corners, origin[kept])
+    return Solid(points, triangles[kept], corners, origin[kept])
 
 
-def _faces(points: NDArray, triangles: NDArray) -> _Solid:
+def _faces(points: NDArray, triangles: NDArray) -> Solid:
     """A solid made of triangles."""
     count = len(triangles)
-    return _Solid(
+    return Solid(
         points, np.arange(3 * count).reshape(count, 3), np.asarray(triangles, int).ravel(), np.arange(count)
     )
 
@@ -379,7 +384,7 @@ def _box(size: float) -> tuple[NDArray, NDArray]:
 
 
 def _plane(width: float, length: float, axis: str) -> tuple[NDArray, NDArray]:
-    """A rectangle whose normal is `axis`; width and length lie as UsdGeomPlane has them."""
+    """A rectangle with the normal `axis`; width and length as in UsdGeomPlane."""
     w, h = width / 2, length / 2
     across = {"X": ([0, 0, w], [0, h, 0]), "Y": ([w, 0, 0], [0, 0, h]), "Z": ([w, 0, 0], [0, h, 0])}[axis]
     u, v = np.array(across, float)
@@ -396,7 +401,7 @@ def _arc(radius: float, start_deg: float, end_deg: float) -> NDArray:
 
 
 def _revolved(profile: NDArray, axis: str) -> tuple[NDArray, NDArray]:
-    """The surface that a profile of (distance, height) sweeps about an axis; its ends lie on the axis."""
+    """The surface of revolution of a profile of (distance, height) that begins and ends on the axis."""
     angle = 2 * np.pi * np.arange(SEGMENTS) / SEGMENTS
     ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(SEGMENTS)])
     rings = [r * ring + [0, 0, z] for r, z in profile[1:-1]]
@@ -415,8 +420,8 @@ def _revolved(profile: NDArray, axis: str) -> tuple[NDArray, NDArray]:
     return points[:, order], np.vstack(triangles)
 
 
-def _shapes(gprim: UsdGeom.Gprim, solid: _Solid, to_frame: NDArray, link: str) -> list[Shape]:
-    """The shapes of one gprim: one, or one a subset with a material of its own."""
+def _shapes(gprim: UsdGeom.Gprim, solid: Solid, to_frame: NDArray, link: str) -> list[Shape]:
+    """The shapes of one gprim: one, plus one for each subset with its own material."""
     prim = gprim.GetPrim()
     points = _placed(solid, to_frame)
     mirrored = np.linalg.det(to_frame[:3, :3]) < 0
@@ -448,13 +453,13 @@ def _shapes(gprim: UsdGeom.Gprim, solid: _Solid, to_frame: NDArray, link: str) -
     return shapes
 
 
-def _placed(solid: _Solid, to_frame: NDArray) -> NDArray[np.float64]:
-    """Points of a solid after a map of row vectors (4, 4), shape (V, 3)."""
+def _placed(solid: Solid, to_frame: NDArray) -> NDArray[np.float64]:
+    """Points of a solid, transformed by a matrix for row vectors (4, 4), shape (V, 3)."""
     return np.column_stack([solid.points, np.ones(len(solid.points))]) @ to_frame[:, :3]
 
 
 def _material_colour(prim: Usd.Prim) -> tuple[float, float, float, float] | None:
-    """Colour and opacity of the bound UsdPreviewSurface; none where it takes its colour from a primvar."""
+    """Colour and opacity of the bound UsdPreviewSurface; None if a primvar gives its colour."""
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
     surface = material.ComputeSurfaceSource()[0] if material else None
     if not surface or surface.GetIdAttr().Get() != "UsdPreviewSurface":
@@ -476,8 +481,8 @@ def _display_colour(gprim: UsdGeom.Gprim) -> tuple[float, float, float, float]:
     return (float(r), float(g), float(b), float(np.mean(opacities)) if opacities else 1.0)
 
 
-def _display_colours(gprim: UsdGeom.Gprim, solid: _Solid, mask: NDArray) -> NDArray | None:
-    """Its displayColor by point (P, 3), or by corner of the chosen triangles (3 F, 3); none if constant."""
+def _display_colours(gprim: UsdGeom.Gprim, solid: Solid, mask: NDArray) -> NDArray | None:
+    """DisplayColor by point (P, 3), or by corner of the chosen triangles (3 F, 3); None if constant."""
     primvar = gprim.GetDisplayColorPrimvar()
     colours = primvar.ComputeFlattened()
     if not colours or len(colours) == 1:
@@ -497,12 +502,12 @@ def _display_colours(gprim: UsdGeom.Gprim, solid: _Solid, mask: NDArray) -> NDAr
 
 
 def srgb_from_linear(colour: ArrayLike) -> NDArray[np.float64]:
-    """Colours as screens want them (IEC 61966-2-1) from linear ones as USD has them, any shape, 0 to 1."""
+    """SRGB colours (IEC 61966-2-1) from linear ones as in USD, any shape, 0 to 1."""
     c = np.clip(np.asarray(colour, float), 0, 1)
     return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
 
 
 def linear_from_srgb(colour: ArrayLike) -> NDArray[np.float64]:
-    """Linear colours as USD has them from those of screens, any shape, 0 to 1: inverse of the above."""
+    """Linear colours as in USD from sRGB, any shape, 0 to 1: inverse of `srgb_from_linear`."""
     c = np.clip(np.asarray(colour, float), 0, 1)
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)

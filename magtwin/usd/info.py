@@ -1,4 +1,4 @@
-"""What a stage holds, told without knowing what wrote it."""
+"""A summary of any stage."""
 
 from collections import Counter
 from pathlib import Path
@@ -10,7 +10,7 @@ from magtwin.usd.layers import open_stage
 
 _PREFIX = "Magtwin"
 _MANY = ("MagtwinMagneticSourceAPI", "MagtwinFurnitureAPI")
-"""Schemas that a stage has on many prims, which are counted."""
+"""Schemas that are on many prims, so that only their number is shown."""
 
 
 def info_of_stage(path: Path) -> Report:

@@ -1,11 +1,11 @@
-"""The lab as a room in USD: floor, low walls, a motion-capture frame, lights, and what physics needs."""
+"""The room in USD: floor, low walls, motion-capture frame, lights and physics scene."""
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, Vt
 
 from magtwin.frames import quat_from_rpy
 from magtwin.spec.lab import LabSpec
-from magtwin.usd.attributes import read_figures, write_figures, write_pose
+from magtwin.usd.attributes import read_spec, write_pose, write_spec
 from magtwin.usd.layers import WORLD
 from magtwin.usd.looks import define_box, define_looks, wear
 from magtwin.usd.schema import apply_api
@@ -28,7 +28,7 @@ LAMP_HEIGHT_M = 2.8
 def define_lab(stage: Usd.Stage, spec: LabSpec) -> Usd.Prim:
     """Author the room at /World/Lab and the physics scene at /World/PhysicsScene.
 
-    The floor's top lies at z = 0, its centre at the world's origin; the walls stand outside of it.
+    The top of the floor is at z = 0, its centre at the world's origin. The walls stand outside the floor.
 
     Args:
         stage: Written to in its edit target; metres, Z up.
@@ -37,7 +37,7 @@ def define_lab(stage: Usd.Stage, spec: LabSpec) -> Usd.Prim:
     Returns:
         The prim of the lab.
     """
-    lab = write_figures(apply_api(UsdGeom.Xform.Define(stage, LAB).GetPrim(), "lab"), "lab", spec)
+    lab = write_spec(apply_api(UsdGeom.Xform.Define(stage, LAB).GetPrim(), "lab"), "lab", spec)
     _define_physics_scene(stage)
     define_looks(stage, LOOKS, [look.name for look in (FLOOR, WALL, POST, CAMERA, LENS)])
     _define_floor(stage, spec)
@@ -51,9 +51,9 @@ def read_lab(prim: Usd.Prim) -> LabSpec:
     """The spec of an authored lab.
 
     Raises:
-        InputError: It is none, or a figure is out of range.
+        InputError: The prim is no lab, or a value is out of range.
     """
-    return read_figures(LabSpec, prim, "lab")
+    return read_spec(LabSpec, prim, "lab")
 
 
 def _define_physics_scene(stage: Usd.Stage) -> None:
@@ -85,7 +85,7 @@ def _define_walls(stage: Usd.Stage, spec: LabSpec) -> None:
 
 
 def _define_frame(stage: Usd.Stage, spec: LabSpec) -> None:
-    """Posts at the corners and amid the long sides, rails on top, a camera on each post."""
+    """Posts at the corners and in the middle of the long sides, rails on top, a camera on each post."""
     if not spec.post_height_m:
         return
     half = np.array(spec.floor_m) / 2 + spec.wall_thickness_m + POST_WIDTH_M / 2
@@ -108,7 +108,7 @@ def _define_frame(stage: Usd.Stage, spec: LabSpec) -> None:
 
 
 def _camera(stage: Usd.Stage, path: Sdf.Path, post_top: np.ndarray) -> None:
-    """A camera hung under the top of a post, looking at the middle of the floor."""
+    """A camera below the top of a post, which looks at the middle of the floor."""
     inward = -post_top[:2] / np.linalg.norm(post_top[:2])
     at = post_top + np.array([*(0.1 * inward), -0.08])
     yaw = np.arctan2(-at[1], -at[0])

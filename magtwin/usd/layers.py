@@ -1,4 +1,4 @@
-"""Layers: new ones with units and defaults said, old ones opened, files named relative to them."""
+"""Layers: create them with units and default prim, open them, and name files relative to them."""
 
 import hashlib
 import os
@@ -25,9 +25,9 @@ def new_stage(
     """A stage that becomes the file `path` when the block ends: metres, kilograms, Z up, /World.
 
     Args:
-        path: File to make; the suffix says whether it is text or crate.
-        documentation: What the layer is, for people.
-        force: Whether one that exists is replaced.
+        path: File to make; the suffix selects text or crate.
+        documentation: Description of the layer.
+        force: Whether to replace an existing file.
 
     Raises:
         InputError: The suffix is not USD's, or the file exists and `force` was not given.
@@ -44,7 +44,7 @@ def new_stage(
 
 
 def describe_stage(stage: Usd.Stage, documentation: str) -> None:
-    """Say a stage's units and axes, what it is and what wrote it."""
+    """Author a stage's units, up axis, description and creator."""
     UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.meters)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdPhysics.SetStageKilogramsPerUnit(stage, UsdPhysics.MassUnits.kilograms)
@@ -54,33 +54,31 @@ def describe_stage(stage: Usd.Stage, documentation: str) -> None:
 
 
 def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
-    """The stage of a USD file, as it is on disk now, with every layer that it names.
+    """Open the stage of a USD file, reloaded from disk.
 
     Raises:
-        InputError: No such file, or not USD, or one of its sublayers or references is missing; the
-            text says what USD said of it.
+        InputError: The file is missing or not USD, or a sublayer or reference is missing; the text has USD's
+            own message.
     """
     path = existing(path, "USD file")
     if path.is_dir():
         raise InputError(f"{path}: a folder; give a USD file in it")
-    heard = (
-        UsdUtils.CoalescingDiagnosticDelegate()
-    )  # keeps USD's warnings off the terminal: they are refusals
+    diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
     try:
         stage = Usd.Stage.Open(str(path))
-        stage.Reload()  # a layer that someone still holds would be shown as it was
+        stage.Reload()  # a layer that is still held elsewhere would be stale
         errors = stage.GetCompositionErrors()
     except Tf.ErrorException as error:
         raise InputError(f"{path}: cannot be opened as USD: {_reason(error)}") from error
     finally:
-        heard.TakeUncoalescedDiagnostics()
+        diagnostics.TakeUncoalescedDiagnostics()
     if errors:
         raise InputError(f"{path}: {_one_line(_text(errors[0]))}")
     return stage
 
 
 def layer_files(path: str | os.PathLike[str]) -> list[Path]:
-    """The files of a stage's root layer and its sublayers, strongest first; references are not among them.
+    """The files of a stage's root layer and its sublayers, strongest first, without references.
 
     Raises:
         InputError: As for `open_stage`.
@@ -91,11 +89,10 @@ def layer_files(path: str | os.PathLike[str]) -> list[Path]:
 
 
 def stage_sha256(path: str | os.PathLike[str]) -> str:
-    """Checksum of a stage: of its root layer and of every file that it names, and those in turn.
+    """Checksum of a stage: of its root layer and, recursively, of every file that it names.
 
-    A layer that names no file counts with its bytes. One that does counts with its text, in which the
-    checksum of each file stands in the place of its name. So the checksum is of what the files hold, not of
-    where they lie.
+    A layer that names no file counts with its bytes. Another layer counts with its text, in which checksums
+    replace the names of files. So the checksum depends on the contents of the files, not on their locations.
 
     Raises:
         InputError: No such file, or it or a layer that it names is not USD.
@@ -104,9 +101,9 @@ def stage_sha256(path: str | os.PathLike[str]) -> str:
 
 
 def _content_sha256(file: Path, above: tuple[Path, ...]) -> str:
-    """Checksum of a file, layer or not, that the files `above` name."""
+    """Checksum of a file; `above` are the files on the way to it."""
     if file in above:
-        return "circle"  # which composition refuses; here it must only end
+        return "circle"  # composition refuses a circle; here it must end
     if file.suffix not in SUFFIXES:
         return sha256(file)
     try:
@@ -125,13 +122,13 @@ def _content_sha256(file: Path, above: tuple[Path, ...]) -> str:
 
 
 def _reason(error: Tf.ErrorException) -> str:
-    """What USD said first, without where in its sources it said so; what it says later follows from that."""
-    said = getattr(error.args[0], "commentary", str(error)) if error.args else str(error)
-    return re.sub(r"pxrInternal_\w*?pxrReserved__(::|_)", "", _one_line(said))
+    """USD's first message, without its place in USD's sources."""
+    text = getattr(error.args[0], "commentary", str(error)) if error.args else str(error)
+    return re.sub(r"pxrInternal_\w*?pxrReserved__(::|_)", "", _one_line(text))
 
 
 def _text(error: object) -> str:
-    """What USD says of an error; it quotes a damaged layer as it is, UTF-8 or not."""
+    """Text of an error. USD quotes a damaged layer, which need not be UTF-8."""
     try:
         return str(error)
     except UnicodeDecodeError as undecoded:
@@ -143,7 +140,7 @@ def _one_line(text: str) -> str:
 
 
 def relative_asset(layer: Sdf.Layer, path: Path) -> str:
-    """`path` as an asset path relative to `layer`'s file; absolute where the layer has none."""
+    """`path` as an asset path relative to `layer`'s file; absolute if the layer has no file."""
     path = path.resolve()
     if layer.anonymous or not layer.realPath:
         return path.as_posix()

@@ -1,4 +1,4 @@
-"""Looks: the materials that rooms, furniture and steel wear, and the boxes that wear them."""
+"""Looks: materials of rooms, furniture and steel, and boxes with them."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from magtwin.errors import find
 
 @dataclass(frozen=True)
 class Look:
-    """A preview material; one with friction is a material for physics too."""
+    """A preview material; with friction, it is also a physics material."""
 
     colour: tuple[float, float, float]
     """Linear red, green, blue."""
@@ -22,8 +22,8 @@ class Look:
     metallic: float = 0.0
 
     friction: float | None = None
-    """Coulomb friction, static and dynamic. MuJoCo and Newton take the larger of a pair and PhysX the mean:
-    with a slippery floor the wheels' own friction holds, and casters slide, in both."""
+    """Coulomb friction, static and dynamic. MuJoCo and Newton use the larger of a pair and PhysX the mean: on
+    a slippery floor, wheels hold and casters slide in all of them."""
 
 
 LOOKS: Mapping[str, Look] = MappingProxyType(
@@ -48,7 +48,7 @@ LOOKS: Mapping[str, Look] = MappingProxyType(
 
 
 def define_looks(stage: Usd.Stage, scope: Sdf.Path, names: Iterable[str]) -> None:
-    """Author materials as children of a scope, so that a layer brings those that it needs."""
+    """Author materials as children of a scope."""
     UsdGeom.Scope.Define(stage, scope)
     for name in names:
         look = find("look", name, LOOKS)
@@ -77,7 +77,7 @@ def define_box(
     *,
     collides: bool = False,
 ) -> Usd.Prim:
-    """A cube scaled to `size` [m] at `centre` [m] in its parent, wearing the material at `look`."""
+    """A cube scaled to `size` [m] at `centre` [m] in its parent, with the material at `look`."""
     cube = UsdGeom.Cube.Define(stage, path)
     cube.CreateSizeAttr(1.0)
     cube.CreateExtentAttr(Vt.Vec3fArray([Gf.Vec3f(-0.5), Gf.Vec3f(0.5)]))
@@ -90,7 +90,7 @@ def define_box(
 
 
 def wear(gprim: UsdGeom.Gprim, look: Sdf.Path) -> None:
-    """Bind the material at `look`, for all that it says; its colour also stands on the prim."""
+    """Bind the material at `look`, and author its colour on the prim too."""
     gprim.CreateDisplayColorAttr(Vt.Vec3fArray([Gf.Vec3f(*LOOKS[look.name].colour)]))
     material = UsdShade.Material.Get(gprim.GetPrim().GetStage(), look)
     UsdShade.MaterialBindingAPI.Apply(gprim.GetPrim()).Bind(material)

@@ -1,4 +1,4 @@
-"""An AnomalyMap as a USD layer: its arrays on one prim, and a coloured floor that any viewer shows."""
+"""An AnomalyMap as a USD layer: arrays on one prim, and a coloured floor for viewers."""
 
 import datetime
 import hashlib
@@ -31,58 +31,58 @@ HEAT_MAP = MAP.AppendChild("HeatMap")
 MATERIAL = MAP.AppendChild("HeatMapMaterial")
 
 HEAT_MAP_HEIGHT_M = 0.004
-"""Height of the coloured floor: above the slab, below anything that drives."""
+"""Height of the coloured floor [m]: just above the slab."""
 
 UNKNOWN_COLOUR = (0.2, 0.2, 0.2)
 """Linear colour of nodes without a value."""
 
 MOST_QUADS = 60_000
-"""Quads of the coloured floor; of a finer map it shows every second node, or third, ..."""
+"""Most quads of the coloured floor; a finer map shows every second node, or third, ..."""
 
-SAID = 60
-"""Characters of an attribute that a refusal quotes."""
+MOST_CHARACTERS = 60
+"""Characters of an attribute that an error quotes."""
 
 UNIT = "nT"
 TEXTS = ("name", "method", "source", "licence", "created")
 PLACES = ("frame", "datum")
 RECORDED = ("recorded_nt", "recorded_yaw")
-"""What only a survey has: its readings as they were, and the headings at which they were taken."""
+"""What only a survey has: its exact readings, and their headings."""
 
 DAYS_PER_SECOND = 24.0
-"""Time codes, which are days, that a viewer plays in a second; USD's own figure where a stage has none."""
+"""Time codes (days) that a viewer plays per second; USD's own default."""
 
 
 def save_map(field: AnomalyMap, path: str | os.PathLike[str], *, force: bool = False) -> None:
-    """Write a map as a layer that any stage can sublayer.
+    """Write a map as a layer, which any stage can use as a sublayer.
 
-    Values become single precision (steps of 0.004 nT at 42,000 nT), but those of a survey's own nodes, which
-    are kept as they were read; a harmonic field stays as it is.
+    Values become single precision (steps of 0.004 nT at 42,000 nT). The readings of a survey's nodes and a
+    harmonic field keep their precision.
 
     Args:
         field: The map.
-        path: File to make, .usdc or .usd: arrays do not belong in text.
-        force: Whether one that exists is replaced.
+        path: File to make, .usdc or .usd.
+        force: Whether to replace an existing file.
 
     Raises:
-        InputError: The file exists and `force` was not given, or has another suffix; or a figure of
-            the map is none that JSON can hold.
+        InputError: The file exists and `force` was not given, or has another suffix; or a parameter of the
+            map cannot be written as JSON.
     """
     _save((field,), path, force)
 
 
 def save_map_series(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], *, force: bool = False) -> None:
-    """Write the epochs of a map as one layer: a time sample a day, the time code days since 2000-01-01.
+    """Write the epochs of a map as one layer: one time sample per date, in days since 2000-01-01.
 
-    What the epochs share is written once. Whoever asks without a time gets the latest epoch, and its
-    colours; a viewer that plays the layer shows the field drift.
+    Shared attributes are written once. The default values are those of the latest epoch. A viewer that plays
+    the layer shows the drift of the field.
 
     Args:
-        maps: Two or more maps of one grid, each with its day in `created`, in any order.
+        maps: Two or more maps of one grid, each with its date in `created`, in any order.
         path: File to make, .usdc or .usd.
-        force: Whether one that exists is replaced.
+        force: Whether to replace an existing file.
 
     Raises:
-        InputError: As for `save_map`, and for maps that are no epochs of one (`magtwin.field.maps.epochs`).
+        InputError: As for `save_map`, and if the maps are no epochs of one map (`magtwin.field.maps.epochs`).
     """
     _save(in_order(maps), path, force)
 
@@ -92,13 +92,12 @@ def load_map(path: str | os.PathLike[str], date: str | datetime.date | None = No
 
     Args:
         path: The layer or stage.
-        date: Day that the map is asked for, or its name YYYY-MM-DD, linear in time between the epochs
-            around it; the latest unless given.
+        date: Date of the map, or its text YYYY-MM-DD; the map is interpolated linearly in time between two
+            epochs. Default: the latest epoch.
 
     Raises:
-        InputError: The file is missing, is not USD, holds no map or several, its arrays do not fit
-            together, or they are not what the checksum was taken of; or the day is none, or before the
-            first or after the last epoch.
+        InputError: The file is missing or not USD, holds no map or several, or its arrays are inconsistent
+            or do not match the checksum; or the date is not valid or outside the epochs.
     """
     if Path(path).suffix in (".csv", ".txt", ".parquet", ".pq", ".mcap", ".db3"):
         fitted = Path(path).with_suffix(".usdc").name
@@ -113,7 +112,7 @@ def load_map(path: str | os.PathLike[str], date: str | datetime.date | None = No
 
 
 def load_epochs(path: str | os.PathLike[str]) -> tuple[AnomalyMap, ...]:
-    """Every epoch of a layer's or stage's map, the earliest first; one where it has a single one.
+    """Every epoch of a layer's or stage's map, the earliest first.
 
     Raises:
         InputError: As for `load_map`, for any of the epochs.
@@ -137,10 +136,10 @@ def load_epochs(path: str | os.PathLike[str]) -> tuple[AnomalyMap, ...]:
 
 
 def is_map_layer(path: str | os.PathLike[str]) -> bool:
-    """Whether a USD file holds an anomaly map and no robot, so that it is a map and no scene.
+    """Whether a USD file is a map: it holds an anomaly map and no robot.
 
     Raises:
-        InputError: The file is missing or no stage.
+        InputError: The file is missing or not USD.
     """
     stage = open_stage(path)
     root = stage.GetPseudoRoot()
@@ -148,12 +147,12 @@ def is_map_layer(path: str | os.PathLike[str]) -> bool:
 
 
 def read_map(prim: Usd.Prim) -> AnomalyMap:
-    """The map of a prim, of the latest day where it has several; refusals as for `load_map`."""
+    """The map of a prim, its latest epoch; errors as for `load_map`."""
     return _read(prim, None)
 
 
 def checksums(prim: Usd.Prim) -> list[tuple[str, str]]:
-    """What a map's checksum says and what its arrays give, of the default and then of each epoch.
+    """The stored and the computed checksum of a map: of the default, then of each epoch.
 
     Raises:
         InputError: An array is missing or of another type; names the prim.
@@ -168,20 +167,20 @@ def checksums(prim: Usd.Prim) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True)
 class _Sample:
-    """A time of the layer that holds a map's epochs: read there, so that no offset or scale rounds it."""
+    """A time sample in the layer of a map's epochs, read there so that no layer offset rounds its time."""
 
     layer: Sdf.Layer
     prim: Sdf.Path
     time: float
 
     def get(self, attribute: str) -> Any:
-        """An attribute's value at this very time, or None."""
+        """An attribute's value at exactly this time, or None."""
         value = self.layer.QueryTimeSample(self.prim.AppendProperty(attribute), self.time)
         return None if isinstance(value, Sdf.ValueBlock) else value
 
 
 def _samples(prim: Usd.Prim) -> list[_Sample]:
-    """Times at which the map's values are given, the earliest first."""
+    """Time samples of the map's values, the earliest first."""
     for spec in prim.GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack():
         if times := spec.layer.ListTimeSamplesForPath(spec.path):
             return [_Sample(spec.layer, spec.path.GetPrimPath(), time) for time in times]
@@ -196,14 +195,12 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
     if not re.fullmatch("[0-9a-f]{64}", checksum):
         raise InputError(
             f"{place(prim)}: {attribute_name('anomalyMap', 'checksum')} must be a SHA-256, 64 digits 0-9a-f, "
-            f"got {checksum[:SAID]!r}; make the map anew"
+            f"got {checksum[:MOST_CHARACTERS]!r}; make the map anew"
         )
     values, valid, variance = (np.array(_get(prim, name, sample)) for name in ("values", "valid", "variance"))
     harmonic = _read_harmonic(prim, sample)
     if checksum != _checksum(values, valid, variance, harmonic):
-        raise InputError(
-            f"{place(prim)}: the map's values are not those that its checksum was taken of; make the map anew"
-        )
+        raise InputError(f"{place(prim)}: the map's values do not match its checksum; make the map anew")
     shape = tuple(_get(prim, "shape"))
     if len(shape) != 3 or min(shape) < 1 or not values.size == valid.size == math.prod(shape):
         raise InputError(
@@ -215,7 +212,7 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
     if not (headings.size and np.all(np.diff(headings) > 0) and headings[0] >= 0 and headings[-1] < 360):
         raise InputError(
             f"{place(prim)}: {attribute_name('anomalyMap', 'headings')} must ascend in [0, 360) deg, got "
-            f"{str(headings.tolist())[:SAID]}; make the map anew"
+            f"{str(headings.tolist())[:MOST_CHARACTERS]}; make the map anew"
         )
     try:
         return AnomalyMap(
@@ -239,7 +236,7 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
 def _read_recorded(
     prim: Usd.Prim, name: str, sample: _Sample | None, shape: tuple[int, ...]
 ) -> NDArray | None:
-    """What was recorded at the nodes; None where nothing was."""
+    """Recorded numbers at the nodes; None if there are none."""
     attribute = prim.GetAttribute(attribute_name("anomalyMap", name))
     value = sample.get(attribute.GetName()) if sample else attribute.Get()
     if value is None or not len(value):
@@ -253,7 +250,7 @@ def _read_recorded(
 
 
 def _exact(prim: Usd.Prim, values: NDArray, recorded: NDArray | None) -> NDArray[np.float64]:
-    """Values in the precision in which they were read, shape (H, Y, X)."""
+    """Values in their recorded precision, shape (H, Y, X)."""
     if recorded is None:
         return values.astype(float)
     if not np.array_equal(recorded.astype(np.float32), values, equal_nan=True):
@@ -277,7 +274,7 @@ def _read_height(prim: Usd.Prim) -> float | None:
 
 
 def _read_parameters(prim: Usd.Prim, text: str) -> dict[str, Any]:
-    """Figures from their JSON; nothing where there is none."""
+    """Parameters from their JSON; empty if there is none."""
     if not text:
         return {}
     name = attribute_name("anomalyMap", "parameters")
@@ -285,9 +282,11 @@ def _read_parameters(prim: Usd.Prim, text: str) -> dict[str, Any]:
         figures = json.loads(text, parse_constant=_no_number)
         json.dumps(figures, allow_nan=False)  # 1e999 is a number to JSON, and infinite
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{name} is not JSON ({error}), got {text[:SAID]!r}; make the map anew") from error
+        raise InputError(
+            f"{name} is not JSON ({error}), got {text[:MOST_CHARACTERS]!r}; make the map anew"
+        ) from error
     if not isinstance(figures, dict):
-        raise InputError(f"{name} must be a JSON object, got {text[:SAID]!r}; make the map anew")
+        raise InputError(f"{name} must be a JSON object, got {text[:MOST_CHARACTERS]!r}; make the map anew")
     return figures
 
 
@@ -296,7 +295,7 @@ def _no_number(word: str) -> float:
 
 
 def _read_harmonic(prim: Usd.Prim, sample: _Sample | None) -> dict[str, NDArray] | None:
-    """The arrays of the harmonic field, in the schema's order; None where there is none at that time."""
+    """The arrays of the harmonic field in the schema's order; None if there is none at that time."""
     if not prim.HasAPI(NOUNS["harmonic"]):
         return None
     arrays = {}
@@ -317,12 +316,12 @@ def _read_harmonic(prim: Usd.Prim, sample: _Sample | None) -> dict[str, NDArray]
 
 
 def _save(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], force: bool) -> None:
-    """Write maps of one grid, the earliest first: the last as the default, all of several as time samples."""
+    """Write maps of one grid, earliest first: the last as the default, several as time samples."""
     if Path(path).suffix not in (".usdc", ".usd"):
         raise InputError(f"{path}: a map layer ends in .usdc or .usd")
     latest = maps[-1]
     times = [float(day_number(day_of(m))) for m in maps] if len(maps) > 1 else []
-    samples = [_of_a_day(m) for m in maps]
+    samples = [_epoch_values(m) for m in maps]
     for name in (attribute_name("anomalyMap", field) for field in RECORDED):
         if all(sample[name] is None for sample in samples):
             samples = [{n: value for n, value in sample.items() if n != name} for sample in samples]
@@ -331,7 +330,7 @@ def _save(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], force: bool)
         prim = apply_api(UsdGeom.Xform.Define(stage, MAP).GetPrim(), "anomalyMap")
         if any(m.harmonic is not None for m in maps):
             apply_api(prim, "harmonic")
-        for name, value in {**_of_the_floor(latest), **samples[-1]}.items():
+        for name, value in {**_shared_values(latest), **samples[-1]}.items():
             if value is not None:
                 prim.GetAttribute(name).Set(value)
         for time, sample in zip(times, samples, strict=bool(times)):
@@ -346,7 +345,7 @@ def _save(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], force: bool)
         _define_heat_map(stage, maps, times)
 
 
-def _of_the_floor(field: AnomalyMap) -> dict[str, Any]:
+def _shared_values(field: AnomalyMap) -> dict[str, Any]:
     """Values of the attributes that the epochs of a map share, by name."""
     given = {
         "shape": Vt.IntArray(field.values_nt.shape),
@@ -360,8 +359,8 @@ def _of_the_floor(field: AnomalyMap) -> dict[str, Any]:
     return {attribute_name("anomalyMap", name): value for name, value in given.items()}
 
 
-def _of_a_day(field: AnomalyMap) -> dict[str, Any]:
-    """Values of the attributes that differ from day to day, by name; None for what there is not."""
+def _epoch_values(field: AnomalyMap) -> dict[str, Any]:
+    """Values of the attributes that differ between epochs, by name; None if there is no value."""
     values = field.values_nt.astype(np.float32).ravel()
     valid = np.ascontiguousarray(field.valid).ravel()
     variance = np.empty(0, np.float32)
@@ -394,7 +393,7 @@ def _of_a_day(field: AnomalyMap) -> dict[str, Any]:
 
 
 def _usd_array(array: NDArray, shape: tuple[int, ...]) -> Any:
-    """A part of a harmonic field as the type of its attribute; -1 in `shape` is any number of rows."""
+    """An array of a harmonic field as the type of its attribute; -1 in `shape` is any number of rows."""
     if shape == (3, 3):
         return Gf.Matrix3d(*array.ravel().tolist())
     return (
@@ -414,7 +413,7 @@ def _written_parameters(field: AnomalyMap) -> str:
 
 
 def _get(prim: Usd.Prim, name: str, sample: _Sample | None = None) -> Any:
-    """Value of one of the map's attributes, of the type that the schema says."""
+    """Value of one of the map's attributes, of the schema's type."""
     attribute = prim.GetAttribute(attribute_name("anomalyMap", name))
     value = sample.get(attribute.GetName()) if sample else attribute.Get()
     return _check_type(attribute, value)
@@ -440,7 +439,7 @@ def _checksum(
 
 
 def _define_heat_map(stage: Usd.Stage, maps: Sequence[AnomalyMap], times: Sequence[float]) -> None:
-    """A grid of quads, a vertex a node or every few, coloured by a variant a heading."""
+    """A grid of quads with a vertex at every node, or every few, and one colour variant per heading."""
     latest = maps[-1]
     _, rows, columns = latest.values_nt.shape
     every = _every(rows, columns)
@@ -468,7 +467,7 @@ def _define_heat_map(stage: Usd.Stage, maps: Sequence[AnomalyMap], times: Sequen
                 "least": low,
                 "greatest": high,
                 "unit": UNIT,
-                "everyNode": every,  # of so many nodes both ways one is a vertex
+                "everyNode": every,  # stride of the vertices over the nodes
             }
         }
     )
@@ -492,7 +491,7 @@ def _define_heat_map(stage: Usd.Stage, maps: Sequence[AnomalyMap], times: Sequen
 
 
 def _every(rows: int, columns: int) -> int:
-    """The least stride over the nodes that keeps the coloured floor within `MOST_QUADS`."""
+    """The smallest stride over the nodes with at most `MOST_QUADS` quads."""
     every = 1
     while (len(_kept(rows, every)) - 1) * (len(_kept(columns, every)) - 1) > MOST_QUADS:
         every += 1
@@ -500,7 +499,7 @@ def _every(rows: int, columns: int) -> int:
 
 
 def _kept(count: int, every: int) -> NDArray[np.intp]:
-    """Indices of the vertices among `count` nodes: the first, each so many on, and the last."""
+    """Indices of the vertices among `count` nodes: every few from the first, and the last."""
     return np.unique(np.append(np.arange(0, count, every), count - 1))
 
 
@@ -512,7 +511,7 @@ def heading_variants(headings_rad: NDArray) -> list[str]:
 
 
 def viridis() -> NDArray[np.float32]:
-    """Linear colours: the 256 of the colour map, then that of nodes without a value, shape (257, 3)."""
+    """Linear colours: 256 of the colour map, then `UNKNOWN_COLOUR`, shape (257, 3)."""
     from matplotlib import colormaps
 
     linear = linear_from_srgb(colormaps[COLOUR_MAP].colors)  # type: ignore[attr-defined]
@@ -526,7 +525,7 @@ def colour_index(values: NDArray, valid: NDArray, low: float, high: float) -> ND
 
 
 def _define_material(stage: Usd.Stage) -> UsdShade.Material:
-    """A matt material that shows the mesh's own displayColor."""
+    """A matt material that shows the mesh's displayColor."""
     material = UsdShade.Material.Define(stage, MATERIAL)
     reader = UsdShade.Shader.Define(stage, MATERIAL.AppendChild("DisplayColor"))
     reader.CreateIdAttr("UsdPrimvarReader_float3")

@@ -1,4 +1,4 @@
-"""Obstacles of a stage: its colliders that stand still, as a robot that drives among them meets them."""
+"""Obstacles of a stage: its colliders that stand still."""
 
 import functools
 import os
@@ -12,38 +12,36 @@ from magtwin.usd.layers import open_stage
 from magtwin.usd.schema import prims_with
 
 LOWEST_M = 0.01
-"""What does not rise above this is driven over, as a floor is, or its joints [m]."""
+"""A collider that is lower than this is no obstacle, such as a floor [m]."""
 
 ROBOT_HEIGHT_M = 0.4
-"""What hangs higher is driven under [m], unless a robot is taller; the TurtleBot 4 is 0.351 m high."""
+"""Least height up to which colliders are obstacles [m]; the TurtleBot 4 is 0.351 m high."""
 
 SAME_M = 1e-5
-"""Corners nearer than this belong to one piece [m]."""
+"""Corners nearer than this coincide [m]."""
 
 SHEET_M = 0.001
-"""Thickness that a wall without any is given [m]."""
+"""Thickness of a wall that is a single sheet [m]."""
 
 MOST_FACES = 1000
-"""Triangles up to which a part of a mesh that is not convex is met face by face; others are their hull."""
+"""A concave part of a mesh with more triangles counts as its convex hull, others face by face."""
 
 
 def read_obstacles(stage: Usd.Stage | str | os.PathLike[str], *, height_m: float | None = None) -> Obstacles:
     """The colliders of a stage that no rigid body carries, in order of their prims.
 
-    Each prim with CollisionAPI that is not switched off is an obstacle if any of it lies between the floor
-    and `height_m`. Its outlines go by its name: the hull of what lies there, of each gprim, and of each part
-    of a mesh that hangs together; of a part that is not convex, such as the walls of a room in one mesh, each
-    of its faces. Its surface is all of it. Colliders need not be drawn: those of purpose guide and proxy
-    count, those made invisible do not.
+    Each prim with an enabled CollisionAPI is an obstacle if a part of it is between the floor and `height_m`.
+    It has one outline for each gprim and each connected part of a mesh: the hull of what is between these
+    heights. A concave part, such as the walls of a room in one mesh, has one outline for each face. Its
+    surface is complete. Colliders of purpose guide and proxy count; invisible ones do not.
 
     Args:
         stage: A stage, or the path of a USD file.
-        height_m: Height of the robot [m]; None takes that of the tallest on the stage, and at least
+        height_m: Height of the robot [m]. Default: that of the tallest robot on the stage, at least
             `ROBOT_HEIGHT_M`.
 
     Raises:
-        InputError: The file is missing or is not USD, or a mesh contradicts itself; the text names
-            the prim.
+        InputError: The file is missing or not USD, or a mesh is inconsistent; the text names the prim.
     """
     stage = stage if isinstance(stage, Usd.Stage) else open_stage(stage)
     purposes = (*SHOWN, UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy)
@@ -65,7 +63,7 @@ def read_obstacles(stage: Usd.Stage | str | os.PathLike[str], *, height_m: float
 
 
 def _collider(prim: Usd.Prim) -> str:
-    """Path of the prim at or above a gprim that collides, "" for none."""
+    """Path of the prim with CollisionAPI at or above a gprim; "" if there is none."""
     while prim and not prim.IsPseudoRoot():
         if prim.HasAPI(UsdPhysics.CollisionAPI):
             enabled = UsdPhysics.CollisionAPI(prim).GetCollisionEnabledAttr().Get()
@@ -75,7 +73,7 @@ def _collider(prim: Usd.Prim) -> str:
 
 
 def _tallest_m(stage: Usd.Stage) -> float:
-    """How high the tallest robot of a stage is above the floor, at least `ROBOT_HEIGHT_M` [m]."""
+    """Height of the tallest robot of a stage, at least `ROBOT_HEIGHT_M` [m]."""
     cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), [*SHOWN, UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy])
     tops = [
         cache.ComputeWorldBound(prim).ComputeAlignedRange().GetMax()[2]
@@ -85,8 +83,8 @@ def _tallest_m(stage: Usd.Stage) -> float:
 
 
 def _pieces(corners: np.ndarray) -> list[np.ndarray]:
-    """Triangles (T, 3, 3) by the parts that hang together at their corners and are convex, or one by one."""
-    from scipy.sparse import coo_array  # a tenth of a second, which stages without such meshes do not pay
+    """Triangles (T, 3, 3) as connected parts, or one by one for a concave part."""
+    from scipy.sparse import coo_array  # takes 0.1 s
     from scipy.sparse.csgraph import connected_components
 
     flat = np.round(corners.reshape(-1, 3) / SAME_M).astype(np.int64)
@@ -113,9 +111,9 @@ def _convex(corners: np.ndarray) -> bool:
 
 
 def _outline(corners: np.ndarray, height_m: float) -> np.ndarray | None:
-    """Points (K, 2) of triangles (T, 3, 3) within the robot's height; none if they are nowhere or at a point.
+    """Points (K, 2) of triangles (T, 3, 3) within the robot's height; None if there is at most one point.
 
-    A wall without thickness is given `SHEET_M`.
+    A wall without thickness gets `SHEET_M`.
     """
     points = []
     for k in range(3):

@@ -26,7 +26,7 @@ from magtwin.usd.sensors import (
 )
 
 PARALLEL = 1e-12
-"""Sine of half the angle between axes that count as parallel."""
+"""Largest sine of half the angle between parallel axes."""
 
 
 def load_robot(file: str | os.PathLike[str]) -> RobotSpec:
@@ -104,23 +104,23 @@ def _conversion(asset: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def _base(root: Usd.Prim) -> Usd.Prim:
-    """The body of a robot called base_link, or the root where there is none of that name."""
+    """The body of a robot called base_link, or else the root."""
     return next((p for p in Usd.PrimRange(root) if p.GetName() == BASE), root)
 
 
 def _p_root(root: Usd.Prim, prim: Usd.Prim) -> Vec3:
-    """A prim's origin in the axes of its robot's root [m], wherever in the world the robot stands."""
+    """A prim's origin in the axes of its robot's root [m]."""
     return tuple(UsdGeom.XformCache().ComputeRelativeTransform(prim, root)[0].ExtractTranslation())
 
 
 def _p_base(root: Usd.Prim, sensor: Usd.Prim) -> Vec3:
-    """A sensor's origin in the axes of its robot's base [m], wherever in the world the robot stands."""
+    """A sensor's origin in the axes of its robot's base [m]."""
     to_root = UsdGeom.XformCache().ComputeRelativeTransform(_base(root), root)[0]
     return tuple(to_root.GetInverse().Transform(_p_root(root, sensor)))
 
 
 def _q_base(root: Usd.Prim, link: Usd.Prim) -> Quat:
-    """A link's axes in those of its robot's base (xyzw, w >= 0), wherever in the world the robot stands."""
+    """A link's axes in those of its robot's base (xyzw, w >= 0)."""
     cache = UsdGeom.XformCache()
     link_to_root, base_to_root = (
         cache.ComputeRelativeTransform(prim, root)[0].RemoveScaleShear() for prim in (link, _base(root))

@@ -1,8 +1,8 @@
-"""Sensors, drive, battery and magnetic sources as prims: `define_` authors one, `read_` gives its spec back.
+"""Sensors, drive and battery as prims: `define_` authors a prim, `read_` reads its spec.
 
-Every prim is an Xform with an applied schema of magtwin's, so that a runtime which has never heard of
-magtwin still places it. A figure is authored where no layer says it yet, be it the schema's fallback,
-or says otherwise, in the stage's edit target: layers over a robot hold only what they change.
+Every prim is an Xform with one of magtwin's applied schemas, so that programs without magtwin still place it.
+Values are authored in the stage's edit target, if no layer has them yet: layers over a robot hold only what
+they change.
 """
 
 from dataclasses import dataclass
@@ -16,23 +16,23 @@ from magtwin.errors import InputError, hint
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.magnetics import PlatformFieldSpec
 from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec, MountSpec
-from magtwin.usd.attributes import read_figures, read_pose, target, write_figures, write_pose
+from magtwin.usd.attributes import read_pose, read_spec, target, write_pose, write_spec
 from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, require_api
 
 S = TypeVar("S")
 
 POSE_FIELDS = frozenset(("link", "p_link_sensor", "q_link_sensor_xyzw"))
-"""Fields of a MountSpec: the prim's place among the links and its transform hold them."""
+"""Fields of a MountSpec, which are the prim's parent and transform."""
 
 JOINT_FIELDS = ("left_wheel_joint", "right_wheel_joint")
 """Fields of a DriveSpec that are relationships to joints."""
 
 BASE = "base_link"
-"""Name of the link that REP-105 makes the robot's own frame."""
+"""Name of the link whose frame is the robot's, as in REP-105."""
 
 MAP_RELATIONSHIP = "magtwin:magnetometer:map"
 MAP_CHECKSUM = "magtwin:magnetometer:mapSha256"
-"""What a scene adds to its robot's magnetometer: the map that it reads, and the checksum of its file."""
+"""What a scene adds to a magnetometer: its map, and the checksum of the map's file."""
 
 IMU_TYPE = "IsaacImuSensor"
 LIDAR_TYPE = "OmniLidar"
@@ -41,7 +41,7 @@ EMITTER_API = "OmniSensorGenericLidarCoreEmitterStateAPI:s001"
 """NVIDIA's types, by name: their plugins live in Omniverse, not here."""
 
 CORE = "omni:sensor:Core:"
-"""How the LiDAR's attributes begin."""
+"""Prefix of the LiDAR's attributes."""
 
 SINGLE_MAX = float(np.finfo(np.float32).max)
 UINT_MAX = 2**32 - 1
@@ -50,8 +50,8 @@ FOOTPRINT = attribute_name("robot", "footprint_radius_m")
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Way:
-    """Attributes of a robot that say what it drives."""
+class _DefaultPath:
+    """Attributes of a robot with its default path."""
 
     path: str = ""
     path_file: Path | None = None
@@ -69,15 +69,15 @@ def define_magnetometer(stage: Usd.Stage, path: str | Sdf.Path, spec: Magnetomet
         InputError: The parent prim is not the link, or a prim of another type is there.
     """
     prim = _define_mounted(stage, path, spec)
-    write_figures(apply_api(prim, "magnetometer"), "magnetometer", spec, skip=POSE_FIELDS)
+    write_spec(apply_api(prim, "magnetometer"), "magnetometer", spec, skip=POSE_FIELDS)
     return prim
 
 
 def read_magnetometer(prim: Usd.Prim) -> MagnetometerSpec:
-    """The spec of an authored magnetometer; whether its network is there is for its user to see.
+    """The spec of an authored magnetometer. Whether its network exists is not checked.
 
     Raises:
-        InputError: It is none, or a figure is out of range.
+        InputError: The prim is no magnetometer, or a value is out of range.
     """
     return _read_mounted(MagnetometerSpec, prim, "magnetometer")
 
@@ -85,10 +85,10 @@ def read_magnetometer(prim: Usd.Prim) -> MagnetometerSpec:
 def define_imu(stage: Usd.Stage, path: str | Sdf.Path, spec: ImuSpec) -> Usd.Prim:
     """Author an inertial unit below the prim of its link, with NVIDIA's sensor as a child.
 
-    Args and refusals as for `define_magnetometer`.
+    Arguments and errors as for `define_magnetometer`.
     """
     prim = _define_mounted(stage, path, spec)
-    write_figures(apply_api(prim, "imu"), "imu", spec, skip=POSE_FIELDS)
+    write_spec(apply_api(prim, "imu"), "imu", spec, skip=POSE_FIELDS)
     define_isaac_imu(prim, spec.rate_hz)
     return prim
 
@@ -102,17 +102,17 @@ def define_isaac_imu(mount: Usd.Prim, rate_hz: float) -> Usd.Prim:
 
 
 def read_imu(prim: Usd.Prim) -> ImuSpec:
-    """The spec of an authored inertial unit; refusals as for `read_magnetometer`."""
+    """The spec of an authored inertial unit; errors as for `read_magnetometer`."""
     return _read_mounted(ImuSpec, prim, "imu")
 
 
 def define_lidar(stage: Usd.Stage, path: str | Sdf.Path, spec: LidarSpec) -> Usd.Prim:
     """Author a planar LiDAR below the prim of its link, with NVIDIA's sensor as a child.
 
-    Args and refusals as for `define_magnetometer`.
+    Arguments and errors as for `define_magnetometer`.
     """
     prim = _define_mounted(stage, path, spec)
-    write_figures(apply_api(prim, "lidar"), "lidar", spec, skip=POSE_FIELDS)
+    write_spec(apply_api(prim, "lidar"), "lidar", spec, skip=POSE_FIELDS)
     sensor = define_omni_lidar(prim, spec.scan_rate_hz, (spec.range_min_m, spec.range_max_m))
     _define_beam(sensor, spec.rays)
     return prim
@@ -124,10 +124,10 @@ def define_omni_lidar(
     """Author NVIDIA's LiDAR as a child of an Xform; returns the sensor's prim.
 
     Args:
-        mount: Its pose.
-        scan_rate_hz: Scans a second [Hz]; NVIDIA's is a whole number, from 1.
-        ranges_m: Nearest and farthest range [m].
-        rotary: Whether it turns, or fires one fixed pattern.
+        mount: Xform with the sensor's pose.
+        scan_rate_hz: Scan rate [Hz], rounded to a whole number from 1.
+        ranges_m: Smallest and largest range [m].
+        rotary: Whether it rotates; otherwise it fires one fixed pattern.
     """
     sensor = mount.GetStage().DefinePrim(mount.GetPath().AppendChild("omni_lidar"), LIDAR_TYPE)
     if LIDAR_API not in sensor.GetPrimTypeInfo().GetAppliedAPISchemas():
@@ -142,9 +142,9 @@ def define_omni_lidar(
 
 
 def _define_beam(sensor: Usd.Prim, rays: int) -> None:
-    """One emitter that fires `rays` times a turn; without it Isaac Sim's default has 128, one above another.
+    """One emitter that fires `rays` times per turn; Isaac Sim's default has 128 emitters above each other.
 
-    A sensor that has the emitters of a URDF's tags is left as it is.
+    A sensor with the emitters of a URDF's tags does not change.
     """
     if sensor.GetAttribute(f"{CORE}numberOfEmitters") and not sensor.GetAttribute(f"{CORE}reportRateBaseHz"):
         return
@@ -165,22 +165,22 @@ def _define_beam(sensor: Usd.Prim, rays: int) -> None:
 
 
 def read_lidar(prim: Usd.Prim) -> LidarSpec:
-    """The spec of an authored LiDAR; refusals as for `read_magnetometer`."""
+    """The spec of an authored LiDAR; errors as for `read_magnetometer`."""
     return _read_mounted(LidarSpec, prim, "lidar")
 
 
 def define_battery(stage: Usd.Stage, path: str | Sdf.Path, spec: BatterySpec) -> Usd.Prim:
-    """Author a battery as an Xform of its own; returns its prim."""
-    return write_figures(apply_api(_define_xform(stage, path), "battery"), "battery", spec)
+    """Author a battery as an Xform; returns its prim."""
+    return write_spec(apply_api(_define_xform(stage, path), "battery"), "battery", spec)
 
 
 def read_battery(prim: Usd.Prim) -> BatterySpec:
-    """The spec of an authored battery; refusals as for `read_magnetometer`."""
-    return read_figures(BatterySpec, prim, "battery")
+    """The spec of an authored battery; errors as for `read_magnetometer`."""
+    return read_spec(BatterySpec, prim, "battery")
 
 
 def define_footprint(prim: Usd.Prim, footprint_radius_m: float) -> Usd.Prim:
-    """Mark `prim`, an Xform, as the root of a robot that needs a clear circle of this radius [m]."""
+    """Mark an Xform as the root of a robot with this footprint radius [m]."""
     attribute = apply_api(prim, "robot").GetAttribute(FOOTPRINT)
     if not attribute.HasAuthoredValue() or attribute.Get() != footprint_radius_m:
         attribute.Set(footprint_radius_m)
@@ -188,31 +188,31 @@ def define_footprint(prim: Usd.Prim, footprint_radius_m: float) -> Usd.Prim:
 
 
 def read_footprint(prim: Usd.Prim) -> float:
-    """Radius of the circle that the robot rooted at `prim` needs clear [m]."""
+    """Footprint radius of the robot rooted at `prim` [m]."""
     return float(require_api(prim, "robot").GetAttribute(FOOTPRINT).Get())
 
 
 def define_path(prim: Usd.Prim, path: str | Path) -> Usd.Prim:
-    """Say what the robot rooted at `prim` drives unless told otherwise: a name, a CSV file, or ""."""
-    way = _Way(path_file=path) if isinstance(path, Path) else _Way(path=path)
-    return write_figures(apply_api(prim, "robot"), "robot", way)
+    """Author the default path of the robot rooted at `prim`: a name, a CSV file, or ""."""
+    default = _DefaultPath(path_file=path) if isinstance(path, Path) else _DefaultPath(path=path)
+    return write_spec(apply_api(prim, "robot"), "robot", default)
 
 
 def read_path(prim: Usd.Prim) -> str | Path:
-    """What the robot rooted at `prim` drives unless told otherwise; a file is named before a name is."""
-    way = read_figures(_Way, prim, "robot")
-    return way.path_file or way.path
+    """Default path of the robot rooted at `prim`; a file takes precedence over a name."""
+    default = read_spec(_DefaultPath, prim, "robot")
+    return default.path_file or default.path
 
 
 def define_drive(prim: Usd.Prim, spec: DriveSpec) -> Usd.Prim:
     """Apply a differential drive to a robot's root prim; its wheel joints must be authored below.
 
     Raises:
-        InputError: No joint has the name that the spec gives.
+        InputError: There is no joint of that name.
     """
-    write_figures(apply_api(prim, "drive"), "drive", spec, skip=JOINT_FIELDS)
-    found = [p for p in Usd.PrimRange(prim) if p.IsA(UsdPhysics.Joint)]
-    joints = {p.GetDisplayName() or p.GetName(): p for p in found} | {p.GetName(): p for p in found}
+    write_spec(apply_api(prim, "drive"), "drive", spec, skip=JOINT_FIELDS)
+    prims = [p for p in Usd.PrimRange(prim) if p.IsA(UsdPhysics.Joint)]
+    joints = {p.GetDisplayName() or p.GetName(): p for p in prims} | {p.GetName(): p for p in prims}
     for field in JOINT_FIELDS:
         name = getattr(spec, field)
         if name not in joints:
@@ -227,37 +227,37 @@ def read_drive(prim: Usd.Prim) -> DriveSpec:
     """The spec of an authored drive.
 
     Raises:
-        InputError: It is none, a figure is out of range, or a wheel's joint is missing.
+        InputError: The prim has no drive, a value is out of range, or a wheel's joint is missing.
     """
     require_api(prim, "drive")
     joints = {f: target(prim, attribute_name("drive", f)).GetName() for f in JOINT_FIELDS}
-    return read_figures(DriveSpec, prim, "drive", **joints)
+    return read_spec(DriveSpec, prim, "drive", **joints)
 
 
 def define_platform(prim: Usd.Prim, spec: PlatformFieldSpec) -> Usd.Prim:
     """Apply the robot's own magnetic field to its root prim."""
-    return write_figures(apply_api(prim, "platform"), "platform", spec)
+    return write_spec(apply_api(prim, "platform"), "platform", spec)
 
 
 def read_platform(prim: Usd.Prim) -> PlatformFieldSpec:
-    """The spec of an authored platform field; refusals as for `read_magnetometer`."""
-    return read_figures(PlatformFieldSpec, prim, "platform")
+    """The spec of an authored platform field; errors as for `read_magnetometer`."""
+    return read_spec(PlatformFieldSpec, prim, "platform")
 
 
 def define_mocap(prim: Usd.Prim, spec: MocapSpec) -> Usd.Prim:
-    """Apply to a robot's root prim how motion capture sees it."""
-    return write_figures(apply_api(prim, "mocap"), "mocap", spec)
+    """Apply the settings of motion capture to a robot's root prim."""
+    return write_spec(apply_api(prim, "mocap"), "mocap", spec)
 
 
 def read_mocap(prim: Usd.Prim) -> MocapSpec:
-    """How motion capture sees the robot rooted at `prim`: the default where no layer says it."""
+    """Settings of motion capture of the robot rooted at `prim`, or the default."""
     if not prim.HasAPI(NOUNS["mocap"]):
         return MocapSpec()
-    return read_figures(MocapSpec, prim, "mocap")
+    return read_spec(MocapSpec, prim, "mocap")
 
 
 def _define_xform(stage: Usd.Stage, path: str | Sdf.Path) -> Usd.Prim:
-    """An Xform at `path`; one that is there already is left as it is."""
+    """The Xform at `path`, defined if it does not exist."""
     prim = stage.GetPrimAtPath(path)
     if not prim or not prim.IsDefined():
         return UsdGeom.Xform.Define(stage, path).GetPrim()
@@ -277,7 +277,7 @@ def _read_mounted(cls: type[S], prim: Usd.Prim, noun: str) -> S:
     require_api(prim, noun)
     p, q = read_pose(prim)
     link = prim.GetParent().GetName()
-    return read_figures(cls, prim, noun, link=link, p_link_sensor=p, q_link_sensor_xyzw=q)
+    return read_spec(cls, prim, noun, link=link, p_link_sensor=p, q_link_sensor_xyzw=q)
 
 
 def _write_foreign(prim: Usd.Prim, name: str, kind: Sdf.ValueTypeName, value: Any) -> None:

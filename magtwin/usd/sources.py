@@ -1,4 +1,4 @@
-"""Magnetised things on a stage: authored as what they look like, and found wherever they stand."""
+"""Magnetised things on a stage, authored as shapes with materials."""
 
 from typing import Any
 
@@ -12,32 +12,33 @@ from magtwin.frames import IDENTITY_XYZW, canonical, quat_conjugate, quat_multip
 from magtwin.spec.base import ZERO3, Quat, Vec3
 from magtwin.spec.magnetics import SourceSpec
 from magtwin.usd.attributes import check_prim_name, plain_value, write_pose
+from magtwin.usd.geometry import mesh_solid
 from magtwin.usd.layers import WORLD
 from magtwin.usd.looks import define_looks, wear
 from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, require_api
 
 SOURCES = WORLD.AppendChild("Sources")
 LOOK = "Steel"
-"""What a body of its own wears."""
+"""Material of a body that is no furniture."""
 
 LOOKS = "Looks"
 TYPES = {"point": "Xform", "cuboid": "Cube", "cylinder": "Cylinder", "sphere": "Sphere", "mesh": "Mesh"}
 SHAPES = {kind: shape for shape, kind in TYPES.items()}
 
 SQUARE = 1e-6
-"""Cosine up to which axes count as square, and relative difference up to which widths count as one."""
+"""Largest cosine between perpendicular axes, and largest relative difference between equal widths."""
 
 PARALLEL = 1e-12
-"""Sine of half the angle up to which axes count as parallel."""
+"""Largest sine of half the angle between parallel axes."""
 
 TURNS: dict[str, Quat] = {"X": (0.5, 0.5, 0.5, 0.5), "Y": (-0.5, -0.5, -0.5, 0.5), "Z": IDENTITY_XYZW}
-"""Turns of a cylinder's own z onto its prim's axis."""
+"""Rotations from a cylinder's z to the axis of its prim."""
 
 POSED = (["translate"], ["translate", "orient"], ["translate", "scale"], ["translate", "orient", "scale"])
-"""Transforms that come back to the bit."""
+"""Transforms that are read back exactly."""
 
-Placement = tuple[Vec3, Quat, Vec3]
-"""Position [m], turn and scale."""
+Transform = tuple[Vec3, Quat, Vec3]
+"""Position [m], orientation and scale."""
 
 
 def define_source(
@@ -47,9 +48,9 @@ def define_source(
 
     Args:
         stage: Written to in its edit target.
-        parent: A prim with the materials that its bodies wear under `Looks`.
-        spec: What to author: an Xform for a point, otherwise what has its shape.
-        look: Which of those materials it wears.
+        parent: A prim with materials under `Looks`.
+        spec: What to author: an Xform for a point, otherwise a prim of the shape.
+        look: Name of its material.
 
     Raises:
         InputError: Its name cannot name a prim.
@@ -79,7 +80,7 @@ def define_sources(stage: Usd.Stage, sources: tuple[SourceSpec, ...]) -> None:
 
 
 def _define_shape(prim: Usd.Prim, spec: SourceSpec) -> None:
-    """A body's geometry, with the scale that makes a cube a box."""
+    """A body's geometry; a box is a scaled cube."""
     write_pose(prim, spec.p_world, None if spec.q_world_xyzw == IDENTITY_XYZW else spec.q_world_xyzw)
     x, y, z = spec.size_m
     half = Gf.Vec3f(x / 2, y / 2, z / 2)
@@ -112,21 +113,21 @@ def define_triangles(mesh: UsdGeom.Mesh, vertices_m: Any, faces: Any) -> None:
 
 
 def source_prims(stage: Usd.Stage) -> list[Usd.Prim]:
-    """Every prim that is a source, in order: invisible ones and those in instances too, inactive ones not."""
+    """Every active prim that is a source, also invisible ones and those inside instances."""
     return [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if prim.HasAPI(NOUNS["source"])]
 
 
 def read_source(prim: Usd.Prim, *, name: str | None = None, local: bool = False) -> SourceSpec:
-    """The spec of a source as it stands in world.
+    """The spec of a source.
 
     Args:
         prim: Has the schema.
-        name: What to call it; the prim's name unless given.
-        local: Whether its pose is wanted in its parent's axes in place of world's.
+        name: Name of the source. Default: the prim's name.
+        local: Whether the pose is in the parent's axes instead of world.
 
     Raises:
-        InputError: It is no source, is of a type that none can be, is sheared or mirrored, its mesh is
-            open, or a figure is out of range.
+        InputError: The prim is no source, is sheared or mirrored, its mesh is open, or a value is out of
+            range.
     """
     require_api(prim, "source")
     shape = SHAPES.get(prim.GetTypeName())
@@ -137,14 +138,14 @@ def read_source(prim: Usd.Prim, *, name: str | None = None, local: bool = False)
         )
     if any(above.IsA(UsdGeom.PointInstancer) for above in _above(prim)):
         raise InputError(
-            f"{place(prim)}: a magnetic source below a PointInstancer stands in no one place; reference it "
-            "where it stands, as an instance if need be"
+            f"{place(prim)}: a magnetic source below a PointInstancer has no single place; reference it "
+            "at its place, as an instance if needed"
         )
     figures = {
         key: plain_value(prim.GetAttribute(attribute_name("source", key)))
         for key in ("moment", "magnetization", "susceptibility")
     }
-    p, q, scale = placement(prim, local=local)
+    p, q, scale = read_transform(prim, local=local)
     try:
         spec: dict[str, Any] = {"name": name or prim.GetName(), "p_world": p, "shape": shape}
         if shape == "point":
@@ -166,7 +167,7 @@ def read_source(prim: Usd.Prim, *, name: str | None = None, local: bool = False)
 def _point(
     spec: dict[str, Any], q: Quat, *, moment: Vec3, magnetization: Vec3, susceptibility: float
 ) -> SourceSpec:
-    """An Xform's dipole, its moment turned into world axes."""
+    """The dipole of an Xform, with its moment in world axes."""
     if magnetization != ZERO3 or susceptibility:
         raise InputError(
             "an Xform has no volume to be magnetised; give it a moment, or put the schema on its Cube, "
@@ -176,7 +177,7 @@ def _point(
 
 
 def _geometry(prim: Usd.Prim, shape: str, scale: Vec3) -> tuple[dict[str, Any], Quat]:
-    """Size, or vertices and faces, in own axes, and the turn from those to the prim's."""
+    """Size, or vertices and faces, in the body's axes, and the rotation from these to the prim's."""
     if shape == "mesh":
         points, faces = _triangles(UsdGeom.Mesh(prim), scale)
         if len(faces) and mesh_moments(points, faces)[0] < 0:
@@ -202,25 +203,9 @@ def _geometry(prim: Usd.Prim, shape: str, scale: Vec3) -> tuple[dict[str, Any], 
 
 
 def _triangles(mesh: UsdGeom.Mesh, scale: Vec3) -> tuple[Any, Any]:
-    """A mesh's vertices, those at one place as one, and its polygons cut into fans of triangles."""
-    points = np.array(mesh.GetPointsAttr().Get() or np.empty((0, 3)), float)
-    counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [], int)
-    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [], int)
-    if counts.sum() != len(corners) or (
-        len(corners) and not 0 <= corners.min() <= corners.max() < len(points)
-    ):
-        raise InputError(
-            f"its {counts.sum()} corners, {len(corners)} indices and {len(points)} points do not fit together"
-        )
-    first = np.cumsum(counts) - counts
-    fans = [
-        (corners[f], corners[f + k], corners[f + k + 1])
-        for f, n in zip(first, counts, strict=True)
-        for k in range(1, n - 1)
-    ]
-    faces = np.array(fans, int).reshape(-1, 3)
-    if mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded:
-        faces = faces[:, ::-1]
+    """A mesh's distinct vertices, and its polygons as fans of triangles."""
+    solid = mesh_solid(mesh)
+    points, faces = solid.points, solid.corners[solid.triangles]
     points = np.asarray(points * scale, np.float32).astype(float)
     places, index = np.unique(points[faces.ravel()], axis=0, return_inverse=True)
     if len(places) < len(points):  # doubled, as at seams, or of no face
@@ -236,13 +221,13 @@ def _check_round(scales: Any, what: str) -> None:
         raise InputError(f"{what} must be the same each way, got {seen}; use a Mesh for an ellipsoid or oval")
 
 
-def placement(prim: Usd.Prim, *, local: bool = False) -> Placement:
-    """Position [m], turn and scale of a prim in world, or in its parent.
+def read_transform(prim: Usd.Prim, *, local: bool = False) -> Transform:
+    """Position [m], orientation and scale of a prim in world, or in its parent.
 
-    What magtwin wrote at the origin comes back to the bit, any other transform as it composes.
+    A transform that magtwin wrote is read back exactly, another one is composed.
 
     Raises:
-        InputError: It is mirrored, sheared, flattened or not finite.
+        InputError: The transform is mirrored, sheared, flat or not finite.
     """
     xformable = UsdGeom.Xformable(prim)
     ops = xformable.GetOrderedXformOps()
@@ -270,8 +255,8 @@ def placement(prim: Usd.Prim, *, local: bool = False) -> Placement:
         )
     if np.linalg.det(rows) < 0:
         raise InputError(
-            f"{place(prim)}: it is mirrored by a negative scale, and a magnetization in mirrored axes has no "
-            "one meaning; turn it instead"
+            f"{place(prim)}: it is mirrored by a negative scale, so its magnetization is ambiguous; turn it "
+            "instead"
         )
     turned = Gf.Matrix4d(1)
     turned.SetRotateOnly(Gf.Matrix3d(*rows.ravel().tolist()))
@@ -290,7 +275,7 @@ def _above(prim: Usd.Prim) -> list[Usd.Prim]:
 
 
 def _quat(turn: Gf.Quatd) -> Quat:
-    """A turn as xyzw."""
+    """A quaternion as xyzw."""
     x, y, z, w = xyzw_from_wxyz((turn.GetReal(), *turn.GetImaginary())).tolist()
     return (x, y, z, w)
 

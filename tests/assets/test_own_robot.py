@@ -70,7 +70,7 @@ def test_a_scene_that_names_a_urdf_is_driven_in_two_commands(tmp_path, capsys):
         ('joint = "left"', 'joint = "lft"', r"no joint 'lft' for left_wheel_joint; did you mean 'left'"),
         ("cart.urdf", "cat.urdf", r"cat.urdf: no such .*did you mean 'cart.urdf'"),
         ("urdf =", "udrf =", r"mine.toml:6: \[robot\] unknown key 'udrf'; did you mean 'urdf'"),
-        ("urdf =", 'asset = "a.usda"\nurdf =', "needs asset .* or urdf .* one of the two"),
+        ("urdf =", 'asset = "a.usda"\nurdf =', "needs asset .* or urdf .* and not both"),
         ('[robot.magnetometer]\nlink = "mast"', "[robot.magnetometer]", "no link 'magnetometer_link'"),
     ],
 )
@@ -89,7 +89,7 @@ def test_keys_of_a_urdf_are_refused_beside_an_asset(tmp_path):
 
     asset = shipped("robots", "turtlebot4", "turtlebot4.usda")
     file = scene(tmp_path, SCENE.replace(f'urdf = "{CART}"', f'asset = "{asset}"'))
-    with pytest.raises(InputError, match=r"\[robot\] drive goes with urdf; the asset says it already"):
+    with pytest.raises(InputError, match=r"\[robot\] drive goes with urdf; an asset has it already"):
         scene_from_toml(file)
 
 

@@ -11,6 +11,7 @@ from pxr import Usd
 from validators import assert_valid
 
 import magtwin
+from magtwin.author.furniture import DRAWN_A_M, drawn_magnetization
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.field.maps.holes import filled
@@ -21,12 +22,10 @@ from magtwin.files import shipped
 from magtwin.sim.contradiction import contradiction_nt
 from magtwin.sim.survey import field_at_rest_nt
 from magtwin.spec.furniture import (
-    DRAWN_A_M,
     KINDS,
     MATERIALS,
     STEEL,
     FurnitureSpec,
-    drawn_magnetization,
     parts_of,
 )
 from magtwin.twin import author_scene, new_scene, open_twin, scene_from_toml, simulate
@@ -387,7 +386,7 @@ def test_the_starter_works_as_it_stands(tmp_path, monkeypatch, capsys):
     main(["scene", "attic.toml", "--out", "attic"])
     run = simulate("attic/attic.usda", "figure8", duration_s=5.0, rate_hz=10.0)
     assert np.isfinite(run["b_total_nt"]).all()
-    with pytest.raises(InputError, match=r"attic\.toml: exists already; give --force"):
+    with pytest.raises(InputError, match=r"attic\.toml: exists already; give `force=True`"):
         main(["new", "attic.toml", "--debug"])
     with pytest.raises(InputError, match=r"ends in \.toml"):
         main(["new", "attic.txt", "--debug"])

@@ -243,5 +243,5 @@ def test_two_drives_of_one_path_lie_over_each_other_once_they_are_aligned(lab_sc
 
 def test_a_run_that_cannot_be_driven_again_is_refused(lab_scene):
     run = a_run(0, "figure8")
-    with pytest.raises(InputError, match="do not say how it was made"):
+    with pytest.raises(InputError, match="the metadata of the run are incomplete"):
         made_again(run, lab_scene, engine="kinematic", seed=1)

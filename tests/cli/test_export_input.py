@@ -71,7 +71,7 @@ def test_a_reference_in_a_variant_that_is_not_chosen_is_refused_too(tmp_path):
         'variantSet "v" = {\n"a" {\n}\n"b" (references = @./gone.usda@) {\n}\n}\n}\n'
     )
     refuse(
-        r"stage\.usda: names .*gone\.usda, which is not there; put it there",
+        r"stage\.usda: names .*gone\.usda, which does not exist; add the file",
         write(tmp_path, HEAD + text),
         tmp_path,
     )
@@ -86,7 +86,7 @@ def test_a_network_that_is_not_there_is_refused_with_the_prim_that_names_it(lab,
     own = shutil.copytree(lab, tmp_path / "lab")
     next((own / "weights").glob("*.safetensors")).unlink()
     refuse(
-        r"<\S*/magnetometer\S*network>: names .*\.safetensors, which is not there",
+        r"<\S*/magnetometer\S*network>: names .*\.safetensors, which does not exist",
         own / "lab.usda",
         tmp_path,
     )
@@ -107,13 +107,13 @@ def test_a_map_that_is_not_the_one_of_its_checksum_is_refused(lab, tmp_path):
     values = layer.GetAttributeAtPath("/World/AnomalyMap.magtwin:anomalyMap:values")
     values.default = type(values.default)([v + 1 for v in values.default])
     layer.Save()
-    refuse("<.*AnomalyMap>: the map's values are not those that its checksum", own / "lab.usda", tmp_path)
+    refuse("<.*AnomalyMap>: the map's values do not match its checksum", own / "lab.usda", tmp_path)
 
 
 def test_a_texture_that_is_not_there_is_refused_with_the_property_that_names_it(tmp_path):
     text = 'def Xform "World"\n{\n    asset inputs:file = @./wood.png@\n}\n'
     refuse(
-        r"</World\.inputs:file>: names .*wood\.png, which is not there",
+        r"</World\.inputs:file>: names .*wood\.png, which does not exist",
         write(tmp_path, HEAD + text),
         tmp_path,
     )
@@ -121,7 +121,7 @@ def test_a_texture_that_is_not_there_is_refused_with_the_property_that_names_it(
 
 def test_a_file_that_is_nothing_a_stage_needs_is_not_handed_on(tmp_path):
     text = 'def Xform "World"\n{\n    asset picture = @/etc/passwd@\n}\n'
-    refuse(r"</World\.picture>: names /etc/passwd, .* not handed on", write(tmp_path, HEAD + text), tmp_path)
+    refuse(r"</World\.picture>: names /etc/passwd, .* not exported", write(tmp_path, HEAD + text), tmp_path)
 
 
 def test_a_material_that_omniverse_brings_may_be_named(tmp_path):
@@ -137,7 +137,7 @@ def test_an_entry_that_climbs_out_of_its_package_is_refused_before_anything_is_w
     with zipfile.ZipFile(tmp_path / "slip.usdz", "w") as archive:
         archive.writestr("a.usda", HEAD + CUBE)
         archive.writestr(name, "#usda 1.0\n")
-    refuse(r"slip\.usdz: its entry .*evil.* would lie outside", tmp_path / "slip.usdz", tmp_path)
+    refuse(r"slip\.usdz: its entry .*evil.* would be written outside", tmp_path / "slip.usdz", tmp_path)
     assert not list(tmp_path.rglob("evil*"))
 
 
@@ -146,7 +146,7 @@ def test_a_package_that_names_a_layer_outside_of_itself_is_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.usdz", "w") as archive:
         text = HEAD.replace("    upAxis", f"    subLayers = [@{secret}@]\n    upAxis")
         archive.writestr("a.usda", text + CUBE)
-    refuse(r"a\.usdz/a\.usda: names .*stage\.usda, outside of its package", tmp_path / "a.usdz", tmp_path)
+    refuse(r"a\.usdz/a\.usda: names .*stage\.usda, outside its package", tmp_path / "a.usdz", tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_bytes_that_were_changed_in_a_package_are_refused(tmp_path):
     layer.Save()
     pack(root, tmp_path / "changed.usdz")
     refuse(
-        r"<.*/Files/\w+_safetensors>: the bytes of \w+\.safetensors are not those",
+        r"<.*/Files/\w+_safetensors>: the bytes of \w+\.safetensors do not match",
         tmp_path / "changed.usdz",
         tmp_path,
     )
@@ -218,7 +218,9 @@ def test_a_name_in_a_package_that_would_lie_elsewhere_is_refused(tmp_path):
     attached(layer, "name").default = "../../evil.csv"
     layer.Save()
     pack(root, tmp_path / "changed.usdz")
-    refuse(r"magtwin:file:name '\.\./\.\./evil\.csv' is no name", tmp_path / "changed.usdz", tmp_path)
+    refuse(
+        r"magtwin:file:name '\.\./\.\./evil\.csv' is not a valid name", tmp_path / "changed.usdz", tmp_path
+    )
 
 
 def test_a_layer_that_ends_its_reader_is_refused_in_one_line(lab, tmp_path, monkeypatch):
@@ -230,7 +232,7 @@ def test_a_layer_that_ends_its_reader_is_refused_in_one_line(lab, tmp_path, monk
         return __import__("subprocess").CompletedProcess(command, -signal.SIGSEGV, "", "")
 
     monkeypatch.setattr("magtwin.export.validation.inspection.subprocess.run", killed)
-    refuse(r"lab\.usda: damaged: USD ends when it reads it", own / "lab.usda", tmp_path, trusted=False)
+    refuse(r"lab\.usda: damaged: USD crashes on it", own / "lab.usda", tmp_path, trusted=False)
     assert "magtwin.export.validation.inspection" in seen["command"]
 
 
@@ -248,7 +250,7 @@ def test_what_cannot_be_made_is_refused(out, options, text, tmp_path):
 
 def test_a_stage_without_a_robot_has_no_action_graph_to_be_exported_with(tmp_path):
     refuse(
-        "is no scene of magtwin's, .* take --profile omniverse",
+        "has no lab, robot and magnetometer, .* use `profile='omniverse'`",
         write(tmp_path, HEAD + CUBE),
         tmp_path,
         profile="isaac",
@@ -260,7 +262,7 @@ def test_what_exists_is_replaced_only_when_asked(lab, tmp_path):
     for name in ("a", "a.usdz", "a.glb", "a.usd"):
         export_scene(stage, tmp_path / name, trusted=True)
         before = (tmp_path / name).stat().st_mtime_ns
-        with pytest.raises(InputError, match="exists already; give --force"):
+        with pytest.raises(InputError, match="exists already; give `force=True`"):
             export_scene(stage, tmp_path / name, trusted=True)
         assert (tmp_path / name).stat().st_mtime_ns == before
         export_scene(stage, tmp_path / name, trusted=True, force=True)
@@ -270,7 +272,7 @@ def test_what_exists_is_replaced_only_when_asked(lab, tmp_path):
 def test_an_export_does_not_take_the_place_of_the_stage_that_it_is_made_from(lab, tmp_path):
     own = shutil.copytree(lab, tmp_path / "lab")
     for out in (own, own.parent):
-        with pytest.raises(InputError, match="holds the stage that is exported; name another place"):
+        with pytest.raises(InputError, match="contains the exported stage; give another output"):
             export_scene(own / "lab.usda", out, trusted=True, force=True)
     assert (own / "room.usda").is_file()
 
@@ -301,7 +303,7 @@ def test_a_prim_in_the_place_of_attached_files_is_refused(lab, tmp_path):
         .replace('    def Xform "turtlebot4"', '    def "Files"\n    {\n    }\n\n    def Xform "turtlebot4"')
     )
     (own / "lab.usda").write_text(text)
-    refuse("</World/Files>: is where files are attached; rename", own / "lab.usda", tmp_path, "lab.usdz")
+    refuse("</World/Files>: is the scope of attached files; rename", own / "lab.usda", tmp_path, "lab.usdz")
 
 
 # Units

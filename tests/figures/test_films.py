@@ -242,7 +242,7 @@ def test_runs_that_cannot_be_shown_are_refused(run, lab_scene, tmp_path):
     with pytest.raises(InputError, match=r"a\.mov: films end in \.mp4 or \.gif"):
         film_of_run(run, lab_scene, tmp_path / "a.mov")
     (tmp_path / "a.mp4").write_text("precious")
-    with pytest.raises(InputError, match="exists already; give --force"):
+    with pytest.raises(InputError, match="exists already; give `force=True`"):
         film_of_run(run, lab_scene, tmp_path / "a.mp4")
     assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
     assert (tmp_path / "a.mp4").read_text() == "precious"

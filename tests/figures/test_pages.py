@@ -232,13 +232,13 @@ def test_a_map_that_is_no_longer_what_the_run_read_is_not_shown(runs, tmp_path, 
     file = tmp_path / "a.parquet"
     write_parquet(runs[0].with_metadata(map_sha256="0" * 64), file)
     main(["report", str(file), "--out", str(tmp_path / "a.md")])
-    assert "is not the map that the run read" in (tmp_path / "a.md").read_text()
+    assert "is not the map of the run" in (tmp_path / "a.md").read_text()
 
 
 def test_what_cannot_be_reported_is_refused_and_nothing_is_written(runs, tmp_path):
     page = page_of_runs([NamedRun("a", runs[0])], pictures=False)
     (tmp_path / "there.html").write_text("precious")
-    with pytest.raises(InputError, match="exists already; give --force"):
+    with pytest.raises(InputError, match="exists already; give `force=True`"):
         write_page(page, tmp_path / "there.html")
     with pytest.raises(InputError, match=r"a\.pdf: a report ends in \.html, \.md, \.json"):
         write_page(page, tmp_path / "a.pdf")

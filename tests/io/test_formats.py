@@ -10,7 +10,7 @@ from test_tables import few_bytes
 
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.io.bags.rosbag import BagWriter
+from magtwin.io.bags import BagWriter
 from magtwin.io.formats import FORMATS, read_run, write_run
 from magtwin.io.tables import ParquetParts
 from magtwin.run.run import Column, Run
@@ -135,7 +135,7 @@ def test_a_bag_that_did_not_end_is_read_as_far_as_it_goes(run, twin, tmp_path):
 def test_options_of_another_format_and_unknown_endings_are_refused(run, tmp_path):
     with pytest.raises(InputError, match="Parquet has no option 'units'; drop it"):
         write_run(run, tmp_path / "run.parquet", units="nT")
-    with pytest.raises(InputError, match=r"run\.parqet: no known kind of run file; did you mean '\.parquet'"):
+    with pytest.raises(InputError, match=r"run\.parqet: unknown format of a run; did you mean '\.parquet'"):
         write_run(run, tmp_path / "run.parqet")
     (tmp_path / "run.csv").touch()
     with pytest.raises(InputError, match=r"no such run; did you mean 'run\.csv'"):
@@ -143,7 +143,7 @@ def test_options_of_another_format_and_unknown_endings_are_refused(run, tmp_path
     assert [p.name for p in tmp_path.iterdir()] == ["run.csv"]
 
 
-@pytest.mark.parametrize("name", [f"run{suffix}" for suffix, one in FORMATS.items() if one.write])
+@pytest.mark.parametrize("name", [f"run{suffix}" for suffix, kind in FORMATS.items() if kind.write])
 def test_every_format_refuses_a_file_cut_short_or_of_another_kind(name, written, tmp_path):
     whole = (written / name).read_bytes()
     for content in (b"", b"nothing of the kind\n" * 40, whole[: len(whole) // 3]):
@@ -219,7 +219,7 @@ def test_convert_takes_frames_a_second_units_and_the_scene(run, written, lab_sce
     ("source", "out", "options", "message"),
     [
         ("run.parquet", "run.csv", [], "run.csv: exists already; give --force"),
-        ("run.parquet", "new.xyz", [], "no known kind of run file; known: .csv"),
+        ("run.parquet", "new.xyz", [], "unknown format of a run; known: .csv"),
         ("run.parquet", "new.csv", ["--out-unit", "nT"], "CSV has no option 'units'; drop it"),
         ("run.parquet", "new.csv", ["--scene", "x.usda"], "a table shows no scene; drop --scene"),
         ("run.parquet", "new.rrd", ["--scene", "x.usda"], "x.usda: no such scene"),

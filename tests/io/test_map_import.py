@@ -291,7 +291,7 @@ def test_a_fit_of_one_heading_and_of_few_readings_says_that_they_are_doubtful(tm
     said = " ".join(capsys.readouterr().out.split())
     assert "only 16 good readings" in said
     assert "one heading only, 29 deg: nothing tells the robot's own field from the room's" in said
-    assert "field in uT, as its size tells (--unit)" in said
+    assert "field in uT, by its size (--unit)" in said
 
 
 @pytest.mark.parametrize("method", ["harmonic", "gp", "trilinear"])

@@ -227,18 +227,18 @@ def test_what_is_no_longer_at_hand_is_refused(twin, run):
         (Commands("script", np.array([[0.0, 0.1, 0.0], [0.3, 0.0, 0.0]])), "'script'"),
         (run, "'figure8'"),
     ):
-        with pytest.raises(InputError, match=f"the run drove .*{name}, which came from no file"):
+        with pytest.raises(InputError, match=f"the run drove .*{name}, which is in no file"):
             repeat(simulate(twin, what, duration_s=0.5, rate_hz=20.0))
     lost = replace(run, metadata={k: v for k, v in run.metadata.items() if k != "seed"})
-    with pytest.raises(InputError, match="the run does not say its seed"):
+    with pytest.raises(InputError, match="the metadata hold no seed"):
         repeat(lost)
     with pytest.raises(InputError, match="does not name its scene"):
         repeat(Run(run.columns, {"seed": 1}))
-    with pytest.raises(InputError, match="do not say how it was made: could not convert"):
+    with pytest.raises(InputError, match="are incomplete: could not convert"):
         repeat(run.with_metadata(rate_hz="often"))
-    with pytest.raises(InputError, match="/dev/null: the file that the run drove is not there"):
+    with pytest.raises(InputError, match="/dev/null: the file that the run drove is missing"):
         repeat(run.with_metadata(path_file="/dev/null"))  # a device, as a file of a stranger's may name one
-    with pytest.raises(InputError, match="an engine of its maker's own, 'wings'"):
+    with pytest.raises(InputError, match="a custom engine, 'wings'"):
         repeat(run.with_metadata(engine="wings"))
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.io.bags.rosbag import BagWriter
+from magtwin.io.bags import BagWriter
 from magtwin.io.formats import read_run
 from magtwin.io.recorder import FLUSH_S, Recorder, in_step, partial_of
 from magtwin.io.rerun.file import read_run as read_rrd
@@ -27,7 +27,7 @@ CHILD = """
 import sys
 from magtwin.io.rerun.live import RrdWriter
 from magtwin.io.recorder import Recorder, in_step
-from magtwin.io.bags.rosbag import BagWriter
+from magtwin.io.bags import BagWriter
 from magtwin.io.tables import ParquetParts, read_parquet
 
 folder = sys.argv[1]

@@ -390,7 +390,7 @@ def test_runs_without_rows_or_times_existing_files_and_a_disabled_rerun_are_refu
         write_rrd(Run({"t": [0.0, 1.0, np.nan]}), path)
     assert not list(tmp_path.iterdir())
     path.write_text("kept")
-    with pytest.raises(InputError, match=r"run\.rrd: exists already; give --force"):
+    with pytest.raises(InputError, match=r"run\.rrd: exists already; give `force=True`"):
         write_rrd(run, path, **rest)
     for kind in (lambda out: write_rrd(run, out), RrdWriter):
         with pytest.raises(InputError, match="cannot be written"):

@@ -9,7 +9,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from magtwin.errors import InputError
-from magtwin.io.bags.rosbag import read_bag_readings
+from magtwin.io.bags import read_bag_readings
 from magtwin.io.surveys.readings import read_readings
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -146,7 +146,7 @@ def test_the_unit_is_told_by_size_or_by_option(tmp_path, factor, unit):
     assert_allclose(read_bag_readings(bag).b_nt, 41_000)
     assert_allclose(read_bag_readings(bag, unit=unit).b_nt, 41_000)
     other = "nT" if unit != "nT" else "T"
-    with pytest.raises(InputError, match=f"the mean of /mag .* were it {unit}, .* say --unit {unit}"):
+    with pytest.raises(InputError, match=f"the mean of /mag .* in {unit} .* give --unit {unit}"):
         read_bag_readings(bag, unit=other)
 
 
@@ -256,7 +256,7 @@ def test_a_bag_that_was_cut_short_is_refused_in_one_line(tmp_path, storage, keep
     topics = {"/pose": drive(), "/mag": at_middle(np.full(40, 41_000.0))}
     folder = write_bag(tmp_path / "bag", topics, storage)
     cut(next(p for p in folder.iterdir() if p.suffix in (".db3", ".mcap")), keep)
-    with pytest.raises(InputError, match="bag: damaged bag, or none") as refusal:
+    with pytest.raises(InputError, match=r"bag: (damaged bag, or none|cut short)") as refusal:
         read_bag_readings(folder)
     assert "\n" not in str(refusal.value)
 

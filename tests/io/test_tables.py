@@ -198,7 +198,7 @@ def test_parquet_with_text_or_holes_is_refused(tmp_path):
 
 def test_an_output_that_exists_is_kept_unless_forced(written):
     before = written.read_bytes()
-    with pytest.raises(InputError, match="exists already; give --force"):
+    with pytest.raises(InputError, match="exists already; give `force=True`"):
         write_parquet(some_run(seed=1), written)
     assert written.read_bytes() == before
     write_parquet(some_run(seed=1), written, force=True)
@@ -351,26 +351,26 @@ def test_a_csv_of_a_spreadsheet_is_a_run_where_the_names_are(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (b"", "has no line of column names; it is empty"),
-        (b"# facts {}\n", "has no line of column names"),
+        (b"", "no line of column names; the file is empty"),
+        (b"# facts {}\n", "no line of column names"),
         (b"t,yaw\n0,1\n1\n", "Expected 2 columns, got 1"),
         (b"t,yaw\n0,1\n1,2,3\n", "Expected 2 columns, got 3"),
         (b"t,yaw\n0,1\n1,north\n", "invalid value 'north'"),
         (b"t,yaw\n0,1\n1,\n", "column 'yaw', row 1: no value; write nan"),
         (b"t,yaw,yaw\n0,1,2\n", "two columns are called 'yaw'"),
-        (b"t;yaw\n0;1,5\n", "its columns are separated by ';'; save it with commas"),
+        (b"t;yaw\n0;1,5\n", "columns are separated by ';'; save it with commas"),
         (b"time,yaw\n0,1\n", "not a Run: column 't' is missing"),
         (b"t,yaw\n0,1\n0,2\n", "row 1 has 0 s after 0 s"),
         (b"t,yaw\n2,1\n1,2\n", "t must ascend from row to row, but row 1 has 1 s after 2 s"),
         (b"t\nnan\n", "t must be finite, got nan in row 0"),
         (b"t,odom_p_x\n0,1\n", "column 'odom_p_y' is missing beside 'odom_p_x'"),
         (b"t,flag_bump\n0,2\n", "'2'"),
-        (b"\xff\xfe\x00t\n", "is not text in UTF-8"),
-        (b"a" * (1 << 21), "line 1 is no line of a CSV file"),
+        (b"\xff\xfe\x00t\n", "is not UTF-8"),
+        (b"a" * (1 << 21), "line 1 is not a line of a CSV file"),
         (b"# facts [1]\nt\n0\n", "must be an object"),
         (b"# facts {\nt\n0\n", "is not JSON"),
-        (b'# facts {"a": [1]}\nt\n0\n', "fact 'a' must be a text, a number"),
-        (b"# column t nonsense\nt\n0\n", "csv:1: what it says of a column is not JSON"),
+        (b'# facts {"a": [1]}\nt\n0\n', "metadata 'a' must be a text, a number"),
+        (b"# column t nonsense\nt\n0\n", "csv:1: metadata of a column are not JSON"),
         (b'# column t {"type": "tensor"}\nt\n0\n', "column 't' has no such type"),
         (b'# column t {"type": "double", "column": "t"}\nt\n0\n1', "cut short: its last line has no end"),
     ],
@@ -435,7 +435,7 @@ def test_an_array_whose_header_claims_more_than_is_there_takes_no_memory(tmp_pat
         ({"t": np.arange(2.0), "name": np.array(["a", "b"])}, "'name' must hold numbers or flags"),
         ({"t": np.arange(2.0), "yaw": np.zeros(2, complex)}, "'yaw' must hold numbers or flags"),
         ({"t": np.arange(2.0), "est_n": np.array(3)}, "column 'est_n' must hold numbers or flags in rows"),
-        ({"t": np.arange(2.0), "magtwin": np.zeros(2)}, "tells nothing of a run"),
+        ({"t": np.arange(2.0), "magtwin": np.zeros(2)}, "holds no metadata of a run"),
         ({"t": np.arange(2.0), "magtwin": np.array('{"columns": {"t": 1}}')}, "object of texts"),
     ],
 )

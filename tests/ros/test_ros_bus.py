@@ -12,7 +12,7 @@ from nodes import DOMAINS, spin
 from places import ROOT
 
 from magtwin.errors import InputError
-from magtwin.io.bags.messages import LATCHED, ODOMETRY, SENSOR_DATA, TOPICS, TYPES, Qos
+from magtwin.io.bags.topics import LATCHED, ODOMETRY, SENSOR_DATA, TOPICS, Qos
 from magtwin.ros.bus import Bus, Message, names_of, open_bus, to_bytes
 from magtwin.ros.clock import Clock
 
@@ -39,19 +39,22 @@ def pair(domain: int) -> Iterator[tuple[Bus, Bus]]:
         node.close()
 
 
+KINDS = sorted({kind for topic in TOPICS.values() for kind in (topic.kind, *topic.reads)})
+
+
 def test_every_type_of_the_table_crosses_unchanged(pair: tuple[Bus, Bus]) -> None:
     one, other = pair
     heard: dict[str, Message] = {}
     said: dict[str, bytes] = {}
     offered = []
-    for k, kind in enumerate(TYPES):
+    for k, kind in enumerate(KINDS):
         offered.append(one.publisher(f"t{k}", kind, Qos()))
         other.subscribe(f"t{k}", kind, lambda m: heard.__setitem__(m.kind, m), Qos())
         said[kind] = to_bytes(kind, {"header.frame_id": "base_link", "pose.position": [1.0, 2.0, 3.0]})
     spin(lambda: all(p.subscribers() for p in offered), one, other)
     for publisher in offered:
         publisher.publish(said[publisher.kind])
-    spin(lambda: len(heard) == len(TYPES), one, other)
+    spin(lambda: len(heard) == len(KINDS), one, other)
     for kind, message in heard.items():
         assert message.data[: len(said[kind])] == said[kind]  # DDS pads to four bytes
         assert not any(message.data[len(said[kind]) :])
@@ -60,9 +63,9 @@ def test_every_type_of_the_table_crosses_unchanged(pair: tuple[Bus, Bus]) -> Non
 def test_our_bytes_are_those_that_cyclonedds_itself_writes() -> None:
     from cyclonedds.idl import IdlStruct
 
-    from magtwin.ros.types import _whole
+    from magtwin.ros.types import _struct
 
-    struct = _whole(FIELD)
+    struct = _struct(FIELD)
     header, field = (struct.__annotations__[name] for name in ("header", "magnetic_field"))
     stamp = header.__annotations__["stamp"]
     sample = struct(
@@ -218,7 +221,7 @@ def jazzy() -> Path:
 ECHO = """
 import sys
 sys.path.insert(0, sys.argv[1])
-from magtwin.io.bags.messages import LATCHED, Qos
+from magtwin.io.bags.topics import LATCHED, Qos
 from magtwin.ros.bus import open_bus
 node = open_bus("echo", backend="rclpy")
 there = node.publisher("back", "sensor_msgs/msg/MagneticField", Qos(depth=50))

@@ -11,7 +11,7 @@ from nodes import DOMAINS, spin
 from magtwin.errors import InputError
 from magtwin.files import shipped
 from magtwin.frames import quat_from_yaw
-from magtwin.io.bags.messages import CLOCK, COMMAND, ODOMETRY, POSE, Qos
+from magtwin.io.bags.topics import CLOCK, COMMAND, ODOMETRY, POSE, Qos
 from magtwin.path import PATHS, Path
 from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
 from magtwin.ros.diagnostics import KIND, Status, from_message
@@ -88,7 +88,7 @@ class Ideal:
             self.bus.spin_once(0.001)
 
     def _hear(self, message: Message) -> None:
-        linear, angular = COMMAND.leaves[self.kind]
+        linear, angular = COMMAND.leaves(self.kind)
         read = message.read([linear, angular])
         self.commands.append((float(read[linear][0]), float(read[angular][2])))
 

@@ -10,7 +10,7 @@ from nodes import DOMAINS, spin
 from magtwin.errors import InputError
 from magtwin.files import shipped
 from magtwin.frames import into_base, quat_from_yaw
-from magtwin.io.bags.messages import BATTERY, CLOCK, IMU, MAGNITUDE, ODOMETRY, POSE, Qos, Topic
+from magtwin.io.bags.topics import BATTERY, CLOCK, IMU, MAGNITUDE, ODOMETRY, POSE, Qos, Topic
 from magtwin.ros.bus import Bus, Message, Publisher, names_of, open_bus, to_bytes
 from magtwin.ros.diagnostics import KIND, Status, from_message
 from magtwin.ros.inputs import GRAVITY, Gravity, Input
@@ -312,7 +312,7 @@ def test_a_clock_that_stands_still_is_said_by_the_wall(world: World, monkeypatch
         world.ear.spin_once(0.0)
         return bool(world.said) and world.said[-1]["readings"].message == f"no reading: {text}"
 
-    spin(lambda: told("nobody says /clock"), bus)
+    spin(lambda: told("nobody publishes /clock"), bus)
     world.tick(bus, 3)
     before = world.heard(bus)
     spin(lambda: told("/clock stands still"), bus)
@@ -354,7 +354,7 @@ def test_an_input_that_comes_back_in_another_type_is_told_of(world: World) -> No
     world.buses.remove(first)
     first.close()
     again.publisher(topic.name, "std_msgs/msg/Float64", topic.qos)
-    told = "nothing heard yet; offered as std_msgs/msg/Float64 now: start this node anew"
+    told = "nothing received yet; published as std_msgs/msg/Float64 now: restart this node"
     spin(lambda: one.look() or one.status(bus.now_ns()).message == told, bus)
 
 

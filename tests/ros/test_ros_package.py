@@ -126,7 +126,7 @@ def called(name: str):
 
 
 def test_the_package_is_one_of_format_3_and_names_every_package_whose_messages_are_said() -> None:
-    from magtwin.io.bags.messages import TYPES
+    from magtwin.io.bags.topics import TOPICS
 
     root = ElementTree.parse(PACKAGE / "package.xml").getroot()
     assert (root.tag, root.get("format")) == ("package", "3")
@@ -136,7 +136,10 @@ def test_the_package_is_one_of_format_3_and_names_every_package_whose_messages_a
     assert root.findtext("export/build_type") == "ament_python"
     assert "@" in root.find("maintainer").get("email")  # type: ignore[union-attr, operator]
     depends = {element.text for element in root.findall("exec_depend")}
-    assert {kind.partition("/")[0] for kind in TYPES} | {"tf2_msgs", "std_srvs", "rclpy"} <= depends
+    assert {kind.partition("/")[0] for topic in TOPICS.values() for kind in (topic.kind, *topic.reads)} | {
+        "std_srvs",
+        "rclpy",
+    } <= depends
 
 
 def test_all_that_setup_installs_is_there() -> None:

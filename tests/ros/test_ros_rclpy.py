@@ -12,7 +12,7 @@ from nodes import DOMAINS
 from places import ROOT
 
 from magtwin.files import shipped
-from magtwin.io.bags.messages import MAGNITUDE
+from magtwin.io.bags.topics import MAGNITUDE
 from magtwin.ros.bus import Message, open_bus
 from magtwin.ros.simulate import Simulator
 from magtwin.twin import Twin, open_twin

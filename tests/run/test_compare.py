@@ -126,15 +126,15 @@ def test_the_figures_are_json_for_scripts():
     ("a", "b", "align", "what"),
     [
         (Run({"t": [0.0]}), circle(), "time", "the first run has 1 readings"),
-        (circle(), Run({"t": [0.0, 0.0]}), "time", "the second run has no time that goes on"),
+        (circle(), Run({"t": [0.0, 0.0]}), "time", "the second run has no time that ascends"),
         (Run({"t": [0.0, 1.0]}), circle(), "time", "no column of p_world_base, mocap_p, odom_p is known"),
         (Run({"t": [0.0, 1.0]}), circle(), "none", "nothing to compare"),
-        (circle(), circle(start_s=500.0), "none", "do not lie over each other: 0 to 59.98 s and 500 to"),
+        (circle(), circle(start_s=500.0), "none", "do not overlap: 0 to 59.98 s and 500 to"),
         (
             circle(),
             Run({"t": np.arange(9.0), "p_world_base": np.zeros((9, 3))}),
             "path",
-            "the second run cannot be laid over the other: its robot moves no 0.01 m; align by time",
+            "the second run cannot be aligned: its robot moves no 0.01 m; align by time",
         ),
     ],
 )

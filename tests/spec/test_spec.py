@@ -90,10 +90,10 @@ def test_no_number_of_a_spec_may_be_infinite_or_none(given, name, bad):
         (
             EARTH,
             {"date": "2026-02-30"},
-            "date of EarthFieldSpec must be a day as YYYY-MM-DD, got '2026-02-30'",
+            "date of EarthFieldSpec must be a date YYYY-MM-DD, got '2026-02-30'",
         ),
-        (EARTH, {"date": "20260101"}, "must be a day as YYYY-MM-DD, got '20260101'"),
-        (EARTH, {"date": ""}, "must be a day as YYYY-MM-DD, got ''"),
+        (EARTH, {"date": "20260101"}, "must be a date YYYY-MM-DD, got '20260101'"),
+        (EARTH, {"date": ""}, "must be a date YYYY-MM-DD, got ''"),
         (
             LidarSpec(),
             {"range_min_m": 12.0},
@@ -107,7 +107,7 @@ def test_no_number_of_a_spec_may_be_infinite_or_none(given, name, bad):
         (
             DriveSpec(),
             {"left_wheel_joint": "right_wheel_joint"},
-            "right_wheel_joint of DriveSpec must be another joint than the left wheel's, got",
+            "right_wheel_joint of DriveSpec must differ from left_wheel_joint, got",
         ),
         (BatterySpec(), {"initial_fraction": 1.5}, r"must lie in 0\.\.1, got 1\.5"),
         *(

@@ -501,7 +501,7 @@ def test_a_mesh_that_is_broken_empty_or_flat_is_refused(tmp_path):
 def test_an_output_that_exists_is_kept_unless_forced(tmp_path):
     path = arm(tmp_path, "fixed|")
     out = convert_urdf(path, tmp_path / "out.usda")
-    with pytest.raises(InputError, match=r"out\.usda: exists already; give --force"):
+    with pytest.raises(InputError, match=r"out\.usda: exists already; give `force=True`"):
         convert_urdf(path, out)
     convert_urdf(path, out, force=True)
     with pytest.raises(InputError, match=r"out\.usdc: the robot's root layer is text; give it the suffix"):

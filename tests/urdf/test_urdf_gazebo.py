@@ -545,9 +545,7 @@ def test_settings_come_before_tags_and_leave_one_sensor_of_each_kind(tmp_path, r
     report = build_robot(urdf, settings, out)
     spec = load_robot(out)  # needs one of each
     assert (spec.lidar.scan_rate_hz, spec.imu.link, spec.drive.v_max) == (7.5, "oakd_imu_frame", 0.46)
-    assert "lidar 'rplidar' of link 'rplidar_link': the settings say what it is, not the URDF's tags" in (
-        report.notes
-    )
+    assert "lidar 'rplidar' of link 'rplidar_link': the settings replace the URDF's tags" in (report.notes)
     assert "imu 'imu' of link 'imu_link' is not simulated here: the settings name another" in report.notes
     assert_valid(out, tmp_path)
 

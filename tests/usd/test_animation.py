@@ -190,7 +190,7 @@ def test_only_what_plays_a_run_is_an_animation(played, lab_scene):
 @pytest.mark.parametrize(
     ("columns", "options", "message"),
     [
-        ({"b_total_nt": np.zeros(2)}, {}, "says nowhere where the robot is; it needs p_world_base and"),
+        ({"b_total_nt": np.zeros(2)}, {}, "has no pose of the robot; it needs p_world_base and"),
         ({"t": [1.0, 1.0]}, {}, "row 1 has 1 s after 1 s"),
         ({"t": []}, {}, "no rows, there is nothing to play"),
         (
@@ -218,7 +218,7 @@ def test_a_part_of_the_scene_is_never_replaced_by_what_plays_in_it(run, lab_scen
 
 def test_what_exists_is_kept_unless_forced_and_other_names_are_refused(run, played):
     before = played.read_bytes()
-    with pytest.raises(InputError, match="exists already; give --force"):
+    with pytest.raises(InputError, match="exists already; give `force=True`"):
         write_animation(run, played)
     with pytest.raises(InputError, match="a USD file ends in"):
         write_animation(run, played.with_suffix(".usdz"))

@@ -125,7 +125,7 @@ def test_registering_too_late_is_refused():
     done = subprocess.run([sys.executable, "-c", late], capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert "InputError: the USD schemas MagtwinAnomalyMapAPI" in done.stderr
-    assert "came too late" in done.stderr
+    assert "registered too late" in done.stderr
     assert "import magtwin.usd before" in done.stderr
 
 

@@ -307,9 +307,9 @@ def put(prim: Usd.Prim, attribute: str, value) -> None:
         (lambda p: p.SetTypeName("Xform"), "an Xform has no volume to be magnetised; give it a moment"),
         (
             lambda p: p.GetParent().SetTypeName("PointInstancer"),
-            "below a PointInstancer stands in no one place",
+            "below a PointInstancer has no single place",
         ),
-        (lambda p: apply_api(p.GetParent(), "robot"), "on the robot /World/Sources, which carries it about"),
+        (lambda p: apply_api(p.GetParent(), "robot"), "on the robot /World/Sources, which moves"),
     ],
 )
 def test_what_cannot_be_a_source_is_refused_by_prim(change, said):
@@ -353,12 +353,12 @@ def test_a_source_whose_name_cannot_name_a_prim_is_refused():
     ("given", "said"),
     [
         ({"shape": "cubiod"}, "must be a known shape .did you mean 'cuboid'.., got 'cubiod'"),
-        ({"size_m": (0.0, 1.0, 1.0)}, "size_m of SourceSpec must be above 0 m each way: no volume, no field"),
-        ({"shape": "cylinder", "size_m": (1.0, 2.0, 1.0)}, "as wide in y as in x"),
-        ({"shape": "sphere", "size_m": (1.0, 1.0, 2.0)}, "alike each way"),
-        ({"shape": "point"}, "size_m of SourceSpec must be given with a shape: a point has no volume"),
-        ({"m_world": (0, 0, 1.0)}, "m_world of SourceSpec must not be given for a cuboid"),
-        ({"vertices_m": TETRAHEDRON}, "vertices_m of SourceSpec must go with shape mesh"),
+        ({"size_m": (0.0, 1.0, 1.0)}, "size_m of SourceSpec must be above 0 m each way"),
+        ({"shape": "cylinder", "size_m": (1.0, 2.0, 1.0)}, "be equal in x and y for a cylinder"),
+        ({"shape": "sphere", "size_m": (1.0, 1.0, 2.0)}, "equal each way"),
+        ({"shape": "point"}, "size_m of SourceSpec must be left out for a point"),
+        ({"m_world": (0, 0, 1.0)}, "m_world of SourceSpec must be left out for a cuboid"),
+        ({"vertices_m": TETRAHEDRON}, "vertices_m of SourceSpec must be given for shape mesh only"),
         ({"q_world_xyzw": (0.0, 0.0, 0.0, 2.0)}, "must be a unit quaternion"),
         (
             {"shape": "mesh", "vertices_m": TETRAHEDRON, "faces": SIDES[:3]},
@@ -486,7 +486,7 @@ def test_a_field_that_is_not_the_models_is_refused_unless_it_was_measured():
 @pytest.mark.parametrize(
     ("attribute", "value", "said"),
     [
-        ("date", "soon", "date of EarthFieldSpec must be a day as YYYY-MM-DD"),
+        ("date", "soon", "date of EarthFieldSpec must be a date YYYY-MM-DD"),
         (
             "date",
             "2031-01-01",

@@ -1,4 +1,4 @@
-"""Findings: what validators say of a file, each with the prim and what to do."""
+"""Findings of validators about a file, each with the prim and advice."""
 
 import json
 from collections.abc import Mapping
@@ -23,26 +23,26 @@ class Finding:
     """Path of the prim, or name of the file; "" for the whole stage."""
 
     advice: str = ""
-    """What to do; "" where the text says it."""
+    """What to do; "" if the text has it."""
 
     severity: Severity = "error"
-    """An error is mended before others get the file, a warning may stay, a note is nothing to mend."""
+    """An error must be fixed before others get the file; a warning may stay; a note is information."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """What one validator said."""
+    """The result of one validator."""
 
     validator: str
-    """Its name, with its version or its profile where it has one."""
+    """Its name, with version or profile if it has one."""
 
     findings: tuple[Finding, ...] = ()
 
     not_run: str = ""
-    """Why it was not run; "" where it was."""
+    """Why it was not run; "" if it was."""
 
     scope: str = ""
-    """What it looked at, such as "30 validators"."""
+    """What it checked, such as "30 validators"."""
 
     def count(self, severity: Severity) -> int:
         """Number of findings of that severity."""
@@ -50,7 +50,7 @@ class Check:
 
     @property
     def result(self) -> str:
-        """In a word: "not run", "failed" where there is an error, else "passed"."""
+        """Verdict: 'not run', 'failed' if there is an error, else 'passed'."""
         if self.not_run:
             return "not run"
         return "failed" if self.count("error") else "passed"
@@ -58,14 +58,14 @@ class Check:
 
 @dataclass(frozen=True)
 class Findings:
-    """What all validators said of a file."""
+    """The results of all validators for a file."""
 
     file: Path
 
     checks: tuple[Check, ...]
 
     mended: tuple[str, ...] = ()
-    """What was mended before they looked, one line each."""
+    """Repairs before the check, one line each."""
 
     def count(self, severity: Severity) -> int:
         """Number of findings of that severity."""
@@ -73,11 +73,11 @@ class Findings:
 
     @property
     def clean(self) -> bool:
-        """Whether no validator that was run found an error."""
+        """Whether no validator found an error."""
         return not self.count("error")
 
     def table(self) -> dict[str, Any]:
-        """All of it as plain data, as the JSON has it."""
+        """All results as plain data."""
         return {
             "file": str(self.file),
             "clean": self.clean,
@@ -88,7 +88,7 @@ class Findings:
         }
 
     def to_json(self) -> str:
-        """All of it as one JSON object."""
+        """All results as one JSON object."""
         return json.dumps(self.table(), indent=2, ensure_ascii=False)
 
 

@@ -1,4 +1,4 @@
-"""Fix: what is wrong with a stage and can be mended without a guess, each file written aside and renamed."""
+"""Fixes of a stage that need no guess. Each file is written aside and then renamed."""
 
 import os
 import re
@@ -15,35 +15,35 @@ from magtwin.export.validation.rules import is_absolute
 from magtwin.files import output
 from magtwin.usd.schema import NOUNS
 
-Mend = Callable[["Patient"], Iterator[str]]
+Mend = Callable[["EditedStage"], Iterator[str]]
 
 
 @dataclass
-class Patient(Subject):
-    """A stage that is mended, and the layers that were touched."""
+class EditedStage(Subject):
+    """A stage that is fixed, and its changed layers."""
 
     touched: list[Sdf.Layer] = field(default_factory=list)
 
     def edit(self, layer: Sdf.Layer) -> Sdf.Layer:
-        """A layer to change; one outside of the stage's folder is not the stage's to change.
+        """A layer to change.
 
         Raises:
-            InputError: It lies outside.
+            InputError: It is outside the stage's folder.
         """
         if not self.owns(layer):
-            raise InputError(f"{layer.realPath}: lies outside {self.folder}; mend it where it belongs")
+            raise InputError(f"{layer.realPath}: is outside {self.folder}; fix it there")
         if layer not in self.touched:
             self.touched.append(layer)
         return layer
 
     def owns(self, layer: Sdf.Layer) -> bool:
-        """Whether a layer lies in the stage's folder."""
+        """Whether a layer is in the stage's folder."""
         return Path(layer.realPath).resolve().is_relative_to(self.folder)
 
 
 @dataclass(frozen=True)
 class Fix:
-    """Something that can be mended."""
+    """A fix."""
 
     name: str
     sentence: str
@@ -51,7 +51,7 @@ class Fix:
 
 
 SAFE: dict[str, Fix] = {}
-"""What nobody can have meant otherwise, by name."""
+"""Fixes by name; the decorator `_into` fills it."""
 
 
 def _into(fixes: dict[str, Fix]) -> Callable[[Mend], Mend]:
@@ -64,52 +64,52 @@ def _into(fixes: dict[str, Fix]) -> Callable[[Mend], Mend]:
 
 
 def mend(file: Path, names: Collection[str]) -> list[str]:
-    """Mend a stage.
+    """Fix a stage.
 
     Args:
-        file: Its root layer. Layers that it names below its folder are mended too, others are left alone.
+        file: Its root layer. Layers in its folder are fixed too.
         names: Keys of `SAFE`.
 
     Returns:
-        What was done, a line each.
+        What was changed, one line each.
 
     Raises:
         InputError: A name is unknown, or a file cannot be written; no file is half-written.
     """
     fixes = {name: find("fix", name, SAFE) for name in names}
-    patient, done = Patient(Usd.Stage.Open(str(file)), file), list[str]()
+    edited, done = EditedStage(Usd.Stage.Open(str(file)), file), list[str]()
     for fix in fixes.values():
-        done += fix.mend(patient)
-        for layer in patient.touched:  # at once: the checksums that are mended next are of files
+        done += fix.mend(edited)
+        for layer in edited.touched:  # before the next fix
             path = Path(layer.realPath)
             with output(path, force=True) as aside:
                 layer.Export(str(aside), args={"format": _format(path)} if path.suffix == ".usd" else {})
-        patient.touched.clear()
+        edited.touched.clear()
     return done
 
 
 def _format(path: Path) -> str:
-    """Whether a .usd file is text or crate; it stays so."""
+    """Format of a .usd file: text or crate."""
     with path.open("rb") as file:
         return "usdc" if file.read(8) == b"PXR-USDC" else "usda"
 
 
 @_into(SAFE)
-def default_prim(patient: Patient) -> Iterator[str]:
+def default_prim(edited: EditedStage) -> Iterator[str]:
     """The one prim at the root becomes the default prim where there is none."""
-    layer = patient.stage.GetRootLayer()
-    roots = [prim for prim in patient.stage.GetPseudoRoot().GetChildren() if not prim.IsAbstract()]
-    if not patient.stage.GetDefaultPrim() and len(roots) == 1:
-        patient.edit(layer).defaultPrim = roots[0].GetName()
-        yield f"{patient.name_of(layer)}: its default prim is {roots[0].GetName()}"
+    layer = edited.stage.GetRootLayer()
+    roots = [prim for prim in edited.stage.GetPseudoRoot().GetChildren() if not prim.IsAbstract()]
+    if not edited.stage.GetDefaultPrim() and len(roots) == 1:
+        edited.edit(layer).defaultPrim = roots[0].GetName()
+        yield f"{edited.name_of(layer)}: its default prim is {roots[0].GetName()}"
 
 
 @_into(SAFE)
-def units(patient: Patient) -> Iterator[str]:
+def units(edited: EditedStage) -> Iterator[str]:
     """Metres, kilograms and Z up are said where magtwin's prims are in them and nothing says so."""
-    stage, layer = patient.stage, patient.stage.GetRootLayer()
-    if not any(patient.having(noun) for noun in NOUNS):
-        return  # a stranger's stage may mean what USD takes it for
+    stage, layer = edited.stage, edited.stage.GetRootLayer()
+    if not any(edited.having(noun) for noun in NOUNS):
+        return  # another stage may rely on USD's defaults
     said = (
         ("metersPerUnit", lambda: UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.meters)),
         ("upAxis", lambda: UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)),
@@ -120,28 +120,28 @@ def units(patient: Patient) -> Iterator[str]:
     )
     for name, say in said:
         if not stage.HasAuthoredMetadata(name):
-            patient.edit(layer)
+            edited.edit(layer)
             say()
-            yield f"{patient.name_of(layer)}: says {name}"
+            yield f"{edited.name_of(layer)}: says {name}"
 
 
 @_into(SAFE)
-def relative_paths(patient: Patient) -> Iterator[str]:
+def relative_paths(edited: EditedStage) -> Iterator[str]:
     """Files of the stage's folder that are named by an absolute path are named relative to the layer."""
-    for layer in patient.layers:
+    for layer in edited.layers:
         here = Path(layer.realPath).resolve().parent
         moved = {}
-        for named in named_files(layer) if patient.owns(layer) else ():
-            file = _inside(named.path, patient.folder) if is_absolute(named.path) else None
+        for named in named_files(layer) if edited.owns(layer) else ():
+            file = _inside(named.path, edited.folder) if is_absolute(named.path) else None
             if file is not None:
                 moved[named.path] = _relative(file, here)
         if moved:
-            UsdUtils.ModifyAssetPaths(patient.edit(layer), lambda path, moved=moved: moved.get(path, path))
-            yield from (f"{patient.name_of(layer)}: names {new}, was {old}" for old, new in moved.items())
+            UsdUtils.ModifyAssetPaths(edited.edit(layer), lambda path, moved=moved: moved.get(path, path))
+            yield from (f"{edited.name_of(layer)}: names {new}, was {old}" for old, new in moved.items())
 
 
 def _inside(path: str, folder: Path) -> Path | None:
-    """The file below a folder that an absolute path means, here or on the machine where it was written."""
+    """The file in a folder that an absolute path names, here or on the machine where it was written."""
     parts = [part for part in re.split(r"[\\/]", path.removeprefix("file:")) if part and part != ".."]
     there = Path(path)
     if there.is_file() and there.resolve().is_relative_to(folder):
@@ -159,36 +159,36 @@ def _relative(file: Path, here: Path) -> str:
 
 
 @_into(SAFE)
-def extents(patient: Patient) -> Iterator[str]:
+def extents(edited: EditedStage) -> Iterator[str]:
     """Shapes that do not say their extent say it."""
-    for prim in patient.prims:
+    for prim in edited.prims:
         boundable = UsdGeom.Boundable(prim)
         if not boundable or prim.IsA(UsdGeom.PointInstancer) or boundable.GetExtentAttr().HasAuthoredValue():
             continue
         extent = UsdGeom.Boundable.ComputeExtentFromPlugins(boundable, Usd.TimeCode.Default())
-        layer = _home(patient, prim)
+        layer = _home(edited, prim)
         if extent and layer is not None:
-            with Usd.EditContext(patient.stage, patient.edit(layer)):
+            with Usd.EditContext(edited.stage, edited.edit(layer)):
                 boundable.CreateExtentAttr(extent)
-            yield f"{patient.name_of(layer)}: <{prim.GetPath()}> says its extent"
+            yield f"{edited.name_of(layer)}: <{prim.GetPath()}> says its extent"
 
 
 @_into(SAFE)
-def material_bindings(patient: Patient) -> Iterator[str]:
+def material_bindings(edited: EditedStage) -> Iterator[str]:
     """Prims with a material bound to them have MaterialBindingAPI."""
-    for prim in patient.prims:
+    for prim in edited.prims:
         bound = any(name.startswith("material:binding") for name in prim.GetAuthoredPropertyNames())
-        layer = _home(patient, prim)
+        layer = _home(edited, prim)
         if bound and not prim.HasAPI(UsdShade.MaterialBindingAPI) and layer is not None:
-            with Usd.EditContext(patient.stage, patient.edit(layer)):
+            with Usd.EditContext(edited.stage, edited.edit(layer)):
                 UsdShade.MaterialBindingAPI.Apply(prim)
-            yield f"{patient.name_of(layer)}: <{prim.GetPath()}> has MaterialBindingAPI"
+            yield f"{edited.name_of(layer)}: <{prim.GetPath()}> has MaterialBindingAPI"
 
 
-def _home(patient: Patient, prim: Usd.Prim) -> Sdf.Layer | None:
-    """The layer of the stage's own stack that defines a prim; None where another asset does."""
-    own = [layer for layer in patient.stage.GetLayerStack(includeSessionLayers=False) if layer.realPath]
+def _home(edited: EditedStage, prim: Usd.Prim) -> Sdf.Layer | None:
+    """The layer of the stage's own layer stack that defines a prim; None if another asset does."""
+    own = [layer for layer in edited.stage.GetLayerStack(includeSessionLayers=False) if layer.realPath]
     for spec in prim.GetPrimStack():
         if spec.specifier == Sdf.SpecifierDef:
-            return spec.layer if spec.layer in own and patient.owns(spec.layer) else None
+            return spec.layer if spec.layer in own and edited.owns(spec.layer) else None
     return None

@@ -1,8 +1,8 @@
-"""Inspection: a stage looked at in a process of its own, since a damaged layer can end its reader.
+"""Check a stage in a separate process, since a damaged layer can crash its reader.
 
     python -m magtwin.export.validation.inspection JOB.json
 
-`inspect` starts it. The job says what to look at, and the answer is written where the job says.
+`inspect` starts it. The job has the arguments, and the name of the file for the answer.
 """
 
 import importlib
@@ -19,20 +19,20 @@ from magtwin.errors import InputError
 from magtwin.export.validation.findings import Check, Finding, check_from
 
 PATIENCE_S = 120.0
-"""How long a stage may take, and a second more a megabyte [s]."""
+"""Time limit for a stage, plus 1 s per megabyte [s]."""
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """What was seen of a stage."""
+    """The result of an inspection."""
 
     checks: tuple[Check, ...]
 
     robots: dict[str, Path | None] = field(default_factory=dict)
-    """File of the asset of each robot, by its prim; None where it is no asset of its own."""
+    """Asset of each robot by its prim; None if the robot has no separate asset."""
 
     bodies: int = 0
-    """Rigid bodies of the stage."""
+    """Number of rigid bodies."""
 
     mended: tuple[str, ...] = ()
 
@@ -46,18 +46,18 @@ def inspect(
     inputs: Collection[str] | None = None,
     fix: Collection[str] = (),
 ) -> Inspection:
-    """Mend a stage and hold it to what this process cannot risk to read.
+    """Fix and check a stage in another process.
 
     Args:
-        file: What the user named.
-        against: Of "core", "isaac" and "magtwin".
-        root: Root layer of a .usdz that was unpacked; the file itself unless given.
-        home: Folder that it was unpacked to.
+        file: The file that the user named.
+        against: Some of "core", "isaac" and "magtwin".
+        root: Root layer of an unpacked .usdz. Default: the file itself.
+        home: Folder of the unpacked .usdz.
         inputs: Names of the inputs that a network may have.
-        fix: Names of what to mend first.
+        fix: Names of fixes to apply first.
 
     Raises:
-        InputError: The file ends its reader, or is no stage, or cannot be mended.
+        InputError: The file crashes its reader, is no stage, or cannot be fixed.
     """
     with tempfile.TemporaryDirectory() as folder:
         answer = Path(folder, "answer.json")
@@ -83,35 +83,35 @@ def inspect(
                 errors="replace",
             )
         except subprocess.TimeoutExpired as error:
-            raise InputError(f"{file}: damaged: USD does not come to its end; copy it again") from error
+            raise InputError(f"{file}: damaged: USD does not finish reading it; copy it again") from error
         if not answer.is_file():
             if done.returncode < 0:
-                raise InputError(f"{file}: damaged: USD ends when it reads it; copy it, or write it again")
-            last = (done.stderr.strip().splitlines() or ["nothing was said"])[-1]
+                raise InputError(f"{file}: damaged: USD crashes on it; copy it, or write it again")
+            last = (done.stderr.strip().splitlines() or ["no output"])[-1]
             raise RuntimeError(f"the inspection of {file} ended with {done.returncode}: {last}")
-        said = json.loads(answer.read_text(encoding="utf-8"))
-    if said.get("refused"):
-        raise InputError(_as_named(said["refused"], home, file))
-    for check in said["checks"]:
+        result = json.loads(answer.read_text(encoding="utf-8"))
+    if result.get("refused"):
+        raise InputError(_as_named(result["refused"], home, file))
+    for check in result["checks"]:
         for finding in check["findings"]:
             finding |= {name: _as_named(finding[name], home, file) for name in ("text", "where")}
     return Inspection(
-        tuple(check_from(check) for check in said["checks"]),
-        {prim: None if asset is None else Path(asset) for prim, asset in said["robots"].items()},
-        said["bodies"],
-        tuple(said["mended"]),
+        tuple(check_from(check) for check in result["checks"]),
+        {prim: None if asset is None else Path(asset) for prim, asset in result["robots"].items()},
+        result["bodies"],
+        tuple(result["mended"]),
     )
 
 
 def _as_named(text: str, home: Path | None, file: Path) -> str:
-    """What was said of the folder that a package was unpacked to, said of the package."""
+    """A text with the folder of an unpacked package replaced by the package."""
     for folder in () if home is None else (home.resolve(), home):
         text = text.replace(folder.as_posix(), file.as_posix())
     return text
 
 
 def _look(job: dict[str, Any]) -> dict[str, Any]:
-    """Do a job."""
+    """Do a job, and return the answer."""
     importlib.import_module("magtwin.usd")  # registers the schemas before USD is first used
     from pxr import Tf, Usd, UsdPhysics, UsdUtils
 
@@ -124,7 +124,7 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
 
     file, root = Path(job["file"]), Path(job["root"])
     packed = None if job["home"] is None else Path(job["home"])
-    heard = UsdUtils.CoalescingDiagnosticDelegate()  # keeps what USD says off the terminal
+    diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's messages off the terminal
     checks: list[Check] = []
     try:
         lost: list[Finding] = []
@@ -138,7 +138,7 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
         if stage is None:
             raise InputError(f"{file}: cannot be opened as USD; it is damaged, cut short, or not USD")
         for layer in stage.GetUsedLayers():
-            _take_out(layer)
+            _read_all(layer)
         if "core" in job["against"]:
             checks.append(_core(stage if packed is None else Usd.Stage.Open(str(file))))
         inputs = None if job["inputs"] is None else frozenset(job["inputs"])
@@ -153,7 +153,7 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
     except (Tf.ErrorException, UnicodeError, MemoryError) as error:
         raise InputError(f"{file}: cannot be opened as USD; it is damaged, cut short, or not USD") from error
     finally:
-        heard.TakeUncoalescedDiagnostics()
+        diagnostics.TakeUncoalescedDiagnostics()
     return {
         "checks": [asdict(check) for check in checks],
         "robots": {prim: None if asset is None else str(asset) for prim, asset in assets.items()},
@@ -162,8 +162,8 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _take_out(layer: Any) -> None:
-    """Read every value of a layer, so that one which cannot be decoded ends this process and no other."""
+def _read_all(layer: Any) -> None:
+    """Read every value of a layer, so that a damaged one crashes this process and no other."""
 
     def visit(path: Any) -> None:
         if path.IsPropertyPath():
@@ -175,7 +175,7 @@ def _take_out(layer: Any) -> None:
 
 
 def _core(stage: Any) -> Check:
-    """What OpenUSD's own validators say of a stage."""
+    """Check a stage with OpenUSD's own validators."""
     from pxr import Usd, UsdValidation
 
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()

@@ -1,8 +1,8 @@
-"""A stage loaded in Newton as it is, in a process of its own: its schemas must be known before USD is used.
+"""Load a stage in Newton, in a separate process: its schemas must be registered before USD is used.
 
     python -m magtwin.export.validation.newton_load STAGE
 
-Prints one line of JSON: the bodies, joints and shapes that Newton made of it, and what they weigh.
+Prints one line of JSON: numbers of bodies, joints and shapes in Newton, and their mass.
 """
 
 import json
@@ -13,7 +13,7 @@ import newton_usd_schemas  # noqa: F401 - registers them
 
 
 def main(stage: str) -> None:
-    """Load a stage, and say what came of it."""
+    """Load a stage, and print the result."""
     builder = newton.ModelBuilder(up_axis=newton.Axis.Z)
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     builder.add_usd(stage, load_visual_shapes=False, load_static_visual_shapes=False)

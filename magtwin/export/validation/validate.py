@@ -1,7 +1,8 @@
-"""Validate: a file held to every validator there is, in one answer.
+"""Validate a file with every validator.
 
-`core` is OpenUSD's own validators, `nvidia` usd-validation-nvidia, `simready` SimReady's profiles, `isaac`
-and `magtwin` the rules of `isaac_rules` and `rules`, `newton` a load in Newton.
+`core` are OpenUSD's own validators, `nvidia` is usd-validation-nvidia, `simready` are SimReady's profiles,
+`isaac` and `magtwin` are the rules of `isaac_rules` and `rules`, `newton` loads the file in Newton. `rule`
+explains how to add a rule.
 """
 
 import os
@@ -18,12 +19,12 @@ from magtwin.export.validation.validators import newton, nvidia, simready
 from magtwin.files import existing
 
 AGAINST = ("core", "nvidia", "simready", "isaac", "newton", "magtwin")
-"""What a file can be held to, in the order of the answer."""
+"""Validators, in the order of the results."""
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 
 SAFE = ("default-prim", "units", "relative-paths", "extents", "material-bindings")
-"""What can be mended without a guess, of `magtwin.export.validation.fix`."""
+"""Names of the fixes in `magtwin.export.validation.fix`."""
 
 
 def validate(
@@ -34,20 +35,20 @@ def validate(
     fix: Collection[str] = (),
     progress: Callable[[str], Any] | None = None,
 ) -> Findings:
-    """Hold a stage to validators.
+    """Check a stage with validators.
 
-    The file is read in processes of their own: what is damaged ends them, not the caller.
+    Other processes read the file, so that a damaged one does not crash the caller.
 
     Args:
         file: A .usd, .usda, .usdc or .usdz.
-        against: Of `AGAINST`.
-        inputs: Names of the inputs that a network may have; any unless given.
-        fix: What to mend first, of `magtwin.export.validation.fix.FIXES`.
-        progress: Told the name of each validator before it looks.
+        against: Some of `AGAINST`.
+        inputs: Names of the inputs that a network may have. None allows any.
+        fix: Fixes to apply first, some of `SAFE`.
+        progress: Function that is called with the name of each validator.
 
     Raises:
-        InputError: No such file, it is not USD or is damaged, an entry of a package would lie outside of
-            it, or a name is none of `AGAINST`, or of what can be mended.
+        InputError: The file is missing, not USD or damaged; a package has an entry outside its folder; or a
+            name is not in `AGAINST` or `SAFE`.
     """
     file = existing(file, "USD file")
     if file.is_dir():
@@ -58,7 +59,7 @@ def validate(
     wanted = [name for name in AGAINST if name in {find("validator", given, names) for given in against}]
     if fix and file.suffix == ".usdz":
         raise InputError(
-            f"{file}: a package is not mended; `magtwin export` it to a folder, mend that, and pack it again"
+            f"{file}: a package cannot be fixed; `magtwin export` it to a folder, fix that, and pack it again"
         )
     say = progress or (lambda name: None)
     with tempfile.TemporaryDirectory() as folder:

@@ -1,7 +1,7 @@
-"""Validators of others': NVIDIA's usd-validation-nvidia and SimReady, and a load in Newton.
+"""External validators: NVIDIA's usd-validation-nvidia, SimReady, and loading in Newton.
 
-Each is a program of its own, run where it is installed. Where it is not, its check says so and how to get it;
-it never counts as passed.
+Each is a separate program. If it is not installed, its check is not run, with a text how to get it, and never
+counts as passed.
 """
 
 import ast
@@ -20,18 +20,17 @@ from typing import Any
 from magtwin.export.validation.findings import Check, Finding, Severity
 
 PATIENCE_S = 600.0
-"""How long a validator may take [s]: Newton's kernels compile for a minute at first."""
+"""Time limit of a validator [s]; Newton's kernels take a minute to compile at first."""
 
 SIMREADY = "MAGTWIN_SIMREADY"
-"""Variable that names the `simready-validate` of an environment of its own, as `make simready` makes it."""
+"""Environment variable with the path of `simready-validate`; `make simready` installs it separately."""
 
 PROFILES = (("Robot-Body", "3.0.0"), ("Sensor-IMU", "1.0.0"), ("Sensor-LiDAR", "1.0.0"))
-"""SimReady's profiles that a robot is held to, each with its version."""
+"""SimReady's profiles for a robot, with their versions."""
 
 GET_NVIDIA = "usd-validation-nvidia is not installed; pip install 'magtwin[validate]'"
 GET_SIMREADY = (
-    f"simready-validate is not installed; `make simready` makes an environment of it, {SIMREADY} names its "
-    "command"
+    f"simready-validate is not installed; `make simready` installs it, {SIMREADY} is the path of its command"
 )
 GET_NEWTON = "newton is not installed; pip install 'magtwin[physics]'"
 
@@ -44,15 +43,15 @@ _SEVERITIES: Mapping[str, Severity] = {
 
 
 def nvidia(file: Path) -> Check:
-    """What usd-validation-nvidia says of a file."""
+    """Check a file with usd-validation-nvidia."""
     command = shutil.which("nvidia_usd_validate", path=_programs())
     if command is None:
         return Check("nvidia", not_run=GET_NVIDIA)
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder, "report.json")
-        said = _run([command, str(file), "--json-output", str(report)])
+        result = _run([command, str(file), "--json-output", str(report)])
         if not report.is_file():
-            return Check("nvidia", (_unfinished("nvidia_usd_validate", said),))
+            return Check("nvidia", (_unfinished("nvidia_usd_validate", result),))
         rules = json.loads(report.read_text(encoding="utf-8"))["rules"]
     findings = [
         Finding(
@@ -70,12 +69,12 @@ def nvidia(file: Path) -> Check:
 
 
 def simready(robots: Mapping[str, Path | None], *, packed: bool = False) -> list[Check]:
-    """What SimReady's profiles say of the robots of a stage, each by its own asset.
+    """Check the robots of a stage, each in its own asset, with SimReady's profiles.
 
     Args:
-        robots: File of the asset of each robot by its prim; None where it is no asset of its own.
-        packed: Whether they lie in a package: a profile is of an asset's folder with its picture, which no
-            package may hold.
+        robots: Asset of each robot by its prim; None if the robot has no separate asset.
+        packed: Whether the stage is a package. A profile needs an asset's folder with its thumbnail, which a
+            package may not hold.
     """
     command = os.environ.get(SIMREADY) or shutil.which("simready-validate")
     checks = []
@@ -86,50 +85,48 @@ def simready(robots: Mapping[str, Path | None], *, packed: bool = False) -> list
         elif not robots:
             checks.append(Check(name, not_run="the stage has no robot"))
         elif packed:
-            checks.append(Check(name, not_run="a package is no folder of an asset, which the profile is for"))
+            checks.append(Check(name, not_run="the profile needs the folder of an asset, not a package"))
         elif any(asset is None for asset in robots.values()):
-            checks.append(Check(name, not_run="a robot is no asset of its own, which the profile is for"))
+            checks.append(Check(name, not_run="the profile needs a robot in a separate asset"))
         else:
             checks.append(_profile(command, profile, version, robots))
     return checks
 
 
 def _profile(command: str, profile: str, version: str, robots: Mapping[str, Path | None]) -> Check:
-    """What one profile says of the assets of robots, of each once."""
+    """Check the assets of robots with one profile, each asset once."""
     findings: list[Finding] = []
     scope, assets = "", {asset: prim for prim, asset in reversed(list(robots.items()))}
     for asset, prim in assets.items():
         with tempfile.TemporaryDirectory() as folder:
             report = Path(folder, "report.json")
-            said = _run(
+            result = _run(
                 [command, "--profile", profile, "--version", version, "--output", str(report), str(asset)]
             )
             metadata = _metadata(report)
         if (
-            metadata is None and "is not registered" in said.stdout + said.stderr
-        ):  # of a tier that is not installed
-            get = f"{command} has not the profile; `make simready` makes an environment that has"
+            metadata is None and "is not registered" in result.stdout + result.stderr
+        ):  # its tier is not installed
+            get = f"{command} lacks the profile; `make simready` installs it"
             return Check(f"simready {profile} {version}", not_run=get)
         if metadata is None:
-            findings.append(_unfinished("simready-validate", said))
+            findings.append(_unfinished("simready-validate", result))
             continue
         scope = f"simready-validate {metadata.get('simready_validate_version', '')}".strip()
         features = metadata["features_summary"]
         if not features:
-            findings.append(Finding(profile, "no feature was looked at", prim, "install the profile's tier"))
+            findings.append(Finding(profile, "no feature was checked", prim, "install the profile's tier"))
         for name, feature in features.items():
             if feature["blocking_failure"]:
                 findings += _unmet(name, feature, prim)
         optional = [n for n, f in features.items() if not f["passed"] and not f["blocking_failure"]]
         if optional:
-            findings.append(
-                Finding("optional", f"features that it has not: {', '.join(optional)}", prim, "", "note")
-            )
+            findings.append(Finding("optional", f"missing features: {', '.join(optional)}", prim, "", "note"))
     return Check(f"simready {profile} {version}", tuple(findings), scope=scope)
 
 
 def _metadata(report: Path) -> dict[str, Any] | None:
-    """What a report says of its one asset, None where it says nothing."""
+    """The entry of a report for its only asset; None if there is none."""
     try:
         (metadata,) = json.loads(report.read_text(encoding="utf-8")).values()
     except (OSError, ValueError, AttributeError):
@@ -138,19 +135,19 @@ def _metadata(report: Path) -> dict[str, Any] | None:
 
 
 def _unmet(name: str, feature: Mapping[str, Any], prim: str) -> list[Finding]:
-    """The requirements that a feature fails, each with what was said of it."""
+    """The requirements that a feature fails, with their messages."""
     codes = _literal(feature.get("failing requirements"), [])
-    told = _literal(feature.get("requirement_messages"), {})
-    found = [
+    messages = _literal(feature.get("requirement_messages"), {})
+    findings = [
         Finding(f"{name} {code.rpartition('simready.')[2]}", " ".join(text.split()), prim)
         for code in codes
-        for text in (told.get(code) or ["is not met"])[:3]
+        for text in (messages.get(code) or ["is not met"])[:3]
     ]
-    return found or [Finding(name, "is not met", prim)]
+    return findings or [Finding(name, "is not met", prim)]
 
 
 def _literal(text: Any, default: Any) -> Any:
-    """A list or a table that a report writes as text."""
+    """A list or a table that a report has as text."""
     try:
         value = ast.literal_eval(text) if isinstance(text, str) else text
     except (ValueError, SyntaxError):
@@ -159,21 +156,21 @@ def _literal(text: Any, default: Any) -> Any:
 
 
 def newton(file: Path, bodies: int) -> Check:
-    """Whether Newton loads a stage as it is, every body of it.
+    """Check that Newton loads every body of a stage.
 
     Args:
         file: The stage.
-        bodies: Rigid bodies that it has.
+        bodies: Number of its rigid bodies.
     """
     lacking = [name for name in ("newton", "newton_usd_schemas") if importlib.util.find_spec(name) is None]
     if lacking:
         return Check("newton", not_run=GET_NEWTON)
-    said = _run([sys.executable, "-P", "-m", "magtwin.export.validation.newton_load", str(file)])
-    lines = said.stdout.strip().splitlines()
+    result = _run([sys.executable, "-P", "-m", "magtwin.export.validation.newton_load", str(file)])
+    lines = result.stdout.strip().splitlines()
     try:
         model = json.loads(lines[-1])
     except (ValueError, IndexError):
-        return Check("newton", (_unfinished("Newton", said),))
+        return Check("newton", (_unfinished("Newton", result),))
     findings = []
     if model["bodies"] != bodies:
         text = f"Newton made {model['bodies']} bodies of the stage's {bodies}"
@@ -185,12 +182,12 @@ def newton(file: Path, bodies: int) -> Check:
 
 
 def _programs() -> str:
-    """Where programs are looked for: beside this Python first."""
+    """Search path of programs: the folder of this Python first."""
     return os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
 
 
 def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    """Run a program with no path of ours in it; what it says is kept."""
+    """Run a program without PYTHONPATH, and capture its output."""
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     try:
         return subprocess.run(
@@ -203,14 +200,14 @@ def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
             timeout=PATIENCE_S,
         )
     except subprocess.TimeoutExpired:
-        return subprocess.CompletedProcess(command, 1, "", f"did not end within {PATIENCE_S:g} s")
+        return subprocess.CompletedProcess(command, 1, "", f"took longer than {PATIENCE_S:g} s")
 
 
-def _unfinished(program: str, said: subprocess.CompletedProcess[str]) -> Finding:
-    """A program that ended without an answer."""
-    lines = (said.stderr.strip() or said.stdout.strip() or "nothing was said").splitlines()
-    text = f"{program} ended with {said.returncode} and without an answer: {lines[-1][:200]}"
-    return Finding("unfinished", text, "", "the stage may be damaged, or the program is")
+def _unfinished(program: str, result: subprocess.CompletedProcess[str]) -> Finding:
+    """The finding for a program that ended without a report."""
+    lines = (result.stderr.strip() or result.stdout.strip() or "no output").splitlines()
+    text = f"{program} ended with status {result.returncode} and without a report: {lines[-1][:200]}"
+    return Finding("unfinished", text, "", "the stage or the program may be damaged")
 
 
 def _version(package: str) -> str:

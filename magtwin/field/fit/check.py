@@ -1,4 +1,4 @@
-"""Check: how well methods tell readings that they were not shown."""
+"""Cross-validation: how well methods predict readings that they were not fitted to."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -20,14 +20,11 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 Progress = Callable[[int, int, str], Any]
 
+# Options of methods in a check: held-out nodes are filled, or every cell would be unknown
 FILLED: Mapping[str, Mapping[str, Any]] = {"trilinear": {"fill": True}, "cubic": {"fill": True}}
-"""Options of methods in a check: nodes that were left out are bridged, or every cell would be unknown."""
-
-BLOCK_SPACINGS = 3
-"""Side of a block that is left out, in spacings of the readings."""
-
+BLOCK_SPACINGS = 3  # Side of a held-out block, in spacings of the readings
+# Number of parts of a floor in blocks: block (i, j) is in part (i + 2 j) mod 5, unlike all eight around it
 BLOCKS = 5
-"""Parts of a floor in blocks: block (i, j) is in part (i + 2 j) mod 5, apart from all eight around it."""
 
 
 def check(
@@ -39,32 +36,30 @@ def check(
     options: Mapping[str, Mapping[str, Any]] = FILLED,
     progress: Progress | None = None,
 ) -> Report:
-    """Fit every method to a part of a survey, and hold what it says of the rest against the readings.
+    """Fit every method to a part of a survey, and compare its predictions of the rest with the readings.
 
-    Readings that are not good count on neither side. Every method is fitted anew to each part, with its
-    figures: nothing of the readings left out reaches it.
+    Readings that are not good are ignored. Every method is fitted anew to each part, including its
+    hyperparameters.
 
     Args:
         readings: A survey.
         methods: Names of map methods. Default: all.
-        split: "checkerboard": every other node of a gridded survey is left out, at all its headings,
-            then the others. "heading": one nominal heading of a gridded survey at a time. "run": one run at
-            a time. "block": every fifth block of three spacings, in five
-            turns. Or the rows to fit and the rows to predict of each turn. Unless given, the first
-            that the survey allows of checkerboard, run and block.
-        within_m: Only readings this near to one that was fitted are predicted [m].
-        options: Options of the methods, by name of the method.
+        split: "checkerboard": every other node of a gridded survey at all headings, then the others.
+            "heading": one nominal heading of a gridded survey at a time. "run": one run at a time. "block":
+            every fifth block of three spacings, in five turns. Or the rows to fit and to predict of each
+            turn. Default: the first of checkerboard, run and block that the survey allows.
+        within_m: Predict only readings this near to a fitted one [m].
+        options: Options by name of the method.
         progress: Called as progress(done, total, what).
 
     Returns:
-        Of each method, and of the mean of the readings that it was shown as "naive": root of the mean squared
-        error, mean and median absolute error [nT] over the readings that it predicts; the share of
-        readings that it does predict; the share that lies in its 90 % interval; the mean logarithm of its
-        predictive density at the reading [log 1/nT], higher is better, both for normal
-        errors of the variance it states and its noise. For gridded surveys, errors and coverage by heading.
+        For each method, and for the mean of the fitted readings as "naive": RMSE, mean and median absolute
+        error [nT]; the share of readings that it predicts; the share within its 90 % interval; the mean log
+        predictive density [log 1/nT] (higher is better), for normal errors of its variance and noise. For
+        gridded surveys also errors and coverage by heading.
 
     Raises:
-        InputError: No such method or split, the split does not fit, or nothing is left to predict.
+        InputError: No such method or split, the split does not fit the survey, or nothing is left to predict.
     """
     methods = list(METHODS) if methods is None else list(methods)
     for name in methods:
@@ -107,7 +102,7 @@ def check(
 
 
 def _shown(readings: Readings, rows: Rows) -> Readings:
-    """Some readings, on a grid of the headings that they have."""
+    """Some readings, on a grid of only the headings that they have."""
     shown = readings.take(rows)
     if shown.grid is None or shown.node is None:
         return shown
@@ -119,9 +114,9 @@ def _shown(readings: Readings, rows: Rows) -> Readings:
 
 
 def _predict(train: Readings, test: Readings, method: str, options: Mapping[str, Any]) -> tuple[Array, Array]:
-    """What a method fitted to some readings says of others: mean [nT], variance with noise [nT^2].
+    """Mean [nT] and variance with noise [nT^2] of readings from a fit to others.
 
-    Maps that know nominal headings only are asked for these.
+    Models of nominal headings are evaluated at those.
     """
     model = fit(train, method, **options)
     yaw = test.yaw
@@ -134,20 +129,20 @@ def _predict(train: Readings, test: Readings, method: str, options: Mapping[str,
 def _turns(
     readings: Readings, split: str | Sequence[tuple[Rows, Rows]] | None
 ) -> tuple[str, list[tuple[Rows, Rows]]]:
-    """Name of a split, and the rows to fit and to predict of each turn."""
+    """Description of a split, and the rows to fit and to predict of each turn."""
     good = np.flatnonzero(readings.good)
     if split is not None and not isinstance(split, str):
         return "given rows", [(np.intersect1d(a, good), np.intersect1d(b, good)) for a, b in split]
     if split is None:
         runs = len(np.unique(readings.run[good])) > 1
         split = "checkerboard" if readings.grid is not None else "run" if runs else "block"
-    part, said = find("split", split, SPLITS)(readings)
+    part, description = find("split", split, SPLITS)(readings)
     parts = np.unique(part[good])
     if len(parts) < 2:
         raise InputError(
             f"split {split!r} leaves nothing out of {readings.name!r}: all readings are in one part"
         )
-    return said, [(good[part[good] != k], good[part[good] == k]) for k in parts]
+    return description, [(good[part[good] != k], good[part[good] == k]) for k in parts]
 
 
 def _checkerboard(readings: Readings) -> tuple[Rows, str]:
@@ -180,13 +175,13 @@ def _block(readings: Readings) -> tuple[Rows, str]:
     return (i + 2 * j) % BLOCKS, f"every fifth block of {side:.3g} x {side:.3g} m, in turn"
 
 
+# Functions that assign each reading to a part, by name
 SPLITS: dict[str, Callable[[Readings], tuple[Rows, str]]] = {
     "checkerboard": _checkerboard,
     "heading": _heading,
     "run": _run,
     "block": _block,
 }
-"""What gives each reading the part that it is left out with, by name."""
 
 
 def _near(readings: Readings, train: Rows, test: Rows, within_m: float | None) -> Rows:

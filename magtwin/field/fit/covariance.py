@@ -1,4 +1,4 @@
-"""Covariance of a field over place and heading, and how likely readings are under it."""
+"""Covariance of a field over position and heading, and the likelihood of readings under it."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -11,58 +11,40 @@ Kernel = Literal["matern", "poisson"]
 
 ROOT5 = np.sqrt(5.0)
 
-ARM_M = 1 / 30
-"""Length that a figure of 1 stands for in the sensor's place [m]: the scale that its learning has."""
-
-UNLIKELY = 1e25
-"""Loss where there is none: finite, so that a line search steps back from it."""
-
-DOUBT = 3.0
-"""Standard deviation of the prior of every logarithm about its first guess: a factor of 20 either way."""
-
-UNEVEN = 0.25
-"""Standard deviation of the prior of the logarithm of how strong the field is at a place, about 0."""
-
-OVERLAP = 0.7
-"""Width of a patch, one standard deviation, in the distance between patches."""
+ARM_M = 1 / 30  # Unit of the sensor's position in the hyperparameters [m], chosen for the optimiser's scale
+UNLIKELY = 1e25  # Loss if the covariance is not positive definite: finite, so that a line search steps back
+DOUBT = 3.0  # Prior standard deviation of every logarithm about its first guess: a factor of 20 either way
+UNEVEN = 0.25  # Prior standard deviation of the logarithm of the field's local strength, about 0
+OVERLAP = 0.7  # Width of a patch (one standard deviation), as a share of the distance between patches
 
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """What two readings have in common, by where they were taken, how the robot was turned, and in which run.
+    """Covariance of two readings, from their positions, headings and runs.
 
         k = sum over h of cos(h (yaw - yaw')) (s_h^2 a_h a_h' k_h(|x - x'|) + u_h^2)
             + r^2 k_r(|x - x'|) [same run],
         x = p + R(yaw) l,
 
-    with h = 0, 1, 2 (0 alone where no heading differs): the field; what a hard iron adds to its
-    magnitude; what a soft iron does. Each has a part that changes over the floor and one that does not.
-    x is where the sensor is, l beside base_link; r is how far runs disagree about one place. Iron lies in
-    some places and not in others: log a_0 is a mean over patches of the floor, with the weights of normal
-    distributions about them (a_h is 1 for other h). k_h is Matern's
-    function of order 5/2 (Rasmussen & Williams 2006, eq. 4.17), or the Poisson kernel
-    (1 + (d / reach)^2)^(-3/2): the covariance that a harmonic field has above uncorrelated sources at a
-    depth of half its reach (as the upward continuation of white noise; Blakely 1995, eq. 12.6).
+    with h = 0, 1, 2 (only 0 if all headings are equal): the field, the effect of hard iron on its magnitude,
+    and that of soft iron. Each has a part that varies over the floor and a constant one. x is the sensor's
+    position, at l from base_link; r is the disagreement of runs. Sources are unevenly distributed: log a_0 is
+    a weighted mean over patches of the floor, with normal weights (a_h is 1 for other h). k_h is Matern's
+    function of order 5/2 (Rasmussen & Williams 2006, eq. 4.17), or the Poisson kernel (1 + (d /
+    reach)^2)^(-3/2): the covariance of a harmonic field above uncorrelated sources at depth reach / 2 (the
+    upward continuation of white noise; Blakely 1995, eq. 12.6).
     """
 
-    kernel: Kernel
-    """The function of distance."""
-
-    harmonics: int
-    """Number of terms in h: 3, or 1 where no heading differs."""
-
-    runs: bool
-    """Whether runs may disagree."""
-
+    kernel: Kernel  # Function of distance
+    harmonics: int  # Number of terms in h: 3, or 1 if all headings are equal
+    runs: bool  # Whether runs may disagree
+    # Centres of patches of the floor [m], shape (B, 2); empty for uniform strength
     patches: Array = field(default_factory=lambda: np.empty((0, 2)))
-    """Middles of patches of the floor [m], shape (B, 2); none where the field is as strong everywhere."""
-
-    apart_m: float = 1.0
-    """Distance between patches [m]."""
+    apart_m: float = 1.0  # Distance between patches [m]
 
     @property
     def size(self) -> int:
-        """Number of figures: log s_h, reach_h, u_h, noise; if any, log r and its reach, those of log a_0 of
+        """Number of hyperparameters: log s_h, reach_h, u_h, noise; if any, log r and its reach, log a_0 of
         the patches, the arm's x and y.
         """
         return self._even + len(self.patches) + 2 * (self.harmonics > 1)
@@ -73,16 +55,16 @@ class Covariance:
 
     @property
     def of_patches(self) -> slice:
-        """Which figures are those of the patches."""
+        """Indices of the patches' hyperparameters."""
         return slice(self._even, self._even + len(self.patches))
 
     def prior_sd(self) -> Array:
-        """Standard deviations of the figures' priors about their first guesses, shape (size,)."""
+        """Prior standard deviations of the hyperparameters about their first guesses, shape (size,)."""
         arm = [np.inf] * (2 * (self.harmonics > 1))
         return np.array([DOUBT] * self._even + [UNEVEN] * len(self.patches) + arm)
 
     def noise_nt2(self, figures: Array) -> float:
-        """Variance of a reading beside the field and its run [nT^2]."""
+        """Variance of a reading about the field and its run [nT^2]."""
         return float(np.exp(2 * figures[3 * self.harmonics]))
 
     def run_nt2(self, figures: Array) -> float:
@@ -90,21 +72,21 @@ class Covariance:
         return float(np.exp(2 * figures[3 * self.harmonics + 1])) if self.runs else 0.0
 
     def arm_m(self, figures: Array) -> Array:
-        """The sensor's place beside base_link, forward and left [m], shape (2,)."""
+        """Sensor position from base_link, forward and left [m], shape (2,)."""
         return np.asarray(ARM_M * figures[-2:] if self.harmonics > 1 else np.zeros(2))
 
     def variance_nt2(self, figures: Array, p_xy: Array) -> Array:
-        """Variance of the field at places of base_link [nT^2], shape (N,)."""
+        """Variance of the field at positions of base_link [nT^2], shape (N,)."""
         h = self.harmonics
         even = np.exp(2 * figures[1:h]).sum() + np.exp(2 * figures[2 * h : 3 * h]).sum()
         return np.asarray(np.exp(2 * figures[0]) * self._strength(figures, p_xy) ** 2 + even)
 
     def _strength(self, figures: Array, p_xy: Array) -> Array:
-        """a_0 at places of base_link, shape (N,)."""
+        """a_0 at positions of base_link, shape (N,)."""
         return np.asarray(np.exp(self._shares(p_xy) @ figures[self.of_patches]))
 
     def _shares(self, p_xy: Array) -> Array:
-        """Weights of the patches at places, shape (N, B)."""
+        """Weights of the patches at positions, shape (N, B)."""
         if not len(self.patches):
             return np.empty((len(p_xy), 0))
         near = -((_distance(p_xy, self.patches) / (OVERLAP * self.apart_m)) ** 2) / 2
@@ -112,19 +94,19 @@ class Covariance:
         return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
     def places(self, figures: Array, p_xy: Array, yaw: Array) -> Array:
-        """Where the sensor is [m], shape (N, 2)."""
+        """Sensor positions [m], shape (N, 2)."""
         x, y = self.arm_m(figures)
         c, s = np.cos(yaw), np.sin(yaw)
         return p_xy + np.column_stack([c * x - s * y, s * x + c * y])
 
     def within_runs(self, figures: Array, place: Array, run: NDArray[np.intp]) -> Array:
-        """What readings of one run have in common beside the field [nT^2], shape (N, N)."""
+        """Covariance of readings of one run beside the field [nT^2], shape (N, N)."""
         reach = float(np.exp(figures[3 * self.harmonics + 2]))
         same = run[:, None] == run[None, :]
         return self.run_nt2(figures) * _value(self.kernel, _distance(place, place), reach) * same
 
     def between(self, figures: Array, a: tuple[Array, Array], b: tuple[Array, Array]) -> Array:
-        """Covariance of the field at poses `a` and `b`, each places and headings [nT^2], shape (A, B)."""
+        """Covariance of the field at poses `a` and `b`, each positions and headings [nT^2], shape (A, B)."""
         h = self.harmonics
         place_a, place_b = (self.places(figures, *pose) for pose in (a, b))
         r = _distance(place_a, place_b)
@@ -140,37 +122,33 @@ class Covariance:
         return out
 
     def _waves(self, a: Array, b: Array) -> list[Array]:
-        """cos(h (yaw - yaw')) of every pair, for each h; three cosines a pair would take longest of all."""
-        one = np.ones((len(a), len(b)))
+        """cos(h (yaw - yaw')) of every pair, for each h, from one product: cosines of every pair would be
+        slowest.
+        """
+        ones = np.ones((len(a), len(b)))
         if self.harmonics == 1:
-            return [one]
+            return [ones]
         turned = np.column_stack([np.cos(a), np.sin(a)]) @ np.vstack([np.cos(b), np.sin(b)])
-        return [one, turned, 2 * turned * turned - 1]
+        return [ones, turned, 2 * turned * turned - 1]
 
     def loss(
-        self,
-        figures: Array,
-        guess: Array,
-        p_xy: Array,
-        yaw: Array,
-        run: NDArray[np.intp],
-        b_nt: Array,
+        self, figures: Array, guess: Array, p_xy: Array, yaw: Array, run: NDArray[np.intp], b_nt: Array
     ) -> tuple[float, Array]:
-        """Minus the logarithm of marginal likelihood and prior, and its gradient.
+        """Negative logarithm of marginal likelihood and prior, and its gradient.
 
-        b K^-1 b / 2 + log |K| / 2 (Rasmussen & Williams 2006, eq. 5.8, 5.9, a constant left out), and
-        (figure - guess)^2 / (2 sd^2) for every figure that has a prior.
+        b K^-1 b / 2 + log |K| / 2 (Rasmussen & Williams 2006, eq. 5.8, 5.9, without a constant), plus (value
+        - guess)^2 / (2 sd^2) for every hyperparameter with a prior.
 
         Args:
-            figures: Where to evaluate, shape (size,).
-            guess: First guess of the figures, shape (size,).
-            p_xy: Places of base_link [m], shape (N, 2).
+            figures: Hyperparameters, shape (size,).
+            guess: Their first guess, shape (size,).
+            p_xy: Positions of base_link [m], shape (N, 2).
             yaw: Headings [rad], shape (N,).
             run: Run of each reading, shape (N,).
-            b_nt: Readings less a constant [nT], shape (N,).
+            b_nt: Readings minus a constant [nT], shape (N,).
 
         Returns:
-            The value, `UNLIKELY` where the covariance is not positive definite; its gradient, shape (size,).
+            The value, `UNLIKELY` if the covariance is not positive definite; its gradient, shape (size,).
         """
         from scipy.linalg import cho_solve
         from scipy.linalg.lapack import dpotrf, dpotri

@@ -1,7 +1,7 @@
-"""From readings to a map: a method by its name, and the raster of what it fitted.
+"""Fit a map method to readings, and lay the fit out as a map.
 
-Linear algebra runs on one thread here. Its own threads wait for each other by spinning, so that on a busy
-machine a fit of small matrices takes twenty times as long; what runs beside each other are whole parts.
+Linear algebra runs on one thread here. Its own threads spin while they wait, so on a busy machine small
+matrices take twenty times as long. Whole headings run in parallel instead.
 """
 
 import inspect
@@ -26,24 +26,15 @@ from magtwin.report import Figure, Report
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], Any]
 
-NARROW = 5.0
-"""Readings whose extent is narrower than their spacing over this lie on a line."""
-
-REACH = 2.0
-"""Distance to the nearest good reading up to which a node is known, in spacings of the readings."""
-
-MOST_DOUBT = 0.5
-"""Part of the readings' standard deviation from which a method's own counts as not knowing."""
-
+NARROW = 5.0  # Readings lie on a line if their extent is below their spacing over this
+REACH = 2.0  # Largest distance from a known node to a good reading, in spacings of the readings
+MOST_DOUBT = 0.5  # Largest standard deviation of a known node, as a share of the readings' own
+# Parameters of a map: RMS errors of linear interpolation
 ERRORS = ("error between nodes [nT]", "error between headings [nT]")
-"""Parameters of a map: root of the mean squared error of linear interpolation."""
-
-MOST_THREADS = 4
-"""Headings of a raster that are told beside each other: each holds blocks of 100 MB."""
+MOST_THREADS = 4  # Headings of a raster that are computed in parallel: each holds blocks of 100 MB
 
 
-ON_NODES = ("trilinear",)
-"""Methods whose raster of a gridded survey is the survey's own nodes."""
+ON_NODES = ("trilinear",)  # Methods whose map of a gridded survey has the survey's own nodes
 
 
 def fit(
@@ -53,12 +44,12 @@ def fit(
 
     Args:
         readings: A survey.
-        method: One of `METHODS`.
-        progress: Called as progress(done, total, what) by the methods that take their time.
+        method: Name of a map method, see `magtwin.field.fit.methods`.
+        progress: Called as progress(done, total, what) by slow methods.
         **options: Options of the method.
 
     Raises:
-        InputError: There is no such method or option; or as the method refuses.
+        InputError: There is no such method or option, or the method refuses the readings.
     """
     function = METHODS[method]
     kinds = inspect.signature(function).parameters.values()
@@ -74,7 +65,7 @@ def fit(
 
 
 def _one_thread() -> Any:
-    """The context in which linear algebra has one thread."""
+    """A context in which linear algebra uses one thread."""
     import scipy.linalg  # noqa: F401  # threadpool_limits sees only libraries that are loaded
     from threadpoolctl import threadpool_limits
 
@@ -92,26 +83,25 @@ def raster(
 ) -> AnomalyMap:
     """The map of a model over the floor of its readings.
 
-    A node is valid where the model gives a value, where a good reading lies within two spacings of the
-    readings, and where the model's standard deviation is below half that of the readings. It is not where
-    the sensor latched: where the nearest reading is none that is good, and those that are good are over half
-    a spacing away, at whatever heading. Trilinear and cubic maps of nodes know by themselves where they end.
+    A node is valid if the model has a value there, a good reading is within two spacings of the readings, and
+    the model's standard deviation is below half that of the readings. Nodes are masked where the sensor was
+    stuck: where the nearest reading is not good and good ones are over half a spacing away, at any heading.
+    Trilinear and cubic models of gridded surveys have their own mask.
 
     Args:
-        model: What was fitted.
-        readings: What it was fitted to.
+        model: The fit.
+        readings: The readings that it was fitted to.
         spacing_m: Distance between nodes [m]. Default: for "trilinear" on a gridded survey its own nodes,
-            else the widest spacing that costs next to no accuracy (`magtwin.field.fit.resolution`).
+            else the widest spacing with almost no loss of accuracy (`magtwin.field.fit.resolution`).
         headings_rad: Headings of the layers [rad], ascending in [0, 2 pi). Default: for "trilinear" on a
-            gridded survey its own; the one heading of a survey that has only one; else the fewest of 4 to
-            24 that cost next to no accuracy.
-        extent: Least x, greatest x, least y, greatest y [m]; that of the readings unless given.
-        progress: Called as progress(done, total, what), once a heading.
+            gridded survey its own; the heading of a survey with only one; else the fewest of 4 to 24 with
+            almost no loss of accuracy.
+        extent: Least x, greatest x, least y, greatest y [m]. Default: that of the readings.
+        progress: Called as progress(done, total, what), once per heading.
 
     Returns:
-        The map, with values, variance, method, parameters and the survey's name, source, licence, day,
-        frame, datum and height; and with the harmonic field where the model has one. The parameters hold
-        the error of linear interpolation between its nodes and between its headings.
+        The map with values, variance, method, parameters, the survey's metadata and, if the model has one,
+        the harmonic field. The parameters include the errors of interpolation between its nodes and headings.
 
     Raises:
         InputError: The spacing leaves no cell, the headings do not ascend, or no node is valid.
@@ -123,19 +113,19 @@ def raster(
     predict = getattr(model, "predict_nodes", model.predict)
     threads = min(MOST_THREADS, os.cpu_count() or 1, len(headings))
     with _one_thread(), ThreadPoolExecutor(threads) as pool:
-        for h, told in enumerate(pool.map(predict, p, headings)):
+        for h, predicted in enumerate(pool.map(predict, p, headings)):
             if progress is not None:
                 progress(h, len(headings), "headings")
-            values[h], variance[h] = told
+            values[h], variance[h] = predicted
     if progress is not None:
         progress(len(headings), len(headings), "headings")
     valid = np.isfinite(values) & np.isfinite(variance) & _known(model, readings, p[0], variance)
     if not valid.any():
         x0, x1, y0, y1 = grid.extent
         raise InputError(
-            f"no node of x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m is known to the {model.method} fit of "
+            f"the {model.method} fit has no valid node in x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m, for survey "
             f"{readings.name!r}: each is too far from a good reading, or its sd is above {MOST_DOUBT:g} of "
-            "theirs; keep the extent within the readings, and leave out what contradicts itself"
+            "theirs; keep the extent within the readings, and mask readings that contradict each other"
         )
     return AnomalyMap(
         values_nt=values,
@@ -158,7 +148,7 @@ def raster(
 
 
 def grid_report(field: AnomalyMap) -> Report:
-    """How far a map's nodes and headings are apart, and the error of linear interpolation between them."""
+    """Spacing of a map's nodes and headings, and the error of linear interpolation between them."""
     dx, dy = field.cell_m
     figures = []
     for label, value, unit, error in (
@@ -181,7 +171,7 @@ def _grid(
     headings_rad: ArrayLike | None,
     extent: ArrayLike | None,
 ) -> tuple[Grid, dict[str, float]]:
-    """Nodes of the map, and what interpolation between them costs, by name with unit."""
+    """Nodes of the map, and the errors of interpolation between them, by name with unit."""
     own = readings.grid if model.method in ON_NODES else None
     if own is not None and spacing is None and extent is None:
         if headings_rad is None:
@@ -227,7 +217,7 @@ def _box(readings: Readings) -> tuple[float, float, float, float]:
 
 
 def _known(model: FieldModel, readings: Readings, p_xy: Array, variance: Array) -> NDArray[np.bool_]:
-    """Nodes that the readings reach, and that the model is sure enough of."""
+    """Nodes that are near enough to readings, and certain enough."""
     from scipy.spatial import cKDTree
 
     if readings.grid is not None and model.method in ("trilinear", "cubic"):

@@ -1,4 +1,4 @@
-"""Gaussian process: the field as a survey makes it likely, place and heading together."""
+"""Gaussian process over position and heading, conditioned on a survey."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.fit.covariance import Covariance, Kernel
-from magtwin.field.fit.interpolation import check_readings, flat_poses
-from magtwin.field.fit.methods import FittedModel
+from magtwin.field.fit.interpolation import check_readings
+from magtwin.field.fit.methods import FittedModel, flat_poses
 from magtwin.field.fit.roughness import local_mean, tail
 from magtwin.field.survey.bins import GRAIN_M, Bins, bin_readings, spacing_m
 from magtwin.field.survey.readings import Readings
@@ -18,80 +18,44 @@ from magtwin.field.survey.readings import Readings
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], Any]
 
-MOST = 4000
-"""Readings, or means of some that lie together, that the field is conditioned on: 128 MB of covariance."""
-
-MOST_LEARNT = 800
-"""Of these, those that the figures are learnt from."""
-
-MOST_TRIED = 240
-"""Of these, those that the starts are tried on."""
-
-STARTS = (1.0, 0.4, 2.5)
-"""Reaches that learning starts from, in first guesses."""
-
-STEPS = 60
-"""Steps of L-BFGS, once the best start is known."""
-
-PATCHES = 8
-"""Patches along the longer side of the floor at most, each with its own strength of field."""
-
+MOST = 4000  # Most readings, or means of adjacent ones, in the conditioning: 128 MB of covariance
+MOST_LEARNT = 800  # Most of these from which the hyperparameters are learnt
+MOST_TRIED = 240  # Most of these on which the starts are tried
+STARTS = (1.0, 0.4, 2.5)  # Initial reaches of the optimisation, as factors of the first guess
+STEPS = 60  # Steps of L-BFGS from the best start
+PATCHES = 8  # Most patches along the longer side of the floor, each with its own field strength
+# Least distance between patches, in spacings of the readings: smaller ones cannot tell strength from noise
 PATCH_SPACINGS = 3.0
-"""Least distance between patches in spacings of the readings: fewer tell no strength from noise."""
-
+# Largest change of a hyperparameter from its first guess: a factor of 400 for logarithms, 0.2 m for the arm
 WIDEST = 6.0
-"""How far a figure may go from its first guess: a logarithm by a factor of 400, the arm by 0.2 m."""
-
-SECTORS = 24
-"""Sectors of heading in which readings that lie together are averaged apart."""
-
-FINEST = 8
-"""Cells along a spacing in which the readings of a drive are averaged at least."""
-
-BLOCK = 1024
-"""Poses predicted at a time."""
+SECTORS = 24  # Heading sectors in which adjacent readings are averaged separately
+FINEST = 8  # Averaging cells per spacing for readings of a drive, at least
+BLOCK = 1024  # Poses predicted at a time
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class GpModel(FittedModel):
     """A Gaussian process conditioned on readings."""
 
-    parameters: Mapping[str, Any]
-    """Figures of the covariance and of the data, by name with unit."""
-
-    noise_nt2: float
-    """Variance of a reading about the field [nT^2]: of the sensor, of headings and places, and of runs."""
-
-    covariance: Covariance
-    """Its form."""
-
-    figures: Array
-    """Its figures, shape (covariance.size,)."""
-
-    mean_nt: float
-    """Mean of the readings [nT]."""
-
+    parameters: Mapping[str, Any]  # Hyperparameters and data, by name with unit
+    noise_nt2: float  # Variance of a reading about the field [nT^2]: sensor, headings, positions, and runs
+    covariance: Covariance  # Form of the covariance
+    figures: Array  # Its hyperparameters, shape (covariance.size,)
+    mean_nt: float  # Mean of the readings [nT]
+    # Positions [m], shape (N, 2), and headings [rad], shape (N,), of the conditioning
     poses: tuple[Array, Array]
-    """Places [m], shape (N, 2), and headings [rad], shape (N,), of what it is conditioned on."""
-
-    lower: Array
-    """Cholesky factor of the covariance of what was read, shape (N, N)."""
-
-    alpha: Array
-    """That covariance's inverse times the readings less their mean, shape (N,)."""
-
+    lower: Array  # Cholesky factor of the readings' covariance, shape (N, N)
+    alpha: Array  # Inverse of that covariance times the readings minus their mean, shape (N,)
+    # Positions left out in turn, a cKDTree, and the mean squared residual over the variance at each
     missed: tuple[Any, Array]
-    """Places left out in turn, a cKDTree, and the mean squared miss over the variance at each."""
-
-    method: str = "gp"
-    """Name of the method."""
+    method: str = "gp"  # Name of the method
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
-        """Field [nT] and its variance [nT^2] at poses; nan where a pose is nan.
+        """Field [nT] and its variance [nT^2] at poses; nan if a pose is nan. See `FieldModel`.
 
-        The variance is the process's own (Rasmussen & Williams 2006, eq. 2.26), scaled by how far places
-        around that were left out were missed, for real fields are rougher here than there, and so that
-        nine in ten of all readings left out lie in their 90 % intervals. See `FieldModel.predict`.
+        The variance is that of the process (Rasmussen & Williams 2006, eq. 2.26), scaled by the local
+        residuals of positions left out, since real fields are rougher in some places, and so that 90 % of all
+        readings left out lie in their 90 % intervals.
         """
         from scipy.linalg import solve_triangular
 
@@ -105,21 +69,16 @@ class GpModel(FittedModel):
             half = solve_triangular(self.lower, across, lower=True, overwrite_b=True, check_finite=False)
             prior = self.covariance.variance_nt2(self.figures, p[rows])
             own = np.maximum(prior - np.einsum("ij,ij->j", half, half), 0.0)
-            variance[rows] = own * self._scale(p[rows])
+            variance[rows] = own * local_mean(*self.missed, p[rows])
         return mean.reshape(shape), variance.reshape(shape)
-
-    def _scale(self, p_xy: Array) -> Array:
-        tree, squares = self.missed
-        return local_mean(tree, squares, p_xy)
 
 
 def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress | None = None) -> GpModel:
-    """Condition a Gaussian process on the good readings, its figures the likeliest.
+    """Condition a Gaussian process on the good readings, with the likeliest hyperparameters.
 
-    Recorded headings count. Where there are more than `MOST` readings, or a drive's crowd, those of one
-    run, cell and sector of heading are averaged; their scatter joins the noise. The figures, among them
-    how strong the field is in each part of the floor, maximise the marginal likelihood by L-BFGS with its
-    gradient, from several starts.
+    Recorded headings are used. More than `MOST` readings, and those of a drive, are averaged per run, cell
+    and sector of heading; their scatter adds to the noise. The hyperparameters, including the field's
+    strength in each patch of the floor, maximise the marginal likelihood by L-BFGS from several starts.
 
     Args:
         readings: A survey.
@@ -130,8 +89,8 @@ def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress
         The model.
 
     Raises:
-        InputError: There are fewer than four good readings, they lie on one line or are all the same;
-            or the kernel is unknown.
+        InputError: There are fewer than four good readings, they are on one line or all the same, or the
+            kernel is unknown.
     """
     if kernel not in ("matern", "poisson"):
         raise InputError(f'kernel must be "matern" or "poisson", got {kernel!r}')
@@ -171,7 +130,7 @@ def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress
 
 
 def _data(readings: Readings) -> tuple[Bins, float]:
-    """What the process is conditioned on, and the variance of a reading within it [nT^2]."""
+    """Data of the conditioning, and the variance of a reading within a mean [nT^2]."""
     good = readings.good
     cell = GRAIN_M if readings.grid is not None else spacing_m(readings) / FINEST
     while True:
@@ -185,7 +144,7 @@ def _data(readings: Readings) -> tuple[Bins, float]:
 
 
 def _patches(p_xy: Array, spacing: float) -> tuple[Array, float]:
-    """Middles of even patches over the readings, and how far they are apart [m]."""
+    """Centres of even patches over the readings, and their spacing [m]."""
     low, high = p_xy.min(axis=0), p_xy.max(axis=0)
     apart = max(float((high - low).max()) / PATCHES, PATCH_SPACINGS * spacing)
     axes = [np.linspace(a, b, round((b - a) / apart) + 1) for a, b in zip(low, high, strict=True)]
@@ -200,10 +159,10 @@ def _learn(
     least_m: float,
     say: Callable[[int, str], Any],
 ) -> Array:
-    """The likeliest figures: the best of several starts on few readings, then on more.
+    """The likeliest hyperparameters: the best of several starts on few readings, then on more.
 
-    The starts have one strength everywhere. No reach is shorter than
-    the readings' spacing: such a part could not be told from noise.
+    The starts have one strength everywhere. No reach is below the readings' spacing: such a part would be
+    noise.
     """
     from scipy.optimize import minimize
 
@@ -218,7 +177,7 @@ def _learn(
 
     def descend(start: Array, rows: NDArray[np.intp], steps: int, bounds: Any) -> tuple[float, Array]:
         data = (bins.p_xy[rows], bins.yaw[rows], bins.run[rows], b[rows])
-        found = minimize(
+        result = minimize(
             covariance.loss,
             np.maximum(start, least),
             (guess, *data),
@@ -227,7 +186,7 @@ def _learn(
             bounds=bounds,
             options={"maxiter": steps},
         )
-        return float(found.fun), np.asarray(found.x)
+        return float(result.fun), np.asarray(result.x)
 
     tried = np.sort(order[:MOST_TRIED])
     starts = []
@@ -236,13 +195,13 @@ def _learn(
         start = guess.copy()
         start[h : 2 * h] += np.log(factor)
         starts.append(descend(start, tried, STEPS // 2, even))
-    best = min(starts, key=lambda found: found[0])[1]
+    best = min(starts, key=lambda start: start[0])[1]
     say(len(STARTS), "figures")
     return descend(best, np.sort(order[:MOST_LEARNT]), STEPS, bounds)[1]
 
 
 def _guess(covariance: Covariance, bins: Bins, b: Array) -> Array:
-    """Where learning starts: the readings' spread and an eighth of the floor."""
+    """First guess: the readings' spread and an eighth of the floor."""
     h, spread = covariance.harmonics, float(b.std())
     extent = float(np.ptp(bins.p_xy, axis=0).max())
     waves = [np.log(spread)] + [np.log(spread / 20)] * (h - 1)
@@ -254,7 +213,7 @@ def _guess(covariance: Covariance, bins: Bins, b: Array) -> Array:
 
 
 def _matrix(covariance: Covariance, figures: Array, bins: Bins, rows: Any = slice(None)) -> Array:
-    """Covariance of what was read, noise and runs included."""
+    """Covariance of the readings, with noise and runs."""
     poses, run = (bins.p_xy[rows], bins.yaw[rows]), bins.run[rows]
     matrix = covariance.between(figures, poses, poses)
     if covariance.runs:
@@ -280,10 +239,10 @@ def _missed(
     lower: Array,
     side_m: float,
 ) -> tuple[Any, Array]:
-    """Leave out each cell of the floor in turn: its middle, and its mean squared miss over the variance.
+    """Leave out each cell of the floor in turn: its centre, and its mean squared residual over the variance.
 
-    With P the inverse of the covariance, what the others say misses the readings of a block by
-    P_bb^-1 (P b)_b, with covariance P_bb^-1 (Rasmussen & Williams 2006, eq. 5.12, for blocks).
+    With P the inverse of the covariance, the residual of a block is P_bb^-1 (P b)_b, with covariance P_bb^-1
+    (Rasmussen & Williams 2006, eq. 5.12, for blocks).
     """
     from scipy.linalg.lapack import dpotri
     from scipy.spatial import cKDTree
@@ -317,7 +276,7 @@ def _parameters(
 ) -> dict[str, Any]:
     h = covariance.harmonics
     size, uneven = np.exp(figures[: 3 * h]), np.exp(figures[covariance.of_patches])
-    told: dict[str, Any] = {
+    parameters: dict[str, Any] = {
         "kernel": covariance.kernel,
         "readings": int(readings.good.sum()),
         "conditioned_on": count,
@@ -328,8 +287,8 @@ def _parameters(
         "noise_nt": round(float(np.sqrt(noise)), 3),
     }
     if covariance.runs:
-        told["run_sd_nt"] = round(float(np.sqrt(covariance.run_nt2(figures))), 3)
-        told["run_reach_m"] = round(float(np.exp(figures[3 * h + 2])), 5)
+        parameters["run_sd_nt"] = round(float(np.sqrt(covariance.run_nt2(figures))), 3)
+        parameters["run_reach_m"] = round(float(np.exp(figures[3 * h + 2])), 5)
     if h > 1:
-        told["p_base_sensor_m"] = [round(float(v), 5) for v in covariance.arm_m(figures)]
-    return told
+        parameters["p_base_sensor_m"] = [round(float(v), 5) for v in covariance.arm_m(figures)]
+    return parameters

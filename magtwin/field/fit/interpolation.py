@@ -1,8 +1,8 @@
-"""Interpolation of a survey: trilinear, as the paper has it, and cubic; the baselines of all other methods.
+"""Interpolation of a survey, trilinear (as in the paper) and cubic: the baselines of all other methods.
 
-A gridded survey is interpolated on its own nodes and nominal headings. A scattered one is first parted
-into what depends on the heading and what on the place; the first is a wave of two harmonics, the same
-everywhere, the second is interpolated over the triangles of its places.
+A gridded survey is interpolated on its nodes and nominal headings. A scattered one is separated into a part
+that depends on the heading, a wave of two harmonics that is the same everywhere, and a part that depends on
+the position, which is interpolated over triangles.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.field.fit.methods import FittedModel
+from magtwin.field.fit.methods import FittedModel, flat_poses
 from magtwin.field.fit.roughness import Roughness
 from magtwin.field.grid import TURN, Grid
 from magtwin.field.survey.bins import Bins, bin_readings, spacing_m
@@ -24,59 +24,51 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Order = Literal["linear", "cubic"]
 
-EDGE = 1e-9
-"""Rounding that a node forgives, in cells; also the weight from which an unknown node counts."""
-
-BINS_A_SPACING = 4
-"""Cells of a scattered survey whose readings are averaged, along one spacing."""
-
-FLATTEST = 0.05
-"""Wave that the headings of a scattered survey cannot tell from a constant: its relative spread in a cell."""
-
-LEAST = 4
-"""Fewer readings than this make no map."""
+EDGE = 1e-9  # Rounding forgiven at a node, in cells; also the weight from which an unknown node counts
+BINS_A_SPACING = 4  # Averaging cells per spacing of a scattered survey
+FLATTEST = 0.05  # Least relative spread of a heading wave within cells; waves with less are not fitted
+LEAST = 4  # Fewest readings of a map
 
 
 def fit_trilinear(readings: Readings, *, fill: bool = False) -> "GridInterpolation | ScatterInterpolation":
-    """Linear interpolation in x, y and heading: exact at the nodes of a gridded survey.
+    """Linear interpolation in x, y and heading; exact at the nodes of a gridded survey.
 
-    Between nodes of a gridded survey B = sum of w_h w_y w_x B_hyx over the eight around, the heading on
-    the circle, as `AnomalyMap.lookup`. Recorded headings are not used: the paper's maps are so. A
-    scattered survey is interpolated over Delaunay's triangles.
+    On a gridded survey as `AnomalyMap.lookup`: B = sum of w_h w_y w_x B_hyx over the eight nodes around.
+    Recorded headings are not used, as in the paper. A scattered survey is interpolated over Delaunay
+    triangles.
 
     Args:
-        readings: A survey; only its good readings count.
-        fill: Whether a node of a gridded survey without a good reading takes a value from good ones of the
-            same heading: from the nearest on both sides in its row and in its column, linear between each
-            two, the pairs weighted by 1 / (a b)^2, with a and b the nodes to either. Otherwise cells
-            that touch such a node are unknown.
+        readings: A survey; only its good readings are used.
+        fill: Whether to fill nodes of a gridded survey that have no good reading, from the nearest good ones
+            on both sides in row and column of the same heading: linear between each two, weighted by 1 / (a
+            b)^2 with distances a and b. Otherwise cells at such a node are unknown.
 
     Returns:
-        The model. Its variance is what places that were left out in turn show interpolation to miss
-        (`Roughness`), and at the nodes, and between them by the weights, that of a reading
-        (`magtwin.field.survey.node_errors`); of a scattered survey, that of the readings of one place.
+        The model. Its variance is the interpolation error at positions left out in turn (`Roughness`), plus
+        that of a reading (`magtwin.field.survey.node_errors`; for a scattered survey, that of readings at one
+        place).
 
     Raises:
-        InputError: There are fewer than four good readings, they lie on one line, or are all the same.
+        InputError: There are fewer than four good readings, they are on one line, or all are the same.
     """
     return _fit(readings, "linear", fill)
 
 
 def fit_cubic(readings: Readings, *, fill: bool = False) -> "GridInterpolation | ScatterInterpolation":
-    """Cubic interpolation in x and y, and periodic cubic splines in heading: smooth and exact at nodes.
+    """Cubic interpolation in x and y, periodic cubic splines in heading; smooth, and exact at nodes.
 
-    A gridded survey is interpolated by bicubic splines (not-a-knot; de Boor 1978), a scattered one by
-    Clough and Tocher's triangles. Arguments, result and refusals are those of `fit_trilinear`, but filled
-    nodes, and those that carry the spline across an unknown cell, are of Clough and Tocher's triangles.
+    Bicubic splines (not-a-knot; de Boor 1978) on a gridded survey, Clough-Tocher triangles on a scattered
+    one. Arguments, result and errors are those of `fit_trilinear`, but missing nodes are filled by
+    Clough-Tocher triangles.
     """
     return _fit(readings, "cubic", fill)
 
 
 def check_readings(readings: Readings) -> None:
-    """Refuse readings that no method makes a map of.
+    """Refuse readings from which no method can make a map.
 
     Raises:
-        InputError: Fewer than four are good, they lie on one line, or all are the same to the last digit.
+        InputError: Fewer than four are good, they are on one line, or all are the same to the last digit.
     """
     good = readings.good
     count, of = int(np.count_nonzero(good)), f"of {len(readings)} in {readings.name or 'the survey'}"
@@ -95,39 +87,21 @@ def check_readings(readings: Readings) -> None:
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class GridInterpolation(FittedModel):
-    """Values on the nodes of a survey, and the rule between them."""
+    """Values on the nodes of a survey, interpolated."""
 
-    method: str
-    """"trilinear" or "cubic"."""
-
-    parameters: Mapping[str, Any]
-    """Figures of the fit."""
-
-    noise_nt2: float
-    """Variance of a reading about the field of its node, mean over the survey [nT^2]."""
-
-    grid: Grid
-    """The nodes."""
-
-    values_nt: Array
-    """Field at the nodes [nT], shape (H, Y, X); 0 where not `known`."""
-
-    known: Flags
-    """Nodes that were read, or filled, shape (H, Y, X)."""
-
-    node_nt2: Array
-    """Variance of the value of each node [nT^2], shape (H, Y, X)."""
-
-    roughness: Roughness
-    """How far interpolation is from the field between nodes."""
-
-    turned_nt2: float
-    """Mean square by which leaving out a heading misses it [nT^2]."""
+    method: str  # "trilinear" or "cubic"
+    parameters: Mapping[str, Any]  # Parameters of the fit
+    noise_nt2: float  # Variance of a reading about the field of its node, mean over the survey [nT^2]
+    grid: Grid  # The nodes
+    values_nt: Array  # Field at the nodes [nT], shape (H, Y, X); 0 where not `known`
+    known: Flags  # Nodes that were read or filled, shape (H, Y, X)
+    node_nt2: Array  # Variance of the value of each node [nT^2], shape (H, Y, X)
+    roughness: Roughness  # Error of interpolation between nodes
+    turned_nt2: float  # Mean squared error of interpolating a heading that is left out [nT^2]
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
-        """Field [nT] and its variance [nT^2] at poses; nan off the grid and in unknown cells.
-
-        See `FieldModel.predict`.
+        """Field [nT] and its variance [nT^2] at poses; nan off the grid and in unknown cells. See
+        `FieldModel`.
         """
         p, angle, shape = flat_poses(p_xy, yaw)
         u = (p - self.grid.origin_m) / self.grid.cell_m
@@ -167,37 +141,19 @@ class GridInterpolation(FittedModel):
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class ScatterInterpolation(FittedModel):
-    """A surface over the triangles of scattered readings, and a wave over heading."""
+    """A surface over triangles of scattered readings, and a wave over heading."""
 
-    method: str
-    """"trilinear" or "cubic"."""
-
-    parameters: Mapping[str, Any]
-    """Figures of the fit."""
-
-    noise_nt2: float
-    """Variance of a run's readings at one place, and of runs about each other there [nT^2]."""
-
-    p_xy: Array
-    """Places that the surface goes through [m], shape (M, 2)."""
-
-    b_nt: Array
-    """Its values there [nT], shape (M,)."""
-
-    place_nt2: Array
-    """Variance of these values [nT^2], shape (M,)."""
-
-    wave_nt: Array
-    """Coefficients of cos yaw, sin yaw, cos 2 yaw, sin 2 yaw [nT], shape (4,)."""
-
-    roughness: Roughness
-    """How far interpolation is from the field between these places."""
+    method: str  # "trilinear" or "cubic"
+    parameters: Mapping[str, Any]  # Parameters of the fit
+    noise_nt2: float  # Variance of readings at one place, within and between runs [nT^2]
+    p_xy: Array  # Positions of the surface's vertices [m], shape (M, 2)
+    b_nt: Array  # Values at the vertices [nT], shape (M,)
+    place_nt2: Array  # Variance of these values [nT^2], shape (M,)
+    wave_nt: Array  # Coefficients of cos yaw, sin yaw, cos 2 yaw, sin 2 yaw [nT], shape (4,)
+    roughness: Roughness  # Error of interpolation between the vertices
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
-        """Field [nT] and its variance [nT^2] at poses; nan outside the convex hull of the readings.
-
-        See `FieldModel.predict`.
-        """
+        """Field [nT] and its variance [nT^2] at poses; nan outside the convex hull. See `FieldModel`."""
         p, angle, shape = flat_poses(p_xy, yaw)
         order: Order = "cubic" if self.method == "cubic" else "linear"
         finite = np.all(np.isfinite(p), axis=1)
@@ -207,19 +163,6 @@ class ScatterInterpolation(FittedModel):
         mean[~finite] = np.nan
         variance[~np.isfinite(mean)] = np.nan
         return mean.reshape(shape), variance.reshape(shape)
-
-
-def flat_poses(p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
-    """Poses broadcast and in rows, and the shape that they came in.
-
-    Raises:
-        InputError: p_xy has not two columns.
-    """
-    p, angle = np.asarray(p_xy, float), np.asarray(yaw, float)
-    if p.ndim == 0 or p.shape[-1] != 2:
-        raise InputError(f"p_xy must have shape (..., 2), got {p.shape}")
-    shape = np.broadcast_shapes(p.shape[:-1], angle.shape)
-    return np.broadcast_to(p, (*shape, 2)).reshape(-1, 2), np.broadcast_to(angle, shape).reshape(-1), shape
 
 
 def _fit(readings: Readings, order: Order, fill: bool) -> GridInterpolation | ScatterInterpolation:
@@ -265,7 +208,7 @@ def _fit_gridded(readings: Readings, grid: Grid, order: Order, fill: bool) -> Gr
             "nodes_read": int(read.sum()),
             "nodes_filled": int((known & ~read).sum()),
             "noise_nt": round(float(np.sqrt(errors.mean_nt2)), 3),
-            f"place_error_m_{'told' if errors.told else 'assumed'}": round(errors.place_m, 5),
+            f"place_error_m_{'estimated' if errors.estimated else 'assumed'}": round(errors.place_m, 5),
         },
         noise_nt2=errors.mean_nt2,
         grid=grid,
@@ -287,7 +230,7 @@ def _check_layer(grid: Grid, h: int, places: Array) -> None:
 
 
 def _turned_nt2(grid: Grid, values: Array, read: Flags) -> float:
-    """Mean square by which the two headings beside one miss it [nT^2]."""
+    """Mean squared error of interpolating a heading from the two beside it [nT^2]."""
     headings = np.asarray(grid.headings_rad)
     whole = read & np.roll(read, 1, axis=0) & np.roll(read, -1, axis=0)
     if len(headings) < 3 or not whole.any():
@@ -300,7 +243,7 @@ def _turned_nt2(grid: Grid, values: Array, read: Flags) -> float:
 
 
 def _heading_weights(headings_rad: tuple[float, ...], yaw: Array) -> tuple[Array, Array]:
-    """Weight of each layer, linear on the circle, shape (N, H); how far between two, 0 to 1, shape (N,)."""
+    """Weight of each layer, linear on the circle, shape (N, H); position between two, 0 to 1, shape (N,)."""
     count, rows = len(headings_rad), np.arange(len(yaw))
     if count == 1:
         return np.ones((len(yaw), 1)), np.zeros(len(yaw))
@@ -323,14 +266,14 @@ def _periodic_cubic(headings_rad: tuple[float, ...], yaw: Array) -> Array:
     if count == 1:
         return np.ones((len(yaw), 1))
     knots = np.append(headings_rad, headings_rad[0] + TURN)
-    one = np.eye(count)
-    spline = CubicSpline(knots, np.vstack([one, one[:1]]), bc_type="periodic")
+    layers = np.eye(count)
+    spline = CubicSpline(knots, np.vstack([layers, layers[:1]]), bc_type="periodic")
     weights = np.asarray(spline(np.mod(yaw - knots[0], TURN) + knots[0]))
     return np.where(np.abs(weights) < EDGE, 0.0, weights)
 
 
 def _bilinear(layer: Array, low: NDArray[np.intp], part: Array, *, squared: bool = False) -> Array:
-    """Bilinear sums, exact at nodes; with the weights squared, as variances add up."""
+    """Bilinear sums, exact at nodes; with squared weights for variances."""
     (i, j), (u, v) = low.T, part.T
     left, right, below, above = (w * w if squared else w for w in (1 - u, u, 1 - v, v))
     lower = layer[j, i] * left + layer[j, i + 1] * right
@@ -376,10 +319,11 @@ def _fit_scattered(readings: Readings, order: Order) -> ScatterInterpolation:
 
 
 def _binned(readings: Readings, still: Array, cell_m: float) -> tuple[Bins, float, Array]:
-    """Bins of what depends on the place; variance of a reading, and of the mean of each bin [nT^2].
+    """Bins of the position's part; variance of a reading, and of the mean of each bin [nT^2].
 
-    A run's readings in a bin vary by w about their mean, and runs' means by r beside w over their number:
-    a reading's variance is w + r. Where no two runs met, r is unknown, and a bin is no surer than a reading.
+    Readings of one run in a bin have variance w about their mean, and the runs' means vary by r more: a
+    reading's variance is w + r. If no two runs met, r is unknown, and a bin is no more certain than a
+    reading.
     """
     bins, index = bin_readings(readings, cell_m)
     rows = np.flatnonzero(readings.good)
@@ -395,15 +339,16 @@ def _binned(readings: Readings, still: Array, cell_m: float) -> tuple[Bins, floa
     if not freedom:
         return replace(bins, b_nt=mean), within, np.full(len(runs), within)
     middle, several = np.bincount(place, means) / runs, runs[place] > 1
-    found = float(np.sum((means - middle[place]) ** 2) / freedom)
-    between = max(found - within * float(np.mean(1 / apart.count[several])), 0.0)
+    variance = float(np.sum((means - middle[place]) ** 2) / freedom)
+    between = max(variance - within * float(np.mean(1 / apart.count[several])), 0.0)
     return replace(bins, b_nt=mean), within + between, between / runs + within / bins.count
 
 
 def _wave(readings: Readings, cell_m: float) -> Array:
-    """The heading's part by least squares over differences within cells, where the place's part cancels.
+    """The heading's part, by least squares over differences within cells, in which the position's part
+    cancels.
 
-    Directions of the coefficients that the headings in a cell hardly tell apart stay 0.
+    Combinations of coefficients that the headings in a cell do not determine stay 0.
     """
     bins, index = bin_readings(readings, cell_m)
     rows = np.flatnonzero(readings.good)
@@ -411,8 +356,8 @@ def _wave(readings: Readings, cell_m: float) -> Array:
     means = np.stack([np.bincount(index, c) / bins.count for c in every.T], axis=-1)
     away = every - means[index]
     left, size, right = np.linalg.svd(away[:, :4], full_matrices=False)
-    told = size > FLATTEST * np.sqrt(len(rows))
-    return np.asarray(right[told].T @ ((left[:, told].T @ away[:, 4]) / size[told]))
+    determined = size > FLATTEST * np.sqrt(len(rows))
+    return np.asarray(right[determined].T @ ((left[:, determined].T @ away[:, 4]) / size[determined]))
 
 
 def _waves(yaw: Array) -> Array:
@@ -420,7 +365,7 @@ def _waves(yaw: Array) -> Array:
 
 
 def _triangles(order: Order) -> Callable[[Array, Array, Array], Array]:
-    """Values at points (third) from those (second) at places (first), nan outside their hull."""
+    """A function of positions, values and points that gives values at the points, nan outside the hull."""
     from scipy.interpolate import CloughTocher2DInterpolator, LinearNDInterpolator
     from scipy.spatial import QhullError
 
@@ -437,7 +382,7 @@ def _triangles(order: Order) -> Callable[[Array, Array, Array], Array]:
 
 
 def _across(values: Array, known: Flags) -> Array:
-    """Values linear between the nearest known nodes in row and column; nan where neither has two."""
+    """Values linear between the nearest known nodes in row and column; nan if neither has two."""
     total, weight = np.zeros(values.shape), np.zeros(values.shape)
     for axis in (0, 1):
         lines, there = np.moveaxis(values, axis, -1), np.moveaxis(known, axis, -1)

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.errors import InputError
 from magtwin.field.survey.readings import Readings
 from magtwin.registry import Registry
 from magtwin.summary import Summarized, Summary, printable
@@ -64,6 +65,7 @@ class MapMethod(Protocol):
         """Fit the good readings of a survey; raise `InputError` if they make no map."""
 
 
+# Map methods by name
 METHODS: Registry[MapMethod] = Registry(
     "method",
     "map_methods",
@@ -74,10 +76,7 @@ METHODS: Registry[MapMethod] = Registry(
         "harmonic": "magtwin.field.fit.harmonic.inversion:fit_harmonic",
     },
 )
-"""Map methods by name."""
-
-map_method = METHODS.register
-"""Decorator that names a map method."""
+map_method = METHODS.register  # Decorator that names a map method
 
 
 class FittedModel(Summarized):
@@ -95,3 +94,16 @@ class FittedModel(Summarized):
             ("parameter", "value"),
             [(name, str(value)) for name, value in self.parameters.items()],
         )
+
+
+def flat_poses(p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
+    """Broadcast poses to rows; also returns their shape.
+
+    Raises:
+        InputError: p_xy does not have two columns.
+    """
+    p, angle = np.asarray(p_xy, float), np.asarray(yaw, float)
+    if p.ndim == 0 or p.shape[-1] != 2:
+        raise InputError(f"p_xy must have shape (..., 2), got {p.shape}")
+    shape = np.broadcast_shapes(p.shape[:-1], angle.shape)
+    return np.broadcast_to(p, (*shape, 2)).reshape(-1, 2), np.broadcast_to(angle, shape).reshape(-1), shape

@@ -1,4 +1,4 @@
-"""Resolution: how far apart a map's nodes and headings may be for what a fit knows."""
+"""Resolution: the widest spacing and the fewest headings of a map with almost no loss of accuracy."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -15,44 +15,27 @@ from magtwin.field.survey.readings import Readings
 Array = NDArray[np.float64]
 Choice = TypeVar("Choice")
 
-LEAST_HEIGHT_M = 0.3
-"""Height of a sensor above magnetic sources that is assumed at least [m]."""
-
+LEAST_HEIGHT_M = 0.3  # Assumed least height of a sensor above magnetic sources [m]
+# Nodes tried per scale of the field: the larger of the sensor's height and the readings' spacing. A field has
+# almost no waves shorter than its height above the sources.
 PARTS = (2.0, 2.5, 3.0, 4.0, 5.0, 6.0)
-"""Nodes along one scale of the field that are tried, the scale being the larger of the sensor's height and
-the distance between readings: a field has nearly no waves shorter than its height above the sources."""
-
-HEADINGS = (4, 6, 8, 12, 24)
-"""Numbers of headings that are tried."""
-
+HEADINGS = (4, 6, 8, 12, 24)  # Numbers of headings that are tried
+# Allowed error of linear interpolation, as a share of the fit's standard deviation: adds 2 % to it
 SHARE = 0.2
-"""Error of linear interpolation that is allowed, in the fit's standard deviation: it adds 2 % to it."""
-
-PROBES = 400
-"""Poses at which the error is measured."""
-
+PROBES = 400  # Poses at which the error is measured
+# Steps of a sequence that fills a cube evenly (Roberts 2018, R3)
 GOLDEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
-"""Steps of a sequence that fills a cube evenly (Roberts 2018, R3)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Resolution:
-    """Spacing and headings of a map, and what linear interpolation between them costs."""
+    """Spacing and headings of a map, and the errors of linear interpolation between them."""
 
-    spacing_m: float
-    """Distance between nodes [m]."""
-
-    headings_rad: tuple[float, ...]
-    """Headings [rad], ascending in [0, 2 pi)."""
-
-    nodes_nt: float
-    """Root of the mean squared error of interpolation between nodes [nT]; nan where not measured."""
-
-    turn_nt: float
-    """The same between headings [nT]."""
-
-    sd_nt: float
-    """The fit's own standard deviation, the median over poses of the readings [nT]."""
+    spacing_m: float  # Distance between nodes [m]
+    headings_rad: tuple[float, ...]  # Headings [rad], ascending in [0, 2 pi)
+    nodes_nt: float  # RMS error of interpolation between nodes [nT]; nan if not measured
+    turn_nt: float  # The same between headings [nT]
+    sd_nt: float  # Standard deviation of the fit, median over poses of the readings [nT]
 
 
 def resolution(
@@ -63,17 +46,16 @@ def resolution(
     headings_rad: ArrayLike | None = None,
     largest_m: float = np.inf,
 ) -> Resolution:
-    """The widest spacing and the fewest headings that cost next to no accuracy.
+    """Choose the widest spacing and the fewest headings with almost no loss of accuracy.
 
-    The error of linear interpolation is measured on the fitted field itself, at places of the readings, and
-    must stay below `SHARE` of the fit's standard deviation. Where no spacing or number that is tried does
-    that, the finest counts.
+    The error of linear interpolation is measured on the fitted field, at positions of the readings, and must
+    be below `SHARE` of the fit's standard deviation. If no choice reaches this, the finest is used.
 
     Args:
-        model: What was fitted.
-        readings: What it was fitted to.
-        spacing: Spacing that the caller chose [m]; its error is measured.
-        headings_rad: Headings that the caller chose [rad].
+        model: The fit.
+        readings: The readings that it was fitted to.
+        spacing: Spacing chosen by the caller [m]; only its error is measured.
+        headings_rad: Headings chosen by the caller [rad].
         largest_m: Widest spacing that leaves a cell [m].
     """
     p, yaw, part = _probes(readings)
@@ -113,16 +95,12 @@ def resolution(
         headings = np.asarray(headings_rad, float).ravel()
         turn = between_headings(headings)
     return Resolution(
-        spacing_m=step,
-        headings_rad=tuple(headings.tolist()),
-        nodes_nt=nodes,
-        turn_nt=turn,
-        sd_nt=sd,
+        spacing_m=step, headings_rad=tuple(headings.tolist()), nodes_nt=nodes, turn_nt=turn, sd_nt=sd
     )
 
 
 def _first_good(tried: Iterable[tuple[Choice, float]], sd: float) -> tuple[Choice, float]:
-    """The first choice whose error is small against the standard deviation, else the last; with its error."""
+    """The first choice whose error is small enough, else the last; with its error."""
     for choice, error in tried:  # noqa: B007
         if error <= SHARE * sd:
             break
@@ -130,7 +108,9 @@ def _first_good(tried: Iterable[tuple[Choice, float]], sd: float) -> tuple[Choic
 
 
 def _probes(readings: Readings) -> tuple[Array, Array, Array]:
-    """Places of readings (K, 2), headings evenly all around (K,), places in a cell from 0 to 1 (K, 2)."""
+    """Positions of readings (K, 2), evenly spread headings (K,), positions within a cell from 0 to 1 (K,
+    2).
+    """
     rows = np.flatnonzero(readings.good)
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, PROBES).astype(np.intp))]
     even = np.mod(0.5 + np.arange(1, len(rows) + 1)[:, None] * GOLDEN, 1.0)

@@ -1,4 +1,4 @@
-"""Roughness: how far interpolation is from readings that were left out, and so from the field elsewhere."""
+"""Roughness: the error of interpolation, estimated from readings that are left out."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,39 +11,26 @@ from magtwin.verdict import Z_90
 
 Array = NDArray[np.float64]
 
-FOLDS = 5
-"""Parts that are left out in turn: cell (i, j) is in part (i + 2 j) mod 5, so that none of the eight
-cells around it is left out with it."""
-
-NEIGHBOURS = 16
-"""Residuals that make the local mean square."""
-
-PRIOR = 4
-"""Residuals that the mean square of the whole survey counts as, beside the local ones."""
+FOLDS = 5  # Parts left out in turn: cell (i, j) is in part (i + 2 j) mod 5, unlike the eight cells around it
+NEIGHBOURS = 16  # Residuals per local mean square
+PRIOR = 4  # Weight of the survey's mean square in a local one, as a number of residuals
 
 
 @dataclass(frozen=True, eq=False)
 class Roughness:
-    """Squared residuals of readings that were left out, where, and how far from the readings that were kept.
+    """Squared residuals of readings that were left out, with their positions and distances.
 
-    At distances d and g from the readings on either side, linear interpolation errs by f'' d g / 2
-    (de Boor 1978, chapter 3). So the variance at a point is the mean square of the residuals around it,
-    times (d g)^2 there over (d g)^2 where they were left out, with d the distance to the nearest
-    reading and g = max(cell - d, d) the way on to the next. Residuals have tails, so that the
-    whole is scaled until nine in ten of them lie in their own 90 % intervals, the readings' errors included.
+    Linear interpolation errs by f'' d g / 2 at distances d and g from the readings on either side (de Boor
+    1978, chapter 3). So the variance at a point is the mean square of the residuals around it times (d g)^2
+    there over (d g)^2 where they were left out. d is the distance to the nearest reading and g = max(cell -
+    d, d) that to the next. Since residuals have heavy tails, the variance is scaled so that 90 % of them lie
+    in their 90 % intervals, including the readings' errors.
     """
 
-    tree: Any
-    """Places of the readings, a scipy cKDTree."""
-
-    left_out: Any
-    """Places of the residuals, a scipy cKDTree."""
-
-    scaled: Array
-    """Squared residual less the readings' own errors, over (d g)^2 [nT^2 / m^4], shape (R,)."""
-
-    cell_m: float
-    """Distance between readings, as a rule [m]."""
+    tree: Any  # Positions of the readings, a scipy cKDTree
+    left_out: Any  # Positions of the residuals, a scipy cKDTree
+    scaled: Array  # Squared residual minus the readings' variance, over (d g)^2 [nT^2 / m^4], shape (R,)
+    cell_m: float  # Typical distance between readings [m]
 
     @classmethod
     def of(
@@ -54,17 +41,18 @@ class Roughness:
         cell_m: float,
         interpolate: Callable[[Array, Array, Array], Array],
     ) -> "Roughness":
-        """Leave out each fifth of the places in turn, and see how well the rest tells it.
+        """Leave out each fifth of the positions in turn, and interpolate them from the rest.
 
-        A residual has the errors of what was left out and of what tells it, which are no roughness: of a
-        place told by those on either side of it, half as much again as its own.
+        A residual contains the errors of the reading left out and of those beside it, 1.5 times the variance
+        of a reading, which are not roughness.
 
         Args:
-            p_xy: Places of readings [m], shape (N, 2).
-            b_nt: What was read there [nT], shape (N,).
-            noise_nt2: Variance of it [nT^2], shape (N,).
+            p_xy: Positions of readings [m], shape (N, 2).
+            b_nt: Readings [nT], shape (N,).
+            noise_nt2: Their variance [nT^2], shape (N,).
             cell_m: Side of the cells that are left out [m].
-            interpolate: Gives values at places (third) from places (first) and values (second); nan outside.
+            interpolate: Gives values at positions (third) from positions (first) and values (second); nan
+                outside.
         """
         from scipy.spatial import cKDTree
 
@@ -87,7 +75,7 @@ class Roughness:
 
     @classmethod
     def joined(cls, parts: "Sequence[Roughness]") -> "Roughness":
-        """That of several layers over one floor."""
+        """Roughness of several layers over one floor."""
         from scipy.spatial import cKDTree
 
         known = [part for part in parts if part.left_out is not None]
@@ -96,7 +84,7 @@ class Roughness:
         return cls(cKDTree(np.vstack([part.tree.data for part in parts])), left_out, scaled, parts[0].cell_m)
 
     def variance_nt2(self, p_xy: ArrayLike) -> Array:
-        """Variance of the interpolation at points [nT^2], shape (...); nan where none could be left out."""
+        """Variance of the interpolation at points [nT^2], shape (...); nan if no residuals are known."""
         p = np.asarray(p_xy, float)
         if self.left_out is None:
             return np.full(p.shape[:-1], np.nan)
@@ -110,13 +98,13 @@ def _between(d: Array, cell_m: float) -> Array:
 
 
 def local_mean(tree: Any, squares: Array, p_xy: Array, *, skip: int = 0) -> Array:
-    """Mean of squares at the places of `tree` nearest to points, and of all of them, shape (...).
+    """Mean of the squares nearest to each point, drawn towards the mean of all, shape (...).
 
     Args:
-        tree: A cKDTree of R places.
-        squares: What is averaged, shape (R,).
+        tree: A cKDTree of R positions.
+        squares: Values to average, shape (R,).
         p_xy: Points [m], shape (..., 2).
-        skip: Nearest places that do not count: 1 leaves each place itself out.
+        skip: Nearest positions to ignore: 1 leaves each position itself out.
     """
     count = min(NEIGHBOURS, len(squares) - skip)
     if count < 1:
@@ -126,7 +114,7 @@ def local_mean(tree: Any, squares: Array, p_xy: Array, *, skip: int = 0) -> Arra
 
 
 def _stretch(square: Array, rough: Array, noise: Array) -> float:
-    """Factor on `rough` with which nine in ten squares lie in the 90 % intervals of it and noise."""
+    """Factor on `rough` with which 90 % of the squares lie in the 90 % intervals of rough and noise."""
     known = rough > 0
     if not known.any():
         return 1.0
@@ -137,13 +125,13 @@ def _stretch(square: Array, rough: Array, noise: Array) -> float:
 
 
 def tail(tree: Any, squares: Array, each: Array, place: NDArray[np.intp] | None = None) -> float:
-    """Factor on a local variance that makes its 90 % intervals hold nine of ten residuals left out.
+    """Factor on a local variance with which its 90 % intervals hold 90 % of the residuals.
 
     Args:
-        tree: A cKDTree of R places.
+        tree: A cKDTree of R positions.
         squares: Mean square residual at each, shape (R,).
         each: Squares of single residuals, in the same measure, shape (E,).
-        place: Place of each of these, shape (E,); the R places themselves unless given.
+        place: Position of each of these, shape (E,). Default: the R positions.
     """
     variance = local_mean(tree, squares, np.asarray(tree.data), skip=1)
     ratio = each / np.maximum(variance if place is None else variance[place], np.finfo(float).tiny)

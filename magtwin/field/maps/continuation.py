@@ -12,11 +12,8 @@ from magtwin.field.sources.harmonic import HarmonicField
 
 Array = NDArray[np.float64]
 
-LARGEST_STEP_DOWN = 0.25
-"""Largest step down of a grid, in cells: its shortest waves then grow threefold."""
-
-GRAIN_M = 1e-6
-"""Heights closer than this are equal."""
+LARGEST_STEP_DOWN = 0.25  # Largest step down of a grid, in cells: its shortest waves then grow threefold
+GRAIN_M = 1e-6  # Heights closer than this are equal
 
 
 def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
@@ -61,7 +58,7 @@ def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
     height_m = float(height_m)
     if field.height_m is None:
         raise InputError(
-            f"the height of map {field.name!r} is unknown, so it cannot be taken to another; say it when the "
+            f"the height of map {field.name!r} is unknown, so it cannot be continued; give it when the "
             "survey is read (--height)"
         )
     start = field.harmonic.height_m if field.harmonic is not None else field.height_m
@@ -95,7 +92,7 @@ def _of_the_dipoles(field: AnomalyMap, start: float, height_m: float) -> Anomaly
         variance_nt2=variance,
         recorded_yaw=None,
         height_m=height_m,
-        method=_said(field, start, height_m, "by its harmonic field"),
+        method=_method(field, start, height_m, "by its harmonic field"),
         parameters={**field.parameters, "continued_from_m": start},
         harmonic=replace(harmonic, p_base_sensor=np.append(harmonic.p_base_sensor[:2], height_m)),
     )
@@ -151,7 +148,7 @@ def _of_the_grid(field: AnomalyMap, start: float, height_m: float) -> AnomalyMap
         variance_nt2=None if field.variance_nt2 is None else _variance(field, step),
         recorded_yaw=None,
         height_m=height_m,
-        method=_said(field, start, height_m, "by the waves of its grid (Blakely 1995, eq. 12.8)"),
+        method=_method(field, start, height_m, "by the waves of its grid (Blakely 1995, eq. 12.8)"),
         parameters={
             **field.parameters,
             "continued_from_m": start,
@@ -160,7 +157,7 @@ def _of_the_grid(field: AnomalyMap, start: float, height_m: float) -> AnomalyMap
     )
 
 
-def _said(field: AnomalyMap, start: float, height_m: float, how: str) -> str:
+def _method(field: AnomalyMap, start: float, height_m: float, how: str) -> str:
     text = f"continued from {start:g} to {height_m:g} m {how}"
     return f"{field.method}; {text}" if field.method else text
 

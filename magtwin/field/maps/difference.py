@@ -1,6 +1,6 @@
 """MapDifference: compare two surveys of one floor, and find what changed and where."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,48 +15,26 @@ from magtwin.summary import Summarized, Summary
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-FALSE_SHARE = 0.05
-"""False-discovery rate: expected share of the nodes called changed that did not change."""
-
-SD_PER_MAD = 1.4826
-"""Standard deviation of a normal distribution per median absolute deviation."""
-
-GRAIN_M = 1e-3
-"""Heights that differ by less are equal: 5 nT in a steep field."""
-
-TOLD = 20
-"""Most regions in a report, those of the greatest z first."""
+FALSE_SHARE = 0.05  # False-discovery rate: expected share of the nodes called changed that did not change
+SD_PER_MAD = 1.4826  # Standard deviation of a normal distribution per median absolute deviation
+GRAIN_M = 1e-3  # Heights that differ by less are equal: 5 nT in a steep field
+LISTED = 20  # Most regions in a report, those of the greatest z first
 
 
 @dataclass(frozen=True, kw_only=True)
 class Region:
     """Adjacent nodes, also diagonally, whose field changed at some heading."""
 
-    centre_m: tuple[float, float]
-    """World x and y of its centre, weighted by change [m]."""
+    centre_m: tuple[float, float]  # World x and y of its centre, weighted by change [m]
+    extent_m: tuple[float, float, float, float]  # Least x, greatest x, least y, greatest y of its nodes [m]
+    nodes: int  # Number of nodes
+    peak_nt: float  # Local change at the greatest |z| [nT]
+    peak_sd_nt: float  # Standard deviation of that change if the field did not change [nT]
+    peak_z: float  # z at that node
+    peak_m: tuple[float, float]  # World x and y of that node [m]
+    peak_heading_rad: float  # Heading of that node [rad]
 
-    extent_m: tuple[float, float, float, float]
-    """Least x, greatest x, least y, greatest y of its nodes [m]."""
-
-    nodes: int
-    """Number of nodes."""
-
-    peak_nt: float
-    """Local change at the greatest |z| [nT]."""
-
-    peak_sd_nt: float
-    """Standard deviation of that change if the field did not change [nT]."""
-
-    peak_z: float
-    """z at that node."""
-
-    peak_m: tuple[float, float]
-    """World x and y of that node [m]."""
-
-    peak_heading_rad: float
-    """Heading of that node [rad]."""
-
-    def said(self) -> str:
+    def text(self) -> str:
         """Place and significance, as text."""
         (x, y), (x0, x1, y0, y1) = self.centre_m, self.extent_m
         return (
@@ -153,8 +131,8 @@ class MapDifference(Summarized):
             Figure("changed nodes", changed, note=f"{changed / count:.1%} of those compared"),
             Figure("regions", len(self.regions)),
         ]
-        for number, region in enumerate(self.regions[:TOLD], 1):
-            figures.append(Figure(f"region {number}", region.peak_nt, "nT", region.peak_sd_nt, region.said()))
+        for number, region in enumerate(self.regions[:LISTED], 1):
+            figures.append(Figure(f"region {number}", region.peak_nt, "nT", region.peak_sd_nt, region.text()))
         metadata: dict[str, Any] = {}
         for label, name, day in zip(("from", "to"), self.names, self.days, strict=True):
             metadata[label] = " ".join(text for text in (name, day) if text)
@@ -172,10 +150,7 @@ class MapDifference(Summarized):
         return Summary(
             f"MapDifference: {before} to {after}",
             (
-                (
-                    "nodes",
-                    f"{changed:,} of {known:,} changed (|z| >= {self.threshold_z:.2f})",
-                ),
+                ("nodes", f"{changed:,} of {known:,} changed (|z| >= {self.threshold_z:.2f})"),
                 ("bias", f"{self.bias_nt.mean():+.3g} nT, mean over {len(self.bias_nt)} headings"),
                 ("regions", f"{len(self.regions)}" + (f"; first: {self.regions[0]}" if self.regions else "")),
                 ("caution", "; ".join(self.cautions)),
@@ -225,7 +200,7 @@ def difference(a: AnomalyMap, b: AnomalyMap) -> MapDifference:
     floor = float(np.spacing(np.float32(np.abs(b.values_nt[b.valid]).max())))
     from_variance = a.variance_nt2 is not None and b.variance_nt2 is not None
     if from_variance:
-        sd = np.sqrt(_variance(a, p, yaw) + _variance(b, p, yaw))
+        sd = np.hypot(a.lookup_with_sd(p, yaw)[1], b.lookup_with_sd(p, yaw)[1])
     else:
         sd = np.where(known, _robust_sd(local[known]), np.nan)
     sd = np.maximum(sd, floor)
@@ -268,7 +243,7 @@ def _compared(a: AnomalyMap, b: AnomalyMap) -> tuple[str, ...]:
     }
     for count, which in ((1, "one map"), (2, "both maps")):
         if names := [name for name, maps in unknown.items() if maps == count]:
-            cautions.append(f"{', '.join(names)} unknown in {which}, taken for one")
+            cautions.append(f"{', '.join(names)} unknown in {which}; assumed equal")
     return tuple(cautions)
 
 
@@ -284,12 +259,6 @@ def _common(a: AnomalyMap, b: AnomalyMap) -> Grid:
         rows=rows,
         columns=columns,
     )
-
-
-def _variance(field: AnomalyMap, p_xy: Array, yaw: Array) -> Array:
-    """Variance of a map's values at poses, interpolated [nT^2]."""
-    assert field.variance_nt2 is not None
-    return replace(field, values_nt=field.variance_nt2, variance_nt2=None, harmonic=None).lookup(p_xy, yaw)
 
 
 def _robust_sd(values: Array) -> float:

@@ -13,11 +13,9 @@ from magtwin.field.days import day_number, parse_day
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.report import Figure, Report
 
+# What all epochs of a map share, besides the number of nodes
 COMMON = ("headings_rad", "origin_m", "cell_m", "frame", "datum", "height_m")
-"""What all epochs of a map share, besides the number of nodes."""
-
-GRAIN = 1e-9
-"""Lengths [m] and angles [rad] closer than this are equal."""
+GRAIN = 1e-9  # Lengths [m] and angles [rad] closer than this are equal
 
 
 def day_of(field: AnomalyMap) -> datetime.date:
@@ -28,7 +26,7 @@ def day_of(field: AnomalyMap) -> datetime.date:
     """
     if field.created == "":
         raise InputError(
-            f"map {field.name!r} does not say its day; say it when the map is made (--created YYYY-MM-DD)"
+            f"map {field.name!r} has no day; give it when the map is made (--created YYYY-MM-DD)"
         )
     return parse_day(field.created, f"created of map {field.name!r}")
 
@@ -59,8 +57,8 @@ def in_order(maps: Sequence[AnomalyMap]) -> tuple[AnomalyMap, ...]:
             mine, theirs = getattr(first, name), getattr(other, name)
             if not _same(mine, theirs):
                 raise InputError(
-                    f"epochs lie on one grid, but {name} is {_said(mine)} on {first.created} and "
-                    f"{_said(theirs)} on {other.created}; fit or survey both on one grid"
+                    f"epochs lie on one grid, but {name} is {_text(mine)} on {first.created} and "
+                    f"{_text(theirs)} on {other.created}; fit or survey both on one grid"
                 )
         if first.values_nt.shape != other.values_nt.shape:
             raise InputError(
@@ -164,5 +162,5 @@ def _joined(first: str, second: str) -> str:
     return first if first == second else "; ".join(text for text in (first, second) if text)
 
 
-def _said(value: object) -> str:
+def _text(value: object) -> str:
     return str(value.tolist()) if isinstance(value, np.ndarray) else repr(value)

@@ -14,20 +14,12 @@ from magtwin.field.maps.trilinear import EDGE, TURN, blend, sides
 
 Array = NDArray[np.float64]
 
-FEW = 24
-"""Poses up to which plain Python is faster than numpy."""
-
-BLOCK = 8192
-"""Poses that numpy works on at a time: their temporaries stay in the second-level cache."""
-
-AS_MANY = 25
-"""Poses in numpy that take as long as one in plain Python."""
-
-SHARE = 65_536
-"""Poses that a thread of compiled code takes at a time."""
-
+FEW = 24  # Poses up to which plain Python is faster than numpy
+BLOCK = 8192  # Poses that numpy works on at a time: their temporaries stay in the second-level cache
+AS_MANY = 25  # Poses in numpy that take as long as one in plain Python
+SHARE = 65_536  # Poses that a thread of compiled code takes at a time
+# Compiled loops of maps; work is counted in poses looked up in numpy
 LOOPS = Loops("magtwin.field.maps.loops", pays=20_000_000)
-"""Compiled loops of maps; work is counted in poses looked up in numpy."""
 
 
 def warm_up() -> None:

@@ -15,8 +15,7 @@ from magtwin.field.maps.trilinear import HEADER, TURN, blend, corners, planes, s
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
-BLOCK = 512
-"""Poses worked on at a time: their weights stay in the first-level cache."""
+BLOCK = 512  # Poses worked on at a time: their weights stay in the first-level cache
 
 _IN = types.Array(types.float64, 1, "C", readonly=True)
 _OUT = types.Array(types.float64, 1, "C")

@@ -1,6 +1,7 @@
 """AnomalyMap: the magnitude of the magnetic field over a floor, by position and heading."""
 
 import importlib
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
@@ -23,11 +24,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 TURN = 2 * np.pi
-TEXTS = ("name", "method", "source", "licence", "created", "frame", "datum")
-"""Metadata that are texts."""
-
-CONSTANT_NT = 1e-3
-"""Range of values up to which a map is constant [nT]."""
+TEXTS = ("name", "method", "source", "licence", "created", "frame", "datum")  # Metadata that are texts
+CONSTANT_NT = 1e-3  # Range of values up to which a map is constant [nT]
 
 Outside = Literal["nan", "clamp", "raise"]
 
@@ -144,7 +142,7 @@ class AnomalyMap(Summarized):
             return NotImplemented
         return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
 
-    @property
+    @cached_property
     def grid(self) -> Grid:
         """The nodes."""
         _, rows, columns = self.values_nt.shape
@@ -156,19 +154,17 @@ class AnomalyMap(Summarized):
     @property
     def x_m(self) -> Array:
         """World x of the columns [m], shape (X,)."""
-        return np.asarray(self.origin_m[0] + self.cell_m[0] * np.arange(self.values_nt.shape[2]))
+        return self.grid.x_m
 
     @property
     def y_m(self) -> Array:
         """World y of the rows [m], shape (Y,)."""
-        return np.asarray(self.origin_m[1] + self.cell_m[1] * np.arange(self.values_nt.shape[1]))
+        return self.grid.y_m
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
         """Least x, greatest x, least y, greatest y of the nodes, in world [m]."""
-        _, rows, columns = self.values_nt.shape
-        (x, y), (dx, dy) = self.origin_m, self.cell_m
-        return x, x + dx * (columns - 1), y, y + dy * (rows - 1)
+        return self.grid.extent
 
     def contains(self, p_xy: ArrayLike) -> NDArray[np.bool_]:
         """Whether points are on the grid, including its border and masked nodes.
@@ -226,6 +222,29 @@ class AnomalyMap(Summarized):
         """Results of `lookup` and `gradient`, shapes (...) and (..., 3), in one pass."""
         return self._look(p_xy, yaw, outside, gradient=True)
 
+    def lookup_with_sd(
+        self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan"
+    ) -> tuple[Array, Array]:
+        """Field at poses, and its standard deviation: the root of the variance, interpolated like the field.
+
+        Args:
+            p_xy: Points in world [m], shape (..., 2).
+            yaw: Headings [rad], shape (...); the two shapes are broadcast.
+            outside: As for `lookup`.
+
+        Returns:
+            Field magnitude and its standard deviation [nT], each of shape (...).
+
+        Raises:
+            InputError: The map has no variance; or as `lookup`.
+        """
+        if self._variance is None:
+            raise InputError(
+                f"map {self.name!r} has no variance; fit one with `magtwin map fit`, or use lookup instead"
+            )
+        mean = self.lookup(p_xy, yaw, outside=outside)
+        return mean, np.sqrt(self._look(p_xy, yaw, outside, gradient=False, table=self._variance)[0])
+
     def at(self, x: float, y: float, yaw: float, *, outside: Outside = "nan") -> float:
         """Field at one pose [nT], as `lookup`, without the overhead of arrays.
 
@@ -265,6 +284,10 @@ class AnomalyMap(Summarized):
             InputError: No heading is to be shown, or the map does not have the quantity.
         """
         return importlib.import_module("magtwin").plot(self, quantity=quantity, headings=headings)  # loads io
+
+    def save(self, path: str | os.PathLike[str], **options: Any) -> Any:
+        """Write the map as a USD layer; see `magtwin.save_map`."""
+        return importlib.import_module("magtwin").save_map(self, path, **options)  # loads usd
 
     def report(self) -> Report:
         """Statistics over the valid nodes.
@@ -314,11 +337,23 @@ class AnomalyMap(Summarized):
     def _lookup(self) -> Lookup:
         return Lookup(self.values_nt, self.valid, self.origin_m, self.cell_m, self.headings_rad)
 
+    @cached_property
+    def _variance(self) -> Lookup | None:
+        if self.variance_nt2 is None:
+            return None
+        return Lookup(self.variance_nt2, self.valid, self.origin_m, self.cell_m, self.headings_rad)
+
     def __getstate__(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
     def _look(
-        self, p_xy: ArrayLike, yaw: ArrayLike, outside: Outside, *, gradient: bool
+        self,
+        p_xy: ArrayLike,
+        yaw: ArrayLike,
+        outside: Outside,
+        *,
+        gradient: bool,
+        table: Lookup | None = None,
     ) -> tuple[Array, Array]:
         p, yaw = np.asarray(p_xy, float), np.asarray(yaw, float)
         if p.ndim == 0 or p.shape[-1] != 2:
@@ -330,7 +365,7 @@ class AnomalyMap(Summarized):
         p, yaw = p.reshape(-1, 2), yaw.reshape(-1)
         if outside != "nan":
             self._check_outside(p, outside)
-        b, slopes = self._lookup.lookup(p, yaw, clamp=outside == "clamp", gradient=gradient)
+        b, slopes = (table or self._lookup).lookup(p, yaw, clamp=outside == "clamp", gradient=gradient)
         return b.reshape(shape), slopes.reshape(*shape, 3) if gradient else slopes
 
     def _check_outside(self, p: Array, outside: Outside) -> None:

@@ -14,28 +14,18 @@ from magtwin.field.sources.dipoles import dipole_block, in_blocks, in_two_thread
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
-HALF_M = CELL_M / 2
-"""Half the side of a square [m]; squares are level cuts of the cells of `Bodies`."""
-
-NODES = 10
-"""Chebyshev nodes along each side of a square."""
-
+HALF_M = CELL_M / 2  # Half the side of a square [m]; squares are level cuts of the cells of `Bodies`
+NODES = 10  # Chebyshev nodes along each side of a square
+# Distance from a square beyond which sources are interpolated [m]; nearer ones are summed for each point
 CLEAR_M = 0.35
-"""Distance from a square beyond which sources are interpolated [m]; nearer ones are summed for each point."""
-
-MOST_SQUARES = 40_000
-"""Squares kept: 2,500 m2, 0.1 GB. Beyond, all are dropped."""
-
-BLOCK = 32_768
-"""Points worked on at a time; they lie in fewer squares than are kept."""
-
+MOST_SQUARES = 40_000  # Squares kept: 2,500 m2, 0.1 GB. Beyond, all are dropped.
+BLOCK = 32_768  # Points worked on at a time; they lie in fewer squares than are kept
+# Points in numpy that take as long as a square takes beside its points; a point takes as long as `AS_MANY`
+# poses of a map
 PER_SQUARE = 100
-"""Points in numpy that take as long as a square takes beside its points; a point takes as long as `AS_MANY`
-poses of a map."""
-
+# Bounds of the interpolation error of field and slope, relative to the largest that a source makes at
+# distance `CLEAR_M`: 0.01 nT for a source as strong there as the Earth's field. A test checks them.
 ERROR, SLOPE_ERROR = 2e-7, 2e-5
-"""Bounds of the interpolation error of field and slope, relative to the largest that a source makes at
-distance `CLEAR_M`: 0.01 nT for a source as strong there as the Earth's field. A test checks them."""
 
 
 class Plane:

@@ -19,47 +19,28 @@ from magtwin.summary import span
 class HeadingStatistics:
     """Statistics of one heading over its valid nodes; nan if there is none."""
 
-    heading_deg: float
-    """Heading [deg]."""
-
-    nodes: int
-    """Number of nodes."""
-
-    masked: int
-    """Nodes that are not valid."""
-
-    mean_nt: float
-    """Mean [nT]."""
-
-    sd_nt: float
-    """Standard deviation over the nodes [nT]."""
-
-    least_nt: float
-    """Smallest value [nT]."""
-
-    greatest_nt: float
-    """Largest value [nT]."""
-
-    median_gradient_nt_m: float
-    """Median horizontal gradient of the magnitude, by central differences [nT/m]."""
-
-    greatest_gradient_nt_m: float
-    """Largest gradient [nT/m]."""
-
-    median_error_nt: float
-    """Median standard deviation of a value [nT]; nan if unknown."""
+    heading_deg: float  # Heading [deg]
+    nodes: int  # Number of nodes
+    masked: int  # Nodes that are not valid
+    mean_nt: float  # Mean [nT]
+    sd_nt: float  # Standard deviation over the nodes [nT]
+    least_nt: float  # Smallest value [nT]
+    greatest_nt: float  # Largest value [nT]
+    median_gradient_nt_m: float  # Median horizontal gradient of the magnitude, by central differences [nT/m]
+    greatest_gradient_nt_m: float  # Largest gradient [nT/m]
+    median_error_nt: float  # Median standard deviation of a value [nT]; nan if unknown
 
 
 def statistics(field: AnomalyMap) -> tuple[HeadingStatistics, ...]:
     """Statistics of each heading of a map, in the order of its layers."""
-    found = []
+    rows = []
     for h, heading in enumerate(np.degrees(field.headings_rad)):
         valid = field.valid[h]
         values = np.where(valid, field.values_nt[h], np.nan)
         slope = np.hypot(*np.gradient(values, *field.cell_m[::-1]))
         slope, known = slope[np.isfinite(slope)], values[valid]
         errors = np.empty(0) if field.variance_nt2 is None else np.sqrt(field.variance_nt2[h][valid])
-        found.append(
+        rows.append(
             HeadingStatistics(
                 heading_deg=float(heading),
                 nodes=valid.size,
@@ -73,7 +54,7 @@ def statistics(field: AnomalyMap) -> tuple[HeadingStatistics, ...]:
                 median_error_nt=float(np.median(errors)) if errors.size else np.nan,
             )
         )
-    return tuple(found)
+    return tuple(rows)
 
 
 _FILE = re.compile(r"(?P<name>.+?) sha256:(?P<sha256>[0-9a-f]{64})")
@@ -127,14 +108,14 @@ def source_files(source: str) -> dict[str, str]:
     """
     files: dict[str, str] = {}
     for part in source.split("; "):
-        found = _FILE.fullmatch(part)
-        if found is None:
+        match = _FILE.fullmatch(part)
+        if match is None:
             return {}
-        name, count = found["name"], 1
-        while files.get(name, found["sha256"]) != found["sha256"]:
+        name, count = match["name"], 1
+        while files.get(name, match["sha256"]) != match["sha256"]:
             count += 1
-            name = f"{found['name']} ({count})"
-        files[name] = found["sha256"]
+            name = f"{match['name']} ({count})"
+        files[name] = match["sha256"]
     return files
 
 
@@ -142,15 +123,15 @@ def _headings(field: AnomalyMap) -> list[Figure]:
     """Mean and standard deviation of each heading, with its range and masked share."""
     return [
         Figure(
-            f"heading {one.heading_deg:.6g}",
-            round(one.mean_nt, 1),
+            f"heading {row.heading_deg:.6g}",
+            round(row.mean_nt, 1),
             "nT",
-            round(one.sd_nt, 1),
-            f"{span(one.least_nt, one.greatest_nt, 'nT')}; {100 * one.masked / one.nodes:.3g} % masked",
+            round(row.sd_nt, 1),
+            f"{span(row.least_nt, row.greatest_nt, 'nT')}; {100 * row.masked / row.nodes:.3g} % masked",
         )
-        if one.masked < one.nodes
-        else Figure(f"heading {one.heading_deg:.6g}", "no valid node")
-        for one in statistics(field)
+        if row.masked < row.nodes
+        else Figure(f"heading {row.heading_deg:.6g}", "no valid node")
+        for row in statistics(field)
     ]
 
 
@@ -179,10 +160,13 @@ def _harmonic(harmonic: HarmonicField, above: str) -> list[Figure]:
             "uniform field",
             float(np.linalg.norm(harmonic.b_uniform_nt)),
             "nT",
-            note=_said(harmonic.b_uniform_nt),
+            note=_vector(harmonic.b_uniform_nt),
         ),
         Figure(
-            "hard iron", float(np.linalg.norm(harmonic.hard_iron_nt)), "nT", note=_said(harmonic.hard_iron_nt)
+            "hard iron",
+            float(np.linalg.norm(harmonic.hard_iron_nt)),
+            "nT",
+            note=_vector(harmonic.hard_iron_nt),
         ),
         Figure(
             "soft iron",
@@ -194,16 +178,13 @@ def _harmonic(harmonic: HarmonicField, above: str) -> list[Figure]:
     ]
 
 
-def _said(vector: np.ndarray) -> str:
+def _vector(vector: np.ndarray) -> str:
     return "(" + ", ".join(f"{c:.5g}" for c in vector) + ")"
 
 
-COLOUR_MAP = "viridis"
-"""Name of the colour map for fields."""
-
+COLOUR_MAP = "viridis"  # Name of the colour map for fields
+# Share of nodes left out at either end of a colour scale: a few nodes beside a source would flatten the rest
 OUTER_PERCENT = 0.5
-"""Share of nodes left out at either end of a colour scale: a few nodes beside a source would flatten the
-rest."""
 
 
 def colour_limits(values: ArrayLike, outer_percent: float = OUTER_PERCENT) -> tuple[float, float]:

@@ -15,14 +15,10 @@ import numpy as np
 
 TURN = 2 * math.pi
 
-EDGE = 1e-9
-"""Rounding that a lookup forgives: cells beyond the border, or weight of a masked node."""
-
-HEADER = 10
-"""Numbers in the header of a table."""
-
+EDGE = 1e-9  # Rounding that a lookup forgives: cells beyond the border, or weight of a masked node
+HEADER = 10  # Numbers in the header of a table
+# The 8 nodes of a cell, numbers or arrays of them; x changes first, then y, then heading
 Corners = Sequence[Any]
-"""The 8 nodes of a cell, numbers or arrays of them; x changes first, then y, then heading."""
 
 
 def blend(corners: Corners, x: Any, y: Any, h: Any) -> Any:

@@ -11,46 +11,30 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.field.sources.dipoles import (
-    MU_0_OVER_4_PI,
-    NT_PER_T,
-    dipole_block,
-    in_blocks,
-    in_two_threads,
-)
+from magtwin.field.sources.dipoles import MU_0_OVER_4_PI, NT_PER_T, dipole_block, in_blocks, in_two_threads
 from magtwin.frames import matrix_from_quat
 
 Array = NDArray[np.float64]
 Triangles = NDArray[np.intp]
 Rows = NDArray[np.intp]
 
-MU_0 = 4 * math.pi * MU_0_OVER_4_PI
-"""Magnetic constant [T m/A]."""
-
+MU_0 = 4 * math.pi * MU_0_OVER_4_PI  # Magnetic constant [T m/A]
+# Target error of the dipoles that replace a box or a cylinder, relative to its largest field at that distance
+# from its box. One in a hundred random bodies exceeds it, none reaches twice as much.
 TOLERANCE = 1e-4
-"""Target error of the dipoles that replace a box or a cylinder, relative to its largest field at that
-distance from its box. One in a hundred random bodies exceeds it, none reaches twice as much."""
-
+# Distance up to which a mesh's field is exact, in its longest side; beyond, four dipoles replace it, within
+# 0.2 % for nearly convex meshes
 MESH_SIZES = 3.0
-"""Distance up to which a mesh's field is exact, in its longest side; beyond, four dipoles replace it,
-within 0.2 % for nearly convex meshes."""
-
+# Most dipoles that replace a box or a cylinder; nearer than they suffice, its field is exact
 MOST_DIPOLES = 512
-"""Most dipoles that replace a box or a cylinder; nearer than they suffice, its field is exact."""
-
+# Ratio of the distances at which a body gets a new set of dipoles, and their number: up to 45,000 times as
+# far
 LADDER, RUNGS = 1.25, 48
-"""Ratio of the distances at which a body gets a new set of dipoles, and their number: up to 45,000 times
-as far."""
-
-CELL_M = 0.25
-"""Side of the cells of space that share one set of dipoles [m]."""
-
-FARTHEST_CELL = 1 << 19
-"""Cells beyond this one, 130 km from the origin, use its dipoles."""
-
+CELL_M = 0.25  # Side of the cells of space that share one set of dipoles [m]
+FARTHEST_CELL = 1 << 19  # Cells beyond this one, 130 km from the origin, use its dipoles
+# Step of the differences for the rate of change near a body [m]. 1 cm from an edge of a box the error is
+# (1e-5 / 1e-2)^2 / 6, 2e-7 of it.
 STEP_M = 1e-5
-"""Step of the differences for the rate of change near a body [m]. 1 cm from an edge of a box the error is
-(1e-5 / 1e-2)^2 / 6, 2e-7 of it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -248,9 +232,9 @@ def _count(half: float, distance: float) -> int:
     return count
 
 
+# Bounds of the errors over (a / d)^2, (2 n)^3/2 rho^-2n and (b / d)^4, above the measured ones; a test checks
+# them
 SECOND, AMPLIFIED, FOURTH = 4.0, 60.0, 80.0
-"""Bounds of the errors over (a / d)^2, (2 n)^3/2 rho^-2n and (b / d)^4, above the measured ones; a test
-checks them."""
 
 
 def _line(half: float, thin: float, distance: float) -> tuple[Array, Array]:
@@ -360,10 +344,7 @@ class Bodies:
     """
 
     def __init__(
-        self,
-        bodies: Sequence[Body] = (),
-        p_world_dipole: ArrayLike = (),
-        m_world: ArrayLike = (),
+        self, bodies: Sequence[Body] = (), p_world_dipole: ArrayLike = (), m_world: ArrayLike = ()
     ) -> None:
         """Take bodies, and dipoles as positions [m] and moments [A m2] in world, each of shape (D, 3)."""
         self.bodies = tuple(bodies)

@@ -12,11 +12,8 @@ from magtwin.field.sources.dipoles import MU_0_OVER_4_PI, NT_PER_T, checked
 
 Array = NDArray[np.float64]
 
-BLOCK = 256
-"""Points worked on at a time, with all dipoles: their sums stay in the first-level cache."""
-
-SHARE = 262_144
-"""Pairs of a point and a dipole that a thread takes at a time."""
+BLOCK = 256  # Points worked on at a time, with all dipoles: their sums stay in the first-level cache
+SHARE = 262_144  # Pairs of a point and a dipole that a thread takes at a time
 
 _IN = types.Array(types.float64, 2, "C", readonly=True)
 _OUT = types.Array(types.float64, 2, "C")

@@ -11,20 +11,16 @@ from magtwin.errors import InputError
 
 Array = NDArray[np.float64]
 
-MU_0_OVER_4_PI = 1.00000000055e-7
-"""Magnetic constant over 4 pi [T m/A] (CODATA 2018)."""
+MU_0_OVER_4_PI = 1.00000000055e-7  # Magnetic constant over 4 pi [T m/A] (CODATA 2018)
 
 NT_PER_T = 1e9
 
-SHARED = 16
-"""Blocks from which a second thread pays; the results do not depend on it."""
-
+SHARED = 16  # Blocks from which a second thread pays; the results do not depend on it
+# Pairs of a point and a dipole worked on at a time: their arrays stay in the second-level cache
 PAIRS = 32_768
-"""Pairs of a point and a dipole worked on at a time: their arrays stay in the second-level cache."""
-
+# Pairs whose squared distance is below this share of their squared distances from the origin are computed
+# again without cancellation
 CLOSE = 1e-4
-"""Pairs whose squared distance is below this share of their squared distances from the origin are computed
-again without cancellation."""
 
 T = TypeVar("T")
 
@@ -54,41 +50,6 @@ def dipole_field_nt(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: Arra
 
     in_two_threads(work, in_blocks(len(points), len(place)), pairs=len(points) * len(place))
     return field.reshape(p.shape)
-
-
-def dipole_field_and_rate_nt(
-    p_world: ArrayLike, v_world: ArrayLike, p_world_dipole: ArrayLike, m_world: ArrayLike
-) -> tuple[Array, Array]:
-    """Field of point dipoles at moving points, and its rate of change.
-
-    dB/dt = (v . grad) B = mu_0 / 4 pi * sum_d 3 / |r|^5 *
-            ((m_d . v) r + (m_d . r) v + (v . r) m_d - 5 (m_d . r) (v . r) r / |r|^2),  r = p - p_d
-
-    Args:
-        p_world: Observation points [m], shape (..., 3).
-        v_world: Their velocities [m/s], shape (..., 3).
-        p_world_dipole: Dipole positions [m], shape (D, 3).
-        m_world: Dipole moments [A m^2], shape (D, 3).
-
-    Returns:
-        Field in world axes [nT], the same bytes as from `dipole_field_nt`, and its rate of change at the
-        moving point [nT/s], each of shape (..., 3).
-
-    Raises:
-        InputError: A shape is wrong.
-    """
-    p, place, moment = checked(p_world, p_world_dipole, m_world)
-    v = np.asarray(v_world, float)
-    if v.shape != p.shape:
-        raise InputError(f"v_world must have the shape of p_world, {p.shape}, got {v.shape}")
-    points, velocities = p.reshape(-1, 3), v.reshape(-1, 3)
-    field, rate = np.zeros(points.shape), np.zeros(points.shape)
-
-    def work(rows: slice) -> None:
-        field[rows], rate[rows] = dipole_block(points[rows], velocities[rows], place, moment)
-
-    in_two_threads(work, in_blocks(len(points), len(place)), pairs=len(points) * len(place))
-    return field.reshape(p.shape), rate.reshape(p.shape)
 
 
 def checked(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: ArrayLike) -> tuple[Array, Array, Array]:

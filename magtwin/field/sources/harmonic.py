@@ -92,21 +92,6 @@ class HarmonicField(Summarized):
         """
         return dipole_field_nt(p_world, self.p_world_dipole, self.m_world) + self.b_uniform_nt
 
-    def field_and_gradient_nt(self, p_world: ArrayLike) -> tuple[Array, Array]:
-        """Field without the robot, and its gradient; compiled.
-
-        Args:
-            p_world: Points above the dipoles [m], shape (..., 3).
-
-        Returns:
-            Field [nT], shape (..., 3), and dB_i/dx_j [nT/m], shape (..., 3, 3), in world axes: symmetric and
-            of trace 0.
-        """
-        from magtwin.field.sources.compiled_dipoles import dipole_field_and_gradient_nt
-
-        field, gradient = dipole_field_and_gradient_nt(p_world, self.p_world_dipole, self.m_world)
-        return field + self.b_uniform_nt, gradient
-
     def magnitude_nt(self, p_xy: ArrayLike, yaw: ArrayLike, *, height_m: float | None = None) -> Array:
         """What the survey's robot reads at rest at a pose.
 

@@ -11,34 +11,21 @@ from magtwin.frames import wrap_angle
 
 Array = NDArray[np.float64]
 
-PROBES = 40_000
-"""Points at which the distance to the nearest reading is measured."""
-
+PROBES = 40_000  # Points at which the distance to the nearest reading is measured
+# Median distance to the nearest node of a square grid of spacing 1: circles of this radius cover half
 MEDIAN_OF_GRID = (2 * np.pi) ** -0.5
-"""Median distance to the nearest node of a square grid of spacing 1: circles of this radius cover half."""
-
-GRAIN_M = 1e-4
-"""Readings closer than this are at one place."""
+GRAIN_M = 1e-4  # Readings closer than this are at one place
 
 
 @dataclass(frozen=True, eq=False)
 class Bins:
     """Means of readings that share a cell of the floor, a sector of heading and, optionally, a run."""
 
-    p_xy: Array
-    """Mean positions [m], shape (M, 2)."""
-
-    yaw: Array
-    """Mean headings, on the circle [rad], shape (M,)."""
-
-    b_nt: Array
-    """Mean magnitudes [nT], shape (M,)."""
-
-    count: NDArray[np.intp]
-    """Readings per bin, shape (M,)."""
-
-    run: NDArray[np.intp]
-    """Run of each bin, shape (M,); 0 if runs are averaged."""
+    p_xy: Array  # Mean positions [m], shape (M, 2)
+    yaw: Array  # Mean headings, on the circle [rad], shape (M,)
+    b_nt: Array  # Mean magnitudes [nT], shape (M,)
+    count: NDArray[np.intp]  # Readings per bin, shape (M,)
+    run: NDArray[np.intp]  # Run of each bin, shape (M,); 0 if runs are averaged
 
 
 def bin_readings(
@@ -104,26 +91,14 @@ def distance_m(tree: object, p_xy: ArrayLike) -> Array:
     return np.asarray(tree.query(np.asarray(p_xy, float))[0])  # type: ignore[attr-defined]
 
 
-CELL = 1 / 6
-"""Distance along which readings of a drive are averaged, in depths of the first layer."""
-
-TURN_M = 0.1
-"""Distance that a turn of 1 rad counts as [m]."""
-
-MOST_MEANS = 900
-"""Most means along a drive; the distance grows until there are so few."""
-
+CELL = 1 / 6  # Distance along which readings of a drive are averaged, in depths of the first layer
+TURN_M = 0.1  # Distance that a turn of 1 rad counts as [m]
+MOST_MEANS = 900  # Most means along a drive; the distance grows until there are so few
+# Longest averaging distance, in depths of the first layer; beyond, all passes of one place are averaged
 LONGEST = 0.75
-"""Longest averaging distance, in depths of the first layer; beyond, all passes of one place are averaged."""
-
-BIN = 2 / 3
-"""Side of the squares in which passes are averaged, in depths of the first layer."""
-
-SECTORS = 4
-"""Heading sectors kept apart in a square."""
-
-MOST_BINS = 1800
-"""Most means of squares and sectors; the squares grow until there are so few."""
+BIN = 2 / 3  # Side of the squares in which passes are averaged, in depths of the first layer
+SECTORS = 4  # Heading sectors kept apart in a square
+MOST_BINS = 1800  # Most means of squares and sectors; the squares grow until there are so few
 
 WIDEN = 1.1
 

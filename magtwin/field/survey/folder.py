@@ -25,17 +25,12 @@ Array = NDArray[np.float64]
 COLUMNS = ("x", "y", "theta", "scalar_mag")
 SUFFIX = "_map.csv"
 
+# Widest angle between headings of a complete survey, if the caller does not give the headings
 WIDEST_DEG = 90.0
-"""Widest angle between headings of a complete survey, if the caller does not give the headings."""
-
-GRAIN_M = 1e-6
-"""Coordinates closer than this are equal."""
-
+GRAIN_M = 1e-6  # Coordinates closer than this are equal
+# Method of a map whose values are readings
 METHOD = "survey, one reading a node and heading, the robot at rest"
-"""Method of a map whose values are readings."""
-
-QUOTED = 60
-"""Characters of a file that an error quotes."""
+QUOTED = 60  # Characters of a file that an error quotes
 
 
 def read_grid(folder: str | os.PathLike[str], **options: Any) -> Readings:
@@ -115,7 +110,7 @@ def node_map(readings: Readings) -> AnomalyMap:
     return AnomalyMap(
         values_nt=np.where(valid, *means).reshape(grid.shape),
         valid=valid.reshape(grid.shape),
-        variance_nt2=errors.variance_nt2 / counts[0] if errors.told else None,
+        variance_nt2=errors.variance_nt2 / counts[0] if errors.estimated else None,
         recorded_yaw=_recorded_yaw(readings, flat, grid),
         origin_m=grid.origin_m,
         cell_m=grid.cell_m,
@@ -209,7 +204,7 @@ def read_survey(
     if _common(layers, "method") not in ("", METHOD):
         field = _fitted(layers, readings)
         return field, _report(layers, field, folder, Report(""))
-    masked, found = mask_stuck(readings)
+    masked, findings = mask_stuck(readings)
     if not (keep_stuck or masked.good.any()):
         raise InputError(
             f"{folder}: all {len(readings)} readings are those of a sensor that was stuck; "
@@ -217,7 +212,7 @@ def read_survey(
         )
     field = node_map(readings if keep_stuck else masked)
     field = replace(field, parameters=_common(layers, "parameters") or {})
-    return field, _report(layers, field, folder, found)
+    return field, _report(layers, field, folder, findings)
 
 
 def _fitted(layers: "list[_Layer]", readings: Readings) -> AnomalyMap:
@@ -262,15 +257,11 @@ class _Layer:
     theta: Array
     field: Array
     sha256: str
-    metadata: dict[str, Any]
-    """Metadata of its comment lines; see `magtwin.field.survey.header`."""
+    metadata: dict[str, Any]  # Metadata of its comment lines; see `magtwin.field.survey.header`
 
 
 def _read(
-    folder: str | os.PathLike[str],
-    headings_deg: tuple[float, ...] | None,
-    unit: str,
-    scale: float | None,
+    folder: str | os.PathLike[str], headings_deg: tuple[float, ...] | None, unit: str, scale: float | None
 ) -> list[_Layer]:
     folder = existing(folder, "survey folder")
     if not folder.is_dir():
@@ -309,21 +300,23 @@ def _check_headings(folder: Path, found: list[float], expected: tuple[float, ...
         expected = tuple(sorted((found[0] + 360 * k / count) % 360 for k in range(count)))
         if not all(any(math.isclose(h, e, abs_tol=1e-9) for e in expected) for h in found):
             raise InputError(
-                f"{folder}: headings {_say(found)} deg are not evenly spaced; "
+                f"{folder}: headings {_degrees_of(found)} deg are not evenly spaced; "
                 "survey the missing ones, or name those that there are with headings_deg"
             )
     missing = [e for e in expected if not any(math.isclose(h, e, abs_tol=1e-9) for h in found)]
     if missing:
         raise InputError(
-            f"{folder}: heading {_say(missing)} deg missing, found {_say(found)}; "
+            f"{folder}: heading {_degrees_of(missing)} deg missing, found {_degrees_of(found)}; "
             f"expected {', '.join(f'{h:g}{SUFFIX}' for h in missing)}"
         )
     beyond = [h for h in found if not any(math.isclose(h, e, abs_tol=1e-9) for e in expected)]
     if beyond:
-        raise InputError(f"{folder}: heading {_say(beyond)} deg is not among the expected {_say(expected)}")
+        raise InputError(
+            f"{folder}: heading {_degrees_of(beyond)} deg is not among the expected {_degrees_of(expected)}"
+        )
 
 
-def _say(headings: list[float] | tuple[float, ...]) -> str:
+def _degrees_of(headings: list[float] | tuple[float, ...]) -> str:
     return ", ".join(f"{h:g}" for h in headings)
 
 
@@ -416,7 +409,9 @@ def _readings(layers: list[_Layer], folder: Path, name: str | None, about: dict[
     )
 
 
-def _report(layers: list[_Layer], field: AnomalyMap, folder: str | os.PathLike[str], found: Report) -> Report:
+def _report(
+    layers: list[_Layer], field: AnomalyMap, folder: str | os.PathLike[str], findings: Report
+) -> Report:
     """Statistics of the survey, and how well its headings were kept."""
     deviation = [np.degrees(np.abs(wrap_angle(s.theta - np.radians(s.heading_deg)))) for s in layers]
     worst = max(range(len(layers)), key=lambda k: deviation[k].max())
@@ -438,9 +433,9 @@ def _report(layers: list[_Layer], field: AnomalyMap, folder: str | os.PathLike[s
             Figure(
                 "repeated readings", repeated, note="equal to the one before in the row to the last digit"
             ),
-            *found.figures,
+            *findings.figures,
         ),
-        {"files": {s.path.name: s.sha256 for s in layers}, **found.metadata},
+        {"files": {s.path.name: s.sha256 for s in layers}, **findings.metadata},
     )
 
 

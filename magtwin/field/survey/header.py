@@ -18,14 +18,13 @@ from magtwin.field.days import check_day
 from magtwin.field.maps.map import TEXTS, AnomalyMap
 from magtwin.field.maps.statistics import statistics
 
+# Fields of a map that an import restores. Its source becomes the imported files.
 KEPT = (*(name for name in TEXTS if name != "source"), "height_m", "parameters")
-"""Fields of a map that an import restores. Its source becomes the imported files."""
-
+# Keys: rows of a file that are not field, counted from 0; median standard deviation of its values [nT]
 MASKED, ERROR = "masked_rows", "median_error_nt"
-"""Keys: rows of a file that are not field, counted from 0; median standard deviation of its values [nT]."""
 
 _LINE = re.compile(r"#\s*(\w+):\s*(.*?)\s*$")
-_SAID = 60
+_QUOTED = 60
 
 
 def header_lines(field: AnomalyMap, heading: int) -> list[str]:
@@ -40,13 +39,13 @@ def header_lines(field: AnomalyMap, heading: int) -> list[str]:
     """
     figures = {name: value for name, value in asdict(statistics(field)[heading]).items() if _known(value)}
     named = {name: getattr(field, name) for name in (*KEPT, "source")}
-    told: dict[str, Any] = {name: value for name, value in named.items() if value not in ("", None)}
-    told["parameters"] = dict(field.parameters)
-    told |= {"units": ["m", "m", "rad", "nT"], "spacing_m": list(field.cell_m), **figures}
-    told[MASKED] = np.flatnonzero(~field.valid[heading].ravel()).tolist()
-    told = {name: value for name, value in told.items() if value not in ({}, [])}
+    metadata: dict[str, Any] = {name: value for name, value in named.items() if value not in ("", None)}
+    metadata["parameters"] = dict(field.parameters)
+    metadata |= {"units": ["m", "m", "rad", "nT"], "spacing_m": list(field.cell_m), **figures}
+    metadata[MASKED] = np.flatnonzero(~field.valid[heading].ravel()).tolist()
+    metadata = {name: value for name, value in metadata.items() if value not in ({}, [])}
     try:
-        return [f"# {name}: {json.dumps(value, allow_nan=False)}" for name, value in told.items()]
+        return [f"# {name}: {json.dumps(value, allow_nan=False)}" for name, value in metadata.items()]
     except (TypeError, ValueError) as error:
         raise InputError(
             f"parameters of map {field.name!r} must be finite numbers, texts and lists of them ({error})"
@@ -63,27 +62,29 @@ def read_header(path: Path, lines: list[tuple[int, str]]) -> dict[str, Any]:
     Raises:
         InputError: A value is not JSON, has the wrong type, or its key occurs twice; with file and line.
     """
-    told: dict[str, Any] = {}
+    metadata: dict[str, Any] = {}
     for number, line in lines:
         match = _LINE.match(line)
         if match is None or match[1] not in (*KEPT, MASKED, ERROR):
             continue
         key, text = match.groups()
-        if key in told:
+        if key in metadata:
             raise InputError(f"{path}:{number}: {key} is given a second time; remove one of the two lines")
         try:
-            told[key] = json.loads(text, parse_constant=_no_number)
+            metadata[key] = json.loads(text, parse_constant=_no_number)
         except (ValueError, RecursionError) as error:
             if key not in TEXTS:
                 raise InputError(
-                    f"{path}:{number}: {key} must be JSON, got {text[:_SAID]!r} ({error})"
+                    f"{path}:{number}: {key} must be JSON, got {text[:_QUOTED]!r} ({error})"
                 ) from error
-            told[key] = text  # written by hand, without quotes
-        if not _fits(key, told[key]):
-            raise InputError(f"{path}:{number}: {key} cannot be {text[:_SAID]!r}; correct or remove the line")
+            metadata[key] = text  # written by hand, without quotes
+        if not _fits(key, metadata[key]):
+            raise InputError(
+                f"{path}:{number}: {key} cannot be {text[:_QUOTED]!r}; correct or remove the line"
+            )
         if key == "created":
-            check_day(told[key], f"{path}:{number}: created")
-    return told
+            check_day(metadata[key], f"{path}:{number}: created")
+    return metadata
 
 
 def _fits(key: str, value: Any) -> bool:

@@ -9,21 +9,13 @@ from magtwin.field.survey.readings import Readings
 
 Array = NDArray[np.float64]
 
+# Degrees of freedom of Student's t for standardised residuals: real surveys have heavy tails, since a field
+# is rougher in some places than in others (Lange et al. 1989, section 2).
 FREEDOM = 4.0
-"""Degrees of freedom of Student's t for standardised residuals: real surveys have heavy tails, since a field
-is rougher in some places than in others (Lange et al. 1989, section 2)."""
-
-LEAST = 48
-"""Fewest readings from which the field's spread and reach are learnt."""
-
-TRIED = 512
-"""Readings from which the parameters are learnt, evenly spaced; fewer for larger neighbourhoods."""
-
-WIDEST = np.log(50)
-"""Largest change of the parameters from their first guess, as a logarithm."""
-
-BLOCK = 64
-"""Neighbourhoods solved at a time: their matrices stay in the second-level cache."""
+LEAST = 48  # Fewest readings from which the field's spread and reach are learnt
+TRIED = 512  # Readings from which the parameters are learnt, evenly spaced; fewer for larger neighbourhoods
+WIDEST = np.log(50)  # Largest change of the parameters from their first guess, as a logarithm
+BLOCK = 64  # Neighbourhoods solved at a time: their matrices stay in the second-level cache
 
 
 @dataclass(frozen=True)
@@ -36,20 +28,12 @@ class LocalFit:
     that varies over the floor.
     """
 
-    p_xy: Array
-    """Positions of the readings [m], shape (N, 2)."""
-
-    yaw: Array
-    """Their headings [rad], shape (N,)."""
-
-    residual_nt: Array
-    """Readings minus the trend [nT], shape (N,)."""
-
+    p_xy: Array  # Positions of the readings [m], shape (N, 2)
+    yaw: Array  # Their headings [rad], shape (N,)
+    residual_nt: Array  # Readings minus the trend [nT], shape (N,)
+    # Logarithms of the reach [m], the sd of the three terms [nT] and the noise's sd [nT], shape (5,)
     log_figures: Array
-    """Logarithms of the reach [m], the sd of the three terms [nT] and the noise's sd [nT], shape (5,)."""
-
-    count: int
-    """Neighbours per reading."""
+    count: int  # Neighbours per reading
 
     @classmethod
     def to(cls, readings: Readings, rows: NDArray[np.intp]) -> "LocalFit":
@@ -134,8 +118,8 @@ class LocalFit:
         from scipy.spatial import cKDTree
 
         count = min(self.count, len(pool) - 1)
-        _, found = cKDTree(self.p_xy[pool]).query(self.p_xy[rows], k=count + 1)
-        near = pool[found]
+        _, nearest = cKDTree(self.p_xy[pool]).query(self.p_xy[rows], k=count + 1)
+        near = pool[nearest]
         own = near == rows[:, None]
         dropped = np.where(own.any(axis=1), own.argmax(axis=1), count)  # itself, else the farthest
         kept = np.arange(count + 1) != dropped[:, None]

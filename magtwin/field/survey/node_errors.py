@@ -11,41 +11,24 @@ from magtwin.field.survey.readings import Readings
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+# Standard deviation of the robot's position about its node, in x and in y, if it cannot be estimated [m]
 PLACE_M = 0.01
-"""Standard deviation of the robot's position about its node, in x and in y, if it cannot be estimated [m]."""
-
-FEWEST = 24
-"""Fewest differences from which errors are estimated."""
-
-GROSS = 4.0
-"""Standard deviations at which a difference is clipped."""
-
-MEDIAN = 0.4549
-"""Median of the square of a standard normal."""
-
-ROUNDS = 8
-"""Rounds of the weighted fit of the two variances."""
+FEWEST = 24  # Fewest differences from which errors are estimated
+GROSS = 4.0  # Standard deviations at which a difference is clipped
+MEDIAN = 0.4549  # Median of the square of a standard normal
+ROUNDS = 8  # Rounds of the weighted fit of the two variances
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NodeErrors:
     """Variance of the reading of a node about the field there, at the node's nominal heading."""
 
+    # Variance of each node's reading [nT^2], shape (H, Y, X); the mean of the others at nodes without one
     variance_nt2: Array
-    """Variance of each node's reading [nT^2], shape (H, Y, X); the mean of the others at nodes without one.
-    """
-
-    mean_nt2: float
-    """Mean variance over the readings [nT^2]."""
-
-    place_m: float
-    """Standard deviation of the robot's position about its nodes, in x and in y [m]."""
-
-    noise_nt: float
-    """Standard deviation of the errors that do not depend on the gradient [nT]."""
-
-    told: bool
-    """Whether place_m and noise_nt were estimated; otherwise they are `PLACE_M` and 0."""
+    mean_nt2: float  # Mean variance over the readings [nT^2]
+    place_m: float  # Standard deviation of the robot's position about its nodes, in x and in y [m]
+    noise_nt: float  # Standard deviation of the errors that do not depend on the gradient [nT]
+    estimated: bool  # Whether place_m and noise_nt were estimated; otherwise they are `PLACE_M` and 0
 
 
 def node_errors(readings: Readings, grid: Grid, values_nt: Array, read: Flags) -> NodeErrors:
@@ -60,7 +43,7 @@ def node_errors(readings: Readings, grid: Grid, values_nt: Array, read: Flags) -
     heading dependence, which is smooth over the floor. So its second differences along rows and columns, (c_-
     - 2 c + c_+) / sqrt(6), have the variance s^2 + p^2 |grad B|^2, for noise s and position error p. Both are
     fitted to the squared differences, not below 0; on simulated surveys p is right within a tenth. With one
-    heading, errors cannot be told from the field's curvature, and p is 1 cm.
+    heading, errors cannot be separated from the field's curvature, and p is 1 cm.
 
     Args:
         readings: A gridded survey.
@@ -77,13 +60,13 @@ def node_errors(readings: Readings, grid: Grid, values_nt: Array, read: Flags) -
         slope = np.tensordot(slopes @ np.linalg.pinv(waves), values_nt, axes=1)
         missed = slope * _deviation(readings, grid)
     steep = _steepness(grid, values_nt)
-    place, noise, told = PLACE_M, 0.0, False
+    place, noise, estimated = PLACE_M, 0.0, False
     fewer = _waves(headings, min(2, len(headings) // 2 - 1))[0] if len(headings) > 1 else waves
     left = np.linalg.svd(fewer.T)[2][fewer.shape[1] :]  # combinations of headings that no such wave enters
     if len(left):
         fitted = _fitted(left, np.where(read, values_nt - missed, np.nan), steep)
         if fitted is not None:
-            (place, noise), told = fitted, True
+            (place, noise), estimated = fitted, True
     variance = missed**2 + noise**2 + place**2 * steep
     known = read & np.isfinite(variance)
     mean = float(variance[known].mean()) if known.any() else 0.0
@@ -92,7 +75,7 @@ def node_errors(readings: Readings, grid: Grid, values_nt: Array, read: Flags) -
         mean_nt2=mean,
         place_m=place,
         noise_nt=noise,
-        told=told,
+        estimated=estimated,
     )
 
 
@@ -150,6 +133,6 @@ def _fitted(left: Array, values: Array, steep: Array) -> tuple[float, float] | N
     expected = np.full_like(q, max(np.median(q) / MEDIAN, 1e-3 * q.mean()))
     for _ in range(ROUNDS):
         kept = np.minimum(q, GROSS**2 * expected)
-        found = nnls(terms / scale / expected[:, None], kept / expected)[0] / scale
-        expected = np.maximum(terms @ found, 1e-3 * kept.mean())
-    return float(np.sqrt(found[0])), float(np.sqrt(found[1]))
+        solution = nnls(terms / scale / expected[:, None], kept / expected)[0] / scale
+        expected = np.maximum(terms @ solution, 1e-3 * kept.mean())
+    return float(np.sqrt(solution[0])), float(np.sqrt(solution[1]))

@@ -14,8 +14,7 @@ from magtwin.summary import Summarized, Summary, listed, rectangle, span
 
 Array = NDArray[np.float64]
 
-FARTHEST_M = 1e8
-"""Largest coordinate accepted [m]: twice round the Earth."""
+FARTHEST_M = 1e8  # Largest coordinate accepted [m]: twice round the Earth
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -192,11 +191,8 @@ class Readings(Summarized):
         )
 
 
-TAKEN = "taken "
-"""Start of a part of `source` that lists what was deduced from names or sizes."""
-
-TEXTS = ("name", "source", "licence", "created", "frame", "datum")
-"""Metadata that are texts."""
+TAKEN = "taken "  # Start of a part of `source` that lists what was deduced from names or sizes
+TEXTS = ("name", "source", "licence", "created", "frame", "datum")  # Metadata that are texts
 
 
 def checked_earth_nt(earth_nt: ArrayLike) -> tuple[float, float, float]:
@@ -210,6 +206,7 @@ def checked_earth_nt(earth_nt: ArrayLike) -> tuple[float, float, float]:
     return x, y, z
 
 
+# Columns (0 for a plain column) and type of each array of rows
 SHAPES: dict[str, tuple[int, type]] = {
     "p_xy": (2, float),
     "yaw": (0, float),
@@ -220,4 +217,3 @@ SHAPES: dict[str, tuple[int, type]] = {
     "good": (0, bool),
     "node": (3, np.intp),
 }
-"""Columns (0 for a plain column) and type of each array of rows."""

@@ -39,44 +39,21 @@ from magtwin.report import Figure, Report
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
-FALSE_FROZEN = 0.01
-"""Share of frozen stretches that are false, and of sound surveys that show any."""
-
-FALSE_FLAT = 0.01
-"""Expected number of sound flat stretches per survey that are masked."""
-
-SURE = 0.95
-"""Probability from which a reading counts as stuck."""
-
-REACH_M = 0.1
-"""Distance over which the field's slope is assumed constant."""
-
+FALSE_FROZEN = 0.01  # Share of frozen stretches that are false, and of sound surveys that show any
+FALSE_FLAT = 0.01  # Expected number of sound flat stretches per survey that are masked
+SURE = 0.95  # Probability from which a reading counts as stuck
+REACH_M = 0.1  # Distance over which the field's slope is assumed constant
+# Slopes nearest to a stretch from which the field's roughness is estimated; slopes of 0 do not count
 BESIDE = 48
-"""Slopes nearest to a stretch from which the field's roughness is estimated; slopes of 0 do not count."""
-
+# Range about the level in which stuck readings are searched, in standard deviations of the level
 WIDTH = 12.0
-"""Range about the level in which stuck readings are searched, in standard deviations of the level."""
-
-CELL_M = 0.05
-"""Length of a drive whose readings are averaged for the fit."""
-
-LEAST_SLOPES = 8
-"""With fewer slopes the roughness is unknown, and no stretch is called frozen."""
-
-FLAT_M = 0.25
-"""Least length of a flat stretch of a drive."""
-
-MOST_TOGETHER = 12
-"""Most readings of one place that are tested jointly; more are thinned evenly."""
-
-ROUNDS = 4
-"""Rounds in which level, spread and share of stuck readings converge."""
-
-SPREAD_ROWS = 51
-"""Readings of a drive from which the usual size of a jump is estimated."""
-
-NAMED = 20
-"""Most outliers listed in the report, the largest first."""
+CELL_M = 0.05  # Length of a drive whose readings are averaged for the fit
+LEAST_SLOPES = 8  # With fewer slopes the roughness is unknown, and no stretch is called frozen
+FLAT_M = 0.25  # Least length of a flat stretch of a drive
+MOST_TOGETHER = 12  # Most readings of one place that are tested jointly; more are thinned evenly
+ROUNDS = 4  # Rounds in which level, spread and share of stuck readings converge
+SPREAD_ROWS = 51  # Readings of a drive from which the usual size of a jump is estimated
+NAMED = 20  # Most outliers listed in the report, the largest first
 
 
 def mask_stuck(readings: Readings) -> tuple[Readings, Report]:
@@ -89,35 +66,22 @@ def mask_stuck(readings: Readings) -> tuple[Readings, Report]:
         The readings with frozen and stuck ones no longer good; and the report: counts, the level, nodes stuck
         at every heading, the expected number masked falsely, outliers with place and size.
     """
-    found = find_stuck(readings)
-    good = readings.good & ~found.frozen & ~found.stuck
-    return readings.with_(good=good), found.report(readings)
+    findings = find_stuck(readings)
+    good = readings.good & ~findings.frozen & ~findings.stuck
+    return readings.with_(good=good), findings.report(readings)
 
 
 @dataclass(frozen=True)
 class Findings:
     """What is wrong with which readings."""
 
-    frozen: NDArray[np.bool_]
-    """Repeats to the last digit, shape (N,)."""
-
-    stuck: NDArray[np.bool_]
-    """At the level of a sensor that lost lock, shape (N,); may also be frozen."""
-
-    doubt: Array
-    """Probability that a stuck reading is field, shape (N,); 0 if it is not stuck."""
-
-    outlier: Array
-    """Difference from the neighbours' prediction [nT], shape (N,); 0 if it is not unusual."""
-
-    level_nt: float | None
-    """Level of the stuck sensor; None if no stretches agree on one."""
-
-    spread_nt: float
-    """Standard deviation of stuck readings about the level [nT]."""
-
-    judged: bool
-    """Whether there were enough readings to compare with neighbours."""
+    frozen: NDArray[np.bool_]  # Repeats to the last digit, shape (N,)
+    stuck: NDArray[np.bool_]  # At the level of a sensor that lost lock, shape (N,); may also be frozen
+    doubt: Array  # Probability that a stuck reading is field, shape (N,); 0 if it is not stuck
+    outlier: Array  # Difference from the neighbours' prediction [nT], shape (N,); 0 if it is not unusual
+    level_nt: float | None  # Level of the stuck sensor; None if no stretches agree on one
+    spread_nt: float  # Standard deviation of stuck readings about the level [nT]
+    judged: bool  # Whether there were enough readings to compare with neighbours
 
     def report(self, readings: Readings) -> Report:
         """Counts, level, doubt and outliers of the findings."""
@@ -157,7 +121,9 @@ class Findings:
             metadata["note"] = f"fewer than {LEAST} good readings: only repeats were looked for"
         if len(outliers):
             first = outliers[np.argsort(-np.abs(self.outlier[outliers]), kind="stable")][:NAMED]
-            metadata["outliers"] = [_say(readings, int(row), float(self.outlier[row])) for row in first]
+            metadata["outliers"] = [
+                _place_and_size(readings, int(row), float(self.outlier[row])) for row in first
+            ]
         return Report(f"stuck and outlying readings of {readings.name}", tuple(figures), metadata)
 
 
@@ -232,7 +198,7 @@ def _frozen(readings: Readings) -> list[Rows]:
         return [] if still or readings.good.sum() <= LEAST_SLOPES else [np.flatnonzero(readings.good)]
     resolution = float(gaps.min())
     place, slope = _slopes(readings, sequences)
-    found = []
+    candidates = []
     for rows in sequences:
         same = np.diff(b[rows]) == 0
         if readings.b_body_nt is not None:
@@ -249,12 +215,12 @@ def _frozen(readings: Readings) -> list[Rows]:
             if usual * way / trials < 3 * resolution:
                 continue  # the sensor is too coarse for this place to tell
             chance = resolution * 0.25 / (2 * usual) * trials / way  # a quarter of slopes lie within +-usual
-            found.append((trials * np.log(min(1.0, chance)), held))
-    found.sort(key=lambda one: one[0])
+            candidates.append((trials * np.log(min(1.0, chance)), held))
+    candidates.sort(key=lambda candidate: candidate[0])
     tests = sum(len(rows) - 1 for rows in sequences)
-    allowed = np.log(FALSE_FROZEN / max(tests, 1) * np.arange(1, len(found) + 1))
-    passed = [k for k, (chance, _) in enumerate(found) if chance <= allowed[k]]
-    return [held for _, held in found[: passed[-1] + 1]] if passed else []
+    allowed = np.log(FALSE_FROZEN / max(tests, 1) * np.arange(1, len(candidates) + 1))
+    passed = [k for k, (chance, _) in enumerate(candidates) if chance <= allowed[k]]
+    return [held for _, held in candidates[: passed[-1] + 1]] if passed else []
 
 
 def _slopes(readings: Readings, sequences: list[Rows]) -> tuple[Array, Array]:
@@ -464,7 +430,7 @@ def _spikes(b: Array) -> Array:
     return np.where(spike, off, 0.0)
 
 
-def _say(readings: Readings, row: int, off_nt: float) -> str:
+def _place_and_size(readings: Readings, row: int, off_nt: float) -> str:
     """Place and size of an outlier, as text."""
     x, y = readings.p_xy[row]
     run = readings.runs[readings.run[row]]

@@ -1,1 +1,25 @@
-"""ROS 2 bags: MCAP and sqlite3, read and written without ROS."""
+"""Bags: rosbag2 in MCAP and sqlite3, read and written without ROS.
+
+Messages are decoded with the type definitions of rosbags, never with those that a bag contains.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from magtwin.io.bags.reader import read_bag as read_bag
+    from magtwin.io.bags.survey import read_bag_readings as read_bag_readings
+    from magtwin.io.bags.writer import BagWriter as BagWriter
+    from magtwin.io.bags.writer import RawBagWriter as RawBagWriter
+    from magtwin.io.bags.writer import write_bag as write_bag
+
+_MODULES = {"read_bag": "reader", "read_bag_readings": "survey"}
+_MODULES |= dict.fromkeys(("BagWriter", "RawBagWriter", "write_bag"), "writer")
+
+__all__ = ["BagWriter", "RawBagWriter", "read_bag", "read_bag_readings", "write_bag"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

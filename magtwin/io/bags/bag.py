@@ -1,180 +1,318 @@
-"""Bag: what the two storages of a rosbag2, MCAP and sqlite3, have in common."""
+"""Bag: the reading layer of all bags: storage files, topics, types, stamps, and the unit of the field."""
 
 import json
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple, Self
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
-from magtwin.io.bags.cdr import Bytes, Index
-from magtwin.io.bags.messages import Qos
+from magtwin.errors import InputError, hint
+from magtwin.field.units import GREATEST_MEAN_NT, LEAST_MEAN_NT, NT_PER, Unit, check_unit
+from magtwin.files import existing
+from magtwin.io.bags.cdr import Messages, decode
+from magtwin.io.bags.db3 import RosbagsReader, custom_data
+from magtwin.io.bags.mcap import McapReader
+from magtwin.io.bags.topics import Topic
+from magtwin.io.bags.types import layout
+from magtwin.io.bags.writer import CUSTOM, NOTE
+from magtwin.io.recorder import PARTIAL, partial_of
+from magtwin.run.resample import linear, quaternion
 
-VERSION = 8
-"""Version of metadata.yaml: of those that rosbag2 has had the newest one that Humble reads."""
+Array = NDArray[np.float64]
+Metadata = dict[str, str | int | float | bool]
 
-ROOM = 31
-"""Bytes before each message of a batch that are a storage's own: the head of a message record of MCAP."""
+LARGEST_METADATA = 1 << 24
+"""Largest metadata.yaml that is read [bytes]."""
 
-_PLAIN = re.compile(r"(?!true$|null$|false$)[a-z_]\w{3,}")
-"""Keys that need no quotes in YAML."""
+LONGEST_LINE = 2000
+"""Most characters of an error message."""
 
-INFINITE = {"sec": 9223372036, "nsec": 854775807}
-"""What stands for no limit in a quality of service."""
+GAP = 5.0
+"""Poses further apart than this multiple of their median interval are not interpolated between."""
 
-
-@dataclass(frozen=True)
-class Connection:
-    """A topic of a bag that is written."""
-
-    id: int
-    topic: str
-    kind: str
-    """Type of its messages."""
-
-    definition: str
-    """That type in text, with those that it is made of."""
-
-    digest: str
-    """Hash of it, as REP 2011 has it."""
-
-    qos: Qos
-
-    @property
-    def offered(self) -> str:
-        """Its quality of service as rosbag2 keeps it: a list in YAML, names as rmw numbers them."""
-        unlimited = "".join(f"\n    {key}: {value}" for key, value in INFINITE.items())
-        return "\n".join(
-            (
-                "- history: 1",
-                f"  depth: {self.qos.depth}",
-                f"  reliability: {1 if self.qos.reliable else 2}",
-                f"  durability: {1 if self.qos.latched else 2}",
-                f"  deadline:{unlimited}",
-                f"  lifespan:{unlimited}",
-                "  liveliness: 1",
-                f"  liveliness_lease_duration:{unlimited}",
-                "  avoid_ros_namespace_conventions: false",
-            )
-        )
+LEAST_GAP_S = 0.1
+"""Poses closer than this are always interpolated between [s]."""
 
 
-class Batch(NamedTuple):
-    """Messages of one topic and one size, in the order of their times; a topic may have several batches."""
-
-    connection: Connection
-    received: Index
-    """When each was received [ns], shape (M,)."""
-
-    rows: Bytes
-    """A message a row, after `ROOM` free bytes, shape (M, ROOM + size)."""
-
-    arrival: Index | None = None
-    """Rank of each message among messages with the same time, shape (M,). None: the order of the batches."""
-
-
-class Heard(NamedTuple):
-    """A topic of a bag that is read."""
-
-    id: int
-    topic: str
-    kind: str
-    encoding: str
-    """How its messages are encoded; "cdr" is read."""
-
-
-@dataclass
-class Tally:
-    """What has been written, for the metadata."""
-
-    counts: dict[int, int]
-    first: int = 2**63 - 1
-    last: int = 0
-
-    def add(self, batches: Sequence[Batch]) -> None:
-        """Count messages."""
-        for batch in batches:
-            if len(batch.received):
-                self.counts[batch.connection.id] += len(batch.received)
-                self.first = min(self.first, int(batch.received[0]))
-                self.last = max(self.last, int(batch.received[-1]))
-
-
-def metadata(
-    storage: str,
-    files: Sequence[str],
-    connections: Sequence[Connection],
-    tally: Tally,
-    custom: Mapping[str, str],
-) -> dict[str, Any]:
-    """What metadata.yaml says of a bag, under `rosbag2_bagfile_information`.
+class Bag:
+    """An open bag: all of its storage files as one.
 
     Args:
-        storage: "mcap" or "sqlite3".
-        files: Names of its storage files.
-        connections: Its topics.
-        tally: What has been written.
-        custom: What else it is to say.
+        path: Folder of a rosbag2, or a storage file (.mcap, .db3).
+        recover: Read a truncated file up to its last whole chunk. Always done if the name is partial.
+
+    Attributes:
+        path: As given.
+        files: Its storage files.
+        kinds: Message type of each topic.
+
+    Raises:
+        InputError: There is no bag, or it is damaged or truncated.
     """
-    count = sum(tally.counts.values())
-    begin = {"nanoseconds_since_epoch": tally.first if count else 0}
-    span = {"nanoseconds": max(0, tally.last - tally.first) if count else 0}
-    return {
-        "version": VERSION,
-        "storage_identifier": storage,
-        "duration": dict(span),
-        "starting_time": dict(begin),
-        "message_count": count,
-        "topics_with_message_count": [
-            {
-                "topic_metadata": {
-                    "name": c.topic,
-                    "type": c.kind,
-                    "serialization_format": "cdr",
-                    "offered_qos_profiles": c.offered,
-                    "type_description_hash": c.digest,
-                },
-                "message_count": tally.counts[c.id],
-            }
-            for c in connections
-        ],
-        "compression_format": "",
-        "compression_mode": "",
-        "relative_file_paths": list(files),
-        "files": [
-            {"path": name, "starting_time": dict(begin), "duration": dict(span), "message_count": count}
-            for name in files
-        ],
-        "custom_data": dict(custom) or None,
-        "ros_distro": "humble",
-    }
+
+    def __init__(self, path: Path, *, recover: bool = False) -> None:
+        self.path = existing(path, "bag")
+        self.kinds: dict[str, str] = {}
+        self._readers: list[McapReader | RosbagsReader] = []
+        with _one_line(self.path), ExitStack() as opened:
+            self.files, self._custom, compressed = _files(self.path)
+            for file in [self.path] if compressed else self.files:
+                reader = (McapReader if file.suffix == ".mcap" else RosbagsReader)(file)
+                opened.callback(reader.close)
+                self._readers.append(reader)
+                for topic in reader.topics:
+                    if self.kinds.setdefault(topic.topic, topic.kind) != topic.kind:
+                        kinds = f"{self.kinds[topic.topic]} and {topic.kind}"
+                        raise InputError(f"topic {topic.topic} has two types, {kinds}")
+                if isinstance(reader, McapReader):
+                    self._custom |= {CUSTOM + key: value for key, value in reader.notes.get(NOTE, {}).items()}
+                else:
+                    self._custom |= reader.notes
+            if not (all(reader.whole for reader in self._readers) or recover or PARTIAL in self.path.name):
+                raise InputError(
+                    f"{self.path}: cut short: its end is missing; copy it again, or rename it such as "
+                    f"{partial_of(self.path).name} to read the whole part"
+                )
+            self._opened = opened.pop_all()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: Any) -> None:
+        self._opened.close()
+        if error is not None:
+            with _one_line(self.path):
+                raise error
+
+    def metadata(self) -> Metadata:
+        """The metadata of the run that magtwin wrote; empty for other bags."""
+        custom = {
+            key.removeprefix(CUSTOM): text for key, text in self._custom.items() if key.startswith(CUSTOM)
+        }
+        return check_metadata({key: json.loads(text) for key, text in custom.items()})
+
+    def messages(self, topics: Iterable[str]) -> dict[str, Messages]:
+        """The messages of topics, each in the order of receipt."""
+        wanted = set(topics)
+        parts: dict[str, list[Messages]] = {topic: [] for topic in wanted}
+        for reader in self._readers:
+            chosen = {topic.id: topic for topic in reader.topics if topic.topic in wanted}
+            for number, messages in reader.messages(chosen.keys()).items():
+                topic = chosen[number]
+                if len(messages) and topic.encoding != "cdr":
+                    raise InputError(f"topic {topic.topic} is encoded as {topic.encoding!r}, not cdr")
+                parts[topic.topic].append(messages)
+        return {topic: _joined(found) for topic, found in parts.items()}
+
+    def signal(self, name: str, topic: Topic, messages: Messages) -> "Signal":
+        """The messages of a topic, decoded.
+
+        Args:
+            name: Name of the topic in this bag.
+            topic: What to read from it.
+            messages: Its messages.
+        """
+        kind = self.kinds[name]
+        leaves = layout(kind)
+        stamped = leaves[0].name == "header.stamp"
+        wanted = [*topic.leaves(kind), *(["header.stamp"] if stamped else [])]
+        try:
+            fields = decode(leaves, messages, wanted)
+        except InputError as error:
+            raise InputError(f"{self.path}: topic {name}: {error}") from error
+        stamps = fields.pop("header.stamp", None) if stamped else None
+        # A single stamp of 0 is the first moment of a simulation; several mean that there are no stamps.
+        if stamps is not None and np.count_nonzero(stamps == 0) > 1:
+            stamps = None
+        return Signal(name, topic, kind, messages.received, fields, stamps)
+
+    def missing(self, name: str) -> InputError:
+        """The refusal of a topic that is not in the bag."""
+        near = hint(name, self.kinds)
+        near = near + "; " if near.startswith("did you mean") else ""
+        return InputError(f"{self.path}: no topic {name}; {near}topics in it: {self.listed()}")
+
+    def listed(self) -> str:
+        """The topics with their types."""
+        return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(self.kinds.items())) or "none"
 
 
-def yaml_of(content: Mapping[str, Any] | Sequence[Any], indent: str = "") -> str:
-    """Metadata as YAML: a line an entry, every scalar as JSON has it, which YAML has too.
+class Signal(NamedTuple):
+    """The decoded messages of a topic."""
 
-    A hundred times as fast as a library for all of YAML, for it is written at every flush of a recording.
+    name: str
+    """Name of the topic in the bag."""
+
+    topic: Topic
+    kind: str
+    """Message type."""
+
+    received: NDArray[np.int64]
+    """Times of receipt [ns], shape (M,)."""
+
+    fields: dict[str, Any]
+    """Values by leaf name."""
+
+    stamps: NDArray[np.int64] | None
+    """Stamps of the headers [ns], shape (M,). None: the messages have none."""
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """The columns that the topic gives, one row a message."""
+        return self.topic.read(self.kind, self.fields)
+
+
+class Field(NamedTuple):
+    """A magnetic field in nT."""
+
+    b_nt: Array
+    """Magnitude [nT], shape (N,)."""
+
+    vector_nt: Array | None
+    """Vector [nT], shape (N, 3). None: the messages hold a magnitude."""
+
+    label: str
+    """Unit of the messages."""
+
+
+def field_nt(
+    b: Array, where: str, topic: str, *, unit: Unit | None = None, scale: float | None = None
+) -> Field:
+    """The field of messages in nT.
+
+    Args:
+        b: Magnitudes, shape (N,), or vectors, shape (N, 3). Vectors whose y and z are all 0 are magnitudes in
+            x, as APRILab's robot publishes them.
+        where: The file, for refusals.
+        topic: The topic, for refusals.
+        unit: Their unit. Default: the unit that makes their mean the Earth's field.
+        scale: Factor to nT, in place of a unit.
+
+    Raises:
+        InputError: The mean cannot be the Earth's field, or no message holds a number.
     """
-    named = isinstance(content, Mapping)
-    lines = []
-    for key, value in content.items() if named else enumerate(content):  # type: ignore[union-attr]
-        word = str(key) if _PLAIN.fullmatch(str(key)) else json.dumps(key, ensure_ascii=False)
-        head = f"{indent}{word}:" if named else f"{indent}-"
-        if not isinstance(value, Mapping | list) or not value:
-            lines.append(f"{head} {json.dumps(value, ensure_ascii=False)}\n")
-        elif named:
-            lines.append(f"{head}\n{yaml_of(value, indent + '  ')}")
+    vector = b if b.ndim == 2 and np.any(b[:, 1:] != 0) else None
+    size = np.abs(b if b.ndim == 1 else b[:, 0]) if vector is None else np.linalg.norm(b, axis=1)
+    finite = size[np.isfinite(size)]
+    if not len(finite):
+        raise InputError(f"{where}: no message of {topic} holds a number")
+    if scale is None:
+        unit = unit or unit_of(float(finite.mean()), where, topic)
+    factor = NT_PER[unit] if unit else float(scale or 1.0)
+    check_unit(factor * finite, where, topic, unit or "nT", scale=scale)
+    label = unit or f"units of {scale:g} nT"
+    return Field(factor * size, None if vector is None else factor * vector, label)
+
+
+def unit_of(mean: float, where: str, topic: str) -> Unit:
+    """The unit in which a mean magnitude is the Earth's field; the ranges of the units do not overlap."""
+    for unit, factor in NT_PER.items():
+        if LEAST_MEAN_NT <= mean * factor < GREATEST_MEAN_NT:
+            return unit  # type: ignore[return-value]
+    raise InputError(f"{where}: the mean of {topic} is {mean:.6g}; in no unit is that the Earth's field")
+
+
+def poses_at(t: Array, pose_t: Array, pose: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Interpolate poses; positions linearly, orientations by slerp.
+
+    Args:
+        t: Times [s], shape (N,).
+        pose_t: Times of the poses, ascending [s], shape (M,).
+        pose: Positions and orientations xyzw, shape (M, 7).
+
+    Returns:
+        Positions (N, 3), orientations xyzw (N, 4), and whether each time lies between two poses (N,).
+    """
+    sound = np.isfinite(pose).all(axis=1)
+    length = np.linalg.norm(pose[:, 3:], axis=1)
+    sound &= np.abs(length - 1) < 0.01
+    pose_t, pose = pose_t[sound], pose[sound]
+    if len(pose_t) < 2:
+        return np.zeros((len(t), 3)), np.zeros((len(t), 4)), np.zeros(len(t), bool)
+    steps = np.diff(pose_t)
+    widest = max(GAP * float(np.median(steps)), LEAST_GAP_S)
+    low = np.clip(np.searchsorted(pose_t, t, side="right") - 1, 0, len(steps) - 1)
+    part = (t - pose_t[low]) / steps[low]
+    bridged = (steps[low] <= widest) | (part == 0) | (part == 1)
+    inside = (part >= 0) & (part <= 1) & bridged
+    share = np.clip(part, 0, 1)
+    q = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+    return linear(pose[:, :3], low, share), quaternion(q, low, share), inside
+
+
+def check_metadata(metadata: Any) -> Metadata:
+    """Metadata, if they are texts and numbers by name."""
+    if not isinstance(metadata, dict):
+        raise InputError("its metadata are not a table")
+    for key, value in metadata.items():
+        if not isinstance(value, str | int | float | bool):
+            raise InputError(f"metadata {key!r} is neither a text nor a number")
+    return metadata
+
+
+@contextmanager
+def _one_line(path: Path) -> Iterator[None]:
+    """Turn any fault of damaged bytes into one line; rosbags, SQLite and YAML raise errors of many kinds."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:
+        text, prefix = str(error), f"{path}: "
+        if isinstance(error, InputError) and text.startswith(prefix):
+            text = _printable(text.removeprefix(prefix))
         else:
-            lines.append(f"{head} {yaml_of(value, indent + '  ').lstrip(' ')}")
-    return "".join(lines)
+            reason = f"{text} is missing" if isinstance(error, KeyError) else text or type(error).__name__
+            limit = LONGEST_LINE if isinstance(error, InputError) else 200
+            text = f"damaged bag, or none ({_printable(reason)[:limit]})"
+        raise InputError(prefix + text) from error
 
 
-def in_time(batches: Sequence[Batch]) -> tuple[Index, NDArray[np.intp]]:
-    """Times of all messages of batches, ascending [ns], and of which batch each is; both shape (M,)."""
-    times = np.concatenate([b.received for b in batches]) if batches else np.zeros(0, np.int64)
-    which = np.repeat(np.arange(len(batches)), [len(b.received) for b in batches])
-    ranks = [np.zeros(len(b.received), np.int64) if b.arrival is None else b.arrival for b in batches]
-    order = np.lexsort((np.concatenate(ranks), times)) if batches else np.zeros(0, np.int64)
-    return times[order], which[order]
+def _printable(text: str) -> str:
+    """A text in one line of limited length; names in a bag may hold any bytes."""
+    text = " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    return text if len(text) <= LONGEST_LINE else f"{text[:LONGEST_LINE]} ..."
+
+
+def _files(path: Path) -> tuple[list[Path], dict[str, str], bool]:
+    """The storage files of a bag, its custom data, and whether rosbag2 compressed files or messages."""
+    suffixes = (".mcap", ".db3")
+    if path.is_file():
+        if path.suffix not in suffixes:
+            raise InputError(f"{path}: no bag: a folder with metadata.yaml is one, or a .mcap or .db3 file")
+        return [path], {}, False
+    found = sorted(p for p in path.iterdir() if p.suffix in suffixes and p.is_file())
+    description = path / "metadata.yaml"
+    if not description.is_file():
+        if not found:
+            raise InputError(f"{path}: no bag: metadata.yaml is missing; give the folder that holds it")
+        return found, {}, False
+    if description.stat().st_size > LARGEST_METADATA:
+        raise InputError("its metadata.yaml is too large")
+    about = yaml.safe_load(description.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+    names = [Path(str(name)).name for name in about["relative_file_paths"]]  # never outside of the folder
+    missing = [name for name in names if not (path / name).is_file()]
+    if missing or not names:
+        raise InputError(f"storage file {missing[0] if missing else ''} is missing")
+    compressed = str(about.get("compression_mode") or "none").lower() in ("file", "message")
+    other = [name for name in names if Path(name).suffix not in suffixes]
+    if other and not compressed:
+        raise InputError(f"{other[0]} is neither a .mcap nor a .db3 file")
+    return [path / name for name in names], custom_data(about), compressed
+
+
+def _joined(parts: Collection[Messages]) -> Messages:
+    """The messages of several files as one."""
+    if len(parts) == 1:
+        return next(iter(parts))
+    bases = np.cumsum([0] + [len(part.buffer) for part in parts])
+    none = np.zeros(0, np.int64)
+    return Messages(
+        np.concatenate([none, *(part.received for part in parts)]),
+        np.concatenate([np.zeros(0, np.uint8), *(part.buffer for part in parts)]),
+        np.concatenate([none, *(part.start + base for part, base in zip(parts, bases, strict=False))]),
+        np.concatenate([none, *(part.size for part in parts)]),
+    ).in_order()

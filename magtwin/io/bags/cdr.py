@@ -1,18 +1,16 @@
 """CDR: ROS 2 messages to bytes and back, all messages of a topic at once.
 
-A message type is written as the leaves of its tree in order, `f8[3] pose.position` for a Point: numpy's
-codes for numbers, `time` for a stamp, `text` for a string, `[n]` for n of them, `[]` for a sequence. All
-messages are read and written leaf by leaf, by whole arrays: where a leaf stands is an array too, so strings
-and sequences may differ from message to message. Nothing is allocated that the bytes at hand do not fill.
+A message type is the sequence of leaves of its tree, see `magtwin.io.bags.types.layout`. A leaf is read or
+written for all messages in one array operation. The offset of a leaf is an array too, so strings and
+sequences may differ in length between messages. No more memory is allocated than the bytes of the messages
+can fill.
 
-Plain CDR, little endian, as rmw_fastrtps and rmw_cyclonedds write it: a header of four bytes, then each
-number at a multiple of its size (OMG formal/2002-06-51, section 15.3).
+The encoding is plain CDR, little endian, as rmw_fastrtps and rmw_cyclonedds write it: a header of four bytes,
+then each number at a multiple of its size (OMG formal/2002-06-51, section 15.3).
 """
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -24,89 +22,74 @@ Bytes = NDArray[np.uint8]
 Index = NDArray[np.int64]
 
 HEADER = 4
-"""Bytes before the first leaf, which tell the encoding."""
+"""Bytes of the encapsulation header before the first leaf."""
 
 MOST_TEXTS = 4096
-"""Most strings of a sequence that are read."""
+"""Largest number of strings in a sequence."""
 
 MOST_PADDING = 64
-"""Bytes that sequences of unequal length may be filled up to, for each byte of the messages."""
+"""Largest array for sequences of unequal length, in bytes for each byte of the messages."""
 
 NS = 10**9
 """Nanoseconds in a second."""
 
-_LEAF = re.compile(r"(f8|f4|i8|i4|u4|u2|u1|i1|time|text|none)(?:\[(\d*)\])? ([\w.]+)")
-
 
 @dataclass(frozen=True)
 class Leaf:
-    """A number, a stamp or a string in a message, or some of them in a row."""
+    """A number, stamp or string of a message, or several of them in a row."""
 
     name: str
-    """Where it stands, such as `pose.position`."""
+    """Path in the message, such as `pose.position`."""
 
     kind: str
-    """numpy's code of a number; `time`, int32 seconds and uint32 nanoseconds; `text`; `none`, a sequence of
-    something that must be empty."""
+    """numpy code of a number; `time` for int32 seconds and uint32 nanoseconds; `text`; or `none` for a
+    sequence that must be empty."""
 
     count: int | None = 1
-    """How many in a row; none for a sequence, which tells it itself."""
+    """How many in a row. None: a sequence, whose length stands in the message."""
 
 
 @dataclass(frozen=True, eq=False)
 class Messages:
-    """Messages of a topic, as they lie in a buffer."""
+    """Messages of a topic in one buffer."""
 
     received: Index
-    """When each was received [ns], shape (M,)."""
+    """Time of receipt of each [ns], shape (M,)."""
 
     buffer: Bytes
-    """Bytes in which all of them lie, shape (B,)."""
+    """Bytes that hold all of them, shape (B,)."""
 
     start: Index
-    """Where each begins, shape (M,)."""
+    """Offset of each in the buffer, shape (M,)."""
 
     size: Index
-    """How many bytes each has, shape (M,)."""
+    """Bytes of each, shape (M,)."""
 
     def __len__(self) -> int:
         return len(self.received)
 
     def in_order(self) -> "Messages":
-        """The same messages as they were received."""
+        """The messages sorted by time of receipt."""
         if np.all(self.received[1:] >= self.received[:-1]):
             return self
         order = np.argsort(self.received, kind="stable")
         return Messages(self.received[order], self.buffer, self.start[order], self.size[order])
 
 
-@lru_cache(maxsize=64)
-def leaves(text: str) -> tuple[Leaf, ...]:
-    """The leaves that a text names, `f8[3] pose.position, text frame_id`."""
-    found = []
-    for word in text.split(", "):
-        match = _LEAF.fullmatch(word)
-        if match is None:
-            raise ValueError(f"no leaf: {word!r}")
-        kind, count, name = match.groups()
-        found.append(Leaf(name, kind, 1 if count is None else int(count) if count else None))
-    return tuple(found)
-
-
-def encode(form: Sequence[Leaf], fields: Mapping[str, Any], rows: int, *, room: int = 0) -> Bytes:
-    """Messages of equal size, a row each, shape (rows, room + size).
+def encode(leaves: Sequence[Leaf], fields: Mapping[str, Any], rows: int, *, room: int = 0) -> Bytes:
+    """Messages of equal size, one per row, shape (rows, room + size).
 
     Args:
-        form: Leaves of their type.
-        fields: By name of the leaf what it holds: an array of `rows` rows or a single value for all; stamps
-            as int64 [ns]; a string, or a sequence of them, for all. What is not named holds 0 or nothing.
-        rows: How many.
-        room: Bytes to leave free at the beginning of each row.
+        leaves: Leaves of the type.
+        fields: Values by leaf name: an array of `rows` rows, or one value for all rows; stamps as int64 [ns];
+            a string or a sequence of strings for all rows. Default: zero or empty.
+        rows: Number of messages.
+        room: Bytes left free at the beginning of each row.
     """
     numbers: list[tuple[int, str, NDArray[Any]]] = []
     texts: list[tuple[int, bytes]] = []
     at = 0
-    for leaf in form:
+    for leaf in leaves:
         value = fields.get(leaf.name)
         if leaf.kind == "none":
             at = _aligned(at, 4) + 4
@@ -154,22 +137,22 @@ def encode(form: Sequence[Leaf], fields: Mapping[str, Any], rows: int, *, room: 
     return out
 
 
-def decode(form: Sequence[Leaf], messages: Messages, wanted: Iterable[str]) -> dict[str, Any]:
-    """What stands in some leaves of messages.
+def decode(leaves: Sequence[Leaf], messages: Messages, wanted: Iterable[str]) -> dict[str, Any]:
+    """Values of some leaves of messages.
 
     Args:
-        form: Leaves of their type.
+        leaves: Leaves of the type.
         messages: The messages.
-        wanted: Names of the leaves.
+        wanted: Names of the leaves to read.
 
     Returns:
-        By name: numbers of shape (M,), (M, n) for n in a row, of sequences filled up with nan; stamps as
-        int64 [ns]; of a string a list of M, of a sequence of strings a list of M tuples.
+        Values by name: numbers of shape (M,), or (M, n) for n in a row; sequences padded with nan; stamps as
+        int64 [ns]; a list of M strings; a list of M tuples for sequences of strings.
 
     Raises:
-        InputError: A message is too short for what it should hold, or is encoded otherwise.
+        InputError: A message is too short for its type, or has another encoding.
     """
-    left, found = set(wanted), {}
+    left, values_of = set(wanted), {}
     body, room = messages.start + HEADER, messages.size - HEADER
     if len(room) and room.min() < 0:
         raise InputError("a message of less than 4 bytes")
@@ -177,7 +160,7 @@ def decode(form: Sequence[Leaf], messages: Messages, wanted: Iterable[str]) -> d
     if np.any(head != 1) or np.any(messages.buffer[messages.start] != 0):
         raise InputError("messages are not plain little-endian CDR")
     at = np.zeros(len(messages), np.int64)
-    for leaf in form:
+    for leaf in leaves:
         if not left:
             break
         if leaf.kind == "text":
@@ -185,14 +168,14 @@ def decode(form: Sequence[Leaf], messages: Messages, wanted: Iterable[str]) -> d
         elif leaf.kind == "none":
             count, at = _numbers("u4", 1, messages.buffer, body, room, at)
             if np.any(count):
-                raise InputError(f"{leaf.name} is not empty")
+                raise InputError(f"sequence {leaf.name} is not empty, which is not supported")
             continue
         else:
             values, at = _leaf(leaf, messages.buffer, body, room, at, leaf.name in left)
         if leaf.name in left:
-            found[leaf.name] = values
+            values_of[leaf.name] = values
             left.discard(leaf.name)
-    return found
+    return values_of
 
 
 def _aligned(at: Any, size: int) -> Any:
@@ -200,7 +183,7 @@ def _aligned(at: Any, size: int) -> Any:
 
 
 def _numbers(kind: str, count: int, buffer: Bytes, body: Index, room: Index, at: Index) -> tuple[Any, Index]:
-    """`count` numbers of each message, shape (M, count), and where what follows them stands."""
+    """`count` numbers of each message, shape (M, count), and the offset behind them."""
     dtype = np.dtype(kind).newbyteorder("<")
     at = _aligned(at, dtype.itemsize)
     need = dtype.itemsize * count
@@ -213,7 +196,7 @@ def _numbers(kind: str, count: int, buffer: Bytes, body: Index, room: Index, at:
 
 
 def _leaf(leaf: Leaf, buffer: Bytes, body: Index, room: Index, at: Index, wanted: bool) -> tuple[Any, Index]:
-    """Numbers or stamps of a leaf, and where what follows them stands."""
+    """Numbers or stamps of a leaf, and the offset behind them."""
     if leaf.kind == "time":
         parts, at = _numbers("u4", 2, buffer, body, room, at)
         return parts[:, 0].astype(np.int32).astype(np.int64) * NS + parts[:, 1], at
@@ -231,7 +214,7 @@ def _leaf(leaf: Leaf, buffer: Bytes, body: Index, room: Index, at: Index, wanted
     if np.all(count == most):
         return _numbers(leaf.kind, most, buffer, body, room, at)
     if most * size * len(count) > MOST_PADDING * len(buffer):
-        raise InputError(f"{leaf.name} is too unequally long")
+        raise InputError(f"lengths of {leaf.name} differ too much between messages")
     values = np.full((len(count), most), np.nan)
     for n in np.unique(count):
         rows = np.flatnonzero(count == n)
@@ -242,10 +225,10 @@ def _leaf(leaf: Leaf, buffer: Bytes, body: Index, room: Index, at: Index, wanted
 def _texts(
     leaf: Leaf, buffer: Bytes, body: Index, room: Index, at: Index, wanted: bool
 ) -> tuple[list[Any], Index]:
-    """Strings of a leaf, where they are wanted, and where what follows them stands."""
+    """Strings of a leaf if wanted, and the offset behind them."""
     if leaf.count:
         begins, at = _text(leaf, buffer, body, room, at)
-        return _said(buffer, body + begins, body + at) if wanted else [], at
+        return _strings(buffer, body + begins, body + at) if wanted else [], at
     counts, at = _numbers("u4", 1, buffer, body, room, at)
     count = counts[:, 0].astype(np.int64)
     most = int(count.max(initial=0))
@@ -256,7 +239,9 @@ def _texts(
         rows = np.flatnonzero(count > k)
         begins, after = _text(leaf, buffer, body[rows], room[rows], at[rows])
         if wanted:
-            for row, word in zip(rows, _said(buffer, body[rows] + begins, body[rows] + after), strict=True):
+            for row, word in zip(
+                rows, _strings(buffer, body[rows] + begins, body[rows] + after), strict=True
+            ):
                 words[row].append(word)
         at = at.copy()
         at[rows] = after
@@ -264,7 +249,7 @@ def _texts(
 
 
 def _text(leaf: Leaf, buffer: Bytes, body: Index, room: Index, at: Index) -> tuple[Index, Index]:
-    """Where a string begins, and where what follows it stands."""
+    """Offsets of a string and of the byte behind it."""
     lengths, at = _numbers("u4", 1, buffer, body, room, at)
     after = at + lengths[:, 0].astype(np.int64)
     if np.any(after > room):
@@ -272,13 +257,13 @@ def _text(leaf: Leaf, buffer: Bytes, body: Index, room: Index, at: Index) -> tup
     return at, after
 
 
-def _said(buffer: Bytes, first: Index, last: Index) -> list[str]:
-    """Strings between positions; equal ones are decoded once."""
+def _strings(buffer: Bytes, first: Index, last: Index) -> list[str]:
+    """Strings between offsets; equal ones are decoded once."""
     known: dict[bytes, str] = {}
-    said = []
+    strings = []
     for a, b in zip(first.tolist(), last.tolist(), strict=True):
         raw = buffer[a:b].tobytes()
         if raw not in known:
             known[raw] = raw.rstrip(b"\0").decode(errors="replace")
-        said.append(known[raw])
-    return said
+        strings.append(known[raw])
+    return strings

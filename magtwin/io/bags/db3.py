@@ -1,186 +1,116 @@
-"""db3: the storage of rosbag2 that is a sqlite3 database."""
+"""db3: bags in sqlite3, and bags compressed as a whole or message by message, through rosbags."""
 
 import shutil
 import sqlite3
-import tempfile
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
-from magtwin.errors import InputError
-from magtwin.io.bags.bag import ROOM, Batch, Connection, Heard, in_time
 from magtwin.io.bags.cdr import Messages
-
-MOST_BYTES = 1 << 30
-"""Bytes of the largest message that is read."""
-
-_TABLES = """
-CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL);
-CREATE TABLE metadata(
-    id INTEGER PRIMARY KEY, metadata_version INTEGER NOT NULL, metadata TEXT NOT NULL);
-CREATE TABLE topics(
-    id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, serialization_format TEXT NOT NULL,
-    offered_qos_profiles TEXT NOT NULL, type_description_hash TEXT NOT NULL);
-CREATE TABLE message_definitions(
-    id INTEGER PRIMARY KEY, topic_type TEXT NOT NULL, encoding TEXT NOT NULL,
-    encoded_message_definition TEXT NOT NULL, type_description_hash TEXT NOT NULL);
-CREATE TABLE messages(
-    id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL, data BLOB NOT NULL);
-INSERT INTO schema(schema_version, ros_distro) VALUES (4, 'humble');
-"""
+from magtwin.io.bags.storage import ROOM, VERSION, Batch, Connection, StoredTopic, in_time
 
 
 class Db3Writer:
-    """A database of messages that grows; what has been flushed stays readable.
+    """A sqlite3 bag, which is complete once it is closed.
 
     Args:
-        path: The file to make.
-        live: Whether it is to outlive this process at each flush; otherwise only once it is closed.
-    """
-
-    def __init__(self, path: Path, *, live: bool) -> None:
-        self._live = live
-        self._database = sqlite3.connect(path, isolation_level=None)
-        self._run("PRAGMA page_size = 32768")
-        # The new file counts only once it is whole, or it keeps a log beside it that a crash leaves sound.
-        self._run("PRAGMA journal_mode = WAL" if live else "PRAGMA journal_mode = OFF")
-        self._run("PRAGMA synchronous = OFF")
-        self._database.executescript(_TABLES)
-        self._kinds: set[str] = set()
-
-    def add(self, connections: Iterable[Connection]) -> None:
-        """Tell of topics."""
-        for c in connections:
-            row = (c.id, c.topic, c.kind, "cdr", c.offered, c.digest)
-            self._run("INSERT INTO topics VALUES(?, ?, ?, ?, ?, ?)", row)
-            if c.kind not in self._kinds:
-                self._kinds.add(c.kind)
-                definition = (c.kind, "ros2msg", c.definition, c.digest)
-                self._run("INSERT INTO message_definitions VALUES(NULL, ?, ?, ?, ?)", definition)
-
-    def note(self, version: int, text: str) -> None:
-        """Keep the metadata of the bag, in place of what was kept before."""
-        self._run("INSERT OR REPLACE INTO metadata VALUES(1, ?, ?)", (version, text))
-
-    def write(self, batches: Sequence[Batch]) -> None:
-        """Write messages, in the order of their times."""
-        times, which = in_time(batches)
-        ids = np.array([batch.connection.id for batch in batches], np.int64)[which]
-        messages = np.empty(len(times), object)
-        for k, batch in enumerate(batches):
-            messages[which == k] = _cut(batch)
-        rows = zip(ids.tolist(), times.tolist(), messages.tolist(), strict=True)
-        self._run("BEGIN")
-        self._database.executemany("INSERT INTO messages VALUES(NULL, ?, ?, ?)", rows)
-        self._run("COMMIT")
-
-    def flush(self) -> None:
-        """Bring everything into the file itself: it outlives this process."""
-        if self._live:
-            self._run("PRAGMA wal_checkpoint(TRUNCATE)")
-
-    def close(self) -> None:
-        """Make the file whole."""
-        self._run("CREATE INDEX timestamp_idx ON messages (timestamp ASC)")
-        if self._live:
-            self._run("PRAGMA journal_mode = DELETE")
-        self._database.close()
-
-    def abort(self) -> None:
-        """Leave the file as it is."""
-        self._database.close()
-
-    def _run(self, statement: str, values: Sequence[object] = ()) -> None:
-        self._database.execute(statement, values).close()
-
-
-def _cut(batch: Batch) -> list[bytes]:
-    """The messages of a batch one after the other."""
-    width = batch.rows.shape[1]
-    raw = batch.rows.tobytes()
-    return [raw[at + ROOM : at + width] for at in range(0, len(raw), width)]
-
-
-class Db3Reader:
-    """A database of messages: its topics, the metadata that it keeps, and its messages on demand.
-
-    Attributes:
-        topics: Its topics.
-        note: The metadata that it keeps, in YAML; "" where it keeps none.
+        path: The folder of a bag to make, or its storage file, which ends in .db3.
     """
 
     def __init__(self, path: Path) -> None:
-        self._folder = None
-        log = path.with_name(path.name + "-wal")
-        if log.exists() and log.stat().st_size:
-            # What a killed recording left is in its log yet; reading that writes, so a copy is read.
-            self._folder = tempfile.TemporaryDirectory()
-            path = Path(shutil.copy(path, self._folder.name))
-            shutil.copy(log, path.with_name(path.name + "-wal"))
-            place = path.as_uri()
-        else:
-            place = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
-        self._database = sqlite3.connect(place, uri=True, isolation_level=None)
-        try:
-            self._learn()
-        except BaseException:
-            self.close()
-            raise
+        self._path = path
+        self._folder = path.with_suffix("") if path.suffix else path
+        self._writer = Writer(self._folder, version=VERSION, storage_plugin=StoragePlugin.SQLITE3)
+        self._writer.open()
+        self._connections: dict[int, Any] = {}
 
-    def _learn(self) -> None:
-        for pragma in ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0"):
-            self._database.execute(f"PRAGMA {pragma}").close()
-        self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_BYTES)  # of a message
-        made = dict(self._all("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
-        tables = {name for name in ("topics", "messages", "metadata") if name in made}
-        if not {"topics", "messages"} <= tables:
-            raise InputError("a database without the tables of a bag")
-        for name in tables:  # what is computed when it is read could be of any size
-            columns = self._all(f"SELECT hidden FROM pragma_table_xinfo('{name}')")
-            if any(hidden for (hidden,) in columns) or not str(made[name]).upper().startswith("CREATE TABLE"):
-                raise InputError(f"its table {name} is not one of plain columns")
+    def add(self, connection: Connection) -> None:
+        """Register a topic."""
+        self._connections[connection.id] = self._writer.add_connection(
+            connection.topic,
+            connection.kind,
+            msgdef=connection.definition,
+            rihs01=connection.digest,
+            offered_qos_profiles=[connection.rosbags_qos],
+        )
+
+    def write(self, batches: Sequence[Batch]) -> None:
+        """Write messages in the order of their times."""
+        rows = [iter(batch.rows) for batch in batches]
+        for t, k in zip(*(array.tolist() for array in in_time(batches)), strict=True):
+            data = next(rows[k])[ROOM:].tobytes()
+            self._writer.write(self._connections[batches[k].connection.id], t, data)
+
+    def close(self, custom: Mapping[str, str]) -> None:
+        """Complete the bag; `custom` is its custom data."""
+        for key, value in custom.items():
+            self._writer.set_custom_data(key, value)
+        self._writer.close()
+        if self._folder != self._path:
+            next(self._folder.glob("*.db3")).rename(self._path)
+            shutil.rmtree(self._folder)
+
+    def abort(self) -> None:
+        """Give up; nothing can be read."""
+        self._writer.abort()
+
+
+class RosbagsReader:
+    """A bag that rosbags reads: a .db3 file, or a folder.
+
+    Attributes:
+        topics: Its topics.
+        notes: The custom data that a .db3 file holds.
+    """
+
+    whole = True
+
+    def __init__(self, path: Path) -> None:
+        self._reader = Reader(path)
+        self._reader.open()
         self.topics = [
-            Heard(int(number), str(name), str(kind), str(encoding))
-            for number, name, kind, encoding in self._all(
-                "SELECT id, name, type, serialization_format FROM topics"
-            )
+            StoredTopic(c.id, c.topic, c.msgtype, getattr(c.ext, "serialization_format", ""))
+            for c in self._reader.connections
         ]
-        self.note = ""
-        if "metadata" in tables:
-            kept = self._all("SELECT metadata FROM metadata ORDER BY id DESC LIMIT 1")
-            self.note = str(kept[0][0]) if kept else ""
+        self.notes: dict[str, str] = {} if path.is_dir() else _custom_data(path)
 
     def close(self) -> None:
-        """Close the database."""
-        self._database.close()
-        if self._folder is not None:
-            self._folder.cleanup()
+        """Close the bag."""
+        self._reader.close()
 
     def messages(self, ids: Collection[int]) -> dict[int, Messages]:
-        """The messages of some topics, as they were received."""
+        """The messages of some topics in the order of receipt."""
         found: dict[int, tuple[list[int], list[bytes]]] = {number: ([], []) for number in ids}
-        marks = ", ".join("?" * len(found))
-        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id"
-        with closing(self._database.execute(query, tuple(found))) as rows:
-            while block := rows.fetchmany(50_000):
-                for number, received, data in block:
-                    times, contents = found[number]
-                    times.append(received)
-                    contents.append(data)
+        connections = [c for c in self._reader.connections if c.id in found]
+        for connection, received, data in self._reader.messages(connections) if connections else ():
+            times, contents = found[connection.id]
+            times.append(received)
+            contents.append(data)
         joined = {}
         for number, (times, contents) in found.items():
-            try:
-                received = np.array(times, np.int64)
-                size = np.array([len(c) for c in contents], np.int64)
-                buffer = np.frombuffer(b"".join(contents), np.uint8)
-            except (TypeError, ValueError, OverflowError) as error:
-                raise InputError("a message without a time or without bytes") from error
-            joined[number] = Messages(received, buffer, np.cumsum(size) - size, size).in_order()
+            size = np.array([len(content) for content in contents], np.int64)
+            buffer = np.frombuffer(b"".join(contents), np.uint8)
+            joined[number] = Messages(
+                np.array(times, np.int64), buffer, np.cumsum(size) - size, size
+            ).in_order()
         return joined
 
-    def _all(self, query: str) -> list[tuple[Any, ...]]:
-        with closing(self._database.execute(query)) as rows:
-            return rows.fetchall()
+
+def _custom_data(path: Path) -> dict[str, str]:
+    """The custom data that a .db3 file holds beside its messages; empty if it holds none."""
+    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as database:
+        if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'metadata'").fetchone():
+            return {}
+        row = database.execute("SELECT metadata FROM metadata ORDER BY id DESC LIMIT 1").fetchone()
+    return custom_data(yaml.safe_load(row[0])) if row else {}
+
+
+def custom_data(metadata: Any) -> dict[str, str]:
+    """The custom data in a bag's metadata."""
+    custom = metadata.get("custom_data") if isinstance(metadata, dict) else None
+    return {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}

@@ -1,147 +1,143 @@
-"""MCAP: the storage of rosbag2 that Foxglove made, written and read by whole arrays.
+"""MCAP: the default storage of rosbag2, written and read in whole arrays.
 
-A file is records one after the other: opcode, length, content. Messages lie in chunks, compressed, each
-followed by an index of its messages by channel; a summary at the end says where all of it is. What a chunk
-holds is readable without the summary, so a file that was cut short is, up to its last whole chunk.
-Specification: https://mcap.dev/spec.
+A file is a sequence of records: opcode, length, content. Messages lie in compressed chunks, each followed by
+an index of its messages by channel. A summary at the end locates all of it. Chunks are read without their
+index and without the summary, so a truncated file is readable up to its last whole chunk.
+Specification: https://mcap.dev/spec. Small records are those of the library `mcap`, whose own writer takes
+one message at a time and is ten times as slow.
 """
 
 import struct
 import zlib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 import pyarrow as pa
+from mcap import records
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.io.bags.bag import ROOM, Batch, Connection, Heard, in_time
 from magtwin.io.bags.cdr import Bytes, Index, Messages
+from magtwin.io.bags.storage import ROOM, Batch, Connection, StoredTopic, in_time
 
 MAGIC = b"\x89MCAP0\r\n"
 
 CHUNK = 1 << 20
-"""Bytes of a chunk before compression, about."""
+"""Approximate bytes of a chunk before compression."""
 
 LARGEST_CHUNK = 1 << 30
-"""Bytes of the largest chunk that is read."""
+"""Largest chunk that is read [bytes]."""
 
 MOST_RATIO = 1000
-"""Most bytes that a chunk may hold for each one that it has in the file, beside those of `SPARE`."""
+"""Largest compression ratio that is accepted, beyond `SPARE`."""
 
 SPARE = 1 << 26
-"""Bytes that all chunks of a file together may hold beyond `MOST_RATIO`: blank images shrink to nothing."""
+"""Bytes that the chunks of a file may hold beyond `MOST_RATIO`: blank images compress to almost nothing."""
 
 LEVEL = 1
-"""Of zstd's compression."""
+"""Compression level of zstd."""
 
-_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _CHUNK_INDEX = range(1, 9)
-_STATISTICS, _METADATA, _METADATA_INDEX, _SUMMARY_OFFSET, _DATA_END = range(0x0B, 0x10)
 _HEAD = struct.Struct("<BQ")
+_RECORD = struct.Struct("<BQH")
+"""Opcode and length of a record, and the channel of a message."""
 
 
-def _text(word: str) -> bytes:
-    raw = word.encode()
-    return struct.pack("<I", len(raw)) + raw
-
-
-def _map(entries: Mapping[str, str]) -> bytes:
-    raw = b"".join(_text(key) + _text(value) for key, value in entries.items())
-    return struct.pack("<I", len(raw)) + raw
-
-
-def _record(opcode: int, content: bytes) -> bytes:
-    return _HEAD.pack(opcode, len(content)) + content
+def _bytes(record: records.McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
 
 
 class McapWriter:
-    """An MCAP file that grows; whatever has been flushed stays readable."""
+    """An MCAP file that grows; whatever was flushed stays readable."""
 
     def __init__(self, path: Path, library: str) -> None:
         self._file: BinaryIO = open(path, "xb")  # noqa: SIM115
-        self._put(MAGIC + _record(_HEADER, _text("ros2") + _text(library)))
-        self._schemas: dict[str, bytes] = {}
-        self._channels: dict[int, bytes] = {}
-        self._pending = b""  # schemas and channels that the next chunk tells of
-        self._chunks: list[bytes] = []
-        self._metadata: list[bytes] = []
-        self._counts: dict[int, int] = {}
-        self._span = (2**63 - 1, 0)
+        self._file.write(MAGIC + _bytes(records.Header("ros2", library)))
+        self._schemas: dict[str, records.Schema] = {}
+        self._channels: list[records.Channel] = []
+        self._pending = b""  # schemas and channels that the next chunk begins with
+        self._chunks: list[records.ChunkIndex] = []
+        self._metadata: list[records.MetadataIndex] = []
+        self.counts: dict[int, int] = {}
+        """Messages by connection."""
+        self.first, self.last = 2**63 - 1, 0
+        """Times of the first and the last message [ns]."""
 
-    def add(self, connections: Iterable[Connection]) -> None:
-        """Tell of topics."""
-        for c in connections:
-            if c.kind not in self._schemas:
-                schema = struct.pack("<H", len(self._schemas) + 1)
-                schema += _text(c.kind) + _text("ros2msg") + _text(c.definition)
-                self._schemas[c.kind] = _record(_SCHEMA, schema)
-                self._pending += self._schemas[c.kind]
-            number = list(self._schemas).index(c.kind) + 1
-            about = {"offered_qos_profiles": c.offered, "topic_type_hash": c.digest}
-            channel = struct.pack("<HH", c.id, number) + _text(c.topic) + _text("cdr")
-            self._channels[c.id] = _record(_CHANNEL, channel + _map(about))
-            self._pending += self._channels[c.id]
-            self._counts[c.id] = 0
+    def add(self, connection: Connection) -> None:
+        """Register a topic, before its first message."""
+        kind = connection.kind
+        if kind not in self._schemas:
+            definition = connection.definition.encode()
+            self._schemas[kind] = records.Schema(len(self._schemas) + 1, definition, "ros2msg", kind)
+            self._pending += _bytes(self._schemas[kind])
+        about = {"offered_qos_profiles": connection.offered_qos, "topic_type_hash": connection.digest}
+        schema = self._schemas[kind].id
+        self._channels.append(records.Channel(connection.id, connection.topic, "cdr", about, schema))
+        self._pending += _bytes(self._channels[-1])
+        self.counts[connection.id] = 0
 
     def note(self, name: str, entries: Mapping[str, str]) -> None:
-        """Write a record of metadata."""
-        record = _record(_METADATA, _text(name) + _map(entries))
-        self._metadata.append(struct.pack("<QQ", self._file.tell(), len(record)) + _text(name))
-        self._put(record)
+        """Write a metadata record."""
+        record = _bytes(records.Metadata(name, dict(entries)))
+        self._metadata.append(records.MetadataIndex(self._file.tell(), len(record), name))
+        self._file.write(record)
 
     def write(self, batches: Sequence[Batch]) -> None:
-        """Write messages, in the order of their times."""
+        """Write messages in the order of their times."""
         codec = pa.Codec("zstd", compression_level=LEVEL)
-        with ThreadPoolExecutor(2) as pool:
-            chunks = pool.map(lambda chunk: (chunk, *_compressed(chunk.content, codec)), self._cut(batches))
-            for chunk, raw, crc in chunks:
-                self._put_chunk(chunk, raw, crc)
+        for times, content, index in self._cut([batch for batch in batches if len(batch.received)]):
+            raw = codec.compress(content, asbytes=True)
+            self._put_chunk(int(times[0]), int(times[-1]), content, raw, index)
 
     def flush(self) -> None:
-        """Hand everything to the system: it outlives this process."""
+        """Hand everything to the operating system, so that it outlives this process."""
         self._file.flush()
 
     def close(self) -> None:
-        """Write the summary; the file is whole then."""
-        self._put(self._pending)  # topics without a message: the summary may only repeat the data section
-        self._put(_record(_DATA_END, struct.pack("<I", 0)))
-        start = self._file.tell()
-        first, last = self._span if any(self._counts.values()) else (0, 0)
-        counts = b"".join(struct.pack("<HQ", *item) for item in self._counts.items())
-        statistics = struct.pack(
-            "<QHIIIIQQI",
-            *(sum(self._counts.values()), len(self._schemas), len(self._channels), 0),
-            *(len(self._metadata), len(self._chunks), first, last, len(counts)),
+        """Write the summary, which completes the file."""
+        self._file.write(self._pending)  # topics without a message: the summary may only repeat the data
+        self._file.write(_bytes(records.DataEnd(0)))
+        start, count = self._file.tell(), sum(self.counts.values())
+        statistics = records.Statistics(
+            attachment_count=0,
+            channel_count=len(self._channels),
+            channel_message_counts=self.counts,
+            chunk_count=len(self._chunks),
+            message_count=count,
+            message_start_time=self.first if count else 0,
+            message_end_time=self.last if count else 0,
+            metadata_count=len(self._metadata),
+            schema_count=len(self._schemas),
         )
-        groups: list[tuple[int, list[bytes]]] = [
-            (_SCHEMA, list(self._schemas.values())),
-            (_CHANNEL, list(self._channels.values())),
-            (_CHUNK_INDEX, [_record(_CHUNK_INDEX, c) for c in self._chunks]),
-            (_METADATA_INDEX, [_record(_METADATA_INDEX, m) for m in self._metadata]),
-            (_STATISTICS, [_record(_STATISTICS, statistics + counts)]),
+        groups: list[tuple[Opcode, Sequence[records.McapRecord]]] = [
+            (Opcode.SCHEMA, list(self._schemas.values())),
+            (Opcode.CHANNEL, self._channels),
+            (Opcode.CHUNK_INDEX, self._chunks),
+            (Opcode.METADATA_INDEX, self._metadata),
+            (Opcode.STATISTICS, [statistics]),
         ]
         offsets = b""
-        for opcode, records in groups:
-            if records:
-                place = struct.pack("<BQQ", opcode, self._file.tell(), sum(map(len, records)))
-                offsets += _record(_SUMMARY_OFFSET, place)
-                self._put(b"".join(records))
+        for opcode, group in groups:
+            content = b"".join(map(_bytes, group))
+            if content:
+                offsets += _bytes(records.SummaryOffset(opcode, self._file.tell(), len(content)))
+                self._file.write(content)
         offsets_start = self._file.tell()
-        self._put(offsets + _record(_FOOTER, struct.pack("<QQI", start, offsets_start, 0)) + MAGIC)
+        self._file.write(offsets + _bytes(records.Footer(start, offsets_start, 0)) + MAGIC)
         self._file.close()
 
     def abort(self) -> None:
-        """Leave the file as it is."""
+        """Close the file as it is."""
         self._file.close()
 
-    def _put(self, raw: Any) -> None:
-        self._file.write(raw)
-
-    def _cut(self, batches: Sequence[Batch]) -> Iterator["_Chunk"]:
-        """Messages in chunks, in the order of their times."""
-        batches = [batch for batch in batches if len(batch.received)]
+    def _cut(self, batches: Sequence[Batch]) -> Iterator[tuple[Index, Bytes, dict[int, Any]]]:
+        """Chunks of messages in the order of their times: times, content, and the index by channel."""
         for batch in batches:
             _fill_heads(batch)
         times, which = in_time(batches)
@@ -156,78 +152,68 @@ class McapWriter:
             content = np.empty(len(pending) + int(ends[last - 1]) - before, np.uint8)
             content[: len(pending)] = np.frombuffer(pending, np.uint8)
             offsets = ends[first:last] - sizes[first:last] - before + len(pending)
-            parts: dict[int, list[Any]] = {}
+            index: dict[int, list[Any]] = {}
             for k, batch in enumerate(batches):
-                mine = offsets[which[first:last] == k]
-                if len(mine):
-                    rows = batch.rows[done[k] : done[k] + len(mine)]
-                    _scatter(rows, content, mine)
-                    stamps = batch.received[done[k] : done[k] + len(mine)]
-                    parts.setdefault(batch.connection.id, []).append(np.stack([stamps, mine], axis=1))
-                    done[k] += len(mine)
-            index = {channel: _sorted(np.concatenate(part).astype("<u8")) for channel, part in parts.items()}
-            yield _Chunk(int(times[first]), int(times[last - 1]), content, index)
+                at = offsets[which[first:last] == k]
+                if len(at):
+                    rows = slice(done[k], done[k] + len(at))
+                    done[k] = rows.stop
+                    _scatter(batch.rows[rows], content, at)
+                    entries = np.stack([batch.received[rows], at], axis=1)
+                    index.setdefault(batch.connection.id, []).append(entries)
+            yield times[first:last], content, {c: np.concatenate(parts) for c, parts in index.items()}
             first = last
 
-    def _put_chunk(self, chunk: "_Chunk", raw: Any, crc: int) -> None:
+    def _put_chunk(self, first: int, last: int, content: Bytes, raw: bytes, index: dict[int, Any]) -> None:
         begin = self._file.tell()
-        head = struct.pack("<QQQI", chunk.first, chunk.last, len(chunk.content), crc)
-        head += _text("zstd") + struct.pack("<Q", len(raw))
-        self._put(_HEAD.pack(_CHUNK, len(head) + len(raw)) + head)
-        self._put(raw)
-        length = self._file.tell() - begin
-        places, index = b"", b""
-        for channel, entries in chunk.places.items():
-            places += struct.pack("<HQ", channel, begin + length + len(index))
-            index += _record(_INDEX, struct.pack("<HI", channel, entries.nbytes) + entries.tobytes())
-            self._counts[channel] += len(entries)
-        self._put(index)
-        self._span = (min(self._span[0], chunk.first), max(self._span[1], chunk.last))
+        crc = zlib.crc32(content.data)
+        self._file.write(_bytes(records.Chunk("zstd", raw, last, first, crc, len(content))))
+        end = self._file.tell()
+        offsets, indexes = {}, b""
+        for channel, entries in index.items():
+            offsets[channel] = end + len(indexes)
+            entries = entries[np.argsort(entries[:, 1], kind="stable")].astype("<u8")
+            head = struct.pack("<HI", channel, entries.nbytes)
+            indexes += _HEAD.pack(Opcode.MESSAGE_INDEX, len(head) + entries.nbytes) + head + entries.tobytes()
+            self.counts[channel] += len(entries)
+        self._file.write(indexes)
+        self.first, self.last = min(self.first, first), max(self.last, last)
         self._chunks.append(
-            struct.pack("<QQQQI", chunk.first, chunk.last, begin, length, len(places))
-            + places
-            + struct.pack("<Q", len(index))
-            + _text("zstd")
-            + struct.pack("<QQ", len(raw), len(chunk.content))
+            records.ChunkIndex(
+                chunk_length=end - begin,
+                chunk_start_offset=begin,
+                compression="zstd",
+                compressed_size=len(raw),
+                message_start_time=first,
+                message_end_time=last,
+                message_index_length=len(indexes),
+                message_index_offsets=offsets,
+                uncompressed_size=len(content),
+            )
         )
 
 
-class _Chunk(NamedTuple):
-    """Messages that are compressed together."""
-
-    first: int
-    last: int
-    content: Bytes
-    places: dict[int, Any]
-    """By channel: time and place of each message, shape (M, 2)."""
-
-
-def _compressed(content: Bytes, codec: Any) -> tuple[Any, int]:
-    return codec.compress(content), zlib.crc32(content.data)
-
-
 def _fill_heads(batch: Batch) -> None:
-    """Make each row a record: opcode, length, channel, sequence, and the time twice."""
+    """Make each row a message record: opcode, length, channel, sequence, and the time twice."""
     count, width = batch.rows.shape
-    heads = np.zeros(
-        count,
-        np.dtype({"names": list("olcstp"), "formats": ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"]}),
-    )
-    heads["o"], heads["l"], heads["c"] = _MESSAGE, width - 9, batch.connection.id
+    formats = ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"]
+    heads = np.zeros(count, np.dtype({"names": list("olcstp"), "formats": formats}))
+    heads["o"], heads["l"], heads["c"] = Opcode.MESSAGE, width - _HEAD.size, batch.connection.id
     heads["t"] = heads["p"] = batch.received
     batch.rows[:, :ROOM] = heads.view(np.uint8).reshape(count, ROOM)
 
 
-def _sorted(entries: Any) -> Any:
-    """Entries of a message index, (time, offset), in the order of their offsets."""
-    return entries[np.argsort(entries[:, 1], kind="stable")]
-
-
 def _scatter(rows: Bytes, out: Bytes, at: Index) -> None:
-    """Put each row of (M, S) where it is to stand in `out`."""
+    """Copy each row of (M, S) to its offset in `out`."""
     size = rows.shape[1]
     places = np.ndarray((len(out) - size + 1,), f"V{size}", out, 0, (1,))
     places[at] = rows.view(f"V{size}")[:, 0]
+
+
+def _look(kind: str, content: Bytes, at: Index) -> Any:
+    """Numbers of a kind at offsets."""
+    size = np.dtype(kind).itemsize
+    return np.ndarray((max(len(content) - size + 1, 0),), kind, content, 0, (1,))[at]
 
 
 class McapReader:
@@ -235,37 +221,33 @@ class McapReader:
 
     Attributes:
         topics: Its channels.
-        notes: Records of metadata by name; of several of one name the last.
-        whole: Whether it has its end.
-        unindexed: How many messages read so far are in a chunk and not in its index, by channel.
+        notes: Metadata records by name; the last one if several have the same name.
+        whole: Whether the file has its end.
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
         self._file: BinaryIO = open(path, "rb")  # noqa: SIM115
         self._size = path.stat().st_size
         self.notes: dict[str, dict[str, str]] = {}
         self.whole = False
-        self.unindexed: dict[int, int] = {}
         self._spare = SPARE
         self._schemas: dict[int, str] = {}
-        self._channels: dict[int, tuple[int, str, str]] = {}
-        self._chunks: list[tuple[int, int, dict[int, Any]]] = []
-        self._loose: dict[int, list[tuple[int, int, int]]] = {}
+        self._channels: dict[int, records.Channel] = {}
+        self._chunks: list[tuple[int, int]] = []
+        self._loose: list[tuple[int, int, int, int]] = []
         try:
             if self._file.read(len(MAGIC)) != MAGIC:
-                raise InputError("it does not begin as MCAP does")
+                raise InputError("it does not begin like MCAP")
             self._scan()
-            if self._chunks and not self.whole:
-                self._chunks[-1][2].clear()  # its index may lack what was not written any more
-            if self._chunks and not (self.whole and self._channels):
-                self._learn()
+            if not (self.whole and self._channels):
+                for chunk in self._chunks:
+                    self._walk(self._content(*chunk), ())
         except BaseException:
             self.close()
             raise
         self.topics = [
-            Heard(number, topic, self._schemas.get(schema, ""), encoding)
-            for number, (schema, topic, encoding) in self._channels.items()
+            StoredTopic(c.id, c.topic, self._schemas.get(c.schema_id, ""), c.message_encoding)
+            for c in self._channels.values()
         ]
 
     def close(self) -> None:
@@ -273,41 +255,26 @@ class McapReader:
         self._file.close()
 
     def messages(self, ids: Collection[int]) -> dict[int, Messages]:
-        """The messages of some topics, as they were received."""
-        parts: dict[int, list[tuple[Index, Index, Index]]] = {number: [] for number in ids}
-        buffers: list[Bytes] = []
-        base, self._spare = 0, SPARE
-        self.unindexed |= dict.fromkeys(ids, 0)
-        for number, loose in self._loose.items():
-            if number in parts:
-                received, starts, sizes = (np.array(a, np.int64) for a in zip(*loose, strict=True))
-                raw = b"".join(self._at(int(a), int(n)) for a, n in zip(starts, sizes, strict=True))
-                parts[number].append((received, base + np.cumsum(sizes) - sizes, sizes))
-                buffers.append(np.frombuffer(raw, np.uint8))
-                base += len(raw)
-        for place, length, index in self._chunks:
-            if index and parts.keys().isdisjoint(index):
-                continue
-            content = self._content(place, length)
-            if content is None:
-                continue
-            if index:
-                found_here, lacking = _indexed(content, index, parts, self._tell)
-                for number, count in lacking.items():
-                    self.unindexed[number] += count
-            else:
-                found_here = _walked(content, parts, self._tell)
-            for number, (received, start, size) in found_here.items():
-                parts[number].append((received, base + start, size))
-            if found_here:
-                buffers.append(content)
-                base += len(content)
-        buffer = np.concatenate(buffers) if buffers else np.zeros(0, np.uint8)
-        none = np.zeros(0, np.int64)
+        """The messages of some topics in the order of receipt."""
+        self._spare = SPARE
+        parts: list[tuple[Bytes, Any]] = []
+        for channel, received, place, size in self._loose:
+            if channel in ids:
+                raw = np.frombuffer(self._at(place, size), np.uint8)
+                parts.append((raw, np.array([(channel, received, 0, size)])))
+        for chunk in self._chunks:
+            content = self._content(*chunk)
+            found = self._walk(content, ids)
+            if len(found):
+                parts.append((content, found))
+        buffer = np.concatenate([raw for raw, _ in parts]) if parts else np.zeros(0, np.uint8)
+        bases = np.cumsum([0] + [len(raw) for raw, _ in parts])
+        table = [rows + np.array([0, 0, base, 0]) for (_, rows), base in zip(parts, bases, strict=False)]
+        rows = np.concatenate(table) if table else np.zeros((0, 4), np.int64)
         joined = {}
-        for number, found in parts.items():
-            columns = [np.concatenate(c) for c in zip(*found, strict=True)] if found else [none] * 3
-            joined[number] = Messages(columns[0], buffer, columns[1], columns[2]).in_order()
+        for number in ids:
+            _, received, start, size = rows[rows[:, 0] == number].T
+            joined[number] = Messages(received, buffer, start, size).in_order()
         return joined
 
     def _at(self, place: int, length: int) -> bytes:
@@ -315,67 +282,66 @@ class McapReader:
         return self._file.read(length)
 
     def _scan(self) -> None:
-        """Go from record to record, over what chunks hold."""
+        """Go through the records outside of chunks."""
         at = len(MAGIC)
         while at + _HEAD.size <= self._size:
-            self._file.seek(at)
-            opcode, length = _HEAD.unpack(self._file.read(_HEAD.size))
+            opcode, length = _HEAD.unpack(self._at(at, _HEAD.size))
             body = at + _HEAD.size
             if body + length > self._size:
                 return
-            if opcode == _CHUNK:
-                self._chunks.append((body, length, {}))
-            elif opcode == _MESSAGE and length >= ROOM - _HEAD.size:
-                channel, _, received = struct.unpack("<HIQ", self._file.read(14))
-                head = ROOM - _HEAD.size
-                self._loose.setdefault(channel, []).append((received, body + head, length - head))
-            elif opcode == _INDEX and self._chunks and length >= 6:
-                content = self._file.read(length)
-                count = struct.unpack_from("<I", content, 2)[0] // 16
-                if 6 + 16 * count == length:
-                    entries = np.frombuffer(content, "<u8", 2 * count, 6).reshape(-1, 2)
-                    index, channel = self._chunks[-1][2], struct.unpack_from("<H", content)[0]
-                    index[channel] = (
-                        np.concatenate([index[channel], entries]) if channel in index else entries
-                    )
-            elif opcode in (_SCHEMA, _CHANNEL, _METADATA):
-                self._tell(opcode, self._file.read(length))
-            elif opcode == _FOOTER:
-                self._file.seek(body + length)
-                self.whole = self._file.read(len(MAGIC)) == MAGIC
+            if opcode == Opcode.CHUNK:
+                self._chunks.append((body, length))
+            elif opcode == Opcode.MESSAGE and length >= ROOM - _HEAD.size:
+                channel, _, received = struct.unpack("<HIQ", self._at(body, 14))
+                self._loose.append((channel, received, at + ROOM, length - (ROOM - _HEAD.size)))
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
+                self._learn(opcode, self._at(body, length))
+            elif opcode == Opcode.FOOTER:
+                self.whole = self._at(body + length, len(MAGIC)) == MAGIC
                 return
             at = body + length
 
-    def _tell(self, opcode: int, content: bytes) -> None:
-        """Learn from a record what schemas, channels and metadata there are."""
-        words = _Words(content)
-        if opcode == _SCHEMA:
-            number = words.number("<H")
-            self._schemas[number] = words.text()
-        elif opcode == _CHANNEL:
-            number, schema = words.number("<H"), words.number("<H")
-            self._channels[number] = (schema, words.text(), words.text())
-        elif opcode == _METADATA:
-            name = words.text()
-            self.notes[name] = words.entries()
+    def _learn(self, opcode: int, content: bytes) -> None:
+        stream = ReadDataStream(BytesIO(content))
+        if opcode == Opcode.SCHEMA:
+            schema = records.Schema.read(stream)
+            self._schemas[schema.id] = schema.name
+        elif opcode == Opcode.CHANNEL:
+            channel = records.Channel.read(stream)
+            self._channels[channel.id] = channel
+        else:
+            note = records.Metadata.read(stream)
+            self.notes[note.name] = note.metadata
 
-    def _learn(self) -> None:
-        """Learn of channels from the chunks themselves, where no summary tells."""
-        for place, length, _ in self._chunks:
-            content = self._content(place, length)
-            if content is not None:
-                _walked(content, (), self._tell)
+    def _walk(self, content: Bytes, wanted: Collection[int]) -> NDArray[np.int64]:
+        """Channel, time, offset and size of wanted messages, shape (M, 4); learns schemas and channels."""
+        places: list[int] = []
+        raw, at, size = content.data, 0, len(content)
+        unpack, message = _RECORD.unpack_from, int(Opcode.MESSAGE)
+        while at + _RECORD.size <= size:
+            opcode, length, channel = unpack(raw, at)
+            after = at + 9 + length
+            if after > size:
+                raise InputError("a record ends outside of its chunk")
+            if opcode == message:
+                if channel in wanted and length >= ROOM - 9:
+                    places.append(at)
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._learn(opcode, bytes(raw[at + 9 : after]))
+            at = after
+        start = np.array(places, np.int64)
+        columns = (_look("<u2", content, start + 9), _look("<u8", content, start + 15))
+        sizes = _look("<u8", content, start + 1).astype(np.int64) - (ROOM - 9)
+        return np.stack([*(c.astype(np.int64) for c in columns), start + ROOM, sizes], axis=1)
 
-    def _content(self, place: int, length: int) -> Bytes | None:
-        """What a chunk holds; none of the last one of a file that was cut short, if it is damaged."""
-        words = _Words(self._at(place, length))
-        words.number("<QQ")
-        size, crc, codec, stored = words.number("<Q"), words.number("<I"), words.text(), words.number("<Q")
-        raw = words.rest()
+    def _content(self, place: int, length: int) -> Bytes:
+        """The uncompressed content of a chunk; its checksum is verified."""
+        chunk = records.Chunk.read(ReadDataStream(BytesIO(self._at(place, length))))
+        size, raw, codec = chunk.uncompressed_size, chunk.data, chunk.compression
         most = min(LARGEST_CHUNK, self._spare + MOST_RATIO * len(raw))
-        if stored != len(raw) or size > most or codec not in ("", "zstd", "lz4"):
+        if size > most or codec not in ("", "zstd", "lz4"):
             raise InputError(
-                f"a chunk of {size} bytes, {codec[:8] or 'not'} compressed to {stored}, cannot be"
+                f"a chunk claims {size} bytes, compressed to {len(raw)} ({codec[:8]}); not supported"
             )
         self._spare -= max(0, size - MOST_RATIO * len(raw))
         try:
@@ -383,118 +349,8 @@ class McapReader:
         except (pa.ArrowException, OSError, ValueError) as error:
             raise InputError(f"a damaged chunk ({str(error).splitlines()[0]})") from error
         array = np.frombuffer(content, np.uint8)
-        if len(array) != size or (crc and zlib.crc32(array.data) != crc):
-            raise InputError("a damaged chunk (its checksum is another)")
+        if len(array) != size or (
+            chunk.uncompressed_crc and zlib.crc32(array.data) != chunk.uncompressed_crc
+        ):
+            raise InputError("a damaged chunk (its checksum differs)")
         return array
-
-
-class _Words:
-    """The words of a record, read one after the other and never past its end."""
-
-    def __init__(self, content: bytes) -> None:
-        self._content, self._at = content, 0
-
-    def number(self, form: str) -> Any:
-        """A number, or the last of several."""
-        size = struct.calcsize(form)
-        return struct.unpack(form, self._take(size))[-1]
-
-    def text(self) -> str:
-        """A string."""
-        return self._take(self.number("<I")).decode(errors="replace")
-
-    def entries(self) -> dict[str, str]:
-        """A map."""
-        inner = _Words(self._take(self.number("<I")))
-        found = {}
-        while inner._at < len(inner._content):
-            key = inner.text()
-            found[key] = inner.text()
-        return found
-
-    def rest(self) -> bytes:
-        """All that is left."""
-        return self._take(len(self._content) - self._at)
-
-    def _take(self, size: int) -> bytes:
-        if self._at + size > len(self._content):
-            raise InputError("a record ends within its content")
-        self._at += size
-        return self._content[self._at - size : self._at]
-
-
-Found = dict[int, tuple[Index, Index, Index]]
-"""By channel: times [ns], places and sizes of messages, each of shape (M,)."""
-
-
-def _indexed(
-    content: Bytes, index: Mapping[int, Any], wanted: Collection[int], tell: Any
-) -> tuple[Found, dict[int, int]]:
-    """Messages of wanted channels by the chunk's index, and how many the index lacks by channel.
-
-    Bytes of the chunk that no entry of the index covers are read record by record, so a message that the
-    index lacks is read too.
-    """
-    found: Found = {}
-    begins, ends = [np.array([len(content)])], [np.zeros(1, np.int64)]
-    for channel, entries in index.items():
-        if not len(entries):
-            continue
-        if int(entries[:, 1].max()) + ROOM > len(content):
-            raise InputError("the index of a chunk points outside of it")
-        at = np.unique(entries[:, 1]).astype(np.int64)
-        lengths = _look("<u8", content, at + 1)
-        right = (content[at] == _MESSAGE) & (_look("<u2", content, at + 9) == channel)
-        if not right.all() or np.any(lengths < ROOM - 9) or np.any(lengths > len(content)):
-            raise InputError("the index of a chunk points at what is no message")
-        sizes = lengths.astype(np.int64) - (ROOM - 9)
-        if np.any(at + ROOM + sizes > len(content)):
-            raise InputError("a message ends outside of its chunk")
-        begins.append(at)
-        ends.append(at + ROOM + sizes)
-        if channel in wanted:
-            found[channel] = (_look("<u8", content, at + 15).astype(np.int64), at + ROOM, sizes)
-    begin = np.concatenate(begins)
-    order = np.argsort(begin)
-    after, before = begin[order], np.concatenate([[0], np.concatenate(ends)[order][:-1]])
-    if np.any(before > after):
-        raise InputError("the index of a chunk points at messages that overlap")
-    lacking: dict[int, int] = {}
-    for gap in np.flatnonzero(before < after):
-        first = int(before[gap])
-        for channel, columns in _walked(content[first : int(after[gap])], wanted, tell).items():
-            more = (columns[0], columns[1] + first, columns[2])
-            lacking[channel] = lacking.get(channel, 0) + len(more[0])
-            known = found.get(channel, (np.zeros(0, np.int64),) * 3)
-            received, start, size = (np.concatenate(pair) for pair in zip(known, more, strict=True))
-            rank = np.argsort(start)
-            found[channel] = (received[rank], start[rank], size[rank])
-    return found, lacking
-
-
-def _look(kind: str, content: Bytes, at: Index) -> Any:
-    size = np.dtype(kind).itemsize
-    return np.ndarray((len(content) - size + 1,), kind, content, 0, (1,))[at]
-
-
-def _walked(content: Bytes, wanted: Collection[int], tell: Any) -> Found:
-    """Messages of wanted channels by going from record to record; schemas and channels are told."""
-    found: dict[int, list[tuple[int, int, int]]] = {}
-    raw, at, size = content.data, 0, len(content)
-    message = struct.Struct("<HIQ")
-    while at + _HEAD.size <= size:
-        opcode, length = _HEAD.unpack_from(raw, at)
-        body = at + _HEAD.size
-        if body + length > size:
-            raise InputError("a record ends outside of its chunk")
-        if opcode == _MESSAGE and length >= ROOM - _HEAD.size:
-            channel, _, received = message.unpack_from(raw, body)
-            if channel in wanted:
-                found.setdefault(channel, []).append((received, at + ROOM, length - (ROOM - _HEAD.size)))
-        elif opcode in (_SCHEMA, _CHANNEL):
-            tell(opcode, bytes(raw[body : body + length]))
-        at = body + length
-    return {
-        channel: tuple(np.array(a, np.int64) for a in zip(*rows, strict=True))  # type: ignore[misc]
-        for channel, rows in found.items()
-    }

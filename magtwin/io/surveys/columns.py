@@ -1,4 +1,4 @@
-"""Columns: which columns of a table of readings hold what, and in which units."""
+"""Columns: the meaning and the units of the columns of a table of readings."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,7 +10,7 @@ Axes = Literal["body", "world"]
 HeadingUnit = Literal["rad", "deg"]
 
 HEADINGS = ("heading", "yaw", "theta")
-"""Names under which a heading is looked for where none is given."""
+"""Default names of a heading."""
 
 FIELDS = (
     *(
@@ -27,22 +27,22 @@ FIELDS = (
     ),
     *("btotal", "bt", "|b|", "b_mag", "mag", "total", "total_field", "f"),
 )
-"""Names under which a magnitude is looked for where neither it nor a vector is given; case does not count."""
+"""Default names of a magnitude; case does not matter."""
 
 VECTORS = (
     *(("bx", "by", "bz"), ("b_x", "b_y", "b_z"), ("mx", "my", "mz"), ("mag_x", "mag_y", "mag_z")),
     *(("magx", "magy", "magz"), ("field_x", "field_y", "field_z"), ("bx_nt", "by_nt", "bz_nt")),
     *(("bx_ut", "by_ut", "bz_ut"), ("magnetic_field.x", "magnetic_field.y", "magnetic_field.z")),
 )
-"""Names under which a vector is looked for where neither it nor a magnitude is given or found."""
+"""Default names of a vector, if there is no magnitude."""
 
 TIMES = ("t", "time", "timestamp", "stamp", "time_s")
-"""Names under which time is looked for where none is given."""
+"""Default names of time."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """What to read from which columns of a table; a column is a name of the header, or a number from 1."""
+    """Columns to read from a table, by name in the header or by number from 1."""
 
     x: str = "x"
     """Column of world x [m]."""
@@ -51,35 +51,34 @@ class Columns:
     """Column of world y [m]."""
 
     heading: str = ""
-    """Column of the robot's heading; heading, yaw or theta unless given."""
+    """Column of the robot's heading. Default: heading, yaw or theta."""
 
     quaternion: str = ""
-    """Columns of the robot's orientation in world, qx,qy,qz,qw, in place of a heading."""
+    """Columns of the robot's orientation in world, qx,qy,qz,qw, instead of a heading."""
 
     field: str = ""
-    """Column of the field's magnitude; unless given, one of a usual name, such as field, b_total or b_nt."""
+    """Column of the magnitude of the field. Default: a usual name, such as field, b_total or b_nt."""
 
     vector: str = ""
-    """Columns of the field's three components, bx,by,bz; unless given, those of usual names where there is no
-    magnitude."""
+    """Columns of the components of the field, bx,by,bz. Default: usual names, if there is no magnitude."""
 
     axes: Axes | None = None
-    """Axes of the vector: body (forward, left, up), the default, or world."""
+    """Axes of the vector: body (forward, left, up) or world. Default: body."""
 
     heading_unit: HeadingUnit | None = None
-    """Unit of the heading: rad, which is checked unless given, or deg."""
+    """Unit of the heading. Default: rad, with a check of its range."""
 
     unit: Unit | None = None
     """Unit of the field. Default: the unit in which it has the size of the Earth's field."""
 
     scale: float | None = None
-    """Factor from the file's values to nT, in place of a unit, as for a normalised sensor."""
+    """Factor from the file's values to nT, instead of a unit, such as for a normalised sensor."""
 
     time: str = ""
-    """Column of time [s]; t, time or timestamp unless given."""
+    """Column of time [s]. Default: t, time or timestamp."""
 
     run_column: str = ""
-    """Column whose values, numbers or words, tell runs apart."""
+    """Column whose values, numbers or words, separate runs."""
 
     def __post_init__(self) -> None:
         for name, count in (("quaternion", 4), ("vector", 3)):
@@ -88,11 +87,11 @@ class Columns:
                 raise InputError(f"{name} takes {count} columns with commas between, got {given!r}")
         if self.scale is not None:
             if self.unit is not None:
-                raise InputError("give the field's unit or its scale, the factor to nT, not both")
+                raise InputError("give either the unit of the field or its scale, the factor to nT")
             if not (0 < self.scale < float("inf")):
-                raise InputError(f"scale is a factor to nT, above 0, got {self.scale:g}")
+                raise InputError(f"scale, the factor to nT, must be above 0, got {self.scale:g}")
         if self.heading and self.quaternion:
-            raise InputError("give the heading's column or the quaternion's, not both")
+            raise InputError("give either the heading's column or the quaternion's")
 
     def several(self, name: str) -> list[str]:
         """The columns that an option names, such as the three of `vector`."""

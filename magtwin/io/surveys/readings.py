@@ -1,4 +1,4 @@
-"""Readings from files: gridded surveys, tables, runs, bags; and Readings kept as Parquet, exactly."""
+"""Readings from files: gridded surveys, tables, runs and bags; and Readings saved as Parquet."""
 
 import json
 import os
@@ -19,28 +19,28 @@ from magtwin.field.units import check_unit, nt_per, unit_by_size
 from magtwin.files import existing, output, sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
 from magtwin.io.surveys.columns import FIELDS, HEADINGS, TIMES, VECTORS, Columns
-from magtwin.io.surveys.table import Sheet, read_csv, read_parquet_sheet
+from magtwin.io.surveys.table import Table, read_csv, read_parquet_table
 from magtwin.run.run import Run
 
 Array = NDArray[np.float64]
 Source = str | os.PathLike[str]
 
 BAGS = (".mcap", ".db3")
-"""Endings of rosbag2's storage files."""
+"""Suffixes of rosbag2 storage files."""
 
 PARQUET = (".parquet", ".pq")
 
 LARGEST_TURN = 2 * np.pi + 0.01
-"""Headings beyond this are taken for degrees unless the caller says that they are radians."""
+"""Headings beyond this are refused unless their unit is given [rad]."""
 
 APART = 2.0
-"""Times that vectors may be longer or shorter than magnitudes read beside them, in the median."""
+"""Largest median ratio between vectors and magnitudes of the same table."""
 
 TURNED = 0.7
-"""Length of the mean of the headings' unit vectors above which a survey hardly turned."""
+"""Length of the mean unit vector of the headings above which a survey hardly turned."""
 
 ALIGNED = 0.8
-"""Part of the level field that its mean keeps, above which it keeps one direction."""
+"""Ratio of the mean level field to its size above which it keeps one direction."""
 
 _SURVEY = b"magtwin_readings"
 _PARTS = {"p_xy": ("x", "y"), "b_body_nt": ("x", "y", "z"), "node": ("heading", "row", "column")}
@@ -63,36 +63,34 @@ def read_readings(
     pose_topic: str | None = None,
     field_topic: str | None = None,
 ) -> Readings:
-    """The readings of a survey, whatever form it is in.
+    """Read the readings of a survey from any supported source.
 
-    A source is a folder of one CSV a heading (`magtwin.field.survey.folder`); a table of readings, CSV or
-    Parquet; several files whose rows belong together, joined by `+` (`1-time.csv+1-loc.csv+1-mag.csv`;
-    those after the first are looked for beside it); a Run's Parquet; Readings' own Parquet; or a
-    rosbag2, its folder or its storage file. Several sources are several runs of one survey; so are the
-    files that match a pattern (`drives/*.parquet`), and the Parquet files of a folder, in the order of
-    their names.
+    A source is a folder of one CSV per heading (`magtwin.field.survey`); a table of readings, CSV or Parquet;
+    several files with matching rows, joined by `+` (`1-time.csv+1-loc.csv+1-mag.csv`; the others are
+    searched for beside the first); the Parquet of a Run or of Readings; or a rosbag2, as a folder or a
+    storage file. Several sources are several runs of one survey, as are the files of a pattern
+    (`drives/*.parquet`) and the Parquet files of a folder, in the order of their names.
 
     Args:
-        sources: One or more of them.
-        columns: Which columns of a table hold what, in which units.
-        name: What the survey is called; after the first source unless given.
-        licence: SPDX name of the licence; where the source knows its own, "" keeps that.
+        sources: One or more sources.
+        columns: Meaning and units of the columns of a table.
+        name: Name of the survey. Default: that of the first source.
+        licence: SPDX name of the licence; "" keeps the licence of the source.
         created: Day of the survey, YYYY-MM-DD; likewise.
         height_m: Height of the sensor above the floor [m]; likewise.
-        frame: Axes that x, y and heading are in, in words; likewise.
-        datum: Where that frame lies, in words; likewise.
-        headings_deg: Headings of a folder of CSVs [deg], for one that is not whole.
-        pose_topic: Topic of a bag's poses, where there are several.
-        field_topic: Topic of a bag's field, where there are several.
+        frame: Axes of x, y and heading, in words; likewise.
+        datum: Location of that frame, in words; likewise.
+        headings_deg: Headings of a folder of CSVs [deg], if it is incomplete.
+        pose_topic: Topic of a bag's poses, if there are several.
+        field_topic: Topic of a bag's field, if there are several.
 
     Returns:
-        Readings, in the order of the sources. Rows without a value (a cell that is empty or nan) are
-        left out, and `source` tells how many.
+        Readings in the order of the sources. Rows with a cell that is empty or nan are left out; `source` has
+        their number.
 
     Raises:
-        InputError: A source is missing, damaged, or of no known form; no file matches a pattern; a column
-            is not there (the
-            near one is named); a cell is no number, with file and line; the unit cannot be.
+        InputError: A source is missing, damaged or unknown; no file matches a pattern; a column is missing
+            (the message has the nearest name); a cell is not a number (with file and line); or no unit fits.
     """
     columns = Columns() if columns is None else columns
     if not sources:
@@ -103,7 +101,7 @@ def read_readings(
         if path.is_dir() or path.suffix in BAGS:
             _only_unit(path, columns)
         if path.suffix in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
-            from magtwin.io.bags.rosbag import read_bag_readings
+            from magtwin.io.bags import read_bag_readings
 
             parts.append(
                 read_bag_readings(
@@ -127,16 +125,16 @@ def read_readings(
 
 
 def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
-    """The readings of a Run: what its magnetometer measured where base_link truly was.
+    """The readings of a Run: its measured field at the true pose of base_link.
 
     Args:
         run: A run with p_world_base, yaw and b_measured_nt, or b_total_nt.
-        name: What the readings are called.
-        source: Where the run is from.
+        name: Name of the readings.
+        source: Source of the run.
 
     Returns:
-        Its readings; rows whose field is nan (off the map) are left out, and those with lock lost
-        are not good.
+        Its readings. Rows whose field is nan (outside the map) are left out; rows with lost lock are not
+        good.
 
     Raises:
         InputError: A column is missing, or no row has a field.
@@ -164,16 +162,16 @@ def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
 def save_readings(readings: Readings, path: Source, *, force: bool = False) -> None:
     """Write readings as Parquet; the same readings give the same bytes.
 
-    Every Arrow field says its unit and frame; the file's metadata `magtwin_readings` holds, in JSON,
-    the runs, the grid, the height and where all of it is from.
+    Arrow fields have unit and frame as metadata. The metadata `magtwin_readings` of the file hold, as JSON,
+    the runs, the grid, the height and the source.
 
     Args:
         readings: The readings.
         path: The file to make.
-        force: Whether one that exists is replaced.
+        force: Replace an existing file.
 
     Raises:
-        InputError: The file exists and `force` was not given.
+        InputError: The file exists and `force` is not set.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -185,10 +183,10 @@ def save_readings(readings: Readings, path: Source, *, force: bool = False) -> N
             continue
         for i, part in enumerate(_PARTS[key] if width else ("",)):
             array = pa.array(np.ascontiguousarray(values[:, i] if width else values))
-            said = {"column": key, "part": part, "unit": _UNITS.get(key, ""), "frame": _FRAMES.get(key, "")}
-            said = {k: text for k, text in said.items() if text}
+            texts = {"column": key, "part": part, "unit": _UNITS.get(key, ""), "frame": _FRAMES.get(key, "")}
+            texts = {k: text for k, text in texts.items() if text}
             label = f"{key}_{part}" if part else key
-            fields.append(pa.field(label, array.type, nullable=False, metadata=said))
+            fields.append(pa.field(label, array.type, nullable=False, metadata=texts))
             arrays.append(array)
     about: dict[str, Any] = {key: getattr(readings, key) for key in (*_TEXTS, *_PLACES)}
     about |= {"runs": readings.runs, "height_m": readings.height_m, "earth_nt": readings.earth_nt}
@@ -206,13 +204,13 @@ def save_readings(readings: Readings, path: Source, *, force: bool = False) -> N
 
 
 def load_readings(path: Source) -> Readings:
-    """The readings that `save_readings` wrote, to the last bit.
+    """Read readings that `save_readings` wrote, to the last bit.
 
     Raises:
-        InputError: The file is missing, is not Parquet, was cut short, or holds no Readings.
+        InputError: The file is missing, is not Parquet, is truncated, or holds no Readings.
     """
     path = existing(path, "Parquet file")
-    sheet, metadata = read_parquet_sheet(path), _metadata(path)
+    table, metadata = read_parquet_table(path), _metadata(path)
     if _SURVEY not in metadata:
         raise InputError(f"{path}: no Readings: metadata {_SURVEY.decode()!r} is missing")
     try:
@@ -228,13 +226,13 @@ def load_readings(path: Source) -> Readings:
         raise InputError(
             f"{path}: metadata {_SURVEY.decode()!r} is damaged ({type(error).__name__}: {error})"
         ) from error
-    names = set(sheet.names)
+    names = set(table.names)
     arrays: dict[str, ArrayLike] = {}
     for key, (width, kind) in SHAPES.items():
         labels = [f"{key}_{part}" for part in _PARTS[key]] if width else [key]
         if names.isdisjoint(labels) and key in ("b_body_nt", "t", "node"):
             continue
-        cells: list[NDArray[Any]] = [sheet.numbers(label).astype(kind) for label in labels]
+        cells: list[NDArray[Any]] = [table.numbers(label).astype(kind) for label in labels]
         arrays[key] = np.column_stack(cells) if width else cells[0]
     try:
         return Readings(**arrays, grid=grid or None, **given)  # type: ignore[arg-type]
@@ -243,12 +241,12 @@ def load_readings(path: Source) -> Readings:
 
 
 def is_pattern(source: Source) -> bool:
-    """Whether a source is a pattern, not a file whose name has such characters."""
+    """Whether a source is a pattern, and not a file with such a name."""
     return has_magic(str(source)) and not Path(source).exists()
 
 
 def _each(sources: Sequence[Source]) -> Iterator[Source]:
-    """The sources, with the files of patterns and of folders of Parquet files in their place.
+    """The sources, with patterns and folders of Parquet files replaced by their files.
 
     Raises:
         InputError: Nothing matches a pattern.
@@ -257,8 +255,8 @@ def _each(sources: Sequence[Source]) -> Iterator[Source]:
         path = Path(source)
         if is_pattern(source):
             root = Path(path.anchor)
-            found = root.glob(str(path.relative_to(path.anchor)))
-            matches = sorted(match for match in found if not match.name.startswith("."))
+            files = root.glob(str(path.relative_to(path.anchor)))
+            matches = sorted(match for match in files if not match.name.startswith("."))
             if not matches:
                 raise InputError(f"no file or folder matches {str(source)!r}; check the pattern")
             yield from matches
@@ -281,16 +279,16 @@ def _first(source: Source) -> Path:
 
 
 def _only_unit(path: Path, columns: Columns) -> None:
-    """Refuse columns that are named for a source that has none to choose from."""
+    """Refuse options for columns of a source whose columns are known."""
     if replace(columns, unit=None, scale=None) != Columns():
-        raise InputError(f"{path}: its columns are known; columns are named for tables of your own")
+        raise InputError(f"{path}: its columns are known; drop the options that name columns")
 
 
 def _of_file(source: str, path: Path, columns: Columns) -> Readings:
     if path.suffix in (".usd", ".usda", ".usdc"):
         raise InputError(
-            f"{path}: a stage or a map, not readings; give the survey that it was made from, or survey a "
-            "scene (magtwin map survey)"
+            f"{path}: a stage or a map, not readings; give the survey of the map, or survey a scene "
+            " (magtwin map survey)"
         )
     if path.suffix in PARQUET and path == Path(source):
         metadata = _metadata(path)
@@ -307,70 +305,71 @@ def _of_file(source: str, path: Path, columns: Columns) -> Readings:
     paths = [path]
     if path != Path(source):
         paths += [_beside(path, word) for word in source.split("+")[1:]]
-    sheet = _sheet(paths[0])
+    table = _read_table(paths[0])
     for other in paths[1:]:
-        sheet = sheet.beside(_sheet(other))
-    return _of_sheet(sheet, paths, columns)
+        table = table.beside(_read_table(other))
+    return _of_table(table, paths, columns)
 
 
 def _beside(first: Path, word: str) -> Path:
-    """A joined file: beside the first one, or at a path of its own."""
+    """A joined file: beside the first one, or at its path."""
     beside = first.parent / word
     return existing(beside if beside.exists() or not Path(word).exists() else Path(word), "file of readings")
 
 
-def _sheet(path: Path) -> Sheet:
-    return read_parquet_sheet(path) if path.suffix in PARQUET else read_csv(path)
+def _read_table(path: Path) -> Table:
+    return read_parquet_table(path) if path.suffix in PARQUET else read_csv(path)
 
 
-def _of_sheet(sheet: Sheet, paths: list[Path], columns: Columns) -> Readings:
+def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
     """The readings in a table."""
-    columns, taken = _told(sheet, columns)
-    p = np.column_stack([sheet.numbers(columns.x), sheet.numbers(columns.y)])
-    turn = _turn(sheet, columns)
-    vector, b = _field(sheet, columns)
-    t = sheet.numbers(columns.time) if columns.time else None
+    columns, taken = _complete(table, columns)
+    p = np.column_stack([table.numbers(columns.x), table.numbers(columns.y)])
+    turn = _turn(table, columns)
+    vector, b = _field(table, columns)
+    t = table.numbers(columns.time) if columns.time else None
     some = [p, b[:, None]] + [v.reshape(len(p), -1) for v in (turn, vector, t) if v is not None]
     known: NDArray[np.bool_] = np.all(np.isfinite(np.hstack(some)), axis=1)
     if not known.any():
-        raise InputError(f"{sheet.path}: no row has all its values; {len(known)} have a cell empty or nan")
+        raise InputError(
+            f"{table.path}: no row is complete; all {len(known)} have a cell that is empty or nan"
+        )
     away = np.flatnonzero(known & (np.abs(p) > FARTHEST_M).any(axis=1))
     if len(away):
         row = int(away[0])
-        where = sheet.column(columns.x).where(row)
+        where = table.column(columns.x).where(row)
         raise InputError(f"{where}: x and y are metres, within {FARTHEST_M:g} of the origin, got {p[row]}")
     if turn is not None and turn.ndim == 2:
         length = np.linalg.norm(turn, axis=1)
         off = np.flatnonzero(known & (np.abs(length - 1) > 0.01))
         if len(off):
-            where = sheet.column(columns.several("quaternion")[0]).where(int(off[0]))
+            where = table.column(columns.several("quaternion")[0]).where(int(off[0]))
             raise InputError(f"{where}: a quaternion's length is 1, got {length[off[0]]:.4g}")
         turn = turn / length[:, None]
     elif turn is None:
         if vector is None or columns.axes != "world":
             raise InputError(
-                f"{sheet.path}: no heading: no column is called {', '.join(HEADINGS)}; name it with "
-                "--heading or --quaternion, for a robot's readings turn with it; only vectors in world axes "
-                "do without"
+                f"{table.path}: no heading: no column is called {', '.join(HEADINGS)}; name it with "
+                "--heading or --quaternion; only vectors in world axes need none"
             )
         turn = np.zeros(len(p))
     yaw = turn if turn.ndim == 1 else yaw_from_quat(turn)
-    nought = np.flatnonzero(known & (b <= 0))
-    if len(nought):
-        where = _magnitude(sheet, columns)
-        raise InputError(f"{where.where(int(nought[0]))}: a magnitude is above 0, got {b[nought[0]]:g} nT")
+    zero = np.flatnonzero(known & (b <= 0))
+    if len(zero):
+        where = _magnitude(table, columns)
+        raise InputError(f"{where.where(int(zero[0]))}: a magnitude is above 0, got {b[zero[0]]:g} nT")
     check_unit(
         b[known],
-        str(sheet.path),
-        _magnitude(sheet, columns).name or columns.field or columns.vector,
+        str(table.path),
+        _magnitude(table, columns).name or columns.field or columns.vector,
         columns.unit or "nT",
-        lambda k: _magnitude(sheet, columns).where(int(np.flatnonzero(known)[k])),
+        lambda k: _magnitude(table, columns).where(int(np.flatnonzero(known)[k])),
         columns.scale,
     )
     if vector is not None:
-        _check_sizes(vector[known], b[known], sheet, columns)
-        _check_axes(vector[known], yaw[known], sheet, columns)
-    run, runs = _runs(sheet, columns, paths[0].stem, known)
+        _check_sizes(vector[known], b[known], table, columns)
+        _check_axes(vector[known], yaw[known], table, columns)
+    run, runs = _runs(table, columns, paths[0].stem, known)
     return Readings(
         p_xy=p[known],
         yaw=yaw[known],
@@ -384,14 +383,14 @@ def _of_sheet(sheet: Sheet, paths: list[Path], columns: Columns) -> Readings:
     )
 
 
-def _told(sheet: Sheet, columns: Columns) -> tuple[Columns, list[str]]:
-    """The columns and the unit, those that are not given found by their names and size; what was found so."""
+def _complete(table: Table, columns: Columns) -> tuple[Columns, list[str]]:
+    """Columns and unit, with missing ones found by name and size; and what was found so."""
     taken = list[str]()
     lower: dict[str, str] = {}
-    for label in sheet.names:
+    for label in table.names:
         lower.setdefault(label.strip().lower(), label)
     if not (columns.heading or columns.quaternion):
-        label = next((name for name in HEADINGS if name in sheet.names), "")
+        label = next((name for name in HEADINGS if name in table.names), "")
         columns = replace(columns, heading=label or next((lower[n] for n in HEADINGS if n in lower), ""))
     if not columns.time and (label := next((lower[name] for name in TIMES if name in lower), "")):
         columns = replace(columns, time=label)
@@ -404,24 +403,24 @@ def _told(sheet: Sheet, columns: Columns) -> tuple[Columns, list[str]]:
             if columns.axes is None:
                 taken.append(f"{columns.vector} as the field in the robot's axes, forward, left, up (--axes)")
         else:
-            named = [label for label in sheet.names if not label.isdigit()]
+            named = [label for label in table.names if not label.isdigit()]
             known = (
-                f"columns: {', '.join(named)}" if named else f"{len(sheet.columns)} columns without a header"
+                f"columns: {', '.join(named)}" if named else f"{len(table.columns)} columns without a header"
             )
             raise InputError(
-                f"{sheet.path}: no column of the field was found by its name ({known}); name the magnitude "
+                f"{table.path}: no column of the field was found by its name ({known}); name the magnitude "
                 "with --field NAME, or the components with --vector BX,BY,BZ"
             )
     if columns.unit is None and columns.scale is None:
-        _, b = _field(sheet, replace(columns, unit="nT"))
+        _, b = _field(table, replace(columns, unit="nT"))
         unit = unit_by_size(b)
         if unit not in (None, "nT"):
             columns = replace(columns, unit=unit)  # type: ignore[arg-type]
-            taken.append(f"{columns.field or columns.vector} in {unit}, as its size tells (--unit)")
+            taken.append(f"{columns.field or columns.vector} in {unit}, by its size (--unit)")
     return columns, taken
 
 
-def _check_axes(vector_nt: Array, yaw: Array, sheet: Sheet, columns: Columns) -> None:
+def _check_axes(vector_nt: Array, yaw: Array, table: Table, columns: Columns) -> None:
     """Refuse vectors whose level part keeps its direction in the other axes than those that were said."""
     if np.hypot(np.cos(yaw).mean(), np.sin(yaw).mean()) > TURNED:
         return  # one heading: nothing tells the axes apart
@@ -435,7 +434,7 @@ def _check_axes(vector_nt: Array, yaw: Array, sheet: Sheet, columns: Columns) ->
     if there > ALIGNED and here < ALIGNED / 2:
         other = "world" if said == "body" else "body"
         raise InputError(
-            f"{sheet.path}: {columns.vector} are taken to be in {said} axes, but they keep one direction "
+            f"{table.path}: {columns.vector} are taken to be in {said} axes, but they keep one direction "
             f"({100 * there:.0f} % of them) in {other} axes, as the Earth's field does: give --axes {other}, "
             "or correct the headings or the order of the components"
         )
@@ -460,68 +459,68 @@ def levelled(vector_nt: Array, turn: Array, axes: str) -> Array:
     return rotate(quat_conjugate(quat_from_yaw(yaw_from_quat(turn))), world)
 
 
-def _turn(sheet: Sheet, columns: Columns) -> Array | None:
-    """Headings [rad], shape (N,), or quaternions xyzw, shape (N, 4); none where there is no such column."""
+def _turn(table: Table, columns: Columns) -> Array | None:
+    """Headings [rad], shape (N,), or quaternions xyzw, shape (N, 4); None if there is no such column."""
     if columns.quaternion:
-        return np.column_stack([sheet.numbers(name) for name in columns.several("quaternion")])
-    name = columns.heading or next((name for name in HEADINGS if name in sheet.names), "")
+        return np.column_stack([table.numbers(name) for name in columns.several("quaternion")])
+    name = columns.heading or next((name for name in HEADINGS if name in table.names), "")
     if not name:
         return None
-    heading = sheet.numbers(name)
+    heading = table.numbers(name)
     if columns.heading_unit == "deg":
         return np.radians(heading)
     beyond = np.flatnonzero(np.abs(heading) > LARGEST_TURN)
     if columns.heading_unit is None and len(beyond):
-        where = sheet.column(name).where(int(beyond[0]))
+        where = table.column(name).where(int(beyond[0]))
         raise InputError(
             f"{where}: heading {heading[beyond[0]]:g} is beyond a full turn in radians; "
-            "give --heading-unit deg, or rad where it counts turns"
+            "give --heading-unit deg, or rad if it counts turns"
         )
     return heading
 
 
-def _magnitude(sheet: Sheet, columns: Columns) -> Any:
-    """The column that a fault of the magnitude is told of."""
+def _magnitude(table: Table, columns: Columns) -> Any:
+    """The column to name in errors of the magnitude."""
     if columns.field:
-        return sheet.column(columns.field)
+        return table.column(columns.field)
     if columns.vector:
-        return sheet.column(columns.several("vector")[0])
-    return sheet.column(next((name for name in FIELDS if name in sheet.names), FIELDS[0]))
+        return table.column(columns.several("vector")[0])
+    return table.column(next((name for name in FIELDS if name in table.names), FIELDS[0]))
 
 
-def _field(sheet: Sheet, columns: Columns) -> tuple[Array | None, Array]:
-    """Vectors, where there are, and magnitudes [nT], shapes (N, 3) and (N,)."""
+def _field(table: Table, columns: Columns) -> tuple[Array | None, Array]:
+    """Vectors, if there are any, and magnitudes [nT], shapes (N, 3) and (N,)."""
     vector, factor = None, nt_per(columns.unit, columns.scale)
     if columns.vector:
         names = columns.several("vector")
-        vector = factor * np.column_stack([sheet.numbers(name) for name in names])
+        vector = factor * np.column_stack([table.numbers(name) for name in names])
     if columns.field or vector is None:
-        return vector, factor * sheet.numbers(_magnitude(sheet, columns).name or columns.field)
+        return vector, factor * table.numbers(_magnitude(table, columns).name or columns.field)
     return vector, np.linalg.norm(vector, axis=1)
 
 
-def _check_sizes(vector_nt: Array, b_nt: Array, sheet: Sheet, columns: Columns) -> None:
-    """Refuse vectors that are not of their magnitudes' size: of another unit, or other columns."""
+def _check_sizes(vector_nt: Array, b_nt: Array, table: Table, columns: Columns) -> None:
+    """Refuse vectors that differ in size from the magnitudes: another unit, or other columns."""
     ratio = float(np.median(np.linalg.norm(vector_nt, axis=1) / b_nt))
     if not 1 / APART <= ratio <= APART:
         raise InputError(
-            f"{sheet.path}: {columns.vector} is {ratio:.3g} times as long as {columns.field} in the median; "
+            f"{table.path}: {columns.vector} is {ratio:.3g} times as long as {columns.field} (median); "
             "give both in one unit, and the components of the whole field"
         )
 
 
-def _runs(sheet: Sheet, columns: Columns, stem: str, known: NDArray[np.bool_]) -> Any:
-    """Which run each of the known rows belongs to, and the runs' names."""
+def _runs(table: Table, columns: Columns, stem: str, known: NDArray[np.bool_]) -> Any:
+    """Run of each known row, and names of the runs."""
     if not columns.run_column:
         return None, (stem,)
-    words = [word for word, is_known in zip(sheet.texts(columns.run_column), known, strict=True) if is_known]
+    words = [word for word, is_known in zip(table.texts(columns.run_column), known, strict=True) if is_known]
     runs = list(dict.fromkeys(words))
     index = {word: i for i, word in enumerate(runs)}
     return np.array([index[word] for word in words]), tuple(f"{stem} {word}" for word in runs)
 
 
 def _together(parts: Sequence[Readings]) -> Readings:
-    """Several surveys as the runs of one."""
+    """Several surveys as runs of one."""
     gridded = [part for part in parts if part.grid is not None]
     if gridded:
         raise InputError(
@@ -540,8 +539,8 @@ def _together(parts: Sequence[Readings]) -> Readings:
         ("height_m", None),
         ("earth_nt", None),
     ):
-        found = {getattr(part, key) for part in parts}
-        same[key] = found.pop() if len(found) == 1 else unknown
+        values_of = {getattr(part, key) for part in parts}
+        same[key] = values_of.pop() if len(values_of) == 1 else unknown
     same["licence"] = "; ".join(dict.fromkeys(part.licence for part in parts if part.licence))
     runs = tuple(run for part in parts for run in part.runs)
     source = "; ".join(part.source for part in parts)
@@ -568,6 +567,6 @@ def _sum(path: Path) -> str:
 
 
 def _left_out(known: NDArray[np.bool_]) -> str:
-    """A remark on rows without a value."""
+    """A note on rows without a value."""
     missing = int(np.count_nonzero(~known))
     return f" ({missing} of {len(known)} rows without a value left out)" if missing else ""

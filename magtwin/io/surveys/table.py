@@ -1,4 +1,4 @@
-"""Sheet: rows of numbers in columns, from CSV or Parquet, that know file and line of every cell."""
+"""Table: columns of numbers from CSV or Parquet, with file and line of every cell for error messages."""
 
 import csv
 import math
@@ -19,33 +19,33 @@ from magtwin.files import existing
 Array = NDArray[np.float64]
 
 LONGEST_LINE = 65_536
-"""Characters; a longer line is no row of numbers."""
+"""Longest line [characters]."""
 
-SAID = 60
-"""Characters of a file's own text that a refusal quotes."""
+QUOTED = 60
+"""Most characters of a file that an error message quotes."""
 
 _NUMBER = re.compile(r"\s*[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
 _NOTHING = {"", "nan", "na", "null", "none"}
 
 _REMARK = re.compile(r"\s*#\s*\w+:\s")
-"""A comment line `# KEY: VALUE`, as maps that are written as CSVs have them."""
+"""A comment line `# KEY: VALUE`, as in maps written as CSV."""
 
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """A column of a sheet."""
+    """A column of a table."""
 
     name: str
-    """Its name; "" in a file without a header."""
+    """Name; "" in a file without a header."""
 
     cells: Any
-    """Texts of the cells, a list, or numbers, an array with nan for nothing; N of them."""
+    """N cells: a list of texts, or an array of numbers with nan for empty cells."""
 
     path: Path
-    """File that it is from."""
+    """Its file."""
 
     lines: Sequence[int] | None
-    """Line of each cell in the file; none in a file that has no lines."""
+    """Line of each cell in the file; None for files without lines."""
 
     def where(self, row: int) -> str:
         """File and line of a cell."""
@@ -53,11 +53,11 @@ class Column:
 
 
 @dataclass(frozen=True, eq=False)
-class Sheet:
-    """Equally long columns, side by side."""
+class Table:
+    """Columns of equal length."""
 
     columns: tuple[Column, ...]
-    """In the order of the file, or of the files."""
+    """In the order of the file or files."""
 
     @property
     def rows(self) -> int:
@@ -66,7 +66,7 @@ class Sheet:
 
     @property
     def names(self) -> list[str]:
-        """Names of the columns; "1", "2", ... where they have none."""
+        """Names of the columns; "1", "2", ... if they have none."""
         return [column.name or str(i) for i, column in enumerate(self.columns, 1)]
 
     @property
@@ -78,24 +78,26 @@ class Sheet:
         """A column by its name, or by its number from 1.
 
         Raises:
-            InputError: No such column (the near one is named), or two of that name.
+            InputError: There is no such column (the message has the nearest name), or two have that name.
         """
-        found = [column for column in self.columns if column.name == name]
-        if len(found) > 1:
-            raise InputError(f"{self.path}: {len(found)} columns are called {name!r}; name it by its number")
-        if found:
-            return found[0]
+        matches = [column for column in self.columns if column.name == name]
+        if len(matches) > 1:
+            raise InputError(
+                f"{self.path}: {len(matches)} columns are called {name!r}; name it by its number"
+            )
+        if matches:
+            return matches[0]
         if name.isascii() and name.isdigit() and 1 <= int(name) <= len(self.columns):
             return self.columns[int(name) - 1]
-        named = [column.name[:SAID] for column in self.columns if column.name]
+        named = [column.name[:QUOTED] for column in self.columns if column.name]
         known = hint(name, named) if named else f"no header: name columns by number, 1 to {len(self.columns)}"
         raise InputError(f"{self.path}: no column {name!r}; {known}")
 
     def numbers(self, name: str) -> Array:
-        """The numbers of a column, shape (N,); nan where a cell is empty or says so.
+        """The numbers of a column, shape (N,); nan for cells that are empty or nan.
 
         Raises:
-            InputError: No such column, or a cell is neither; with file and line.
+            InputError: There is no such column, or a cell is not a number; with file and line.
         """
         column = self.column(name)
         if isinstance(column.cells, np.ndarray):
@@ -108,7 +110,9 @@ class Sheet:
             if len(wrong):
                 row = int(wrong[0])
                 text = column.cells[row].strip()
-                raise InputError(f"{column.where(row)}: {name} must be a finite number, got {text[:SAID]!r}")
+                raise InputError(
+                    f"{column.where(row)}: {name} must be a finite number, got {text[:QUOTED]!r}"
+                )
         infinite = np.flatnonzero(np.isinf(values))
         if len(infinite):
             row = int(infinite[0])
@@ -116,33 +120,33 @@ class Sheet:
         return values
 
     def texts(self, name: str) -> list[str]:
-        """The cells of a column as text, without blanks around."""
+        """The cells of a column as stripped texts."""
         column = self.column(name)
         return [str(cell).strip() for cell in column.cells]
 
-    def beside(self, other: "Sheet") -> "Sheet":
-        """This sheet with the columns of another to the right.
+    def beside(self, other: "Table") -> "Table":
+        """This table with the columns of another on the right.
 
         Raises:
-            InputError: They have not equally many rows.
+            InputError: The numbers of rows differ.
         """
         if self.rows != other.rows:
             raise InputError(
                 f"{other.path}: {other.rows} rows, but {self.path} has {self.rows}; "
-                "files joined side by side have a row each for every reading"
+                "files joined side by side need one row per reading each"
             )
-        return Sheet(self.columns + other.columns)
+        return Table(self.columns + other.columns)
 
 
-def read_csv(path: str | os.PathLike[str]) -> Sheet:
-    """The sheet of a text file: values between commas, semicolons, tabs or blanks.
+def read_csv(path: str | os.PathLike[str]) -> Table:
+    """Read a text file with values separated by commas, semicolons, tabs or blanks.
 
-    The header is the first line where any of its words is no number; else the last comment line above the
-    rows that has as many words as they have. Other lines that begin with `#`, such as `# KEY: VALUE`, and
-    empty ones are passed over.
+    The header is the first line if any of its words is not a number, else the last comment line above the
+    rows with as many words as they have. Other lines that begin with `#`, such as `# KEY: VALUE`, and empty
+    lines are skipped.
 
     Raises:
-        InputError: The file is missing, no text, empty, has lines too long or of uneven width.
+        InputError: The file is missing, not text, or empty, or its lines are too long or of different widths.
     """
     path = existing(path, "file of readings")
     if path.is_dir():
@@ -155,7 +159,7 @@ def read_csv(path: str | os.PathLike[str]) -> Sheet:
             above.append((number, line.lstrip().lstrip("#")))
     lines = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
     if not lines:
-        raise InputError(f"{path}: empty; expected a row of numbers for every reading")
+        raise InputError(f"{path}: empty; expected one row of numbers per reading")
     between = next((mark for mark in ",;\t" if mark in lines[0][1]), None)
     words = _words(path, lines, between)
     names: list[str] = []
@@ -164,17 +168,17 @@ def read_csv(path: str | os.PathLike[str]) -> Sheet:
         lines.pop(0)
     else:
         for comment in above:
-            with suppress(InputError):  # a remark in words, with quotes of its own
-                (said,) = _words(path, [comment], between)
-                names = [word.strip() for word in said] if len(said) == len(words[0]) else names
+            with suppress(InputError):  # prose with unpaired quotes
+                (header,) = _words(path, [comment], between)
+                names = [word.strip() for word in header] if len(header) == len(words[0]) else names
     if not words:
-        raise InputError(f"{path}: no rows below the header; expected one for every reading")
+        raise InputError(f"{path}: no rows below the header; expected one per reading")
     width = len(names) or len(words[0])
     for (number, _), row in zip(lines, words, strict=True):
         if len(row) != width:
             raise InputError(f"{path}:{number}: {width} values expected, got {len(row)}")
     numbers = [number for number, _ in lines]
-    return Sheet(
+    return Table(
         tuple(
             Column(name, list(cells), path, numbers)
             for name, cells in zip(names or [""] * width, zip(*words, strict=True), strict=True)
@@ -182,11 +186,11 @@ def read_csv(path: str | os.PathLike[str]) -> Sheet:
     )
 
 
-def read_parquet_sheet(path: str | os.PathLike[str]) -> Sheet:
-    """The sheet of a Parquet file; columns of lists and the like are left out.
+def read_parquet_table(path: str | os.PathLike[str]) -> Table:
+    """Read the columns of numbers and texts of a Parquet file.
 
     Raises:
-        InputError: The file is missing, is not Parquet, was cut short, or has no rows.
+        InputError: The file is missing, is not Parquet, is truncated, or has no rows.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -211,12 +215,12 @@ def read_parquet_sheet(path: str | os.PathLike[str]) -> Sheet:
         elif pa.types.is_string(kind) or pa.types.is_large_string(kind):
             columns.append(Column(field.name, np.array(values.to_pylist(), object), path, None))
     if not columns or not table.num_rows:
-        raise InputError(f"{path}: no rows of numbers in it; expected one for every reading")
-    return Sheet(tuple(columns))
+        raise InputError(f"{path}: it has no rows of numbers; expected one per reading")
+    return Table(tuple(columns))
 
 
 def _lines(path: Path) -> Any:
-    """Number and text of every line that is not blank."""
+    """Number and text of every nonblank line."""
     with open(path, encoding="utf-8-sig", newline=None) as file:
         number = 0
         try:
@@ -224,7 +228,7 @@ def _lines(path: Path) -> Any:
                 number += 1
                 if len(line) > LONGEST_LINE:
                     raise InputError(
-                        f"{path}:{number}: longer than {LONGEST_LINE:,} characters; no row of numbers is"
+                        f"{path}:{number}: longer than {LONGEST_LINE:,} characters; this is no row of numbers"
                     )
                 if line.strip():
                     yield number, line.rstrip("\n")
@@ -240,12 +244,12 @@ def _words(path: Path, lines: list[tuple[int, str]], between: str | None) -> lis
         try:
             rows.append(next(csv.reader([line], delimiter=between, strict=True)))
         except csv.Error as error:
-            raise InputError(f"{path}:{number}: not CSV: {error}, in {line[:SAID]!r}") from None
+            raise InputError(f"{path}:{number}: not CSV: {error}, in {line[:QUOTED]!r}") from None
     return rows
 
 
 def _number(word: str) -> float:
-    """A word as a number; nan where it says nothing, -inf where it is none."""
+    """A word as a number; nan if it is empty, -inf if it is not a number."""
     if _NUMBER.fullmatch(word):
         value = float(word)
         return value if math.isfinite(value) else -math.inf

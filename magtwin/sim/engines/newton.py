@@ -1,4 +1,4 @@
-"""Newton: the engine that drives the stage itself, its bodies, contact and drives (extra `physics`)."""
+"""Newton: physics in the stage itself, with its bodies, contacts and drives (extra `physics`)."""
 
 import importlib.util
 import json
@@ -25,38 +25,38 @@ from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import RobotSpec
 
 STEP_S = 0.001
-"""Length of a physics step, about [s]; a control step has a whole number of them."""
+"""Approximate length of a physics step [s]; a control step has a whole number of them."""
 
 TOUCH_M = 0.003
-"""Distance from an obstacle at which the footprint counts as touching it [m]: shapes are no circles."""
+"""Distance at which the footprint counts as touching an obstacle [m], since shapes are not circles."""
 
 UPRIGHT = 0.8
-"""Cosine of the tilt beyond which the robot has fallen over."""
+"""Cosine of the tilt at which the robot counts as fallen over."""
 
 
 @dataclass(frozen=True)
 class Newton:
-    """A robot in Newton on the CPU; the same commands give the same bits.
+    """A robot in Newton on the CPU; the same commands give the same bytes.
 
-    Commands are limited, and followed by the wheels' set speeds with the motors' lag, as in the kinematic
-    engine; what comes of them is physics. Wheels slip as the stage's contact says, and scrub on curves as
-    wide as it has them; where the drive's `yaw_slip` is 0 they roll on the middle of their treads. Errors of
-    radius and separation are the kinematic engine's: wheels turn as much more as they should roll farther.
+    Commands are limited, and the wheels' set speeds follow with the motors' lag, as in the kinematic engine;
+    the rest is physics. Wheels slip according to the stage's contact and scrub on curves according to their
+    width. If the drive's `yaw_slip` is 0, they roll on the middle of their treads. Errors of radius and
+    separation scale the set speeds.
     """
 
     stage: FilePath
     """Root layer of the scene."""
 
     robot: RobotSpec
-    """The robot that is driven; it is found in the stage by its name."""
+    """The robot to drive; it is found in the stage by its name."""
 
     progress: Callable[[int, int, str], Any] | None = None
-    """Called ten times a simulated second: steps made, the most there can be, and the time in words."""
+    """Called ten times a simulated second with steps done, steps at most, and the time as text."""
 
     name = "newton"
 
     def drive(
-        self, course: ClosedLoop, controller: Controller | None, obstacles: Obstacles | None
+        self, closed_loop: ClosedLoop, controller: Controller | None, obstacles: Obstacles | None
     ) -> SampledMotion:
         """As for `magtwin.sim.motion.engine.Engine`.
 
@@ -66,23 +66,23 @@ class Newton:
         """
         check_installed()
         obstacles = obstacles or Obstacles()
-        course.check(obstacles)
-        drive, dt = course.drive, course.dt
-        guide: Controller = replace(course.guide) if controller is None else controller
+        closed_loop.check(obstacles)
+        drive, dt = closed_loop.drive, closed_loop.dt
+        guide: Controller = replace(closed_loop.guide) if controller is None else controller
         limit, parts = limiter(drive, dt), max(1, round(dt / STEP_S))
         step = dt / parts
         left = math.exp(-step / drive.motor_lag_s) if drive.motor_lag_s else 0.0
         in_mean = drive.motor_lag_s / step * (1.0 - left)
-        told, wheels, last, age = (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), 0.0
-        radius, separation = (1.0 + error for error in course.wheel_errors)
+        target, wheels, last, age = (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), 0.0
+        radius, separation = (1.0 + error for error in closed_loop.wheel_errors)
         rest_w = REST_M_S * 2 / drive.wheel_separation_m
-        asked: list[tuple[float, float]] = []
-        with _Process(self, course, step) as world:
+        commanded: list[tuple[float, float]] = []
+        with _Process(self, closed_loop, step) as world:
             rows = [world.seen()]
             yaw = rows[0][2]
-            for k in range(course.steps):
+            for k in range(closed_loop.steps):
                 if self.progress is not None and k % max(1, round(0.1 / dt)) == 0:
-                    self.progress(k, course.steps, f"{k * dt:.1f} s driven")
+                    self.progress(k, closed_loop.steps, f"{k * dt:.1f} s driven")
                 command = guide.command(k * dt, rows[-1][0], rows[-1][1], yaw, *wheels)
                 age = 0.0 if command is not None else age + dt
                 if command is not None:
@@ -94,17 +94,20 @@ class Newton:
                         )
                 elif age > drive.command_timeout_s + LATE_S:
                     last = 0.0, 0.0
-                told = limit(*last, *told)
+                target = limit(*last, *target)
                 rates = []
                 for _ in range(parts):
-                    mean = [b + in_mean * (a - b) for a, b in zip(wheels, told, strict=True)]
-                    wheels = told[0] + left * (wheels[0] - told[0]), told[1] + left * (wheels[1] - told[1])
+                    mean = [b + in_mean * (a - b) for a, b in zip(wheels, target, strict=True)]
+                    wheels = (
+                        target[0] + left * (wheels[0] - target[0]),
+                        target[1] + left * (wheels[1] - target[1]),
+                    )
                     rolls = mean[0] * radius, mean[1] * radius / separation
                     rates.append(wheel_rates(*rolls, drive).tolist())
-                if told == (0.0, 0.0) and abs(wheels[0]) < REST_M_S and abs(wheels[1]) < rest_w:
+                if target == (0.0, 0.0) and abs(wheels[0]) < REST_M_S and abs(wheels[1]) < rest_w:
                     wheels = 0.0, 0.0
                 rows.append(world.step(rates))
-                asked.append(last)
+                commanded.append(last)
                 yaw += wrapped(rows[-1][2] - yaw)
                 if rows[-1][8] < UPRIGHT or not math.isfinite(rows[-1][7]):
                     raise InputError(
@@ -114,9 +117,9 @@ class Newton:
                 if guide.done and wheels == (0.0, 0.0):
                     break
         seen = np.array(rows)
-        commands = np.array([*asked, asked[-1]])
+        commands = np.array([*commanded, commanded[-1]])
         both, apart = (seen[:, 5] + seen[:, 6]) / radius, (seen[:, 6] - seen[:, 5]) * separation / radius
-        distance, _ = obstacles.clearance(seen[:, :2], reach_m=course.footprint_radius_m + 1.0)
+        distance, _ = obstacles.clearance(seen[:, :2], reach_m=closed_loop.footprint_radius_m + 1.0)
         return SampledMotion(
             t=np.arange(len(seen), dtype=float) * dt,
             pose=np.column_stack([seen[:, :2], np.unwrap(seen[:, 2])]),
@@ -125,13 +128,13 @@ class Newton:
             wheel_angle=np.column_stack([both - apart, both + apart]) / 2,
             v_cmd=commands[:, 0],
             w_cmd=commands[:, 1],
-            bump=distance < course.footprint_radius_m + TOUCH_M,
+            bump=distance < closed_loop.footprint_radius_m + TOUCH_M,
             duration_s=(len(seen) - 1) * dt,
         )
 
 
 def check_installed() -> None:
-    """Refuse where Newton is not installed; the text says how to get it."""
+    """Refuse to run without Newton; the text says how to install it."""
     lacking = [m for m in ("newton", "newton_usd_schemas", "mujoco") if importlib.util.find_spec(m) is None]
     if lacking:
         raise InputError(
@@ -141,23 +144,23 @@ def check_installed() -> None:
 
 
 class _Process:
-    """`newton_world` in a process of its own, ended with the block."""
+    """`newton_world` in another process, which ends with the block."""
 
-    def __init__(self, engine: Newton, course: ClosedLoop, step_s: float) -> None:
+    def __init__(self, engine: Newton, closed_loop: ClosedLoop, step_s: float) -> None:
         self._engine = engine
-        drive = course.drive
+        drive = closed_loop.drive
         self._job = {
             "stage": str(FilePath(engine.stage).resolve()),
             "robot": engine.robot.name,
             "base": "base_link",
             "joints": [drive.left_wheel_joint, drive.right_wheel_joint],
-            "start": list(course.pose0),
+            "start": list(closed_loop.pose0),
             "step_s": step_s,
             "scrub": drive.yaw_slip > 0,
         }
 
     def __enter__(self) -> "_Process":
-        self._folder = tempfile.TemporaryDirectory()  # MuJoCo leaves its log where it runs
+        self._folder = tempfile.TemporaryDirectory()  # MuJoCo writes its log there
         self._log = open(FilePath(self._folder.name, "log"), "w+", encoding="utf-8")
         root = str(FilePath(__file__).resolve().parents[3])
         path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
@@ -171,7 +174,7 @@ class _Process:
             cwd=self._folder.name,
             env={**os.environ, "PYTHONPATH": path},
         )
-        self._say(self._job)
+        self._send(self._job)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -194,20 +197,20 @@ class _Process:
         line = self._process.stdout.readline()
         if not line:
             self._log.seek(0)
-            said = [text for text in self._log.read().splitlines() if text.strip()]
+            lines = [text for text in self._log.read().splitlines() if text.strip()]
             raise InputError(
-                f"{self._engine.stage}: Newton cannot run it: {said[-1] if said else 'it gave no reason'}"
+                f"{self._engine.stage}: Newton cannot run it: {lines[-1] if lines else 'it gave no reason'}"
             )
         row: list[float] = json.loads(line)
         return row
 
     def step(self, rates: list[list[float]]) -> list[float]:
-        """Drive on for one control step, a pair of wheel rates [rad/s] a physics step."""
-        self._say(rates)
+        """Drive for one control step, with a pair of wheel rates [rad/s] for each physics step."""
+        self._send(rates)
         return self.seen()
 
-    def _say(self, message: object) -> None:
+    def _send(self, message: object) -> None:
         assert self._process.stdin is not None
-        with suppress(OSError):  # it has ended: `seen` says why
+        with suppress(OSError):  # it has ended; `seen` reports why
             self._process.stdin.write(json.dumps(message) + "\n")
             self._process.stdin.flush()

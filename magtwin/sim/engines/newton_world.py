@@ -1,15 +1,14 @@
-"""A stage in Newton's MuJoCo solver, stepped by whoever holds the other end of a pipe.
+"""A stage in Newton's MuJoCo solver, stepped through a pipe.
 
     python -m magtwin.sim.engines.newton_world
 
-Newton wants its USD schemas registered before USD is first used, so this is a process of its own; `newton.py`
-starts it and talks to it. In: a line of JSON, `{"stage", "robot", "joints": [left, right], "base", "start":
-[x, y, yaw], "step_s", "scrub"}`, then a line a control step: rates of both wheels [rad/s], a pair a physics
-step.
-Out: a line after the robot has settled and one after each control step: x, y, yaw, v, w, both wheels' angles,
-height of the base [m], and the z component of its up axis. Newton reads the stage, its contact and its
-drives; its solver's own MuJoCo model is then stepped in C, as through Newton's arrays a step takes a
-millisecond.
+Newton needs its USD schemas registered before USD is first used, so `newton.py` starts this as another
+process. In: a line of JSON, `{"stage", "robot", "joints": [left, right], "base", "start":
+[x, y, yaw], "step_s", "scrub"}`, then a line per control step with the rates of both wheels [rad/s], a pair
+per physics step. Out: a line after the robot has settled and one after each control step: x, y, yaw, v, w,
+both wheels' angles, height of the base [m], and the z component of its up axis. Newton reads the stage, its
+contacts and drives. Then the MuJoCo model of its solver is stepped in C, because a step through Newton's
+arrays takes a millisecond.
 """
 
 import json
@@ -23,20 +22,18 @@ import newton
 import newton_usd_schemas  # noqa: F401 - registers them
 
 SETTLE_S = 0.5
-"""How long the robot stands before it is driven [s]."""
+"""Time for which the robot settles before it is driven [s]."""
 
 ROTOR_KG_M2 = 0.002
-"""Inertia of a wheel's motor through its gears; ours. With less, a wheel answers its stiff drive within one
-step, for which MuJoCo's implicit integrator corrects the wheel but not the contact, and the robot is thrown.
-"""
+"""Inertia of a wheel's motor through its gears; assumed. With less, a wheel answers its stiff drive within
+one step: MuJoCo's implicit integrator then corrects the wheel but not the contact, and throws the robot."""
 
 STIFF_STEPS = 4.0
-"""Steps in which a contact gives way and comes back, MuJoCo's solref; ours. In its own 0.02 s a robot of 4 kg
-sinks by 0.34 mm into a hard floor, and its wheels roll as if they were 0.5 % smaller.
-"""
+"""Time constant of a contact in steps (MuJoCo's solref); assumed. With MuJoCo's default of 0.02 s a robot of
+4 kg sinks by 0.34 mm into a hard floor, and its wheels roll as if they were 0.5 % smaller."""
 
 EDGE_M = 0.0005
-"""Half of the width on which a wheel rolls that does not scrub [m]."""
+"""Half of the width of a wheel that does not scrub [m]."""
 
 
 class World:
@@ -54,15 +51,13 @@ class World:
         for joint in wheels:
             armature[starts[joint]] = max(float(armature[starts[joint]]), ROTOR_KG_M2)
         model.joint_armature.assign(armature)
-        # Kept, as the model and the data belong to it.
+        # Kept, since it owns the model and the data.
         self._solver = newton.solvers.SolverMuJoCo(model, use_mujoco_cpu=True, cone="elliptic")
         self._model, self._data = self._solver.mj_model, self._solver.mj_data
         self._model.opt.timestep = job["step_s"]
-        self._model.geom_gap[:] = (
-            0.0  # Newton's own 0.1 m has twice the contacts looked for, which bear nothing
-        )
-        # Newton has MuJoCo look for one point of contact a pair: a cylinder's jumps from edge to edge of its
-        # tread, and the wheels stand now nearer to each other, now farther apart.
+        self._model.geom_gap[:] = 0.0  # Newton's default of 0.1 m doubles the contacts, without effect
+        # Newton asks MuJoCo for one contact point per pair. That of a cylinder jumps from edge to edge of its
+        # tread, so that the distance between the wheels would jump too.
         self._model.geom_solref[:] = STIFF_STEPS * job["step_s"], 1.0
         self._model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
         bodies = [self._model.body(i).name for i in range(self._model.nbody)]
@@ -82,7 +77,7 @@ class World:
         self._qd = self._model.jnt_dofadr[free]
         x, y, yaw = job["start"]
         self._data.qpos[self._q + 3 : self._q + 7] = math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)
-        for _ in range(2):  # first to settle, then without the little way that this took
+        for _ in range(2):  # settle, put the robot back, and settle again
             self._data.qpos[self._q : self._q + 2] = x, y
             mujoco.mj_forward(self._model, self._data)
             for _ in range(round(SETTLE_S / 2 / job["step_s"])):
@@ -91,7 +86,7 @@ class World:
         self._zero = self._angles()
 
     def _narrow(self) -> None:
-        """Have the wheels roll on the middle of their treads, as the edges of a wide one slip on a curve."""
+        """Let the wheels roll on the middle of their treads, since the edges of a wide one slip on curves."""
         turned = [self._model.jnt_bodyid[joint] for joint in self._wheels]
         for i, body in enumerate(self._model.geom_bodyid.tolist()):
             if body in turned and self._model.geom_type[i] == mujoco.mjtGeom.mjGEOM_CYLINDER:
@@ -110,7 +105,7 @@ class World:
         turn = self._data.xmat[self._base].reshape(3, 3)
         yaw = math.atan2(turn[1, 0], turn[0, 0])
         vx, vy, _, wx, wy, wz = self._data.qvel[self._qd : self._qd + 6].tolist()
-        w = turn[2, 0] * wx + turn[2, 1] * wy + turn[2, 2] * wz  # MuJoCo's is in the body's axes
+        w = turn[2, 0] * wx + turn[2, 1] * wy + turn[2, 2] * wz  # MuJoCo gives it in the body's axes
         v = vx * math.cos(yaw) + vy * math.sin(yaw)
         left, right = (a - b for a, b in zip(self._angles(), self._zero, strict=True))
         return [x, y, yaw, v, float(w), left, right, z, float(turn[2, 2])]
@@ -120,7 +115,7 @@ class World:
 
 
 def _only(labels: list[str], robot: str, name: str) -> int:
-    """The label that ends with a robot's link or joint; MuJoCo's have _ where those of USD have /."""
+    """Index of the label of a robot's link or joint; MuJoCo's labels have _ in place of /."""
     plain = [label.replace("/", "_") for label in labels]
     ends = [i for i, label in enumerate(plain) if label.endswith(f"_{name}")]
     ends = [i for i in ends if f"_{robot}_" in plain[i]] if len(ends) > 1 else ends
@@ -134,7 +129,7 @@ def _only(labels: list[str], robot: str, name: str) -> int:
 def main() -> None:
     """Serve one stage."""
     out = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)  # what the libraries say is no answer
+    os.dup2(2, 1)  # what the libraries print goes to stderr
     world = World(json.loads(sys.stdin.readline()))
     out.write(json.dumps(world.seen()) + "\n")
     for line in sys.stdin:

@@ -1,8 +1,8 @@
-"""Replay: a recorded Run driven once more, so that sensors set anew read what they would have read on it.
+"""Replay: the motion of a recorded Run, on which other sensors can be read.
 
-What follows from how speeds change, the motors' torque above all, is only as good as what is known of them
-between rows. Rows of the kinematic engine, with one or more in each control step and no first ones cut off,
-tell its steps, and the drive is itself again. Of others speeds go evenly from row to row.
+Rows of the kinematic engine, from the first on and at least one in each control step, give its exact motion.
+For other rows speeds change evenly from row to row; quantities that depend on their change, above all the
+motors' torque, are then only as good as the rate of the rows.
 """
 
 from dataclasses import replace
@@ -22,18 +22,16 @@ def replayed(run: Run, drive: DriveSpec) -> SampledMotion:
     """The motion that a Run recorded, from its first row on.
 
     Args:
-        run: It needs t, p_world_base, and yaw or q_world_base_xyzw. Where v_base or w_base are missing,
-            speeds follow from the poses; where wheel_angle is missing, the wheels roll without slip;
-            commands that are missing are not known.
+        run: It needs t, p_world_base, and yaw or q_world_base_xyzw. Without v_base or w_base, speeds follow
+            from the poses. Without wheel_angle, the wheels roll without slip. Commands may be missing.
         drive: The robot's wheels.
 
     Returns:
-        The motion, one mean interval longer than the rows, so that at the rate of the Run it has as many
-        readings as the Run has rows.
+        The motion, one mean interval longer than the rows, so that it gives as many readings.
 
     Raises:
-        InputError: A column is missing, there are fewer than two rows, time does not go on, or a pose is
-            not finite; the text gives the row.
+        InputError: A column is missing, there are fewer than two rows, times do not ascend, or a pose is not
+            finite; the text has the row.
     """
     lacking = [name for name in ("t", "p_world_base") if name not in run]
     if "yaw" not in run and "q_world_base_xyzw" not in run:
@@ -44,7 +42,7 @@ def replayed(run: Run, drive: DriveSpec) -> SampledMotion:
             "t,v,w is for --commands"
         )
     if run.rows < 2:
-        raise InputError(f"a run of {run.rows} rows is no motion to replay; two or more are needed")
+        raise InputError(f"a run to replay needs at least two rows, got {run.rows}")
     t = run["t"]
     yaw = run["yaw"] if "yaw" in run else yaw_from_quat(run["q_world_base_xyzw"])
     pose = np.column_stack([run["p_world_base"][:, :2], yaw])
@@ -65,9 +63,9 @@ def replayed(run: Run, drive: DriveSpec) -> SampledMotion:
     if "v_base" in run and "w_base" in run:
         v, w = run["v_base"][:, 0], run["w_base"][:, 2]
     else:
-        way = np.gradient(pose, t, axis=0)
-        v = way[:, 0] * np.cos(pose[:, 2]) + way[:, 1] * np.sin(pose[:, 2])
-        w = way[:, 2]
+        rate = np.gradient(pose, t, axis=0)
+        v = rate[:, 0] * np.cos(pose[:, 2]) + rate[:, 1] * np.sin(pose[:, 2])
+        w = rate[:, 2]
     if "wheel_angle" in run:
         wheels = run["wheel_angle"] - run["wheel_angle"][0]
     else:

@@ -1,4 +1,4 @@
-"""A motion that is known at samples: what a physics engine did, or what a Run recorded."""
+"""SampledMotion: a motion known at samples, from a physics engine or a recorded Run."""
 
 from dataclasses import dataclass
 
@@ -11,25 +11,24 @@ from magtwin.sim.motion.drive import Moment, advance
 Array = NDArray[np.float64]
 
 SAME = 1e-9
-"""Rounding that poses of a drive are forgiven [m, rad]."""
+"""Tolerance of poses [m, rad]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SampledMotion:
-    """A motion between whose samples position and heading are cubics with the sampled velocities.
+    """A motion whose position and heading between samples are cubics with the sampled velocities.
 
-    At a sample it gives what was sampled, to the last bit; before the first and after the last the robot
-    stands. Where the twist is constant between samples h apart, a cubic is v w^3 h^4 / 384 off the arc:
-    nothing to speak of at 135 Hz, 0.3 mm at 2 Hz and the drive's limits. Of a drive whose speeds were held
-    for control steps, each with a sample, it is that drive itself: speeds jump where the steps did, and
-    positions go on along arcs.
+    At a sample it gives the exact sample; before the first and after the last the robot stands. If the twist
+    is constant between samples h apart, the cubic is off the arc by v w^3 h^4 / 384: negligible at 135 Hz,
+    0.3 mm at 2 Hz and the drive's limits. If speeds were held for control steps, each with a sample, the
+    motion is exact: speeds jump between steps, and positions follow arcs.
     """
 
     t: Array
     """Times of the samples since the start, the first at 0, ascending [s], shape (K,), K >= 2."""
 
     pose: Array
-    """x [m], y [m], yaw [rad] of base_link in world, shape (K, 3); yaw without jumps."""
+    """x [m], y [m], yaw [rad] of base_link in world, shape (K, 3); yaw is not wrapped."""
 
     v: Array
     """Forward speed [m/s], shape (K,)."""
@@ -41,10 +40,10 @@ class SampledMotion:
     """Angle turned by the left and the right wheel since the start [rad], shape (K, 2)."""
 
     v_cmd: Array
-    """Commanded forward speed [m/s], shape (K,); nan where it is not known."""
+    """Commanded forward speed [m/s], shape (K,); nan if unknown."""
 
     w_cmd: Array
-    """Commanded yaw rate [rad/s], shape (K,); nan where it is not known."""
+    """Commanded yaw rate [rad/s], shape (K,); nan if unknown."""
 
     bump: NDArray[np.bool_]
     """Whether an obstacle was touched, shape (K,)."""
@@ -53,8 +52,8 @@ class SampledMotion:
     """Time from the start to the end [s], at least that of the last sample."""
 
     step_s: float | None = None
-    """Length of the control steps, the first from 0 on, in which speeds are held [s]; None where they go
-    evenly from sample to sample."""
+    """Length of the control steps, the first at 0, in which speeds are held [s]; None if speeds change evenly
+    from sample to sample."""
 
     def __post_init__(self) -> None:
         count = len(self.t)
@@ -70,7 +69,7 @@ class SampledMotion:
         if self.step_s is not None and not self.has_steps(self.step_s):
             raise InputError(f"a motion has no sample, or speeds that change, in a step of {self.step_s:g} s")
         if count < 2 or self.t[0] != 0 or not np.all(np.diff(self.t) > 0):
-            raise InputError("a motion needs two samples or more, the first at 0 s, in order of time")
+            raise InputError("a motion needs at least two samples in order of time, the first at 0 s")
         for name in ("t", "pose", "v", "w", "wheel_angle"):
             if not np.isfinite(getattr(self, name)).all():
                 raise InputError(f"{name} of a motion is not finite")
@@ -108,7 +107,7 @@ class SampledMotion:
         )
 
     def has_steps(self, step_s: float) -> bool:
-        """Whether this is a drive whose speeds were held for steps from 0 on, with a sample in each.
+        """Whether speeds were held for steps from 0 on, with a sample in each step.
 
         Args:
             step_s: Length of the steps [s].
@@ -122,7 +121,7 @@ class SampledMotion:
         return held and bool(np.all(np.abs(along[same]) < SAME))
 
     def _held(self, t: Array, step_s: float) -> Moment:
-        """`at` of speeds that are held: each time takes the sample of its step that is next to it."""
+        """`at` for held speeds: each time takes the nearest sample of its step."""
         step, of = _steps(t, step_s), _steps(self.t, step_s)
         k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 1)
         after = np.minimum(k + 1, len(self.t) - 1)
@@ -130,7 +129,7 @@ class SampledMotion:
         moving = t <= self.t[-1]
         first = np.flatnonzero(np.diff(of, prepend=-1))
         a = np.diff(self.v[first], prepend=0.0) / step_s
-        # A wheel's rate is that between two samples of a step, or of a step with one, of both its sides.
+        # A wheel's rate is that between two samples of a step; with one sample, the mean over both sides.
         rates = np.diff(self.wheel_angle, axis=0) / np.diff(self.t)[:, None]
         before, behind = np.vstack([rates[:1], rates]), np.vstack([rates, rates[-1:]])
         inside = np.diff(of) == 0
@@ -156,6 +155,6 @@ class SampledMotion:
 
 
 def _steps(t: Array, step_s: float) -> NDArray[np.intp]:
-    """Which control step times fall into, as `magtwin.sim.motion.drive.Motion.at` has it, shape (N,)."""
+    """Control step of each time, as in `magtwin.sim.motion.drive.Motion.at`, shape (N,)."""
     starts = np.arange(int(np.max(t, initial=0.0) / step_s) + 2) * step_s
     return np.searchsorted(starts, t, side="right") - 1

@@ -1,4 +1,4 @@
-"""ClosedLoop: the closed loop of one robot or many, in plain Python or compiled."""
+"""ClosedLoop: a robot and its controller, ready to run, alone or with many others, plain or compiled."""
 
 import math
 from array import array
@@ -23,16 +23,16 @@ LOOPS = Loops("magtwin.sim.motion.compiled", pays=140_000)
 """The compiled loop, and the steps of plain Python that take as long as opening it."""
 
 BLOCK = 8192
-"""Steps that are recorded at a time, as most courses end long before their last step."""
+"""Steps that are recorded at a time; most robots stop long before their last allowed step."""
 
 RECORDED = 40_000_000
-"""Numbers that the records and tables of robots driven at once may hold: 0.3 GB."""
+"""Most numbers in the records and tables of robots that are driven at once: 0.3 GB."""
 
 SHARE = 200_000
 """Steps for which a thread of compiled code is worth its start."""
 
 TOUCH_M = 1e-9
-"""Rounding that a start beside an obstacle is forgiven [m]."""
+"""Tolerance of a start beside an obstacle [m]."""
 
 
 def warm_up() -> None:
@@ -49,33 +49,33 @@ def warm_up() -> None:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ClosedLoop:
-    """What one robot's closed loop needs."""
+    """A robot and its controller at the start."""
 
     drive: DriveSpec
 
     guide: Guide
-    """What commands it; it is not changed by the drive."""
+    """Its controller; driving does not change it."""
 
     dt: float
     """Length of a control step [s]."""
 
     pose0: Pose
-    """First x [m], y [m], yaw [rad] in world; it begins at rest."""
+    """First x [m], y [m], yaw [rad] in world; the robot begins at rest."""
 
     steps: int
     """Most steps."""
 
     least_steps: int = 0
-    """As many will be made, as far as is known."""
+    """Expected number of steps."""
 
     footprint_radius_m: float = 0.0
-    """Radius of the circle that obstacles stop [m]."""
+    """Radius of the footprint that obstacles stop [m]."""
 
     wheel_errors: tuple[float, float] = (0.0, 0.0)
-    """How far the wheels' radius and separation are from the nominal ones, relative."""
+    """Relative errors of the wheels' radius and separation."""
 
     def figures(self) -> list[float]:
-        """As `loop.drive_on` takes them."""
+        """Figures for `loop.drive_on`."""
         drive, dt = self.drive, self.dt
         left = math.exp(-dt / drive.motor_lag_s) if drive.motor_lag_s else 0.0
         in_mean = drive.motor_lag_s / dt * (1.0 - left)
@@ -94,7 +94,7 @@ class ClosedLoop:
         ]
 
     def state(self) -> list[float]:
-        """At the start, as `loop.drive_on` takes it."""
+        """State at the start for `loop.drive_on`."""
         return [
             *self.pose0,
             0.0,
@@ -111,7 +111,7 @@ class ClosedLoop:
         ]
 
     def check(self, obstacles: Obstacles) -> None:
-        """Refuse a course that begins in an obstacle, or whose steps are too long."""
+        """Refuse a start in an obstacle, and steps that are too long."""
         if not 0 < self.dt < self.drive.command_timeout_s:
             raise InputError(
                 f"a control step of {self.dt:g} s must be above 0 s and below the drive's command_timeout_s, "
@@ -123,92 +123,90 @@ class ClosedLoop:
             radius, name = self.footprint_radius_m, obstacles.names[which[0]]
             raise InputError(
                 f"the robot would begin in {name}: at ({x:.3f}, {y:.3f}) m its footprint of radius "
-                f"{radius:g} m is {radius - distance[0]:.3f} m too near; begin elsewhere, or move that"
+                f"{radius:g} m is {radius - distance[0]:.3f} m too near; begin elsewhere, or move it"
             )
 
 
-def run_loops(courses: Sequence[ClosedLoop], obstacles: Obstacles | None = None) -> list[Motion]:
-    """Drive robots, each as if it were alone: the same bits whatever their number, order and way of running.
+def run_loops(loops: Sequence[ClosedLoop], obstacles: Obstacles | None = None) -> list[Motion]:
+    """Drive robots, each as if it were alone; the bytes depend on neither their number nor their order.
 
     Args:
-        courses: Theirs; all with the same length of a step.
+        loops: The robots; all with the same length of a step.
         obstacles: What stands in the room; robots do not meet each other.
 
     Returns:
-        What each did: until its controller was done and it stood, or its steps were over.
+        The motion of each, until its controller was done and it stood, or its steps were over.
 
     Raises:
-        InputError: A robot would begin in an obstacle, or lengths of steps differ.
+        InputError: A robot would begin in an obstacle, or the lengths of steps differ.
     """
     obstacles = obstacles or Obstacles()
-    starts = {(c.pose0, c.footprint_radius_m, c.dt, c.drive.command_timeout_s): c for c in courses}
-    for course in starts.values():
-        course.check(obstacles)
-    if len({course.dt for course in courses}) > 1:
-        raise InputError("courses that are run at once must have the same length of a step")
-    code = LOOPS.after(sum(course.least_steps for course in courses))
+    starts = {(c.pose0, c.footprint_radius_m, c.dt, c.drive.command_timeout_s): c for c in loops}
+    for closed_loop in starts.values():
+        closed_loop.check(obstacles)
+    if len({closed_loop.dt for closed_loop in loops}) > 1:
+        raise InputError("robots that are driven at once must have the same length of a step")
+    code = LOOPS.after(sum(closed_loop.least_steps for closed_loop in loops))
     if code is None:
-        return [_in_python(course, obstacles) for course in courses]
+        return [_in_python(closed_loop, obstacles) for closed_loop in loops]
     motions: list[Motion] = []
     group: list[ClosedLoop] = []
     size = 0
-    for course in courses:
-        own = min(course.steps, BLOCK) * loop.RECORD + course.guide.table.size
+    for closed_loop in loops:
+        own = min(closed_loop.steps, BLOCK) * loop.RECORD + closed_loop.guide.table.size
         if group and size + own > RECORDED:
             motions += _compiled(group, obstacles)
             group, size = [], 0
-        group.append(course)
+        group.append(closed_loop)
         size += own
     return motions + (_compiled(group, obstacles) if group else [])
 
 
 def fence_of(obstacles: Obstacles) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Obstacles as `loop.robots` takes them: edges (4, E), boxes (4, O), and where edges begin (O + 1,)."""
+    """Obstacles for `loop.robots`: edges (4, E), boxes (4, O), and first edge of each obstacle (O + 1,)."""
     edges, begins = obstacles.edges
     boxes = [np.concatenate([o.min(axis=0), o.max(axis=0)]) for o in obstacles.outlines]
     box = np.array(boxes).reshape(-1, 4)
     return np.ascontiguousarray(edges.T), np.ascontiguousarray(box.T), begins.astype(np.int64)
 
 
-def _in_python(course: ClosedLoop, obstacles: Obstacles) -> Motion:
-    """One course in plain Python."""
+def _in_python(closed_loop: ClosedLoop, obstacles: Obstacles) -> Motion:
+    """Drive one robot in plain Python."""
     edges, boxes, begins = fence_of(obstacles)
     fence, spans = [*edges.tolist(), *boxes.tolist()], begins.tolist()
-    figures, state, table = course.figures(), course.state(), course.guide.columns
+    figures, state, table = closed_loop.figures(), closed_loop.state(), closed_loop.guide.columns
     state[8] = math.inf if not len(obstacles) else 0.0
     records, first = [], 0
-    while first < course.steps:
-        steps = min(BLOCK, course.steps - first)
+    while first < closed_loop.steps:
+        steps = min(BLOCK, closed_loop.steps - first)
         record = [array("d", bytes(8 * steps)) for _ in range(loop.RECORD)]
-        made = loop.drive_on(course.guide.law, figures, table, fence, spans, state, first, steps, record)
+        made = loop.drive_on(closed_loop.guide.law, figures, table, fence, spans, state, first, steps, record)
         records.append(np.array([np.frombuffer(column)[:made] for column in record]))
         first += made
         if made < steps:
             break
-    return _motion(course, np.concatenate(records, axis=1))
+    return _motion(closed_loop, np.concatenate(records, axis=1))
 
 
-def _compiled(courses: Sequence[ClosedLoop], obstacles: Obstacles) -> list[Motion]:
-    """Courses in the compiled loop."""
+def _compiled(loops: Sequence[ClosedLoop], obstacles: Obstacles) -> list[Motion]:
+    """Drive robots in the compiled loop."""
     room = fence_of(obstacles)
-    figures = np.array([course.figures() for course in courses])
-    state = np.array([course.state() for course in courses])
+    figures = np.array([closed_loop.figures() for closed_loop in loops])
+    state = np.array([closed_loop.state() for closed_loop in loops])
     state[:, 8] = np.inf if not len(obstacles) else 0.0
-    most = np.array([course.steps for course in courses])
-    records: list[list[Array]] = [[] for _ in courses]
-    first, going = 0, np.arange(len(courses))
+    most = np.array([closed_loop.steps for closed_loop in loops])
+    records: list[list[Array]] = [[] for _ in loops]
+    first, going = 0, np.arange(len(loops))
     while len(going):
         steps = min(BLOCK, int(most[going].min()) - first)
         part = state[going]
-        record, made = _block(
-            [courses[int(n)].guide for n in going], figures[going], part, room, first, steps
-        )
+        record, made = _block([loops[int(n)].guide for n in going], figures[going], part, room, first, steps)
         state[going] = part
         for n, rows, count in zip(going, record, made, strict=True):
             records[n].append(rows[:, :count].copy())
         first += steps
         going = going[(made == steps) & (most[going] > first)]
-    return [_motion(c, np.concatenate(r, axis=1)) for c, r in zip(courses, records, strict=True)]
+    return [_motion(c, np.concatenate(r, axis=1)) for c, r in zip(loops, records, strict=True)]
 
 
 def _block(
@@ -219,13 +217,13 @@ def _block(
     first: int,
     steps: int,
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Some steps of robots, whose state is changed, on several threads where there is work for them.
+    """Drive robots for some steps, on several threads if that pays; changes `state`.
 
     Returns:
-        What happened, shape (N, RECORD, steps), and how many steps each made, shape (N,).
+        Their records, shape (N, RECORD, steps), and the number of steps of each, shape (N,).
     """
     robots, count = LOOPS.open().robots, len(guides)
-    distinct = {id(guide.table): guide.table for guide in guides}  # those on one path share its table
+    distinct = {id(guide.table): guide.table for guide in guides}  # robots on one path share its table
     ends = np.cumsum([table.shape[1] for table in distinct.values()])
     places = dict(zip(distinct, ends, strict=True))
     last = np.array([places[id(guide.table)] for guide in guides], np.int64)
@@ -242,18 +240,18 @@ def _block(
     return record, made
 
 
-def _motion(course: ClosedLoop, record: Array) -> Motion:
-    """What a record of `loop.drive_on` tells, shape (RECORD, K)."""
+def _motion(closed_loop: ClosedLoop, record: Array) -> Motion:
+    """The motion in a record of `loop.drive_on`, shape (RECORD, K)."""
     x, y, yaw, v, w, wheel_v, wheel_w, v_cmd, w_cmd, bump = record
     poses = np.empty((len(x) + 1, 3))
-    poses[0] = course.pose0
+    poses[0] = closed_loop.pose0
     poses[1:, 0], poses[1:, 1], poses[1:, 2] = x, y, yaw
     return Motion(
-        course.drive,
-        course.dt,
+        closed_loop.drive,
+        closed_loop.dt,
         v,
         w,
-        course.pose0,
+        closed_loop.pose0,
         wheel_v=wheel_v,
         wheel_w=wheel_w,
         v_cmd=v_cmd,
@@ -264,20 +262,20 @@ def _motion(course: ClosedLoop, record: Array) -> Motion:
 
 
 class Chassis:
-    """A robot that is commanded step by step: by a controller of one's own, a keyboard, a learner."""
+    """A robot that is commanded step by step: by a custom controller, a keyboard, or a learner."""
 
-    def __init__(self, course: ClosedLoop, obstacles: Obstacles | None = None) -> None:
-        """Put a robot at the beginning of a course, whose guide is not asked.
+    def __init__(self, closed_loop: ClosedLoop, obstacles: Obstacles | None = None) -> None:
+        """Put a robot at its start; the guide is not used.
 
         Raises:
             InputError: It would begin in an obstacle.
         """
         obstacles = obstacles or Obstacles()
-        course.check(obstacles)
+        closed_loop.check(obstacles)
         edges, boxes, spans = fence_of(obstacles)
-        self._course = course
+        self._course = closed_loop
         self._fence, self._spans = [*edges.tolist(), *boxes.tolist()], spans.tolist()
-        self._figures, self._state = course.figures(), course.state()
+        self._figures, self._state = closed_loop.figures(), closed_loop.state()
         self._state[8] = math.inf if not len(obstacles) else 0.0
         self._record = [array("d") for _ in range(loop.RECORD)]
         self._last = (0.0, 0.0)
@@ -290,26 +288,26 @@ class Chassis:
 
     @property
     def pose(self) -> Pose:
-        """Where it is: x [m], y [m], yaw [rad] in world."""
+        """Its x [m], y [m], yaw [rad] in world."""
         x, y, yaw = self._state[:3]
         return x, y, yaw
 
     @property
     def twist(self) -> tuple[float, float]:
-        """Forward speed [m/s] and yaw rate [rad/s], as the wheels turn."""
+        """Forward speed [m/s] and yaw rate [rad/s] of the wheels."""
         return self._state[5], self._state[6]
 
     @property
     def bump(self) -> bool:
-        """Whether it touches what stopped it."""
+        """Whether it touches an obstacle."""
         return self._state[9] > 0
 
     def step(self, command: tuple[float, float] | None) -> None:
-        """Drive on for one control step.
+        """Drive for one control step.
 
         Args:
-            command: Forward speed [m/s] and yaw rate [rad/s]; none is no news: the last one holds until
-                the drive's command_timeout_s is over.
+            command: Forward speed [m/s] and yaw rate [rad/s]. None keeps the last command until the drive's
+                command_timeout_s is over.
 
         Raises:
             InputError: The command is not finite.
@@ -335,9 +333,9 @@ class Chassis:
 
     @property
     def last(self) -> Array:
-        """What happened in the last step, shape (loop.RECORD,)."""
+        """The record of the last step, shape (loop.RECORD,)."""
         return np.array([column[-1] for column in self._record])
 
     def motion(self) -> Motion:
-        """What it has done so far."""
+        """The motion so far."""
         return _motion(self._course, np.array([np.frombuffer(column) for column in self._record]))

@@ -1,4 +1,4 @@
-"""Commands: a script of cmd_vel, as a CSV of t,v,w brings it and as manual driving leaves it."""
+"""Commands: a script of cmd_vel, from a CSV of t,v,w or from manual driving."""
 
 import math
 import os
@@ -19,19 +19,19 @@ HEADER = "t,v,w"
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Commands(Summarized):
-    """What a robot is commanded, row by row; a command holds until the next, or until it is too old."""
+    """Commands of a robot, one a row; a command holds until the next, or until it is too old."""
 
     name: str
-    """What it is called: the file that it came from."""
+    """Name, such as that of the file."""
 
     rows: Array
     """Time since the start [s], forward speed [m/s], yaw rate [rad/s], shape (K, 3), in order of time."""
 
     file: str = ""
-    """The file that they were read from, as that was named; "" where they came from none."""
+    """File that they were read from, as the user named it; "" if none."""
 
     def beyond(self, drive: DriveSpec) -> str:
-        """What of it a drive will not do, in a line; "" where it keeps the drive's limits."""
+        """A line on the commands that exceed a drive's limits; "" if none does."""
         parts = []
         for column, name, most, unit in ((1, "v", drive.v_max, "m/s"), (2, "w", drive.w_max, "rad/s")):
             size = np.abs(self.rows[:, column])
@@ -60,8 +60,8 @@ def read_commands(file: str | os.PathLike[str]) -> Commands:
     """Commands from a CSV of `t,v,w` in s, m/s and rad/s, a command a line, with or without a header.
 
     Raises:
-        InputError: The file is missing or empty, a line is not three finite numbers, or time does not go
-            on from 0 s up; the text gives the line.
+        InputError: The file is missing or empty, a line is not three finite numbers, or times do not ascend
+            from 0 s; the text has the number of the line.
     """
     file = existing(file, "file of commands")
     try:
@@ -81,7 +81,7 @@ def read_commands(file: str | os.PathLike[str]) -> Commands:
             t, v, w = (float(cell) for cell in cells)
         except ValueError:
             if rows or headers:
-                raise InputError(f"{where}: not a number in {line!r}; t,v,w are wanted") from None
+                raise InputError(f"{where}: not a number in {line!r}; a line is t,v,w") from None
             headers += 1
             continue
         if not (math.isfinite(t) and math.isfinite(v) and math.isfinite(w)):
@@ -89,16 +89,16 @@ def read_commands(file: str | os.PathLike[str]) -> Commands:
         if t < 0 or (rows and t <= rows[-1][0]):
             after = f"after {rows[-1][0]:g} s" if rows else "as the first"
             raise InputError(
-                f"{where}: time must go on from 0 s up, got t = {t:g} s {after}; put the lines in order"
+                f"{where}: times must ascend from 0 s, got t = {t:g} s {after}; put the lines in order"
             )
         rows.append((t, v, w))
     if not rows:
-        raise InputError(f"{file}: no commands in it; one t,v,w a line is wanted")
+        raise InputError(f"{file}: no commands in it; a line is t,v,w")
     return Commands(file.name, np.array(rows), file.as_posix())
 
 
 def write_commands(commands: Commands, file: str | os.PathLike[str], *, force: bool = False) -> None:
-    """Write commands as `read_commands` reads them, to the last bit.
+    """Write commands so that `read_commands` reads the same numbers.
 
     Raises:
         InputError: The file exists and `force` was not given, or it cannot be written.

@@ -1,5 +1,6 @@
 """The closed loop of `loop.py`, compiled; `closed_loop.LOOPS` opens this module."""
 
+from collections.abc import Callable
 from typing import Any
 
 from numba import types
@@ -26,10 +27,17 @@ _SIGNATURE = (
 )
 
 # A call counts references to every array that it is given, which would double the time of a step.
-_function: Any
-for _function in (loop.towards_point, loop.along_path, loop.commanded):
+_IN_PLACE: tuple[Callable[..., Any], ...] = (loop.towards_point, loop.along_path, loop.commanded)
+_CALLED: tuple[Callable[..., Any], ...] = (
+    loop.wrapped,
+    loop.limited,
+    loop.clearance,
+    loop.free_way,
+    loop.drive_on,
+)
+for _function in _IN_PLACE:
     inlined(_function, inline="always")
-for _function in (loop.wrapped, loop.limited, loop.clearance, loop.free_way, loop.drive_on):
+for _function in _CALLED:
     inlined(_function)
 
 robots = compiled(*_SIGNATURE)(loop.robots)

@@ -1,11 +1,11 @@
-"""Controllers: what a robot is commanded, step by step, from where it is.
+"""Controllers: from where a robot is to what it is commanded, step by step.
 
-A controller of one's own is any object with what `Controller` names. Those of magtwin are `Guide`s, made by
-name from a path, or from a script of commands; what each of them computes stands in `loop.py`.
+A custom controller is any object with the members of `Controller`. The controllers of magtwin are `Guide`s,
+made by name from a path or from a script of commands; `loop.py` computes what they command.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError, find
 from magtwin.path import Path
+from magtwin.registry import Registry
 from magtwin.sim.motion import loop
 from magtwin.sim.motion.plan import LIMIT_SHARE, drivable, plan
 from magtwin.spec.drive import DriveSpec
@@ -30,28 +31,28 @@ CONTROLLERS: Mapping[str, int] = MappingProxyType(
         "pure_pursuit": loop.PURE_PURSUIT,
     }
 )
-"""Controllers that follow a path: ours; that of the released package, as it drives the real robot; Stanley's
-(Hoffmann et al. 2007); pure pursuit (Coulter 1992)."""
+"""Built-in controllers that follow a path: magtwin's; that of the released package, which drives the real
+robot; Stanley's (Hoffmann et al. 2007); pure pursuit (Coulter 1992)."""
 
 RELEASE_GAIN = 0.5
 """k of the released follower [1/s], as published."""
 
 LOST_M = 0.05
-"""Distance from the path beyond which the robot drives straight back to where it left it [m]."""
+"""Distance from the path beyond which the robot drives straight back to it [m]."""
 
 CREEP = 0.01
-"""Speed at which a piece is begun and ended [m/s]; one step of it is 0.2 mm."""
+"""Speed at the start and end of a piece [m/s]; one step of it is 0.2 mm."""
 
 AHEAD_M: Mapping[str, float] = MappingProxyType({"stanley": 0.06, "pure_pursuit": 0.15})
-"""How far Stanley's steered wheel is ahead of the axle, and pure pursuit's goal along the path [m]; ours."""
+"""Distance of Stanley's steered wheel ahead of the axle, and of pure pursuit's goal along the path [m]."""
 
 
 class Controller(Protocol):
-    """What commands a robot."""
+    """Commands a robot."""
 
     @property
     def done(self) -> bool:
-        """Whether it has nothing more to command; the run then ends when the robot stands."""
+        """Whether it has no more commands; the run then ends when the robot stands."""
 
     def command(
         self, t: float, x: float, y: float, yaw: float, v: float, w: float
@@ -62,49 +63,56 @@ class Controller(Protocol):
             t: Time since the start [s].
             x: Position in world [m].
             y: Position in world [m].
-            yaw: Heading in world [rad], which goes on beyond pi.
+            yaw: Heading in world, not wrapped at pi [rad].
             v: Forward speed, as the wheels turn [m/s].
             w: Yaw rate, as the wheels turn [rad/s].
 
         Returns:
-            None says nothing: the last command then holds, until the drive's command_timeout_s is over.
+            None keeps the last command until the drive's command_timeout_s is over.
         """
+
+
+ControllerFactory = Callable[[Path, DriveSpec, float], Controller]
+"""From a path, the drive and the wanted speed [m/s] to a controller at the start of a run."""
+
+CUSTOM_CONTROLLERS: Registry[ControllerFactory] = Registry("controller", "controllers")
+"""Registered controllers; see `magtwin.sim.extensions`."""
 
 
 @dataclass(eq=False)
 class Guide:
-    """A controller of magtwin's own, which can be compiled."""
+    """A built-in controller, which can be compiled."""
 
     law: int
-    """Which: a number of `loop.py`."""
+    """Number of its control law in `loop.py`."""
 
     table: Array
-    """What it follows, as `loop.drive_on` reads it, shape (loop.TABLE, M)."""
+    """The path or script, as `loop.drive_on` reads it, shape (loop.TABLE, M)."""
 
     gains: tuple[float, float, float, float, float, float, float, float]
     """As `loop.along_path` takes them."""
 
     timeout_s: float
-    """Age at which a scripted command is void [s]."""
+    """Age at which a scripted command becomes invalid [s]."""
 
     pose0: tuple[float, float, float] | None = None
-    """x [m], y [m], yaw [rad] at which what it follows begins; none for a script."""
+    """x [m], y [m], yaw [rad] at the start of the path; None for a script."""
 
     node: int = 0
-    """Node that is next; their number when it is done."""
+    """Next node; the number of nodes when it is done."""
 
     driven_m: float = 0.0
-    """Way since that changed [m]."""
+    """Distance driven since `node` changed [m]."""
 
     @cached_property
     def columns(self) -> list[list[float]]:
-        """`table` as lists, which plain Python reads faster."""
+        """`table` as lists, which are faster in plain Python."""
         columns: list[list[float]] = self.table.tolist()
         return columns
 
     @property
     def done(self) -> bool:
-        """Whether its end was reached; it then commands a stand."""
+        """Whether the end was reached; it then commands a stop."""
         return self.node >= self.table.shape[1]
 
     def command(self, t: float, x: float, y: float, yaw: float, v: float, w: float) -> tuple[float, float]:
@@ -131,20 +139,19 @@ def guide_along(name: str, path: Path, drive: DriveSpec, *, speed: float, dt: fl
 
     Args:
         name: One of `CONTROLLERS`.
-        path: Where to drive, taken as an open line.
-        drive: Its limits, and its motors' lag, which all but the release's foresee.
+        path: Where to drive, as an open line.
+        drive: Its limits, and the lag of its motors, which all but "release" compensate.
         speed: Wanted forward speed [m/s].
         dt: Time between commands [s].
 
     Raises:
         UnknownNameError: No such controller; the text names the nearest one.
-        InputError: `speed` is out of range, or the path too small to be driven.
+        InputError: `speed` is out of range, or the path is too small.
     """
     law = find("controller", name, CONTROLLERS)
-    way = drivable(path)
-    pieces = plan(way, drive, speed=speed)
+    pieces = plan(drivable(path), drive, speed=speed)
     if law == loop.RELEASE:
-        p = path.p_xy  # the release pursues the points as they stand in its file
+        p = path.p_xy  # the release pursues the points of its file
         unused = np.zeros((loop.TABLE - 2, len(p)))
         (x, y), (dx, dy) = p[0].tolist(), (p[1] - p[0]).tolist()
         gains = (dt, dt, speed, speed, 0.0, 0.0, 0.0, RELEASE_GAIN)
@@ -168,14 +175,14 @@ def guide_along(name: str, path: Path, drive: DriveSpec, *, speed: float, dt: fl
 
 
 def guide_by_commands(commands: ArrayLike, drive: DriveSpec) -> Guide:
-    """A controller that plays a script: each command holds until the next, or until it is too old.
+    """A controller that plays a script. A command holds until the next one, or until it is too old.
 
     Args:
         commands: Time since the start [s], forward speed [m/s] and yaw rate [rad/s] of each, shape (K, 3).
-        drive: Whose command_timeout_s makes a command void.
+        drive: Its command_timeout_s ends a command.
 
     Raises:
-        InputError: They are not of that shape, not finite, or not in order of time; the text gives the row.
+        InputError: They have another shape, are not finite, or not in order of time; the text gives the row.
     """
     rows = np.asarray(commands, float)
     if rows.ndim != 2 or rows.shape[1] != 3 or not len(rows):

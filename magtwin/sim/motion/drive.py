@@ -1,7 +1,7 @@
 """The differential drive: exact integration of twists, wheels, limits."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -19,17 +19,17 @@ Pose = tuple[float, float, float]
 def advance(pose: ArrayLike, v: ArrayLike, w: ArrayLike, duration: ArrayLike) -> Array:
     """Poses of a unicycle after a constant twist, without Euler's error.
 
-    The way is an arc of angle a = w t; its chord, v t sin(a/2) / (a/2), points halfway between the
+    The robot drives an arc of angle a = w t. Its chord, v t sin(a/2) / (a/2), points halfway between the
     headings at its ends.
 
     Args:
         pose: x [m], y [m], yaw [rad] before, in world, shape (..., 3).
         v: Forward speeds [m/s], shape (...).
         w: Yaw rates [rad/s], shape (...).
-        duration: How long each twist lasts, t [s], shape (...).
+        duration: Duration t of each twist [s], shape (...).
 
     Returns:
-        x, y, yaw after, shape (..., 3); yaw goes on beyond pi.
+        x, y, yaw after, shape (..., 3); yaw is not wrapped.
     """
     pose = np.asarray(pose, float)
     half = np.asarray(w, float) * duration / 2
@@ -69,7 +69,7 @@ def wheel_rates(v: ArrayLike, w: ArrayLike, drive: DriveSpec) -> Array:
 
 
 def limits(drive: DriveSpec, dt: float) -> tuple[float, float, float, float, float, float]:
-    """A drive's limits as `magtwin.sim.motion.loop.limited` takes them, for steps of `dt` [s]."""
+    """Limits of a drive for steps of `dt` [s], as arguments of `magtwin.sim.motion.loop.limited`."""
     rim = drive.wheel_rate_max * drive.wheel_radius_m
     return (
         drive.v_max,
@@ -82,21 +82,16 @@ def limits(drive: DriveSpec, dt: float) -> tuple[float, float, float, float, flo
 
 
 def limiter(drive: DriveSpec, dt: float) -> Callable[[float, float, float, float], tuple[float, float]]:
-    """What a drive makes of a command: a function of scalars, to be called at each control step.
+    """The function `limit(v_wanted, w_wanted, v, w) -> (v, w)` of a drive, for each control step.
 
-    Returns:
-        `limit(v_wanted, w_wanted, v, w) -> (v, w)`: the twist nearest to the wanted one that keeps
-        v_max, w_max and the highest rate of a wheel, and differs from the last one by at most a_max dt and
-        alpha_max dt; see `magtwin.sim.motion.loop.limited`.
+    It gives the nearest twist to the wanted one that keeps v_max, w_max and the highest rate of a wheel, and
+    differs from the last twist by at most a_max dt and alpha_max dt; see `magtwin.sim.motion.loop.limited`.
     """
     return partial(limited, limits(drive, dt))
 
 
 def draw_wheel_errors(drive: DriveSpec, rng: np.random.Generator) -> tuple[float, float]:
-    """How far the wheels are from their nominal size in one run: of radius and separation, relative.
-
-    What the runs of a session share, and what this run draws beside it.
-    """
+    """Relative errors of the wheels' radius and separation in one run: the session's, plus a draw."""
     radius, separation = rng.standard_normal(2).tolist()
     shared = drive.wheel_errors
     return (
@@ -107,10 +102,10 @@ def draw_wheel_errors(drive: DriveSpec, rng: np.random.Generator) -> tuple[float
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """A motion at given times; arrays of shape (N,) unless said."""
+    """A motion at given times; arrays of shape (N,) except as noted."""
 
     pose: Array
-    """x [m], y [m], yaw [rad] of base_link in world, shape (N, 3); yaw goes on beyond pi."""
+    """x [m], y [m], yaw [rad] of base_link in world, shape (N, 3); yaw is not wrapped."""
 
     v: Array
     """Forward speed [m/s]."""
@@ -125,21 +120,21 @@ class Moment:
     """Angle turned by the left and the right wheel since the start [rad], shape (N, 2)."""
 
     v_cmd: Array
-    """Commanded forward speed [m/s]; nan where it is not known."""
+    """Commanded forward speed [m/s]; nan if unknown."""
 
     w_cmd: Array
-    """Commanded yaw rate [rad/s]; nan where it is not known."""
+    """Commanded yaw rate [rad/s]; nan if unknown."""
 
     bump: NDArray[np.bool_]
-    """Whether the robot touches what stopped it."""
+    """Whether the robot touches an obstacle."""
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What a differential drive did: a twist for each control step, from rest at `pose0`.
+    """The motion of a differential drive: a twist for each control step, from rest at `pose0`.
 
-    Of a drive that is ideal no more need be said. Columns that are not given follow from the others: the
-    wheels roll without slip, what was done was commanded, and nothing was touched.
+    Defaults of the other columns are those of an ideal drive: wheels roll without slip, the motion was
+    commanded, and nothing was touched.
     """
 
     drive: DriveSpec
@@ -157,22 +152,22 @@ class Motion:
     """First x [m], y [m], yaw [rad] in world."""
 
     wheel_v: Array | None = field(default=None, kw_only=True, repr=False)
-    """Forward speed that the wheels would give at their nominal size without slip [m/s], shape (K,)."""
+    """Forward speed of the wheels at their nominal size without slip [m/s], shape (K,)."""
 
     wheel_w: Array | None = field(default=None, kw_only=True, repr=False)
-    """Yaw rate that they would give [rad/s], shape (K,)."""
+    """Yaw rate of the wheels likewise [rad/s], shape (K,)."""
 
     v_cmd: Array | None = field(default=None, kw_only=True, repr=False)
-    """Forward speed that was commanded in each step [m/s], shape (K,)."""
+    """Commanded forward speed in each step [m/s], shape (K,)."""
 
     w_cmd: Array | None = field(default=None, kw_only=True, repr=False)
-    """Yaw rate that was commanded [rad/s], shape (K,)."""
+    """Commanded yaw rate in each step [rad/s], shape (K,)."""
 
     bump: NDArray[np.bool_] | None = field(default=None, kw_only=True, repr=False)
-    """Whether an obstacle shortened the step, or the robot has not left it since, shape (K,)."""
+    """Whether an obstacle shortened the step or is still touched, shape (K,)."""
 
     poses: Array | None = field(default=None, kw_only=True, repr=False)
-    """x, y, yaw at the start and after each step, shape (K + 1, 3); yaw goes on beyond pi."""
+    """x, y, yaw at the start and after each step, shape (K + 1, 3); yaw is not wrapped."""
 
     wheel_rates: Array = field(init=False, repr=False)
     """Rates of the left and the right wheel in each step [rad/s], shape (K, 2)."""
@@ -184,8 +179,8 @@ class Motion:
     """Angle turned by left and right wheel at the start and after each step [rad], shape (K + 1, 2)."""
 
     _steps: Array = field(init=False, repr=False)
-    """What holds in each step, to be taken at once: its first pose (3), wheel angles (2) and rates (2), v, w,
-    acceleration, v_cmd, w_cmd, whether an obstacle is touched; shape (K, 13)."""
+    """Columns of each step: first pose (3), wheel angles (2) and rates (2), v, w, acceleration, v_cmd, w_cmd,
+    bump; shape (K, 13)."""
 
     def __post_init__(self) -> None:
         v, w = np.asarray(self.v, float), np.asarray(self.w, float)
@@ -229,20 +224,34 @@ class Motion:
         return len(self.v) * self.dt
 
     def at(self, t: ArrayLike) -> Moment:
-        """Pose, speeds and wheels at times `t`, exact within the steps; after the last it stands.
+        """Pose, speeds and wheels at times `t`, exact within the steps; after the last step the robot stands.
 
         Args:
             t: Times since the start, from 0 [s], shape (N,).
         """
         t = np.asarray(t, float)
-        starts = np.arange(len(self.v)) * self.dt
-        k = np.searchsorted(starts, t, side="right") - 1
-        into = np.clip(t - starts[k], 0.0, self.dt)
-        then = self._steps.take(k, axis=0)
-        v, w, a, v_cmd, w_cmd, bump = then[:, 7:].T
-        pose = advance(then[:, :3], v, w, into)
-        turned = then[:, 3:5] + then[:, 5:7] * into[:, None]
+        moment = moment_in_steps(self._steps, self.dt, t)
         moving = t < self.duration_s
-        if not moving.all():
-            v, w, a, v_cmd, w_cmd = (column * moving for column in (v, w, a, v_cmd, w_cmd))
-        return Moment(pose=pose, v=v, w=w, a=a, wheel_angle=turned, v_cmd=v_cmd, w_cmd=w_cmd, bump=bump > 0)
+        if moving.all():
+            return moment
+        stopped = {name: getattr(moment, name) * moving for name in ("v", "w", "a", "v_cmd", "w_cmd")}
+        return replace(moment, **stopped)
+
+
+def moment_in_steps(steps: Array, dt: float, t: Array, *, first: int = 0) -> Moment:
+    """A motion within its control steps, exact.
+
+    Args:
+        steps: Columns of each step, as `Motion` keeps them, shape (K, 13).
+        dt: Length of a control step [s].
+        t: Times within the steps [s], shape (N,).
+        first: Number of the first of these steps since the start.
+    """
+    starts = np.arange(first, first + len(steps)) * dt
+    k = np.maximum(np.searchsorted(starts, t, side="right") - 1, 0)
+    into = np.clip(t - starts[k], 0.0, dt)
+    then = steps.take(k, axis=0)
+    v, w, a, v_cmd, w_cmd, bump = then[:, 7:].T
+    pose = advance(then[:, :3], v, w, into)
+    turned = then[:, 3:5] + then[:, 5:7] * into[:, None]
+    return Moment(pose=pose, v=v, w=w, a=a, wheel_angle=turned, v_cmd=v_cmd, w_cmd=w_cmd, bump=bump > 0)

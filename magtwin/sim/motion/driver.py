@@ -1,11 +1,10 @@
-"""Driver: somebody who drives about by hand, as seeds make them; a controller without a path.
+"""Driver: a random, human-like driver; a controller without a path.
 
-Ten times a second, about as fast as people react, the driver looks and decides. Speed and turn wander as
-Ornstein-Uhlenbeck processes do, dx = -(x - m) dt / tau + s sqrt(2 / tau) dW, exactly discretised; now and
-then they pause. They make for a place that has been seldom visited, round what is in the way, until they are
-there or lose patience. And they never bump: a command is given only if, after driving by it until the next
-look and then braking, the footprint has stayed clear of everything, by a margin for what the robot does
-otherwise than it is told.
+Ten times a second, about as fast as people react, the driver decides. Speed and turn wander as
+Ornstein-Uhlenbeck processes, dx = -(x - m) dt / tau + s sqrt(2 / tau) dW, exactly discretised, with pauses in
+between. The driver heads for a seldom visited place, around obstacles, until it is reached or takes too long.
+The robot never bumps: a command is given only if the footprint stays clear of everything until the next
+decision and while braking after it, with a margin for lag and wheel errors.
 """
 
 import math
@@ -20,38 +19,38 @@ from magtwin.spec.obstacles import Obstacles
 
 Array = NDArray[np.float64]
 
-LOOK_S = 0.1
+DECIDE_S = 0.1
 """Time between decisions [s]."""
 
 CELL_M = 0.02
-"""Spacing of the places whose distance from everything is known [m]."""
+"""Spacing of the table of clearances [m]."""
 
 MARGIN_M = 0.04
-"""Clearance that is kept [m]: wheels that differ from their nominal size, and lag, take some of it."""
+"""Least planned clearance [m]; wheel errors and lag use some of it."""
 
 SPEED_TAU_S, SPEED_SHARE = 3.0, 0.3
 """Time constant of the speed [s], and its standard deviation as a share of its mean."""
 
 TURN_TAU_S, TURN_STD = 0.8, 0.35
-"""Time constant [s] and standard deviation [rad/s] of the turn beside the one that is meant."""
+"""Time constant [s] and standard deviation [rad/s] of the random part of the turn."""
 
 PAUSE_EVERY_S, PAUSE_S = 25.0, 1.5
 """Mean time between pauses and mean length of one [s]."""
 
 PLACE_M = 0.25
-"""Spacing of the places that are made for [m]."""
+"""Spacing of the goals [m]."""
 
 NEAR_M, PATIENCE_S = 0.25, 15.0
-"""Distance at which a place counts as reached [m], and the time after which another is chosen [s]."""
+"""Distance at which a goal counts as reached [m], and time after which it is given up [s]."""
 
 SIGHT_M = 0.5
-"""Way ahead that is looked at for something in the way [m]."""
+"""Distance ahead that is checked for obstacles [m]."""
 
 ASIDE = tuple(math.radians(a) for a in (0, 25, -25, 50, -50, 75, -75, 105, -105, 140, -140, 180))
-"""Directions that are tried, from that of the place [rad]."""
+"""Directions that are tried, relative to that of the goal [rad]."""
 
 STEER = 1.8
-"""Turn for a direction that is meant [1/s]."""
+"""Gain from the angle to the wanted direction to the turn [1/s]."""
 
 
 class Driver:
@@ -69,20 +68,20 @@ class Driver:
         speed: float = 0.2,
         duration_s: float = 60.0,
     ) -> None:
-        """Let somebody look about a room.
+        """Measure the room.
 
         Args:
             drive: Limits of the robot.
-            rng: Source of all that is chosen.
+            rng: Source of all choices.
             floor_m: Extent of the floor in x and y, about the world's origin [m].
             obstacles: What stands in the room.
             footprint_radius_m: Radius of the robot [m].
-            start: Where the robot stands.
+            start: Pose of the robot.
             speed: Mean forward speed [m/s].
-            duration_s: How long they drive [s].
+            duration_s: How long to drive [s].
 
         Raises:
-            InputError: `speed` is out of range, or there is no room to begin.
+            InputError: `speed` is out of range, or there is no room at the start.
         """
         if not 0 < speed <= drive.v_max:
             raise InputError(
@@ -104,13 +103,13 @@ class Driver:
         self._visits = np.zeros(len(self._places))
         self._goal, self._goal_until = 0, -1.0
         self._ou_v, self._ou_w = rng.standard_normal(2).tolist()
-        self._pause_until, self._next_look = 0.0, 0.0
+        self._pause_until, self._next_decision = 0.0, 0.0
         self._command = 0.0, 0.0
         self._t = 0.0
 
     @property
     def done(self) -> bool:
-        """Whether they have had enough."""
+        """Whether the time is over."""
         return self._t >= self._duration_s
 
     def command(self, t: float, x: float, y: float, yaw: float, v: float, w: float) -> tuple[float, float]:
@@ -118,13 +117,13 @@ class Driver:
         self._t = t
         if self.done:
             return 0.0, 0.0
-        if t >= self._next_look - 1e-9:
-            self._next_look = t + LOOK_S
-            self._command = self._look(t, x, y, yaw, v)
+        if t >= self._next_decision - 1e-9:
+            self._next_decision = t + DECIDE_S
+            self._command = self._decide(t, x, y, yaw, v)
         return self._command
 
-    def _look(self, t: float, x: float, y: float, yaw: float, v: float) -> tuple[float, float]:
-        """A decision."""
+    def _decide(self, t: float, x: float, y: float, yaw: float, v: float) -> tuple[float, float]:
+        """Decide on a command."""
         drive = self._drive
         noise_v, noise_w, begins = (
             self._rng.standard_normal(),
@@ -132,12 +131,12 @@ class Driver:
             self._rng.random(),
         )
         for name, noise, tau in (("_ou_v", noise_v, SPEED_TAU_S), ("_ou_w", noise_w, TURN_TAU_S)):
-            left = math.exp(-LOOK_S / tau)
+            left = math.exp(-DECIDE_S / tau)
             setattr(self, name, left * getattr(self, name) + math.sqrt(1 - left * left) * noise)
         self._visit(t, x, y)
         if t < self._pause_until:
             return 0.0, 0.0
-        if begins < LOOK_S / PAUSE_EVERY_S:
+        if begins < DECIDE_S / PAUSE_EVERY_S:
             self._pause_until = t + self._rng.exponential(PAUSE_S)
             return 0.0, 0.0
         off = self._direction(x, y, yaw)
@@ -153,9 +152,9 @@ class Driver:
         return 0.0, wanted_w if abs(off) > 0.2 else math.copysign(0.8, off)
 
     def _visit(self, t: float, x: float, y: float) -> None:
-        """Note where they are, and choose where to go next."""
+        """Count the visit, and choose a new goal if needed."""
         away = np.hypot(self._places[:, 0] - x, self._places[:, 1] - y)
-        self._visits[away < PLACE_M] += LOOK_S
+        self._visits[away < PLACE_M] += DECIDE_S
         if t < self._goal_until and away[self._goal] > NEAR_M:
             return
         self._visits[self._goal] += 1.0  # reached, or given up
@@ -164,7 +163,7 @@ class Driver:
         self._goal_until = t + PATIENCE_S
 
     def _direction(self, x: float, y: float, yaw: float) -> float:
-        """Angle to drive at, from the heading [rad]: to their place, or past what is in the way."""
+        """Direction to drive, relative to the heading [rad]: to the goal, or past obstacles."""
         gx, gy = self._places[self._goal].tolist()
         far = math.hypot(gx - x, gy - y)
         towards = math.atan2(gy - y, gx - x)
@@ -181,7 +180,7 @@ class Driver:
         return (best - yaw + math.pi) % (2 * math.pi) - math.pi
 
     def _sight(self, x: float, y: float, angle: float, reach: float) -> float:
-        """How far the footprint can go straight, up to a reach [m]."""
+        """Distance that the footprint can go straight, up to `reach` [m]."""
         cos, sin = math.cos(angle), math.sin(angle)
         way = 0.0
         while way < reach:
@@ -191,10 +190,10 @@ class Driver:
         return reach
 
     def _safe(self, x: float, y: float, yaw: float, v_cmd: float, v: float, w: float) -> bool:
-        """Whether a command can be driven until the next look, and then be braked from."""
+        """Whether a command is safe until the next decision, and while braking after it."""
         drive = self._drive
         fastest = max(v_cmd, v)
-        way = fastest * (LOOK_S + 2 * drive.motor_lag_s + 0.02) + fastest * fastest / (2 * drive.a_max)
+        way = fastest * (DECIDE_S + 2 * drive.motor_lag_s + 0.02) + fastest * fastest / (2 * drive.a_max)
         here = self._clearance(x, y)
         if here - way >= self._keep:
             return True
@@ -213,7 +212,7 @@ class Driver:
         return True
 
     def _clearance(self, x: float, y: float) -> float:
-        """Distance of a point from everything [m], at least."""
+        """Lower bound of the distance of a point from everything [m]."""
         half_x, half_y = self._half
         i, j = round((x + half_x) / CELL_M), round((y + half_y) / CELL_M)
         rows = self._clear
@@ -221,7 +220,7 @@ class Driver:
 
 
 def _clearances(floor_m: tuple[float, float], obstacles: Obstacles) -> list[list[float]]:
-    """Distance of a grid's nodes from the floor's border and all obstacles, less half a cell."""
+    """Distances of a grid's nodes from the floor's border and all obstacles, less half a cell [m]."""
     half_x, half_y = floor_m[0] / 2, floor_m[1] / 2
     x = -half_x + CELL_M * np.arange(round(floor_m[0] / CELL_M) + 1)
     y = -half_y + CELL_M * np.arange(round(floor_m[1] / CELL_M) + 1)

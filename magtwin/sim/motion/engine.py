@@ -1,7 +1,8 @@
-"""Engine: what moves a robot that is commanded. All are told the same, and sensors read each alike."""
+"""Engine: what moves a robot. All engines take the same commands, and sensors read each alike."""
 
 from typing import Protocol
 
+from magtwin.registry import Registry
 from magtwin.sim.motion.closed_loop import Chassis, ClosedLoop, run_loops
 from magtwin.sim.motion.controllers import Controller
 from magtwin.sim.motion.drive import Motion
@@ -18,34 +19,47 @@ class Travel(Moving, Protocol):
 
 
 class Engine(Protocol):
-    """What moves a robot."""
+    """Moves a robot."""
 
     @property
     def name(self) -> str:
-        """What it is called in the metadata of a run."""
+        """Its name in the metadata of a run."""
 
-    def drive(self, course: ClosedLoop, controller: Controller | None, obstacles: Obstacles | None) -> Travel:
-        """Drive until the controller is done and the robot stands, or the course's steps are over.
+    def drive(
+        self, closed_loop: ClosedLoop, controller: Controller | None, obstacles: Obstacles | None
+    ) -> Travel:
+        """Drive until the controller is done and the robot stands, or the steps are over.
 
         Args:
-            course: The robot, its start, and what guides it.
-            controller: What guides it in place of `course.guide`; None for that.
+            closed_loop: The robot, its start, and its guide.
+            controller: Replaces `closed_loop.guide`; None for that.
             obstacles: What stands in the room.
         """
 
 
+ENGINES: Registry[Engine] = Registry(
+    "engine", "engines", {"kinematic": "magtwin.sim.motion.engine:KINEMATIC"}
+)
+"""Registered engines; see `magtwin.sim.extensions`."""
+
+
 class Kinematic:
-    """The closed loop of `loop.py`: wheels that follow their commands with a lag, slip, and stop at walls."""
+    """The closed loop of `loop.py`: wheels follow their commands with a lag, slip, and stop at walls."""
 
     name = "kinematic"
 
-    def drive(self, course: ClosedLoop, controller: Controller | None, obstacles: Obstacles | None) -> Motion:
+    def drive(
+        self, closed_loop: ClosedLoop, controller: Controller | None, obstacles: Obstacles | None
+    ) -> Motion:
         """As for `Engine`."""
         if controller is None:
-            return run_loops([course], obstacles)[0]
-        chassis = Chassis(course, obstacles)
-        for k in range(course.steps):
-            chassis.step(controller.command(k * course.dt, *chassis.pose, *chassis.twist))
+            return run_loops([closed_loop], obstacles)[0]
+        chassis = Chassis(closed_loop, obstacles)
+        for k in range(closed_loop.steps):
+            chassis.step(controller.command(k * closed_loop.dt, *chassis.pose, *chassis.twist))
             if controller.done and chassis.twist == (0.0, 0.0):
                 break
         return chassis.motion()
+
+
+KINEMATIC = Kinematic()

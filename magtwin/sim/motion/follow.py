@@ -8,9 +8,15 @@ from numpy.typing import ArrayLike
 from magtwin.errors import InputError
 from magtwin.path import Path, check_clear
 from magtwin.sim.motion.closed_loop import ClosedLoop
-from magtwin.sim.motion.controllers import Controller, guide_along, guide_by_commands
+from magtwin.sim.motion.controllers import (
+    CONTROLLERS,
+    CUSTOM_CONTROLLERS,
+    Controller,
+    guide_along,
+    guide_by_commands,
+)
 from magtwin.sim.motion.drive import Pose
-from magtwin.sim.motion.engine import Engine, Kinematic, Travel
+from magtwin.sim.motion.engine import KINEMATIC, Engine, Travel
 from magtwin.sim.motion.plan import SLOWEST, drivable
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
@@ -35,31 +41,32 @@ def loop_along(
     footprint_radius_m: float = 0.0,
     wheel_errors: tuple[float, float] = (0.0, 0.0),
 ) -> ClosedLoop:
-    """What drives along a path, checked and ready to run; arguments and refusals are those of `follow`."""
+    """The closed loop along a path, ready to run; arguments and refusals are those of `follow`."""
     dt = _step(rate_hz, drive)
     if duration_s is not None:
         _check_duration(duration_s)
     if obstacles is not None:
         check_clear(path, obstacles, footprint_radius_m)
-    way = path if controller == "release" else drivable(path)
+    line = path if controller == "release" else drivable(path)
     if duration_s is not None and 0 < speed < math.inf:  # the plan refuses others
-        way = way.prolonged(speed * duration_s)
+        line = line.prolonged(speed * duration_s)
     if start is not None:
-        way = Path(way.name, np.vstack([start[:2], way.p_xy]))
-        if obstacles is not None and math.dist(*way.p_xy[:2]) > 0:
-            check_clear(Path(f"{path.name}, from its start", way.p_xy[:2]), obstacles, footprint_radius_m)
-    if duration_s is None and way.length > speed * LONGEST_S > 0:
+        line = Path(line.name, np.vstack([start[:2], line.p_xy]))
+        if obstacles is not None and math.dist(*line.p_xy[:2]) > 0:
+            check_clear(Path(f"{path.name}, from its start", line.p_xy[:2]), obstacles, footprint_radius_m)
+    if duration_s is None and line.length > speed * LONGEST_S > 0:
         raise InputError(
-            f"path {path.name}: its {way.length:.4g} m take {way.length / speed:.3g} s at {speed:g} m/s, "
-            f"more than {LONGEST_S:g} s, a day; drive faster than {way.length / LONGEST_S:.2g} m/s, or "
-            "give duration_s"
+            f"path {path.name}: its {line.length:.4g} m take {line.length / speed:.3g} s at {speed:g} m/s, "
+            f"more than {LONGEST_S:g} s, a day; drive faster than {line.length / LONGEST_S:.2g} m/s, or "
+            "give `duration_s`",
+            parameter="duration_s",
         )
-    guide = guide_along(controller, way, drive, speed=speed, dt=dt)
+    guide = guide_along(controller, line, drive, speed=speed, dt=dt)
     assert guide.pose0 is not None
-    least_s = way.length / speed if duration_s is None else duration_s
+    least_s = line.length / speed if duration_s is None else duration_s
     if duration_s is None:
         stops = 1 + np.count_nonzero(guide.table[5] == 0)
-        duration_s = min(60 + 10 * stops + 4 * way.length / min(SLOWEST, speed), LONGEST_S)
+        duration_s = min(60 + 10 * stops + 4 * line.length / min(SLOWEST, speed), LONGEST_S)
     return ClosedLoop(
         drive=drive,
         guide=guide,
@@ -92,54 +99,56 @@ def follow(
         path: Where to drive.
         drive: Limits, motors and wheels.
         speed: Wanted forward speed [m/s].
-        duration_s: How long to drive [s]: further laps of a closed path, back and forth on an open
-            one. None means to the end of the path, or one lap, and to stop there.
-        start: First x [m], y [m], yaw [rad] in world, from where the robot drives straight to the
-            path's first point; None means on that point, along the path.
+        duration_s: How long to drive [s]: further laps of a closed path, back and forth on an open one.
+            Default: to the end of the path, or one lap, and stop there.
+        start: First x [m], y [m], yaw [rad] in world, from where the robot drives straight to the path's
+            first point. Default: on that point, along the path.
         rate_hz: Control steps a second [Hz].
-        controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`, or a controller of one's own,
-        which
-            is given neither path nor speed; `start`, or the path's, is where it begins.
+        controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`, a registered controller, or a
+            custom object, which gets neither path nor speed and begins at `start` or the path's start.
         obstacles: What stops the robot.
         footprint_radius_m: Radius of the circle that they stop [m].
-        wheel_errors: How far the wheels' radius and separation are from the nominal ones, relative.
-        engine: What moves the robot; None is the kinematic one.
+        wheel_errors: Relative errors of the wheels' radius and separation.
+        engine: What moves the robot. Default: the kinematic engine.
 
     Raises:
         InputError: `speed`, `duration_s` or `rate_hz` is out of range, the path or the start touches an
-            obstacle, a command is not finite, or the end of the path was not reached in a time that
-            suffices for any path.
+            obstacle, a command is not finite, or the end of the path was not reached in ample time.
     """
-    course = loop_along(
+    custom: Controller | None = None
+    if not isinstance(controller, str):
+        custom, controller = controller, "follower"
+    elif controller not in CONTROLLERS and controller in CUSTOM_CONTROLLERS:
+        custom, controller = CUSTOM_CONTROLLERS[controller](path, drive, speed), "follower"
+    closed_loop = loop_along(
         path,
         drive,
         speed=speed,
         duration_s=duration_s,
         start=start,
         rate_hz=rate_hz,
-        controller=controller if isinstance(controller, str) else "follower",
+        controller=controller,
         obstacles=obstacles,
         footprint_radius_m=footprint_radius_m,
         wheel_errors=wheel_errors,
     )
-    own = None if isinstance(controller, str) else controller
-    motion = (engine or Kinematic()).drive(course, own, obstacles)
+    motion = (engine or KINEMATIC).drive(closed_loop, custom, obstacles)
     if duration_s is None:
-        check_arrived(path, speed, course, motion)
+        check_arrived(path, speed, closed_loop, motion)
     return motion
 
 
-def check_arrived(path: Path, speed: float, course: ClosedLoop, motion: Travel) -> None:
-    """Refuse a motion that took all the steps which its course allows for reaching the end of a path."""
-    if motion.duration_s > (course.steps - 0.5) * course.dt:
+def check_arrived(path: Path, speed: float, closed_loop: ClosedLoop, motion: Travel) -> None:
+    """Refuse a motion that took all steps that were allowed for reaching the end of a path."""
+    allowed_s = closed_loop.steps * closed_loop.dt
+    if motion.duration_s > allowed_s - 0.5 * closed_loop.dt:
         why = (
             "the robot stands at an obstacle"
             if motion.at([motion.duration_s]).bump[-1]
             else "it winds too tightly for this drive: smooth it, or drive more slowly"
         )
         raise InputError(
-            f"path {path.name}: its end was not reached in {course.steps * course.dt:.0f} s at {speed:g} "
-            f"m/s; {why}"
+            f"path {path.name}: its end was not reached in {allowed_s:.0f} s at {speed:g} m/s; {why}"
         )
 
 
@@ -156,25 +165,25 @@ def play(
     controller: Controller | None = None,
     engine: Engine | None = None,
 ) -> Travel:
-    """Drive by a script: each command holds until the next one, or until it is older than the drive allows.
+    """Drive by a script. A command holds until the next one, or until it is older than the drive allows.
 
     Args:
         commands: Time since the start [s], forward speed [m/s] and yaw rate [rad/s] of each, shape (K, 3).
-        drive: Limits, motors and wheels.
+        drive: As for `follow`.
         start: First x [m], y [m], yaw [rad] in world.
-        duration_s: How long to drive [s]; None is until the last command is void and the robot stands.
-        rate_hz: Control steps a second [Hz].
-        obstacles: What stops the robot.
-        footprint_radius_m: Radius of the circle that they stop [m].
-        wheel_errors: How far the wheels' radius and separation are from the nominal ones, relative.
-        controller: Who commands in place of the script, whose times then only say how long; a driver.
-        engine: What moves the robot; None is the kinematic one.
+        duration_s: How long to drive [s]. Default: until the last command is void and the robot stands.
+        rate_hz: As for `follow`.
+        obstacles: As for `follow`.
+        footprint_radius_m: As for `follow`.
+        wheel_errors: As for `follow`.
+        controller: Commands in place of the script, such as a driver; the script then only gives the time.
+        engine: As for `follow`.
 
     Raises:
         InputError: Commands are not finite or not in order of time, `duration_s` or `rate_hz` is out of
             range, or the start touches an obstacle.
     """
-    course = loop_by_commands(
+    closed_loop = loop_by_commands(
         commands,
         drive,
         start=start,
@@ -183,7 +192,7 @@ def play(
         footprint_radius_m=footprint_radius_m,
         wheel_errors=wheel_errors,
     )
-    return (engine or Kinematic()).drive(course, controller, obstacles)
+    return (engine or KINEMATIC).drive(closed_loop, controller, obstacles)
 
 
 def loop_by_commands(
@@ -196,21 +205,19 @@ def loop_by_commands(
     footprint_radius_m: float = 0.0,
     wheel_errors: tuple[float, float] = (0.0, 0.0),
 ) -> ClosedLoop:
-    """What plays a script, ready to run; arguments and refusals are those of `play`."""
+    """The closed loop that plays a script, ready to run; arguments and refusals are those of `play`."""
     dt = _step(rate_hz, drive)
     guide = guide_by_commands(commands, drive)
     if duration_s is None:
         at_rest = 1 + drive.v_max / drive.a_max + drive.w_max / drive.alpha_max + 20 * drive.motor_lag_s
-        end = float(guide.table[0, -1]) + drive.command_timeout_s + at_rest
-    else:
-        end = duration_s
-    _check_duration(end)
+        duration_s = float(guide.table[0, -1]) + drive.command_timeout_s + at_rest
+    _check_duration(duration_s)
     return ClosedLoop(
         drive=drive,
         guide=guide,
         dt=dt,
         pose0=start,
-        steps=math.ceil(end / dt - 1e-9),
+        steps=math.ceil(duration_s / dt - 1e-9),
         least_steps=int(guide.table[0, -1] / dt),
         footprint_radius_m=footprint_radius_m,
         wheel_errors=wheel_errors,
@@ -233,5 +240,6 @@ def _step(rate_hz: float, drive: DriveSpec) -> float:
 def _check_duration(duration_s: float) -> None:
     if not 0 < duration_s <= LONGEST_S:
         raise InputError(
-            f"duration_s must be above 0 s and finite, at most {LONGEST_S:g}, a day; got {duration_s!r}"
+            f"duration_s must be above 0 s and finite, at most {LONGEST_S:g}, a day; got {duration_s!r}",
+            parameter="duration_s",
         )

@@ -1,17 +1,17 @@
-"""The closed loop of a robot: what it is commanded, what its drive makes of it, and where obstacles stop it.
+"""The closed loop of a robot: controller, drive, and stops at obstacles.
 
-One source, run in two ways to the same bits: as plain Python on lists, which is at work at once, and
-compiled on arrays (`compiled.py`), which takes half a second to open and then a ten-millionth of one for a
-step. So there is nothing here but numbers, sequences of them, and operations that round alike in both: no
-`hypot`, no power, no sum of many. `course.py` prepares what goes in and names what comes out.
+The same source runs as plain Python on lists, which starts at once, and compiled on arrays (`compiled.py`),
+which takes half a second to open and then 0.1 us a step. Both give the same bytes. So it uses only numbers,
+sequences of them, and operations that round alike in both: no `hypot`, no powers, no long sums.
+`closed_loop.py` prepares the input and names the output.
 
-A step of the drive, of length dt: the command is limited (`limited`); the motors follow it with a first-order
-lag, v(t) = v1 + (v0 - v1) exp(-t / lag), of which the step has the mean, so that ways and turns are exact at
-its end; the tyres slip by slip * dv/dt, as a linear tyre does under the force that speeds the robot up, and
-by a share of the yaw rate; wheels that differ from their nominal size scale the rest. The twist that remains
-holds for the step: an arc, whose chord is integrated without Euler's error. Where the chord would bring the
-round footprint into an obstacle, the robot stops at it and its wheels stall; it can turn on the spot there,
-and drive away. It does not slide along: a bumper of rubber grips.
+A step of length dt: the command is limited (`limited`). The motors follow it with a first-order lag,
+v(t) = v1 + (v0 - v1) exp(-t / lag); the step has the mean of this, so that distances and turns are exact at
+its end. The tyres slip by slip * dv/dt, as a linear tyre under the accelerating force, and by a share of the
+yaw rate. Wheels that differ from their nominal size scale the rest. The resulting twist holds for the step:
+an arc, whose chord is integrated without Euler's error. If the chord would bring the round footprint into an
+obstacle, the robot stops at it and its wheels stall. It can turn there and drive away, but does not slide
+along the obstacle, because a rubber bumper grips.
 """
 
 import math
@@ -22,31 +22,29 @@ Numbers = Sequence[float]
 Columns = Sequence[Numbers]
 
 COMMANDS, RELEASE, FOLLOWER, STANLEY, PURE_PURSUIT = range(5)
-"""Numbers of the controllers that can be compiled; `controllers.py` says what each does."""
+"""Numbers of the built-in controllers; see `controllers.py`."""
 
 FIGURES = 22
-"""Figures of a robot and its controller: see `drive_on`."""
+"""Number of figures of a robot and its controller; see `drive_on`."""
 
 TABLE = 6
 """Columns of a controller's table."""
 
 STATE = 14
-"""x, y, yaw; limited command v, w; wheels' v, w; mean v of the last step; way that is surely free; bump; node
-that is next; way driven since that changed; cosine and sine of yaw.
-"""
+"""x, y, yaw; limited command v, w; wheels' v, w; mean v of the last step; distance that is surely free; bump;
+next node; distance driven since that changed; cosine and sine of yaw."""
 
 RECORD = 10
-"""Columns of what happened in each step: x, y, yaw at its end; v, w of the body; v, w of the wheels at their
-nominal size; commanded v, w; whether an obstacle was touched.
-"""
+"""Columns of a step: x, y, yaw at its end; v, w of the body; v, w of the wheels at their nominal size;
+commanded v, w; whether an obstacle was touched."""
 
 TURN = 2 * math.pi
 
 REST_M_S = 1e-3
-"""Speed of the wheels' rims at which friction brings a robot to rest that is told to stand [m/s]."""
+"""Speed of the rims below which friction stops a robot that is commanded to stand [m/s]."""
 
 GRAZE = 1e-6
-"""Way that a touching robot may come nearer to an obstacle per way driven, so that rounding holds none."""
+"""Share of the distance driven by which a touching robot may approach an obstacle, against rounding."""
 
 A1, A2, A3 = 1 / 6, 1 / 20, 1 / 42
 """sin(x)/x = 1 - A1 x^2 (1 - A2 x^2 (1 - A3 x^2 ...))."""
@@ -55,25 +53,25 @@ B1, B2, B3 = 1 / 2, 1 / 12, 1 / 30
 """cos(x) = 1 - B1 x^2 (1 - B2 x^2 (1 - B3 x^2 ...))."""
 
 ANEW = 64
-"""Steps after which the heading's cosine and sine, turned step by step, are computed anew."""
+"""Steps after which the cosine and sine of the heading are computed afresh."""
 
 SHORT = 4e-4
-"""Square of half a turn below which four terms of the series of sin(x)/x and cos(x) are all of them."""
+"""Square of half a turn below which four terms of the series of sin(x)/x and cos(x) are exact."""
 
 LATE_S = 1e-9
-"""Rounding of a time that is forgiven [s]."""
+"""Tolerance of times [s]."""
 
 STUCK_M = 0.03
-"""Way driven without getting abreast of the next node after which it counts as passed [m]."""
+"""Distance driven without reaching the next node after which the node counts as passed [m]."""
 
 ARRIVED_M = 0.0005
-"""A piece has been driven when this much of it is left [m]."""
+"""Remaining length at which a piece counts as driven [m]."""
 
 SETTLE_M = 0.15
-"""Way in which an error in position dies out, twice the time constant of the feedback [m]."""
+"""Distance in which a position error decays, twice the time constant of the feedback [m]."""
 
 TURN_GAIN = 3.9
-"""Gain of turning on the spot [1/s]: below alpha_max / w_max = 4.1, so that it need not overshoot."""
+"""Gain of turning on the spot [1/s]: below alpha_max / w_max = 4.1, which avoids overshoot."""
 
 GAIN = 4.0 / SETTLE_M
 V_TURN = TURN_GAIN / GAIN
@@ -88,20 +86,20 @@ STANLEY_GAIN = 2.5
 """Gain k of Stanley's controller [1/s], as published."""
 
 STANLEY_SOFT = 0.1
-"""Speed k_s that keeps it calm at low speed [m/s]; ours."""
+"""Speed k_s that calms it at low speed [m/s]; assumed."""
 
 STANLEY_MOST = 1.2
-"""Angle to which its wheel is steered at most [rad]; ours."""
+"""Largest angle of its steered wheel [rad]; assumed."""
 
 NOWHERE_M2 = 1e-12
-"""Added to a square that pure pursuit divides by, as the goal may be where the robot is [m2]."""
+"""Added to the square that pure pursuit divides by, since the goal can be at the robot [m2]."""
 
 RELEASE_NEAR_M = 0.25
-"""Distance from a point at which the released follower goes on to the next [m], as published."""
+"""Distance from a point at which the released follower takes the next [m], as published."""
 
 
 def wrapped(angle: float) -> float:
-    """An angle brought into [-pi, pi) [rad]."""
+    """An angle wrapped to [-pi, pi) [rad]."""
     if -math.pi <= angle < math.pi:
         return angle
     return angle - TURN * math.floor((angle + math.pi) / TURN)
@@ -114,9 +112,9 @@ def limited(
     v: float,
     w: float,
 ) -> tuple[float, float]:
-    """The twist that a drive makes of a wanted one: nearest to it within every limit.
+    """The nearest twist to a wanted one within every limit of a drive.
 
-    Where a wheel would turn too fast, speed gives way to turning as quickly as it may be changed.
+    If a wheel would turn too fast, the forward speed is reduced, as quickly as it may change.
 
     Args:
         limits: Highest speed [m/s], yaw rate [rad/s], change of either in a step, speed of a wheel's rim
@@ -154,10 +152,10 @@ def limited(
 def towards_point(
     xs: Numbers, ys: Numbers, speed: float, gain: float, node: int, x: float, y: float, yaw: float
 ) -> tuple[float, float, int]:
-    """Command of the released follower, and the point that it pursues next.
+    """Command of the released follower, and its next point.
 
-    w = (angle to the point - yaw) + atan(k d / v) for a point at distance d, v constant; a point nearer
-    than 0.25 m is passed. The second term is above 0 on either side of a path, so it drives to the left of
+    w = (angle to the point - yaw) + atan(k d / v) for a point at distance d, v constant; a point nearer than
+    0.25 m counts as passed. The second term is positive on both sides of a path, so it drives to the left of
     its points: as published, and as the real robot does.
     """
     ex, ey = xs[node] - x, ys[node] - y
@@ -178,20 +176,19 @@ def along_path(
     v: float,
     w: float,
 ) -> tuple[float, float, int, float]:
-    """Command of a controller that drives along planned nodes, the node that is next, and the way since.
+    """Command of a controller along planned nodes, the next node, and the distance since it changed.
 
-    Where on the path the robot is, and the planned speed there, is one for all; how it is steered is not.
-    The follower's wanted heading leans towards the path, by u (1 - 0.3 u^2) for a distance u L from it, which
-    is atan(u) to a milliradian as far as the robot is not lost; and
-    w = v k + (4 / L) max(v, v_turn) (wanted - actual), which for small errors is critically damped, with
-    both poles at -2 / L per metre driven. Stanley's (Hoffmann et al., ACC 2007, eq. 5): a point b ahead of
-    the axle is a steered wheel, turned by the path's heading there less the robot's and by
-    atan(-k e / (k_s + v)) for its distance e from the path; w = v tan(that) / b. Pure pursuit (Coulter,
-    CMU-RI-TR-92-01): the arc through a goal on the path some way ahead, w = v 2 y / D^2 for a goal at
-    distance D that is y to the left.
+    All share the place on the path and the planned speed there, and differ in steering. The follower's wanted
+    heading leans towards the path, by u (1 - 0.3 u^2) for a distance u L from it, which is atan(u) to a
+    milliradian unless the robot is lost; and w = v k + (4 / L) max(v, v_turn) (wanted - actual), which for
+    small errors is critically damped, with both poles at -2 / L per metre driven. Stanley's (Hoffmann et al.,
+    ACC 2007, eq. 5): a point b ahead of the axle is a steered wheel, turned by the path's heading there less
+    the robot's and by atan(-k e / (k_s + v)) for its distance e from the path; w = v tan(that) / b. Pure
+    pursuit (Coulter, CMU-RI-TR-92-01): the arc through a goal on the path some way ahead, w = v 2 y / D^2 for
+    a goal at distance D that is y to the left.
 
-    Each stops and turns on the spot where its heading is far off, so corners are turned standing. A robot
-    that was carried away drives straight back to where it left the path.
+    Each stops and turns on the spot if its heading is far off, as in corners. A robot that was carried away
+    drives straight back to where it left the path.
 
     Args:
         law: FOLLOWER, STANLEY or PURE_PURSUIT.
@@ -316,11 +313,11 @@ def commanded(
     v: float,
     w: float,
 ) -> tuple[float, float, int, float]:
-    """Command of any controller at a time t [s], the node that is next, and the way since.
+    """Command of any controller at a time t [s], the next node, and the distance since it changed.
 
-    A controller is done when that is the number of its nodes; it then commands a stand. Of scripted
-    commands the latest holds, until it is older than `timeout` [s]. All else as for `along_path`; the
-    released follower takes its gain in the place of the distance to look ahead.
+    A controller is done when the next node is the number of its nodes; it then commands a stop. A scripted
+    command holds until it is older than `timeout` [s]. Other arguments as for `along_path`; the released
+    follower has its gain in the place of the distance to look ahead.
     """
     times = table[0]
     count = len(times)
@@ -343,7 +340,7 @@ def commanded(
 
 
 def clearance(fence: Columns, spans: Sequence[int], x: float, y: float, most: float) -> float:
-    """Distance of a point that lies in no obstacle from the nearest of them, or `most` [m].
+    """Distance of a point outside of all obstacles from the nearest of them, or `most` [m].
 
     Args:
         fence: Edges of all outlines x0, y0, x1, y1 [m], of E numbers each; then the box about each outline,
@@ -351,7 +348,7 @@ def clearance(fence: Columns, spans: Sequence[int], x: float, y: float, most: fl
         spans: Edge that begins each outline, and E, of O + 1 numbers.
         x: Position in world [m].
         y: Position in world [m].
-        most: Distance beyond which nothing counts [m].
+        most: Largest distance of interest [m].
     """
     x0s, y0s, x1s, y1s, low_x, low_y, high_x, high_y = fence
     best = most * most
@@ -377,20 +374,20 @@ def clearance(fence: Columns, spans: Sequence[int], x: float, y: float, most: fl
 def free_way(
     fence: Columns, spans: Sequence[int], radius: float, x: float, y: float, ux: float, uy: float, way: float
 ) -> float:
-    """How far a round footprint can go in a direction until it touches an obstacle, at most `way` [m].
+    """Distance that a round footprint can go in a direction until it touches an obstacle, at most `way` [m].
 
-    The footprint's centre is followed as it meets the outlines, each grown by the radius: sides pushed
-    out, with a circle about every corner. Obstacles that it touches count only if it comes nearer.
+    The centre of the footprint meets outlines grown by the radius: sides pushed out, a circle about every
+    corner. Obstacles that it already touches count only if it comes nearer.
 
     Args:
         fence: As for `clearance`.
         spans: As for `clearance`.
-        radius: That of the footprint [m].
+        radius: Radius of the footprint [m].
         x: Position of its centre in world [m].
         y: Position of its centre in world [m].
         ux: Direction, a unit vector.
         uy: Direction, a unit vector.
-        way: How far it wants to go [m].
+        way: Wanted distance [m].
     """
     x0s, y0s, x1s, y1s, low_x, low_y, high_x, high_y = fence
     reach = radius + way
@@ -435,16 +432,16 @@ def drive_on(
     steps: int,
     record: Sequence[Any],
 ) -> int:
-    """Drive a robot on from a state, until its controller is done and it stands.
+    """Drive a robot from a state until its controller is done and it stands.
 
     Args:
         law: Number of its controller.
         figures: dt [s]; the six limits of `limited`; share of the last speed that is left at the end of a
-            step, and share of it in the step's mean; slip per change of speed in a step [s/m]; scales of v
+            step, and its share in the mean of the step; slip per change of speed in a step [s/m]; scales of v
             and w; age at which a command is void [s]; radius of the footprint [m]; the eight
             `gains` of `along_path`.
         table: For COMMANDS time [s], v [m/s], w [rad/s] of each; for RELEASE x, y of each point [m]; for
-            the others as in `along_path`. Columns that are not named are not read.
+            the others as in `along_path`. Other columns are not read.
         fence: As for `clearance`.
         spans: As for `clearance`.
         state: STATE numbers, which are changed.
@@ -457,13 +454,8 @@ def drive_on(
     """
     dt = figures[0]
     limits = (figures[1], figures[2], figures[3], figures[4], figures[5], figures[6])
-    left_at_end, left_in_mean, slip, scale_v, scale_w = (
-        figures[7],
-        figures[8],
-        figures[9],
-        figures[10],
-        figures[11],
-    )
+    left_at_end, left_in_mean, slip = figures[7], figures[8], figures[9]
+    scale_v, scale_w = figures[10], figures[11]
     timeout, radius, rest_w = figures[12], figures[13], REST_M_S / figures[6]
     gains = (
         figures[14],
@@ -562,18 +554,18 @@ def robots(
     record: Any,
     made: Any,
 ) -> None:
-    """`drive_on` for many robots in one room, on arrays; each is driven as it would be alone.
+    """`drive_on` for many robots in one room, on arrays; each is driven as if it were alone.
 
     Args:
-        laws: Number of each one's controller, shape (N,).
-        figures: Those of each, shape (N, FIGURES).
-        tables: Those of all, one after the other, shape (TABLE, M).
-        begin: Where the table of each begins, shape (N,).
-        end: And where it ends, shape (N,).
+        laws: Numbers of the controllers, shape (N,).
+        figures: Figures of each robot, shape (N, FIGURES).
+        tables: All tables, one after the other, shape (TABLE, M).
+        begin: Start of each robot's table, shape (N,).
+        end: End of each robot's table, shape (N,).
         fence: x0, y0, x1, y1 of the obstacles' edges, shape (4, E).
         boxes: Lower and upper corners about each obstacle, shape (4, O).
         spans: Edge that begins each obstacle, and E, shape (O + 1,).
-        state: Each one's, changed, shape (N, STATE).
+        state: State of each robot, which is changed, shape (N, STATE).
         first: Number of the first step since the start.
         steps: Most steps.
         record: Takes what happened, shape (N, RECORD, steps).

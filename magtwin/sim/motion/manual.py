@@ -1,4 +1,4 @@
-"""Manual driving: keys of a terminal, or the sticks of a gamepad, as commands."""
+"""Manual driving: commands from the keys of a terminal or the sticks of a gamepad."""
 
 import struct
 from collections.abc import Iterator, Sequence
@@ -13,7 +13,7 @@ from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
 
 V_STEP, W_STEP = 0.05, 0.25
-"""By how much a key changes speed [m/s] and yaw rate [rad/s]."""
+"""Change of speed [m/s] and yaw rate [rad/s] by one key press."""
 
 KEYS = {
     **dict.fromkeys(("w", "W", "\x1b[A", "\x1bOA"), "faster"),
@@ -24,13 +24,13 @@ KEYS = {
     " ": "stop",
     **dict.fromkeys(("q", "Q", "\x04", "\x03", ""), "end"),
 }
-"""What keys do, by what a terminal sends: WASD or arrows; x, space, q; Ctrl-C, Ctrl-D and a closed line."""
+"""Actions by the bytes of a terminal: WASD or arrows; x, space, q; Ctrl-C, Ctrl-D and the end of input."""
 
 HELP = "w/s or up/down: speed, a/d or left/right: turn, x: straight on, space: stop, q: end"
 
 
 class Hand(Protocol):
-    """Whoever drives by hand: what was put in so far is the command that holds."""
+    """An input device; its input so far gives the present command."""
 
     command: tuple[float, float]
     """Forward speed [m/s] and yaw rate [rad/s]."""
@@ -39,11 +39,11 @@ class Hand(Protocol):
     """Whether the drive is to end."""
 
     def feed(self, data: bytes) -> None:
-        """Take what a device sent, in pieces as they come; no bytes are the end of it."""
+        """Take bytes from the device; no bytes mean its end."""
 
 
 class Keyboard:
-    """A terminal's keys. It tells of no key that is let go, so each changes the speeds by a step."""
+    """The keys of a terminal. Key releases are unknown, so each press changes the speeds by a step."""
 
     def __init__(self, drive: DriveSpec) -> None:
         """Stand still."""
@@ -53,7 +53,7 @@ class Keyboard:
         self.done = False
 
     def feed(self, data: bytes) -> None:
-        """As for `Hand`; keys that do nothing are passed over."""
+        """As for `Hand`; other keys are ignored."""
         for key in self._keys(data):
             self._press(KEYS.get(key, "nothing"))
 
@@ -64,7 +64,7 @@ class Keyboard:
         while data:
             length = 3 if data[:2] in (b"\x1b[", b"\x1bO") else 1
             if len(data) < length or data == b"\x1b":
-                self._rest = data  # an arrow of which the rest is on its way
+                self._rest = data  # the first bytes of an arrow key
                 return
             yield data[:length].decode("latin-1")
             data = data[length:]
@@ -86,17 +86,17 @@ class Keyboard:
 
 
 class Gamepad:
-    """A gamepad as Linux tells of it (/dev/input/js0): left stick drives, Start ends.
+    """A gamepad of Linux (/dev/input/js0): left stick drives, Start ends.
 
-    Its events are 8 bytes: time [ms], value, type (1 button, 2 axis; 128 more for how it stands at first),
-    and number (Linux, Documentation/input/joydev/joystick-api).
+    Its events are 8 bytes: time [ms], value, type (1 button, 2 axis; plus 128 for the initial state), and
+    number (Linux, Documentation/input/joydev/joystick-api).
     """
 
     DEAD = 0.08
-    """Share of a stick's way that is none."""
+    """Dead zone of a stick, as a share of its range."""
 
     END = (7, 9)
-    """Numbers of Start, on the pads of two makers."""
+    """Numbers of the Start button on pads of two makers."""
 
     def __init__(self, drive: DriveSpec) -> None:
         """Stand still."""
@@ -125,20 +125,20 @@ class Gamepad:
 
 
 class Recorder:
-    """A robot that is driven by hand, and the commands that were given."""
+    """A robot that is driven by hand, and its commands so far."""
 
     def __init__(self, chassis: Chassis, hand: Hand, dt: float) -> None:
-        """Begin where the chassis stands."""
+        """Begin at the pose of the chassis."""
         self.chassis, self._hand, self._dt = chassis, hand, dt
         self._rows: list[tuple[float, float, float]] = []
 
     def step(self) -> None:
-        """Drive on for one control step by the command that holds."""
+        """Drive for one control step by the present command."""
         self._rows.append((len(self._rows) * self._dt, *self._hand.command))
         self.chassis.step(self._hand.command)
 
     def commands(self, name: str) -> Commands:
-        """All commands, a row a control step, and a stand at the end."""
+        """All commands, one row per control step, and a stop at the end."""
         rows: Sequence[tuple[float, float, float]] = [*self._rows, (len(self._rows) * self._dt, 0.0, 0.0)]
         return Commands(name, np.array(rows))
 
@@ -151,7 +151,7 @@ def at_start(
     wheel_errors: tuple[float, float],
     dt: float,
 ) -> Chassis:
-    """A robot to be driven by hand, as `magtwin.sim.motion.follow.play` will drive it by the commands.
+    """A robot to be driven by hand, at rest at `start`.
 
     Raises:
         InputError: It would begin in an obstacle.

@@ -1,4 +1,4 @@
-"""Plan: a path cut where it turns too sharply to be driven round, smoothed, with a speed for every 5 mm."""
+"""Plan: a path cut at sharp corners and smoothed, with a speed for every 5 mm."""
 
 import bisect
 import itertools
@@ -15,36 +15,36 @@ from magtwin.spec.drive import DriveSpec
 Array = NDArray[np.float64]
 
 LIMIT_SHARE = 0.8
-"""Share of the drive's limits that is planned with; the rest is left to feedback."""
+"""Share of the drive's limits used by the plan; feedback has the rest."""
 
 SLOWEST = 0.02
 """Least planned speed inside a piece [m/s]."""
 
 _WHEEL_SHARE = 0.95
-"""The same share of the wheels' highest rate, which feedback asks for in sharp bends only."""
+"""Share of the wheels' highest rate used by the plan; feedback needs the rest in sharp bends only."""
 
 NODE_M = 0.005
 """Spacing of a piece's nodes [m]."""
 
 _JITTER_M = 0.005
-"""Points of a path nearer than this to the last one that counts do not count [m]: a recorded path's noise."""
+"""Distance below which a point of a path is dropped as noise of its recording [m]."""
 
 _COINCIDENT_M = 1e-5
-"""Smoothed nodes of a zigzag that come nearer than this are one [m]."""
+"""Distance below which smoothed nodes of a zigzag are merged [m]."""
 
 _SMOOTH_M = 0.06
 """Half the base of the triangular window that smooths a piece [m]; a corner of 45 deg loses 8 mm."""
 
 _CORNER_REACH_M = 0.03
-"""Chords this long before and after a point tell how sharply the path turns there [m]."""
+"""Length of the chords before and after a point that measure its turn [m]."""
 
 _CORNER_RAD = math.radians(45.0)
-"""A turn sharper than this is made standing [rad]: a bend of radius below about 4 cm."""
+"""Angle above which the robot stops to turn [rad]: a bend of radius below about 4 cm."""
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A stretch of path between two stops, ready to be driven; arrays of its M nodes."""
+    """A part of a path between two stops, ready to be driven; arrays of its M nodes."""
 
     x: Array
     """Nodes in world [m], evenly apart on the path."""
@@ -62,13 +62,13 @@ class Piece:
     """Squared planned speed at each node [m2/s2], linear between them: constant acceleration."""
 
     left_m: Array
-    """Way from each node to the end of the piece along the path [m]."""
+    """Distance from each node to the end of the piece along the path [m]."""
 
 
 def corners(path: Path) -> Array:
-    """Arc lengths at which a path turns too sharply to be driven round [m], ascending, shape (C,).
+    """Arc lengths of the sharp corners of a path [m], ascending, shape (C,).
 
-    Of points nearer to each other than the chords that measure the turn, only the sharpest counts.
+    Among points nearer to each other than the chords that measure the turn, only the sharpest counts.
     """
     s = path.s[1:-1]
     turn = np.abs(path.turn(s, _CORNER_REACH_M))
@@ -85,12 +85,12 @@ def corners(path: Path) -> Array:
 def plan(path: Path, drive: DriveSpec, *, speed: float) -> list[Piece]:
     """The pieces of a path with their planned speeds.
 
-    A planned speed is at most `speed`, keeps w = k v, dw/dt = (dk/ds) v^2 and the rate of the outer wheel,
-    v (1 + |k| b / 2) / r, within the drive's limits, and is reached and left again with the drive's
-    acceleration, from and to a stop.
+    A planned speed is at most `speed` and keeps w = k v, dw/dt = (dk/ds) v^2 and the rate of the outer wheel,
+    v (1 + |k| b / 2) / r, within the drive's limits. Each piece begins and ends with a stop, within the limit
+    of acceleration.
 
     Args:
-        path: Where to drive, taken as an open line.
+        path: Where to drive, as an open line.
         drive: Limits.
         speed: Wanted forward speed [m/s].
 
@@ -109,7 +109,7 @@ def _piece(path: Path, s_first: float, s_last: float, drive: DriveSpec, speed: f
     count = max(3, math.ceil((s_last - s_first) / NODE_M) + 1)
     s = np.linspace(s_first, s_last, count)
     p = path.at(np.minimum(s, path.length))
-    # Past its ends the piece goes on turned by half a circle about them, so that the ends stay.
+    # Past its ends the piece is continued by point reflection, so that smoothing leaves the ends in place.
     reach = min(round(_SMOOTH_M / 2 / NODE_M), count - 1)
     before, after = 2 * p[0] - p[reach:0:-1], 2 * p[-1] - p[-2 : -reach - 2 : -1]
     window = 1.0 - np.abs(np.arange(-reach, reach + 1)) / (reach + 1)
@@ -118,7 +118,7 @@ def _piece(path: Path, s_first: float, s_last: float, drive: DriveSpec, speed: f
     apart = np.hypot(np.diff(x, prepend=np.inf), np.diff(y, prepend=np.inf)) > _COINCIDENT_M
     keep = np.flatnonzero(apart[:-1])
     if not apart[-1] and len(keep) > 1:
-        keep = keep[:-1]  # so that the end stays, and no segment is without length
+        keep = keep[:-1]  # keeps the end, and no segment has length 0
     x, y = np.append(x[keep], x[-1]), np.append(y[keep], y[-1])
 
     dx, dy = np.gradient(x), np.gradient(y)
@@ -146,8 +146,8 @@ def _piece(path: Path, s_first: float, s_last: float, drive: DriveSpec, speed: f
 def drivable(path: Path) -> Path:
     """A path without the noise of its recording: points at least 5 mm from the one before.
 
-    Its first and last points stay. A robot that was recorded while it stood leaves a knot of points,
-    which no robot could follow.
+    Its first and last points stay. A robot that was recorded at rest leaves a knot of points that no robot
+    can follow.
 
     Raises:
         InputError: The whole path lies within 5 mm.

@@ -1,8 +1,8 @@
-"""sweep: thousands of robots, each as if it were alone, driven at once and read in blocks.
+"""Runs: many runs, driven at once and read in blocks when they are asked for.
 
-A robot's bits depend on nothing but its own scene, path and seed: the closed loop drives each as it would
-alone, sensors draw from generators of its own, and a network gives a row the same whatever is beside it. So
-runs can be made in any order, in blocks of any size, and any of them anew.
+The bytes of a run depend only on its own scene, path and seed: the closed loop drives each robot as if it
+were alone, sensors draw from their own generators, and a network treats each row by itself. So runs can be
+made in any order and in blocks of any size, and any run can be made again.
 """
 
 import importlib
@@ -16,18 +16,18 @@ from typing import Any, overload
 import numpy as np
 
 from magtwin.errors import InputError, find
-from magtwin.field.maps.map import AnomalyMap
 from magtwin.path import Path
-from magtwin.run.run import COLUMNS, Metadata, Run
+from magtwin.run.run import COLUMNS, Run
 from magtwin.sim.motion.closed_loop import LOOPS, ClosedLoop, run_loops, warm_up
 from magtwin.sim.motion.commands import Commands
-from magtwin.sim.motion.drive import Motion, Pose, draw_wheel_errors
-from magtwin.sim.motion.engine import Kinematic, Travel
+from magtwin.sim.motion.controllers import CONTROLLERS, CUSTOM_CONTROLLERS
+from magtwin.sim.motion.drive import Pose, draw_wheel_errors
+from magtwin.sim.motion.drive_input import DriveInput
+from magtwin.sim.motion.engine import Travel
 from magtwin.sim.motion.follow import check_arrived, loop_along, loop_by_commands
-from magtwin.sim.runs.sensing import LidarMode, Outside, Sensing, streams
-from magtwin.sim.runs.simulate import Sensed, check_run, sense_all, travel
+from magtwin.sim.runs.sensing import Conditions, Sensing, streams
+from magtwin.sim.runs.simulate import Metadata, Sensed, check_run, sense_all, travel
 from magtwin.spec.drive import DriveSpec
-from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.scene import Scene
 from magtwin.summary import Summarized, Summary, listed
 
@@ -37,49 +37,30 @@ BLOCK = 16
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A run that is wanted."""
+    """A run to be made."""
 
     scene: Scene
     """Lab, robot and sensors."""
 
-    path: Path | Commands | Run | str
-    """Where to drive, as for `magtwin.sim.runs.simulate.simulate`."""
+    path: DriveInput
+    """What to drive, as for `magtwin.sim.runs.simulate.simulate`."""
 
     seed: int
     """Seed of all noise."""
 
     speed: float
-    """Forward speed where the path is straight [m/s]."""
+    """Forward speed on straight parts of the path [m/s]."""
 
 
 Finish = Callable[[Sequence[Job], Sequence[Sensed]], list[Run]]
-"""From jobs, and what was sensed in each, to whole runs: where a network predicts, all rows in one stream."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Conditions:
-    """What all runs have in common."""
-
-    anomaly_map: AnomalyMap
-    obstacles: Obstacles
-    network: bool
-    """Whether a network predicts the disturbance."""
-
-    inputs: frozenset[str] = frozenset()
-    """Columns that it reads."""
-
-    duration_s: float | None = None
-    rate_hz: float | None = None
-    controller: str = "follower"
-    lidar: LidarMode = "schedule"
-    outside: Outside = "nan"
+"""From jobs and their sensed runs to whole runs: where a network predicts, for all rows at once."""
 
 
 class Runs(Summarized, Sequence[Run]):
     """Runs that are made when they are asked for.
 
-    `runs[i]` makes one, `for run in runs` all, block by block, so that memory stays bounded however many
-    there are; `list(runs)` keeps them. Asked again, a run is made again, to the same bits. While one block
+    `runs[i]` makes one run. `for run in runs` makes all, block by block, so that memory stays bounded.
+    `list(runs)` keeps them. A run that is asked for again is made again, with the same bytes. While one block
     goes through the network, the next is driven and sensed.
     """
 
@@ -96,14 +77,14 @@ class Runs(Summarized, Sequence[Run]):
 
         Args:
             jobs: The runs, at least one.
-            conditions: What they have in common.
-            finish: What makes whole runs of what was sensed.
-            columns: Those to keep, beside t; None keeps all.
+            conditions: What they have in common; the engine is the kinematic one.
+            finish: Makes whole runs of sensed ones.
+            columns: Columns to keep beside t. Default: all.
             block: Runs made at a time.
 
         Raises:
-            InputError: There is no job, a column or `block` is not as said, or `simulate` would refuse a
-                job; the text then gives its number.
+            InputError: There is no job, a column or `block` is wrong, or `simulate` would refuse a job; the
+                text then has its number.
         """
         if not jobs:
             raise InputError("no runs are asked for; give a seed for each")
@@ -114,21 +95,17 @@ class Runs(Summarized, Sequence[Run]):
         for name in sorted(self._columns):
             find("column", name, COLUMNS)
         self._planned: dict[tuple[Path | Commands, float, DriveSpec, float, Pose], ClosedLoop] = {}
-        self._courses: list[ClosedLoop | None] = []
+        self._loops: list[ClosedLoop | None] = []
         checked = set()
-        steps = 0
-        for i in range(len(jobs)):
-            job = jobs[i]
+        for i, job in enumerate(jobs):
             with self._numbered(i):
                 key = (id(job.scene), id(job.path))
                 if key not in checked:
-                    self._rate(job)
+                    check_run(job.scene, job.path, conditions)
                     checked.add(key)
-                course = self._course(job)
-                steps += course.least_steps if course else 0
-                self._courses.append(course)
-        if steps >= LOOPS.pays:
-            with suppress(ImportError):  # plain Python gives the same bits
+                self._loops.append(self._closed_loop(job))
+        if sum(planned.least_steps for planned in self._loops if planned) >= LOOPS.pays:
+            with suppress(ImportError):  # plain Python gives the same bytes
                 warm_up()
 
     def __len__(self) -> int:
@@ -143,7 +120,7 @@ class Runs(Summarized, Sequence[Run]):
     def __getitem__(self, index: int | slice) -> Run | list[Run]:
         numbers = range(len(self))[index]
         if isinstance(numbers, int):
-            return self._finished([numbers], self._sensed([numbers]))[0]
+            return self._finish([self._jobs[numbers]], self._sensed([numbers]))[0]
         return list(self._made(numbers))
 
     def __iter__(self) -> Iterator[Run]:
@@ -164,97 +141,47 @@ class Runs(Summarized, Sequence[Run]):
                 sensed = ahead.result()
                 if after is not None:
                     ahead = pool.submit(self._sensed, after)
-                yield from self._finished(block, sensed)
+                yield from self._finish([self._jobs[i] for i in block], sensed)
 
     def _sensed(self, numbers: Sequence[int]) -> list[Sensed]:
         """Drive and sense some runs."""
+        common = self._conditions
         draws = {i: streams(np.random.default_rng(self._jobs[i].seed)) for i in numbers}
-        courses: dict[int, ClosedLoop] = {}
+        loops: dict[int, ClosedLoop] = {}
         for i in numbers:
-            if (course := self._courses[i]) is not None:
+            if (planned := self._loops[i]) is not None:
                 drive = self._jobs[i].scene.robot.drive
                 errors = draw_wheel_errors(drive, draws[i]["drive"])
-                courses[i] = replace(course, drive=drive, wheel_errors=errors)
-        together = dict(
-            zip(courses, run_loops(list(courses.values()), self._conditions.obstacles), strict=True)
-        )
-        done = []
+                loops[i] = replace(planned, drive=drive, wheel_errors=errors)
+        motions = dict(zip(loops, run_loops(list(loops.values()), common.obstacles), strict=True))
+        sensed = []
         for i in numbers:
+            job = self._jobs[i]
             with self._numbered(i):
-                if i in together:
-                    motion, metadata = self._travelled(self._jobs[i], courses[i], together.pop(i))
+                motion: Travel
+                if i in motions:
+                    motion, metadata = motions.pop(i), self._metadata(job)
+                    if isinstance(job.path, Path) and common.duration_s is None:
+                        check_arrived(job.path, job.speed, loops[i], motion)
                 else:
-                    motion, metadata = self._travel(self._jobs[i], draws[i])
-                done.append(self._sense(self._jobs[i], draws[i], motion, metadata))
-        return done
+                    motion, metadata = travel(job.scene, job.path, draws[i], job.speed, common)
+                sensing = Sensing(job.scene, draws[i], common, wanted=self._columns)
+                sensed.append(sense_all(sensing, motion, metadata))
+        return sensed
 
-    def _travelled(self, job: Job, course: ClosedLoop, motion: Motion) -> tuple[Travel, Metadata]:
-        """What a robot did that was driven among others."""
-        common = self._conditions
+    def _metadata(self, job: Job) -> Metadata:
+        """As `travel` gives it for a closed loop that was planned."""
         if isinstance(job.path, Commands):
-            return motion, {"path": job.path.name, "controller": "commands"}
+            return {"path": job.path.name, "controller": "commands"}
         assert isinstance(job.path, Path)
-        if common.duration_s is None:
-            check_arrived(job.path, job.speed, course, motion)
-        name, speed = job.path.name, float(job.speed)
-        return motion, {"path": name, "controller": common.controller, "speed_m_s": speed}
+        name = str(self._conditions.controller)
+        return {"path": job.path.name, "controller": name, "speed_m_s": float(job.speed)}
 
-    def _travel(self, job: Job, draws: dict[str, np.random.Generator]) -> tuple[Travel, Metadata]:
-        """What a robot does that somebody drives, or did when it was recorded."""
-        common = self._conditions
-        return travel(
-            job.scene,
-            job.path,
-            draws,
-            job.speed,
-            common.duration_s,
-            common.obstacles,
-            common.controller,
-            Kinematic(),
-        )
+    def _closed_loop(self, job: Job) -> ClosedLoop | None:
+        """The closed loop of a job without its wheels' errors, planned once for all jobs that share it.
 
-    def _sense(
-        self, job: Job, draws: dict[str, np.random.Generator], motion: Travel, metadata: Metadata
-    ) -> Sensed:
-        common = self._conditions
-        rate = job.scene.robot.magnetometer.rate_hz if common.rate_hz is None else common.rate_hz
-        sensing = Sensing(
-            job.scene,
-            draws,
-            anomaly_map=common.anomaly_map,
-            rate_hz=rate,
-            outside=common.outside,
-            lidar=common.lidar,
-            network=common.network,
-            wanted=self._columns,
-            inputs=common.inputs,
-        )
-        how = {**metadata, "outside": common.outside, "lidar": common.lidar}
-        return sense_all(sensing, motion, common.duration_s, how)
-
-    def _finished(self, numbers: Sequence[int], sensed: list[Sensed]) -> list[Run]:
-        """Whole runs of what was sensed."""
-        return self._finish([self._jobs[i] for i in numbers], sensed)
-
-    def _rate(self, job: Job) -> float:
-        common = self._conditions
-        return check_run(
-            job.scene,
-            job.path,
-            anomaly_map=common.anomaly_map,
-            rate_hz=common.rate_hz,
-            duration_s=common.duration_s,
-            lidar=common.lidar,
-            network=common.network,
-        )
-
-    def _course(self, job: Job) -> ClosedLoop | None:
-        """The course of a job, without its wheels' errors: planned once for all who drive alike.
-
-        None where it is not known beforehand: where somebody drives, or a run is driven once more.
+        None if it cannot be planned: a random driver, a custom controller, or a run that is driven again.
         """
-        if isinstance(job.path, Run):
-            return None
         common, radius = self._conditions, job.scene.robot.footprint_radius_m
         alike = replace(
             job.scene.robot.drive,
@@ -264,17 +191,23 @@ class Runs(Summarized, Sequence[Run]):
             odometry_scale=(1.0, 1.0),
             odometry_noise_std=0.0,
         )
+        if isinstance(job.path, Run):
+            return None
         if isinstance(job.path, str):
-            still = loop_by_commands(
-                [[0.0, 0.0, 0.0]], alike, start=job.scene.start, footprint_radius_m=radius
+            stand = [[0.0, 0.0, 0.0]]
+            loop_by_commands(stand, alike, start=job.scene.start, footprint_radius_m=radius).check(
+                common.obstacles
             )
-            still.check(common.obstacles)
             return None
         key = (job.path, job.speed, alike, radius, job.scene.start)
         if key in self._planned:
             return self._planned[key]
         if isinstance(job.path, Path):
-            course = loop_along(
+            if not isinstance(common.controller, str) or (
+                common.controller not in CONTROLLERS and common.controller in CUSTOM_CONTROLLERS
+            ):
+                return None
+            planned = loop_along(
                 job.path,
                 alike,
                 speed=job.speed,
@@ -284,37 +217,36 @@ class Runs(Summarized, Sequence[Run]):
                 footprint_radius_m=radius,
             )
         else:
-            course = loop_by_commands(
+            planned = loop_by_commands(
                 job.path.rows,
                 alike,
                 start=job.scene.start,
                 duration_s=common.duration_s,
                 footprint_radius_m=radius,
             )
-            course.check(common.obstacles)
-        self._planned[key] = course
-        return course
+            planned.check(common.obstacles)
+        self._planned[key] = planned
+        return planned
 
     @contextmanager
     def _numbered(self, index: int) -> Iterator[None]:
-        """Refusals say of which run they are."""
+        """Put the number of the run into refusals."""
         try:
             yield
         except InputError as error:
-            raise InputError(f"run {index} of {len(self)}, counted from 0: {error}") from error
+            text = f"run {index} of {len(self)}, counted from 0: {error}"
+            raise InputError(text, parameter=error.parameter) from error
 
     def _summary(self) -> Summary:
-        """How many runs, along what, with which seeds."""
         names = dict.fromkeys(
-            getattr(job.path, "name", job.path) if not isinstance(job.path, Run) else "a run once more"
+            getattr(job.path, "name", job.path) if not isinstance(job.path, Run) else "a recorded run"
             for job in self._jobs
         )
-        seeds = [job.seed for job in self._jobs]
         return Summary(
             f"Runs: {len(self):,}, made when they are asked for",
             (
                 ("paths", listed([str(name) for name in names])),
-                ("seeds", listed([str(seed) for seed in seeds])),
+                ("seeds", listed([str(job.seed) for job in self._jobs])),
                 ("columns", listed([name for name in COLUMNS if name in self._columns])),
             ),
         )

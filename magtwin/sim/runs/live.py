@@ -13,10 +13,10 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.run.run import Run
 from magtwin.sim.motion.closed_loop import Chassis
 from magtwin.sim.motion.commands import Commands
-from magtwin.sim.motion.drive import Moment, advance, draw_wheel_errors, wheel_rates
+from magtwin.sim.motion.drive import Moment, draw_wheel_errors, moment_in_steps, wheel_rates
 from magtwin.sim.motion.follow import CONTROL_RATE_HZ
 from magtwin.sim.motion.manual import at_start
-from magtwin.sim.runs.sensing import LidarMode, Sensing, streams
+from magtwin.sim.runs.sensing import Conditions, LidarMode, Sensing, streams
 from magtwin.sim.runs.simulate import check_run, run_metadata
 from magtwin.sim.sensors.clock import Samples
 from magtwin.sim.sensors.lidar import Scanner, Scans
@@ -28,14 +28,14 @@ from magtwin.spec.scene import Scene
 Array = NDArray[np.float64]
 Network = Callable[[Run], tuple[NDArray[Any], NDArray[Any], "NDArray[np.bool_] | None"]]
 """From rows of a run to the disturbance of each, the standard deviation of its error [nT], and whether it is
-out of the training's range. Rows come in the order of time, each once."""
+outside of the training range. Rows come in the order of time, each once."""
 
 KEPT = 256
-"""Control steps that are kept: 5 s, more than any sensor looks back."""
+"""Control steps that are kept: 5 s, more than any sensor needs."""
 
 
 class Track:
-    """The last steps of a chassis, as `magtwin.sim.motion.drive.Motion` tells all of them."""
+    """The last steps of a chassis, as a motion."""
 
     def __init__(self, drive: DriveSpec, dt: float, pose0: tuple[float, float, float]) -> None:
         """Begin at rest."""
@@ -43,12 +43,12 @@ class Track:
         self._first, self._count = 0, 0
         self._steps = np.zeros((2 * KEPT, 13))
         self._pose = np.array(pose0, float)
-        self._turned = np.zeros(2)  # the sum of rates, which a Motion multiplies by dt once
+        self._turned = np.zeros(2)  # sum of rates, as in a Motion
         self._v = 0.0
 
     @property
     def steps(self) -> int:
-        """How many steps have been made."""
+        """Number of steps so far."""
         return self._first + self._count
 
     @property
@@ -57,7 +57,7 @@ class Track:
         return self.steps * self._dt
 
     def add(self, record: Array) -> None:
-        """A step, as `magtwin.sim.motion.loop.RECORD` tells it."""
+        """Add a step; see `magtwin.sim.motion.loop.RECORD`."""
         if self._count == len(self._steps):
             self._steps[:KEPT] = self._steps[KEPT:]
             self._first, self._count = self._first + KEPT, KEPT
@@ -71,16 +71,9 @@ class Track:
         self._count += 1
 
     def at(self, t: Any) -> Moment:
-        """As `magtwin.sim.motion.drive.Motion.at`, of times within the steps that are kept."""
-        t = np.asarray(t, float)
-        starts = np.arange(self._first, self.steps) * self._dt
-        k = np.maximum(np.searchsorted(starts, t, side="right") - 1, 0)
-        into = np.clip(t - starts[k], 0.0, self._dt)
-        then = self._steps[: self._count].take(k, axis=0)
-        v, w, a, v_cmd, w_cmd, bump = then[:, 7:].T
-        pose = advance(then[:, :3], v, w, into)
-        turned = then[:, 3:5] + then[:, 5:7] * into[:, None]
-        return Moment(pose=pose, v=v, w=w, a=a, wheel_angle=turned, v_cmd=v_cmd, w_cmd=w_cmd, bump=bump > 0)
+        """As `magtwin.sim.motion.drive.Motion.at`, for times within the kept steps."""
+        steps = self._steps[: self._count]
+        return moment_in_steps(steps, self._dt, np.asarray(t, float), first=self._first)
 
 
 class LiveRobot:
@@ -116,15 +109,14 @@ class LiveRobot:
             InputError: It would begin in an obstacle, or an option is out of range.
         """
         robot, obstacles = scene.robot, obstacles or Obstacles()
-        self.rate_hz = check_run(
-            scene,
-            Commands("live", np.zeros((1, 3))),
+        conditions = Conditions(
             anomaly_map=anomaly_map,
-            rate_hz=rate_hz,
-            duration_s=None,
-            lidar=lidar,
             network=network is not None,
+            rate_hz=rate_hz,
+            lidar=lidar,
+            outside=outside,
         )
+        check_run(scene, Commands("live", np.zeros((1, 3))), conditions)
         self.step_s = 1.0 / CONTROL_RATE_HZ
         draws = streams(rng)
         errors = draw_wheel_errors(robot.drive, draws["drive"])
@@ -132,20 +124,13 @@ class LiveRobot:
         self._chassis: Chassis = at_start(robot.drive, scene.start, obstacles, radius, errors, self.step_s)
         self._track = Track(robot.drive, self.step_s, scene.start)
         self._network, self._model_error, self._height_m = network, model_error, robot.base_height_m
-        self._sensing = Sensing(
-            scene,
-            draws,
-            anomaly_map=anomaly_map,
-            rate_hz=self.rate_hz,
-            outside=outside,
-            lidar=lidar,
-            network=network is not None,
-        )
+        self._sensing = Sensing(scene, draws, conditions)
+        self.rate_hz = self._sensing.rate_hz
         self._scanner = Scanner(robot, obstacles, draws["lidar"])
         self._noise_sd_nt = robot.magnetometer.noise_density_nt * np.sqrt(self.rate_hz / 2)
         self._readings = 0
         self._rows: list[tuple[float, float, float]] = []
-        self._metadata = {**run_metadata(self._sensing), "controller": "commands", "lidar": lidar}
+        self._metadata = {**run_metadata(self._sensing), "controller": "commands"}
 
     @property
     def t(self) -> float:

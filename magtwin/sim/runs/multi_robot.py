@@ -6,6 +6,7 @@ own.
 """
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -14,9 +15,8 @@ from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.run.run import Run
 from magtwin.sim.motion.drive_input import DriveInput
-from magtwin.sim.motion.engine import Kinematic
 from magtwin.sim.runs.neighbours import Approach, Neighbour, approaches
-from magtwin.sim.runs.sensing import LidarMode, Outside, Sensing, streams
+from magtwin.sim.runs.sensing import Conditions, LidarMode, Outside, Sensing, streams
 from magtwin.sim.runs.simulate import Predict, check_run, sense_all, travel
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.spec.obstacles import Obstacles
@@ -76,29 +76,23 @@ def simulate_robots(
     find("way of robots to meet", meet, {"refuse": None, "flag": None})
     predicts = {name: (disturbances_nt or {}).get(name) for name in paths}
     led = {name: scene.led_by(name) for name in paths}
-    rates, draws, robots, metadata = {}, {}, {}, {}
+    common = Conditions(
+        anomaly_map=anomaly_map,
+        obstacles=obstacles or Obstacles(),
+        network=False,
+        duration_s=duration_s,
+        rate_hz=rate_hz,
+        controller=controller,
+        lidar=lidar,
+        outside=outside,
+    )
+    conditions = {name: replace(common, network=predicts[name] is not None) for name in paths}
+    draws, robots, metadata = {}, {}, {}
     for name, path in paths.items():
         try:
-            rates[name] = check_run(
-                led[name],
-                path,
-                anomaly_map=anomaly_map,
-                rate_hz=rate_hz,
-                duration_s=duration_s,
-                lidar=lidar,
-                network=predicts[name] is not None,
-            )
+            check_run(led[name], path, conditions[name])
             draws[name] = streams(rngs[name])
-            motion, metadata[name] = travel(
-                led[name],
-                path,
-                draws[name],
-                speed,
-                duration_s,
-                obstacles or Obstacles(),
-                controller,
-                Kinematic(),
-            )
+            motion, metadata[name] = travel(led[name], path, draws[name], speed, conditions[name])
         except InputError as error:
             raise InputError(f"robot {name!r}: {error}", parameter=error.parameter) from error
         robots[name] = Neighbour(led[name].robot, motion)
@@ -108,18 +102,9 @@ def simulate_robots(
     runs = {}
     for name in paths if wanted is None else wanted:
         robot, predict = find("robot", name, robots), predicts[name]
-        sensing = Sensing(
-            led[name],
-            draws[name],
-            anomaly_map=anomaly_map,
-            rate_hz=rates[name],
-            outside=outside,
-            lidar=lidar,
-            network=predict is not None,
-            neighbours=[other for key, other in robots.items() if key != name],
-        )
-        how = {**metadata[name], "outside": outside, "lidar": lidar}
-        sensed = sense_all(sensing, robot.motion, duration_s, how)
+        others = [other for key, other in robots.items() if key != name]
+        sensing = Sensing(led[name], draws[name], conditions[name], neighbours=others)
+        sensed = sense_all(sensing, robot.motion, metadata[name])
         run = sensed.read(None if predict is None else predict(sensed.run), (model_errors or {}).get(name))
         runs[name] = run.with_metadata(robot=name, **_nearest(name, near))
     return runs

@@ -1,11 +1,10 @@
-"""Neighbours: the other robots in a lab, as a robot's magnetometer and its bumper meet them.
+"""Neighbours: the other robots in a lab, as a robot's magnetometer and bumper meet them.
 
-A robot feels the iron of another one as a point dipole at the other's base_link: the moment that makes the
-permanent and the induced part of the other's platform at the other's own magnetometer, so that what is known
-of a robot tells what it does to others. Far away that is what its iron does, near by about so; where in the
-robot the iron is, nobody has measured. Its motors, LiDAR, battery and turning iron are left out.
+The iron of another robot is a point dipole at its base_link, with the moment that makes the permanent and
+induced field of its platform at its own magnetometer. That is exact far away and approximate nearby, because
+the place of the iron in the robot is unknown. Motors, LiDAR, battery and turning iron are neglected.
 
-Robots do not see each other while they drive. How near they came is found afterwards.
+Robots do not see each other while they drive. Their least distance is found afterwards.
 """
 
 import math
@@ -30,15 +29,15 @@ MU_0_NT = 4 * math.pi * 1e2
 """Magnetic constant [nT m/A]."""
 
 RATE_STEP_S = 1e-3
-"""Half of the time over which a neighbour's field is differenced [s]; robots go 0.3 mm in it."""
+"""Half of the time over which a neighbour's field is differenced [s]; robots drive 0.3 mm in it."""
 
 SEEN_HZ = 50.0
-"""How often it is looked how far robots are apart [Hz]: every 12 mm of two that drive at each other."""
+"""Rate of the clearance check [Hz]: every 12 mm for two robots that drive at each other."""
 
 
 @dataclass(frozen=True, eq=False)
 class Neighbour:
-    """Another robot, and what it did."""
+    """Another robot and its motion."""
 
     robot: RobotSpec
     motion: Travel
@@ -46,42 +45,42 @@ class Neighbour:
 
 @dataclass(frozen=True)
 class Approach:
-    """How near two robots came."""
+    """Nearest approach of two robots."""
 
     names: tuple[str, str]
-    """Theirs."""
+    """Names of the robots."""
 
     clearance_m: float
-    """Least distance between their footprints [m]; below 0 where they overlap."""
+    """Least distance between their footprints [m]; below 0 if they overlap."""
 
     t_s: float
-    """When [s]."""
+    """Time of the least distance [s]."""
 
     p_xy: tuple[float, float]
-    """Where: midway between them [m]."""
+    """Place then, midway between them [m]."""
 
     meet_s: float | None
-    """When their footprints first overlapped [s]; none if they never did."""
+    """Time of their first overlap [s]; None if they never overlap."""
 
     p_meet: tuple[float, float]
-    """Where they did, midway between them, or else where they were nearest [m]."""
+    """Place of the first overlap, or else of the least distance, midway between them [m]."""
 
 
 def iron_moments(robot: RobotSpec, b_base_nt: ArrayLike) -> Array:
-    """Moment at base_link's origin that stands for a robot's iron.
+    """Dipole at base_link's origin that represents a robot's iron.
 
-    With r u the way from there to its magnetometer and B = h + S b its permanent and induced field at that,
+    With r u the vector from there to its magnetometer, and B = h + S b its permanent and induced field there,
     B = mu_0 / 4 pi r^3 (3 (m . u) u - m) has the solution m = 4 pi r^3 / mu_0 (3/2 (B . u) u - B).
 
     Args:
-        robot: Its platform, and where its magnetometer is.
+        robot: Its platform and magnetometer.
         b_base_nt: Ambient field b in base_link axes [nT], shape (N, 3).
 
     Returns:
         Moments in base_link axes [A m2], shape (N, 3).
 
     Raises:
-        InputError: Its magnetometer is at base_link's origin, so no moment can stand for its iron.
+        InputError: Its magnetometer is at base_link's origin, so the moment is unknown.
     """
     platform, b = robot.platform, np.asarray(b_base_nt, float)
     iron = np.einsum("nk,jk->nj", b, np.reshape(platform.soft_iron, (3, 3))) + platform.hard_iron_nt
@@ -90,8 +89,8 @@ def iron_moments(robot: RobotSpec, b_base_nt: ArrayLike) -> Array:
         return iron
     if not r > NEAREST_M:
         raise InputError(
-            f"robot {robot.name!r}: its magnetometer is at the origin of base_link, so no dipole there can "
-            "stand for its iron, which other robots feel; move the magnetometer, or run it by itself"
+            f"robot {robot.name!r}: its magnetometer is at the origin of base_link, so the dipole "
+            "of its iron, which other robots feel, is unknown; move the magnetometer, or run it alone"
         )
     u = np.divide(robot.p_base_magnetometer, r)
     return np.asarray(4 * math.pi * r**3 / MU_0_NT * (1.5 * (iron @ u)[:, None] * u - iron))
@@ -100,13 +99,13 @@ def iron_moments(robot: RobotSpec, b_base_nt: ArrayLike) -> Array:
 def neighbours_field_nt(
     scene: Scene, neighbours: Sequence[Neighbour], motion: Moving, t: ArrayLike, true: Moment
 ) -> Array:
-    """What other robots add to the field at a robot's magnetometer.
+    """Field of other robots at a robot's magnetometer.
 
-    (1 + S) b + E db/dt with their field b in base_link axes: the robot's own soft iron and eddy currents
-    answer to it as to the lab's.
+    (1 + S) b + E db/dt with their field b in base_link axes: the robot's soft iron and eddy currents respond
+    to it as to the lab's field.
 
     Args:
-        scene: A scene whose Earth's field is known, and its first robot, which reads.
+        scene: A scene whose Earth's field is known; its first robot has the magnetometer.
         neighbours: The other robots.
         motion: What the first robot did.
         t: Times of the readings, ascending [s], shape (N,).
@@ -143,21 +142,21 @@ def _at_sensor(scene: Scene, neighbours: Sequence[Neighbour], motion: Moving, t:
 
 
 def _dipole_each_nt(r: Array, m: Array) -> Array:
-    """Field of N dipoles m (N, 3), each at its own point r (N, 3) from it [nT]; as `dipole_field_nt`."""
+    """Field of N dipoles m (N, 3), each at its own offset r (N, 3) [nT]; see `dipole_field_nt`."""
     d = np.sqrt(np.sum(r * r, axis=1))[:, None]
     along = 3 * np.sum(m * r, axis=1)[:, None] * r / d**5
     return np.asarray(MU_0_NT / (4 * math.pi) * (along - m / d**3))
 
 
 def approaches(travels: Mapping[str, Neighbour]) -> Iterator[Approach]:
-    """How near each two of some robots came, from the start to the end of the last; who has arrived stands.
+    """Nearest approach of each pair of robots, until the last has arrived; the others stand then.
 
     Args:
         travels: The robots by name.
     """
-    end = max(one.motion.duration_s for one in travels.values())
+    end = max(robot.motion.duration_s for robot in travels.values())
     t = np.arange(int(end * SEEN_HZ) + 1) / SEEN_HZ
-    places = {name: one.motion.at(t).pose[:, :2] for name, one in travels.items()}
+    places = {name: robot.motion.at(t).pose[:, :2] for name, robot in travels.items()}
     for a, b in combinations(travels, 2):
         apart = np.hypot(*(places[a] - places[b]).T)
         apart -= travels[a].robot.footprint_radius_m + travels[b].robot.footprint_radius_m

@@ -5,6 +5,7 @@ step. Each sensor draws from its own generator, so its bytes do not depend on wh
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal
 
@@ -18,7 +19,9 @@ from magtwin.run.run import COLUMNS, Column
 from magtwin.sim.exact import ExactField
 from magtwin.sim.extensions import INTERFERENCE, Interference, SensorFactory, start_sensors
 from magtwin.sim.interference import level_gradient_nt_m, sensor_places
+from magtwin.sim.motion.controllers import Controller
 from magtwin.sim.motion.drive import Moment
+from magtwin.sim.motion.engine import KINEMATIC, Engine
 from magtwin.sim.motion.sampling import Moving, into_sensor
 from magtwin.sim.runs.neighbours import Neighbour, neighbours_field_nt, touching
 from magtwin.sim.sensors.battery import Battery
@@ -30,6 +33,7 @@ from magtwin.sim.sensors.mocap import Mocap
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.sim.sensors.noise import GaussMarkov
 from magtwin.sim.sensors.odometry import Odometry
+from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
@@ -59,6 +63,26 @@ _READ = frozenset(
 )
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Conditions:
+    """What all runs of a job have in common; see `magtwin.sim.runs.simulate.simulate`."""
+
+    anomaly_map: AnomalyMap
+    obstacles: Obstacles = field(default_factory=Obstacles)
+    network: bool
+    """Whether a network predicts the disturbance."""
+
+    inputs: frozenset[str] = frozenset(COLUMNS)
+    """Columns that the network reads."""
+
+    duration_s: float | None = None
+    rate_hz: float | None = None
+    controller: str | Controller = "follower"
+    engine: Engine = KINEMATIC
+    lidar: LidarMode = "schedule"
+    outside: Outside = "nan"
+
+
 def streams(rng: np.random.Generator) -> dict[str, np.random.Generator]:
     """The child generators of a run by name, from the generator that `simulate` is given."""
     return dict(zip(STREAMS, rng.spawn(len(STREAMS)), strict=True))
@@ -71,14 +95,9 @@ class Sensing:
         self,
         scene: Scene,
         draws: Mapping[str, np.random.Generator],
+        conditions: Conditions,
         *,
-        anomaly_map: AnomalyMap,
-        rate_hz: float,
-        outside: Outside,
-        lidar: LidarMode,
-        network: bool,
         wanted: Iterable[str] = COLUMNS,
-        inputs: Iterable[str] = COLUMNS,
         neighbours: Sequence[Neighbour] = (),
         sensors: Iterable[str | SensorFactory] = (),
         interference: Iterable[str | Interference] = (),
@@ -90,13 +109,8 @@ class Sensing:
         Args:
             scene: Lab, robot and sensors.
             draws: What `streams` gave.
-            anomaly_map: The map of the scene.
-            rate_hz: Magnetometer readings a second [Hz].
-            outside: What the map reads outside its extent.
-            lidar: Whether the LiDAR follows its schedule, or stays on or off.
-            network: Whether a network predicts the disturbance.
+            conditions: Map, rate, LiDAR, and whether there is a network.
             wanted: Columns of `COLUMNS` that the run is to have.
-            inputs: Columns that the network reads.
             neighbours: Other robots in the lab. The magnetometer reads their iron if the Earth's field is
                 known; it is added to what a network predicts.
             sensors: Custom sensors; see `magtwin.sim.extensions`.
@@ -104,14 +118,16 @@ class Sensing:
         """
         robot = scene.robot
         spec = robot.magnetometer
-        self.scene, self.rate_hz, self.wanted = scene, rate_hz, frozenset(wanted)
-        self._map, self._outside, self.network = anomaly_map, outside, network
+        self.scene, self.conditions, self.wanted = scene, conditions, frozenset(wanted)
+        self.rate_hz = spec.rate_hz if conditions.rate_hz is None else conditions.rate_hz
+        self._map, self._outside = conditions.anomaly_map, conditions.outside
+        network = conditions.network
         terms = [INTERFERENCE[term] if isinstance(term, str) else term for term in interference]
         self._terms = list(zip(terms, draws["interference"].spawn(len(terms)), strict=True))
         self._custom = start_sensors(sensors, scene, draws["sensors"])
-        needed = self.wanted | frozenset(inputs if network else ())
+        needed = self.wanted | (conditions.inputs if network else frozenset())
         needed = frozenset(COLUMNS) if terms else needed
-        self._exact = ExactField(scene=scene, anomaly_map=anomaly_map, outside=outside)
+        self._exact = ExactField(scene=scene, anomaly_map=self._map, outside=self._outside)
         self._physical = not network and spec.kind == "physical"
         self._neighbours, self._near = neighbours, neighbours if scene.earth is not None else ()
         added = bool(self._near or terms)
@@ -131,7 +147,7 @@ class Sensing:
         )
         self._known = self._exact.of == "sources" or (self._exact.of == "map" and (self._physical or added))
         self._sloped = "b_map_gradient_nt_m" in needed
-        self.lidar_on = partial(lidar_on, robot.lidar, mode=lidar)
+        self.lidar_on = partial(lidar_on, robot.lidar, mode=conditions.lidar)
         self._battery = Battery(robot.battery, robot.drive, self.lidar_on, draws["battery"])
         every: dict[str, SampledSensor] = {
             "odometry": Odometry(robot.drive, draws["odometry"]),
@@ -146,7 +162,7 @@ class Sensing:
         }
         """The sensors with their own clocks that are read, by name."""
 
-        self._magnetometer = Magnetometer(spec, rate_hz, draws["magnetometer"])
+        self._magnetometer = Magnetometer(spec, self.rate_hz, draws["magnetometer"])
         self._error_rng = draws["model_error"]
         self._error_process: GaussMarkov | None = None
         self._checks, self._steep = 0, False

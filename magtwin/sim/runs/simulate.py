@@ -19,9 +19,9 @@ from magtwin.sim.motion.controllers import Controller
 from magtwin.sim.motion.drive import draw_wheel_errors
 from magtwin.sim.motion.drive_input import DriveInput
 from magtwin.sim.motion.driver import Driver
-from magtwin.sim.motion.engine import Engine, Kinematic, Travel
+from magtwin.sim.motion.engine import KINEMATIC, Engine, Travel
 from magtwin.sim.motion.follow import follow, play
-from magtwin.sim.runs.sensing import LidarMode, Outside, Predicted, Sensing, streams
+from magtwin.sim.runs.sensing import Conditions, LidarMode, Outside, Predicted, Sensing, streams
 from magtwin.sim.sensors.lidar import lidar_on
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.spec.obstacles import Obstacles
@@ -99,31 +99,22 @@ def simulate(
         InputError: The path leaves the floor or touches an obstacle, an option is out of range, or nothing
             gives the disturbance. Nothing has been computed then.
     """
-    rate = check_run(
-        scene,
-        path,
+    conditions = Conditions(
         anomaly_map=anomaly_map,
-        rate_hz=rate_hz,
+        obstacles=obstacles or Obstacles(),
+        network=disturbance_nt is not None,
         duration_s=duration_s,
+        rate_hz=rate_hz,
+        controller=controller,
+        engine=engine or KINEMATIC,
         lidar=lidar,
-        network=disturbance_nt is not None,
-    )
-    draws = streams(rng)
-    sensing = Sensing(
-        scene,
-        draws,
-        anomaly_map=anomaly_map,
-        rate_hz=rate,
         outside=outside,
-        lidar=lidar,
-        network=disturbance_nt is not None,
-        sensors=sensors,
-        interference=interference,
     )
-    motion, metadata = travel(
-        scene, path, draws, speed, duration_s, obstacles or Obstacles(), controller, engine or Kinematic()
-    )
-    sensed = sense_all(sensing, motion, duration_s, {**metadata, "outside": outside, "lidar": lidar})
+    check_run(scene, path, conditions)
+    draws = streams(rng)
+    sensing = Sensing(scene, draws, conditions, sensors=sensors, interference=interference)
+    motion, metadata = travel(scene, path, draws, speed, conditions)
+    sensed = sense_all(sensing, motion, metadata)
     return sensed.read(None if disturbance_nt is None else disturbance_nt(sensed.run), model_error)
 
 
@@ -132,13 +123,11 @@ def travel(
     path: DriveInput,
     draws: Mapping[str, np.random.Generator],
     speed: float,
-    duration_s: float | None,
-    obstacles: Obstacles,
-    controller: str | Controller,
-    engine: Engine,
+    conditions: Conditions,
 ) -> tuple[Travel, Metadata]:
     """Drive the robot; returns what it did, and metadata on how. Arguments as for `simulate`."""
-    robot = scene.robot
+    robot, duration_s, obstacles = scene.robot, conditions.duration_s, conditions.obstacles
+    controller, engine = conditions.controller, conditions.engine
     if isinstance(path, Run):
         kept = ("path", "controller", "speed_m_s")
         metadata = {name: path.metadata[name] for name in kept if name in path.metadata}
@@ -175,40 +164,30 @@ def travel(
     return motion, {"path": "random", "controller": "driver", "speed_m_s": float(speed), **metadata}
 
 
-def check_run(
-    scene: Scene,
-    path: DriveInput,
-    *,
-    anomaly_map: AnomalyMap,
-    rate_hz: float | None,
-    duration_s: float | None,
-    lidar: LidarMode,
-    network: bool,
-) -> float:
-    """Check the arguments of `simulate`, and return the magnetometer's rate [Hz].
+def check_run(scene: Scene, path: DriveInput, conditions: Conditions) -> None:
+    """Check the arguments of `simulate`.
 
     Raises:
         InputError: The path leaves the floor, an option is out of range, or nothing gives the disturbance.
     """
     robot = scene.robot
-    rate = robot.magnetometer.rate_hz if rate_hz is None else rate_hz
+    rate = robot.magnetometer.rate_hz if conditions.rate_hz is None else conditions.rate_hz
     if not 0 < rate < math.inf:
         raise InputError(
             f"rate_hz of the magnetometer must be above 0 Hz and finite, got {rate!r}", parameter="rate_hz"
         )
-    if not network:
+    if not conditions.network:
         if robot.magnetometer.kind == "neural":
             raise InputError(
                 f"scene {scene.name!r} has a neural magnetometer, and no network predicts its disturbance; "
                 'open it as a twin that names one, or take the kind "physical" or "map-only"'
             )
-        check_truth(scene, anomaly_map)
-    lidar_on(robot.lidar, 0.0, lidar)  # refuses an unknown mode before anything is computed
+        check_truth(scene, conditions.anomaly_map)
+    lidar_on(robot.lidar, 0.0, conditions.lidar)  # refuses an unknown mode before anything is computed
     if isinstance(path, Path):
         check_on_floor(path, scene.lab.floor_m, robot.footprint_radius_m)
-    if duration_s is not None:
-        _check_readings(duration_s, rate)
-    return rate
+    if conditions.duration_s is not None:
+        _check_readings(conditions.duration_s, rate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,30 +211,20 @@ class Sensed:
         return Run(columns, self.run.metadata, self.sensing.specs)
 
 
-def sense_all(
-    sensing: Sensing,
-    motion: Travel,
-    duration_s: float | None,
-    metadata: Mapping[str, str | int | float | bool],
-) -> Sensed:
+def sense_all(sensing: Sensing, motion: Travel, metadata: Mapping[str, str | int | float | bool]) -> Sensed:
     """Read the sensors of a whole run.
 
     Args:
         sensing: Sensors that have not been read yet.
         motion: What the robot did.
-        duration_s: Length of the run [s]. Default: that of the motion.
         metadata: How the motion came about.
     """
-    end = motion.duration_s if duration_s is None else duration_s
+    conditions = sensing.conditions
+    end = motion.duration_s if conditions.duration_s is None else conditions.duration_s
     _check_readings(end, sensing.rate_hz)
     t = np.arange(max(1, math.ceil(end * sensing.rate_hz - 1e-9))) / sensing.rate_hz
-    columns = sensing.sense(motion, t)
-    return Sensed(
-        Run(
-            columns, {**run_metadata(sensing), **metadata, "duration_s": round(float(end), 9)}, sensing.specs
-        ),
-        sensing,
-    )
+    known = {**run_metadata(sensing), **metadata, "duration_s": round(float(end), 9)}
+    return Sensed(Run(sensing.sense(motion, t), known, sensing.specs), sensing)
 
 
 def run_metadata(sensing: Sensing) -> Metadata:
@@ -265,7 +234,9 @@ def run_metadata(sensing: Sensing) -> Metadata:
         "scene": sensing.scene.name,
         **robot_metadata(robot),
         "rate_hz": float(sensing.rate_hz),
-        "magnetometer": "neural" if sensing.network else robot.magnetometer.kind,
+        "outside": sensing.conditions.outside,
+        "lidar": sensing.conditions.lidar,
+        "magnetometer": "neural" if sensing.conditions.network else robot.magnetometer.kind,
         **sensing.metadata,
     }
 

@@ -56,7 +56,8 @@ def wheels_energy_j(spec: BatterySpec, drive: DriveSpec, moments: Moment) -> Arr
     rolled = np.abs(np.diff(moments.wheel_angle, axis=0)) * drive.wheel_radius_m
     gain = np.maximum(np.diff(speed * speed, axis=0), 0.0)
     work = spec.drag_n / 2 * rolled + spec.mass_kg / 4 * gain
-    return np.asarray((work[..., 0] + work[..., 1]) / spec.motor_efficiency)
+    joules: Array = (work[..., 0] + work[..., 1]) / spec.motor_efficiency
+    return joules
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +170,7 @@ class Battery(SampledSensor):
         else:
             self._history, self._first = self._history[-1:], self._done
         last = max(int(np.ceil((until_s - 1e-9) / STEP_S)) - 1, self._done)
-        times = np.asarray(np.arange(self._done, last + 1) * STEP_S, np.float64)
+        times: Array = np.arange(self._done, last + 1, dtype=float) * STEP_S
         self._done = last
         if len(times) > 1:
             energy = wheels_energy_j(self.spec, self._drive, motion.at(times))

@@ -1,4 +1,4 @@
-"""LiDAR: when it spins, and what a planar one sees."""
+"""LiDAR: its schedule, and the scans of a planar one."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from magtwin.summary import Summarized, Summary, span
 Array = NDArray[np.float64]
 
 _EDGE = 1e-9
-"""Part of a ray's step by which a surface reaches past its ends, lest a ray slip between two."""
+"""Part of a ray's step by which a surface is extended, so that no ray slips between two."""
 
 _SAME_S = 1e-6
 """How far past the last reading a scan still belongs to a run [s]."""
@@ -34,12 +34,12 @@ def lidar_on(
     """Whether the LiDAR spins at times `t` [s], shape (...).
 
     Args:
-        spec: The schedule: off for off_s, then on for on_s, and again; at t = 0 it is phase_s into it.
+        spec: The schedule: off for off_s, on for on_s, and so on; at t = 0 it is at phase_s.
         t: Times since the start [s].
         mode: "schedule", or always "on" or "off".
 
     Raises:
-        InputError: `mode` is none of these.
+        InputError: `mode` is another word.
     """
     t = np.asarray(t, float)
     if mode == "schedule":
@@ -53,10 +53,7 @@ def lidar_on(
 
 
 def ray_angles(rays: int) -> Array:
-    """Directions of a scan's rays in the LiDAR's own xy plane, from its x axis [rad], shape (rays,).
-
-    They go anticlockwise from -pi, evenly all the way round.
-    """
+    """Directions of a scan's rays in the LiDAR's xy plane [rad]: anticlockwise from -pi, evenly; (rays,)."""
     return np.arange(rays, dtype=float) * (2 * np.pi / rays) - np.pi
 
 
@@ -66,17 +63,17 @@ def scan(
     spec: LidarSpec,
     rng: np.random.Generator | None = None,
 ) -> Array:
-    """Ranges of one turn, all rays at one moment; the robot itself is not seen.
+    """Ranges of one turn, all rays at the same time; the robot itself is not seen.
 
     Args:
-        obstacles: What there is to see; its triangles count.
+        obstacles: What there is to see, by its triangles.
         pose: LiDAR's origin p_world_lidar [m], shape (3,), and its axes q_world_lidar_xyzw, shape (4,).
         spec: Rays, ranges and noise.
-        rng: Source of noise, a number a ray; none for none.
+        rng: Source of noise. Default: no noise.
 
     Returns:
-        Ranges along `ray_angles` [m], shape (rays,), as REP 117 has them: inf where nothing is
-        within `range_max_m`, -inf where something is nearer than `range_min_m`.
+        Ranges along `ray_angles` [m], shape (rays,), after REP 117: inf if nothing is within `range_max_m`,
+        -inf if something is nearer than `range_min_m`.
     """
     p, turn = np.asarray(pose[0], float), matrix_from_quat(pose[1])
     cuts = _cuts((obstacles.triangles - p) @ turn, 0.0)
@@ -85,16 +82,16 @@ def scan(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scans(Summarized):
-    """The scans of a run, a row each."""
+    """The scans of a run, one a row."""
 
     t: Array
-    """Moment of each scan [s], shape (S,)."""
+    """Time of each scan [s], shape (S,)."""
 
     arrival: Array
-    """When it arrived [s], shape (S,)."""
+    """Time of its arrival [s], shape (S,)."""
 
     p_world_lidar: Array
-    """Where the LiDAR was at that moment [m], shape (S, 3)."""
+    """Place of the LiDAR [m], shape (S, 3)."""
 
     q_world_lidar_xyzw: Array
     """Its axes, shape (S, 4)."""
@@ -103,7 +100,7 @@ class Scans(Summarized):
     """Ranges along `ray_angles` [m], shape (S, rays); see `scan`."""
 
     def points_world(self) -> list[Array]:
-        """What each scan hit, in world [m], each of shape (H, 3)."""
+        """Points that each scan hit, in world [m], each of shape (H, 3)."""
         angle = ray_angles(self.ranges_m.shape[1])
         unit = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
         hits = [np.isfinite(row) for row in self.ranges_m]
@@ -217,16 +214,16 @@ def _reported(ranges: Array, spec: LidarSpec, rng: np.random.Generator | None) -
 
 
 def _cuts(triangles: Array, height: float) -> Array:
-    """Where triangles (T, 3, 3) cross a level plane: ends of a segment each, in x and y, shape (C, 2, 2).
+    """Segments in which triangles (T, 3, 3) cross a level plane: ends in x and y, shape (C, 2, 2).
 
-    One that lies in the plane does not cross it; its neighbours do.
+    A triangle in the plane does not cross it, but its neighbours do.
     """
     z = triangles[:, :, 2] - height
     above = z >= 0
     count = above.sum(axis=1)
     crossing = (count == 1) | (count == 2)
     corner, z, above = triangles[crossing], z[crossing], above[crossing]
-    # The corner that is alone on its side; both others are joined to it by an edge that crosses.
+    # Both edges from the corner that is alone on its side cross the plane.
     alone = np.argmax(above == (count[crossing] == 1)[:, None], axis=1)
     row = np.arange(len(corner))
     ends = []
@@ -238,9 +235,9 @@ def _cuts(triangles: Array, height: float) -> Array:
 
 
 def _cast(segments: Array, rays: int) -> Array:
-    """Range to the first segment along each ray from the origin, inf for none, shape (rays,).
+    """Range to the first segment along each ray from the origin, inf if there is none, shape (rays,).
 
-    Each segment is met by the rays between the directions to its ends, and by no other.
+    A segment is met by the rays between the directions to its ends.
 
     Args:
         segments: Their ends [m], shape (C, 2, 2).

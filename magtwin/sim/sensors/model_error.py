@@ -1,8 +1,8 @@
-"""Model error: how a neural magnetometer's reading is off what its network predicts.
+"""Model error: the error of a network's prediction in the reading of a neural magnetometer.
 
-A network gives the mean of the disturbance and the standard deviation of its error. A reading is one draw
-from that distribution, not its mean. The error has a part that stays for a session and a part that changes
-over seconds, as on recordings that the network never saw.
+A network gives the mean of the disturbance and the standard deviation of its error. A reading is a draw from
+that distribution. The error has a part that is constant in a session and a part that changes over seconds, as
+on held-out recordings.
 """
 
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ class ModelError:
     """Correlation time of the rest [s]."""
 
     offset: float = 0.0
-    """The session's own number, standard normal; see `in_session`."""
+    """Standard normal number of the session; see `in_session`."""
 
     def in_session(self, rng: np.random.Generator) -> "ModelError":
         """The same statistics with the number of one session drawn."""
@@ -37,14 +37,12 @@ class ModelError:
 
             e_t = c_t o + sqrt(sd_t^2 - c_t^2) u_t,   c_t = min(offset_sd, sd_t)
 
-        so that e_t has the variance sd_t^2 everywhere, and its offset is a constant wherever sd_t is above
-        offset_sd.
+        so that e_t has the variance sd_t^2, and a constant offset wherever sd_t is above offset_sd.
 
         Args:
-            sd_nt: Predicted standard deviations [nT], shape (N,); where unknown (nan) the error is 0.
+            sd_nt: Predicted standard deviations [nT], shape (N,); the error is 0 where it is nan.
             process: u at each reading, shape (N,).
-            offset: o of each reading, shape (N,), where readings are of several sessions; default: the
-                session's own.
+            offset: o of each reading, shape (N,), if readings belong to several sessions. Default: `offset`.
 
         Returns:
             Errors [nT], shape (N,).

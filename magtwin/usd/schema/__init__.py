@@ -33,41 +33,39 @@ NOUNS = {
 
 
 def register() -> None:
-    """Make the schemas known to USD; once more does nothing.
+    """Register the schemas with USD; a second call does nothing.
 
     Raises:
-        InputError: USD's schema registry was in use before, and will not take them any more.
+        InputError: USD's schema registry was used before, so it cannot add schemas.
     """
     Plug.Registry().RegisterPlugins(str(FOLDER))
     registry = Usd.SchemaRegistry()
     unknown = [api for api in NOUNS.values() if not registry.FindAppliedAPIPrimDefinition(api)]
     if unknown:
         raise InputError(
-            f"the USD schemas {', '.join(unknown)} came too late: USD reads schemas once, at the first use "
-            "of a stage; import magtwin.usd before opening one, or add "
+            f"the USD schemas {', '.join(unknown)} are registered too late: USD reads schemas at the first "
+            "use of a stage; import magtwin.usd before opening one, or add "
             f"{FOLDER} to PXR_PLUGINPATH_NAME"
         )
 
 
 def attribute_name(noun: str, field: str) -> str:
-    """The attribute that stands for a field of a spec: ("drive", "wheel_radius_m") gives
-    `magtwin:drive:wheelRadiusM`.
-    """
+    """The attribute of a spec's field: ("drive", "wheel_radius_m") is `magtwin:drive:wheelRadiusM`."""
     first, *rest = field.split("_")
     return f"magtwin:{noun}:{first}{''.join(word.capitalize() for word in rest)}"
 
 
 def place(prim: Usd.Prim) -> str:
-    """Where a prim is, for refusals: file and path."""
+    """File and path of a prim, for error messages."""
     layer = prim.GetStage().GetRootLayer()
     return f"{layer.realPath or layer.identifier} <{prim.GetPath()}>"
 
 
 def apply_api(prim: Usd.Prim, noun: str) -> Usd.Prim:
-    """Apply the schema of `noun` to `prim`, in the stage's edit target, unless it has it already.
+    """Apply the schema of `noun` to `prim` in the stage's edit target, if it does not have it.
 
     Raises:
-        InputError: It may not be applied to a prim of that type.
+        InputError: The schema is not for a prim of that type.
     """
     api = find("schema", noun, NOUNS)
     if prim.HasAPI(api):
@@ -82,7 +80,7 @@ def apply_api(prim: Usd.Prim, noun: str) -> Usd.Prim:
 
 
 def _kinds(api: str) -> str:
-    """The types of prim that a schema goes on, in words."""
+    """The types of prim of a schema, in words."""
     *others, last = Usd.SchemaRegistry().GetAPISchemaCanOnlyApplyToTypeNames(api)
     return f"an {', '.join(others)} or {last}" if others else f"an {last}"
 
@@ -91,25 +89,25 @@ def require_api(prim: Usd.Prim, noun: str) -> Usd.Prim:
     """`prim`, if it has the schema of `noun`.
 
     Raises:
-        InputError: It has not.
+        InputError: It lacks the schema.
     """
     api = find("schema", noun, NOUNS)
     if not prim.HasAPI(api):
-        raise InputError(f"{place(prim)}: has no {api}; it is not a {noun} that magtwin authored")
+        raise InputError(f"{place(prim)}: has no {api}, so it is no {noun} of magtwin")
     return prim
 
 
 def prims_with(root: Usd.Prim, noun: str) -> list[Usd.Prim]:
-    """The prims at and below `root` that have the schema of `noun`, in order of the stage."""
+    """The prims at and below `root` with the schema of `noun`, in order of the stage."""
     api = find("schema", noun, NOUNS)
     return [prim for prim in Usd.PrimRange(root) if prim.HasAPI(api)]
 
 
 def only_prim_with(root: Usd.Prim, noun: str) -> Usd.Prim:
-    """The one prim at or below `root` that has the schema of `noun`.
+    """The only prim at or below `root` with the schema of `noun`.
 
     Raises:
-        InputError: There is none, or there are several.
+        InputError: There is none, or more than one.
     """
     prims = prims_with(root, noun)
     if len(prims) != 1:

@@ -1,7 +1,7 @@
-"""Make what follows from schema.usda: `python magtwin/usd/schema/generate.py`, or `make schema`.
+"""Generate files from schema.usda: `python magtwin/usd/schema/generate.py`, or `make schema`.
 
-generatedSchema.usda and plugInfo.json are for USD, docs/schema.md is for people. Run as a script, so that it
-works while the generated files are broken. Needs jinja2.
+generatedSchema.usda and plugInfo.json are for USD, docs/schema.md is for people. It is a script, so that it
+works while the generated files are broken.
 """
 
 import json
@@ -41,7 +41,7 @@ one that equals the fallback; only empty values are left out.
 def generate(folder: Path) -> None:
     """Write the generated files of the schema library to `folder`, with USD's own generator.
 
-    USD leaves placeholders for paths in plugInfo.json; here the library lies where that file lies.
+    USD leaves placeholders for paths in plugInfo.json; here the library is beside that file.
     """
     spec = find_spec("pxr.Usd")
     assert spec is not None
@@ -61,7 +61,7 @@ def generate(folder: Path) -> None:
 
 
 def reference() -> str:
-    """The schemas for people, in Markdown: every attribute with type, fallback and meaning."""
+    """The page docs/schema.md: every attribute with type, fallback and meaning."""
     from pxr import Sdf
 
     layer = Sdf.Layer.FindOrOpen(str(HERE / "schema.usda"))
@@ -75,13 +75,13 @@ def reference() -> str:
         for item in schema.properties:
             attribute = isinstance(item, Sdf.AttributeSpec)
             kind = str(item.typeName) if attribute else "rel"
-            fallback = f"`{_said(item)}`" if attribute and _said(item) else ""
+            fallback = f"`{_fallback(item)}`" if attribute and _fallback(item) else ""
             parts.append(f"| `{item.name}` | {kind} | {fallback} | {item.documentation} |\n")
     return "".join(parts)
 
 
-def _said(attribute: Any) -> str:
-    """An attribute's fallback as USD's text says it; "" where it is empty."""
+def _fallback(attribute: Any) -> str:
+    """An attribute's fallback as text; "" if it is empty."""
     value = attribute.default
     if isinstance(value, float):
         return f"{value:g}"

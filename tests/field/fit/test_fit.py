@@ -7,7 +7,7 @@ from test_gp import survey, truth
 
 from magtwin.errors import InputError
 from magtwin.field.fit.fit import fit, grid_report, raster
-from magtwin.field.fit.methods import METHODS
+from magtwin.field.fit.methods import METHODS, map_method
 from magtwin.field.survey.readings import Readings
 
 QUICK = ("trilinear", "cubic", "gp")
@@ -155,3 +155,15 @@ def test_a_stuck_hole_is_masked_at_every_heading_and_a_node_read_at_one_is_not()
     assert not known[:, masked].any()
     assert known[:, 10, 2].all()
     assert known[:, ~masked].mean() > 0.9
+
+
+def test_a_method_of_the_users_own_fits_by_its_name(monkeypatch):
+    monkeypatch.setattr(METHODS, "_loaded", {})
+
+    @map_method("plane")
+    def fit_plane(readings, *, level_nt=0.0):
+        return readings.name, level_nt
+
+    assert fit(survey(), "plane", level_nt=5.0) == (survey().name, 5.0)
+    with pytest.raises(InputError, match="method 'plane' has no option 'levl_nt'; did you mean 'level_nt'"):
+        fit(survey(), "plane", levl_nt=1.0)

@@ -190,13 +190,6 @@ def test_a_whole_turn_changes_nothing_and_nan_gives_nan():
     assert np.isnan(model.predict([[np.nan, 0.0], [0.0, 0.0]], [0.0, np.nan])).all()
 
 
-def test_the_same_readings_give_the_same_bytes():
-    one, other = (fit_gp(survey(rows=5, columns=5)) for _ in range(2))
-    assert_array_equal(one.figures, other.figures)
-    at, yaw, _ = some(30)
-    assert_array_equal(one.predict(at, yaw), other.predict(at, yaw))
-
-
 def test_one_heading_has_no_harmonics_and_holds_for_all():
     whole = survey()
     only = whole.take(whole.node[:, 0] == 0).with_(yaw=np.zeros(56))

@@ -5,6 +5,7 @@ import math
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -95,15 +96,6 @@ def test_numpy_plain_python_and_compiled_code_give_the_same_bytes(field, seed, o
         assert_array_equal(other, gradients[0])
 
 
-def test_a_pose_gives_the_same_bytes_alone_and_among_others():
-    field = field_map(masked=0.05)
-    p, yaw = poses(field, 2_000)
-    together = field.lookup_with_gradient(p, yaw)
-    for count in (1, lookup.FEW, lookup.FEW + 1):
-        for got, want in zip(field.lookup_with_gradient(p[:count], yaw[:count]), together, strict=True):
-            assert_array_equal(got, want[:count])
-
-
 @pytest.mark.parametrize("masked", [0.0, 0.05])
 def test_the_number_of_threads_changes_no_byte(monkeypatch, masked):
     field = field_map(masked=masked)
@@ -175,13 +167,6 @@ def test_the_gradient_of_a_plane_is_its_slope_and_of_a_heading_ramp_its_rate():
     p = [(0.0, 1.1), (-0.3, 1.0), (0.3, 1.8), (0.11, 1.43)]  # inside, and at two corners of the map
     assert_allclose(field.gradient(p, 1.0), [(300, -200, rate)] * 4, rtol=0, atol=1e-7)
     assert_allclose(field.gradient(p, -0.5), [(300, -200, -3 * rate)] * 4, rtol=0, atol=1e-7)
-
-
-def test_with_one_heading_the_field_does_not_change_with_heading():
-    field = field_map(degrees=(30.0,))
-    p, yaw = poses(field, 200)
-    slopes = field.gradient(p, yaw)
-    assert_array_equal(slopes[:, 2][np.isfinite(slopes[:, 0])], 0.0)
 
 
 def test_across_the_border_a_clamped_field_does_not_change():
@@ -266,3 +251,16 @@ def test_a_map_that_was_looked_up_is_copied_and_pickled_without_what_lookup_keep
         assert same == field
         assert_array_equal(same.lookup(p, yaw), want)
     assert len(pickle.dumps(field)) == before
+
+
+def test_the_sd_is_the_root_of_the_interpolated_variance():
+    field = field_map(masked=0.05)
+    variance = np.random.default_rng(3).uniform(1, 9, field.values_nt.shape)
+    known = replace(field, variance_nt2=variance)
+    p, yaw = poses(field, 200)
+    mean, sd = known.lookup_with_sd(p.reshape(20, 10, 2), yaw.reshape(20, 10))
+    assert mean.shape == sd.shape == (20, 10)
+    assert_array_equal(mean.ravel(), field.lookup(p, yaw))
+    assert_allclose(sd.ravel() ** 2, replace(field, values_nt=variance).lookup(p, yaw), rtol=1e-12)
+    with pytest.raises(InputError, match=r"map 'lab' has no variance; fit one"):
+        field.lookup_with_sd(p, yaw)

@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from magtwin.errors import InputError
 from magtwin.field.sources import compiled_dipoles as dipoles
 from magtwin.field.sources import dipoles as sources
+from magtwin.field.sources.bodies import Bodies
 from magtwin.field.sources.compiled_dipoles import dipole_field_and_gradient_nt, dipole_field_nt
 from magtwin.field.sources.harmonic import HarmonicField
 
@@ -66,7 +67,7 @@ def test_the_gradient_is_what_the_field_changes_by_along_each_axis():
     assert gradient.shape == (4, 5, 3, 3)
     for axis in range(3):
         v = np.broadcast_to(np.eye(3)[axis], p.shape)
-        _, rate = sources.dipole_field_and_rate_nt(p, v, place, moment)
+        _, rate = Bodies((), place, moment).field_and_rate_nt(p, v)
         assert apart(gradient[..., axis], rate) < 1e-11
     assert_array_equal(gradient, np.swapaxes(gradient, -1, -2))
     assert_array_equal(np.trace(gradient, axis1=-2, axis2=-1), 0.0)

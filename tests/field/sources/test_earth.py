@@ -40,17 +40,6 @@ def coefficients(day):
     return [t.iloc[k] + part * (t.iloc[k + 1] - t.iloc[k]) for t in tables]
 
 
-def test_the_coefficients_are_those_that_the_iaga_published():
-    # IAGA Division V, IGRF-14 (2024): g10, g11, h11
-    for day, want in {
-        "1900-01-01": (-31543, -2298, 5922),
-        "2020-01-01": (-29403.41, -1451.37, 4653.35),
-        "2025-01-01": (-29350.0, -1410.3, 4545.5),
-    }.items():
-        g, h = coefficients(day)
-        assert (g[1, 0], g[1, 1], h[1, 1]) == pytest.approx(want)
-
-
 def test_the_span_is_that_of_the_coefficients():
     from ppigrf.ppigrf import read_shc
 
@@ -137,16 +126,6 @@ def test_the_field_turns_with_the_worlds_north():
     )
     with pytest.raises(InputError, match="north_deg must be a number, got nan"):
         earth_field_nt(*GAINESVILLE, "2026-11-21", north_deg=math.nan)
-
-
-def test_the_field_falls_with_height_as_a_dipoles_to_first_order():
-    low, high = (np.linalg.norm(earth_field_nt(29.65, -82.35, h, "2026-11-21")) for h in (0, 10_000))
-    assert high / low == pytest.approx(1 - 3 * 10 / 6371, abs=5e-4)
-
-
-@pytest.mark.parametrize("day", ["1900-01-01", "2030-01-01"])
-def test_the_models_first_and_last_days_are_within_it(day):
-    assert 20_000 < np.linalg.norm(earth_field_nt(*GAINESVILLE, day)) < 70_000
 
 
 @pytest.mark.parametrize(

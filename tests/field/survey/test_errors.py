@@ -53,7 +53,7 @@ def told(readings, values):
 def test_the_survey_tells_how_far_its_robot_stood_off_its_nodes(headings, place_m):
     readings, values, off = surveyed(headings, place_m=place_m)
     found = told(readings, values)
-    assert found.told
+    assert found.estimated
     assert found.place_m == pytest.approx(place_m, rel=0.12)
     assert found.mean_nt2 == pytest.approx(np.mean(off**2), rel=0.15)
     z = off / np.sqrt(found.variance_nt2)
@@ -86,7 +86,7 @@ def test_a_survey_without_errors_has_hardly_any():
 def test_of_one_heading_a_centimetre_is_taken_for_granted():
     readings, values, off = surveyed((0.0,), place_m=0.01)
     found = told(readings, values)
-    assert not found.told
+    assert not found.estimated
     assert found.place_m == PLACE_M
     assert found.mean_nt2 == pytest.approx(np.mean(off**2), rel=0.25)
 

@@ -226,12 +226,6 @@ def test_few_readings_are_judged_by_repeats_alone_and_the_report_says_so():
     assert "only repeats were looked for" in report.metadata["note"]
 
 
-def test_the_same_survey_gives_the_same_findings():
-    a, b = (find_stuck(gridded(2)) for _ in range(2))
-    assert_array_equal(a.outlier, b.outlier)
-    assert_array_equal(a.doubt, b.doubt)
-
-
 def test_rows_in_no_order_are_judged_as_those_of_a_drive_are():
     rng = np.random.default_rng(3)
     p, yaw = rng.uniform(-3, 3, (400, 2)), rng.uniform(0, 2 * np.pi, 400)

@@ -174,7 +174,7 @@ def test_a_survey_in_another_unit_is_read_when_it_is_said(tmp_path, unit, scale)
     values = [v * scale for v in (41_000, 41_200, 40_900, 41_100)]
     folder = write_survey(tmp_path, **{f"h{h}": layer_text(h, values) for h in (0, 90, 180, 270)})
     assert_allclose(read_grid(folder, unit=unit).b_nt[:2], [41_000, 41_200])
-    with pytest.raises(InputError, match=f"were it {unit}, it would be 41,050 nT, so say --unit {unit}"):
+    with pytest.raises(InputError, match=f"in {unit} it would be 41,050 nT: give --unit {unit}"):
         read_grid(folder)
 
 
@@ -241,9 +241,9 @@ REFUSALS = {
         {"90_map.csv": HEADER + "0,0,1.57,41000\n0.5,0,1.57,41000\n"},
         r"90_map\.csv: all rows have y = 0; a map needs two rows",
     ),
-    "tesla": ("scaled", 1e-9, r"mean of scalar_mag is 4\.105e-05 nT.*were it T, it would be 41,050 nT"),
-    "uT": ("scaled", 1e-3, r"mean of scalar_mag is 41\.05.*were it uT, it would be 41,050 nT"),
-    "mG": ("scaled", 1e-2, r"mean of scalar_mag is 410\.5.*were it mG, it would be 41,050 nT"),
+    "tesla": ("scaled", 1e-9, r"mean of scalar_mag is 4\.105e-05 nT.*in T it would be 41,050 nT"),
+    "uT": ("scaled", 1e-3, r"mean of scalar_mag is 41\.05.*in uT it would be 41,050 nT"),
+    "mG": ("scaled", 1e-2, r"mean of scalar_mag is 410\.5.*in mG it would be 41,050 nT"),
     "pT": ("scaled", 1e3, r"mean of scalar_mag is 4\.105e\+07 nT, outside .* no usual unit"),
 }
 

@@ -124,7 +124,7 @@ def test_a_pth_loads_without_conversion(real_data, tmp_path):
 def test_an_output_that_exists_is_refused_unless_forced(real_data, tmp_path):
     out = tmp_path / "n.safetensors"
     out.write_bytes(b"precious")
-    with pytest.raises(InputError, match="exists already; give --force"):
+    with pytest.raises(InputError, match="exists already; give `force=True`"):
         convert(real_data / RELEASED, out)
     assert out.read_bytes() == b"precious"
     convert(real_data / RELEASED, out, force=True)

@@ -53,9 +53,7 @@ def test_a_run_without_commands_is_not_replayed_for_a_network_that_reads_them(la
     t = np.arange(200) / 20.0
     p = np.column_stack([0.2 * t - 1, 0 * t, 0.05 + 0 * t])
     told = Run({"t": t, "p_world_base": p, "yaw": 0 * t})
-    with pytest.raises(
-        InputError, match=r"has no column 'v_cmd', which the network turtlebot4_hybrid\.safetensors"
-    ):
+    with pytest.raises(InputError, match="no column 'v_cmd', which the network turtlebot4_hybrid"):
         simulate(neural, told)
     paper = open_twin(lab_scene, network=shipped("weights", "turtlebot4_paper.safetensors"))
     assert np.isfinite(simulate(paper, told)["b_total_nt"]).all()
@@ -100,7 +98,7 @@ def test_a_replay_between_its_samples_is_the_drive_itself():
 
 @pytest.mark.parametrize(
     ("t", "x", "what"),
-    [([0, 1, 1], [0, 1, 2], "row 3"), ([0, 1, 2], [0, np.nan, 2], "row 2"), ([0], [0], "two or more")],
+    [([0, 1, 1], [0, 1, 2], "row 3"), ([0, 1, 2], [0, np.nan, 2], "row 2"), ([0], [0], "at least two rows")],
 )
 def test_a_run_that_cannot_be_replayed_is_refused(t, x, what):
     zero = np.zeros(len(t))
@@ -124,11 +122,11 @@ def test_commands_are_read_as_they_were_written(tmp_path):
 @pytest.mark.parametrize(
     ("text", "what"),
     [
-        ("t,v,w\n0,0.1,0\n0.5,0.1,0\n0.4,0.1,0\n", ":4: time must go on"),
+        ("t,v,w\n0,0.1,0\n0.5,0.1,0\n0.4,0.1,0\n", ":4: times must ascend"),
         ("0,nan,0\n", ":1: a command must be finite"),
         ("0,0.1\n", ":1: a command is three numbers"),
         ("t,v,w\nx,y,z\n", ":2: not a number"),
-        ("-1,0.1,0\n", ":1: time must go on"),
+        ("-1,0.1,0\n", ":1: times must ascend"),
         ("t,v,w\n", "no commands"),
     ],
 )
@@ -185,7 +183,7 @@ ROOM = (box("desk", 1.5, 0.9, 0.4), box("chair", -1.2, -0.6, 0.2), box("cabinet"
 OBSTACLES = Obstacles(tuple(n for n, _ in ROOM), tuple(np.array(o) for _, o in ROOM))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_driver_covers_the_floor_and_never_bumps(seed):
     errors = np.random.default_rng(seed).normal(0, [0.004, 0.006]).tolist()
     motion = drive_about(seed, obstacles=OBSTACLES, wheel_errors=tuple(errors))
@@ -223,14 +221,14 @@ def test_a_driver_without_room_is_refused():
 
 
 def test_run_drives_at_random_by_commands_and_by_replay(lab_scene, tmp_path, capsys):
-    arguments = ["run", str(lab_scene), "--network", "none", "--json"]
+    arguments = ["run", str(lab_scene), "--net", "none", "--json"]
     once, again = tmp_path / "a.parquet", tmp_path / "b.parquet"
-    main([*arguments, "--path", "random", "--duration-s", "5", "--out", str(once)])
-    main([*arguments, "--replay", str(once), "--out", str(again)])
+    main([*arguments, "--path", "random", "--duration", "5", "--parquet", str(once)])
+    main([*arguments, "--engine", "replay", "--replay", str(once), "--parquet", str(again)])
     assert_array_equal(read_parquet(once)["p_world_base"], read_parquet(again)["p_world_base"])
     (tmp_path / "c.csv").write_text("t,v,w\n0,0.5,0\n0.4,0,0\n")
     capsys.readouterr()
-    main([*arguments, "--commands", str(tmp_path / "c.csv"), "--out", str(tmp_path / "c.parquet")])
+    main([*arguments, "--commands", str(tmp_path / "c.csv"), "--parquet", str(tmp_path / "c.parquet")])
     assert "|v| above 0.306 m/s" in capsys.readouterr().err
     run = read_parquet(tmp_path / "c.parquet")
     assert 0.05 < run["p_world_base"][-1, 0] - run["p_world_base"][0, 0] < 0.2

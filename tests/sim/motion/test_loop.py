@@ -187,14 +187,6 @@ def test_a_prompt_drive_goes_the_closed_ways_of_its_commands(way):
     assert_allclose(spin.poses[-1], [0.0, 0.0, -6.0], atol=1e-12)
 
 
-def test_there_and_back_ends_where_it_began(way):
-    there = held(0.25, 0.7, 3.0)
-    back = there[::-1] * [-1.0, -1.0, -1.0] + [5.9, 0.0, 0.0]
-    motion = play(np.vstack([there, back]), PROMPT, duration_s=6.0)
-    assert np.abs(motion.poses[150]).max() > 0.3
-    assert_allclose(motion.poses[-1], 0, atol=1e-12)
-
-
 def test_the_motors_lag_is_the_closed_form_of_first_order(way):
     lagging = dataclasses.replace(PROMPT, motor_lag_s=0.15)
     motion = play(held(0.3, 0.9, 2.0), lagging, duration_s=2.0)
@@ -465,28 +457,3 @@ def test_courses_of_different_steps_are_not_run_at_once():
     chosen = [loop_along(LINE, REAL, speed=0.2, rate_hz=rate) for rate in (50.0, 20.0)]
     with pytest.raises(InputError, match="the same length of a step"):
         run_loops(chosen)
-
-
-def test_a_shipped_scene_refuses_a_path_through_its_wall_or_its_furniture():
-    from magtwin.files import shipped
-    from magtwin.twin import open_twin, simulate
-
-    twin = open_twin(shipped("scenes", "lab", "lab.usda"), network="none")
-    desk = next(i for i, name in enumerate(twin.obstacles.names) if "desk" in name)
-    x, y = twin.obstacles.outlines[desk].mean(axis=0)
-    scene = dataclasses.replace(twin.scene, lab=dataclasses.replace(twin.scene.lab, floor_m=(40.0, 40.0)))
-    through = Path("through", np.array([[x - 1.0, y], [x + 1.0, y]]))
-    with pytest.raises(InputError, match=r"path through runs into /World/"):
-        simulate(dataclasses.replace(twin, scene=scene), through)
-
-
-@pytest.mark.parametrize("name", ["stanley", "pure_pursuit"])
-def test_a_run_tells_which_controller_drove(name):
-    from magtwin.files import shipped
-    from magtwin.twin import open_twin, simulate
-
-    run = simulate(
-        open_twin(shipped("scenes", "lab", "lab.usda"), network="none"), duration_s=5.0, controller=name
-    )
-    assert run.metadata["controller"] == name
-    assert not run["flag_bump"].any()

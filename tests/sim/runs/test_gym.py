@@ -262,7 +262,7 @@ def test_commands_that_are_not_finite_are_refused(twin):
 
 
 def test_seeds_must_be_as_many_as_robots(twin):
-    with pytest.raises(InputError, match="as many as robots, 2, got 3"):
+    with pytest.raises(InputError, match="one seed for each of the 2 robots, got 3"):
         magtwin.gym.MagNavVectorEnv(2, scene=twin).reset(seed=[0, 1, 2])
 
 

@@ -64,14 +64,6 @@ def test_flicker_noise_falls_as_1_over_f_to_its_corner():
     assert power[at_corner].mean() == pytest.approx(2 * density**2, rel=0.1)
 
 
-def test_noise_begins_alike_however_long_the_run_and_differs_by_seed():
-    spec = replace(QUIET, noise_density_nt=0.1, flicker_corner_hz=5.0, dropout_share=0.1)
-    long, short = scalar(spec), scalar(spec, FLAT[:700], DOWN[:700])
-    assert_array_equal(long[:700], short)
-    assert_array_equal(scalar(spec), long)
-    assert not np.array_equal(scalar(spec, seed=1), long)
-
-
 # What it makes of a field
 
 

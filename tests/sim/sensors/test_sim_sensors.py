@@ -228,13 +228,6 @@ def test_what_happens_later_changes_nothing_that_was_read_before(sense):
     assert any(not np.array_equal(a[name], b[name]) for name in a)
 
 
-@every_sense
-def test_a_longer_run_begins_with_the_noise_of_a_shorter_one(sense):
-    short, long = sense(winding(), T[:1000]), sense(winding(), T)
-    for name, values in short.items():
-        assert_array_equal(values, long[name][:1000], err_msg=name)
-
-
 def test_each_sensor_changes_at_its_own_rate():
     t = np.arange(10_000) / 1000.0
     imu = Imu(ImuSpec(jitter_s=0.0, latency_s=0.0), (0.0, 0.0, 0.0, 1.0), generator()).sense(winding(), t)

@@ -1,4 +1,4 @@
-"""Forward: what a robot reads over layers of dipoles, and how that changes with every unknown."""
+"""Forward model: what a robot reads above layers of dipoles, and its derivatives by every unknown."""
 
 from dataclasses import dataclass
 
@@ -10,37 +10,27 @@ from magtwin.field.sources.harmonic import HarmonicField
 
 Array = NDArray[np.float64]
 
+# Orthonormal components of soft iron: six off the diagonal, two on it. The trace is left out: it cannot be
+# told from the strength of the field, and the prior of the moments would make it grow.
 SOFT = np.zeros((8, 3, 3))
-"""Soft iron's parts, orthonormal: the six off the diagonal, and two on it. The trace is none of them: how
-much a platform strengthens every field alike cannot be told from how strong the field is, and if it were
-free, the prior of the moments would make it grow."""
 SOFT[np.arange(6), [0, 0, 1, 1, 2, 2], [1, 2, 0, 2, 0, 1]] = 1.0
 SOFT[6] = np.diag([1.0, -1.0, 0.0]) / np.sqrt(2)
 SOFT[7] = np.diag([1.0, 1.0, -2.0]) / np.sqrt(6)
 SOFT.flags.writeable = False
 
-PLATFORM = 13
-"""Unknowns of the platform: hard iron (3), soft iron (8, see `SOFT`), lever arm (2)."""
-
+PLATFORM = 13  # Unknowns of the platform: hard iron (3), soft iron (8, see `SOFT`), lever arm (2)
+# dR/dyaw = R SPIN for rotations about z
 SPIN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-"""dR/dyaw = R SPIN for turns about z."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """Readings that a set of unknowns predicts, C parts each: 1 for magnitudes, 3 for vectors."""
+    """Predicted readings with C components each: 1 for magnitudes, 3 for vectors."""
 
-    values_nt: Array
-    """What is read, shape (N, C)."""
-
-    jacobian: Array
-    """Its derivatives by the unknowns, shape (N, C, P)."""
-
-    by_place: Array
-    """Its derivatives by x and y of the robot [nT/m], shape (N, C, 2)."""
-
-    by_yaw: Array
-    """Its derivative by the heading [nT/rad], shape (N, C)."""
+    values_nt: Array  # Predicted values [nT], shape (N, C)
+    jacobian: Array  # Derivatives by the unknowns, shape (N, C, P)
+    by_place: Array  # Derivatives by x and y of the robot [nT/m], shape (N, C, 2)
+    by_yaw: Array  # Derivative by the heading [nT/rad], shape (N, C)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +41,8 @@ class Forward:
     platform's h, S and l (`PLATFORM`).
     """
 
-    p_world_dipole: Array
-    """Places of the dipoles [m], shape (D, 3)."""
-
-    height_m: float
-    """Height of the sensor [m]."""
+    p_world_dipole: Array  # Dipole positions [m], shape (D, 3)
+    height_m: float  # Height of the sensor [m]
 
     @property
     def size(self) -> int:
@@ -75,11 +62,7 @@ class Forward:
         )
 
     def vectors(self, p_world: Array) -> Array:
-        """Derivatives of the field at points by the unknowns, in world axes, shape (N, 3, P).
-
-        Args:
-            p_world: Points [m], shape (N, 3).
-        """
+        """Derivatives of the field at points (N, 3) [m] by the unknowns, in world axes, shape (N, 3, P)."""
         p, count = np.ascontiguousarray(p_world, float), 3 * len(self.p_world_dipole)
         jacobian = np.zeros((len(p), 3, self.size))
         moment_rows(p, self.p_world_dipole, np.tile(np.eye(3), (len(p), 1, 1)), jacobian)
@@ -91,9 +74,9 @@ class Forward:
 
         Args:
             unknowns: Moments [A m^2], uniform field [nT] and platform, shape (P,).
-            p_xy: Where base_link is [m], shape (N, 2).
+            p_xy: Positions of base_link [m], shape (N, 2).
             yaw: Headings [rad], shape (N,).
-            vectors: Whether the field's parts in base_link are read, or its magnitude.
+            vectors: Whether to read vectors in base_link axes, or magnitudes.
         """
         m, uniform, hard, soft, lever = self._parts(unknowns)
         turn, swing = _turns(yaw)

@@ -1,23 +1,22 @@
 """Inversion of a survey: the dipoles, the uniform field and the platform that explain its readings.
 
-What is fitted are the moments of dipoles on layers below and above the sensor (equivalent sources: Dampney
+The unknowns are the moments of dipoles on layers below and above the sensor (equivalent sources: Dampney
 1969; Blakely 1995, section 12.1), a uniform field and the robot's hard iron, soft iron and lever arm. The
-moments have normal priors, which is a Gaussian process with curl- and divergence-free covariance
-(Wahlstrom et al. 2013; Solin et al. 2018). Three things make it honest on a real floor:
+moments have normal priors, so the field is a Gaussian process with curl- and divergence-free covariance
+(Wahlstrom et al. 2013; Solin et al. 2018). Three things adapt it to real floors:
 
-- Places and headings are recorded with errors, so a reading's variance is noise^2 + position^2 |grad|^2 +
-  heading^2 (d/dyaw)^2 at the field's own slopes (noisy-input processes: McHutchon & Rasmussen 2011), about
-  which it follows Student's t, by reweighting (Lange et al. 1989).
-- Iron lies in some places and not in others, so every dipole's prior strength is that of the dipoles
-  around it in its layer, drawn a little towards the layer's.
-- All these figures follow from the readings: strengths by MacKay's (1992) fixed point of the evidence
-  (Rasmussen & Williams 2006, section 5.4, with Laplace's approximation), noises and tail by
-  expectation-maximization. How wide the intervals are is learnt from places left out in turn, and
-  between headings that are far apart from headings left out in turn: iron is not all that a robot changes.
+- Recorded positions and headings have errors, so a reading's variance is noise^2 + position^2 |grad|^2 +
+  heading^2 (d/dyaw)^2 at the field's slopes (noisy-input processes: McHutchon & Rasmussen 2011). Readings
+  follow Student's t about it, by reweighting (Lange et al. 1989).
+- Iron is unevenly distributed, so each dipole's prior strength is that of the dipoles around it in its layer,
+  drawn slightly towards the layer's.
+- All these hyperparameters are learnt: strengths by MacKay's (1992) fixed point of the evidence (Rasmussen &
+  Williams 2006, section 5.4, with Laplace's approximation), noises and tail by expectation-maximization. The
+  width of intervals is learnt from positions left out in turn, and between headings that are far apart from
+  headings left out in turn, since a platform is more than iron.
 
-The magnitude is not linear in the field; Gauss-Newton steps, halved until the posterior grows, solve it. Each
-costs one factorisation, of a matrix as large as the readings where they are few, so that layers may be
-fine, else as the unknowns.
+The magnitude is not linear in the field. Gauss-Newton steps, halved until the posterior grows, solve it. Each
+needs one factorisation, of a matrix as large as the number of readings or of unknowns, whichever is smaller.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,17 +37,11 @@ Progress = Callable[[int, int, str], Any]
 
 LEAST_READINGS = 8
 
-EARTH_SD_NT = 1000.0
-"""How far the uniform part may lie from `earth_nt` [nT], each way."""
-
-ROUNDS = 30
-"""Rounds in which the figures settle."""
-
-LAYERWISE = 4
-"""First rounds, in which a layer has one strength."""
-
+EARTH_SD_NT = 1000.0  # Prior standard deviation of the uniform field about `earth_nt`, per component [nT]
+ROUNDS = 30  # Most rounds of learning
+LAYERWISE = 4  # First rounds, in which a layer has one strength
+# Change of the logarithms of hyperparameters in a round (of strengths, in the mean) at which learning ends
 STILL = 0.03
-"""Change of the logarithms of figures in a round, in the mean over strengths, below which they are learnt."""
 
 
 def fit_harmonic(
@@ -62,39 +55,35 @@ def fit_harmonic(
     like: HarmonicModel | None = None,
     progress: Progress | None = None,
 ) -> HarmonicModel:
-    """The field without curl or divergence, and the platform, that make a survey's readings likeliest.
+    """Fit a field without curl or divergence, and the platform, to a survey.
 
-    Vectors are fitted where the survey has them, else magnitudes. A platform is fitted where the headings
-    differ; else it counts as part of the field. Readings of a drive that follow each
-    other within a short way count as one, their mean.
+    Vectors are fitted if the survey has them, else magnitudes. A platform is fitted if the headings differ;
+    otherwise it is part of the field. Readings of a drive within a short distance are averaged.
 
-    Magnitudes alone leave the field's sign open: B and -B read the same, with the hard iron turned too.
-    Where the Earth's field is unknown the uniform part is thought to point down with the readings' median
-    magnitude, give or take half of it each way, as nowhere but in the northern hemisphere; the fit is begun
-    in several directions, and goes on from the likeliest. Name the Earth's field where it is known
-    (`magtwin.field.sources.earth`), above all where vectors are wanted. Where vectors are read it is
-    thought to be their mean, as loosely.
+    Magnitudes leave the field's sign open: B and -B read the same with the hard iron reversed. If the Earth's
+    field is unknown, the uniform field is assumed to point down with the readings' median magnitude, with a
+    standard deviation of half of it per component (valid on the northern hemisphere). The fit starts from
+    several directions and continues from the likeliest. Give the Earth's field if it is known
+    (`magtwin.field.sources.earth`), above all if vectors are wanted. For vector readings, the uniform field
+    is assumed near their mean.
 
     Args:
-        readings: A survey; those that are not `good` count for nothing.
-        depth_m: Depth of the dipoles' layers below the sensor [m], negative for layers above. Unless
-            given, 1.8 spacings of the survey (0.9 of a drive), no nearer than `LEAST_DEPTH_M` or the floor,
-            twice and four times that, and, if the evidence is for it, a layer above at twice that.
-        spacing_m: Distance between the dipoles of the first layer [m]; 0.6 of a layer's depth unless
-            given, and in every layer in proportion to its depth.
-        earth_nt: The Earth's field in world axes [nT]; that of the readings unless given.
-        earth_sd_nt: How far the uniform part of the lab's may lie from it, each way [nT].
-        height_m: Height of the sensor above the floor [m]; that of the readings unless given, and 0
-            where unknown: heights then count from the sensor.
-        like: A model whose layers and figures are taken as they are, and its field to begin with; nothing but
-            the field is learnt then.
-        progress: Called as progress(done, total, what), once a round.
-
-    Returns:
-        The model.
+        readings: A survey; only its good readings are used.
+        depth_m: Depths of the layers of dipoles below the sensor [m], negative above it. Default: 1.8
+            spacings of the survey (0.9 of a drive), at least `LEAST_DEPTH_M` and the sensor's height, twice
+            and four times that, and, if the evidence is for it, a layer above at twice that.
+        spacing_m: Distance between the dipoles of the first layer [m], in other layers in proportion to
+            depth. Default: 0.6 of the depth.
+        earth_nt: The Earth's field in world axes [nT]. Default: that of the readings.
+        earth_sd_nt: Standard deviation of the uniform field from it, per component [nT].
+        height_m: Height of the sensor above the floor [m]. Default: that of the readings, or 0 if unknown;
+            heights then count from the sensor.
+        like: A model whose layers and hyperparameters are used, and its field as the start; only the field is
+            fitted then.
+        progress: Called as progress(done, total, what), once per round.
 
     Raises:
-        InputError: There are too few good readings, all at one place, or an option is none.
+        InputError: There are too few good readings, all are at one place, or an option is invalid.
     """
     good = readings.take(readings.good)
     if len(good) < LEAST_READINGS:
@@ -121,7 +110,7 @@ def fit_harmonic(
 
 
 def _part(progress: Progress | None, k: int, count: int) -> Progress | None:
-    """Progress of the k-th of some fits, as a part of all."""
+    """Progress of the k-th of several fits, as a part of all."""
     if progress is None:
         return None
     return lambda done, total, what: progress(k * total + done, count * total, what)
@@ -140,7 +129,7 @@ def _check(
 
 
 def _of_model(model: HarmonicModel) -> Layers:
-    """The layers of a model; their areas matter to learning only."""
+    """The layers of a model; their areas matter only for learning."""
     places = model.forward.p_world_dipole
     heights, layer = np.unique(-places[:, 2], return_inverse=True)
     depths = tuple(float(d) + model.forward.height_m for d in heights)
@@ -163,26 +152,26 @@ def _solve(
     tried = len(begins) if len(begins) > 1 else 0
     total = tried * (1 + LAYERWISE) + ROUNDS
 
-    def told(done: int) -> None:
+    def report(done: int) -> None:
         if progress is not None:
             progress(done, total, "learning")
 
-    told(0)
+    report(0)
     begun = []
     for k, uniform in enumerate(begins):
         solution = Solution.start(problem, problem.first(), uniform)
         for step in range(LAYERWISE if tried else 0):
-            told(k * (1 + LAYERWISE) + step + 1)
+            report(k * (1 + LAYERWISE) + step + 1)
             solution = solution.learnt(None).step()
         begun.append(solution)
     solution = max(begun, key=Solution.evidence) if tried else begun[0]
     shares = problem.layers.shares()
     for done in range(ROUNDS):
-        told(total - ROUNDS + done)
+        report(total - ROUNDS + done)
         before = solution.figures
         solution = solution.learnt(shares if done >= LAYERWISE else None).step()
         if done > LAYERWISE and solution.figures.change(before) < STILL:
             break
     solution = solution.settle()
-    told(total)
+    report(total)
     return solution

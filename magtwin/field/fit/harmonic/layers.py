@@ -1,4 +1,4 @@
-"""Layers: where the equivalent dipoles of a harmonic fit lie."""
+"""Layers of the equivalent dipoles of a harmonic fit."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,61 +13,36 @@ from magtwin.field.survey.readings import Readings
 
 Array = NDArray[np.float64]
 
+# Depths of the layers below the sensor, in that of the first; each represents sources twice as large. The
+# second set has a layer above the sensor, for iron beside it. The set with the greater evidence is used.
 LADDERS = ((1.0, 2.0, 4.0), (1.0, 2.0, 4.0, -2.0))
-"""Depths of the layers below the sensor, in that of the first: each stands for sources twice as large. The
-last of the second set is above the sensor, for what stands beside it. The fit takes the set with the greater
-evidence."""
-
+# Depth of the first layer in spacings of the survey: a layer nearer than about one represents waves that the
+# readings do not resolve (Dampney 1969)
 DEPTH_SPACINGS = 1.8
-"""Depth of the first layer in spacings of the survey: a layer nearer than about one stands for
-waves that the readings do not resolve (Dampney 1969)."""
-
-DRIVE_SPACINGS = 0.9
-"""The same for a drive, whose readings are dense along it."""
-
-LEAST_DEPTH_M = 0.3
-"""Least depth of the first layer below the sensor [m]; a robot's sensor is not nearer to the floor's iron."""
-
+DRIVE_SPACINGS = 0.9  # The same for a drive, whose readings are dense along it
+LEAST_DEPTH_M = 0.3  # Least depth of the first layer below the sensor [m]
+# Distance between the dipoles of a layer, in its depth: the ripple is e^(-2 pi / 0.6) = 3e-5 of their field
 SHEET = 0.6
-"""Distance of the dipoles of a layer in its depth: e^(-2 pi / 0.6) of their field is ripple, 3e-5."""
-
-MARGIN = 1.2
-"""Width by which a layer goes beyond the readings, in its depth."""
-
-REACH = 0.6
-"""Distance over which dipoles share one strength, in their layer's depth."""
-
-MOST_DIPOLES = 1500
-"""Dipoles at most; layers with more are thinned."""
-
-FEW_ROWS = 2700
-"""Readings, each part of a vector counted, up to which their matrix is factored; beyond, the unknowns' is."""
-
-DIPOLES_OF_MANY = 800
-"""Dipoles at most where there are more rows than `FEW_ROWS`."""
-
+MARGIN = 1.2  # Width by which a layer extends beyond the readings, in its depth
+REACH = 0.6  # Distance over which dipoles share one strength, in their layer's depth
+MOST_DIPOLES = 1500  # Most dipoles; larger layers are thinned
+FEW_ROWS = 2700  # Most reading components whose matrix is factored; beyond, that of the unknowns is
+DIPOLES_OF_MANY = 800  # Most dipoles if there are more rows than `FEW_ROWS`
+# Most dipoles for the magnitudes of a drive: more took 15 times as long and predicted no better
 DIPOLES_OF_DRIVE = 500
-"""Dipoles at most for the magnitudes of a drive: more took 15 times as long and predicted no better."""
 
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """Places of the dipoles."""
+    """Positions of the dipoles."""
 
-    p_world_dipole: Array
-    """Places [m], shape (D, 3)."""
-
-    area_m2: Array
-    """Area of its layer that each stands for [m^2], shape (D,)."""
-
-    layer: NDArray[np.intp]
-    """Layer of each, shape (D,)."""
-
-    depths: tuple[float, ...]
-    """Depth of each layer below the sensor, negative above it [m]."""
+    p_world_dipole: Array  # Positions [m], shape (D, 3)
+    area_m2: Array  # Area per dipole [m^2], shape (D,)
+    layer: NDArray[np.intp]  # Layer of each dipole, shape (D,)
+    depths: tuple[float, ...]  # Depth of each layer below the sensor, negative above it [m]
 
     def shares(self) -> list[Array]:
-        """Weights with which dipoles of a layer share their strengths, one matrix for each layer."""
+        """Weights with which dipoles of a layer share their strengths, one matrix per layer."""
         shares = []
         for k, depth in enumerate(self.depths):
             p = self.p_world_dipole[self.layer == k, :2]
@@ -79,7 +54,7 @@ class Layers:
 def ladders(
     depth_m: float | Sequence[float] | None, good: Readings, height_m: float
 ) -> list[tuple[float, ...]]:
-    """The sets of depths to try [m]: those given, else what `LADDERS` makes of the survey's spacing.
+    """Sets of depths to try [m]: the given one, else `LADDERS` for the survey's spacing.
 
     Raises:
         InputError: A depth is 0 or not finite.
@@ -97,16 +72,16 @@ def ladders(
 def layers_below(
     good: Readings, depths: tuple[float, ...], spacing_m: float | None, height_m: float
 ) -> Layers:
-    """Layers below (and above) the bounding box of the readings; thinned if there are too many dipoles.
+    """Layers below (and above) the bounding box of the readings, thinned if there are too many dipoles.
 
     Args:
         good: Good readings of a survey.
         depths: Depth of each layer below the sensor [m].
-        spacing_m: Distance between the dipoles of the first layer [m]; `SHEET` of its depth if None.
+        spacing_m: Distance between the dipoles of the first layer [m]; None: `SHEET` of its depth.
         height_m: Height of the sensor [m].
 
     Raises:
-        InputError: The spacing given makes too many dipoles.
+        InputError: The given spacing needs too many dipoles.
     """
     low, high = good.p_xy.min(axis=0), good.p_xy.max(axis=0)
     part = SHEET if spacing_m is None else spacing_m / abs(depths[0])
@@ -130,7 +105,7 @@ def layers_below(
 
 
 def _most(good: Readings, depth_m: float) -> int:
-    """Dipoles at most for a survey."""
+    """Most dipoles for a survey."""
     if good.node is None and good.b_body_nt is None:
         return DIPOLES_OF_DRIVE
     rows = (1 if good.b_body_nt is None else 3) * (1 + int(means(good, depth_m)[0].max()))

@@ -1,4 +1,4 @@
-"""HarmonicModel: a fitted harmonic field, what it predicts and how sure it is."""
+"""HarmonicModel: a fitted harmonic field, its predictions and their variance."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,84 +7,51 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.errors import InputError
 from magtwin.field.fit.harmonic.forward import Forward
 from magtwin.field.fit.harmonic.problem import Figures
-from magtwin.field.fit.methods import FittedModel
+from magtwin.field.fit.methods import FittedModel, flat_poses
 from magtwin.field.grid import TURN
 from magtwin.field.sources.harmonic import HarmonicField
 
 Array = NDArray[np.float64]
 
-BLOCK = 512
-"""Poses predicted at a time."""
-
+BLOCK = 512  # Poses predicted at a time
+# Largest distance between nodes at which the variance is computed, in the depth of the nearest layer
 COARSE = 1 / 3
-"""Distance between nodes whose variance is evaluated, at most, in the depth of the nearest layer."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class HarmonicModel(FittedModel):
-    """A harmonic field fitted to readings, and how sure it is."""
+    """A harmonic field fitted to readings, with its uncertainty."""
 
-    field: HarmonicField
-    """The field and the platform."""
-
-    parameters: Mapping[str, Any]
-    """Figures of the fit, by name with unit."""
-
-    noise_nt2: float
-    """Variance of one reading of the magnitude about the field, the mean over the survey [nT^2]."""
-
-    figures: Figures
-    """What was learnt beside the field."""
-
-    forward: Forward
-    """How readings follow from the unknowns."""
-
-    unknowns: Array
-    """The unknowns at the posterior's greatest, shape (P,)."""
-
-    prior_sd: Array
-    """Standard deviations of their priors, shape (P,)."""
-
+    field: HarmonicField  # The field and the platform
+    parameters: Mapping[str, Any]  # Hyperparameters and unknowns, by name with unit
+    noise_nt2: float  # Variance of one reading of the magnitude about the field, mean over the survey [nT^2]
+    figures: Figures  # Hyperparameters
+    forward: Forward  # How readings follow from the unknowns
+    unknowns: Array  # Most likely unknowns, shape (P,)
+    prior_sd: Array  # Prior standard deviations of the unknowns, shape (P,)
+    # Information of the readings: in units of `prior_sd` the posterior covariance is 1 - learnt learnt^T,
+    # shape (P, K)
     learnt: Array
-    """What the readings tell of the unknowns, in units of `prior_sd`: the posterior's covariance is
-    1 - learnt learnt^T there, shape (P, K)."""
 
     @property
     def method(self) -> str:
         """Name of the method."""
         return "harmonic"
 
-    width: float
-    """Factor of the magnitude's posterior variance where that is large beside the noise, see `widened`."""
-
-    headings_rad: Array
-    """Headings that were surveyed, ascending, where they are few and far apart; else none, shape (H,)."""
-
+    width: float  # Factor of the posterior variance where it is large against the noise, see `widened`
+    headings_rad: Array  # Surveyed headings, ascending, if they are few and far apart; else empty, shape (H,)
+    # Added variance between these headings, over (d g)^2 with the angles d and g to the two beside, estimated
+    # from headings left out in turn [nT^2/rad^4]. Few headings determine it loosely: of the APRILab survey's
+    # four, each left out, 73 % of the readings lie in the 90 % intervals from the other three.
     turned: float
-    """Variance that headings between them add, over (d g)^2 with d and g the angles to the two beside,
-    as headings left out in turn show it [nT^2/rad^4]: a platform is more than iron. Few headings tell it
-    loosely: of the APRILab survey's four, each left out, 73 % lie in the 90 % intervals that the other three
-    give; `magtwin map check --split heading` says so of any survey."""
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
-        """Field magnitude as the survey's robot reads it, and its variance.
-
-        Args:
-            p_xy: Where base_link is, in world [m], shape (..., 2).
-            yaw: Headings [rad], shape (...); the two shapes are broadcast.
-
-        Returns:
-            Magnitude [nT] and its variance [nT^2], that of `noise_nt2` left out, each of shape (...).
+        """Field magnitude as the survey's robot reads it [nT], and its variance without noise [nT^2]. See
+        `FieldModel`.
         """
-        p, yaw = np.asarray(p_xy, float), np.asarray(yaw, float)
-        if p.ndim == 0 or p.shape[-1] != 2:
-            raise InputError(f"p_xy must have shape (..., 2), got {p.shape}")
-        shape = np.broadcast_shapes(p.shape[:-1], yaw.shape)
-        p = np.broadcast_to(p, (*shape, 2)).reshape(-1, 2)
-        yaw = np.broadcast_to(yaw, shape).reshape(-1)
+        p, yaw, shape = flat_poses(p_xy, yaw)
         value, variance = np.empty(len(p)), np.empty(len(p))
         for start in range(0, len(p), BLOCK):
             part = slice(start, start + BLOCK)
@@ -95,14 +62,14 @@ class HarmonicModel(FittedModel):
         return value.reshape(shape), variance.reshape(shape)
 
     def predict_nodes(self, p_xy: Array, yaw: float) -> tuple[Array, Array]:
-        """What `predict` gives on evenly spaced nodes, several times faster.
+        """`predict` on evenly spaced nodes, several times faster.
 
-        On a fine grid the posterior's variance is evaluated at some nodes only, `COARSE` apart, and
-        interpolated in its logarithm; it is then within some 5 % of its value at most nodes.
+        On a fine grid the variance is computed only at nodes `COARSE` apart, and its logarithm interpolated;
+        the error is about 5 % at most nodes.
 
         Args:
             p_xy: Nodes of a grid [m], shape (Y, X, 2).
-            yaw: One heading for all of them [rad].
+            yaw: Heading [rad].
 
         Returns:
             Magnitude [nT] and its variance [nT^2], each of shape (Y, X).
@@ -129,13 +96,13 @@ class HarmonicModel(FittedModel):
         return value, whole + self.turned * between(self.headings_rad, np.array([yaw]))
 
     def predict_vector(self, p_world: ArrayLike) -> tuple[Array, Array]:
-        """The field without the robot, at any height between the layers of dipoles, and its variance.
+        """Field without the robot, at any height between the layers of dipoles, and its variance.
 
         Args:
             p_world: Points [m], shape (..., 3).
 
         Returns:
-            Field [nT] and the variance of each part [nT^2], in world axes, each of shape (..., 3).
+            Field [nT] and the variance of each component [nT^2], in world axes, each of shape (..., 3).
         """
         p = np.asarray(p_world, float)
         value = self.field.field_nt(p)
@@ -148,30 +115,25 @@ class HarmonicModel(FittedModel):
         return value, variance
 
     def _variance(self, jacobian: Array) -> Array:
-        """Posterior variances of what changes by `jacobian` (N, P) with the unknowns, shape (N,)."""
+        """Posterior variances of linear functions `jacobian` (N, P) of the unknowns, shape (N,)."""
         scaled = jacobian * self.prior_sd
-        told = scaled @ self.learnt
-        left = np.einsum("np,np->n", scaled, scaled) - np.einsum("nk,nk->n", told, told)
+        known = scaled @ self.learnt
+        left = np.einsum("np,np->n", scaled, scaled) - np.einsum("nk,nk->n", known, known)
         return np.asarray(np.maximum(left, 0))
 
 
 def widened(variance_nt2: Array, noise_nt2: Array | float, width: Array | float) -> Array:
-    """Posterior variances as places left out in turn show them to be.
+    """Posterior variances, corrected by positions left out in turn.
 
-    Beside readings, where the variance is small against the noise, the posterior is right. Away from
-    them it is too modest, or too bold, by a factor, for the prior's layers are not the floor's iron.
+    Near readings, where the variance is small against the noise, the posterior is right. Away from them it is
+    off by a factor, since the prior's layers are not the floor's iron.
     """
     return np.asarray(variance_nt2 * (noise_nt2 + width * variance_nt2) / (noise_nt2 + variance_nt2))
 
 
-FAR_TURN = np.radians(60.0)
-"""Gap between headings from which what lies in it counts as not surveyed."""
-
-TURN_SECTORS = 24
-"""Sectors into which headings are parted to see where a scattered survey has none."""
-
-STRAY = 0.05
-"""Largest share of the readings that a heading may have and still be ignored."""
+FAR_TURN = np.radians(60.0)  # Gap between headings that counts as not surveyed
+TURN_SECTORS = 24  # Heading sectors in which gaps of a scattered survey are found
+STRAY = 0.05  # Largest share of readings at a heading that is ignored
 
 
 def surveyed(yaw: Array) -> tuple[Array, NDArray[np.intp]]:
@@ -181,8 +143,8 @@ def surveyed(yaw: Array) -> tuple[Array, NDArray[np.intp]]:
         yaw: Headings of the readings [rad], shape (N,).
 
     Returns:
-        Mean heading of each group [rad], ascending, shape (H,); and the group of each reading, -1 for a
-        stray one, shape (N,). No groups where the headings are all around, or where there are fewer than 3.
+        Mean heading of each group [rad], ascending, shape (H,); and the group of each reading, -1 for strays,
+        shape (N,). No groups if the headings are all around, or fewer than 3.
     """
     angle = np.mod(yaw, TURN)
     sorted_angles = np.sort(angle)
@@ -208,8 +170,8 @@ def between(headings_rad: Array, yaw: Array) -> Array:
     """(d g)^2, where d and g are the angles from a heading to the nearest surveyed one on each side.
 
     Args:
-        headings_rad: Surveyed headings [rad], shape (H,); with none of them the result is 0.
-        yaw: Headings to look at [rad], shape (N,).
+        headings_rad: Surveyed headings [rad], shape (H,); if empty, the result is 0.
+        yaw: Headings [rad], shape (N,).
 
     Returns:
         Squared product of the two angles [rad^4], shape (N,).

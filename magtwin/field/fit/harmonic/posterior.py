@@ -1,4 +1,4 @@
-"""Posterior: what readings tell of unknowns, once both are in units of their standard deviations."""
+"""Posterior of a linear problem whose unknowns and noise have unit variance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,27 +8,23 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-TOLD = 0.01
-"""Ratio of what readings tell of a direction to what the prior does, below which it is left out."""
+LEAST = 0.01  # Directions with less information than this, relative to the prior, are left out
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Unknowns x ~ N(0, 1), read as t = rows x + noise, noise ~ N(0, 1).
+    """Unknowns x ~ N(0, 1), observed as t = rows x + noise, noise ~ N(0, 1).
 
-    Of R rows and P unknowns the fewer are factored: the readings' covariance rows rows^T + 1, or the
-    unknowns' precision rows^T rows + 1 (Rasmussen & Williams 2006, section 2.1.2, eqs. 2.8 and 2.12).
+    The smaller matrix is factored: the readings' covariance rows rows^T + 1, or the unknowns' precision
+    rows^T rows + 1 (Rasmussen & Williams 2006, section 2.1.2, eqs. 2.8 and 2.12).
     """
 
-    rows: Array
-    """Shape (R, P)."""
-
-    lower: Array
-    """Cholesky factor of the smaller of the two matrices."""
+    rows: Array  # Shape (R, P)
+    lower: Array  # Cholesky factor of that matrix
 
     @classmethod
     def of(cls, rows: Array) -> "Posterior":
-        """Factor the smaller matrix."""
+        """The posterior of a problem; factors the matrix."""
         whole = rows @ rows.T if len(rows) <= rows.shape[1] else rows.T @ rows
         whole[np.diag_indices(len(whole))] += 1
         return cls(rows, np.asarray(np.linalg.cholesky(whole)))
@@ -39,7 +35,7 @@ class Posterior:
         return len(self.rows) <= self.rows.shape[1]
 
     def mean(self, target: Array) -> Array:
-        """Likeliest unknowns for readings, (R,) -> (P,)."""
+        """Most likely unknowns for readings, (R,) -> (P,)."""
         from scipy.linalg import cho_solve
 
         if self.dual:
@@ -47,23 +43,23 @@ class Posterior:
         return np.asarray(cho_solve((self.lower, True), self.rows.T @ target))
 
     def half_log_det(self) -> float:
-        """Half the logarithm of either matrix's determinant: they are equal."""
+        """Half the log determinant, which is equal for both matrices."""
         return float(np.log(np.diag(self.lower)).sum())
 
     def known(self) -> Array:
-        """How far readings, not the prior, determine each unknown: 1 - its variance, (P,)."""
+        """Information on each unknown: 1 - its variance, (P,)."""
         if self.dual:
             return np.sum(self._whitened() ** 2, axis=0)
         return 1 - np.sum(self._inverse() ** 2, axis=0)
 
     def fitted(self) -> Array:
-        """Variance of what each reading should be, (R,)."""
+        """Variance of each predicted reading, (R,)."""
         if self.dual:
             return 1 - np.sum(self._inverse() ** 2, axis=0)
         return np.sum(self._whitened() ** 2, axis=0)
 
     def left_out(self, target: Array, groups: Sequence[NDArray[np.intp]]) -> tuple[Array, Array]:
-        """Readings minus what the other groups say, and the variance of that without noise, (R,) each.
+        """Readings minus their prediction from the other groups, and its variance without noise, (R,) each.
 
         In closed form (Rasmussen & Williams 2006, eq. 5.12, by blocks).
         """
@@ -78,15 +74,15 @@ class Posterior:
         return error, field
 
     def directions(self) -> Array:
-        """What is known of the unknowns, as columns (P, K): their covariance is 1 - columns columns^T.
+        """Information on the unknowns as columns (P, K): their covariance is 1 - columns columns^T.
 
-        Directions of which readings tell nearly nothing are left out: variances come out a little larger.
+        Directions with almost no information are left out, so variances come out slightly larger.
         """
         from scipy.linalg import eigh
 
         rows = self.rows
         size, ways = eigh(rows @ rows.T if self.dual else rows.T @ rows, overwrite_a=True, check_finite=False)
-        kept = size > TOLD
+        kept = size > LEAST
         size, ways = size[kept], ways[:, kept]
         if self.dual:
             return np.asarray(rows.T @ (ways / np.sqrt(1 + size)))

@@ -1,4 +1,4 @@
-"""Problem: which readings a harmonic fit explains, and the priors that it does not learn."""
+"""Problem: the readings and fixed priors of a harmonic fit, and the hyperparameters that it learns."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,53 +13,39 @@ from magtwin.field.survey.readings import Readings
 
 Array = NDArray[np.float64]
 
-WEAK = 0.1
-"""Strength of layers above in those of layers below, to begin with: what both can explain is below."""
-
+WEAK = 0.1  # Initial strength of layers above relative to layers below: what both can explain is put below
+# Compass directions and dip of the starts beside straight down, if the Earth's field is unknown: several
+# fields explain magnitudes, and the steps find the nearest one
 BEGINNINGS, BEGUN_DIP = 4, np.radians(60.0)
-"""Directions of the compass, and dip, that a fit begins with beside straight down if the Earth's field is
-unknown: several fields explain magnitudes, and steps find the nearest one."""
-
+# Prior standard deviations of the platform's unknowns, about 0
 HARD_IRON_SD_NT, SOFT_IRON_SD, LEVER_SD_M = 3000.0, 0.03, 0.05
-"""Standard deviations of the priors of the platform's parts, about 0."""
-
+# Length of a drive that is left out together, in the first layer's depth: over half a minute at 0.2 m/s
 STRETCH = 24.0
-"""Way of a drive that is left out together, in the first layer's depth: at 0.2 m/s over half a minute."""
-
+# Length of the headings' mean vector from which they count as one: a spread of at most 8 deg
 ONE_HEADING = 0.99
-"""Length of the headings' mean vector from which they are one: they spread by 8 deg at most."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Figures:
-    """What a fit learns beside the field itself."""
+    """Hyperparameters of a fit."""
 
-    noise_nt: float
-    """Noise of a reading, or of a mean of several [nT]."""
-
-    position_m: float
-    """Error of a recorded place, each way [m]."""
-
-    heading_rad: float
-    """Error of a recorded heading [rad]."""
-
-    freedom: float
-    """Degrees of freedom of Student's t."""
-
-    strength: Array
-    """Prior standard deviation of each part of each dipole's moment [A m^2], shape (D,)."""
+    noise_nt: float  # Noise of a reading, or of a mean of several [nT]
+    position_m: float  # Error of a recorded position, per axis [m]
+    heading_rad: float  # Error of a recorded heading [rad]
+    freedom: float  # Degrees of freedom of Student's t
+    strength: Array  # Prior standard deviation of each component of each dipole's moment [A m^2], shape (D,)
 
     def change(self, before: "Figures") -> float:
-        """How far the figures are from others, as a logarithm: the noise's, or the strengths' in the mean."""
+        """Logarithmic difference to other hyperparameters: of the noise, or RMS of the strengths."""
         moved = np.sqrt(np.mean(np.log(self.strength / before.strength) ** 2))
         return float(max(abs(np.log(self.noise_nt / before.noise_nt)), moved))
 
     def variance(self, reading: Reading) -> Array:
-        """Squared scale of each part of readings [nT^2], shape (N, C)."""
+        """Squared scale of each component of readings [nT^2], shape (N, C)."""
         return np.asarray(self.terms(reading).sum(axis=-1))
 
     def terms(self, reading: Reading) -> Array:
-        """The parts of `variance` that come from noise, place and heading [nT^2], shape (N, C, 3)."""
+        """Parts of `variance` from noise, position and heading [nT^2], shape (N, C, 3)."""
         place = self.position_m**2 * np.sum(reading.by_place**2, axis=-1)
         heading = self.heading_rad**2 * reading.by_yaw**2
         return np.stack([np.full_like(place, self.noise_nt**2), place, heading], axis=-1)
@@ -67,7 +53,7 @@ class Figures:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What is read where, and the priors that are no figures."""
+    """The readings and the fixed priors."""
 
     forward: Forward
     layers: Layers
@@ -89,7 +75,7 @@ class Problem:
         earth_nt: Sequence[float] | None,
         earth_sd_nt: float,
     ) -> "Problem":
-        """The problem of good readings over layers of dipoles, as `fit_harmonic` describes its arguments."""
+        """The problem of good readings over layers of dipoles; see `fit_harmonic` for the arguments."""
         read = good.b_nt[:, None] if good.b_body_nt is None else good.b_body_nt
         cell, follow = means(good, min(map(abs, layers.depths)))
         size = np.bincount(cell)
@@ -126,14 +112,14 @@ class Problem:
         return self.read_nt.shape[1] == 3
 
     def places(self) -> list[NDArray[np.intp]]:
-        """Rows of the parts of readings that lie together: at one node, or within a spacing."""
+        """Rows of reading components that lie together: at one node, or within a spacing."""
         side = abs(self.layers.depths[0]) / DEPTH_SPACINGS
         square = np.floor(self.p_xy / side + 0.5).astype(np.int64)
         _, place = np.unique(square, axis=0, return_inverse=True)
         return self._grouped(place.ravel())
 
     def stretches(self) -> list[NDArray[np.intp]]:
-        """Rows of the parts of readings of each stretch of a drive's way; none of other surveys."""
+        """Rows of reading components of each stretch of a drive; empty for other surveys."""
         if not self.follow:
             return []
         step = np.linalg.norm(np.diff(self.p_xy, axis=0), axis=1)
@@ -141,18 +127,18 @@ class Problem:
         return self._grouped(np.floor(way / (STRETCH * abs(self.layers.depths[0]))).astype(np.intp))
 
     def _grouped(self, group: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-        """Rows of the parts of readings, by the groups that their readings (N,) are in."""
+        """Rows of reading components, by the groups (N,) of their readings."""
         rows = np.arange(self.read_nt.size).reshape(self.read_nt.shape)
         order = np.argsort(group, kind="stable")
         ends = np.flatnonzero(np.diff(group[order])) + 1
         return [rows[part].ravel() for part in np.split(order, ends)]
 
     def at(self, unknowns: Array) -> Reading:
-        """What unknowns predict for every row, with derivatives."""
+        """Predictions for every row, with derivatives."""
         return self.forward.read(unknowns, self.p_xy, self.yaw, vectors=self.vectors)
 
     def first(self) -> Figures:
-        """Figures to begin with: strengths that make the field's spread, noises of a small part of it."""
+        """Initial hyperparameters: strengths that give the field's spread, and small noises."""
         spread = float(self.read_nt.std(axis=0).max())
         depth = np.array(self.layers.depths)[self.layers.layer]
         above = depth < 0
@@ -168,7 +154,7 @@ class Problem:
 
 
 def _tilted(magnitude_nt: float) -> list[Array]:
-    """Fields that dip by `BEGUN_DIP` towards each of some directions of the compass."""
+    """Fields that dip by `BEGUN_DIP` towards several compass directions."""
     level, down = magnitude_nt * np.cos(BEGUN_DIP), magnitude_nt * np.sin(BEGUN_DIP)
     angles = 2 * np.pi * np.arange(BEGINNINGS) / BEGINNINGS
     return [np.array([level * np.cos(a), level * np.sin(a), -down]) for a in angles]

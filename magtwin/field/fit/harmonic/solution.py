@@ -1,4 +1,4 @@
-"""Solution: unknowns of a harmonic fit, Gauss-Newton steps to likelier ones, and learning of figures."""
+"""Solution of a harmonic fit: Gauss-Newton steps, learning of hyperparameters, and the resulting model."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,33 +15,22 @@ from magtwin.verdict import Z_90
 
 Array = NDArray[np.float64]
 
-DRAWN = 0.005
-"""Weight of the layer's strength beside that of the dipoles around, as a part of theirs."""
-
-TAILS = np.geomspace(4.0, 48.0, 13)
-"""Degrees of freedom of Student's t that are tried."""
-
-SETTLED = 0.2
-"""Change of the logarithm of the posterior below which Gauss-Newton has arrived."""
+DRAWN = 0.005  # Weight of the layer's strength relative to that of the dipoles around
+TAILS = np.geomspace(4.0, 48.0, 13)  # Degrees of freedom of Student's t that are tried
+SETTLED = 0.2  # Gain of the log posterior below which Gauss-Newton has converged
 
 STEPS = 30
 
-FIRST_STEPS = 4
-"""Gauss-Newton steps under the first figures, before learning begins."""
-
+FIRST_STEPS = 4  # Gauss-Newton steps before learning begins
+# Logarithms of the widths that are tried, as factors of the posterior's variances
 WIDTHS = np.linspace(-np.log(16), np.log(16), 161)
-"""Logarithms of the widths of intervals that are tried, as factors of the posterior's variances."""
-
-NOISES = np.geomspace(1.0, 16.0, 25)
-"""Factors of the noise's variance that are tried for a drive."""
-
-WIDTH_SD = np.log(2)
-"""How far the width is thought to lie from 1, as a logarithm, before places are left out."""
+NOISES = np.geomspace(1.0, 16.0, 25)  # Factors of the noise's variance that are tried for a drive
+WIDTH_SD = np.log(2)  # Prior standard deviation of the logarithm of the width about 0
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Unknowns, what they predict, and the figures that they were found under."""
+    """Unknowns, their predictions, and the hyperparameters."""
 
     problem: Problem
     figures: Figures
@@ -50,7 +39,7 @@ class Solution:
 
     @classmethod
     def start(cls, problem: Problem, figures: Figures, uniform: Array) -> "Solution":
-        """Steps from a uniform field, in the first of which all readings are trusted alike and little."""
+        """Start from a uniform field; the first step weights all readings equally and weakly."""
         unknowns = problem.mean.copy()
         count = 3 * len(figures.strength)
         unknowns[count : count + 3] = uniform
@@ -70,21 +59,21 @@ class Solution:
 
     @property
     def prior_sd(self) -> Array:
-        """Standard deviations of the unknowns' priors, shape (P,)."""
+        """Prior standard deviations of the unknowns, shape (P,)."""
         return np.concatenate([np.repeat(self.figures.strength, 3), self.problem.rest_sd])
 
     @property
     def off(self) -> Array:
-        """What is read minus what is predicted (N, C)."""
+        """Residuals (N, C)."""
         return self.problem.read_nt - self.reading.values_nt
 
     def weights(self, variance: Array) -> Array:
-        """Expected precision of a reading's own scale under Student's t, (N,)."""
+        """Expected relative precision of each reading under Student's t, (N,)."""
         freedom, parts = self.figures.freedom, variance.shape[1]
         return np.asarray((freedom + parts) / (freedom + np.sum(self.off**2 / variance, axis=1)))
 
     def objective(self, variance: Array) -> float:
-        """Minus the logarithm of the posterior, but for a constant, for scales that are held."""
+        """Negative log posterior for fixed scales, without a constant."""
         freedom, parts = self.figures.freedom, variance.shape[1]
         surprise = np.log1p(np.sum(self.off**2 / variance, axis=1) / freedom)
         moved = self._scaled()
@@ -129,7 +118,7 @@ class Solution:
         return self._stepped()[0]
 
     def settle(self) -> "Solution":
-        """Steps until nothing is gained."""
+        """Step until nothing is gained."""
         state = self
         for _ in range(STEPS):
             state, gain = state._stepped()
@@ -138,7 +127,7 @@ class Solution:
         return state
 
     def learnt(self, shares: list[Array] | None) -> "Solution":
-        """The same with figures that these unknowns make likely."""
+        """The same unknowns with more likely hyperparameters."""
         from scipy.special import gammaln, psi
 
         figures, layers = self.figures, self.problem.layers
@@ -180,7 +169,7 @@ class Solution:
         return Solution(self.problem, learnt, self.unknowns, self.reading)
 
     def evidence(self) -> float:
-        """Logarithm of the evidence by Laplace's approximation (Rasmussen & Williams 2006, eq. 3.32)."""
+        """Log evidence by Laplace's approximation (Rasmussen & Williams 2006, eq. 3.32)."""
         from scipy.special import gammaln
 
         variance = self.figures.variance(self.reading)
@@ -224,11 +213,11 @@ class Solution:
         )
 
     def _calibrated(self, posterior: Posterior, precision: Array) -> tuple[float, float]:
-        """Factors of the noise's and of the field's variance that readings left out in turn show.
+        """Factors of the noise's and of the field's variance, from readings left out in turn.
 
-        The likeliest under Student's t, a place counting once; where readings tell nothing of it, near 1.
-        Readings that follow each other on a drive share what motors, battery and LiDAR add, so that whole
-        stretches of a drive are left out, and the noise grows by what they share.
+        The likeliest under Student's t, with each place counting once; near 1 if the readings do not
+        determine them. Consecutive readings of a drive share errors from motors, battery and LiDAR, so whole
+        stretches are left out, and the noise grows by what they share.
         """
         root, problem = np.sqrt(precision).ravel(), self.problem
         places, stretches = problem.places(), problem.stretches()

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from magtwin.errors import InputError
-from magtwin.io.surveys.table import LONGEST_LINE, read_csv, read_parquet_sheet
+from magtwin.io.surveys.table import LONGEST_LINE, read_csv, read_parquet_table
 
 
 def written(tmp_path, content, name="a.csv"):
@@ -27,31 +27,31 @@ def written(tmp_path, content, name="a.csv"):
     ids=["commas", "hash", "semicolons", "tabs and a remark", "blanks", "quotes"],
 )
 def test_a_table_is_the_same_whatever_stands_between_its_values(tmp_path, text):
-    sheet = read_csv(written(tmp_path, text))
-    assert sheet.names == ["x", "y"]
-    assert_array_equal(sheet.numbers("x"), [1, 3])
-    assert_array_equal(sheet.numbers("2"), [2, 4])
+    table = read_csv(written(tmp_path, text))
+    assert table.names == ["x", "y"]
+    assert_array_equal(table.numbers("x"), [1, 3])
+    assert_array_equal(table.numbers("2"), [2, 4])
 
 
 def test_columns_without_a_header_are_numbered_from_1(tmp_path):
-    sheet = read_csv(written(tmp_path, "1,2\n3,nan\n"))
-    assert sheet.names == ["1", "2"]
-    assert_array_equal(sheet.numbers("2"), [2, np.nan])
+    table = read_csv(written(tmp_path, "1,2\n3,nan\n"))
+    assert table.names == ["1", "2"]
+    assert_array_equal(table.numbers("2"), [2, np.nan])
     with pytest.raises(InputError, match="no header: name columns by number, 1 to 2"):
-        sheet.numbers("x")
+        table.numbers("x")
 
 
 def test_a_missing_column_is_refused_by_the_near_name(tmp_path):
-    sheet = read_csv(written(tmp_path, "x,y,heading\n1,2,3\n"))
+    table = read_csv(written(tmp_path, "x,y,heading\n1,2,3\n"))
     with pytest.raises(InputError, match=r"a\.csv: no column 'headin'; did you mean 'heading'"):
-        sheet.numbers("headin")
+        table.numbers("headin")
 
 
 def test_two_columns_of_one_name_are_told_apart_by_number(tmp_path):
-    sheet = read_csv(written(tmp_path, "x,x\n1,2\n"))
+    table = read_csv(written(tmp_path, "x,x\n1,2\n"))
     with pytest.raises(InputError, match="2 columns are called 'x'; name it by its number"):
-        sheet.numbers("x")
-    assert_array_equal(sheet.numbers("2"), [2])
+        table.numbers("x")
+    assert_array_equal(table.numbers("2"), [2])
 
 
 @pytest.mark.parametrize(
@@ -68,9 +68,9 @@ def test_two_columns_of_one_name_are_told_apart_by_number(tmp_path):
     ],
 )
 def test_a_cell_that_is_no_finite_number_is_refused_with_its_line(tmp_path, cell, said):
-    sheet = read_csv(written(tmp_path, f"x,y\n1,2\n\n{cell},3\n"))
+    table = read_csv(written(tmp_path, f"x,y\n1,2\n\n{cell},3\n"))
     with pytest.raises(InputError, match=rf"a\.csv:4: x must be a finite number, got {said}"):
-        sheet.numbers("x")
+        table.numbers("x")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv"]
 
 
@@ -94,7 +94,7 @@ def test_a_broken_table_is_refused_with_its_line(tmp_path, content, what):
     assert "\n" not in str(refusal.value)
 
 
-def test_sheets_side_by_side_number_their_columns_on_and_know_their_own_files(tmp_path):
+def test_tables_side_by_side_number_their_columns_on_and_know_their_own_files(tmp_path):
     left = read_csv(written(tmp_path, "1\n2\n"))
     right = read_csv(written(tmp_path, "a,b\n3,4\nfive,6\n", "b.csv"))
     both = left.beside(right)
@@ -109,18 +109,18 @@ def test_sheets_side_by_side_number_their_columns_on_and_know_their_own_files(tm
 def test_a_parquet_table_has_nan_for_nulls_and_keeps_words(tmp_path):
     table = pa.table({"x": pa.array([1, None], pa.int32()), "run": ["a", "b"], "list": [[1], [2]]})
     pq.write_table(table, tmp_path / "a.parquet")
-    sheet = read_parquet_sheet(tmp_path / "a.parquet")
-    assert sheet.names == ["x", "run"]
-    assert_array_equal(sheet.numbers("x"), [1, np.nan])
-    assert sheet.texts("run") == ["a", "b"]
+    table = read_parquet_table(tmp_path / "a.parquet")
+    assert table.names == ["x", "run"]
+    assert_array_equal(table.numbers("x"), [1, np.nan])
+    assert table.texts("run") == ["a", "b"]
     with pytest.raises(InputError, match="column 'run' must hold numbers, got texts"):
-        sheet.numbers("run")
+        table.numbers("run")
 
 
 def test_an_infinite_number_in_parquet_is_refused_with_its_row(tmp_path):
     pq.write_table(pa.table({"x": [1.0, np.inf]}), tmp_path / "a.parquet")
     with pytest.raises(InputError, match=r"a\.parquet, row 1: x must be a finite number, got inf"):
-        read_parquet_sheet(tmp_path / "a.parquet").numbers("x")
+        read_parquet_table(tmp_path / "a.parquet").numbers("x")
 
 
 @pytest.mark.parametrize("keep", [0, 3, 40, -5])
@@ -129,7 +129,7 @@ def test_parquet_that_was_cut_short_is_refused(tmp_path, keep):
     pq.write_table(pa.table({"x": np.arange(1_000.0)}), path)
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(InputError, match=r"a\.parquet: (not a Parquet file|Parquet cut short)"):
-        read_parquet_sheet(path)
+        read_parquet_table(path)
 
 
 def test_parquet_whose_middle_is_damaged_is_refused(tmp_path):
@@ -139,7 +139,7 @@ def test_parquet_whose_middle_is_damaged_is_refused(tmp_path):
     whole[-200:-8] = bytes(192)
     path.write_bytes(whole)
     with pytest.raises(InputError, match="damaged Parquet"):
-        read_parquet_sheet(path)
+        read_parquet_table(path)
 
 
 def test_the_header_may_stand_above_remarks(tmp_path):

@@ -67,7 +67,7 @@ def test_units_are_turned_into_nt(tmp_path, unit, factor):
 )
 def test_a_mistaken_unit_is_refused_by_the_one_that_would_fit(tmp_path, value, said, wanted):
     path = file(tmp_path, f"x,y,yaw,field\n0,0,0,{value}\n")
-    with pytest.raises(InputError, match=f"a.csv: the mean of field .* were it {wanted}, .*--unit {wanted}$"):
+    with pytest.raises(InputError, match=f"a.csv: the mean of field .* in {wanted} .*--unit {wanted}$"):
         read_readings(path, columns=Columns(unit=said))
 
 
@@ -78,7 +78,7 @@ def test_a_mistaken_unit_is_refused_by_the_one_that_would_fit(tmp_path, value, s
 def test_a_unit_that_is_not_given_follows_from_the_size_and_is_told(tmp_path, value, unit, factor):
     readings = read_readings(file(tmp_path, f"x,y,yaw,field\n0,0,0,{value}\n"))
     assert_allclose(readings.b_nt, float(value) * factor)
-    told = f"taken field in {unit}, as its size tells (--unit)"
+    told = f"taken field in {unit}, by its size (--unit)"
     assert (told in readings.source) == (unit != "nT")
 
 
@@ -162,7 +162,7 @@ def test_rows_without_a_value_are_left_out_and_the_source_tells_how_many(tmp_pat
     readings = read_readings(path)
     assert len(readings) == 3
     assert readings.source.endswith("(3 of 6 rows without a value left out)")
-    with pytest.raises(InputError, match="no row has all its values; 1 have a cell empty or nan"):
+    with pytest.raises(InputError, match="no row is complete; all 1 have a cell"):
         read_readings(file(tmp_path, "x,y,heading,field\n0,0,0,nan\n", "b.csv"))
 
 
@@ -302,7 +302,7 @@ def test_the_same_readings_give_the_same_bytes_with_units_on_every_column(tmp_pa
     assert schema.field("b_nt").metadata[b"unit"] == b"nT"
     assert schema.field("p_xy_x").metadata[b"unit"] == b"m"
     assert json.loads(schema.metadata[b"magtwin_readings"])["source"] == readings.source
-    with pytest.raises(InputError, match=r"a\.parquet: exists already; give --force"):
+    with pytest.raises(InputError, match=r"a\.parquet: exists already; give `force=True`"):
         save_readings(readings, tmp_path / "a.parquet")
 
 
@@ -373,7 +373,7 @@ REFUSALS = {
     "vectors of another size": (
         "x,y,yaw,field,bx,by,bz\n0,0,0,41000,12,20,-33\n1,0,0,41000,12,20,-33\n",
         {"vector": "bx,by,bz", "field": "field"},
-        r"a\.csv: bx,by,bz is 0\.000986 times as long as field in the median; give both in one unit",
+        r"a\.csv: bx,by,bz is 0\.000986 times as long as field .median.; give both in one unit",
     ),
     "word": ("x,y,yaw,field\n0,0,0,high\n", {}, r"a\.csv:2: field must be a finite number, got 'high'"),
 }
@@ -395,7 +395,7 @@ def test_a_table_that_makes_no_readings_is_refused(tmp_path, case):
         ({"quaternion": "q"}, "quaternion takes 4 columns"),
         (
             {"quaternion": "a,b,c,d", "heading": "yaw"},
-            "give the heading's column or the quaternion's, not both",
+            "give either the heading's column or the quaternion's",
         ),
     ],
 )
@@ -408,7 +408,7 @@ def test_columns_are_refused_for_sources_whose_columns_are_known(tmp_path):
     save_readings(read_readings(file(tmp_path, ROWS)), tmp_path / "a.parquet")
     (tmp_path / "maps").mkdir()
     for source in ("a.parquet", "maps"):
-        with pytest.raises(InputError, match="its columns are known; columns are named for tables"):
+        with pytest.raises(InputError, match="its columns are known; drop the options"):
             read_readings(tmp_path / source, columns=Columns(x="px"))
 
 
@@ -469,9 +469,9 @@ def test_a_scale_that_cannot_be_is_refused_with_one_that_could(tmp_path):
         read_readings(path, columns=Columns(field="b"))
     with pytest.raises(InputError, match=r"mean of b is 3 nT with scale 3, .*; --scale 50000 would make"):
         read_readings(path, columns=Columns(field="b", scale=3.0))
-    with pytest.raises(InputError, match="the field's unit or its scale"):
+    with pytest.raises(InputError, match="the unit of the field or its scale"):
         Columns(scale=3.0, unit="uT")
-    with pytest.raises(InputError, match="scale is a factor to nT, above 0, got 0"):
+    with pytest.raises(InputError, match="scale, the factor to nT, must be above 0, got 0"):
         Columns(scale=0.0)
     save_readings(read_readings(file(tmp_path, ROWS, "b.csv")), tmp_path / "b.parquet")
     with pytest.raises(InputError, match="in nT already; leave out --scale"):

@@ -1,0 +1,237 @@
+"""Furniture of a scene's TOML: its table, its default magnetization, and whether it stands on the slab."""
+
+import hashlib
+import math
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from magtwin.errors import InputError
+from magtwin.field.sources.bodies import mesh_moments
+from magtwin.files import existing, refused_at
+from magtwin.frames import IDENTITY_XYZW, quat_from_yaw, rotate
+from magtwin.spec.base import ZERO3, Quat, Spec, Vec3
+from magtwin.spec.furniture import BODY, FurnitureSpec, Part
+from magtwin.spec.lab import LabSpec
+from magtwin.urdf.meshes.mesh import read_mesh
+from magtwin.usd.attributes import check_prim_name
+
+LARGEST_M = 1000.0
+"""A larger room or piece of furniture is probably in mm [m]."""
+
+SATURATION_A_M = 2.2e6
+"""Magnetization that no material exceeds [A/m]; iron saturates at 1.7e6."""
+
+DRAWN_A_M = (500.0, 5000.0)
+"""Range of the default magnetization of a steel part [A/m]: usual for desks, chairs and cabinets."""
+
+WALL_M = 0.002
+"""Thickness of the steel of a box, cylinder or mesh, since most are hollow [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FurnitureTable(Spec):
+    """A piece of furniture or of the building; see the kinds above."""
+
+    name: str
+    """Name of the piece, used once: letters, digits and _, not starting with a digit."""
+
+    kind: str
+    """desk, chair, cabinet, column, radiator, door_frame or shelf; or box, cylinder or mesh."""
+
+    p_world: Vec3
+    """Middle of the footprint, and height of the underside above the floor [m]."""
+
+    yaw: float = 0.0
+    """Direction of the front, counter-clockwise from the world's x [rad]."""
+
+    q_world_xyzw: Quat = IDENTITY_XYZW
+    """Orientation as a quaternion, instead of yaw."""
+
+    magnetization: tuple[float, ...] | None = None
+    """Magnetization of each steel part along its longest side [A/m]. Default: drawn from the seed, 500 to
+    5000 A/m of either sign, less for wide hollow sections. [] means none."""
+
+    susceptibility: float = 0.0
+    """Volume susceptibility of the steel [1]. Above 0, the Earth's field magnetises it too."""
+
+    material: str = ""
+    """Material of a box, cylinder or mesh: steel, painted_steel, wood, concrete, brick, plastic or aluminium.
+    Only the steels are magnetised."""
+
+    size_m: Vec3 = ZERO3
+    """Depth, width and height of a box; diameter, diameter and height of a cylinder [m]."""
+
+    file: Path | None = None
+    """File of a mesh: .stl, .obj, .ply, .dae, .glb or .gltf. The mesh is put on the floor, the middle of its
+    footprint at p_world. A steel mesh must be closed."""
+
+    scale: float = 1.0
+    """Factor on the coordinates of a mesh file; 0.001 for a file in mm."""
+
+    seed: int | None = None
+    """Seed of the magnetization. Default: the scene's."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_prim_name(self.name, "furniture")
+        self._above_zero("scale")
+        degrees = f"be in radians, at most 2 pi; {self.yaw:g} deg are {math.radians(self.yaw):.4f} rad"
+        self._require("yaw", abs(self.yaw) <= 2 * math.pi + 1e-6, degrees, self.yaw)
+        both = self.yaw != 0 and self.q_world_xyzw != IDENTITY_XYZW
+        self._require("yaw", not both, "be left out beside q_world_xyzw", self.yaw)
+        self._require("seed", self.seed is None or self.seed >= 0, "not be below 0", self.seed)
+        strong = max(map(abs, self.magnetization or ()), default=0.0)
+        self._require(
+            "magnetization",
+            strong <= SATURATION_A_M,
+            "be in A/m; iron saturates at 1.7e6",
+            self.magnetization,
+        )
+        if self.kind == "mesh" and self.file is None:
+            raise InputError('kind "mesh" needs file = "FILE.stl"')
+        if self.kind != "mesh" and (self.file is not None or self.scale != 1):
+            raise InputError(f'file and scale are for kind "mesh", not for a {self.kind}')
+        object.__setattr__(self, "_piece", self._made())
+
+    def _made(self) -> FurnitureSpec:
+        """The piece, with the magnetization of the table or none."""
+        given = {
+            f.name: getattr(self, f.name)
+            for f in fields(FurnitureSpec)
+            if hasattr(self, f.name) and f.name != "magnetization"
+        }
+        given["magnetization"] = self.magnetization or ()
+        if self.yaw:
+            given["q_world_xyzw"] = tuple(map(float, quat_from_yaw(self.yaw)))
+        if self.file is not None:
+            points, faces = _mesh_of(self.file, self.scale)
+            largest = float(np.ptp(points, axis=0).max())
+            if largest > LARGEST_M:
+                raise InputError(
+                    f"scale is missing: {self.file.name} would be {largest:,.0f} m large; if it is in mm, "
+                    "give scale = 0.001"
+                )
+            given |= {
+                "vertices_m": tuple(map(tuple, points.tolist())),
+                "faces": tuple(map(tuple, faces.tolist())),
+            }
+        return FurnitureSpec(**given)
+
+    def spec(self, seed: int) -> FurnitureSpec:
+        """The piece, with the magnetization of the table or the default drawn from the scene's seed."""
+        piece: FurnitureSpec = self._piece  # type: ignore[attr-defined]
+        if self.magnetization is not None:
+            return piece
+        drawn = drawn_magnetization(self.name, piece.parts, seed=seed if self.seed is None else self.seed)
+        return replace(piece, magnetization=drawn)
+
+
+def _mesh_of(file: Path, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [m] and triangles of a mesh file, facing outwards."""
+    mesh = read_mesh(existing(file, "mesh file"))
+    points, faces = mesh.points.astype(float) * scale, mesh.faces
+    return points, faces[:, ::-1] if mesh_moments(points, faces)[0] < 0 else faces
+
+
+def drawn_magnetization(name: str, parts: Iterable[Part], *, seed: int = 0) -> tuple[float, ...]:
+    """Default magnetization of a piece's steel parts, each along its longest side.
+
+    Uniform in `DRAWN_A_M` with a random sign, times the fraction of steel, rounded to 1 A/m. It depends on
+    seed and name alone, so adding, removing or moving another piece changes nothing.
+
+    Args:
+        name: Name of the piece.
+        parts: Its parts.
+        seed: Seed of the scene.
+
+    Returns:
+        One number for each steel part, in order [A/m].
+    """
+    words = np.frombuffer(hashlib.sha256(name.encode()).digest(), "<u4").tolist()
+    rng = np.random.default_rng([seed, *words])
+    drawn = list[float]()
+    for part in parts:
+        if part.steel:
+            size = rng.uniform(*DRAWN_A_M) * rng.choice((-1.0, 1.0)) * _steel_fraction(part)
+            drawn.append(float(np.copysign(max(round(abs(size)), 1), size)))
+    return tuple(drawn)
+
+
+def _steel_fraction(part: Part) -> float:
+    """Fraction of a part's volume that is steel; a generic part is a shell of `WALL_M`."""
+    if part.name != BODY:
+        return part.fill
+    if not part.faces:
+        inner = [max(side - 2 * WALL_M, 0.0) / side for side in part.size_m]
+        return 1 - inner[0] * inner[1] * inner[2]
+    corner = np.array(part.vertices_m)[np.array(part.faces)]
+    across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    volume = abs(float(np.einsum("fi,fi->", corner[:, 0], across)) / 6)
+    shell = WALL_M * float(np.linalg.norm(across, axis=1).sum()) / 2
+    return min(1.0, shell / volume) if volume else 1.0
+
+
+def check_stands(piece: FurnitureSpec, lab: LabSpec) -> None:
+    """Refuse a piece of furniture that does not stand on the slab.
+
+    Raises:
+        InputError: It does not; the text has the size of the slab.
+    """
+    signs = np.array(np.meshgrid((-1, 1), (-1, 1), (-1, 1))).reshape(3, -1).T
+    corners = np.concatenate(
+        [np.asarray(part.p) + signs * np.asarray(part.size_m) / 2 for part in piece.parts]
+    )
+    world = rotate(piece.q_world_xyzw, corners) + piece.p_world
+    half = np.array(lab.floor_m) / 2 + lab.wall_thickness_m + lab.apron_m
+    beyond = float(np.max(np.abs(world[:, :2]) - half))
+    if beyond > 1e-6:
+        x, y = piece.p_world[:2]
+        raise InputError(
+            f"p_world of {piece.name!r} is ({x:g}, {y:g}): it reaches {beyond:.2f} m beyond the slab, "
+            f"which is {2 * half[0]:g} x {2 * half[1]:g} m about the origin; move it, or enlarge floor_m or "
+            "apron_m of [lab]"
+        )
+
+
+def placed_furniture(
+    tables: Sequence[FurnitureTable], lab: LabSpec | None, path: str | os.PathLike[str], *, seed: int
+) -> tuple[FurnitureSpec, ...]:
+    """The pieces of [[furniture]] tables, with their magnetization.
+
+    Args:
+        tables: The tables, in order.
+        lab: Room whose slab they must stand on. None skips the check.
+        path: The file of the tables, for error messages.
+        seed: Seed of the scene.
+
+    Raises:
+        InputError: A piece does not stand on the slab; the text has its line.
+    """
+    pieces = []
+    for number, table in enumerate(tables):
+        pieces.append(table.spec(seed))
+        try:
+            if lab is not None:
+                check_stands(pieces[-1], lab)
+        except InputError as error:
+            raise refused_at(path, "p_world", str(error), section="furniture", number=number) from error
+    return tuple(pieces)
+
+
+def check_names(pieces: Iterable[FurnitureSpec], path: str | os.PathLike[str]) -> None:
+    """Refuse two pieces of furniture with the same name.
+
+    Raises:
+        InputError: Two have the same name.
+    """
+    seen = set()
+    for piece in pieces:
+        if piece.name in seen:
+            raise InputError(
+                f"{path}: two pieces of furniture are called {piece.name!r}; give each its own name"
+            )
+        seen.add(piece.name)

@@ -1,0 +1,160 @@
+"""Sender: what the messages of a robot hold beside its readings: frames, covariances, links, units."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from magtwin.errors import InputError
+from magtwin.frames import IDENTITY_XYZW
+from magtwin.spec.base import ZERO3, Quat, Vec3
+from magtwin.spec.robot import RobotSpec
+
+if TYPE_CHECKING:
+    from magtwin.twin import Twin
+
+Unit = Literal["T", "nT"]
+
+
+@dataclass(frozen=True)
+class FixedFrame:
+    """A frame at rest in another."""
+
+    parent: str
+    name: str
+    p: Vec3 = ZERO3
+    q_xyzw: Quat = IDENTITY_XYZW
+    axis: Vec3 = (0.0, 0.0, 1.0)
+    """Axis of rotation, for a wheel."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sender:
+    """The robot that sends messages; a standard deviation of 0 is unknown."""
+
+    map_frame: str = "map"
+    odom_frame: str = "odom"
+    base_frame: str = "base_link"
+    imu_frame: str = "imu_link"
+    magnetometer_frame: str = "magnetometer_link"
+    lidar_frame: str = "rplidar_link"
+    wheel_joints: tuple[str, str] = ("left_wheel_joint", "right_wheel_joint")
+
+    unit: Unit = "T"
+    """Unit of magnetic fields in messages."""
+
+    odometry_std: tuple[float, ...] = (0.0,) * 6
+    """Standard deviation of odometry's velocities, linear [m/s] and angular [rad/s]."""
+
+    orientation_std: float = 0.0
+    """Standard deviation of each small angle of the IMU's orientation [rad]."""
+
+    gyro_std: float = 0.0
+    """Standard deviation of the gyroscope at rest [rad/s]."""
+
+    gyro_vibration: Vec3 = ZERO3
+    """Additional gyroscope noise per speed [rad/m]."""
+
+    accel_std: float = 0.0
+    """Standard deviation of the accelerometer at rest [m/s2]."""
+
+    accel_vibration: Vec3 = ZERO3
+    """Additional accelerometer noise per speed [1/s]."""
+
+    vector_std_nt: float = 0.0
+    """Standard deviation of each vector axis of the magnetometer [nT]."""
+
+    scan_rate_hz: float = 0.0
+    range_m: tuple[float, float] = (0.0, 0.0)
+
+    links: tuple[FixedFrame, ...] = ()
+    """Links fixed in base_link, and sensors mounted at an angle on their links."""
+
+    wheels: tuple[FixedFrame, FixedFrame] | None = None
+    """The left and the right wheel at rest."""
+
+    description: str = ""
+    """The robot's URDF; "" if unknown."""
+
+
+def sender_of(
+    robot: RobotSpec,
+    *,
+    unit: Unit = "T",
+    rate_hz: float | None = None,
+    links: tuple[FixedFrame, ...] = (),
+    wheels: tuple[FixedFrame, FixedFrame] | None = None,
+    description: str = "",
+) -> Sender:
+    """The sender of a robot's messages.
+
+    Args:
+        robot: Its sensors and drive.
+        unit: Unit of magnetic fields in messages.
+        rate_hz: Rate of the magnetometer [Hz]. Default: the robot's.
+        links: Links fixed in base_link.
+        wheels: The left and the right wheel at rest.
+        description: Its URDF.
+    """
+    mounts = {"magnetometer": robot.magnetometer, "imu": robot.imu, "lidar": robot.lidar}
+    frames, tilted = {}, []
+    for name, mount in mounts.items():
+        straight = (mount.p_link_sensor, mount.q_link_sensor_xyzw) == (ZERO3, IDENTITY_XYZW)
+        frames[name] = mount.link if straight else name
+        if not straight:
+            tilted.append(FixedFrame(mount.link, name, mount.p_link_sensor, mount.q_link_sensor_xyzw))
+    rate = robot.magnetometer.rate_hz if rate_hz is None else rate_hz
+    return Sender(
+        imu_frame=frames["imu"],
+        magnetometer_frame=frames["magnetometer"],
+        lidar_frame=frames["lidar"],
+        wheel_joints=(robot.drive.left_wheel_joint, robot.drive.right_wheel_joint),
+        unit=unit,
+        odometry_std=(*robot.drive.odometry_v_noise_std, *robot.drive.odometry_w_noise_std),
+        orientation_std=robot.imu.orientation_noise_std,
+        gyro_std=robot.imu.gyro_noise_std,
+        gyro_vibration=robot.imu.gyro_vibration,
+        accel_std=robot.imu.accel_noise_std,
+        accel_vibration=robot.imu.accel_vibration,
+        vector_std_nt=robot.magnetometer.vector_noise_density_nt * float(np.sqrt(rate / 2)),
+        scan_rate_hz=robot.lidar.scan_rate_hz,
+        range_m=(robot.lidar.range_min_m, robot.lidar.range_max_m),
+        links=(*links, *tilted),
+        wheels=wheels,
+        description=description,
+    )
+
+
+def sender_for(twin: "Twin | None", unit: Unit, rate_hz: Any = None) -> Sender:
+    """The sender of a twin's robot; without a twin, a robot of default frames and unknown noise.
+
+    Raises:
+        InputError: The unit is neither T nor nT.
+    """
+    if unit not in ("T", "nT"):
+        raise InputError(f'units of a bag must be "T" or "nT", got {unit!r}')
+    if twin is None:
+        return Sender(unit=unit)
+    from magtwin.author.robot import read_description
+    from magtwin.usd.geometry import BASE_LINK, read_links
+
+    robot = twin.scene.robot
+    joints = (robot.drive.left_wheel_joint, robot.drive.right_wheel_joint)
+    fixed, wheels = [], {}
+    for link in read_links(robot.asset).values():
+        if link.name == BASE_LINK:
+            continue
+        axis = link.axis_link or (0.0, 0.0, 1.0)
+        frame = FixedFrame(BASE_LINK, link.name, link.p_base_link, link.q_base_link_xyzw, axis)
+        if link.joint in joints:
+            wheels[link.joint] = frame
+        else:
+            fixed.append(frame)
+    return sender_of(
+        robot,
+        unit=unit,
+        rate_hz=float(rate_hz) if isinstance(rate_hz, int | float) and rate_hz > 0 else None,
+        links=tuple(fixed),
+        wheels=(wheels[joints[0]], wheels[joints[1]]) if len(wheels) == 2 else None,
+        description=read_description(robot.asset),
+    )

@@ -1,0 +1,161 @@
+"""Storage: what the two storages of a rosbag2, MCAP and sqlite3, have in common."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from magtwin.io.bags.cdr import Bytes, Index
+from magtwin.io.bags.topics import Qos
+
+Storage = Literal["mcap", "sqlite3"]
+
+STORAGES: Mapping[str, str] = {"mcap": ".mcap", "sqlite3": ".db3"}
+"""Suffix of a storage's files."""
+
+VERSION: Literal[8] = 8
+"""Version of metadata.yaml: the newest one that ROS 2 Humble reads."""
+
+ROOM = 31
+"""Bytes left free before each message of a batch, for the head of an MCAP message record."""
+
+
+class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+@dataclass(frozen=True)
+class Connection:
+    """A topic of a bag that is written."""
+
+    id: int
+    topic: str
+    kind: str
+    """Message type."""
+
+    definition: str
+    """Definition of the type and of the types in it, as text."""
+
+    digest: str
+    """REP 2011 hash of the definition."""
+
+    qos: Qos
+
+    @cached_property
+    def rosbags_qos(self) -> Any:
+        """The quality of service as a `rosbags.interfaces.Qos`, with infinite durations."""
+        from rosbags import interfaces as ros
+
+        infinite = ros.QosTime(9223372036, 854775807)
+        return ros.Qos(
+            ros.QosHistory.KEEP_LAST,
+            self.qos.depth,
+            ros.QosReliability.RELIABLE if self.qos.reliable else ros.QosReliability.BEST_EFFORT,
+            ros.QosDurability.TRANSIENT_LOCAL if self.qos.latched else ros.QosDurability.VOLATILE,
+            infinite,
+            infinite,
+            ros.QosLiveliness.AUTOMATIC,
+            infinite,
+            avoid_ros_namespace_conventions=False,
+        )
+
+    @cached_property
+    def offered_qos(self) -> str:
+        """The quality of service as YAML, as rosbag2 stores it."""
+        from rosbags.rosbag2.metadata import dump_qos_v8
+
+        return dump_qos_v8([self.rosbags_qos])
+
+
+class Batch(NamedTuple):
+    """Messages of one topic and one size, sorted by time. A topic may have several batches."""
+
+    connection: Connection
+    received: Index
+    """Time of receipt [ns], shape (M,)."""
+
+    rows: Bytes
+    """One message per row, after `ROOM` free bytes, shape (M, ROOM + size)."""
+
+    arrival: Index | None = None
+    """Rank among messages with the same time, shape (M,). Default: the order of the batches."""
+
+
+class StoredTopic(NamedTuple):
+    """A topic of a bag that is read."""
+
+    id: int
+    topic: str
+    kind: str
+    encoding: str
+    """Encoding of its messages; only "cdr" can be read."""
+
+
+def bag_metadata(
+    file: str,
+    connections: Sequence[Connection],
+    counts: Mapping[int, int],
+    span: tuple[int, int],
+    custom: Any,
+) -> dict[str, Any]:
+    """The content of metadata.yaml, below `rosbag2_bagfile_information`, of a bag of one MCAP file.
+
+    Args:
+        file: Name of the storage file.
+        connections: Topics.
+        counts: Messages by connection.
+        span: Times of the first and the last message [ns].
+        custom: Custom data, texts by name.
+    """
+    count = sum(counts.values())
+    begin = {"nanoseconds_since_epoch": span[0] if count else 0}
+    duration = {"nanoseconds": span[1] - span[0] if count else 0}
+    return {
+        "version": VERSION,
+        "storage_identifier": "mcap",
+        "duration": duration,
+        "starting_time": begin,
+        "message_count": count,
+        "topics_with_message_count": [
+            {
+                "topic_metadata": {
+                    "name": c.topic,
+                    "type": c.kind,
+                    "serialization_format": "cdr",
+                    "offered_qos_profiles": c.offered_qos,
+                    "type_description_hash": c.digest,
+                },
+                "message_count": counts[c.id],
+            }
+            for c in connections
+        ],
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": [file],
+        "files": [
+            {"path": file, "starting_time": dict(begin), "duration": dict(duration), "message_count": count}
+        ],
+        "custom_data": dict(custom) or None,
+        "ros_distro": "humble",
+    }
+
+
+def to_yaml(content: Any) -> str:
+    """YAML text of plain data."""
+    return yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=2**30)
+
+
+def in_time(batches: Sequence[Batch]) -> tuple[Index, NDArray[np.intp]]:
+    """Times of all messages, ascending [ns], and the batch that each belongs to; both of shape (M,)."""
+    if not batches:
+        return np.zeros(0, np.int64), np.zeros(0, np.intp)
+    times = np.concatenate([b.received for b in batches])
+    which = np.repeat(np.arange(len(batches)), [len(b.received) for b in batches])
+    ranks = [np.zeros(len(b.received), np.int64) if b.arrival is None else b.arrival for b in batches]
+    order = np.lexsort((np.concatenate(ranks), times))
+    return times[order], which[order]

@@ -1,0 +1,235 @@
+"""Stream: the messages that a robot sends as a run goes on."""
+
+import dataclasses
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.io.bags.cdr import NS, Index
+from magtwin.io.bags.sender import Sender
+from magtwin.io.bags.topics import DESCRIPTION, NAMES, READING, SCAN, TF_STATIC, TOPICS, Columns, Topic
+from magtwin.run.arrow import check_clock
+from magtwin.run.run import Run
+
+if TYPE_CHECKING:
+    from magtwin.sim.sensors.lidar import Scans
+
+Array = NDArray[np.float64]
+
+LATEST_S = 2.0**31
+"""First time that ROS stamps cannot hold [s]."""
+
+
+@dataclass
+class _Last:
+    """State of a topic at the end of the previous rows."""
+
+    values: dict[str, Any] = field(default_factory=dict)
+    """Its columns in the last row; empty before the first."""
+
+    changed_s: float = 0.0
+    """When they last changed [s]."""
+
+    times: int = 0
+    """How often they were sent again since."""
+
+
+Sent = tuple[Topic, Index, dict[str, Any]]
+"""A topic, the times of some of its messages [ns], and their fields."""
+
+
+class Stream:
+    """The messages of a run, rows after rows; remembers what was sent last."""
+
+    def __init__(
+        self,
+        run: Run,
+        sender: Sender,
+        scans: "Scans | None",
+        *,
+        topics: Iterable[Topic] = tuple(TOPICS.values()),
+        whole: bool = False,
+    ) -> None:
+        """Begin.
+
+        Args:
+            run: Some rows, which define the columns.
+            sender: The robot.
+            scans: The LiDAR's scans of the whole run; None sends no scans.
+            topics: Topics to send, as far as the run has their columns.
+            whole: Put every column into /magtwin/reading, not only those that no other topic carries, and the
+                run's metadata into /magtwin/columns: a recorder of live topics has no other source for them.
+
+        Raises:
+            InputError: A column cannot stand in a bag.
+        """
+        self._sender, self._scans = sender, scans
+        self._t = -np.inf
+        self._last: dict[str, _Last] = {}
+        columns = set(run)
+        sent = [t for t in topics if t.needs and columns.issuperset(t.needs)]
+        carried = (
+            {} if whole else {column: topic for topic in sent if topic.carried for column in topic.needs}
+        )
+        self._carried: dict[str, Topic] = carried
+        self._rest = [name for name in run if name not in self._carried]
+        self._columns = {name: (values.dtype, values.shape[1:]) for name, values in run.items()}
+        self._table = self._columns_json(run, run.metadata if whole else {})
+        for name, values in run.items():
+            if values.ndim > 2 or values.dtype.kind not in "bfiu":
+                raise InputError(
+                    f"column {name!r} cannot stand in a bag: it needs numbers or flags of shape (N,) or "
+                    f"(N, width), got {values.dtype} of shape {values.shape}"
+                )
+        once = [NAMES]
+        if sender.links:
+            once.append(TF_STATIC)
+        if sender.description:
+            once.append(DESCRIPTION)
+        self._once = once
+        self.topics = [*once, *sent, *([] if scans is None else [SCAN]), READING]
+        """Topics that are sent."""
+
+    def messages(self, run: Run) -> Iterator[Sent]:
+        """The messages of some rows.
+
+        Raises:
+            InputError: The columns differ from the first rows, or time does not ascend.
+        """
+        if {name: (values.dtype, values.shape[1:]) for name, values in run.items()} != self._columns:
+            raise InputError(f"rows of a bag must have the same columns, {', '.join(self._columns)}")
+        t = self._checked(run)
+        stamps = np.rint(t * NS).astype(np.int64)
+        once, self._once = self._once, []
+        for topic in once:
+            first = stamps[:1] if len(stamps) else np.zeros(1, np.int64)
+            fields = {"data": self._table} if topic is NAMES else topic.write({}, first, self._sender)
+            yield topic, first, fields
+        for topic in self.topics:
+            if topic.needs:
+                rows = self._rows(topic, run, t)
+                chosen = (
+                    run
+                    if len(rows) == len(t)
+                    else {name: run[name][rows] for name in self._wanted(topic, run)}
+                )
+                fields = topic.write(chosen, stamps[rows], self._sender)
+                yield topic, stamps[rows], fields
+        data = np.column_stack([np.asarray(run[name], float) for name in self._rest])
+        yield READING, stamps, {"data": data}
+        if len(t):
+            self._t = float(t[-1])
+            yield from self._scanned(self._t)
+
+    def last(self) -> Iterator[Sent]:
+        """The messages after the last row: scans that arrive later."""
+        yield from self._scanned(np.inf)
+
+    def _scanned(self, until_s: float) -> Iterator[Sent]:
+        """The scans that arrived by a time and were not sent yet."""
+        if self._scans is None:
+            return
+        arrived, self._scans = _arrived(self._scans, until_s)
+        moments, came = (np.rint(t * NS).astype(np.int64) for t in (arrived.t, arrived.arrival))
+        fields = SCAN.write({"ranges_m": arrived.ranges_m}, moments, self._sender)
+        yield SCAN, came, fields
+
+    def _checked(self, run: Run) -> Array:
+        """Times of rows, if they ascend and stamps can hold them."""
+        check_clock(run, "the run to write")
+        t = np.asarray(run["t"], float)
+        if len(t) and t[0] <= self._t:
+            raise InputError(f"time runs backwards: rows at {t[0]:.9g} s come after rows at {self._t:.9g} s")
+        if len(t) and not 0 <= t[0] <= t[-1] < LATEST_S:
+            raise InputError(
+                f"t runs from {t[0]:.9g} to {t[-1]:.9g} s, but stamps hold 0 to {LATEST_S:.0f} s; begin at 0"
+            )
+        return t
+
+    @staticmethod
+    def _wanted(topic: Topic, run: Run) -> list[str]:
+        """Columns that a topic's messages are made from."""
+        also = {"wheel_angle", "odom_v", "b_sd_nt"} & set(run)
+        return [*topic.needs, *(also - set(topic.needs))]
+
+    def _rows(self, topic: Topic, run: Columns, t: Array) -> NDArray[np.intp]:
+        """Rows at which a topic is sent."""
+        if not len(t):
+            return np.zeros(0, np.intp)
+        if topic.sent == "each":
+            known = np.isfinite(run[topic.needs[0]])
+            return np.flatnonzero(known if known.ndim == 1 else known.any(axis=1))
+        last = self._last.setdefault(topic.name, _Last(changed_s=float(t[0])))
+        if topic.sent == "ticks":
+            steps = np.floor(t / topic.every_s + 1e-6).astype(np.int64)
+            sent = np.diff(steps, prepend=last.times if last.values else steps[0] - 1) > 0
+            last.times, last.values = int(steps[-1]), {"t": t[-1]}
+            return np.flatnonzero(sent & _finite(run, topic.needs))
+        changed = np.zeros(len(t), bool)
+        changed[0] = not last.values
+        for name in topic.needs:
+            values = run[name]
+            changed[1:] |= _differ(values[1:], values[:-1])
+            if name in last.values:
+                changed[:1] |= _differ(values[:1], last.values[name][None])
+        last.values = {name: run[name][-1].copy() for name in topic.needs}
+        latest = np.maximum.accumulate(np.where(changed, np.arange(len(t)), -1))
+        since = np.where(latest >= 0, t[np.maximum(latest, 0)], last.changed_s)
+        times = np.floor((t - since) / topic.every_s + 1e-6).astype(np.int64)
+        again = np.diff(times, prepend=last.times) > 0
+        if topic.lost in run:
+            again &= ~run[topic.lost]
+        last.changed_s, last.times = float(since[-1]), int(times[-1])
+        sent = changed | again
+        if not topic.carried:
+            sent &= _finite(run, topic.needs)
+        return np.flatnonzero(sent)
+
+    def _columns_json(self, run: Run, metadata: Mapping[str, Any]) -> str:
+        """The content of /magtwin/columns: the columns, and where each of them is."""
+        columns, first = [], 0
+        for name, (dtype, shape) in self._columns.items():
+            spec = run.spec(name)
+            entry: dict[str, Any] = {"name": name, "unit": spec.unit, "frame": spec.frame, "doc": spec.doc}
+            entry |= {"parts": spec.parts, "interpolation": spec.interpolation}
+            entry |= {"dtype": dtype.name, "width": shape[0] if shape else None, "own": name in run.specs}
+            if name in self._carried:
+                entry["topic"] = self._carried[name].name
+            else:
+                entry["first"] = first
+                first += shape[0] if shape else 1
+            columns.append(entry)
+        table = {
+            "unit": self._sender.unit,
+            "columns": columns,
+            **({"facts": dict(metadata)} if metadata else {}),
+        }
+        return json.dumps(table, ensure_ascii=False, indent=1)
+
+
+def _arrived(scans: "Scans", t: float) -> "tuple[Scans, Scans]":
+    """Scans that arrived by a time [s], and those that arrive later."""
+    k = int(np.searchsorted(scans.arrival, t, side="right"))
+    parts = [
+        {f.name: getattr(scans, f.name)[rows] for f in dataclasses.fields(scans)}
+        for rows in (slice(k), slice(k, None))
+    ]
+    return type(scans)(**parts[0]), type(scans)(**parts[1])
+
+
+def _finite(run: Columns, names: Iterable[str]) -> NDArray[np.bool_]:
+    """Rows in which some columns are finite."""
+    return np.asarray(
+        np.logical_and.reduce([np.isfinite(run[n]).reshape(len(run[n]), -1).all(1) for n in names])
+    )
+
+
+def _differ(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:
+    """Rows of float64 arrays that differ in any bit."""
+    other = a.view(np.int64) != b.view(np.int64)
+    return other if other.ndim == 1 else other.any(axis=1)

@@ -1,0 +1,425 @@
+"""Topics: what each ROS 2 topic of the robot carries, from the columns of a Run and back.
+
+One table, for bags and for live robots. Its functions turn columns into fields of messages, which are arrays
+by leaf name (`pose.position`, shape (M, 3)), and fields into columns. They use neither bytes nor a ROS
+library. Magnetic fields are in tesla, as in ROS, or in nT, as APRILab's robot publishes them.
+
+A Run holds slower signals causally on the magnetometer's clock. A message is therefore sent at the first
+reading that has its value.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.frames import quat_conjugate, quat_multiply, rotate
+from magtwin.io.bags.sender import Sender
+
+Array = NDArray[np.float64]
+Columns = Mapping[str, NDArray[Any]]
+Fields = dict[str, Any]
+
+NT_PER_T = 1e9
+
+
+@dataclass(frozen=True)
+class Qos:
+    """Quality of service of a topic."""
+
+    depth: int = 10
+    reliable: bool = True
+    latched: bool = False
+    """Whether late subscribers get the last message (transient local)."""
+
+
+SENSOR_DATA = Qos(depth=5, reliable=False)
+LATCHED = Qos(depth=1, latched=True)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Topic:
+    """A topic: its name, its message type, and the columns that it carries."""
+
+    name: str
+    kind: str
+    """Message type."""
+
+    qos: Qos = field(default_factory=Qos)
+
+    needs: tuple[str, ...] = ()
+    """Columns without which it is not written."""
+
+    carried: bool = False
+    """Whether a bag's reader takes the columns of `needs` from this topic."""
+
+    sent: Literal["changed", "each", "ticks", "once"] = "changed"
+    """When messages are sent: when a needed column changes and again every `every_s` while it stays; at each
+    reading that has a value; in even steps of `every_s`; or once."""
+
+    every_s: float = 0.1
+    """Time after which an unchanged value is sent again, or the length of a step [s]."""
+
+    lost: str = ""
+    """Column of flags that suspend sending again."""
+
+    write: Callable[[Columns, NDArray[np.int64], Sender], Fields]
+    """Fields of messages, from the columns of some rows and their stamps [ns]."""
+
+    reads: Mapping[str, Mapping[str, str | tuple[str, int]]] = field(default_factory=dict)
+    """By message type: the leaf of each column that is read, or a leaf and an index into it."""
+
+    def leaves(self, kind: str) -> list[str]:
+        """Names of the leaves of a message type that are read."""
+        return [leaf if isinstance(leaf, str) else leaf[0] for leaf in self.reads[kind].values()]
+
+    def read(self, kind: str, fields: Fields) -> dict[str, NDArray[Any]]:
+        """The columns that the fields of messages give."""
+        columns = {}
+        for name, leaf in self.reads[kind].items():
+            values = fields[leaf] if isinstance(leaf, str) else fields[leaf[0]][:, leaf[1]]
+            # ROS counts current into the battery, magtwin out of it
+            columns[name] = -values.astype(float) if name == "battery_a" else values.astype(float, copy=False)
+        return columns
+
+
+def nt_per(sender: Sender) -> float:
+    """Nanotesla per unit of magnetic field in a sender's messages."""
+    return NT_PER_T if sender.unit == "T" else 1.0
+
+
+def _header(stamp: NDArray[np.int64], frame: str) -> Fields:
+    return {"header.stamp": stamp, "header.frame_id": frame}
+
+
+def _diagonal(variances: Any) -> Array:
+    """Covariance matrices of independent errors, row by row, shape (..., n) -> (..., n * n)."""
+    variances = np.asarray(variances, float)
+    n = variances.shape[-1]
+    out = np.zeros((*variances.shape[:-1], n * n))
+    out[..., :: n + 1] = variances
+    return out
+
+
+def _pose(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
+    return {
+        **_header(stamp, sender.map_frame),
+        "pose.position": c["mocap_p"],
+        "pose.orientation": c["mocap_q_xyzw"],
+    }
+
+
+def _odometry(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
+    return {
+        **_header(stamp, sender.odom_frame),
+        "child_frame_id": sender.base_frame,
+        "pose.pose.position": c["odom_p"],
+        "pose.pose.orientation": c["odom_q_xyzw"],
+        "twist.twist.linear": c["odom_v"],
+        "twist.twist.angular": c["odom_w"],
+        "twist.covariance": _diagonal(np.square(sender.odometry_std)),
+    }
+
+
+def _imu(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
+    speed = np.abs(c["odom_v"][:, :1]) if "odom_v" in c else np.zeros((len(stamp), 1))
+    speed = np.where(np.isfinite(speed), speed, 0.0)
+    rates = sender.gyro_std**2 + (speed * np.array(sender.gyro_vibration)) ** 2
+    accelerations = sender.accel_std**2 + (speed * np.array(sender.accel_vibration)) ** 2
+    return {
+        **_header(stamp, sender.imu_frame),
+        "orientation": c["imu_q_xyzw"],
+        "orientation_covariance": _diagonal([sender.orientation_std**2] * 3),
+        "angular_velocity": c["imu_w"],
+        "angular_velocity_covariance": _diagonal(rates),
+        "linear_acceleration": c["imu_a"],
+        "linear_acceleration_covariance": _diagonal(accelerations),
+    }
+
+
+def _battery(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
+    unknown = np.nan
+    return {
+        **_header(stamp, sender.base_frame),
+        "voltage": c["battery_v"],
+        "temperature": unknown,
+        "current": -c["battery_a"],
+        "charge": unknown,
+        "capacity": unknown,
+        "design_capacity": unknown,
+        "percentage": c["battery_fraction"],
+        "power_supply_status": 2 * (c["battery_a"] > 0),  # discharging, else unknown
+        "present": 1,
+    }
+
+
+def _magnitude(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
+    """The magnitude in x, as APRILab's robot publishes it, with its predicted variance."""
+    zero = np.zeros(len(stamp))
+    variance = c["b_sd_nt"] / nt_per(sender) if "b_sd_nt" in c else zero
+    variance = np.where(np.isfinite(variance), variance, 0.0) ** 2
+    return {
+        **_header(stamp, sender.magnetometer_frame),
+        "magnetic_field": np.column_stack([c["b_measured_nt"] / nt_per(sender), zero, zero]),
+        "magnetic_field_covariance": np.column_stack([variance, *[zero] * 8]),
+    }
+
+
+def _field(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
+    return {
+        **_header(stamp, sender.magnetometer_frame),
+        "magnetic_field": c["b_vector_measured_nt"] / nt_per(sender),
+        "magnetic_field_covariance": _diagonal([(sender.vector_std_nt / nt_per(sender)) ** 2] * 3),
+    }
+
+
+def _command(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
+    zero = np.zeros(len(stamp))
+    return {
+        "linear": np.column_stack([c["v_cmd"], zero, zero]),
+        "angular": np.column_stack([zero, zero, c["w_cmd"]]),
+    }
+
+
+def _joints(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
+    return {**_header(stamp, ""), "name": sender.wheel_joints, "position": c["wheel_angle"]}
+
+
+def _transform_fields(stamp: NDArray[np.int64], transforms: list[tuple[str, str, Any, Any]]) -> Fields:
+    """A TFMessage of transforms: parent, child, translation and rotation (xyzw) of each."""
+    fields: Fields = {"transforms": len(transforms)}
+    for k, (parent, child, p, q_xyzw) in enumerate(transforms):
+        fields |= {
+            f"transforms.{k}.header.stamp": stamp,
+            f"transforms.{k}.header.frame_id": parent,
+            f"transforms.{k}.child_frame_id": child,
+            f"transforms.{k}.transform.translation": p,
+            f"transforms.{k}.transform.rotation": q_xyzw,
+        }
+    return fields
+
+
+def _transforms(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
+    """Map to odom, such that base_link is at its true pose; odom to base_link; base_link to each wheel."""
+    p_odom, q_odom = c["odom_p"], c["odom_q_xyzw"]
+    q = quat_multiply(c["q_world_base_xyzw"], quat_conjugate(q_odom))
+    chain = [
+        (sender.map_frame, sender.odom_frame, c["p_world_base"] - rotate(q, p_odom), q),
+        (sender.odom_frame, sender.base_frame, p_odom, q_odom),
+    ]
+    if sender.wheels is not None and "wheel_angle" in c:
+        for wheel, angle in zip(sender.wheels, c["wheel_angle"].T, strict=True):
+            half = angle[:, None] / 2
+            turn = np.concatenate([np.sin(half) * np.array(wheel.axis), np.cos(half)], axis=1)
+            p = np.broadcast_to(np.array(wheel.p), (len(stamp), 3))
+            chain.append((wheel.parent, wheel.name, p, quat_multiply(wheel.q_xyzw, turn)))
+    return _transform_fields(stamp, chain)
+
+
+def _static(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
+    links = [(link.parent, link.name, np.array(link.p), np.array(link.q_xyzw)) for link in sender.links]
+    return _transform_fields(stamp, links)
+
+
+def scan_fields(ranges_m: NDArray[np.float32], stamp: NDArray[np.int64], sender: Sender) -> Fields:
+    """LaserScans of ranges along `magtwin.sim.sensors.lidar.ray_angles`; all rays of a scan have one stamp.
+
+    Args:
+        ranges_m: Ranges [m], shape (S, rays), as in REP 117.
+        stamp: Time of each scan [ns], shape (S,).
+        sender: The robot.
+    """
+    step = 2 * np.pi / ranges_m.shape[1]
+    return {
+        **_header(stamp, sender.lidar_frame),
+        "angle_min": -np.pi,
+        "angle_max": np.pi - step,
+        "angle_increment": step,
+        "scan_time": 1 / sender.scan_rate_hz if sender.scan_rate_hz else 0.0,
+        "range_min": sender.range_m[0],
+        "range_max": sender.range_m[1],
+        "ranges": ranges_m,
+    }
+
+
+def _pose_at(prefix: str) -> dict[str, str]:
+    return {"mocap_p": f"{prefix}position", "mocap_q_xyzw": f"{prefix}orientation"}
+
+
+_FIELD = "sensor_msgs/msg/MagneticField"
+
+POSE = Topic(
+    name="/robot/enu/pose",
+    kind="geometry_msgs/msg/PoseStamped",
+    needs=("mocap_p", "mocap_q_xyzw"),
+    carried=True,
+    lost="flag_pose_lost",
+    write=_pose,
+    reads={
+        "geometry_msgs/msg/PoseStamped": _pose_at("pose."),
+        "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_at("pose.pose."),
+        "geometry_msgs/msg/TransformStamped": {
+            "mocap_p": "transform.translation",
+            "mocap_q_xyzw": "transform.rotation",
+        },
+        "nav_msgs/msg/Odometry": _pose_at("pose.pose."),
+    },
+)
+ODOMETRY = Topic(
+    name="/robot/odom",
+    kind="nav_msgs/msg/Odometry",
+    qos=SENSOR_DATA,
+    needs=("odom_p", "odom_q_xyzw", "odom_v", "odom_w"),
+    carried=True,
+    write=_odometry,
+    reads={
+        "nav_msgs/msg/Odometry": {
+            "odom_p": "pose.pose.position",
+            "odom_q_xyzw": "pose.pose.orientation",
+            "odom_v": "twist.twist.linear",
+            "odom_w": "twist.twist.angular",
+        }
+    },
+)
+IMU = Topic(
+    name="/robot/imu",
+    kind="sensor_msgs/msg/Imu",
+    qos=SENSOR_DATA,
+    needs=("imu_q_xyzw", "imu_w", "imu_a"),
+    carried=True,
+    write=_imu,
+    reads={
+        "sensor_msgs/msg/Imu": {
+            "imu_q_xyzw": "orientation",
+            "imu_w": "angular_velocity",
+            "imu_a": "linear_acceleration",
+        }
+    },
+)
+BATTERY = Topic(
+    name="/robot/battery_state",
+    kind="sensor_msgs/msg/BatteryState",
+    qos=SENSOR_DATA,
+    needs=("battery_v", "battery_a", "battery_fraction"),
+    carried=True,
+    every_s=4.0,
+    write=_battery,
+    reads={
+        "sensor_msgs/msg/BatteryState": {
+            "battery_v": "voltage",
+            "battery_a": "current",
+            "battery_fraction": "percentage",
+        }
+    },
+)
+MAGNITUDE = Topic(
+    name="/robot/qtfm/magnitude",
+    kind=_FIELD,
+    needs=("b_measured_nt",),
+    carried=True,
+    sent="each",
+    write=_magnitude,
+    reads={
+        _FIELD: {"magnetic_field": "magnetic_field"},
+        "std_msgs/msg/Float64": {"magnetic_field": "data"},
+        "std_msgs/msg/Float32": {"magnetic_field": "data"},
+    },
+)
+VECTOR = Topic(
+    name="/robot/qtfm/field",
+    kind=_FIELD,
+    needs=("b_vector_measured_nt",),
+    carried=True,
+    sent="each",
+    write=_field,
+    reads={_FIELD: {"magnetic_field": "magnetic_field"}},
+)
+COMMAND = Topic(
+    name="/robot/cmd_vel",
+    kind="geometry_msgs/msg/Twist",
+    needs=("v_cmd", "w_cmd"),
+    write=_command,
+    reads={
+        "geometry_msgs/msg/Twist": {"v_cmd": ("linear", 0), "w_cmd": ("angular", 2)},
+        "geometry_msgs/msg/TwistStamped": {"v_cmd": ("twist.linear", 0), "w_cmd": ("twist.angular", 2)},
+    },
+)
+JOINTS = Topic(
+    name="/robot/joint_states",
+    kind="sensor_msgs/msg/JointState",
+    needs=("wheel_angle",),
+    sent="ticks",
+    every_s=1 / 62,
+    write=_joints,
+    reads={"sensor_msgs/msg/JointState": {"names": "name", "angles": "position"}},
+)
+TF = Topic(
+    name="/tf",
+    kind="tf2_msgs/msg/TFMessage",
+    qos=Qos(depth=100),
+    needs=("odom_p", "odom_q_xyzw", "p_world_base", "q_world_base_xyzw"),
+    sent="ticks",
+    every_s=1 / 62,
+    write=_transforms,
+)
+CLOCK = Topic(
+    name="/clock",
+    kind="rosgraph_msgs/msg/Clock",
+    qos=Qos(depth=1, reliable=False),
+    needs=("t",),
+    sent="ticks",
+    every_s=0.025,
+    write=lambda c, stamp, sender: {"clock": stamp},
+)
+TF_STATIC = Topic(name="/tf_static", kind="tf2_msgs/msg/TFMessage", qos=LATCHED, sent="once", write=_static)
+DESCRIPTION = Topic(
+    name="/robot/robot_description",
+    kind="std_msgs/msg/String",
+    qos=LATCHED,
+    sent="once",
+    write=lambda c, stamp, sender: {"data": sender.description},
+)
+SCAN = Topic(
+    name="/robot/scan",
+    kind="sensor_msgs/msg/LaserScan",
+    qos=SENSOR_DATA,
+    write=lambda c, stamp, sender: scan_fields(c["ranges_m"], stamp, sender),
+    reads={"sensor_msgs/msg/LaserScan": {"stamp": "header.stamp"}},
+)
+NAMES = Topic(
+    name="/magtwin/columns",
+    kind="std_msgs/msg/String",
+    qos=LATCHED,
+    sent="once",
+    write=lambda c, stamp, sender: {},  # `magtwin.io.bags.stream.Stream` fills in the table
+)
+READING = Topic(
+    name="/magtwin/reading",
+    kind="std_msgs/msg/Float64MultiArray",
+    sent="each",
+    write=lambda c, stamp, sender: {"data": c["data"]},
+)
+
+TOTAL_FIELD = Topic(
+    name="/robot/qtfm/total_field_nt",
+    kind="std_msgs/msg/Float64",
+    needs=("b_measured_nt",),
+    sent="each",
+    write=lambda c, stamp, sender: {"data": c["b_measured_nt"]},
+)
+"""The magnitude in nT, whatever the unit of the other topics; live robots only. In bags, use MAGNITUDE."""
+
+TOPICS: Mapping[str, Topic] = MappingProxyType(
+    {
+        topic.name: topic
+        for topic in (
+            *(POSE, ODOMETRY, IMU, BATTERY, MAGNITUDE, VECTOR, COMMAND, JOINTS, SCAN),
+            *(TF, TF_STATIC, DESCRIPTION, CLOCK, NAMES, READING),
+        )
+    }
+)
+"""Topics by name. /magtwin/reading holds the columns that no ROS message carries, in the order that
+/magtwin/columns gives."""

@@ -1,0 +1,112 @@
+"""Custom sensors, interference, controllers and engines, as a user registers them."""
+
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.errors import InputError
+from magtwin.path import path_named
+from magtwin.run.run import Column
+from magtwin.sim import extensions
+from magtwin.sim.motion.drive import Motion
+from magtwin.sim.motion.engine import ENGINES, KINEMATIC
+from magtwin.sim.runs.simulate import simulate
+from magtwin.twin import Twin, open_twin
+
+
+@extensions.sensor("test_speedometer")
+class Speedometer:
+    columns = MappingProxyType({"speed_m_s": Column("m/s", "base_link", "measured forward speed")})
+
+    def __init__(self, scene, rng):
+        self.rng = rng
+
+    def sense(self, motion, t, until_s=None):
+        return {"speed_m_s": motion.at(t).v + 0.01 * self.rng.standard_normal(len(t))}
+
+
+@extensions.interference("test_pump")
+def pump_nt(columns, robot, rng):
+    hum = 300.0 * np.sin(2 * np.pi * 0.8 * columns["t"])
+    return np.column_stack([0 * hum, 0 * hum, hum])
+
+
+@extensions.controller("test_straight_on")
+class StraightOn:
+    def __init__(self, path, drive, speed):
+        self.speed, self.done = speed, False
+
+    def command(self, t, x, y, yaw, v, w):
+        self.done = t > 2.0
+        return (0.0 if self.done else self.speed), 0.0
+
+
+@pytest.fixture(scope="module")
+def twin(lab_scene) -> Twin:
+    return open_twin(lab_scene, magnetometer="physical")
+
+
+def run_of(twin, **options):
+    path = options.pop("path", path_named("figure8"))
+    rng = np.random.default_rng(0)
+    return simulate(twin.scene, path, anomaly_map=twin.field, rng=rng, duration_s=5.0, **options)
+
+
+def test_a_registered_sensor_adds_its_columns_and_changes_no_others(twin):
+    run, plain = run_of(twin, sensors=["test_speedometer"]), run_of(twin)
+    assert run.spec("speed_m_s").unit == "m/s"
+    assert np.std(run["speed_m_s"] - run["v_base"][:, 0]) == pytest.approx(0.01, rel=0.1)
+    for name in plain:
+        assert_array_equal(run[name], plain[name], err_msg=name)
+
+
+def test_a_factory_is_taken_as_well_and_a_column_that_exists_is_refused(twin):
+    assert "speed_m_s" in run_of(twin, sensors=[Speedometer])
+    with pytest.raises(InputError, match="add the column 'speed_m_s', which exists already"):
+        run_of(twin, sensors=[Speedometer, "test_speedometer"])
+    with pytest.raises(InputError, match="no sensor 'test_speedometr'; did you mean 'test_speedometer'"):
+        run_of(twin, sensors=["test_speedometr"])
+
+
+def test_an_interference_term_is_added_to_the_field_at_the_sensor(twin):
+    run, plain = run_of(twin, interference=["test_pump"]), run_of(twin)
+    added = run["b_vector_nt"] - plain["b_vector_nt"]
+    assert_allclose(
+        np.linalg.norm(added, axis=1), np.abs(300 * np.sin(2 * np.pi * 0.8 * run["t"])), atol=1e-6
+    )
+    assert_allclose(run["b_truth_nt"], np.linalg.norm(run["b_vector_nt"], axis=1))
+    assert_allclose(run["b_total_nt"], run["b_truth_nt"])
+
+
+def test_interference_is_added_to_what_a_network_predicts(twin):
+    def none(run):
+        return np.zeros(run.rows)
+
+    off = run_of(twin, interference=[pump_nt], disturbance_nt=none)["b_disturbance_nt"]
+    assert np.ptp(off) > 100
+    assert np.abs(off).max() < 301
+
+
+def test_a_registered_controller_drives_by_its_name(twin):
+    run = run_of(twin, controller="test_straight_on")
+    assert run.metadata["controller"] == "test_straight_on"
+    moved = run["p_world_base"][-1] - run["p_world_base"][0]
+    assert np.hypot(*moved[:2]) == pytest.approx(0.4, abs=0.05)
+    assert np.ptp(run["yaw"]) < 0.05
+
+
+def test_a_registered_engine_moves_the_robot(twin):
+    class Frozen:
+        name = "frozen"
+
+        def drive(self, closed_loop, controller, obstacles):
+            still = np.zeros(closed_loop.steps)
+            return Motion(closed_loop.drive, closed_loop.dt, still, still, closed_loop.pose0)
+
+    extensions.engine("test_frozen")(Frozen())
+    run = run_of(twin, engine=ENGINES["test_frozen"])
+    assert run.metadata["engine"] == "frozen"
+    assert np.ptp(run["p_world_base"], axis=0).max() == 0
+    assert ENGINES["kinematic"] is KINEMATIC
