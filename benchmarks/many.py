@@ -1,7 +1,7 @@
 """Many robots through the neural magnetometer, against the network alone; and the closed loop of many.
 
 Each robot drives a figure of eight for 60 s at 135 Hz, 8,100 readings, with a seed and a session of its own,
-through a 20-512-512-512-512-1 network. The yardstick is `NeuralMagnetometer.predict` on as many rows, in the
+through a 20-512-512-512-512-1 network. The yardstick is the network's `predict` on as many rows, in the
 chunking that the runs use: what a data set costs when its inputs are there already. Kept are poses and
 readings, as for a map or a filter; `--exact` keeps every column. Both are measured in turn in one process,
 by the clock and by the processors' time, which other work on the machine disturbs less; ratios are medians

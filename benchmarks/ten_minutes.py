@@ -121,7 +121,7 @@ def parts_of_run(twin: Twin, run: magtwin.Run) -> dict[str, float]:
     x = features(run, twin.magnetometer.features)
     return {
         "  features": seconds(lambda: features(run, twin.magnetometer.features)),
-        "  network": seconds(lambda: twin.magnetometer.predict(x)),
+        "  network": seconds(lambda: twin.magnetometer.net.predict(x)),
         "  map": seconds(lambda: twin.field.lookup(run["p_world_base"][:, :2], run["yaw"])),
     }
 

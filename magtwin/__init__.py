@@ -25,6 +25,11 @@ if TYPE_CHECKING:
     from magtwin.io.formats import write_run as save_run
     from magtwin.io.surveys.readings import load_readings as read_survey
     from magtwin.io.sweeps import save_runs as save_runs
+    from magtwin.learn.models.predictor import load_predictor as load_predictor
+    from magtwin.learn.training.train import train as train
+    from magtwin.learning import build_dataset as build_dataset
+    from magtwin.learning import error_budget as error_budget
+    from magtwin.learning import evaluate as evaluate
     from magtwin.run.run import COLUMNS as COLUMNS
     from magtwin.run.run import Run as Run
     from magtwin.spec.scene import Scene as Scene
@@ -48,10 +53,14 @@ _NAMES = {
     "Scene": "spec.scene",
     "Twin": "twin",
     "author_scene": "twin",
+    "build_dataset": "learning",
+    "error_budget": "learning",
+    "evaluate": "learning",
     "fit_map": "field.fit.fit:fit",
     "from_urdf": "author.from_urdf",
     "in_session": "twin",
     "load_map": "usd.maps",
+    "load_predictor": "learn.models.predictor",
     "load_run": "io.formats:read_run",
     "open_twin": "twin",
     "plot": "figures.plot",
@@ -63,6 +72,7 @@ _NAMES = {
     "simulate": "twin",
     "simulate_robots": "twin",
     "sweep": "twin",
+    "train": "learn.training.train",
 }
 """Module of each public name, and its name there if it differs."""
 
@@ -75,10 +85,14 @@ __all__ = [
     "Scene",
     "Twin",
     "author_scene",
+    "build_dataset",
+    "error_budget",
+    "evaluate",
     "fit_map",
     "from_urdf",
     "in_session",
     "load_map",
+    "load_predictor",
     "load_run",
     "open_twin",
     "plot",
@@ -90,6 +104,7 @@ __all__ = [
     "simulate",
     "simulate_robots",
     "sweep",
+    "train",
 ]
 
 

@@ -1,4 +1,4 @@
-"""Files: where magtwin's own lie, how outputs are written, checksums, settings in TOML."""
+"""Files: those shipped with magtwin, outputs, checksums, and settings in TOML."""
 
 import dataclasses
 import difflib
@@ -21,7 +21,7 @@ from magtwin.errors import InputError, hint
 T = TypeVar("T")
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
-"""What an operating system says of a disk that takes no more."""
+"""Errors of a disk that is full or read-only."""
 
 _COMMIT = re.compile("[0-9a-f]{40}|[0-9a-f]{64}")
 
@@ -29,22 +29,22 @@ _COMMIT = re.compile("[0-9a-f]{40}|[0-9a-f]{64}")
 def shipped(*parts: str) -> Path:
     """A file or folder that ships with magtwin: `shipped("maps", "lab")`.
 
-    `robots/`, `maps/`, `scenes/` and `weights/` stand at the top of a checkout, and inside the
-    package, under `_shipped/`, where magtwin was installed from a wheel.
+    `robots/`, `maps/`, `scenes/` and `weights/` are at the top of a checkout, or in the package under
+    `_shipped/` if magtwin was installed from a wheel.
     """
     package = Path(__file__).resolve().parent
     root = package / "_shipped"
     path = (root if root.is_dir() else package.parent).joinpath(*parts)
     if not path.exists():
-        raise InputError(f"{path}: not there; magtwin's own files are missing, install it again")
+        raise InputError(f"{path}: missing; reinstall magtwin")
     return path
 
 
 def existing(path: str | os.PathLike[str], what: str) -> Path:
-    """`path` if it is there.
+    """`path` if it exists.
 
     Raises:
-        InputError: It is not; the text says what was expected of it.
+        InputError: It does not exist; the text names the expected kind of file and a similar name.
     """
     path = Path(path)
     if not path.exists():
@@ -55,10 +55,10 @@ def existing(path: str | os.PathLike[str], what: str) -> Path:
 
 
 def check_free(path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """`path` if it may be written: nothing is there yet, or `force` was given.
+    """`path` if it does not exist yet, or if `force` is True.
 
     Raises:
-        InputError: It exists and `force` was not given.
+        InputError: It exists and `force` is False.
     """
     path = Path(path)
     if path.exists() and not force:
@@ -70,24 +70,24 @@ def check_free(path: str | os.PathLike[str], *, force: bool = False) -> Path:
 
 @contextmanager
 def output(path: str | os.PathLike[str], *, force: bool = False) -> Iterator[Path]:
-    """A path beside `path` to write a file or a folder to; it takes the place of `path` at the end.
+    """Write a file or a folder aside; it replaces `path` at the end of the block.
 
-    Nothing is left behind when the block raises, so no half-written output is ever seen. Give the
-    yielded name the suffix of the target (it has it) and create the file or folder yourself.
+    Create the file or folder at the yielded path, which has the suffix of `path`. If the block raises,
+    nothing is left behind, so no output is ever half-written.
 
     Args:
         path: The file or folder to make. Its parents are created.
-        force: Whether one that exists is replaced.
+        force: Whether to replace an existing file or folder.
 
     Raises:
-        InputError: It exists and `force` was not given, its folder cannot be written, or the disk is full.
+        InputError: It exists and `force` is False, its folder cannot be written, or the disk is full.
     """
     path = check_free(path, force=force)
-    place = Path.cwd() / path  # the working folder may itself be renamed
+    place = Path.cwd() / path  # absolute, since the working folder can be renamed
     if place.resolve() in (Path.cwd(), *Path.cwd().parents):
-        raise InputError(f"{path}: is the working folder or holds it; name a folder inside it")
+        raise InputError(f"{path}: is the working folder or contains it; give a folder inside it")
     if path.exists() and not (path.is_file() or path.is_dir()):
-        raise InputError(f"{path}: a device or pipe, which cannot be replaced; name a file")
+        raise InputError(f"{path}: a device or pipe, which cannot be replaced; give a file")
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         aside = Path(tempfile.mkdtemp(prefix=f".{place.name}.", dir=place.parent))
@@ -98,7 +98,7 @@ def output(path: str | os.PathLike[str], *, force: bool = False) -> Iterator[Pat
         yield new
         if place.exists() and place.is_dir() != new.is_dir():
             kind = "folder" if place.is_dir() else "file"
-            raise InputError(f"{path}: is a {kind}, which this output will not replace; remove it first")
+            raise InputError(f"{path}: is a {kind}, and the output is not; remove it first")
         if place.is_dir():
             place.rename(old)
             try:
@@ -123,14 +123,14 @@ def sha256(path: str | os.PathLike[str]) -> str:
 
 
 def git_revision(folder: str | os.PathLike[str]) -> str:
-    """The commit that the Git checkout around a folder is at, or "" where there is no checkout.
+    """The commit of the Git checkout that contains a folder, or "" if there is none.
 
-    Read from `.git` itself: no program is started, and no setting of the checkout is obeyed.
+    It is read from `.git` itself, without starting a program.
     """
     for place in (here := Path(folder).resolve(), *here.parents):
         git = place / ".git"
         try:
-            if git.is_file():  # a worktree or a submodule, whose own folder lies elsewhere
+            if git.is_file():  # a worktree or a submodule, whose folder is elsewhere
                 git = place / git.read_text(encoding="utf-8").removeprefix("gitdir:").strip()
             elif not git.is_dir():
                 continue
@@ -141,7 +141,7 @@ def git_revision(folder: str | os.PathLike[str]) -> str:
 
 
 def _commit_of(git: Path) -> str:
-    """The commit that HEAD of a repository names, "" where it names none yet."""
+    """The commit of HEAD, or "" if there is none yet."""
     head = (git / "HEAD").read_text(encoding="utf-8").strip()
     if _COMMIT.fullmatch(head):
         return head
@@ -166,7 +166,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The tables of a TOML file.
 
     Raises:
-        InputError: The file is missing, or is not TOML; the text gives the line.
+        InputError: The file is missing or not TOML; the text has the line.
     """
     path = existing(path, "TOML file")
     if path.is_dir():
@@ -180,18 +180,18 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
 def from_table(
     cls: type[T], table: dict[str, Any], path: str | os.PathLike[str], section: str = "", number: int = 0
 ) -> T:
-    """A dataclass made from a table of a TOML file, every key and type checked.
+    """A dataclass from a table of a TOML file, with every key and type checked.
 
     Args:
-        cls: The dataclass; nested dataclasses are nested tables, tuples of them are arrays of tables.
-        table: What `read_toml` gave, or a part of it.
-        path: The file, for refusals; relative `Path` fields are taken from its folder.
-        section: Name of the table in the file, for refusals.
-        number: Which of several tables of that name it is, from 0.
+        cls: The dataclass. A nested dataclass is a nested table, a tuple of dataclasses an array of tables.
+        table: The result of `read_toml`, or a part of it.
+        path: The file, for error messages; `Path` fields are relative to its folder.
+        section: Name of the table in the file, for error messages.
+        number: Index among tables of that name.
 
     Raises:
-        InputError: A key that the class does not have (the nearest one is named), a missing key, or
-            a value of the wrong type or range, each with file and line.
+        InputError: A key is unknown or missing, or a value has the wrong type or range; the text has file and
+            line.
     """
     where = _Where(Path(path), section, number)
     hints = typing.get_type_hints(cls)
@@ -216,21 +216,21 @@ def from_table(
 def refused_at(
     path: str | os.PathLike[str], key: str, text: str, *, section: str = "", number: int = 0
 ) -> InputError:
-    """A refusal that names the line of a key in a TOML file.
+    """An error with the line of a key in a TOML file.
 
     Args:
         path: The file.
         key: The key.
         text: What is wrong, and what to do.
-        section: Name of the table that holds the key; "" for the top.
-        number: Which of several tables of that name it is, from 0.
+        section: Name of the key's table; "" for the top.
+        number: Index among tables of that name.
     """
     return _Where(Path(path), section, number).refused(key, text)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Where:
-    """A table of a TOML file, for refusals that name the line."""
+    """A table of a TOML file, for errors that name the line."""
 
     path: Path
     section: str
@@ -262,8 +262,8 @@ class _Where:
 
 
 def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
-    """`value` as the annotation `kind` says."""
-    wrong = where.refused(key, f"{key} must be {_say(kind)}, got {value!r}")
+    """`value` checked and converted to the annotation `kind`."""
+    wrong = where.refused(key, f"{key} must be {_in_words(kind)}, got {value!r}")
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         return _value(next(a for a in args if a is not type(None)), value, where, key)
@@ -296,7 +296,7 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
             raise wrong
         return {name: _value(args[1], entry, where, name) for name, entry in value.items()}
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
-        if not abs(value) < 1e300:  # nan, inf, and whole numbers that no float holds
+        if not abs(value) < 1e300:  # nan, inf, and too large integers
             raise wrong
         return float(value)
     if kind is Path and isinstance(value, str):
@@ -306,7 +306,7 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
     raise wrong
 
 
-def _say(kind: Any) -> str:
+def _in_words(kind: Any) -> str:
     """An annotation in words."""
     words = {
         float: "a number",
@@ -318,8 +318,8 @@ def _say(kind: Any) -> str:
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if origin is tuple:
         if args[-1] is Ellipsis:
-            return f"a list, each {_say(args[0])}"
-        return f"a list of {len(args)}, each {_say(args[0])}"
+            return f"a list, each {_in_words(args[0])}"
+        return f"a list of {len(args)}, each {_in_words(args[0])}"
     if origin in (typing.Union, types.UnionType):
-        return _say(next(a for a in args if a is not type(None)))
+        return _in_words(next(a for a in args if a is not type(None)))
     return words.get(kind, "a table")

@@ -136,7 +136,7 @@ def test_sha256_is_that_of_fips_180_abc(tmp_path):
 
 def test_shipped_files_are_found_and_missing_ones_refused():
     assert shipped("robots", "turtlebot4", "robot.toml").is_file()
-    with pytest.raises(InputError, match="install it again"):
+    with pytest.raises(InputError, match="reinstall magtwin"):
         shipped("robots", "nobody")
 
 

@@ -15,10 +15,12 @@ from magtwin.field.fit.fit import fit
 from magtwin.field.maps.difference import difference
 from magtwin.field.survey.readings import Readings
 from magtwin.files import shipped
+from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import build_dataset
-from magtwin.learn.data.labels import Alignment
 from magtwin.learn.data.split import split
-from magtwin.learn.evaluation.evaluate import Contender, Mean, Trial, chart_of, evaluate
+from magtwin.learn.evaluation.candidates import Candidate, Mean, named_map
+from magtwin.learn.evaluation.evaluate import evaluate
+from magtwin.learn.evaluation.trials import Trial
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.models.predictor import load_predictor
 from magtwin.learn.training.config import TrainConfig
@@ -59,13 +61,16 @@ def learnt(twin, run, tmp_path_factory):
     config = TrainConfig(model="linear", features="circular")
     parts = split(data.recordings, config.split, rng=np.random.default_rng(0))
     trained = train(config, data, parts, rng=np.random.default_rng(0))
-    chart = chart_of("lab", twin.field)
-    models = [
-        Contender("naive", Mean(0.0, 1.0), chart),
-        Contender("net", NeuralMagnetometer(trained.predictor), chart),
-    ]
+    chart = named_map("lab", twin.field)
+    baseline = Candidate("naive", Mean(0.0, 1.0), chart)
+    models = [Candidate("net", NeuralMagnetometer(trained.predictor), chart)]
     trials = [Trial(name, lambda run=run: run) for name, run in runs.items()]
-    return data, parts, trained, evaluate(models, trials, rng=np.random.default_rng(0), truth=True)
+    return (
+        data,
+        parts,
+        trained,
+        evaluate(models, trials, baseline=baseline, rng=np.random.default_rng(0), truth=True),
+    )
 
 
 def nouns(twin, run, learnt):
@@ -109,8 +114,8 @@ def nouns(twin, run, learnt):
         "evaluation": evaluation,
         "judged": evaluation.judged[0],
         "case": evaluation.cases[0],
-        "contender": evaluation.contenders[1],
-        "chart": evaluation.charts[0],
+        "candidate": evaluation.candidates[1],
+        "chart": evaluation.maps[0],
     }
     return named | {file.stem: load_predictor(file) for file in WEIGHTS}
 

@@ -1,16 +1,16 @@
-"""The paper's protocol on a twin: survey it, drive it, train, and judge on days and paths never seen.
+"""The paper's protocol on a twin: survey it, drive it, train, and evaluate on new sessions and paths.
 
     python weights/protocol.py --out FOLDER [--lab lab|aprilab] [--ship]
 
-Every step is a command of magtwin's, and is printed. Nothing under test looks at the truth: maps are fitted
-to a survey that the twin's robot makes, labels are what it measured less these maps, where motion capture
-saw it, and the robot is drawn anew for each day of training and each day of test. The hybrid network of the
-default lab learns on the lab's own map, maps/lab/lab.usdc, which maps/lab/build.py fitted to such a survey.
-FOLDER gets maps, recordings, data sets, weights with their cards, and the report. --ship puts the weights of
-the default lab beside this file.
+Every step is a command of magtwin and is printed. No step under test uses the truth: maps are fitted to a
+survey by the twin's robot, labels are its readings minus these maps at the poses of motion capture, and the
+robot is drawn anew for each session of training and test. The hybrid network of the default lab learns on the
+lab's own map, maps/lab/lab.usdc, which maps/lab/build.py fitted to such a survey. FOLDER gets maps,
+recordings, data sets, weights with model cards, and the report. --ship copies the weights of the default lab
+beside this file.
 
-aprilab is the published survey's laboratory as a twin, for which the survey is needed (`magtwin fetch
-aprilab`): dipoles that explain the survey, and small iron below the floor that no survey of 0.25 m resolves.
+aprilab is a twin of the laboratory of the published survey, which it needs (`magtwin fetch aprilab`): dipoles
+fitted to the survey, and small iron below the floor that a survey with a spacing of 0.25 m does not resolve.
 """
 
 import argparse
@@ -37,53 +37,53 @@ from magtwin.usd.robot import load_robot
 
 CONSOLE = Console()
 
-SURVEY = ("--heading-error", "7", "--position-error", "0.015", "--readings", "135")
-"""How the robot stands about a node: the published survey's recorded headings are 5 to 11 deg off its
-nominal ones, and what its four headings leave at a node, 79 nT, is 1.5 cm of the lab's gradient."""
+SURVEY = ("--heading-error-deg", "7", "--position-error-m", "0.015", "--readings", "135")
+"""Errors of the robot's pose at a node: headings in the published survey are 5 to 11 deg off, and the
+residual of its four headings at a node, 79 nT, equals 1.5 cm of the lab's gradient."""
 
 TRAINING = ("sine", "lawnmower", "figure8", "continuous_cycle", "random")
-"""What is driven to learn from: the paper's kinds, and a driver at random for its manual drives."""
+"""Training paths: the paper's kinds, and random driving for its manual drives."""
 
-DAYS, RUNS, SECONDS, RATE_HZ = 12, 75, 60, 20
-"""Of the training: 75 min, as published; neighbours at 135 Hz are too alike to be worth their time."""
+SESSIONS, RUNS, SECONDS, RATE_HZ = 12, 75, 60, 20
+"""Training recordings: 75 min, as published. Readings at 135 Hz are too correlated to be worth the time."""
 
-TEST_DAYS = 12
-"""Other days, on each of which the robot drives the paths of the paper's Table 1 once."""
+TEST_SESSIONS = 12
+"""Test sessions, in each of which the robot drives the paths of the paper's Table 1 once."""
 
 SCRAPS, SCRAP_SEED = 60, 5
-"""Small iron below the floor of the published lab's twin, and the seed of where it lies."""
+"""Number of pieces of small iron below the floor of aprilab, and their seed."""
 
 LEVEL = 1.45
-"""What the level parts of what moving and the LiDAR add are multiplied by in the published laboratory's
-twin, whose steeper field shows less of them. A choice, by two published figures: the paper's network leaves
-0.81 of the naive error, here 0.967 at 1 and 0.885 at 1.45, and labels spread by 525 nT, here by 556."""
+"""Factor of the horizontal fields of motion and LiDAR in aprilab, whose steeper field shows less of them. It
+is chosen by two published figures: the paper's network has 0.81 of the naive error (here 0.967 at a factor of
+1, 0.885 at 1.45), and labels spread by 525 nT (here 556)."""
 
 SHIPPED = ("turtlebot4_paper", "turtlebot4_hybrid")
 
 
 def do(*words: object) -> None:
-    """Print a command of magtwin's, and do it."""
-    told = [str(word) for word in words]
-    CONSOLE.print(f"\n$ magtwin {shlex.join(told)}", markup=False, highlight=False)
-    magtwin(told)
+    """Print a command of magtwin and run it."""
+    command = [str(word) for word in words]
+    CONSOLE.print(f"\n$ magtwin {shlex.join(command)}", markup=False, highlight=False)
+    magtwin(command)
 
 
 def aprilab(surveys: Path, out: Path) -> Path:
-    """Author the published survey's laboratory as a twin; returns its stage.
+    """Author the laboratory of the published survey as a twin; returns its stage.
 
-    Its field is that of the dipoles that a harmonic fit puts below the floor, the Earth's as the fit finds
-    it, and of `SCRAPS` cuboids of iron, up to 8 cm long, 5 to 15 cm deep: finer than a survey can tell.
+    Its field is that of the dipoles and the uniform field of a harmonic fit, and of `SCRAPS` cuboids of iron,
+    up to 8 cm long and 5 to 15 cm deep, which the survey cannot resolve.
     """
     robot = load_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))
     height = robot.base_height_m + robot.p_base_magnetometer[2]
     about = read_toml(shipped("maps", "lab", "map.toml"))
     where = from_table(EarthFieldSpec, about["earth"], shipped("maps", "lab", "map.toml"), "earth")
     readings = read_readings(surveys).with_(height_m=height, earth_nt=where.b_world_nt)
-    found = raster(fit(readings, "harmonic"), readings, spacing_m=0.25).harmonic
-    assert found is not None
+    field = raster(fit(readings, "harmonic"), readings, spacing_m=0.25).harmonic
+    assert field is not None
     sources = [
         SourceSpec(name=f"dipole_{k}", p_world=tuple(map(float, p)), m_world=tuple(map(float, m)))
-        for k, (p, m) in enumerate(zip(found.p_world_dipole, found.m_world, strict=True))
+        for k, (p, m) in enumerate(zip(field.p_world_dipole, field.m_world, strict=True))
     ]
     rng = np.random.default_rng(SCRAP_SEED)
     for k in range(SCRAPS):
@@ -111,7 +111,7 @@ def aprilab(surveys: Path, out: Path) -> Path:
         map_layer=layer,
         robot=replace(robot, platform=replace(robot.platform, **level)),
         earth=EarthFieldSpec(
-            b_world_nt=tuple(map(float, found.b_uniform_nt)),
+            b_world_nt=tuple(map(float, field.b_uniform_nt)),
             latitude_deg=where.latitude_deg,
             longitude_deg=where.longitude_deg,
             height_m=where.height_m,
@@ -136,10 +136,10 @@ def protocol(
 
     Args:
         stage: The twin.
-        out: Folder of all that is made.
-        harmonic: Harmonic map for the hybrid to learn on; default: one fitted to the survey.
-        released: The released network, to judge it too.
-        shorter: Part of the drives and of the epochs that is left out: 1 for none.
+        out: Folder of all outputs.
+        harmonic: Harmonic map for the hybrid. Default: fitted to the survey.
+        released: The released network, to evaluate too.
+        shorter: Divisor of the number of drives and epochs.
     """
     by_physics = ("--magnetometer", "physical", "--rate-hz", RATE_HZ)
     survey, trilinear = out / "survey.parquet", out / "trilinear.usdc"
@@ -149,16 +149,35 @@ def protocol(
         harmonic = out / "harmonic.usdc"
         do("map", "fit", survey, "--method", "harmonic", "--out", harmonic)
     do(
-        *("runs", stage, "--out", out / "train", "--count", RUNS // shorter, "--sessions", DAYS),
-        *("--duration", SECONDS, "--seed", 1000, *by_physics, "--path", *TRAINING),
+        *("sweep", stage, "--out", out / "train", "--count", RUNS // shorter, "--sessions", SESSIONS),
+        *("--duration-s", SECONDS, "--seed", 1000, *by_physics, "--path", *TRAINING),
     )
     do(
-        *("runs", stage, "--out", out / "test", "--count", 5 * TEST_DAYS // shorter, "--sessions", TEST_DAYS),
+        *(
+            "sweep",
+            stage,
+            "--out",
+            out / "test",
+            "--count",
+            5 * TEST_SESSIONS // shorter,
+            "--sessions",
+            TEST_SESSIONS,
+        ),
         *("--seed", 2000, *by_physics, "--path", *"ABCDE"),
     )
-    by_day = ("--session-by", "fact")
-    do("dataset", "build", out / "train", "--map", trilinear, "--out", out / "paper_set", *by_day)
-    do("dataset", "build", out / "train", "--map", harmonic, "--align", "fit", "--out", out / "hybrid_set")
+    by_session = ("--session-by", "metadata")
+    do("dataset", "build", out / "train", "--map", trilinear, "--out", out / "paper_set", *by_session)
+    do(
+        "dataset",
+        "build",
+        out / "train",
+        "--map",
+        harmonic,
+        "--alignment",
+        "fit",
+        "--out",
+        out / "hybrid_set",
+    )
     weights = [out / f"{name}.safetensors" for name in SHIPPED]
     leak = out / "leak.safetensors"
     licence = ("--licence", "Apache-2.0")
@@ -176,14 +195,16 @@ def protocol(
 
 
 def main() -> None:
-    """Read what is asked for, and do it."""
+    """Run the protocol as given on the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder of all that is made")
+    parser.add_argument("--out", type=Path, required=True, help="folder of all outputs")
     parser.add_argument("--lab", choices=("lab", "aprilab"), default="lab")
     parser.add_argument("--surveys", type=Path, help="folder of the published survey, for --lab aprilab")
-    parser.add_argument("--released", type=Path, help="the released network (.pth), to judge it too")
-    parser.add_argument("--shorter", type=int, default=1, help="a part of all drives, to try the way")
-    parser.add_argument("--ship", action="store_true", help="put the weights beside this file")
+    parser.add_argument("--released", type=Path, help="the released network (.pth), to evaluate too")
+    parser.add_argument(
+        "--shorter", type=int, default=1, help="divisor of the number of drives and epochs, for a trial"
+    )
+    parser.add_argument("--ship", action="store_true", help="copy the weights beside this file")
     given = parser.parse_args()
     if given.out.exists():
         parser.error(f"{given.out} exists; name another folder")

@@ -1,4 +1,4 @@
-"""Robot: an articulation made from a URDF, and back, for scripts and `magtwin robot`; where links stand."""
+"""From URDF: a robot as USD from a URDF, and back."""
 
 import dataclasses
 import os
@@ -22,16 +22,16 @@ __all__ = ["DriveRule", "Options", "Robot", "RobotSettings", "from_urdf", "link_
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot as USD, and how it came about."""
+    """A robot as USD, with the report of its conversion."""
 
     asset: Path
     """Root layer of the articulation."""
 
     spec: RobotSpec | None
-    """What the simulator needs to drive it; none where no settings were given."""
+    """Parameters for the simulator; None without settings."""
 
     report: ConversionReport
-    """What became of every link, joint and geometry."""
+    """Every link, joint and geometry before and after."""
 
 
 def from_urdf(
@@ -43,24 +43,23 @@ def from_urdf(
     thumbnail: Callable[[Path, Path], object] | None = None,
     **choices: Any,
 ) -> Robot:
-    """Convert a URDF or a xacro to a USD articulation that drives.
+    """Convert a URDF or a xacro to a USD articulation that can be driven.
 
     Args:
         urdf: The description.
-        out: Folder to make, which will hold `<name>.usda` and the layers that it refers to.
-        settings: What a URDF cannot say (drive, battery, platform field, sensor mounts), as
-            RobotSettings or a TOML of their fields. Without them the articulation alone is made.
-        force: Whether a folder that exists is replaced.
-        thumbnail: Draws an asset, its first argument, to a PNG, its second, such as
-            `magtwin.figures.pictures.picture_of_stage` does; SimReady assets have one, 256 pixels square.
-        **choices: Fields of `Options`; they come before the conversion that the settings name.
+        out: Folder to create, with `<name>.usda` and the layers that it references.
+        settings: Values that a URDF lacks (drive, battery, platform field, sensor mounts), as RobotSettings
+            or a TOML file of their fields. `None` converts the articulation only.
+        force: Whether to replace an existing folder.
+        thumbnail: Function that draws an asset (first argument) to a PNG (second argument), such as
+            `magtwin.figures.pictures.picture_of_stage`; SimReady assets have one of 256 x 256 pixels.
+        **choices: Fields of `Options`; they override the conversion in the settings.
 
     Returns:
-        The asset, its spec where settings were given, and the report.
+        The asset, its spec if settings were given, and the report.
 
     Raises:
-        InputError: The description or the settings cannot be used, or the folder
-            exists; nothing is written.
+        InputError: The description or the settings are invalid, or the folder exists; nothing is written.
     """
     urdf = existing(urdf, "URDF")
     if settings is not None and not isinstance(settings, RobotSettings):

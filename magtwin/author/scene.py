@@ -209,7 +209,7 @@ def _write_magnetics(scene: Scene, folder: Path) -> list[Path]:
     if scene.earth is None and not scene.sources:
         return []
     path = _part(scene, folder, "magnetics")
-    with new_stage(path, "The sources of the magnetic field: the Earth and magnetised things") as stage:
+    with new_stage(path, "What makes the magnetic field: the Earth and magnetised things") as stage:
         if scene.earth is not None:
             define_earth(stage, EARTH, scene.earth)
         if scene.sources:
@@ -221,7 +221,7 @@ def _write_furniture(scene: Scene, folder: Path) -> list[Path]:
     if not scene.furniture:
         return []
     path = _part(scene, folder, "furniture")
-    with new_stage(path, "Furniture and columns, with their magnetization") as stage:
+    with new_stage(path, "Furniture and columns, and how they are magnetised") as stage:
         define_furniture(stage, scene.furniture)
     return [path]
 

@@ -39,6 +39,7 @@ ALIASES = {
     "map_layer": "map",
     "net": "network",
     "offsets_s": "offset_s",
+    "profile": "target",
 }
 """Options of the command line whose parameter has another name in Python."""
 

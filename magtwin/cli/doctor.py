@@ -62,27 +62,23 @@ def doctor() -> Done:
 
 def diagnose() -> dict[str, Any]:
     """Versions, tools and extras of this installation, as a table for JSON."""
-    tools = {
-        "Rerun viewer": _found(shutil.which("rerun"), "pip install rerun-sdk"),
-        "usdview": _found(
-            shutil.which("usdview"), "a build of OpenUSD; magtwin view opens a window without it"
-        ),
-        "Vulkan": _found(
-            _vulkan(), "apt install mesa-vulkan-drivers libvulkan1; pictures of recordings need it"
-        ),
-        "Newton": _found(_version("newton"), "pip install 'magtwin[physics]'"),
-        "ROS 2, rclpy": _found("installed" if find_spec("rclpy") else "", "source a ROS 2 installation"),
-        "ROS 2, cyclonedds": _found(_version("cyclonedds"), "pip install 'magtwin[ros]'"),
-        "NVIDIA validator": _found(_version("usd-validation-nvidia"), "pip install 'magtwin[validate]'"),
-        "SimReady validator": _found(_version("simready-validate"), "make simready, in a checkout"),
-    }
+    tools = (
+        ("Rerun viewer", shutil.which("rerun"), "pip install rerun-sdk"),
+        ("usdview", shutil.which("usdview"), "a build of OpenUSD; magtwin view opens a window without it"),
+        ("Vulkan", _vulkan(), "apt install mesa-vulkan-drivers libvulkan1; pictures of recordings need it"),
+        ("Newton", _version("newton"), "pip install 'magtwin[physics]'"),
+        ("ROS 2, rclpy", find_spec("rclpy") and "installed", "source a ROS 2 installation"),
+        ("ROS 2, cyclonedds", _version("cyclonedds"), "pip install 'magtwin[ros]'"),
+        ("NVIDIA validator", _version("usd-validation-nvidia"), "pip install 'magtwin[validate]'"),
+        ("SimReady validator", _version("simready-validate"), "make simready, in a checkout"),
+    )
     from magtwin.version import __version__
 
     return {
         "magtwin": __version__,
         "python": sys.version.split()[0],
         "packages": {name: _version(name) or "not installed" for name in PACKAGES},
-        "tools": tools,
+        "tools": {name: found or f"not found; {remedy}" for name, found, remedy in tools},
         "extras": _extras(),
     }
 
@@ -113,10 +109,6 @@ def _line(extra: dict[str, Any]) -> str:
         if extra["installed"]
         else f"missing: {extra['adds']}; {extra['install']}"
     )
-
-
-def _found(what: str | None, otherwise: str) -> str:
-    return what or f"not found; {otherwise}"
 
 
 def _version(package: str) -> str:

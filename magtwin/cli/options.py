@@ -25,11 +25,6 @@ def _session(kind: Any, tokens: Any) -> int | str:
         raise ValueError(f"a session is a whole number, or survey; got {text!r}") from None
 
 
-def flag(text: str) -> Any:
-    """A switch without a negative, with its help."""
-    return Parameter(negative="", help=text)
-
-
 Whole = Annotated[int, Parameter(converter=_whole)]
 Flag = Annotated[bool, Parameter(negative="")]
 Names = Annotated[list[str] | None, Parameter(consume_multiple=True)]

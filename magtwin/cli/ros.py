@@ -328,7 +328,7 @@ def record(
     Parameters
     ----------
     out
-        Folder to make, or a file (.mcap or .db3).
+        Folder to make, or a file (.mcap).
     topic
         Topic to record. May be repeated. Default: all of the robot's.
     """

@@ -8,7 +8,7 @@ from magtwin.figures.canvas import WIDTH_IN, Picture, label, new_figure, open_fr
 from magtwin.figures.evaluation_pictures import MOST_PANELS, ink, trained_models
 from magtwin.figures.page import Section, Table
 from magtwin.learn.evaluation.budget import CLOSED, TERMS, Budget, TrueError
-from magtwin.learn.evaluation.evaluate import Evaluation
+from magtwin.learn.evaluation.evaluation import Evaluation
 
 SAVED, LOST = "#40916c", "#c92a2a"
 """Colours of a step that reduces an error, and of one that increases it."""
@@ -38,7 +38,7 @@ def section_of_budget(
     rows = tuple((b.name, *(term.rms_nt for term in b.terms)) for b in budgets)
     note = "Root mean square of each part of the error [nT]; at each reading, the parts add up to the error."
     sizes = Table("How large each part is", ("model", *TERMS), rows, note)
-    rows = tuple((e.chart, e.mae_nt, e.rms_nt, e.bias_nt) for e in map_errors)
+    rows = tuple((e.map, e.mae_nt, e.rms_nt, e.bias_nt) for e in map_errors)
     note = "Map minus the exact field of the surveying robot at rest, along the recorded paths."
     maps = Table("Errors of the maps", ("map", "MAE [nT]", "RMS [nT]", "mean [nT]"), rows, note)
     tables = (_steps_table(evaluation, order), _budget_table(budgets), sizes, maps)
@@ -51,7 +51,7 @@ def _steps_table(evaluation: Evaluation, order: Sequence[int]) -> Table:
     for k, m in enumerate(order):
         score, before = scores[m], scores[order[max(k - 1, 0)]]
         gain = (before.mae_nt - score.mae_nt, before.ratio - score.ratio) if k else ("", "")
-        chart = evaluation.contenders[m].chart.name
+        chart = evaluation.candidates[m].map.name
         rows.append((evaluation.names[m], chart, score.mae_nt, score.ratio, *gain))
     head = ("model", "map", "MAE [nT]", "ratio to naive", "gain [nT]", "gain in ratio")
     note = "gain: improvement over the row above; negative where the row above was better."

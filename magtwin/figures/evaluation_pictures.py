@@ -23,7 +23,7 @@ from magtwin.figures.maps import mean_field_ut
 from magtwin.figures.training import draw_correlations, label_epochs
 from magtwin.learn.data.correlation import correlations
 from magtwin.learn.data.features import FEATURES, FULL, features
-from magtwin.learn.evaluation.evaluate import Evaluation, Judged
+from magtwin.learn.evaluation.evaluation import Evaluation, Judged
 from magtwin.learn.evaluation.scores import COVERED, LEVEL
 from magtwin.verdict import Z_90
 
@@ -53,8 +53,8 @@ def ink(m: int) -> str:
 
 def trained_models(evaluation: Evaluation) -> list[int]:
     """Indices of at most `MOST_PANELS` models from weights files; if there are none, of all but the naive."""
-    own = [i for i, one in enumerate(evaluation.contenders) if "sha256" in one.metadata]
-    own = own or list(range(1, len(evaluation.contenders))) or [0]
+    own = [i for i, one in enumerate(evaluation.candidates) if "sha256" in one.metadata]
+    own = own or list(range(1, len(evaluation.candidates))) or [0]
     return own if len(own) <= MOST_PANELS else [own[0], *own[1 - MOST_PANELS :]]
 
 
@@ -134,8 +134,8 @@ def floor_plan(evaluation: Evaluation) -> Picture:
     cases = list(dict.fromkeys(one.case for one in evaluation.judged))[:MOST_PANELS]
     shown = [next(one for one in evaluation.judged if one.case == case) for case in cases]
     best = _best(evaluation)
-    chart = evaluation.contenders[best].chart
-    x0, x1, y0, y1 = chart.field.extent
+    named = evaluation.candidates[best].map
+    x0, x1, y0, y1 = named.field.extent
     height = np.clip(2.2 * (y1 - y0) / (x1 - x0), 0.9, 5.0)
     figure = new_figure(WIDTH_IN, 1.0 + (height + 0.35) * len(shown))
     axes = figure.subplots(len(shown), 2, sharex=True, sharey=True, squeeze=False)
@@ -148,9 +148,9 @@ def floor_plan(evaluation: Evaluation) -> Picture:
     ):
         low, high = np.nanquantile(np.concatenate(values), [0.01, 0.99])
         for ax, one, value in zip(axes[:, column], shown, values, strict=True):
-            known, place = mean_field_ut(chart.field), np.isfinite(one.p_xy).all(axis=1)
+            known, place = mean_field_ut(named.field), np.isfinite(one.p_xy).all(axis=1)
             ax.pcolormesh(
-                chart.field.x_m, chart.field.y_m, known, shading="nearest", cmap="Greys", alpha=0.35
+                named.field.x_m, named.field.y_m, known, shading="nearest", cmap="Greys", alpha=0.35
             )
             limits = (0.0 if column else low, high)
             line = coloured_line(ax, one.p_xy[place], value[place], limits, colours, 2.2)
@@ -162,14 +162,14 @@ def floor_plan(evaluation: Evaluation) -> Picture:
         label(axes[-1, column], "x [m]")
     for ax in axes[:, 0]:
         label(ax, y="y [m]")
-    title = f"Figure 7: paths over the map {chart.name} (grey, mean over headings)"
+    title = f"Figure 7: paths over the map {named.name} (grey, mean over headings)"
     return picture(figure, title, file="figure_7", kind="png")
 
 
 def path_errors(evaluation: Evaluation) -> Picture:
     """Figure 6 a and b: errors by path, with their intervals."""
     cases = [case for case in evaluation.cases if case.name != "all"]
-    count = len(evaluation.contenders)
+    count = len(evaluation.candidates)
     figure = new_figure(WIDTH_IN, 2.9 + 0.13 * count)
     ax = figure.subplots()
     width = 0.84 / count

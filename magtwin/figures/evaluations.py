@@ -23,7 +23,7 @@ from magtwin.figures.evaluation_pictures import (
 )
 from magtwin.figures.page import WRITERS, Page, Section, Table
 from magtwin.files import output
-from magtwin.learn.evaluation.evaluate import PAPER, Case, Evaluation
+from magtwin.learn.evaluation.evaluation import PAPER, Case, Evaluation
 from magtwin.learn.evaluation.scores import COVERED, DRAWS, LEVEL
 
 NAME, PICTURES = "evaluation", "figures"
@@ -196,23 +196,23 @@ def _models(evaluation: Evaluation) -> Table:
     rows = tuple(
         (
             one.name,
-            one.chart.name,
+            one.map.name,
             len(one.model.features),
             ", ".join(f"{1000 * part:.1f}" for part in one.alignment.lever_arm_m),
             1000 * one.alignment.latency_s,
             str(one.metadata.get("sha256", ""))[:12],
         )
-        for one in evaluation.contenders
+        for one in evaluation.candidates
     )
     return Table("Models", ("model", "map", "inputs", "lever arm [mm]", "latency [ms]", "SHA-256"), rows)
 
 
 def _maps(evaluation: Evaluation) -> Table:
     rows = []
-    for chart in evaluation.charts:
-        mae, rms = evaluation.floor(chart)
+    for named in evaluation.maps:
+        mae, rms = evaluation.floor(named)
         expected = ("unknown", "unknown") if np.isnan(mae) else (mae, rms)
-        rows.append((chart.name, chart.field.method, *expected, *_map_errors(evaluation, chart.field)))
+        rows.append((named.name, named.field.method, *expected, *_map_errors(evaluation, named.field)))
     head = ("map", "method", "expected MAE [nT]", "expected RMS [nT]", "map alone, MAE [nT]")
     note = (
         "expected: the map's error on these readings, according to its own variances; the noise floor of its "
@@ -223,7 +223,7 @@ def _maps(evaluation: Evaluation) -> Table:
 
 def _map_errors(evaluation: Evaluation, field: AnomalyMap) -> tuple[float, float]:
     """MAE of a map without a model [nT], before and after its mean error on these readings is removed."""
-    m = next(i for i, one in enumerate(evaluation.contenders) if one.chart.field is field)
+    m = next(i for i, one in enumerate(evaluation.candidates) if one.map.field is field)
     error = np.concatenate([one.map_nt[m, one.kept] - one.measured_nt[one.kept] for one in evaluation.judged])
     return float(np.mean(np.abs(error))), float(np.mean(np.abs(error - error.mean())))
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 IN_FOLDER = ("run.rrd", "run.parquet")
 """Runs in a folder that is named as an output; the LiDAR's scans and a picture lie beside them."""
 
-GROWING = (".rrd", ".parquet", ".mcap", ".db3", "")
+GROWING = (".rrd", ".parquet", ".mcap", "")
 """Suffixes of files that grow while a run is shown live; "" is the folder of a bag."""
 
 USD = (".usd", ".usda", ".usdc")
@@ -207,7 +207,7 @@ class Outputs:
 
     def sinks(self, driven: Driven) -> list["Sink"]:
         """Writers that take the run as it comes, one per growing format."""
-        from magtwin.io.bags.rosbag import BagWriter
+        from magtwin.io.bags import BagWriter
         from magtwin.io.rerun.live import RrdWriter
         from magtwin.io.tables import ParquetParts
 
@@ -223,7 +223,7 @@ class Outputs:
                 sinks[".rrd"] = RrdWriter(target, driven.twin, **expected)
             elif target.suffix == ".parquet" and ".parquet" not in sinks:
                 sinks[".parquet"] = ParquetParts(target, force=self.force)
-            elif target.suffix in (".mcap", ".db3"):
+            elif target.suffix == ".mcap":
                 unit = self.out_unit or "T"
                 sinks[str(target)] = BagWriter(
                     target, driven.twin, units=unit, scans=driven.scans, force=self.force

@@ -179,7 +179,7 @@ def curvilinear(
 
     (x, y) = (a cos u, b sin u) (1 + c cos n u) / (1 + c)
 
-    The paper calls two of its drives curvilinear and gives no equation; this one is ours.
+    The paper calls two of its drives curvilinear without an equation; this one is ours.
 
     Args:
         half_length_m: a, which |x| does not exceed [m].
@@ -199,7 +199,7 @@ def curvilinear(
 
 @path("curvilinear_2")
 def curvilinear_2() -> Path:
-    """Case C of the paper's Table 1, its second curvilinear drive; it has no equation there, this is ours."""
+    """Case C of the paper's Table 1, its second curvilinear drive; no equation is published, this is ours."""
     points = curvilinear(half_length_m=2.4, half_width_m=1.5, lobes=3, depth=0.25).p_xy
     return Path("curvilinear_2", points, closed=True)
 
@@ -226,7 +226,7 @@ def path_named(name: str) -> Path:
     """The path that `PATHS` calls `name`, or that of a case of `CASES`, with its default size.
 
     Raises:
-        UnknownNameError: No such path; the text names the nearest one.
+        UnknownNameError: There is no such path; the text has the nearest name.
     """
     return PATHS[CASES.get(name, name)]()
 
@@ -234,13 +234,13 @@ def path_named(name: str) -> Path:
 def spline(p_xy: ArrayLike, *, closed: bool = False, spacing_m: float = 0.01, name: str = "spline") -> Path:
     """A smooth curve through points: a cubic spline with continuous curvature over their chord length.
 
-    An open one has no curvature at its ends (a natural spline), a closed one is periodic.
+    An open curve has no curvature at its ends (natural spline); a closed one is periodic.
 
     Args:
-        p_xy: Points in world [m], shape (N, 2), neighbours apart.
-        closed: Whether it goes on from the last point to the first.
-        spacing_m: Distance between the points of the path, about [m].
-        name: What it is called.
+        p_xy: Points in world [m], shape (N, 2); neighbours must differ.
+        closed: Whether the curve continues from the last point to the first.
+        spacing_m: Approximate distance between points of the path [m].
+        name: Name of the path.
 
     Raises:
         InputError: There are fewer than three points, or `spacing_m` is not above 0 or makes too many.
@@ -261,6 +261,6 @@ def spline(p_xy: ArrayLike, *, closed: bool = False, spacing_m: float = 0.01, na
 
 
 def _check_points(name: str, points: float, what: str) -> None:
-    """Refuse a path of more points than there is room for, or of no number of them."""
+    """Refuse a path with too many points."""
     if not points <= MOST_POINTS:
         raise InputError(f"path {name!r}: {what} would make {points:.3g} points, more than {MOST_POINTS:,}")

@@ -14,15 +14,15 @@ from magtwin.path.polyline import SAME_M, Path, without_repeats
 
 
 def path_of_points(p_xy: ArrayLike, name: str = "points", file: str = "") -> Path:
-    """A polyline through points, as a CSV file of them gives it; closed where it ends where it began.
+    """A polyline through points; it is closed if the last point equals the first.
 
     Args:
-        p_xy: Points in world [m], shape (N, 2), N >= 2. Neighbours that coincide are merged.
-        name: What to call it.
-        file: The file that they were read from.
+        p_xy: Points in world [m], shape (N, 2), N >= 2. Equal neighbours are merged.
+        name: Name of the path.
+        file: The file of the points.
 
     Raises:
-        InputError: They are not finite numbers of that shape, or only one point.
+        InputError: The points are not finite numbers of that shape, or only one point.
     """
     try:
         p = np.asarray(p_xy, float)
@@ -54,7 +54,7 @@ def resolve_path(path: "str | os.PathLike[str] | ArrayLike") -> Path:
 def read_path_csv(file: str | os.PathLike[str]) -> Path:
     """A polyline from a CSV file of `x,y` in metres, one point a line, with or without a header.
 
-    Neighbours that coincide are merged. A line that ends where it began is closed.
+    Equal neighbours are merged. A line whose last point equals the first is closed.
 
     Raises:
         InputError: The file is missing, empty, or has a line that is not two numbers.

@@ -1,4 +1,4 @@
-"""Path: where to drive, a line on the floor that knows its arc length."""
+"""A path: a polyline on the floor, parametrised by arc length."""
 
 import math
 from dataclasses import dataclass, field
@@ -12,31 +12,30 @@ from magtwin.summary import Summarized, Summary, rectangle
 Array = NDArray[np.float64]
 
 SAME_M = 1e-6
-"""Neighbours nearer than this are one point; a line whose ends are nearer than this is closed [m]."""
+"""Points nearer than this are equal, and a line whose ends are nearer is closed [m]."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Path(Summarized):
     """A polyline in the plane of the floor, parametrised by its arc length.
 
-    Neighbours that coincide are merged at birth. A closed path ends where it began: its first point
-    is repeated at the end, and is added there if it is not.
+    Equal neighbours are merged. A closed path repeats its first point at the end, which is added if needed.
     """
 
     name: str
-    """What it is called: a name of `PATHS`, or the file that it came from."""
+    """Name: one of `PATHS`, or that of a file."""
 
     p_xy: Array
     """Points in world [m], shape (N, 2), N >= 2."""
 
     closed: bool = False
-    """Whether it can be driven round and round."""
+    """Whether the path can be repeated from its end."""
 
     file: str = ""
-    """The file that it was read from, as that was named; "" for one that came from no file."""
+    """File that it was read from, or ""."""
 
     placing: tuple[float, ...] = ()
-    """How a path was brought onto its floor: scale in x and y, then shift in x and y [m]; () for none."""
+    """Scale in x and y, then shift in x and y [m], which fitted the path to its floor; () means none."""
 
     s: Array = field(init=False, repr=False)
     """Arc length at each point, from 0 [m], shape (N,)."""
@@ -68,7 +67,7 @@ class Path(Summarized):
     def at(self, s: ArrayLike) -> Array:
         """Points at arc lengths `s` [m], shape (...) -> (..., 2).
 
-        A closed path repeats with its length; an open one goes on straight beyond its ends.
+        A closed path repeats; an open one continues straight beyond its ends.
         """
         s, i = self._segment(s)
         along = ((s - self.s[i]) / (self.s[i + 1] - self.s[i]))[..., None]
@@ -77,14 +76,14 @@ class Path(Summarized):
     def heading(self, s: ArrayLike) -> Array:
         """Direction of travel at arc lengths `s` [rad], in [-pi, pi], shape (...).
 
-        At a corner it is the direction after it.
+        At a corner, it is the direction after it.
         """
         _, i = self._segment(s)
         step = self.p_xy[i + 1] - self.p_xy[i]
         return np.arctan2(step[..., 1], step[..., 0])
 
     def turn(self, s: ArrayLike, reach_m: float) -> Array:
-        """Angle between the chords that come to and go from `s`, left positive [rad], shape (...).
+        """Angle between the chords before and after `s`, left positive [rad], shape (...).
 
         Args:
             s: Arc lengths [m], shape (...).
@@ -97,17 +96,17 @@ class Path(Summarized):
         return np.arctan2(x0 * y1 - y0 * x1, x0 * x1 + y0 * y1)
 
     def curvature(self, s: ArrayLike, reach_m: float = 0.02) -> Array:
-        """Mean curvature over `reach_m` each way of `s`, left positive [1/m], shape (...).
+        """Mean curvature over `reach_m` before and after `s`, left positive [1/m], shape (...).
 
-        The angle between two chords over the arc between their middles, which for an arc of a circle
-        of radius R is 1/R. A polyline has none of its own, so choose `reach_m` above its spacing.
+        The angle between two chords divided by the arc length between their middles; 1/R for a circle. Choose
+        `reach_m` larger than the spacing of the points.
         """
         return self.turn(s, reach_m) / reach_m
 
     def nearest(self, p_xy: ArrayLike) -> tuple[Array, Array]:
-        """The nearest point of the path, exactly, to each of many points.
+        """The nearest point of the path to each of many points, exactly.
 
-        Every segment is tried, in blocks of points, so time is points x segments (about 10 ns each).
+        Every segment is tried, which takes about 10 ns per point and segment.
 
         Args:
             p_xy: Points in world [m], shape (..., 2).
@@ -137,9 +136,9 @@ class Path(Summarized):
         return s.reshape(q.shape[:-1]), d.reshape(q.shape[:-1])
 
     def prolonged(self, length_m: float) -> "Path":
-        """This path driven on until it is at least `length_m` long.
+        """This path, repeated until it is at least `length_m` long; the result is open.
 
-        A closed path gets further laps, an open one is driven back and forth. The result is open.
+        A closed path gets further laps, an open one is driven back and forth.
         """
         times = max(1, math.ceil(length_m / self.length))
         there, back = self.p_xy[1:], (self.p_xy if self.closed else self.p_xy[::-1])[1:]
@@ -166,7 +165,7 @@ class Path(Summarized):
         return s, np.clip(np.searchsorted(self.s, s, side="right") - 1, 0, len(self.s) - 2)
 
     def _summary(self) -> Summary:
-        """Name, length, extent, and where it begins and ends."""
+        """Name, length, extent and ends."""
         (x0, y0), (x1, y1) = self.p_xy.min(axis=0), self.p_xy.max(axis=0)
         (ax, ay), (bx, by) = self.p_xy[0], self.p_xy[-1]
         ends = f"begins and ends at ({ax:z.2f}, {ay:z.2f}) m"
@@ -180,7 +179,7 @@ class Path(Summarized):
 
 
 def without_repeats(p: Array) -> Array:
-    """Points of (N, 2) whose neighbours differ; the first of equals stays."""
+    """Points (N, 2) without equal neighbours."""
     first = np.ones(len(p), bool)
     first[1:] = np.hypot(*np.diff(p, axis=0).T) >= SAME_M
     return p[first]

@@ -1,4 +1,4 @@
-"""Placement: a path brought onto a floor, between the things that stand on it."""
+"""The room of a path: checks on floor and obstacles, and fitting a path to them."""
 
 import math
 import os
@@ -17,30 +17,30 @@ from magtwin.spec.obstacles import Obstacles
 Array = NDArray[np.float64]
 
 FLOOR_M = (6.0, 3.5)
-"""Floor that the named paths are made for [m]."""
+"""Floor for which the named paths are designed [m]."""
 
 RADIUS_M = 0.171
-"""Radius of the robot that they are made for [m]."""
+"""Robot radius for which they are designed [m]."""
 
 CLEAR_M = 0.05
-"""Room left beside obstacles where there is enough, as a robot strays a little from its path [m]."""
+"""Clearance from obstacles, if there is room, since a robot deviates a little from its path [m]."""
 
 STEP_M = 0.03
-"""Spacing of the raster on which the free floor is looked for [m]; wider on large floors."""
+"""Spacing of the raster of the free floor [m]; larger on large floors."""
 
 MOST_CELLS = 400_000
-"""Cells of that raster at most."""
+"""Most cells of that raster."""
 
 SHRINK = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)
-"""Sizes that are tried, as shares of what the floor without obstacles would take."""
+"""Sizes to try, as fractions of the size that fits the empty floor."""
 
 SHIFTS = 13
-"""Places that are tried along each axis, for each size."""
+"""Positions to try along each axis for each size."""
 
 
 @dataclass(frozen=True)
 class Room:
-    """What a path must fit into."""
+    """A floor with obstacles, and the robot that drives on it."""
 
     floor_m: tuple[float, float]
     """Extent of the floor in x and y, centred on the world's origin [m]."""
@@ -49,10 +49,10 @@ class Room:
     """Radius of the robot [m]."""
 
     obstacles: Obstacles
-    """What stands in the room."""
+    """Obstacles in the room."""
 
     def refusal(self, path: Path) -> InputError | None:
-        """Why a robot cannot drive the path here; None if it can."""
+        """The error if the robot cannot drive the path here; None if it can."""
         try:
             check_on_floor(path, self.floor_m, self.footprint_radius_m)
             check_clear(path, self.obstacles, self.footprint_radius_m)
@@ -66,41 +66,40 @@ class Room:
         return np.asarray(self.floor_m) / 2 - self.footprint_radius_m
 
 
-def path_in(room: Room, way: str | os.PathLike[str]) -> Path:
-    """The path that a name or a CSV file stands for; a named one is brought onto the floor of the room.
+def path_in(room: Room, path: str | os.PathLike[str]) -> Path:
+    """A named path, fitted to the room, or the path of a CSV file, unchanged.
 
-    On the floor of 6 x 3.5 m that they are made for, named paths are as they are. On another they are
-    scaled with it, in x and in y; where something stands in the way they are moved and made smaller,
-    until the robot passes. A CSV file is taken as it is.
+    Named paths are designed for a floor of 6 x 3.5 m. On another floor they are scaled in x and y. If an
+    obstacle is in the way, they are moved and made smaller until the robot passes.
 
     Args:
-        room: Where it is driven.
-        way: A name of `PATHS`, a case A to E, or a CSV file.
+        room: The room.
+        path: A name of `PATHS`, a case A to E, or a CSV file.
 
     Raises:
         InputError: There is no such path, or no room for it.
     """
-    text = os.fspath(way)
+    text = os.fspath(path)
     if text not in PATHS and text not in CASES:
-        return resolve_path(FilePath(text) if isinstance(way, FilePath) else text)
-    path = path_named(text)
-    if tuple(room.floor_m) == FLOOR_M and room.refusal(path) is None:
-        return path
+        return resolve_path(FilePath(text) if isinstance(path, FilePath) else text)
+    named = path_named(text)
+    if tuple(room.floor_m) == FLOOR_M and room.refusal(named) is None:
+        return named
     made_for = np.asarray(FLOOR_M) / 2 - RADIUS_M
     if min(room.reach_m) <= 0:
-        raise InputError(f"path {path.name} does not fit: {_too_small(room)}")
-    return _placed(path, room, room.reach_m / made_for, each_way=True)
+        raise InputError(f"path {named.name} does not fit: {_too_small(room)}")
+    return _placed(named, room, room.reach_m / made_for, each_way=True)
 
 
 def fit_path(path: Path, room: Room) -> Path:
-    """A path that keeps its shape, moved and if need be made smaller until it fits into a room.
+    """A path, moved and if necessary made smaller until it fits into a room.
 
     Args:
-        path: Any path; one that fits is returned as it is.
-        room: Where it is driven.
+        path: Any path; one that fits is returned unchanged.
+        room: The room.
 
     Raises:
-        InputError: It does not fit at a quarter of what the empty floor would take.
+        InputError: It does not fit at a quarter of the size for the empty floor.
     """
     if room.refusal(path) is None:
         return path
@@ -113,15 +112,15 @@ def fit_path(path: Path, room: Room) -> Path:
 
 
 def check_on_floor(path: Path, floor_m: tuple[float, float], footprint_radius_m: float) -> None:
-    """Whether a round robot on the path stays on a floor that is centred on the world's origin.
+    """Check that a round robot on the path stays on a floor centred on the world's origin.
 
     Args:
-        path: Where its centre goes.
+        path: Path of its centre.
         floor_m: Extent of the floor in x and y [m].
         footprint_radius_m: Radius of the robot [m].
 
     Raises:
-        InputError: It does not; the text gives the first such point and how far it is outside.
+        InputError: It does not; the text has the first such point and what would fit.
     """
     beyond = np.max(np.abs(path.p_xy) + footprint_radius_m - np.array(floor_m) / 2, axis=1)
     outside = np.flatnonzero(beyond > 1e-9)
@@ -138,7 +137,7 @@ def check_on_floor(path: Path, floor_m: tuple[float, float], footprint_radius_m:
 
 
 def _what_fits(path: Path, floor_m: tuple[float, float], footprint_radius_m: float) -> str:
-    """What would bring a path onto the floor, in words."""
+    """Advice how to fit a path to the floor."""
     room = np.array(floor_m) - 2 * footprint_radius_m
     if min(room) <= 0:
         return "the floor is no wider than the robot; enlarge it"
@@ -152,17 +151,17 @@ def _what_fits(path: Path, floor_m: tuple[float, float], footprint_radius_m: flo
 
 
 def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> None:
-    """Whether a round robot on the path passes all obstacles.
+    """Check that a round robot on the path touches no obstacle.
 
     Args:
-        path: Where its centre goes.
-        obstacles: What it must not touch.
+        path: Path of its centre.
+        obstacles: The obstacles.
         footprint_radius_m: Radius of the robot [m].
 
     Raises:
-        InputError: It touches one; the text gives the first such point and the obstacle.
+        InputError: It touches one; the text has the first such point and the obstacle.
     """
-    step = max(footprint_radius_m / 4, path.length / 100_000)  # a straight segment may be long
+    step = max(footprint_radius_m / 4, path.length / 100_000)  # segments may be long
     s = np.union1d(np.linspace(0.0, path.length, math.ceil(path.length / step) + 1), path.s)
     p = path.at(np.minimum(s, path.length))
     distance, which = obstacles.clearance(p, reach_m=footprint_radius_m)
@@ -183,7 +182,7 @@ def _too_small(room: Room) -> str:
 
 
 def _placed(path: Path, room: Room, whole: Array, *, each_way: bool) -> Path:
-    """The path at the largest size that fits, up to `whole` (2,), as near to its own place as it can be."""
+    """The path at the largest size that fits, up to the scale `whole` (2,), near its original position."""
     middle = (path.p_xy.min(axis=0) + path.p_xy.max(axis=0)) / 2
     half = np.ptp(path.p_xy, axis=0) / 2
     sizes = [(a, b) for a in SHRINK for b in (SHRINK if each_way else (a,))]
@@ -195,7 +194,7 @@ def _placed(path: Path, room: Room, whole: Array, *, each_way: bool) -> Path:
             slack = np.maximum(room.reach_m - half * scale - clear, 0.0)
             start = middle * scale if each_way else middle
             shifts = _shifts(np.clip(start, -slack, slack), slack) - middle * scale + 0.0
-            if each_way:  # scaled with the floor a path keeps the room that it is made with
+            if each_way:  # first try the path scaled with the floor
                 shifts = np.vstack([np.zeros(2), shifts])
             dense = _dense(path, scale, max(free.step_m, 0.02))
             for shift in shifts[free.holds(dense, shifts)]:
@@ -204,14 +203,14 @@ def _placed(path: Path, room: Room, whole: Array, *, each_way: bool) -> Path:
                 if room.refusal(found) is None:
                     return found
     raise InputError(
-        f"path {path.name} does not fit between what stands on the floor of {room.floor_m[0]:g} x "
-        f"{room.floor_m[1]:g} m, not even at a quarter of its size; move the furniture, or give points of "
-        "your own in a CSV file"
+        f"path {path.name} does not fit between the obstacles on the floor of {room.floor_m[0]:g} x "
+        f"{room.floor_m[1]:g} m, not even at a quarter of its size; move the furniture, or give your "
+        "own points in a CSV file"
     )
 
 
 def _shifts(home: Array, slack: Array) -> Array:
-    """Middles to try, nearest to `home` first, shape (N, 2)."""
+    """Centres to try, nearest to `home` first, shape (N, 2)."""
     axes = [np.union1d(np.linspace(-s, s, SHIFTS), [h]) for s, h in zip(slack, home, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     away = np.round(np.hypot(*(grid - home).T), 9)
@@ -219,17 +218,17 @@ def _shifts(home: Array, slack: Array) -> Array:
 
 
 def _dense(path: Path, scale: Array, step_m: float) -> Array:
-    """Points along a scaled path, a step apart, and its own, shape (N, 2)."""
+    """Points along a scaled path, a step apart, shape (N, 2)."""
     scaled = path.placed((float(scale[0]), float(scale[1]), 0.0, 0.0))
     count = min(math.ceil(scaled.length / step_m) + 1, 20_000)
     return scaled.at(np.linspace(0.0, scaled.length * (1 - 1e-12), count))
 
 
 class _Free:
-    """The floor as a raster of places where the robot's centre can be."""
+    """Raster of the places where the robot's centre can be."""
 
     def __init__(self, room: Room, clear_m: float) -> None:
-        """Look where a robot has `clear_m` to spare beside what stands on the floor itself."""
+        """Mark the places where the robot is at least `clear_m` away from obstacles on the floor."""
         half = np.asarray(room.floor_m) / 2
         self.step_m = max(STEP_M, math.sqrt(4 * half[0] * half[1] / MOST_CELLS))
         self._low = -half
@@ -246,7 +245,7 @@ class _Free:
         self._free = (distance >= needed).reshape(at.shape[:2])
 
     def holds(self, points: Array, shifts: ArrayLike) -> NDArray[np.bool_]:
-        """Whether all points (N, 2) are free under each of the shifts (M, 2), shape (M,)."""
+        """Whether all points (N, 2) are free after each of the shifts (M, 2), shape (M,)."""
         if self._free.all():
             return np.ones(len(np.asarray(shifts)), bool)
         most: Array = np.array(self._free.shape) - 1.0
@@ -258,5 +257,5 @@ class _Free:
 
 
 def _meets(outline: Array, half: Array) -> bool:
-    """Whether an outline comes onto the floor, not only to its edge."""
+    """Whether an outline overlaps the floor, not only its edge."""
     return bool(np.all(outline.max(axis=0) > -half + 1e-6) and np.all(outline.min(axis=0) < half - 1e-6))

@@ -97,9 +97,7 @@ class ExactField:
         at, sensor = self.anomaly_map.height_m, self.scene.robot.base_height_m
         sensor += self.scene.robot.p_base_magnetometer[2]
         if at is not None and abs(sensor - at) > OFF_HEIGHT_M:
-            text += (
-                f"; it holds {at:.3g} m above the floor, and the sensor is at {sensor:.3g} m (map continue)"
-            )
+            text += f"; it holds {at:.3g} m above the floor, and the sensor is at {sensor:.3g} m (map upward)"
         return {"truth": text}
 
     def at_sensor_nt(

@@ -1,4 +1,4 @@
-"""URDF to a USD articulation: `convert_urdf` is the door, one noun a module behind it."""
+"""URDF to USD articulation and back."""
 
 from magtwin.urdf.convert import convert_urdf, read_notes
 

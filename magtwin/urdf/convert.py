@@ -30,7 +30,7 @@ from magtwin.urdf.physics.gazebo import (
     read_surfaces,
     self_collides,
 )
-from magtwin.urdf.physics.joint import define_joint, define_mimic, define_root_joint
+from magtwin.urdf.physics.joint import define_fixed_joint, define_joint, define_mimic
 from magtwin.urdf.physics.link import Rider, define_body, define_frame, is_marker
 from magtwin.urdf.physics.mechanism import Mechanism, read_mechanism
 from magtwin.urdf.physics.merge import WORLD, Place, carried, place_links, riders
@@ -285,7 +285,7 @@ class _Author:
         base = next((name for name, (above, _) in places.items() if above == name), WORLD)
         if options.fix_base and places[description.root][0] != WORLD and base != WORLD:
             pose, ends = mechanism.poses()[base], (paths[WORLD], paths[base])
-            made[""] = define_root_joint(stage, scope.AppendChild(names[""]), ends, pose)
+            made[""] = define_fixed_joint(stage, scope.AppendChild(names[""]), ends, pose)
         elif description.root == "world" and base != WORLD:
             description.note(f"link 'world' is not the world: the base {base!r} floats; --fix-base holds it")
         for child, joint in description.joints.items():

@@ -1,18 +1,17 @@
-"""Layout: one authored layer becomes the layers of Isaac Sim's asset structure 3.0.
+"""Layout: split one authored layer into the layers of Isaac Sim's asset structure 3.0.
 
     robot.usda                      interface: references base, variant set Physics
-    payloads/base.usda              links, frames and sensors, where they are, what they wear
-    payloads/instances.usda         shapes of each link: visuals and colliders
+    payloads/base.usda              links, frames and sensors with their poses and looks
+    payloads/instances.usda         visuals and colliders of each link
     payloads/geometries.usdc        triangles
     payloads/materials.usda         looks
-    payloads/robot.usda             what Isaac Sim and magtwin know the robot by; a sublayer of base
+    payloads/robot.usda             schemas of Isaac Sim and magtwin; a sublayer of base
     payloads/Physics/physics.usda   bodies, masses, joints, colliders, friction: UsdPhysics and Newton
-    payloads/Physics/physx.usda     PhysX's own attributes, over physics
-    payloads/Physics/mujoco.usda    MuJoCo's own attributes, over physics
+    payloads/Physics/physx.usda     attributes for PhysX only, over physics
+    payloads/Physics/mujoco.usda    attributes for MuJoCo only, over physics
 
-Structure and roles are those of NVIDIA's "Asset Structure" (Isaac Sim 6.0.1 documentation). Nothing is
-invented on the way: each opinion of the one layer stands in exactly one of these, so that the asset
-composes to the stage that was authored.
+Structure and roles follow NVIDIA's "Asset Structure" (Isaac Sim 6.0.1 documentation). Each opinion of the
+authored layer goes to exactly one of these layers, so that the asset composes to the same stage.
 """
 
 import os
@@ -39,10 +38,10 @@ VARIANTS = {
     "physx": "Physics/physx.usda",
     "mujoco": "Physics/mujoco.usda",
 }
-"""Variants of the physics, each with its layer below PAYLOADS."""
+"""Layer of each physics variant, below PAYLOADS."""
 
 DEFAULT_VARIANT = "physx"
-"""As Isaac Sim 6.0.1 sets it: Newton and MuJoCo read the neutral attributes that it is built on."""
+"""Default of Isaac Sim 6.0.1; Newton and MuJoCo read the neutral attributes below it."""
 
 FILES = {
     "base": "base.usda",
@@ -53,16 +52,16 @@ FILES = {
     "physx": VARIANTS["physx"],
     "mujoco": VARIANTS["mujoco"],
 }
-"""Layers that hold opinions, by the name that they have below."""
+"""Layers with opinions, by the names used below."""
 
 ROLES = {
     "base": "links, frames and sensors",
     "instances": "visuals and colliders of its links",
     "materials": "looks",
-    "robot": "what it is known by",
+    "robot": "schemas of Isaac Sim and magtwin",
     "physics": "bodies, joints and contact, for any engine",
-    "physx": "what is PhysX's own",
-    "mujoco": "what is MuJoCo's own",
+    "physx": "attributes for PhysX only",
+    "mujoco": "attributes for MuJoCo only",
 }
 
 SCHEMAS = (
@@ -88,14 +87,14 @@ NAMESPACES = (
 
 INSTANCES = Sdf.Path("/Instances")
 SHAPES = (VISUALS, COLLISIONS)
-"""Children of a link whose own children are its shapes."""
+"""Children of a link with its shapes."""
 
 
 def check_payloads(out: Path, *, force: bool) -> Path:
-    """Folder of the layers of the asset `out`, if it may be written.
+    """Folder of the layers of the asset `out`.
 
     Raises:
-        InputError: It is there and `force` was not given, or it is another asset's or nobody's.
+        InputError: It exists and `force` is not set, or it does not belong to this asset.
     """
     folder = out.parent / PAYLOADS
     check_free(folder, force=force)
@@ -105,7 +104,7 @@ def check_payloads(out: Path, *, force: bool) -> Path:
         owner = layer.customLayerData.get("magtwin", {}).get("interface", "") if layer else ""
         if owner != out.name:
             whose = f"is of {owner}" if owner else "was not made by a conversion"
-            raise InputError(f"{folder}: {whose}; give each robot a folder of its own")
+            raise InputError(f"{folder}: {whose}; give each robot its own folder")
     return folder
 
 
@@ -113,10 +112,10 @@ def write_layers(flat: Sdf.Layer, out: Path, folder: Path, final: Path) -> None:
     """Write an authored layer as an asset of layers.
 
     Args:
-        flat: Holds the whole robot below its default prim. It stands where `out` will.
+        flat: Layer with the whole robot below its default prim, in the folder of `out`.
         out: Interface layer to write.
-        folder: Folder to write the other layers to; the geometries are there already.
-        final: Where `out` will stand in the end, beside PAYLOADS.
+        folder: Folder for the other layers; contains the geometries already.
+        final: Final path of `out`, beside PAYLOADS.
     """
     parts = split(flat)
     for name, layer in parts.items():
@@ -128,9 +127,9 @@ def write_layers(flat: Sdf.Layer, out: Path, folder: Path, final: Path) -> None:
 
 
 def split(flat: Sdf.Layer) -> dict[str, Sdf.Layer]:
-    """The layers of an authored one, by the names in FILES and "interface".
+    """The layers of an authored layer, by the names in FILES and "interface".
 
-    Asset paths to layers among them are written as they are to stand; all others as in `flat`.
+    Asset paths between these layers are final; all others are as in `flat`.
     """
     robot = flat.GetPrimAtPath(flat.rootPrims[flat.defaultPrim].path)
     parts = {name: Sdf.Layer.CreateAnonymous(f"{name}.usda") for name in ("interface", *FILES)}
@@ -144,13 +143,13 @@ def split(flat: Sdf.Layer) -> dict[str, Sdf.Layer]:
 
 
 class _Splitter:
-    """Takes the opinions of one layer to several."""
+    """Copies the opinions of one layer to several."""
 
     def __init__(self, flat: Sdf.Layer, parts: dict[str, Sdf.Layer]) -> None:
         self.flat, self.parts = flat, parts
 
     def route(self, spec: Sdf.PrimSpec) -> None:
-        """Take a prim and all below it to where they belong."""
+        """Copy a prim and everything below it to its layers."""
         owner, path = self._owner(spec)
         home = _prim(self.parts[owner], path)
         home.specifier = spec.specifier
@@ -169,7 +168,7 @@ class _Splitter:
         for prop in spec.properties:
             name = _by_start(prop.name, NAMESPACES, owner)
             if owner == "instances" and prop.name.startswith("material:binding") and name == owner:
-                name = "base"  # its target lies outside of what base references
+                name = "base"  # its target is outside the prims that base references
             where = path if name == owner else spec.path
             _prim(self.parts[name], where)
             to = where.AppendProperty(prop.name)
@@ -189,7 +188,7 @@ class _Splitter:
         if len(steps) > 1 and steps[1].name == LOOKS:
             material = self.flat.GetPrimAtPath(steps[2]) if len(steps) > 2 else None
             if material is not None and not material.nameChildren:
-                return "physics", spec.path  # a grip: it has no shader
+                return "physics", spec.path  # a physics material has no shader
             return "materials", spec.path.ReplacePrefix(
                 steps[1], Sdf.Path.absoluteRootPath.AppendChild(LOOKS)
             )
@@ -205,7 +204,7 @@ class _Splitter:
         here.referenceList.prependedItems.append(reference)
 
     def _schemas(self, spec: Sdf.PrimSpec, owner: str, path: Sdf.Path) -> None:
-        """Take a prim's applied schemas to their layers, in their order."""
+        """Copy applied schemas of a prim to their layers, in order."""
         names = spec.GetInfo("apiSchemas").GetAppliedItems() if spec.HasInfo("apiSchemas") else []
         by_layer: dict[str, list[str]] = {}
         root = spec.path.pathElementCount == 1
@@ -224,7 +223,7 @@ class _Splitter:
 
 
 def _repoint(prop: Sdf.PropertySpec, old: Sdf.Path, new: Sdf.Path) -> None:
-    """Let targets and connections of a property follow the prims that moved with its own."""
+    """Update targets and connections of a property whose prims moved with it."""
     while old.name == new.name and old.pathElementCount > 1 and new.pathElementCount > 1:
         old, new = old.GetParentPath(), new.GetParentPath()
     attribute = isinstance(prop, Sdf.AttributeSpec)
@@ -235,22 +234,22 @@ def _repoint(prop: Sdf.PropertySpec, old: Sdf.Path, new: Sdf.Path) -> None:
 
 
 def _by_start(name: str, table: tuple[tuple[str, str], ...], other: str) -> str:
-    """The layer of the first start that a name has."""
+    """The layer of the first matching prefix of a name."""
     return next((layer for start, layer in table if name.startswith(start)), other)
 
 
 def _all_physics(specs: Sdf.PrimSpec) -> bool:
-    """Whether there are prims and all are joints."""
+    """Whether all prims are joints, and there is at least one."""
     return len(specs) > 0 and all(spec.typeName.startswith("Physics") for spec in specs)
 
 
 def _prim(layer: Sdf.Layer, path: Sdf.Path) -> Sdf.PrimSpec:
-    """The spec at a path, made as an `over` if it is not there."""
+    """The spec at a path, created as an `over` if missing."""
     return layer.GetPrimAtPath(path) or Sdf.CreatePrimInLayer(layer, path)
 
 
 def _describe(layer: Sdf.Layer, flat: Sdf.Layer, name: str, robot: str) -> None:
-    """Give a layer its units, axis, default prim and a line about it."""
+    """Set units, up axis, default prim and documentation of a layer."""
     for key in ("metersPerUnit", "upAxis", "kilogramsPerUnit"):
         layer.pseudoRoot.SetInfo(key, flat.pseudoRoot.GetInfo(key))
     if name == "interface":
@@ -268,7 +267,7 @@ def _describe(layer: Sdf.Layer, flat: Sdf.Layer, name: str, robot: str) -> None:
 
 
 def _compose(parts: dict[str, Sdf.Layer], robot: Sdf.PrimSpec) -> None:
-    """Put the arcs between the layers."""
+    """Add the composition arcs between the layers."""
     parts["base"].subLayerPaths.append(f"./{FILES['robot']}")
     for name in ("physx", "mujoco"):
         parts[name].subLayerPaths.append("./physics.usda")
@@ -287,12 +286,12 @@ def _compose(parts: dict[str, Sdf.Layer], robot: Sdf.PrimSpec) -> None:
 
 
 def _moved(here: Path, final: Path, home: Path) -> Callable[[str], str]:
-    """Asset paths of the layer that was authored in `here`, as seen from the layer at `home`.
+    """A function that converts asset paths of the authored layer to those of a final layer.
 
     Args:
-        here: Folder that stands for the final one while the asset is written.
-        final: Where the interface will stand.
-        home: Where the layer will stand that has the path.
+        here: Temporary folder of the asset while it is written.
+        final: Final path of the interface.
+        home: Final path of the layer with the asset path.
     """
     own = {f"./{path}" for path in FILES.values()} | {"./physics.usda"}
     own |= {f"./{PAYLOADS}/{path}" for path in (*VARIANTS.values(), FILES["base"]) if path}

@@ -105,7 +105,7 @@ def _swapped_sides(description: Description) -> Iterator[str]:
     """Pairs called left and right that are swapped: left is +y (REP-103)."""
     poses = description.poses()
     for name in description.links:
-        twin = next((name.replace(left, right) for left, right in SIDES if left in name), None)
+        twin = next((name.replace(left, right) for left, right in SIDES if left in name), "")
         if twin not in description.links or not _is_rigid(description, name, twin):
             continue
         left, right = float(poses[name][1, 3]), float(poses[twin][1, 3])

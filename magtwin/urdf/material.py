@@ -1,4 +1,4 @@
-"""Material: how a surface looks (UsdPreviewSurface) and how it grips (UsdPhysics)."""
+"""Material: the look of a surface (UsdPreviewSurface) and its friction (UsdPhysics)."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +11,7 @@ from magtwin.urdf.physics.gazebo import Surface
 from magtwin.usd.geometry import linear_from_srgb
 
 PHYSX_API = "PhysxMaterialAPI"
-"""PhysX's applied schema, by name: its plugin lives elsewhere."""
+"""PhysX's applied schema; its plugin is not installed here."""
 
 LOOKS = "Looks"
 """Scope of all materials below the robot's prim."""
@@ -22,16 +22,16 @@ SURFACE, TEXTURE, READER = "surface", "texture", "reader"
 
 @dataclass(frozen=True)
 class Look:
-    """How a surface looks; colours as screens show them (sRGB), 0 to 1, as URDF has them."""
+    """The look of a surface; colours are sRGB, 0 to 1, as in URDF."""
 
     rgba: Rgba = GREY
-    """Colour and opacity; of a textured surface, what multiplies it."""
+    """Colour and opacity; with a texture, the factor that multiplies it."""
 
     name: str = ""
-    """Name of the material; "" makes one from the colour."""
+    """Name of the material. Default: from the colour."""
 
     texture: str = ""
-    """Asset path of the picture of its colour; "" for none."""
+    """Asset path of the colour texture, or ""."""
 
     mean: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Mean colour of the texture."""
@@ -43,28 +43,28 @@ class Look:
     """0 is an insulator, 1 is metal."""
 
     see_through: bool = False
-    """Whether the texture's opacity counts."""
+    """Whether the texture's opacity is used."""
 
     cutoff: float = 0.0
-    """Opacity below which nothing is shown, and above which all is; 0 blends."""
+    """Opacity threshold between invisible and opaque; 0 blends."""
 
     by_vertex: bool = False
-    """Whether the mesh's displayColor is shown in place of the colour."""
+    """Whether the mesh's displayColor replaces the colour."""
 
     @property
     def display_colour(self) -> tuple[float, float, float]:
-        """Linear colour by which viewers without materials show it."""
+        """Linear colour for viewers without materials."""
         colour = linear_from_srgb(self.rgba[:3]) * linear_from_srgb(self.mean)
         r, g, b = (round(float(c), 5) for c in colour)
         return (r, g, b)
 
 
 def define_look(robot: Usd.Prim, look: Look) -> UsdShade.Material:
-    """The material of a look, shared by all that have it.
+    """The material of a look, shared by all prims with that look.
 
     Args:
-        robot: Root prim; looks lie in a scope below it.
-        look: What to author; USD's colours are linear.
+        robot: Root prim; looks are in a scope below it.
+        look: The look.
     """
     stage = robot.GetStage()
     scope = UsdGeom.Scope.Define(stage, robot.GetPath().AppendChild(LOOKS)).GetPath()
@@ -76,7 +76,7 @@ def define_look(robot: Usd.Prim, look: Look) -> UsdShade.Material:
         if _shows(material, look):
             return material
         path = scope.AppendChild(f"{stem}_{hexed}" if number == 1 else f"{stem}_{hexed}_{number}")
-        number += 1  # one name is used for two looks
+        number += 1  # two looks have the same name
     material = UsdShade.Material.Define(stage, path)
     surface = UsdShade.Shader.Define(stage, path.AppendChild(SURFACE))
     surface.CreateIdAttr("UsdPreviewSurface")
@@ -106,7 +106,7 @@ def _inputs(look: Look) -> list[tuple[str, Sdf.ValueTypeName, Any]]:
 
 
 def _connect_texture(stage: Usd.Stage, path: Sdf.Path, surface: UsdShade.Shader, look: Look) -> None:
-    """Let a texture, laid on by the mesh's `st`, give the colour, and the opacity if it counts."""
+    """Connect a texture, mapped by the mesh's `st`, to the colour and, if used, the opacity."""
     kinds = Sdf.ValueTypeNames
     texture = UsdShade.Shader.Define(stage, path.AppendChild(TEXTURE))
     texture.CreateIdAttr("UsdUVTexture")
@@ -135,7 +135,7 @@ def _reader(
 
 
 def _shows(material: UsdShade.Material, look: Look) -> bool:
-    """Whether a material that `define_look` made is that of a look."""
+    """Whether a material from `define_look` has this look."""
     stage, path = material.GetPrim().GetStage(), material.GetPath()
     surface = UsdShade.Shader(stage.GetPrimAtPath(path.AppendChild(SURFACE)))
     texture = UsdShade.Shader(stage.GetPrimAtPath(path.AppendChild(TEXTURE)))
@@ -151,11 +151,11 @@ def _shows(material: UsdShade.Material, look: Look) -> bool:
 
 
 def define_grip(robot: Usd.Prim, surface: Surface) -> UsdShade.Material:
-    """The physics material of a friction, shared by all that have it.
+    """The physics material of a surface, shared by all colliders with that surface.
 
     Args:
-        robot: Root prim; physics materials lie among its looks.
-        surface: How it grips and bounces; how it gives way is PhysX's own, a compliant contact.
+        robot: Root prim; physics materials are in the scope of its looks.
+        surface: The surface; its stiffness and damping become PhysX's compliant contact.
     """
     stage = robot.GetStage()
     scope = UsdGeom.Scope.Define(stage, robot.GetPath().AppendChild(LOOKS)).GetPath()
@@ -184,10 +184,9 @@ def define_grip(robot: Usd.Prim, surface: Surface) -> UsdShade.Material:
 
 
 def wear(prim: Usd.Prim, robot: Usd.Prim, look: Look, grip: UsdShade.Material | None = None) -> None:
-    """Give a gprim, or an Xform over one, its look, and a collider its grip.
+    """Bind a look to a gprim or an Xform over one, and a physics material to a collider.
 
-    The look is authored as displayColor too, for viewers without materials; one that the mesh's vertices
-    give stands there already.
+    The colour is also authored as displayColor, for viewers without materials, unless the mesh has one.
     """
     api = UsdShade.MaterialBindingAPI.Apply(prim)
     api.Bind(define_look(robot, look))

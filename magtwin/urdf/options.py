@@ -1,4 +1,4 @@
-"""What a user may ask of a conversion."""
+"""Options: the user's choices for a conversion."""
 
 import math
 from collections.abc import Mapping
@@ -15,22 +15,22 @@ _Kind = Literal["velocity", "position", "none"]
 
 @dataclass(frozen=True, kw_only=True)
 class DriveRule:
-    """How the joints whose name fits a pattern are driven."""
+    """The drive of all joints whose name matches a pattern."""
 
     joints: str
-    """Pattern of joint names, as in a shell: `*_wheel_joint`."""
+    """Shell pattern of joint names, such as `*_wheel_joint`."""
 
     type: _Kind = "velocity"
-    """What the drive holds; none leaves the joint free."""
+    """What the drive holds; "none" leaves the joint free."""
 
     stiffness: float = 0.0
-    """Gain on the error of position [N m/rad or N/m]."""
+    """Gain on the position error [N m/rad or N/m]."""
 
     damping: float = 0.0
-    """Gain on the error of velocity [N m s/rad or N s/m]."""
+    """Gain on the velocity error [N m s/rad or N s/m]."""
 
     max_force: float | None = None
-    """Highest torque or force [N m or N]; the joint's effort unless given."""
+    """Maximum torque or force [N m or N]. Default: the joint's effort."""
 
     def __post_init__(self) -> None:
         wanted = {"velocity": "damping", "position": "stiffness"}.get(self.type)
@@ -39,7 +39,7 @@ class DriveRule:
                 raise InputError(f"drive {self.joints!r}: {name} must be a number from 0 up, got {figure!r}")
             if name == wanted and figure == 0:
                 raise InputError(
-                    f"drive {self.joints!r}: without {name} it holds no {self.type}; give {name}="
+                    f"drive {self.joints!r}: without {name} it cannot hold a {self.type}; give {name}="
                 )
             if figure and (self.type == "none" or (self.type == "velocity" and name == "stiffness")):
                 raise InputError(f"drive {self.joints!r}: type {self.type} has no {name}, got {figure:g}")
@@ -48,10 +48,10 @@ class DriveRule:
 
     @classmethod
     def parse(cls, text: str) -> "DriveRule":
-        """The rule of `PATTERN:TYPE[:stiffness=X][:damping=X][:max_force=X]`.
+        """Parse `PATTERN:TYPE[:stiffness=X][:damping=X][:max_force=X]`.
 
         Raises:
-            InputError: The text is not of that form.
+            InputError: The text does not have that form.
         """
         joints, kind, *figures = text.split(":") if ":" in text else (text, "")
         gains = dict(figure.partition("=")[::2] for figure in figures)
@@ -63,53 +63,53 @@ class DriveRule:
         except ValueError:
             pass
         raise InputError(
-            f"drive {text!r}: PATTERN:TYPE[:stiffness=X][:damping=X][:max_force=X] is wanted, "
+            f"drive {text!r}: expected PATTERN:TYPE[:stiffness=X][:damping=X][:max_force=X], "
             f"TYPE one of {', '.join(get_args(_Kind))}"
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What a conversion does where a URDF leaves a choice."""
+    """Choices that a URDF leaves open."""
 
     packages: Mapping[str, Path] = field(default_factory=dict)
-    """Folders of packages by name, before those that are found."""
+    """Folders of packages by name; they override packages that are found."""
 
     arguments: Mapping[str, str] = field(default_factory=dict)
     """Arguments of a xacro."""
 
     missing_meshes: Literal["refuse", "note"] = "refuse"
-    """What is done about a mesh that is not there: note leaves its visual or collider out and says so."""
+    """Treatment of a missing mesh; "note" leaves out its visual or collider with a note."""
 
     collision: Collision = "hull"
-    """What a mesh collides as: its convex hull, a convex decomposition (extra `decomposition`), or itself."""
+    """Mesh colliders: the convex hull, a convex decomposition (extra `decomposition`), or the mesh itself."""
 
     fix_base: bool = False
-    """Whether the base is bolted to the world."""
+    """Whether the base is fixed to the world."""
 
     merge_fixed: bool = False
-    """Whether links on fixed joints become part of the body that they ride on; their frames stay as sites."""
+    """Whether links on fixed joints are merged into the body above; their frames stay as sites."""
 
     profile: Profile = "general"
-    """diff-drive: velocity drives on wheels, slippery casters, dead suspensions welded."""
+    """diff-drive: velocity drives on wheels, low friction on casters, suspensions without springs welded."""
 
     drives: tuple[DriveRule, ...] = ()
-    """How joints are driven; the first rule that fits wins, before what the URDF says."""
+    """Drive rules; the first match wins and overrides the URDF."""
 
     density: float | None = None
-    """Density of links without inertia [kg/m3]; None leaves them as they are."""
+    """Density of links without inertia [kg/m3]; None leaves them without."""
 
     single_file: bool = False
-    """Whether one root layer holds all but the meshes, in place of Isaac Sim's layers."""
+    """Whether to write one root layer and the meshes, instead of Isaac Sim's layers."""
 
     strict: bool = False
-    """Whether a conversion that lost anything is refused."""
+    """Whether to refuse a conversion that loses anything."""
 
     mass: float | None = None
-    """Mass of a data sheet to hold the robot's against [kg]."""
+    """Mass on the data sheet, to check the robot's [kg]."""
 
     metadata: Mapping[str, str] = field(default_factory=dict)
-    """What the asset says of itself (author, asset_license, category, ...), before what its package says."""
+    """Metadata of the asset (author, asset_license, category, ...); overrides that of its package."""
 
     def __post_init__(self) -> None:
         for name in ("density", "mass"):

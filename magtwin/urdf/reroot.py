@@ -1,4 +1,4 @@
-"""Reroot: a URDF told from another link down."""
+"""Reroot: a URDF with another root link."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -12,21 +12,21 @@ from magtwin.urdf.write import write_origin
 
 
 def reroot(text: str, base: str, path: Path) -> str:
-    """A description whose root is `base`: frames that were above it, such as base_footprint, hang below it.
+    """Make `base` the root of a URDF; frames above it, such as base_footprint, move below it.
 
-    Who publishes where `base` is in odom leaves it no other parent (REP 105), and robot_state_publisher makes
-    one of each joint. Only fixed joints are turned round: T_child_parent = T_parent_child^-1.
+    A frame has one parent (REP 105). If odometry publishes `base` in odom, no joint above `base` may publish
+    it too. Only fixed joints are inverted: T_child_parent = T_parent_child^-1.
 
     Args:
         text: The URDF.
         base: Name of a link.
-        path: Where it was read, for refusals.
+        path: File of the text, for error messages.
 
     Returns:
-        The text as it is, where `base` is its root already, is none of its links, or moves on a joint.
+        The URDF; unchanged if `base` is the root, is not a link, or is on a joint that moves.
 
     Raises:
-        InputError: It is not XML, could not be read safely, or a place in it is none.
+        InputError: The text is not safe XML, or an origin is invalid.
     """
     tree = parse_markup(text.encode("utf-8"), path).root
     above = {
@@ -35,11 +35,11 @@ def reroot(text: str, base: str, path: Path) -> str:
         if (parent := joint.find("parent")) is not None and (child := joint.find("child")) is not None
     }
     chain, link = list[tuple[ElementTree.Element, ...]](), base
-    while (found := above.get(link)) is not None:
-        if found in chain or found[0].get("type") != "fixed":
+    while (match := above.get(link)) is not None:
+        if match in chain or match[0].get("type") != "fixed":
             return text
-        chain.append(found)
-        link = found[1].get("link", "")
+        chain.append(match)
+        link = match[1].get("link", "")
     if not chain:
         return text
     for joint, parent, child in chain:
@@ -52,7 +52,7 @@ def reroot(text: str, base: str, path: Path) -> str:
             xyz, rpy = (np.array(origin.get(name, "0 0 0").split(), float) for name in ("xyz", "rpy"))
             T[:3, :3], T[:3, 3] = matrix_from_quat(quat_from_rpy(rpy)), xyz
         except ValueError as error:
-            raise InputError(f"{path}: joint {joint.get('name')!r} has no place: {error}") from error
+            raise InputError(f"{path}: joint {joint.get('name')!r} has an invalid origin: {error}") from error
         joint.remove(origin)
         write_origin(joint, np.linalg.inv(T).astype(np.float64))
     return ElementTree.tostring(tree, encoding="unicode", xml_declaration=False)

@@ -1,7 +1,7 @@
-"""Sensor: `<sensor>` elements of `<gazebo>` tags as prims on their links, with their figures.
+"""Sensor: `<sensor>` elements of `<gazebo>` tags as prims on their links.
 
-Figures and their meaning after SDFormat's specification of `<sensor>` (sdformat.org/spec). Gazebo's
-sensors look along x, z up; USD's cameras along -z, y up.
+Follows SDFormat's specification of `<sensor>` (sdformat.org/spec). Gazebo's sensors look along x with z up,
+USD's cameras along -z with y up.
 """
 
 import math
@@ -18,6 +18,7 @@ from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.spec.base import ZERO3
 from magtwin.spec.sensors import ImuSpec, LidarSpec, MagnetometerSpec
 from magtwin.urdf.description.tag import Element, Tags
+from magtwin.urdf.meshes.mesh_layer import free_name
 from magtwin.urdf.shape import pose_of
 from magtwin.usd.schema import prims_with
 from magtwin.usd.sensors import (
@@ -30,20 +31,20 @@ from magtwin.usd.sensors import (
     write_pose,
 )
 
-FACTS = "magtwin:sensor"
-"""Key of a sensor's customData: figures that no schema has, by name with their unit."""
+METADATA = "magtwin:sensor"
+"""Key of a sensor's customData: values without a schema, by name with unit."""
 
 CONTACT_TYPE, CONTACT_API = "IsaacContactSensor", "PhysxContactReportAPI"
-"""NVIDIA's types, by name: their plugins live in Omniverse, not here."""
+"""NVIDIA's types; their plugins are not installed here."""
 
 SCANNER = np.pi
-"""View from which on a LiDAR is one that spins [rad]; below, it is a range finder."""
+"""Smallest field of view of a spinning LiDAR [rad]; below, it is a range finder."""
 
 APERTURE_MM = 20.955
-"""Width of a camera's aperture, UsdGeom's own default [mm]; the field of view is what counts."""
+"""Width of a camera's aperture, UsdGeom's default [mm]; only the field of view matters."""
 
 RAYS, PIXELS = 2_000_000, 65_536
-"""Most rays of a LiDAR, and most pixels along a side of a camera's image."""
+"""Most rays of a LiDAR, and most pixels along one side of an image."""
 
 X_FORWARD: NDArray[np.float64] = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """Axes of USD's camera in Gazebo's sensor, as columns."""
@@ -53,19 +54,19 @@ NT_PER_T = 1e9
 
 @dataclass(frozen=True)
 class Fan:
-    """Rays of a LiDAR in one plane, at even angles."""
+    """Rays of a LiDAR in one plane, at equal angles."""
 
     least: float
-    """Angle of the first [rad]."""
+    """Angle of the first ray [rad]."""
 
     most: float
-    """Angle of the last [rad]."""
+    """Angle of the last ray [rad]."""
 
     count: int
 
     @property
     def angles(self) -> NDArray[np.float64]:
-        """Angle of each ray [rad], shape (count,); a single one looks along the middle."""
+        """Angle of each ray [rad], shape (count,); a single ray is in the middle."""
         if self.count == 1:
             return np.array([(self.least + self.most) / 2])
         return np.linspace(self.least, self.most, self.count)
@@ -73,43 +74,43 @@ class Fan:
 
 @dataclass(frozen=True)
 class Site:
-    """Where a sensor goes."""
+    """Place of a sensor."""
 
     stage: Usd.Stage
     path: Sdf.Path
     """Path of its prim, below its link's."""
 
     pose: NDArray[np.float64]
-    """In its link, shape (4, 4)."""
+    """Pose in its link, shape (4, 4)."""
 
     @property
     def mount(self) -> dict[str, Any]:
-        """Its place as fields of a MountSpec."""
+        """The place as fields of a MountSpec."""
         p, q = pose_of(self.pose)
         turn = {} if q is None else {"q_link_sensor_xyzw": q}
         return {"link": self.path.GetParentPath().name, "p_link_sensor": p, **turn}
 
     def define(self) -> Usd.Prim:
-        """An Xform there."""
+        """Define an Xform there."""
         prim = UsdGeom.Xform.Define(self.stage, self.path).GetPrim()
         write_pose(prim, *pose_of(self.pose))
         return prim
 
 
 def define_sensors(tags: Tags, robot: Usd.Prim, prim_of: Callable[[str], Usd.Prim]) -> list[Usd.Prim]:
-    """Author every `<sensor>` of `<gazebo reference="LINK">` that has a counterpart, on its link's prim.
+    """Author every `<sensor>` of `<gazebo reference="LINK">` with a known type on its link's prim.
 
-    IMU, magnetometer and the first LiDAR that spins get magtwin's schemas, so that magtwin simulates
-    them; there is one of each on a robot. All others are NVIDIA's types and USD's cameras alone. Sensors
-    without a counterpart are kept as text, with a note.
+    The first IMU, magnetometer and spinning LiDAR of a robot get magtwin's schemas, so that magtwin simulates
+    them. All others become NVIDIA's types or USD cameras only. Sensors of other types are kept as text, with
+    a note.
 
     Args:
-        tags: Read.
+        tags: Tags of the description.
         robot: The robot's prim.
-        prim_of: Gives the prim of a link by its name.
+        prim_of: Returns the prim of a link by its name.
 
     Raises:
-        InputError: A figure of a sensor is not a number, or out of range; the text gives the line.
+        InputError: A value is not a number, or out of range; the message gives the line.
     """
     made, description = list[Usd.Prim](), tags.description
     for block in tags.blocks("gazebo"):
@@ -118,14 +119,14 @@ def define_sensors(tags: Tags, robot: Usd.Prim, prim_of: Callable[[str], Usd.Pri
             name, kind = sensor.get("name") or "sensor", (sensor.get("type") or "").lower()
             start = f"sensor {name!r} of link {link!r}"
             if link not in description.links:
-                description.note(f"{start}: {hint(link, description.links)}; it is kept as text", lost=True)
+                description.note(f"{start}: {hint(link, description.links)}; kept as text", lost=True)
                 continue
             if kind not in KINDS:
                 description.note(f"{start} is of type {kind!r}, which has no counterpart: kept as text")
                 continue
             tags.read(sensor)
             prim = prim_of(link)
-            site = Site(prim.GetStage(), _free(prim, name), _pose(tags, sensor))
+            site = Site(prim.GetStage(), _child(prim, name), _pose(tags, sensor))
             try:
                 made.append(KINDS[kind](tags, sensor, site, robot))
             except InputError as error:
@@ -140,7 +141,7 @@ def _define_imu(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> Usd
     spec = ImuSpec(
         **site.mount,
         rate_hz=rate,
-        tilt=(0.0, 0.0),  # Gazebo gives the true orientation, and shakes nothing
+        tilt=(0.0, 0.0),  # Gazebo gives the true orientation without vibration
         level_error=(0.0, 0.0),
         tilt_std=0.0,
         orientation_noise_std=0.0,
@@ -156,7 +157,7 @@ def _define_imu(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> Usd
         site.define(), rateHz=rate, gyroNoiseStd=spec.gyro_noise_std, accelNoiseStd=spec.accel_noise_std
     )
     define_isaac_imu(prim, rate)
-    tags.description.note(f"{_say(sensor)} is an IMU more than magtwin simulates; others see it")
+    tags.description.note(f"{_say(sensor)} is a second IMU, which magtwin does not simulate")
     return prim
 
 
@@ -164,9 +165,9 @@ def _define_magnetometer(tags: Tags, sensor: Element, site: Site, robot: Usd.Pri
     rate = _rate(tags, sensor, MagnetometerSpec.rate_hz)
     noise = NT_PER_T * _noise(tags, tags.find(sensor, "magnetometer"))
     if noise:
-        tags.description.note(f"{_say(sensor)}: its noise is taken as tesla, {noise:.6g} nT")
+        tags.description.note(f"{_say(sensor)}: the unit of its noise is assumed to be tesla: {noise:.6g} nT")
     if prims_with(robot, "magnetometer"):
-        tags.description.note(f"{_say(sensor)} is a magnetometer more than magtwin simulates")
+        tags.description.note(f"{_say(sensor)} is a second magnetometer, which magtwin does not simulate")
         return _metadata(site.define(), rateHz=rate, noiseStdNt=noise)
     density = noise / math.sqrt(rate / 2)
     spec = MagnetometerSpec(**site.mount, rate_hz=rate, noise_density_nt=density, resolution_nt=0.0)
@@ -201,7 +202,7 @@ def _define_lidar(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> U
     else:
         prim = site.define()
         if spins:
-            tags.description.note(f"{_say(sensor)} is a LiDAR more than magtwin simulates; others see it")
+            tags.description.note(f"{_say(sensor)} is a second LiDAR, which magtwin does not simulate")
     lidar = define_omni_lidar(prim, rate, (near, far), rotary=spins)
     if spins:
         _define_turning(lidar, across, up, rate)
@@ -224,7 +225,7 @@ def _define_lidar(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> U
 
 
 def _define_turning(lidar: Usd.Prim, across: Fan, up: Fan, rate_hz: float) -> None:
-    """A column of emitters that fires at even angles and keeps what lies between two azimuths."""
+    """Author a column of emitters that fires at equal angles, between two azimuths."""
     span = across.most - across.least
     full = np.isclose(span, 2 * np.pi, atol=1e-3)
     start, end = (0.0, 360.0) if full else (np.degrees(a) % 360 for a in (across.least, across.most))
@@ -237,7 +238,7 @@ def _define_turning(lidar: Usd.Prim, across: Fan, up: Fan, rate_hz: float) -> No
 
 
 def _define_fixed(lidar: Usd.Prim, across: Fan, up: Fan) -> None:
-    """A grid of emitters that all fire at once, line by line."""
+    """Author a grid of emitters, line by line, that fire at the same time."""
     names = Sdf.ValueTypeNames
     _write(lidar, "numLines", names.UInt, up.count)
     _write(lidar, "numRaysPerLine", names.UIntArray, Vt.UIntArray([across.count] * up.count))
@@ -246,7 +247,7 @@ def _define_fixed(lidar: Usd.Prim, across: Fan, up: Fan) -> None:
 
 
 def _define_emitters(lidar: Usd.Prim, azimuth: NDArray, elevation: NDArray) -> None:
-    """Directions of the emitters [rad], shape (E,)."""
+    """Author the directions of emitters [rad], shape (E,)."""
     names, state, count = Sdf.ValueTypeNames, "emitterState:s001:", len(azimuth)
     if EMITTER_API not in lidar.GetPrimTypeInfo().GetAppliedAPISchemas():
         lidar.AddAppliedSchema(EMITTER_API)
@@ -268,11 +269,13 @@ def _define_camera(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> 
     fov = tags.number(lens, "horizontal_fov", above=0.0)
     fov = 1.047 if fov is None else fov  # SDFormat's own default
     if not fov < np.pi:
-        raise InputError(f"its horizontal_fov of {fov:g} rad is no perspective's; give one below pi")
+        raise InputError(f"its horizontal_fov of {fov:g} rad is too large; give one below pi")
     size = [tags.number(lens, f"image/{side}", above=0.0) for side in ("width", "height")]
     width, height = (int(n or default) for n, default in zip(size, (320, 240), strict=True))
     if not 1 <= min(width, height) <= max(width, height) <= PIXELS:
-        raise InputError(f"its image of {width:g} x {height:g} is none; give sides from 1 to {PIXELS}")
+        raise InputError(
+            f"its image of {width:g} x {height:g} pixels is invalid; give sides from 1 to {PIXELS}"
+        )
     near = tags.number(lens, "clip/near", "depth_camera/clip/near", above=0.0) or 0.1
     far = tags.number(lens, "clip/far", "depth_camera/clip/far", above=0.0) or 100.0
     if not far > near:
@@ -303,7 +306,7 @@ def _define_camera(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> 
 def _define_image(
     prim: Usd.Prim, camera: UsdGeom.Camera, size: tuple[int, int], *, depth: bool, colour: bool
 ) -> None:
-    """What a camera gives: a render product of its resolution with its channels."""
+    """Author a render product with the resolution and channels of a camera."""
     stage = prim.GetStage()
     product = UsdRender.Product.Define(stage, prim.GetPath().AppendChild("image"))
     product.CreateResolutionAttr(Gf.Vec2i(*size))
@@ -323,7 +326,7 @@ def _define_image(
 def _define_contact(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> Usd.Prim:
     rate = _rate(tags, sensor, 0.0)
     link = site.stage.GetPrimAtPath(site.path.GetParentPath())
-    prim = site.stage.DefinePrim(site.path, CONTACT_TYPE)  # NVIDIA's wants the body as its parent
+    prim = site.stage.DefinePrim(site.path, CONTACT_TYPE)  # NVIDIA's sensor needs the body as its parent
     names = Sdf.ValueTypeNames
     prim.CreateAttribute("enabled", names.Bool, custom=False).Set(True)
     prim.CreateAttribute("sensorPeriod", names.Float, custom=False).Set(1 / rate if rate else 0.0)
@@ -339,7 +342,7 @@ KINDS: Mapping[str, Callable[[Tags, Element, Site, Usd.Prim], Usd.Prim]] = {
     **dict.fromkeys(("camera", "depth", "depth_camera", "rgbd", "rgbd_camera"), _define_camera),
     "contact": _define_contact,
 }
-"""Types of sensors that have a counterpart."""
+"""Functions that author a sensor, by type."""
 
 
 def _say(sensor: Element) -> str:
@@ -347,48 +350,50 @@ def _say(sensor: Element) -> str:
 
 
 def _rate(tags: Tags, sensor: Element, default: float) -> float:
-    """Readings a second [Hz]; Gazebo's 0 and nothing mean each step of its own."""
+    """Rate [Hz]; the default where Gazebo would use every step."""
     rate = tags.number(sensor, "update_rate", least=0.0)
     if tags.flag(sensor, "always_on") is False:
-        tags.description.note(f"{_say(sensor)} is off until asked in Gazebo; here it is on")
+        tags.description.note(f"{_say(sensor)} is off by default in Gazebo; here it is on")
     if not rate and default:
         tags.description.note(f"{_say(sensor)} gives no rate: {default:g} Hz")
     return rate or default
 
 
 def _noise(tags: Tags, element: Element | None) -> float:
-    """Standard deviation of a sensor's white noise: of the axes' the root mean square; 0 for none."""
+    """Standard deviation of a sensor's white noise, the RMS of its axes; 0 if there is none."""
     if element is None:
         return 0.0
     if element.tag in ("rate", "accel"):
         places: tuple[str, ...] = ("",)
     else:
         places = ("noise/", *(f"{axis}/noise/" for axis in "xyz"))
-    found = []
+    deviations = []
     for place in places:
         tags.nothing(element, *(f"{place}{tag}" for tag in ("mean", "bias_mean", "bias_stddev")))
         if place:
             tags.find(element, f"{place}type")
         value = tags.number(element, f"{place}stddev", least=0.0)
         if value is not None:
-            found.append(value)
-    if len(set(found)) > 1:
-        words = ", ".join(f"{value:g}" for value in found)
-        tags.description.note(
-            f"{tags.description.where(element)}: noise {words} of the axes becomes their RMS"
-        )
-    return found[0] if len(set(found)) == 1 else float(np.sqrt(np.mean(np.square(found or [0.0]))))
+            deviations.append(value)
+    deviations = deviations or [0.0]
+    if len(set(deviations)) == 1:
+        return deviations[0]
+    words, where = ", ".join(f"{value:g}" for value in deviations), tags.description.where(element)
+    tags.description.note(f"{where}: noise {words} of the axes becomes their RMS")
+    return float(np.sqrt(np.mean(np.square(deviations))))
 
 
 def _fan(tags: Tags, element: Element | None) -> Fan:
-    """The rays of a LiDAR's `<horizontal>` or `<vertical>`; one where there is none."""
+    """The rays of a LiDAR's `<horizontal>` or `<vertical>`; one if there is none."""
     samples = tags.number(element, "samples", least=1)
     density = tags.number(element, "resolution", above=0.0)
     count = max(1, round((samples or 1) * (1.0 if density is None else density)))
     least = tags.number(element, "min_angle") or 0.0
     most = tags.number(element, "max_angle") or 0.0
     if most < least or most - least > 2 * np.pi + 1e-6:
-        raise InputError(f"its angles go from {least:g} to {most:g} rad; give them in order, a turn at most")
+        raise InputError(
+            f"its angles go from {least:g} to {most:g} rad; give them in order, at most one turn apart"
+        )
     return Fan(least, most, count)
 
 
@@ -396,43 +401,41 @@ def _pose(tags: Tags, element: Element) -> NDArray[np.float64]:
     """A `<pose>` x y z roll pitch yaw, shape (4, 4).
 
     Raises:
-        InputError: It is not six finite numbers, or is given in another frame than the link's.
+        InputError: It is not six finite numbers, or is relative to another frame.
     """
-    found, T = tags.find(element, "pose"), np.eye(4)
-    if found is None or not (found.text or "").strip():
+    tag, T = tags.find(element, "pose"), np.eye(4)
+    if tag is None or not (tag.text or "").strip():
         return T
-    where = tags.description.where(found)
-    frame = found.get("relative_to") or found.get("frame")
+    where = tags.description.where(tag)
+    frame = tag.get("relative_to") or tag.get("frame")
     if frame:
         raise InputError(
-            f"{where}: a pose relative to {frame!r} is not followed; give it in the link's frame"
+            f"{where}: a pose relative to {frame!r} is not supported; give it in the link's frame"
         )
     try:
-        values = [float(word) for word in (found.text or "").split()]
+        values = [float(word) for word in (tag.text or "").split()]
     except ValueError:
         values = []
     if len(values) != 6 or not np.isfinite(values).all():
-        raise InputError(f"{where}: a pose is x y z roll pitch yaw, got {(found.text or '').strip()!r}")
-    angles = np.radians(values[3:]) if found.get("degrees", "").lower() in ("true", "1") else values[3:]
+        raise InputError(f"{where}: a pose is x y z roll pitch yaw, got {(tag.text or '').strip()!r}")
+    angles = np.radians(values[3:]) if tag.get("degrees", "").lower() in ("true", "1") else values[3:]
     T[:3, :3], T[:3, 3] = matrix_from_quat(quat_from_rpy(angles)), values[:3]
     return T
 
 
 def _metadata(prim: Usd.Prim, **metadata: object) -> Usd.Prim:
-    """Keep figures that no schema has on a sensor's prim."""
+    """Keep values without a schema as custom data of a sensor's prim."""
     for name, value in metadata.items():
-        prim.SetCustomDataByKey(f"{FACTS}:{name}", value)
+        prim.SetCustomDataByKey(f"{METADATA}:{name}", value)
     return prim
 
 
 def _write(lidar: Usd.Prim, name: str, kind: Sdf.ValueTypeName, value: object) -> None:
-    """Set an attribute of NVIDIA's LiDAR, whose schema is not here."""
+    """Set an attribute of NVIDIA's LiDAR schema, which is not installed here."""
     lidar.CreateAttribute(f"omni:sensor:Core:{name}", kind, custom=False).Set(value)
 
 
-def _free(prim: Usd.Prim, name: str) -> Sdf.Path:
-    """Path of a child of a link's prim that is not there yet, called `name` if that is free."""
-    name = Tf.MakeValidIdentifier(name)
+def _child(prim: Usd.Prim, name: str) -> Sdf.Path:
+    """A free path below a link's prim, called `name` if possible."""
     taken = {child.GetName() for child in prim.GetChildren()}
-    unique = next(n for n in (name, *(f"{name}_{i}" for i in range(2, 10_000))) if n not in taken)
-    return prim.GetPath().AppendChild(unique)
+    return prim.GetPath().AppendChild(free_name(Tf.MakeValidIdentifier(name), taken))

@@ -1,8 +1,7 @@
 """Shape: visuals and colliders of a link, as gprims in its frame.
 
-A mesh looks as in RViz (robot_link.cpp): its file's own materials win, part by part; the visual's URDF
-material is worn by the parts to which the file gives none, which is all of an STL. GREY is what neither
-dresses.
+Materials follow RViz (robot_link.cpp): those of a mesh file win, part by part. The visual's URDF material
+applies to the other parts, such as all of an STL. The rest is GREY.
 """
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
 from magtwin.urdf.description.description import Description, origin_of
-from magtwin.urdf.description.model import Material, Shape
+from magtwin.urdf.description.model import Shape
 from magtwin.urdf.material import Look, define_grip, define_look, wear
 from magtwin.urdf.meshes.mesh import Paint
 from magtwin.urdf.meshes.mesh_layer import MESH, Entry, MeshLayer, free_name
@@ -25,26 +24,26 @@ VISUALS, COLLISIONS = "visuals", "collisions"
 """Xforms below a link's prim."""
 
 APPROXIMATIONS = {"hull": "convexHull", "decomposition": "convexHull", "mesh": "none"}
-"""What engines are to make of a mesh collider's triangles, by `Options.collision`."""
+"""Approximation of a mesh collider by `Options.collision`."""
 
 NEWTON_MESH_API = "NewtonMeshCollisionAPI"
-"""Newton's applied schema, by name: its plugin lives elsewhere."""
+"""Newton's applied schema; its plugin is not installed here."""
 
 
 def define_visual(
     body: Usd.Prim, visual: Shape, description: Description, meshes: MeshLayer, layer: str
 ) -> list[Usd.Prim]:
-    """The prim of a URDF `<visual>`: a gprim with its look, or an Xform over the mesh that it shares.
+    """Author a URDF `<visual>`: a gprim with its look, or an Xform over a shared mesh.
 
     Args:
-        body: Prim of the link, a child of the robot's.
+        body: Prim of the link, a child of the robot's prim.
         visual: The visual.
-        description: Where the robot's materials stand.
-        meshes: Where the mesh's triangles stand.
+        description: The description, with the robot's materials.
+        meshes: Meshes of the robot.
         layer: Asset path of the exported mesh layer.
 
     Returns:
-        The prim, or nothing where its mesh is missing and that was allowed.
+        The prim; empty if its mesh is missing and the options allow that.
     """
     paint = _paint_of(visual, description)
     if visual.geometry.mesh is None:
@@ -64,9 +63,9 @@ def define_visual(
 def define_collider(
     body: Usd.Prim, collision: Shape, surface: Surface, meshes: MeshLayer, layer: str
 ) -> list[Usd.Prim]:
-    """The colliders of a URDF `<collision>`: its primitive, or the solids that its mesh collides as.
+    """Author a URDF `<collision>`: its primitive, or the solids of its mesh.
 
-    They are of purpose guide, so that no viewer shows them unasked. Other args as for `define_visual`.
+    The prims have purpose guide, so that viewers hide them by default. Arguments as for `define_visual`.
     """
     if collision.geometry.mesh is None:
         made = [_define_primitive(body, COLLISIONS, collision)]
@@ -91,10 +90,10 @@ def define_collider(
 def _define_mesh(
     body: Usd.Prim, visual: Shape, entry: Entry, given: Paint | None, meshes: MeshLayer, layer: str
 ) -> Usd.Prim:
-    """An Xform that refers to a mesh, as an instance where one look covers it.
+    """An Xform that references a mesh, as an instance if it has one look.
 
-    Looks stand in the robot's own scope, which nothing below an instance can see: the one of an instance
-    is bound over it, and a mesh of several is no instance. Its arrays are shared either way.
+    Looks are in the robot's scope, to which prims below an instance cannot refer: a single look is bound
+    above the instance, and a mesh with several looks is not an instance. Arrays are shared in both cases.
     """
     stage, robot = body.GetStage(), body.GetParent()
     prim = UsdGeom.Xform.Define(stage, _path(body, VISUALS, visual.name or entry.path.name)).GetPrim()
@@ -115,7 +114,7 @@ def _define_mesh(
 
 
 def _look(paint: Paint | None, meshes: MeshLayer) -> Look:
-    """The look of a paint, its texture among the robot's; that of what has none if it is none."""
+    """The look of a paint, with its texture added to the robot's; the default look for None."""
     if paint is None:
         return Look()
     return Look(
@@ -132,10 +131,10 @@ def _look(paint: Paint | None, meshes: MeshLayer) -> Look:
 
 
 def _paint_of(visual: Shape, description: Description) -> Paint | None:
-    """A visual's URDF material: its own, or the robot's of that name; none if it has none.
+    """The URDF material of a visual: its own, or the robot's of that name; None if it has none.
 
-    As urdfdom has it, what a visual says of a material holds for others that only name it. A texture is
-    the colour alone, as in RViz; where it is missing, the material's colour is.
+    As in urdfdom, a material defined in one visual applies to others that name it. As in RViz, a texture
+    replaces the colour; if the texture is missing, the colour is used.
     """
     material = visual.material
     if material is None:
@@ -143,26 +142,21 @@ def _paint_of(visual: Shape, description: Description) -> Paint | None:
     name = material.name or ""
     shared = description.materials.get(name)
     if not (material.color or material.texture or shared):
-        shared = _told_by_another(name, description)
+        given = (v.material for link in description.links.values() for v in link.visuals if v.material)
+        shared = next((m for m in given if name and m.name == name and (m.color or m.texture)), None)
     colour = material.color or (shared.color if shared else None)
     texture = material.texture or (shared.texture if shared else None)
     image = None if texture is None else _image(texture.filename, name, description)
     if image is None and colour is None:
         if texture is None and name:
-            description.note(f"material {name!r} is named, but nothing says its colour: shown without it")
+            description.note(f"material {name!r} is named, but has no colour: shown without it")
         return None
     r, g, b, a = (1.0, 1.0, 1.0, 1.0) if colour is None else (float(c) for c in colour.rgba)
     return Paint(name, (r, g, b, a)) if image is None else Paint(name, (1.0, 1.0, 1.0, a), image)
 
 
-def _told_by_another(name: str, description: Description) -> Material | None:
-    """The first material of a name that a visual says more of than that; none if none does."""
-    given = (v.material for link in description.links.values() for v in link.visuals if v.material)
-    return next((m for m in given if name and m.name == name and (m.color or m.texture)), None)
-
-
 def _image(filename: str, material: str, description: Description) -> Image | None:
-    """The picture of a URDF `<texture>`; none, with a note, where it is missing or none."""
+    """The image of a URDF `<texture>`; None with a note if it is missing or unreadable."""
     reading = Reading(description.path, description.source.packages.holds)
     try:
         image = read_image(str(description.find_file(filename, "texture")), reading)
@@ -175,7 +169,7 @@ def _image(filename: str, material: str, description: Description) -> Image | No
 
 
 def _plain(paint: Paint | None, what: str, description: Description) -> Paint | None:
-    """A paint for what no texture can lie on: its mean colour."""
+    """A paint without texture: the mean colour of the texture, with a note."""
     if paint is None or paint.image is None:
         return paint
     description.note(f"material {paint.name!r}: {what} shows the mean colour of its texture", lost=True)
@@ -183,7 +177,7 @@ def _plain(paint: Paint | None, what: str, description: Description) -> Paint | 
 
 
 def _define_primitive(body: Usd.Prim, scope: str, shape: Shape) -> Usd.Prim:
-    """The gprim of a box, capsule, cylinder or sphere."""
+    """Author a box, capsule, cylinder or sphere."""
     stage, geometry = body.GetStage(), shape.geometry
     kind = geometry.kind
     solid, path, scale = getattr(geometry, kind), _path(body, scope, shape.name or kind), None
@@ -198,7 +192,7 @@ def _define_primitive(body: Usd.Prim, scope: str, shape: Shape) -> Usd.Prim:
         schema = UsdGeom.Capsule if kind == "capsule" else UsdGeom.Cylinder
         prim = schema.Define(stage, path).GetPrim()
         schema(prim).CreateRadiusAttr(solid.radius)
-        schema(prim).CreateHeightAttr(solid.length)  # of a capsule without its ends, in URDF and in USD
+        schema(prim).CreateHeightAttr(solid.length)  # without the ends of a capsule, in URDF and USD
         schema(prim).CreateAxisAttr(UsdGeom.Tokens.z)
     _place(prim, origin_of(shape), scale)
     extent = UsdGeom.Boundable.ComputeExtentFromPlugins(UsdGeom.Boundable(prim), Usd.TimeCode.Default())
@@ -207,14 +201,14 @@ def _define_primitive(body: Usd.Prim, scope: str, shape: Shape) -> Usd.Prim:
 
 
 def _path(body: Usd.Prim, scope: str, name: str) -> Sdf.Path:
-    """Path of a prim that is not there yet, in a scope of a link, called `name` if that is free."""
+    """A free path in a scope of a link, called `name` if possible."""
     parent = UsdGeom.Xform.Define(body.GetStage(), body.GetPath().AppendChild(scope)).GetPrim()
     taken = {child.GetName() for child in parent.GetChildren()}
     return parent.GetPath().AppendChild(free_name(Tf.MakeValidIdentifier(name), taken))
 
 
 def _place(prim: Usd.Prim, pose: NDArray, scale: NDArray | None = None) -> None:
-    """Put a gprim at a pose (4, 4) in its link, stretched by `scale` first."""
+    """Place a gprim at a pose (4, 4) in its link, after scaling it."""
     p, q = pose_of(pose)
     write_pose(prim, p, q)
     if scale is not None:
@@ -222,10 +216,10 @@ def _place(prim: Usd.Prim, pose: NDArray, scale: NDArray | None = None) -> None:
 
 
 def pose_of(T: NDArray) -> tuple[tuple[float, float, float], tuple[float, float, float, float] | None]:
-    """Position and quaternion xyzw of a transform (4, 4); no quaternion where it does not turn.
+    """Position and quaternion xyzw of a transform (4, 4); the quaternion is None without a rotation.
 
-    Rounded to 1e-12 (the quaternion to 1e-15: its w tells turns of 1e-6 from none), so that the text
-    shows 0 where the arithmetic left 1e-17.
+    Rounded to 1e-12, to remove rounding errors of arithmetic; the quaternion to 1e-15, since its w differs
+    little from 1 for small rotations.
     """
     x, y, z = (round(float(v), 12) + 0.0 for v in T[:3, 3])
     if np.allclose(T[:3, :3], np.eye(3), rtol=0, atol=1e-12):

@@ -1,4 +1,4 @@
-"""SimReady: what an asset says of itself, as NVIDIA's SimReady Foundation wants it (SR.001, SR.004)."""
+"""SimReady: metadata of an asset for NVIDIA's SimReady Foundation (SR.001, SR.004)."""
 
 import os
 import re
@@ -17,10 +17,10 @@ KEY = "SimReady_Metadata"
 """Entry of the root layer's customLayerData."""
 
 OUTSIDE = ("asset_name", "asset_type", "source_file", "usd_date_generated")
-"""Entries that an older rule (SR.001) wants beside that one too."""
+"""Entries that an older rule (SR.001) also requires at the top level."""
 
 UNKNOWN = "not stated"
-"""What stands where neither the user nor the description says anything."""
+"""Default of entries that neither the user nor the package gives."""
 
 ROBOT_QCODE = "Q11012"
 """Wikidata's item for robots."""
@@ -30,34 +30,33 @@ GIVEN = ("author", "asset_license", "asset_name", "asset_type", "category", "qco
 
 
 def check_metadata(given: Mapping[str, str]) -> None:
-    """Refuse entries that are none.
+    """Refuse invalid entries.
 
     Raises:
-        InputError: A name is unknown, a text is empty, or qcode is no item of Wikidata.
+        InputError: A name is unknown, a text is empty, or qcode is not an item of Wikidata.
     """
     for name, text in given.items():
         if name not in GIVEN:
             raise InputError(f"metadata {name!r} is unknown; {hint(name, GIVEN)}")
         if not text.strip():
-            raise InputError(f"metadata {name!r} is empty; leave it out or say something")
+            raise InputError(f"metadata {name!r} is empty; leave it out or give a text")
     code = given.get("qcode", ROBOT_QCODE)
     if not re.fullmatch("Q[0-9]+", code):
-        raise InputError(f"metadata 'qcode' must be Wikidata's, such as {ROBOT_QCODE}, got {code!r}")
+        raise InputError(f"metadata 'qcode' must be an item of Wikidata, such as {ROBOT_QCODE}, got {code!r}")
 
 
 def metadata(
     stage: Usd.Stage, description: Description, report: ConversionReport, given: Mapping[str, str]
 ) -> dict[str, object]:
-    """Entries of an asset's customLayerData: those given, then those of its package, then what is known.
+    """Entries of an asset's customLayerData: those given, then those of its package, then defaults.
 
-    The day is that of SOURCE_DATE_EPOCH, as reproducible builds set it, and no other, so that one
-    description makes the same bytes on every day.
+    The date is that of SOURCE_DATE_EPOCH, or unknown, so that the output is reproducible.
 
     Args:
-        stage: What was authored.
-        description: Its folder's `package.xml` names author and licence.
+        stage: The authored stage.
+        description: The description; the `package.xml` of its package names author and licence.
         report: Size and mass.
-        given: By name, see GIVEN.
+        given: The user's entries by name, see GIVEN.
     """
     author, licence = _package(description)
     low, high = report.box_out or ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
@@ -69,7 +68,7 @@ def metadata(
         "qcode": ROBOT_QCODE,
         "author": author,
         "asset_license": licence,
-        "usd_date_generated": _day(),
+        "usd_date_generated": _date(),
         **given,
         "source_file": report.source,
         "rigid_body_count": int(bodies),
@@ -80,7 +79,7 @@ def metadata(
 
 
 def _package(description: Description) -> tuple[str, str]:
-    """Author and licence in the manifest of the package that holds the description."""
+    """Author and licence in the manifest of the description's package."""
     manifest = description.source.packages.home / MANIFEST
     if not manifest.is_file():
         return UNKNOWN, UNKNOWN
@@ -93,8 +92,8 @@ def _package(description: Description) -> tuple[str, str]:
     return next(filter(None, names), UNKNOWN), ", ".join(filter(None, licences)) or UNKNOWN
 
 
-def _day() -> str:
-    """The day that SOURCE_DATE_EPOCH gives, YYYY-MM-DD."""
+def _date() -> str:
+    """The date of SOURCE_DATE_EPOCH, YYYY-MM-DD."""
     try:
         seconds = int(os.environ.get("SOURCE_DATE_EPOCH", ""))
         return datetime.fromtimestamp(seconds, UTC).date().isoformat()

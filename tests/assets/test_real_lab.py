@@ -22,7 +22,7 @@ def real_run(tmp_path_factory):
     magtwin = lambda *arguments: main([str(a) for a in arguments])  # noqa: E731
     magtwin("map", "import", real / "maps", "--out", out / "aprilab.usdc", "--licence", "MIT")
     magtwin(
-        "net",
+        "network",
         "convert",
         real / "models" / "nn_magnetometer_model_v0.0.1.pth",
         "--out",

@@ -162,7 +162,7 @@ def test_correlate_tells_and_draws(made, tmp_path, capsys):
             ["correlate", "SET", "--features", "gradiant"],
             "no feature set 'gradiant'; did you mean 'gradient'?",
         ),
-        (["correlate", "SET", "--features", "vector"], "which its recordings do not all have"),
+        (["correlate", "SET", "--features", "vector"], "which not all of its recordings have"),
         (["info", "DAYS"], "no such manifest of a data set"),
     ],
 )

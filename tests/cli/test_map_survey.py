@@ -83,7 +83,7 @@ def test_a_survey_becomes_readings_whose_headings_deviate(lab_scene, tmp_path):
         (["--headings-deg", "north"], "headings are degrees with commas between"),
         (["--readings", "0"], "readings must be at least 1"),
         (["--seed", "-1"], "seed must be a whole number from 0 up"),
-        (["--height-m", "nan"], "height_m is a height above the floor, 0 m or more"),
+        (["--height-m", "nan"], "height_m must be a height above the floor, 0 m or more"),
         (["--position-error-m", "-1"], "position_error_m must not be below 0"),
     ],
 )

@@ -155,16 +155,20 @@ def test_doctor_lists_extras_and_how_to_install_them(capsys):
     assert "pip install" in capsys.readouterr().out
 
 
-def test_cheap_checks_come_first_and_say_what_to_do(tmp_path, capsys):
+def test_cheap_checks_come_first_and_say_what_to_do(lab_scene, tmp_path, capfd):
     (tmp_path / "a.toml").touch()
     for arguments, text in (
         (["run", tmp_path / "a.toml"], "author it first: magtwin scene"),
-        (["run", tmp_path, "--out", "x.txt"], "no known kind of run file"),
+        (["run", tmp_path, "--out", "x.txt"], "unknown format of a run"),
         (["map", "fit", "gone.csv", "--out", "x.csv"], "a map layer ends in .usdc or .usd"),
+        (["train", tmp_path, "--out", tmp_path / "x.safetensors"], "build one from the runs first"),
+        (["scene", "lab", "--map", lab_scene, "--out", tmp_path / "s"], "is no map layer"),
     ):
         with pytest.raises(SystemExit):
             main([str(word) for word in arguments])
-        assert text in capsys.readouterr().err
+        lines = [line for line in capfd.readouterr().err.splitlines() if not line.startswith("  ")]
+        assert len(lines) == 1
+        assert text in lines[0]
 
 
 def test_help_takes_less_than_half_a_second_of_the_processor():

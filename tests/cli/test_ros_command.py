@@ -67,7 +67,7 @@ def test_a_recording_of_nothing_is_said(tmp_path: Path, capsys: pytest.CaptureFi
         (["sim", SCENE, "--pace", "-1"], "speed must be above 0"),
         (["sim", SCENE, "--domain", "300"], "a domain of ROS must be from 0 to 232, got 300"),
         (["sim", SCENE, "--remap", "odom=x"], "a remap is a name:=another"),
-        (["sim", SCENE, "--namespace", "my robot"], "namespace 'my robot' is none of ROS"),
+        (["sim", SCENE, "--namespace", "my robot"], "namespace 'my robot' is not a ROS name"),
         (["sim", SCENE, "--duration-s", "nan"], "--duration-s must be above 0 s, got nan"),
         (["sim", SCENE, "--rate-hz", "1e9"], "rate_hz must be at most 1000 Hz live"),
         (["magnetometer", SCENE, "--duration-s", "-1"], "--duration-s must be above 0 s, got -1.0"),

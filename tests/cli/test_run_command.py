@@ -76,7 +76,7 @@ def test_outputs_that_cannot_all_be_written_leave_none(lab_scene, tmp_path, caps
     for name, said in (
         ("file/a.usd", "cannot be written"),
         ("file/a.mcap", "cannot be written"),
-        ("a.txt", "no known kind of run file"),
+        ("a.txt", "unknown format of a run"),
         ("a.json", "is read, not written"),
         ("a.rrd", "two outputs have one name"),
     ):

@@ -198,7 +198,7 @@ def test_the_commands_draw_a_moment_a_film_and_a_stage(run, lab_scene, tmp_path,
         with Image.open(tmp_path / f"{name}.png") as image:
             assert image.size == SIZE
             assert np.ptp(np.asarray(image)) > 150
-    pace = ["--size", "160x90", "--speed", "10", "--fps", "5"]
+    pace = ["--size", "160x90", "--pace", "10", "--fps", "5"]
     main(["film", str(file), "--out", str(tmp_path / "a.mp4"), *pace])
     assert (tmp_path / "a.mp4").stat().st_size > 1000
     assert "changed since" not in capsys.readouterr().err

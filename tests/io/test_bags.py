@@ -471,7 +471,12 @@ def test_a_recording_that_is_killed_leaves_every_block_that_was_appended(made, t
         assert told["rosbag2_bagfile_information"]["message_count"] > run.rows
 
 
-@pytest.mark.parametrize("keep", [0.3, 0.5, 0.97])
+def test_a_growing_bag_in_sqlite3_is_refused_with_what_to_do(tmp_path):
+    with pytest.raises(InputError, match=r"a bag that grows is MCAP; name it run\.mcap, and make a \.db3"):
+        BagWriter(tmp_path / "run.db3")
+
+
+@pytest.mark.parametrize("keep", [0.3, 0.97])
 def test_of_an_mcap_that_was_cut_anywhere_what_is_whole_is_read(made, tmp_path, monkeypatch, keep):
     monkeypatch.setattr("magtwin.io.bags.mcap.CHUNK", 1 << 16)
     cut = tmp_path / "run.mcap"

@@ -8,10 +8,11 @@ from test_cli import refused
 from test_run import assert_same, every_column
 from test_tables import few_bytes
 
+import magtwin
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.io.bags import BagWriter
-from magtwin.io.formats import FORMATS, read_run, write_run
+from magtwin.io.formats import FORMATS, Format, read_run, write_run
 from magtwin.io.tables import ParquetParts
 from magtwin.run.run import Column, Run
 from magtwin.twin import Twin, open_twin, simulate
@@ -291,4 +292,28 @@ def test_view_without_a_display_refuses_a_stage_and_names_the_picture(lab_scene,
     monkeypatch.setattr("shutil.which", lambda name: None)
     monkeypatch.setattr("sys.platform", "linux")
     assert "no display to show it on; magtwin picture draws it" in refused(capsys, "view", lab_scene)
-    assert "view needs a file" in refused(capsys, "view")
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".db3", ".parquet"])
+def test_a_run_saves_itself_as_one_file_in_the_format_of_its_suffix(tmp_path, suffix):
+    run = Run({"t": [0.0, 0.5], "b_measured_nt": [41_000.0, 41_001.0]}, {"seed": 3})
+    run.save(tmp_path / f"run{suffix}", **({} if suffix == ".parquet" else {"units": "nT"}))
+    assert [p.name for p in tmp_path.iterdir()] == [f"run{suffix}"]
+    assert (tmp_path / f"run{suffix}").is_file()
+    back = magtwin.load_run(tmp_path / f"run{suffix}")
+    np.testing.assert_array_equal(back["b_measured_nt"], run["b_measured_nt"])
+    assert back.metadata["seed"] == 3
+    with pytest.raises(InputError, match="exists already"):
+        run.save(tmp_path / f"run{suffix}")
+
+
+def test_a_registered_format_is_read_and_written_by_its_suffix(tmp_path, monkeypatch):
+    monkeypatch.setattr(FORMATS, "_loaded", dict(FORMATS._loaded))
+    text = Format(
+        name="text",
+        read=lambda path: Run({"t": np.loadtxt(path, ndmin=1)}),
+        write=lambda run, path, *, force: np.savetxt(path, run["t"]),
+    )
+    FORMATS.register(".txt")(text)
+    write_run(Run({"t": [0.0, 1.0]}), tmp_path / "run.txt")
+    assert read_run(tmp_path / "run.txt").rows == 2

@@ -7,13 +7,13 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from test_cli import refused
 from test_gp import survey
-from test_latch import gridded
 from test_rosbag import at_middle, drive, write_bag
+from test_stuck import gridded
 
 from magtwin.author.earth import earth_of
 from magtwin.cli import main
 from magtwin.field.sources.earth import earth_field_nt
-from magtwin.field.survey.folder import import_survey
+from magtwin.io.surveys.maps import open_map
 from magtwin.io.surveys.readings import load_readings, save_readings
 from magtwin.usd.maps import load_map
 from magtwin.usd.scene import read_scene
@@ -28,16 +28,16 @@ def test_latched_nodes_leave_the_layers_valid_ones_and_can_be_kept(tmp_path, cap
     run("map", "import", maps, "--out", tmp_path / "a.usdc", "--licence", "MIT", "--json")
     report = json.loads(capsys.readouterr().out)
     field = load_map(tmp_path / "a.usdc")
-    assert report["figures"]["latched at every heading"]["value"] == 17
+    assert report["figures"]["stuck at every heading"]["value"] == 17
     assert report["figures"]["masked nodes"]["value"] == np.count_nonzero(~field.valid) > 68
     assert np.isnan(field.lookup([-1.25, 0.75], 0.0))
-    assert_array_equal(field.valid, import_survey(maps).valid)
+    assert_array_equal(field.valid, open_map(maps).valid)
     run("map", "import", maps, "--out", tmp_path / "b.usdc", "--keep-stuck", "--json")
     whole = load_map(tmp_path / "b.usdc")
     assert whole.valid.all()
     assert whole.lookup([-1.25, 0.75], 0.0) == pytest.approx(35_602.1, abs=0.1)
     report = json.loads(capsys.readouterr().out)
-    assert report["figures"]["latched at every heading"]["value"] == 17
+    assert report["figures"]["stuck at every heading"]["value"] == 17
 
 
 def test_readings_kept_as_parquet_make_the_same_layer_as_the_folder(tmp_path, capsys, real_data):
@@ -98,11 +98,10 @@ def test_scattered_readings_make_no_nodes_and_the_way_on_is_told(tmp_path, capsy
     [
         (("a.csv", "--x", "px"), "no column 'px'; did you mean 'x'"),
         (("a.csv", "--vector", "a,b"), "vector takes 3 columns"),
-        (("a.csv", "--unit", "uT"), "say --unit nT"),
+        (("a.csv", "--unit", "uT"), "give --unit nT"),
         (("m.usdc",), "m.usdc: a stage or a map, not readings"),
         (("b.csv",), "b.csv: no such source of readings; did you mean 'a.csv'"),
         (("a.csv+b.csv",), "b.csv: no such file of readings"),
-        ((), "no source of readings given"),
         (("a.csv", "--out", "a.txt"), "ends in .usdc or .usd or .parquet"),
     ],
 )
@@ -132,7 +131,7 @@ def test_a_survey_whose_sensor_was_stuck_throughout_is_refused_unless_it_is_to_b
     save_readings(readings.with_(b_nt=np.full(len(readings), 41_000.0)), tmp_path / "a.parquet")
     arguments = ("map", "import", tmp_path / "a.parquet", "--out", tmp_path / "a.usdc")
     line = refused(capsys, *arguments)
-    assert f"all {len(readings)} readings are those of a sensor that was stuck" in line
+    assert f"all {len(readings)} readings come from a sensor that was stuck" in line
     assert "--keep-stuck" in line
     run(*arguments, "--keep-stuck")
     assert load_map(tmp_path / "a.usdc").valid.all()
@@ -146,7 +145,7 @@ def test_a_fit_and_a_check_run_from_readings_with_latched_ones_out(tmp_path, cap
     save_readings(gridded(0, change=latch), tmp_path / "a.parquet")
     run("map", "fit", tmp_path / "a.parquet", "--method", "trilinear", "--out", tmp_path / "a.usdc", "--json")
     report = json.loads(capsys.readouterr().out)
-    assert report["figures"]["latched at every heading"]["value"] == 12
+    assert report["figures"]["stuck at every heading"]["value"] == 12
     field = load_map(tmp_path / "a.usdc")
     assert field.values_nt[field.valid].min() > 32_000
     run("map", "validate", tmp_path / "a.parquet", "--method", "trilinear", "--json")
@@ -254,8 +253,8 @@ def test_a_check_takes_the_kernel_of_the_gaussian_process_and_leaves_headings_ou
 @pytest.mark.parametrize(
     ("arguments", "what"),
     [
-        (("--method", "cubic", "--kernel", "matern"), "--kernel is for --method gp alone"),
-        (("--method", "gp", "--earth", "1,2,3"), "--earth is for --method harmonic alone"),
+        (("--method", "cubic", "--kernel", "matern"), "--kernel is for --method gp; drop it"),
+        (("--method", "gp", "--earth", "1,2,3"), "--earth is for --method harmonic; drop it"),
         (("--earth", "1,2,south"), "--earth is a scene; latitude,longitude,height,date; or x,y,z in nT"),
         (("--earth", "0,0,0"), "earth_nt must be three numbers"),
         (
@@ -290,7 +289,7 @@ def test_a_fit_of_one_heading_and_of_few_readings_says_that_they_are_doubtful(tm
     )
     said = " ".join(capsys.readouterr().out.split())
     assert "only 16 good readings" in said
-    assert "one heading only, 29 deg: nothing tells the robot's own field from the room's" in said
+    assert "one heading only, 29 deg: the robot's own field cannot be separated" in said
     assert "field in uT, by its size (--unit)" in said
 
 

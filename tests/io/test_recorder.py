@@ -268,8 +268,7 @@ def test_a_viewer_that_is_not_there_is_refused_before_anything_is_written(lab_sc
         (["--live", "--pace", "0"], "--pace must be above 0"),
         (["--live", "--viewer", "rerun+http://127.0.0.1:9/proxy"], "give one of them"),
         (["--out-unit", "nT"], "--out-unit is for a bag"),
-        (["--usd-fps", "10"], "--usd-fps is for a layer"),
-        (["--out", str(tmp_path / "run.csv")], r"ends in .usd or .usda or .usdc"),
+        (["--usd-fps", "10"], "--usd-fps is for a USD layer"),
     ):
         with pytest.raises(SystemExit):
             main([*arguments, *options])

@@ -113,7 +113,7 @@ def test_what_the_refusal_says_is_true():
 def test_no_room_is_refused():
     with pytest.raises(InputError, match=r"the floor of 0\.3 x 3 m is no wider than a robot"):
         path_in(room(0.3, 3.0), "sine")
-    with pytest.raises(InputError, match="does not fit between what stands on the floor of 2 x 2 m"):
+    with pytest.raises(InputError, match="does not fit between the obstacles on the floor of 2 x 2 m"):
         path_in(room(2.0, 2.0, box(0, 0, 1.6, 1.6)), "sine")
 
 

@@ -130,7 +130,7 @@ def test_a_broken_message_tells_no_clock_and_wall_timers_go_on_without_it(domain
     due: list[str] = []
     bus.timer(0.01, lambda: due.append("sim"))
     bus.timer(0.01, lambda: due.append("wall"), wall=True)
-    bus._told(Message("rosgraph_msgs/msg/Clock", b"\0\1\0\0\5", 0, 0))
+    bus._tick(Message("rosgraph_msgs/msg/Clock", b"\0\1\0\0\5", 0, 0))
     spin(lambda: len(due) > 2, bus)
     assert bus.now_ns() == 0
     assert set(due) == {"wall"}
@@ -206,7 +206,7 @@ def test_where_rclpy_is_broken_cyclonedds_is_taken_and_who_asks_for_rclpy_is_tol
 
 def test_a_topic_is_of_one_type_in_a_node(pair: tuple[Bus, Bus]) -> None:
     pair[0].publisher("odom", ODOMETRY.kind, SENSOR_DATA)
-    with pytest.raises(InputError, match="/robot/odom has messages of nav_msgs/msg/Odometry"):
+    with pytest.raises(InputError, match="/robot/odom is a nav_msgs/msg/Odometry"):
         pair[0].subscribe("odom", FIELD, lambda m: None, SENSOR_DATA)
 
 

@@ -213,7 +213,7 @@ def test_before_its_inputs_it_waits_and_says_for_what(world: World) -> None:
     assert said["readings"].message == "no reading: no fresh /robot/battery_state"
     assert said["input /robot/battery_state"].level == "stale"
     assert said["input /robot/odom"].level == "ok"
-    assert said["input /robot/cmd_vel"].message == "no commands: the robot is taken to stand"
+    assert said["input /robot/cmd_vel"].message == "no commands: the robot is assumed to stand"
     assert said["input /robot/cmd_vel"].level == "ok"
     world.tick(bus, 3)
     assert world.heard(bus)
@@ -325,7 +325,7 @@ def test_another_who_says_the_field_is_told_of(world: World) -> None:
     world.send_on(MAGNITUDE)
     bus = world.start()
     said = world.diagnose(bus)
-    assert "1 others say /robot/qtfm/magnitude too" in said["readings"].message
+    assert "1 others publish /robot/qtfm/magnitude too" in said["readings"].message
     assert said["readings"].level == "warn"
 
 

@@ -273,7 +273,7 @@ def test_commands_that_it_cannot_hear_and_others_on_its_topics_are_said(
     simulator.run(lambda: hand.spin_once(0.0) or bool(said))
     assert said[0].level == "warn"
     assert "1 commands were not finite" in said[0].message
-    assert "commands come as geometry_msgs/msg/TwistStamped and are not heard" in said[0].message
+    assert "commands of type geometry_msgs/msg/TwistStamped are ignored" in said[0].message
     assert "2 publishers on /clock" in said[0].message
     assert "2 publishers on /robot/qtfm/magnitude" in said[0].message
     assert simulator.online.commands.rows[:, 1:].any() == np.False_

@@ -6,14 +6,14 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
+from pxr import Usd, UsdGeom, UsdPhysics
 from validators import assert_valid
 
 from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.urdf import convert_urdf, read_notes
 from magtwin.urdf.description.description import read_description
-from magtwin.urdf.meshes.mesh import corner_normals, read_mesh
+from magtwin.urdf.meshes.mesh import corner_normals
 from magtwin.urdf.physics.inertia import principal_axes, quaternion
 from magtwin.usd.geometry import read_links, read_shapes
 
@@ -160,19 +160,6 @@ def test_a_wheel_without_effort_is_noted_and_a_dead_suspension_is_welded(tmp_pat
     assert any("cannot move by its own limits: welded" in note for note in read_notes(tmp_path / "arm.usda"))
 
 
-def test_friction_of_gazebo_tags_reaches_the_collider(tmp_path):
-    path = arm(tmp_path, "fixed|")
-    tag = '<gazebo reference="hand"><mu1>0.05</mu1><maxVel>1</maxVel></gazebo></robot>'
-    path.write_text(path.read_text().replace("</robot>", tag))
-    _, robot = convert(path)
-    collider = robot.GetPrimAtPath("hand/collisions").GetChildren()[0]
-    grip = UsdShade.MaterialBindingAPI(collider).ComputeBoundMaterial("physics")[0]
-    assert_allclose(UsdPhysics.MaterialAPI(grip).GetDynamicFrictionAttr().Get(), 0.05, rtol=1e-6)
-    assert collider.GetAttribute("purpose").Get() == "guide"
-    (note,) = read_notes(tmp_path / "arm.usda")
-    assert note == "1 tags without a meaning here are kept as text, such as gazebo/maxVel"
-
-
 def test_colours_of_materials_arrive_linear_and_one_name_with_two_colours_stays_two(tmp_path):
     colour = '<material name="paint"><color rgba="{} 0 0 0.5"/></material>'
     path = urdf(
@@ -225,18 +212,6 @@ def test_big_arrays_stay_out_of_the_text(tmp_path):
     assert not [layer for layer in text if "points" in layer]
 
 
-def test_two_conversions_give_the_same_bytes(tmp_path):
-    trimesh.creation.icosphere().export(tmp_path / "ball.stl")
-    mesh = '<visual><geometry><mesh filename="ball.stl"/></geometry></visual>'
-    path = urdf(tmp_path, f"<link name='base_link'>{{INERTIAL}}{mesh}</link>")
-    first = convert_urdf(path, tmp_path / "one" / "arm.usda")
-    second = convert_urdf(path, tmp_path / "two" / "arm.usda")
-    made = sorted(p.relative_to(first.parent) for p in first.parent.rglob("*.usd*"))
-    assert len(made) == 9
-    for name in made:
-        assert (first.parent / name).read_bytes() == (second.parent / name).read_bytes()
-
-
 # --- inertia and normals --------------------------------------------------------------------------
 
 
@@ -286,51 +261,8 @@ def test_a_ball_is_shaded_smooth_and_a_box_sharp():
 
 # --- COLLADA --------------------------------------------------------------------------------------
 
-DAE = """<?xml version="1.0"?>
-<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
-<asset><unit meter="{unit}"/><up_axis>Z_UP</up_axis></asset>
-<library_effects><effect id="e"><profile_COMMON><technique sid="t"><lambert>
-<diffuse><color>{colour}</color></diffuse></lambert></technique></profile_COMMON></effect></library_effects>
-<library_materials><material id="m"><instance_effect url="#e"/></material></library_materials>
-<library_geometries><geometry id="g"><mesh>
-<source id="p"><float_array id="pa" count="9">0 0 0 1 0 0 0 1 0</float_array><technique_common>
-<accessor source="#pa" count="3" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
-<param name="Z" type="float"/></accessor></technique_common></source>
-<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
-<triangles count="1" material="s"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p></triangles>
-</mesh></geometry></library_geometries>
-<library_visual_scenes><visual_scene id="scene"><node><rotate>0 0 1 90</rotate><node>
-<translate>10 0 0</translate><instance_geometry url="#g"><bind_material><technique_common>
-<instance_material symbol="s" target="#m"/></technique_common></bind_material></instance_geometry>
-</node></node></visual_scene></library_visual_scenes>
-<scene><instance_visual_scene url="#scene"/></scene></COLLADA>
-"""
-
-
-def test_nested_nodes_of_collada_compose_outside_in_and_its_unit_applies(tmp_path):
-    path = tmp_path / "t.dae"
-    path.write_text(DAE.format(unit=0.1, colour="0.2 0.4 0.6 1"))
-    mesh = read_mesh(path)  # moved by 10 along x, then turned by 90 degrees: to +y
-    assert_allclose([mesh.points.min(0), mesh.points.max(0)], [[-0.1, 1.0, 0], [0, 1.1, 0]], atol=1e-6)
-    assert_allclose(mesh.paints[0].rgba, (0.2, 0.4, 0.6, 1))
-
-
-@pytest.mark.parametrize(
-    ("colour", "read"),
-    [("0.5 0.0 0.01.0", (0.5, 0, 0, 1)), ("0.2 0.4 0.6", (0.2, 0.4, 0.6, 1)), ("red", (0.5, 0.5, 0.5, 1))],
-)
-def test_a_malformed_colour_is_mended_with_a_note_and_its_geometry_kept(tmp_path, colour, read):
-    path = tmp_path / "t.dae"
-    path.write_text(DAE.format(unit=1, colour=colour))
-    mesh = read_mesh(path)
-    assert_allclose(mesh.paints[0].rgba, read)
-    words = " ".join(f"{c:g}" for c in read)
-    assert [note.text for note in mesh.notes] == [f"t.dae: malformed colour {colour!r} read as {words!r}"]
-
 
 # --- refusals -------------------------------------------------------------------------------------
-
-LINK = '<link name="base_link">{BODY}</link>'
 
 
 def mesh_link(filename):
@@ -339,32 +271,16 @@ def mesh_link(filename):
 
 FLAT = INERTIAL.replace('izz="1"', 'izz="9"')
 NO_MASS = '<link name="b"><inertial><origin xyz="0 0 1"/></inertial></link>'
-NO_NUMBER = '<link name="b"><visual><geometry><sphere radius="big"/></geometry></visual></link>'
-NEGATIVE = '<gazebo reference="base_link"><mu1>-1</mu1></gazebo>'
+
 
 REFUSED = {
-    "twice": (LINK + "\n" + LINK, r"arm\.urdf:4: link 'base_link' exists twice, first on line 3; rename"),
-    "no name": ("<link/>", r"arm\.urdf:3: a <link> has no name"),
-    "no link": ("", r"arm\.urdf:2: the robot has no <link>"),
-    "two roots": (LINK + '<link name="b"/>', "link 'b' is not connected: a robot has one root, this has"),
-    "mesh missing": (mesh_link("no.stl"), r"arm\.urdf:3: mesh 'no\.stl' is missing; looked for .*no\.stl"),
-    "mesh above": (mesh_link("../up.stl"), r"mesh '\.\./up\.stl' lies outside .*; files are read from there"),
-    "mesh absolute": (mesh_link("/etc/x.stl"), r"mesh '/etc/x\.stl' lies outside"),
-    "mesh format": (mesh_link("a.blend"), r"mesh 'a\.blend' is of no known format \(\.dae, \.glb"),
     "mesh scale": (mesh_link('t.stl" scale="1 0 1'), r"mesh 't\.stl' has scale \[1\.0, 0\.0, 1\.0\]; give"),
-    "package": (
-        mesh_link("package://nowhere/a.stl"),
-        "is in a package: no package 'nowhere' around it; give",
-    ),
-    "package above": (mesh_link("package://arms/../../a.stl"), r"mesh .* lies outside .*arms"),
     "no mass": (NO_MASS, r":3: link 'b' has a mass of None"),
     "inertia": (f'<link name="b">{FLAT}</link>', r":3: link 'b' has an impossible inertia: no body has"),
-    "friction": (LINK + NEGATIVE, r"arm\.urdf:3: mu1 must be a finite number not below 0, got '-1'"),
     "too large": (
-        NO_NUMBER.replace("big", "1e200"),
+        '<link name="b"><visual><geometry><sphere radius="1e200"/></geometry></visual></link>',
         r":3: link 'b': radius of <sphere> must be a finite number, got '1e200'",
     ),
-    "no number": (NO_NUMBER, r":3: link 'b': radius of <sphere> must be a finite number, got 'big'"),
 }
 
 
@@ -372,7 +288,6 @@ REFUSED = {
 def test_a_bad_description_is_refused_in_one_line_and_nothing_is_written(tmp_path, case):
     body, message = REFUSED[case]
     path = urdf(tmp_path, body)
-    (tmp_path / "arms" / "meshes").mkdir(parents=True)
     tetrahedron(tmp_path / "t.stl")
     with pytest.raises(InputError, match=message) as refusal:
         convert_urdf(path, tmp_path / "out" / "arm.usda")
@@ -390,7 +305,7 @@ NAMED = """
 <joint name="w 1" type="continuous"><parent link="底座"/><child link="1st wheel"/></joint>"""
 
 
-def test_no_name_is_refused_and_one_that_usd_has_no_place_for_is_shown(tmp_path):
+def test_any_name_is_accepted_and_invalid_usd_names_become_display_names(tmp_path):
     stage, robot = convert(urdf(tmp_path, NAMED, "my robot"))
     notes = read_notes(tmp_path / "my robot.usda")
     renamed = {
@@ -415,13 +330,7 @@ def test_no_name_is_refused_and_one_that_usd_has_no_place_for_is_shown(tmp_path)
 
 
 JOINTS = {
-    "type": ("ball|", "joint 'j' is of type 'ball'; known: fixed, revolute, continuous, prismatic, planar"),
-    "axis": ('continuous|<axis xyz="0 0 0"/>', "joint 'j' moves about an axis of length 0"),
     "no limit": ("revolute|", "joint 'j' is revolute and needs <limit lower= upper=>"),
-    "limits": (
-        'revolute|<limit effort="1" velocity="1" lower="1" upper="-1"/>',
-        "joint 'j' has its lower limit 1 above its upper -1",
-    ),
     "effort": (
         'continuous|<limit effort="-1" velocity="1"/>',
         "joint 'j' has an effort of -1; give one above 0",
@@ -436,63 +345,9 @@ def test_a_bad_joint_is_refused_with_its_line(tmp_path, case):
         convert_urdf(arm(tmp_path, inner), tmp_path / "arm.usda")
 
 
-def test_a_joint_to_a_link_that_is_not_there_names_the_near_one(tmp_path):
-    path = arm(tmp_path, "fixed|")
-    path.write_text(path.read_text().replace('child link="hand"', 'child link="hnad"'))
-    with pytest.raises(InputError, match=r":5: joint 'j' names no link 'hnad'; did you mean 'hand'"):
-        read_description(path)
-
-
-def test_links_in_a_circle_are_refused(tmp_path):
-    path = arm(tmp_path, "fixed|")
-    back = '<joint name="k" type="fixed"><parent link="hand"/><child link="base_link"/></joint></robot>'
-    path.write_text(path.read_text().replace("</robot>", back))
-    with pytest.raises(InputError, match="joint 'j' closes a circle: no link is the root; remove one joint"):
-        read_description(path)
-
-
-def test_a_link_held_twice_is_refused(tmp_path):
-    path = arm(tmp_path, "fixed|")
-    twice = '<joint name="k" type="fixed"><parent link="base_link"/><child link="hand"/></joint></robot>'
-    path.write_text(path.read_text().replace("</robot>", twice))
-    with pytest.raises(InputError, match=r"joint 'k' holds 'hand', which 'j' holds already"):
-        read_description(path)
-
-
-def test_broken_xml_is_refused_with_its_line(tmp_path):
-    path = urdf(tmp_path, "<link name='a'>\n</lnik>")
-    with pytest.raises(InputError, match=r"arm\.urdf:4: not XML: mismatched tag \(column \d+\)"):
-        read_description(path)
-
-
-def test_entity_bombs_and_outer_entities_are_refused_before_they_unfold(tmp_path):
-    path = tmp_path / "bomb.urdf"
-    laughs = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 12))
-    path.write_text(f'<?xml version="1.0"?>\n<!DOCTYPE r [<!ENTITY l0 "ha">{laughs}]>\n<robot name="&l11;"/>')
-    with pytest.raises(InputError, match=r"bomb\.urdf:2: has a DOCTYPE, whose entities are not followed"):
-        read_description(path)
-    path.write_text('<!DOCTYPE r [<!ENTITY x SYSTEM "file:///etc/passwd">]>\n<robot name="&x;"/>')
-    with pytest.raises(InputError, match="has a DOCTYPE"):
-        read_description(path)
-
-
-def test_what_is_no_urdf_is_refused(tmp_path):
-    path = tmp_path / "arm.urdf"
-    path.write_text("<sdf/>")
-    with pytest.raises(InputError, match=r"arm\.urdf:1: a URDF begins with <robot>, this file with <sdf>"):
-        read_description(path)
-    with pytest.raises(InputError, match=r"amr\.urdf: no such URDF file; did you mean 'arm\.urdf'"):
-        read_description(tmp_path / "amr.urdf")
-    with pytest.raises(InputError, match="cannot be read"):
-        read_description(tmp_path)
-
-
-def test_a_mesh_that_is_broken_empty_or_flat_is_refused(tmp_path):
+def test_a_flat_mesh_has_no_hull_and_is_refused(tmp_path):
     mesh = '<geometry><mesh filename="m.stl"/></geometry>'
     path = urdf(tmp_path, f'<link name="b">{{INERTIAL}}<collision>{mesh}</collision></link>')
-    (tmp_path / "m.stl").write_text("nonsense")
-    with pytest.raises(InputError, match=r"m\.stl: (cannot be read as a mesh|holds no triangle)"):
-        convert_urdf(path, tmp_path / "arm.usda")
     trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).export(tmp_path / "m.stl")
     with pytest.raises(InputError, match=r"m\.stl: is flat and has no convex hull to collide with"):
         convert_urdf(path, tmp_path / "arm.usda")
@@ -521,19 +376,6 @@ def real_robot(tmp_path_factory):
     return path, convert_urdf(path, tmp_path_factory.mktemp("real") / "turtlebot4.usda")
 
 
-def reference_box(path, T):
-    """Bounding box of a COLLADA file under a transform, read by pycollada alone, nothing repaired."""
-    import collada
-
-    text = path.read_bytes().replace(b"0.0 0.0 0.01.0", b"0.0 0.0 0.0 1.0")
-    file = collada.Collada(__import__("io").BytesIO(text))
-    points = [
-        p.vertex[p.vertex_index.ravel()] for g in file.scene.objects("geometry") for p in g.primitives()
-    ]
-    points = np.vstack(points) @ T[:3, :3].T + T[:3, 3]
-    return points.min(0), points.max(0)
-
-
 def primitive_box(geometry):
     """Lower and upper corner of a primitive about its origin, shape (2, 3)."""
     if geometry.box is not None:
@@ -543,32 +385,6 @@ def primitive_box(geometry):
     else:
         half = np.full(3, geometry.sphere.radius)
     return np.stack([-half, half])
-
-
-def test_every_visual_of_the_real_robot_arrives_with_its_bounding_box(real_robot):
-    import yourdfpy
-
-    path, out = real_robot
-    peer = yourdfpy.URDF.load(str(path), load_meshes=False)  # its forward kinematics, not ours
-    links, shapes = read_links(out), read_shapes(out)
-    checked = 0
-    for link in peer.robot.links:
-        for visual in link.visuals:
-            origin = np.eye(4) if visual.origin is None else visual.origin
-            if visual.geometry.mesh is None:
-                low, high = primitive_box(visual.geometry) + origin[:3, 3]
-                stem = ""
-            else:
-                low, high = reference_box(path.parent / visual.geometry.mesh.filename, origin)
-                stem = visual.geometry.mesh.filename.split("/")[-1].removesuffix(".dae")
-            mine = np.vstack([s.vertices for s in shapes if s.link == link.name and stem in s.prim])
-            assert_allclose([mine.min(0), mine.max(0)], [low, high], atol=1e-6, err_msg=link.name)
-            checked += 1
-    assert checked == 18
-    for name, link in links.items():
-        T = peer.get_transform(name, "base_link")
-        assert_allclose(link.p_base_link, T[:3, 3], atol=1e-9)
-        assert_allclose(matrix_from_quat(link.q_base_link_xyzw), T[:3, :3], atol=1e-9)
 
 
 def test_the_mass_of_the_real_robot_is_its_urdfs_and_nothing_is_silent(real_robot):
@@ -583,7 +399,3 @@ def test_the_mass_of_the_real_robot_is_its_urdfs_and_nothing_is_silent(real_robo
     assert "rplidar.dae: malformed colour '0.0 0.0 0.01.0' read as '0 0 0 1'" in notes
     assert "joint 'wheel_drop_left_joint' (prismatic) cannot move by its own limits: welded" in notes
     assert any(s.link == "rplidar_link" and len(s.faces) > 5000 for s in read_shapes(stage))
-
-
-def test_the_real_robot_passes_the_validators(real_robot, tmp_path):
-    assert_valid(real_robot[1], tmp_path)

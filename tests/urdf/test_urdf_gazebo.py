@@ -79,7 +79,7 @@ def test_friction_bounce_and_compliance_reach_the_collider(tmp_path):
     assert_valid(tmp_path / "cart.usda", tmp_path)
 
 
-def test_a_figure_may_stand_in_an_attribute_called_value(tmp_path):
+def test_a_number_may_be_in_the_attribute_value(tmp_path):
     _, robot, report = cart(tmp_path, on("left_wheel", '<mu1 value="0.7"/><selfCollide value="true"/>'))
     collider = robot.GetPrimAtPath("left_wheel/collisions").GetChildren()[0]
     grip = UsdShade.MaterialBindingAPI(collider).ComputeBoundMaterial("physics")[0].GetPrim()
@@ -88,7 +88,7 @@ def test_a_figure_may_stand_in_an_attribute_called_value(tmp_path):
     assert not report.unknown_tags
 
 
-def test_tags_about_nothing_that_is_there_are_a_loss_that_names_it(tmp_path):
+def test_tags_of_an_unknown_link_are_a_loss(tmp_path):
     _, _, report = cart(tmp_path, on("left_weel", "<mu1>1</mu1>"))
     (loss,) = report.losses
     assert loss.startswith(
@@ -170,7 +170,7 @@ def test_a_partial_scan_keeps_its_azimuths_across_zero(tmp_path):
     assert core(lidar, "patternFiringRateHz") == 360 * 8  # 240 steps of one degree, round the whole turn
 
 
-def test_a_range_finder_is_a_fixed_grid_of_rays_and_none_of_magtwins(tmp_path):
+def test_a_range_finder_is_a_fixed_grid_of_rays_without_magtwins_schema(tmp_path):
     text = LIDAR.format(type="gpu_lidar", tag="lidar", samples=5, least=-0.2, most=0.2, lines=3)
     _stage, robot, _ = cart(tmp_path, on("eye", text))
     assert not prims_with(robot, "lidar")
@@ -181,12 +181,12 @@ def test_a_range_finder_is_a_fixed_grid_of_rays_and_none_of_magtwins(tmp_path):
     assert_allclose(core(lidar, "emitterState:s001:azimuthDeg"), np.tile(azimuth, 3), atol=1e-5)
 
 
-def test_only_the_first_scanner_is_magtwins(tmp_path):
+def test_only_the_first_scanner_gets_magtwins_schema(tmp_path):
     text = LIDAR.format(type="gpu_lidar", tag="lidar", samples=360, least=-3, most=3, lines=1)
     stage, robot, report = cart(tmp_path, on("eye", text) + on("base_link", text))
     assert len(prims_with(robot, "lidar")) == 1
     assert sum(p.GetTypeName() == "OmniLidar" for p in stage.Traverse()) == 2
-    assert any("is a LiDAR more than magtwin simulates" in note for note in report.notes)
+    assert any("is a second LiDAR, which magtwin does not simulate" in note for note in report.notes)
 
 
 CAMERA = """<sensor name="eye" type="{type}"><update_rate>30</update_rate><pose>0 0 0 0 0.2 0</pose><camera>
@@ -228,7 +228,7 @@ def test_a_magnetometer_is_magtwins_with_its_noise_in_nanotesla(tmp_path):
     spec = read_magnetometer(prim)
     assert spec.rate_hz == 50
     assert_allclose(spec.noise_std_nt, 20)
-    assert any("taken as tesla" in note for note in report.notes)
+    assert any("assumed to be tesla" in note for note in report.notes)
 
 
 def test_a_contact_sensor_is_nvidias_on_the_body(tmp_path):
@@ -250,12 +250,16 @@ def test_a_sensor_without_a_counterpart_is_kept_as_text_on_its_link_and_counted(
     assert any("sensor 'gps' of link 'eye' is of type 'navsat'" in note for note in report.notes)
 
 
-def test_what_a_sensor_says_beyond_its_figures_is_counted(tmp_path):
+def test_unknown_tags_of_a_sensor_are_counted(tmp_path):
     text = IMU.replace("<imu>", "<topic>imu</topic><visualize>1</visualize><imu>")
     _stage, robot, report = cart(tmp_path, on("eye", text))
     assert report.unknown_tags == {"gazebo/sensor/topic": 1, "gazebo/sensor/visualize": 1}
     kept = list(robot.GetPrimAtPath("base_link/eye").GetCustomDataByKey("magtwin:unconverted"))
     assert kept[0] == "gazebo/sensor(imu): <topic>imu</topic>"
+    note = (
+        "2 tags without a meaning here are kept as text, such as gazebo/sensor/topic, gazebo/sensor/visualize"
+    )
+    assert note in report.notes
 
 
 # --- drives ---------------------------------------------------------------------------------------
@@ -301,7 +305,7 @@ def test_older_plugins_give_a_diameter_and_limits_come_from_the_wheels(tmp_path,
     assert any("TurtleBot 4's values are used for a_max" in note for note in report.notes)
 
 
-def test_a_size_that_no_plugin_tells_is_measured_on_the_robot(tmp_path):
+def test_sizes_missing_in_a_plugin_are_measured_on_the_robot(tmp_path):
     plugin = GZ.replace("<wheel_separation>0.31</wheel_separation>", "")
     plugin = plugin.replace("<wheel_radius>0.041</wheel_radius>", "")
     _stage, robot, report = cart(tmp_path, plugin)
@@ -356,7 +360,7 @@ def test_settings_that_are_missing_are_a_loss_that_names_them(tmp_path):
 @pytest.mark.parametrize(
     ("kind", "gains"), [("velocity", (0, 5)), ("position", (100, 10)), ("effort", (0, 0))]
 )
-def test_command_interfaces_say_what_a_drive_holds(tmp_path, tags, kind, gains):
+def test_command_interfaces_choose_the_drive(tmp_path, tags, kind, gains):
     stage, _, _ = cart(tmp_path, tags.format(kind, kind.capitalize()))
     drive = UsdPhysics.DriveAPI(stage.GetPrimAtPath("/cart/joints/left"), "angular")
     per_rad = np.array([drive.GetStiffnessAttr().Get(), drive.GetDampingAttr().Get()]) * 180 / np.pi
@@ -429,7 +433,7 @@ REFUSED = {
     ),
     "pixels": (
         on("eye", CAMERA.format(type="camera").replace("<width>640", "<width>9e30")),
-        r"its image of 9.*e\+\d+ x \d+ is none; give sides from 1 to 65536",
+        r"its image of 9.*e\+\d+ x \d+ pixels is invalid; give sides from 1 to 65536",
     ),
     "flag": (
         on("base_link", "<selfCollide>maybe</selfCollide>"),
@@ -458,12 +462,6 @@ def test_a_bad_tag_is_refused_with_its_line_and_nothing_is_written(tmp_path, nam
     assert [p.name for p in tmp_path.iterdir()] == ["cart.urdf"]
 
 
-MERGES = "a0: &a0 {a: 1, b: 2}\n" + "".join(
-    f"a{i}: &a{i} {{<<: [*a{i - 1}, *a{i - 1}]}}\n" for i in range(1, 60)
-)
-"""Tables that each merge the one before twice: 2**60 entries."""
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -472,7 +470,6 @@ MERGES = "a0: &a0 {a: 1, b: 2}\n" + "".join(
         ("a: 2001-99-99", r"control\.yaml: not YAML: month must be in 1\.\.12"),
         ("a: " + "9" * 5000, r"control\.yaml: not YAML: .*digits"),
         ("a: " + "[" * 5000, r"control\.yaml: not YAML"),
-        (MERGES, r"control\.yaml:\d+: not YAML: a table of over 10000 entries"),
         (YAML.replace("0.04", "round"), r"control\.yaml: wheel_radius must be a number above 0, got 'round'"),
         (YAML.replace("[left]", "[lefft]"), r"left_wheel_names: no joint 'lefft'; did you mean 'left'"),
     ],
@@ -483,7 +480,7 @@ def test_bad_settings_are_refused(tmp_path, text, message):
         cart(tmp_path, CONTROL)
 
 
-def test_settings_that_grow_without_end_are_no_settings(tmp_path):
+def test_settings_that_grow_exponentially_are_ignored(tmp_path):
     lines = ["a0: &a0 {x: 1}"] + [f"a{i}: &a{i} {{l: *a{i - 1}, r: *a{i - 1}}}" for i in range(1, 60)]
     (tmp_path / "control.yaml").write_text("\n".join(lines))
     _stage, robot, _ = cart(tmp_path, CONTROL)

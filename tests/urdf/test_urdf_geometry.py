@@ -5,7 +5,6 @@ import io
 import json
 import struct
 import sys
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ from magtwin.urdf import convert_urdf, read_notes
 from magtwin.urdf.meshes.mesh import Piece, distinct, read_mesh
 from magtwin.urdf.meshes.polygon import cut_polygons
 from magtwin.urdf.options import Options
-from magtwin.usd.geometry import linear_from_srgb, read_links, read_shapes
+from magtwin.usd.geometry import linear_from_srgb, read_shapes
 
 GREEN = '<material name="green"><color rgba="0 1 0 1"/></material>'
 
@@ -143,7 +142,7 @@ def test_two_materials_of_a_wavefront_file_become_two_subsets_of_one_mesh(tmp_pa
     assert_valid(stage.GetRootLayer().realPath, tmp_path)
 
 
-def test_a_texture_lies_beside_the_asset_and_colours_the_mesh_where_it_did(tmp_path):
+def test_a_texture_is_copied_beside_the_asset_and_keeps_its_place_on_the_mesh(tmp_path):
     bytes_in = picture(tmp_path / "tiles.png").read_bytes()
     file = squares(tmp_path, MTL + "map_Kd -s 1 1 1 tiles.png\n")
     stage = robot(tmp_path, visual(file))
@@ -172,7 +171,7 @@ def test_a_single_file_has_its_textures_beside_it_too(tmp_path):
     assert_valid(stage.GetRootLayer().realPath, tmp_path)
 
 
-def test_two_pictures_of_one_name_stay_two_and_one_in_two_places_becomes_one(tmp_path):
+def test_images_are_shared_by_content_not_by_name(tmp_path):
     (tmp_path / "a").mkdir()
     picture(tmp_path / "t.png")
     picture(tmp_path / "copy.png")
@@ -205,7 +204,7 @@ LOST = {
 
 
 @pytest.mark.parametrize("case", LOST)
-def test_what_is_wrong_with_a_material_is_noted_and_the_mesh_arrives(tmp_path, case):
+def test_material_errors_are_noted_and_the_mesh_is_kept(tmp_path, case):
     line, note = LOST[case]
     inside = tmp_path / "robot"
     inside.mkdir()
@@ -218,7 +217,7 @@ def test_what_is_wrong_with_a_material_is_noted_and_the_mesh_arrives(tmp_path, c
     assert not list((inside / "out").rglob("*.png"))
 
 
-def test_a_library_or_material_that_is_not_there_is_noted(tmp_path):
+def test_a_missing_library_or_material_is_noted(tmp_path):
     (tmp_path / "o.obj").write_text(SQUARES.replace("paint.mtl", "no.mtl") + "l 1 2\n")
     notes = notes_of(robot(tmp_path, visual("o.obj")))
     assert "o.obj: material library 'no.mtl' is missing; shown without it" in notes
@@ -330,6 +329,17 @@ def test_collada_nodes_may_refer_to_others_but_not_to_themselves(tmp_path):
     path.write_text(text.replace("<library_images>", library.format('<instance_node url="#part"/>')))
     with pytest.raises(InputError, match=r"n\.dae:\d+: node 'part' is within itself; export it again"):
         read_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("colour", "read"),
+    [("0.5 0.0 0.01.0", (0.5, 0, 0, 1)), ("0.2 0.4 0.6", (0.2, 0.4, 0.6, 1)), ("red", (0.5, 0.5, 0.5, 1))],
+)
+def test_a_malformed_collada_colour_is_repaired_with_a_note(tmp_path, colour, read):
+    mesh = read_mesh(dae(tmp_path / "n.dae", "<node>{mesh}</node>", diffuse=f"<color>{colour}</color>"))
+    assert_allclose(mesh.paints[0].rgba, read)
+    words = " ".join(f"{c:g}" for c in read)
+    assert [note.text for note in mesh.notes] == [f"n.dae: malformed colour {colour!r} read as {words!r}"]
 
 
 def test_a_collada_file_whose_author_has_an_accent_in_latin_1_is_read(tmp_path):
@@ -701,7 +711,7 @@ def test_a_piece_under_any_map_encloses_its_volume_and_its_normals_stand_on_its_
 # --- materials of the URDF ------------------------------------------------------------------------
 
 
-def test_a_urdf_material_dresses_what_its_mesh_file_leaves_bare(tmp_path):
+def test_a_urdf_material_applies_to_parts_without_a_material(tmp_path):
     trimesh.Trimesh(POINTS, FACES, process=False).export(tmp_path / "t.stl")
     (tmp_path / "half.obj").write_text(SQUARES.replace("usemtl blue\n", "").replace("usemtl red\n", ""))
     (tmp_path / "paint.mtl").write_text(MTL)
@@ -732,7 +742,7 @@ def test_a_robot_wide_material_is_found_by_its_name(tmp_path):
     assert_allclose(read_shapes(stage)[0].colour, [0, 1, 0, 1], atol=1e-5)
 
 
-def test_a_material_that_one_visual_tells_of_holds_for_others_that_name_it_and_else_is_noted(tmp_path):
+def test_a_material_defined_in_one_visual_applies_to_others_that_name_it(tmp_path):
     trimesh.Trimesh(POINTS, FACES, process=False).export(tmp_path / "t.stl")
     told = '<material name="green"><color rgba="0 1 0 1"/></material>'
     looks = (told, '<material name="green"/>', '<material name="geren"/>')
@@ -741,7 +751,7 @@ def test_a_material_that_one_visual_tells_of_holds_for_others_that_name_it_and_e
     assert_allclose(colours[:2], [[0, 1, 0, 1]] * 2, atol=1e-5)
     assert_allclose(colours[2][:3], np.full(3, colours[2][0]))
     notes = read_notes(stage.GetRootLayer().realPath)
-    assert "material 'geren' is named, but nothing says its colour: shown without it" in notes
+    assert "material 'geren' is named, but has no colour: shown without it" in notes
 
 
 SKIN = '<material name="skin"><texture filename="{}"/></material>'
@@ -966,74 +976,3 @@ def test_bytes_are_the_same_each_time(tmp_path):
         files = {p.name: p.read_bytes() for p in sorted((tmp_path / "out").rglob("*")) if p.is_file()}
         assert files == (once or files)
         once = files
-
-
-# --- the real robot -------------------------------------------------------------------------------
-
-NAMESPACE = {"c": "http://www.collada.org/2005/11/COLLADASchema"}
-
-
-def collada_points(path):
-    """Points of a COLLADA file of plain nodes, read here by ElementTree alone, metres."""
-    root = ElementTree.fromstring(path.read_bytes())
-    unit = float(root.find("c:asset/c:unit", NAMESPACE).get("meter"))
-    arrays_ = {
-        geometry.get("id"): np.array(
-            geometry.find("c:mesh/c:source/c:float_array", NAMESPACE).text.split(), float
-        ).reshape(-1, 3)
-        for geometry in root.iterfind(".//c:geometry", NAMESPACE)
-    }
-    shown = []
-
-    def walk(node, T):
-        for child in node:
-            tag = child.tag.partition("}")[2]
-            if tag == "matrix":
-                T = T @ np.array(child.text.split(), float).reshape(4, 4)
-            elif tag in ("translate", "rotate", "scale"):
-                raise AssertionError(f"{path}: this reading knows matrices only")
-            elif tag == "instance_geometry":
-                shown.append(arrays_[child.get("url")[1:]] @ T[:3, :3].T + T[:3, 3])
-            elif tag == "node":
-                walk(child, T)
-
-    for scene in root.iterfind(".//c:visual_scene", NAMESPACE):
-        walk(scene, np.eye(4))
-    return np.vstack(shown) * unit
-
-
-@pytest.mark.parametrize("name", ["turtlebot4", "turtlebot4_gazebo_tags"])
-def test_every_mesh_of_the_real_robot_arrives_in_its_place_or_is_named_as_missing(real_data, tmp_path, name):
-    import yourdfpy
-
-    folder = real_data / "turtlebot4"
-    packages = {
-        "irobot_create_description": folder / "xacro/irobot_create_common/irobot_create_description",
-        "turtlebot4_description": folder / "xacro/turtlebot4_description",
-    }
-    urdf = folder / f"{name}.urdf"
-    options = Options(packages=packages, missing_meshes="note", single_file=True)
-    out = convert_urdf(urdf, tmp_path / "tb4.usda", options=options)
-    peer = yourdfpy.URDF.load(str(urdf), load_meshes=False, build_scene_graph=False)
-    shapes, links, notes = read_shapes(out), read_links(out), read_notes(out)
-    checked, missing = 0, []
-    for link in peer.robot.links:
-        for shown in link.visuals:
-            if shown.geometry.mesh is None:
-                continue
-            file = shown.geometry.mesh.filename
-            package, _, rest = file.removeprefix("package://").partition("/")
-            path = packages[package] / rest if file.startswith("package://") else folder / file
-            if not path.is_file():
-                missing.append(path.name)
-                assert f"link {link.name!r}: visual is left out: its mesh {file!r} is missing" in notes
-                continue
-            T = np.eye(4) if shown.origin is None else shown.origin
-            want = collada_points(path) @ T[:3, :3].T + T[:3, 3]
-            mine = [s.vertices for s in shapes if s.link == link.name and f"/{path.stem}" in s.prim]
-            assert_allclose(bounds(np.vstack(mine)), bounds(want), atol=2e-6, err_msg=link.name)
-            checked += 1
-    assert (checked, missing) == ((14, []) if name == "turtlebot4" else (13, ["shell.dae", "oakd_pro.dae"]))
-    lidar = [s for s in shapes if s.link == "rplidar_link"]
-    assert sum(len(s.faces) for s in lidar) > 5000
-    assert "rplidar_link" in links

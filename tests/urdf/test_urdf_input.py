@@ -221,7 +221,7 @@ SLIPS = {
 
 
 @pytest.mark.parametrize("slip", SLIPS)
-def test_a_slip_in_a_xacro_is_told_with_its_line(tmp_path, slip):
+def test_a_mistake_in_a_xacro_is_refused_with_its_line(tmp_path, slip):
     lines = (f"a{i}: &a{i} {{<<: [*a{i - 1}, *a{i - 1}]}}" for i in range(1, 60))
     (tmp_path / "merges.yaml").write_text("\n".join(["a0: &a0 {a: 1, b: 2}", *lines]))
     (tmp_path / "deep.yaml").write_text("[" * 5000)
@@ -229,7 +229,7 @@ def test_a_slip_in_a_xacro_is_told_with_its_line(tmp_path, slip):
         read_source(write_xacro(tmp_path, slip))
 
 
-def test_what_a_xacro_says_and_what_it_hides_is_noted(tmp_path):
+def test_messages_and_hidden_problems_of_a_xacro_are_noted(tmp_path):
     body = '<l x="${xacro.warning(\'careful\')}"/><xacro:property name="e" value="2"/>'
     body += '<xacro:include filename="none*.xacro"/>'
     assert read_source(write_xacro(tmp_path, body)).notes == (
@@ -239,7 +239,7 @@ def test_what_a_xacro_says_and_what_it_hides_is_noted(tmp_path):
     )
 
 
-def test_the_environment_has_no_part_in_a_xacro(tmp_path, monkeypatch):
+def test_a_xacro_does_not_read_the_environment(tmp_path, monkeypatch):
     monkeypatch.setenv("ARM_MODE", "secret")
     path = write_xacro(tmp_path, '<link name="$(optenv ARM_MODE quiet)"/>')
     source = read_source(path)
@@ -252,7 +252,7 @@ def test_the_environment_has_no_part_in_a_xacro(tmp_path, monkeypatch):
     assert given.notes == ()
 
 
-def test_links_in_the_file_system_do_not_lead_out_of_the_folder(tmp_path):
+def test_symbolic_links_do_not_leave_the_folder(tmp_path):
     (tmp_path / "secret.xacro").write_text(XACRO.format('<link name="secret"/>'))
     path = write_xacro(tmp_path, '<xacro:include filename="inner.xacro"/>', "robot/arm.xacro")
     (tmp_path / "robot" / "inner.xacro").symlink_to(tmp_path / "secret.xacro")
@@ -332,24 +332,7 @@ def test_the_expanded_text_is_a_urdf_of_the_same_robot(tmp_path):
     assert list(read_description(again).links) == list(read_description(source).links)
 
 
-def test_capsules_arrive_beside_what_yourdfpy_knows():
-    link = read(URDF / "input_capsule.urdf").links["base_link"]
-    visual, collision = link.visuals[0].geometry, link.collisions[0].geometry
-    assert (visual.capsule.radius, visual.capsule.length, visual.cylinder) == (0.1, 0.4, None)
-    assert (collision.cylinder.radius, collision.cylinder.length, collision.capsule) == (0.1, 0.4, None)
-
-
-def test_every_kind_of_joint_arrives_with_its_figures():
-    joints = read(URDF / "input_joints.urdf").joints
-    kinds = ["planar", "floating", "continuous", "prismatic", "revolute", "fixed"]
-    assert [joint.type for joint in joints.values()] == kinds
-    slide, turn = joints["l2"], joints["l3"]
-    assert (slide.dynamics.damping, slide.dynamics.friction) == (1, 2)
-    assert (turn.limit.lower, turn.limit.effort) == (-np.inf, np.inf)
-    assert (turn.mimic.joint, turn.mimic.multiplier, turn.mimic.offset) == ("j1", 2, 0.5)
-
-
-def test_slips_are_repaired_and_noted():
+def test_small_errors_are_repaired_and_noted():
     description = read(URDF / "input_repairs.urdf")
     link = description.links["base_link"]
     assert_allclose(link.visuals[0].geometry.box.size, [1, 2, 3])
@@ -398,7 +381,7 @@ def found(path, filename="package://hand/meshes/a.stl", **packages):
     return read_source(path, packages=packages).find_file(filename, "mesh")
 
 
-def test_packages_are_those_given_then_those_above_then_those_beside(tmp_path):
+def test_given_packages_win_over_those_above_and_those_beside(tmp_path):
     path = robot(package(tmp_path / "src" / "arms" / "arm", "arm") / "urdf")
     beside = package(tmp_path / "src" / "arms" / "stack" / "hand_folder", "hand")
     assert found(path) == beside / "meshes" / "a.stl"
@@ -409,7 +392,7 @@ def test_packages_are_those_given_then_those_above_then_those_beside(tmp_path):
     assert found(path) == path.parents[1] / "meshes" / "a.stl"
 
 
-def test_a_folder_of_the_packages_name_will_do_without_a_manifest(tmp_path):
+def test_a_folder_with_the_packages_name_needs_no_manifest(tmp_path):
     path = robot(tmp_path / "urdf")
     (tmp_path / "hand" / "meshes").mkdir(parents=True)
     (tmp_path / "hand" / "meshes" / "a.stl").write_text("")
@@ -434,7 +417,7 @@ def test_a_file_that_cannot_be_looked_for_is_refused(tmp_path, name):
         convert_urdf(path, tmp_path / "arm.usda")
 
 
-def test_a_package_that_is_there_twice_is_noted(tmp_path):
+def test_a_duplicate_package_is_noted(tmp_path):
     path = robot(tmp_path)
     package(tmp_path / "a", "hand"), package(tmp_path / "b", "hand")
     description = read(path)
@@ -478,7 +461,7 @@ REAL_INPUTS = {
 
 
 @pytest.mark.parametrize("name", REAL_INPUTS)
-def test_the_real_robot_is_read_in_every_form_but_for_the_meshes_that_upstream_lacks(real_data, name):
+def test_the_real_robot_is_read_in_every_form_without_the_meshes_that_upstream_lacks(real_data, name):
     source = read_source(real_data / "turtlebot4" / name)
     description = read_description(source)
     assert (len(description.links), len(description.joints)) == (49, 48)

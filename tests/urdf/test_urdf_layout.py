@@ -138,7 +138,7 @@ def test_the_files_are_those_of_isaac_sims_structure(tmp_path):
     assert not interface.nameChildren  # the interface holds arcs, no opinions
 
 
-def test_each_layer_holds_what_it_is_for(tmp_path):
+def test_each_layer_contains_its_own_opinions(tmp_path):
     out = convert_urdf(arm(tmp_path), tmp_path / "made" / "arm.usda")
     folder = out.parent / "payloads"
     physical = ("physics:", "drive:", "newton:", "physx", "isaac:")
@@ -204,7 +204,7 @@ def test_the_layers_of_another_robot_are_never_overwritten(tmp_path):
     other = arm(tmp_path, name="leg")
     with pytest.raises(InputError, match="exists already"):
         convert_urdf(other, out / "leg.usda")
-    with pytest.raises(InputError, match=r"is of arm\.usda; give each robot a folder of its own"):
+    with pytest.raises(InputError, match=r"is of arm\.usda; give each robot its own folder"):
         convert_urdf(other, out / "leg.usda", force=True)
     assert before == {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
 
@@ -228,7 +228,7 @@ def test_a_conversion_that_fails_leaves_nothing(tmp_path):
     assert not list((tmp_path / "made").iterdir())
 
 
-def test_what_the_asset_says_of_itself_is_from_its_package_unless_given(tmp_path, monkeypatch):
+def test_metadata_come_from_the_package_by_default(tmp_path, monkeypatch):
     (tmp_path / "package.xml").write_text(
         "<package><name>arms</name><author>A. Maker</author><license>BSD-3-Clause</license></package>"
     )
@@ -246,10 +246,10 @@ def test_what_the_asset_says_of_itself_is_from_its_package_unless_given(tmp_path
     [
         ({"autor": "me"}, "metadata 'autor' is unknown; did you mean 'author'"),
         ({"author": " "}, "metadata 'author' is empty"),
-        ({"qcode": "robot"}, "metadata 'qcode' must be Wikidata's, such as Q11012, got 'robot'"),
+        ({"qcode": "robot"}, "metadata 'qcode' must be an item of Wikidata, such as Q11012, got 'robot'"),
     ],
 )
-def test_metadata_that_is_none_is_refused(tmp_path, given, message):
+def test_invalid_metadata_is_refused(tmp_path, given, message):
     with pytest.raises(InputError, match=message):
         convert_urdf(arm(tmp_path), tmp_path / "made" / "arm.usda", options=Options(metadata=given))
 

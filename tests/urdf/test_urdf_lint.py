@@ -46,7 +46,7 @@ DOUBTS = {
 
 
 @pytest.mark.parametrize("name", DOUBTS)
-def test_each_doubt_is_raised_where_it_is_due_and_no_other(name):
+def test_each_doubtful_input_raises_exactly_its_doubts(name):
     assert list(doubts(name)) == DOUBTS[name]
 
 
@@ -54,7 +54,7 @@ def test_every_doubtful_input_has_its_lines():
     assert {f"lint_{name}.urdf" for name in DOUBTS} == {p.name for p in URDF.glob("lint_*")}
 
 
-def test_the_mass_is_held_against_a_data_sheet_within_5_percent():
+def test_the_mass_is_compared_with_a_data_sheet_within_5_percent():
     assert doubts("fine", mass=1.04) == ()
     assert doubts("fine", mass=0.5) == ("the links weigh 1 kg in all, the data sheet says 0.5 kg (+100%)",)
 

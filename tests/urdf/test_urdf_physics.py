@@ -169,7 +169,7 @@ def test_impossible_masses_are_refused_with_their_line_merged_or_not(tmp_path, c
 ZEROS = '<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/>'
 
 
-def test_masses_and_tensors_that_are_filled_in_with_zeros_count_as_none(tmp_path):
+def test_masses_and_inertias_of_zero_are_ignored(tmp_path):
     text = f"""<link name="foot"><inertial><mass value="0"/>{ZEROS}</inertial></link>
     <link name="base">{{BODY}}</link>
     <link name="eye"><inertial><mass value="0.5"/>{ZEROS}</inertial><collision>{BALL}</collision></link>
@@ -187,7 +187,7 @@ def test_masses_and_tensors_that_are_filled_in_with_zeros_count_as_none(tmp_path
     )
 
 
-def test_the_zeros_that_an_exporter_fills_in_weld_no_wheel(tmp_path):
+def test_zero_limits_do_not_weld_a_wheel(tmp_path):
     zeros = '<limit lower="0" upper="0" effort="0" velocity="0"/>'
     look = (
         '<visual><geometry><sphere radius="1"/></geometry><material name=""><texture filename=""/></material>'
@@ -199,7 +199,7 @@ def test_the_zeros_that_an_exporter_fills_in_weld_no_wheel(tmp_path):
     assert "link 'hand': a <texture> of no file is left out" in notes
 
 
-def test_a_range_that_is_half_told_ends_at_0_and_one_of_an_endless_joint_is_noted(tmp_path):
+def test_a_missing_limit_is_0_and_limits_of_a_continuous_joint_are_noted(tmp_path):
     limit = '<limit upper="1" effort="inf" velocity="2"/>'
     stage, _, notes = convert(arm(tmp_path, f"revolute|{limit}"))
     joint = UsdPhysics.RevoluteJoint(stage.GetPrimAtPath("/arm/joints/j"))
@@ -344,7 +344,7 @@ def test_speed_damping_and_friction_reach_newton_and_physx_in_their_units(tmp_pa
         assert_allclose(joint.GetAttribute(name).Get(), value, rtol=1e-6, err_msg=name)
 
 
-def test_limits_without_room_weld_a_joint_where_they_are(tmp_path):
+def test_equal_limits_weld_a_joint_at_their_value(tmp_path):
     limit = '<limit lower="0.3" upper="0.3" effort="1" velocity="1"/>'
     _stage, robot, notes = convert(arm(tmp_path, f'prismatic|<axis xyz="0 1 0"/>{limit}'))
     joint = prim(robot, "j")
@@ -355,7 +355,7 @@ def test_limits_without_room_weld_a_joint_where_they_are(tmp_path):
     assert "joint 'j' (prismatic) cannot move by its own limits: welded" in notes
 
 
-def test_a_joint_that_may_not_stand_at_0_is_held_at_its_nearest_limit_and_noted(tmp_path):
+def test_a_joint_whose_limits_exclude_0_is_held_at_the_nearest_limit(tmp_path):
     limit = '<limit lower="0.2" upper="0.9" effort="1" velocity="1"/>'
     _stage, robot, notes = convert(arm(tmp_path, f'revolute|<axis xyz="0 1 0"/>{limit}'))
     drive, *_ = drive_of(robot, "j")
@@ -477,22 +477,22 @@ def test_a_rule_that_fits_no_joint_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("rule", "message"),
     [
-        ({"type": "velocity"}, "without damping it holds no velocity; give damping="),
-        ({"type": "position", "damping": 1.0}, "without stiffness it holds no position"),
+        ({"type": "velocity"}, "without damping it cannot hold a velocity; give damping="),
+        ({"type": "position", "damping": 1.0}, "without stiffness it cannot hold a position"),
         ({"type": "velocity", "damping": 1.0, "stiffness": 2.0}, "type velocity has no stiffness, got 2"),
         ({"type": "none", "damping": 1.0}, "type none has no damping, got 1"),
         ({"damping": float("nan")}, "damping must be a number from 0 up, got nan"),
         ({"damping": 1.0, "max_force": 0.0}, r"max_force must be above 0, got 0\.0"),
     ],
 )
-def test_a_rule_that_would_do_nothing_or_other_than_it_says_is_refused(rule, message):
+def test_a_rule_without_effect_is_refused(rule, message):
     with pytest.raises(InputError, match=rf"drive 'x': {message}"):
         DriveRule(joints="x", **rule)
     with pytest.raises(InputError, match="drive 'x': without damping"):
         DriveRule.parse("x:velocity")
 
 
-def test_a_root_called_world_does_not_hold_the_base_unasked(tmp_path):
+def test_a_root_called_world_does_not_fix_the_base_by_default(tmp_path):
     body = """<link name="world"/><link name="base">{BODY}</link>
     <joint name="j" type="fixed"><parent link="world"/><child link="base"/></joint>"""
     path = urdf(tmp_path, body, "desk")
@@ -583,7 +583,7 @@ def test_all_wheels_that_a_plugin_names_are_driven_not_the_first_of_each_side(tm
     assert "drive plugin: the first of 2 <left_joint> is used" in notes
 
 
-def test_what_the_urdf_says_of_its_wheels_wins_over_the_profile(tmp_path):
+def test_the_urdfs_values_of_wheels_override_the_profile(tmp_path):
     path = rover(tmp_path, wheel='<limit effort="1.5" velocity="8"/>')
     tag = '<gazebo reference="skid"><mu1>0.3</mu1></gazebo></robot>'
     path.write_text(path.read_text().replace("</robot>", tag))

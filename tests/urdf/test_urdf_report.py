@@ -157,7 +157,7 @@ def spoil(what):
         ("light", r"mass 2 kg became 1\.5 kg"),
     ],
 )
-def test_a_stage_that_is_not_the_description_is_caught(tmp_path, what, message):
+def test_a_changed_stage_is_detected(tmp_path, what, message):
     path = urdf(tmp_path, ARM)
     with pytest.raises(InputError, match=message):
         convert_with_report(path, path.with_suffix(".usda"), options=Options(strict=True), finish=spoil(what))
@@ -213,7 +213,7 @@ def test_the_json_of_a_report_holds_all_of_it(tmp_path):
     assert set(metadata) == set(vars(report))
 
 
-def test_the_summary_says_the_figures_that_matter(tmp_path):
+def test_the_summary_has_the_main_numbers(tmp_path):
     summary = convert(urdf(tmp_path, ARM)).summary()
     figures = {figure.name: figure.value for figure in summary.figures}
     assert (figures["links"], figures["joints"], figures["shapes"], figures["mass"]) == (3, 2, 4, 2)

@@ -63,7 +63,7 @@ def test_frames_above_the_base_hang_below_it_where_they_were() -> None:
     ],
     ids=["a root", "on a joint that moves", "in a ring"],
 )
-def test_what_cannot_or_need_not_be_turned_round_is_left_as_it_is(joints: tuple[str, ...]) -> None:
+def test_joints_that_cannot_or_need_not_be_inverted_stay(joints: tuple[str, ...]) -> None:
     assert reroot(robot(*joints), "base_link", HERE) == robot(*joints)
     assert reroot(robot(*joints), "chassis", HERE) == robot(*joints)
 
@@ -73,7 +73,7 @@ def test_entities_are_refused() -> None:
         reroot('<!DOCTYPE r [<!ENTITY a "aaaa">]>' + robot(), "base_link", HERE)
 
 
-def test_a_place_that_is_none_is_refused_by_its_joint() -> None:
+def test_an_invalid_origin_is_refused_with_its_joint() -> None:
     for xyz in ("1 2 x", "1 2"):
         with pytest.raises(InputError, match="footprint_base_link"):
             reroot(robot(joint("footprint", "base_link", xyz=xyz)), "base_link", HERE)

@@ -238,14 +238,14 @@ def _no_robot(stage):
         (_no_robot, "a URDF has one articulation, found none"),
     ],
 )
-def test_what_no_urdf_holds_is_refused_with_nothing_written(tmp_path, change, said):
+def test_what_a_urdf_cannot_hold_is_refused_and_nothing_is_written(tmp_path, change, said):
     asset = edit(tmp_path, change)
     with pytest.raises(InputError, match=said):
         write_urdf(asset, tmp_path / "out" / "a.urdf")
     assert not (tmp_path / "out").exists()
 
 
-def test_the_command_goes_both_ways_and_says_what_stays_behind(tmp_path, capfd):
+def test_the_command_converts_both_ways_and_lists_what_is_left_out(tmp_path, capfd):
     out = tmp_path / "back.urdf"
     main(["robot", str(shipped("robots", "turtlebot4", "turtlebot4.usda")), "--out", str(out), "--json"])
     said = json.loads(capfd.readouterr().out)

@@ -1,4 +1,4 @@
-"""`magtwin compensate`: the platform's field taken out of a run's readings, by Tolles and Lawson's model."""
+"""`magtwin compensate`: remove the platform's field from a run's readings, by Tolles and Lawson's model."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from magtwin.cli.app import app
 from magtwin.cli.options import Flag, Force
 from magtwin.cli.terminal import Done, check_output, step
 
-compensate_app = App(name="compensate", help="Take the platform's field out of a run (Tolles-Lawson).")
+compensate_app = App(name="compensate", help="Remove the platform's field from a run (Tolles-Lawson).")
 app.command(compensate_app)
 
 
@@ -24,10 +24,10 @@ def fit(
     truth: Flag = False,
     force: Force = False,
 ) -> Done:
-    """Fit the model to a calibration run: one that turns about in a field that is uniform or well mapped.
+    """Fit the model to a calibration run that turns through all headings in a uniform or well mapped field.
 
-    A map that the same robot surveyed in several headings holds the platform's field already, so what is
-    left to fit is small; survey without the platform, or calibrate outdoors.
+    A map that the same robot surveyed in several headings contains the platform's field already, so little is
+    left to fit. Survey without the platform, or calibrate outdoors.
 
     Parameters
     ----------
@@ -36,17 +36,17 @@ def fit(
     out
         Model to write, a .json file.
     terms
-        Terms, comma between: permanent; induced3, induced5 or induced6; eddy3, eddy8 or eddy9; bias, which
-        wants --no-band.
+        Terms separated by commas: permanent; induced3, induced5 or induced6; eddy3, eddy8 or eddy9; bias,
+        which needs --no-band.
     band_hz
         Pass band of the manoeuvres [Hz].
     no_band
-        Fit all frequencies, slow ones too.
+        Fit all frequencies.
     penalty
-        Penalty of the regression; by cross-validation unless given.
+        Penalty of the regression. Default: by cross-validation.
     truth
-        Take the directions from the exact field of a simulated run, b_vector_nt, in place of what the vector
-        axes read, b_vector_measured_nt: shows what their errors cost.
+        Use the exact field of a simulated run, b_vector_nt, instead of the reading of the vector axes,
+        b_vector_measured_nt, to see the cost of their errors.
     """
     from magtwin.files import output
     from magtwin.io.tables import read_parquet
@@ -69,7 +69,7 @@ def fit(
 
 @compensate_app.command
 def apply(run: Path, model: Path, *, out: Path, force: Force = False) -> Done:
-    """Take what a fitted model explains out of a run's b_measured_nt.
+    """Remove the part of a run's b_measured_nt that a fitted model explains.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""`magtwin net`: work with networks."""
+"""`magtwin network`: convert and export networks."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ app.command(net_app)
 
 @net_app.command(name="convert")
 def net_convert(pth: Path, *, out: Path, licence: Licence = "", force: Force = False) -> Done:
-    """Convert a released checkpoint (.pth) to safetensors, executing nothing of what it holds.
+    """Convert a released checkpoint (.pth) to safetensors, without executing its content.
 
     Parameters
     ----------
@@ -22,6 +22,8 @@ def net_convert(pth: Path, *, out: Path, licence: Licence = "", force: Force = F
         Checkpoint with the weights and the two scalers.
     out
         File to write, .safetensors.
+    licence
+        Licence of the weights, an SPDX identifier such as MIT, kept in their metadata.
     """
     from magtwin.learn.models.network import convert
 
@@ -35,9 +37,9 @@ def net_convert(pth: Path, *, out: Path, licence: Licence = "", force: Force = F
 def net_export(weights: Path, *, out: Path, force: Force = False) -> Done:
     """Export a network as ONNX, which runs in onnxruntime without torch and without magtwin.
 
-    Its input is float64 features in their units, as magtwin info lists them; its outputs are the disturbance
-    and the standard deviation of its error [nT]. Scalers are inside. What onnxruntime gives is held against
-    torch before the file is written. Needs the extra onnx.
+    The input is float64 features in their units, as magtwin info lists them; the outputs are the disturbance
+    and the standard deviation of its error [nT]. Scalers are inside. onnxruntime is compared with torch
+    before the file is written. Needs the extra onnx.
 
     Parameters
     ----------

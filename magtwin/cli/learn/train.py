@@ -107,6 +107,9 @@ def train(
     from magtwin.learn.training.train import train as train_model
 
     check_suffix(out, (".safetensors",), "a network")
+    if dataset.is_dir() and not (dataset / "dataset.json").exists():
+        build = f"magtwin dataset build {dataset} --map MAP --out SET"
+        raise InputError(f"{dataset}: is no data set; build one from the runs first: {build}")
     picture, table = (out.with_suffix(end) for end in (".png", ".csv"))
     given = {
         "model": model,

@@ -1,29 +1,39 @@
 """`magtwin map import`, `fit`, `validate` and `survey`: surveys to maps."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from magtwin.cli.maps.map import (
-    LAYERS,
-    Earth,
-    FieldTopic,
-    KeepStuck,
-    Kernel,
-    PoseTopic,
-    Sources,
-    headings_rad,
-    map_app,
-)
-from magtwin.cli.options import Force, Licence, Seed
+from magtwin.cli.maps.map import LAYERS, Earth, Kernel, Sources, headings_rad, map_app
+from magtwin.cli.options import Flag, Force, Licence, Seed
 from magtwin.cli.terminal import Done, check_output, progress, step
 from magtwin.io.surveys.about import About
 from magtwin.io.surveys.columns import Columns
 
-TableColumns = Annotated[Columns, Parameter(name="*")]
+COLUMNS = Columns()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """How the files of a survey are read."""
+
+    keep_stuck: Flag = False
+    """Keep readings of a sensor that was stuck."""
+
+    pose_topic: str | None = None
+    """Topic of the poses in a bag, if it has several."""
+
+    field_topic: str | None = None
+    """Topic of the field in a bag, if it has several."""
+
+    columns: Annotated[Columns, Parameter(name="*")] = COLUMNS
+
+
 AboutSurvey = Annotated[About, Parameter(name="*")]
-COLUMNS, ABOUT = Columns(), About()
+ReadingOptions = Annotated[Reading, Parameter(name="*")]
+ABOUT, READING = About(), Reading()
 
 
 @map_app.command(name="import")
@@ -31,10 +41,7 @@ def map_import(
     *sources: Sources,
     out: Path,
     about: AboutSurvey = ABOUT,
-    keep_stuck: KeepStuck = False,
-    pose_topic: PoseTopic = None,
-    field_topic: FieldTopic = None,
-    columns: TableColumns = COLUMNS,
+    reading: ReadingOptions = READING,
     force: Force = False,
 ) -> Done:
     """Import a survey as a map layer, if it is gridded, or as a file of readings.
@@ -55,16 +62,7 @@ def map_import(
 
     check_output(out, (*LAYERS, ".parquet"), "a map layer, or a file of readings,", force=force)
     step("Reading the survey")
-    report = import_survey(
-        sources,
-        out,
-        columns=columns,
-        about=about,
-        keep_stuck=keep_stuck,
-        pose_topic=pose_topic,
-        field_topic=field_topic,
-        force=force,
-    )
+    report = import_survey(sources, out, about=about, force=force, **vars(reading))
     return Done(report, out)
 
 
@@ -78,10 +76,7 @@ def map_fit(
     spacing_m: float | None = None,
     headings_deg: str | None = None,
     about: AboutSurvey = ABOUT,
-    keep_stuck: KeepStuck = False,
-    pose_topic: PoseTopic = None,
-    field_topic: FieldTopic = None,
-    columns: TableColumns = COLUMNS,
+    reading: ReadingOptions = READING,
     force: Force = False,
 ) -> Done:
     """Fit a model to a survey and write its map with variance.
@@ -115,13 +110,10 @@ def map_fit(
             earth=earth,
             spacing_m=spacing_m,
             headings_rad=angles,
-            columns=columns,
             about=about,
-            keep_stuck=keep_stuck,
-            pose_topic=pose_topic,
-            field_topic=field_topic,
             progress=advance,
             force=force,
+            **vars(reading),
         )
     return Done(report, out)
 
@@ -134,10 +126,7 @@ def map_validate(
     kernel: Kernel = None,
     earth: Earth = None,
     within_m: float | None = None,
-    keep_stuck: KeepStuck = False,
-    pose_topic: PoseTopic = None,
-    field_topic: FieldTopic = None,
-    columns: TableColumns = COLUMNS,
+    reading: ReadingOptions = READING,
 ) -> Done:
     """Measure how well each method predicts readings that were left out of its fit.
 
@@ -164,10 +153,7 @@ def map_validate(
             earth=earth,
             within_m=within_m,
             progress=advance,
-            columns=columns,
-            keep_stuck=keep_stuck,
-            pose_topic=pose_topic,
-            field_topic=field_topic,
+            **vars(reading),
         )
     return Done(report)
 

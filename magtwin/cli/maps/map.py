@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import flag
 from magtwin.errors import InputError
 
 map_app = App(name="map", help="Import, fit, validate, compare and draw anomaly maps.")
@@ -19,9 +18,6 @@ PICTURES = (".png", ".svg")
 MapFile = Annotated[
     Path, Parameter(help="Map layer or stage (.usd, .usda, .usdc), or a folder of survey CSVs.")
 ]
-KeepStuck = Annotated[bool, flag("Keep readings of a sensor that was stuck.")]
-PoseTopic = Annotated[str | None, Parameter(help="Topic of the poses in a bag, if it has several.")]
-FieldTopic = Annotated[str | None, Parameter(help="Topic of the field in a bag, if it has several.")]
 Kernel = Annotated[
     Literal["matern", "poisson"] | None,
     Parameter(

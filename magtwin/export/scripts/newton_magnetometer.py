@@ -2,7 +2,7 @@
 
     python newton_magnetometer.py STAGE.usda NETWORK.onnx READINGS.csv
 
-STAGE is a scene of magtwin's, NETWORK what `magtwin net export WEIGHTS.safetensors --onnx NETWORK.onnx`
+STAGE is a scene of magtwin's, NETWORK what `magtwin network export WEIGHTS.safetensors --out NETWORK.onnx`
 wrote. Needs newton[sim], newton-usd-schemas, onnxruntime, numpy and usd-core, and nothing of magtwin. Signals
 are the physics' own, without noise or delay, and the battery stays full.
 """

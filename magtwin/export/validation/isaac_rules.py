@@ -207,7 +207,7 @@ def materials(subject: Subject) -> Iterator[Wrong]:
             yield Wrong("wears no material", str(prim.GetPath()), severity="warning")
 
 
-@rule("isaac", "author it with magtwin export --profile isaac")
+@rule("isaac", "author it with magtwin export --target isaac")
 def action_graph(subject: Subject) -> Iterator[Wrong]:
     """Every node of an Action Graph has what its definition has, and takes what it can from outputs."""
     from magtwin.export.ogn import faults, ports

@@ -64,6 +64,35 @@ def fit(
         return function(readings, **options)
 
 
+def fit_map(
+    survey: Readings,
+    method: str = "harmonic",
+    *,
+    spacing_m: float | None = None,
+    headings_rad: ArrayLike | None = None,
+    progress: Progress | None = None,
+    **options: Any,
+) -> AnomalyMap:
+    """Fit a map to a survey.
+
+    Args:
+        survey: Readings at known poses.
+        method: One of `METHODS`: "harmonic", "gp", "trilinear", "cubic" or a registered method.
+        spacing_m: Distance between nodes [m]. Default: the widest with almost no loss of accuracy.
+        headings_rad: Headings of the layers [rad]. Default: the fewest with almost no loss of accuracy.
+        progress: Called as progress(done, total, what).
+        **options: Options of the method.
+
+    Returns:
+        The map with its variance.
+
+    Raises:
+        InputError: There is no such method or option, or the survey has too few good readings.
+    """
+    model = fit(survey, method, progress=progress, **options)
+    return raster(model, survey, spacing_m=spacing_m, headings_rad=headings_rad, progress=progress)
+
+
 def _one_thread() -> Any:
     """A context in which linear algebra uses one thread."""
     import scipy.linalg  # noqa: F401  # threadpool_limits sees only libraries that are loaded

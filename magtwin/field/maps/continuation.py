@@ -59,7 +59,7 @@ def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
     if field.height_m is None:
         raise InputError(
             f"the height of map {field.name!r} is unknown, so it cannot be continued; give it when the "
-            "survey is read (--height)"
+            "survey is read (--height-m)"
         )
     start = field.harmonic.height_m if field.harmonic is not None else field.height_m
     if abs(height_m - start) < GRAIN_M:

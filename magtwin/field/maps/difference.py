@@ -98,36 +98,26 @@ class MapDifference(Summarized):
         known = np.isfinite(self.z)
         local = self.local_nt[known]
         count, changed = int(known.sum()), int(self.changed.sum())
-        source = (
-            "from both maps' variances" if self.from_variance else "a map has none: from the robust spread"
-        )
+        robust = "a map has no variance: from the robust spread"
+        source = "from both maps' variances" if self.from_variance else robust
         h, j, i = np.unravel_index(np.nanargmax(np.abs(self.z)), self.z.shape)
+        mean, spread = float(self.bias_nt.mean()), float(self.bias_nt.std())
+        surest, sd = float(self.local_nt[h, j, i]), float(self.sd_nt[h, j, i])
+        x, y, heading = self.grid.x_m[i], self.grid.y_m[j], np.degrees(self.grid.headings_rad[h])
+        where = f"z {self.z[h, j, i]:.3g}, at ({x:g}, {y:g}) m, heading {heading:g} deg"
         figures = [
             Figure("compared nodes", count, note="over all headings"),
-            Figure(
-                "common bias",
-                float(self.bias_nt.mean()),
-                "nT",
-                float(self.bias_nt.std()),
-                "mean and spread over headings",
-            ),
+            Figure("common bias", mean, "nT", spread, "mean and spread over headings"),
             Figure("spread of local changes", _robust_sd(local), "nT", note="robust"),
             Figure("expected spread", float(np.sqrt(np.mean(self.sd_nt[known] ** 2))), "nT", note=source),
         ]
         if self.from_variance:
-            note = "robust; 1 where the variances are right and little changed"
+            note = "robust; 1 if the variances are right and little changed"
             figures.append(Figure("spread of z", _robust_sd(self.z[known]), note=note))
+        rate = f"|z|, for a false-discovery rate of {FALSE_SHARE:.0%}"
         figures += [
-            Figure(
-                "surest local change",
-                float(self.local_nt[h, j, i]),
-                "nT",
-                float(self.sd_nt[h, j, i]),
-                f"z {self.z[h, j, i]:.3g}, {self._where(h, j, i)}",
-            ),
-            Figure(
-                "threshold", self.threshold_z, note=f"|z|, for a false-discovery rate of {FALSE_SHARE:.0%}"
-            ),
+            Figure("surest local change", surest, "nT", sd, where),
+            Figure("threshold", self.threshold_z, note=rate),
             Figure("changed nodes", changed, note=f"{changed / count:.1%} of those compared"),
             Figure("regions", len(self.regions)),
         ]
@@ -139,10 +129,6 @@ class MapDifference(Summarized):
         if self.cautions:
             metadata["caution"] = list(self.cautions)
         return Report(f"difference {self.names[0]} to {self.names[1]}", tuple(figures), metadata)
-
-    def _where(self, h: Any, j: Any, i: Any) -> str:
-        x, y = self.grid.x_m[i], self.grid.y_m[j]
-        return f"at ({x:g}, {y:g}) m, heading {np.degrees(self.grid.headings_rad[h]):g} deg"
 
     def _summary(self) -> Summary:
         before, after = (" ".join(t for t in pair if t) for pair in zip(self.names, self.days, strict=True))
@@ -234,7 +220,7 @@ def _compared(a: AnomalyMap, b: AnomalyMap) -> tuple[str, ...]:
     if a.height_m is not None and b.height_m is not None and abs(a.height_m - b.height_m) > GRAIN_M:
         raise InputError(
             f"map {a.name!r} is of {a.height_m:g} m above the floor and {b.name!r} of {b.height_m:g} m; take "
-            "one to the other's height first (magtwin map continue)"
+            "one to the other's height first (magtwin map upward)"
         )
     cautions = []
     unknown = {

@@ -83,7 +83,18 @@ def map_metadata(field: AnomalyMap, epochs: Sequence[AnomalyMap] = ()) -> Report
     figures.append(
         Figure("extent", f"x {x0:g}..{x1:g}, y {y0:g}..{y1:g}", "m", note=f"cells {dx:g} x {dy:g} m")
     )
-    figures += [_deviation(field), _height(field), *_headings(field)]
+    known = None if field.variance_nt2 is None else field.variance_nt2[field.valid]
+    if known is None or not known.size:
+        figures.append(Figure("standard deviation", "unknown"))
+    else:
+        low, middle, high = np.sqrt(np.percentile(known, (0, 50, 100)))
+        note = f"median; from {low:.3g} to {high:.3g} nT"
+        figures.append(Figure("standard deviation", float(middle), "nT", note=note))
+    if field.height_m is None:
+        figures.append(Figure("height", "unknown"))
+    else:
+        figures.append(Figure("height", field.height_m, "m", note="of the sensor above the floor"))
+    figures += _headings(field)
     if field.harmonic is not None:
         figures += _harmonic(field.harmonic, "sensor" if field.height_m is None else "floor")
     if len(epochs) > 1:
@@ -121,65 +132,32 @@ def source_files(source: str) -> dict[str, str]:
 
 def _headings(field: AnomalyMap) -> list[Figure]:
     """Mean and standard deviation of each heading, with its range and masked share."""
-    return [
-        Figure(
-            f"heading {row.heading_deg:.6g}",
-            round(row.mean_nt, 1),
-            "nT",
-            round(row.sd_nt, 1),
-            f"{span(row.least_nt, row.greatest_nt, 'nT')}; {100 * row.masked / row.nodes:.3g} % masked",
-        )
-        if row.masked < row.nodes
-        else Figure(f"heading {row.heading_deg:.6g}", "no valid node")
-        for row in statistics(field)
-    ]
-
-
-def _deviation(field: AnomalyMap) -> Figure:
-    known = None if field.variance_nt2 is None else field.variance_nt2[field.valid]
-    if known is None or not known.size:
-        return Figure("standard deviation", "unknown")
-    low, middle, high = np.sqrt(np.percentile(known, (0, 50, 100)))
-    return Figure("standard deviation", float(middle), "nT", note=f"median; from {low:.3g} to {high:.3g} nT")
-
-
-def _height(field: AnomalyMap) -> Figure:
-    if field.height_m is None:
-        return Figure("height", "unknown")
-    return Figure("height", field.height_m, "m", note="of the sensor above the floor")
+    figures = []
+    for row in statistics(field):
+        name = f"heading {row.heading_deg:.6g}"
+        if row.masked == row.nodes:
+            figures.append(Figure(name, "no valid node"))
+            continue
+        note = f"{span(row.least_nt, row.greatest_nt, 'nT')}; {100 * row.masked / row.nodes:.3g} % masked"
+        figures.append(Figure(name, round(row.mean_nt, 1), "nT", round(row.sd_nt, 1), note))
+    return figures
 
 
 def _harmonic(harmonic: HarmonicField, above: str) -> list[Figure]:
     """Figures of the sources and of the robot; depths count from `above`."""
     depths = -harmonic.p_world_dipole[:, 2]
     below = f"{depths.min():.3g} to {depths.max():.3g} m below the {above}" if len(depths) else ""
+    figures = [Figure("dipoles", len(depths), note=below)]
+    for name, vector in (("uniform field", harmonic.b_uniform_nt), ("hard iron", harmonic.hard_iron_nt)):
+        note = "(" + ", ".join(f"{c:.5g}" for c in vector) + ")"
+        figures.append(Figure(name, float(np.linalg.norm(vector)), "nT", note=note))
+    soft = float(np.linalg.norm(harmonic.soft_iron, 2))
     x, y, z = harmonic.p_base_sensor
     return [
-        Figure("dipoles", len(depths), note=below),
-        Figure(
-            "uniform field",
-            float(np.linalg.norm(harmonic.b_uniform_nt)),
-            "nT",
-            note=_vector(harmonic.b_uniform_nt),
-        ),
-        Figure(
-            "hard iron",
-            float(np.linalg.norm(harmonic.hard_iron_nt)),
-            "nT",
-            note=_vector(harmonic.hard_iron_nt),
-        ),
-        Figure(
-            "soft iron",
-            float(np.linalg.norm(harmonic.soft_iron, 2)),
-            "nT/nT",
-            note="greatest part of a field that it adds",
-        ),
+        *figures,
+        Figure("soft iron", soft, "nT/nT", note="greatest part of a field that it adds"),
         Figure("sensor", f"({x:.4g}, {y:.4g}, {z:.4g})", "m", note="in base_link"),
     ]
-
-
-def _vector(vector: np.ndarray) -> str:
-    return "(" + ", ".join(f"{c:.5g}" for c in vector) + ")"
 
 
 COLOUR_MAP = "viridis"  # Name of the colour map for fields

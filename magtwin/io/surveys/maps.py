@@ -100,24 +100,18 @@ def import_survey(
     sources: Sequence[Source],
     out: Source,
     *,
-    columns: Columns | None = None,
     about: About | None = None,
-    keep_stuck: bool = False,
-    pose_topic: str | None = None,
-    field_topic: str | None = None,
     force: bool = False,
+    **reading: Any,
 ) -> Report:
     """Write a survey as a map layer, which it must be gridded for, or as readings.
 
     Args:
         sources: As for `read_survey`; a folder with one CSV per heading too.
         out: Map layer (.usdc) or readings (.parquet) to write.
-        columns: Columns of tables.
         about: Metadata that the files lack.
-        keep_stuck: Whether stuck readings stay in.
-        pose_topic: Topic of a bag's poses, if it has several.
-        field_topic: Topic of a bag's field, if it has several.
         force: Whether an existing output is replaced.
+        reading: Options of `read_survey`.
 
     Returns:
         A report on the field and on stuck readings.
@@ -129,7 +123,7 @@ def import_survey(
     from magtwin.field.survey.folder import read_survey as read_folder
     from magtwin.usd.maps import save_map
 
-    out, columns, about = _checked(out, force), columns or Columns(), about or About()
+    out, columns, about = check_free(out, force=force), reading.get("columns") or Columns(), about or About()
     name = about.name or out.stem
     if out.suffix != ".parquet" and len(sources) == 1 and _is_survey_folder(Path(sources[0]), columns):
         field, report = read_folder(
@@ -137,18 +131,11 @@ def import_survey(
             **{**asdict(about), "name": name},
             unit=columns.unit or "nT",
             scale=columns.scale,
-            keep_stuck=keep_stuck,
+            keep_stuck=reading.get("keep_stuck", False),
         )
         save_map(field, out, force=force)
         return report
-    readings, found = read_survey(
-        sources,
-        columns=columns,
-        about=about,
-        keep_stuck=keep_stuck,
-        pose_topic=pose_topic,
-        field_topic=field_topic,
-    )
+    readings, found = read_survey(sources, about=about, **reading)
     readings = readings.with_(name=name)
     if out.suffix == ".parquet":
         save_readings(readings, out, force=force)
@@ -167,13 +154,10 @@ def fit_survey(
     earth: str | None = None,
     spacing_m: float | None = None,
     headings_rad: Sequence[float] | None = None,
-    columns: Columns | None = None,
     about: About | None = None,
-    keep_stuck: bool = False,
-    pose_topic: str | None = None,
-    field_topic: str | None = None,
     progress: Progress | None = None,
     force: bool = False,
+    **reading: Any,
 ) -> Report:
     """Fit a model to a survey and write its map with variance.
 
@@ -185,13 +169,10 @@ def fit_survey(
         earth: The Earth's field for the harmonic fit, as for `magtwin.author.earth.earth_of`.
         spacing_m: Spacing of the map's nodes [m]. None: chosen by accuracy.
         headings_rad: Headings of the map [rad]. None: chosen by accuracy.
-        columns: Columns of tables.
         about: Metadata that the files lack.
-        keep_stuck: Whether stuck readings stay in.
-        pose_topic: Topic of a bag's poses, if it has several.
-        field_topic: Topic of a bag's field, if it has several.
         progress: Called with the number done, the total, and a word.
         force: Whether an existing output is replaced.
+        reading: Options of `read_survey`.
 
     Returns:
         A report on the map, its grid, stuck readings and doubts.
@@ -202,23 +183,16 @@ def fit_survey(
     from magtwin.field.fit.fit import fit, grid_report, raster
     from magtwin.usd.maps import save_map
 
-    out, about = _checked(out, force), about or About()
+    out, about = check_free(out, force=force), about or About()
     options = _method_options([method], kernel, earth).get(method, {})
-    readings, report = read_survey(
-        sources,
-        columns=columns,
-        about=about,
-        keep_stuck=keep_stuck,
-        pose_topic=pose_topic,
-        field_topic=field_topic,
-    )
+    readings, report = read_survey(sources, about=about, **reading)
     if doubts := _doubts(readings, sources[0]):
         report = replace(report, metadata={**report.metadata, "doubts": doubts})
     model = fit(readings, method, progress=progress, **options)
     named = readings.with_(name=about.name or out.stem)
     field = raster(model, named, spacing_m=spacing_m, headings_rad=headings_rad, progress=progress)
     save_map(field, out, force=force)
-    return _joined(_joined(field.report(), grid_report(field)), report)
+    return _joined(field.report(), grid_report(field), report)
 
 
 def validate_methods(
@@ -296,14 +270,13 @@ def survey_scene(
     Raises:
         InputError: The scene has no Earth field, a number is out of range, or the output cannot be written.
     """
-    from magtwin.sim.room_survey import blocked_by
-    from magtwin.sim.survey import survey, survey_readings
+    from magtwin.sim.survey import blocked_by, survey, survey_readings
     from magtwin.usd.layers import layer_files
     from magtwin.usd.maps import save_map
     from magtwin.usd.obstacles import read_obstacles
     from magtwin.usd.scene import read_scene
 
-    out = _checked(out, force)
+    out = check_free(out, force=force)
     if seed < 0:
         raise InputError(f"`seed` must be a whole number from 0 up, got {seed}", parameter="seed")
     twin = read_scene(scene_file, check_network=False)
@@ -333,10 +306,6 @@ def survey_scene(
     return field.report()
 
 
-def _checked(out: Source, force: bool) -> Path:
-    return check_free(out, force=force)
-
-
 def _is_survey_folder(source: Path, columns: Columns) -> bool:
     """Whether a source is a folder with one CSV per heading, whose columns need no names."""
     if (source / "metadata.yaml").is_file() or is_pattern(source) or any(source.glob("*.parquet")):
@@ -363,7 +332,7 @@ def _doubts(readings: Readings, source: Source) -> list[str]:
     if np.abs(mean) >= ONE_HEADING:
         doubts.append(
             f"one heading only, {np.degrees(np.angle(mean)):.0f} deg: the robot's own field cannot be "
-            "separated from the room's; survey in several headings"
+            "separated from the room's, and a simulated robot adds its own again; survey in several headings"
         )
     return doubts
 
@@ -385,7 +354,9 @@ def _method_options(
     return options
 
 
-def _joined(report: Report, below: Report) -> Report:
-    """A report with the figures and metadata of another below its own."""
-    figures, metadata = report.figures + below.figures, {**report.metadata, **below.metadata}
-    return replace(report, figures=figures, metadata=metadata)
+def _joined(report: Report, *below: Report) -> Report:
+    """A report with the figures and metadata of others below its own."""
+    for other in below:
+        figures, metadata = report.figures + other.figures, {**report.metadata, **other.metadata}
+        report = replace(report, figures=figures, metadata=metadata)
+    return report

@@ -65,8 +65,8 @@ def read_readings(
 ) -> Readings:
     """Read the readings of a survey from any supported source.
 
-    A source is a folder of one CSV per heading (`magtwin.field.survey`); a table of readings, CSV or Parquet;
-    several files with matching rows, joined by `+` (`1-time.csv+1-loc.csv+1-mag.csv`; the others are
+    A source is a folder of one CSV per heading (`magtwin.field.survey.folder`); a table of readings, CSV or
+    Parquet; several files with matching rows, joined by `+` (`1-time.csv+1-loc.csv+1-mag.csv`; the others are
     searched for beside the first); the Parquet of a Run or of Readings; or a rosbag2, as a folder or a
     storage file. Several sources are several runs of one survey, as are the files of a pattern
     (`drives/*.parquet`) and the Parquet files of a folder, in the order of their names.

@@ -1,5 +1,6 @@
-"""Correlation: how each input goes with the disturbance, by rank, as in the paper's Figure 2."""
+"""Rank correlation of each input with the disturbance, as in the paper's Figure 2."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
+from magtwin.learn.data.dataset import Dataset, open_dataset
 from magtwin.report import Figure, Report
 from magtwin.summary import Summarized
 
@@ -16,7 +18,7 @@ Array = NDArray[np.float64]
 PAPER: Mapping[str, float] = MappingProxyType(
     {"yaw_deg": 0.31, "odom_v_x": -0.09, "imu_q_x": -0.13, "imu_q_y": -0.28, "imu_q_z": 0.31, "imu_q_w": 0.37}
 )
-"""What the paper's Figure 2 shows; all other inputs are within 0.04 of 0 there."""
+"""Correlations in the paper's Figure 2; those of all other inputs are within 0.04 of 0."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -27,19 +29,19 @@ class Correlations(Summarized):
     """Inputs, in their order."""
 
     rho: Array
-    """Correlation of each with the label, -1 to 1, shape (F,); nan of an input that never varies."""
+    """Correlation of each with the label, -1 to 1, shape (F,); nan for an input that never varies."""
 
     sd: Array
-    """Standard deviation of each, by leaving out one group after the other, shape (F,); nan for one group."""
+    """Jackknife standard deviation of each over groups, shape (F,); nan for one group."""
 
     rows: int
     """Readings."""
 
     groups: int
-    """Recordings or sessions, of which each is left out once."""
+    """Number of recordings or sessions."""
 
     def report(self, title: str = "Correlation with the disturbance") -> Report:
-        """Every input with its correlation, its spread and the paper's."""
+        """Every input with its correlation, its spread, and the paper's correlation."""
         figures = []
         for name, rho, sd in zip(self.features, self.rho.tolist(), self.sd.tolist(), strict=True):
             paper = f"the paper {PAPER[name]:+.2f}" if name in PAPER else ""
@@ -56,15 +58,15 @@ def correlations(
 ) -> Correlations:
     """Spearman's correlation of each input with the label: Pearson's of their ranks (Spearman 1904).
 
-    Readings of a run are alike, so that their number says little of how sure a correlation is. Its
-    spread is the jackknife's over groups: sd^2 = (G - 1) / G sum over g of (rho_-g - mean)^2, rho_-g without
-    the rows of group g, whose ranks among all rows are kept.
+    Readings of a run are correlated, so the spread is the jackknife's over groups:
+    sd^2 = (G - 1) / G sum over g of (rho_-g - mean)^2, with rho_-g from the rows outside group g, which keep
+    their ranks among all rows.
 
     Args:
         x: Inputs, shape (N, F).
         y: Labels [nT], shape (N,).
         features: Names of the inputs, F of them.
-        groups: Which recording or session each row is of, whole numbers, shape (N,); one unless given.
+        groups: Recording or session of each row, whole numbers, shape (N,). Default: one group.
 
     Raises:
         InputError: Shapes do not fit, a value is not finite, there are fewer than three rows, or the
@@ -81,7 +83,9 @@ def correlations(
     group = np.unique(group, return_inverse=True)[1]
     b = _ranks(y)
     if not b.any():
-        raise InputError(f"every label is {y[0]:g} nT: nothing goes with it; were they made right?")
+        raise InputError(
+            f"every label is {y[0]:g} nT: there is nothing to correlate with; were they made right?"
+        )
     count = int(group.max()) + 1
     rho, sd = np.full(len(features), np.nan), np.full(len(features), np.nan)
     n, sum_b, sum_bb = (np.bincount(group, w, count) for w in (np.ones(len(b)), b, b * b))
@@ -99,15 +103,37 @@ def correlations(
     return Correlations(tuple(features), rho, sd, len(y), count)
 
 
+def correlations_of(
+    dataset: Dataset | str | os.PathLike[str], features: str | Sequence[str] = "full"
+) -> Correlations:
+    """Correlations of a data set's inputs with its labels, grouped by session, or by recording if there is
+    one.
+
+    Args:
+        dataset: The data set, or its folder.
+        features: A set of features, or their names.
+
+    Raises:
+        InputError: As for `correlations`, or the recordings lack a column of a feature.
+    """
+    dataset = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
+    rows = dataset.rows(features)
+    sessions = [dataset.recording(name).session for name in rows.names]
+    keys = rows.names if len(set(sessions)) < 2 else sessions
+    number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    groups = np.array([number[key] for key in keys])[rows.recording]
+    return correlations(rows.x, rows.y, rows.features, groups)
+
+
 def _ranks(values: Array) -> Array:
-    """Ranks less their mean, each of equal values at the mean of theirs, in units of N, shape (N,)."""
+    """Centred ranks divided by N, ties at their mean rank, shape (N,)."""
     _, place, count = np.unique(values, return_inverse=True, return_counts=True)
     rank = np.cumsum(count) - (count - 1) / 2
     return (rank[place] - (len(values) + 1) / 2) / len(values)
 
 
 def _pearson(sums: Array) -> Array:
-    """Pearson's correlation from sums of 1, a, b, a^2, b^2, ab, shape (6, G); nan where one does not vary."""
+    """Pearson's correlation from sums of 1, a, b, a^2, b^2, ab, shape (6, G); nan if one does not vary."""
     n, a, b, aa, bb, ab = sums
     spread = np.maximum(n * aa - a * a, 0) * np.maximum(n * bb - b * b, 0)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -1,4 +1,4 @@
-"""Features: what a neural magnetometer reads from a Run, by name, in the units it was trained on."""
+"""Features: the inputs of neural magnetometers, by name, computed from the columns of a Run."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,20 +19,20 @@ Convert = Callable[..., NDArray[Any]]
 
 @dataclass(frozen=True)
 class Feature:
-    """One input of a network: a number made of columns of a Run, in the unit in which it is read."""
+    """One input of a network: a number computed from columns of a Run."""
 
     columns: tuple[str, ...]
-    """Columns of the Run it is made of."""
+    """Columns of the Run."""
 
     index: int | None
-    """Which number of each row of what they give; None where that holds one."""
+    """Index into the result of the conversion; None if that is one number per row."""
 
     unit: str
-    """Unit in which the network reads it, "" for numbers without one."""
+    """Unit of the input, "" if it has none."""
 
     convert: Convert | None = None
-    """From the columns, each (N,) or (N, width), to what the network reads, (N,) or (N, width'), row by row:
-    no row of it depends on another. None takes the one column as it is."""
+    """From the columns, each (N,) or (N, width), to inputs, (N,) or (N, width'); no row depends on another.
+    None takes the one column as it is."""
 
 
 def degrees_0_360(yaw: NDArray[Any]) -> Array:
@@ -42,9 +42,9 @@ def degrees_0_360(yaw: NDArray[Any]) -> Array:
 
 
 def circle(yaw: NDArray[Any]) -> Array:
-    """Headings [rad], shape (N,), as sin, cos and those of twice the heading, shape (N, 4).
+    """Sin and cos of headings [rad], shape (N,), and of twice the headings, shape (N, 4).
 
-    The field of hard iron goes once about with the heading, that of soft iron twice.
+    The field of hard iron varies with the heading, that of soft iron with twice the heading.
     """
     return np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2 * yaw), np.cos(2 * yaw)])
 
@@ -52,15 +52,15 @@ def circle(yaw: NDArray[Any]) -> Array:
 def carried(gradient_nt_m: NDArray[Any], odom_v: NDArray[Any]) -> Array:
     """Gradients forward and to the left [nT/m], (N, 2), times the forward speed [m/s] of (N, 3): [nT/s].
 
-    A reading that is late by tau errs by tau of the first, as a lever arm l does by l of the gradient.
+    A reading that is late by tau errs by tau times this; a lever arm l errs by l times the gradient.
     """
     return gradient_nt_m * odom_v[:, :1]
 
 
 def lags(v_cmd: NDArray[Any], w_cmd: NDArray[Any], odom_v: NDArray[Any], odom_w: NDArray[Any]) -> Array:
-    """What is commanded beyond what is driven, forward [m/s] and turning [rad/s], shape (N, 2).
+    """Commanded minus driven speed [m/s] and turning [rad/s], shape (N, 2).
 
-    The motors' torque, and so their current, goes with it while the robot gains speed or loses it.
+    The motors' torque, and so their current, follows it while the robot changes speed.
     """
     return np.column_stack([v_cmd - odom_v[:, 0], w_cmd - odom_w[:, 2]])
 
@@ -68,8 +68,8 @@ def lags(v_cmd: NDArray[Any], w_cmd: NDArray[Any], odom_v: NDArray[Any], odom_w:
 def turned(yaw: NDArray[Any], *signals: NDArray[Any]) -> Array:
     """Signals (N,) or (N, width) times sin and cos of the heading, shape (N, 2 x their numbers).
 
-    A current's field is fixed to the robot, beside which the Earth's turns: of its level part
-    the magnitude sees what lies along the Earth's.
+    A current's field is fixed to the robot, relative to which the Earth's field turns. The magnitude changes
+    by the part along the Earth's field.
     """
     each = np.column_stack(signals)
     return np.column_stack([w * s for s in each.T for w in (np.sin(yaw), np.cos(yaw))])
@@ -88,14 +88,14 @@ def turned_lags(
 
 
 def turning_size(odom_w: NDArray[Any]) -> Array:
-    """How fast a robot turns, to either side [rad/s], shape (N,): friction does not know the side."""
+    """Size of the turning rate [rad/s], shape (N,), which friction depends on."""
     return np.abs(odom_w[:, 2])
 
 
 def direction_cosines(b_vector_nt: NDArray[Any]) -> Array:
     """Unit vectors along fields, shape (N, 3); nan for a field of 0.
 
-    Their size is left out on purpose: it is the very field that is to be predicted.
+    The size is left out on purpose: it is the field that is to be predicted.
     """
     size = np.linalg.norm(b_vector_nt, axis=1, keepdims=True)
     return np.divide(b_vector_nt, size, out=np.full(b_vector_nt.shape, np.nan), where=size > 0)
@@ -113,9 +113,8 @@ def induced_products(b_vector_nt: NDArray[Any]) -> Array:
 def eddy_products(b_vector_nt: NDArray[Any], imu_w: NDArray[Any]) -> Array:
     """Products u_i du_j/dt of direction cosines and their rates [1/s], j = x, y of i = x, y, z: (N, 6).
 
-    Tolles and Lawson's eddy terms (Leliak 1961). In a field that stands still a turning body sees
-    du/dt = -w x u, so the gyroscope gives the rates of a row without its neighbours; on a floor that of z
-    is about 0.
+    Tolles and Lawson's eddy terms (Leliak 1961). In a constant field a turning body sees du/dt = -w x u, so
+    the gyroscope gives the rates without neighbouring rows; on a floor that of z is about 0.
     """
     u = direction_cosines(b_vector_nt)
     rate = -np.cross(imu_w, u)
@@ -123,18 +122,18 @@ def eddy_products(b_vector_nt: NDArray[Any], imu_w: NDArray[Any]) -> Array:
 
 
 def _canonical(q: NDArray[Any]) -> Array:
-    """Quaternions (N, 4) with w >= 0; a factor of +-1, three times as fast as choosing whole rows."""
+    """Quaternions (N, 4) with w >= 0."""
     return q * np.where(q[:, 3:] < 0, -1.0, 1.0)
 
 
 def _vector(prefix: str, column: str, convert: Convert | None = None) -> dict[str, Feature]:
-    """A feature for each number of a vector column: `prefix` and the name of its part."""
+    """A feature for each part of a vector column."""
     spec = COLUMNS[column]
     return _named({f"{prefix}_{part}": spec.unit for part in spec.parts}, convert, column)
 
 
 def _named(units: Mapping[str, str], convert: Convert | None, *columns: str) -> dict[str, Feature]:
-    """A feature for each number that `convert` makes of the columns."""
+    """A feature for each number that `convert` computes."""
     return {name: Feature(columns, i, unit, convert) for i, (name, unit) in enumerate(units.items())}
 
 
@@ -191,7 +190,7 @@ FEATURES: Mapping[str, Feature] = MappingProxyType(
         **_named(dict.fromkeys(EDDY, "1/s"), eddy_products, _B, "imu_w"),
     }
 )
-"""Every feature by name. Names are kept in weights: they are added to, and never change what they mean."""
+"""Every feature by name. Weights keep the names, so their meaning never changes."""
 
 FULL: tuple[str, ...] = (
     "yaw_deg",
@@ -212,8 +211,8 @@ CIRCULAR: tuple[str, ...] = (
     *("imu_a_x", "imu_a_y", "imu_a_z"),
     *("battery_a", "lidar_on"),
 )
-"""What a robot's field depends on, and nothing that tells one session from another: no level of charge or
-voltage, no orientation from a zero of the IMU's own."""
+"""What a robot's field depends on, without inputs that identify a session: no charge or voltage, and no
+orientation relative to the IMU's own zero."""
 
 SETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -225,20 +224,20 @@ SETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "vector": (*CIRCULAR, *GRADIENT, *CARRIED, *COSINES, *INDUCED, *EDDY),
     }
 )
-"""Features by the name of a set. "correlated" holds those whose Spearman correlation with the
-disturbance exceeds 0.04 in the paper's Figure 2; "gradient" adds to "circular" what a lever arm and a
-latency make of the map; "platform" what a field that is fixed to the robot makes of currents, torques and the
-LiDAR as the robot turns; "vector" what the vector axes tell of the platform's attitude in the field."""
+"""Sets of features by name. "correlated": those with a Spearman correlation with the disturbance above 0.04
+in the paper's Figure 2. "gradient": "circular" and the map's gradient, for a lever arm and a latency.
+"platform": also currents, torques and the LiDAR by heading. "vector": "gradient" and the platform's attitude
+in the field, from the vector axes."""
 
 
 def feature_names(names: str | Sequence[str]) -> tuple[str, ...]:
-    """The features of a named set, or the names given, each known and none twice.
+    """The features of a set, or the given names, checked.
 
     Args:
-        names: A name of `SETS`; a feature, or several with commas between; or their names.
+        names: A name of `SETS`, features separated by commas, or a sequence of features.
 
     Raises:
-        InputError: An unknown set or feature (the text names the near one), or one named twice.
+        InputError: An unknown set or feature (the nearest one is named), or one named twice.
     """
     if isinstance(names, str):
         if "," not in names and names not in FEATURES:
@@ -256,7 +255,7 @@ def features(run: Run, names: str | Sequence[str] = "full") -> Array:
     """Inputs of a network for each reading of a run.
 
     Args:
-        run: Needs the columns that the features are taken from.
+        run: Needs the columns of the features.
         names: A set of `SETS` or names of features, in the order of the network's inputs.
 
     Returns:
@@ -267,7 +266,7 @@ def features(run: Run, names: str | Sequence[str] = "full") -> Array:
     """
     names = feature_names(names)
     x = np.empty((run.rows, len(names)))
-    made: dict[tuple[Any, ...], NDArray[Any]] = {}  # a quaternion is made canonical once, not four times
+    made: dict[tuple[Any, ...], NDArray[Any]] = {}  # results of conversions that several features share
     for i, name in enumerate(names):
         feature = FEATURES[name]
         key = (feature.convert, feature.columns)
@@ -280,7 +279,7 @@ def features(run: Run, names: str | Sequence[str] = "full") -> Array:
 
 
 def columns_of(names: str | Sequence[str]) -> tuple[str, ...]:
-    """Columns of a Run that features are made of, each once; `names` as for `features`.
+    """Columns of a Run that features need, each once; `names` as for `features`.
 
     Raises:
         InputError: An unknown feature or set.

@@ -1,4 +1,4 @@
-"""Inputs: what a predictor reads in a row, how it is scaled, and what it was trained within."""
+"""Inputs: the features of a predictor, their scaler and their training ranges."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,10 +18,10 @@ SCALERS = ("x_mean", "x_scale", "x_min", "x_max")
 """Tensors of a weights file that hold scaler and ranges."""
 
 FAR = 5.0
-"""Scales from the mean beyond which an input is outside, where the training range is unknown."""
+"""Scales from the mean beyond which an input is outside if the training range is unknown."""
 
 _BLOCK = 512
-"""Rows compared at once, so that what is compared stays in a core's cache."""
+"""Rows compared at once, to stay in the cache of a core."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -38,35 +38,35 @@ class Inputs(Summarized):
     """Scales of the training inputs, shape (F,), above 0."""
 
     low: Array
-    """Smallest training inputs, shape (F,); nan where unknown."""
+    """Smallest training inputs, shape (F,); nan if unknown."""
 
     high: Array
-    """Largest training inputs, shape (F,); nan where unknown."""
+    """Largest training inputs, shape (F,); nan if unknown."""
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """What a weights file holds of them, by name, float64."""
+        """Scaler and ranges as tensors of a weights file, by name, float64."""
         values = (self.mean, self.scale, self.low, self.high)
         return {name: torch.as_tensor(value) for name, value in zip(SCALERS, values, strict=True)}
 
-    def grown(self, of: "Inputs") -> "Inputs":
-        """The same scaler, with ranges that hold those of other rows too, or stay unknown.
+    def grown(self, other: "Inputs") -> "Inputs":
+        """The same scaler, with ranges extended by those of other rows; unknown ranges stay unknown.
 
         Raises:
-            InputError: The others are of other features.
+            InputError: The features differ.
         """
-        if of.features != self.features:
+        if other.features != self.features:
             raise InputError(
-                f"the model to go on from has inputs {', '.join(self.features)}, this training "
-                f"{', '.join(of.features)}; give it the same features"
+                f"the model to continue from has inputs {', '.join(self.features)}, this training "
+                f"{', '.join(other.features)}; give it the same features"
             )
-        low, high = np.minimum(self.low, of.low), np.maximum(self.high, of.high)
+        low, high = np.minimum(self.low, other.low), np.maximum(self.high, other.high)
         return Inputs(self.features, self.mean, self.scale, low, high)
 
     def checked(self, x: ArrayLike) -> Array:
-        """`x` as rows of float64, if they are as wide as the features are many.
+        """`x` as float64 rows of one column per feature.
 
         Raises:
-            InputError: They are not.
+            InputError: `x` has another shape.
         """
         x = np.ascontiguousarray(x, float)
         wanted = len(self.features)
@@ -82,10 +82,9 @@ class Inputs(Summarized):
 
     @property
     def within(self) -> tuple[Array, Array]:
-        """Least and greatest inputs that are not outside, each (F,).
+        """Smallest and largest inputs that are not outside, each (F,).
 
-        Where the training range is unknown (the released weights do not hold it), they lie 5 scales from the
-        mean.
+        If the training range is unknown, as in the released weights, they lie 5 scales from the mean.
         """
         low = np.where(np.isnan(self.low), self.mean - FAR * self.scale, self.low)
         high = np.where(np.isnan(self.high), self.mean + FAR * self.scale, self.high)
@@ -93,7 +92,7 @@ class Inputs(Summarized):
         return low - slack, high + slack
 
     def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
-        """Whether an input of a row left what it was trained `within`, shape (N,); nan is outside."""
+        """Whether an input of a row is not `within` the training range, shape (N,); nan is outside."""
         x = self.checked(x)
         low, high = self.within
         inside = np.empty(len(x), bool)
@@ -108,7 +107,7 @@ def inputs_of(x: ArrayLike, features: str | Sequence[str]) -> Inputs:
 
     Args:
         x: Features, shape (N, F). One that does not vary keeps a scale of 1.
-        features: Their names, or that of a set of them.
+        features: Their names, or the name of a set.
     """
     x = np.asarray(x, float)
     scale = x.std(axis=0)
@@ -117,7 +116,7 @@ def inputs_of(x: ArrayLike, features: str | Sequence[str]) -> Inputs:
 
 
 def scaler_tensors(count: int) -> dict[str, torch.Tensor]:
-    """Tensors of the names, shapes and types in which a weights file holds so many inputs."""
+    """Tensors with the names, shapes and types of the scaler and ranges of `count` inputs."""
     return dict.fromkeys(SCALERS, torch.ones(count, dtype=torch.float64))
 
 
@@ -126,8 +125,8 @@ def inputs_from(features: Sequence[str], tensors: Mapping[str, torch.Tensor], pa
 
     Args:
         features: Names of the inputs.
-        tensors: Those of `scaler_tensors`, and others.
-        path: The file, for refusals.
+        tensors: Tensors of the file.
+        path: The file, for error messages.
 
     Raises:
         InputError: A scale is not above 0.

@@ -1,8 +1,7 @@
-"""Origin: the map and the robot that a network learned on, and whether it is used with others.
+"""Origin: the map and the robot that a network was trained on, and warnings if it is used with others.
 
-A network predicts what a robot reads beyond one map, at the place where its labels took that map. With
-another map, at another place or on another robot its prediction is off, often by an amount that can be
-computed.
+A network predicts the field of one robot beyond one map, at the place where its labels used that map. With
+another map, place or robot its prediction is off, often by an amount that can be computed.
 """
 
 import math
@@ -22,51 +21,49 @@ from magtwin.spec.robot import RobotSpec
 Array = NDArray[np.float64]
 
 ROBOT_METADATA = ("robot_name", "sensor_m", "platform_sha256", "mocap_offset_m", "mocap_latency_s")
-"""Metadata of a run that tell which robot drove, and how motion capture saw it."""
+"""Metadata of a run about its robot and its motion capture."""
 
 UNKNOWN, SEVERAL = "unknown", "several"
-"""What a data set says of its robot where no recording tells, or where they differ."""
+"""Values in a data set if no recording names its robot, or if they differ."""
 
 SAMPLES = 100
-"""Poses at which a map is kept with a network, to compare it with another: an RMS to 7 %."""
+"""Number of poses at which a network keeps its map's values, to compare maps: the RMS is known to 7 %."""
 
 SAME_NT = 1.0
-"""Maps that differ by less are the same map [nT]: samples are kept to the nT."""
+"""Maps that differ by less are the same [nT]; samples are rounded to 1 nT."""
 
 LEAST_SAMPLES = 10
-"""Fewer poses that both maps know tell nothing of their difference."""
+"""Least number of poses on both maps for a comparison."""
 
 TYPICAL_M_S = 0.2
-"""Speed for which the effect of a latency is told [m/s], the default of a run."""
+"""Speed at which the effect of a latency is computed [m/s], the default of a run."""
 
 SMALL_SHARE = 0.25
-"""An effect below this share of the network's own error is not worth a warning."""
+"""Effects below this share of the network's own error give no warning."""
 
 
 @dataclass(frozen=True)
 class Mismatch:
-    """Something that a network is used with and did not learn on."""
+    """A difference between the training of a network and its use."""
 
     text: str
-    """What it is, the expected effect, and what to do, in a line."""
+    """The difference, its expected effect, and what to do, in one line."""
 
     grave: bool = False
-    """Whether predictions are meaningless: another robot."""
+    """Whether predictions are meaningless, as for another robot."""
 
 
 def shared_metadata(runs: Iterable[Mapping[str, Any]]) -> dict[str, str]:
-    """What the metadata of recordings tell of their robot: one value, `UNKNOWN` or `SEVERAL` for each."""
-    told: dict[str, set[str]] = {name: set() for name in ROBOT_METADATA}
+    """Metadata of recordings about their robot: the common value, `UNKNOWN` or `SEVERAL` for each."""
+    values: dict[str, set[str]] = {name: set() for name in ROBOT_METADATA}
     for metadata in runs:
         for name in ROBOT_METADATA:
-            told[name].add(str(metadata.get(name, UNKNOWN)))
-    return {
-        name: next(iter(values)) if len(values) == 1 else SEVERAL for name, values in told.items() if values
-    }
+            values[name].add(str(metadata.get(name, UNKNOWN)))
+    return {name: next(iter(of)) if len(of) == 1 else SEVERAL for name, of in values.items() if of}
 
 
 def map_metadata(field: AnomalyMap) -> dict[str, str]:
-    """What is kept of a map to compare others with it: its method, and its values at `SAMPLES` poses."""
+    """Metadata to compare a map with others: its method, and its values at `SAMPLES` poses."""
     p, yaw = _poses(field.extent)
     values = field.lookup(p, yaw)
     metadata = {
@@ -88,47 +85,47 @@ def mismatches(
     robot: RobotSpec,
     platform_sha256: str,
 ) -> tuple[Mismatch, ...]:
-    """What a network is used with and did not learn on.
+    """Differences between the training of a network and its use.
 
-    A simulated run takes the map at the robot's true pose. Labels with fitted lever arm and latency took it
-    there too, to some mm; labels without took it where motion capture saw the robot.
+    A simulated run looks the map up at the robot's true pose. Labels with fitted lever arm and latency did so
+    too, within some mm; labels without used the pose of motion capture.
 
     Args:
-        metadata: Those of the network.
+        metadata: Metadata of the network.
         name: What to call the network.
-        residual_sd_nt: Its own error [nT]; nan where unknown.
+        residual_sd_nt: Its own error [nT]; nan if unknown.
         field: The map that its predictions are added to.
         map_sha256: Checksum of that map's file.
         robot: The robot that it is used on.
-        platform_sha256: Checksum of what makes that robot's own field.
+        platform_sha256: Checksum of that robot's own field.
 
     Returns:
-        One for each thing that differs; none where everything is as it learned it.
+        One entry per difference.
 
     Raises:
-        InputError: Metadata of the network are not what they should be.
+        InputError: The network's metadata are invalid.
     """
-    found = [
+    each = (
         _robot_mismatch(metadata, name, field, robot, platform_sha256),
         _map_mismatch(metadata, name, field, map_sha256),
         _frame_mismatch(metadata, name, field, residual_sd_nt),
-    ]
-    return tuple(one for one in found if one is not None)
+    )
+    return tuple(mismatch for mismatch in each if mismatch is not None)
 
 
 def label_frame(metadata: Metadata, name: str = "") -> tuple[float, float, float] | None:
-    """Where a network's labels took the map, seen from the robot's true pose.
+    """Place where a network's labels used the map, relative to the robot's true pose.
 
-    Labels took it at p(t - latency) + R l of what motion capture saw, which is the true pose of `a` seconds
-    ago less R o. So the map was read l - o forward and left of the true place, and latency + a late.
+    Labels used p(t - latency) + R l of motion capture's pose, which is the true pose of `a` seconds ago minus
+    R o. So the map was looked up l - o forward and left of the true place, and latency + a late.
 
     Args:
-        metadata: Those of the network.
-        name: What to call the network, in a refusal.
+        metadata: Metadata of the network.
+        name: What to call the network in an error.
 
     Returns:
-        Forward [m], left [m] and lateness [s]; all 0 where labels took the true pose. None where the robot
-        does not tell how motion capture saw it, as a real one.
+        Forward [m], left [m] and lateness [s]; all 0 if labels used the true pose. None if the offset and age
+        of motion capture are unknown, as for a real robot.
     """
     lever, late = _numbers(metadata, name, "lever_arm_m", 2), _numbers(metadata, name, "latency_s", 1)
     offset, age = (
@@ -145,7 +142,7 @@ def label_frame(metadata: Metadata, name: str = "") -> tuple[float, float, float
 
 
 def displacement_nt(field: AnomalyMap, forward_m: float, left_m: float, late_s: float) -> float:
-    """Root mean square of what a map changes by when it is read at a displaced pose [nT].
+    """RMS change of a map when it is looked up at a displaced pose [nT].
 
     First order: the gradient in the robot's axes times (forward - v late, left), at v = `TYPICAL_M_S`, over
     `SAMPLES` poses of the map.
@@ -158,11 +155,33 @@ def displacement_nt(field: AnomalyMap, forward_m: float, left_m: float, late_s: 
     return float(np.sqrt(np.mean(change[known] ** 2))) if known.any() else math.nan
 
 
+def same_map(metadata: Metadata, field: AnomalyMap, name: str = "") -> bool:
+    """Whether a map has the values that a network keeps of its own map, within `SAME_NT`."""
+    rms = _map_difference_nt(metadata, field, name)
+    return rms is not None and rms < SAME_NT
+
+
+def _map_difference_nt(metadata: Metadata, field: AnomalyMap, name: str) -> float | None:
+    """RMS difference of a map from the values that a network keeps [nT]; None if unknown, inf if too few
+    overlap.
+    """
+    known, extent = (
+        _numbers(metadata, name, "map_samples_nt", SAMPLES),
+        _numbers(metadata, name, "map_extent_m", 4),
+    )
+    if known is None or extent is None:
+        return None
+    low_x, high_x, low_y, high_y = extent
+    difference = field.lookup(*_poses((low_x, high_x, low_y, high_y))) - np.array(known)
+    both = np.isfinite(difference)
+    return math.inf if both.sum() < LEAST_SAMPLES else float(np.sqrt(np.mean(difference[both] ** 2)))
+
+
 def _map_mismatch(metadata: Metadata, name: str, field: AnomalyMap, map_sha256: str) -> Mismatch | None:
     if "map_sha256" not in metadata:
         return Mismatch(
-            f"{name} does not say which map it was trained on; if that was not {field.name!r}, its field "
-            "errs by the difference of the two"
+            f"{name} does not name the map that it was trained on; if that is not {field.name!r}, its field "
+            "is off by the difference of the two"
         )
     if metadata["map_sha256"] == map_sha256:
         return None
@@ -170,21 +189,13 @@ def _map_mismatch(metadata: Metadata, name: str, field: AnomalyMap, map_sha256: 
     if "map_method" in metadata:
         learned += f" ({metadata['map_method']})"
     here = f"{field.name!r}" + (f" ({field.method})" if field.method else "")
-    effect, known = "the expected effect is unknown", _numbers(metadata, name, "map_samples_nt", SAMPLES)
-    extent = _numbers(metadata, name, "map_extent_m", 4)
-    if known is not None and extent is not None:
-        low_x, high_x, low_y, high_y = extent
-        difference = field.lookup(*_poses((low_x, high_x, low_y, high_y))) - np.array(known)
-        both = np.isfinite(difference)
-        if both.sum() < LEAST_SAMPLES:
-            effect = "the two cover different floors, and the field is meaningless"
-        else:
-            rms = float(np.sqrt(np.mean(difference[both] ** 2)))
-            if rms < SAME_NT:
-                return None
-            effect = (
-                f"the two differ by {rms:.0f} nT RMS over the floor, so its predictions may not fit this map"
-            )
+    effect, rms = "the expected effect is unknown", _map_difference_nt(metadata, field, name)
+    if rms is not None and rms < SAME_NT:
+        return None
+    if rms == math.inf:
+        effect = "the two cover different floors, and the field is meaningless"
+    elif rms is not None:
+        effect = f"the two differ by {rms:.0f} nT RMS over the floor, so its predictions may not fit this map"
     return Mismatch(
         f"{name} learned on the map {learned}, and the scene's map is {here}: {effect}; use that map, or "
         "train on this one"
@@ -207,7 +218,8 @@ def _frame_mismatch(
         + (
             "Their fit of lever arm and latency is that far off: record more turns at several speeds"
             if metadata.get("alignment") == "fitted"
-            else "To avoid it, train on labels with fitted lever arm and latency (dataset build --align fit)"
+            else "To avoid it, train on labels with fitted lever arm and latency ("
+            "dataset build --alignment fit)"
         )
     )
 
@@ -229,9 +241,8 @@ def _robot_mismatch(
             size = f" ({float(metadata['label_mean_nt']):.0f} ± {float(metadata['label_sd_nt']):.0f} nT)"
         return Mismatch(
             f"WRONG ROBOT: {name} learned the robot {learned!r} with its sensor at ({metadata['sensor_m']}) "
-            f"m, "
-            f"and this is {robot.name!r} with its sensor at ({here}) m. The disturbance it predicts{size} is "
-            "not this robot's, and readings are meaningless; train a network on this robot, or use a "
+            f"m, and this is {robot.name!r} with its sensor at ({here}) m. The disturbance it predicts{size} "
+            "is not this robot's, and readings are meaningless; train a network on this robot, or use a "
             "physical magnetometer",
             grave=True,
         )
@@ -242,14 +253,14 @@ def _robot_mismatch(
             f"({here}) m: at least {effect:.0f} nT RMS, by the map's gradient alone; train a network on this "
             "robot"
         )
-    told = metadata.get("platform_sha256", UNKNOWN)
-    if told not in (UNKNOWN, SEVERAL, platform_sha256):
+    learned_platform = metadata.get("platform_sha256", UNKNOWN)
+    if learned_platform not in (UNKNOWN, SEVERAL, platform_sha256):
         return Mismatch(
             f"{name} learned {learned!r} with another [platform] than {robot.name!r} has here: what it "
             "predicts of the robot's own field is off by what was changed; train a network on this robot"
         )
     if learned != robot.name:
-        same = "same" if told == platform_sha256 else "at the same place"
+        same = "same" if learned_platform == platform_sha256 else "at the same place"
         return Mismatch(
             f"{name} learned the robot {learned!r}, and this is {robot.name!r}; its sensor is {same}, so no "
             "effect is expected if only the name differs"
@@ -258,10 +269,10 @@ def _robot_mismatch(
 
 
 def _poses(extent: tuple[float, float, float, float]) -> tuple[Array, Array]:
-    """`SAMPLES` poses spread evenly over a floor and all headings: Roberts' R3 sequence (2018).
+    """`SAMPLES` poses spread evenly over a floor and all headings, by Roberts' R3 sequence (2018).
 
     Args:
-        extent: Least and greatest x, least and greatest y [m].
+        extent: Smallest and largest x, then y [m].
 
     Returns:
         Points [m], shape (SAMPLES, 2), and headings [rad], shape (SAMPLES,).
@@ -274,10 +285,10 @@ def _poses(extent: tuple[float, float, float, float]) -> tuple[Array, Array]:
 
 
 def _numbers(metadata: Metadata, name: str, key: str, count: int) -> list[float] | None:
-    """Numbers that a fact lists; None where it is not there, or says that they are not known.
+    """Numbers of a metadata entry; None if it is missing or unknown.
 
     Raises:
-        InputError: It is there and lists something else.
+        InputError: The entry is not that many numbers.
     """
     text = str(metadata.get(key, UNKNOWN))
     if text in (UNKNOWN, SEVERAL):
@@ -287,7 +298,7 @@ def _numbers(metadata: Metadata, name: str, key: str, count: int) -> list[float]
     except ValueError:
         values = []
     if len(values) != count:
-        raise InputError(f"{name}: its fact {key!r} must list {count} numbers, got {text[:60]!r}")
+        raise InputError(f"{name}: its metadata {key!r} must list {count} numbers, got {text[:60]!r}")
     return values
 
 

@@ -1,4 +1,4 @@
-"""Recordings: what goes into a data set, and what comes out of it."""
+"""Recordings of a data set: the sources it is built from, their entries in it, and the rows read from it."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -19,19 +19,19 @@ _SHA = re.compile("[0-9a-f]{64}")
 
 @dataclass(frozen=True)
 class Source:
-    """A recording that goes into a data set."""
+    """A recording to put into a data set."""
 
     name: str
-    """What it is called; letters, digits and _ . + - make the name of its shard."""
+    """Its name, of letters, digits and _ . + -; also that of its shard."""
 
     read: Callable[[], Run]
-    """Gives the run; called once, or twice where an alignment is fitted."""
+    """Returns the run; called once, or twice if an alignment is fitted."""
 
     session: str = ""
-    """What it shares with others that were recorded between two switchings on; its run's own unless given."""
+    """Its session. Default: that in the run's metadata."""
 
     path: str = ""
-    """What was driven; its run's own unless given."""
+    """The driven path. Default: that in the run's metadata."""
 
 
 @dataclass(frozen=True)
@@ -39,19 +39,17 @@ class Recording:
     """A recording of a data set."""
 
     name: str
-    """What it is called."""
-
     session: str
-    """What was switched on and off with it; its own name where nobody said."""
+    """Its session; its own name if unknown."""
 
     path: str
-    """What was driven; its own name where nobody said."""
+    """The driven path; its own name if unknown."""
 
     rows: int
-    """Readings."""
+    """Number of readings."""
 
     labelled: int
-    """Readings that have a label."""
+    """Number of readings with a label."""
 
     duration_s: float
     """From the first reading to the last [s]."""
@@ -87,7 +85,7 @@ class Recording:
 
 @dataclass(frozen=True, repr=False)
 class Rows(Summarized):
-    """What a network learns from: inputs and labels, row by row."""
+    """Inputs and labels to train on, row by row."""
 
     x: Array
     """Features in the units of `FEATURES`, shape (N, F); none is nan."""
@@ -96,10 +94,10 @@ class Rows(Summarized):
     """Labels [nT], shape (N,)."""
 
     sd: Array
-    """How well the map is known there [nT], shape (N,)."""
+    """Standard deviation of the map there [nT], shape (N,)."""
 
     recording: NDArray[np.intp]
-    """Which of `names` each row is of, shape (N,), ascending."""
+    """Index into `names` of each row, shape (N,), ascending."""
 
     names: tuple[str, ...]
     """Recordings."""
@@ -108,20 +106,20 @@ class Rows(Summarized):
     """Names of the columns of `x`."""
 
     left_out: Mapping[str, int]
-    """How many rows there were without a label, and how many labelled ones with an input that is nan."""
+    """Number of rows without a label, and of labelled rows without an input."""
 
     row: NDArray[np.intp]
-    """Which row of its recording each is, shape (N,)."""
+    """Number of each row in its recording, shape (N,)."""
 
     beside: Array
-    """Other features that were asked for on the same rows, shape (N, K); nan where unknown."""
+    """Other features of the same rows, shape (N, K); nan if unknown."""
 
 
 def sources_of(recordings: Mapping[str, Run] | Sequence[Source]) -> list[Source]:
-    """Sources of runs by name, or as given, each with a name of its own.
+    """Sources of runs by name, or the given sources, with their names checked.
 
     Raises:
-        InputError: There is none, a name cannot be that of a file, or two have one.
+        InputError: There is none, a name is not valid, or two have one name.
     """
     if isinstance(recordings, Mapping):
         sources = [Source(name, lambda run=run: run) for name, run in recordings.items()]  # type: ignore[misc]
@@ -142,10 +140,10 @@ def sources_of(recordings: Mapping[str, Run] | Sequence[Source]) -> list[Source]
 
 
 def read(source: Source) -> Run:
-    """The run of a source, that it can be labelled.
+    """Read the run of a source and check that it can be labelled.
 
     Raises:
-        InputError: It tells no pose, or no field, or a field that a network or a map made up.
+        InputError: It has no pose or no field, or its field comes from a network or a map.
     """
     run = source.read()
     posed = {"mocap_p", "mocap_q_xyzw"} <= set(run) or {"p_world_base", "yaw"} <= set(run)
@@ -154,14 +152,14 @@ def read(source: Source) -> Run:
         raise InputError(f"{source.name}: nothing to label: it has no column {wanted}")
     if (kind := run.metadata.get("magnetometer")) in ("neural", "map-only"):
         raise InputError(
-            f"{source.name}: its readings are those of a {kind} magnetometer, and what learns from them "
-            "learns that model; record a robot, or drive the twin with --magnetometer physical"
+            f"{source.name}: its readings come from a {kind} magnetometer, and training on them would learn "
+            "that model; record a robot, or drive the twin with --magnetometer physical"
         )
     return run
 
 
 def thinned(run: Run, rate_hz: float | None) -> Run:
-    """Every second, third, ... row, so that there are not more than some a second."""
+    """Every k-th row, so that the rate is at most `rate_hz`."""
     if rate_hz is None or run.rows < 2:
         return run
     step = float(np.median(np.diff(run["t"])))

@@ -1,4 +1,4 @@
-"""Split: which recordings are learned from, which stop the learning, and which judge it."""
+"""Split: the recordings of training, validation and test."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,30 +22,30 @@ LEAK = (
     "split by row: rows a hundredth of a second apart lie on both sides, so that the test repeats what was "
     "learned; its error shows the leak, not how well a run that was never seen is predicted"
 )
-"""What is said of a split by row."""
+"""Warning about a split by row."""
 
 _DEAL = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
-"""Constants of splitmix64 (Steele, Lea and Flood 2014), which deals rows."""
+"""Constants of splitmix64 (Steele, Lea and Flood 2014), which assigns rows."""
 
 
 class Recorded(Protocol):
-    """What a split needs to know of a recording."""
+    """The properties of a recording that a split uses."""
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """Its name."""
 
     @property
     def session(self) -> str:
-        """The session that it is of."""
+        """Its session."""
 
     @property
     def path(self) -> str:
-        """The path that was driven."""
+        """The driven path."""
 
     @property
     def labelled(self) -> int:
-        """How many of its rows have a label."""
+        """Number of rows with a label."""
 
 
 _KEYS: Mapping[str, Callable[[Recorded], str]] = MappingProxyType(
@@ -60,54 +60,54 @@ _KEYS: Mapping[str, Callable[[Recorded], str]] = MappingProxyType(
 
 @dataclass(frozen=True, repr=False)
 class Split(Summarized):
-    """Recordings by what they are for; by row, every recording is in each part with rows of its own."""
+    """Recordings of training, validation and test; by row, each part has some rows of every recording."""
 
     train: tuple[str, ...]
-    """Names of those that weights are fitted to."""
+    """Names of recordings to fit to."""
 
     validation: tuple[str, ...]
-    """Names of those that end the training and calibrate."""
+    """Names of recordings to stop and calibrate by."""
 
     test: tuple[str, ...]
-    """Names of those that judge; nothing else looks at them."""
+    """Names of recordings to judge by, used for nothing else."""
 
     by: By = "run"
-    """What is never on two sides."""
+    """Unit kept whole."""
 
     held_out: tuple[str, ...] = ()
-    """Names that were asked to be in the test."""
+    """Names that were put into the test on request."""
 
     row_seed: int = 0
-    """Of a split by row: what deals the rows."""
+    """Seed of a split by row."""
 
     row_shares: tuple[float, float, float] = field(default=SHARES)
-    """Of a split by row: the shares of its parts."""
+    """Shares of the parts of a split by row."""
 
     @property
     def leak(self) -> str:
-        """What is wrong with it, for whoever is told of its results; "" where nothing is."""
+        """Warning that goes with its results, or ""."""
         return LEAK if self.by == "row" else ""
 
     def names(self, part: Part) -> tuple[str, ...]:
-        """Names of the recordings that have rows in a part.
+        """Names of the recordings of a part.
 
         Raises:
-            InputError: There is no such part.
+            InputError: No such part.
         """
         return find(
             "part of a split", part, {"train": self.train, "validation": self.validation, "test": self.test}
         )
 
     def rows(self, part: Part, name: str, count: int) -> NDArray[np.bool_]:
-        """Which of the rows of a recording are in a part, shape (N,).
+        """Mask of the rows of a recording that are in a part, shape (N,).
 
         Args:
             part: "train", "validation" or "test".
-            name: The recording's.
-            count: How many rows it has, labelled or not.
+            name: Name of the recording.
+            count: Number of its rows.
 
         Raises:
-            InputError: There is no such part.
+            InputError: No such part.
         """
         if name not in self.names(part):
             return np.zeros(count, bool)
@@ -119,7 +119,7 @@ class Split(Summarized):
         return (drawn >= edges[i]) & (drawn < (edges[i + 1] if part != "test" else 2.0))
 
     def report(self, title: str = "Split") -> Report:
-        """How many recordings are in each part, and what is wrong with it."""
+        """Number of recordings of each part, and the warning."""
         figures = [Figure(part, len(self.names(part)), "recordings") for part in PARTS]
         metadata: dict[str, object] = {"by": self.by}
         if self.leak:
@@ -144,46 +144,45 @@ def split(
     *,
     rng: np.random.Generator,
 ) -> Split:
-    """Deal recordings to training, validation and test, whole sessions, runs or paths at a time.
+    """Split recordings into training, validation and test, keeping sessions, runs or paths whole.
 
-    Groups are dealt in a random order, each to the part that is furthest below its share of labelled rows;
-    a part with a share never stays empty.
+    Groups are taken in random order. Each goes to the part that is furthest below its share of labelled rows;
+    no part with a share stays empty.
 
     Args:
         recordings: Such as those of a `Dataset`.
-        by: What is never on two sides: a session, a run or a path. "row" deals single rows, to show
-            what that hides; it says so in `Split.leak`.
-        shares: Of labelled rows in training, validation and test; they sum to 1.
-        hold_out: Sessions, runs or paths (by `by`), or names of recordings, that are all in the test;
-            where given, the other recordings are dealt to training and validation alone.
+        by: Unit kept whole. "row" splits single rows, for comparison; `Split.leak` warns of it.
+        shares: Shares of labelled rows in training, validation and test; they sum to 1.
+        hold_out: Sessions, runs or paths (by `by`), or names of recordings, to put into the test. The others
+            then go to training and validation only.
         rng: Source of the order.
 
     Raises:
-        InputError: There are fewer groups than parts, shares do not sum to 1, or what is to be held out is
-            not there.
+        InputError: There are fewer groups than parts, shares do not sum to 1, or a name in `hold_out` is
+            unknown.
     """
     key = find("way to split", by, _KEYS)
     numbers = np.asarray(shares, float)
     if numbers.shape != (3,) or not (np.isfinite(numbers).all() and (numbers >= 0).all() and numbers[0] > 0):
-        raise InputError(f"shares must be three, none below 0 and training's above it, got {tuple(shares)}")
+        raise InputError(f"shares must be three, none below 0 and the first above 0, got {tuple(shares)}")
     if abs(numbers.sum() - 1) > 1e-6:
         raise InputError(f"shares must sum to 1, got {tuple(shares)}, which sum to {numbers.sum():g}")
     if not recordings:
         raise InputError("there is no recording to split")
-    known = {key(one) for one in recordings} | {one.name for one in recordings}
+    known = {key(each) for each in recordings} | {each.name for each in recordings}
     for wanted in hold_out:
         find(f"{by if by != 'row' else 'run'} or recording to hold out", wanted, dict.fromkeys(known))
-    held = {one.name for one in recordings if key(one) in hold_out or one.name in hold_out}
-    if by in ("session", "path"):  # a recording of it that was held out takes the others along
-        groups_held = {key(one) for one in recordings if one.name in held}
-        held = {one.name for one in recordings if key(one) in groups_held}
-    left = [one for one in recordings if one.name not in held]
+    held = {each.name for each in recordings if key(each) in hold_out or each.name in hold_out}
+    if by in ("session", "path"):  # holding out a recording holds out its group
+        groups_held = {key(each) for each in recordings if each.name in held}
+        held = {each.name for each in recordings if key(each) in groups_held}
+    left = [each for each in recordings if each.name not in held]
     if held:
         numbers = np.array([numbers[0], numbers[1], 0.0]) / (numbers[0] + numbers[1])
     if by == "row":
-        names = tuple(one.name for one in left)
+        names = tuple(each.name for each in left)
         train, validation, test = (names if share > 0 else () for share in numbers)
-        test = (*test, *(one.name for one in recordings if one.name in held))
+        test = (*test, *_in_order(recordings, held))
         row_shares = (float(numbers[0]), float(numbers[1]), float(numbers[2]))
         return Split(
             train, validation, test, by, _in_order(recordings, held), int(rng.integers(2**63)), row_shares
@@ -203,8 +202,8 @@ def _dealt(
 ) -> dict[str, set[str]]:
     """Names by part."""
     groups: dict[str, list[Recorded]] = {}
-    for one in recordings:
-        groups.setdefault(key(one), []).append(one)
+    for recording in recordings:
+        groups.setdefault(key(recording), []).append(recording)
     wanted = [part for part, share in zip(PARTS, shares, strict=True) if share > 0]
     if len(groups) < len(wanted):
         finer = {"session": "run", "path": "run"}.get(by)
@@ -214,7 +213,7 @@ def _dealt(
         )
     names = sorted(groups)
     names = [names[i] for i in rng.permutation(len(names))]
-    rows = {name: max(1, sum(one.labelled for one in groups[name])) for name in names}
+    rows = {name: max(1, sum(each.labelled for each in groups[name])) for name in names}
     total = sum(rows.values())
     parts: dict[str, set[str]] = {part: set() for part in PARTS}
     held = dict.fromkeys(wanted, 0)
@@ -223,17 +222,17 @@ def _dealt(
         empty = [part for part in wanted if not parts[part]]
         open_to = empty if len(names) - i <= len(empty) else wanted
         part = max(open_to, key=lambda part: share_of[part] - held[part] / total)
-        parts[part] |= {one.name for one in groups[name]}
+        parts[part] |= {each.name for each in groups[name]}
         held[part] += rows[name]
     return parts
 
 
 def _in_order(recordings: Sequence[Recorded], names: set[str]) -> tuple[str, ...]:
-    return tuple(one.name for one in recordings if one.name in names)
+    return tuple(each.name for each in recordings if each.name in names)
 
 
 def _uniform(seed: int, name: str, count: int) -> NDArray[np.float64]:
-    """Numbers in [0, 1) that a row's place in a named recording decides, so that blocks can be read alone."""
+    """Numbers in [0, 1) that depend on name and row only, so that blocks can be read alone."""
     state = np.uint64(seed)
     with np.errstate(over="ignore"):
         for byte in name.encode():

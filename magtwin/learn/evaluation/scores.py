@@ -1,4 +1,4 @@
-"""Score: errors in figures, with intervals that know how alike the readings of a run err."""
+"""Scores: errors of models, with intervals that account for correlated readings."""
 
 import math
 from collections.abc import Sequence
@@ -15,51 +15,51 @@ Array = NDArray[np.float64]
 Interval = tuple[float, float]
 
 BLOCK_S = 5.0
-"""Length of the blocks of time that are drawn anew [s]: the robot's own field changes within seconds, a map's
-error with the place, which is another 1 m on."""
+"""Length of the blocks of time that are resampled [s]: the robot's own field changes within seconds, and the
+map's error within 1 m."""
 
 DRAWS = 1000
-"""How often everything is drawn anew."""
+"""Number of resamples."""
 
 LEVEL = 0.95
-"""Share of the draws within an interval."""
+"""Confidence level of intervals."""
 
 COVERED = 0.9
-"""Share of the errors that a predicted interval is to hold."""
+"""Nominal coverage of a predicted interval."""
 
 _ABS, _SQUARE, _SUM, _KNOWN, _WITHIN, _OUTSIDE = range(6)
 
 
 @dataclass(frozen=True)
 class Score:
-    """Errors of one model on some readings, each interval of `LEVEL`."""
+    """Errors of one model on some readings, with intervals of level `LEVEL`."""
 
     rows: int
-    """Readings."""
+    """Number of readings."""
 
     mae_nt: float
     """Mean absolute error [nT]."""
     mae_interval_nt: Interval
-    """Where it lies, by resampling [nT]."""
+    """Its interval [nT]."""
 
     ratio: float
-    """`mae_nt` by that of the naive model on the same readings."""
+    """`mae_nt` divided by that of the naive model on the same readings."""
     ratio_interval: Interval
-    """Where that lies, both drawn together."""
+    """Its interval; both errors are resampled together."""
 
     rmse_nt: float
     """Root mean square error [nT]."""
 
     bias_nt: float
-    """Mean error, predicted less measured [nT]."""
+    """Mean error, predicted minus measured [nT]."""
 
     coverage: float
-    """Share of the readings in the predicted interval of 90 %; nan where none is predicted."""
+    """Share of the readings in the predicted 90 % interval; nan if none is predicted."""
     coverage_interval: Interval
-    """Where that lies."""
+    """Its interval."""
 
     outside: float
-    """Share of the readings with an input beyond the training ranges."""
+    """Share of the readings with an input outside the training ranges."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -67,25 +67,27 @@ class Errors(Summarized):
     """Errors of several models on the readings of one run."""
 
     session: str
-    """What was switched on and off with it."""
+    """Its session."""
 
     group: str
-    """The case that it is of."""
+    """Its row of the table."""
 
     t: Array
     """Times, shape (N,) [s]."""
 
     error_nt: Array
-    """Predicted less measured [nT], shape (M, N); all finite."""
+    """Predicted minus measured [nT], shape (M, N); all finite."""
 
     sd_nt: Array
-    """Predicted standard deviations [nT], shape (M, N); nan where there is none."""
+    """Predicted standard deviations [nT], shape (M, N); nan if there is none."""
 
     outside: NDArray[np.bool_]
-    """Whether an input was beyond the training ranges, shape (M, N)."""
+    """Whether an input is outside the training ranges, shape (M, N)."""
 
     def sums(self) -> tuple[Array, Array]:
-        """Readings in each block of `BLOCK_S`, (K,), and sums of what scores are made of, (K, M, 6)."""
+        """Readings in each block of `BLOCK_S`, (K,), and the sums that scores are computed from, (K, M,
+        6).
+        """
         block = ((self.t - self.t[0]) // BLOCK_S).astype(int)
         block = np.unique(block, return_inverse=True)[1]
         size = np.abs(self.error_nt)
@@ -102,19 +104,19 @@ def scores(
 ) -> tuple[dict[str, tuple[Score, ...]], tuple[Score, ...], tuple[Score, ...]]:
     """Scores of each model in each group, on all readings, and in the mean of the groups; the first is naive.
 
-    Intervals are percentiles of a bootstrap that draws as the data came about: sessions, then runs within
-    each group of a session, then blocks of time within each run, all with replacement (Davison and Hinkley
-    1997, section 3.8; Künsch 1989 for blocks). Of one session, or one run, only what lies below is drawn, and
-    the interval says nothing of other days.
+    Intervals are percentiles of a hierarchical bootstrap: sessions, then runs within each group of a session,
+    then blocks of time within each run, all with replacement (Davison and Hinkley 1997, section 3.8; Künsch
+    1989 for blocks). With one session or one run only the lower levels are resampled, and the interval does
+    not cover other sessions.
 
     Args:
         runs: Errors by run, of the same models.
         rng: Source of the draws.
-        draws: How many.
+        draws: Number of resamples.
 
     Returns:
-        By group, in order of first appearance, a Score a model; those of all readings; and those of the
-        mean over groups, whose figures are means of the groups' figures.
+        Scores of each model by group, in order of first appearance; on all readings; and in the mean over
+        groups.
 
     Raises:
         InputError: There is no run.
@@ -123,26 +125,26 @@ def scores(
         raise InputError("no run to score")
     groups = list(dict.fromkeys(run.group for run in runs))
     children = iter(rng.spawn(len(groups) + 1))
-    told: dict[str, tuple[Score, ...]] = {}
+    by_group: dict[str, tuple[Score, ...]] = {}
     for group in groups:
         own = [run for run in runs if run.group == group]
         rows, whole, drawn = _resampled(own, [group], next(children), draws)
-        told[group] = _scored(rows[0], whole[0], drawn[0])
+        by_group[group] = _scored(rows[0], whole[0], drawn[0])
     rows, whole, drawn = _resampled(runs, groups, next(children), draws)
     every = _scored(rows.sum(), whole.sum(axis=0), drawn.sum(axis=0))
     if len(groups) == 1:
-        return told, every, every
+        return by_group, every, every
     figures = [_figures(whole[i]) for i in range(len(groups))]
     spreads = [_figures(drawn[i]) for i in range(len(groups))]
-    mean = [np.mean([one[k] for one in figures], axis=0) for k in range(len(_FIGURES))]
-    spread = [np.mean([one[k] for one in spreads], axis=0) for k in range(len(_FIGURES))]
-    return told, every, _told(int(rows.sum()), mean, spread)
+    mean = [np.mean([each[k] for each in figures], axis=0) for k in range(len(_FIGURES))]
+    spread = [np.mean([each[k] for each in spreads], axis=0) for k in range(len(_FIGURES))]
+    return by_group, every, _scores(int(rows.sum()), mean, spread)
 
 
 def _resampled(
     runs: Sequence[Errors], groups: Sequence[str], rng: np.random.Generator, draws: int
 ) -> tuple[NDArray[np.intp], Array, Array]:
-    """Rows (C,), sums as they are (C, M, 7), and as drawn (C, D, M, 7), the last of the seven the rows."""
+    """Rows (C,), sums (C, M, 7), and resampled sums (C, D, M, 7); the last of the seven is the rows."""
     sessions = list(dict.fromkeys(run.session for run in runs))
     models = len(runs[0].error_nt)
     rows = np.zeros(len(groups), np.intp)
@@ -168,7 +170,7 @@ _FIGURES = ("mae", "ratio", "rmse", "bias", "coverage", "outside")
 
 
 def _figures(sums: Array) -> list[Array]:
-    """What `_FIGURES` names of sums (..., M, 7), each (..., M); nan of a draw without readings."""
+    """Values of `_FIGURES` from sums (..., M, 7), each (..., M); nan for a draw without readings."""
     with np.errstate(invalid="ignore", divide="ignore"):
         count = sums[..., 6]
         mae = sums[..., _ABS] / count
@@ -184,34 +186,30 @@ def _figures(sums: Array) -> list[Array]:
 
 
 def _scored(rows: np.intp, whole: Array, drawn: Array) -> tuple[Score, ...]:
-    return _told(int(rows), _figures(whole), _figures(drawn))
+    return _scores(int(rows), _figures(whole), _figures(drawn))
 
 
-def _told(rows: int, figures: Sequence[Array], spreads: Sequence[Array]) -> tuple[Score, ...]:
-    """A Score a model from its figures (M,), and those of the draws (D, M)."""
-    found = []
-    for m in range(len(figures[0])):
-        mae, ratio, rmse, bias, coverage, outside = (float(figure[m]) for figure in figures)
-        around = dict(zip(_FIGURES, (_interval(spread[:, m]) for spread in spreads), strict=True))
-        found.append(
-            Score(
-                rows,
-                mae,
-                around["mae"],
-                ratio,
-                around["ratio"],
-                rmse,
-                bias,
-                coverage,
-                around["coverage"],
-                outside,
-            )
+def _scores(rows: int, figures: Sequence[Array], spreads: Sequence[Array]) -> tuple[Score, ...]:
+    """A Score for each model from its figures (M,) and those of the draws (D, M)."""
+    return tuple(
+        Score(
+            rows=rows,
+            mae_nt=float(figures[0][m]),
+            mae_interval_nt=_interval(spreads[0][:, m]),
+            ratio=float(figures[1][m]),
+            ratio_interval=_interval(spreads[1][:, m]),
+            rmse_nt=float(figures[2][m]),
+            bias_nt=float(figures[3][m]),
+            coverage=float(figures[4][m]),
+            coverage_interval=_interval(spreads[4][:, m]),
+            outside=float(figures[5][m]),
         )
-    return tuple(found)
+        for m in range(len(figures[0]))
+    )
 
 
 def _interval(values: Array) -> Interval:
-    """The middle `LEVEL` of the draws that had readings."""
+    """The central `LEVEL` of the draws that have readings."""
     known = values[np.isfinite(values)]
     if not len(known):
         return math.nan, math.nan

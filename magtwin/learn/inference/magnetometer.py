@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from magtwin import files
 from magtwin.errors import InputError
@@ -140,22 +140,6 @@ class NeuralMagnetometer(Summarized):
         mean, sd = (np.split(values, ends) for values in self.net.predict(x))
         flags = np.split(self.net.outside(x), ends) if outside else [None] * len(runs)
         return [Read(*values) for values in zip(mean, sd, flags, strict=True)]
-
-    def outside_training(self, run: Run) -> NDArray[np.bool_]:
-        """Whether an input of a reading left the range of the training rows, shape (N,)."""
-        return self.outside(features(run, self.features))
-
-    def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
-        """As `outside_training`, from features, shape (N, F)."""
-        return self.net.outside(x)
-
-    def predict(self, x: ArrayLike) -> Array:
-        """Disturbances [nT], shape (N,), from features in their units, shape (N, F)."""
-        return self.net.predict(x)[0]
-
-    def predict_with_sd(self, x: ArrayLike) -> tuple[Array, Array]:
-        """Disturbances and standard deviations of their errors [nT], each (N,), from features (N, F)."""
-        return self.net.predict(x)
 
     def _summary(self) -> Summary:
         return summary_of(self.net, f"NeuralMagnetometer {self.name}".rstrip())

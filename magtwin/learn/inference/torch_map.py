@@ -1,4 +1,4 @@
-"""TorchMap and TorchHarmonic: the field of maps in torch, to be differentiated by, on any device."""
+"""TorchMap: an anomaly map in torch, differentiable, on any device."""
 
 from typing import Any
 
@@ -8,28 +8,26 @@ from numpy.typing import ArrayLike
 from magtwin.errors import InputError
 from magtwin.field.maps.lookup import EDGE, TURN, Lookup, blend, sides
 from magtwin.field.maps.map import AnomalyMap, Outside
-from magtwin.field.sources.dipoles import MU_0_OVER_4_PI, NT_PER_T
-from magtwin.field.sources.harmonic import SHAPES, HarmonicField
 
 
 class TorchMap(torch.nn.Module):
     """`AnomalyMap.lookup` on tensors, differentiable in p and yaw.
 
-    Its buffers are float64 on the CPU; `.to(device)` and `.float()` move and narrow them, and it computes
-    in their precision. In float64 it gives the map's own bytes, and its derivatives are those of
-    `AnomalyMap.gradient`, nan where that is. Derivatives with respect to the values are not taken.
+    Its buffers are float64 on the CPU; `.to(device)` and `.float()` convert them, and it computes in their
+    precision. In float64 values and derivatives are the bytes of `AnomalyMap.lookup` and `gradient`. There
+    are no derivatives with respect to the map's values.
     """
 
     values: torch.Tensor
-    """Values of the nodes [nT], 0 where masked, the first layer once more at the end."""
+    """Values of the nodes [nT], 0 where masked; the first layer is repeated at the end."""
     holes: torch.Tensor
-    """1 at masked nodes and 0 elsewhere; empty where no node is masked."""
+    """1 at masked nodes and 0 elsewhere; empty if no node is masked."""
     origin: torch.Tensor
     """World x and y of the first node [m], shape (2,)."""
     cell: torch.Tensor
     """Distance between nodes along x and y [m], shape (2,)."""
     last: torch.Tensor
-    """Greatest column and row, shape (2,)."""
+    """Last column and row, shape (2,)."""
     knots: torch.Tensor
     """Angles of the layers above the first [rad], shape (H,)."""
     gaps: torch.Tensor
@@ -60,7 +58,7 @@ class TorchMap(torch.nn.Module):
         Args:
             p_xy: Points in world [m], shape (..., 2).
             yaw: Headings [rad], shape (...); the two shapes are broadcast.
-            outside: What a point off the grid gives: nan, the nearest point's field, or a refusal, which
+            outside: Result off the grid: "nan", "clamp" (the field of the nearest point) or "raise", which
                 waits for the device.
 
         Returns:
@@ -102,8 +100,8 @@ class TorchMap(torch.nn.Module):
                 across = sides(holes, wx, wy, wh, 1.0)
                 unknown = [~known | ((r != 0) & (s > EDGE)) for r, s in zip(rates, across, strict=True)]
         moved = (*p.unbind(-1), yaw)
-        found = zip(moved, (wx, wy, wh), rates, unknown, strict=True)
-        wx, wy, wh = (_Weight.apply(*of) for of in found)
+        weights = zip(moved, (wx, wy, wh), rates, unknown, strict=True)
+        wx, wy, wh = (_Weight.apply(*each) for each in weights)
         b = blend(self._corners(self.values, node), wx, wy, wh)
         return torch.where(known, b, torch.nan).to(p_xy.dtype)
 
@@ -126,7 +124,7 @@ class TorchMap(torch.nn.Module):
 
 
 class _Weight(torch.autograd.Function):
-    """A weight that is known already, and how it changes with a coordinate: `rate`, or nan where unknown."""
+    """A known weight with its derivative by a coordinate: `rate`, or nan if unknown."""
 
     @staticmethod
     def forward(
@@ -144,69 +142,10 @@ class _Weight(torch.autograd.Function):
         return (slopes[0] * rate).masked_fill(unknown, torch.nan), None, None, None
 
 
-class TorchHarmonic(torch.nn.Module):
-    """`HarmonicField` on tensors, differentiable in place, heading and, where a caller asks, its figures.
-
-    Its buffers are those of the field, float64 on the CPU; `.to(device)` and `.float()` move and narrow
-    them, and it computes in their precision. N points and D dipoles take some 30 N D numbers of memory
-    while derivatives are wanted; give many points a part at a time.
-    """
-
-    p_world_dipole: torch.Tensor
-    """Places of the dipoles [m], shape (D, 3)."""
-    m_world: torch.Tensor
-    """Their moments [A m^2], shape (D, 3)."""
-    b_uniform_nt: torch.Tensor
-    """Uniform part in world axes [nT], shape (3,)."""
-    hard_iron_nt: torch.Tensor
-    """Permanent field of the robot, in base_link axes [nT], shape (3,)."""
-    soft_iron: torch.Tensor
-    """Induced part of the robot [nT per nT], shape (3, 3)."""
-    p_base_sensor: torch.Tensor
-    """Place of the sensor in base_link, its height above the floor as z [m], shape (3,)."""
-
-    def __init__(self, field: HarmonicField) -> None:
-        super().__init__()
-        for name in SHAPES:
-            self.register_buffer(name, torch.tensor(getattr(field, name), dtype=torch.float64))
-
-    def field_nt(self, p_world: torch.Tensor) -> torch.Tensor:
-        """The field without the robot, in world axes [nT], at points [m]; both of shape (..., 3)."""
-        r = p_world.to(self.m_world.dtype)[..., None, :] - self.p_world_dipole
-        inverse = 1 / (r * r).sum(-1, keepdim=True)
-        along = 3 * inverse * (self.m_world * r).sum(-1, keepdim=True)
-        dipoles = ((along * r - self.m_world) * inverse * inverse.sqrt()).sum(-2)
-        return (MU_0_OVER_4_PI * NT_PER_T * dipoles + self.b_uniform_nt).to(p_world.dtype)
-
-    def magnitude_nt(
-        self, p_xy: torch.Tensor, yaw: torch.Tensor | float, *, height_m: float | None = None
-    ) -> torch.Tensor:
-        """What the survey's robot reads, standing at a pose.
-
-        Args:
-            p_xy: Where base_link is, in world [m], shape (..., 2).
-            yaw: Headings [rad], shape (...); the two shapes are broadcast.
-            height_m: Height of the sensor above the floor [m]; the survey's unless given.
-
-        Returns:
-            Field magnitude [nT], shape (...), of the type of `p_xy`.
-        """
-        p, yaw = _broadcast(p_xy, yaw, self.m_world)
-        cos, sin = yaw.cos(), yaw.sin()
-        lx, ly, lz = self.p_base_sensor.unbind()
-        z = torch.full_like(cos, height_m) if height_m is not None else lz.expand_as(cos)
-        at = torch.stack([p[..., 0] + lx * cos - ly * sin, p[..., 1] + lx * sin + ly * cos, z], dim=-1)
-        bx, by, bz = self.field_nt(at).unbind(-1)
-        b = torch.stack([cos * bx + sin * by, cos * by - sin * bx, bz], dim=-1)
-        return torch.linalg.vector_norm(b + b @ self.soft_iron.T + self.hard_iron_nt, dim=-1).to(p_xy.dtype)
-
-    forward = magnitude_nt
-
-
 def _broadcast(
     p: torch.Tensor, yaw: torch.Tensor | float, like: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Points and headings of one shape, in the precision that is computed in, on its device."""
+    """Points and headings of one shape, in the map's precision."""
     if p.ndim == 0 or p.shape[-1] != 2:
         raise InputError(f"p_xy must have shape (..., 2), got {tuple(p.shape)}")
     if p.device != like.device:

@@ -1,4 +1,4 @@
-"""Calibration: standard deviations that errors on recordings never seen keep to."""
+"""Calibration: standard deviations that hold on recordings left out of a fit."""
 
 import math
 from dataclasses import dataclass
@@ -11,51 +11,49 @@ from magtwin.learn.data.inputs import Array
 from magtwin.verdict import Z_90
 
 WITHIN = 0.9
-"""Share of rows that an interval is to hold."""
+"""Nominal coverage of intervals."""
 
 MOST_FACTOR = 3.0
-"""By which few recordings may widen or narrow an interval at most."""
+"""Largest factor by which few recordings change an interval."""
 
 MOST_ROWS = 200_000
-"""Rows that a spread is fitted to; of more, every second, third, ... is taken."""
+"""Most rows that a spread is fitted to; of more, every k-th is used."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Standard deviation of an error by how far the inputs are from their means.
+    """Standard deviation of an error by the distance of the inputs from their means.
 
         sd^2 = floor + sum_j slope_j z_j^2,   z = (x - mean) / scale,   none of them below 0
 
-    What a lever arm, a latency or a heading leaves grows with the map's gradient, what a motor leaves
-    with its current: the squares say so, without the sign of either, and never shrink outside the training.
+    Errors of lever arm, latency and heading grow with the map's gradient, errors of motors with the current.
+    The squares model that independent of sign, and never shrink outside the training range.
     """
 
     floor_nt2: float
     """Variance at the means of the inputs [nT^2]."""
 
     slopes_nt2: Array
-    """What the square of each scaled input adds [nT^2], shape (F,)."""
+    """Variance per square of each scaled input [nT^2], shape (F,)."""
 
     def sd_nt(self, z: Array) -> Array:
-        """Standard deviations [nT], shape (N,), at scaled inputs, shape (N, F); nan where one of them is."""
-        found = np.full(len(z), self.floor_nt2)
-        for j, slope in enumerate(
-            self.slopes_nt2
-        ):  # column by column: no row's sum depends on its neighbours
-            found += slope * z[:, j] ** 2
-        return np.sqrt(found)
+        """Standard deviations [nT], shape (N,), at scaled inputs, shape (N, F); nan if an input is nan."""
+        variance = np.full(len(z), self.floor_nt2)
+        for j, slope in enumerate(self.slopes_nt2):  # by column, so that no row depends on others
+            variance += slope * z[:, j] ** 2
+        return np.sqrt(variance)
 
     def scaled(self, factor: float) -> "Spread":
-        """With every standard deviation `factor` times as large."""
+        """The spread with standard deviations `factor` times as large."""
         return Spread(self.floor_nt2 * factor**2, self.slopes_nt2 * factor**2)
 
 
 def fit_spread(z: Array, error_nt: Array) -> Spread:
-    """The spread that squares of errors follow, by least squares weighted by its own variance.
+    """Fit a spread to squares of errors, by least squares weighted by its own variance.
 
     Args:
         z: Scaled inputs, shape (N, F).
-        error_nt: Errors on rows that the fit behind them had left out [nT], shape (N,).
+        error_nt: Errors on rows left out of the fit [nT], shape (N,).
     """
     from scipy.optimize import nnls
 
@@ -64,30 +62,27 @@ def fit_spread(z: Array, error_nt: Array) -> Spread:
     target = error_nt[::every] ** 2
     mean = max(float(target.mean()), 1e-12)
     variance = np.full(len(target), mean)
-    found = np.zeros(squares.shape[1])
-    for _ in range(
-        3
-    ):  # squares of normal errors scatter by their variance: near ones tell more than far ones
+    solution = np.zeros(squares.shape[1])
+    for _ in range(3):  # the scatter of squares grows with the variance
         weight = (mean / variance)[:, None]
-        # nnls of the triangle in place of all rows; the factor of the identity is for inputs that never vary
+        # nnls of the triangle instead of all rows
         stacked = np.column_stack([weight * squares, weight[:, 0] * target / mean])
         triangle = np.asarray(np.linalg.qr(stacked, mode="r"))
-        found = nnls(triangle[:, :-1], triangle[:, -1])[0]
-        found[0] = max(found[0], 1e-3)  # of the mean variance: an interval is never of no width
-        variance = mean * (squares @ found)
-    return Spread(mean * float(found[0]), mean * found[1:])
+        solution = nnls(triangle[:, :-1], triangle[:, -1])[0]
+        solution[0] = max(solution[0], 1e-3)  # no interval has width 0
+        variance = mean * (squares @ solution)
+    return Spread(mean * float(solution[0]), mean * solution[1:])
 
 
 def quantile_factor(error_nt: Array, sd_nt: Array, groups: NDArray[np.intp]) -> float:
-    """Factor by which standard deviations are multiplied so that 90 % intervals hold 90 %.
+    """Factor of standard deviations with which 90 % intervals hold 90 %.
 
-    Each group counts as much as any other: recordings differ by offsets of their own, and a long one is
-    still one draw of them.
+    Every group has the same weight: recordings differ by offsets, and a long recording is still one draw.
 
     Args:
         error_nt: Errors [nT], shape (N,).
-        sd_nt: Standard deviations that were told of them [nT], shape (N,), above 0.
-        groups: Which recording each row is of, shape (N,).
+        sd_nt: Predicted standard deviations [nT], shape (N,), above 0.
+        groups: Recording of each row, shape (N,).
 
     Raises:
         InputError: There is no row.
@@ -103,14 +98,14 @@ def quantile_factor(error_nt: Array, sd_nt: Array, groups: NDArray[np.intp]) -> 
 
 
 def few_groups_factor(error_nt: Array, groups: NDArray[np.intp]) -> float:
-    """What standard deviations of a few groups are multiplied by, because few tell little of the next one.
+    """Factor of standard deviations for the small number of groups.
 
-    The part of the error that a group has in common is as uncertain as Student's t with one degree of freedom
-    less than there are groups, the part within groups as a normal one.
+    The common error of a group follows Student's t with one degree of freedom less than there are groups, the
+    error within groups a normal distribution.
 
     Args:
         error_nt: Errors [nT], shape (N,).
-        groups: Which recording each row is of, shape (N,).
+        groups: Recording of each row, shape (N,).
     """
     from scipy.stats import t
 
@@ -127,16 +122,16 @@ def few_groups_factor(error_nt: Array, groups: NDArray[np.intp]) -> float:
 def transferred_factor(
     error_nt: Array, sd_nt: Array, groups: NDArray[np.intp], yardstick: "Yardstick"
 ) -> float:
-    """Factor for a model that was held against the validation recordings alone.
+    """Factor for a model that was compared with the validation recordings only.
 
-    A few recordings have offsets of their own: by luck all small, or all large. How a yardstick that was
-    held against all recordings did on these few tells which, and cancels it.
+    The offsets of a few recordings may by chance be all small or all large. A yardstick that was compared
+    with all recordings shows which, and corrects for it.
 
     Args:
         error_nt: Errors on the validation rows [nT], shape (N,).
-        sd_nt: Standard deviations that were told of them [nT], shape (N,).
-        groups: Which recording each row is of, shape (N,).
-        yardstick: Of the same recordings.
+        sd_nt: Predicted standard deviations [nT], shape (N,).
+        groups: Recording of each row, shape (N,).
+        yardstick: Factors of a linear model on the same recordings.
     """
     luck = yardstick.everywhere / yardstick.validation
     return quantile_factor(error_nt, sd_nt, groups) * min(max(luck, 1 / MOST_FACTOR), MOST_FACTOR)
@@ -144,24 +139,24 @@ def transferred_factor(
 
 @dataclass(frozen=True)
 class Yardstick:
-    """Factors that a linear model's standard deviations needed on recordings that it had not seen."""
+    """Factors of a linear model's standard deviations on recordings left out of its fit."""
 
     everywhere: float
-    """On those of training, each left out in turn, and of validation, with `few_groups_factor`."""
+    """On training (each group left out in turn) and validation, with `few_groups_factor`."""
 
     validation: float
-    """On those of validation alone."""
+    """On validation only."""
 
 
 def yardstick(
     error_nt: Array, sd_nt: Array, groups: NDArray[np.intp], validation: NDArray[np.bool_]
 ) -> Yardstick:
-    """Args as for `quantile_factor`, of training and validation rows; `validation` tells which are which."""
+    """Yardstick from training and validation rows; `validation` marks the latter."""
     everywhere = quantile_factor(error_nt, sd_nt, groups) * few_groups_factor(error_nt, groups)
     return Yardstick(everywhere, quantile_factor(error_nt[validation], sd_nt[validation], groups[validation]))
 
 
 def _numbered(groups: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Groups numbered from 0, shape (N,), and how many rows each has."""
+    """Groups numbered from 0, shape (N,), and their numbers of rows."""
     _, number, counts = np.unique(groups, return_inverse=True, return_counts=True)
     return number, counts

@@ -1,4 +1,4 @@
-"""Training: from features and labels to a FieldNet, judged on runs that it never saw."""
+"""Fit a FieldNet to features and labels."""
 
 import math
 import os
@@ -44,42 +44,40 @@ def train(
     """Fit a network by Adam to the mean squared error of scaled labels.
 
     The step size rises over the first half epoch and then falls to 0 along half a cosine. The weights of the
-    epoch that did best on the validation rows are kept; these have to come from other runs than the
-    training rows, because rows of one run are alike and a network can know a run by its battery.
+    epoch with the smallest error on the validation rows are kept. Validation rows must come from other runs,
+    because rows of one run are correlated and a network can recognise a run by its battery.
 
     Args:
         x: Training features, in the units of `magtwin.learn.data.features`, shape (N, F).
-        y: Training labels: true or measured field minus map [nT], shape (N,).
+        y: Training labels [nT], shape (N,).
         x_val: Features of other runs, shape (M, F).
         y_val: Their labels [nT], shape (M,).
-        rng: Source of the first weights, the order of rows and dropout. One state, one machine, one device
-            and one number of threads give the same weights, bit for bit.
-        weight: How much each training row counts, shape (N,), of any scale; all alike unless given.
-        features: Names of the features, in order, or of a set of them.
+        rng: Source of the initial weights, the order of rows and dropout. The same state, machine, device and
+            number of threads give the same bits.
+        weight: Weight of each training row, shape (N,), on any scale. Default: all alike.
+        features: Names of the features, in order, or the name of a set.
         layers: Widths of the hidden layers.
         dropout: Share of units dropped in training, to the nearest 65,536th.
         epochs: Passes over the training rows.
-        batch: Rows a step.
+        batch: Rows per step.
         lr: Largest step size of Adam.
-        patience: Stop after so many epochs without a better one; None runs them all.
+        patience: Stop after this many epochs without improvement; None runs all epochs.
         metadata: Provenance to keep in the weights file.
-        init: Network of the same inputs and layers whose weights and scalers are gone on from. It is an
-            epoch 0 of its own, so that what is kept is never worse on the validation rows than it was.
-        freeze: Names of layers that stay as `init` has them: "layers.0" is the first.
-        checkpoint: File that the state of the training is written to after each epoch.
-        resume: Go on from `checkpoint`; the weights are those of a training that was never stopped.
-        device: Where it is trained, as torch calls it: "cpu", "cuda". The network comes back to the CPU.
+        init: Network of the same inputs and layers to continue from, with its scalers. It is epoch 0, so that
+            the result is never worse on the validation rows.
+        freeze: Names of layers that stay as in `init`: "layers.0" is the first.
+        checkpoint: File for the state after each epoch.
+        resume: Continue from `checkpoint`; the result is that of an uninterrupted training.
+        device: Where torch trains, "cpu" or "cuda". The result is on the CPU.
         progress: Called after each epoch.
-        advance: Called after each step with how many rows are done, and of how many in all epochs.
+        advance: Called after each step with the rows done and the rows of all epochs.
 
     Returns:
-        The network, in evaluation mode, its `residual_sd_nt` the root mean square error on the
-        validation rows, and how each epoch went.
+        The network in evaluation mode, with `residual_sd_nt` the RMSE on the validation rows, and its epochs.
 
     Raises:
-        InputError: Rows that are nan or of the wrong shape, a label that never varies, a step size at
-            which training diverged, a device that is not there, an `init` of other inputs or layers, or a
-            checkpoint of another training.
+        InputError: Rows with nan or of the wrong shape, constant labels, training diverged, no such device,
+            an `init` of other inputs or layers, or a checkpoint of another training.
     """
     names = feature_names(features)
     x, y = _rows("training", x, y, names)
@@ -95,16 +93,16 @@ def train(
     if not (epochs > 0 and batch > 0 and lr > 0):
         raise InputError(f"epochs, batch and lr must be above 0, got {epochs}, {batch} and {lr}")
     if patience is not None and patience < 1:
-        raise InputError(f"patience must be 1 epoch at least, got {patience}; leave it out to run them all")
+        raise InputError(f"patience must be 1 epoch at least, got {patience}; leave it out to run all epochs")
     check_device(device)
     seed = int(rng.integers(2**62))
-    with torch.random.fork_rng(devices=[]):  # first weights are drawn from torch's own generator
+    with torch.random.fork_rng(devices=[]):  # torch draws initial weights from its global generator
         torch.manual_seed(seed)
         net = FieldNet(names, layers, dropout=dropout, metadata=metadata)
     if init is None:
         net.set_scalers(x, y)
     else:
-        _go_on_from(net, init, x)
+        _continue_from(net, init, x)
     _freeze(net, freeze, init)
     settings = {
         "features": list(names),
@@ -136,7 +134,7 @@ def train(
 
 
 class _Rows:
-    """Rows as a network learns them, on the device that its dropout draws on."""
+    """Scaled rows on the device of training."""
 
     def __init__(
         self,
@@ -158,10 +156,8 @@ class _Rows:
         net.to(device)
 
     @property
-    def items(self) -> int:
+    def rows(self) -> int:
         return len(self.z)
-
-    rows = items
 
     def loss(self, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         z, label = self.z[chosen], self.label[chosen]
@@ -177,7 +173,7 @@ class _Rows:
         return np.concatenate(parts) - self.y_val
 
     def _forward(self, z: torch.Tensor) -> torch.Tensor:
-        """Scaled labels, shape (B,), from scaled features, shape (B, F), units dropped."""
+        """Scaled labels, shape (B,), from scaled features, shape (B, F), with dropout."""
         *inner, last = self.module.linears
         for i, layer in enumerate(inner):
             z = torch.relu(layer(z))
@@ -187,24 +183,20 @@ class _Rows:
 
 
 class Dropout:
-    """Drops a share of units and scales the others up, by 16 random bits a unit.
-
-    torch's own draws a number for each unit, which takes a fifth of all time of a training on a CPU; this
-    takes a twentieth.
-    """
+    """Dropout by 16 random bits per unit, four times as fast as torch's own on a CPU."""
 
     def __init__(self, share: float, generator: torch.Generator) -> None:
-        """A dropout of a share of the units, to the nearest 65,536th, by the bits of a generator."""
+        """Drop a share of the units, to the nearest 65,536th."""
         self.generator = generator
         dropped = min(round(share * 65_536), 65_535)
         self._least = dropped - 32_768
-        """Least of 16 bits, read as a number from -32,768 up, that a unit is kept by."""
+        """A unit is kept if its 16 bits, as a signed number, are at least this."""
 
         self._scale = 65_536 / (65_536 - dropped)
         self._bits = torch.empty(0, dtype=torch.int64, device=generator.device)
 
     def __call__(self, h: torch.Tensor) -> torch.Tensor:
-        """The units with some of them dropped, shape as they have."""
+        """Drop units of an array of any shape, and scale the others up."""
         if self._scale == 1:
             return h
         words = -(-h.numel() // 4)
@@ -215,12 +207,13 @@ class Dropout:
         return h * kept.to(h.dtype).mul_(self._scale)
 
 
-def _go_on_from(net: FieldNet, init: FieldNet, x: Array) -> None:
-    """Take over weights and scalers; the training ranges grow by the new rows, or stay unknown."""
+def _continue_from(net: FieldNet, init: FieldNet, x: Array) -> None:
+    """Copy weights and scalers; training ranges are extended by the new rows, or stay unknown."""
     if init.features != net.features or init.hidden != net.hidden:
         raise InputError(
-            f"the network to go on from has inputs {', '.join(init.features)} and layers of {init.hidden}, "
-            f"this training {', '.join(net.features)} and {net.hidden}; give it the same features and layers"
+            f"the network to continue from has inputs {', '.join(init.features)} and layers of "
+            f"{init.hidden}, this training {', '.join(net.features)} and {net.hidden}; give it the same "
+            "features and layers"
         )
     net.load_state_dict(init.state_dict())
     net.x_min.copy_(torch.from_numpy(np.minimum(net.x_min.numpy(), x.min(axis=0))))
@@ -228,7 +221,7 @@ def _go_on_from(net: FieldNet, init: FieldNet, x: Array) -> None:
 
 
 def _freeze(net: FieldNet, names: Sequence[str], init: FieldNet | None) -> None:
-    """Leave layers out of the training."""
+    """Exclude layers from the training."""
     if names and init is None:
         raise InputError("freeze keeps layers of trained weights: give init too")
     layers = {f"layers.{i}": layer for i, layer in enumerate(net.linears)}
@@ -239,7 +232,7 @@ def _freeze(net: FieldNet, names: Sequence[str], init: FieldNet | None) -> None:
 
 
 def _rows(kind: str, x: ArrayLike, y: ArrayLike, names: Sequence[str]) -> tuple[Array, Array]:
-    """Features and labels as float64 arrays that fit each other and hold no nan."""
+    """Features and labels as float64 arrays, checked."""
     x, y = np.ascontiguousarray(x, float), np.ascontiguousarray(y, float)
     if x.ndim != 2 or y.shape != x.shape[:1] or x.shape[1] != len(names) or not len(y):
         raise InputError(

@@ -1,4 +1,4 @@
-"""Hybrid: a linear base, and a small network for what the base leaves, where that does better."""
+"""Hybrid: a linear base, and a small network for its residual if that does better."""
 
 import math
 from collections.abc import Mapping
@@ -22,19 +22,19 @@ from magtwin.report import Figure
 class Hybrid(Regressor):
     """A disturbance y = base(x) + net(x clipped to the training ranges), or the base alone.
 
-    Outside the training ranges the network stays as it is at their edge, while the base goes on as a straight
-    line: what is extrapolated is what physics extrapolates.
+    Outside the training ranges the network keeps its value at their edge, while the base extrapolates
+    linearly.
     """
 
     inputs: Inputs = field(init=False)
-    """Those of the base."""
+    """Inputs of the base."""
 
     base: Linear
     net: FieldNet | None
-    """What the base leaves [nT]; none where the base alone does better on recordings it never saw."""
+    """Residual of the base [nT]; None if the base alone does better on validation."""
 
     sd_factor: float = 1.0
-    """What the spread of the base is multiplied by."""
+    """Factor of the base's standard deviation."""
 
     kind = "hybrid"
 
@@ -60,14 +60,14 @@ class Hybrid(Regressor):
         return mean, sd * self.sd_factor
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """Those of the base and those of the network, under the names of both."""
+        """Tensors of the base and of the network, prefixed."""
         tensors = {f"base.{name}": value for name, value in self.base.tensors().items()}
         if self.net is not None:
             tensors |= {f"net.{name}": value for name, value in self.net.state_dict().items()}
         return tensors
 
     def settings(self) -> dict[str, Any]:
-        """Those of the base, dropout of the network, and the factor of the spread."""
+        """Settings of the base, dropout of the network, and the factor of the spread."""
         dropout = self.net.dropout if self.net else 0.0
         return {**self.base.settings(), "dropout": dropout, "sd_factor": self.sd_factor}
 
@@ -83,17 +83,17 @@ class Hybrid(Regressor):
 
 
 def hybrid_of(weights: Weights) -> Hybrid:
-    """The hybrid that a weights file holds.
+    """The hybrid of a weights file.
 
     Raises:
         InputError: Its parts do not fit each other.
     """
-    found = {part: _part(weights.tensors, f"{part}.") for part in ("base", "net")}
+    parts = {part: _part(weights.tensors, f"{part}.") for part in ("base", "net")}
     extra = [name for name in weights.tensors if not name.startswith(("base.", "net."))]
     if extra:
         raise InputError(f"{weights.path}: tensor {extra[0]!r} belongs to no layer of a hybrid")
-    base = weights.with_tensors(found["base"]).fit(like(len(weights.features)))
-    net = net_of(weights.with_tensors(found["net"])) if found["net"] else None
+    base = weights.with_tensors(parts["base"]).fit(like(len(weights.features)))
+    net = net_of(weights.with_tensors(parts["net"])) if parts["net"] else None
     return Hybrid(
         base=linear_from(weights, base),
         net=net,

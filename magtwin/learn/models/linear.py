@@ -1,7 +1,7 @@
-"""Linear: a disturbance as a weighted sum of named features, by ridge regression over whole recordings.
+"""Linear: a disturbance as a weighted sum of features, by ridge regression.
 
 With heading harmonics, current, LiDAR, speed and turning as features (the set "circular") it is the scalar
-form of Tolles and Lawson's compensation: hard iron goes once about with the heading, soft iron twice.
+form of Tolles and Lawson's compensation: hard iron varies with the heading, soft iron with twice the heading.
 """
 
 import math
@@ -22,13 +22,13 @@ from magtwin.learn.models.weights import Weights
 from magtwin.report import Figure
 
 PENALTIES = tuple(float(p) for p in np.logspace(-8, 1, 19))
-"""Penalties that cross-validation chooses among."""
+"""Penalties that cross-validation chooses from."""
 
 FALLBACK_PENALTY = 1e-3
-"""The penalty where there is one group of recordings alone, and nothing can be left out."""
+"""Penalty if there is one group of recordings, so that cross-validation is impossible."""
 
 MOST_FOLDS = 10
-"""Groups are left out one at a time up to so many; more are dealt to so many folds."""
+"""Most folds of the cross-validation; with fewer groups, each group is a fold."""
 
 Weighting = Literal["auto", "label_sd", "none"]
 
@@ -41,22 +41,22 @@ class Linear(Regressor):
     """Disturbance at the means of the inputs [nT]."""
 
     coefficients_nt: Array
-    """What a scale of each input adds [nT], shape (F,)."""
+    """Disturbance per scale of each input [nT], shape (F,)."""
 
     spread: Spread
-    """Of errors on recordings left out."""
+    """Spread of errors on recordings left out."""
 
     penalty: float
-    """Of the ridge, as a share of the rows' own curvature."""
+    """Ridge penalty, relative to the curvature of the rows."""
 
     weighted: bool = False
-    """Whether rows counted by how well the map is known there."""
+    """Whether rows were weighted by how well the map is known there."""
 
     kind = "linear"
 
     @property
     def layers_text(self) -> str:
-        """How many terms it has."""
+        """Number of terms."""
         return f"linear in {len(self.features)}"
 
     @property
@@ -66,10 +66,10 @@ class Linear(Regressor):
 
     def mean_nt(self, z: Array) -> Array:
         """Disturbances [nT], shape (N,), from scaled inputs, shape (N, F)."""
-        found = np.full(len(z), self.constant_nt)
-        for j, value in enumerate(self.coefficients_nt):  # column by column: a row never sees its neighbours
-            found += value * z[:, j]
-        return found
+        mean = np.full(len(z), self.constant_nt)
+        for j, value in enumerate(self.coefficients_nt):  # by column, so that no row depends on others
+            mean += value * z[:, j]
+        return mean
 
     def predict(self, x: ArrayLike) -> tuple[Array, Array]:
         """Disturbances and standard deviations of their errors [nT], each (N,), from features (N, F)."""
@@ -92,12 +92,12 @@ class Linear(Regressor):
         return {"penalty": self.penalty, "weighted": self.weighted}
 
     def figures(self) -> list[Figure]:
-        """Its terms, and the spread of its errors."""
+        """Terms, and the spread of errors."""
         constant = Figure("constant", self.constant_nt, "nT", note="at the means")
         return [constant, *self.terms(), Figure("sd at the means", math.sqrt(self.spread.floor_nt2), "nT")]
 
     def terms(self) -> list[Figure]:
-        """Coefficients in the features' own units, and the penalty that held them down."""
+        """Coefficients per unit of the features, and the penalty."""
         figures = []
         for name, value, scale in zip(self.features, self.coefficients_nt, self.inputs.scale, strict=True):
             unit = FEATURES[name].unit
@@ -110,18 +110,18 @@ class Linear(Regressor):
 
 @dataclass(frozen=True)
 class FittedLinear:
-    """A linear model, and what it says of rows by fits that had left their recordings out."""
+    """A linear model, and predictions of the rows by fits without them."""
 
     model: Linear
 
     held_out_nt: Array
-    """For each row, the disturbance by a fit without its group [nT], shape (N,)."""
+    """Disturbance at each row by a fit without its group [nT], shape (N,)."""
 
     groups: NDArray[np.intp]
-    """Which group of recordings each row is of, shape (N,)."""
+    """Group of each row, shape (N,)."""
 
     weight: Array | None = None
-    """How much each row counted, shape (N,); none where all count alike."""
+    """Weight of each row, shape (N,); None if all are equal."""
 
 
 def fit_linear(
@@ -136,35 +136,35 @@ def fit_linear(
     start: Linear | None = None,
     inputs: Inputs | None = None,
 ) -> FittedLinear:
-    """Fit features to labels by ridge regression: least squares with |c|^2 held down.
+    """Fit labels by ridge regression on features.
 
-    The penalty is chosen by cross-validation over groups of rows, never over rows: those of one recording
-    are alike. The intercept bears no penalty. What the fits without a group say of that group tells how
-    large errors are on recordings that were never seen, offsets between days included: `Linear.spread`.
+    The penalty is chosen by cross-validation over groups, because rows of one recording are correlated. The
+    intercept has no penalty. The errors of fits on the groups that they left out give `Linear.spread`, which
+    includes offsets between sessions.
 
     Args:
-        x: Features, shape (N, F), none nan.
+        x: Features, shape (N, F), without nan.
         y: Labels [nT], shape (N,).
-        groups: Which session, recording or path each row is of, shape (N,).
-        features: Names of the columns of `x`, or that of a set.
-        sd: How well the map is known there [nT], shape (N,); none where it is not known.
-        penalty: As a share of the rows' own curvature; None chooses among `PENALTIES`.
-        weighting: "label_sd" weighs rows by 1 / (s0^2 + sd^2), s0 the error that is left where the map is
-            known; "none" weighs all alike; "auto" takes what does better on groups left out.
-        start: A model of the same features to go on from: coefficients are pulled towards its own in place
-            of 0, and its scaler is kept.
-        inputs: Scaler and ranges to use in place of those of the rows.
+        groups: Session, recording or path of each row, shape (N,).
+        features: Names of the columns of `x`, or the name of a set.
+        sd: Standard deviation of the map at each row [nT], shape (N,). None: unknown.
+        penalty: Ridge penalty, relative to the curvature of the rows. None: chosen from `PENALTIES`.
+        weighting: "label_sd" weighs rows by 1 / (s0^2 + sd^2), s0 the error that remains if the map is known
+            exactly; "none" weighs all alike; "auto" uses the better of the two on groups left out.
+        start: A model of the same features; coefficients are shrunk towards its own instead of 0, and its
+            scaler is kept.
+        inputs: Scaler and ranges. Default: those of the rows.
 
     Raises:
-        InputError: A label that never varies, or `start` of other features.
+        InputError: All labels are the same, or `start` has other features.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     if y.std() < 1e-9:
         raise InputError(f"the label is {y[0]:g} nT in every training row; there is nothing to learn")
-    of = inputs or inputs_of(x, features)
+    inputs = inputs or inputs_of(x, features)
     if start is not None:
-        of = start.inputs.grown(of)
-    z = np.column_stack([of.scaled(x), np.ones(len(x))])
+        inputs = start.inputs.grown(inputs)
+    z = np.column_stack([inputs.scaled(x), np.ones(len(x))])
     towards = np.zeros(z.shape[1]) if start is None else np.append(start.coefficients_nt, start.constant_nt)
     folds, groups = _folds(groups)
     label_sd = np.zeros(len(y)) if sd is None else np.asarray(sd, float)
@@ -175,14 +175,14 @@ def fit_linear(
         s0_squared = max(left - float(np.mean(label_sd**2)), 0.05 * left)
         weight = s0_squared / (s0_squared + label_sd**2)
         other = solve(weight)
-        error, its = (np.abs(one.held_out - y).mean() for one in (best, other))
-        if weighting == "label_sd" or its < error:
+        plain, weighted = (np.abs(each.held_out - y).mean() for each in (best, other))
+        if weighting == "label_sd" or weighted < plain:
             best = _Solved(other.beta, other.penalty, other.held_out, weighted=True)
     error = best.held_out - y
     spread = fit_spread(z[:, :-1], error)
     factor = quantile_factor(error, spread.sd_nt(z[:, :-1]), groups) * few_groups_factor(error, groups)
     model = Linear(
-        inputs=of,
+        inputs=inputs,
         constant_nt=float(best.beta[-1]),
         coefficients_nt=best.beta[:-1].copy(),
         spread=spread.scaled(factor),
@@ -193,7 +193,7 @@ def fit_linear(
 
 
 def linear_of(weights: Weights) -> Linear:
-    """The linear model that a weights file holds.
+    """The linear model of a weights file.
 
     Raises:
         InputError: Its parts do not fit each other.
@@ -205,10 +205,10 @@ def linear_of(weights: Weights) -> Linear:
 
 
 def linear_from(weights: Weights, tensors: Mapping[str, torch.Tensor]) -> Linear:
-    """A linear model from its tensors, and penalty and weighting from a file's metadata.
+    """A linear model from tensors, with the settings of a weights file.
 
     Raises:
-        InputError: A scale is not above 0, a variance below it, or the metadata lack a key.
+        InputError: A scale is not above 0, a variance is below 0, or a setting is missing.
     """
     held = {name: value.numpy() for name, value in tensors.items()}
     if held["spread_floor_nt2"] <= 0 or (held["spread_slopes_nt2"] < 0).any():
@@ -224,7 +224,7 @@ def linear_from(weights: Weights, tensors: Mapping[str, torch.Tensor]) -> Linear
 
 
 def like(count: int) -> dict[str, torch.Tensor]:
-    """Tensors of the names, shapes and types that a linear model of so many features has."""
+    """Tensors with the names, shapes and types of a linear model of `count` features."""
     ones, one = torch.ones(count, dtype=torch.float64), torch.ones((), dtype=torch.float64)
     wide = ("coefficients_nt", "spread_slopes_nt2")
     return (
@@ -236,7 +236,7 @@ def like(count: int) -> dict[str, torch.Tensor]:
 
 @dataclass(frozen=True)
 class _Solved:
-    """Coefficients with the intercept last, and what fits without a row's fold say of it."""
+    """Coefficients with the intercept last, and predictions by fits without each row's fold."""
 
     beta: Array
     penalty: float
@@ -254,7 +254,7 @@ class _Ridge:
         self.rows = [np.flatnonzero(folds == k) for k in range(int(folds.max()) + 1)]
 
     def __call__(self, weight: Array) -> _Solved:
-        """Weights of rows, shape (N,)."""
+        """Solve with weights of rows, shape (N,)."""
         curved, sloped, squares = [], [], []
         for rows in self.rows:
             z, w = self.z[rows], weight[rows]
@@ -283,14 +283,14 @@ class _Ridge:
         return _Solved(self._solve(whole, slope, penalty), penalty, held_out)
 
     def _solve(self, curved: Array, sloped: Array, penalty: float) -> Array:
-        """Coefficients; the intercept, last, bears no penalty."""
-        # z has unit variance, so that the intercept's own entry is the sum of all weights
-        held = np.full(len(curved), penalty * curved[-1, -1])
-        held[-1] = 0.0
-        return self.towards + np.linalg.lstsq(curved + np.diag(held), sloped, rcond=None)[0]
+        """Coefficients; the intercept, last, has no penalty."""
+        # the entry of the intercept is the sum of all weights, and z has unit variance
+        ridge = np.full(len(curved), penalty * curved[-1, -1])
+        ridge[-1] = 0.0
+        return self.towards + np.linalg.lstsq(curved + np.diag(ridge), sloped, rcond=None)[0]
 
 
 def _folds(groups: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Folds that groups are dealt to, and groups numbered from 0, each shape (N,)."""
+    """Fold of each row, and its group numbered from 0, each shape (N,)."""
     numbers = np.unique(groups, return_inverse=True)[1].astype(np.intp)
     return numbers % MOST_FOLDS, numbers

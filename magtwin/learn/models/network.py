@@ -1,4 +1,4 @@
-"""FieldNet: a network that predicts the disturbance, with all it needs to be used, in one file."""
+"""FieldNet: a multilayer perceptron that predicts the disturbance, with its scalers, in one file."""
 
 import itertools
 import math
@@ -36,27 +36,26 @@ _SCALERS = ("x_mean", "x_scale", "x_min", "x_max", "y_mean", "y_scale")
 
 
 class FieldNet(Summarized, torch.nn.Module):
-    """Disturbance of the field's magnitude [nT] from features of a Run, (B, F) -> (B,).
+    """Disturbance of the field magnitude [nT] from features of a Run, (B, F) -> (B,).
 
     A multilayer perceptron between two scalers:
 
         y = y_mean + y_scale * W_L relu(... relu(W_1 z + b_1) ...) + b_L,   z = (x - x_mean) / x_scale
 
-    Inputs are scaled in float64, because folding the scaler into float32 weights raises the error
-    from 0.003 to 0.1 nT. In training, dropout follows every hidden layer but the last.
+    Inputs are scaled in float64; with the scaler in float32 weights the error rises from 0.003 to 0.1 nT. In
+    training, dropout follows every hidden layer but the last.
     """
 
     kind = "mlp"
-    """Among the predictors: a multilayer perceptron."""
 
     x_mean: torch.Tensor
     """Means of the training inputs, in the units of the features, shape (F,), float64."""
     x_scale: torch.Tensor
     """Scales of the training inputs, shape (F,), float64, above 0."""
     x_min: torch.Tensor
-    """Smallest training inputs, shape (F,), float64; nan where unknown."""
+    """Smallest training inputs, shape (F,), float64; nan if unknown."""
     x_max: torch.Tensor
-    """Largest training inputs, shape (F,), float64; nan where unknown."""
+    """Largest training inputs, shape (F,), float64; nan if unknown."""
     y_mean: torch.Tensor
     """Mean of the training labels [nT], shape (), float64."""
     y_scale: torch.Tensor
@@ -71,15 +70,14 @@ class FieldNet(Summarized, torch.nn.Module):
         residual_sd_nt: float = math.nan,
         metadata: Mapping[str, MetadataValue] | None = None,
     ) -> None:
-        """A network with random weights and scalers that change nothing.
+        """Make a network with random weights and identity scalers.
 
         Args:
-            features: Names of the inputs, in order, or of a set of them.
+            features: Names of the inputs, in order, or the name of a set.
             hidden: Widths of the hidden layers.
             dropout: Share of units dropped in training.
-            residual_sd_nt: Standard deviation of label minus prediction on held-out runs [nT]; nan
-                where unknown.
-            metadata: Provenance: on what it was trained, source, licence.
+            residual_sd_nt: Root mean square error on held-out runs [nT]; nan if unknown.
+            metadata: Provenance: training data, source, licence.
         """
         super().__init__()
         self.features = feature_names(features)
@@ -125,7 +123,7 @@ class FieldNet(Summarized, torch.nn.Module):
         return self.y_mean + self.y_scale * self.body(h).to(self.y_mean.dtype)
 
     def body(self, z: torch.Tensor) -> torch.Tensor:
-        """Scaled labels, shape (B,), from scaled features, shape (B, F): what training works on."""
+        """Scaled labels, shape (B,), from scaled features, shape (B, F)."""
         *inner, last = self.linears
         for i, layer in enumerate(inner):
             z = torch.relu(layer(z))
@@ -147,23 +145,23 @@ class FieldNet(Summarized, torch.nn.Module):
     def predict(self, x: ArrayLike) -> tuple[Array, Array]:
         """Disturbances and their standard deviations [nT], each (N,), from features in their units (N, F).
 
-        The standard deviation is `residual_sd_nt` on every row. A row with a nan gives nan. Products are
-        float32, scaling is float64: against float64 throughout the released network errs by under 0.01 nT.
+        The standard deviation is `residual_sd_nt` for every row. A row with nan gives nan. Products are
+        float32; compared with float64 the released network errs by less than 0.01 nT.
         """
         inputs = self.inputs
         layers = [(layer.weight.detach(), layer.bias.detach()) for layer in self.linears]
-        found = outputs(layers, inputs, inputs.checked(x))[:, 0]
-        return float(self.y_mean) + float(self.y_scale) * found, np.full(len(found), self.residual_sd_nt)
+        y = outputs(layers, inputs, inputs.checked(x))[:, 0]
+        return float(self.y_mean) + float(self.y_scale) * y, np.full(len(y), self.residual_sd_nt)
 
     def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
         """Whether an input of a row left the range of the training rows; see `Inputs.outside`."""
         return self.inputs.outside(x)
 
     def set_scalers(self, x: ArrayLike, y: ArrayLike) -> None:
-        """Take scalers and training ranges from training rows.
+        """Set scalers and training ranges from training rows.
 
         Args:
-            x: Features, shape (N, F). One that does not vary keeps a scale of 1.
+            x: Features, shape (N, F). A constant feature gets a scale of 1.
             y: Labels [nT], shape (N,).
         """
         x, y = np.asarray(x, float), np.asarray(y, float)
@@ -179,7 +177,7 @@ class FieldNet(Summarized, torch.nn.Module):
             getattr(self, name).copy_(torch.as_tensor(value))
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write weights, scalers and everything else to one safetensors file; same net, same bytes.
+        """Write it to a safetensors file; the same network gives the same bytes.
 
         Raises:
             InputError: The file exists and `force` was not given.
@@ -197,7 +195,7 @@ class FieldNet(Summarized, torch.nn.Module):
         )
 
     def report(self, title: str) -> Report:
-        """What the network is, in figures."""
+        """Layers, inputs, scales and error."""
         figures = [
             Figure("layers", self.layers_text),
             Figure("parameters", self.parameters_count),
@@ -214,10 +212,10 @@ class FieldNet(Summarized, torch.nn.Module):
 
 
 def load_net(path: str | os.PathLike[str]) -> FieldNet:
-    """A network from its file: magtwin's safetensors, or a released `.pth`; in evaluation mode.
+    """Load a network, safetensors or a released `.pth`, in evaluation mode.
 
     Raises:
-        InputError: Neither of the two, damaged, or parts that do not fit each other.
+        InputError: Neither of the two, another kind, damaged, or its parts do not fit each other.
     """
     if is_checkpoint(path):
         return net_of_checkpoint(path)
@@ -234,13 +232,13 @@ def convert(
     licence: str = "",
     force: bool = False,
 ) -> FieldNet:
-    """Turn a released `.pth` into safetensors, once; its inputs are the paper's 20.
+    """Convert a released `.pth` to safetensors; its inputs are the paper's 20.
 
     Args:
-        checkpoint: The `.pth`, read as data (see `magtwin.learn.models.checkpoint`).
+        checkpoint: The `.pth`.
         out: The safetensors file to write.
-        licence: Licence of the weights, which no checkpoint says; kept in their metadata.
-        force: Whether one that exists is replaced.
+        licence: Licence of the weights, for their metadata.
+        force: Replace an existing file.
 
     Raises:
         InputError: Not such a checkpoint, or `out` exists.
@@ -281,7 +279,7 @@ def net_of_checkpoint(path: str | os.PathLike[str]) -> FieldNet:
 
 
 def net_of(weights: Weights) -> FieldNet:
-    """The network that a weights file of the kind "mlp" holds, in evaluation mode.
+    """The network of a weights file, in evaluation mode.
 
     Raises:
         InputError: Its parts do not fit each other.

@@ -1,4 +1,4 @@
-"""Regressor: what every kind but the perceptron shares: inputs, provenance, its file and its report."""
+"""Regressor: base class of predictors other than networks: inputs, provenance, file and report."""
 
 import math
 import os
@@ -18,7 +18,7 @@ from magtwin.summary import Summarized, Summary, listed
 
 @dataclass(kw_only=True, repr=False)
 class Regressor(Summarized, ABC):
-    """A predictor that is kept as tensors and settings; a kind tells which, and its figures."""
+    """A predictor that is saved as tensors and settings."""
 
     inputs: Inputs
     residual_sd_nt: float = math.nan
@@ -37,18 +37,18 @@ class Regressor(Summarized, ABC):
 
     @abstractmethod
     def tensors(self) -> dict[str, torch.Tensor]:
-        """Every array that its file holds, by name."""
+        """Arrays to save, by name."""
 
     @abstractmethod
     def settings(self) -> dict[str, Any]:
-        """What its file says beside them, as JSON has it."""
+        """Other values to save, as JSON."""
 
     @abstractmethod
     def figures(self) -> list[Figure]:
-        """What it is, in figures."""
+        """Its parts, for the report."""
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write it to one safetensors file; the same model, the same bytes.
+        """Write it to a safetensors file; the same model gives the same bytes.
 
         Raises:
             InputError: The file exists and `force` was not given.
@@ -65,7 +65,7 @@ class Regressor(Summarized, ABC):
         )
 
     def report(self, title: str) -> Report:
-        """Its kind, its figures, and its error on recordings that it never saw, where that is known."""
+        """Its kind, its parts, and its error on held-out recordings if known."""
         figures = [Figure("kind", self.kind), *self.figures()]
         if not math.isnan(self.residual_sd_nt):
             figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note="on held-out recordings"))

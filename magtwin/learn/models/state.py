@@ -1,8 +1,4 @@
-"""The state of a training on its way, in one file, so that one that was killed goes on as if it had not been.
-
-A safetensors file: tensors by name, and JSON of the settings that they belong to and how each epoch
-went. Nothing of it is executed, and every tensor is held against the one that it is to replace.
-"""
+"""The state of an unfinished training in a safetensors file: tensors, settings and the history of epochs."""
 
 import hashlib
 import json
@@ -20,17 +16,17 @@ from magtwin.errors import InputError
 from magtwin.files import existing, output
 
 FORMAT_VERSION = 1
-"""Version of the file; a reader refuses another."""
+"""Version of the file; other versions are refused."""
 
 Tensors = Mapping[str, torch.Tensor]
 
 
 def digest(*arrays: NDArray[Any] | torch.Tensor) -> str:
-    """SHA-256 of the numbers of arrays, by which a checkpoint knows what it was trained on."""
-    found = hashlib.sha256()
+    """SHA-256 of arrays, to recognise the data of a checkpoint."""
+    checksum = hashlib.sha256()
     for array in arrays:
-        found.update(np.ascontiguousarray(array).data)
-    return found.hexdigest()
+        checksum.update(np.ascontiguousarray(array).data)
+    return checksum.hexdigest()
 
 
 def save_state(
@@ -39,13 +35,13 @@ def save_state(
     settings: Mapping[str, Any],
     history: list[dict[str, Any]],
 ) -> None:
-    """Write the state of a training in place of the one before; a kill leaves one of the two, whole.
+    """Write the state of a training, replacing the previous one atomically.
 
     Args:
         path: The file.
-        tensors: What training goes on from.
-        settings: What decides the outcome, as JSON has it.
-        history: The epochs that are done.
+        tensors: Tensors that training continues from.
+        settings: Everything that decides the outcome, as JSON.
+        history: Finished epochs.
     """
     about = {"format_version": FORMAT_VERSION, "settings": settings, "history": history}
     metadata = {"magtwin training": json.dumps(about, sort_keys=True, allow_nan=False)}
@@ -57,18 +53,18 @@ def save_state(
 def load_state(
     path: str | os.PathLike[str], like: Tensors, settings: Mapping[str, Any]
 ) -> tuple[dict[str, torch.Tensor], list[dict[str, Any]]]:
-    """Read the state of a training, if it is one of these settings.
+    """Read the state of a training with the same settings.
 
     Args:
         path: A file that `save_state` wrote.
-        like: Tensors of the names, shapes and types that it must have.
-        settings: Those of the training that is to go on, as JSON has them.
+        like: Tensors of the required names, shapes and types.
+        settings: Settings of the training to resume.
 
     Returns:
-        Its tensors, and the epochs that are done.
+        Its tensors, and the finished epochs.
 
     Raises:
-        InputError: No such file, damaged, or the state of another training; the text says what differs.
+        InputError: No such file, damaged, or of another training; the text names the difference.
     """
     path = existing(path, "checkpoint")
     if path.is_dir():
@@ -76,26 +72,26 @@ def load_state(
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         about = json.loads(metadata["magtwin training"])
-        version, told, history = (about[key] for key in ("format_version", "settings", "history"))
+        version, stored, history = (about[key] for key in ("format_version", "settings", "history"))
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{path}: not the checkpoint of a training, or damaged; start anew") from error
     if version != FORMAT_VERSION:
         raise InputError(f"{path}: format version {version!r}, this magtwin reads {FORMAT_VERSION}")
-    if not isinstance(told, dict) or not isinstance(history, list):
+    if not isinstance(stored, dict) or not isinstance(history, list):
         raise InputError(f"{path}: its settings or epochs are missing; start anew")
     for key, now in settings.items():
-        if told.get(key) != now:
+        if stored.get(key) != now:
             raise InputError(
-                f"{path}: the checkpoint of another training: its {key} is {told.get(key)!r}, here {now!r}; "
-                "go on with what it was begun with, or start anew"
+                f"{path}: the checkpoint of another training: its {key} is {stored.get(key)!r}, here "
+                f"{now!r}; resume with the same settings, or start anew"
             )
-    for name in sorted({*like, *found}):
-        if name not in found or name not in like:
+    for name in sorted({*like, *tensors}):
+        if name not in tensors or name not in like:
             raise InputError(
                 f"{path}: tensor {name!r} is {'missing' if name in like else 'unknown'}; start anew"
             )
-        if found[name].shape != like[name].shape or found[name].dtype != like[name].dtype:
+        if tensors[name].shape != like[name].shape or tensors[name].dtype != like[name].dtype:
             raise InputError(f"{path}: tensor {name!r} has another shape or type; start anew")
-    return found, history
+    return tensors, history

@@ -1,4 +1,4 @@
-"""Weights files: tensors and what they say of themselves, as safetensors, of which nothing is executed."""
+"""Weights files: tensors and metadata as safetensors, which execute nothing."""
 
 import json
 import math
@@ -29,14 +29,14 @@ _TYPES = {"features": list, "units": list, "residual_sd_nt": float | None, "fact
 
 @dataclass(frozen=True)
 class Weights:
-    """A weights file that was read; whether its tensors fit the rest shows when its kind takes them."""
+    """The content of a weights file; its kind checks the tensors."""
 
     path: Path
     kind: str
-    """"mlp", "linear", "hybrid", "ensemble" or "tcn"."""
+    """Kind of the predictor."""
 
     about: Mapping[str, Any]
-    """Features, units, metadata, `residual_sd_nt`, and what the kind keeps beside them."""
+    """Features, units, provenance, `residual_sd_nt`, and the settings of the kind."""
 
     tensors: Mapping[str, torch.Tensor]
 
@@ -47,19 +47,19 @@ class Weights:
 
     @property
     def residual_sd_nt(self) -> float:
-        """Root mean square error on held-out recordings [nT]; nan where unknown."""
+        """Root mean square error on held-out recordings [nT]; nan if unknown."""
         sd = self.about["residual_sd_nt"]
         return math.nan if sd is None else sd
 
     def with_tensors(self, tensors: Mapping[str, torch.Tensor]) -> "Weights":
-        """The same file with a part of its tensors alone, under names of their own."""
+        """The same file with some of its tensors, renamed."""
         return replace(self, tensors=tensors)
 
     def expect(self, key: str, kind: Any) -> Any:
-        """What the file says of itself under a key, if it is of a type.
+        """A setting of the file.
 
         Raises:
-            InputError: It is not there, or of another type.
+            InputError: It is missing, or of another type.
         """
         value = self.about.get(key)
         if key not in self.about or not isinstance(value, kind):
@@ -67,10 +67,10 @@ class Weights:
         return value
 
     def number(self, key: str, *, above: float = -math.inf) -> float:
-        """A finite number that the file says of itself, above another.
+        """A finite number among the settings, above a bound.
 
         Raises:
-            InputError: It is not there, no number, or not above.
+            InputError: It is missing or no such number.
         """
         value = self.expect(key, int | float)
         if isinstance(value, bool) or not above < value < math.inf:
@@ -78,52 +78,28 @@ class Weights:
             raise InputError(f"{self.path}: {key!r} of its metadata must be {wanted}, got {value}")
         return float(value)
 
-    def widths(self, key: str) -> tuple[int, ...]:
-        """Whole numbers above 0 that the file says of itself, no more of them than its tensors hold numbers.
-
-        Raises:
-            InputError: They are not there, or none such.
-        """
-        values = self.expect(key, list)
-        held = sum(tensor.numel() for tensor in self.tensors.values())
-        if not values or not all(type(value) is int and 0 < value <= held for value in values):
-            raise InputError(f"{self.path}: {key!r} of its metadata must be widths of layers, got {values}")
-        return tuple(values)
-
-    def check_size(self, count: int) -> None:
-        """Refuse a file whose metadata ask for more numbers than its tensors hold, before room is made.
-
-        Raises:
-            InputError: They do.
-        """
-        held = sum(tensor.numel() for tensor in self.tensors.values())
-        if count > held:
-            raise InputError(
-                f"{self.path}: its metadata ask for {count:,} weights, its tensors hold {held:,} numbers"
-            )
-
     def fit(
         self, like: Mapping[str, torch.Tensor], *, unknown: Sequence[str] = ("x_min", "x_max")
     ) -> dict[str, torch.Tensor]:
-        """The tensors, each held against the one of its name.
+        """The tensors, checked against others.
 
         Args:
-            like: Tensors of the names, shapes and types that there must be.
-            unknown: Names of those that may hold nan.
+            like: Tensors of the required names, shapes and types.
+            unknown: Names of tensors that may hold nan.
 
         Raises:
-            InputError: One is missing or one too many, of another shape or type, or not finite.
+            InputError: A tensor is missing, unknown, of another shape or type, or not finite.
         """
         for name, expected in like.items():
             if name not in self.tensors:
                 raise InputError(f"{self.path}: tensor {name!r} is missing; train the {self.kind} again")
-            found = self.tensors[name]
-            if found.shape != expected.shape or found.dtype != expected.dtype:
+            tensor = self.tensors[name]
+            if tensor.shape != expected.shape or tensor.dtype != expected.dtype:
                 raise InputError(
-                    f"{self.path}: tensor {name!r} is {say(found)}, the {len(self.features)} features and "
+                    f"{self.path}: tensor {name!r} is {say(tensor)}, the {len(self.features)} features and "
                     f"the other layers ask for {say(expected)}"
                 )
-            if name not in unknown and not bool(torch.isfinite(found).all()):
+            if name not in unknown and not bool(torch.isfinite(tensor).all()):
                 raise InputError(f"{self.path}: tensor {name!r} has numbers that are nan or infinite")
         if extra := sorted(set(self.tensors) - set(like)):
             noun = "FieldNet" if self.kind == "mlp" else self.kind
@@ -132,7 +108,7 @@ class Weights:
 
 
 def is_checkpoint(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is a PyTorch checkpoint, by its first bytes or its name.
+    """Whether a file is a PyTorch checkpoint, by its first bytes or its suffix.
 
     Raises:
         InputError: No such file, or a folder.
@@ -155,22 +131,22 @@ def write_weights(
     force: bool = False,
     **about: Any,
 ) -> None:
-    """Write a predictor to one safetensors file; the same one gives the same bytes.
+    """Write a predictor to a safetensors file; the same predictor gives the same bytes.
 
     Args:
         path: The file.
-        kind: A key of `VERSIONS`.
-        tensors: By name.
+        kind: Kind of the predictor.
+        tensors: Tensors by name.
         features: Names of the inputs, in order.
-        residual_sd_nt: Root mean square error on held-out recordings [nT]; nan where unknown.
+        residual_sd_nt: Root mean square error on held-out recordings [nT]; nan if unknown.
         metadata: Provenance.
-        force: Whether a file that exists is replaced.
-        about: What else the file says of itself, as JSON has it.
+        force: Replace an existing file.
+        about: Settings of the kind, as JSON.
 
     Raises:
         InputError: The file exists and `force` was not given.
     """
-    told = {
+    header = {
         "format_version": VERSIONS.get(kind, VERSION),
         "features": features,
         "units": [FEATURES[name].unit for name in features],
@@ -181,19 +157,19 @@ def write_weights(
         **about,
     }
     if kind != "mlp":
-        told["kind"] = kind
+        header["kind"] = kind
     whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    # One key, because safetensors orders several at random.
-    header = {"magtwin": json.dumps(told, sort_keys=True, allow_nan=False)}
+    # One key, because safetensors writes several in random order.
+    metadata_text = {"magtwin": json.dumps(header, sort_keys=True, allow_nan=False)}
     with output(path, force=force) as aside:
-        aside.write_bytes(save(whole, header))  # save_file would leave it readable by its owner alone
+        aside.write_bytes(save(whole, metadata_text))  # save_file makes a file that only its owner can read
 
 
 def read_weights(path: str | os.PathLike[str]) -> Weights:
-    """What a safetensors file of magtwin's holds, its metadata checked.
+    """Read a safetensors file that magtwin wrote, and check its metadata.
 
     Raises:
-        InputError: No such file, no safetensors, damaged, or not of magtwin's; the text says what.
+        InputError: No such file, no safetensors, damaged, or not written by magtwin.
     """
     path = existing(path, "weights file")
     with path.open("rb") as file:
@@ -210,7 +186,7 @@ def read_weights(path: str | os.PathLike[str]) -> Weights:
 
 
 def _about(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """What the file says of itself, every key that all kinds have there and of its type."""
+    """The metadata of a file, with the keys that all kinds have checked."""
     if "magtwin" not in metadata:
         raise InputError(f"{path}: safetensors without magtwin's metadata; not a network of magtwin's")
     try:
@@ -231,11 +207,11 @@ def _about(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     sd = about["residual_sd_nt"]
     if sd is not None and not 0 <= sd < math.inf:
         raise InputError(
-            f"{path}: 'residual_sd_nt' of its metadata must be from 0 nT up and finite, got {sd}"
+            f"{path}: 'residual_sd_nt' of its metadata must be 0 nT or more and finite, got {sd}"
         )
     for key, value in about["facts"].items():
         if not isinstance(value, MetadataValue):
-            raise InputError(f"{path}: fact {key!r} of its metadata must be text, a number, true or false")
+            raise InputError(f"{path}: {key!r} of its metadata must be text, a number, true or false")
     for name, unit in zip(about["features"], about["units"], strict=False):
         if name in FEATURES and FEATURES[name].unit != unit:
             raise InputError(f"{path}: reads {name} in {unit!r}, magtwin gives it in {FEATURES[name].unit!r}")
@@ -247,10 +223,10 @@ def _about(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def shown(metadata: Mapping[str, MetadataValue]) -> dict[str, MetadataValue]:
-    """Metadata for people: without the map's samples, which are for comparing maps."""
-    return {name: fact for name, fact in metadata.items() if name != "map_samples_nt"}
+    """Metadata to show: without the map's samples."""
+    return {name: value for name, value in metadata.items() if name != "map_samples_nt"}
 
 
 def say(tensor: torch.Tensor) -> str:
-    """Type and shape of a tensor, for refusals."""
+    """Type and shape of a tensor, for error messages."""
     return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"

@@ -34,9 +34,9 @@ class Tags:
 
     def blocks(self, tag: str) -> list[Element]:
         """Elements called `tag` directly below `<robot>`; marks them, but not their children."""
-        found = self.description.xml.findall(tag)
-        self._read.update(found)
-        return found
+        elements = self.description.xml.findall(tag)
+        self._read.update(elements)
+        return elements
 
     def find(self, element: Element | None, *paths: str) -> Element | None:
         """The first element at one of the paths below another, or None; marks it and its parents."""
@@ -53,9 +53,9 @@ class Tags:
 
     def findall(self, element: Element, tag: str) -> list[Element]:
         """The children of an element called `tag`; marks them."""
-        found = element.findall(tag)
-        self._read.update(found)
-        return found
+        elements = element.findall(tag)
+        self._read.update(elements)
+        return elements
 
     def read(self, element: Element) -> Element:
         """Mark an element, but not its children."""
@@ -69,8 +69,8 @@ class Tags:
 
     def text(self, element: Element | None, *paths: str) -> str:
         """Text of the first element at one of the paths; "" if there is none."""
-        found = self.find(element, *paths)
-        return "" if found is None else _text_of(found)
+        match = self.find(element, *paths)
+        return "" if match is None else _text_of(match)
 
     def number(
         self,
@@ -84,19 +84,19 @@ class Tags:
         Raises:
             InputError: It is not a number, below `least` or not above `above`; the message gives the line.
         """
-        found = self.find(element, *paths)
-        if found is None:
+        match = self.find(element, *paths)
+        if match is None:
             return None
         try:
-            value = float(_text_of(found))
+            value = float(_text_of(match))
         except ValueError:
             value = np.nan
         if not np.isfinite(value) or value < least or not (value > above or above == -np.inf):
             want = f" above {above:g}" if above > -np.inf else f" not below {least:g}"
             want = want if max(least, above) > -np.inf else ""
             raise InputError(
-                f"{self.description.where(found)}: {found.tag} must be a finite number{want}, "
-                f"got {_text_of(found)!r}"
+                f"{self.description.where(match)}: {match.tag} must be a finite number{want}, "
+                f"got {_text_of(match)!r}"
             )
         return value
 
@@ -114,13 +114,13 @@ class Tags:
         Raises:
             InputError: It is not a boolean; the message gives the line.
         """
-        found = self.find(element, *paths)
-        if found is None:
+        match = self.find(element, *paths)
+        if match is None:
             return None
-        word = _text_of(found).lower()
+        word = _text_of(match).lower()
         if word not in ("true", "false", "1", "0"):
-            where = self.description.where(found)
-            raise InputError(f"{where}: {found.tag} must be true or false, got {word!r}")
+            where = self.description.where(match)
+            raise InputError(f"{where}: {match.tag} must be true or false, got {word!r}")
         return word in ("true", "1")
 
     def keep(self, prim_of: Callable[[str], Usd.Prim]) -> dict[str, int]:

@@ -237,8 +237,8 @@ class _Collada:
         number: int = -1,
     ) -> NDArray | None:
         """Values at the triangles' corners, shape (F, 3, width); None if the file gives none that fit."""
-        found = [i for i in inputs if i.semantic == semantic]
-        chosen = next((i for i in found if i.set == number), found[0] if found else None)
+        matches = [i for i in inputs if i.semantic == semantic]
+        chosen = next((i for i in matches if i.set == number), matches[0] if matches else None)
         if chosen is None:
             return None
         values, rows = self._source(chosen, width), index[triangles, chosen.offset]

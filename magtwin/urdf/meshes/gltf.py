@@ -249,13 +249,13 @@ def _parse(path: Path) -> tuple[dict[str, Any], bytes]:
         return json.loads(data), b""
     if len(data) < 20 or struct.unpack_from("<I", data, 8)[0] > len(data):
         raise InputError(f"{path}: is cut short; export it again")
-    found: dict[int, bytes] = {}
+    chunks: dict[int, bytes] = {}
     at = 12
     while at + 8 <= len(data):
         length, kind = struct.unpack_from("<II", data, at)
-        found.setdefault(kind, data[at + 8 : at + 8 + length])
+        chunks.setdefault(kind, data[at + 8 : at + 8 + length])
         at += 8 + length
-    return json.loads(found[JSON_CHUNK]), found.get(BINARY_CHUNK, b"")
+    return json.loads(chunks[JSON_CHUNK]), chunks.get(BINARY_CHUNK, b"")
 
 
 def _inline(uri: str) -> bytes:

@@ -229,7 +229,7 @@ def gather(description: Description, options: Options, textures: str) -> MeshLay
                 colliding = True
     if options.collision == "mesh" and colliding:
         description.note(
-            "meshes collide as they are; PhysX does this for static bodies only, and uses convex hulls for others"
+            "meshes collide as they are; PhysX does this for static bodies only, others become convex hulls"
         )
     return meshes
 
@@ -267,9 +267,7 @@ def _primvar(
     values: NDArray,
     interpolation: str = UsdGeom.Tokens.faceVarying,
 ) -> None:
-    """Author a primvar, by default of values at corners, shape (F, 3, K), with an index of distinct
-    values.
-    """
+    """Author a primvar, by default of values at corners, shape (F, 3, K), indexed by distinct values."""
     rows = values.reshape(-1, values.shape[-1]).astype(np.float32) + np.float32(0)
     first, index = distinct(rows)
     arrays = {2: Vt.Vec2fArray, 3: Vt.Vec3fArray}

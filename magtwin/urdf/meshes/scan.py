@@ -12,14 +12,14 @@ from magtwin.urdf.meshes.reading import Reading
 from magtwin.usd.geometry import linear_from_srgb
 
 
-def read_scan(file: Reading) -> list[Piece]:
+def read_scan(reading: Reading) -> list[Piece]:
     """The triangles of an STL or PLY file, for `read_mesh`.
 
     Normals of an STL are ignored: they are those of the faces, from which smooth ones are computed. Texture
     coordinates of a PLY are ignored, since the format references no image.
     """
-    with file.path.open("rb") as stream:
-        if file.path.suffix.lower() == ".stl":
+    with reading.path.open("rb") as stream:
+        if reading.path.suffix.lower() == ".stl":
             from trimesh.exchange.stl import load_stl
 
             read = load_stl(stream)
@@ -28,8 +28,8 @@ def read_scan(file: Reading) -> list[Piece]:
 
             read = load_ply(stream)
     parts = _parts(read)
-    if not parts and file.path.suffix.lower() == ".stl":
-        raise InputError(f"{file.path}: {_why_empty(file.path)}; export it again, or use a primitive")
+    if not parts and reading.path.suffix.lower() == ".stl":
+        raise InputError(f"{reading.path}: {_why_empty(reading.path)}; export it again, or use a primitive")
     return [_piece(part) for part in parts]
 
 

@@ -1,7 +1,7 @@
 """Wavefront: reader of .obj files with the materials of their .mtl.
 
-tinyobjloader is not used: its only wheels are pre-releases, a malformed face makes it drop the whole file, and a
-malformed colour becomes black without a warning.
+tinyobjloader is not used: its only wheels are pre-releases, a malformed face makes it drop the whole file,
+and it turns a malformed colour into black without a warning.
 """
 
 import re
@@ -40,9 +40,7 @@ class _Group:
 
 
 def read_wavefront(reading: Reading) -> list[Piece]:
-    """The triangles of a Wavefront OBJ, for `read_mesh`; vertices may have colours, as MeshLab writes
-    them.
-    """
+    """The triangles of a Wavefront OBJ, for `read_mesh`; vertices may have colours as in MeshLab."""
     path = reading.path
     rows: dict[str, list[str]] = {"v": [], "vt": [], "vn": []}
     paints: dict[str, Paint] = {}

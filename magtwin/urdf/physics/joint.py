@@ -74,7 +74,7 @@ def define_joint(
         InputError: A limit is missing; the message gives the line.
     """
     if joint.name in mechanism.welded:
-        return _define(UsdPhysics.FixedJoint, stage, path, ends, T).GetPrim()
+        return define_fixed_joint(stage, path, ends, T)
     description = mechanism.description
     token, turn = _axis(joint.axis)
     made = _define(KINDS[joint.type], stage, path, ends, T, turn)
@@ -89,21 +89,24 @@ def define_joint(
         for axis in axes:
             define_drive(prim, axis, drive)
     _tune(prim, joint, axes, joint.name in wheels, description)
+    prim.AddAppliedSchema(JOINT_API)
     return prim
 
 
-def define_root_joint(
+def define_fixed_joint(
     stage: Usd.Stage, path: Sdf.Path, ends: tuple[Sdf.Path, Sdf.Path], T: NDArray
 ) -> Usd.Prim:
-    """Fix a robot's base to the world at the robot's prim.
+    """Author a fixed joint.
 
     Args:
         stage: Stage; its edit target is written to.
         path: Path of the joint's prim.
-        ends: Paths of the robot's prim, which is not a body, and of the base.
-        T: Pose of the base in the robot's prim, shape (4, 4).
+        ends: Paths of the two bodies. To fix a base to the world, the first is the robot's prim, not a body.
+        T: Pose of the second body in the first, shape (4, 4).
     """
-    return _define(UsdPhysics.FixedJoint, stage, path, ends, T).GetPrim()
+    prim = _define(UsdPhysics.FixedJoint, stage, path, ends, T).GetPrim()
+    prim.AddAppliedSchema(JOINT_API)
+    return prim
 
 
 def define_mimic(prim: Usd.Prim, leader: Usd.Prim, joint: Joint, lead: Joint, mechanism: Mechanism) -> None:
@@ -161,7 +164,6 @@ def _define(
     made.CreateLocalRot0Attr(_quatf(T[:3, :3] @ turn))
     made.CreateLocalPos1Attr(Gf.Vec3f(0))
     made.CreateLocalRot1Attr(_quatf(turn))
-    made.GetPrim().AddAppliedSchema(JOINT_API)
     return made
 
 

@@ -103,7 +103,7 @@ def test_without_variance_it_says_so_and_takes_the_robust_spread():
     found = difference(replace(before, variance_nt2=None), with_a_magnet(after))
     assert known.from_variance
     assert not found.from_variance
-    assert "a map has none: from the robust spread" in figures(found)["expected spread"].note
+    assert "a map has no variance: from the robust spread" in figures(found)["expected spread"].note
     assert "from both maps' variances" in figures(known)["expected spread"].note
     assert "spread of z" not in figures(found)
     assert_allclose(found.sd_nt, NOISE_NT * np.sqrt(2), rtol=0.15)

@@ -15,14 +15,13 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files import shipped
 from magtwin.io.tables import write_parquet
+from magtwin.learn.compensation.platform import fit_platform, platform_of_run
 from magtwin.learn.compensation.tolles_lawson import (
     TollesLawson,
     compensate_run,
     design_matrix,
-    fit_platform,
     fit_run,
     fit_tolles_lawson,
-    platform_of_run,
 )
 from magtwin.path import path_named
 from magtwin.run.run import Run
@@ -371,7 +370,7 @@ def test_a_model_whose_coefficients_do_not_fit_its_terms_is_refused(tmp_path):
         ({"rate_hz": 0.0}, "rate_hz must be above 0"),
         ({"band_hz": (0.9, 0.1)}, "band_hz must ascend"),
         ({"band_hz": (0.1, 10.0)}, "half the rate, 10 Hz"),
-        ({"terms": ("permanent", "bias")}, "a bias is in no pass band"),
+        ({"terms": ("permanent", "bias")}, "a pass band excludes a bias"),
         ({"ridge": -1.0}, "ridge must not be below 0"),
         ({"b_nt": np.full(400, np.nan)}, "b_nt must be finite, got nan in row 0"),
         ({"b_nt": np.ones(3)}, r"must have shape \(400,\)"),
@@ -429,4 +428,4 @@ def test_the_page_on_compensation_takes_out_what_it_says():
     wrong = replace(mown, coefficients=tuple(-2 * c for c in mown.coefficients))
     removed = compensate_run(told["drive"]("curvilinear", seed=2), wrong)[1].figures[-1]
     assert removed.value < 0
-    assert removed.note.startswith("below 0: they vary more than before")
+    assert removed.note.startswith("below 0: more variance than before")

@@ -56,7 +56,7 @@ def test_the_picture_is_the_same_every_time(tmp_path, suffix):
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"y": np.ones(400)}, "every label is 1 nT: nothing goes with it"),
+        ({"y": np.ones(400)}, "every label is 1 nT: there is nothing to correlate"),
         ({"y": np.full(400, np.nan)}, "three rows at least, all finite"),
         ({"y": np.ones(3)}, r"x must have shape \(3, 4\), a row a label, got \(400, 4\)"),
         ({"groups": np.zeros(3)}, r"groups must have shape \(400,\), got \(3,\)"),

@@ -8,9 +8,10 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.io.tables import read_parquet
 from magtwin.learn.data import dataset as rooms
+from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import build_dataset, open_dataset
 from magtwin.learn.data.features import SETS, features
-from magtwin.learn.data.labels import Alignment, labels
+from magtwin.learn.data.labels import labels
 from magtwin.learn.data.recording import Source
 from magtwin.learn.data.split import split
 from magtwin.run.run import COLUMNS, Run
@@ -198,7 +199,7 @@ def test_the_report_says_what_there_is_to_learn_from(made):
         ),
         (
             {"a": RUNS["a"].with_metadata(magnetometer="neural")},
-            "a: its readings are those of a neural magnetometer, and what learns from them learns that model",
+            "a: its readings come from a neural magnetometer, and training on them would learn that model",
         ),
         (
             {"a": RUNS["a"].with_columns(b_measured_nt=labels(RUNS["a"], FIELD).map_nt)},
@@ -215,7 +216,7 @@ def test_what_cannot_be_labelled_is_refused_and_leaves_nothing(tmp_path, runs, t
 def test_a_feature_that_the_recordings_lack_is_refused_with_what_can_be_made(tmp_path):
     run = Run({k: v for k, v in RUNS["a"].items() if k not in ("battery_a", "b_vector_measured_nt")})
     found = build_dataset({"a": run, "b": RUNS["b"]}, FIELD, tmp_path / "d")
-    with pytest.raises(InputError, match=r"'battery_a' is made of column 'battery_a'.*: full, correlated$"):
+    with pytest.raises(InputError, match=r"'battery_a' needs column 'battery_a'.*: full, correlated$"):
         found.rows("circular")
     with pytest.raises(InputError, match="no recording 'bb'; did you mean 'b'"):
         found.rows("full", ["bb"])
@@ -253,7 +254,7 @@ def test_a_shard_that_was_changed_is_refused(tmp_path):
     data[1000] ^= 1
     shard.write_bytes(data)
     for read in (found.check, found.rows, lambda: list(found.runs())):
-        with pytest.raises(InputError, match=r"not what dataset.json tells of, by its checksum"):
+        with pytest.raises(InputError, match=r"its checksum is not that in dataset.json"):
             read()
     shard.unlink()
     with pytest.raises(InputError, match="no such shard of a data set"):

@@ -7,7 +7,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import quat_from_yaw
-from magtwin.learn.data.labels import Alignment, fit_alignment, labelled, labels
+from magtwin.learn.data.alignment import Alignment, fit_alignment
+from magtwin.learn.data.labels import labelled, labels
 from magtwin.run.run import Run
 
 
@@ -145,7 +146,7 @@ def test_the_motors_torque_where_a_robot_slows_is_taken_for_neither(monkeypatch)
     run = run.with_columns(b_measured_nt=run["b_measured_nt"] + torque)
     found = fit_alignment([run], FIELD)
     assert (*found.lever_arm_m, found.latency_s) == pytest.approx((0, 0, 0), abs=0.005)
-    monkeypatch.setattr("magtwin.learn.data.labels._slope", lambda values, t, at: np.zeros(len(at)))
+    monkeypatch.setattr("magtwin.learn.data.alignment._slope", lambda values, t, at: np.zeros(len(at)))
     assert abs(fit_alignment([run], FIELD).lever_arm_m[0]) > 0.02
 
 

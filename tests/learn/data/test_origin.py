@@ -85,7 +85,7 @@ def test_maps_of_different_floors_are_told_as_such():
 
 def test_a_network_that_does_not_say_its_map_is_told_mildly():
     (one,) = found({})
-    assert "does not say which map it was trained on" in one.text
+    assert "does not name the map that it was trained on" in one.text
 
 
 def test_unaligned_labels_are_told_with_the_effect_of_the_place_where_they_took_the_map():
@@ -138,7 +138,7 @@ def test_another_platform_and_another_name_alone_are_told():
     "fact", [{"sensor_m": "here"}, {"lever_arm_m": "1"}, {"map_samples_nt": "1 2 3", "map_sha256": "b" * 64}]
 )
 def test_metadata_that_are_no_numbers_are_refused_by_name(fact):
-    with pytest.raises(InputError, match=f"f.safetensors: its fact '{next(iter(fact))}' must list"):
+    with pytest.raises(InputError, match=f"f.safetensors: its metadata '{next(iter(fact))}' must list"):
         found(learned() | fact)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from magtwin.learn.data.residuals import PRIOR_SHARE, Held, residuals
+from magtwin.learn.data.residuals import PRIOR_SHARE, HeldOut, residuals
 from magtwin.sim.sensors.noise import gauss_markov
 
 OFFSET, WITHIN, TIME_S, RATE_HZ = 100.0, 60.0, 3.0, 10.0
@@ -17,8 +17,9 @@ def drawn(sessions, recordings, *, seconds=60.0, offset=OFFSET, within=WITHIN, t
     for k in range(sessions):
         constant = offset * rng.standard_normal()
         for _ in range(recordings):
-            process = gauss_markov(rng.standard_normal(len(t)), time_s, RATE_HZ)
-            held.append(Held(str(k), t, constant + within * process))
+            white = rng.standard_normal(len(t))
+            process = np.append(*gauss_markov(white[1:], white[0], time_s, RATE_HZ))
+            held.append(HeldOut(str(k), t, constant + within * process))
     return held
 
 
@@ -66,7 +67,7 @@ def test_rows_without_a_label_do_not_shift_the_others():
     holed = []
     for one in whole:
         kept = rng.random(len(one.t)) < 0.7
-        holed.append(Held(one.session, one.t[kept], one.error_nt[kept]))
+        holed.append(HeldOut(one.session, one.t[kept], one.error_nt[kept]))
     a, b = residuals(whole), residuals(holed)
     assert b.time_s == pytest.approx(a.time_s, rel=0.05)
     assert b.offset_sd_nt == pytest.approx(a.offset_sd_nt, rel=0.02)
@@ -74,10 +75,10 @@ def test_rows_without_a_label_do_not_shift_the_others():
 
 def test_nothing_is_found_in_no_error():
     assert residuals([]) is None
-    assert residuals([Held("a", np.arange(5.0), np.zeros(5))]) is None
+    assert residuals([HeldOut("a", np.arange(5.0), np.zeros(5))]) is None
 
 
 def test_a_recording_of_one_row_gives_no_time():
-    found = residuals([Held(str(k), np.zeros(1), np.array([float(k)])) for k in range(-3, 4)])
+    found = residuals([HeldOut(str(k), np.zeros(1), np.array([float(k)])) for k in range(-3, 4)])
     assert found.time_s == 0.0
     assert np.isfinite([found.offset_sd_nt, found.within_sd_nt]).all()

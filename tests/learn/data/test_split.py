@@ -85,7 +85,7 @@ def test_by_run_a_recordings_rows_are_all_in_its_part():
     [
         ({"by": "sesion"}, "no way to split 'sesion'; did you mean 'session'?"),
         ({"shares": (0.5, 0.2, 0.2)}, r"shares must sum to 1, got \(0.5, 0.2, 0.2\), which sum to 0.9"),
-        ({"shares": (0.0, 0.5, 0.5)}, "training's above it"),
+        ({"shares": (0.0, 0.5, 0.5)}, "none below 0 and the first above 0"),
         ({"hold_out": ["day 33"]}, "no session or recording to hold out 'day 33'; did you mean 'day 3'?"),
         ({"log": []}, "there is no recording to split"),
         ({"log": LOG[:2]}, "2 sessions cannot be dealt to 3 parts .*record more, or split by run"),

@@ -7,19 +7,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 from magtwin.errors import InputError
+from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import build_dataset
-from magtwin.learn.data.labels import Alignment, labels
+from magtwin.learn.data.labels import labels
 from magtwin.learn.evaluation.budget import TERMS, Truth, budgets, steps, true_errors
-from magtwin.learn.evaluation.evaluate import (
-    NAIVE,
-    Contender,
-    Mean,
-    Trial,
-    chart_of,
-    evaluate,
-    naive,
-    tolles_lawson,
-)
+from magtwin.learn.evaluation.candidates import NAIVE, Candidate, Mean, naive, named_map, tolles_lawson
+from magtwin.learn.evaluation.evaluate import evaluate
+from magtwin.learn.evaluation.trials import Trial
 from magtwin.run.run import Run
 from magtwin.sim.survey import field_at_rest_nt
 from magtwin.twin import check_scene, in_session_of, open_twin, simulate
@@ -46,29 +40,30 @@ def drives(twin):
 
 @pytest.fixture(scope="module")
 def truth(twin):
-    def day_of(name, run):
+    def scene_of(name, run):
         scene = in_session_of(twin, run.metadata).scene
         check_scene(scene, run.metadata, name)
         return scene
 
-    return Truth(twin.scene, day_of)
+    return Truth(twin.scene, scene_of)
 
 
 @pytest.fixture(scope="module")
-def chart(twin):
-    return chart_of("lab", twin.field)
+def named(twin):
+    return named_map("lab", twin.field)
 
 
 @pytest.fixture(scope="module")
-def train(drives, chart, tmp_path_factory):
+def train(drives, named, tmp_path_factory):
     learned = {name: drives[name] for name in ("d0", "d1")}
-    return build_dataset(learned, chart.field, tmp_path_factory.mktemp("budget") / "set")
+    return build_dataset(learned, named.field, tmp_path_factory.mktemp("budget") / "set")
 
 
 @pytest.fixture(scope="module")
-def found(drives, chart, train):
-    models = [naive(chart, dataset=train), tolles_lawson(chart, train)]
-    return evaluate(models, [Trial("d2", lambda: drives["d2"])], rng=np.random.default_rng(0))
+def found(drives, named, train):
+    trials = [Trial("d2", lambda: drives["d2"])]
+    baseline = naive(named, dataset=train)
+    return evaluate([tolles_lawson(named, train)], trials, baseline=baseline, rng=np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")
@@ -76,9 +71,9 @@ def made(found, truth, train):
     return budgets(found, [0, 1], truth, train)
 
 
-def test_the_parts_of_a_label_add_up_to_it(truth, drives, chart):
+def test_the_parts_of_a_label_add_up_to_it(truth, drives, named):
     run, alignment = drives["d2"], Alignment((0.03, 0.01), -0.02)
-    label = labels(run, chart.field, alignment)
+    label = labels(run, named.field, alignment)
     rows = np.flatnonzero(label.known)
     parts = truth.parts("d2 moved", run, rows, label.map_nt[rows], alignment, run["b_measured_nt"][rows])
     assert_allclose(parts.sum(axis=0), -label.value_nt[rows], atol=1e-6)  # fields of 4e4 nT, double precision
@@ -92,11 +87,11 @@ def test_the_exact_field_is_that_of_a_robot_at_rest(truth, twin):
     assert np.isnan(truth.at_rest(p, yaw)[3])
 
 
-def test_a_robot_with_the_true_lever_arm_and_no_drift_errs_by_neither(twin, chart):
+def test_a_robot_with_the_true_lever_arm_and_no_drift_errs_by_neither(twin, named):
     still = Truth(twin.scene, lambda name, run: twin.scene)
     run = simulate(twin, "figure8", seed=3, duration_s=10.0, rate_hz=10.0)
     rows = np.arange(5, run.rows)
-    parts = still.parts("a", run, rows, chart.field.lookup(run["p_world_base"][rows, :2], run["yaw"][rows]),
+    parts = still.parts("a", run, rows, named.field.lookup(run["p_world_base"][rows, :2], run["yaw"][rows]),
                         Alignment(twin.scene.robot.mocap.offset_m), run["b_measured_nt"][rows])  # fmt: skip
     told = dict(zip(TERMS, parts, strict=True))
     assert np.abs(told["lever arm"]).max() == 0
@@ -115,7 +110,7 @@ def test_all_terms_closed_leave_nothing_and_what_each_bought_adds_up(made):
 def test_closing_the_map_leaves_what_naive_errs_by_on_an_exact_map(made, found, truth, train, drives):
     def exact_label(run):
         p = run["mocap_p"][:, :2]
-        label = labels(run, found.charts[0].field)
+        label = labels(run, found.maps[0].field)
         yaw = 2 * np.arctan2(run["mocap_q_xyzw"][:, 2], run["mocap_q_xyzw"][:, 3])
         return np.where(label.known, run["b_measured_nt"] - truth.at_rest(p, yaw), np.nan)
 
@@ -133,23 +128,23 @@ def test_what_a_map_misses_is_counted_where_the_robot_was(found, truth, twin, dr
     assert one.mae_nt == pytest.approx(np.nanmean(np.abs(missed)), rel=0.1)  # seen 2 cm off, by its offset
 
 
-def test_steps_go_from_naive_over_the_first_map_to_the_weights_on_the_last(chart):
-    other = replace(chart, name="other")
+def test_steps_go_from_naive_over_the_first_map_to_the_weights_on_the_last(named):
+    other = replace(named, name="other")
     cosines = Mean(0.0, 1.0, ("yaw_cos",))
     gradient = Mean(0.0, 1.0, ("map_gradient_left",))
     own = {"sha256": "0"}
     models = [
-        Contender(NAIVE, Mean(0.0, 1.0), chart),
-        Contender("hybrid", gradient, other, Alignment(), own),
-        Contender("paper", cosines, chart, Alignment(), own),
-        Contender("ridge with gradient", gradient, other),
-        Contender("ridge aligned", cosines, other, Alignment((0.1, 0.0))),
-        Contender("ridge", cosines, other),
-        Contender("ridge on the first", cosines, chart),
+        Candidate(NAIVE, Mean(0.0, 1.0), named),
+        Candidate("hybrid", gradient, other, Alignment(), own),
+        Candidate("paper", cosines, named, Alignment(), own),
+        Candidate("ridge with gradient", gradient, other),
+        Candidate("ridge aligned", cosines, other, Alignment((0.1, 0.0))),
+        Candidate("ridge", cosines, other),
+        Candidate("ridge on the first", cosines, named),
     ]
 
     class Found:
-        contenders, charts = models, (chart, other)
+        candidates, maps = models, (named, other)
 
     wanted = [NAIVE, "paper", "ridge on the first", "ridge", "ridge aligned", "ridge with gradient", "hybrid"]
     assert [models[m].name for m in steps(Found())] == wanted
@@ -158,17 +153,17 @@ def test_steps_go_from_naive_over_the_first_map_to_the_weights_on_the_last(chart
 def test_a_run_of_another_scene_is_refused(drives, truth, found, train):
     changed = drives["d2"].with_metadata(config_sha256="0" * 64)
     other = replace(found, judged=(replace(found.judged[0], name="d9", run=changed),))
-    with pytest.raises(InputError, match="d9: came from a scene whose figures have the sha256 0000"):
+    with pytest.raises(InputError, match="d9: was made in a scene whose values have the sha256 0000"):
         budgets(other, [0], truth, train)
 
 
 def test_a_run_of_no_known_session_is_refused(twin):
-    with pytest.raises(InputError, match="do not say which session it was of"):
+    with pytest.raises(InputError, match="name no valid session"):
         in_session_of(twin, {"session_seed": 1, "session": "monday"})
 
 
 def test_a_run_without_the_truth_is_refused(drives, truth, found, train):
     bare = Run({k: v for k, v in drives["d2"].items() if k != "b_truth_nt"}, drives["d2"].metadata)
     other = replace(found, judged=(replace(found.judged[0], name="d8", run=bare),))
-    with pytest.raises(InputError, match="d8: tells no b_truth_nt, and an error budget needs the truth"):
+    with pytest.raises(InputError, match="d8: has no b_truth_nt, and an error budget needs the truth"):
         budgets(other, [0], truth, train)

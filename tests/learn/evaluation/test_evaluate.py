@@ -7,25 +7,23 @@ import pytest
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import build_dataset
-from magtwin.learn.data.labels import Alignment, labelled
+from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.split import split
-from magtwin.learn.evaluation.evaluate import (
+from magtwin.learn.evaluation.candidates import (
     NAIVE,
-    Contender,
+    Candidate,
     Mean,
-    Trial,
-    chart_of,
-    check_apart,
-    contender,
-    evaluate,
+    candidate_of,
     naive,
+    named_map,
     tolles_lawson,
-    trials_of,
-    unseen,
 )
+from magtwin.learn.evaluation.evaluate import evaluate
+from magtwin.learn.evaluation.trials import Trial, check_apart, trials_of, unseen
 from magtwin.learn.training.config import TrainConfig
-from magtwin.learn.training.result import fit
+from magtwin.learn.training.train import fit
 from magtwin.run.run import COLUMNS, Run
 
 
@@ -43,8 +41,8 @@ def a_map(name="hills", level=41e3, variance=400.0, valid=None):
     )
 
 
-HILLS = chart_of("hills", a_map())
-HIGHER = chart_of("higher", a_map("higher", 41.5e3))
+HILLS = named_map("hills", a_map())
+HIGHER = named_map("higher", a_map("higher", 41.5e3))
 
 
 def a_run(seed=0, rows=300, **metadata):
@@ -70,11 +68,13 @@ def trial(name="one", run=None, **told):
     return Trial(name, lambda: run, **told)
 
 
-def judged(contenders, *trials, **options):
-    return evaluate(contenders, trials or [trial()], rng=np.random.default_rng(0), **options)
+def judged(models, *trials, **options):
+    """An evaluation, the first model the baseline."""
+    rng = np.random.default_rng(0)
+    return evaluate(models[1:], trials or [trial()], baseline=models[0], rng=rng, **options)
 
 
-FLAT = Contender(NAIVE, Mean(300.0, 100.0), HILLS)
+FLAT = Candidate(NAIVE, Mean(300.0, 100.0), HILLS)
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ def weights(data, tmp_path_factory):
     parts = split(data.recordings, config.split, rng=deals)
     made = fit(config, data, parts, rng=draws)
     path = tmp_path_factory.mktemp("weights") / "line.safetensors"
-    made.net.save(path)
+    made.predictor.save(path)
     return path, parts
 
 
@@ -104,7 +104,7 @@ def test_an_error_is_map_and_prediction_less_what_was_measured():
 
 
 def test_models_on_different_maps_are_judged_by_the_total_field():
-    found = judged([FLAT, Contender("other", Mean(-200.0, 100.0), HIGHER)])
+    found = judged([FLAT, Candidate("other", Mean(-200.0, 100.0), HIGHER)])
     first, second = found.every.scores
     assert second.mae_nt == pytest.approx(first.mae_nt)
     assert second.bias_nt == pytest.approx(first.bias_nt)
@@ -114,7 +114,7 @@ def test_a_model_looks_its_map_up_with_its_own_lever_arm_and_latency():
     alignment = Alignment((0.05, -0.02), 0.1)
     run = a_run(5, path="figure8")
     moved = labelled(run, HILLS.field, alignment)
-    found = judged([FLAT, Contender("moved", Mean(300.0, 1.0), HILLS, alignment)], trial(run=run))
+    found = judged([FLAT, Candidate("moved", Mean(300.0, 1.0), HILLS, alignment)], trial(run=run))
     kept = np.isfinite(moved["label_nt"])
     assert found.every.scores[1].rows == kept.sum() < run.rows
     assert found.every.scores[1].mae_nt == pytest.approx(np.abs(300 - moved["label_nt"][kept]).mean())
@@ -123,8 +123,8 @@ def test_a_model_looks_its_map_up_with_its_own_lever_arm_and_latency():
 def test_all_models_are_judged_on_common_readings_and_what_is_left_out_is_counted():
     masked = np.ones((1, 17, 21), bool)
     masked[0, :, :8] = False
-    holed = chart_of("holed", a_map("holed", valid=masked))
-    found = judged([FLAT, Contender("holed", Mean(300.0, 1.0), holed)])
+    holed = named_map("holed", a_map("holed", valid=masked))
+    found = judged([FLAT, Candidate("holed", Mean(300.0, 1.0), holed)])
     assert found.left_out == {"have no label on holed": 300 - found.every.scores[0].rows}
     assert {score.rows for score in found.every.scores} == {found.every.scores[0].rows}
 
@@ -154,9 +154,9 @@ def test_naive_is_the_mean_training_label_on_the_map_at_hand(data):
 
 
 def test_weights_tell_their_mean_label_where_no_training_set_is_at_hand(weights):
-    own = contender(weights[0], [HILLS])
+    own = candidate_of(weights[0], [HILLS])
     assert naive(HILLS, weights=[own]).model.mean_nt == own.metadata["label_mean_nt"]
-    with pytest.raises(InputError, match="nothing tells the mean training label on the map higher"):
+    with pytest.raises(InputError, match="the mean training label on the map higher"):
         naive(HIGHER, weights=[own])
 
 
@@ -167,30 +167,30 @@ def test_tolles_lawson_beats_the_mean_where_speed_makes_a_field(data):
 
 
 def test_weights_take_the_map_that_they_were_trained_on_by_its_checksum(weights):
-    assert contender(weights[0], [HIGHER, HILLS]).chart is HILLS
+    assert candidate_of(weights[0], [HIGHER, HILLS]).map is HILLS
 
 
 def test_weights_for_another_map_are_refused_naming_both(weights):
     with pytest.raises(InputError, match=r"line.*trained on the map 'hills'.*higher has") as refusal:
-        contender(weights[0], [HIGHER])
+        candidate_of(weights[0], [HIGHER])
     for checksum in (*HILLS.checksums, *HIGHER.checksums):
         assert checksum in str(refusal.value)
-    assert contender(weights[0], [HIGHER], any_map=True).chart is HIGHER
+    assert candidate_of(weights[0], [HIGHER], any_map=True).map is HIGHER
 
 
 def test_released_weights_which_name_no_map_take_the_first(real_data):
-    released = contender(
+    released = candidate_of(
         real_data / "aprilab" / "models" / "nn_magnetometer_model_v0.0.1.pth", [HIGHER, HILLS]
     )
-    assert released.chart is HIGHER
-    score = judged([Contender(NAIVE, Mean(300.0, 1.0), HIGHER), released]).every.scores[1]
+    assert released.map is HIGHER
+    score = judged([Candidate(NAIVE, Mean(300.0, 1.0), HIGHER), released]).every.scores[1]
     assert np.isfinite(score.mae_nt)
     assert score.outside == 1.0  # inputs drawn at random are nothing that it knows
 
 
 def test_of_the_set_that_weights_were_trained_on_their_test_recordings_judge(data, weights):
     path, parts = weights
-    names, learned = unseen(data, [contender(path, [HILLS])])
+    names, learned = unseen(data, [candidate_of(path, [HILLS])])
     assert names == tuple(name for name in data.names if name in parts.test)
     assert set(learned) == set(parts.train)
     assert unseen(data, [FLAT]) == (data.names, data.names)
@@ -204,7 +204,7 @@ def test_baselines_are_not_judged_by_what_they_learn_from(data):
 
 
 def test_weights_trained_on_rows_of_every_recording_are_refused(data, weights):
-    one = contender(weights[0], [HILLS])
+    one = candidate_of(weights[0], [HILLS])
     leaky = replace(one, metadata={**one.metadata, "config": 'split = "row"\nseed = 3\n'})
     with pytest.raises(InputError, match="trained on rows of every recording"):
         unseen(data, [leaky])
@@ -217,13 +217,13 @@ def test_the_exact_field_judges_where_it_is_asked_for():
     assert found.every.scores[0].bias_nt == pytest.approx(
         judged([FLAT], trial(run=exact)).every.scores[0].bias_nt - 50
     )
-    with pytest.raises(InputError, match="one: tells no b_truth_nt"):
+    with pytest.raises(InputError, match="one: has no b_truth_nt"):
         judged([FLAT], trial(run=run), truth=True)
 
 
 def test_readings_that_are_a_networks_own_are_refused():
     run = a_run(2, path="figure8", magnetometer="neural")
-    with pytest.raises(InputError, match="those of a neural magnetometer, a model's own"):
+    with pytest.raises(InputError, match="come from a neural magnetometer"):
         judged([FLAT], trial(run=run))
 
 
@@ -238,7 +238,7 @@ def test_a_run_without_an_input_is_refused_with_the_near_name(weights):
     run = a_run(2, path="figure8")
     bare = Run({name: v for name, v in run.items() if name != "odom_v"}, run.metadata)
     with pytest.raises(InputError, match=r"one: line\.safetensors: no column 'odom_v'; did you mean 'odom_"):
-        judged([FLAT, contender(weights[0], [HILLS])], trial(run=bare))
+        judged([FLAT, candidate_of(weights[0], [HILLS])], trial(run=bare))
 
 
 def test_a_constant_label_is_refused():
@@ -252,11 +252,11 @@ def test_readings_on_no_common_ground_are_refused_with_counts():
     left, right = (np.ones((1, 17, 21), bool) for _ in range(2))
     left[0, :, 11:] = False
     right[0, :, :10] = False
-    halves = [chart_of(name, a_map(name, valid=v)) for name, v in (("left", left), ("right", right))]
+    halves = [named_map(name, a_map(name, valid=v)) for name, v in (("left", left), ("right", right))]
     with pytest.raises(
         InputError, match=r"no reading that every model can be judged on: \d+ have no label on"
     ):
-        judged([Contender(one.name, Mean(0.0, 1.0), one) for one in halves])
+        judged([Candidate(one.name, Mean(0.0, 1.0), one) for one in halves])
 
 
 def test_a_path_that_is_called_as_a_total_is_told_from_it():
@@ -273,4 +273,4 @@ def test_two_of_one_name_are_refused():
 
 def test_nothing_to_judge_by_is_refused():
     with pytest.raises(InputError, match="nothing to evaluate"):
-        evaluate([FLAT], [], rng=np.random.default_rng(0))
+        evaluate([], [], baseline=FLAT, rng=np.random.default_rng(0))

@@ -38,21 +38,21 @@ def paper():
 def test_the_released_network_errs_by_less_than_a_hundredth_nt_against_float64(real_data):
     released = NeuralMagnetometer.load(real_data / RELEASED)
     x = inputs(released.net, 3000)
-    assert_allclose(released.predict(x), forward64(released.net, x), atol=0.01)  # of up to 8,000 nT
+    assert_allclose(released.net.predict(x)[0], forward64(released.net, x), atol=0.01)  # of up to 8,000 nT
 
 
 def test_blocks_agree_with_torch_on_the_whole_array(paper):
     x = inputs(paper.net, 1500)
     with torch.inference_mode():
-        assert_allclose(paper.predict(x), paper.net(torch.from_numpy(x)).numpy(), atol=1e-3)
+        assert_allclose(paper.net.predict(x)[0], paper.net(torch.from_numpy(x)).numpy(), atol=1e-3)
 
 
 @pytest.mark.parametrize("rows", [1, 2, 15, 16, 17, 511, 512, 513, 1025])
 def test_a_rows_bytes_do_not_depend_on_how_many_rows_there_are(paper, rows):
     x = inputs(paper.net, 1100)
-    all_at_once = paper.predict(x)
-    assert_array_equal(paper.predict(x[:rows]), all_at_once[:rows])
-    assert_array_equal(paper.predict(x[-rows:]), all_at_once[-rows:])
+    all_at_once = paper.net.predict(x)[0]
+    assert_array_equal(paper.net.predict(x[:rows])[0], all_at_once[:rows])
+    assert_array_equal(paper.net.predict(x[-rows:])[0], all_at_once[-rows:])
 
 
 def test_one_thread_and_two_give_the_same_bytes_and_torch_keeps_its_threads(paper):
@@ -60,25 +60,25 @@ def test_one_thread_and_two_give_the_same_bytes_and_torch_keeps_its_threads(pape
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(2)
-        two = paper.predict(x)
+        two = paper.net.predict(x)[0]
         assert torch.get_num_threads() == 2
         torch.set_num_threads(1)
-        assert_array_equal(paper.predict(x), two)
+        assert_array_equal(paper.net.predict(x)[0], two)
     finally:
         torch.set_num_threads(before)
 
 
 def test_nan_in_gives_nan_out_in_that_row_alone(paper):
     x = inputs(paper.net, 600)
-    clean = paper.predict(x)
+    clean = paper.net.predict(x)[0]
     x[[3, 555], [0, 19]] = np.nan
-    y = paper.predict(x)
+    y = paper.net.predict(x)[0]
     assert_array_equal(np.flatnonzero(np.isnan(y)), [3, 555])
     assert_array_equal(np.delete(y, [3, 555]), np.delete(clean, [3, 555]))
 
 
 def test_no_rows_give_no_disturbances(paper):
-    assert paper.predict(np.empty((0, 20))).shape == (0,)
+    assert paper.net.predict(np.empty((0, 20)))[0].shape == (0,)
 
 
 def test_a_run_is_read_by_the_names_of_the_networks_inputs():
@@ -93,7 +93,7 @@ def test_an_input_beyond_its_training_range_is_outside():
     net.x_min.copy_(torch.tensor([0.2, -1.0], dtype=torch.float64))
     net.x_max.copy_(torch.tensor([1.0, 1.0]))
     x = [[0.2, 1.0], [1.0, -1.0], [-0.1, 0.0], [0.5, 1.01], [np.nan, 0.0]]
-    assert NeuralMagnetometer(net).outside(x).tolist() == [False, False, True, True, True]
+    assert net.outside(x).tolist() == [False, False, True, True, True]
 
 
 def test_where_the_range_is_unknown_5_scales_from_the_mean_are_outside(real_data):
@@ -101,19 +101,14 @@ def test_where_the_range_is_unknown_5_scales_from_the_mean_are_outside(real_data
     mean, scale = released.net.x_mean.numpy(), released.net.x_scale.numpy()
     x = np.stack([mean, mean + 4.9 * scale, mean - 5.1 * scale])
     x = np.vstack([x, np.where(np.arange(20) == 18, -0.1, mean)])  # the battery runs below empty
-    assert released.outside(x).tolist() == [False, False, True, True]
+    assert released.net.outside(x).tolist() == [False, False, True, True]
 
 
 def test_rounding_of_an_input_that_never_varied_is_not_outside():
     net = a_net(["battery_v"])
     net.x_min.fill_(15.1)
     net.x_max.fill_(15.1)
-    assert not NeuralMagnetometer(net).outside([[np.nextafter(15.1, 16)]]).any()
-
-
-def test_outside_training_reads_the_run(paper):
-    run = a_run(30)
-    assert_array_equal(paper.outside_training(run), paper.outside(features(run)))
+    assert not net.outside([[np.nextafter(15.1, 16)]]).any()
 
 
 def test_the_metadata_name_the_file_its_checksum_and_its_shape(tmp_path):
@@ -141,7 +136,7 @@ def test_another_checksum_is_refused(tmp_path):
 
 def test_features_of_another_width_are_refused(paper):
     with pytest.raises(InputError, match=r"reads 20 features a row, shape \(N, 20\); got \(5, 19\)"):
-        paper.predict(np.zeros((5, 19)))
+        paper.net.predict(np.zeros((5, 19)))
 
 
 # The networks that ship
@@ -186,7 +181,7 @@ def test_a_battery_that_is_fuller_than_any_trained_on_is_flagged(new_days):
     paper = NeuralMagnetometer.load(shipped("weights", "turtlebot4_paper.safetensors"))
     fullest = paper.net.x_max.numpy()[paper.features.index("battery_fraction")]
     for run in new_days:
-        flagged = paper.outside(features(run, paper.features))
+        flagged = paper.net.outside(features(run, paper.features))
         assert flagged[run["battery_fraction"] > fullest + 1e-6].all()
         assert flagged[run["battery_fraction"] < fullest].mean() < 0.3
 

@@ -7,8 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.sources.harmonic import HarmonicField
-from magtwin.learn.inference.torch_map import TorchHarmonic, TorchMap
+from magtwin.learn.inference.torch_map import TorchMap
 
 QUARTERS = (0.0, 90.0, 180.0, 270.0)
 HEADINGS = [QUARTERS, (33.0,), (0.0, 180.0), (15.0, 100.0, 110.0, 300.0)]
@@ -127,42 +126,3 @@ def test_what_torch_cannot_look_up_is_refused():
     with pytest.raises(InputError, match="p_xy is on meta, the field on cpu"):
         torch_map(torch.zeros(2, device="meta"), 0.0)
     assert torch_map(torch.tensor([0.0, 0.7]), 0.0, outside="raise") > 0
-
-
-@pytest.fixture
-def harmonic():
-    rng = np.random.default_rng(4)
-    return HarmonicField(
-        p_world_dipole=np.column_stack([rng.uniform(-2, 2, (40, 2)), rng.uniform(-1, -0.3, 40)]),
-        m_world=rng.normal(0, 3, (40, 3)),
-        b_uniform_nt=(500.0, 20_000.0, -36_000.0),
-        hard_iron_nt=(300.0, -500.0, 800.0),
-        soft_iron=0.02 * rng.standard_normal((3, 3)),
-        p_base_sensor=(0.1, -0.05, 0.4),
-    )
-
-
-@pytest.mark.parametrize("height_m", [None, 0.9])
-def test_a_harmonic_field_in_torch_has_the_numbers_of_numpys(harmonic, height_m):
-    rng = np.random.default_rng(5)
-    p, yaw = rng.uniform(-2, 2, (6, 50, 2)), rng.uniform(-4, 4, 50)
-    ours = TorchHarmonic(harmonic)
-    got = ours(torch.tensor(p), torch.tensor(yaw), height_m=height_m)
-    assert_allclose(got, harmonic.magnitude_nt(p, yaw, height_m=height_m), rtol=1e-12)
-    above = np.concatenate([p, np.full((6, 50, 1), 0.3)], axis=-1)
-    assert_allclose(ours.field_nt(torch.tensor(above)), harmonic.field_nt(above), rtol=1e-11, atol=1e-7)
-
-
-def test_derivatives_of_a_harmonic_field_are_what_small_steps_say(harmonic):
-    rng = np.random.default_rng(6)
-    p = torch.tensor(rng.uniform(-2, 2, (8, 2)), requires_grad=True)
-    yaw = torch.tensor(rng.uniform(-4, 4, 8), requires_grad=True)
-    assert torch.autograd.gradcheck(TorchHarmonic(harmonic).magnitude_nt, (p, yaw), rtol=1e-5, atol=1e-2)
-
-
-def test_the_figures_of_a_harmonic_field_have_derivatives_too(harmonic):
-    ours = TorchHarmonic(harmonic)
-    iron = ours.hard_iron_nt.clone().requires_grad_()
-    ours.hard_iron_nt = iron
-    ours(torch.zeros(5, 2, dtype=torch.float64), torch.linspace(0, 3, 5)).sum().backward()
-    assert (iron.grad != 0).all()

@@ -86,7 +86,9 @@ def test_going_on_from_a_model_pulls_towards_it_not_towards_nothing(fitted):
     assert_allclose(far.coefficients_nt, fitted.model.coefficients_nt, rtol=1e-4)
     assert far.constant_nt == pytest.approx(fitted.model.constant_nt + 1000, abs=20)
     assert_array_equal(far.inputs.mean, fitted.model.inputs.mean)
-    with pytest.raises(InputError, match="the model to go on from has inputs yaw_sin, odom_v_x, battery_v"):
+    with pytest.raises(
+        InputError, match="the model to continue from has inputs yaw_sin, odom_v_x, battery_v"
+    ):
         fit_linear(x, y, of, features=("yaw_cos", "odom_v_x", "battery_v"), start=fitted.model)
 
 

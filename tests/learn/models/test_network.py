@@ -204,9 +204,9 @@ F8 = torch.float64
         ({"metadata": {"magtwin": "5"}}, "format version None, this magtwin reads 1; update magtwin"),
         (
             {"about": {"residual_sd_nt": math.inf}},
-            "'residual_sd_nt' of its metadata must be from 0 nT up and finite, got inf",
+            "'residual_sd_nt' of its metadata must be 0 nT or more and finite, got inf",
         ),
-        ({"about": {"facts": {"a": [1]}}}, "fact 'a' of its metadata must be text, a number, true or false"),
+        ({"about": {"facts": {"a": [1]}}}, "'a' of its metadata must be text, a number, true or false"),
         (
             {"layers__0__weight": torch.tensor(1.0)},
             "tensor 'layers.0.weight' is float32 (); a layer's have shape (out, in)",

@@ -244,10 +244,10 @@ def test_how_many_rows_are_done_is_told_step_by_step():
     ("options", "text"),
     [
         ({"seed": 1}, "the checkpoint of another training: its seed is"),
-        ({"lr": 1e-2}, "its lr is 0.003, here 0.01; go on with what it was begun with, or start anew"),
+        ({"lr": 1e-2}, "its lr is 0.003, here 0.01; resume with the same settings, or start anew"),
         ({"n": 599}, "the checkpoint of another training: its rows is"),
         ({"layers": (16, 16)}, "its layers is [32, 32], here [16, 16]"),
-        ({"patience": 0}, "patience must be 1 epoch at least, got 0; leave it out to run them all"),
+        ({"patience": 0}, "patience must be 1 epoch at least, got 0; leave it out to run all epochs"),
         ({"freeze": ["layers.0"]}, "freeze keeps layers of trained weights: give init too"),
         ({"checkpoint": None}, "there is no checkpoint to resume from; name one"),
     ],

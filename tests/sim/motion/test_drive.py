@@ -139,7 +139,7 @@ def test_wheels_that_slip_turn_more_than_the_robot_goes():
     ("figure", "value", "says"),
     [
         ("yaw_slip", 1.0, "yaw_slip of DriveSpec must be at least 0 and below 1"),
-        ("slip_s2_m", 1.2, r"slip_s2_m of DriveSpec must be below 1 at a_max 0\.9"),
+        ("slip_s2_m", 1.2, r"slip_s2_m of DriveSpec must be below 1 when multiplied by a_max 0\.9"),
         ("motor_lag_s", -0.1, "motor_lag_s of DriveSpec must not be below 0"),
         ("wheel_rate_max", 0.0, "wheel_rate_max of DriveSpec must be above 0"),
         ("motor_lag_s", float("nan"), "motor_lag_s of DriveSpec must be finite"),

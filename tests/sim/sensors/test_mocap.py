@@ -41,7 +41,7 @@ def test_a_body_that_is_taken_to_be_elsewhere_is_seen_there_whatever_its_heading
 
 
 def test_a_latency_that_drifts_below_0_is_refused():
-    with pytest.raises(InputError, match=r"takes its latency of 0.01 s below 0, got -0.02"):
+    with pytest.raises(InputError, match=r"must not make the latency of 0.01 s negative, got -0.02"):
         MocapSpec(latency_drift_s=-0.02)
 
 

@@ -139,13 +139,8 @@ def _of_model(model: HarmonicModel) -> Layers:
 def _solve(
     problem: Problem, like: HarmonicModel | None, progress: Progress | None, begins: list[Array]
 ) -> Solution:
-    """Fit, and learn the figures unless a model brings them.
-
-    Args:
-        problem: What is read where.
-        like: Model whose figures are taken.
-        progress: Called as progress(done, total, what).
-        begins: Uniform fields to begin with [nT]; the fit goes on from the likeliest.
+    """Fit, and learn the hyperparameters unless the model `like` has them; `begins` are uniform fields to
+    start from [nT].
     """
     if like is not None:
         return Solution(problem, like.figures, like.unknowns, problem.at(like.unknowns)).settle()

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.fit.harmonic.forward import Forward
-from magtwin.field.fit.harmonic.problem import Figures
+from magtwin.field.fit.harmonic.problem import Hyperparameters
 from magtwin.field.fit.methods import FittedModel, flat_poses
 from magtwin.field.grid import TURN
 from magtwin.field.sources.harmonic import HarmonicField
@@ -27,7 +27,7 @@ class HarmonicModel(FittedModel):
     field: HarmonicField  # The field and the platform
     parameters: Mapping[str, Any]  # Hyperparameters and unknowns, by name with unit
     noise_nt2: float  # Variance of one reading of the magnitude about the field, mean over the survey [nT^2]
-    figures: Figures  # Hyperparameters
+    figures: Hyperparameters  # Hyperparameters
     forward: Forward  # How readings follow from the unknowns
     unknowns: Array  # Most likely unknowns, shape (P,)
     prior_sd: Array  # Prior standard deviations of the unknowns, shape (P,)

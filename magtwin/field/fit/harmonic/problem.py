@@ -26,7 +26,7 @@ ONE_HEADING = 0.99
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Figures:
+class Hyperparameters:
     """Hyperparameters of a fit."""
 
     noise_nt: float  # Noise of a reading, or of a mean of several [nT]
@@ -35,7 +35,7 @@ class Figures:
     freedom: float  # Degrees of freedom of Student's t
     strength: Array  # Prior standard deviation of each component of each dipole's moment [A m^2], shape (D,)
 
-    def change(self, before: "Figures") -> float:
+    def change(self, before: "Hyperparameters") -> float:
         """Logarithmic difference to other hyperparameters: of the noise, or RMS of the strengths."""
         moved = np.sqrt(np.mean(np.log(self.strength / before.strength) ** 2))
         return float(max(abs(np.log(self.noise_nt / before.noise_nt)), moved))
@@ -137,14 +137,14 @@ class Problem:
         """Predictions for every row, with derivatives."""
         return self.forward.read(unknowns, self.p_xy, self.yaw, vectors=self.vectors)
 
-    def first(self) -> Figures:
+    def first(self) -> Hyperparameters:
         """Initial hyperparameters: strengths that give the field's spread, and small noises."""
         spread = float(self.read_nt.std(axis=0).max())
         depth = np.array(self.layers.depths)[self.layers.layer]
         above = depth < 0
         # a white layer of density s per metre makes a field of variance 3 (1e2 s)^2 pi / (8 d^4) or so
         density = max(spread, 1.0) * depth**2 / 100
-        return Figures(
+        return Hyperparameters(
             noise_nt=max(spread / 50, 1e-3),
             position_m=0.01,
             heading_rad=0.02 if np.any(self.rest_sd[3:]) else 0.0,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from magtwin.field.fit.harmonic.forward import SOFT, Reading
 from magtwin.field.fit.harmonic.model import HarmonicModel, between, surveyed, widened
 from magtwin.field.fit.harmonic.posterior import Posterior
-from magtwin.field.fit.harmonic.problem import Figures, Problem
+from magtwin.field.fit.harmonic.problem import Hyperparameters, Problem
 from magtwin.field.survey.readings import Readings
 from magtwin.verdict import Z_90
 
@@ -33,12 +33,12 @@ class Solution:
     """Unknowns, their predictions, and the hyperparameters."""
 
     problem: Problem
-    figures: Figures
+    figures: Hyperparameters
     unknowns: Array
     reading: Reading
 
     @classmethod
-    def start(cls, problem: Problem, figures: Figures, uniform: Array) -> "Solution":
+    def start(cls, problem: Problem, figures: Hyperparameters, uniform: Array) -> "Solution":
         """Start from a uniform field; the first step weights all readings equally and weakly."""
         unknowns = problem.mean.copy()
         count = 3 * len(figures.strength)
@@ -80,19 +80,19 @@ class Solution:
         return float((freedom + parts) / 2 * surprise.sum() + moved @ moved / 2)
 
     def posterior(self, precision: Array) -> Posterior:
-        """What the readings, of these precisions (N, C), tell of the unknowns in units of their priors."""
+        """Posterior of the unknowns, in units of their priors, for reading precisions (N, C)."""
         return Posterior.of(self._rows() * np.sqrt(precision).reshape(-1, 1))
 
     def _rows(self) -> Array:
         return self.reading.jacobian.reshape(-1, self.reading.jacobian.shape[-1]) * self.prior_sd
 
     def _scaled(self) -> Array:
-        """The unknowns from their priors' means, in units of their standard deviations; 0 where held."""
+        """Unknowns minus their priors' means, in prior standard deviations; 0 for fixed ones."""
         sd = self.prior_sd
         return np.divide(self.unknowns - self.problem.mean, sd, out=np.zeros_like(sd), where=sd > 0)
 
     def _towards(self, precision: Array) -> Array:
-        """The unknowns that solve the problem made linear here."""
+        """Unknowns that solve the linearised problem."""
         posterior, root = self.posterior(precision), np.sqrt(precision).ravel()
         best = posterior.mean(root * self.off.ravel() + posterior.rows @ self._scaled())
         return np.asarray(self.problem.mean + self.prior_sd * best)
@@ -159,7 +159,7 @@ class Solution:
         tail = np.mean(np.log(weights) - weights) + psi(old) - np.log(old)
         half = TAILS / 2
         freedom = float(TAILS[np.argmax(half * np.log(half) - gammaln(half) + half * tail)])
-        learnt = Figures(
+        learnt = Hyperparameters(
             noise_nt=float(figures.noise_nt * scale[0]),
             position_m=float(figures.position_m * scale[1]),
             heading_rad=float(figures.heading_rad * scale[2]),

@@ -1,0 +1,1 @@
+"""Compensation of the platform's field by linear models of its attitude."""

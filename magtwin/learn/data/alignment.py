@@ -1,0 +1,349 @@
+"""Alignment: the place and time of a reading relative to the pose with its stamp, and its fit to a map."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.frames import into_base, wrap_angle, yaw_from_quat
+from magtwin.report import Figure, Report
+from magtwin.run.run import Run
+from magtwin.summary import Summarized, Summary
+
+Array = NDArray[np.float64]
+
+UNUSABLE = ("flag_lost_lock", "flag_pose_lost")
+"""Flags of a run whose readings have no label."""
+
+BLOCK_S = 5.0
+"""Length of blocks of readings with correlated errors [s]."""
+
+LATENCIES_S = np.arange(-0.4, 0.41, 0.02)
+"""Latencies that are tried before the best are refined [s]."""
+
+LEAST_ROWS = 200
+"""Least number of labelled readings for a fit."""
+
+LEVER_ARM_PRIOR_M = 0.05
+"""Prior standard deviation of each axis of the lever arm [m]."""
+
+LATENCY_PRIOR_S = 0.1
+"""Prior standard deviation of the latency [s]."""
+
+FIT_RATE_HZ = 20.0
+"""Highest rate of readings in the fit [Hz]."""
+
+SLOPE_S = 0.2
+"""Time over which rates of speed and turning are taken [s]; a motor's torque lasts about as long."""
+
+STARTS = 3
+"""Number of best latencies that are refined."""
+
+
+@dataclass(frozen=True, repr=False)
+class Alignment(Summarized):
+    """The place and time of a reading relative to the pose with its stamp."""
+
+    lever_arm_m: tuple[float, float] = (0.0, 0.0)
+    """Place of the sensor forward and left of the map's reference [m], in base_link axes."""
+
+    latency_s: float = 0.0
+    """Age of the reading at its stamp, beside the age of the pose [s]."""
+
+    lever_arm_sd_m: tuple[float, float] = (0.0, 0.0)
+    """Standard deviations of `lever_arm_m` [m]; 0 if it was given."""
+
+    latency_sd_s: float = 0.0
+    """Standard deviation of `latency_s` [s]; 0 if it was given."""
+
+    def __post_init__(self) -> None:
+        figures = (*self.lever_arm_m, self.latency_s, *self.lever_arm_sd_m, self.latency_sd_s)
+        if not np.all(np.isfinite(figures)):
+            raise InputError(f"an alignment must be finite, got {figures}")
+
+    def report(self, title: str = "Alignment") -> Report:
+        """Lever arm and latency, with their standard deviations."""
+        arm = [
+            Figure(f"lever arm, {way}", value, "m", sd)
+            for way, value, sd in zip(("forward", "left"), self.lever_arm_m, self.lever_arm_sd_m, strict=True)
+        ]
+        return Report(title, (*arm, Figure("latency", self.latency_s, "s", self.latency_sd_s)))
+
+    def _summary(self) -> Summary:
+        (x, y), (sx, sy) = self.lever_arm_m, self.lever_arm_sd_m
+        return Summary(
+            "Alignment",
+            (
+                ("lever arm", f"{x:.4g} +- {sx:.2g} m forward, {y:.4g} +- {sy:.2g} m left"),
+                ("latency", f"{self.latency_s:.4g} +- {self.latency_sd_s:.2g} s"),
+            ),
+        )
+
+
+def placed(run: Run, alignment: Alignment) -> tuple[Array, Array, Array]:
+    """Sensor's place (N, 2), heading (N,) and rates of x, y, yaw (N, 3) at the time of each reading.
+
+    The pose is that of motion capture if the run has it, else the true pose.
+    """
+    if {"mocap_p", "mocap_q_xyzw"} <= set(run):
+        p, yaw = run["mocap_p"][:, :2], np.unwrap(_filled(yaw_from_quat(run["mocap_q_xyzw"])))
+    else:
+        p, yaw = run["p_world_base"][:, :2], np.unwrap(run["yaw"])
+    t = run["t"]
+    pose = np.column_stack([p, yaw])
+    rates = np.gradient(pose, t, axis=0) if len(t) > 1 else np.zeros_like(pose)
+    if alignment.latency_s:
+        then = t - alignment.latency_s
+        pose = np.column_stack([np.interp(then, t, column, np.nan, np.nan) for column in pose.T])
+    forward, left = alignment.lever_arm_m
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    place = pose[:, :2] + np.column_stack([c * forward - s * left, s * forward + c * left])
+    return place, wrap_angle(pose[:, 2]), rates
+
+
+def usable(run: Run) -> NDArray[np.bool_]:
+    """Readings with lock and a pose, shape (N,)."""
+    good = np.ones(run.rows, bool)
+    for flag in UNUSABLE:
+        if flag in run:
+            good &= ~run[flag]
+    return good
+
+
+def slopes(gradient: Array, yaw: Array, rates: Array) -> Array:
+    """Change of the map per metre forward, metre left, and second of latency, shape (N, 3)."""
+    late = -np.sum(gradient * rates, axis=1)
+    return np.column_stack([into_base(gradient[:, :2], yaw), late])
+
+
+def fit_alignment(
+    runs: Sequence[Run],
+    field: AnomalyMap,
+    *,
+    lever_arm: bool = True,
+    latency: bool = True,
+    rounds: int = 20,
+    prior_sd: tuple[float, float] = (LEVER_ARM_PRIOR_M, LATENCY_PRIOR_S),
+    progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
+) -> Alignment:
+    """Lever arm and latency with which readings agree best with a map.
+
+    Least squares on label = c + platform + gradient terms. c is a constant of each run, and the gradient
+    terms are the map's first order in both,
+
+        map(p(t - tau) + R l) = map(p) + (R^T grad B) . l - tau dB/dt,
+
+    linearised again until they converge, from the `STARTS` best of `LATENCIES_S`; the likeliest result is
+    returned. The platform terms are fixed to the robot and depend on its heading: iron, turning, speed, their
+    rates, LiDAR and battery current. Without them iron would pass for a lever arm, and the motors' torque
+    before a turn for a latency. The covariance V comes from blocks of `BLOCK_S` with correlated errors. On a
+    straight line at one speed a forward lever arm and a latency are the same, so both have a weak prior of
+    covariance P around 0. The estimate is P (P + V)^-1 times the least squares'.
+
+    Args:
+        runs: Runs of one robot that turns and drives at several speeds, as for `magtwin.learn.data.labels`.
+        field: The map.
+        lever_arm: Fit the lever arm; otherwise it is 0.
+        latency: Fit the latency; otherwise it is 0.
+        rounds: Most linearisations of each start.
+        prior_sd: Prior standard deviations of a lever arm [m] and of a latency [s].
+        progress: Called as progress(done, total, what), once per linearisation.
+
+    Raises:
+        InputError: Fewer than `LEAST_ROWS` readings have a label, or nothing is to be fitted.
+    """
+    if not (lever_arm or latency):
+        raise InputError("neither the lever arm nor the latency is to be fitted; name one")
+    if not all(0 < sd < np.inf for sd in prior_sd):
+        raise InputError(f"prior_sd must be above 0 and finite, got {prior_sd}")
+    known = 0
+    for run in runs:
+        p, yaw, _ = placed(run, Alignment())
+        known += int(np.isfinite(field.lookup(p, yaw) + run["b_measured_nt"])[usable(run)].sum())
+    if known < LEAST_ROWS:
+        raise InputError(
+            f"{known} readings have a label on the map {field.name!r}, too few to fit lever arm and latency: "
+            f"it takes {LEAST_ROWS}; do the runs lie on the map?"
+        )
+    free = np.array([lever_arm, lever_arm, latency])
+    prior = np.array([prior_sd[0], prior_sd[0], prior_sd[1]])[free] ** 2
+    fit = _Fit(runs, field, free, prior)
+    starts = [np.zeros(3)]
+    if latency:
+        tried = np.zeros((len(LATENCIES_S), 3))
+        tried[:, 2] = LATENCIES_S
+        residuals = []
+        for k, place in enumerate(tried):
+            progress(k, len(tried) + STARTS * rounds, "latencies")
+            residuals.append(fit.at(place).promised)
+        starts = [tried[i] for i in np.argsort(residuals)[:STARTS]]
+    fit.alike = fit.at(starts[0]).alike
+    before, most = (len(LATENCIES_S) if latency else 0), len(starts) * rounds
+
+    def descended(k: int, start: Array) -> _Linearised:
+        done = before + k * rounds
+        return _descend(fit, start, rounds, lambda j: progress(done + j, before + most, "rounds"))
+
+    best = min((descended(k, start) for k, start in enumerate(starts)), key=lambda result: result.cost)
+    progress(before + most, before + most, "rounds")
+    sd = np.zeros(3)
+    sd[free] = np.sqrt(np.diag(best.covariance))
+    forward, left, late = best.place.tolist()
+    return Alignment((forward, left), late, (float(sd[0]), float(sd[1])), float(sd[2]))
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    """The least squares of an alignment around a place (forward, left, latency)."""
+
+    place: Array
+    wanted: Array
+    """Solution of least squares and prior, shape (3,)."""
+    covariance: Array
+    """Posterior covariance of the free parameters."""
+    cost: float
+    """Twice the negative logarithm of the posterior of the place, up to a constant."""
+    promised: float
+    """Mean square residual of the solution [nT^2]."""
+    alike: float
+    """Number of readings that err as one."""
+
+
+def _descend(fit: "_Fit", start: Array, rounds: int, report: Callable[[int], Any]) -> _Linearised:
+    """Iterate from a start; a step that raises the cost is halved."""
+    here = fit.at(start)
+    for k in range(rounds):
+        report(k)
+        step = here.wanted - here.place
+        sd = np.sqrt(np.diag(here.covariance))
+        if np.all(np.abs(step[fit.free]) < 1e-3 * sd):
+            break
+        for share in (1.0, 0.5, 0.25, 0.125):
+            there = fit.at(here.place + share * step)
+            if there.cost < here.cost:
+                break
+        else:
+            break
+        here = there
+    return here
+
+
+class _Fit:
+    """Thinned readings and a map."""
+
+    def __init__(self, runs: Sequence[Run], field: AnomalyMap, free: NDArray[np.bool_], prior: Array) -> None:
+        self.field, self.free, self.prior = field, free, prior
+        self.alike = 1.0
+        self.runs = []
+        for run in runs:
+            step = float(np.median(np.diff(run["t"]))) if run.rows > 1 else 1.0
+            every = max(1, round(1 / (step * FIT_RATE_HZ)))
+            self.runs.append((run, np.arange(0, run.rows, every), usable(run)))
+
+    def at(self, place: Array) -> _Linearised:
+        """The least squares around a place."""
+        alignment = Alignment((float(place[0]), float(place[1])), float(place[2]))
+        parts_x, parts_y, parts_block, blocks = [], [], [], 0
+        for run, rows, good in self.runs:
+            p, yaw, rates = (values[rows] for values in placed(run, alignment))
+            value, gradient = self.field.lookup_with_gradient(p, yaw)
+            label = run["b_measured_nt"][rows] - value
+            matrix = np.column_stack(
+                [slopes(gradient, yaw, rates)[:, self.free], _platform(run, rows, yaw, rates)]
+            )
+            kept = good[rows] & np.isfinite(label) & np.isfinite(gradient).all(axis=1)
+            kept &= np.isfinite(matrix).all(axis=1)
+            if not kept.any():
+                continue
+            matrix = matrix[kept]
+            parts_x.append(matrix - matrix.mean(axis=0))
+            parts_y.append(label[kept] - label[kept].mean())
+            block = ((run["t"][rows][kept] - run["t"][0]) // BLOCK_S).astype(int)
+            parts_block.append(blocks + np.unique(block, return_inverse=True)[1])
+            blocks = int(parts_block[-1][-1]) + 1
+        if not parts_x:
+            return _Linearised(place, place, np.diag(self.prior), np.inf, np.inf, 1.0)
+        x, y, block = np.vstack(parts_x), np.concatenate(parts_y), np.concatenate(parts_block)
+        count = len(self.prior)
+        left = _residual(x[:, count:], np.column_stack([x[:, :count], y]))
+        return self._solved(place, left[:, :-1], left[:, -1], block)
+
+    def _solved(self, place: Array, x: Array, y: Array, block: NDArray[np.intp]) -> _Linearised:
+        rows, at = len(y), place[self.free]
+        scale = np.sqrt(np.mean(x**2, axis=0))
+        scale[scale == 0] = 1.0  # on a constant map all places are alike
+        x = x / scale
+        normal = x.T @ x
+        inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
+        solved = inverse @ (x.T @ y)
+        error = y - x @ solved
+        promised = max(float(np.mean(error**2)), 1e-12)
+        score = np.zeros((int(block.max()) + 1, x.shape[1]))
+        np.add.at(score, block, x * error[:, None])
+        # few blocks underestimate their own scatter
+        few = len(score) / max(len(score) - x.shape[1], 1)
+        blocked = few * (inverse @ (score.T @ score) @ inverse)
+        alike = np.trace(blocked) / max(promised * np.trace(inverse), 1e-300)
+        # the pseudo-inverse has variance 0 in directions without information; there the prior holds
+        values, vectors = np.linalg.eigh(normal)
+        blind = vectors[:, values <= 1e-10 * values[-1]]
+        unknown = 1e12 * blind @ blind.T
+        prior = np.diag(self.prior)
+
+        def gain(spread: NDArray[Any]) -> Array:
+            spread = (spread + unknown) / np.outer(scale, scale)
+            return prior @ np.linalg.inv(prior + spread)
+
+        wanted = place.copy()
+        wanted[self.free] = gain(self.alike * promised * inverse) @ (at + solved / scale)
+        covariance = prior - gain(blocked) @ prior
+        left = max(float(np.mean(y**2)), 1e-12)
+        cost = rows / self.alike * np.log(left) + float(np.sum(at**2 / self.prior))
+        return _Linearised(place, wanted, (covariance + covariance.T) / 2, cost, promised, max(alike, 1.0))
+
+
+def _filled(yaw: Array) -> Array:
+    """Headings with gaps filled by the last known one, so that they can be unwrapped."""
+    known = np.isfinite(yaw)
+    if known.all() or not known.any():
+        return yaw
+    held = np.maximum.accumulate(np.where(known, np.arange(len(yaw)), -1))
+    return np.where(held >= 0, yaw[np.maximum(held, 0)], yaw[np.argmax(known)])
+
+
+def _platform(run: Run, rows: NDArray[np.intp], yaw: Array, rates: Array) -> Array:
+    """Columns (M, K) for fields fixed to the platform, by heading.
+
+    The currents are a constant, speed and turning (eddy currents, drag), their rates (motor torque), LiDAR
+    and battery.
+    """
+    t, ahead = run["t"], np.cos(yaw) * rates[:, 0] + np.sin(yaw) * rates[:, 1]
+    speed = run["odom_v"][:, 0] if "odom_v" in run else np.interp(t, t[rows], ahead)
+    turning = run["odom_w"][:, 2] if "odom_w" in run else np.interp(t, t[rows], rates[:, 2])
+    currents = [np.ones(len(rows)), speed[rows], turning[rows]]
+    currents += [_slope(values, t, t[rows]) for values in (speed, turning)]
+    currents += [run["lidar_on"][rows].astype(float)] if "lidar_on" in run else []
+    currents += [run["battery_a"][rows]] if "battery_a" in run else []
+    ways = (np.ones(len(rows)), np.cos(yaw), np.sin(yaw))
+    return np.column_stack(
+        [*(current * way for current in currents for way in ways), np.cos(2 * yaw), np.sin(2 * yaw)]
+    )
+
+
+def _slope(values: Array, t: Array, at: Array) -> Array:
+    """Rate of a signal, over `SLOPE_S` around each instant."""
+    early, late = (np.interp(at + way * SLOPE_S / 2, t, values) for way in (-1, 1))
+    return (late - early) / SLOPE_S
+
+
+def _residual(platform: Array, values: Array) -> Array:
+    """Columns (N, M) less their fit by platform terms (N, K); 0 if the terms explain a column fully."""
+    scale = np.sqrt(np.mean(platform**2, axis=0))
+    platform = platform[:, scale > 0] / scale[scale > 0]
+    left = values - platform @ np.linalg.lstsq(platform, values, rcond=1e-10)[0]
+    explained = np.sum(left**2, axis=0) <= 1e-16 * np.sum(values**2, axis=0)
+    return np.where(explained, 0.0, left)

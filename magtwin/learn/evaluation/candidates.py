@@ -1,0 +1,257 @@
+"""Candidates: models with the map, lever arm and latency that they learned with."""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.learn.data.alignment import Alignment
+from magtwin.learn.data.dataset import Dataset, values_sha256
+from magtwin.learn.data.features import CARRIED, CIRCULAR, FEATURES, GRADIENT
+from magtwin.learn.data.origin import same_map
+from magtwin.learn.evaluation.training_rows import alignment_on, training_rows
+from magtwin.learn.inference.magnetometer import NeuralMagnetometer, Read
+from magtwin.learn.models.linear import fit_linear
+from magtwin.run.run import Run
+from magtwin.summary import Summarized, Summary, listed
+
+NAIVE = "naive"
+"""Name of the naive model."""
+
+
+class Model(Protocol):
+    """Predicts a disturbance; a `NeuralMagnetometer` is one."""
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """Names of its inputs."""
+
+    def read(self, runs: Sequence[Run]) -> list[Read]:
+        """Disturbances, their standard deviations, and rows outside the training ranges, of each run."""
+
+
+@dataclass(frozen=True)
+class Mean:
+    """The naive model: the mean training label, whatever the inputs."""
+
+    mean_nt: float
+    """Mean of the training labels [nT]."""
+
+    sd_nt: float
+    """Their standard deviation [nT]; nan if unknown."""
+
+    features: tuple[str, ...] = ()
+    """It has no inputs."""
+
+    def read(self, runs: Sequence[Run]) -> list[Read]:
+        """The mean and its standard deviation for each row."""
+        counts = [run.rows for run in runs]
+        return [Read(np.full(n, self.mean_nt), np.full(n, self.sd_nt), np.zeros(n, bool)) for n in counts]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class NamedMap(Summarized):
+    """A map of an evaluation, with the checksums by which weights refer to it."""
+
+    name: str
+    """What to call it, such as the name of its file."""
+
+    field: AnomalyMap
+
+    checksums: frozenset[str]
+    """SHA-256 of its file and of its values."""
+
+    def _summary(self) -> Summary:
+        return Summary(f"NamedMap {self.name}", self.field._summary().rows)
+
+
+def named_map(name: str, anomaly_map: AnomalyMap, *checksums: str) -> NamedMap:
+    """A map with its checksums.
+
+    Args:
+        name: What to call it.
+        anomaly_map: The map.
+        checksums: SHA-256 of its file, if it has one. That of its values is added.
+    """
+    return NamedMap(name, anomaly_map, frozenset({*filter(None, checksums), values_sha256(anomaly_map)}))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Candidate(Summarized):
+    """A model with the map, lever arm and latency that it learned with."""
+
+    name: str
+    model: Model
+    map: NamedMap
+    alignment: Alignment = field(default_factory=Alignment)
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    """Metadata of its file, or how it was fitted."""
+
+    def _summary(self) -> Summary:
+        (x, y), latency = self.alignment.lever_arm_m, self.alignment.latency_s
+        return Summary(
+            f"Candidate {self.name}: on map {self.map.name}",
+            (
+                ("inputs", f"{len(self.model.features)}: {listed(self.model.features)}"),
+                ("alignment", f"lever arm ({x:.3g}, {y:.3g}) m, latency {latency:.3g} s"),
+            ),
+        )
+
+
+def candidate_of(
+    model: NeuralMagnetometer | str | os.PathLike[str],
+    maps: Sequence[NamedMap],
+    *,
+    any_map: bool = False,
+    name: str = "",
+) -> Candidate:
+    """A magnetometer or weights file, with the map that it was trained on, its lever arm and its latency.
+
+    Args:
+        model: The magnetometer, or weights of any kind.
+        maps: The maps at hand. Weights that name no map, such as the released ones, use the first.
+        any_map: Use the first map if the right one is not at hand.
+        name: What to call it. Default: the name of the file.
+
+    Raises:
+        InputError: Not a weights file, or it was trained on a map that is not at hand.
+    """
+    magnetometer = model if isinstance(model, NeuralMagnetometer) else NeuralMagnetometer.load(model)
+    metadata = dict(magnetometer.net.metadata)
+    wanted = str(metadata.get("map_sha256", ""))
+    fits = [known for known in maps if wanted in known.checksums]
+    fits = fits or [known for known in maps if wanted and same_map(metadata, known.field)]
+    if wanted and not fits and not any_map:
+        held = "; ".join(f"{known.name} has {', '.join(sorted(known.checksums))}" for known in maps)
+        raise InputError(
+            f"{magnetometer.name}: was trained on the map {metadata.get('map', '')!r} of sha256 {wanted}, "
+            f"and {held}; name its own map with --map, or use the first one all the same with --any-map"
+        )
+    used = fits[0] if fits else maps[0]
+    about = {"sha256": magnetometer.sha256, **metadata} if magnetometer.sha256 else metadata
+    name = name or magnetometer.name or magnetometer.net.kind
+    return Candidate(name, magnetometer, used, alignment_of(metadata, name), about)
+
+
+def alignment_of(metadata: Mapping[str, Any], where: object = "") -> Alignment:
+    """Lever arm and latency in the metadata of weights; 0 if they have none.
+
+    Raises:
+        InputError: They are no numbers.
+    """
+    try:
+        arm = [float(part) for part in str(metadata.get("lever_arm_m", "0, 0")).split(",")]
+        forward, left = arm
+        return Alignment((forward, left), float(metadata.get("latency_s", 0.0)))
+    except ValueError as error:
+        raise InputError(
+            f"{where}: lever_arm_m {metadata.get('lever_arm_m')!r} and latency_s "
+            f"{metadata.get('latency_s')!r} of its metadata are no lengths and time ({error}); train it again"
+        ) from error
+
+
+def naive(
+    named: NamedMap,
+    *,
+    dataset: Dataset | None = None,
+    names: Sequence[str] | None = None,
+    weights: Sequence[Candidate] = (),
+) -> Candidate:
+    """The naive model: a map and the mean training label on every row.
+
+    Args:
+        named: The map; in the paper the trilinear one.
+        dataset: Training recordings, which are labelled on this map.
+        names: Which of them. Default: all.
+        weights: Without a data set, models that were trained on this map; the mean label of the first is
+            used.
+
+    Raises:
+        InputError: The mean is not known.
+    """
+    if dataset is not None:
+        labels = training_rows(dataset, names, named.field, (), alignment_on(dataset, named.checksums)).y
+        model = Mean(float(labels.mean()), float(labels.std()))
+        alignment = alignment_on(dataset, named.checksums)
+        return Candidate(NAIVE, model, named, alignment, {"fitted to": dataset.folder.name})
+    for candidate in weights:
+        mean = candidate.metadata.get("label_mean_nt")
+        fits = candidate.metadata.get("map_sha256") in named.checksums or same_map(
+            candidate.metadata, named.field
+        )
+        if fits and isinstance(mean, int | float):
+            sd = candidate.metadata.get("label_sd_nt", math.nan)
+            about = {"mean label of": candidate.name}
+            return Candidate(NAIVE, Mean(float(mean), float(sd)), named, candidate.alignment, about)
+    raise InputError(
+        f"the mean training label on the map {named.name}, which the naive model needs, is not known: give "
+        "the training recordings (--train SET), or weights trained on it, with that map first"
+    )
+
+
+def tolles_lawson(
+    named: NamedMap,
+    dataset: Dataset,
+    names: Sequence[str] | None = None,
+    *,
+    gradient: bool = False,
+    alignment: Alignment | None = None,
+) -> Candidate:
+    """A ridge regression of Tolles and Lawson's kind: heading, motion, currents, and the map's gradient.
+
+    Args:
+        named: The map.
+        dataset: Training recordings, which are labelled on it.
+        names: Which of them. Default: all.
+        gradient: Add the terms of a lever arm and a latency to the inputs.
+        alignment: Lever arm and latency. Default: those of the data set if it was labelled on this map, else
+            0.
+
+    Raises:
+        InputError: A recording has no label on the map.
+    """
+    given = alignment is not None
+    alignment = alignment or alignment_on(dataset, named.checksums)
+    wanted = (*CIRCULAR, *GRADIENT, *CARRIED) if gradient else CIRCULAR
+    able = set(dataset.columns) | {"yaw", "b_map_gradient_nt_m"}
+    inputs = tuple(name for name in wanted if set(FEATURES[name].columns) <= able)
+    rows = training_rows(dataset, names, named.field, inputs, alignment)
+    model = fit_linear(rows.x, rows.y, rows.session, features=inputs, sd=rows.sd).model
+    kind = "Tolles-Lawson and gradient" if gradient else "Tolles-Lawson"
+    about = {"fitted to": dataset.folder.name, "penalty": model.penalty, "training rows": len(rows.y)}
+    name = f"{kind}, {named.name}{' aligned' * given}"
+    return Candidate(name, NeuralMagnetometer(model, name=name), named, alignment, about)
+
+
+def tolles_lawson_variants(
+    maps: Sequence[NamedMap],
+    candidates: Sequence[Candidate],
+    dataset: Dataset,
+    names: Sequence[str] | None = None,
+) -> list[Candidate]:
+    """Tolles and Lawson's ridge on each map: plain, with the candidates' alignment, and with gradient terms.
+
+    Args:
+        maps: The maps.
+        candidates: Models whose lever arm and latency are used.
+        dataset: Training recordings.
+        names: Which of them. Default: all.
+    """
+    variants = []
+    for named in maps:
+        fitted = [
+            candidate.alignment
+            for candidate in candidates
+            if candidate.map is named and candidate.alignment != Alignment()
+        ]
+        variants.append(tolles_lawson(named, dataset, names))
+        if fitted and variants[-1].alignment == Alignment():
+            variants.append(tolles_lawson(named, dataset, names, alignment=fitted[0]))
+        aligned = variants[-1].alignment if variants[-1].alignment in fitted else None
+        variants.append(tolles_lawson(named, dataset, names, gradient=True, alignment=aligned))
+    return variants

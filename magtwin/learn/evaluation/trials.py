@@ -1,0 +1,146 @@
+"""Trials: recordings that models are judged by, and checks that no model learned from them."""
+
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.files import sha256
+from magtwin.learn.data.dataset import MANIFEST, Dataset
+from magtwin.learn.data.split import split
+from magtwin.learn.evaluation.candidates import Candidate
+from magtwin.run.run import Run
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A recording to judge by."""
+
+    name: str
+    read: Callable[[], Run]
+    session: str = ""
+    """Its session. Default: that in the run's metadata, else the name."""
+    path: str = ""
+    """The path that was driven. Default: that in the run's metadata, else the name."""
+
+
+def session_and_path(run: Run, trial: Trial) -> tuple[str, str]:
+    """Session and path of a trial; see `Trial`."""
+    session, metadata = trial.session, run.metadata
+    if not session and "session" in metadata:
+        session = f"{metadata['session_seed']}-" if "session_seed" in metadata else ""
+        session += str(metadata["session"])
+    return session or trial.name, trial.path or str(metadata.get("path", "")) or trial.name
+
+
+def trials_of(dataset: Dataset, names: Sequence[str]) -> list[Trial]:
+    """Trials of recordings of a data set."""
+
+    def read(name: str) -> Run:
+        return next(run for _, run in dataset.runs([name]))
+
+    recordings = [dataset.recording(name) for name in names]
+    return [
+        Trial(recording.name, partial(read, recording.name), recording.session, recording.path)
+        for recording in recordings
+    ]
+
+
+def unseen(dataset: Dataset, candidates: Sequence[Candidate]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Recordings that no candidate learned from, and recordings that each of them may have learned from.
+
+    If weights were trained on this data set, the first are their test recordings, by the split in their
+    metadata. Otherwise both are all recordings.
+
+    Raises:
+        InputError: Nothing is left, or weights were trained on rows of every recording.
+    """
+    checksum = sha256(dataset.folder / MANIFEST)
+    names, learned = list(dataset.names), list(dataset.names)
+    for candidate in candidates:
+        if candidate.metadata.get("dataset_sha256") != checksum:
+            continue
+        try:
+            config = tomllib.loads(str(candidate.metadata.get("config", "")))
+            by, seed, hold_out = config["split"], int(config["seed"]), tuple(config.get("hold_out", ()))
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(
+                f"{candidate.name}: was trained on {dataset.folder}, and its metadata lack the split "
+                f"({error}); judge it by recordings of another set"
+            ) from error
+        if by == "row":
+            raise InputError(
+                f"{candidate.name}: was trained on rows of every recording of {dataset.folder}; judge it by "
+                "others"
+            )
+        deals = np.random.default_rng(seed).spawn(2)[0]
+        parts = split(dataset.recordings, by, hold_out=hold_out, rng=deals)
+        names = [name for name in names if name in parts.test]
+        learned = [name for name in learned if name in parts.train]
+    if not names:
+        raise InputError(
+            f"{dataset.folder}: the models learned from every recording of it; judge them by others"
+        )
+    return tuple(names), tuple(learned)
+
+
+def unlearned(trials: Sequence[Trial], dataset: Dataset, names: Sequence[str] | None = None) -> list[Trial]:
+    """Trials that refuse to be read if a training set holds them, under any name.
+
+    Args:
+        trials: Recordings to judge by.
+        dataset: Training recordings, possibly thinned.
+        names: Which of them. Default: all.
+    """
+    learned: dict[tuple[bytes, bytes], list[tuple[str, Array, Array]]] = {}
+    for recording, run in dataset.runs(names):
+        t, b = run["t"], run["b_measured_nt"]
+        learned.setdefault(_first(t, b), []).append((recording.name, t, b))
+
+    def read(trial: Trial) -> Run:
+        run = trial.read()
+        t, b = run["t"], run.get("b_measured_nt")
+        if b is None or not run.rows:
+            return run
+        for name, learned_t, learned_b in learned.get(_first(t, b), []):
+            at = np.minimum(np.searchsorted(t, learned_t), run.rows - 1)
+            common = t[at] == learned_t
+            if common.sum() > 1 and np.array_equal(b[at][common], learned_b[common], equal_nan=True):
+                raise InputError(
+                    f"{trial.name}: is {name!r} of {dataset.folder}, which was learned from; judge by others"
+                )
+        return run
+
+    return [replace(trial, read=partial(read, trial)) for trial in trials]
+
+
+def _first(t: Array, b: Array) -> tuple[bytes, bytes]:
+    """First time and first reading of a recording; thinning keeps both."""
+    return t[:1].tobytes(), np.nan_to_num(b[:1], nan=np.inf).tobytes()
+
+
+def check_apart(train: Dataset, names: Sequence[str], judged: Dataset, of: Sequence[str]) -> None:
+    """Refuse to judge baselines by recordings that they are fitted to.
+
+    Raises:
+        InputError: A recording is on both sides, by name, session, path and length.
+    """
+
+    def known(dataset: Dataset, kept: Sequence[str]) -> set[tuple[Any, ...]]:
+        recordings = [dataset.recording(name) for name in kept]
+        return {(each.name, each.session, each.path, each.rows, each.duration_s) for each in recordings}
+
+    both = known(train, names) & known(judged, of)
+    if both:
+        name = sorted(key[0] for key in both)[0]
+        raise InputError(
+            f"{name!r} and {len(both) - 1} more recordings of {judged.folder} are in {train.folder} too, "
+            "which baselines learn from; judge by others"
+        )

@@ -1,0 +1,339 @@
+"""Data sets and evaluations from files: `magtwin dataset build` and `magtwin evaluate` in Python.
+
+Training is `magtwin.learn.training.train.train`.
+"""
+
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from magtwin.errors import InputError, find
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.files import existing, sha256
+from magtwin.io.formats import read_run
+from magtwin.io.surveys.maps import open_map
+from magtwin.learn.data.alignment import Alignment
+from magtwin.learn.data.dataset import MANIFEST, Dataset, open_dataset
+from magtwin.learn.data.dataset import build_dataset as build
+from magtwin.learn.data.recording import Source, sources_of
+from magtwin.learn.evaluation.budget import Budget, TrueError, Truth, budgets, steps, true_errors
+from magtwin.learn.evaluation.candidates import (
+    NAIVE,
+    Candidate,
+    NamedMap,
+    candidate_of,
+    naive,
+    named_map,
+    tolles_lawson,
+    tolles_lawson_variants,
+)
+from magtwin.learn.evaluation.evaluate import evaluate as judge
+from magtwin.learn.evaluation.evaluation import Evaluation
+from magtwin.learn.evaluation.trials import Trial, check_apart, trials_of, unlearned, unseen
+from magtwin.learn.inference.magnetometer import NeuralMagnetometer
+from magtwin.learn.models.predictor import Predictor
+from magtwin.run.run import Run
+from magtwin.spec.scene import Scene
+from magtwin.twin import Twin, check_scene, in_session_of, open_twin
+from magtwin.usd.scene import read_scene
+
+File = str | os.PathLike[str]
+By = Literal["metadata", "file", "folder"]
+Progress = Callable[[int, int, str], Any]
+
+
+def build_dataset(
+    runs: Mapping[str, Run] | Sequence[File] | File,
+    *,
+    out: File,
+    anomaly_map: AnomalyMap | File,
+    alignment: Literal["fit"] | Alignment | None = None,
+    session_by: By = "metadata",
+    path_by: By = "metadata",
+    rate_hz: float | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+    **reading: Any,
+) -> Dataset:
+    """Label recordings on a map and write them as a data set: measured total field minus the map.
+
+    Args:
+        runs: Runs by name, or files of any kind that `magtwin.load_run` reads. A folder of `magtwin sweep`
+            stands for its runs.
+        out: Folder to make.
+        anomaly_map: The map, a map layer or stage, or a folder of survey CSVs.
+        alignment: Lever arm and latency of the sensor; "fit" fits them to all recordings. None uses pose and
+            reading as they are.
+        session_by: Where the session of a file comes from: "metadata" (else its name), "file" (its
+            name) or "folder".
+        path_by: Where the driven path comes from, likewise.
+        rate_hz: Highest rate of readings to keep [Hz]. Default: all.
+        force: Replace an existing folder.
+        progress: Called with the recordings done, their number, and the name of the next.
+        **reading: Options of `magtwin.io.formats.read_run`: topics, unit, columns.
+
+    Raises:
+        InputError: A file cannot be read, two recordings have one name, one has no label on the map, lacks a
+            pose or a field, all labels are the same, or the folder exists.
+    """
+    if isinstance(runs, Mapping):
+        sources = sources_of(runs)
+    else:
+        sources = sources_of_files(runs, session_by=session_by, path_by=path_by, **reading)
+    checksum = ""
+    if not isinstance(anomaly_map, AnomalyMap):
+        path = Path(anomaly_map)
+        anomaly_map, checksum = open_map(path), sha256(path) if path.is_file() else ""
+    return build(
+        sources,
+        anomaly_map,
+        out,
+        alignment=alignment,
+        map_sha256=checksum,
+        rate_hz=rate_hz,
+        force=force,
+        progress=progress,
+    )
+
+
+def sources_of_files(
+    files: Sequence[File] | File, *, session_by: By = "metadata", path_by: By = "metadata", **reading: Any
+) -> list[Source]:
+    """Files of recordings as sources of a data set; the arguments are those of `build_dataset`.
+
+    A recording has the name of its file, preceded by that of its folder if two files have one name.
+    """
+
+    def named(word: str) -> str:
+        return re.sub(r"\.\.+", ".", re.sub(r"[^A-Za-z0-9_.+-]", "_", word)).lstrip(".+-")[:180] or "_"
+
+    paths: list[Path] = []
+    for path in map(Path, [files] if isinstance(files, str | os.PathLike) else files):
+        inside = [path]
+        if (path / "runs.csv").is_file():
+            inside = sorted(path.glob("run_*.parquet"))
+            if not inside:
+                raise InputError(f"{path}: its runs.csv stands alone, without run_*.parquet")
+        paths += inside
+    short = [named(existing(path, "recording").resolve().stem) for path in paths]
+    long = [named(f"{path.resolve().parent.name}_{path.resolve().stem}") for path in paths]
+    names = [name if short.count(name) == 1 else other for name, other in zip(short, long, strict=True)]
+    by: dict[str, Callable[[Path, str], str]] = {
+        "metadata": lambda path, name: "",
+        "file": lambda path, name: name,
+        "folder": lambda path, name: path.resolve().parent.name or name,
+    }
+    session, driven = find("source of sessions", session_by, by), find("source of paths", path_by, by)
+    return [
+        Source(name, partial(read_run, path, **reading), session(path, name), driven(path, name))
+        for path, name in zip(paths, names, strict=True)
+    ]
+
+
+def evaluate(
+    models: Sequence[File | Predictor | Candidate] | File | Predictor | Candidate,
+    recordings: Dataset | Mapping[str, Run] | Sequence[File] | File,
+    *,
+    anomaly_map: Sequence[AnomalyMap | File] | AnomalyMap | File,
+    baseline: Literal["naive", "tolles-lawson"] | Candidate = "naive",
+    train: Dataset | File | None = None,
+    cases: Mapping[str, str] | None = None,
+    any_map: bool = False,
+    truth: bool = False,
+    seed: int = 0,
+    progress: Progress = lambda done, total, what: None,
+) -> Evaluation:
+    """Measure the errors of models on recordings that they never saw.
+
+    Args:
+        models: Weights files, predictors or candidates.
+        recordings: A data set or its folder (its recordings that no model learned from), runs by name, or
+            files of runs.
+        anomaly_map: Maps that the models were trained on, each found by its checksum. The first is the
+            baseline's, and that of weights that record no map.
+        baseline: The model that others are compared with: the mean training label, Tolles and Lawson's ridge
+            regression, or a candidate.
+        train: Data set that baselines are fitted to. With it, Tolles and Lawson's are evaluated on each map.
+            Default: the mean label in weights that were trained on the first map.
+        cases: Paths by row of the table, beside the paper's A to E, as {"D": "lawnmower.csv"}.
+        any_map: Use the first map for weights whose own is not at hand.
+        truth: Compare with the exact field of simulated runs instead of the reading.
+        seed: Seed of the intervals.
+        progress: Called with the recordings done, their number, and the name of the next.
+
+    Raises:
+        InputError: A file cannot be read, a model's map is not at hand, it learned from a recording, or a
+            recording lacks what a model or the evaluation needs.
+    """
+    maps = _named_maps([anomaly_map] if _single(anomaly_map) else anomaly_map)  # type: ignore[arg-type,list-item]
+    given: list[Any] = [models] if _single(models) or _is_model(models) else list(models)  # type: ignore[arg-type]
+    files = iter(short_names([Path(model) for model in given if _single(model)]))
+    candidates = []
+    for model in given:
+        if _single(model):
+            candidates.append(candidate_of(model, maps, any_map=any_map, name=next(files)))
+        elif isinstance(model, Candidate):
+            candidates.append(model)
+        else:
+            candidates.append(candidate_of(NeuralMagnetometer(model), maps, any_map=any_map))
+    learning = None if train is None else _dataset(train)
+    trials, learned = _trials(recordings, learning, candidates)
+    if isinstance(baseline, Candidate):
+        first = baseline
+    elif find("baseline", baseline, {NAIVE: True, "tolles-lawson": False}):
+        first = naive(maps[0], dataset=learning, names=learned, weights=candidates)
+    elif learning is not None:
+        first = tolles_lawson(maps[0], learning, learned)
+    else:
+        raise InputError("the baseline tolles-lawson is fitted to training recordings; give `train`")
+    if learning is not None:
+        variants = tolles_lawson_variants(maps, candidates, learning, learned)
+        candidates += [variant for variant in variants if variant.name != first.name]
+    evaluation = judge(
+        candidates,
+        trials,
+        baseline=first,
+        rng=np.random.default_rng(seed),
+        cases=cases,
+        truth=truth,
+        progress=progress,
+    )
+    return replace(evaluation, learned=tuple(learned))
+
+
+@dataclass(frozen=True)
+class ErrorBudget:
+    """What makes the errors of an evaluation's models; see `magtwin.learn.evaluation.budget`."""
+
+    budgets: tuple[Budget, ...]
+    map_errors: tuple[TrueError, ...]
+
+    order: tuple[int, ...]
+    """Models, step by step from the paper's configuration on."""
+
+    names: tuple[str, ...]
+    """Names of the models."""
+
+    def summary(self) -> dict[str, Any]:
+        """All figures as plain numbers and texts."""
+        return {
+            "models": [budget.summary() for budget in self.budgets],
+            "maps": {
+                error.map: {name: value for name, value in vars(error).items() if name != "map"}
+                for error in self.map_errors
+            },
+            "steps": [self.names[m] for m in self.order],
+        }
+
+
+def error_budget(
+    evaluation: Evaluation,
+    scene: File,
+    train: Dataset | File,
+    *,
+    progress: Progress = lambda done, total, what: None,
+) -> ErrorBudget:
+    """How much of the errors is map, lever arm, latency, sessions, platform and sensor, on a twin.
+
+    Args:
+        evaluation: An evaluation on runs of a twin.
+        scene: Stage of the twin that made the recordings and the training recordings.
+        train: Data set that the baselines are fitted to.
+        progress: Called with the models done, their number, and the name of the next.
+
+    Raises:
+        InputError: A recording has no truth, or is of another scene.
+    """
+    twins: dict[Any, Twin] = {}
+
+    def opened(kind: Any) -> Twin:
+        if kind not in twins:
+            twins[kind] = open_twin(Path(scene), magnetometer=kind)
+        return twins[kind]
+
+    def scene_in_session(name: str, run: Run) -> Scene:
+        of_session = in_session_of(opened(run.metadata.get("magnetometer")), run.metadata).scene
+        check_scene(of_session, run.metadata, name)
+        return of_session
+
+    truth = Truth(opened("physical").scene, scene_in_session)
+    order = steps(evaluation)
+    made = budgets(evaluation, order, truth, _dataset(train), evaluation.learned or None, progress=progress)
+    return ErrorBudget(tuple(made), tuple(true_errors(evaluation, truth)), tuple(order), evaluation.names)
+
+
+def map_of_scene(scene: File) -> Path:
+    """File of the map of a scene."""
+    return Path(read_scene(existing(scene, "scene"), check_network=False).map_layer)
+
+
+def short_names(files: Sequence[Path]) -> list[str]:
+    """Names of files: their stems, or more of their paths if two are alike.
+
+    Raises:
+        InputError: A file is named twice.
+    """
+    for name_of in (lambda path: path.stem, lambda path: path.name, str):
+        names = [name_of(path) for path in files]
+        if len(set(names)) == len(names):
+            return names
+    twice = next(path for path in files if list(files).count(path) > 1)
+    raise InputError(f"{twice} is named twice; name each file once")
+
+
+def _single(value: Any) -> bool:
+    return isinstance(value, str | os.PathLike | AnomalyMap)
+
+
+def _is_model(value: Any) -> bool:
+    return isinstance(value, Candidate) or hasattr(value, "predict")
+
+
+def _dataset(dataset: Dataset | File) -> Dataset:
+    return dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
+
+
+def _named_maps(maps: Sequence[AnomalyMap | File]) -> list[NamedMap]:
+    files = iter(short_names([Path(each) for each in maps if not isinstance(each, AnomalyMap)]))
+    named = []
+    for each in maps:
+        if isinstance(each, AnomalyMap):
+            named.append(named_map(each.name, each))
+        else:
+            path = existing(each, "map")
+            checksum = [sha256(path)] if path.is_file() else []
+            named.append(named_map(next(files), open_map(path), *checksum))
+    if not named:
+        raise InputError(
+            "no map: name those that the weights were trained on (--map), or the scene (--scene)"
+        )
+    return named
+
+
+def _trials(
+    recordings: Dataset | Mapping[str, Run] | Sequence[File] | File,
+    learning: Dataset | None,
+    candidates: Sequence[Candidate],
+) -> tuple[list[Trial], Sequence[str]]:
+    """Recordings to judge by, and the training recordings that baselines are fitted to."""
+    learned: Sequence[str] = () if learning is None else learning.names
+    is_set = isinstance(recordings, str | os.PathLike) and (Path(recordings) / MANIFEST).is_file()
+    if not (isinstance(recordings, Dataset) or is_set):
+        if isinstance(recordings, Mapping):
+            trials = [Trial(name, lambda run=run: run) for name, run in recordings.items()]  # type: ignore[misc]
+        else:
+            trials = [Trial(source.name, source.read) for source in sources_of_files(recordings)]  # type: ignore[arg-type]
+        return trials if learning is None else unlearned(trials, learning), learned
+    judged = _dataset(recordings)  # type: ignore[arg-type]
+    names, rest = unseen(judged, candidates)
+    if learning is not None:
+        if learning.folder.resolve() == judged.folder.resolve():
+            learned = tuple(name for name in rest if name not in names)
+        check_apart(learning, learned, judged, names)
+    return trials_of(judged, names), learned
