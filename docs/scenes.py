@@ -1,4 +1,4 @@
-"""Write scenes.md from the dataclasses that read a scene's TOML: `python docs/scenes.py`."""
+"""Write scenes.md from the dataclasses of a scene's TOML: `python docs/scenes.py`."""
 
 import ast
 import dataclasses
@@ -19,9 +19,8 @@ HERE = Path(__file__).resolve().parent
 INTRODUCTION = """\
 # Scenes: every key of a scene's TOML
 
-A scene is a TOML file. `magtwin scene FILE.toml --out DIR` makes a folder of USD layers from it, and
-`magtwin.author_scene("FILE.toml", "DIR")` does so in Python. `magtwin new room.toml` writes a commented
-file to start from:
+A scene is described by a TOML file: the room, its furniture, its field and its robots. From this file
+`magtwin scene` makes a folder of USD layers that you can simulate. Start from a commented example:
 
 ```
 magtwin new room.toml
@@ -29,56 +28,83 @@ magtwin scene room.toml --out room
 magtwin run room/room.usda
 ```
 
-The one table that a scene must have is `[robot]`. Lengths are in metres, angles in radians unless a name
-ends in `_deg`, fields in nT, magnetization in A/m.
-The world's origin is the middle of the floor; x and y run along its sides, z points up. File names are
-relative to the TOML. An unknown key is refused with the nearest known one, a wrong value with file and
-line.
+In Python, `magtwin.author_scene("room.toml", "room")` makes the same folder. A small scene:
+
+```toml
+name = "small"
+
+[robot]                      # the only required table
+asset = "turtlebot4"
+
+[earth]
+latitude_deg = 29.65
+longitude_deg = -82.35
+height_m = 50.0
+date = "2026-11-21"
+
+[[furniture]]
+name = "desk"
+kind = "desk"
+p_world = [0.0, 1.2, 0.0]
+```
+
+* **Units.** Lengths are in metres, angles in radians unless a name ends in `_deg`, fields in nT,
+  magnetization in A/m.
+* **Axes.** The world's origin is the middle of the floor. x and y run along its sides, z points up.
+* **File names** are relative to the TOML.
+* **Errors.** For an unknown key, the message proposes the nearest known one. For a wrong value, it gives
+  file and line.
 
 ## Where the field comes from
 
-* **A map, and nothing else**: the map is the truth, which a physical magnetometer reads with the robot's own
-  field. [own.md](own.md) shows how to bring a survey and a robot of your own.
-* **`[earth]` with `[[furniture]]` or `[[source]]`, and no map**: the exact field is known everywhere. The
-  scene's own robot surveys it (`[survey]`): it stands at each node of a grid in each heading, and reads its
-  magnetometer. `magtwin scene` prints nodes, spacing, headings, height and the range of the field. Nodes
-  where the robot would stand in furniture, or where its magnetometer loses lock, are filled from their
-  neighbours. The same TOML gives the same map to the byte.
-* **A map and `[earth]` with furniture or sources**: the map is what is looked up, the exact field is what a
-  physical magnetometer reads. The two are compared at the map's nodes, but for those in steel or right
-  beside it. A difference of 50 nT rms or more is printed, with the place where it is largest. Above 500 nT
-  rms and above 0.3 of the map's standard deviation they contradict each other, and the scene is refused.
-* Neither a map nor `[earth]`: refused.
+| the TOML has | the true field | the map |
+|---|---|---|
+| a map only | the map, plus the robot's own field ([own.md](own.md)) | the given map |
+| `[earth]` with furniture or sources, and no map | computed exactly everywhere | surveyed by the robot |
+| a map, and `[earth]` with furniture or sources | computed exactly everywhere | the given map |
+| neither a map nor `[earth]` | an error | |
+
+* **Survey.** `[survey]` sets the survey of a scene without a map. The robot stands at each node of a grid
+  in each heading and reads its magnetometer. `magtwin scene` prints nodes, spacing, headings, height and
+  the range of the field. Some nodes cannot be read, because furniture is in the way or the magnetometer
+  loses lock. They are filled from their neighbours. The same TOML gives a byte-identical map.
+* **Agreement.** If there are a map and sources, the map is compared with the exact field at its nodes,
+  except in steel and right beside it. A difference of 50 nT (rms) or more is printed with the place of its
+  maximum. A difference above both 500 nT and 0.3 of the map's standard deviation is an error.
 
 ## Furniture
 
-Each piece consists of parts; its steel parts are magnetised along their longest side. Without
-`magnetization` each steel part draws one from the `seed`: uniform between 500 and 5000 A/m, of either sign,
-times a factor for wide hollow sections (the last column below; for a box, cylinder or mesh, the share of a
-shell of 2 mm in its volume). Each piece draws from a stream of its own, made from the seed and its name:
-adding, removing or moving a piece changes no other. `magnetization = []` keeps a piece without a field; its
-place as an obstacle stays.
+A piece of furniture consists of parts. Its steel parts are magnetised along their longest side.
+
+* **Default magnetization.** Without `magnetization`, each steel part draws one from `seed`: uniform from
+  500 to 5000 A/m, with a random sign, times a factor for the share of steel. The last column of the table
+  gives this factor for wide hollow sections; it is 1 for all other parts. For a box, cylinder or mesh it is
+  the share of a shell of 2 mm in the volume.
+* **Independent draws.** The draw of a piece depends on the seed and its name only. Adding, removing or
+  moving a piece does not change the others.
+* **No field.** `magnetization = []` removes the field of a piece. It remains an obstacle.
 
 """
 
 ROBOT = """
-The tables below are for a robot from a URDF, `[robot.drive]` and so on; see [urdf.md](urdf.md). For each of
-several robots, write `[[robot]]` with a `name`, and `[robot.drive]` below it. An asset has these figures
-already.
+The tables below, `[robot.drive]` and so on, are for a robot from a URDF; see [urdf.md](urdf.md). An asset
+already has these values. For several robots, write one `[[robot]]` with a `name` for each, and
+`[robot.drive]` below it.
 """
 
 PATHS = """
-## Named paths and the floor
+## Floor and paths
 
-`floor_m` sets the size of the floor; without it, a scene with a map has the smallest floor about the origin
-that holds the map, and one without has 6 x 3.5 m. Named paths (sine, lawnmower, figure8, A to E, ...) are
-made for 6 x 3.5 m and are used as they are there. On another floor they are scaled with it in x and in y.
-Where furniture stands in the way, they are moved and made smaller until the robot passes, with 5 cm to
-spare if there is room. `magtwin run` prints the scale, and the run keeps it as its fact `path_placing`
-(scale in x and y, then shift in x and y [m]).
+**Floor.** `floor_m` is the size of the floor. Default: with a map, the smallest floor around the origin
+that contains the map; without a map, 6 x 3.5 m.
 
-A CSV file is driven as it is. If it does not fit, the refusal says what would: `--fit` moves it and, if
-need be, makes it smaller.
+**Named paths** (sine, lawnmower, figure8, A to E, ...) are made for a floor of 6 x 3.5 m. On another floor
+they are scaled in x and in y. If furniture is in the way, they are moved and shrunk until the robot passes,
+with 5 cm of clearance if there is space. `magtwin run` prints the scale. The run's metadata keeps it as
+`path_placing`: scale in x and y, then shift in x and y [m].
+
+**A CSV file** is driven unchanged. If it does not fit, the error message proposes a change. `--fit` moves
+the path and, if necessary, shrinks it.
 """
 
 
@@ -86,11 +112,11 @@ UNIT = r"(?<!\[)\[([A-Za-z1][^\]]{0,40})\](?!\])"
 """A unit in a docstring."""
 
 LATER = ("robot",)
-"""Tables that come after the others."""
+"""Tables at the end of the page."""
 
 
 def page() -> str:
-    """The page, from the dataclasses."""
+    """The text of scenes.md."""
     parts = [INTRODUCTION, _kinds(), "\nMaterials: ", _materials(), ".\n", PATHS]
     parts += ["\n## Keys\n", *_table(SceneFile, "", "At the top of the file, before any table.")]
     return "".join(parts)
@@ -115,7 +141,7 @@ def _materials() -> str:
 
 
 def _table(cls: type, section: str, about: str, *, many: bool = False) -> list[str]:
-    """The table of a dataclass, and those of the dataclasses in it."""
+    """The table of a dataclass, followed by those of its nested dataclasses."""
     header = f"[[{section}]]" if many else f"[{section}]"
     lines = [f"\n### `{header}`\n\n" if section else "\n", f"{about}\n" if about else ""]
     lines += ["\n| key | type | unit | default | meaning |\n|---|---|---|---|---|\n"]
@@ -132,7 +158,7 @@ def _table(cls: type, section: str, about: str, *, many: bool = False) -> list[s
         kind, unit = _kind(hints[field.name]), ", ".join(units)
         cells = [f"`{field.name}`", kind, unit, _default(field), meaning]
         lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n")
-    below.sort(key=lambda one: one[1] in LATER)
+    below.sort(key=lambda entry: entry[1] in LATER)
     for kind, name, text, array in below:
         lines += _table(kind, name, text or _about(kind), many=array and name != "robot")
         if name == "robot":
@@ -142,7 +168,7 @@ def _table(cls: type, section: str, about: str, *, many: bool = False) -> list[s
 
 
 def field_docs(cls: type) -> dict[str, str]:
-    """The docstrings below the fields of a dataclass and of those that it inherits from."""
+    """Field docstrings of a dataclass and its bases."""
     docs: dict[str, str] = {}
     for base in reversed(cls.__mro__[:-1]):
         if not dataclasses.is_dataclass(base):
@@ -166,7 +192,7 @@ def _about(cls: type) -> str:
 
 
 def _inner(kind: Any) -> tuple[Any, bool]:
-    """What a table holds, and whether it is an array of such tables."""
+    """The type of a table, and whether the field is an array of such tables."""
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         return _inner(next(a for a in args if a is not type(None)))
@@ -176,26 +202,21 @@ def _inner(kind: Any) -> tuple[Any, bool]:
 
 
 def _kind(kind: Any) -> str:
-    """An annotation in words."""
-    words = {float: "number", int: "whole number", str: "text", bool: "true or false", Path: "file"}
+    """An annotation as text."""
+    words = {float: "number", int: "integer", str: "string", bool: "boolean", Path: "file"}
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         return _kind(next(a for a in args if a is not type(None)))
     if origin is tuple:
         if args[-1] is Ellipsis:
-            return f"list of {_many(args[0])}"
-        return f"{len(args)} {_many(args[0])}"
+            item = _kind(args[0])
+            return f"list of [{item}]" if item[0].isdigit() else f"list of {item}s"
+        return f"{len(args)} {_kind(args[0])}s"
     if origin is typing.Literal:
         return ", ".join(f'"{a}"' for a in args)
     if origin in (dict, Mapping):
         return "table"
     return words.get(kind, str(kind))
-
-
-def _many(kind: Any) -> str:
-    """Several of an annotation, in words."""
-    text = _kind(kind)
-    return text if text.endswith("s") else f"{text}s"
 
 
 def _default(field: Any) -> str:

@@ -37,7 +37,7 @@ class _RobotTable(RobotSettings):
     its path. A start inside furniture is an error, which names the nearest free place."""
 
     path: str = ""
-    """Default path: the name of a path, "random", or a CSV file of x,y. Default: figure8."""
+    """Path to drive: the name of a path, "random", or a CSV file of x,y. Default: figure8."""
 
     asset: Path | None = None
     """Name of a robot that ships with magtwin ("turtlebot4"), or USD file made by `magtwin robot`."""

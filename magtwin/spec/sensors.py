@@ -161,8 +161,9 @@ class ImuSpec(MountSpec):
     """Roll and pitch of the sensor on the robot [rad]."""
 
     level_error: Vec2 = (0.0048, -0.0036)
-    """Roll and pitch of the floor, about axes that do not turn with the robot [rad]. With `tilt`, it gives
-    the orientation's x and y the means, and the rank correlations with the disturbance, of published data."""
+    """Roll and pitch of the floor, about axes that do not turn with the robot [rad]. Together with `tilt`, it
+    reproduces published data: the mean orientation in x and y, and its rank correlations with the
+    disturbance."""
 
     tilt_std: float = 0.0095
     """Standard deviation of the roll and pitch that wander because of floor and casters [rad]."""

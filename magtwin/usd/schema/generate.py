@@ -19,12 +19,22 @@ REFERENCE = HERE.parents[2] / "docs" / "schema.md"
 INTRODUCTION = """\
 # magtwin's USD schemas
 
-Made from [schema.usda](../magtwin/usd/schema/schema.usda) by `make schema`. The library is codeless:
-applied API schemas on plain `Xform` prims, so a runtime that does not have it still places everything, and
-reads and keeps every value: magtwin authors each, also where it equals the fallback, unless it is empty.
-`import magtwin.usd` registers it; other programs find it when `PXR_PLUGINPATH_NAME`
-names `magtwin/usd/schema`. Lengths are metres, angles radians, fields nT, unless a name or a text says
-otherwise.
+This page lists every attribute that magtwin adds to a stage. Use it to read a magtwin scene in another
+program, or to author one without magtwin. Lengths are in metres, angles in radians and fields in nT, unless
+a name or a text gives another unit.
+
+`import magtwin.usd` registers the schemas with USD. For other programs, set `PXR_PLUGINPATH_NAME` to the
+absolute path of the folder `magtwin/usd/schema`:
+
+```
+PXR_PLUGINPATH_NAME=$PWD/magtwin/usd/schema usdview scenes/lab/lab.usda
+```
+
+The schemas are codeless applied API schemas on plain `Xform` prims. A program that does not have them still
+places every prim, and reads and keeps every value. This works because magtwin authors every attribute, even
+one that equals the fallback; only empty values are left out.
+
+`make schema` generates this page from [schema.usda](../magtwin/usd/schema/schema.usda).
 """
 
 
