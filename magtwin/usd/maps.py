@@ -87,6 +87,16 @@ def save_map_series(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], *,
     _save(in_order(maps), path, force)
 
 
+def _refuse_tables(path: str | os.PathLike[str]) -> None:
+    """Refuse a table of readings or a recording in place of a map."""
+    if Path(path).suffix in (".csv", ".txt", ".parquet", ".pq", ".mcap", ".db3"):
+        fitted = Path(path).with_suffix(".usdc").name
+        raise InputError(
+            f"{path}: a table of readings or a recording, not a map; fit a map to it first: "
+            f"magtwin map fit {Path(path).name} --out {fitted}"
+        )
+
+
 def load_map(path: str | os.PathLike[str], date: str | datetime.date | None = None) -> AnomalyMap:
     """The map of a layer, or of a stage that holds one.
 
@@ -99,12 +109,7 @@ def load_map(path: str | os.PathLike[str], date: str | datetime.date | None = No
         InputError: The file is missing or not USD, holds no map or several, or its arrays are inconsistent
             or do not match the checksum; or the date is not valid or outside the epochs.
     """
-    if Path(path).suffix in (".csv", ".txt", ".parquet", ".pq", ".mcap", ".db3"):
-        fitted = Path(path).with_suffix(".usdc").name
-        raise InputError(
-            f"{path}: a table of readings or a recording, not a map; fit a map to it first: "
-            f"magtwin map fit {Path(path).name} --out {fitted}"
-        )
+    _refuse_tables(path)
     if date is not None:
         return at_date(load_epochs(path), date)
     stage = open_stage(path)
@@ -141,6 +146,7 @@ def is_map_layer(path: str | os.PathLike[str]) -> bool:
     Raises:
         InputError: The file is missing or not USD.
     """
+    _refuse_tables(path)
     stage = open_stage(path)
     root = stage.GetPseudoRoot()
     return len(prims_with(root, "anomalyMap")) == 1 and not prims_with(root, "robot")

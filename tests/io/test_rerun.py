@@ -538,7 +538,7 @@ def test_view_shows_several_runs_with_the_offsets_that_are_given(parts, tmp_path
     for arguments in ([*files, "--offset-s", "1"], [files[0], "--offset-s", "1"]):
         with pytest.raises(SystemExit):
             main(["view", *arguments])
-        assert "--offset-s is given once for each of several runs" in capsys.readouterr().err
+        assert "--offset-s has one value for each of several runs, got 1 of " in capsys.readouterr().err
 
 
 def test_runs_that_cannot_be_told_apart_and_offsets_of_none_are_refused(parts, tmp_path):

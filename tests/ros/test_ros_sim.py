@@ -305,7 +305,9 @@ def test_a_run_is_said_again_as_its_robot_said_it(
         np.testing.assert_allclose(again[name], part[name], rtol=1e-12, err_msg=name)
     assert again.metadata == part.metadata
     assert again.metadata["magnetometer"] == "neural"
-    with pytest.raises(InputError, match="those of a neural magnetometer"):  # so no network learns from one
+    with pytest.raises(
+        InputError, match="its readings come from a neural magnetometer"
+    ):  # so no network learns from one
         read_source(Source("again", lambda: again))
 
 

@@ -183,32 +183,42 @@ def _started(*options: str) -> Iterator[tuple[str, ViewerClient]]:
     process = None
     with tempfile.TemporaryFile("w+") as log:
         try:
-            with _interrupt_later():
+            with _interrupt_later() as interrupts:
                 process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
-            yield f"rerun+http://{LOCALHOST}:{port}/proxy", _connected(process, port, log)
+                client = _connected(process, port, log, interrupts)
+            assert client is not None  # else the interrupt was raised
+            yield f"rerun+http://{LOCALHOST}:{port}/proxy", client
         finally:
             if process is not None:
                 _end(process)
 
 
 @contextmanager
-def _interrupt_later() -> Iterator[None]:
-    """Delay Ctrl-C to the end of the block, so that the handle of a started process is not lost."""
-    if threading.current_thread() is not threading.main_thread():  # Python interrupts the main thread only
-        yield
-        return
+def _interrupt_later() -> Iterator[list[int]]:
+    """Delay Ctrl-C to the end of the block and collect it in a list.
+
+    So the handle of a started process is not lost, and Rerun cannot turn the interrupt into another error.
+    """
     interrupts: list[int] = []
+    if threading.current_thread() is not threading.main_thread():  # Python interrupts the main thread only
+        yield interrupts
+        return
     before = signal.signal(signal.SIGINT, lambda number, frame: interrupts.append(number))
     try:
-        yield
+        yield interrupts
     finally:
         signal.signal(signal.SIGINT, before)
     if interrupts:
         signal.raise_signal(signal.SIGINT)
 
 
-def _connected(process: "subprocess.Popen[bytes]", port: int, log: IO[str]) -> ViewerClient:
-    """A client of a started viewer, once it draws. It listens before it knows whether it can draw."""
+def _connected(
+    process: "subprocess.Popen[bytes]", port: int, log: IO[str], interrupts: list[int]
+) -> ViewerClient | None:
+    """A client of a started viewer, once it draws. It listens before it knows whether it can draw.
+
+    None if the user interrupted.
+    """
     clients: list[ViewerClient] = []
 
     def draws() -> bool:
@@ -225,8 +235,8 @@ def _connected(process: "subprocess.Popen[bytes]", port: int, log: IO[str]) -> V
             return False
         return True
 
-    _wait_until(draws, "the Rerun viewer did not start")
-    return clients[-1]
+    _wait_until(lambda: bool(interrupts) or draws(), "the Rerun viewer did not start")
+    return None if interrupts else clients[-1]
 
 
 def check_decodes(rrd: Path, source: str | os.PathLike[str]) -> None:

@@ -183,7 +183,7 @@ def test_heights_that_a_grid_cannot_give_are_refused(change, height, said):
 
 def test_a_height_below_the_floor_or_among_the_dipoles_is_refused():
     sheet = a_sheet(1.0)
-    with pytest.raises(InputError, match="height_m must be a height above the floor, 0 m or more"):
+    with pytest.raises(InputError, match="height_m is a height above the floor, 0 m or more"):
         at_height(a_map(sheet, harmonic=sheet), -0.1)
     x, y = np.meshgrid(np.arange(-3, 3.1, 0.25), np.arange(-3, 3.1, 0.25))
     layer = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -0.05)])
@@ -221,7 +221,7 @@ def test_between_a_layer_below_and_one_above_a_field_goes_both_ways_and_through_
 @pytest.mark.parametrize(
     ("height", "said"),
     [
-        (-0.1, "height_m must be a height above the floor, 0 m or more, got -0.1"),
+        (-0.1, "height_m is a height above the floor, 0 m or more, got -0.1"),
         (1e9, "farther above than it is long, what lies beside it makes the field"),
     ],
 )

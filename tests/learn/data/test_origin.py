@@ -95,7 +95,7 @@ def test_unaligned_labels_are_told_with_the_effect_of_the_place_where_they_took_
     told = float(one.text.split("about ")[1].split(" nT")[0])
     assert told == pytest.approx(SLOPE * (0.06 + 0.2 * 0.5 / 120) / 2**0.5, rel=0.1)
     assert "6.0 cm" in one.text
-    assert "--align fit" in one.text
+    assert "--alignment fit" in one.text
 
 
 def test_labels_that_were_aligned_or_took_true_poses_lie_in_the_frame_of_a_run():
