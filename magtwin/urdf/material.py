@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
 
-from magtwin.urdf.meshes.mesh import GREY, Rgba
+from magtwin.urdf.meshes.piece import GREY, Rgba
 from magtwin.urdf.physics.gazebo import Surface
 from magtwin.usd.geometry import linear_from_srgb
 

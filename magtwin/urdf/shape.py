@@ -11,8 +11,8 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Shape
 from magtwin.urdf.material import Look, define_grip, define_look, wear
-from magtwin.urdf.meshes.mesh import Paint
 from magtwin.urdf.meshes.mesh_layer import MESH, Entry, MeshLayer, free_name
+from magtwin.urdf.meshes.piece import Paint
 from magtwin.urdf.meshes.reading import Reading
 from magtwin.urdf.meshes.texture import Image, read_image
 from magtwin.urdf.physics.gazebo import Surface

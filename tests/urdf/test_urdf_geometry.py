@@ -19,7 +19,8 @@ from validators import assert_valid
 
 from magtwin.errors import InputError
 from magtwin.urdf import convert_urdf, read_notes
-from magtwin.urdf.meshes.mesh import Piece, distinct, read_mesh
+from magtwin.urdf.meshes.mesh import distinct, read_mesh
+from magtwin.urdf.meshes.piece import Piece
 from magtwin.urdf.meshes.polygon import cut_polygons
 from magtwin.urdf.options import Options
 from magtwin.usd.geometry import linear_from_srgb, read_shapes

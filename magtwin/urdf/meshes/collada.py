@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.urdf.meshes.mesh import GREY, Paint, Piece, Rgba
+from magtwin.urdf.meshes.piece import GREY, Paint, Piece, Rgba
 from magtwin.urdf.meshes.polygon import cut_polygons, strips
 from magtwin.urdf.meshes.reading import Reading, numbers
 from magtwin.urdf.meshes.texture import Image, read_image

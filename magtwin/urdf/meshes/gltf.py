@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat
-from magtwin.urdf.meshes.mesh import Paint, Piece
+from magtwin.urdf.meshes.piece import Paint, Piece
 from magtwin.urdf.meshes.polygon import strips
 from magtwin.urdf.meshes.reading import Reading
 from magtwin.urdf.meshes.texture import Image, image_of, read_image

@@ -8,99 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
+from magtwin.urdf.meshes.piece import Paint, Piece
 from magtwin.urdf.meshes.reading import Note, Reading
-from magtwin.urdf.meshes.texture import Image
 
 SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
 """Formats that can be read."""
-
-Rgba = tuple[float, float, float, float]
-
-GREY: Rgba = (0.5, 0.5, 0.5, 1.0)
-"""Colour of a surface without a material (sRGB)."""
 
 CREASE = np.radians(35)
 """Faces that meet at a smaller angle than this are shaded as one smooth surface [rad]."""
 
 FAN = 64
 """Where more faces than this meet, as at tips and in the middle of discs, each keeps its own normal."""
-
-
-@dataclass(frozen=True)
-class Paint:
-    """A material of a mesh file."""
-
-    name: str = ""
-    """Its name in the file."""
-
-    rgba: Rgba = (1.0, 1.0, 1.0, 1.0)
-    """Colour (sRGB) and opacity, 0 to 1; with a texture, the factor that multiplies it."""
-
-    image: Image | None = None
-    """Colour texture."""
-
-    roughness: float = 0.5
-    """0 is a mirror, 1 is chalk."""
-
-    metallic: float = 0.0
-    """0 is an insulator, 1 is metal."""
-
-    see_through: bool = False
-    """Whether the texture's opacity is used."""
-
-    cutoff: float = 0.0
-    """Opacity threshold between invisible and opaque; 0 blends."""
-
-    double_sided: bool = False
-    """Whether it is visible from behind."""
-
-    by_vertex: bool = False
-    """Whether the colours at the corners replace `rgba`."""
-
-
-@dataclass(frozen=True)
-class Piece:
-    """Triangles with one paint, from a reader. Missing values are None."""
-
-    points: NDArray
-    """Vertices [m], shape (V, 3)."""
-
-    faces: NDArray
-    """Corners of the triangles, counter-clockwise from outside, shape (F, 3)."""
-
-    paint: Paint | None = None
-
-    normals: NDArray | None = None
-    """Normal at each corner of each face, shape (F, 3, 3)."""
-
-    uvs: NDArray | None = None
-    """Texture coordinates at each corner from the picture's lower left, shape (F, 3, 2)."""
-
-    colours: NDArray | None = None
-    """Linear red, green, blue at each corner, 0 to 1, shape (F, 3, 3)."""
-
-    def moved(self, T: NDArray) -> "Piece":
-        """The piece under an affine map T, shape (4, 4); faces stay outwards under a reflection.
-
-        Normals transform by the inverse transpose of the linear part A, n' ~ A^-T n, times the sign of det A.
-        """
-        if np.array_equal(T, np.eye(4)):
-            return self
-        A = T[:3, :3]
-        det = A[0] @ np.cross(A[1], A[2])
-        if det == 0:
-            raise ValueError("a node's transform flattens the mesh")
-        points = self.points @ A.T + T[:3, 3]
-        normals = None if self.normals is None else self.normals @ np.linalg.inv(A)
-        made = replace(self, points=points, normals=normals)
-        return made.flipped() if det < 0 else made
-
-    def flipped(self) -> "Piece":
-        """The piece with its faces wound the other way and the same normals."""
-        normals, uvs, colours = (
-            None if values is None else values[:, ::-1] for values in (self.normals, self.uvs, self.colours)
-        )
-        return replace(self, faces=self.faces[:, ::-1], normals=normals, uvs=uvs, colours=colours)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description
 from magtwin.urdf.description.model import Mesh as UrdfMesh
 from magtwin.urdf.meshes.collider import Solid, solids_of
-from magtwin.urdf.meshes.mesh import GREY, SUFFIXES, Mesh, Paint, distinct, face_normals, read_mesh
+from magtwin.urdf.meshes.mesh import SUFFIXES, Mesh, distinct, face_normals, read_mesh
+from magtwin.urdf.meshes.piece import GREY, Paint
 from magtwin.urdf.meshes.texture import Textures
 from magtwin.urdf.options import DEFAULTS, Collision, Options
 from magtwin.urdf.source.source import MissingFileError

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.urdf.meshes.mesh import Piece
+from magtwin.urdf.meshes.piece import Piece
 from magtwin.urdf.meshes.reading import Reading
 from magtwin.usd.geometry import linear_from_srgb
 

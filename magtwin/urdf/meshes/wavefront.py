@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.urdf.meshes.mesh import Paint, Piece
+from magtwin.urdf.meshes.piece import Paint, Piece
 from magtwin.urdf.meshes.polygon import cut_polygons
 from magtwin.urdf.meshes.reading import Reading, numbers
 from magtwin.urdf.meshes.texture import read_image
