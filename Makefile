@@ -5,6 +5,9 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q install -c constraints.txt
 
+# Largest size of the default install, PyTorch for CPU included [MiB].
+MOST_MB := 2700
+
 # Two processes whose linear algebra has threads of its own wait for each other more than they work.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 
@@ -58,6 +61,7 @@ wheel-test: $(VENV)/.dev  ## Build the wheel, install it in an empty environment
 	$(PYTHON) -m venv build/wheel/venv
 	build/wheel/venv/bin/python -m pip --disable-pip-version-check -q install -c constraints.txt build/wheel/*.whl
 	cd build/wheel && venv/bin/magtwin demo --out demo && venv/bin/magtwin info demo/run.parquet
+	@size=$$(du -sm build/wheel/venv | cut -f1); echo "The default install takes $$size MB"; test $$size -le $(MOST_MB)
 
 schema: $(VENV)/.dev  ## Generate the schema library anew from schema.usda
 	$(BIN)/python magtwin/usd/schema/generate.py
@@ -86,7 +90,7 @@ $(BIN)/python:
 
 $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
 	@echo "Installing magtwin and what it needs into $(VENV) (a few minutes, once) ..."
-	$(PIP) -e .
+	$(PIP) -e '.[view]'
 	@touch $@
 
 $(VENV)/.dev: $(VENV)/.installed

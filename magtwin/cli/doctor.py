@@ -22,6 +22,7 @@ ADDS = {
     "ros": "ROS 2 nodes on a machine without ROS (magtwin ros)",
     "simready": "NVIDIA's SimReady profiles (magtwin validate --against simready)",
     "validate": "NVIDIA's asset validator (magtwin validate --against nvidia)",
+    "view": "pictures and films of stages (magtwin picture, magtwin film)",
     "xarray": "runs as xarray datasets (Run.to_xarray)",
 }
 """What each extra is for."""
@@ -35,7 +36,6 @@ PACKAGES = (
     "numba",
     "pyarrow",
     "rosbags",
-    "pyvista",
     "cyclopts",
 )
 """Packages whose version matters in a report of a fault."""
