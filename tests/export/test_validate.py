@@ -319,7 +319,7 @@ def test_the_command_shows_rule_prim_and_what_to_do_and_exits_1(lab, capfd, monk
     assert e.value.code == 1
     printed = capfd.readouterr().out
     assert "error magtwin robot-inside /World/turtlebot4: stands at (9, 0) m" in printed
-    assert "start it on the floor" in printed
+    assert "start it upright on the floor" in printed
 
 
 def test_validators_that_are_not_installed_say_how_to_get_them(lab, tmp_path, monkeypatch, capfd):

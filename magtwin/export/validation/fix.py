@@ -96,7 +96,7 @@ def _format(path: Path) -> str:
 
 @_into(SAFE)
 def default_prim(edited: EditedStage) -> Iterator[str]:
-    """The one prim at the root becomes the default prim where there is none."""
+    """A single root prim becomes the default prim if there is none."""
     layer = edited.stage.GetRootLayer()
     roots = [prim for prim in edited.stage.GetPseudoRoot().GetChildren() if not prim.IsAbstract()]
     if not edited.stage.GetDefaultPrim() and len(roots) == 1:
@@ -106,7 +106,7 @@ def default_prim(edited: EditedStage) -> Iterator[str]:
 
 @_into(SAFE)
 def units(edited: EditedStage) -> Iterator[str]:
-    """Metres, kilograms and Z up are said where magtwin's prims are in them and nothing says so."""
+    """Missing units are authored (metres, kilograms, Z up) on a stage with magtwin's prims."""
     stage, layer = edited.stage, edited.stage.GetRootLayer()
     if not any(edited.having(noun) for noun in NOUNS):
         return  # another stage may rely on USD's defaults
@@ -127,7 +127,7 @@ def units(edited: EditedStage) -> Iterator[str]:
 
 @_into(SAFE)
 def relative_paths(edited: EditedStage) -> Iterator[str]:
-    """Files of the stage's folder that are named by an absolute path are named relative to the layer."""
+    """Absolute paths to files in the stage's folder become relative to the layer."""
     for layer in edited.layers:
         here = Path(layer.realPath).resolve().parent
         moved = {}
@@ -160,7 +160,7 @@ def _relative(file: Path, here: Path) -> str:
 
 @_into(SAFE)
 def extents(edited: EditedStage) -> Iterator[str]:
-    """Shapes that do not say their extent say it."""
+    """Shapes without an extent get one."""
     for prim in edited.prims:
         boundable = UsdGeom.Boundable(prim)
         if not boundable or prim.IsA(UsdGeom.PointInstancer) or boundable.GetExtentAttr().HasAuthoredValue():
@@ -175,7 +175,7 @@ def extents(edited: EditedStage) -> Iterator[str]:
 
 @_into(SAFE)
 def material_bindings(edited: EditedStage) -> Iterator[str]:
-    """Prims with a material bound to them have MaterialBindingAPI."""
+    """Prims with a bound material get MaterialBindingAPI."""
     for prim in edited.prims:
         bound = any(name.startswith("material:binding") for name in prim.GetAuthoredPropertyNames())
         layer = _home(edited, prim)

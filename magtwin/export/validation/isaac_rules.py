@@ -42,9 +42,9 @@ def below(prim: Usd.Prim) -> list[Usd.Prim]:
     return list(Usd.PrimRange(prim))
 
 
-@rule("isaac", "magtwin robot makes an articulation that says it")
+@rule("isaac", "magtwin robot authors this")
 def robot_schema(subject: Subject) -> Iterator[Wrong]:
-    """Every articulation is a robot to Isaac Sim, one articulation each, and says of what type it is."""
+    """Every articulation is in a robot prim, which has one articulation root and a robot type."""
     found = robots(subject)
     for prim in subject.prims:
         if prim.HasAPI(UsdPhysics.ArticulationRootAPI) and not any(
@@ -62,7 +62,7 @@ def robot_schema(subject: Subject) -> Iterator[Wrong]:
 
 @rule("isaac", "list them with magtwin robot, or in Isaac Sim's robot schema panel")
 def robot_lists(subject: Subject) -> Iterator[Wrong]:
-    """Every robot lists all its bodies, then all its joints, each once, and nothing that is not there."""
+    """Every robot lists all its bodies and all its joints, each once, and no missing prim."""
     for robot in robots(subject):
         prims, where = below(robot), str(robot.GetPath())
         bodies = {prim.GetPath() for prim in prims if prim.HasAPI(UsdPhysics.RigidBodyAPI)}
@@ -84,7 +84,7 @@ def robot_lists(subject: Subject) -> Iterator[Wrong]:
 
 @rule("isaac", "point body0 and body1 to rigid bodies, or body0 to the robot for the world")
 def joint_bodies(subject: Subject) -> Iterator[Wrong]:
-    """Every joint holds a rigid body to another, or to the world."""
+    """Every joint connects a rigid body to another one or to the world."""
     for prim in subject.prims:
         if not prim.IsA(UsdPhysics.Joint):
             continue
@@ -101,9 +101,9 @@ def joint_bodies(subject: Subject) -> Iterator[Wrong]:
             yield Wrong("holds no rigid body", where)
 
 
-@rule("isaac", "give it a drive of finite force; one of no gains leaves it free")
+@rule("isaac", "give it a drive of finite force; with zero gains the joint stays free")
 def joint_drives(subject: Subject) -> Iterator[Wrong]:
-    """Every joint that moves and follows no other has a drive whose greatest force is finite and above 0."""
+    """Every movable joint that mimics no other has a drive with a finite maximum force above 0."""
     for prim in subject.prims:
         apis = applied(prim)
         if prim.GetTypeName() not in MOVING or any(api.startswith(MIMIC_APIS) for api in apis):
@@ -116,9 +116,9 @@ def joint_drives(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"has a drive of force {force:g}", str(prim.GetPath()))
 
 
-@rule("isaac", "say convexHull or convexDecomposition: a body that moves cannot collide as triangles")
+@rule("isaac", "use convexHull or convexDecomposition; a moving body cannot collide as triangles")
 def collider_shapes(subject: Subject) -> Iterator[Wrong]:
-    """No rigid body collides as bare triangles."""
+    """No rigid body collides as a triangle mesh."""
     for body in subject.prims:
         if not body.HasAPI(UsdPhysics.RigidBodyAPI):
             continue
@@ -131,9 +131,9 @@ def collider_shapes(subject: Subject) -> Iterator[Wrong]:
                 yield Wrong("is a triangle mesh that moves", str(prim.GetPath()))
 
 
-@rule("isaac", "take the scale into the shapes below")
+@rule("isaac", "apply the scale to the shapes below")
 def rigid_scale(subject: Subject) -> Iterator[Wrong]:
-    """No rigid body is scaled, and none lies in another."""
+    """No rigid body is scaled, and none is inside another."""
     cache = UsdGeom.XformCache()
     bodies = {prim.GetPath() for prim in subject.prims if prim.HasAPI(UsdPhysics.RigidBodyAPI)}
     for path in sorted(bodies):
@@ -146,9 +146,9 @@ def rigid_scale(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"lies in the rigid body <{above}>", str(path), "let bodies lie side by side")
 
 
-@rule("isaac", "magtwin robot and magtwin export author it so")
+@rule("isaac", "magtwin robot and magtwin export author these")
 def sensor_mounts(subject: Subject) -> Iterator[Wrong]:
-    """Every sensor of Isaac Sim's rides on a rigid body and has the figures that it runs by."""
+    """Every sensor of Isaac Sim is on a rigid body and has the attributes that it needs."""
     for prim in subject.prims:
         kind, where = prim.GetTypeName(), str(prim.GetPath())
         if kind not in (IMU_TYPE, LIDAR_TYPE):
@@ -183,7 +183,7 @@ def sensor_mounts(subject: Subject) -> Iterator[Wrong]:
 
 @rule("isaac", "add a PhysicsScene: magtwin scene authors one with the lab")
 def physics_scene(subject: Subject) -> Iterator[Wrong]:
-    """A stage with robots in a lab has one physics scene, whose gravity pulls down."""
+    """A stage with robots in a lab has one physics scene, with gravity pointing down."""
     if not (subject.having("lab") and robots(subject)):
         return
     scenes = [prim for prim in subject.prims if prim.IsA(UsdPhysics.Scene)]
@@ -197,7 +197,7 @@ def physics_scene(subject: Subject) -> Iterator[Wrong]:
 
 @rule("isaac", "bind a material to it, or to a prim above it")
 def materials(subject: Subject) -> Iterator[Wrong]:
-    """Everything that is shown wears a material."""
+    """Every visible shape has a material."""
     for prim in subject.stage.Traverse(Usd.TraverseInstanceProxies()):
         if not prim.IsA(UsdGeom.Gprim) or UsdGeom.Imageable(prim).ComputePurpose() == UsdGeom.Tokens.guide:
             continue
@@ -209,7 +209,7 @@ def materials(subject: Subject) -> Iterator[Wrong]:
 
 @rule("isaac", "author it with magtwin export --target isaac")
 def action_graph(subject: Subject) -> Iterator[Wrong]:
-    """Every node of an Action Graph has what its definition has, and takes what it can from outputs."""
+    """Every node of an Action Graph matches its definition, and its connections fit."""
     from magtwin.export.ogn import faults, ports
 
     for prim in subject.prims:

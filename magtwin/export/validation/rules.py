@@ -60,9 +60,9 @@ UPRIGHT = 1 - 1e-9
 """Cosine of the tilt of a robot that stands."""
 
 
-@rule("magtwin", "put the file where it is named, or export the scene anew")
+@rule("magtwin", "put the file there, or export the scene again")
 def references(subject: Subject) -> Iterator[Wrong]:
-    """Every layer, texture and other file that is named is there."""
+    """Every layer, texture and other file that is named exists."""
     networks = {_path(prim, NETWORK) for prim in subject.having("magnetometer")}
     _, _, unresolved = UsdUtils.ComputeAllDependencies(str(subject.file))
     told = [" ".join(str(error).split()) for error in subject.stage.GetCompositionErrors()]
@@ -73,18 +73,18 @@ def references(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"names {path}, which is not there")
 
 
-@rule("magtwin", "name it relative to the layer: --fix does that for what is there")
+@rule("magtwin", "make the path relative to the layer; --fix does this if the file exists")
 def absolute_paths(subject: Subject) -> Iterator[Wrong]:
-    """No layer names a file by a path that holds on one machine alone."""
+    """No layer names a file by an absolute path."""
     for layer in subject.layers:
         for named in named_files(layer):
             if is_absolute(named.path):
                 yield Wrong(f"{subject.name_of(layer)} names {named.path}", named.where)
 
 
-@rule("magtwin", "magtwin export makes a folder that can be moved alone")
+@rule("magtwin", "magtwin export makes a folder without such paths")
 def climbing_paths(subject: Subject) -> Iterator[Wrong]:
-    """Nothing leads out of the stage's folder: a warning, but an error in a .usdz."""
+    """No path leads out of the stage's folder. In a folder this is a warning, in a .usdz an error."""
     for layer in subject.layers:
         if not Path(layer.realPath).resolve().is_relative_to(subject.folder):
             continue  # told where it was named
@@ -98,9 +98,9 @@ def climbing_paths(subject: Subject) -> Iterator[Wrong]:
                 )
 
 
-@rule("magtwin", "convert it to metres with Z up where it was made")
+@rule("magtwin", "convert it to metres with Z up in the program that made it")
 def units(subject: Subject) -> Iterator[Wrong]:
-    """The stage says that it is in metres and kilograms with Z up, and no layer below says otherwise."""
+    """The stage is authored in metres and kilograms with Z up, and no layer below differs."""
     root = subject.stage.GetRootLayer()
     stage, advice = subject.stage, "--fix says so where magtwin made the stage"
     if not stage.HasAuthoredMetadata("metersPerUnit"):
@@ -121,17 +121,17 @@ def units(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"{name}is in units of {kilograms:g} kg; USD does not convert them")
 
 
-@rule("magtwin", "set it to the prim that holds all others: --fix does where there is one")
+@rule("magtwin", "set it to the prim that holds all others; --fix does this if there is only one")
 def default_prim(subject: Subject) -> Iterator[Wrong]:
-    """The stage has a default prim, so that others can refer to it."""
+    """The stage has a default prim, so that other stages can refer to it."""
     if not subject.stage.GetDefaultPrim():
         name = subject.stage.GetRootLayer().defaultPrim
         yield Wrong(f"its default prim {name!r} is not there" if name else "has no default prim")
 
 
-@rule("magtwin", "take the name that is meant from docs/schema.md")
+@rule("magtwin", "use a name that is in docs/schema.md")
 def schema_names(subject: Subject) -> Iterator[Wrong]:
-    """Every schema and attribute in magtwin's name is one that it has, on a prim with its schema."""
+    """Every schema and attribute with magtwin's prefix is defined, and its prim has the schema."""
     for prim in subject.prims:
         for api in prim.GetPrimTypeInfo().GetAppliedAPISchemas():
             if api.startswith("Magtwin") and api not in NOUNS.values():
@@ -145,9 +145,9 @@ def schema_names(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"has {name}, {why}", str(prim.GetPath()))
 
 
-@rule("magtwin", "point it to the prim that is meant")
+@rule("magtwin", "point it to the right prim")
 def targets(subject: Subject) -> Iterator[Wrong]:
-    """Every relationship and every connection points to something that is there."""
+    """Every relationship and every connection points to something that exists."""
     for prim in subject.prims:
         for prop in prim.GetAuthoredProperties():
             if isinstance(prop, Usd.Relationship):
@@ -161,9 +161,9 @@ def targets(subject: Subject) -> Iterator[Wrong]:
                     )
 
 
-@rule("magtwin", "make the map anew with magtwin map")
+@rule("magtwin", "make the map again with magtwin map")
 def map_complete(subject: Subject) -> Iterator[Wrong]:
-    """Every map has its arrays, its grid and its unit, authored, and they fit together."""
+    """Every map authors its arrays, grid and unit, and they match each other."""
     for prim in subject.having("anomalyMap"):
         where = str(prim.GetPath())
         lost = [
@@ -177,9 +177,9 @@ def map_complete(subject: Subject) -> Iterator[Wrong]:
             read_map(prim)
 
 
-@rule("magtwin", "put the map's own arrays back, or make the map anew")
+@rule("magtwin", "restore the map's arrays, or make the map again")
 def map_checksum(subject: Subject) -> Iterator[Wrong]:
-    """The arrays of every map, of each of its days, are those that its checksum was taken of."""
+    """The arrays of every map, at each epoch, match its checksum."""
     for prim in subject.having("anomalyMap"):
         for said, taken in checksums(prim):
             if said != taken:
@@ -189,9 +189,9 @@ def map_checksum(subject: Subject) -> Iterator[Wrong]:
                 )
 
 
-@rule("magtwin", "the checksum does not cover the grid: make the map anew with magtwin map")
+@rule("magtwin", "the checksum does not cover the grid: make the map again with magtwin map")
 def map_grid(subject: Subject) -> Iterator[Wrong]:
-    """The coloured floor of every map lies where its grid does, with a variant for each of its headings."""
+    """The coloured floor of every map covers its grid and has a variant for each heading."""
     for prim in subject.having("anomalyMap"):
         floor = prim.GetChild(HEAT_MAP.name)
         if not floor or not floor.IsA(UsdGeom.Mesh):
@@ -219,9 +219,9 @@ def map_grid(subject: Subject) -> Iterator[Wrong]:
             )
 
 
-@rule("magtwin", "put the map back that the scene was made with, or make the scene anew with this one")
+@rule("magtwin", "restore the map that the scene was made with, or make the scene again with this one")
 def map_file(subject: Subject) -> Iterator[Wrong]:
-    """The file of the map's layer is the one that the magnetometer keeps the checksum of."""
+    """The file of the map's layer matches the checksum in the magnetometer."""
     for prim in subject.having("magnetometer"):
         file = map_file_of(subject, prim)
         said = str(plain_value(prim.GetAttribute(MAP_CHECKSUM)) or "").lower()
@@ -246,7 +246,7 @@ def map_file_of(subject: Subject, magnetometer: Usd.Prim) -> Path | None:
 
 @rule("magtwin", "point magtwin:magnetometer:map to the map's prim")
 def magnetometer_map(subject: Subject) -> Iterator[Wrong]:
-    """Every magnetometer in a lab reads a map that is on the stage, all of them one."""
+    """Every magnetometer in a lab reads a map on the stage, and all read the same one."""
     first = None
     for prim in subject.having("magnetometer") if subject.having("lab") else ():
         end = target(prim, MAP_RELATIONSHIP)
@@ -257,9 +257,9 @@ def magnetometer_map(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"reads <{end.GetPath()}>, another than <{first.GetPath()}>", str(prim.GetPath()))
 
 
-@rule("magtwin", "put the weights back, or make the scene anew with these")
+@rule("magtwin", "restore the weights, or make the scene again with these")
 def network_file(subject: Subject) -> Iterator[Wrong]:
-    """The weights that a magnetometer names are there, and are those that it keeps the checksum of."""
+    """The weights that a magnetometer names exist and match its checksum."""
     for prim in subject.having("magnetometer"):
         spec, where = read_magnetometer(prim), str(prim.GetPath())
         if spec.kind != "neural":
@@ -297,9 +297,9 @@ def network_of(magnetometer: Usd.Prim) -> Path | None:
     return network if network is not None and network.is_file() else None
 
 
-@rule("magtwin", "train it on inputs that magtwin knows (magtwin train --help lists them)")
+@rule("magtwin", "train it on inputs of magtwin.learn.data.features.FEATURES")
 def network_inputs(subject: Subject) -> Iterator[Wrong]:
-    """The inputs of every network are known, none is there twice, and the file of weights has the same."""
+    """The inputs of every network are known and unique, and equal those of its weights file."""
     for prim in subject.having("magnetometer"):
         spec, where = read_magnetometer(prim), str(prim.GetPath())
         if spec.kind != "neural":
@@ -324,9 +324,9 @@ def _inputs_of(weights: Path) -> tuple[str, ...] | None:
     return tuple(map(str, names)) if isinstance(names, list) else None
 
 
-@rule("magtwin", "move the map or the lab to the origin of the world, in its axes")
+@rule("magtwin", "move the lab or the map to the origin of the world, without rotation or scale")
 def frames(subject: Subject) -> Iterator[Wrong]:
-    """Lab and map stand in the world's own axes, and the map lies within the floor."""
+    """Lab and map are in world axes without a transform, and the map is within the floor."""
     cache, labs = UsdGeom.XformCache(), subject.having("lab")
     for prim in (*labs, *subject.having("anomalyMap")):
         if cache.GetLocalToWorldTransform(prim) != Gf.Matrix4d(1):
@@ -345,9 +345,9 @@ def frames(subject: Subject) -> Iterator[Wrong]:
             )
 
 
-@rule("magtwin", "start it on the floor, upright, clear of the walls")
+@rule("magtwin", "start it upright on the floor, clear of the walls")
 def robot_inside(subject: Subject) -> Iterator[Wrong]:
-    """Every robot stands upright on the floor, its footprint within it."""
+    """Every robot stands upright on the floor, with its footprint inside it."""
     labs = subject.having("lab")
     if len(labs) != 1:
         return
@@ -367,9 +367,9 @@ def robot_inside(subject: Subject) -> Iterator[Wrong]:
             yield Wrong("does not stand upright", where)
 
 
-@rule("magtwin", "start it elsewhere: a run that begins in something is refused")
+@rule("magtwin", "start it elsewhere; a run that begins in a collision is refused")
 def robot_clear(subject: Subject) -> Iterator[Wrong]:
-    """Every robot stands clear of what it collides with, and of the other robots."""
+    """Every robot is clear of obstacles and of the other robots."""
     robots = subject.having("robot")
     if not (robots and subject.having("lab")):
         return
@@ -389,9 +389,9 @@ def robot_clear(subject: Subject) -> Iterator[Wrong]:
                 yield Wrong(f"stands {apart:.3g} m from <{robots[j].GetPath()}>", str(prim.GetPath()))
 
 
-@rule("magtwin", "set the figure within the range that docs/schema.md gives")
+@rule("magtwin", "set a value in the range that docs/schema.md gives")
 def figures(subject: Subject) -> Iterator[Wrong]:
-    """Lab, Earth's field, sources and robots have all their parts, and no figure is out of its range."""
+    """Lab, Earth's field, sources and robots are complete, and every value is in its range."""
     looks: list[tuple[Callable[[], object], Usd.Prim]] = []
     for noun, read in (("lab", read_lab), ("earth", read_earth), ("robot", read_robot)):
         looks += [(partial(read, prim), prim) for prim in subject.having(noun)]
@@ -408,9 +408,9 @@ def figures(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"is a second {NOUNS[noun]}", str(prim.GetPath()), "keep one of them")
 
 
-@rule("magtwin", "author the sensor anew with magtwin robot or magtwin scene")
+@rule("magtwin", "author the sensor again with magtwin robot or magtwin scene")
 def sensor_types(subject: Subject) -> Iterator[Wrong]:
-    """The sensors that Isaac Sim runs have the rates and ranges of magtwin's, whose children they are."""
+    """Isaac Sim's sensor prims have the rates and ranges of the magtwin sensors above them."""
     single = {"rel_tol": 1e-6, "abs_tol": 1e-9}
     for prim in subject.having("imu"):
         sensor = next((p for p in prim.GetChildren() if p.GetTypeName() == IMU_TYPE), None)
