@@ -88,3 +88,12 @@ def test_a_sweep_saves_a_folder_that_lists_its_runs(lab_scene, tmp_path):
     again = magtwin.load_run(tmp_path / "runs" / "run_00001.parquet")
     assert np.array_equal(again["b_measured_nt"], runs[1]["b_measured_nt"])
     assert {figure.name: figure.value for figure in report.figures}["readings"] == 2 * again.rows
+
+
+def test_a_shipped_scene_is_opened_by_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert open_twin("lab", magnetometer="physical").scene.name == "lab"
+    with pytest.raises(InputError, match="no scene 'lap'; did you mean 'lab'"):
+        open_twin("lap")
+    with pytest.raises(InputError, match=r"author it first: magtwin scene room\.toml"):
+        open_twin("room.toml")

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any
 
-from magtwin.errors import InputError, MismatchWarning
-from magtwin.files import existing, git_revision, sha256
+from magtwin.errors import InputError, MismatchWarning, find
+from magtwin.files import existing, git_revision, sha256, shipped
 from magtwin.run.run import Run
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
@@ -36,8 +36,8 @@ def open_twin(
     `magtwin.MismatchWarning` with the expected error. Runs keep its text as `network_mismatch`.
 
     Args:
-        scene: Root layer of a scene; or a `Scene`, which is authored to a temporary folder first. Colliders
-            that were added to a stage by hand are not part of a `Scene`.
+        scene: Root layer of a scene, or the name of one that ships ("lab"); or a `Scene`, which is authored
+            to a temporary folder first. Colliders added to a stage by hand are not part of a `Scene`.
         network: Weights (.safetensors or .pth) that replace those of the scene; or "none" for a physical
             magnetometer.
         magnetometer: Kind that replaces the scene's: "physical", "neural" or "map-only".
@@ -55,7 +55,7 @@ def open_twin(
     from magtwin.usd.obstacles import read_obstacles
     from magtwin.usd.scene import read_scene
 
-    file = FilePath(scene)
+    file = scene_file(scene)
     read = read_scene(file, check_network=network is None and magnetometer in (None, "neural"))
     read = dataclasses.replace(
         read,
@@ -77,6 +77,23 @@ def open_twin(
         named = {**twin.metadata, "network_file": FilePath(network).as_posix()}
         return dataclasses.replace(twin, metadata=named)
     return twin
+
+
+def scene_file(scene: str | FilePath) -> FilePath:
+    """The file of a stage, or that of a scene that ships with magtwin by its name, such as "lab".
+
+    Raises:
+        InputError: The file is missing, there is no scene of that name, or it is a TOML.
+    """
+    file = FilePath(scene)
+    if file.suffix == ".toml":
+        raise InputError(f"{scene}: describes a scene; author it first: magtwin scene {scene} --out FOLDER")
+    if file.suffix or file.exists():
+        return existing(file, "scene")
+    stages = {
+        stage.stem: stage for stage in shipped("scenes").glob("*/*.usda") if stage.stem == stage.parent.name
+    }
+    return find("scene", str(scene), stages)
 
 
 def opened(

@@ -366,7 +366,7 @@ def test_a_stage_that_shows_nothing_is_exported_without_a_thumbnail_and_says_so(
 
 
 @pytest.mark.parametrize(
-    ("scene", "text"), [("lap", "did you mean 'lab'"), ("lab.toml", "magtwin scene lab.toml --out DIR")]
+    ("scene", "text"), [("lap", "did you mean 'lab'"), ("lab.toml", "magtwin scene lab.toml --out FOLDER")]
 )
 def test_the_command_refuses_what_is_no_stage_with_status_1(scene, text, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:

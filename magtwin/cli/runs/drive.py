@@ -44,7 +44,7 @@ def drive(
     Parameters
     ----------
     scene
-        USD stage to drive in.
+        USD stage to drive in, or the name of a scene that ships with magtwin: lab.
     out
         Folder to make.
     live
@@ -60,9 +60,9 @@ def drive(
     from magtwin.sim.motion.follow import CONTROL_RATE_HZ
     from magtwin.sim.motion.manual import HELP, Gamepad, Keyboard, Recorder, at_start
     from magtwin.sim.runs.sensing import streams
-    from magtwin.twin import in_session, open_twin
+    from magtwin.twin import in_session, open_twin, scene_file
 
-    existing(scene, "scene")
+    scene = scene_file(scene)
     if gamepad is not None and existing(gamepad, "gamepad").is_dir():
         raise InputError(f"{gamepad}: a folder; name a gamepad in it, such as /dev/input/js0")
     with output(out, force=force) as folder:

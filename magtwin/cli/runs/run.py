@@ -113,7 +113,7 @@ def run(
     Parameters
     ----------
     scene
-        USD stage to drive in.
+        USD stage to drive in, or the name of a scene that ships with magtwin: lab.
     path
         sine, fast_sine, lawnmower, split_lawnmower, figure8, narrow_figure8, continuous_cycle, curvilinear,
         curvilinear_2; A to E, the cases of the paper's Table 1; random, a human-like driver, for a minute or
@@ -153,15 +153,11 @@ def run(
     pace
         Simulated seconds per second while it is shown. Default: 1.
     """
-    from magtwin.files import existing
     from magtwin.io.outputs import Outputs, drive
+    from magtwin.twin import scene_file
     from magtwin.usd.scene import robots_in
 
-    existing(scene, "scene")
-    if scene.suffix == ".toml":
-        raise InputError(
-            f"{scene}: is the description of a scene; author it first: magtwin scene {scene} --out DIR"
-        )
+    scene = scene_file(scene)
     outputs = Outputs.of(
         out or [Path("run")], scans=scans, force=force, out_unit=out_unit, usd_fps=usd_fps, picture=draw_run
     )

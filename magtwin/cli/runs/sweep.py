@@ -55,7 +55,7 @@ def sweep(
     Parameters
     ----------
     scene
-        USD stage to drive in.
+        USD stage to drive in, or the name of a scene that ships with magtwin: lab.
     out
         Folder to make.
     count
@@ -78,12 +78,12 @@ def sweep(
     keep
         Columns to write beside t. Default: all.
     """
-    from magtwin.files import check_free, existing
+    from magtwin.files import check_free
     from magtwin.sim.motion.drive_input import drive_input
-    from magtwin.twin import MIXTURE, open_twin, room_of
+    from magtwin.twin import MIXTURE, open_twin, room_of, scene_file
     from magtwin.twin import sweep as drive_many
 
-    existing(scene, "scene")
+    scene = scene_file(scene)
     for name, value, least in (("count", count, 1), ("sessions", sessions, 1), ("seed", seed, 0)):
         if value is not None and value < least:
             raise InputError(f"--{name} must be a whole number from {least} up, got {value}")

@@ -6,7 +6,6 @@ from typing import Literal
 from magtwin.cli.app import app
 from magtwin.cli.options import Force
 from magtwin.cli.terminal import Done, announce
-from magtwin.errors import InputError, find
 
 
 @app.command
@@ -40,9 +39,10 @@ def export(
     """
     from magtwin.export.package import export_scene
     from magtwin.files import check_free, existing
+    from magtwin.twin import scene_file
 
     check_free(out, force=force)
-    stage = _stage(scene)
+    stage = scene_file(scene)
     animation = None
     if run is not None:
         from magtwin.io.formats import read_run
@@ -59,20 +59,6 @@ def export(
         progress=announce,
     )
     return Done(made.report(), tuple(made.files))
-
-
-def _stage(scene: Path) -> Path:
-    """A stage's file, or that of a scene that ships with magtwin."""
-    if scene.suffix == ".toml":
-        raise InputError(
-            f"{scene}: is the description of a scene; author it first: magtwin scene {scene} --out DIR"
-        )
-    if scene.suffix or scene.exists():
-        return scene
-    from magtwin.files import shipped
-
-    stages = sorted(shipped("scenes").glob("*/*.usda"))
-    return find("scene", str(scene), {file.stem: file for file in stages if file.stem == file.parent.name})
 
 
 def _write_onnx(weights: Path, out: Path) -> None:

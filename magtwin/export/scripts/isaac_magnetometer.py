@@ -5,7 +5,7 @@
 
 Written from the sources of Isaac Sim 6.0.1 and never run there, as it needs an RTX card; the loop is that of
 newton_magnetometer.py, which is tested. STAGE is a scene of magtwin's, NETWORK what `magtwin network export
-WEIGHTS.safetensors --onnx NETWORK.onnx` wrote. Signals are the physics' own, without noise or delay, and the
+WEIGHTS.safetensors --out NETWORK.onnx` wrote. Signals are the physics' own, without noise or delay, and the
 battery stays full.
 """
 
