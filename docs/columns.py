@@ -9,18 +9,19 @@ HERE = Path(__file__).resolve().parent
 INTRODUCTION = """\
 # Columns of a Run
 
-One row a magnetometer reading. Signals that are slower are held: a row has the latest that was known by then.
-These names, units and frames are stable: a column may be added, none changes what it means. A localizer adds
-`est_*`, and a user what they like.
+A Run is a table with one row per magnetometer reading. This page lists the columns that magtwin writes.
 
-In Python a vector is one array, `run["odom_p"]` of shape (N, 3). In tables (Parquet, CSV, pandas, ...)
-it is one column a part, `odom_p_x`, `odom_p_y`, `odom_p_z`; parts of a quaternion are x, y, z, w. `bool`
-columns are flags, all others float64. Fields are in nT (the Earth's is about 50,000), angles in rad; nan
-stands where nothing is known.
+- Names, units and frames are stable. New columns may be added, but none changes its meaning. A localizer
+  adds `est_*`, and you can add your own.
+- Slower signals are held: a row has the latest value known at its time.
+- Fields are in nT (the Earth's is about 50,000), angles in rad. nan means unknown.
+- In Python a vector is one array: `run["odom_p"]` has shape (N, 3). In tables (Parquet, CSV, pandas, ...)
+  it has one column per part: `odom_p_x`, `odom_p_y`, `odom_p_z`. The parts of a quaternion are x, y, z, w.
+- `bool` columns are flags; all others are float64.
 
-Between two rows `Run.resample` reads a column as the last column of this table says: **linear**;
-**angle**, the shorter way round; **quaternion**, at constant rate (slerp); **hold**, the value of the
-row before, as only what was known by then counts.
+The last column of the table is the rule by which `Run.resample` finds values between two rows: **linear**;
+**angle**, linear along the shorter arc; **quaternion**, at constant rate (slerp); **hold**, the value of
+the row before, so that no future value is used.
 """
 
 
@@ -28,7 +29,7 @@ def page() -> str:
     """The page, from `COLUMNS`."""
     lines = [
         INTRODUCTION,
-        "| column | parts | unit | frame | what it is | between rows |",
+        "| column | parts | unit | frame | meaning | between rows |",
         "|---|---|---|---|---|---|",
     ]
     for name, spec in COLUMNS.items():
@@ -37,7 +38,7 @@ def page() -> str:
     return "\n".join([*lines, "", ERRORS])
 
 
-ERRORS = """Every error has an address, where all are known:
+ERRORS = """Each error has its own column. Where all are known:
 
     b_total_nt = b_map_nt + b_disturbance_nt
     b_measured_nt = b_total_nt + b_model_error_nt + b_noise_nt

@@ -1,1 +1,1 @@
-"""Live ROS 2: topics in, topics out. Only here is ROS imported: rclpy where it is, else cyclonedds."""
+"""Live ROS 2 nodes. Only this package imports ROS: rclpy if it is installed, else cyclonedds."""

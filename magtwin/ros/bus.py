@@ -233,11 +233,11 @@ def open_bus(
     """Join ROS 2 as a node.
 
     Args:
-        name: The node's.
+        name: Name of the node.
         names: Namespace and remaps.
-        sim_time: Whether its clock is /clock's.
-        backend: Who carries it; "auto" takes rclpy where it can be imported, else cyclonedds.
-        domain: The domain; None takes ROS_DOMAIN_ID, or 0.
+        sim_time: Use the time of /clock.
+        backend: ROS client library; "auto" is rclpy if it can be imported, else cyclonedds.
+        domain: ROS domain. Default: ROS_DOMAIN_ID, or 0.
 
     Raises:
         InputError: The backend cannot be imported, or the domain is out of range.

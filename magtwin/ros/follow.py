@@ -41,7 +41,7 @@ COASTED_M = 0.3
 """Distance that a robot may coast after its pose is lost [m]."""
 
 BEGINS_M = 0.1
-"""Distance from the first point of a path at which a robot starts it where it stands [m]."""
+"""A robot nearer than this to the first point of a path starts from where it stands [m]."""
 
 STAND_S = 1.0
 """Time for which standing is commanded at the end [s]."""
@@ -194,8 +194,8 @@ class Follower:
     def _begin_here(self, x: float, y: float) -> None:
         """Count the beginning of the path as reached if the robot stands near it.
 
-        Markers a few centimetres off centre move when the robot turns on the spot, so it would never see
-        itself closer than that.
+        Markers a few centimetres off centre move when the robot turns on the spot, so its
+        reported pose may never come closer.
         """
         guide = self._guide
         begins = guide.law != RELEASE and guide.node == 0 and guide.table.shape[1] > 1

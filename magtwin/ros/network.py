@@ -1,4 +1,4 @@
-"""A network that reads rows as they come."""
+"""Following: a neural magnetometer that reads rows as they arrive."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Following:
-    """A neural magnetometer that reads rows as they come."""
+    """A neural magnetometer that reads rows as they arrive, in blocks of any length."""
 
     def __init__(self, magnetometer: "NeuralMagnetometer") -> None:
         self._magnetometer = magnetometer

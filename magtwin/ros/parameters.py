@@ -1,4 +1,4 @@
-"""Parameters of a node, each with its range; on the command line name:=value, as in ROS."""
+"""Parameters of a node, each with its range; set by name:=value on the command line, as in ROS."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

@@ -144,7 +144,7 @@ class Player:
         self._bus, self._begun = bus, time.monotonic()
 
     def run(self, until: Callable[[], bool] = lambda: False, *, speed: float = 1.0) -> int:
-        """Publish it at `speed` times its pace, after `SETTLE_S`; the number of messages."""
+        """Publish it at `speed` times real time, after `SETTLE_S`; returns the number of messages."""
         first = float(self._run["t"][0])
         begin = max(time.monotonic(), self._begun + SETTLE_S)
         count = 0

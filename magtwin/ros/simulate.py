@@ -48,7 +48,7 @@ MOST_HZ = 1000.0
 """Highest rate of readings [Hz], that of the magnetometer node."""
 
 WARM = 5
-"""Steps of a second robot at the start, which load libraries and show which topics there are."""
+"""Steps of a second robot at the start. They load libraries and determine the topics."""
 
 REPORT_S = 1.0
 """Wall time between diagnostics [s]."""

@@ -14,7 +14,7 @@ RATE_HZ = 20.0
 
 
 class Teleop:
-    """The node: repeats the last command of a hand."""
+    """The node: repeats the last command of a keyboard or gamepad."""
 
     def __init__(self, bus: Bus, hand: Hand, source: int, *, stamped_commands: bool = False) -> None:
         """Advertise commands.
@@ -33,7 +33,7 @@ class Teleop:
         self._timer = bus.timer(1 / RATE_HZ, self._command)
 
     def run(self, step: Callable[[], None] = lambda: None) -> None:
-        """Drive until the hand ends it; `step` is called often."""
+        """Drive until the keyboard or gamepad ends it; `step` is called often."""
         while not self._hand.done:
             if select.select([self._source], [], [], 0.0)[0]:
                 self._hand.feed(os.read(self._source, 1024))

@@ -50,7 +50,7 @@ def struct_of(kind: str) -> type[IdlStruct]:
 
 
 def raw(kind: str, data: bytes) -> Any:
-    """A sample of a type that is these bytes."""
+    """A sample of a message type with these bytes as its CDR."""
     sample = object.__new__(struct_of(kind))
     sample.cdr = data
     return sample

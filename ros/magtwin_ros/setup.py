@@ -1,4 +1,4 @@
-"""The ament package of magtwin's nodes: magtwin itself comes from pip."""
+"""The ament package of magtwin's nodes. It does not contain magtwin, which is installed with pip."""
 
 from setuptools import setup
 
@@ -17,6 +17,6 @@ setup(
     install_requires=["setuptools", "pyyaml"],
     zip_safe=True,
     license="Apache-2.0",
-    description="The simulator, the neural-network magnetometer and the path follower as nodes.",
+    description="ROS 2 nodes of magtwin: simulator, neural-network magnetometer, path follower, recorder.",
     entry_points={"console_scripts": [f"{node} = magtwin_ros.nodes:{node}" for node in NODES]},
 )

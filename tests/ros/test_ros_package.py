@@ -75,9 +75,9 @@ def test_parameters_of_a_file_are_read_where_they_are_the_nodes(arguments, tmp_p
         ("--nonsense", "ROS has no argument '--nonsense'"),
         ("-p rate_hz=5", "-p takes name:=value, got 'rate_hz=5'"),
         ("-r", "-r takes a value"),
-        ("--params-file no.yaml", "no.yaml: no file of parameters"),
+        ("--params-file no.yaml", "no.yaml: not a parameter file"),
         ("--params-file {plain}", "section 'rate_hz' has no ros__parameters"),
-        ("--params-file {broken}", "broken.yaml: no file of parameters"),
+        ("--params-file {broken}", "broken.yaml: not a parameter file"),
     ],
 )
 def test_an_argument_that_means_nothing_is_refused_in_one_line(arguments, tmp_path, given, said) -> None:

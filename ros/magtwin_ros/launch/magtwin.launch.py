@@ -1,6 +1,9 @@
-"""The twin and its magnetometer: `ros2 launch magtwin_ros magtwin.launch.py scene:=lab.usda path:=figure8`.
+"""The simulated robot, its magnetometer and a path follower.
 
-With `sim:=false` the magnetometer alone, for a real robot; for Isaac Sim with `use_sim_time:=true` too.
+    ros2 launch magtwin_ros magtwin.launch.py scene:=lab.usda path:=figure8
+
+`sim:=false` launches the magnetometer without the simulator, for a real robot. For Isaac Sim, add
+`use_sim_time:=true`. Without `path` there is no follower.
 """
 
 from launch import LaunchDescription
@@ -15,31 +18,31 @@ SETTINGS = PathJoinSubstitution([FindPackageShare("magtwin_ros"), "config", "mag
 
 
 def generate_launch_description() -> LaunchDescription:
-    """What is launched."""
+    """The arguments and the nodes."""
     value = {
         name: LaunchConfiguration(name)
         for name in ("scene", "namespace", "sim", "use_sim_time", "units", "settings", "path", "speed")
     }
-    words = {name: ParameterValue(one, value_type=str) for name, one in value.items()}
+    words = {name: ParameterValue(argument, value_type=str) for name, argument in value.items()}
     timed = {"use_sim_time": ParameterValue(value["use_sim_time"], value_type=bool)}
     nodes = {"package": "magtwin_ros", "namespace": value["namespace"], "output": "screen"}
     return LaunchDescription(
         [
-            DeclareLaunchArgument("scene", description="USD stage of the twin"),
-            DeclareLaunchArgument("namespace", default_value="robot", description="where the topics stand"),
-            DeclareLaunchArgument("sim", default_value="true", description="whether the robot is simulated"),
+            DeclareLaunchArgument("scene", description="USD stage of the scene"),
+            DeclareLaunchArgument("namespace", default_value="robot", description="namespace of the topics"),
+            DeclareLaunchArgument("sim", default_value="true", description="simulate the robot"),
             DeclareLaunchArgument(
-                "use_sim_time", default_value=value["sim"], description="whether time is /clock's"
+                "use_sim_time",
+                default_value=value["sim"],
+                description="use the time of /clock; default: as sim",
             ),
             DeclareLaunchArgument(
-                "units", default_value="T", description="unit of fields: T, or nT as APRILab's robot has it"
+                "units", default_value="T", description="unit of fields: T, or nT as on APRILab's robot"
             ),
             DeclareLaunchArgument(
-                "settings", default_value=SETTINGS, description="file of the magnetometer's parameters"
+                "settings", default_value=SETTINGS, description="parameter file of the magnetometer"
             ),
-            DeclareLaunchArgument(
-                "path", default_value="", description="path that is driven; none unless given"
-            ),
+            DeclareLaunchArgument("path", default_value="", description="path to follow; empty: no follower"),
             DeclareLaunchArgument("speed", default_value="0.2", description="forward speed [m/s]"),
             Node(
                 executable="sim",

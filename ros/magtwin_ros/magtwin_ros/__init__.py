@@ -1,1 +1,1 @@
-"""Nodes of magtwin as executables of ROS 2."""
+"""magtwin's nodes as ROS 2 executables."""

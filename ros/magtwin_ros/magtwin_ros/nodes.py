@@ -1,4 +1,4 @@
-"""`ros2 run magtwin_ros NODE ...` is `magtwin ros NODE ...`, with the arguments of ROS read too."""
+"""Executables for `ros2 run magtwin_ros NODE ...`: `magtwin ros NODE ...` with ROS arguments."""
 
 import os
 import shutil
@@ -17,39 +17,43 @@ FIRST = {
     "replay": "run",
     "teleop": "",
 }
-"""Executables, and the parameter of each that its command takes without a name."""
+"""Executables, and the parameter of each that is the positional argument of its command."""
 
 OPTIONS = {"magnetometer": ("network", "duration_s")}
-"""Parameters that are options of a node whose others are settings, name:=value."""
+"""Parameters of the magnetometer that are options; its other parameters are settings, name:=value."""
 
 UNTIMED = ("sim", "replay")
-"""Nodes that say what time it is, to whom use_sim_time is nothing."""
+"""Nodes that publish the time and ignore use_sim_time."""
 
-PASSED_OVER = ("--log-level", "--log-config-file", "-e", "--enclave")
-"""What ROS says of logging and security, each with its value, for which magtwin has no use."""
+IGNORED = ("--log-level", "--log-config-file", "-e", "--enclave")
+"""ROS arguments for logging and security, each with a value, that are ignored."""
 
 
 class WrongArgument(ValueError):  # noqa: N818
-    """An argument of ROS that means nothing here."""
+    """A ROS argument that cannot be used."""
 
 
 def arguments(node: str, given: list[str]) -> list[str]:
-    """The command line of magtwin for what ROS gives: `--ros-args -r a:=b -r __ns:=/c -p name:=value`.
+    """The magtwin command line for ROS arguments such as `--ros-args -r a:=b -r __ns:=/c -p name:=value`.
 
-    Namespace, name and remaps become options, parameters settings or options. Those of a file are read as
-    ROS does: where its sections are `/**` or name the node, before those that are given one by one.
+    Namespace, node name and remaps become options. Parameters become settings or options. Of a parameter
+    file, the sections `/**` and those that name the node count. Parameters on the command line override it.
+
+    Args:
+        node: The executable.
+        given: Its command-line arguments.
 
     Raises:
-        WrongArgument: It is none of ROS, or a file of parameters cannot be read.
+        WrongArgument: An argument is unknown, or a parameter file cannot be read.
     """
     own: list[str] = []
     first: list[str] = []
     options: dict[str, str] = {}
     remaps: list[str] = []
-    told: dict[str, str] = {}
+    explicit: dict[str, str] = {}
     files: list[str] = []
     for flag, value in _split(given, own):
-        if flag in PASSED_OVER:
+        if flag in IGNORED:
             continue
         if flag == "--params-file":
             files.append(value)
@@ -57,15 +61,15 @@ def arguments(node: str, given: list[str]) -> list[str]:
         left, sign, right = value.partition(":=")
         if not sign:
             raise WrongArgument(f"{flag} takes name:=value, got {value!r}")
-        left = left.rpartition(":")[2]  # of which node; this executable is one
+        left = left.rpartition(":")[2]  # drop the node name of NODE:name; there is one node
         if flag in ("-p", "--param"):
-            told[left] = right
+            explicit[left] = right
         elif left in ("__ns", "__node", "__name"):
             options["namespace" if left == "__ns" else "node-name"] = right.strip("/")
         else:
             remaps += ["--remap", f"{left}:={right}"]
     whole = f"{options.get('namespace', 'robot')}/{options.get('node-name', f'magtwin_{node}')}".strip("/")
-    parameters = {name: value for file in files for name, value in _read(file, whole).items()} | told
+    parameters = {name: value for file in files for name, value in _read(file, whole).items()} | explicit
     for name, value in parameters.items():
         if name == FIRST[node]:
             first = [value]
@@ -75,19 +79,19 @@ def arguments(node: str, given: list[str]) -> list[str]:
             own.append(f"--{name.replace('_', '-')}={value}")
         elif node not in UNTIMED:
             own.append(f"--sim-time={value}")
-    said = [f"--{name}={value}" for name, value in options.items()]
-    return ["ros", node, *first, *own, *said, *remaps]
+    named = [f"--{name}={value}" for name, value in options.items()]
+    return ["ros", node, *first, *own, *named, *remaps]
 
 
 def _split(given: list[str], own: list[str]) -> Iterator[tuple[str, str]]:
-    """Arguments of ROS with their values; the others go to `own`."""
+    """ROS arguments with their values; the others are appended to `own`."""
     words, inside = iter(given), False
     for word in words:
         if word in ("--ros-args", "--"):
             inside = word == "--ros-args"
         elif not inside:
             own.append(word)
-        elif word in ("-r", "--remap", "-p", "--param", "--params-file", *PASSED_OVER):
+        elif word in ("-r", "--remap", "-p", "--param", "--params-file", *IGNORED):
             value = next(words, None)
             if value is None:
                 raise WrongArgument(f"{word} takes a value")
@@ -99,27 +103,27 @@ def _split(given: list[str], own: list[str]) -> Iterator[tuple[str, str]]:
 
 
 def _read(file: str, node: str) -> dict[str, str]:
-    """Parameters of a node in a file."""
+    """The parameters of a node in a parameter file."""
     try:
         content = yaml.safe_load(Path(file).read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError) as error:
-        raise WrongArgument(f"{file}: no file of parameters ({' '.join(str(error).split())})") from None
-    found: dict[str, str] = {}
+        raise WrongArgument(f"{file}: not a parameter file ({' '.join(str(error).split())})") from None
+    parameters: dict[str, str] = {}
     for section, values in (content if isinstance(content, dict) else {}).items():
-        parameters = values.get("ros__parameters") if isinstance(values, dict) else None
-        if not isinstance(parameters, dict):
+        entries = values.get("ros__parameters") if isinstance(values, dict) else None
+        if not isinstance(entries, dict):
             raise WrongArgument(f"{file}: section {section!r} has no ros__parameters")
         if section == "/**" or str(section).strip("/") in (node, node.rpartition("/")[2]):
-            found |= {str(name): _said(value) for name, value in parameters.items()}
-    return found
+            parameters |= {str(name): _text(value) for name, value in entries.items()}
+    return parameters
 
 
-def _said(value: Any) -> str:
+def _text(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def start(node: str) -> None:
-    """Be a node: by the magtwin of this Python, or the command, which may have a Python of its own."""
+    """Run a node with the magtwin of this Python, else with the magtwin command on the PATH."""
     try:
         command = arguments(node, sys.argv[1:])
     except WrongArgument as error:
@@ -127,12 +131,12 @@ def start(node: str) -> None:
     try:
         from magtwin.cli import main
     except ModuleNotFoundError:
-        if (found := shutil.which("magtwin")) is None:
+        if (command_file := shutil.which("magtwin")) is None:
             sys.exit(
-                "magtwin is neither in this Python nor on the PATH: pip install 'magtwin[ros]' into an "
-                "environment, and have its bin on the PATH"
+                "magtwin is neither in this Python nor on the PATH: pip install 'magtwin[ros]' in an "
+                "environment, and add its bin folder to the PATH"
             )
-        os.execv(found, [found, *command])
+        os.execv(command_file, [command_file, *command])
     main(command)
 
 
