@@ -61,26 +61,26 @@ def build_dataset(
     progress: Progress | None = None,
     **reading: Any,
 ) -> Dataset:
-    """Label recordings on a map and write them as a data set: measured total field minus the map.
+    """Label recordings and write them as a data set. A label is the measured total field minus the map.
 
     Args:
-        runs: Runs by name, or files of any kind that `magtwin.load_run` reads. A folder of `magtwin sweep`
-            stands for its runs.
+        runs: Runs by name, or files of any kind that `magtwin.load_run` reads. A folder of
+            `magtwin sweep` gives all runs in it.
         out: Folder to make.
         anomaly_map: The map, a map layer or stage, or a folder of survey CSVs.
-        alignment: Lever arm and latency of the sensor; "fit" fits them to all recordings. None uses pose and
-            reading as they are.
-        session_by: Where the session of a file comes from: "metadata" (else its name), "file" (its
-            name) or "folder".
-        path_by: Where the driven path comes from, likewise.
+        alignment: Lever arm and latency of the sensor; "fit" fits them to all recordings. None uses poses
+            and readings without correction.
+        session_by: What gives the session of a file: "metadata" (or the file name if it has none), "file"
+            (the file name) or "folder" (the folder name).
+        path_by: What gives the driven path; takes the same values.
         rate_hz: Highest rate of readings to keep [Hz]. Default: all.
         force: Replace an existing folder.
-        progress: Called with the recordings done, their number, and the name of the next.
+        progress: Called as progress(done, total, name of the next recording).
         **reading: Options of `magtwin.io.formats.read_run`: topics, unit, columns.
 
     Raises:
-        InputError: A file cannot be read, two recordings have one name, one has no label on the map, lacks a
-            pose or a field, all labels are the same, or the folder exists.
+        InputError: A file cannot be read; two recordings have the same name; a recording has no label on the
+            map, no pose or no field; all labels are equal; or the folder exists.
     """
     if isinstance(runs, Mapping):
         sources = sources_of(runs)

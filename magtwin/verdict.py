@@ -62,13 +62,13 @@ def verdict(
     least, most = ratio - EVEN, ratio + EVEN
     if interval is not None and all(map(math.isfinite, interval)):
         least, most = interval
-    sizes = f"{mae_nt:,.0f} nT against {naive_mae_nt:,.0f} nT"
+    sizes = f"mean error {mae_nt:,.0f} nT against {naive_mae_nt:,.0f} nT, a ratio of {ratio:.2f}"
     if most < 1:
-        text = f"Better than {than}: {ratio:.2f} of its error ({sizes})."
+        text = f"Better than {than}: {sizes}."
     elif least > 1:
-        text = f"WORSE than {than}: {ratio:.2f} times its error ({sizes})."
+        text = f"WORSE than {than}: {sizes}."
     else:
-        text = f"No better than {than}: {ratio:.2f} of its error ({sizes})."
+        text = f"No better than {than}: {sizes}."
     if not math.isnan(coverage):
         text += f" Its 90 % intervals hold {coverage:.0%} of the readings"
         if coverage < holds[0]:

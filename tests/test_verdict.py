@@ -10,17 +10,21 @@ from magtwin.verdict import coverage, recordings_text, verdict
 def test_a_verdict_says_by_how_much_and_whether_the_intervals_hold():
     good = verdict(100.0, 400.0, coverage=0.93, judged_on="3 runs")
     assert good == (
-        "Better than the naive mean: 0.25 of its error (100 nT against 400 nT). Its 90 % intervals hold 93% "
-        "of the readings. Judged on 3 runs."
+        "Better than the naive mean: mean error 100 nT against 400 nT, a ratio of 0.25. Its 90 % intervals "
+        "hold 93% of the readings. Judged on 3 runs."
     )
-    assert verdict(460.0, 400.0, coverage=0.63).startswith("WORSE than the naive mean: 1.15 times its error")
+    assert verdict(460.0, 400.0, coverage=0.63).startswith(
+        "WORSE than the naive mean: mean error 460 nT against 400 nT, a ratio of 1.15"
+    )
     assert "63% of the readings: they are TOO NARROW." in verdict(460.0, 400.0, coverage=0.63)
     assert verdict(100.0, 400.0, coverage=0.99).endswith("99% of the readings: they are too wide.")
 
 
 def test_models_are_equal_where_the_interval_of_their_ratio_holds_one():
     assert verdict(380.0, 400.0).startswith("Better")
-    assert verdict(380.0, 400.0, interval=(0.85, 1.05)).startswith("No better than the naive mean: 0.95")
+    assert verdict(380.0, 400.0, interval=(0.85, 1.05)).startswith(
+        "No better than the naive mean: mean error 380 nT against 400 nT, a ratio of 0.95"
+    )
     assert verdict(440.0, 400.0, interval=(0.9, 1.3)).startswith("No better")
     assert verdict(440.0, 400.0, interval=(1.02, 1.3)).startswith("WORSE")
     assert verdict(396.0, 400.0, interval=(math.nan, math.nan)).startswith("No better")

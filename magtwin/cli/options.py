@@ -62,8 +62,8 @@ Magnetometer = Annotated[
 ModelError = Annotated[
     bool,
     Parameter(
-        help="Add to neural readings the prediction error that the network had on recordings it was not "
-        "trained on. --no-model-error leaves the prediction and the sensor's noise."
+        help="Add a random model error to neural readings, as large as the network's error on recordings "
+        "outside its training set. With --no-model-error a reading is the prediction plus sensor noise."
     ),
 ]
 Lidar = Annotated[

@@ -33,16 +33,18 @@ def open_twin(
     """Open a scene with the map and the network that it names.
 
     A network that was trained on another map, another robot or another sensor position causes a
-    `magtwin.MismatchWarning` with the expected error. Runs keep its text as `network_mismatch`.
+    `magtwin.MismatchWarning` with the expected error. Its text is stored in the metadata of runs as
+    `network_mismatch`.
 
     Args:
-        scene: Root layer of a scene, or the name of one that ships ("lab"); or a `Scene`, which is authored
+        scene: Root layer of a scene, or the name of one that ships ("lab"); or a `Scene`, which is written
             to a temporary folder first. Colliders added to a stage by hand are not part of a `Scene`.
         network: Weights (.safetensors or .pth) that replace those of the scene; or "none" for a physical
             magnetometer.
         magnetometer: Kind that replaces the scene's: "physical", "neural" or "map-only".
-        model_error: Whether readings of a neural magnetometer include the model's error on recordings that
-            it was not trained on; see `magtwin.sim.sensors.model_error`.
+        model_error: Whether a random model error is added to the readings of a neural magnetometer, as large
+            as the network's error on recordings outside its training set; see
+            `magtwin.sim.sensors.model_error`.
 
     Raises:
         InputError: The stage, its map or its weights are missing or broken, or a checksum does not match.
@@ -88,7 +90,7 @@ def scene_file(scene: str | FilePath) -> FilePath:
     file = FilePath(scene)
     if file.suffix == ".toml":
         raise InputError(f"{scene}: describes a scene; author it first: magtwin scene {scene} --out FOLDER")
-    if file.suffix or file.exists():
+    if file.suffix or file.exists() or len(file.parts) > 1:
         return existing(file, "scene")
     stages = {
         stage.stem: stage for stage in shipped("scenes").glob("*/*.usda") if stage.stem == stage.parent.name

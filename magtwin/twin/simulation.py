@@ -66,13 +66,15 @@ def simulate(
             a `Path`; "random" for a random drive; `Commands` to play back; or a `Run` to drive again as
             recorded, with the scene's sensors.
         seed: Seed of all noise. The same seed gives byte-identical output.
-        session: Session of the robot, as for `in_session`. Default: one drawn from the seed. "survey" is the
-            robot as it was when the map was surveyed; a network trained on later sessions does not fit it.
+        session: Session of the robot; takes the values of `in_session`. Default: one drawn from the seed.
+            "survey" is the robot as it was during the survey of the map; a network trained on later sessions
+            is not
+            valid for it.
         speed: Forward speed on straight parts [m/s].
         duration_s: Duration [s]. Default: once along the path. A longer duration drives further laps.
         rate_hz: Magnetometer readings per second [Hz]. Default: the scene's.
-        network: As for `open_twin`, if `twin` is a file.
-        magnetometer: As for `open_twin`, if `twin` is a file.
+        network: As for `open_twin`; only if `twin` is not an opened twin.
+        magnetometer: As for `open_twin`; only if `twin` is not an opened twin.
         model_error: Whether readings of a neural magnetometer include model error; see `open_twin`.
         lidar: Whether the LiDAR follows its schedule, or stays on or off.
         outside: What the map reads outside its extent: nan, the nearest value inside, or an error.
@@ -80,17 +82,18 @@ def simulate(
             `magtwin.sim.motion.controllers.Controller`.
         engine: "kinematic"; "newton" for physics in the stage (extra `physics`); the name of a registered
             engine; or a custom `magtwin.sim.motion.engine.Engine`.
-        sensors: Custom sensors whose columns are added: names of registered ones, or factories; see
-            `magtwin.sim.extensions`.
+        sensors: Custom sensors: names of registered sensors, or functions that make a sensor. Their columns
+            are added to the run; see `magtwin.sim.extensions`.
         interference: Custom terms of the field at the magnetometer: names of registered ones, or functions.
-        progress: As for `engine_named`.
+        progress: Called by slow engines with steps done, steps at most, and the simulated time as text.
 
     Returns:
-        A Run with the columns of `magtwin.COLUMNS`. Its metadata record everything needed to reproduce it.
+        A Run with the columns of `magtwin.COLUMNS`. Its metadata contain everything that is needed to
+        reproduce it.
 
     Raises:
-        InputError: The path leaves the floor, hits an obstacle or leaves the map so that there is nothing to
-            read; an option is out of range; or the scene's field is constant.
+        InputError: The path leaves the floor or hits an obstacle; the whole path is outside the map; an
+            option is out of range; or the scene's field is constant.
     """
     from magtwin.sim.exact import check_field, check_read
     from magtwin.sim.runs.simulate import simulate as run_scene

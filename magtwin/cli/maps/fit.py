@@ -84,15 +84,15 @@ def map_fit(
     Parameters
     ----------
     sources
-        Readings of any form that `magtwin map import` takes, and its .parquet files.
+        Readings in any format that `magtwin map import` reads, or the .parquet files that it writes.
     out
         Map layer to write (.usdc).
     method
         trilinear interpolation between nodes, cubic, a Gaussian process (gp), or the field of equivalent
         dipoles with the robot's own field (harmonic).
     spacing_m
-        Spacing of the map's nodes [m]. Default: the survey's for trilinear, else the widest that costs almost
-        no accuracy; the report has the interpolation error.
+        Spacing of the map's nodes [m]. Default for trilinear: that of the survey. Default for other methods:
+        the widest with almost no loss of accuracy. The report gives the interpolation error.
     headings_deg
         Headings of the map [deg], such as 0,90,180,270. Default: the survey's for trilinear, else the fewest
         of 4, 6, 8, 12 or 24 that cost almost no accuracy.
@@ -133,7 +133,7 @@ def map_validate(
     Parameters
     ----------
     sources
-        Readings of any form that `magtwin map import` takes, and its .parquet files.
+        Readings in any format that `magtwin map import` reads, or the .parquet files that it writes.
     method
         Method to validate. May be repeated. Default: all methods.
     split

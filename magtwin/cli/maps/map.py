@@ -21,16 +21,16 @@ MapFile = Annotated[
 Kernel = Annotated[
     Literal["matern", "poisson"] | None,
     Parameter(
-        help="Covariance of the Gaussian process: Matern of order 5/2, or Poisson, that of a field above "
-        "uncorrelated sources. Default: poisson."
+        help="Covariance of the Gaussian process: Matern of order 5/2, or Poisson (a field above "
+        "uncorrelated sources). Default: poisson."
     ),
 ]
 Earth = Annotated[
     str | None,
     Parameter(
         help="The Earth's field for the harmonic fit: a scene; latitude,longitude,height,date [deg, deg, m, "
-        "YYYY-MM-DD] if the world's y is true north; or x,y,z in the world [nT]. Default: that of the "
-        "survey, if it is a twin's."
+        "YYYY-MM-DD] if the world's y is true north; or x,y,z in the world [nT]. Default: the one "
+        "stored in the survey, if a twin was surveyed."
     ),
 ]
 Date = Annotated[

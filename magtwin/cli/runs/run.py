@@ -116,42 +116,47 @@ def run(
         USD stage to drive in, or the name of a scene that ships with magtwin: lab.
     path
         sine, fast_sine, lawnmower, split_lawnmower, figure8, narrow_figure8, continuous_cycle, curvilinear,
-        curvilinear_2; A to E, the cases of the paper's Table 1; random, a human-like driver, for a minute or
-        --duration-s; or a CSV file of x,y [m]. Named paths are scaled to the floor. Default: the path of the
+        curvilinear_2; A to E (Table 1 of
+        Penumarti et al. 2025); random (like a human driver, for one minute or --duration-s); or a CSV file of
+        x,y [m]. Named paths are scaled to the floor. Default: the path of the
         scene, else figure8.
     fit
         Move and shrink the path until it fits the floor and its obstacles.
     commands
-        CSV file of t,v,w [s, m/s, rad/s] to drive by in place of a path, as `magtwin drive` writes it.
+        CSV file of commands t,v,w [s, m/s, rad/s] to drive instead of a path; `magtwin drive` writes one.
     robot
-        Robot, in a scene of several, that --path, --commands or --replay are for, and whose run alone is
-        written; the others drive what the scene says. Default: write every run, as run.NAME.rrd and so on.
+        In a scene of several robots: the robot that --path, --commands or --replay applies to. Only its run
+        is written; the other robots drive their paths in the scene. Default: write every run, as
+        run.NAME.rrd and so on.
     meet
         What happens if robots collide: refuse the run, or flag it as a bump. Default: refuse.
     engine
         What moves the robot: kinematic, or newton for physics in the stage.
     replay
-        Run, in any format, to drive again as it was recorded, with the sensors as they are set now.
+        File of a run, in any format. The robot repeats the recorded motion; the sensors use the current
+        settings.
     controller
-        What steers: magtwin's follower, the released package's controller, Stanley's, or pure pursuit.
+        Controller: magtwin's follower; release, the one of APRILab's released package; stanley; or
+        pure_pursuit.
     speed
         Forward speed on straight parts [m/s].
     duration_s
-        Length of the run [s]; more than once along the path gives further laps. Default: once along the path.
+        Duration of the run [s]. If it is longer than one pass along the path, the robot drives further laps.
+        Default: once along the path.
     out
         Output; may be repeated. A file gets the format of its suffix: .rrd, .parquet, .mcap, .db3, .csv,
         .npz, .usd, .usda or .usdc. A name without a suffix is a folder with run.rrd, run.parquet and run.png.
         Default: the folder run.
     scans
-        Cast the LiDAR's rays while it spins. Scans go into recordings, bags, and a table beside the run's,
-        such as run.scans.parquet.
+        Cast the LiDAR's rays while it spins. Scans are written to recordings and bags; for tables, to a
+        second file such as run.scans.parquet.
     live
-        Show the run in a Rerun viewer while it goes on. Files grow meanwhile, under names with "partial" or
-        "parts". Ctrl-C ends it and keeps what was driven.
+        Show the run in a Rerun viewer while it goes on. Until it ends, the names of growing files contain
+        "partial" or "parts". Ctrl-C ends it and keeps what was driven.
     viewer
-        Address of a running Rerun viewer to show it in, such as rerun+http://127.0.0.1:9876/proxy.
+        Address of a running Rerun viewer that shows the run, such as rerun+http://127.0.0.1:9876/proxy.
     pace
-        Simulated seconds per second while it is shown. Default: 1.
+        Simulated seconds per second of the live display. Default: 1.
     """
     from magtwin.io.outputs import Outputs, drive
     from magtwin.twin import scene_file

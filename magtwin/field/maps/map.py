@@ -225,7 +225,7 @@ class AnomalyMap(Summarized):
     def lookup_with_sd(
         self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan"
     ) -> tuple[Array, Array]:
-        """Field at poses, and its standard deviation: the root of the variance, interpolated like the field.
+        """Field at poses and its standard deviation, the root of the interpolated variance.
 
         Args:
             p_xy: Points in world [m], shape (..., 2).
@@ -236,7 +236,7 @@ class AnomalyMap(Summarized):
             Field magnitude and its standard deviation [nT], each of shape (...).
 
         Raises:
-            InputError: The map has no variance; or as `lookup`.
+            InputError: The map has no variance; or an error of `lookup`.
         """
         if self._variance is None:
             raise InputError(

@@ -69,10 +69,11 @@ class Columns:
     """Unit of the heading. Default: rad, with a check of its range."""
 
     unit: Unit | None = None
-    """Unit of the field. Default: the unit in which it has the size of the Earth's field."""
+    """Unit of the field. Default: detected, as the unit in which the values have the size of the
+    Earth's field."""
 
     scale: float | None = None
-    """Factor from the file's values to nT, instead of a unit, such as for a normalised sensor."""
+    """Factor from the file's values to nT. It replaces the unit, for example for normalised values."""
 
     time: str = ""
     """Column of time [s]. Default: t, time or timestamp."""
