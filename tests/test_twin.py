@@ -1,5 +1,7 @@
 """Twins and the sessions that their robots are in."""
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -97,3 +99,17 @@ def test_a_shipped_scene_is_opened_by_its_name(tmp_path, monkeypatch):
         open_twin("lap")
     with pytest.raises(InputError, match=r"author it first: magtwin scene room\.toml"):
         open_twin("room.toml")
+
+
+def test_a_twin_opens_its_stage_once_and_survives_another_process(lab_scene, monkeypatch):
+    twin = open_twin(lab_scene, magnetometer="physical")
+    shapes, links = twin.geometry()
+    copy = pickle.loads(pickle.dumps(twin))
+    assert copy.opened is None
+    assert copy.geometry()[1].keys() == links.keys()
+    assert len(copy.geometry()[0]) == len(shapes)
+    run = simulate(twin, duration_s=0.5, rate_hz=5.0)
+    monkeypatch.setattr("magtwin.usd.layers.open_stage", lambda *_: pytest.fail("opened the stage again"))
+    monkeypatch.setattr("magtwin.usd.scene.open_stage", lambda *_: pytest.fail("opened the stage again"))
+    assert twin.geometry()[1] is links
+    assert run.rows

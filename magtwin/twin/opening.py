@@ -52,13 +52,11 @@ def open_twin(
     options: Any = {"network": network, "magnetometer": magnetometer, "model_error": model_error}
     if isinstance(scene, Scene):
         return _open_in_memory(scene, **options)
-    from magtwin.usd.layers import stage_sha256
-    from magtwin.usd.maps import load_map
-    from magtwin.usd.obstacles import read_obstacles
-    from magtwin.usd.scene import read_scene
+    from magtwin.usd.scene import open_scene
 
     file = scene_file(scene)
-    read = read_scene(file, check_network=network is None and magnetometer in (None, "neural"))
+    stage = open_scene(file, check_network=network is None and magnetometer in (None, "neural"))
+    read = stage.scene
     read = dataclasses.replace(
         read,
         robot=_with_magnetometer(read.robot, network, magnetometer),
@@ -67,14 +65,15 @@ def open_twin(
             for other in read.others
         ),
     )
-    obstacles, field, predictor = read_obstacles(file), load_map(read.map_layer), _magnetometer(read)
-    metadata: Metadata = {"scene_file": file.as_posix(), "scene_sha256": stage_sha256(file)}
+    field, predictor = stage.map, _magnetometer(read)
+    metadata: Metadata = {"scene_file": file.as_posix(), "scene_sha256": stage.sha256}
     if revision := git_revision(file.parent):
         metadata["git_revision"] = revision
     metadata |= {"map": field.name, "map_sha256": sha256(read.map_layer)}
     platforms = {placed.robot.name: _platform_sha256(placed.robot) for placed in read.robots}
     metadata["platform_sha256"] = platforms[read.robot.name]
-    twin = _with_network(Twin(read, file, field, predictor, obstacles, metadata, platforms, model_error))
+    twin = Twin(read, file, field, predictor, stage.obstacles, metadata, platforms, model_error, opened=stage)
+    twin = _with_network(twin)
     if predictor and network is not None:
         named = {**twin.metadata, "network_file": FilePath(network).as_posix()}
         return dataclasses.replace(twin, metadata=named)

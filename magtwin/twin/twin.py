@@ -22,6 +22,8 @@ from magtwin.summary import Summarized, Summary
 if TYPE_CHECKING:
     from magtwin.learn.inference.magnetometer import NeuralMagnetometer
     from magtwin.sim.sensors.model_error import ModelError
+    from magtwin.usd.geometry import Link, Shape
+    from magtwin.usd.scene import OpenedScene
 
 Kind = Literal["physical", "neural", "map-only"]
 """Kind of magnetometer."""
@@ -64,8 +66,32 @@ class Twin(Summarized):
     session: Mapping[str, str | int] = dataclasses.field(default_factory=dict)
     """`session` and `session_seed`. Empty before a session is chosen."""
 
+    opened: "OpenedScene | None" = dataclasses.field(default=None, repr=False, compare=False)
+    """The open stage with its links and shapes. None in another process."""
+
     stage: object = dataclasses.field(default=None, repr=False, compare=False)
     """Keeps the temporary stage of a `Scene` alive. None if `scene_file` is a user's file."""
+
+    def geometry(self) -> "tuple[list[Shape], dict[str, Link]]":
+        """Shapes of the lab and the first robot, and the links of that robot, for writers and viewers.
+
+        They come from the stage that `open_twin` opened. A twin from another process opens it again.
+        """
+        from magtwin.usd.geometry import read_links, read_shapes
+        from magtwin.usd.scene import open_alone
+
+        name = self.scene.robot.name
+        if self.opened is not None:
+            opened = self.opened.alone(name)
+            return opened.shapes, opened.links
+        stage = open_alone(self.scene_file, name)
+        return list(read_shapes(stage)), read_links(stage)
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "opened": None}  # an open stage stays in its process
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        self.__dict__.update(state)
 
     def _summary(self) -> Summary:
         """The scene and its file, the robot, the map and the network."""

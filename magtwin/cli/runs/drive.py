@@ -80,7 +80,7 @@ def drive(
                 from magtwin.io.rerun.live import live_view
 
                 try:
-                    show = stack.enter_context(live_view(twin.scene, scene))
+                    show = stack.enter_context(live_view(twin))
                 except InputError as error:
                     note(f"no view: {error}")
             source = stack.enter_context(device(gamepad))

@@ -113,7 +113,7 @@ def write_comparison(
     lab, heading = (None, 0.0) if twin is None else (twin.scene.lab, heading_of(twin.field, first))
     size = ROOM + sum(map(size_of, runs.values()))
     if twin is not None:
-        interior = Interior.of(twin.scene, twin.scene_file)
+        interior = Interior.of(twin)
         size += interior.size(twin.field)
     title = " and ".join(runs) if len(runs) < 4 else f"{len(runs)} runs"
     views = comparison_layout(compared, lab, heading=heading)

@@ -32,7 +32,6 @@ from magtwin.io.rerun.world import POSE_HZ, Interior, Robot, send_still
 from magtwin.path import Path as Planned
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
-from magtwin.spec.scene import Scene
 from magtwin.twin import Twin
 
 Show = Callable[[float, tuple[float, float, float]], None]
@@ -232,23 +231,23 @@ def check_listens(address: str) -> None:
 
 
 @contextmanager
-def live_view(scene: Scene, scene_file: Path) -> Iterator[Show]:
+def live_view(twin: Twin) -> Iterator[Show]:
     """The lab and the robot in a window, which is closed with the block.
 
     Raises:
         InputError: No window can be opened here.
     """
-    with live_viewer() as (address, _), streamed(scene, scene_file, address) as show:
+    with live_viewer() as (address, _), streamed(twin, address) as show:
         yield show
 
 
 @contextmanager
-def streamed(scene: Scene, scene_file: Path, address: str) -> Iterator[Show]:
+def streamed(twin: Twin, address: str) -> Iterator[Show]:
     """The lab and the robot in the viewer at an address."""
     rec = rr.RecordingStream(APPLICATION, send_properties=False)
-    rec.connect_grpc(address, default_blueprint=drive_layout(scene.lab))
+    rec.connect_grpc(address, default_blueprint=drive_layout(twin.scene.lab))
     rec.send_recording_name("manual drive")
-    interior = Interior.of(scene, scene_file)
+    interior = Interior.of(twin)
     send_still(rec, interior.shapes)
     robot = Robot(rec, interior, rate_hz=POSE_HZ)
 
@@ -256,7 +255,7 @@ def streamed(scene: Scene, scene_file: Path, address: str) -> Iterator[Show]:
         x, y, yaw = pose
         columns = {
             "t": np.array([t]),
-            "p_world_base": np.array([[x, y, scene.robot.base_height_m]]),
+            "p_world_base": np.array([[x, y, twin.scene.robot.base_height_m]]),
             "q_world_base_xyzw": quat_from_yaw(np.array([yaw])),
         }
         robot.append(Run(columns))

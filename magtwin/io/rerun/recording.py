@@ -235,7 +235,7 @@ def recording_of(
     views = layout(known, lab, heading=heading, events=events, whole=whole)
     room += ROOM
     if twin is not None:
-        interior = Interior.of(twin.scene, twin.scene_file)
+        interior = Interior.of(twin)
         room += interior.size(twin.field)
     with stream(recording_id, name, views, room=room, **sinks) as rec:
         properties: dict[str, Any] = {

@@ -1,7 +1,6 @@
 """World: the lab, the robots and their paths in a Rerun recording, in 3D and from above."""
 
 import math
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -19,10 +18,9 @@ from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
 from magtwin.spec.robot import RobotSpec
-from magtwin.spec.scene import Scene
-from magtwin.usd.geometry import BASE_LINK, Link, Shape, read_links, read_shapes, srgb_from_linear
+from magtwin.twin import Twin
+from magtwin.usd.geometry import BASE_LINK, Link, Shape, srgb_from_linear
 from magtwin.usd.maps import HEAT_MAP, HEAT_MAP_HEIGHT_M
-from magtwin.usd.scene import open_alone
 
 Array = NDArray[np.float64]
 
@@ -95,14 +93,14 @@ class Interior:
     links: dict[str, Link]
 
     @classmethod
-    def of(cls, scene: Scene, scene_file: str | os.PathLike[str]) -> "Interior":
-        """Read the stage of a scene.
+    def of(cls, twin: Twin) -> "Interior":
+        """The lab and the first robot of a twin.
 
         Raises:
             InputError: The stage cannot be read.
         """
-        stage = open_alone(scene_file, scene.robot.name)
-        return cls(scene.robot, list(read_shapes(stage)), read_links(stage))
+        shapes, links = twin.geometry()
+        return cls(twin.scene.robot, shapes, links)
 
     def size(self, field: AnomalyMap) -> int:
         """Upper bound of its bytes in a recording: corners, normals and colours; the map twice."""
