@@ -95,6 +95,8 @@ def test_a_sweep_saves_a_folder_that_lists_its_runs(lab_scene, tmp_path):
 def test_a_shipped_scene_is_opened_by_its_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert open_twin("lab", magnetometer="physical").scene.name == "lab"
+    magtwin.author_scene("lab", tmp_path / "lab")
+    assert open_twin("lab", magnetometer="physical").scene_file.as_posix() == "lab/lab.usda"
     with pytest.raises(InputError, match="no scene 'lap'; did you mean 'lab'"):
         open_twin("lap")
     with pytest.raises(InputError, match=r"author it first: magtwin scene room\.toml"):

@@ -37,8 +37,9 @@ def open_twin(
     `network_mismatch`.
 
     Args:
-        scene: Root layer of a scene, or the name of one that ships ("lab"); or a `Scene`, which is written
-            to a temporary folder first. Colliders added to a stage by hand are not part of a `Scene`.
+        scene: Root layer or folder of a scene, the name of one that ships ("lab"), or a `Scene`, which is
+            written to a temporary folder first. Colliders added to a stage by hand are not part of a
+            `Scene`.
         network: Weights (.safetensors or .pth) that replace those of the scene; or "none" for a physical
             magnetometer.
         magnetometer: Kind that replaces the scene's: "physical", "neural" or "map-only".
@@ -81,7 +82,7 @@ def open_twin(
 
 
 def scene_file(scene: str | FilePath) -> FilePath:
-    """The file of a stage, or that of a scene that ships with magtwin by its name, such as "lab".
+    """The file of a stage, of a folder that `author_scene` wrote, or of a shipped scene's name such as "lab".
 
     Raises:
         InputError: The file is missing, there is no scene of that name, or it is a TOML.
@@ -89,6 +90,9 @@ def scene_file(scene: str | FilePath) -> FilePath:
     file = FilePath(scene)
     if file.suffix == ".toml":
         raise InputError(f"{scene}: describes a scene; author it first: magtwin scene {scene} --out FOLDER")
+    inside = file / f"{file.resolve().name}.usda"
+    if inside.is_file():
+        return inside
     if file.suffix or file.exists() or len(file.parts) > 1:
         return existing(file, "scene")
     stages = {
