@@ -247,7 +247,7 @@ def test_the_magnetometers_parameters_are_told_with_their_ranges_and_set_while_i
     ended = subprocess.run(command, capture_output=True, text=True, timeout=90)
     assert ended.returncode == 0, ended.stderr
     seen = json.loads(ended.stdout.splitlines()[-1])
-    assert (seen["doc"], seen["range"]) == ("readings a second [Hz]", [1.0, 1000.0])
+    assert (seen["doc"], seen["range"]) == ("rate of readings [Hz]", [1.0, 1000.0])
     assert (seen["words"], seen["was"]) == ("T or nT", 20.0)
     answers = seen["answers"]
     assert [name for name, (done, _) in answers.items() if done] == ["rate_hz 50.0", "units nT"]
