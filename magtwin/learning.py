@@ -68,8 +68,8 @@ def build_dataset(
             `magtwin sweep` gives all runs in it.
         out: Folder to make.
         anomaly_map: The map, a map layer or stage, or a folder of survey CSVs.
-        alignment: Lever arm and latency of the sensor; "fit" fits them to all recordings. None uses poses
-            and readings without correction.
+        alignment: Lever arm and latency of the sensor; "fit" fits them to all recordings. With None, poses
+            and readings are not corrected.
         session_by: What gives the session of a file: "metadata" (or the file name if it has none), "file"
             (the file name) or "folder" (the folder name).
         path_by: What gives the driven path; takes the same values.
@@ -79,8 +79,8 @@ def build_dataset(
         **reading: Options of `magtwin.io.formats.read_run`: topics, unit, columns.
 
     Raises:
-        InputError: A file cannot be read; two recordings have the same name; a recording has no label on the
-            map, no pose or no field; all labels are equal; or the folder exists.
+        InputError: A file cannot be read; two recordings have the same name; a recording has no poses, no
+            field or no reading inside the map; all labels are equal; or the folder exists.
     """
     if isinstance(runs, Mapping):
         sources = sources_of(runs)

@@ -40,8 +40,8 @@ Session = Annotated[
     int | Literal["survey"] | None,
     Parameter(
         converter=_session,
-        help="Session to draw from the seed: charge, IMU offsets, wheels, odometry and the robot's own "
-        "field differ between sessions. survey: the robot as it was when the map was surveyed. Default: 0.",
+        help="Session to draw from the seed. Sessions differ in battery charge, IMU offsets, wheels, "
+        "odometry and the robot's own field. survey: the robot as it was when the map was surveyed. Default: 0.",
     ),
 ]
 Network = Annotated[

@@ -66,7 +66,7 @@ def simulate(
             a `Path`; "random" for a random drive; `Commands` to play back; or a `Run` to drive again as
             recorded, with the scene's sensors.
         seed: Seed of all noise. The same seed gives byte-identical output.
-        session: Session of the robot; takes the values of `in_session`. Default: one drawn from the seed.
+        session: Session of the robot; see the function `in_session`. Default: one drawn from the seed.
             "survey" is the robot as it was during the survey of the map; a network trained on later sessions
             is not
             valid for it.
@@ -80,12 +80,12 @@ def simulate(
         outside: What the map reads outside its extent: nan, the nearest value inside, or an error.
         controller: "follower", "release", "stanley" or "pure_pursuit", or a custom
             `magtwin.sim.motion.controllers.Controller`.
-        engine: "kinematic"; "newton" for physics in the stage (extra `physics`); the name of a registered
+        engine: "kinematic"; "newton" for physics in the stage (`magtwin[physics]`); the name of a registered
             engine; or a custom `magtwin.sim.motion.engine.Engine`.
         sensors: Custom sensors: names of registered sensors, or functions that make a sensor. Their columns
             are added to the run; see `magtwin.sim.extensions`.
         interference: Custom terms of the field at the magnetometer: names of registered ones, or functions.
-        progress: Called by slow engines with steps done, steps at most, and the simulated time as text.
+        progress: Called by slow engines as progress(steps done, most steps, simulated time as text).
 
     Returns:
         A Run with the columns of `magtwin.COLUMNS`. Its metadata contain everything that is needed to

@@ -28,8 +28,9 @@ Kernel = Annotated[
 Earth = Annotated[
     str | None,
     Parameter(
-        help="The Earth's field for the harmonic fit: a scene; latitude,longitude,height,date [deg, deg, m, "
-        "YYYY-MM-DD] if the world's y is true north; or x,y,z in the world [nT]. Default: the one "
+        help="The Earth's field for the harmonic fit: that of a scene (its file); of a place and date, as "
+        "latitude,longitude,height,date [deg, deg, m, YYYY-MM-DD], if the world's y axis points to true north; "
+        "or its components x,y,z in the world [nT]. Default: the one "
         "stored in the survey, if a twin was surveyed."
     ),
 ]

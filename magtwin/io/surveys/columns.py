@@ -79,7 +79,7 @@ class Columns:
     """Column of time [s]. Default: t, time or timestamp."""
 
     run_column: str = ""
-    """Column whose values, numbers or words, separate runs."""
+    """Column that identifies the run of each row, by numbers or text."""
 
     def __post_init__(self) -> None:
         for name, count in (("quaternion", 4), ("vector", 3)):
