@@ -41,7 +41,8 @@ Session = Annotated[
     Parameter(
         converter=_session,
         help="Session to draw from the seed. Sessions differ in battery charge, IMU offsets, wheels, "
-        "odometry and the robot's own field. survey: the robot as it was when the map was surveyed. Default: 0.",
+        "odometry and the robot's own field. survey: the robot as it was when the map was surveyed. "
+        "Default: 0.",
     ),
 ]
 Network = Annotated[

@@ -29,9 +29,9 @@ Earth = Annotated[
     str | None,
     Parameter(
         help="The Earth's field for the harmonic fit: that of a scene (its file); of a place and date, as "
-        "latitude,longitude,height,date [deg, deg, m, YYYY-MM-DD], if the world's y axis points to true north; "
-        "or its components x,y,z in the world [nT]. Default: the one "
-        "stored in the survey, if a twin was surveyed."
+        "latitude,longitude,height,date [deg, deg, m, YYYY-MM-DD], if the world's y axis points to true "
+        "north; or its components x,y,z in the world [nT]. Default: the one stored in the survey, if a twin "
+        "was surveyed."
     ),
 ]
 Date = Annotated[
