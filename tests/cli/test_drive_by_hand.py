@@ -138,9 +138,9 @@ def test_a_folder_is_no_gamepad(tmp_path, lab_scene, capsys):
 
 
 def test_a_viewer_that_listens_shows_the_drive_while_it_goes_on(lab_scene):
-    scene = open_twin(lab_scene, network="none").scene
+    twin = open_twin(lab_scene, network="none")
     try:
-        with live_viewer(headless=True) as (address, client), streamed(scene, lab_scene, address) as show:
+        with live_viewer(headless=True) as (address, client), streamed(twin, address) as show:
             for k in range(20):
                 show(k / 50, (k / 100, 0.0, 0.0))
             end = time.monotonic() + 60

@@ -253,5 +253,5 @@ def test_the_magnetometers_parameters_are_told_with_their_ranges_and_set_while_i
     assert [name for name, (done, _) in answers.items() if done] == ["rate_hz 50.0", "units nT"]
     assert "T or nT" in answers["units gauss"][1]
     assert "range" in answers["rate_hz 5000.0"][1]
-    assert seen["lines"][:2] == ["rate_hz is 50.0 now", "units is nT now"]
+    assert seen["lines"][:2] == ["rate_hz is now 50.0", "units is now nT"]
     assert "nT" in seen["lines"][2]

@@ -1,5 +1,6 @@
 """The simulator as a node: what is recorded over ROS is what happened; it obeys, and says how it fares."""
 
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -274,8 +275,8 @@ def test_commands_that_it_cannot_hear_and_others_on_its_topics_are_said(
     assert said[0].level == "warn"
     assert "1 commands were not finite" in said[0].message
     assert "commands of type geometry_msgs/msg/TwistStamped are ignored" in said[0].message
-    assert "2 publishers on /clock" in said[0].message
-    assert "2 publishers on /robot/qtfm/magnitude" in said[0].message
+    for topic in (CLOCK, MAGNITUDE):  # a node of an earlier test may still be known
+        assert re.search(rf"[2-9] publishers on {topic.name}", said[0].message)
     assert simulator.online.commands.rows[:, 1:].any() == np.False_
 
 
