@@ -64,7 +64,7 @@ def beside_the_network(twin: Twin, robots: int, repetitions: int, exact: bool) -
 
     def alone() -> None:
         for first in range(0, robots, 16):
-            network.predict(x[: rows * min(16, robots - first)])
+            network.net.predict(x[: rows * min(16, robots - first)])
 
     def whole() -> None:
         runs = sweep(
@@ -73,7 +73,7 @@ def beside_the_network(twin: Twin, robots: int, repetitions: int, exact: bool) -
         for _ in runs:
             pass
 
-    network.predict(x[:rows])
+    network.net.predict(x[:rows])
     warm_up()
     ratios, best = [], math.inf
     for k in range(repetitions):
