@@ -3,6 +3,11 @@
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# The same examples on every run; `pytest --hypothesis-profile=default` draws new ones.
+settings.register_profile("fixed", derandomize=True, deadline=None, database=None)
+settings.load_profile("fixed")
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data"
 
