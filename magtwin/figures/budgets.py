@@ -5,7 +5,7 @@ from textwrap import fill
 from typing import Any
 
 from magtwin.figures.canvas import WIDTH_IN, Picture, label, new_figure, open_frame, picture
-from magtwin.figures.evaluation_pictures import MOST_PANELS, ink, trained_models
+from magtwin.figures.evaluations import MOST_PANELS, ink, trained_models
 from magtwin.figures.page import Section, Table
 from magtwin.learn.evaluation.budget import CLOSED, TERMS, Budget, TrueError
 from magtwin.learn.evaluation.evaluation import Evaluation

@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
-from magtwin.figures.cutaway import Cutaway
 from magtwin.figures.pictures import (
     BACKGROUND,
     LAB_ELEVATION_DEG,
     Camera,
+    Cutaway,
     add_bar,
     add_text,
     aim,

@@ -141,9 +141,10 @@ def correlate(
     step("Ranking the inputs")
     result = correlations_of(dataset, features)
     if out is not None:
-        from magtwin.figures.training import plot_correlations
+        from magtwin.figures.canvas import save
+        from magtwin.figures.training import draw_correlations
 
-        plot_correlations(result, out, title=f"{dataset}", force=force)
+        save(draw_correlations(result, title=f"{dataset}"), out, force=force)
     return Done(result.report(f"Correlation with the disturbance in {dataset}"), out or ())
 
 

@@ -130,7 +130,7 @@ def _traversals(
     evaluation: "Evaluation", scene: Path | None, overlay: Path | None, engine: str | None
 ) -> "tuple[Section, dict[str, Any]]":
     """One path driven twice, as a section and as figures."""
-    from magtwin.figures.comparisons import section_of_traversals
+    from magtwin.figures.reports import section_of_traversals
     from magtwin.io.formats import read_run
     from magtwin.io.provenance import made_again
     from magtwin.run.compare import traversals

@@ -100,7 +100,8 @@ def train(
     rrd
         Rerun recording of the learning curve to write, .rrd.
     """
-    from magtwin.figures.training import plot_learning_curve, write_learning_curve
+    from magtwin.figures.canvas import save
+    from magtwin.figures.training import draw_learning_curve, write_learning_curve
     from magtwin.files import check_free
     from magtwin.io.rerun.learning import record_learning_curve
     from magtwin.learn.training.config import TrainConfig, read_config
@@ -155,7 +156,8 @@ def train(
         )
     if result.history:
         naive = result.parts[0].naive_rmse_nt
-        plot_learning_curve(result.history, picture, naive_rmse_nt=naive, title=out.name, force=force)
+        curve = draw_learning_curve(result.history, naive_rmse_nt=naive, title=out.name)
+        save(curve, picture, force=force)
         write_learning_curve(result.history, table, force=force)
         if rrd is not None:
             record_learning_curve(result.history, rrd, naive_rmse_nt=naive, title=out.name, force=force)

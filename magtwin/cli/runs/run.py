@@ -70,7 +70,7 @@ def demo(
         relative = {"scene_file": scene_file.relative_to(folder).as_posix()}
         driven = drive(scene_file, seed=seed, model_error=model_error, metadata=relative, report=announce)
         announce("Writing the run and pictures")
-        Outputs(folder, picture=draw_run).write(driven)
+        Outputs(folder, picture=save_picture).write(driven)
         _picture(scene_file, folder / "lab.png")
     pictures = ", ".join(str(file) for file in sorted(out.glob("*.png")))
     text = f"\nLook at it:  magtwin view {out / 'run.rrd'}\nPictures:    {pictures}"
@@ -164,7 +164,12 @@ def run(
 
     scene = scene_file(scene)
     outputs = Outputs.of(
-        out or [Path("run")], scans=scans, force=force, out_unit=out_unit, usd_fps=usd_fps, picture=draw_run
+        out or [Path("run")],
+        scans=scans,
+        force=force,
+        out_unit=out_unit,
+        usd_fps=usd_fps,
+        picture=save_picture,
     )
     if live and viewer:
         raise InputError("--live opens a viewer and --viewer names one; give one of them")
@@ -244,12 +249,13 @@ def run(
     return Done(driven.run.report(f"{what} in {scene}"), tuple(outputs.targets))
 
 
-def draw_run(driven: "Driven", out: Path, force: bool) -> None:
+def save_picture(driven: "Driven", out: Path, force: bool) -> None:
     """Draw run.png: the path over the map."""
-    from magtwin.figures.runs import plot_run
+    from magtwin.figures.canvas import save
+    from magtwin.figures.runs import draw_run
 
     planned = driven.planned.p_xy if driven.planned else None
-    plot_run(driven.run, driven.twin.field, out, planned=planned, force=force)
+    save(draw_run(driven.run, driven.twin.field, planned), out, force=force)
 
 
 def _run_robots(
