@@ -367,7 +367,5 @@ def _on_path(path: Path, s: Array, p_xy: Array) -> tuple[Array, Array]:
 
 
 gymnasium.register(
-    "magtwin/MagNav-v0",
-    entry_point="magtwin.gym:MagNavEnv",
-    vector_entry_point="magtwin.gym:MagNavVectorEnv",
+    "magtwin/MagNav-v0", entry_point="magtwin.gym:MagNavEnv", vector_entry_point="magtwin.gym:MagNavVectorEnv"
 )

@@ -27,17 +27,7 @@ ADDS = {
 }
 """What each extra is for."""
 
-PACKAGES = (
-    "usd-core",
-    "rerun-sdk",
-    "torch",
-    "numpy",
-    "scipy",
-    "numba",
-    "pyarrow",
-    "rosbags",
-    "cyclopts",
-)
+PACKAGES = ("usd-core", "rerun-sdk", "torch", "numpy", "scipy", "numba", "pyarrow", "rosbags", "cyclopts")
 """Packages whose version matters in a report of a fault."""
 
 DRIVERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")

@@ -15,10 +15,7 @@ SAVED, LOST = "#40916c", "#c92a2a"
 
 
 def section_of_budget(
-    evaluation: Evaluation,
-    budgets: Sequence[Budget],
-    map_errors: Sequence[TrueError],
-    order: Sequence[int],
+    evaluation: Evaluation, budgets: Sequence[Budget], map_errors: Sequence[TrueError], order: Sequence[int]
 ) -> Section:
     """The error budget of a twin, for `page_of_evaluation`.
 

@@ -116,11 +116,7 @@ def info(dataset: Path) -> Done:
 
 @dataset_app.command
 def correlate(
-    dataset: Path,
-    *,
-    features: str = "full",
-    out: Path | None = None,
-    force: Force = False,
+    dataset: Path, *, features: str = "full", out: Path | None = None, force: Force = False
 ) -> Done:
     """Correlate each input with the disturbance: Spearman's rank correlation, as in the paper's Figure 2.
 

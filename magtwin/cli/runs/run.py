@@ -37,11 +37,7 @@ Outs = Annotated[list[Path] | None, Parameter(consume_multiple=False)]
 
 @app.command
 def demo(
-    *,
-    out: Path = Path("demo"),
-    seed: Seed = 0,
-    model_error: ModelError = True,
-    force: Force = False,
+    *, out: Path = Path("demo"), seed: Seed = 0, model_error: ModelError = True, force: Force = False
 ) -> Done:
     """Author a lab and a TurtleBot 4, drive a figure of eight and log what the magnetometer reads.
 
