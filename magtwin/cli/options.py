@@ -5,6 +5,8 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+from magtwin.errors import InputError
+
 
 def _whole(kind: type, tokens: Any) -> int:
     """A whole number; cyclopts itself would round 1.5 to 2."""
@@ -23,6 +25,20 @@ def _session(kind: Any, tokens: Any) -> int | str:
         return int(text)
     except ValueError:
         raise ValueError(f"a session is a whole number, or survey; got {text!r}") from None
+
+
+def pairs(
+    option: str, texts: list[str] | None, form: str = "NAME=VALUE", *, empty: bool = False
+) -> dict[str, str]:
+    """NAME=VALUE or NAME:=VALUE texts of an option as a table; `form` is shown if one is wrong."""
+    table: dict[str, str] = {}
+    for text in texts or ():
+        name, equals, value = text.partition("=")
+        name = name.removesuffix(":")
+        if not (name and equals and (value or empty)) or name in table:
+            raise InputError(f"--{option} takes {form}, each once, got {text!r}")
+        table[name] = value
+    return table
 
 
 Whole = Annotated[int, Parameter(converter=_whole)]
@@ -93,6 +109,7 @@ UsdFps = Annotated[
 RunScene = Annotated[
     Path | None, Parameter(help="Scene of the run. Default: the one that the run's metadata names.")
 ]
+OURS_THEIRS = "OURS:=THEIRS, such as /robot/enu/pose:=/vrpn/pose"
 Remap = Annotated[
     list[str] | None,
     Parameter(
