@@ -1,5 +1,6 @@
 """Options that several commands share: one type and one help text for each."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -123,3 +124,19 @@ Gamepad = Annotated[
         help="Linux gamepad such as /dev/input/js0. The left stick drives, Start ends. Default: the keyboard."
     ),
 ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensing:
+    """How a simulated robot reads its sensors; options of `magtwin run` and `magtwin sweep`."""
+
+    network: Network = None
+    magnetometer: Magnetometer = None
+    model_error: ModelError = True
+    rate_hz: RateHz = None
+    lidar: Lidar = "schedule"
+    outside: Outside = "nan"
+
+
+SensingOptions = Annotated[Sensing, Parameter(name="*")]
+SENSING = Sensing()

@@ -11,16 +11,13 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import (
+    SENSING,
     Flag,
     Force,
-    Lidar,
-    Magnetometer,
     ModelError,
-    Network,
-    Outside,
     OutUnit,
-    RateHz,
     Seed,
+    SensingOptions,
     Session,
     UsdFps,
 )
@@ -85,16 +82,11 @@ def run(
     engine: Literal["kinematic", "newton"] = "kinematic",
     replay: Path | None = None,
     controller: Literal["follower", "release", "stanley", "pure_pursuit"] = "follower",
-    network: Network = None,
-    magnetometer: Magnetometer = None,
-    model_error: ModelError = True,
+    sensing: SensingOptions = SENSING,
     seed: Seed = 0,
     session: Session = None,
     speed: float = 0.2,
     duration_s: float | None = None,
-    rate_hz: RateHz = None,
-    lidar: Lidar = "schedule",
-    outside: Outside = "nan",
     out: Outs = None,
     out_unit: OutUnit = None,
     usd_fps: UsdFps = None,
@@ -175,14 +167,11 @@ def run(
         raise InputError(f"--pace must be above 0 simulated seconds per second, got {pace:g}")
     what = _what(path, commands, replay)
     free = commands or replay  # driven without a path
+    no_path = free or path == "random"
     for given, option, fault in (
-        (
-            controller != "follower" and (free or path == "random"),
-            f"--controller {controller}",
-            "follows a path",
-        ),
+        (controller != "follower" and no_path, f"--controller {controller}", "follows a path"),
         (speed != 0.2 and free, "--speed", "is for a path or a driver"),
-        (fit and (free or path == "random"), "--fit", "is for a path"),
+        (fit and no_path, "--fit", "is for a path"),
         (engine == "newton" and replay, "--engine newton", "cannot repeat the motion of a run"),
     ):
         if given:
@@ -195,21 +184,8 @@ def run(
         from magtwin.io.rerun.live import check_listens
 
         check_listens(viewer)
-    options: dict[str, Any] = {
-        "commands": commands,
-        "replay": replay,
-        "network": network,
-        "magnetometer": magnetometer,
-        "model_error": model_error,
-        "seed": seed,
-        "session": session,
-        "speed": speed,
-        "duration_s": duration_s,
-        "rate_hz": rate_hz,
-        "lidar": lidar,
-        "outside": outside,
-        "controller": controller,
-    }
+    options: dict[str, Any] = {"commands": commands, "replay": replay, "seed": seed, "session": session}
+    options |= {"speed": speed, "duration_s": duration_s, "controller": controller, **vars(sensing)}
     robots = robots_in(scene)
     if robot is not None:
         find("robot", robot, robots)
