@@ -241,19 +241,6 @@ def view_distance(
     return float(np.max(b + np.maximum(np.abs(r) / np.tan(h), np.abs(u) / np.tan(v))))
 
 
-def check_view() -> None:
-    """Refuse to draw if a package of the extra `view` is missing.
-
-    Raises:
-        InputError: One is missing; the text says how to install it.
-    """
-    missing = [name for name in ("pyvista", "vtkmodules", "imageio_ffmpeg") if find_spec(name) is None]
-    if missing:
-        raise InputError(
-            f"pictures and films of stages need {', '.join(missing)}: pip install 'magtwin[view]'"
-        )
-
-
 def plotter_of(size: tuple[int, int], *, window: bool = False) -> Any:
     """A plotter, off screen or in a window.
 
@@ -261,7 +248,11 @@ def plotter_of(size: tuple[int, int], *, window: bool = False) -> Any:
         InputError: The extra `view` is missing, or the machine has no OpenGL. VTK itself would end the
             process.
     """
-    check_view()
+    missing = [name for name in ("pyvista", "vtkmodules", "imageio_ffmpeg") if find_spec(name) is None]
+    if missing:
+        raise InputError(
+            f"pictures and films of stages need {', '.join(missing)}: pip install 'magtwin[view]'"
+        )
     import vtkmodules.vtkRenderingOpenGL2
     from vtkmodules.vtkCommonCore import vtkLogger
     from vtkmodules.vtkRenderingCore import vtkRenderWindow
