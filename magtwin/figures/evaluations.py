@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from magtwin.errors import InputError
-from magtwin.field.maps.map import AnomalyMap
 from magtwin.figures.canvas import (
     INK,
     WIDTH_IN,
@@ -31,7 +30,7 @@ from magtwin.figures.training import draw_correlations, label_epochs
 from magtwin.files import output
 from magtwin.learn.data.correlation import correlations
 from magtwin.learn.data.features import FEATURES, FULL, features
-from magtwin.learn.evaluation.evaluation import PAPER, Case, Evaluation, Judged
+from magtwin.learn.evaluation.evaluation import PAPER, Evaluation, Judged
 from magtwin.learn.evaluation.scores import COVERED, DRAWS, LEVEL
 from magtwin.verdict import Z_90
 
@@ -171,7 +170,10 @@ def _lead_of_table(evaluation: Evaluation) -> str:
 def _table(evaluation: Evaluation) -> Table:
     """The paper's Table 1, transposed: one row per model."""
     cases = evaluation.cases
-    head = ["model", *(_case_name(evaluation, case) for case in cases)]
+    head = ["model"]
+    for case in cases:  # with its path if that differs
+        path = next((one.path for one in evaluation.judged if one.case == case.name), case.name)
+        head.append(case.name if path == case.name else f"{case.name} ({path})")
     rows = [["readings", *(case.scores[0].rows for case in cases)]]
     for m, name in enumerate(evaluation.names):
         scores = [case.scores[m] for case in cases]
@@ -185,12 +187,6 @@ def _table(evaluation: Evaluation) -> Table:
         head, *rows = (list(line) for line in zip(head, *rows, strict=True))
     note = "" if len(cases) < 3 else "mean: over the paths, with equal weights."
     return Table("Mean absolute errors", tuple(head), tuple(map(tuple, rows)), note)
-
-
-def _case_name(evaluation: Evaluation, case: Case) -> str:
-    """The name of a case, with its path if that differs."""
-    path = next((one.path for one in evaluation.judged if one.case == case.name), case.name)
-    return case.name if path == case.name else f"{case.name} ({path})"
 
 
 def _intervals(evaluation: Evaluation) -> Table:
@@ -239,20 +235,17 @@ def _maps(evaluation: Evaluation) -> Table:
     for named in evaluation.maps:
         mae, rms = evaluation.floor(named)
         expected = ("unknown", "unknown") if np.isnan(mae) else (mae, rms)
-        rows.append((named.name, named.field.method, *expected, *_map_errors(evaluation, named.field)))
+        m = next(i for i, one in enumerate(evaluation.candidates) if one.map.field is named.field)
+        errors = [one.map_nt[m, one.kept] - one.measured_nt[one.kept] for one in evaluation.judged]
+        error = np.concatenate(errors)
+        alone = (float(np.mean(np.abs(e))) for e in (error, error - error.mean()))
+        rows.append((named.name, named.field.method, *expected, *alone))
     head = ("map", "method", "expected MAE [nT]", "expected RMS [nT]", "map alone, MAE [nT]")
     note = (
         "expected: the map's error on these readings, according to its own variances; the noise floor of its "
         "labels. map alone: the map without a model of the robot, before and after its mean error is removed."
     )
     return Table("Maps", (*head, "less its mean [nT]"), tuple(rows), note)
-
-
-def _map_errors(evaluation: Evaluation, field: AnomalyMap) -> tuple[float, float]:
-    """MAE of a map without a model [nT], before and after its mean error on these readings is removed."""
-    m = next(i for i, one in enumerate(evaluation.candidates) if one.map.field is field)
-    error = np.concatenate([one.map_nt[m, one.kept] - one.measured_nt[one.kept] for one in evaluation.judged])
-    return float(np.mean(np.abs(error))), float(np.mean(np.abs(error - error.mean())))
 
 
 def _left_out(evaluation: Evaluation) -> Table:

@@ -5,7 +5,7 @@ import itertools
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -210,8 +210,14 @@ def _draw(
             screens.append(actor)
     if ground is None:
         ground = camera.elevation_deg > 0 and all(s.link for s in shapes)
-    if ground:
-        _add_ground(plotter, everything)
+    if ground:  # just below everything, in the colour of the background: only shadows on it are visible
+        import pyvista
+
+        low, high = everything.min(axis=0), everything.max(axis=0)
+        reach = 3 * float(np.max(high - low))
+        middle = (*((low + high) / 2)[:2], low[2] - 1e-3 * reach)
+        floor = pyvista.Disc(center=middle, inner=0, outer=reach, normal=(0, 0, 1), c_res=64)
+        plotter.add_mesh(floor, color=BACKGROUND, ambient=1.0, diffuse=0.0, specular=0.0)
     light(plotter, everything)
     aim(plotter, camera, around, size, bar=scale is not None and legend)
     if scale is not None and legend:
@@ -278,11 +284,8 @@ def plotter_of(size: tuple[int, int], *, window: bool = False) -> Any:
 def _loads(*names: str) -> bool:
     """Whether one of the shared libraries can be loaded."""
     for name in names:
-        try:
-            ctypes.CDLL(name)
-        except OSError:
-            continue
-        return True
+        with suppress(OSError):
+            return bool(ctypes.CDLL(name))
     return False
 
 
@@ -339,17 +342,6 @@ def bake(mesh: Any) -> None:
         towards = np.array(direction) / np.linalg.norm(direction)
         shade += DIFFUSE * strength * np.maximum(normals @ towards, 0.0)
     mesh["rgb"] = np.minimum(mesh["rgb"] * shade[:, None], 255).round().astype(np.uint8)
-
-
-def _add_ground(plotter: Any, everything: NDArray) -> None:
-    """A floor just below everything, in the colour of the background: only shadows on it are visible."""
-    import pyvista
-
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    reach = 3 * float(np.max(high - low))
-    middle = (*((low + high) / 2)[:2], low[2] - 1e-3 * reach)
-    floor = pyvista.Disc(center=middle, inner=0, outer=reach, normal=(0, 0, 1), c_res=64)
-    plotter.add_mesh(floor, color=BACKGROUND, ambient=1.0, diffuse=0.0, specular=0.0)
 
 
 def light(plotter: Any, everything: NDArray, *, soft: bool = True) -> None:
@@ -430,24 +422,14 @@ class Cutaway:
     """
 
     def __init__(self, plotter: Any, size: tuple[int, int], screens: Sequence[Any]) -> None:
-        """Prepare the pictures.
-
-        Args:
-            plotter: A pyvista plotter whose window was rendered once.
-            size: Width and height [pixel].
-            screens: Actors that may hide the subject. All others are the subject.
-        """
+        """Prepare the pictures of a rendered plotter; `screens` are the actors that may hide the subject."""
         self._plotter, self._size, self._screens = plotter, size, tuple(screens)
         window = plotter.render_window
         window.SetAlphaBitPlanes(1)
         self._whole, self._subject = _grabber(window, alpha=False), _grabber(window, alpha=True)
 
     def image(self, *, whole: bool = False) -> NDArray[np.uint8]:
-        """The picture from the present camera, shape (height, width, 3).
-
-        Args:
-            whole: Whether to draw everything solid.
-        """
+        """The picture from the present camera, shape (height, width, 3); all solid if `whole`."""
         image = self._grab(self._whole)
         if whole or not self._screens:
             return image
@@ -492,10 +474,7 @@ def _grabber(window: Any, *, alpha: bool) -> Any:
 
     grabber = vtkWindowToImageFilter()
     grabber.SetInput(window)
-    if alpha:
-        grabber.SetInputBufferTypeToRGBA()
-    else:
-        grabber.SetInputBufferTypeToRGB()
+    (grabber.SetInputBufferTypeToRGBA if alpha else grabber.SetInputBufferTypeToRGB)()
     grabber.ReadFrontBufferOff()
     grabber.ShouldRerenderOff()
     return grabber
