@@ -47,6 +47,7 @@ def demo(
     """
     from magtwin.author.robot import build_robot
     from magtwin.author.scene import author_scene
+    from magtwin.figures.pictures import picture_of_stage
     from magtwin.files import output, shipped
     from magtwin.io.outputs import Outputs, drive
     from magtwin.twin import scene_from_toml
@@ -64,7 +65,10 @@ def demo(
         driven = drive(scene_file, seed=seed, model_error=model_error, metadata=relative, report=announce)
         announce("Writing the run and pictures")
         Outputs(folder, picture=save_picture).write(driven)
-        _picture(scene_file, folder / "lab.png")
+        try:
+            picture_of_stage(scene_file, folder / "lab.png")
+        except InputError as error:  # OpenGL is missing
+            note(f"no picture of the stage: {error}")
     pictures = ", ".join(str(file) for file in sorted(out.glob("*.png")))
     text = f"\nLook at it:  magtwin view {out / 'run.rrd'}\nPictures:    {pictures}"
     return Done(driven.run.report(f"Demo in {out}"), out, text=text)
@@ -346,13 +350,3 @@ def _what(path: str | None, commands: Path | None, replay: Path | None) -> str:
     if len(named) > 1:
         raise InputError(f"{' and '.join(named)} each name what to drive; give one of them")
     return path or str(commands or replay or "figure8")
-
-
-def _picture(scene_file: Path, out: Path) -> None:
-    """Draw a stage; if OpenGL is missing, print that and go on."""
-    from magtwin.figures.pictures import picture_of_stage
-
-    try:
-        picture_of_stage(scene_file, out)
-    except InputError as error:
-        note(f"no picture of the stage: {error}")
