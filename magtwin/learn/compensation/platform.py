@@ -125,8 +125,7 @@ def fit_platform(
     )
 
 
-IRON = ("left_wheel", "right_wheel", "caster")
-"""Turning iron, by its names in a PlatformFieldSpec."""
+IRON = ("left_wheel", "right_wheel", "caster")  # Turning iron, by its names in a PlatformFieldSpec
 
 
 def _turning_iron(wheel_angle: Array, robot: RobotSpec | None) -> Array:

@@ -42,14 +42,9 @@ Progress = Callable[[int, int, str], None]
 KIND, VERSION = "magtwin data set", 1
 MANIFEST, RUNS = "dataset.json", "runs"
 
-BLOCK_ROWS = 65_536
-"""Rows of a row group, about 20 MB of columns."""
-
-MOST_BYTES = 64 << 20
-"""Largest manifest; 100,000 recordings take half of it."""
-
-ALIGNED_AT_HZ = 25.0
-"""Rate at which recordings are held in memory while an alignment is fitted [Hz]."""
+BLOCK_ROWS = 65_536  # Rows of a row group, about 20 MB of columns
+MOST_BYTES = 64 << 20  # Largest manifest; 100,000 recordings take half of it
+ALIGNED_AT_HZ = 25.0  # Rate at which recordings are held in memory while an alignment is fitted [Hz]
 
 ALIGNED = (
     *("t", "p_world_base", "yaw", "mocap_p", "mocap_q_xyzw", "odom_v", "odom_w"),

@@ -29,17 +29,10 @@ UNKNOWN, SEVERAL = "unknown", "several"
 SAMPLES = 100
 """Number of poses at which a network keeps its map's values, to compare maps: the RMS is known to 7 %."""
 
-SAME_NT = 1.0
-"""Maps that differ by less are the same [nT]; samples are rounded to 1 nT."""
-
-LEAST_SAMPLES = 10
-"""Least number of poses on both maps for a comparison."""
-
-TYPICAL_M_S = 0.2
-"""Speed at which the effect of a latency is computed [m/s], the default of a run."""
-
-SMALL_SHARE = 0.25
-"""Effects below this share of the network's own error give no warning."""
+SAME_NT = 1.0  # Maps that differ by less are the same [nT]; samples are rounded to 1 nT
+LEAST_SAMPLES = 10  # Least number of poses on both maps for a comparison
+TYPICAL_M_S = 0.2  # Speed at which the effect of a latency is computed [m/s], the default of a run
+SMALL_SHARE = 0.25  # Effects below this share of the network's own error give no warning
 
 
 @dataclass(frozen=True)

@@ -57,11 +57,8 @@ CLOSED = {
 
 _OTHERS = tuple(term for term in TERMS if term != "platform")
 
-PENALTY = 1e-3
-"""Penalty of the ridge for the expectations, relative to the curvature of the rows."""
-
-BUDGET_HZ = 20.0
-"""Highest rate of readings in a budget [Hz]; their exact field takes time."""
+PENALTY = 1e-3  # Penalty of the ridge for the expectations, relative to the curvature of the rows
+BUDGET_HZ = 20.0  # Highest rate of readings in a budget [Hz]; their exact field takes time
 
 
 @dataclass(frozen=True)

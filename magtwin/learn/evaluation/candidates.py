@@ -20,8 +20,7 @@ from magtwin.learn.models.linear import fit_linear
 from magtwin.run.run import Run
 from magtwin.summary import Summarized, Summary, listed
 
-NAIVE = "naive"
-"""Name of the naive model."""
+NAIVE = "naive"  # Name of the naive model
 
 
 class Model(Protocol):

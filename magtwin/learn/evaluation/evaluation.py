@@ -31,11 +31,8 @@ PAPER: Mapping[str, tuple[float, float, float]] = MappingProxyType(
 )
 """Table 1 of the paper (Penumarti et al. 2025): MAE and naive MAE [nT], and their ratio."""
 
-TOTALS = ("all", "mean")
-"""Rows of the table that are not paths."""
-
-GAUSSIAN_MAE = math.sqrt(2 / math.pi)
-"""Mean absolute error of a normal distribution, in standard deviations."""
+TOTALS = ("all", "mean")  # Rows of the table that are not paths
+GAUSSIAN_MAE = math.sqrt(2 / math.pi)  # Mean absolute error of a normal distribution, in standard deviations
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -18,14 +18,9 @@ BLOCK_S = 5.0
 """Length of the blocks of time that are resampled [s]: the robot's own field changes within seconds, and the
 map's error within 1 m."""
 
-DRAWS = 1000
-"""Number of resamples."""
-
-LEVEL = 0.95
-"""Confidence level of intervals."""
-
-COVERED = 0.9
-"""Nominal coverage of a predicted interval."""
+DRAWS = 1000  # Number of resamples
+LEVEL = 0.95  # Confidence level of intervals
+COVERED = 0.9  # Nominal coverage of a predicted interval
 
 _ABS, _SQUARE, _SUM, _KNOWN, _WITHIN, _OUTSIDE = range(6)
 

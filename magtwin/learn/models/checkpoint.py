@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.files import existing
 
-MOST_BYTES = 1 << 30
-"""Largest checkpoint that is read, unpacked."""
+MOST_BYTES = 1 << 30  # Largest checkpoint that is read, unpacked
 
 KEYS = ("model_state_dict", "scaler_X", "scaler_y")
 

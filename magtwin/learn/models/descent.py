@@ -249,8 +249,7 @@ class _Descent:
         return tensors | {f"rng.{name}": each.get_state() for name, each in self.generators.items()}
 
 
-_ADAM = ("step", "exp_avg", "exp_avg_sq")
-"""State of Adam for each parameter."""
+_ADAM = ("step", "exp_avg", "exp_avg_sq")  # State of Adam for each parameter
 
 
 def _part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:

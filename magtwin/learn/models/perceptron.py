@@ -15,8 +15,7 @@ Array = NDArray[np.float64]
 Layer = tuple[torch.Tensor, torch.Tensor]
 """Weights (out, in) and biases (out,), float32."""
 
-CHUNK = 512
-"""Rows of a block: layers of 512 then stay in a core's cache."""
+CHUNK = 512  # Rows of a block: layers of 512 then stay in a core's cache
 
 TILE = 16
 """Rows of the last block are padded to a multiple of this, a multiple of the rows that matrix kernels take at

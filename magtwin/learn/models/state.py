@@ -15,8 +15,7 @@ from safetensors.torch import save
 from magtwin.errors import InputError
 from magtwin.files import existing, output
 
-FORMAT_VERSION = 1
-"""Version of the file; other versions are refused."""
+FORMAT_VERSION = 1  # Version of the file; other versions are refused
 
 Tensors = Mapping[str, torch.Tensor]
 
