@@ -11,8 +11,8 @@ from magtwin.field.maps.map import AnomalyMap, Outside
 class TorchMap(torch.nn.Module):
     """`AnomalyMap.lookup` on tensors of any device, differentiable in p and yaw.
 
-    Values and derivatives are those of `AnomalyMap.lookup_with_gradient`, computed in float64 on the CPU. There
-    are no second derivatives, and none with respect to the map's values.
+    Values and derivatives are those of `AnomalyMap.lookup_with_gradient`, in float64 on the CPU. There are
+    no second derivatives, and none with respect to the map's values.
     """
 
     def __init__(self, field: AnomalyMap) -> None:
