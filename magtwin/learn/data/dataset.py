@@ -465,14 +465,11 @@ def _write(run: Run, source: Source, path: Path) -> Recording:
         column_encoding=floats,
     )
     label = run["label_nt"][np.isfinite(run["label_nt"])]
-    session, metadata = source.session, run.metadata
-    if not session and "session" in metadata:
-        seed = f"{metadata['session_seed']}-" if "session_seed" in metadata else ""
-        session = f"{seed}{metadata['session']}"
+    session, path_driven = source.session_and_path(run)
     return Recording(
         name=source.name,
-        session=session or source.name,
-        path=source.path or str(metadata.get("path", "")) or source.name,
+        session=session,
+        path=path_driven,
         rows=run.rows,
         labelled=len(label),
         duration_s=run.duration_s,

@@ -10,10 +10,10 @@ from magtwin.errors import InputError
 from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import build_dataset
 from magtwin.learn.data.labels import labels
+from magtwin.learn.data.recording import Source
 from magtwin.learn.evaluation.budget import TERMS, Truth, budgets, steps, true_errors
 from magtwin.learn.evaluation.candidates import NAIVE, Candidate, Mean, naive, named_map, tolles_lawson
 from magtwin.learn.evaluation.evaluate import evaluate
-from magtwin.learn.evaluation.trials import Trial
 from magtwin.run.run import Run
 from magtwin.sim.survey import field_at_rest_nt
 from magtwin.twin import check_scene, in_session_of, open_twin, simulate
@@ -61,7 +61,7 @@ def train(drives, named, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(drives, named, train):
-    trials = [Trial("d2", lambda: drives["d2"])]
+    trials = [Source("d2", lambda: drives["d2"])]
     baseline = naive(named, dataset=train)
     return evaluate([tolles_lawson(named, train)], trials, baseline=baseline, rng=np.random.default_rng(0))
 
