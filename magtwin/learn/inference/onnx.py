@@ -149,9 +149,7 @@ def inputs_of(predictor: Predictor) -> Inputs:
     Raises:
         InputError: A kind that has no graph.
     """
-    if isinstance(predictor, Hybrid):
-        return predictor.base.inputs
-    if isinstance(predictor, FieldNet | Linear):
+    if isinstance(predictor, FieldNet | Linear | Hybrid):
         return predictor.inputs
     raise InputError(f"a predictor of the kind {predictor.kind!r} has no ONNX graph")
 
