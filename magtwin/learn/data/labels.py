@@ -28,8 +28,8 @@ def labelled(run: Run, field: AnomalyMap, alignment: Alignment | None = None) ->
 
     label_nt and label_sd_nt are added; b_map_nt, b_map_gradient_nt_m and flag_outside_map are replaced by
     those of this map at the sensor's place, so that b_measured_nt = b_map_nt + label_nt. label_sd_nt is the
-    map's own standard deviation, with its gradient times the uncertainty of the alignment. The pose is that of
-    motion capture if the run has it, else the true pose; a run without yaw gets that of motion capture. A
+    map's own standard deviation, with its gradient times the uncertainty of the alignment. The pose is that
+    of motion capture if the run has it, else the true pose; a run without yaw gets that of motion capture. A
     reading has no label off the map, on masked nodes, without lock or pose, or without a measurement.
 
     Args:

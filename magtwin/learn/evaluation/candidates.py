@@ -65,9 +65,6 @@ class NamedMap(Summarized):
     checksums: frozenset[str]
     """SHA-256 of its file and of its values."""
 
-    def _summary(self) -> Summary:
-        return Summary(f"NamedMap {self.name}", self.field._summary().rows)
-
 
 def named_map(name: str, anomaly_map: AnomalyMap, *checksums: str) -> NamedMap:
     """A map with its checksums.
