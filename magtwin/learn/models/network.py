@@ -3,7 +3,7 @@
 import itertools
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -122,13 +122,15 @@ class FieldNet(Summarized, torch.nn.Module):
         h = ((x - self.x_mean) / self.x_scale).to(self.linears[0].weight.dtype)
         return self.y_mean + self.y_scale * self.body(h).to(self.y_mean.dtype)
 
-    def body(self, z: torch.Tensor) -> torch.Tensor:
-        """Scaled labels, shape (B,), from scaled features, shape (B, F)."""
+    def body(
+        self, z: torch.Tensor, drop: Callable[[torch.Tensor], torch.Tensor] | None = None
+    ) -> torch.Tensor:
+        """Scaled labels, shape (B,), from scaled features, shape (B, F); `drop` replaces torch's dropout."""
         *inner, last = self.linears
         for i, layer in enumerate(inner):
             z = torch.relu(layer(z))
             if i < len(inner) - 1:
-                z = torch.nn.functional.dropout(z, self.dropout, self.training)
+                z = drop(z) if drop else torch.nn.functional.dropout(z, self.dropout, self.training)
         return last(z).squeeze(-1)
 
     @property
