@@ -5,7 +5,6 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -259,25 +258,10 @@ def net_of_checkpoint(path: str | os.PathLike[str]) -> FieldNet:
         InputError: Not such a checkpoint.
     """
     path = Path(path)
-    saved = read_checkpoint(path, len(FULL))
-    net = FieldNet(
-        FULL,
-        [len(bias) for _, bias in saved.layers[:-1]],
-        metadata={
-            "source": path.name,
-            "source_sha256": sha256(path),
-            "scalers_by": saved.written_by,
-            "training_rows": saved.samples,
-        },
-    )
-    state: dict[str, Any] = {}
-    for i, (weight, bias) in enumerate(saved.layers):
-        state |= {f"layers.{i}.weight": weight, f"layers.{i}.bias": bias}
-    nan = np.full(len(FULL), math.nan)
-    state |= {"x_mean": saved.x_mean, "x_scale": saved.x_scale, "x_min": nan, "x_max": nan}
-    state |= {"y_mean": np.float64(saved.y_mean), "y_scale": np.float64(saved.y_scale)}
-    net.load_state_dict({name: torch.tensor(value) for name, value in state.items()})
-    return net.eval()
+    tensors, metadata = read_checkpoint(path)
+    facts = {"source": path.name, "source_sha256": sha256(path), **metadata}
+    about = {"features": FULL, "residual_sd_nt": None, "dropout": 0.3, "facts": facts}
+    return net_of(Weights(path, "mlp", about, tensors))
 
 
 def net_of(weights: Weights) -> FieldNet:
@@ -301,17 +285,18 @@ def net_of(weights: Weights) -> FieldNet:
                 f"{path}: tensor 'layers.{i}.weight' is {say(weight)}; a layer's have shape (out, in)"
             )
     try:
-        net = FieldNet(
-            weights.features,
-            [len(weight) for weight in held[:-1]],
-            dropout=dropout,
-            residual_sd_nt=weights.residual_sd_nt,
-            metadata=weights.about["facts"],
-        )
+        with torch.device("meta"):  # no memory before the shapes are checked
+            net = FieldNet(
+                weights.features,
+                [len(weight) for weight in held[:-1]],
+                dropout=dropout,
+                residual_sd_nt=weights.residual_sd_nt,
+                metadata=weights.about["facts"],
+            )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     state = weights.fit(net.state_dict())
     if not (bool((tensors["x_scale"] > 0).all()) and bool(tensors["y_scale"] > 0)):
         raise InputError(f"{path}: a scale of its scalers is not above 0")
-    net.load_state_dict(state)
+    net.load_state_dict(state, assign=True)
     return net.eval()
