@@ -155,9 +155,7 @@ def same_map(metadata: Metadata, field: AnomalyMap, name: str = "") -> bool:
 
 
 def _map_difference_nt(metadata: Metadata, field: AnomalyMap, name: str) -> float | None:
-    """RMS difference of a map from the values that a network keeps [nT]; None if unknown, inf if too few
-    overlap.
-    """
+    """RMS difference from the values that a network keeps [nT]; None if unknown, inf if too few overlap."""
     known, extent = (
         _numbers(metadata, name, "map_samples_nt", SAMPLES),
         _numbers(metadata, name, "map_extent_m", 4),
@@ -262,14 +260,7 @@ def _robot_mismatch(
 
 
 def _poses(extent: tuple[float, float, float, float]) -> tuple[Array, Array]:
-    """`SAMPLES` poses spread evenly over a floor and all headings, by Roberts' R3 sequence (2018).
-
-    Args:
-        extent: Smallest and largest x, then y [m].
-
-    Returns:
-        Points [m], shape (SAMPLES, 2), and headings [rad], shape (SAMPLES,).
-    """
+    """`SAMPLES` points and headings spread evenly over a floor, by Roberts' R3 sequence (2018)."""
     g = 1.22074408460575947536  # the root of g^4 = g + 1
     at = (0.5 + np.arange(1, SAMPLES + 1)[:, None] * g ** -np.arange(1.0, 4.0)) % 1.0
     low_x, high_x, low_y, high_y = extent
@@ -278,11 +269,7 @@ def _poses(extent: tuple[float, float, float, float]) -> tuple[Array, Array]:
 
 
 def _numbers(metadata: Metadata, name: str, key: str, count: int) -> list[float] | None:
-    """Numbers of a metadata entry; None if it is missing or unknown.
-
-    Raises:
-        InputError: The entry is not that many numbers.
-    """
+    """Numbers of a metadata entry; None if it is missing or unknown."""
     text = str(metadata.get(key, UNKNOWN))
     if text in (UNKNOWN, SEVERAL):
         return None

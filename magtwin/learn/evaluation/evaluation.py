@@ -206,13 +206,8 @@ class Evaluation(Summarized):
                 for case in self.cases
             ],
             "recordings": [
-                {
-                    "name": recording.name,
-                    "session": recording.session,
-                    "path": recording.path,
-                    "case": recording.case,
-                    "rows": int(recording.kept.sum()),
-                }
+                {name: getattr(recording, name) for name in ("name", "session", "path", "case")}
+                | {"rows": int(recording.kept.sum())}
                 for recording in self.judged
             ],
             "left_out": dict(self.left_out),

@@ -153,14 +153,7 @@ def _ridge(task: FitTask, start: Linear | None) -> FittedLinear:
 
 
 def _yardstick(task: FitTask, fitted: FittedLinear, mean_nt: Array, sd_nt: Array) -> Yardstick:
-    """How well the standard deviations of a linear model held on recordings that it had not seen.
-
-    Args:
-        task: What it was fitted to.
-        fitted: The fit.
-        mean_nt: Its predictions of the validation rows [nT].
-        sd_nt: Their standard deviations [nT].
-    """
+    """How well the standard deviations of a linear model held on unseen recordings."""
     learned, stops = task.train, task.validation
     error = np.concatenate([fitted.held_out_nt - learned.y, mean_nt - stops.y])
     sd = np.concatenate([fitted.model.predict(learned.x)[1], sd_nt])

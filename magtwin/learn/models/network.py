@@ -91,14 +91,8 @@ class FieldNet(Summarized, torch.nn.Module):
         widths = [len(self.features), *hidden, 1]
         self.layers = torch.nn.ModuleList(torch.nn.Linear(a, b) for a, b in itertools.pairwise(widths))
         ones = torch.ones(len(self.features), dtype=torch.float64)
-        for name, value in (
-            ("x_mean", 0 * ones),
-            ("x_scale", ones),
-            ("x_min", math.nan * ones),
-            ("x_max", math.nan * ones),
-            ("y_mean", 0 * ones[0]),
-            ("y_scale", ones[0].clone()),
-        ):
+        start = (0 * ones, ones, math.nan * ones, math.nan * ones, 0 * ones[0], ones[0].clone())
+        for name, value in zip(_SCALERS, start, strict=True):
             self.register_buffer(name, value)
 
     @property
@@ -167,14 +161,8 @@ class FieldNet(Summarized, torch.nn.Module):
         """
         x, y = np.asarray(x, float), np.asarray(y, float)
         of = inputs_of(x, self.features)
-        for name, value in (
-            ("x_mean", of.mean),
-            ("x_scale", of.scale),
-            ("x_min", of.low),
-            ("x_max", of.high),
-            ("y_mean", y.mean()),
-            ("y_scale", y.std()),
-        ):
+        values = (of.mean, of.scale, of.low, of.high, y.mean(), y.std())
+        for name, value in zip(_SCALERS, values, strict=True):
             getattr(self, name).copy_(torch.as_tensor(value))
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
