@@ -171,9 +171,9 @@ def naive(
         InputError: The mean is not known.
     """
     if dataset is not None:
-        labels = training_rows(dataset, names, named.field, (), alignment_on(dataset, named.checksums)).y
-        model = Mean(float(labels.mean()), float(labels.std()))
         alignment = alignment_on(dataset, named.checksums)
+        labels = training_rows(dataset, names, named.field, (), alignment)[1]
+        model = Mean(float(labels.mean()), float(labels.std()))
         return Candidate(NAIVE, model, named, alignment, {"fitted to": dataset.folder.name})
     for candidate in weights:
         mean = candidate.metadata.get("label_mean_nt")
@@ -216,10 +216,10 @@ def tolles_lawson(
     wanted = (*CIRCULAR, *GRADIENT, *CARRIED) if gradient else CIRCULAR
     able = set(dataset.columns) | {"yaw", "b_map_gradient_nt_m"}
     inputs = tuple(name for name in wanted if set(FEATURES[name].columns) <= able)
-    rows = training_rows(dataset, names, named.field, inputs, alignment)
-    model = fit_linear(rows.x, rows.y, rows.session, features=inputs, sd=rows.sd).model
+    x, y, sd, session = training_rows(dataset, names, named.field, inputs, alignment)
+    model = fit_linear(x, y, session, features=inputs, sd=sd).model
     kind = "Tolles-Lawson and gradient" if gradient else "Tolles-Lawson"
-    about = {"fitted to": dataset.folder.name, "penalty": model.penalty, "training rows": len(rows.y)}
+    about = {"fitted to": dataset.folder.name, "penalty": model.penalty, "training rows": len(y)}
     name = f"{kind}, {named.name}{' aligned' * given}"
     return Candidate(name, NeuralMagnetometer(model, name=name), named, alignment, about)
 

@@ -13,7 +13,7 @@ import torch
 from magtwin.errors import InputError
 from magtwin.learn.data.inputs import Array
 from magtwin.learn.models.network import FieldNet
-from magtwin.learn.models.state import load_state, save_state
+from magtwin.learn.models.state import load_state, save_state, tensors_below
 
 
 @dataclass(frozen=True)
@@ -102,20 +102,13 @@ class Learner:
 
 @dataclass(frozen=True, kw_only=True)
 class Course:
-    """Length and step sizes of a descent."""
+    """Length and step sizes of a descent, as in `fit_network.train`, and the seed of the order of rows."""
 
     epochs: int
     batch: int
-    """Rows per step."""
-
     lr: float
-    """Largest step size of Adam."""
-
     patience: int | None = None
-    """Stop after this many epochs without improvement; None runs all epochs."""
-
     seed: int = 0
-    """Seed of the order of rows."""
 
 
 def check_device(device: str) -> None:
@@ -228,8 +221,8 @@ class _Descent:
             sound = False
         if not sound:
             raise InputError(f"{checkpoint}: its epochs are not those of a training; start anew")
-        self.module.load_state_dict(_part(tensors, "module."))
-        self.kept = _part(tensors, "kept.")
+        self.module.load_state_dict(tensors_below(tensors, "module."))
+        self.kept = tensors_below(tensors, "kept.")
         for name, parameter in self.trained.items():
             state = {key: tensors[f"adam.{name}.{key}"].to(parameter.device) for key in _ADAM}
             self.adam.state[parameter] = state
@@ -290,7 +283,3 @@ class _Descent:
 
 
 _ADAM = ("step", "exp_avg", "exp_avg_sq")  # State of Adam for each parameter
-
-
-def _part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError, find
 from magtwin.learn.data.features import feature_names
 from magtwin.learn.models.descent import Course, Dropout, Epoch, Learner, check_device, descend
-from magtwin.learn.models.network import FieldNet, MetadataValue
+from magtwin.learn.models.network import FieldNet
 from magtwin.learn.models.state import digest
 
 Array = NDArray[np.float64]
@@ -32,7 +32,6 @@ def train(
     batch: int = 1024,
     lr: float = 1e-3,
     patience: int | None = None,
-    metadata: Mapping[str, MetadataValue] | None = None,
     init: FieldNet | None = None,
     freeze: Sequence[str] = (),
     checkpoint: str | os.PathLike[str] | None = None,
@@ -62,7 +61,6 @@ def train(
         batch: Rows per step.
         lr: Largest step size of Adam.
         patience: Stop after this many epochs without improvement; None runs all epochs.
-        metadata: Provenance to keep in the weights file.
         init: Network of the same inputs and layers to continue from, with its scalers. It is epoch 0, so that
             the result is never worse on the validation rows.
         freeze: Names of layers that stay as in `init`: "layers.0" is the first.
@@ -98,7 +96,7 @@ def train(
     seed = int(rng.integers(2**62))
     with torch.random.fork_rng(devices=[]):  # torch draws initial weights from its global generator
         torch.manual_seed(seed)
-        net = FieldNet(names, layers, dropout=dropout, metadata=metadata)
+        net = FieldNet(names, layers, dropout=dropout)
     if init is None:
         net.set_scalers(x, y)
     else:
