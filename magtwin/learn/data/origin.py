@@ -120,11 +120,8 @@ def label_frame(metadata: Metadata, name: str = "") -> tuple[float, float, float
         Forward [m], left [m] and lateness [s]; all 0 if labels used the true pose. None if the offset and age
         of motion capture are unknown, as for a real robot.
     """
-    lever, late = _numbers(metadata, name, "lever_arm_m", 2), _numbers(metadata, name, "latency_s", 1)
-    offset, age = (
-        _numbers(metadata, name, "mocap_offset_m", 2),
-        _numbers(metadata, name, "mocap_latency_s", 1),
-    )
+    entries = (("lever_arm_m", 2), ("latency_s", 1), ("mocap_offset_m", 2), ("mocap_latency_s", 1))
+    lever, late, offset, age = (_numbers(metadata, name, key, count) for key, count in entries)
     if lever is None or late is None:
         return None
     if metadata.get("poses") == "true":
@@ -156,10 +153,8 @@ def same_map(metadata: Metadata, field: AnomalyMap, name: str = "") -> bool:
 
 def _map_difference_nt(metadata: Metadata, field: AnomalyMap, name: str) -> float | None:
     """RMS difference from the values that a network keeps [nT]; None if unknown, inf if too few overlap."""
-    known, extent = (
-        _numbers(metadata, name, "map_samples_nt", SAMPLES),
-        _numbers(metadata, name, "map_extent_m", 4),
-    )
+    known = _numbers(metadata, name, "map_samples_nt", SAMPLES)
+    extent = _numbers(metadata, name, "map_extent_m", 4)
     if known is None or extent is None:
         return None
     low_x, high_x, low_y, high_y = extent
