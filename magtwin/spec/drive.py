@@ -58,8 +58,8 @@ class DriveSpec(Spec):
     """Relative error of radius and separation in all runs of the session, in addition to that of each run."""
 
     localization_std_m: float = 0.02
-    """Standard deviation of the position, along each axis of the world, that a path follower gets [m]. Default: of
-    a good indoor localization; 0 disables it."""
+    """Standard deviation of the position that a path follower gets, on each axis [m]; 0 disables it. Default:
+    that of a good indoor localization."""
 
     localization_yaw_std: float = 0.01
     """Standard deviation of the heading that a path follower gets [rad]; an estimate."""

@@ -17,8 +17,8 @@ from magtwin.sim.motion.controllers import (
 )
 from magtwin.sim.motion.drive import Pose
 from magtwin.sim.motion.engine import KINEMATIC, Engine, Travel
-from magtwin.sim.motion.pose_error import EXACT, PoseError
 from magtwin.sim.motion.plan import SLOWEST, drivable
+from magtwin.sim.motion.pose_error import EXACT, PoseError
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
 

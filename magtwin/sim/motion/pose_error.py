@@ -9,7 +9,7 @@ from magtwin.sim.motion import loop
 from magtwin.spec.drive import DriveSpec
 
 FASTEST = 4.0
-"""Largest frequency of a wave times the correlation time."""
+"""Highest W T of a wave."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,12 @@ def draw_pose_error(drive: DriveSpec, rng: np.random.Generator) -> PoseError:
     """The error of one run, from the figures `localization_*` of a drive.
 
     A Gauss-Markov process of correlation time T has the spectrum 1 / (1 + (W T)^2), so the frequencies of its
-    waves are W = tan(u pi / 2) / T for u between 0 and 1. One is drawn from each third; the highest is at
-    most `FASTEST` / T, since localizations are filtered.
+    waves are W = tan(u) / T with u drawn evenly, one from each third of its range. W T is at most `FASTEST`,
+    since localizations are filtered.
     """
     waves = loop.WAVES
     u = (np.arange(waves) + rng.random((3, waves))) / waves
-    frequency = np.minimum(np.tan(u * np.pi / 2), FASTEST) / drive.localization_time_s
+    frequency = np.tan(u * math.atan(FASTEST)) / drive.localization_time_s
     phase = rng.uniform(0.0, 2 * np.pi, (3, waves))
     share = math.sqrt(2.0 / waves)
     position, yaw = share * drive.localization_std_m, share * drive.localization_yaw_std

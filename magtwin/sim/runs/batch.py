@@ -22,10 +22,10 @@ from magtwin.sim.motion.closed_loop import LOOPS, ClosedLoop, run_loops, warm_up
 from magtwin.sim.motion.commands import Commands
 from magtwin.sim.motion.controllers import CONTROLLERS, CUSTOM_CONTROLLERS
 from magtwin.sim.motion.drive import Pose, draw_wheel_errors
-from magtwin.sim.motion.pose_error import draw_pose_error
 from magtwin.sim.motion.drive_input import DriveInput
 from magtwin.sim.motion.engine import Travel
 from magtwin.sim.motion.follow import check_arrived, loop_along, loop_by_commands
+from magtwin.sim.motion.pose_error import draw_pose_error
 from magtwin.sim.runs.sensing import Conditions, Sensing, streams
 from magtwin.sim.runs.simulate import Metadata, Sensed, check_run, sense_all, travel
 from magtwin.spec.drive import DriveSpec
