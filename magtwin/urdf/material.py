@@ -1,12 +1,12 @@
 """Material: the look of a surface (UsdPreviewSurface) and its friction (UsdPhysics)."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
 
-from magtwin.urdf.meshes.piece import GREY, Rgba
+from magtwin.urdf.meshes.piece import PLAIN, Paint
+from magtwin.urdf.meshes.texture import Textures
 from magtwin.urdf.physics.gazebo import Surface
 from magtwin.usd.geometry import linear_from_srgb
 
@@ -20,52 +20,15 @@ SURFACE, TEXTURE, READER = "surface", "texture", "reader"
 """Shaders of a look."""
 
 
-@dataclass(frozen=True)
-class Look:
-    """The look of a surface; colours are sRGB, 0 to 1, as in URDF."""
-
-    rgba: Rgba = GREY
-    """Colour and opacity; with a texture, the factor that multiplies it."""
-
-    name: str = ""
-    """Name of the material. Default: from the colour."""
-
-    texture: str = ""
-    """Asset path of the colour texture, or ""."""
-
-    mean: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Mean colour of the texture."""
-
-    roughness: float = 0.5
-    """0 is a mirror, 1 is chalk."""
-
-    metallic: float = 0.0
-    """0 is an insulator, 1 is metal."""
-
-    see_through: bool = False
-    """Whether the texture's opacity is used."""
-
-    cutoff: float = 0.0
-    """Opacity threshold between invisible and opaque; 0 blends."""
-
-    by_vertex: bool = False
-    """Whether the mesh's displayColor replaces the colour."""
-
-    @property
-    def display_colour(self) -> tuple[float, float, float]:
-        """Linear colour for viewers without materials."""
-        colour = linear_from_srgb(self.rgba[:3]) * linear_from_srgb(self.mean)
-        r, g, b = (round(float(c), 5) for c in colour)
-        return (r, g, b)
-
-
-def define_look(robot: Usd.Prim, look: Look) -> UsdShade.Material:
+def define_look(robot: Usd.Prim, look: Paint, textures: Textures) -> UsdShade.Material:
     """The material of a look, shared by all prims with that look.
 
     Args:
         robot: Root prim; looks are in a scope below it.
         look: The look.
+        textures: Receives its texture.
     """
+    texture = "" if look.image is None else textures.add(look.image)
     stage = robot.GetStage()
     scope = UsdGeom.Scope.Define(stage, robot.GetPath().AppendChild(LOOKS)).GetPath()
     hexed = "".join(f"{round(c * 255):02x}" for c in look.rgba)
@@ -73,7 +36,7 @@ def define_look(robot: Usd.Prim, look: Look) -> UsdShade.Material:
     path = scope.AppendChild(stem)
     while stage.GetPrimAtPath(path):
         material = UsdShade.Material(stage.GetPrimAtPath(path))
-        if _shows(material, look):
+        if _shows(material, look, texture):
             return material
         path = scope.AppendChild(f"{stem}_{hexed}" if number == 1 else f"{stem}_{hexed}_{number}")
         number += 1  # two looks have the same name
@@ -85,17 +48,17 @@ def define_look(robot: Usd.Prim, look: Look) -> UsdShade.Material:
     if look.by_vertex:
         reader = _reader(stage, path, "UsdPrimvarReader_float3", "displayColor", Sdf.ValueTypeNames.Float3)
         surface.GetInput("diffuseColor").ConnectToSource(reader)
-    elif look.texture:
-        _connect_texture(stage, path, surface, look)
+    elif texture:
+        _connect_texture(stage, path, surface, look, texture)
     surface.CreateOutput("surface", Sdf.ValueTypeNames.Token)
     material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
     return material
 
 
-def _inputs(look: Look) -> list[tuple[str, Sdf.ValueTypeName, Any]]:
+def _inputs(look: Paint) -> list[tuple[str, Sdf.ValueTypeName, Any]]:
     """Inputs of a look's UsdPreviewSurface: name, type and value."""
     kinds = Sdf.ValueTypeNames
-    colour = look.display_colour if look.texture else linear_from_srgb(look.rgba[:3])
+    colour = linear_from_srgb(look.rgba[:3]) if look.image is None else look.display_colour
     return [
         ("diffuseColor", kinds.Color3f, Gf.Vec3f(*(round(float(c), 5) for c in colour))),
         ("opacity", kinds.Float, round(look.rgba[3], 4)),
@@ -105,12 +68,14 @@ def _inputs(look: Look) -> list[tuple[str, Sdf.ValueTypeName, Any]]:
     ]
 
 
-def _connect_texture(stage: Usd.Stage, path: Sdf.Path, surface: UsdShade.Shader, look: Look) -> None:
+def _connect_texture(
+    stage: Usd.Stage, path: Sdf.Path, surface: UsdShade.Shader, look: Paint, file: str
+) -> None:
     """Connect a texture, mapped by the mesh's `st`, to the colour and, if used, the opacity."""
     kinds = Sdf.ValueTypeNames
     texture = UsdShade.Shader.Define(stage, path.AppendChild(TEXTURE))
     texture.CreateIdAttr("UsdUVTexture")
-    texture.CreateInput("file", kinds.Asset).Set(Sdf.AssetPath(look.texture))
+    texture.CreateInput("file", kinds.Asset).Set(Sdf.AssetPath(file))
     st = _reader(stage, path, "UsdPrimvarReader_float2", "st", kinds.Float2)
     texture.CreateInput("st", kinds.Float2).ConnectToSource(st)
     for side in ("wrapS", "wrapT"):
@@ -134,7 +99,7 @@ def _reader(
     return reader.CreateOutput("result", type_)
 
 
-def _shows(material: UsdShade.Material, look: Look) -> bool:
+def _shows(material: UsdShade.Material, look: Paint, file: str) -> bool:
     """Whether a material from `define_look` has this look."""
     stage, path = material.GetPrim().GetStage(), material.GetPath()
     surface = UsdShade.Shader(stage.GetPrimAtPath(path.AppendChild(SURFACE)))
@@ -144,9 +109,9 @@ def _shows(material: UsdShade.Material, look: Look) -> bool:
     wanted = {name: np.float32(value).tolist() for name, _, value in _inputs(look)}
     return (
         {i.GetBaseName(): np.float32(i.Get()).tolist() for i in surface.GetInputs()} == wanted
-        and (texture.GetInput("file").Get().path if texture else "") == look.texture
-        and surface.GetInput("opacity").HasConnectedSource() == look.see_through
-        and bool(stage.GetPrimAtPath(path.AppendChild(READER))) == bool(look.by_vertex or look.texture)
+        and (texture.GetInput("file").Get().path if texture else "") == file
+        and surface.GetInput("opacity").HasConnectedSource() == bool(look.see_through and file)
+        and bool(stage.GetPrimAtPath(path.AppendChild(READER))) == bool(look.by_vertex or file)
     )
 
 
@@ -183,13 +148,20 @@ def define_grip(robot: Usd.Prim, surface: Surface) -> UsdShade.Material:
     return material
 
 
-def wear(prim: Usd.Prim, robot: Usd.Prim, look: Look, grip: UsdShade.Material | None = None) -> None:
+def wear(
+    prim: Usd.Prim,
+    robot: Usd.Prim,
+    look: Paint | None,
+    textures: Textures,
+    grip: UsdShade.Material | None = None,
+) -> None:
     """Bind a look to a gprim or an Xform over one, and a physics material to a collider.
 
     The colour is also authored as displayColor, for viewers without materials, unless the mesh has one.
     """
+    look = look or PLAIN
     api = UsdShade.MaterialBindingAPI.Apply(prim)
-    api.Bind(define_look(robot, look))
+    api.Bind(define_look(robot, look, textures))
     if not look.by_vertex:
         colour = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(
             "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.constant

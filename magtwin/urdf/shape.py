@@ -10,9 +10,9 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Shape
-from magtwin.urdf.material import Look, define_grip, define_look, wear
+from magtwin.urdf.material import define_grip, define_look, wear
 from magtwin.urdf.meshes.mesh_layer import MESH, Entry, MeshLayer, free_name
-from magtwin.urdf.meshes.piece import Paint
+from magtwin.urdf.meshes.piece import PLAIN, Paint
 from magtwin.urdf.meshes.reading import Reading
 from magtwin.urdf.meshes.texture import Image, read_image
 from magtwin.urdf.physics.gazebo import Surface
@@ -48,7 +48,7 @@ def define_visual(
     paint = _paint_of(visual, description)
     if visual.geometry.mesh is None:
         prim = _define_primitive(body, VISUALS, visual)
-        wear(prim, body.GetParent(), _look(_plain(paint, "a primitive", description), meshes))
+        wear(prim, body.GetParent(), _plain(paint, "a primitive", description), meshes.textures)
         return [prim]
     entry = meshes.try_add(visual.geometry.mesh, meshes.visual)
     if entry is None:
@@ -83,7 +83,7 @@ def define_collider(
         if prim.IsA(UsdGeom.Mesh):
             UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr(APPROXIMATIONS[meshes.collision])
             prim.AddAppliedSchema(NEWTON_MESH_API)
-        wear(prim, robot, Look(), define_grip(robot, surface))
+        wear(prim, robot, None, meshes.textures, define_grip(robot, surface))
     return made
 
 
@@ -99,35 +99,19 @@ def _define_mesh(
     prim = UsdGeom.Xform.Define(stage, _path(body, VISUALS, visual.name or entry.path.name)).GetPrim()
     prim.GetReferences().AddReference(layer, entry.path)
     _place(prim, origin_of(visual))
-    looks = [_look(paint or given, meshes) for paint in entry.paints]
+    looks = [paint or given or PLAIN for paint in entry.paints]
     if not entry.subsets:
-        wear(prim, robot, looks[0])
+        wear(prim, robot, looks[0], meshes.textures)
         prim.SetInstanceable(True)
         return prim
     mesh = prim.GetPrimAtPath(MESH)
     for name, look in zip(entry.subsets, looks, strict=True):
-        UsdShade.MaterialBindingAPI.Apply(mesh.GetPrimAtPath(name)).Bind(define_look(robot, look))
+        material = define_look(robot, look, meshes.textures)
+        UsdShade.MaterialBindingAPI.Apply(mesh.GetPrimAtPath(name)).Bind(material)
     colours = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("displayColor")
     if given is not None and None in entry.paints and colours.GetInterpolation() == UsdGeom.Tokens.uniform:
         colours.GetAttr().Set(Vt.Vec3fArray([Gf.Vec3f(*look.display_colour) for look in looks]))
     return prim
-
-
-def _look(paint: Paint | None, meshes: MeshLayer) -> Look:
-    """The look of a paint, with its texture added to the robot's; the default look for None."""
-    if paint is None:
-        return Look()
-    return Look(
-        rgba=paint.rgba,
-        name=paint.name,
-        texture="" if paint.image is None else meshes.textures.add(paint.image),
-        mean=(1.0, 1.0, 1.0) if paint.image is None else paint.image.mean,
-        roughness=paint.roughness,
-        metallic=paint.metallic,
-        see_through=paint.see_through and paint.image is not None,
-        cutoff=paint.cutoff,
-        by_vertex=paint.by_vertex,
-    )
 
 
 def _paint_of(visual: Shape, description: Description) -> Paint | None:

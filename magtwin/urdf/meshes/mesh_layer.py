@@ -17,11 +17,10 @@ from magtwin.urdf.description.description import Description
 from magtwin.urdf.description.model import Mesh as UrdfMesh
 from magtwin.urdf.meshes.collider import Solid, solids_of
 from magtwin.urdf.meshes.mesh import SUFFIXES, Mesh, distinct, face_normals, read_mesh
-from magtwin.urdf.meshes.piece import GREY, Paint
+from magtwin.urdf.meshes.piece import PLAIN, Paint
 from magtwin.urdf.meshes.texture import Textures
 from magtwin.urdf.options import DEFAULTS, Collision, Options
 from magtwin.urdf.source.source import MissingFileError
-from magtwin.usd.geometry import linear_from_srgb
 from magtwin.usd.layers import describe_stage
 
 T = TypeVar("T")
@@ -182,7 +181,7 @@ class MeshLayer:
         A mesh of one colour has none here, since its visual has it.
         """
         kind, tokens = Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens
-        by_paint = np.array([display_colour(paint) for paint in file.paints], np.float32)
+        by_paint = np.array([(paint or PLAIN).display_colour for paint in file.paints], np.float32)
         if file.colours is not None:
             colours = np.where(np.isfinite(file.colours), file.colours, by_paint[file.paint][:, None])
             _primvar(mesh, "displayColor", kind, np.round(colours[:, corners], 4))
@@ -243,16 +242,6 @@ def free_name(name: str, taken: set[str]) -> str:
         unique = f"{name}_{number}"
     taken.add(unique)
     return unique
-
-
-def display_colour(paint: Paint | None) -> tuple[float, float, float]:
-    """Linear colour of a paint for viewers without materials."""
-    if paint is None:
-        r, g, b = linear_from_srgb(GREY[:3])
-    else:
-        mean = (1.0, 1.0, 1.0) if paint.image is None else paint.image.mean
-        r, g, b = linear_from_srgb(paint.rgba[:3]) * linear_from_srgb(mean)
-    return (round(float(r), 5), round(float(g), 5), round(float(b), 5))
 
 
 def _scaled(points: NDArray, faces: NDArray, scale: NDArray) -> tuple[NDArray[np.float32], NDArray]:
