@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,7 +22,7 @@ from magtwin.urdf.meshes.mesh_layer import MeshLayer, free_name, gather
 from magtwin.urdf.meshes.texture import TEXTURES
 from magtwin.urdf.options import DEFAULTS, Options
 from magtwin.urdf.physics.control import define_differential, define_safety, read_commands, read_drive
-from magtwin.urdf.physics.drive import NO_WHEELS, WheelDrive, check_rules
+from magtwin.urdf.physics.drive import NO_WHEELS, Wheels, check_rules
 from magtwin.urdf.physics.gazebo import (
     Surface,
     define_springs,
@@ -274,7 +274,7 @@ class _Author:
         stage: Usd.Stage,
         mechanism: Mechanism,
         options: Options,
-        wheels: Mapping[str, WheelDrive],
+        wheels: Wheels,
         places: dict[str, Place],
         paths: dict[str, Sdf.Path],
     ) -> list[Sdf.Path]:
@@ -303,7 +303,7 @@ class _Author:
             self.ledger.joint(joint.name, prim)
         joints = {joint.name: joint for joint in description.joints.values()}
         for name, mimic in mechanism.mimics.items():
-            define_mimic(made[name], made[mimic.leader], joints[name], joints[mimic.leader], mechanism)
+            define_mimic(made[name], made[mimic.joint], joints[name], joints[mimic.joint], mechanism)
         return [prim.GetPath() for prim in made.values()]
 
     def _equip(self, robot: Usd.Prim, tags: Tags, options: Options, drive: DriveSpec | None) -> None:

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description, origin_of
-from magtwin.urdf.description.model import Mesh, Shape
+from magtwin.urdf.description.model import Geometry, Shape
 from magtwin.urdf.meshes.mesh import bounds
 
 Array = NDArray[np.float64]
 
-Vertices = Callable[[Mesh], Array]
+Vertices = Callable[[Geometry], Array]
 """Vertices of a URDF `<mesh>`, scaled [m], shape (V, 3)."""
 
 OUTSIDE = 0.1
@@ -197,10 +197,10 @@ def _mass(description: Description, mass: float | None) -> Iterator[str]:
 
 def _box(part: Shape, vertices: Vertices | None) -> list[Array]:
     """Corners of a box around a visual or collision in its link's frame, shape (8, 3); [] if unknown."""
-    if part.geometry.mesh is None:
+    if part.geometry.kind != "mesh":
         high = part.geometry.half_extents(np.eye(3))
         low = -high
-    elif (points := _read(part.geometry.mesh, vertices)) is not None:
+    elif (points := _read(part.geometry, vertices)) is not None:
         low, high = bounds(points)
     else:
         return []
@@ -211,16 +211,16 @@ def _volume(parts: Iterable[Shape], vertices: Vertices | None) -> float:
     """Upper limit of the volume of shapes [m3], with boxes for meshes; inf if one is unknown."""
     total = 0.0
     for part in parts:
-        if part.geometry.mesh is None:
+        if part.geometry.kind != "mesh":
             total += part.geometry.volume
-        elif (points := _read(part.geometry.mesh, vertices)) is not None:
+        elif (points := _read(part.geometry, vertices)) is not None:
             total += float(np.prod(np.subtract(*bounds(points)[::-1])))
         else:
             return np.inf
     return total
 
 
-def _read(mesh: Mesh, vertices: Vertices | None) -> Array | None:
+def _read(mesh: Geometry, vertices: Vertices | None) -> Array | None:
     """Vertices of a mesh; None if it cannot be read."""
     try:
         return None if vertices is None else vertices(mesh)

@@ -280,10 +280,10 @@ def _geometries(
     for name, link in description.links.items():
         for role, shapes in (("visual", link.visuals), ("collision", link.collisions)):
             for index, shape in enumerate(shapes):
-                prims, mesh = ledger.shapes.get((name, role, index), []), shape.geometry.mesh
+                prims, form = ledger.shapes.get((name, role, index), []), shape.geometry
                 box_in = _box_of(shape, poses[name] @ origin_of(shape), meshes)
                 box_out = [box for prim in prims for path, box in boxes.items() if path.HasPrefix(prim)]
-                kind = shape.geometry.kind if mesh is None else str(mesh.filename).rpartition("/")[2]
+                kind = form.filename.rpartition("/")[2] if form.kind == "mesh" else form.kind
                 paths = tuple(map(str, prims))
                 lines.append(GeometryLine(name, role, index, kind, paths, box_in, _union(box_out)))
     return tuple(lines)
@@ -291,11 +291,11 @@ def _geometries(
 
 def _box_of(shape: Shape, T: NDArray[np.float64], meshes: MeshLayer) -> Box | None:
     """The box around a URDF visual or collision at a pose (4, 4) in the robot's frame."""
-    if shape.geometry.mesh is None:
+    if shape.geometry.kind != "mesh":
         half = shape.geometry.half_extents(T[:3, :3])
         return _corners(T[:3, 3] - half, T[:3, 3] + half)
     try:
-        points = meshes.vertices(shape.geometry.mesh)
+        points = meshes.vertices(shape.geometry)
     except (InputError, KeyError):
         return None  # missing, with a note
     return _corners(*bounds(points @ T[:3, :3].T + T[:3, 3]))

@@ -46,17 +46,15 @@ def define_visual(
         The prim; empty if its mesh is missing and the options allow that.
     """
     paint = _paint_of(visual, description)
-    if visual.geometry.mesh is None:
+    if visual.geometry.kind != "mesh":
         prim = _define_primitive(body, VISUALS, visual)
         wear(prim, body.GetParent(), _plain(paint, "a primitive", description), meshes.textures)
         return [prim]
-    entry = meshes.try_add(visual.geometry.mesh, meshes.visual)
+    entry = meshes.try_add(visual.geometry, meshes.visual)
     if entry is None:
         return []
     if not entry.textured:
-        paint = _plain(
-            paint, f"mesh {visual.geometry.mesh.filename!r} without texture coordinates", description
-        )
+        paint = _plain(paint, f"mesh {visual.geometry.filename!r} without texture coordinates", description)
     return [_define_mesh(body, visual, entry, paint, meshes, layer)]
 
 
@@ -67,11 +65,11 @@ def define_collider(
 
     The prims have purpose guide, so that viewers hide them by default. Arguments as for `define_visual`.
     """
-    if collision.geometry.mesh is None:
+    if collision.geometry.kind != "mesh":
         made = [_define_primitive(body, COLLISIONS, collision)]
     else:
         made = []
-        for path in meshes.try_add(collision.geometry.mesh, meshes.collider) or ():
+        for path in meshes.try_add(collision.geometry, meshes.collider) or ():
             prim = body.GetStage().DefinePrim(_path(body, COLLISIONS, collision.name or path.name), "Mesh")
             prim.GetReferences().AddReference(layer, path)
             _place(prim, origin_of(collision))
@@ -125,17 +123,19 @@ def _paint_of(visual: Shape, description: Description) -> Paint | None:
         return None
     name = material.name or ""
     shared = description.materials.get(name)
-    if not (material.color or material.texture or shared):
+    if material.rgba is None and not material.texture and not shared:
         given = (v.material for link in description.links.values() for v in link.visuals if v.material)
-        shared = next((m for m in given if name and m.name == name and (m.color or m.texture)), None)
-    colour = material.color or (shared.color if shared else None)
+        shared = next(
+            (m for m in given if name and m.name == name and (m.rgba is not None or m.texture)), None
+        )
+    colour = shared.rgba if shared and material.rgba is None else material.rgba
     texture = material.texture or (shared.texture if shared else None)
-    image = None if texture is None else _image(texture.filename, name, description)
+    image = None if texture is None else _image(texture, name, description)
     if image is None and colour is None:
         if texture is None and name:
             description.note(f"material {name!r} is named, but has no colour: shown without it")
         return None
-    r, g, b, a = (1.0, 1.0, 1.0, 1.0) if colour is None else (float(c) for c in colour.rgba)
+    r, g, b, a = (1.0, 1.0, 1.0, 1.0) if colour is None else (float(c) for c in colour)
     return Paint(name, (r, g, b, a)) if image is None else Paint(name, (1.0, 1.0, 1.0, a), image)
 
 
@@ -162,21 +162,20 @@ def _plain(paint: Paint | None, what: str, description: Description) -> Paint | 
 
 def _define_primitive(body: Usd.Prim, scope: str, shape: Shape) -> Usd.Prim:
     """Author a box, capsule, cylinder or sphere."""
-    stage, geometry = body.GetStage(), shape.geometry
-    kind = geometry.kind
-    solid, path, scale = getattr(geometry, kind), _path(body, scope, shape.name or kind), None
+    stage, form, kind, scale = body.GetStage(), shape.geometry, shape.geometry.kind, None
+    path = _path(body, scope, shape.name or kind)
     if kind == "box":
         prim = UsdGeom.Cube.Define(stage, path).GetPrim()
         UsdGeom.Cube(prim).CreateSizeAttr(1.0)
-        scale = np.asarray(solid.size, float)
+        scale = form.size
     elif kind == "sphere":
         prim = UsdGeom.Sphere.Define(stage, path).GetPrim()
-        UsdGeom.Sphere(prim).CreateRadiusAttr(solid.radius)
+        UsdGeom.Sphere(prim).CreateRadiusAttr(form.radius)
     else:
         schema = UsdGeom.Capsule if kind == "capsule" else UsdGeom.Cylinder
         prim = schema.Define(stage, path).GetPrim()
-        schema(prim).CreateRadiusAttr(solid.radius)
-        schema(prim).CreateHeightAttr(solid.length)  # without the ends of a capsule, in URDF and USD
+        schema(prim).CreateRadiusAttr(form.radius)
+        schema(prim).CreateHeightAttr(form.length)  # without the ends of a capsule, in URDF and USD
         schema(prim).CreateAxisAttr(UsdGeom.Tokens.z)
     _place(prim, origin_of(shape), scale)
     extent = UsdGeom.Boundable.ComputeExtentFromPlugins(UsdGeom.Boundable(prim), Usd.TimeCode.Default())

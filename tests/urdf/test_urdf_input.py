@@ -315,7 +315,7 @@ def test_xacro_has_arguments_properties_macros_blocks_conditions_includes_and_ya
     base, joint = description.links["left_base"], description.joints["hand"]
     assert base.inertial.mass == 3.0625
     assert_allclose(base.inertial.origin[:3, 3], [0.2, -0.2, 0.5])
-    assert_allclose(base.visuals[0].geometry.box.size, [2, 4, 6])
+    assert_allclose(base.visuals[0].geometry.size, [2, 4, 6])
     assert (joint.limit.velocity, joint.limit.upper) == (6, 1.5)
     assert_allclose(joint.limit.lower, -np.pi / 2)
     assert description.xml.find("gazebo/note").text == "${kept} quiet"
@@ -335,8 +335,8 @@ def test_the_expanded_text_is_a_urdf_of_the_same_robot(tmp_path):
 def test_small_errors_are_repaired_and_noted():
     description = read(URDF / "input_repairs.urdf")
     link = description.links["base_link"]
-    assert_allclose(link.visuals[0].geometry.box.size, [1, 2, 3])
-    assert_allclose(link.visuals[0].material.color.rgba, [1, 0, 0, 1])
+    assert_allclose(link.visuals[0].geometry.size, [1, 2, 3])
+    assert_allclose(link.visuals[0].material.rgba, [1, 0, 0, 1])
     assert len(link.visuals) == 1
     assert link.inertial.mass == 1
     dropped = [

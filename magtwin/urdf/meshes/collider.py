@@ -1,7 +1,5 @@
 """Collider: the solids of a mesh collider: its convex hull, convex parts, or the mesh itself."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,15 +13,8 @@ CONCAVITY = 0.05
 """Largest depth of a hollow, relative to the mesh, that a convex part may fill (coacd's threshold)."""
 
 
-@dataclass(frozen=True)
-class Solid:
-    """Triangles of a collider."""
-
-    points: NDArray[np.float32]
-    """Vertices [m], shape (V, 3)."""
-
-    faces: NDArray[np.int64]
-    """Corners of the triangles, counter-clockwise from outside, shape (F, 3)."""
+Solid = tuple[NDArray[np.float32], NDArray[np.int64]]
+"""Vertices [m], shape (V, 3), and triangles, counter-clockwise from outside, shape (F, 3)."""
 
 
 def solids_of(mesh: Mesh, collision: Collision) -> tuple[Solid, ...]:
@@ -33,7 +24,7 @@ def solids_of(mesh: Mesh, collision: Collision) -> tuple[Solid, ...]:
         InputError: The mesh is flat and has no hull; or coacd is not installed.
     """
     if collision == "mesh":
-        return (Solid(mesh.points, mesh.faces),)
+        return ((mesh.points, mesh.faces),)
     if collision == "decomposition":
         return _decomposition(mesh)
     return (_hull(mesh),)
@@ -63,7 +54,7 @@ def _hull(mesh: Mesh) -> Solid:
     faces = faces[np.lexsort(faces.T[::-1])]
     faces = faces[has_area(mesh.points, faces)]
     used, index = np.unique(faces, return_inverse=True)
-    return Solid(mesh.points[used], index.reshape(-1, 3))
+    return mesh.points[used], index.reshape(-1, 3)
 
 
 def _decomposition(mesh: Mesh) -> tuple[Solid, ...]:
@@ -78,4 +69,4 @@ def _decomposition(mesh: Mesh) -> tuple[Solid, ...]:
     )
     if not parts:
         raise InputError(f"{mesh.path}: coacd finds no convex parts in it; use --collision hull")
-    return tuple(Solid(np.asarray(v, np.float32), np.asarray(f, np.int64)) for v, f in parts)
+    return tuple((np.asarray(v, np.float32), np.asarray(f, np.int64)) for v, f in parts)

@@ -14,7 +14,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 
 from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description
-from magtwin.urdf.description.model import Mesh as UrdfMesh
+from magtwin.urdf.description.model import Geometry
 from magtwin.urdf.meshes.collider import Solid, solids_of
 from magtwin.urdf.meshes.mesh import SUFFIXES, Mesh, distinct, face_normals, read_mesh
 from magtwin.urdf.meshes.piece import PLAIN, Paint
@@ -83,7 +83,7 @@ class MeshLayer:
     def __len__(self) -> int:
         return len(self._visuals) + len(self._colliders)
 
-    def visual(self, mesh: UrdfMesh) -> Entry:
+    def visual(self, mesh: Geometry) -> Entry:
         """The prim of a URDF `<mesh>` as a visual.
 
         Raises:
@@ -96,7 +96,7 @@ class MeshLayer:
             self._visuals[key] = self._define_visual(self._read(path), np.array(scale))
         return self._visuals[key]
 
-    def collider(self, mesh: UrdfMesh) -> tuple[Sdf.Path, ...]:
+    def collider(self, mesh: Geometry) -> tuple[Sdf.Path, ...]:
         """The prims of a URDF `<mesh>` as a collider, several for a convex decomposition.
 
         Raises as `visual` does.
@@ -112,7 +112,7 @@ class MeshLayer:
             )
         return self._colliders[key]
 
-    def try_add(self, mesh: UrdfMesh, add: Callable[[UrdfMesh], T], label: str = "") -> T | None:
+    def try_add(self, mesh: Geometry, add: Callable[[Geometry], T], label: str = "") -> T | None:
         """The result of `visual` or `collider`; None if the file is missing and the options allow that.
 
         Args:
@@ -130,7 +130,7 @@ class MeshLayer:
                 self._description.note(text, lost=True)
             return None
 
-    def vertices(self, mesh: UrdfMesh) -> NDArray[np.float64]:
+    def vertices(self, mesh: Geometry) -> NDArray[np.float64]:
         """Vertices of the file of an added `<mesh>`, scaled [m], shape (V, 3)."""
         path, scale = self._file(mesh)
         return self._files[path].points.astype(float) * scale
@@ -139,18 +139,18 @@ class MeshLayer:
         """Write the layer."""
         self._stage.GetRootLayer().Export(str(path))
 
-    def _file(self, mesh: UrdfMesh) -> tuple[Path, tuple[float, ...]]:
+    def _file(self, mesh: Geometry) -> tuple[Path, tuple[float, ...]]:
         """File and scale of a URDF `<mesh>`."""
         name, urdf = mesh.filename, self._description.path
         if Path(name).suffix.lower() not in SUFFIXES:
             raise InputError(f"{urdf}: mesh {name!r} is of no known format ({', '.join(SUFFIXES)})")
         if name not in self._found:
             self._found[name] = self._description.find_file(name, "mesh")
-        if not mesh.scale.all():
+        if not mesh.size.all():
             raise InputError(
-                f"{urdf}: mesh {name!r} has scale {mesh.scale.tolist()}; give numbers other than 0"
+                f"{urdf}: mesh {name!r} has scale {mesh.size.tolist()}; give numbers other than 0"
             )
-        return self._found[name], tuple(float(f) for f in np.broadcast_to(mesh.scale, 3))
+        return self._found[name], tuple(float(f) for f in np.broadcast_to(mesh.size, 3))
 
     def _read(self, path: Path) -> Mesh:
         if path not in self._files:
@@ -191,7 +191,7 @@ class MeshLayer:
             primvar.SetIndices(Vt.IntArray.FromNumpy(file.paint.astype(np.int32)))
 
     def _define_solid(self, solid: Solid, scale: NDArray, name: str) -> Sdf.Path:
-        points, faces = _scaled(solid.points, solid.faces, scale)
+        points, faces = _scaled(*solid, scale)
         mesh = self._define_mesh(self._free(name), points, faces)
         normals = np.round(face_normals(points, faces), 4)
         _primvar(mesh, "normals", Sdf.ValueTypeNames.Normal3fArray, normals, UsdGeom.Tokens.uniform)
@@ -220,13 +220,13 @@ def gather(description: Description, options: Options, textures: str) -> MeshLay
     meshes = MeshLayer(description, options, textures)
     colliding = False
     for name, link in description.links.items():
-        for visual in link.visuals:
-            if visual.geometry.mesh is not None:
-                meshes.try_add(visual.geometry.mesh, meshes.visual, f"link {name!r}: visual")
-        for collision in link.collisions:
-            if collision.geometry.mesh is not None:
-                meshes.try_add(collision.geometry.mesh, meshes.collider, f"link {name!r}: collision")
-                colliding = True
+        for role, shapes, add in (
+            ("visual", link.visuals, meshes.visual),
+            ("collision", link.collisions, meshes.collider),
+        ):
+            for form in (shape.geometry for shape in shapes if shape.geometry.kind == "mesh"):
+                meshes.try_add(form, add, f"link {name!r}: {role}")
+                colliding |= role == "collision"
     if options.collision == "mesh" and colliding:
         description.note(
             "meshes collide as they are; PhysX does this for static bodies only, others become convex hulls"

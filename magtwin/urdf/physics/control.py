@@ -275,8 +275,8 @@ def _spec(
 
 def _radius(link: Link) -> float | None:
     """Radius of a wheel's first cylinder or sphere [m]."""
-    forms = (part.geometry.cylinder or part.geometry.sphere for part in (*link.collisions, *link.visuals))
-    return next((float(form.radius) for form in forms if form is not None), None)
+    forms = (part.geometry for part in (*link.collisions, *link.visuals))
+    return next((form.radius for form in forms if form.kind in ("cylinder", "sphere")), None)
 
 
 def _known(tags: Tags, name: str, element: Element) -> str:

@@ -4,7 +4,6 @@ URDF's joint frame is the frame of the child link. UsdPhysics needs an axis X, Y
 body, so an oblique axis turns both frames. Angles are radians in URDF and degrees in UsdPhysics.
 """
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from magtwin.frames import wxyz_from_xyzw
 from magtwin.urdf.description.description import Description
 from magtwin.urdf.description.model import Joint
 from magtwin.urdf.options import DEFAULTS, Options
-from magtwin.urdf.physics.drive import NO_WHEELS, WheelDrive, choose_drive, define_drive
+from magtwin.urdf.physics.drive import NO_WHEELS, Wheels, define_drive
 from magtwin.urdf.physics.inertia import quaternion
 from magtwin.urdf.physics.mechanism import Mechanism
 
@@ -52,7 +51,7 @@ def define_joint(
     T: NDArray,
     mechanism: Mechanism,
     options: Options = DEFAULTS,
-    wheels: Mapping[str, WheelDrive] = NO_WHEELS,
+    wheels: Wheels = NO_WHEELS,
 ) -> Usd.Prim:
     """Author a joint between two bodies; `define_mimic` adds its mimic later.
 
@@ -68,7 +67,7 @@ def define_joint(
         T: Pose of the joint in the parent's body, at 0, or at rest if welded, shape (4, 4).
         mechanism: Joints of the description, which receives notes.
         options: Drives and profile.
-        wheels: Drives of driven wheels by joint name, see `choose_drive`.
+        wheels: Driven wheels.
 
     Raises:
         InputError: A limit is missing; the message gives the line.
@@ -84,10 +83,7 @@ def define_joint(
     if abs(length - 1) > 1e-3:
         description.note(f"joint {joint.name!r} has an axis of length {length:.3g}: used as a direction")
     axes = _free_axes(made, joint, token, description)
-    drive = choose_drive(joint, mechanism, options, wheels)
-    if drive is not None:
-        for axis in axes:
-            define_drive(prim, axis, drive)
+    define_drive(prim, axes, joint, mechanism, options, wheels)
     _tune(prim, joint, axes, joint.name in wheels, description)
     prim.AddAppliedSchema(JOINT_API)
     return prim
