@@ -886,7 +886,7 @@ DAMAGED = {
     "m.stl": (nan_stl, r"m\.stl: has vertices that are not finite numbers; export it again"),
     "cut.stl": (
         lambda p: cut(p, stl),
-        r"cut\.stl: has \d+ bytes, though its \d+ triangles need \d+; export it again",
+        r"cut\.stl: holds no triangle, or is cut short; export it again",
     ),
     "cut_text.stl": (
         lambda p: p.write_text("solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1"),
@@ -926,7 +926,7 @@ DAMAGED = {
     ),
     "zeros.gltf": (
         lambda p: p.write_text(ZEROS),
-        r"zeros\.gltf: accessor 0 has 10+ zeros, over \d+; export it again",
+        r"zeros\.gltf: accessor 0 is sparse or has no buffer; export it without",
     ),
     "json.gltf": (lambda p: p.write_text("{"), r"json\.gltf: cannot be read as a mesh: .+; export it again"),
     "doubles.dae": (

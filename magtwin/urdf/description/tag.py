@@ -62,11 +62,6 @@ class Tags:
         self._read.add(element)
         return element
 
-    def take(self, element: Element) -> Element:
-        """Mark an element and everything in it."""
-        self._read.update(element.iter())
-        return element
-
     def text(self, element: Element | None, *paths: str) -> str:
         """Text of the first element at one of the paths; "" if there is none."""
         match = self.find(element, *paths)

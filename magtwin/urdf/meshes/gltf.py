@@ -36,9 +36,6 @@ TRIANGLES, STRIP, FAN = 4, 5, 6
 SUPPORTED = ("KHR_materials_unlit", "KHR_mesh_quantization", "KHR_materials_emissive_strength")
 """Required extensions that are supported or do not change the shape."""
 
-EMPTY = 2**22
-"""Most zeros of an accessor without a buffer."""
-
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
 
@@ -185,35 +182,21 @@ class _Gltf:
         accessor = self._json["accessors"][index]
         dtype, width = np.dtype(COMPONENTS[accessor["componentType"]]), WIDTHS[accessor["type"]]
         count = accessor["count"]
-        if "bufferView" in accessor:
-            view = self._json["bufferViews"][accessor["bufferView"]]
-            data = self._view(accessor["bufferView"])[accessor.get("byteOffset", 0) :]
-            stride = view.get("byteStride", dtype.itemsize * width)
-            if count and len(data) < stride * (count - 1) + dtype.itemsize * width:
-                raise InputError(
-                    f"{self._reading.path}: accessor {index} is longer than its buffer; export it again"
-                )
-            values = np.ndarray((count, width), dtype, data, 0, (stride, dtype.itemsize))
-        else:
-            if count > EMPTY:
-                raise InputError(
-                    f"{self._reading.path}: accessor {index} has {count} zeros, over {EMPTY}; export it again"
-                )
-            values = np.zeros((count, width), dtype)
-        if "sparse" in accessor:
-            values = self._replaced(np.array(values), accessor["sparse"])
+        if "bufferView" not in accessor or "sparse" in accessor:
+            raise InputError(
+                f"{self._reading.path}: accessor {index} is sparse or has no buffer; export it without"
+            )
+        view = self._json["bufferViews"][accessor["bufferView"]]
+        data = self._view(accessor["bufferView"])[accessor.get("byteOffset", 0) :]
+        stride = view.get("byteStride", dtype.itemsize * width)
+        if count and len(data) < stride * (count - 1) + dtype.itemsize * width:
+            raise InputError(
+                f"{self._reading.path}: accessor {index} is longer than its buffer; export it again"
+            )
+        values = np.ndarray((count, width), dtype, data, 0, (stride, dtype.itemsize))
         if accessor.get("normalized"):
             return np.maximum(values / np.iinfo(dtype).max, -1.0)
         return values.astype(float) if dtype.kind == "f" else values.astype(np.int64)
-
-    def _replaced(self, values: NDArray, sparse: dict[str, Any]) -> NDArray:
-        """Values with the rows of a sparse accessor replaced."""
-        count, where, what = sparse["count"], sparse["indices"], sparse["values"]
-        kind = COMPONENTS[where["componentType"]]
-        rows = np.frombuffer(self._view(where["bufferView"]), kind, count, where.get("byteOffset", 0))
-        new, start = self._view(what["bufferView"]), what.get("byteOffset", 0)
-        values[rows] = np.frombuffer(new, values.dtype, count * values.shape[1], start).reshape(count, -1)
-        return values
 
     def _view(self, index: int) -> bytes:
         view = self._json["bufferViews"][index]

@@ -4,7 +4,7 @@ Follows the documentation of gz-sim's DiffDrive, gazebo_plugins' diff_drive, ros
 diff_drive_controller and URDF's `<transmission>`.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -102,24 +102,6 @@ def define_differential(robot: Usd.Prim, spec: DriveSpec, prim_names: Mapping[st
     fields = ("left_wheel_joint", "right_wheel_joint")
     named = {field: prim_names.get(getattr(spec, field), getattr(spec, field)) for field in fields}
     return define_drive(robot, DriveSpec(**{**vars(spec), **named}))
-
-
-def define_safety(tags: Tags, joint_of: Callable[[str], Usd.Prim | None]) -> None:
-    """Keep the soft limits of `<safety_controller>` as custom data of their joints.
-
-    They limit the commands of the robot's controller, not the joint, so engines have no attribute for them.
-    """
-    for element in tags.description.xml.findall("joint"):
-        safety, name = element.find("safety_controller"), element.get("name", "")
-        prim = None if safety is None else joint_of(name)
-        if safety is None or prim is None:
-            continue
-        tags.take(safety)
-        for key, value in safety.items():
-            prim.SetCustomDataByKey(f"magtwin:safetyController:{key}", float(value))
-        tags.description.note(
-            f"joint {name!r}: its safety controller is kept as metadata; it does not limit the joint"
-        )
 
 
 def _commands(tags: Tags) -> Iterator[tuple[str, str]]:

@@ -73,12 +73,6 @@ def define_body(
     return prim
 
 
-def define_frame(prim: Usd.Prim) -> Usd.Prim:
-    """Make an Xform a site: a named frame on the body above it."""
-    prim.AddAppliedSchema(SITE_API)
-    return prim
-
-
 def _mass_properties(
     part: Rider, body: Usd.Prim, description: Description, density: float | None, alone: bool
 ) -> MassProperties | None:
