@@ -6,12 +6,12 @@ applies to the other parts, such as all of an STL. The rest is GREY.
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Shape
 from magtwin.urdf.material import define_grip, define_look, wear
-from magtwin.urdf.meshes.mesh_layer import MESH, Entry, MeshLayer, free_name
+from magtwin.urdf.meshes.mesh_layer import MESH, Entry, MeshLayer, free_child
 from magtwin.urdf.meshes.piece import PLAIN, Paint
 from magtwin.urdf.meshes.reading import Reading
 from magtwin.urdf.meshes.texture import Image, read_image
@@ -186,8 +186,7 @@ def _define_primitive(body: Usd.Prim, scope: str, shape: Shape) -> Usd.Prim:
 def _path(body: Usd.Prim, scope: str, name: str) -> Sdf.Path:
     """A free path in a scope of a link, called `name` if possible."""
     parent = UsdGeom.Xform.Define(body.GetStage(), body.GetPath().AppendChild(scope)).GetPrim()
-    taken = {child.GetName() for child in parent.GetChildren()}
-    return parent.GetPath().AppendChild(free_name(Tf.MakeValidIdentifier(name), taken))
+    return free_child(parent, name)
 
 
 def _place(prim: Usd.Prim, pose: NDArray, scale: NDArray | None = None) -> None:

@@ -106,10 +106,15 @@ class MeshLayer:
         if key not in self._colliders:
             if path not in self._solids:
                 self._solids[path] = solids_of(self._read(path), self._options.collision)
-            self._colliders[key] = tuple(
-                self._define_solid(solid, np.array(scale), f"{path.stem}_{FORMS[self.collision]}")
-                for solid in self._solids[path]
-            )
+            made = []
+            for solid in self._solids[path]:
+                points, faces = _scaled(*solid, np.array(scale))
+                free = self._free(f"{path.stem}_{FORMS[self.collision]}")
+                normals = np.round(face_normals(points, faces), 4)
+                prim = self._define_mesh(free, points, faces)
+                _primvar(prim, "normals", Sdf.ValueTypeNames.Normal3fArray, normals, UsdGeom.Tokens.uniform)
+                made.append(free)
+            self._colliders[key] = tuple(made)
         return self._colliders[key]
 
     def try_add(self, mesh: Geometry, add: Callable[[Geometry], T], label: str = "") -> T | None:
@@ -171,31 +176,25 @@ class MeshLayer:
             mesh.CreateDoubleSidedAttr(True)
         if file.uvs is not None:
             _primvar(mesh, "st", Sdf.ValueTypeNames.TexCoord2fArray, np.nan_to_num(file.uvs[:, corners]))
-        subsets = _subsets(mesh, file) if len(file.paints) > 1 else []
-        self._define_colours(mesh, file, corners)
-        return Entry(xform.GetPath(), file.paints, tuple(subsets), file.uvs is not None)
-
-    def _define_colours(self, mesh: UsdGeom.Mesh, file: Mesh, corners: slice) -> None:
-        """Author colours at corners, and colours of paints for viewers without materials.
-
-        A mesh of one colour has none here, since its visual has it.
-        """
+        subsets, taken = list[str](), set[str]()
         kind, tokens = Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens
         by_paint = np.array([(paint or PLAIN).display_colour for paint in file.paints], np.float32)
+        if len(file.paints) > 1:
+            api = UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim())
+            for i, paint in enumerate(file.paints):
+                name = Tf.MakeValidIdentifier((paint.name if paint else "") or "plain")
+                subsets.append(free_name(name, taken))
+                of_paint = Vt.IntArray.FromNumpy(np.flatnonzero(file.paint == i).astype(np.int32))
+                api.CreateMaterialBindSubset(subsets[-1], of_paint)
+            api.SetMaterialBindSubsetsFamilyType(tokens.partition)
         if file.colours is not None:
             colours = np.where(np.isfinite(file.colours), file.colours, by_paint[file.paint][:, None])
             _primvar(mesh, "displayColor", kind, np.round(colours[:, corners], 4))
-        elif len(file.paints) > 1:
+        elif subsets:  # a mesh of one colour has none here, since its visual has it
             primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("displayColor", kind, tokens.uniform)
             primvar.Set(Vt.Vec3fArray.FromNumpy(by_paint))
             primvar.SetIndices(Vt.IntArray.FromNumpy(file.paint.astype(np.int32)))
-
-    def _define_solid(self, solid: Solid, scale: NDArray, name: str) -> Sdf.Path:
-        points, faces = _scaled(*solid, scale)
-        mesh = self._define_mesh(self._free(name), points, faces)
-        normals = np.round(face_normals(points, faces), 4)
-        _primvar(mesh, "normals", Sdf.ValueTypeNames.Normal3fArray, normals, UsdGeom.Tokens.uniform)
-        return mesh.GetPath()
+        return Entry(xform.GetPath(), file.paints, tuple(subsets), file.uvs is not None)
 
     def _define_mesh(self, path: Sdf.Path, points: NDArray, faces: NDArray) -> UsdGeom.Mesh:
         mesh = UsdGeom.Mesh.Define(self._stage, path)
@@ -244,6 +243,12 @@ def free_name(name: str, taken: set[str]) -> str:
     return unique
 
 
+def free_child(prim: Usd.Prim, name: str) -> Sdf.Path:
+    """A free path below a prim, called `name` if possible."""
+    taken = {child.GetName() for child in prim.GetChildren()}
+    return prim.GetPath().AppendChild(free_name(Tf.MakeValidIdentifier(name), taken))
+
+
 def _scaled(points: NDArray, faces: NDArray, scale: NDArray) -> tuple[NDArray[np.float32], NDArray]:
     """Points and faces at a scale; faces stay outwards under a reflection."""
     scaled = (points * scale).astype(np.float32)
@@ -264,17 +269,3 @@ def _primvar(
     primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(name, kind, interpolation)
     primvar.Set(arrays[rows.shape[1]].FromNumpy(np.ascontiguousarray(rows[first])))
     primvar.SetIndices(Vt.IntArray.FromNumpy(index.astype(np.int32)))
-
-
-def _subsets(mesh: UsdGeom.Mesh, file: Mesh) -> list[str]:
-    """One GeomSubset for each paint, with its name."""
-    api = UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim())
-    taken: set[str] = set()
-    names: list[str] = []
-    for i, paint in enumerate(file.paints):
-        name = free_name(Tf.MakeValidIdentifier((paint.name if paint else "") or "plain"), taken)
-        faces = Vt.IntArray.FromNumpy(np.flatnonzero(file.paint == i).astype(np.int32))
-        api.CreateMaterialBindSubset(name, faces)
-        names.append(name)
-    api.SetMaterialBindSubsetsFamilyType(UsdGeom.Tokens.partition)
-    return names
