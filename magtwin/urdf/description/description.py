@@ -148,13 +148,24 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
         for part in source.xml
         if part.tag in ("link", "joint", "material")
     ]
-    links = [_without_empty(read_link(e), description) for e in clean if e.tag == "link"]
+    links = [read_link(e) for e in clean if e.tag == "link"]
+    for link in links:
+        for role, shapes in (("visual", link.visuals), ("collision", link.collisions)):
+            for kind in (shape.geometry.kind for shape in shapes if shape.geometry.empty):
+                description.note(f"link {link.name!r}: a {role} {kind} of size 0 is left out", lost=True)
     joints = [read_joint(e) for e in clean if e.tag == "joint"]
     materials = [read_material(e) for e in clean if e.tag == "material"]
     held = {joint.child: joint for joint in joints}
     description = replace(
         description,
-        links={link.name: link for link in links},
+        links={
+            link.name: replace(
+                link,
+                visuals=tuple(shape for shape in link.visuals if not shape.geometry.empty),
+                collisions=tuple(shape for shape in link.collisions if not shape.geometry.empty),
+            )
+            for link in links
+        },
         joints=held,
         materials=MappingProxyType({m.name: m for m in materials}),
     )
@@ -203,19 +214,6 @@ def _check_names(source: Source) -> None:
             named = joint.find(end)
             if named is None or not named.get("link"):
                 raise InputError(f"{where(joint)}: joint {joint.get('name')!r} has no <{end} link=>")
-
-
-def _without_empty(link: Link, description: Description) -> Link:
-    """A link without primitives of size 0; they are noted."""
-
-    def kept(shapes: Sequence[Shape], role: str) -> tuple[Shape, ...]:
-        for shape in shapes:
-            if shape.geometry.empty:
-                text = f"link {link.name!r}: a {role} {shape.geometry.kind} of size 0 is left out"
-                description.note(text, lost=True)
-        return tuple(shape for shape in shapes if not shape.geometry.empty)
-
-    return replace(link, visuals=kept(link.visuals, "visual"), collisions=kept(link.collisions, "collision"))
 
 
 def _check_joints(description: Description, joints: Sequence[Joint]) -> None:

@@ -123,14 +123,7 @@ def _from_shapes(
 
 
 def _checked(link: Link, tensor: NDArray, origin: NDArray, description: Description) -> NDArray[np.float64]:
-    """An inertia in its link's axes, repaired if slightly impossible.
-
-    Args:
-        link: The link.
-        tensor: In the axes of the `<inertial>`, shape (3, 3).
-        origin: Pose of the `<inertial>` in the link, shape (4, 4).
-        description: Receives a note of a repair.
-    """
+    """A tensor (3, 3) at an `origin` (4, 4) in its link's axes, repaired if slightly impossible."""
     turned = origin[:3, :3] @ tensor @ origin[:3, :3].T
     cleared = np.where(np.abs(turned) < 1e-9 * np.abs(turned).max(), 0.0, turned)
     try:

@@ -103,15 +103,11 @@ def displacement(axis: ArrayLike, value: float, *, slides: bool) -> NDArray[np.f
 def _weld_reason(joint: Joint, options: Options) -> str | None:
     """Why a joint cannot move; "" if it is fixed, None if it can move."""
     limit = joint.limit
-    if joint.type == "fixed":
-        return ""
-    if limit is None:
-        return None
+    if joint.type == "fixed" or limit is None:
+        return "" if joint.type == "fixed" else None
     powerless = limit.effort == 0 and limit.velocity == 0 and joint.type != "continuous"
-    closed = (
-        joint.type in ("revolute", "prismatic") and limit.lower is not None and limit.lower == limit.upper
-    )
-    if powerless or closed:
+    closed = limit.lower is not None and limit.lower == limit.upper
+    if powerless or (closed and joint.type in ("revolute", "prismatic")):
         return "cannot move by its own limits"
     if options.profile == "diff-drive" and joint.type == "prismatic" and 0 in (limit.effort, limit.velocity):
         return "is a suspension without effort or speed"

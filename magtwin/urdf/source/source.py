@@ -77,7 +77,7 @@ class Source:
         scheme, separator, rest = filename.partition("://")
         if separator and scheme not in ("package", "model", "file"):
             raise InputError(f"{start} has scheme {scheme!r}; known: file, model, package")
-        if scheme in ("package", "model") and separator:
+        if separator and scheme != "file":
             name, _, rest = rest.partition("/")
             try:
                 folder = self.packages.find(name)
