@@ -48,7 +48,7 @@ def define_visual(
     paint = _paint_of(visual, description)
     if visual.geometry.kind != "mesh":
         prim = _define_primitive(body, VISUALS, visual)
-        wear(prim, body.GetParent(), _plain(paint, "a primitive", description), meshes.textures)
+        wear(prim, body.GetParent(), _plain(paint, "a primitive", description), meshes)
         return [prim]
     entry = meshes.try_add(visual.geometry, meshes.visual)
     if entry is None:
@@ -79,9 +79,11 @@ def define_collider(
         UsdGeom.Imageable(prim).CreatePurposeAttr(UsdGeom.Tokens.guide)
         UsdPhysics.CollisionAPI.Apply(prim).CreateCollisionEnabledAttr(True)
         if prim.IsA(UsdGeom.Mesh):
-            UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr(APPROXIMATIONS[meshes.collision])
+            UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr(
+                APPROXIMATIONS[meshes.options.collision]
+            )
             prim.AddAppliedSchema(NEWTON_MESH_API)
-        wear(prim, robot, None, meshes.textures, define_grip(robot, surface))
+        wear(prim, robot, None, meshes, define_grip(robot, surface))
     return made
 
 
@@ -99,12 +101,12 @@ def _define_mesh(
     _place(prim, origin_of(visual))
     looks = [paint or given or PLAIN for paint in entry.paints]
     if not entry.subsets:
-        wear(prim, robot, looks[0], meshes.textures)
+        wear(prim, robot, looks[0], meshes)
         prim.SetInstanceable(True)
         return prim
     mesh = prim.GetPrimAtPath(MESH)
     for name, look in zip(entry.subsets, looks, strict=True):
-        material = define_look(robot, look, meshes.textures)
+        material = define_look(robot, look, meshes)
         UsdShade.MaterialBindingAPI.Apply(mesh.GetPrimAtPath(name)).Bind(material)
     colours = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("displayColor")
     if given is not None and None in entry.paints and colours.GetInterpolation() == UsdGeom.Tokens.uniform:
@@ -147,8 +149,8 @@ def _image(filename: str, material: str, description: Description) -> Image | No
     except MissingFileError:
         reading.lose(f"texture {filename!r} of material {material!r} is missing and is left out")
         image = None
-    for note in reading.notes:
-        description.note(note.text, lost=note.lost)
+    for note, lost in reading.notes:
+        description.note(note, lost=lost)
     return image
 
 

@@ -340,7 +340,7 @@ def test_a_malformed_collada_colour_is_repaired_with_a_note(tmp_path, colour, re
     mesh = read_mesh(dae(tmp_path / "n.dae", "<node>{mesh}</node>", diffuse=f"<color>{colour}</color>"))
     assert_allclose(mesh.paints[0].rgba, read)
     words = " ".join(f"{c:g}" for c in read)
-    assert [note.text for note in mesh.notes] == [f"n.dae: malformed colour {colour!r} read as {words!r}"]
+    assert [text for text, _ in mesh.notes] == [f"n.dae: malformed colour {colour!r} read as {words!r}"]
 
 
 def test_a_collada_file_whose_author_has_an_accent_in_latin_1_is_read(tmp_path):

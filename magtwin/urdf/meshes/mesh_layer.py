@@ -6,7 +6,7 @@ The readable root layer references it, since large arrays do not belong in text.
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +64,9 @@ class MeshLayer:
             textures: Asset path of the folder for textures, relative to the robot's layer.
         """
         self.textures = Textures(textures)
-        self._description, self._options = description, options
+        self.looks: dict[Sdf.Path, tuple[Any, ...]] = {}
+        """Values of each material on the robot's stage by its path, see `material`."""
+        self._description, self.options = description, options
         self._stage = Usd.Stage.CreateInMemory()
         describe_stage(self._stage, f"{description.name}: triangles of its meshes.")
         self._stage.SetDefaultPrim(UsdGeom.Scope.Define(self._stage, ROOT).GetPrim())
@@ -74,11 +76,6 @@ class MeshLayer:
         self._visuals: dict[tuple[Path, tuple[float, ...]], Entry] = {}
         self._colliders: dict[tuple[Path, tuple[float, ...]], tuple[Sdf.Path, ...]] = {}
         self._solids: dict[Path, tuple[Solid, ...]] = {}
-
-    @property
-    def collision(self) -> Collision:
-        """Type of mesh colliders."""
-        return self._options.collision
 
     def __len__(self) -> int:
         return len(self._visuals) + len(self._colliders)
@@ -105,11 +102,11 @@ class MeshLayer:
         key = (path, scale)
         if key not in self._colliders:
             if path not in self._solids:
-                self._solids[path] = solids_of(self._read(path), self._options.collision)
+                self._solids[path] = solids_of(self._read(path), self.options.collision)
             made = []
             for solid in self._solids[path]:
                 points, faces = _scaled(*solid, np.array(scale))
-                free = self._free(f"{path.stem}_{FORMS[self.collision]}")
+                free = self._free(f"{path.stem}_{FORMS[self.options.collision]}")
                 normals = np.round(face_normals(points, faces), 4)
                 prim = self._define_mesh(free, points, faces)
                 _primvar(prim, "normals", Sdf.ValueTypeNames.Normal3fArray, normals, UsdGeom.Tokens.uniform)
@@ -128,7 +125,7 @@ class MeshLayer:
         try:
             return add(mesh)
         except MissingFileError:
-            if self._options.missing_meshes != "note":
+            if self.options.missing_meshes != "note":
                 raise
             if label:
                 text = f"{label} is left out: its mesh {mesh.filename!r} is missing"
@@ -160,8 +157,8 @@ class MeshLayer:
     def _read(self, path: Path) -> Mesh:
         if path not in self._files:
             self._files[path] = read_mesh(path, self._description.source.packages.holds)
-            for note in self._files[path].notes:
-                self._description.note(note.text, lost=note.lost)
+            for note, lost in self._files[path].notes:
+                self._description.note(note, lost=lost)
         return self._files[path]
 
     def _define_visual(self, file: Mesh, scale: NDArray) -> Entry:
