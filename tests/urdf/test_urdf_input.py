@@ -1,4 +1,5 @@
 import time
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -326,7 +327,7 @@ def test_xacro_has_arguments_properties_macros_blocks_conditions_includes_and_ya
 def test_the_expanded_text_is_a_urdf_of_the_same_robot(tmp_path):
     source = read_source(URDF / "input_xacro_language.xacro")
     path = tmp_path / "arm.urdf"
-    path.write_text(source.text, encoding="utf-8")
+    path.write_text(ElementTree.tostring(source.xml, encoding="unicode"), encoding="utf-8")
     again = read_source(path, packages={"arm_description": URDF / "input_packages" / "arm_description"})
     assert same(again.xml, source.xml)
     assert list(read_description(again).links) == list(read_description(source).links)

@@ -82,7 +82,7 @@ class _Gltf:
         while pending:
             index, above = pending.pop()
             if index in seen:
-                raise InputError(f"{self._reading.path}: node {index} has two parents; export it again")
+                raise self._refused(f"node {index} has two parents")
             seen.add(index)
             node = self._json["nodes"][index]
             T = above @ _local(node)
@@ -105,10 +105,7 @@ class _Gltf:
             )
             faces = _triangles(order, mode)
             if len(faces) and not faces.max() < len(points):
-                raise InputError(
-                    f"{self._reading.path}: a face names vertex {faces.max()} of {len(points)}; "
-                    "export it again"
-                )
+                raise self._refused(f"a face names vertex {faces.max()} of {len(points)}")
             at = {
                 name: self._numbers(attributes[name])[faces]
                 for name in ("NORMAL", "TEXCOORD_0", "COLOR_0")
@@ -141,15 +138,13 @@ class _Gltf:
                 texture = surface["baseColorTexture"]
                 moved = "KHR_texture_transform" in texture.get("extensions", {})
                 if texture.get("texCoord", 0) != 0 or moved:
-                    self._reading.lose(
-                        f"material {index}'s texture uses other coordinates than the first set"
-                    )
+                    text = f"material {index}'s texture uses other coordinates than the first set"
+                    self._reading.lose(text)
                 image = self._image(self._json["textures"][texture["index"]])
-            for other in ("normalTexture", "occlusionTexture", "emissiveTexture"):
-                if other in material:
+            kinds = ("normalTexture", "occlusionTexture", "emissiveTexture", "metallicRoughnessTexture")
+            for other in kinds:
+                if other in material or other in surface:
                     self._reading.lose(f"material {index}'s {other} is left out")
-            if "metallicRoughnessTexture" in surface:
-                self._reading.lose(f"material {index}'s metallicRoughnessTexture is left out")
             red, green, blue = (float(c) for c in srgb_from_linear((r, g, b)))
             alpha = material.get("alphaMode", "OPAQUE")
             self._paints[index] = Paint(
@@ -183,16 +178,12 @@ class _Gltf:
         dtype, width = np.dtype(COMPONENTS[accessor["componentType"]]), WIDTHS[accessor["type"]]
         count = accessor["count"]
         if "bufferView" not in accessor or "sparse" in accessor:
-            raise InputError(
-                f"{self._reading.path}: accessor {index} is sparse or has no buffer; export it without"
-            )
+            raise self._refused(f"accessor {index} is sparse or has no buffer, which is not supported")
         view = self._json["bufferViews"][accessor["bufferView"]]
         data = self._view(accessor["bufferView"])[accessor.get("byteOffset", 0) :]
         stride = view.get("byteStride", dtype.itemsize * width)
         if count and len(data) < stride * (count - 1) + dtype.itemsize * width:
-            raise InputError(
-                f"{self._reading.path}: accessor {index} is longer than its buffer; export it again"
-            )
+            raise self._refused(f"accessor {index} is longer than its buffer")
         values = np.ndarray((count, width), dtype, data, 0, (stride, dtype.itemsize))
         if accessor.get("normalized"):
             return np.maximum(values / np.iinfo(dtype).max, -1.0)
@@ -203,7 +194,7 @@ class _Gltf:
         start = view.get("byteOffset", 0)
         data = self._buffer(view["buffer"])[start : start + view["byteLength"]]
         if len(data) < view["byteLength"]:
-            raise InputError(f"{self._reading.path}: buffer {view['buffer']} is cut short; export it again")
+            raise self._refused(f"buffer {view['buffer']} is cut short")
         return data
 
     def _buffer(self, index: int) -> bytes:
@@ -223,6 +214,9 @@ class _Gltf:
                     raise InputError(f"{self._reading.path}: buffer {uri!r} is missing; looked for {file}")
                 self._buffers[index] = file.read_bytes()
         return self._buffers[index]
+
+    def _refused(self, text: str) -> InputError:
+        return InputError(f"{self._reading.path}: {text}; export it again")
 
 
 def _parse(path: Path) -> tuple[dict[str, Any], bytes]:

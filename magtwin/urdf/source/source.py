@@ -38,11 +38,6 @@ class Source:
     notes: tuple[str, ...] = ()
     """Notes on the expansion, one line each."""
 
-    @property
-    def text(self) -> str:
-        """The description as URDF, without comments."""
-        return ElementTree.tostring(self.xml, encoding="unicode")
-
     def where(self, element: ElementTree.Element | None) -> str:
         """File and line of an element, as `file:line`; the file alone if it has none."""
         if element is None or element not in self.places:
