@@ -109,13 +109,7 @@ class Bag:
         return {topic: _joined(found) for topic, found in parts.items()}
 
     def signal(self, name: str, topic: Topic, messages: Messages) -> "Signal":
-        """The messages of a topic, decoded.
-
-        Args:
-            name: Name of the topic in this bag.
-            topic: What to read from it.
-            messages: Its messages.
-        """
+        """The messages of a topic, decoded; `name` is the topic's name in this bag."""
         kind = self.kinds[name]
         leaves = layout(kind)
         stamped = leaves[0].name == "header.stamp"

@@ -105,12 +105,7 @@ def bag_metadata(
 ) -> dict[str, Any]:
     """The content of metadata.yaml, below `rosbag2_bagfile_information`, of a bag of one MCAP file.
 
-    Args:
-        file: Name of the storage file.
-        connections: Topics.
-        counts: Messages by connection.
-        span: Times of the first and the last message [ns].
-        custom: Custom data, texts by name.
+    `counts` are messages by connection; `span` are the times of the first and the last message [ns].
     """
     count = sum(counts.values())
     begin = {"nanoseconds_since_epoch": span[0] if count else 0}

@@ -133,13 +133,8 @@ BATTERY_PANELS = (
     Panel("Battery charge [0..1]", (Series("battery_fraction", "charge", _GREEN),)),
 )
 PANELS = (
-    FIELD_PANEL,
-    DISTURBANCE_PANEL,
-    ERROR_PANEL,
-    SPEED_PANEL,
-    YAW_RATE_PANEL,
-    ACCELERATION_PANEL,
-    TILT_PANEL,
+    *(FIELD_PANEL, DISTURBANCE_PANEL, ERROR_PANEL),
+    *(SPEED_PANEL, YAW_RATE_PANEL, ACCELERATION_PANEL, TILT_PANEL),
     *BATTERY_PANELS,
 )
 """Every plot of a recording. Series that a run lacks, or that are all nan, are left out."""
@@ -231,7 +226,10 @@ def layout(
     )
     pages = rrb.Tabs(_event_view(), rrb.TextDocumentView(origin="metadata", name="Run"))
     about = rrb.Vertical(states, pages, row_shares=[1.2, 1.4])
-    below = [_robot_view(), _floor_view(lab, [""])] if lab else []
+    eye: dict[str, Any] = {"position": (-0.62, 0.42, 0.55), "target": (0.08, 0.0, 0.17)}
+    # from behind its left shoulder, in the robot's axes, so that it stays in view
+    robot = _view_3d("world/robot", "Robot", [""], without="world/scale", **eye)
+    below = [robot, _floor_view(lab, [""])] if lab else []
     return _blueprint(lab, heading, [""], side, [*below, about], [0.9, 1.1, 1.6])
 
 
@@ -240,10 +238,7 @@ def comparison_layout(
 ) -> rrb.Blueprint:
     """The views of several runs on a common timeline, each in its own colour.
 
-    Args:
-        runs: The runs.
-        lab: Their lab. None: no 3D views.
-        heading: Heading of the map on the floor [rad], for the title.
+    Without a lab there are no 3D views; `heading` is that of the map on the floor [rad], for the title.
     """
     whole = _whole(runs)
     rows = [
@@ -280,7 +275,11 @@ def _blueprint(
         root = rrb.Horizontal(side, *below, column_shares=[3.0, 1.0])
     else:
         lower = rrb.Horizontal(*below, column_shares=shares)
-        left = rrb.Vertical(_lab_view(lab, heading, names), lower, row_shares=[2.0, 1.0])
+        text = "readings along the path" if names == [""] else "a robot and its path for each run"
+        title = f"Lab: map of the total field at heading {np.degrees(heading):.4g}°, {text}"
+        position, target = lab_eye(lab)
+        eye: dict[str, Any] = {"without": "world/robot/sensors", "position": position, "target": target}
+        left = rrb.Vertical(_view_3d("world", title, names, **eye), lower, row_shares=[2.0, 1.0])
         root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
     return rrb.Blueprint(
         root,
@@ -364,12 +363,7 @@ def _line(series: Series) -> rrb.Visualizer:
 def value_range(values: Array) -> tuple[float, float] | None:
     """Ends of an axis with room beyond the values and beyond every tick, so that no label is cut.
 
-    Args:
-        values: The plotted values, any shape; nan is ignored.
-
-    Returns:
-        Least and greatest value of the axis; None for values that do not vary, where the viewer's default
-        is as good.
+    nan is ignored. None for values that do not vary, where the viewer's default is as good.
     """
     known = values[np.isfinite(values)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
@@ -425,20 +419,6 @@ def lab_eye(lab: LabSpec) -> tuple[Vec3, Vec3]:
     x, y = lab.floor_m
     height = max(0.9 * max(x, 1.7 * y), 1.5 * lab.post_height_m)
     return (0, -0.45 * y, height), (0, -0.09 * y, 0)
-
-
-def _lab_view(lab: LabSpec, heading: float, names: Sequence[str]) -> rrb.Spatial3DView:
-    """The whole lab, with the paths of the named runs."""
-    position, target = lab_eye(lab)
-    text = "readings along the path" if names == [""] else "a robot and its path for each run"
-    title = f"Lab: map of the total field at heading {np.degrees(heading):.4g}°, {text}"
-    return _view_3d("world", title, names, without="world/robot/sensors", position=position, target=target)
-
-
-def _robot_view() -> rrb.Spatial3DView:
-    """The robot from behind its left shoulder, in the robot's axes, so that it stays in view."""
-    eye = {"position": (-0.62, 0.42, 0.55), "target": (0.08, 0.0, 0.17)}
-    return _view_3d("world/robot", "Robot", [""], without="world/scale", **eye)
 
 
 def _floor_view(lab: LabSpec, names: Sequence[str]) -> rrb.Spatial2DView:

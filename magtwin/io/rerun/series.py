@@ -196,9 +196,7 @@ def _arrow(name: str, values: NDArray[Any], parts: tuple[str, ...]) -> pa.Array:
 def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | None]:
     """The run in the chunks of its entity: its name, the run, and its number of rows if it is complete.
 
-    Args:
-        chunks: Every chunk of the entity, in any order.
-        what: Name of the file, for errors.
+    `chunks` are all chunks of the entity, in any order; `what` names the file in errors.
 
     Raises:
         InputError: The chunks hold no run.

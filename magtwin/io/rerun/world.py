@@ -112,17 +112,9 @@ class Interior:
 def send_room(
     rec: rr.RecordingStream, interior: Interior, field: AnomalyMap, known: Run, planned: Path | None
 ) -> Scale:
-    """Send the map on the floor, its legend, walls, furniture and the planned path.
+    """Send the map on the floor, its legend, walls, furniture and the planned path; returns its colours.
 
-    Args:
-        rec: The recording.
-        interior: The lab.
-        field: The map.
-        known: The run, for the range of its readings and its first heading.
-        planned: The planned path, or None.
-
-    Returns:
-        The colours of the map.
+    The run `known` gives the range of readings and the first heading.
     """
     scale = Scale.over(field, known.get("b_total_nt", np.empty(0)))
     _send_map(rec, field, scale, heading_of(field, known))

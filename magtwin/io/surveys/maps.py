@@ -97,12 +97,7 @@ def read_survey(
 
 
 def import_survey(
-    sources: Sequence[Source],
-    out: Source,
-    *,
-    about: About | None = None,
-    force: bool = False,
-    **reading: Any,
+    sources: Sequence[Source], out: Source, *, about: About | None = None, force: bool = False, **reading: Any
 ) -> Report:
     """Write a survey as a map layer, which it must be gridded for, or as readings.
 

@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, hint
 from magtwin.files import existing
+from magtwin.io.tables import load_parquet
 
 Array = NDArray[np.float64]
 
@@ -192,18 +194,8 @@ def read_parquet_table(path: str | os.PathLike[str]) -> Table:
     Raises:
         InputError: The file is missing, is not Parquet, is truncated, or has no rows.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    from magtwin.io.tables import check_parquet
-
     path = existing(path, "Parquet file")
-    check_parquet(path)
-    try:
-        table = pq.read_table(path)
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{path}: damaged Parquet ({reason}); write it again") from error
+    table = load_parquet(path)
     columns = []
     for field, values in zip(table.schema, table.columns, strict=True):
         kind = field.type
