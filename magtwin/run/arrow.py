@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.run.resample import RULES
-from magtwin.run.run import COLUMNS, Column, Run, check_clock
+from magtwin.run.run import COLUMNS, Column, Metadata, Run, check_clock
 
 FACTS = b"magtwin_facts"
 
@@ -90,13 +90,10 @@ def metadata_to_json(run: Run) -> str:
     Raises:
         InputError: A value is not a text, number or bool.
     """
-    for key, value in run.metadata.items():
-        if not isinstance(value, str | int | float | bool):
-            raise InputError(f"metadata {key!r} must be a text, a number, or true or false, got {value!r}")
-    return json.dumps(dict(run.metadata), ensure_ascii=False)
+    return json.dumps(check_metadata(dict(run.metadata)), ensure_ascii=False)
 
 
-def metadata_from_json(text: str | bytes, path: Path) -> dict[str, str | int | float | bool]:
+def metadata_from_json(text: str | bytes, path: Path) -> Metadata:
     """The metadata from `metadata_to_json`.
 
     Raises:
@@ -106,12 +103,21 @@ def metadata_from_json(text: str | bytes, path: Path) -> dict[str, str | int | f
         metadata = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: metadata {FACTS.decode()!r} is not JSON: {error}") from error
+    return check_metadata(metadata, f"{path}: ")
+
+
+def check_metadata(metadata: Any, where: str = "") -> Metadata:
+    """Metadata of a run, if they are texts, numbers and bools by name; `where` begins the refusal.
+
+    Raises:
+        InputError: They are not.
+    """
     if not isinstance(metadata, dict):
-        raise InputError(f"{path}: metadata {FACTS.decode()!r} must be an object, got {text[:40]!r}")
+        raise InputError(f"{where}metadata {FACTS.decode()!r} must be an object, got {str(metadata)[:40]!r}")
     for key, value in metadata.items():
         if not isinstance(value, str | int | float | bool):
             raise InputError(
-                f"{path}: metadata {key!r} must be a text, a number, or true or false, got {value!r}"
+                f"{where}metadata {key!r} must be a text, a number, or true or false, got {value!r}"
             )
     return metadata
 

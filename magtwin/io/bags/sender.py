@@ -77,24 +77,14 @@ class Sender:
     """The robot's URDF; "" if unknown."""
 
 
-def sender_of(
-    robot: RobotSpec,
-    *,
-    unit: Unit = "T",
-    rate_hz: float | None = None,
-    links: tuple[FixedFrame, ...] = (),
-    wheels: tuple[FixedFrame, FixedFrame] | None = None,
-    description: str = "",
-) -> Sender:
+def sender_of(robot: RobotSpec, *, unit: Unit = "T", rate_hz: float | None = None, **rest: Any) -> Sender:
     """The sender of a robot's messages.
 
     Args:
         robot: Its sensors and drive.
         unit: Unit of magnetic fields in messages.
         rate_hz: Rate of the magnetometer [Hz]. Default: the robot's.
-        links: Links fixed in base_link.
-        wheels: The left and the right wheel at rest.
-        description: Its URDF.
+        rest: `links`, `wheels` and `description` of the sender.
     """
     mounts = {"magnetometer": robot.magnetometer, "imu": robot.imu, "lidar": robot.lidar}
     frames, tilted = {}, []
@@ -119,9 +109,7 @@ def sender_of(
         vector_std_nt=robot.magnetometer.vector_noise_density_nt * float(np.sqrt(rate / 2)),
         scan_rate_hz=robot.lidar.scan_rate_hz,
         range_m=(robot.lidar.range_min_m, robot.lidar.range_max_m),
-        links=(*links, *tilted),
-        wheels=wheels,
-        description=description,
+        **{**rest, "links": (*rest.get("links", ()), *tilted)},
     )
 
 

@@ -53,10 +53,8 @@ def read_bag_readings(
     """
     path = Path(path)
     with Bag(path) as bag:
-        pose_name, field_name = (
-            _choose(bag, "pose", pose_topic, POSE),
-            _choose(bag, "field", field_topic, MAGNITUDE),
-        )
+        pose_name = _choose(bag, "pose", pose_topic, POSE)
+        field_name = _choose(bag, "field", field_topic, MAGNITUDE)
         messages = bag.messages((pose_name, field_name))
         for name in (pose_name, field_name):
             if not len(messages[name]):
@@ -113,15 +111,12 @@ def _choose(bag: Bag, kind: str, name: str | None, topic: Topic) -> str:
         return name
     if not fitting:
         raise InputError(f"{bag.path}: no topic of a {kind} ({kinds}); topics in it: {bag.listed()}")
-    if len(fitting) > 1:
-        fixed = [t for t in fitting if bag.kinds[t] != ODOMETRY.kind]
-        if len(fixed) != 1:
-            raise InputError(
-                f"{bag.path}: {len(fitting)} topics of a {kind}, {', '.join(fitting)}; choose with "
-                f"--{kind}-topic"
-            )
-        return fixed[0]
-    return fitting[0]
+    fixed = fitting if len(fitting) == 1 else [t for t in fitting if bag.kinds[t] != ODOMETRY.kind]
+    if len(fixed) != 1:
+        raise InputError(
+            f"{bag.path}: {len(fitting)} topics of a {kind}, {', '.join(fitting)}; choose with --{kind}-topic"
+        )
+    return fixed[0]
 
 
 def _in_order(signal: Signal, by_header: bool, columns: Iterable[Array]) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
 from magtwin.errors import InputError
-from magtwin.run.arrow import said_of, spec_said
+from magtwin.run.arrow import check_metadata, said_of, spec_said
 from magtwin.run.run import COLUMNS, Column, Run
 from magtwin.verdict import Z_90
 
@@ -212,9 +212,7 @@ def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | N
     try:
         metadata, names = (json.loads(static[key]) for key in (FACTS, NAMES))
         rows = int(static[ROWS]) if ROWS in static else None
-        whole = isinstance(metadata, dict) and isinstance(names, dict)
-        if not whole or not all(isinstance(value, str | int | float | bool) for value in metadata.values()):
-            raise ValueError("metadata and columns must be tables of plain values")
+        check_metadata(metadata)
         order = np.argsort([table.column(TIMELINE)[0].value for table in tables], kind="stable")
         columns = {
             name: np.concatenate([_values(tables[k].column(name)) for k in order])
