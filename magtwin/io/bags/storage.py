@@ -24,11 +24,6 @@ ROOM = 31
 """Bytes left free before each message of a batch, for the head of an MCAP message record."""
 
 
-class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
-
-
 @dataclass(frozen=True)
 class Connection:
     """A topic of a bag that is written."""
@@ -142,7 +137,8 @@ def bag_metadata(
 
 def to_yaml(content: Any) -> str:
     """YAML text of plain data."""
-    return yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=2**30)
+    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+    return yaml.dump(content, Dumper=dumper, sort_keys=False, allow_unicode=True, width=2**30)
 
 
 def in_time(batches: Sequence[Batch]) -> tuple[Index, NDArray[np.intp]]:

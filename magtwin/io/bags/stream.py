@@ -14,7 +14,7 @@ from magtwin.io.bags.cdr import NS, Index
 from magtwin.io.bags.sender import Sender
 from magtwin.io.bags.topics import DESCRIPTION, NAMES, READING, SCAN, TF_STATIC, TOPICS, Columns, Topic
 from magtwin.run.arrow import check_clock
-from magtwin.run.run import Run
+from magtwin.run.run import Run, check_numbers
 
 if TYPE_CHECKING:
     from magtwin.sim.sensors.lidar import Scans
@@ -78,17 +78,12 @@ class Stream:
         self._columns = {name: (values.dtype, values.shape[1:]) for name, values in run.items()}
         self._table = self._columns_json(run, run.metadata if whole else {})
         for name, values in run.items():
-            if values.ndim > 2 or values.dtype.kind not in "bfiu":
-                raise InputError(
-                    f"column {name!r} cannot stand in a bag: it needs numbers or flags of shape (N,) or "
-                    f"(N, width), got {values.dtype} of shape {values.shape}"
-                )
-        once = [NAMES]
-        if sender.links:
-            once.append(TF_STATIC)
-        if sender.description:
-            once.append(DESCRIPTION)
-        self._once = once
+            check_numbers(name, values, "stand in a bag")
+        self._once = once = [
+            NAMES,
+            *[TF_STATIC] * bool(sender.links),
+            *[DESCRIPTION] * bool(sender.description),
+        ]
         self.topics = [*once, *sent, *([] if scans is None else [SCAN]), READING]
         """Topics that are sent."""
 
@@ -193,11 +188,9 @@ class Stream:
                 entry["first"] = first
                 first += shape[0] if shape else 1
             columns.append(entry)
-        table = {
-            "unit": self._sender.unit,
-            "columns": columns,
-            **({"facts": dict(metadata)} if metadata else {}),
-        }
+        table = {"unit": self._sender.unit, "columns": columns} | (
+            {"facts": dict(metadata)} if metadata else {}
+        )
         return json.dumps(table, ensure_ascii=False, indent=1)
 
 

@@ -19,7 +19,7 @@ import rerun.blueprint as rrb
 
 from magtwin.errors import InputError
 from magtwin.io.rerun.layout import layout
-from magtwin.io.rerun.series import Flags, entity_of, send_columns, send_metadata, send_rows
+from magtwin.io.rerun.series import COLUMNS_ENTITY, ROWS, Flags, entity_of, send_columns, send_metadata
 from magtwin.io.rerun.world import Feed, Interior, Robot, heading_of, send_room
 from magtwin.path import Path
 from magtwin.run.run import Run
@@ -181,7 +181,8 @@ class Recording:
             self.robot.close(self._last)
         if self._feed is not None:
             self._feed.clear(float(self._last["t"][-1]))
-        send_rows(self.rec, self._rows, self.name)
+        rows: dict[str, Any] = {ROWS: [self._rows]}  # marks a complete run
+        self.rec.log(entity_of(COLUMNS_ENTITY, self.name), rr.AnyValues(**rows), static=True)
         self.rec.log(
             entity_of("metadata", self.name), metadata_page(self._last.metadata, self._rows), static=True
         )

@@ -9,7 +9,7 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,7 +19,7 @@ from rerun.chunk import Chunk
 
 from magtwin.errors import InputError
 from magtwin.run.arrow import check_metadata, said_of, spec_said
-from magtwin.run.run import COLUMNS, Column, Run
+from magtwin.run.run import COLUMNS, Run, check_numbers
 from magtwin.verdict import Z_90
 
 Array = NDArray[np.float64]
@@ -145,11 +145,6 @@ def send_metadata(rec: rr.RecordingStream, run: Run, name: str) -> None:
     rec.log(entity_of(COLUMNS_ENTITY, name), rr.AnyValues(**as_json | {NAME: [name]}), static=True)
 
 
-def send_rows(rec: rr.RecordingStream, rows: int, name: str) -> None:
-    """Send the number of rows of a complete run."""
-    rec.log(entity_of(COLUMNS_ENTITY, name), rr.AnyValues(**cast(Any, {ROWS: [rows]})), static=True)
-
-
 def send_columns(rec: rr.RecordingStream, run: Run, t: Array, name: str) -> None:
     """Send the columns of a run, or of a part of it, at times t [s]."""
     parts = {key: run.spec(key).parts for key in run}
@@ -183,11 +178,7 @@ def _send_table(
 
 def _arrow(name: str, values: NDArray[Any], parts: tuple[str, ...]) -> pa.Array:
     """A column as an array, or as a struct of its parts."""
-    if values.ndim > 2 or values.dtype.kind not in "bfiu" or 0 in values.shape[1:]:
-        raise InputError(
-            f"column {name!r} cannot be recorded: numbers or flags of shape (N,) or (N, width) can, "
-            f"got {values.dtype} of shape {values.shape}"
-        )
+    check_numbers(name, values, "be recorded")
     if values.ndim == 1:
         return pa.array(np.ascontiguousarray(values))
     return pa.StructArray.from_arrays([pa.array(row) for row in np.ascontiguousarray(values.T)], names=parts)
@@ -218,7 +209,11 @@ def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | N
             name: np.concatenate([_values(tables[k].column(name)) for k in order])
             for name in (names if tables else ())
         }
-        own = {name: _spec(tables[0].column(name), names[name]) for name in columns if name not in COLUMNS}
+        own = {}
+        for name in [name for name in columns if name not in COLUMNS]:
+            kind = tables[0].column(name).type.value_type  # the fields of a struct are the parts
+            parts = tuple(member.name for member in kind) if pa.types.is_struct(kind) else ()
+            own[name] = spec_said({key: str(text) for key, text in names[name].items()}, parts)
         run = Run(columns, metadata, own)
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError, pa.ArrowException) as error:
         raise InputError(
@@ -226,13 +221,6 @@ def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | N
             f"({type(error).__name__}: {error}); read the run's Parquet, or record it again"
         ) from error
     return str(static.get(NAME) or COLUMNS_ENTITY), run, rows
-
-
-def _spec(column: pa.Array, said: dict[str, str]) -> Column:
-    """Description of a custom column; the fields of its struct are its parts."""
-    kind = column.type.value_type
-    parts = tuple(field.name for field in kind) if pa.types.is_struct(kind) else ()
-    return spec_said({key: str(text) for key, text in said.items()}, parts)
 
 
 def _values(column: pa.Array) -> NDArray[Any]:
