@@ -373,7 +373,7 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
     _check_file(path, "an npz file")
     try:
         with zipfile.ZipFile(path) as archive:
-            names = [info.filename for info in archive.infolist()]
+            names = archive.namelist()
             if twice := sorted({name for name in names if names.count(name) > 1}):
                 raise InputError(f"{path}: two arrays are called {twice[0]!r}; write it again")
             arrays = {name.removesuffix(".npy"): _array(archive, name, path) for name in names}
@@ -400,24 +400,12 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
 
 
 def _array(archive: zipfile.ZipFile, name: str, path: Path) -> NDArray[Any]:
-    """An array of an npz; memory is allocated for its bytes, not for what its header claims."""
-    data = archive.read(name)
-    file = io.BytesIO(data)
     try:
-        version = np.lib.format.read_magic(file)
-        header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        shape, fortran, dtype = header[version](file)
-    except (ValueError, KeyError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: {name} is not a numpy array ({_short(reason)})") from error
-    if dtype.hasobject:
-        raise InputError(f"{path}: {name} holds pickled objects, which are not read; save plain numbers")
-    body = data[file.tell() :]
-    if len(body) != dtype.itemsize * int(np.prod(shape, dtype=object)):
-        raise InputError(
-            f"{path}: {name} is cut short: {len(body)} bytes for {dtype} of shape {shape}; write it again"
-        )
-    return np.frombuffer(body, dtype).reshape(shape, order="F" if fortran else "C")
+        with archive.open(name) as file:
+            return np.lib.format.read_array(file, allow_pickle=False)  # type: ignore[arg-type]
+    except (ValueError, MemoryError, OverflowError) as error:
+        reason = _short(" ".join(str(error).split()))
+        raise InputError(f"{path}: {name} is no whole array of plain numbers ({reason})") from error
 
 
 def _npz_about(about: NDArray[Any], path: Path) -> tuple[Any, dict[str, dict[str, str]]]:

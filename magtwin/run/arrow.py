@@ -61,7 +61,11 @@ def run_of(table: pa.Table, path: Path) -> Run:
         vector = COLUMNS[name].width > 1 if name in COLUMNS else "part" in said
         columns[name] = np.column_stack(parts) if vector else parts[0]
         if name in COLUMNS:
-            _check_flags(columns[name], name, path)
+            wrong = (columns[name] != 0) & (columns[name] != 1) & (COLUMNS[name].unit == "bool")
+            if wrong.any():
+                row = int(np.argmax(wrong))
+                text = f"a flag is 0 or 1, got {columns[name][row]}"
+                raise InputError(f"{path}: column {name!r}, row {row}: {text}")
         elif "column" in said:
             named = tuple(_metadata(table, member)[b"part"].decode() for member in members) if vector else ()
             specs[name] = spec_said(said, named)
@@ -152,12 +156,3 @@ def _numpy(table: pa.Table, name: str, path: Path) -> NDArray[Any]:
         row = column.is_null().to_numpy().argmax()
         raise InputError(f"{path}: column {name!r}, row {row}: no value; write nan for unknown values")
     return column.to_numpy()
-
-
-def _check_flags(values: NDArray[Any], name: str, path: Path) -> None:
-    """Refuse flags other than 0 and 1."""
-    if COLUMNS[name].unit == "bool" and values.dtype.kind != "b":
-        wrong = (values != 0) & (values != 1)
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            raise InputError(f"{path}: column {name!r}, row {row}: a flag is 0 or 1, got {values[row]}")

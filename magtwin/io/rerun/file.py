@@ -1,6 +1,7 @@
 """File: a Run, or several to compare, as a Rerun recording with a layout, and back."""
 
 import os
+import shutil
 import struct
 import tempfile
 import warnings
@@ -229,12 +230,9 @@ def _readable(path: FilePath, *, partial: bool) -> Iterator[FilePath]:
     if not partial or end >= size:
         yield path
         return
-    with tempfile.TemporaryDirectory() as folder, open(path, "rb") as source:
-        file = FilePath(folder) / path.name
-        with open(file, "wb") as target:
-            while end > 0 and (part := source.read(min(end, 1 << 20))):
-                target.write(part)
-                end -= len(part)
+    with tempfile.TemporaryDirectory() as folder:
+        file = shutil.copyfile(path, FilePath(folder) / path.name)
+        os.truncate(file, end)
         yield file
 
 

@@ -57,15 +57,10 @@ _PLACES = ("frame", "datum")
 def read_readings(
     *sources: Source,
     columns: Columns | None = None,
-    name: str | None = None,
-    licence: str = "",
-    created: str = "",
-    height_m: float | None = None,
-    frame: str = "",
-    datum: str = "",
     headings_deg: tuple[float, ...] | None = None,
     pose_topic: str | None = None,
     field_topic: str | None = None,
+    **about: Any,
 ) -> Readings:
     """Read the readings of a survey from any supported source.
 
@@ -78,15 +73,11 @@ def read_readings(
     Args:
         sources: One or more sources.
         columns: Meaning and units of the columns of a table.
-        name: Name of the survey. Default: that of the first source.
-        licence: SPDX name of the licence; "" keeps the licence of the source.
-        created: Day of the survey, YYYY-MM-DD; likewise.
-        height_m: Height of the sensor above the floor [m]; likewise.
-        frame: Axes of x, y and heading, in words; likewise.
-        datum: Location of that frame, in words; likewise.
         headings_deg: Headings of a folder of CSVs [deg], if it is incomplete.
         pose_topic: Topic of a bag's poses, if there are several.
         field_topic: Topic of a bag's field, if there are several.
+        about: Metadata that replace those of the sources, unless None or "": `name`, `licence`, `created`,
+            `height_m` [m], `frame` and `datum`, as in `magtwin.io.surveys.about.About`.
 
     Returns:
         Readings in the order of the sources. Rows with a cell that is empty or nan are left out; `source` has
@@ -116,9 +107,7 @@ def read_readings(
         else:
             parts.append(_of_file(str(source), path, columns))
     readings = parts[0] if len(parts) == 1 else _together(parts)
-    own = {"licence": licence, "created": created, "height_m": height_m, "name": name}
-    own |= {"frame": frame, "datum": datum}
-    return readings.with_(**{key: value for key, value in own.items() if value not in (None, "")})
+    return readings.with_(**{key: value for key, value in about.items() if value not in (None, "")})
 
 
 def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
