@@ -35,11 +35,9 @@ def read_bag_readings(
 
     Args:
         path: Folder of a rosbag2, or its storage file (.db3, .mcap).
-        pose_topic: Topic of the poses. Default: the only one, or the only one that is not odometry, which
-            drifts.
+        pose_topic: Topic of the poses. Default: the only one, or the only one that is not odometry.
         field_topic: Topic of the field. Default: the only one.
-        unit: Unit of the field. Default: the unit that makes it the Earth's field: 1e-5..1e-4 is T,
-            10,000..100,000 is nT, and so on; the ranges do not overlap.
+        unit: Unit of the field. Default: the unit that makes it the Earth's field.
         scale: Factor from the bag's values to nT, in place of a unit.
 
     Returns:

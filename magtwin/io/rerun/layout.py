@@ -317,26 +317,29 @@ def _plot(
     title: str, lines: Sequence[tuple[Shown, Series, Array]], whole: rrb.TimeAxis | None, *, tall: bool
 ) -> rrb.TimeSeriesView:
     """Lines of one unit, with the legend in the corner where it needs least room."""
-    legend = len(lines) > 1
-    corner = rrb.Corner2D.LeftTop
+    legend, corner = len(lines) > 1, rrb.Corner2D.LeftTop
     ends = value_range(np.array([(np.nanmin(values), np.nanmax(values)) for _, _, values in lines]))
     if legend and ends:
         count = len({series.name for _, series, _ in lines})
         height = min(_LEGEND_MOST, count * _LEGEND_ROW * (1.0 if tall else 2.0))
         width = _LEGEND_WIDTH + _LEGEND_LETTER * max(len(series.name) for _, series, _ in lines)
-        t, values = [], []
-        for shown, _, line in lines:
-            step = max(1, len(line) // _LOOKED_AT)
-            t.append(shown.run["t"][::step] + shown.offset_s)
-            values.append(line[::step])
-        order = np.argsort(np.concatenate(t), kind="stable")
-        corner, ends = legend_corner(
-            np.concatenate(values)[order, None], np.concatenate(t)[order], ends, (width, height)
-        )
+        parts = [
+            np.column_stack([shown.run["t"] + shown.offset_s, line])[:: max(1, len(line) // _LOOKED_AT)]
+            for shown, _, line in lines
+        ]
+        t, values = (rows := np.concatenate(parts))[np.argsort(rows[:, 0], kind="stable")].T
+        corner, ends = legend_corner(values[:, None], t, ends, (width, height))
     overrides: dict[Any, list[rrb.Visualizer]] = {}
     for shown, series, _ in lines:
         entity = entity_of(DERIVED_ENTITY if series.column in DERIVED else COLUMNS_ENTITY, shown.name)
-        overrides.setdefault(f"/{entity}", []).append(_line(series))
+        source = VisualizerComponentMapping(
+            "Scalars:scalars",
+            ComponentSourceKind.SourceComponent,
+            source_component=series.column,
+            selector=f".{series.part}" if series.part else None,
+        )
+        style = rr.SeriesLines(names=[series.name], colors=[series.colour], widths=[series.width])
+        overrides.setdefault(f"/{entity}", []).append(style.visualizer(mappings=[source]))
     return rrb.TimeSeriesView(
         origin="/",
         contents=list(overrides),
@@ -346,18 +349,6 @@ def _plot(
         plot_legend=rrb.PlotLegend(corner, visible=legend),
         overrides=overrides,
     )
-
-
-def _line(series: Series) -> rrb.Visualizer:
-    """Style and source of a series."""
-    source = VisualizerComponentMapping(
-        "Scalars:scalars",
-        ComponentSourceKind.SourceComponent,
-        source_component=series.column,
-        selector=f".{series.part}" if series.part else None,
-    )
-    style = rr.SeriesLines(names=[series.name], colors=[series.colour], widths=[series.width])
-    return style.visualizer(mappings=[source])
 
 
 def value_range(values: Array) -> tuple[float, float] | None:
@@ -382,15 +373,10 @@ def legend_corner(
 ) -> tuple[rrb.Corner2D, tuple[float, float]]:
     """The corner for a legend that hides no line, and the axis that this needs.
 
-    Args:
-        values: Series of a plot, shape (N, S).
-        t: Ascending times [s], shape (N,).
-        ends: Ends of an axis that all values fit in.
-        size: Width and height of the legend, as shares of the plot.
-
-    Returns:
-        The corner for which the axis grows least, and the ends of that axis. One hundredth of the readings
-        beside the legend may be under it, such as the ramp at the start of a run.
+    `values` are the series of a plot, shape (N, S), at ascending times `t` [s]; all fit in an axis with these
+    `ends`; `size` is the width and height of the legend, as shares of the plot. The axis grows least in the
+    chosen corner. One hundredth of the readings beside the legend may be under it, such as the ramp at the
+    start of a run.
     """
     width, height = size
     span = (t[-1] - t[0]) * width
@@ -434,11 +420,8 @@ def _floor_view(lab: LabSpec, names: Sequence[str]) -> rrb.Spatial2DView:
 
 
 def _event_view() -> rrb.TextLogView:
-    return rrb.TextLogView(
-        origin="events",
-        name="Events",
-        columns=rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"]),
-    )
+    shown = rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"])
+    return rrb.TextLogView(origin="events", name="Events", columns=shown)
 
 
 def _visible(*, all_time: bool) -> rrb.VisibleTimeRanges:

@@ -339,9 +339,8 @@ class Robot:
         dips. Its pose is relative to the robot, as the sensor's link may have no shape and so no entity.
         """
         entity = f"{entity_of('world/robot', self.name)}/magnetometer"
-        place = _transform(
-            self.interior.robot.p_base_magnetometer, self.interior.robot.q_base_magnetometer_xyzw
-        )
+        robot = self.interior.robot
+        place = _transform(robot.p_base_magnetometer, robot.q_base_magnetometer_xyzw)
         self.rec.log(entity, place, static=True)
         style = rr.Arrows3D.from_fields(colors=[(255, 255, 255)], radii=[0.006])
         self.rec.log(f"{entity}/field", style, static=True)

@@ -341,12 +341,8 @@ def _method_options(
     for name, value, method in (("kernel", kernel, "gp"), ("earth", earth, "harmonic")):
         if value is not None and method not in methods:
             raise InputError(f"`{name}` is for `method={method}`; drop it for {methods[0]}", parameter=name)
-    options: dict[str, dict[str, Any]] = {}
-    if kernel is not None:
-        options["gp"] = {"kernel": kernel}
-    if earth is not None:
-        options["harmonic"] = {"earth_nt": earth_of(earth)}
-    return options
+    options = {} if kernel is None else {"gp": dict[str, Any](kernel=kernel)}
+    return options if earth is None else {**options, "harmonic": {"earth_nt": earth_of(earth)}}
 
 
 def _joined(report: Report, *below: Report) -> Report:

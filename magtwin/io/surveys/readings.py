@@ -113,14 +113,12 @@ def read_readings(
 def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
     """The readings of a Run: its measured field at the true pose of base_link.
 
+    Rows whose field is nan (outside the map) are left out; rows with lost lock are not good.
+
     Args:
         run: A run with p_world_base, yaw and b_measured_nt, or b_total_nt.
         name: Name of the readings.
         source: Source of the run.
-
-    Returns:
-        Its readings. Rows whose field is nan (outside the map) are left out; rows with lost lock are not
-        good.
 
     Raises:
         InputError: A column is missing, or no row has a field.
@@ -224,11 +222,7 @@ def is_pattern(source: Source) -> bool:
 
 
 def _each(sources: Sequence[Source]) -> Iterator[Source]:
-    """The sources, with patterns and folders of Parquet files replaced by their files.
-
-    Raises:
-        InputError: Nothing matches a pattern.
-    """
+    """The sources, with patterns and folders of Parquet files replaced by their files."""
     for source in sources:
         path = Path(source)
         if is_pattern(source):
@@ -239,11 +233,7 @@ def _each(sources: Sequence[Source]) -> Iterator[Source]:
                 raise InputError(f"no file or folder matches {str(source)!r}; check the pattern")
             yield from matches
         elif path.is_dir() and not (path / "metadata.yaml").is_file():
-            tables = sorted(file for file in path.iterdir() if file.suffix in PARQUET)
-            if tables:
-                yield from tables
-            else:
-                yield source
+            yield from sorted(file for file in path.iterdir() if file.suffix in PARQUET) or [path]
         else:
             yield source
 
@@ -366,9 +356,7 @@ def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
 def _complete(table: Table, columns: Columns) -> tuple[Columns, list[str]]:
     """Columns and unit, with missing ones found by name and size; and what was found so."""
     taken = list[str]()
-    lower: dict[str, str] = {}
-    for label in table.names:
-        lower.setdefault(label.strip().lower(), label)
+    lower = {label.strip().lower(): label for label in reversed(table.names)}  # the first of equal names
     if not (columns.heading or columns.quaternion):
         label = next((name for name in HEADINGS if name in table.names), "")
         columns = replace(columns, heading=label or next((lower[n] for n in HEADINGS if n in lower), ""))
@@ -383,10 +371,8 @@ def _complete(table: Table, columns: Columns) -> tuple[Columns, list[str]]:
             if columns.axes is None:
                 taken.append(f"{columns.vector} as the field in the robot's axes, forward, left, up (--axes)")
         else:
-            named = [label for label in table.names if not label.isdigit()]
-            known = (
-                f"columns: {', '.join(named)}" if named else f"{len(table.columns)} columns without a header"
-            )
+            named = ", ".join(label for label in table.names if not label.isdigit())
+            known = f"columns: {named}" if named else f"{len(table.columns)} columns without a header"
             raise InputError(
                 f"{table.path}: no column of the field was found by its name ({known}); name the magnitude "
                 "with --field NAME, or the components with --vector BX,BY,BZ"
@@ -423,18 +409,11 @@ def _check_axes(vector_nt: Array, yaw: Array, table: Table, columns: Columns) ->
 def levelled(vector_nt: Array, turn: Array, axes: str) -> Array:
     """Vectors in the axes of a robot that stands upright: forward, left, up.
 
-    Args:
-        vector_nt: Field in body or world axes, shape (N, 3).
-        turn: Headings [rad], shape (N,), or orientations xyzw of the body in world, shape (N, 4).
-        axes: "body" or "world", what `vector_nt` is in.
-
-    Returns:
-        Field in level axes that are turned by the heading alone, shape (N, 3).
+    `turn` are headings [rad], shape (N,), or orientations xyzw of the body in world, shape (N, 4); `axes` are
+    those of `vector_nt`. The result, shape (N, 3), is in level axes that are turned by the heading alone.
     """
     if turn.ndim == 1:
-        if axes == "body":
-            return vector_nt
-        return rotate(quat_conjugate(quat_from_yaw(turn)), vector_nt)
+        return vector_nt if axes == "body" else rotate(quat_conjugate(quat_from_yaw(turn)), vector_nt)
     world = rotate(turn, vector_nt) if axes == "body" else vector_nt
     return rotate(quat_conjugate(quat_from_yaw(yaw_from_quat(turn))), world)
 
