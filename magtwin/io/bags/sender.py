@@ -128,21 +128,18 @@ def sender_for(twin: "Twin | None", unit: Unit, rate_hz: Any = None) -> Sender:
 
     robot = twin.scene.robot
     joints = (robot.drive.left_wheel_joint, robot.drive.right_wheel_joint)
-    fixed, wheels = [], {}
+    frames: dict[str, FixedFrame] = {}  # by joint; links that do not turn by name
     for link in read_links(robot.asset).values():
-        if link.name == BASE_LINK:
-            continue
-        axis = link.axis_link or (0.0, 0.0, 1.0)
-        frame = FixedFrame(BASE_LINK, link.name, link.p_base_link, link.q_base_link_xyzw, axis)
-        if link.joint in joints:
-            wheels[link.joint] = frame
-        else:
-            fixed.append(frame)
+        if link.name != BASE_LINK:
+            axis = link.axis_link or (0.0, 0.0, 1.0)
+            frame = FixedFrame(BASE_LINK, link.name, link.p_base_link, link.q_base_link_xyzw, axis)
+            frames[link.joint if link.joint in joints else f"/{link.name}"] = frame
+    wheels = tuple(frames.pop(joint) for joint in joints if joint in frames)
     return sender_of(
         robot,
         unit=unit,
         rate_hz=float(rate_hz) if isinstance(rate_hz, int | float) and rate_hz > 0 else None,
-        links=tuple(fixed),
-        wheels=(wheels[joints[0]], wheels[joints[1]]) if len(wheels) == 2 else None,
+        links=tuple(frames.values()),
+        wheels=wheels if len(wheels) == 2 else None,
         description=read_description(robot.asset),
     )

@@ -46,18 +46,11 @@ class Connection:
         """The quality of service as a `rosbags.interfaces.Qos`, with infinite durations."""
         from rosbags import interfaces as ros
 
-        infinite = ros.QosTime(9223372036, 854775807)
-        return ros.Qos(
-            ros.QosHistory.KEEP_LAST,
-            self.qos.depth,
-            ros.QosReliability.RELIABLE if self.qos.reliable else ros.QosReliability.BEST_EFFORT,
-            ros.QosDurability.TRANSIENT_LOCAL if self.qos.latched else ros.QosDurability.VOLATILE,
-            infinite,
-            infinite,
-            ros.QosLiveliness.AUTOMATIC,
-            infinite,
-            avoid_ros_namespace_conventions=False,
-        )
+        infinite, qos = ros.QosTime(9223372036, 854775807), self.qos
+        reliability = ros.QosReliability.RELIABLE if qos.reliable else ros.QosReliability.BEST_EFFORT
+        durability = ros.QosDurability.TRANSIENT_LOCAL if qos.latched else ros.QosDurability.VOLATILE
+        kept = (ros.QosHistory.KEEP_LAST, qos.depth, reliability, durability)
+        return ros.Qos(*kept, infinite, infinite, ros.QosLiveliness.AUTOMATIC, infinite, False)
 
     @cached_property
     def offered_qos(self) -> str:

@@ -221,6 +221,11 @@ def _pose_at(prefix: str, p: str = "position", q: str = "orientation") -> dict[s
     return {"mocap_p": prefix + p, "mocap_q_xyzw": prefix + q}
 
 
+def _carrier(kind: str, leaves: dict[str, str], **rest: Any) -> Topic:
+    """A topic whose message type holds each of its columns in a leaf."""
+    return Topic(kind=kind, needs=tuple(leaves), carried=True, reads={kind: leaves}, qos=SENSOR_DATA, **rest)
+
+
 _FIELD = "sensor_msgs/msg/MagneticField"
 
 POSE = Topic(
@@ -237,55 +242,32 @@ POSE = Topic(
         "nav_msgs/msg/Odometry": _pose_at("pose.pose."),
     },
 )
-ODOMETRY = Topic(
+ODOMETRY = _carrier(
+    "nav_msgs/msg/Odometry",
+    {
+        "odom_p": "pose.pose.position",
+        "odom_q_xyzw": "pose.pose.orientation",
+        "odom_v": "twist.twist.linear",
+        "odom_w": "twist.twist.angular",
+    },
     name="/robot/odom",
-    kind="nav_msgs/msg/Odometry",
-    qos=SENSOR_DATA,
-    needs=("odom_p", "odom_q_xyzw", "odom_v", "odom_w"),
-    carried=True,
     frame="odom_frame",
     more=_odometry,
-    reads={
-        "nav_msgs/msg/Odometry": {
-            "odom_p": "pose.pose.position",
-            "odom_q_xyzw": "pose.pose.orientation",
-            "odom_v": "twist.twist.linear",
-            "odom_w": "twist.twist.angular",
-        }
-    },
 )
-IMU = Topic(
+IMU = _carrier(
+    "sensor_msgs/msg/Imu",
+    {"imu_q_xyzw": "orientation", "imu_w": "angular_velocity", "imu_a": "linear_acceleration"},
     name="/robot/imu",
-    kind="sensor_msgs/msg/Imu",
-    qos=SENSOR_DATA,
-    needs=("imu_q_xyzw", "imu_w", "imu_a"),
-    carried=True,
     frame="imu_frame",
     more=_imu,
-    reads={
-        "sensor_msgs/msg/Imu": {
-            "imu_q_xyzw": "orientation",
-            "imu_w": "angular_velocity",
-            "imu_a": "linear_acceleration",
-        }
-    },
 )
-BATTERY = Topic(
+BATTERY = _carrier(
+    "sensor_msgs/msg/BatteryState",
+    {"battery_v": "voltage", "battery_a": "current", "battery_fraction": "percentage"},
     name="/robot/battery_state",
-    kind="sensor_msgs/msg/BatteryState",
-    qos=SENSOR_DATA,
-    needs=("battery_v", "battery_a", "battery_fraction"),
-    carried=True,
     every_s=4.0,
     frame="base_frame",
     more=_battery,
-    reads={
-        "sensor_msgs/msg/BatteryState": {
-            "battery_v": "voltage",
-            "battery_a": "current",
-            "battery_fraction": "percentage",
-        }
-    },
 )
 MAGNITUDE = Topic(
     name="/robot/qtfm/magnitude",

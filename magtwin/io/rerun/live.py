@@ -75,20 +75,12 @@ class _Growing(Sink):
         self.rows += run.rows
 
     def _begin(self, run: Run) -> Any:
-        rate = run.metadata.get("rate_hz", 0.0)
-        return recording_of(
-            run,
-            uuid.uuid4().hex,
-            title_of(run) or "live run",
-            self._twin,
-            known=self._expected,
-            events=None if self._expected else list(STATES),
-            whole=self._expected is not None,
-            rate_hz=rate if isinstance(rate, float) else 0.0,
-            final=self._final,
-            **self._shown,
-            **self._sinks,
-        )
+        rate, known = run.metadata.get("rate_hz", 0.0), self._expected
+        layout = {"known": known, "events": None if known else list(STATES), "whole": known is not None}
+        more: dict[str, Any] = {**layout, **self._shown, **self._sinks, "final": self._final}
+        rate_hz = rate if isinstance(rate, float) else 0.0
+        title = title_of(run) or "live run"
+        return recording_of(run, uuid.uuid4().hex, title, self._twin, rate_hz=rate_hz, **more)
 
     def close(self) -> None:
         """Complete the recording."""

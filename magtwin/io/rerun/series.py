@@ -80,12 +80,8 @@ STATES: Mapping[str, State] = MappingProxyType(
 """Flags with states and events."""
 
 DERIVED = (
-    "interval_low_nt",
-    "interval_high_nt",
-    "error_nt",
-    "measured_error_nt",
-    "error_low_nt",
-    "error_high_nt",
+    *("interval_low_nt", "interval_high_nt", "error_nt", "measured_error_nt"),
+    *("error_low_nt", "error_high_nt"),
 )
 """Lines of the plots that are not columns: see `derived`."""
 
