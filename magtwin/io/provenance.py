@@ -238,10 +238,9 @@ def _driven(run: Run, near: str | FilePath | None) -> Any:
                 raise InputError(f"{file}: the file that the run drove is missing; put it back")
             return _placed(read(place), run)
     name = str(metadata.get("path", ""))
-    if "replay_sha256" in metadata or "commands_sha256" in metadata:
-        raise InputError(
-            f"the run drove {name!r}, which is in no file; it cannot be reproduced from its metadata"
-        )
+    if {"replay_sha256", "commands_sha256"} & metadata.keys():
+        text = "which is in no file; it cannot be reproduced from its metadata"
+        raise InputError(f"the run drove {name!r}, {text}")
     if name == "random":
         return name
     if name not in PATHS and name not in CASES:

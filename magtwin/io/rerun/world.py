@@ -297,9 +297,9 @@ class Robot:
         self._pose(run, np.arange(-first % poses, run.rows, poses))
         self._trail(run, np.arange(-first % dots, run.rows, dots))
 
-    def close(self, last: Run | None = None) -> None:
+    def close(self, last: Run) -> None:
         """End the path with `last`, the last row of the run."""
-        if last is None or self._strides is None:
+        if self._strides is None:
             return
         row = np.array([0])
         poses, dots = self._strides

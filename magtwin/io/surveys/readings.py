@@ -101,9 +101,8 @@ def read_readings(
             topics = {"pose_topic": pose_topic, "field_topic": field_topic}
             parts.append(read_bag_readings(path, unit=columns.unit, scale=columns.scale, **topics))
         elif path.is_dir():
-            parts.append(
-                read_grid(path, headings_deg=headings_deg, unit=columns.unit or "nT", scale=columns.scale)
-            )
+            unit = columns.unit or "nT"
+            parts.append(read_grid(path, headings_deg=headings_deg, unit=unit, scale=columns.scale))
         else:
             parts.append(_of_file(str(source), path, columns))
     readings = parts[0] if len(parts) == 1 else _together(parts)
