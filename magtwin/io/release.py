@@ -210,13 +210,8 @@ def _frame(text: str, at: int, number: int, where: str) -> tuple[dict[str, Any] 
     try:
         return json.JSONDecoder().raw_decode(text, at)
     except (ValueError, RecursionError) as error:
-        if _is_cut(error, text):
+        if isinstance(error, json.JSONDecodeError) and (
+            error.msg.startswith("Unterminated string") or _STUMP.fullmatch(text, error.pos)
+        ):
             return f"within frame {number}", at
         raise InputError(f"{where}: not JSON: {error}") from error
-
-
-def _is_cut(error: Exception, text: str) -> bool:
-    """Whether JSON is incomplete: it ends within a text, a number or a word."""
-    if not isinstance(error, json.JSONDecodeError):
-        return False
-    return error.msg.startswith("Unterminated string") or bool(_STUMP.fullmatch(text, error.pos))

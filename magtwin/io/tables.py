@@ -379,10 +379,17 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
             arrays = {name.removesuffix(".npy"): _array(archive, name, path) for name in names}
     except (zipfile.BadZipFile, EOFError, OSError, NotImplementedError, RuntimeError) as error:
         raise InputError(f"{path}: not an npz file, damaged, or cut short ({error})") from error
-    metadata, said = _npz_about(arrays.pop(_ABOUT, np.array("{}")), path)
+    try:
+        about = json.loads(str(arrays.pop(_ABOUT, "{}")))
+        metadata = metadata_from_json(json.dumps(about.get("facts", {})), path)
+        said = {name: _texts(json.dumps(text), str(path)) for name, text in about.get("columns", {}).items()}
+    except (ValueError, AttributeError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: array {_ABOUT!r} holds no metadata of a run ({error})") from error
     specs = {
-        name: spec_said(told, tuple(filter(None, told.get("parts", "").split(","))))
-        for name, told in said.items()
+        name: spec_said(texts, tuple(filter(None, texts.get("parts", "").split(","))))
+        for name, texts in said.items()
         if name not in COLUMNS
     }
     for name, values in arrays.items():
@@ -406,14 +413,3 @@ def _array(archive: zipfile.ZipFile, name: str, path: Path) -> NDArray[Any]:
     except (ValueError, MemoryError, OverflowError) as error:
         reason = _short(" ".join(str(error).split()))
         raise InputError(f"{path}: {name} is no whole array of plain numbers ({reason})") from error
-
-
-def _npz_about(about: NDArray[Any], path: Path) -> tuple[Any, dict[str, dict[str, str]]]:
-    """Metadata of the run and of its columns."""
-    try:
-        told = json.loads(str(about))
-        metadata, columns = told.get("facts", {}), told.get("columns", {})
-        said = {str(name): _texts(json.dumps(text), str(path)) for name, text in columns.items()}
-    except (ValueError, AttributeError, RecursionError) as error:
-        raise InputError(f"{path}: array {_ABOUT!r} holds no metadata of a run ({error})") from error
-    return metadata_from_json(json.dumps(metadata), path), said

@@ -252,11 +252,10 @@ def _columns(
     values = signal.columns()
     if signal.topic is VECTOR:
         size = np.linalg.norm(values["magnetic_field"], axis=1)
-        if not np.isfinite(size).any():
+        size = size[np.isfinite(size)]
+        if not len(size):
             return {}
-        unit = unit_of(
-            float(size[np.isfinite(size)].mean()), str(path), signal.name
-        )  # may differ from the clock's
+        unit = unit_of(float(size.mean()), str(path), signal.name)  # may differ from the clock's
         metadata["vector_unit"] = unit
         values = {"b_vector_measured_nt": values["magnetic_field"] * NT_PER[unit]}
     for name in values.keys() & {"mocap_q_xyzw", "imu_q_xyzw"}:

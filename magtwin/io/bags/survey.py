@@ -84,6 +84,7 @@ def read_bag_readings(
         level = rotate(quat_conjugate(quat_from_yaw(yaw_from_quat(q))), rotate(q, field.vector_nt))
     left = f", {np.count_nonzero(~known)} of {len(known)} fields not between poses or not a number left out"
     how = "given" if unit or scale is not None else "told by its size"
+    about = f"poses {poses.name}, field {fields.name} in {field.label}, {how}; stamps of {clock}"
     return Readings(
         p_xy=p[:, :2],
         yaw=yaw_from_quat(q),
@@ -92,8 +93,7 @@ def read_bag_readings(
         t=t - t[0],
         runs=(path.stem,),
         name=path.stem,
-        source=f"{sums} (poses {poses.name}, field {fields.name} in {field.label}, {how}; stamps of {clock}"
-        f"{left if not known.all() else ''})",
+        source=f"{sums} ({about}{left if not known.all() else ''})",
     )
 
 

@@ -140,8 +140,8 @@ def _battery(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
 def _magnitude(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
     """The magnitude in x, as APRILab's robot publishes it, with its predicted variance."""
     zero = np.zeros(len(stamp))
-    variance = c["b_sd_nt"] / nt_per(sender) if "b_sd_nt" in c else zero
-    variance = np.where(np.isfinite(variance), variance, 0.0) ** 2
+    sd = c["b_sd_nt"] / nt_per(sender) if "b_sd_nt" in c else zero
+    variance = np.where(np.isfinite(sd), sd, 0.0) ** 2
     return {
         "magnetic_field": np.column_stack([c["b_measured_nt"] / nt_per(sender), zero, zero]),
         "magnetic_field_covariance": np.column_stack([variance, *[zero] * 8]),
