@@ -48,10 +48,9 @@ def info_of_run(file: Path) -> Report:
     report = run.report(str(file))
     columns = {}
     for name, values in run.items():
-        spec = run.spec(name)
-        shape = f" x {values.shape[1]}" if values.ndim > 1 else ""
+        spec, width = run.spec(name), f" x {values.shape[1]}" if values.ndim > 1 else ""
         words = (spec.unit or "-", spec.frame and f"in {spec.frame}", spec.doc)
-        columns[name + shape] = "  ".join(word for word in words if word)
+        columns[name + width] = "  ".join(word for word in words if word)
     figures = (*report.figures[:2], Figure("columns", len(run)), *report.figures[2:])
     return replace(report, figures=figures, metadata={**report.metadata, "columns": columns})
 

@@ -102,9 +102,8 @@ def _own(bag: Bag) -> Run:
     if not texts:
         raise InputError(f"{bag.path}: a recording into which nothing was written yet")
     table = json.loads(texts[0])
-    if len(rows):
-        data = decode(layout(READING.kind), rows, ["data"])["data"]
-    else:
+    data = decode(layout(READING.kind), rows, ["data"])["data"]
+    if not len(rows):
         data = np.zeros((0, sum(int(column["width"] or 1) for column in table["columns"])))
     names = {str(column["topic"]) for column in table["columns"] if "topic" in column}
     topics = [find("topic", name, TOPICS) for name in names]

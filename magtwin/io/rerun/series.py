@@ -194,17 +194,15 @@ def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | N
         if TIMELINE in batch.schema.names:
             tables.append(batch)
         else:
-            known = [key for key in (FACTS, NAMES, NAME, ROWS) if key in batch.schema.names]
-            static |= {key: batch.column(key)[0][0].as_py() for key in known}
+            keys = [key for key in (FACTS, NAMES, NAME, ROWS) if key in batch.schema.names]
+            static |= {key: batch.column(key)[0][0].as_py() for key in keys}
     try:
         metadata, names = (json.loads(static[key]) for key in (FACTS, NAMES))
         rows = int(static[ROWS]) if ROWS in static else None
         check_metadata(metadata)
         order = np.argsort([table.column(TIMELINE)[0].value for table in tables], kind="stable")
-        columns = {
-            name: np.concatenate([_values(tables[k].column(name)) for k in order])
-            for name in (names if tables else ())
-        }
+        known = names if tables else ()
+        columns = {n: np.concatenate([_values(tables[k].column(n)) for k in order]) for n in known}
         own = {}
         for name in [name for name in columns if name not in COLUMNS]:
             kind = tables[0].column(name).type.value_type  # the fields of a struct are the parts

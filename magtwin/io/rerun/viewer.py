@@ -58,15 +58,12 @@ def show(rrd: str | os.PathLike[str], *, source: str | os.PathLike[str] | None =
     command = [_binary(), "--bind", LOCALHOST, "--port", "auto", str(rrd)]
     result = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
     if result.returncode:
-        advice = (
-            f"use a browser: rerun --web-viewer --bind {LOCALHOST} {rrd}"
-            if source is None
-            else "view the .rrd of this run, which a browser shows too"
-        )
-        raise InputError(
-            f"{source or rrd}: the Rerun viewer opened no window: {_reason(result.stderr)}; "
-            f"without a display {advice}"
-        )
+        advice = "view the .rrd of this run, which a browser shows too"
+        if source is None:
+            advice = f"use a browser: rerun --web-viewer --bind {LOCALHOST} {rrd}"
+        reason = _reason(result.stderr)
+        text = f"the Rerun viewer opened no window: {reason}; without a display {advice}"
+        raise InputError(f"{source or rrd}: {text}")
 
 
 def screenshot(
@@ -105,12 +102,10 @@ def screenshot(
         try:
             views = _draw(client, path.resolve(), rrd, aside, time_s)
         except (ConnectionError, RuntimeError) as error:
-            raise InputError(
-                f"{rrd}: the Rerun viewer ended before the picture was drawn ({error})"
-            ) from error
-    return [
-        f"{v.name}: {r.severity}: {r.summary} {r.details or ''}".strip() for v in views for r in v.reports
-    ]
+            text = f"the Rerun viewer ended before the picture was drawn ({error})"
+            raise InputError(f"{rrd}: {text}") from error
+    lines = [f"{v.name}: {r.severity}: {r.summary} {r.details or ''}" for v in views for r in v.reports]
+    return [line.strip() for line in lines]
 
 
 def _draw(
