@@ -66,10 +66,9 @@ def resolution(
     def between_nodes(step: float) -> float:
         corner = p - part[:, :2] * step
         mixed = np.zeros(len(p))
-        for i in (0, 1):
-            for j in (0, 1):
-                weight = np.abs(1 - i - part[:, 0]) * np.abs(1 - j - part[:, 1])
-                mixed += weight * model.predict(corner + step * np.array([i, j]), yaw)[0]
+        for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            weight = np.abs(1 - i - part[:, 0]) * np.abs(1 - j - part[:, 1])
+            mixed += weight * model.predict(corner + step * np.array([i, j]), yaw)[0]
         return _rms(mixed - value)
 
     def between_headings(headings: Array) -> float:
@@ -108,9 +107,7 @@ def _first_good(tried: Iterable[tuple[Choice, float]], sd: float) -> tuple[Choic
 
 
 def _probes(readings: Readings) -> tuple[Array, Array, Array]:
-    """Positions of readings (K, 2), evenly spread headings (K,), positions within a cell from 0 to 1 (K,
-    2).
-    """
+    """Positions of readings (K, 2), even headings (K,), and positions within a cell from 0 to 1 (K, 2)."""
     rows = np.flatnonzero(readings.good)
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, PROBES).astype(np.intp))]
     even = np.mod(0.5 + np.arange(1, len(rows) + 1)[:, None] * GOLDEN, 1.0)

@@ -101,8 +101,7 @@ def _of_the_dipoles(field: AnomalyMap, start: float, height_m: float) -> Anomaly
 def _reach_m(harmonic: HarmonicField, start: float) -> tuple[float, float]:
     """Range of heights in which a harmonic field holds [m]: the floor, or one dipole spacing off a layer.
 
-    A layer of equivalent dipoles with spacing s has ripples of about exp(-2 pi d / s) at distance d: 0.2 % at
-    d = s. Dipoles that are alone at their height have no spacing.
+    A layer of dipoles with spacing s has ripples of about exp(-2 pi d / s) at distance d: 0.2 % at d = s.
     """
     places = harmonic.p_world_dipole
     below, above = places[places[:, 2] <= start], places[places[:, 2] > start]

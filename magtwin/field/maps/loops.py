@@ -36,7 +36,7 @@ def _place(
 ) -> None:
     """Lowest node of each pose in the first layer, weights of the higher ones, angles above that layer.
 
-    The x weight is nan where the field is not known. Angles are in [0, 2 pi] and take the place of weights.
+    The x weight is nan where the field is not known; `wh` takes the angles, in [0, 2 pi].
     """
     x0, y0, dx, dy, first, edge = table[0], table[1], table[2], table[3], table[4], table[5]
     columns, right, top = table[8], table[8] - 1, table[7] - 1
@@ -109,15 +109,9 @@ def _sides(
 
 @compiled(_IN, _IN, _IN, types.boolean, _OUT, _OUT)
 def lookup(table: Array, q: Array, yaw: Array, clamp: bool, out: Array, gradient: Array) -> None:
-    """Field at poses, and its gradient if `gradient` is not empty.
+    """`Lookup.lookup` at points x, y, x, y, ... in `q`, shape (2 N,).
 
-    Args:
-        table: A map's table, see `trilinear`.
-        q: Points x, y, x, y, ... in world [m], shape (2 N,).
-        yaw: Headings [rad], shape (N,).
-        clamp: Whether a point off the grid takes the field of the nearest point on it.
-        out: Takes the field [nT], shape (N,).
-        gradient: Takes dB/dx, dB/dy [nT/m], dB/dyaw [nT/rad] pose by pose, shape (3 N,) or (0,).
+    `out` takes the field [nT], shape (N,), and `gradient` its derivatives pose by pose, shape (3 N,) or (0,).
     """
     x0, y0, dx, dy, edge = table[0], table[1], table[2], table[3], table[5]
     begin, end, in_row, in_layer = planes(table)
