@@ -48,16 +48,17 @@ def _fill(values: NDArray[np.float64], hole: NDArray[np.bool_]) -> NDArray[np.fl
     number = np.full(hole.shape, -1)
     number[hole] = np.arange(np.count_nonzero(hole))
     at = np.argwhere(hole)
-    total, matrix = np.zeros(len(at)), lil_array((len(at), len(at)))
+    total, degree, matrix = np.zeros(len(at)), np.zeros(len(at)), lil_array((len(at), len(at)))
     edge = np.zeros(hole.shape, bool)
     for step in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         near = at + step
         row = np.flatnonzero(np.all((near >= 0) & (near < hole.shape), axis=1))
         j, i = near[row].T
-        matrix[row, row] += 1
+        degree[row] += 1
         known = ~hole[j, i]
         total[row[known]] += values[j, i][known]
         edge[j[known], i[known]] = True
         matrix[row[~known], number[j, i][~known]] = -1
+    matrix.setdiag(degree)
     values[hole] = spsolve(matrix.tocsc(), total)
     return values[edge]
