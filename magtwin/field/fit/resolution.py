@@ -49,14 +49,9 @@ def resolution(
     """Choose the widest spacing and the fewest headings with almost no loss of accuracy.
 
     The error of linear interpolation is measured on the fitted field, at positions of the readings, and must
-    be below `SHARE` of the fit's standard deviation. If no choice reaches this, the finest is used.
-
-    Args:
-        model: The fit.
-        readings: The readings that it was fitted to.
-        spacing: Spacing chosen by the caller [m]; only its error is measured.
-        headings_rad: Headings chosen by the caller [rad].
-        largest_m: Widest spacing that leaves a cell [m].
+    be below `SHARE` of the fit's standard deviation. If no choice reaches this, the finest is used. Of a
+    spacing [m] or headings [rad] that the caller gives, only the error is measured. `largest_m` is the widest
+    spacing that leaves a cell.
     """
     p, yaw, part = _probes(readings)
     value, variance = model.predict(p, yaw)

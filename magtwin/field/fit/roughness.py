@@ -41,14 +41,7 @@ class Roughness:
         """Leave out each fifth of the positions in turn, and interpolate them from the rest.
 
         A residual contains the errors of the reading left out and of those beside it, 1.5 times the variance
-        of a reading, which are not roughness.
-
-        Args:
-            p_xy: Positions of readings [m], shape (N, 2).
-            b_nt: Readings [nT], shape (N,).
-            noise_nt2: Their variance [nT^2], shape (N,).
-            cell_m: Side of the cells that are left out [m].
-            interpolate: The interpolation.
+        of a reading, which are not roughness. `cell_m` is the side of the cells that are left out.
         """
         from scipy.spatial import cKDTree
 

@@ -149,16 +149,11 @@ def lookup(table: Array, q: Array, yaw: Array, clamp: bool, out: Array, gradient
 
 @compiled(_CUBE, types.Array(types.int64, 1, "C", readonly=True), _IN, _IN, types.float64, _CUBE_OUT)
 def polynomials(table: Array, slot: Numbers, u: Array, w: Array, scale: float, out: Array) -> None:
-    """Polynomials in two variables, three at a time, and their slopes, all by Horner's rule.
+    """Polynomials in u and w (N,), three at a time, and their slopes times `scale`, all by Horner's rule.
 
-    Args:
-        table: Coefficients of each square by the power of u, and in a row by the power of w and by which of
-            the three it is, shape (S, K, 3 K).
-        slot: Which square each point is in, shape (N,).
-        u: First variable, shape (N,).
-        w: Second variable, shape (N,).
-        scale: What the slopes are multiplied by.
-        out: Takes the three values, their slopes along u and those along w, shape (N, 3, 3).
+    `table` has the coefficients of each square by the power of u, and in a row by the power of w and by which
+    of the three it is, shape (S, K, 3 K). `slot` is the square of each point. `out` takes the three values,
+    their slopes along u and those along w, shape (N, 3, 3).
     """
     powers, width = table.shape[1], table.shape[2]
     a, slope = np.empty(width), np.empty(width)

@@ -155,20 +155,14 @@ class AnomalyMap(Summarized):
         return self._look(p_xy, yaw, outside, gradient=False)[0]
 
     def gradient(self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan") -> Array:
-        """Exact derivatives of `lookup` within a cell; at a border, those of the cell at greater x, y or
-        heading.
+        """Exact derivatives of `lookup` within a cell. Arguments and errors are those of `lookup`.
 
-        Args:
-            p_xy: Points in world [m], shape (..., 2).
-            yaw: Headings [rad], shape (...); the two shapes are broadcast.
-            outside: As for `lookup`; with "clamp" the field does not change across the border.
+        At a border they are those of the cell at greater x, y or heading. With "clamp" the field does not
+        change across the border of the grid.
 
         Returns:
             dB/dx, dB/dy [nT/m] and dB/dyaw [nT/rad], shape (..., 3); nan if `lookup` is, or if a masked node
             would enter.
-
-        Raises:
-            InputError: A point is off the grid and `outside` is "raise".
         """
         return self._look(p_xy, yaw, outside, gradient=True)[1]
 
@@ -181,12 +175,7 @@ class AnomalyMap(Summarized):
     def lookup_with_sd(
         self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan"
     ) -> tuple[Array, Array]:
-        """Field at poses and its standard deviation, the root of the interpolated variance.
-
-        Args:
-            p_xy: Points in world [m], shape (..., 2).
-            yaw: Headings [rad], shape (...); the two shapes are broadcast.
-            outside: As for `lookup`.
+        """Field at poses, as `lookup`, and its standard deviation, the root of the interpolated variance.
 
         Returns:
             Field magnitude and its standard deviation [nT], each of shape (...).
@@ -201,17 +190,7 @@ class AnomalyMap(Summarized):
         return mean, np.sqrt(self._look(p_xy, yaw, outside, gradient=False, table=self._variance)[0])
 
     def at(self, x: float, y: float, yaw: float, *, outside: Outside = "nan") -> float:
-        """Field at one pose [nT], as `lookup`, without the overhead of arrays.
-
-        Args:
-            x: World x [m].
-            y: World y [m].
-            yaw: Heading [rad].
-            outside: As for `lookup`.
-
-        Raises:
-            InputError: The point is off the grid and `outside` is "raise".
-        """
+        """Field at one pose (x, y [m], yaw [rad]) [nT], as `lookup`, without the overhead of arrays."""
         if outside != "nan":
             self._check_outside(np.array([[x, y]]), outside)
         return self._lookup.at(x, y, yaw, clamp=outside == "clamp")

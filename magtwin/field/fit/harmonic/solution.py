@@ -218,11 +218,10 @@ class Solution:
         )
 
     def _calibrated(self, posterior: Posterior, precision: Array) -> tuple[float, float]:
-        """Factors of the noise's and of the field's variance, from readings left out in turn.
+        """Likeliest factors of the noise's and of the field's variance, from readings left out in turn.
 
-        The likeliest under Student's t, with each place counting once; near 1 if the readings do not
-        determine them. Consecutive readings of a drive share errors from motors, battery and LiDAR, so whole
-        stretches are left out, and the noise grows by what they share.
+        Each place counts once. Consecutive readings of a drive share errors from motors, battery and LiDAR,
+        so whole stretches are left out, and the noise grows by what they share.
         """
         root, problem = np.sqrt(precision).ravel(), self.problem
         places, stretches = problem.places(), problem.stretches()
