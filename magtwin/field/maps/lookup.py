@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from magtwin.compiled import Loops, in_threads
 from magtwin.field.maps import trilinear
-from magtwin.field.maps.trilinear import EDGE, TURN, blend, sides
+from magtwin.field.maps.trilinear import EDGE, TURN, blend, sides, spread
 
 Array = NDArray[np.float64]
 
 FEW = 24  # Poses up to which plain Python is faster than numpy
 BLOCK = 8192  # Poses that numpy works on at a time: their temporaries stay in the second-level cache
+NONE = np.empty(0)  # No variance
 AS_MANY = 25  # Poses in numpy that take as long as one in plain Python
 SHARE = 65_536  # Poses that a thread of compiled code takes at a time
 # Compiled loops of maps; work is counted in poses looked up in numpy
@@ -67,16 +68,25 @@ class Lookup:
         self.figures = (*origin_m, *cell_m, first, per_rad, layers, rows, columns)
         self._plain = memoryview(self.table.data)  # its entries are plain floats, which Python adds up faster
 
-    def lookup(self, p: Array, yaw: Array, *, clamp: bool, gradient: bool) -> tuple[Array, Array]:
-        """Field at poses (N, 2) and (N,) [nT], (N,), and its gradient, (N, 3), or (0, 3) if not wanted.
+    def spreads(self, *layers: Array) -> Array:
+        """Variances (H, Y, X) laid out for `lookup`: of the nodes, and the errors of interpolation if known."""
+        return np.concatenate([part.ravel() for layer in layers for part in (layer, layer[:1])])
 
-        With `clamp`, a point off the grid takes the field of the nearest point on it, otherwise nan. The
-        gradient is dB/dx, dB/dy [nT/m] and dB/dyaw [nT/rad].
+    def lookup(
+        self, p: Array, yaw: Array, *, clamp: bool, gradient: bool, spreads: Array = NONE
+    ) -> tuple[Array, Array, Array]:
+        """Field at poses (N, 2) and (N,) [nT], (N,), its gradient, (N, 3), and its standard deviation, (N,).
+
+        The gradient is (0, 3) if not wanted, and the standard deviation (0,) without `spreads`. With `clamp`,
+        a point off the grid takes the field of the nearest point on it, otherwise nan. The gradient is dB/dx,
+        dB/dy [nT/m] and dB/dyaw [nT/rad].
         """
-        out = np.empty(len(p))
+        out, sds = np.empty(len(p)), np.empty(len(p) if len(spreads) else 0)
         slopes = np.empty((len(p) if gradient else 0, 3))
         if len(p) <= FEW:
             for n, ((x, y), angle) in enumerate(zip(p.tolist(), yaw.tolist(), strict=True)):
+                if len(sds):
+                    sds[n] = trilinear.sd_at(self._plain, spreads, x, y, angle, clamp)
                 if gradient:
                     out[n], *slopes[n] = self.at_with_gradient(x, y, angle, clamp=clamp)
                 else:
@@ -87,14 +97,16 @@ class Lookup:
 
             def work(rows: slice) -> None:
                 at, g = q[2 * rows.start : 2 * rows.stop], flat[3 * rows.start : 3 * rows.stop]
-                code.lookup(self.table, at, yaw[rows], clamp, out[rows], g)
+                some = sds[rows] if len(sds) else sds
+                code.lookup(self.table, spreads, at, yaw[rows], clamp, out[rows], some, g)
 
             in_threads(work, len(yaw), SHARE)
         else:
             for start in range(0, len(p), BLOCK):
                 part = slice(start, start + BLOCK)
-                self._by_numpy(p[part], yaw[part], clamp, out[part], slopes[part])
-        return out, slopes
+                self._by_numpy(p[part], yaw[part], clamp, out[part], slopes[part], spreads, sds[part])
+        sds[np.isnan(out[: len(sds)])] = np.nan
+        return out, slopes, sds
 
     def at(self, x: float, y: float, yaw: float, *, clamp: bool = False) -> float:
         """Field at one pose [nT], as `lookup` gives it."""
@@ -112,8 +124,10 @@ class Lookup:
             return trilinear.at_with_gradient(self._plain, x, y, yaw, clamp)
         return code.at_with_gradient(self.table, x, y, yaw, clamp)  # type: ignore[no-any-return]
 
-    def _by_numpy(self, p: Array, yaw: Array, clamp: bool, out: Array, slopes: Array) -> None:
-        """Look up a block of poses in numpy; `slopes` is empty if no gradient is wanted."""
+    def _by_numpy(
+        self, p: Array, yaw: Array, clamp: bool, out: Array, slopes: Array, spreads: Array, sds: Array
+    ) -> None:
+        """Look up a block of poses in numpy; `slopes` and `sds` are empty if they are not wanted."""
         x0, y0, dx, dy, first, per_rad, layers, rows, columns = self.figures
         unknown = ~np.isfinite(yaw)
         place, inside = [], []
@@ -144,6 +158,10 @@ class Lookup:
             holes = [self.holes.take(node + way) for way in ways]
             unknown |= blend(holes, wx, wy, wh) > EDGE
         out[unknown] = np.nan
+        if len(sds):
+            layers_of = spreads.reshape(-1, self.values.size)
+            parts = [blend([one.take(node + way) for way in ways], wx, wy, wh) for one in layers_of]
+            sds[:] = np.sqrt(spread(*parts, wx, wy, wh) if len(parts) > 1 else parts[0])
         if not len(slopes):
             return
         rates = (np.where(inside[0], 1 / dx, 0.0), np.where(inside[1], 1 / dy, 0.0), rate)

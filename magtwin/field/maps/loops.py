@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from magtwin.compiled import compiled, inlined
 from magtwin.field.maps import trilinear
-from magtwin.field.maps.trilinear import HEADER, TURN, blend, corners, planes, sides
+from magtwin.field.maps.trilinear import HEADER, TURN, blend, corners, planes, sides, spread
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -22,7 +22,7 @@ _OUT = types.Array(types.float64, 1, "C")
 _CUBE, _CUBE_OUT = types.Array(types.float64, 3, "C", readonly=True), types.Array(types.float64, 3, "C")
 _ONE = np.uint64(1)  # unsigned: numba would otherwise support negative indices, and not vectorise
 
-for _part in (blend, corners, planes, sides, trilinear.find):
+for _part in (blend, corners, planes, sides, spread, trilinear.find):
     inlined(_part)
 
 _POSE = (_IN, types.float64, types.float64, types.float64, types.boolean)
@@ -107,17 +107,21 @@ def _sides(
         out[3 * n], out[3 * n + 1], out[3 * n + 2] = along
 
 
-@compiled(_IN, _IN, _IN, types.boolean, _OUT, _OUT)
-def lookup(table: Array, q: Array, yaw: Array, clamp: bool, out: Array, gradient: Array) -> None:
+@compiled(_IN, _IN, _IN, _IN, types.boolean, _OUT, _OUT, _OUT)
+def lookup(
+    table: Array, spreads: Array, q: Array, yaw: Array, clamp: bool, out: Array, sd: Array, gradient: Array
+) -> None:
     """`Lookup.lookup` at points x, y, x, y, ... in `q`, shape (2 N,).
 
-    `out` takes the field [nT], shape (N,), and `gradient` its derivatives pose by pose, shape (3 N,) or (0,).
+    `out` takes the field [nT], shape (N,), `sd` its standard deviation, shape (N,) or (0,), and `gradient` its
+    derivatives pose by pose, shape (3 N,) or (0,).
     """
     x0, y0, dx, dy, edge = table[0], table[1], table[2], table[3], table[5]
     begin, end, in_row, in_layer = planes(table)
     values, masked = table[begin:end], table[end:]
     row, up = np.uint64(in_row), np.uint64(in_layer)
     wxs, wys, whs, nodes_at = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, np.int64)
+    cells, turns = np.empty(BLOCK), np.empty(BLOCK)
     slopes, holes, hole_sides = np.full(BLOCK, table[9]), np.empty(BLOCK), np.zeros(3 * BLOCK)
     for start in range(0, yaw.shape[0], BLOCK):
         stop = min(start + BLOCK, yaw.shape[0])
@@ -131,6 +135,16 @@ def lookup(table: Array, q: Array, yaw: Array, clamp: bool, out: Array, gradient
             _blend(masked, row, up, node, wx, wy, wh, hole)
             for n in range(count):
                 b[n] = np.nan if hole[n] > edge else b[n]
+        if sd.shape[0] > 0:
+            one, plane = sd[start:stop], end - begin
+            _blend(spreads[:plane], row, up, node, wx, wy, wh, one)
+            if spreads.shape[0] > plane:
+                _blend(spreads[plane : 2 * plane], row, up, node, wx, wy, wh, cells[:count])
+                _blend(spreads[2 * plane :], row, up, node, wx, wy, wh, turns[:count])
+                for n in range(count):
+                    one[n] = spread(one[n], cells[n], turns[n], wx[n], wy[n], wh[n])
+            for n in range(count):
+                one[n] = np.sqrt(one[n])
         if gradient.shape[0] == 0:
             continue
         g = gradient[3 * start : 3 * stop]

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError
 from magtwin.field.days import check_texts
 from magtwin.field.grid import Grid, check_axes
-from magtwin.field.maps.lookup import EDGE, Lookup
+from magtwin.field.maps.lookup import EDGE, NONE, Lookup
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.report import Figure, Report
 from magtwin.summary import Summarized, Summary, listed, rectangle, span
@@ -45,6 +45,9 @@ class AnomalyMap(Summarized):
     # Nodes whose value is field, shape (H, Y, X). Default: all.
     valid: NDArray[np.bool_] = None  # type: ignore[assignment]
     variance_nt2: Array | None = None  # Variance of each value [nT^2], shape (H, Y, X); None if unknown
+    # Mean squared error of interpolation in the middle of a cell and midway between headings [nT^2], shape
+    # (2, H, Y, X), see `magtwin.field.maps.curvature`; None: not part of the standard deviation
+    between_nt2: Array | None = None
     name: str = ""  # Name of the map and of its layer
     method: str = ""  # How the values were obtained
     source: str = ""  # Source files with checksums, or a script with its seed
@@ -70,11 +73,12 @@ class AnomalyMap(Summarized):
         valid = np.ones(values.shape, bool) if self.valid is None else self.valid
         arrays: dict[str, Any] = {"values_nt": values, "valid": _frozen(valid, bool)}
         arrays["headings_rad"] = _frozen(self.headings_rad, float)
-        for name in ("variance_nt2", "recorded_yaw"):
+        for name in ("variance_nt2", "between_nt2", "recorded_yaw"):
             if getattr(self, name) is not None:
                 arrays[name] = _frozen(getattr(self, name), float)
+        shapes = {"headings_rad": values.shape[:1], "between_nt2": (2, *values.shape)}
         for name, array in arrays.items():
-            shape = values.shape[:1] if name == "headings_rad" else values.shape
+            shape = shapes.get(name, values.shape)
             if array.shape != shape:
                 raise InputError(f"{name} of AnomalyMap must have shape {shape}, got {array.shape}")
             object.__setattr__(self, name, array)
@@ -94,6 +98,11 @@ class AnomalyMap(Summarized):
             )
         if self.variance_nt2 is not None and not np.all(self.variance_nt2[self.valid] >= 0):
             raise InputError("variance_nt2 of AnomalyMap must not be below 0, nor nan, at valid nodes")
+        if self.between_nt2 is not None:
+            if self.variance_nt2 is None:
+                raise InputError("between_nt2 of AnomalyMap needs variance_nt2, that of the nodes")
+            if not np.all(self.between_nt2[:, self.valid] >= 0):
+                raise InputError("between_nt2 of AnomalyMap must not be below 0, nor nan, at valid nodes")
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, AnomalyMap):
@@ -170,12 +179,16 @@ class AnomalyMap(Summarized):
         self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan"
     ) -> tuple[Array, Array]:
         """Results of `lookup` and `gradient`, shapes (...) and (..., 3), in one pass."""
-        return self._look(p_xy, yaw, outside, gradient=True)
+        return self._look(p_xy, yaw, outside, gradient=True)[:2]
 
     def lookup_with_sd(
         self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan"
     ) -> tuple[Array, Array]:
-        """Field at poses, as `lookup`, and its standard deviation, the root of the interpolated variance.
+        """Field at poses, as `lookup`, and its standard deviation.
+
+        That is the root of the interpolated variance of the nodes and, if `between_nt2` is known, of the
+        error of linear interpolation between nodes and between headings. It is 0 at nodes, where only their
+        own variance is left. The reference is the field that the survey's robot reads at rest.
 
         Returns:
             Field magnitude and its standard deviation [nT], each of shape (...).
@@ -183,11 +196,20 @@ class AnomalyMap(Summarized):
         Raises:
             InputError: The map has no variance; or an error of `lookup`.
         """
-        if self._variance is None:
-            text = "has no variance; fit one with `magtwin map fit`, or use lookup instead"
-            raise InputError(f"map {self.name!r} {text}")
-        mean = self.lookup(p_xy, yaw, outside=outside)
-        return mean, np.sqrt(self._look(p_xy, yaw, outside, gradient=False, table=self._variance)[0])
+        value, _, sd = self._look(p_xy, yaw, outside, gradient=False, spreads=self._spreads)
+        return value, sd
+
+    def lookup_all(
+        self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan"
+    ) -> tuple[Array, Array, Array]:
+        """Results of `lookup_with_sd` and of `gradient` in one pass. Arguments and errors are theirs.
+
+        Returns:
+            Field magnitude [nT], its standard deviation [nT], shapes (...), and dB/dx, dB/dy [nT/m] and
+            dB/dyaw [nT/rad], shape (..., 3).
+        """
+        value, slopes, sd = self._look(p_xy, yaw, outside, gradient=True, spreads=self._spreads)
+        return value, sd, slopes
 
     def at(self, x: float, y: float, yaw: float, *, outside: Outside = "nan") -> float:
         """Field at one pose (x, y [m], yaw [rad]) [nT], as `lookup`, without the overhead of arrays."""
@@ -267,10 +289,13 @@ class AnomalyMap(Summarized):
         return Lookup(self.values_nt, self.valid, self.origin_m, self.cell_m, self.headings_rad)
 
     @cached_property
-    def _variance(self) -> Lookup | None:
+    def _spreads(self) -> Array:
+        """The variances, laid out for lookup."""
         if self.variance_nt2 is None:
-            return None
-        return Lookup(self.variance_nt2, self.valid, self.origin_m, self.cell_m, self.headings_rad)
+            text = "has no variance; fit one with `magtwin map fit`, or use lookup instead"
+            raise InputError(f"map {self.name!r} {text}")
+        layers = [self.variance_nt2, *([] if self.between_nt2 is None else self.between_nt2)]
+        return self._lookup.spreads(*(np.where(self.valid, layer, 0.0) for layer in layers))
 
     def __getstate__(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(self)}
@@ -282,8 +307,8 @@ class AnomalyMap(Summarized):
         outside: Outside,
         *,
         gradient: bool,
-        table: Lookup | None = None,
-    ) -> tuple[Array, Array]:
+        spreads: Array = NONE,
+    ) -> tuple[Array, Array, Array]:
         p, yaw = np.asarray(p_xy, float), np.asarray(yaw, float)
         if p.ndim == 0 or p.shape[-1] != 2:
             raise InputError(f"p_xy must have shape (..., 2), got {p.shape}")
@@ -294,8 +319,10 @@ class AnomalyMap(Summarized):
         p, yaw = p.reshape(-1, 2), yaw.reshape(-1)
         if outside != "nan":
             self._check_outside(p, outside)
-        b, slopes = (table or self._lookup).lookup(p, yaw, clamp=outside == "clamp", gradient=gradient)
-        return b.reshape(shape), slopes.reshape(*shape, 3) if gradient else slopes
+        clamp = outside == "clamp"
+        b, slopes, sd = self._lookup.lookup(p, yaw, clamp=clamp, gradient=gradient, spreads=spreads)
+        slopes = slopes.reshape(*shape, 3) if gradient else slopes
+        return b.reshape(shape), slopes, sd.reshape(shape) if len(spreads) else sd
 
     def _check_outside(self, p: Array, outside: Outside) -> None:
         if outside not in ("nan", "clamp", "raise"):

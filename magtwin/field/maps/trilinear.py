@@ -45,6 +45,17 @@ def sides(corners: Corners, x: Any, y: Any, h: Any, sign: float) -> tuple[Any, A
     )
 
 
+def spread(variance: Any, cells: Any, turns: Any, x: Any, y: Any, h: Any) -> Any:
+    """Variance at weights x, y, h: that of the nodes, and the errors of interpolation between them.
+
+    With `cells` the mean squared error in the middle of a cell, that elsewhere follows from f_xx x (1 - x) and
+    f_yy y (1 - y), whose correlation is 1/3 in a field that is alike in all directions; `turns` is that midway
+    between headings.
+    """
+    a, b, c = x * (1 - x), y * (1 - y), h * (1 - h)
+    return variance + cells * (6 * (a * a + b * b) + 4 * (a * b)) + turns * (16 * (c * c))
+
+
 def corners(t: Any, k: Any, one: Any, row: Any, layer: Any) -> Corners:
     """Entries of a cell whose lowest node is entry k; `one` is 1, in the type of the other indices."""
     m = k + layer
@@ -108,6 +119,25 @@ def at(t: Any, x: float, y: float, yaw: float, clamp: bool) -> float:
         return math.nan
     field: float = blend(corners(t, values + node, 1, row, layer), wx, wy, wh)
     return field
+
+
+def sd_at(t: Any, s: Any, x: float, y: float, yaw: float, clamp: bool) -> float:
+    """Standard deviation of the field at one pose [nT], nan where the field is not known by its weights.
+
+    `s` has the planes of the nodes' variance and, unless it ends there, of the errors of interpolation in
+    cells and between headings (`spread`), each laid out as the values of the table `t`.
+    """
+    node, wx, wy, wh, _ = find(t, x, y, yaw, clamp)
+    if node < 0:
+        return math.nan
+    values, masks, row, layer = planes(t)
+    plane = masks - values
+    variance = blend(corners(s, node, 1, row, layer), wx, wy, wh)
+    if len(s) > plane:
+        cells = blend(corners(s, plane + node, 1, row, layer), wx, wy, wh)
+        turns = blend(corners(s, 2 * plane + node, 1, row, layer), wx, wy, wh)
+        variance = spread(variance, cells, turns, wx, wy, wh)
+    return math.sqrt(variance)
 
 
 def at_with_gradient(
