@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.grid import Grid
+from magtwin.field.maps.curvature import interpolation_error_nt2
 from magtwin.field.maps.holes import filled
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.magnets import body_of
@@ -215,7 +216,8 @@ def survey(
     """Map the lab as the robot would: the values at the nodes are those of `survey_readings`.
 
     The variance of a node is that of the sensor's noise and resolution, plus the mean square by which the
-    field at the robot's actual pose differs from that at the node.
+    field at the robot's actual pose differs from that at the node. Between nodes, the error of interpolation
+    is estimated from the nodes (`magtwin.field.maps.curvature`).
 
     Args:
         scene: As for `survey_readings`.
@@ -240,13 +242,15 @@ def survey(
     variance = (sensor.noise_std_nt**2 + sensor.resolution_nt**2 / 12) / readings
     with np.errstate(invalid="ignore", divide="ignore"):  # in what stands at a blocked node
         missed = pose_error_nt2(scene, grid, read.height_m, **errors)
+    values, total = read.b_nt.reshape(grid.shape), variance + missed
     return AnomalyMap(
-        values_nt=read.b_nt.reshape(grid.shape),
+        values_nt=values,
         origin_m=grid.origin_m,
         cell_m=grid.cell_m,
         headings_rad=np.array(grid.headings_rad),
         valid=~lost,
-        variance_nt2=variance + missed,
+        variance_nt2=total,
+        between_nt2=interpolation_error_nt2(values, ~lost, grid.headings_rad, total),
         name=scene.name if name is None else name,
         method=f"survey of the twin, {readings} reading{'s' * (readings > 1)} a node and heading, at rest",
         source=read.source,
@@ -426,14 +430,16 @@ def survey_room(
     whole = filled(field)
     holes = int(np.count_nonzero(~field.valid))
     # a map layer holds 32 bit numbers
-    values, variance = (
+    values, variance, between = (
         None if array is None else array.astype(np.float32).astype(float)
-        for array in (whole.values_nt, whole.variance_nt2)
+        for array in (whole.values_nt, whole.variance_nt2, whole.between_nt2)
     )
     assert values is not None
     parameters = {**field.parameters, "seed": seed, "filled_nodes": holes}
     return Surveyed(
-        replace(whole, values_nt=values, variance_nt2=variance, parameters=parameters),
+        replace(
+            whole, values_nt=values, variance_nt2=variance, between_nt2=between, parameters=parameters
+        ),
         holes,
         len(scene.magnets),
     )

@@ -212,7 +212,7 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
         raise InputError(
             f"{place(prim)}: shape {list(shape)} does not fit {values.size} values and {valid.size} flags"
         )
-    if variance.size not in (0, values.size):
+    if variance.size not in (0, values.size, 3 * values.size):
         raise InputError(f"{place(prim)}: {values.size} values have {variance.size} variances")
     headings = np.array(_get(prim, "headings"), float)
     if not (headings.size and np.all(np.diff(headings) > 0) and headings[0] >= 0 and headings[-1] < 360):
@@ -220,11 +220,13 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
             f"{place(prim)}: {attribute_name('anomalyMap', 'headings')} must ascend in [0, 360) deg, got "
             f"{str(headings.tolist())[:MOST_CHARACTERS]}; make the map anew"
         )
+    spreads = variance.reshape(-1, *shape).astype(float)  # of the nodes, and between them
     try:
         return AnomalyMap(
             values_nt=_exact(prim, values.reshape(shape), _read_recorded(prim, RECORDED[0], sample, shape)),
             valid=valid.reshape(shape).astype(bool),
-            variance_nt2=variance.reshape(shape).astype(float) if variance.size else None,
+            variance_nt2=spreads[0] if len(spreads) else None,
+            between_nt2=spreads[1:] if len(spreads) > 1 else None,
             recorded_yaw=_read_recorded(prim, RECORDED[1], sample, shape),
             origin_m=tuple(_get(prim, "origin")),
             cell_m=tuple(_get(prim, "cellSize")),
@@ -371,7 +373,8 @@ def _epoch_values(field: AnomalyMap) -> dict[str, Any]:
     valid = np.ascontiguousarray(field.valid).ravel()
     variance = np.empty(0, np.float32)
     if field.variance_nt2 is not None:
-        variance = field.variance_nt2.astype(np.float32).ravel()
+        parts = [field.variance_nt2, *([] if field.between_nt2 is None else field.between_nt2)]
+        variance = np.stack(parts).astype(np.float32).ravel()
     recorded = [None, None]
     if field.recorded_yaw is not None:
         recorded = [Vt.DoubleArray.FromNumpy(a.ravel()) for a in (field.values_nt, field.recorded_yaw)]

@@ -18,6 +18,7 @@ from magtwin.errors import InputError, hint
 from magtwin.field.fit.methods import METHODS, FieldModel
 from magtwin.field.fit.resolution import resolution
 from magtwin.field.grid import TURN, Grid
+from magtwin.field.maps.curvature import interpolation_error_nt2
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.bins import distance_m, spacing_m
 from magtwin.field.survey.readings import Readings
@@ -152,10 +153,12 @@ def raster(
             f"{readings.name!r}: each is too far from a good reading, or its sd is above {MOST_DOUBT:g} of "
             "theirs; keep the extent within the readings, and mask readings that contradict each other"
         )
+    read = model.method == "trilinear" and readings.grid is not None  # its nodes err independently
     return AnomalyMap(
         values_nt=values,
         valid=valid,
         variance_nt2=variance,
+        between_nt2=interpolation_error_nt2(values, valid, headings, variance if read else None),
         origin_m=grid.origin_m,
         cell_m=grid.cell_m,
         headings_rad=np.asarray(grid.headings_rad),

@@ -15,6 +15,8 @@ from magtwin.errors import InputError
 from magtwin.field.fit.methods import FittedModel, flat_poses
 from magtwin.field.fit.roughness import Interpolation, Roughness
 from magtwin.field.grid import TURN, Grid
+from magtwin.field.maps.curvature import interpolation_error_nt2
+from magtwin.field.maps.trilinear import spread
 from magtwin.field.survey.bins import Bins, bin_readings, spacing_m
 from magtwin.field.survey.node_errors import node_errors
 from magtwin.field.survey.readings import Readings
@@ -26,6 +28,8 @@ EDGE = 1e-9  # Rounding forgiven at a node, in cells; also the weight from which
 BINS_A_SPACING = 4  # Averaging cells per spacing of a scattered survey
 FLATTEST = 0.05  # Least relative spread of a heading wave within cells; waves with less are not fitted
 LEAST = 4  # Fewest readings of a map
+# Squared error of a periodic cubic spline midway between headings, over that of a line: of a cosine through four
+CUBIC_TURN = 0.009
 
 
 def fit_trilinear(readings: Readings, *, fill: bool = False) -> "GridInterpolation | ScatterInterpolation":
@@ -42,9 +46,10 @@ def fit_trilinear(readings: Readings, *, fill: bool = False) -> "GridInterpolati
             b)^2 with distances a and b. Otherwise cells at such a node are unknown.
 
     Returns:
-        The model. Its variance is the interpolation error at positions left out in turn (`Roughness`), plus
-        that of a reading (`magtwin.field.survey.node_errors`; for a scattered survey, that of readings at one
-        place).
+        The model. Its variance is that of a reading (`magtwin.field.survey.node_errors`; for a scattered
+        survey, that of readings at one place), plus the interpolation error: from the second differences of
+        the nodes (`magtwin.field.maps.curvature`), or, if nodes are filled and for a scattered survey, that
+        at positions left out in turn (`Roughness`).
 
     Raises:
         InputError: There are fewer than four good readings, they are on one line, or all are the same.
@@ -57,7 +62,7 @@ def fit_cubic(readings: Readings, *, fill: bool = False) -> "GridInterpolation |
 
     Bicubic splines (not-a-knot; de Boor 1978) on a gridded survey, Clough-Tocher triangles on a scattered
     one. Arguments, result and errors are those of `fit_trilinear`, but missing nodes are filled by
-    Clough-Tocher triangles.
+    Clough-Tocher triangles, and the interpolation error is always that at positions left out.
     """
     return _fit(readings, "cubic", fill)
 
@@ -96,6 +101,9 @@ class GridInterpolation(FittedModel):
     node_nt2: Array  # Variance of the value of each node [nT^2], shape (H, Y, X)
     roughness: Roughness  # Error of interpolation between nodes
     turned_nt2: float  # Mean squared error of interpolating a heading that is left out [nT^2]
+    # Mean squared error of interpolation in the middle of a cell and midway between headings [nT^2], shape
+    # (2, H, Y, X); None: that of `roughness` and `turned_nt2`
+    between_nt2: Array | None
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
         """Field [nT] and its variance [nT^2] at poses; nan off the grid and in unknown cells. See
@@ -114,23 +122,32 @@ class GridInterpolation(FittedModel):
         linear, between = _heading_weights(self.grid.headings_rad, angle)
         weights = _periodic_cubic(self.grid.headings_rad, angle) if self.method == "cubic" else linear
         mean, unknown, nodes = np.zeros(len(p)), np.zeros(len(p)), np.zeros(len(p))
+        both = np.zeros((2, len(p)))
         splines = None
         if self.method == "cubic":
             rows, columns = np.arange(self.grid.rows), np.arange(self.grid.columns)
             ky, kx = min(3, self.grid.rows - 1), min(3, self.grid.columns - 1)
             splines = [RectBivariateSpline(rows, columns, b, kx=ky, ky=kx, s=0) for b in self.values_nt]
         for h, (layer, known) in enumerate(zip(self.values_nt, self.known, strict=True)):
-            nodes += weights[:, h] ** 2 * _bilinear(self.node_nt2[h], low, part, squared=True)
+            if self.between_nt2 is None:
+                nodes += weights[:, h] ** 2 * _bilinear(self.node_nt2[h], low, part, squared=True)
+            else:
+                nodes += weights[:, h] * _bilinear(self.node_nt2[h], low, part)
+                for total, error in zip(both, self.between_nt2[:, h], strict=True):
+                    total += weights[:, h] * _bilinear(error, low, part)
             unknown += np.abs(weights[:, h]) * _bilinear((~known).astype(float), low, part)
             if splines is None:
                 mean += weights[:, h] * _bilinear(layer, low, part)
             else:
                 mean += weights[:, h] * splines[h].ev(u[:, 1], u[:, 0])
-        at = np.where(inside[:, None], p, self.grid.origin_m)
-        variance = self.roughness.variance_nt2(at) + (between * (1 - between)) ** 2 * self.turned_nt2
-        if splines is not None:
-            nodes *= np.prod(_cubic_share(part), axis=1)
-        variance += nodes  # a node's value is a reading, and errs as one
+        if self.between_nt2 is None:
+            at = np.where(inside[:, None], p, self.grid.origin_m)
+            variance = self.roughness.variance_nt2(at) + (between * (1 - between)) ** 2 * self.turned_nt2
+            if splines is not None:
+                nodes *= np.prod(_cubic_share(part), axis=1)
+            variance += nodes  # a node's value is a reading, and errs as one
+        else:  # as `AnomalyMap.lookup_with_sd`
+            variance = spread(nodes, *both, *part.T, between)
         hole = ~inside | (unknown > EDGE)
         mean[hole] = variance[hole] = np.nan
         return mean.reshape(shape), variance.reshape(shape)
@@ -217,7 +234,10 @@ def _fit(readings: Readings, method: str, fill: bool) -> GridInterpolation | Sca
         known=known,
         node_nt2=node_nt2,
         roughness=Roughness.joined(parts),
-        turned_nt2=_turned_nt2(grid, filled, read),
+        turned_nt2=_turned_nt2(grid, filled, read) * (CUBIC_TURN if method == "cubic" else 1.0),
+        between_nt2=None
+        if fill or method == "cubic"
+        else interpolation_error_nt2(filled, read, grid.headings_rad, node_nt2),
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
+from magtwin.field.maps.curvature import interpolation_error_nt2
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.harmonic import HarmonicField
 
@@ -78,16 +79,19 @@ def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
         values = np.stack([_Layer(v, valid, field.cell_m).continued(step) for v, valid in layers])
         known = field.values_nt[field.valid]
         parameters["second_order_nt"] = round(float(known.var() / (2 * known.mean())), 3)
-    variance = None
+    variance = between = None
     if field.variance_nt2 is not None and step >= -LARGEST_STEP_DOWN * min(field.cell_m):
         nodes = zip(field.values_nt, field.valid, np.sqrt(field.variance_nt2), strict=True)
         sds = [_Layer(v, valid, field.cell_m).deviation(sd, step) for v, valid, sd in nodes]
         variance = np.square(sds)
+        if field.between_nt2 is not None:
+            between = interpolation_error_nt2(values, field.valid, field.headings_rad)
     text = f"continued from {start:g} to {height_m:g} m {how}"
     return replace(
         field,
         values_nt=values,
         variance_nt2=variance,
+        between_nt2=between,
         recorded_yaw=None,
         height_m=height_m,
         method=f"{field.method}; {text}" if field.method else text,

@@ -131,8 +131,8 @@ def difference(a: AnomalyMap, b: AnomalyMap) -> MapDifference:
     """Compare two surveys of one floor.
 
     They are compared at the nodes of the coarser grid and the headings of the map with fewer, where both are
-    valid; the other map is interpolated there. The interpolation error is in no variance: fit surveys on one
-    grid to compare them closely.
+    valid; the other map is interpolated there, and its variance holds the error of interpolation if it is
+    known: fit surveys on one grid to compare them closely.
 
     A node's change is b - a. The median over a heading is the bias common to all nodes, such as the day's
     Earth field and the sensor's offset; the rest is local. If both maps have variances, the standard
@@ -158,7 +158,12 @@ def difference(a: AnomalyMap, b: AnomalyMap) -> MapDifference:
     cautions = _compared(a, b)
     grid = _common(a, b)
     p, yaw = grid.poses()
-    change = b.lookup(p, yaw) - a.lookup(p, yaw)
+    from_variance = a.variance_nt2 is not None and b.variance_nt2 is not None
+    if from_variance:
+        (earlier, sd_a), (later, sd_b) = (each.lookup_with_sd(p, yaw) for each in (a, b))
+    else:
+        earlier, later = (each.lookup(p, yaw) for each in (a, b))
+    change = later - earlier
     known = np.isfinite(change)
     if not known.any():
         raise InputError(f"maps {a.name!r} and {b.name!r} have no valid node in common")
@@ -167,9 +172,8 @@ def difference(a: AnomalyMap, b: AnomalyMap) -> MapDifference:
     bias[seen] = np.nanmedian(change[seen], axis=(1, 2))
     local = change - bias[:, None, None]
     floor = float(np.spacing(np.float32(np.abs(b.values_nt[b.valid]).max())))
-    from_variance = a.variance_nt2 is not None and b.variance_nt2 is not None
     if from_variance:
-        sd = np.hypot(a.lookup_with_sd(p, yaw)[1], b.lookup_with_sd(p, yaw)[1])
+        sd = np.hypot(sd_a, sd_b)
     else:
         sd = np.where(known, _robust_sd(local[known]), np.nan)
     sd = np.maximum(sd, floor)

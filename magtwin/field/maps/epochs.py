@@ -94,14 +94,17 @@ def at_date(maps: Sequence[AnomalyMap], date: str | datetime.date) -> AnomalyMap
         return maps[k]
     before, after = maps[k - 1], maps[k]
     w = (day - days[k - 1]) / (days[k] - days[k - 1])
-    variance = None
+    variance = error = None
     if before.variance_nt2 is not None and after.variance_nt2 is not None:
         variance = (1 - w) ** 2 * before.variance_nt2 + w**2 * after.variance_nt2
+        if before.between_nt2 is not None and after.between_nt2 is not None:
+            error = (1 - w) * before.between_nt2 + w * after.between_nt2  # alike on both days
     between = f"linear in time between {before.created} and {after.created}"
     return replace(
         after,
         values_nt=(1 - w) * before.values_nt + w * after.values_nt,
         variance_nt2=variance,
+        between_nt2=error,
         valid=before.valid & after.valid,
         method=f"{_joined(before.method, after.method)}; {between}",
         source=_joined(before.source, after.source),

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.grid import Grid
+from magtwin.field.maps.curvature import interpolation_error_nt2
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.header import ERROR, MASKED, header_lines, read_header
 from magtwin.field.survey.node_errors import node_errors
@@ -115,11 +116,17 @@ def node_map(readings: Readings) -> AnomalyMap:
     if len(flat) == size == len(np.unique(flat)):  # every node has exactly one reading
         recorded = readings.yaw[np.argsort(flat)].reshape(grid.shape)
     valid = np.isfinite(means[0])
-    errors = node_errors(readings, grid, means[0].reshape(grid.shape), valid.reshape(grid.shape))
+    values, known = np.where(valid, *means).reshape(grid.shape), valid.reshape(grid.shape)
+    errors = node_errors(readings, grid, means[0].reshape(grid.shape), known)
+    variance = between = None
+    if errors.estimated:
+        variance = errors.variance_nt2 / counts[0]
+        between = interpolation_error_nt2(values, known, grid.headings_rad, variance)
     return AnomalyMap(
-        values_nt=np.where(valid, *means).reshape(grid.shape),
-        valid=valid.reshape(grid.shape),
-        variance_nt2=errors.variance_nt2 / counts[0] if errors.estimated else None,
+        values_nt=values,
+        valid=known,
+        variance_nt2=variance,
+        between_nt2=between,
         recorded_yaw=recorded,
         origin_m=grid.origin_m,
         cell_m=grid.cell_m,
@@ -200,7 +207,8 @@ def read_survey(
         field = node_map(readings)
         sd = np.square([layer.metadata.get(ERROR, math.nan) for layer in layers])
         variance = np.broadcast_to(sd[:, None, None], field.grid.shape) if np.isfinite(sd).all() else None
-        field = replace(field, variance_nt2=variance, recorded_yaw=None, method=method, parameters=parameters)
+        about: dict[str, Any] = {"method": method, "parameters": parameters}
+        field = replace(field, variance_nt2=variance, between_nt2=None, recorded_yaw=None, **about)
         return field, _report(layers, field, folder, Report(""))
     masked, findings = mask_stuck(readings)
     if not (keep_stuck or masked.good.any()):

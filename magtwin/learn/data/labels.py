@@ -1,6 +1,5 @@
 """Labels: measured field minus the map, and the standard deviation of the map there."""
 
-import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
@@ -42,13 +41,11 @@ def labelled(run: Run, field: AnomalyMap, alignment: Alignment | None = None) ->
     """
     alignment = alignment or Alignment()
     p, yaw, rates = placed(run, alignment)
-    value, gradient = field.lookup_with_gradient(p, yaw)
-    variance = np.zeros(run.rows)
-    if field.variance_nt2 is not None:
-        spread = dataclasses.replace(
-            field, values_nt=np.where(field.valid, field.variance_nt2, 0.0), variance_nt2=None, harmonic=None
-        )
-        variance = spread.lookup(p, yaw)
+    if field.variance_nt2 is None:
+        (value, gradient), variance = field.lookup_with_gradient(p, yaw), np.zeros(run.rows)
+    else:
+        value, sd, gradient = field.lookup_all(p, yaw)
+        variance = sd**2
     if any(alignment.lever_arm_sd_m) or alignment.latency_sd_s:
         sds = np.array([*alignment.lever_arm_sd_m, alignment.latency_sd_s])
         variance = variance + np.sum((sds * slopes(gradient, yaw, rates)) ** 2, axis=1)

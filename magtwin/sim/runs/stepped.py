@@ -278,12 +278,15 @@ class SteppedRobots:
     ) -> Columns:
         """The map, the disturbance, and the magnetometer's reading of their sum."""
         spec = self.scene.robot.magnetometer
-        b_map = self._map.lookup(now.pose[:, :2], table["yaw"], outside="clamp")
+        where = now.pose[:, :2], table["yaw"]
+        if self._disturbance_nt is not None:
+            b_map, slopes = self._map.lookup_with_gradient(*where, outside="clamp")
+        else:
+            b_map = self._map.lookup(*where, outside="clamp")
         b_map = np.where(np.isnan(b_map), np.nanmean(self._map.values_nt), b_map)  # beside masked nodes
         error = np.zeros(len(which))
         if self._disturbance_nt is not None:
-            slopes = self._map.gradient(now.pose[:, :2], table["yaw"], outside="clamp")[:, :2]
-            sloped = into_base(np.nan_to_num(slopes), table["yaw"])
+            sloped = into_base(np.nan_to_num(slopes[:, :2]), table["yaw"])
             known = {"b_map_nt": b_map, "b_map_gradient_nt_m": sloped}
             predicted = self._disturbance_nt(Run(table | known))
             disturbance, sd = predicted if isinstance(predicted, tuple) else (predicted, np.zeros(len(which)))

@@ -43,6 +43,8 @@ class Forward:
 
     p_world_dipole: Array  # Dipole positions [m], shape (D, 3)
     height_m: float  # Height of the sensor [m]
+    # Trace of the soft iron, if it is known: no unknown has a part in it, see `SOFT`
+    soft_iron_trace: float = 0.0
 
     @property
     def size(self) -> int:
@@ -109,7 +111,7 @@ class Forward:
             unknowns[:count].reshape(-1, 3),
             rest[:3],
             rest[3:6],
-            np.tensordot(rest[6:14], SOFT, 1),
+            np.tensordot(rest[6:14], SOFT, 1) + self.soft_iron_trace / 3 * np.eye(3),
             rest[14:],
         )
 

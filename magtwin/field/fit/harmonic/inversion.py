@@ -23,12 +23,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.fit.harmonic.layers import ladders, layers_below
 from magtwin.field.fit.harmonic.model import HarmonicModel
-from magtwin.field.fit.harmonic.problem import Problem
+from magtwin.field.fit.harmonic.problem import Platform, Problem
 from magtwin.field.fit.harmonic.solution import Solution
 from magtwin.field.survey.readings import Readings, checked_earth_nt
 
@@ -46,6 +46,8 @@ def fit_harmonic(
     readings: Readings,
     *,
     earth_nt: Sequence[float] | None = None,
+    hard_iron_nt: ArrayLike | None = None,
+    soft_iron: ArrayLike | None = None,
     progress: Progress | None = None,
 ) -> HarmonicModel:
     """Fit a field without curl or divergence, and the platform, to a survey.
@@ -62,16 +64,23 @@ def fit_harmonic(
     field is unknown, the uniform field is assumed to point down with the readings' median magnitude, with a
     standard deviation of half of it per component (valid on the northern hemisphere). The fit starts from
     several directions and continues from the likeliest. Give the Earth's field if it is known
-    (`magtwin.field.sources.earth`), above all if vectors are wanted. For vector readings, the uniform field
-    is assumed near their mean.
+    (`magtwin.field.sources.earth`). For vector readings, the uniform field is assumed near their mean.
+
+    Magnitudes of a robot that turns about the vertical alone do not tell its hard and soft iron from the
+    uniform field. The magnitudes of the map hardly depend on how they are shared, but the vectors do: without
+    a known platform `HarmonicModel.predict_vector` gives nan.
 
     Args:
         readings: A survey; only its good readings are used.
         earth_nt: The Earth's field in world axes [nT]. Default: that of the readings.
+        hard_iron_nt: The robot's hard iron in base_link axes [nT], shape (3,), if it is known. An error of 50
+            nT moves the vector field by 2,000 nT.
+        soft_iron: Its soft iron [nT per nT], shape (3, 3), given with `hard_iron_nt`. Default: 0 then.
         progress: Called as progress(done, total, what), once per round.
 
     Raises:
-        InputError: There are too few good readings, all are at one place, or `earth_nt` is not a field.
+        InputError: There are too few good readings, all are at one place, or `earth_nt`, `hard_iron_nt` or `soft_iron`
+            is not such a field.
     """
     good = readings.take(readings.good)
     if len(good) < LEAST_READINGS:
@@ -81,13 +90,31 @@ def fit_harmonic(
         )
     height = readings.height_m or 0.0
     earth = readings.earth_nt if earth_nt is None else checked_earth_nt(earth_nt)
+    platform = _platform(hard_iron_nt, soft_iron)
     tries = ladders(good, height)
     fits: list[Solution] = []
     for k, depths in enumerate(tries):
-        problem = Problem.of(good, layers_below(good, depths, height), height, earth)
+        problem = Problem.of(good, layers_below(good, depths, height), height, earth, platform)
         begins = [fits[0].uniform] if fits else problem.begins
         fits.append(_solve(problem, begins, progress, k, len(tries)))
     return max(fits, key=Solution.evidence).model(good)
+
+
+def _platform(hard_iron_nt: ArrayLike | None, soft_iron: ArrayLike | None) -> Platform | None:
+    """A known platform; None if its hard iron is not given."""
+    if hard_iron_nt is None:
+        if soft_iron is not None:
+            raise InputError("soft_iron of a harmonic fit needs hard_iron_nt as well", parameter="soft_iron")
+        return None
+    given: dict[str, Any] = {"hard_iron_nt": hard_iron_nt, "soft_iron": np.zeros((3, 3))}
+    if soft_iron is not None:
+        given["soft_iron"] = soft_iron
+    arrays = {name: np.asarray(value, float) for name, value in given.items()}
+    for (name, array), shape in zip(arrays.items(), ((3,), (3, 3)), strict=True):
+        if array.shape != shape or not np.isfinite(array).all():
+            text = f"{name} of a harmonic fit must be finite, of shape {shape}"
+            raise InputError(f"{text}, got {given[name]!r}", parameter=name)
+    return Platform(**arrays)
 
 
 def _solve(

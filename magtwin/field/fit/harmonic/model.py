@@ -18,6 +18,9 @@ Array = NDArray[np.float64]
 BLOCK = 512  # Poses predicted at a time
 # Largest distance between nodes at which the variance is computed, in the depth of the nearest layer
 COARSE = 1 / 3
+# Factor of the posterior variance of vectors: with a known platform its 90 % intervals then hold 85-95 % of
+# the components in the default lab (`benchmarks/coverage.py`). No reading tells it, since all are magnitudes.
+VECTOR_WIDTH = 1.5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -41,6 +44,7 @@ class HarmonicModel(FittedModel):
     # from headings left out in turn [nT^2/rad^4]. Few headings determine it loosely: of the APRILab survey's
     # four, each left out, 73 % of the readings lie in the 90 % intervals from the other three.
     turned: float
+    untold: str = ""  # Why the vector field is unknown; "" if it is known
     method: str = "harmonic"  # Name of the method
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
@@ -83,20 +87,28 @@ class HarmonicModel(FittedModel):
     def predict_vector(self, p_world: ArrayLike) -> tuple[Array, Array]:
         """Field without the robot, at any height between the layers of dipoles, and its variance.
 
+        Of a survey of magnitudes, it is known only with the platform (options `hard_iron_nt` and `soft_iron`
+        of the fit): turns about the vertical do not tell hard iron, soft iron and the uniform field apart,
+        whether the Earth's field is known or not. `untold` and the parameter "vector field" say so. Of a
+        survey of vectors, hard iron z and the uniform field z are shared out by their priors alone.
+
         Args:
             p_world: Points [m], shape (..., 3).
 
         Returns:
-            Field [nT] and the variance of each component [nT^2], in world axes, each of shape (..., 3).
+            Field [nT] and the variance of each component [nT^2], in world axes, each of shape (..., 3); nan
+            and infinite where the vector field is unknown.
         """
         p = np.asarray(p_world, float)
+        if self.untold:
+            return np.full(p.shape, np.nan), np.full(p.shape, np.inf)
         value = self.field.field_nt(p)
         points, variance = p.reshape(-1, 3), np.empty(p.shape)
         flat = variance.reshape(-1, 3)
         for start in range(0, len(points), BLOCK):
             part = slice(start, start + BLOCK)
             rows = self.forward.vectors(points[part])
-            flat[part] = self._variance(rows.reshape(-1, rows.shape[-1])).reshape(-1, 3)
+            flat[part] = VECTOR_WIDTH * self._variance(rows.reshape(-1, rows.shape[-1])).reshape(-1, 3)
         return value, variance
 
     def _read(self, p: Array, yaw: Array) -> tuple[Array, Array]:

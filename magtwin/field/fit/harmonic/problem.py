@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.field.fit.harmonic.forward import Forward, Reading
+from magtwin.field.fit.harmonic.forward import SOFT, Forward, Reading
 from magtwin.field.fit.harmonic.layers import DEPTH_SPACINGS, Layers
 from magtwin.field.survey.bins import means
 from magtwin.field.survey.readings import Readings
@@ -52,6 +52,22 @@ class Hyperparameters:
         return np.stack([np.full_like(place, self.noise_nt**2), place, heading], axis=-1)
 
 
+# Why magnitudes of a robot that turns about the vertical alone leave the vector field open
+UNTOLD = (
+    "unknown: from magnitudes, turns about the vertical do not tell hard iron, soft iron and the uniform field "
+    "apart; give the platform (hard_iron_nt and soft_iron of the fit), or survey with a vector sensor; the "
+    "Earth's field alone does not settle it, since the building adds a uniform part"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Platform:
+    """The robot's own field, where it is known."""
+
+    hard_iron_nt: Array  # Hard iron in base_link axes [nT], shape (3,)
+    soft_iron: Array  # Soft iron [nT per nT], shape (3, 3)
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """The readings and the fixed priors."""
@@ -66,9 +82,17 @@ class Problem:
     mean: Array  # of the unknowns' priors
     rest_sd: Array  # standard deviations of the priors of all unknowns but the moments
     begins: list[Array]  # uniform fields to begin with
+    untold: str = ""  # Why the vector field is unknown; "" if it is known
 
     @classmethod
-    def of(cls, good: Readings, layers: Layers, height: float, earth_nt: Sequence[float] | None) -> "Problem":
+    def of(
+        cls,
+        good: Readings,
+        layers: Layers,
+        height: float,
+        earth_nt: Sequence[float] | None,
+        platform: Platform | None = None,
+    ) -> "Problem":
         """The problem of good readings over layers of dipoles."""
         read = good.b_nt[:, None] if good.b_body_nt is None else good.b_body_nt
         cell, follow = means(good, min(map(abs, layers.depths)))
@@ -93,14 +117,20 @@ class Problem:
             turned = [c * read[:, 0] - s * read[:, 1], s * read[:, 0] + c * read[:, 1], read[:, 2]]
             uniform = np.array([part.mean() for part in turned])
             begins = [uniform]
-        forward = Forward(layers.p_world_dipole, height)
+        trace = 0.0 if platform is None else float(np.trace(platform.soft_iron))
+        forward = Forward(layers.p_world_dipole, height, trace)
         prior = np.zeros(forward.size)
         count = 3 * len(layers.p_world_dipole)
         prior[count : count + 3] = uniform
         rest = np.repeat([sd, HARD_IRON_SD_NT, SOFT_IRON_SD, LEVER_SD_M], [3, 3, 8, 2])
         if abs(np.mean(np.exp(1j * yaw))) > ONE_HEADING:
             rest[3:] = 0.0  # a platform that never turned cannot be told from the field
-        return cls(forward, layers, p, yaw, read, cell, follow, prior, rest, begins)
+        if platform is not None:
+            prior[count + 3 : count + 6] = platform.hard_iron_nt
+            prior[count + 6 : count + 14] = np.tensordot(SOFT, platform.soft_iron, 2) / np.sum(SOFT**2, (1, 2))
+            rest[3:14] = 0.0
+        untold = UNTOLD if platform is None and good.b_body_nt is None else ""
+        return cls(forward, layers, p, yaw, read, cell, follow, prior, rest, begins, untold)
 
     @property
     def vectors(self) -> bool:

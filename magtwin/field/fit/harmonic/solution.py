@@ -200,6 +200,8 @@ class Solution:
         within = off - (np.bincount(problem.cell, off) / np.bincount(problem.cell))[problem.cell]
         noise += float(np.mean(within**2))
         parameters = self._parameters(learnt, width, len(good))
+        if problem.untold:
+            parameters["vector field"] = problem.untold
         parameters["added between headings [nT/rad^2]"] = round(float(np.sqrt(turned)), 2)
         if louder != 1:
             parameters["factor of the noise along a drive"] = round(float(np.sqrt(louder)), 3)
@@ -215,6 +217,7 @@ class Solution:
             width=width,
             headings_rad=headings,
             turned=turned,
+            untold=problem.untold,
         )
 
     def _calibrated(self, posterior: Posterior, precision: Array) -> tuple[float, float]:
@@ -262,7 +265,8 @@ class Solution:
         figures, problem = self.figures, self.problem
         last = learnt[-len(problem.rest_sd) :]
         sd = problem.rest_sd * np.sqrt(np.maximum(1 - np.sum(last**2, axis=1), 0))
-        uniform, hard, soft, lever = np.split(self.unknowns[-len(problem.rest_sd) :], [3, 6, 14])
+        field = problem.forward.field(self.unknowns)
+        uniform, hard, _, lever = np.split(self.unknowns[-len(problem.rest_sd) :], [3, 6, 14])
         layers = problem.layers
         square = figures.strength**2 / layers.area_m2
         density = [float(np.sqrt(square[layers.layer == k].mean())) for k in range(len(layers.depths))]
@@ -281,7 +285,7 @@ class Solution:
             "uniform field, sd [nT]": np.round(sd[:3], 1).tolist(),
             "hard iron [nT]": np.round(hard, 1).tolist(),
             "hard iron, sd [nT]": np.round(sd[3:6], 1).tolist(),
-            "soft iron": np.round(np.tensordot(soft, SOFT, 1).ravel(), 5).tolist(),
+            "soft iron": np.round(field.soft_iron.ravel(), 5).tolist(),
             "soft iron, sd": np.round(np.sqrt(np.tensordot(sd[6:14] ** 2, SOFT**2, 1)).ravel(), 5).tolist(),
             "lever arm [m]": np.round(lever, 5).tolist(),
             "lever arm, sd [m]": np.round(sd[14:], 5).tolist(),
