@@ -41,7 +41,7 @@ def interpolation_error_nt2(
     noise = np.zeros(known.shape) if noise_nt2 is None else np.where(valid, noise_nt2, np.nan)
     along = [_second(known, axis) for axis in (1, 2)]
     square = (along[0] + along[1]) ** 2 - (20 + 48) * noise
-    for one in along:  # nodes with neighbours along one axis only
+    for one in along if not np.isfinite(square).any() else ():  # as in a map of two rows
         square = np.where(np.isfinite(square), square, BOTH * (one**2 - 6 * noise) - 48 * noise)
     cells = _local(square, float(np.nanvar(known)) if valid.any() else 0.0) / 64
     turns = np.zeros(known.shape)

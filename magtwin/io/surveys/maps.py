@@ -164,7 +164,7 @@ def fit_survey(
     out, about = check_free(out, force=force), about or About()
     options = _method_options([method], kernel, earth).get(method, {})
     readings, report = read_survey(sources, about=about, **reading)
-    if doubts := _doubts(readings, sources[0]):
+    if doubts := [*_doubts(readings, sources[0]), *_shared(readings, method)]:
         report = replace(report, metadata={**report.metadata, "doubts": doubts})
     model = fit(readings, method, progress=progress, **options)
     named = readings.with_(name=about.name or out.stem)
@@ -311,6 +311,26 @@ def _doubts(readings: Readings, source: Source) -> list[str]:
         doubts.append(
             f"one heading only, {np.degrees(np.angle(mean)):.0f} deg: the robot's own field cannot be "
             "separated from the room's, and a simulated robot adds its own again; survey in several headings"
+        )
+    return doubts
+
+
+def _shared(readings: Readings, method: str) -> list[str]:
+    """What a fit takes for granted about the runs of a survey, and what its intervals leave out."""
+    doubts = list[str]()
+    if readings.grid is not None:
+        return doubts
+    if len(readings.runs) > 1 and method != "gp":
+        doubts.append(
+            f"{len(readings.runs)} runs are fitted with one platform: if the robot's hard iron changed between "
+            "them, as between sessions, the map takes the difference for field; fit each session alone, or use "
+            "--method gp, in which runs may disagree"
+        )
+    if readings.t is not None and method == "harmonic":
+        doubts.append(
+            "readings of a drive: the standard deviations are too small for the field at rest; in the default "
+            "lab 90 % intervals held 59 % of it without the fields of motors, battery and LiDAR, and 26 % with "
+            "them; survey at rest, node by node, for intervals that hold"
         )
     return doubts
 

@@ -1,5 +1,7 @@
 """The harmonic fit, held against fields that are known and against the real surveys."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -217,6 +219,48 @@ def test_shapes_are_broadcast_and_points_need_not_be_a_list(lab):
     field, variance = model.predict_vector([0.1, 0.2, 0.5])
     assert field.shape == variance.shape == (3,)
     assert np.all(variance > 0)
+
+
+def test_magnitudes_do_not_tell_vectors_and_the_model_says_what_would(lab):
+    _, model = lab
+    field, variance = model.predict_vector(np.zeros((4, 3)) + (0.1, 0.2, 0.5))
+    assert np.isnan(field).all()
+    assert np.isinf(variance).all()
+    assert "turns about the vertical do not tell hard iron, soft iron and the uniform" in model.untold
+    assert "give the platform" in model.untold
+    assert model.parameters["vector field"] == model.untold
+
+
+def test_with_a_known_platform_magnitudes_tell_vectors():
+    field = truth()
+    given = {"hard_iron_nt": HARD, "soft_iron": field.soft_iron}
+    model = fit_harmonic(survey(field), earth_nt=EARTH, **given)
+    assert model.untold == ""
+    assert_allclose(model.field.hard_iron_nt, HARD)
+    assert_allclose(model.field.soft_iron, field.soft_iron, atol=1e-12)
+    p, _ = off_grid(300)
+    at = np.column_stack([p * 0.8, np.full(len(p), 0.4)])
+    got, variance = model.predict_vector(at)
+    off = got - field.field_nt(at)
+    assert rms(off) < 0.25 * rms(field.field_nt(at) - field.field_nt(at).mean(axis=0))
+    assert covered(off, variance) > 0.8
+
+
+def test_the_trace_of_a_known_soft_iron_counts():
+    field = truth(count=3)
+    soft = field.soft_iron + 0.01 * np.eye(3)
+    readings = survey(replace(field, soft_iron=soft), spacing=0.5)
+    model = fit_harmonic(readings, earth_nt=EARTH, hard_iron_nt=HARD, soft_iron=soft)
+    assert_allclose(model.field.soft_iron, soft, atol=1e-12)
+    assert_allclose(np.reshape(model.parameters["soft iron"], (3, 3)), soft, atol=1e-5)
+
+
+def test_a_platform_that_is_none_is_refused():
+    readings = survey(truth(count=3), spacing=0.5)
+    with pytest.raises(InputError, match="soft_iron of a harmonic fit needs hard_iron_nt"):
+        fit_harmonic(readings, soft_iron=np.zeros((3, 3)))
+    with pytest.raises(InputError, match=r"hard_iron_nt of a harmonic fit must be finite, of shape \(3,\)"):
+        fit_harmonic(readings, hard_iron_nt=(1.0, 2.0))
 
 
 def test_too_few_readings_and_wrong_shapes_are_refused(lab):
