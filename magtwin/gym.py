@@ -27,8 +27,9 @@ from magtwin.sim.motion.drive_input import drive_input
 from magtwin.sim.runs.simulate import Predict
 from magtwin.sim.runs.stepped import SENSED, SteppedRobots
 from magtwin.sim.session import draw_session
+from magtwin.spec.plant import PlantSpec
 from magtwin.spec.scene import Scene
-from magtwin.twin import Kind, Twin, open_twin, room_of, without_model_error
+from magtwin.twin import Kind, Twin, open_twin, room_of, with_plant, without_model_error
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.magnetometer import NeuralMagnetometer
@@ -129,6 +130,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         end_on_bump: bool = False,
         random_start: bool = False,
         session: Literal["drawn", "survey"] = "drawn",
+        plant: PlantSpec | str | None = None,
         render_mode: None = None,
     ) -> None:
         """Open a scene for several robots.
@@ -150,6 +152,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             session: "drawn": each episode is a new session, from `magtwin.sim.session.draw_session`: charge,
                 IMU zero, LiDAR's phase, wheels, odometry and the robot's own field. "survey": the robot as
                 in the survey of the map. A Twin that is in a session stays in it.
+            plant: As for `magtwin.simulate`; all robots and episodes have the same constants.
             render_mode: Must be None.
 
         Raises:
@@ -165,6 +168,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             twin = scene if model_error else without_model_error(scene)
         else:
             twin = open_twin(scene, network=network, magnetometer=magnetometer, model_error=model_error)
+        twin = with_plant(twin, plant)
         check_field(twin.scene, twin.field)
         if twin.magnetometer:
             _check_network(twin.magnetometer)

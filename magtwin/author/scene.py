@@ -38,6 +38,7 @@ from magtwin.usd.sensors import (
     define_magnetometer,
     define_mocap,
     define_path,
+    define_plant,
     define_platform,
 )
 from magtwin.usd.sources import LOOKS, SOURCES, define_sources
@@ -238,6 +239,7 @@ def _define_robot(stage: Usd.Stage, placed: PlacedRobot, map_sha256: str) -> Non
     define_drive(prim, robot.drive)
     define_platform(prim, robot.platform)
     define_mocap(prim, robot.mocap)
+    define_plant(prim, robot.plant)
     for part, define in PARTS.items():
         define(stage, only_prim_with(prim, part).GetPath(), getattr(robot, part))
     magnetometer = only_prim_with(prim, "magnetometer")

@@ -214,10 +214,11 @@ def _robot(
     if named and not table.name:
         raise InputError(f'{where} needs name = "NAME", the name of its prim')
     if table.asset is not None and table.urdf is None:
-        known = {"asset", "network", "kind", "start", "path", *(["name"] if named else [])}
+        known = {"asset", "network", "kind", "start", "path", "plant", *(["name"] if named else [])}
         if others := sorted(set(keys) - known):
             raise InputError(f"{where} {others[0]} goes with urdf; an asset has it already")
         robot = load_robot(asset_named(table.asset, keys["asset"], where))
+        robot = replace(robot, plant=table.plant.spec) if "plant" in keys else robot
         return replace(robot, name=table.name) if named else robot
     if table.urdf is None or table.asset is not None:
         raise InputError(f'{where} needs asset = "FILE.usda" or urdf = "FILE.urdf", and not both')

@@ -45,6 +45,14 @@ Session = Annotated[
         "Default: 0.",
     ),
 ]
+Plant = Annotated[
+    str | None,
+    Parameter(
+        name="--plant",
+        help="Field of the robot beyond its linear platform model: hysteresis, warm-up, nonlinear, "
+        "moving-part, drawn, all or nominal; NAME:SEED draws other constants. Default: the scene's.",
+    ),
+]
 Network = Annotated[
     Path | None,
     Parameter(

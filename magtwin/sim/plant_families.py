@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from magtwin.errors import InputError, find
+from magtwin.files import from_table
 from magtwin.spec.base import ZERO3
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import RobotSpec
@@ -221,15 +222,10 @@ def plant_of(text: str, *, which: int = 0) -> PlantSpec:
     """
     if text.startswith("{"):
         try:
-            given: dict[str, Any] = {
-                name: tuple(value) if isinstance(value, list) else value
-                for name, value in json.loads(text).items()
-            }
-            return PlantSpec(**given)
-        except (ValueError, TypeError, RecursionError) as error:
-            raise InputError(
-                f"plant {text[:60]!r} is no plant's fields: {error}", parameter="plant"
-            ) from error
+            given = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"plant {text[:60]!r} is not JSON: {error}", parameter="plant") from error
+        return from_table(PlantSpec, given, "plant")
     name, colon, seed = text.partition(":")
     if colon and not (seed.isascii() and seed.isdigit()):
         raise InputError(

@@ -16,6 +16,7 @@ from magtwin.spec.plant import PlantSpec
 from magtwin.spec.scene import Scene
 from magtwin.twin.opening import led_by, open_twin, opened
 from magtwin.twin.twin import (
+    OF_SCENE,
     Kind,
     Metadata,
     Session,
@@ -319,6 +320,8 @@ def finished(
     metadata: Metadata = {"magtwin": __version__, "numpy": np.__version__, "seed": seed}
     if duration_s is not None:
         metadata["asked_duration_s"] = float(duration_s)
+    if twin.scene.robot.plant != PlantSpec():
+        metadata["plant"] = OF_SCENE  # unless the twin's metadata name another
     metadata |= dict(twin.session) | path_metadata(path) | dict(twin.metadata)
     metadata["config_sha256"] = config_sha256 or scene_sha256(twin.scene)
     return run.with_metadata(**metadata)

@@ -35,6 +35,10 @@ Session = int | Literal["survey"]
 Metadata = dict[str, str | int | float | bool]
 
 
+OF_SCENE = "of the scene"
+"""Metadata `plant` of a run whose plant is that of its scene."""
+
+
 @dataclass(frozen=True, repr=False)
 class Twin(Summarized):
     """A scene that is ready to simulate: `open_twin` makes one."""
@@ -197,7 +201,7 @@ def in_session_of(twin: Twin, metadata: Mapping[str, str | int | float | bool]) 
     Raises:
         InputError: The metadata name no valid session.
     """
-    if "plant" in metadata:
+    if metadata.get("plant", OF_SCENE) != OF_SCENE:
         twin = with_plant(twin, str(metadata["plant"]))
     if "session_seed" not in metadata:
         return in_session(twin, "survey")

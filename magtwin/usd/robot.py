@@ -22,6 +22,7 @@ from magtwin.usd.sensors import (
     read_lidar,
     read_magnetometer,
     read_mocap,
+    read_plant,
     read_platform,
 )
 
@@ -65,6 +66,7 @@ def read_robot(prim: Usd.Prim, asset: Path | None = None) -> RobotSpec:
         "imu": read_imu(imu),
         "lidar": read_lidar(lidar),
         "mocap": read_mocap(prim),
+        "plant": read_plant(prim),
     }
     try:
         return RobotSpec(

@@ -28,7 +28,7 @@ from magtwin.learn.data.features import FEATURES, SETS, columns_of, feature_name
 from magtwin.learn.data.features import features as features_of
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.origin import map_metadata, shared_metadata
-from magtwin.learn.data.recording import Recording, Rows, Source, read, sources_of, thinned
+from magtwin.learn.data.recording import Recording, Rows, Source, read, session_name, sources_of, thinned
 from magtwin.learn.data.split import Part, Split
 from magtwin.report import Figure, Report
 from magtwin.run.arrow import run_of, table_of
@@ -470,13 +470,10 @@ def _write(run: Run, source: Source, path: Path) -> Recording:
         column_encoding=floats,
     )
     label = run["label_nt"][np.isfinite(run["label_nt"])]
-    session, metadata = source.session, run.metadata
-    if not session and "session" in metadata:
-        seed = f"{metadata['session_seed']}-" if "session_seed" in metadata else ""
-        session = f"{seed}{metadata['session']}"
+    metadata = run.metadata
     return Recording(
         name=source.name,
-        session=session or source.name,
+        session=source.session or session_name(metadata) or source.name,
         path=source.path or str(metadata.get("path", "")) or source.name,
         rows=run.rows,
         labelled=len(label),

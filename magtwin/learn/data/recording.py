@@ -1,5 +1,6 @@
 """Recordings of a data set: the sources it is built from, their entries in it, and the rows read from it."""
 
+import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,6 +33,17 @@ class Source:
 
     path: str = ""
     """The driven path. Default: that in the run's metadata."""
+
+
+def session_name(metadata: Mapping[str, object]) -> str:
+    """Name of the session of a run; "" if its metadata name none. Robots with different plants differ."""
+    if "session" not in metadata:
+        return ""
+    seed = f"{metadata['session_seed']}-" if "session_seed" in metadata else ""
+    plant = str(metadata.get("plant", ""))
+    if plant.startswith("{"):
+        plant = hashlib.sha256(plant.encode()).hexdigest()[:8]
+    return f"{seed}{metadata['session']}" + (f"-{plant}" if plant else "")
 
 
 @dataclass(frozen=True)

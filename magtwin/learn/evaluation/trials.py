@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.files import sha256
 from magtwin.learn.data.dataset import MANIFEST, Dataset
+from magtwin.learn.data.recording import session_name
 from magtwin.learn.data.split import split
 from magtwin.learn.evaluation.candidates import Candidate
 from magtwin.run.run import Run
@@ -33,11 +34,8 @@ class Trial:
 
 def session_and_path(run: Run, trial: Trial) -> tuple[str, str]:
     """Session and path of a trial; see `Trial`."""
-    session, metadata = trial.session, run.metadata
-    if not session and "session" in metadata:
-        session = f"{metadata['session_seed']}-" if "session_seed" in metadata else ""
-        session += str(metadata["session"])
-    return session or trial.name, trial.path or str(metadata.get("path", "")) or trial.name
+    session = trial.session or session_name(run.metadata) or trial.name
+    return session, trial.path or str(run.metadata.get("path", "")) or trial.name
 
 
 def trials_of(dataset: Dataset, names: Sequence[str]) -> list[Trial]:
