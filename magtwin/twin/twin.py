@@ -102,6 +102,8 @@ class Twin(Summarized):
         """The scene and its file, the robot, the map and the network."""
         robot, field = self.scene.robot, self.field._summary()
         sensor = f"{robot.name}, {robot.magnetometer.kind} magnetometer at {robot.magnetometer.rate_hz:g} Hz"
+        plant = self.metadata.get("plant", OF_SCENE if robot.plant != PlantSpec() else "")
+        sensor += f", plant {plant}" if plant else ""
         more = f", and {len(self.scene.others)} more robots" if self.scene.others else ""
         width, depth = self.scene.lab.floor_m
         network = self.magnetometer._summary().title.partition(" ")[2] if self.magnetometer else "none"

@@ -11,6 +11,7 @@ from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.io.provenance import repeat, repeat_of
 from magtwin.io.tables import read_parquet
+from magtwin.learn.data.recording import session_name
 from magtwin.run.run import Run
 from magtwin.sim.plant_families import PLANTS, draw_plant
 from magtwin.sim.runs.live import LiveRobot
@@ -229,3 +230,13 @@ def test_the_commands_take_a_plant_and_reproduce_takes_it_from_the_run(lab_scene
     assert "yes" in capsys.readouterr().out
     main(["sweep", str(lab_scene), "--out", str(tmp_path / "set"), "--count", "1", *options])
     assert read_parquet(tmp_path / "set" / "run_00000.parquet").metadata["plant"] == "nonlinear:2"
+
+
+def test_a_data_set_keeps_sessions_of_different_plants_apart():
+    known = {"session": 3, "session_seed": 1}
+    names = [
+        session_name(known | more) for more in ({}, {"plant": "all:1"}, {"plant": "all:2"}, {"plant": "{}"})
+    ]
+    assert names[:2] == ["1-3", "1-3-all:1"]
+    assert len(set(names)) == 4
+    assert session_name({"plant": "all"}) == ""
