@@ -13,19 +13,8 @@ HEADINGS = ("heading", "yaw", "theta")
 """Default names of a heading."""
 
 FIELDS = (
-    *(
-        "field",
-        "b_nt",
-        "scalar_mag",
-        "magnitude",
-        "b_total",
-        "b_total_nt",
-        "b_ut",
-        "b_total_ut",
-        "b",
-        "b_tot",
-    ),
-    *("btotal", "bt", "|b|", "b_mag", "mag", "total", "total_field", "f"),
+    *("field", "b_nt", "scalar_mag", "magnitude", "b_total", "b_total_nt", "b_ut", "b_total_ut", "b"),
+    *("b_tot", "btotal", "bt", "|b|", "b_mag", "mag", "total", "total_field", "f"),
 )
 """Default names of a magnitude; case does not matter."""
 

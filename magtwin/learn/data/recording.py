@@ -20,19 +20,24 @@ _SHA = re.compile("[0-9a-f]{64}")
 
 @dataclass(frozen=True)
 class Source:
-    """A recording to put into a data set."""
+    """A recording to put into a data set, or to judge models by."""
 
     name: str
-    """Its name, of letters, digits and _ . + -; also that of its shard."""
+    """Its name; in a data set of letters, digits and _ . + -, and also that of its shard."""
 
     read: Callable[[], Run]
     """Returns the run; called once, or twice if an alignment is fitted."""
 
     session: str = ""
-    """Its session. Default: that in the run's metadata."""
+    """Its session. Default: that in the run's metadata, else the name."""
 
     path: str = ""
-    """The driven path. Default: that in the run's metadata."""
+    """The driven path. Default: that in the run's metadata, else the name."""
+
+    def session_and_path(self, run: Run) -> tuple[str, str]:
+        """Its session and path, given its run."""
+        session = self.session or session_name(run.metadata) or self.name
+        return session, self.path or str(run.metadata.get("path", "")) or self.name
 
 
 def session_name(metadata: Mapping[str, object]) -> str:
