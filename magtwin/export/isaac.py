@@ -7,8 +7,7 @@ definitions of its nodes, see `magtwin.export.ogn`.
 """
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from pxr import Sdf, Usd, UsdPhysics
 
@@ -47,8 +46,7 @@ DEFAULT_QOS, SENSOR_QOS, CLOCK_QOS = "qos", "sensor_qos", "clock_qos"
 """Nodes with the QoS of topics."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Parts:
+class _Parts(NamedTuple):
     """Prims of a robot for its graph."""
 
     root: Sdf.Path
@@ -74,46 +72,40 @@ def author_graph(stage: Usd.Stage, scene: Scene) -> list[Usd.Prim]:
     """
     robots = {prim.GetName(): prim for prim in prims_with(stage.GetPseudoRoot(), "robot")}
     alone, graphs = len(scene.robots) == 1, []
-    for k, placed in enumerate(scene.robots):
-        robot = placed.robot
+    for robot in (placed.robot for placed in scene.robots):
         if robot.name not in robots:
             raise InputError(f"the stage has no robot {robot.name!r}; it has {', '.join(robots) or 'none'}")
         parts = _parts(robots[robot.name])
         if not stage.GetPrimAtPath(GRAPHS):
             stage.DefinePrim(GRAPHS, "Scope")
-        graph = Graph(stage, GRAPHS.AppendChild(robot.name))
-        _author(graph, robot, parts, ROBOT if alone else robot.name, clock=k == 0)
+        graph, topics = Graph(stage, GRAPHS.AppendChild(robot.name)), f"/{ROBOT if alone else robot.name}"
+        _clocks(graph, publish=not graphs)
+        _odometry(graph, parts, f"{topics}/odom")
+        _imu(graph, parts, f"{topics}/imu", frame_of(robot.imu, "imu"))
+        _pose(graph, parts, f"{topics}/enu/pose")
+        _battery(graph, robot.battery, f"{topics}/battery_state")
+        _joints(graph, parts, f"{topics}/joint_states")
+        _scan(graph, parts, f"{topics}/scan", frame_of(robot.lidar, "lidar"))
+        _drive(graph, robot, parts, f"{topics}/cmd_vel")
         graphs.append(stage.GetPrimAtPath(graph.path))
     return graphs
 
 
-def _author(graph: Graph, robot: RobotSpec, parts: _Parts, namespace: str, *, clock: bool) -> None:
-    """The nodes of one robot's graph."""
+def _clocks(graph: Graph, *, publish: bool) -> None:
+    """Ticks, time stamps, and the QoS of `magtwin.io.bags.topics`."""
     graph.node("tick", "omni.graph.action.OnPlaybackTick")
     graph.node("time", f"{CORE}IsaacReadSimulationTime", resetOnStop=True)
     graph.node("stamp", f"{CORE}IsaacTimeSplitter")
     graph.connect("time.simulationTime", "stamp.time")
     graph.node("context", f"{BRIDGE}ROS2Context", useDomainIDEnvVar=True)
-    _qos(graph)
-    if clock:
-        graph.node("clock", f"{BRIDGE}ROS2PublishClock", topicName="/clock")
-        _published(graph, "clock", CLOCK_QOS)
-    _odometry(graph, parts, f"/{namespace}/odom")
-    _imu(graph, parts, f"/{namespace}/imu", frame_of(robot.imu, "imu"))
-    _pose(graph, parts, f"/{namespace}/enu/pose")
-    _battery(graph, robot.battery, f"/{namespace}/battery_state")
-    _joints(graph, parts, f"/{namespace}/joint_states")
-    _scan(graph, parts, f"/{namespace}/scan", frame_of(robot.lidar, "lidar"))
-    _drive(graph, robot, parts, f"/{namespace}/cmd_vel")
-
-
-def _qos(graph: Graph) -> None:
-    """QoS as in `magtwin.io.bags.topics`."""
     kind = f"{BRIDGE}ROS2QoSProfile"
     reliable, best = {"reliability": "reliable"}, {"reliability": "bestEffort"}
     graph.node(DEFAULT_QOS, kind, createProfile="Default for publishers/subscribers", depth=10, **reliable)
     graph.node(SENSOR_QOS, kind, createProfile="Sensor Data", depth=5, **best)
     graph.node(CLOCK_QOS, kind, createProfile="Custom", depth=1, **best)
+    if publish:
+        graph.node("clock", f"{BRIDGE}ROS2PublishClock", topicName="/clock")
+        _published(graph, "clock", CLOCK_QOS)
 
 
 def _published(graph: Graph, node: str, qos: str, after: str = "tick.tick", *, stamp: bool = True) -> None:
@@ -157,7 +149,8 @@ def _pose(graph: Graph, parts: _Parts, topic: str) -> None:
     graph.node("pose", f"{CORE}IsaacReadWorldPose", prim=parts.base)
     graph.node("place", f"{BREAK}3")
     graph.node("turn", f"{BREAK}4")
-    _message(graph, "publish_pose", "geometry_msgs/msg/PoseStamped", topic, "map", DEFAULT_QOS)
+    values = {"topicName": topic, "header:frame_id": "map"}
+    _message(graph, "publish_pose", "geometry_msgs/msg/PoseStamped", DEFAULT_QOS, **values)
     graph.connect("pose.translation", "place.tuple")
     graph.connect("pose.orientation", "turn.tuple")
     for axis in "xyz":
@@ -170,39 +163,25 @@ def _battery(graph: Graph, spec: BatterySpec, topic: str) -> None:
     """The battery at the start of a run, with the load of the electronics: it does not discharge."""
     charge = spec.initial_fraction
     current = float(current_a(spec, spec.load_w, charge))
-    unknown = math.nan
     graph.node("seldom", f"{CORE}IsaacSimulationGate", step=max(1, round(FRAMES_HZ / spec.rate_hz)))
     graph.connect("tick.tick", "seldom.execIn")
-    _message(
-        graph,
-        "publish_battery",
-        "sensor_msgs/msg/BatteryState",
-        topic,
-        BASE,
-        SENSOR_QOS,
-        after="seldom.execOut",
-        voltage=float(open_voltage(spec, charge)) - spec.resistance_ohm * current,
-        current=-current,  # ROS counts current into the battery
-        percentage=charge,
-        **dict.fromkeys(("temperature", "charge", "capacity", "design_capacity"), unknown),
-        power_supply_status=DISCHARGING,
-        present=True,
-    )
+    values = {
+        "topicName": topic,
+        "header:frame_id": BASE,
+        "voltage": float(open_voltage(spec, charge)) - spec.resistance_ohm * current,
+        "current": -current,  # ROS counts current into the battery
+        "percentage": charge,
+        **dict.fromkeys(("temperature", "charge", "capacity", "design_capacity"), math.nan),
+        "power_supply_status": DISCHARGING,
+        "present": True,
+    }
+    kind = "sensor_msgs/msg/BatteryState"
+    _message(graph, "publish_battery", kind, SENSOR_QOS, after="seldom.execOut", **values)
 
 
-def _message(
-    graph: Graph,
-    node: str,
-    message: str,
-    topic: str,
-    frame: str,
-    qos: str,
-    after: str = "tick.tick",
-    **values: Any,
-) -> None:
+def _message(graph: Graph, node: str, kind: str, qos: str, after: str = "tick.tick", **values: Any) -> None:
     """A generic publisher of a message with a header."""
-    values |= {"topicName": topic, "header:frame_id": frame}
-    graph.node(node, f"{BRIDGE}ROS2Publisher", message=message, **values)
+    graph.node(node, f"{BRIDGE}ROS2Publisher", message=kind, **values)
     _published(graph, node, qos, after, stamp=False)
     graph.connect("stamp.seconds", f"{node}.header:stamp:sec")
     graph.connect("stamp.nanoseconds", f"{node}.header:stamp:nanosec")
@@ -273,11 +252,7 @@ def frame_of(mount: MountSpec, name: str) -> str:
 
 
 def _parts(root: Usd.Prim) -> _Parts:
-    """The prims of a robot that Isaac Sim needs.
-
-    Raises:
-        InputError: One is missing.
-    """
+    """The prims of a robot that Isaac Sim needs."""
     if ROBOT_API not in root.GetMetadata("apiSchemas").GetAppliedItems():
         raise InputError(
             f"{place(root)}: has no {ROBOT_API}, so Isaac Sim does not see a robot; convert its URDF "

@@ -55,7 +55,9 @@ GENERATED = ("plugInfo.json", "generatedSchema.usda")
 README = "README.md"
 
 SCRIPTS = Path(__file__).resolve().parent / "scripts"
-"""Examples that need no magtwin; the ones whose names begin with the profile are exported too."""
+"""Examples that need no magtwin; those whose names begin with the profile are exported with `SHARED`."""
+
+SHARED = SCRIPTS / "magnetometer.py"
 
 
 @dataclass(frozen=True)
@@ -407,7 +409,7 @@ class _Work:
             notes=self.notes,
         )
         (folder / README).write_text(page, encoding="utf-8")
-        for script in self.scripts:
+        for script in (*self.scripts, SHARED) if self.scripts else ():
             copied(script, folder / script.name)
 
 
