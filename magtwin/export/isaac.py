@@ -71,7 +71,7 @@ def author_graph(stage: Usd.Stage, scene: Scene) -> list[Usd.Prim]:
         InputError: A robot is not on the stage, lacks Isaac Sim's robot schema, or lacks a sensor.
     """
     robots = {prim.GetName(): prim for prim in prims_with(stage.GetPseudoRoot(), "robot")}
-    alone, graphs = len(scene.robots) == 1, []
+    alone, graphs = len(scene.robots) == 1, list[Usd.Prim]()
     for robot in (placed.robot for placed in scene.robots):
         if robot.name not in robots:
             raise InputError(f"the stage has no robot {robot.name!r}; it has {', '.join(robots) or 'none'}")

@@ -1,7 +1,6 @@
 """Inputs of a node, joined by stamp: of each topic the newest message that is not in the future."""
 
 from collections import deque
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -241,8 +240,3 @@ class Scanning:
     def _hear(self, message: Message) -> None:
         self.heard += 1
         self._last_ns = self._bus.now_ns()
-
-
-def newest_sent_ns(inputs: Mapping[str, Input]) -> int:
-    """Wall time at which the newest message of some inputs was sent [ns]; 0 before any."""
-    return max((source.sent_ns for source in inputs.values()), default=0)

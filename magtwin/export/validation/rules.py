@@ -78,7 +78,7 @@ def units(subject: Subject) -> Iterator[Wrong]:
     for name, default in (("metersPerUnit", "centimetres"), ("upAxis", "Y up")):
         if not subject.stage.HasAuthoredMetadata(name):
             yield Wrong(f"does not say {name}, and counts as {default}", advice=advice)
-    defaults = {"metersPerUnit": 1.0, "upAxis": "Z", "kilogramsPerUnit": 1.0}
+    defaults: dict[str, Any] = {"metersPerUnit": 1.0, "upAxis": "Z", "kilogramsPerUnit": 1.0}
     for layer in subject.layers:
         said, name = layer.pseudoRoot, "" if layer == root else f"{subject.name_of(layer)} "
         metres, up, kilograms = (said.GetInfo(k) if said.HasInfo(k) else d for k, d in defaults.items())
