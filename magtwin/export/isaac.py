@@ -19,9 +19,10 @@ from magtwin.spec.base import ZERO3
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import BatterySpec, MountSpec
+from magtwin.usd.geometry import BASE_LINK
 from magtwin.usd.layers import WORLD
 from magtwin.usd.schema import only_prim_with, place, prims_with
-from magtwin.usd.sensors import BASE, IMU_TYPE, LIDAR_TYPE
+from magtwin.usd.sensors import IMU_TYPE, LIDAR_TYPE
 
 GRAPHS = WORLD.AppendChild("Graphs")
 """Scope of the graphs; each has the name of its robot."""
@@ -125,7 +126,7 @@ def _odometry(graph: Graph, parts: _Parts, topic: str) -> None:
         f"{BRIDGE}ROS2PublishOdometry",
         topicName=topic,
         odomFrameId="odom",
-        chassisFrameId=BASE,
+        chassisFrameId=BASE_LINK,
         publishRawVelocities=True,  # they are in the robot's axes already
     )
     graph.connect("tick.tick", "odometry.execIn")
@@ -167,7 +168,7 @@ def _battery(graph: Graph, spec: BatterySpec, topic: str) -> None:
     graph.connect("tick.tick", "seldom.execIn")
     values = {
         "topicName": topic,
-        "header:frame_id": BASE,
+        "header:frame_id": BASE_LINK,
         "voltage": float(open_voltage(spec, charge)) - spec.resistance_ohm * current,
         "current": -current,  # ROS counts current into the battery
         "percentage": charge,

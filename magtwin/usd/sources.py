@@ -182,10 +182,8 @@ def _geometry(prim: Usd.Prim, shape: str, scale: Vec3) -> tuple[dict[str, Any], 
         points, faces = _triangles(UsdGeom.Mesh(prim), scale)
         if len(faces) and mesh_moments(points, faces)[0] < 0:
             faces = faces[:, ::-1]
-        return {
-            "vertices_m": tuple(map(tuple, points.tolist())),
-            "faces": tuple(map(tuple, faces.tolist())),
-        }, (IDENTITY_XYZW)
+        vertices, corners = (tuple(map(tuple, array.tolist())) for array in (points, faces))
+        return {"vertices_m": vertices, "faces": corners}, IDENTITY_XYZW
     if shape == "cuboid":
         size = UsdGeom.Cube(prim).GetSizeAttr().Get()
         return {"size_m": (size * scale[0], size * scale[1], size * scale[2])}, IDENTITY_XYZW
