@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from magtwin.author.furniture import FurnitureTable, placed_furniture
 from magtwin.author.robot import RobotSettings, build_robot
-from magtwin.author.room import asset_named, check_name, check_start, lab_of, no_map, obstacles_in
+from magtwin.author.room import asset_named, check_name, check_start, lab_of, obstacles_in
 from magtwin.author.scene import check_things
 from magtwin.errors import InputError
 from magtwin.files import existing, from_table, read_toml, refused_at, sha256
@@ -154,7 +154,11 @@ def scene_from_toml(
         listed = read_sources(given.sources.file, seed=given.seed, lab=lab)
         sources, pieces = (*listed[0], *sources), (*listed[1], *pieces)
     if layer is None and (given.earth is None or survey_of is None):
-        raise no_map(path, furnished=bool(pieces or sources))
+        more = "" if pieces or sources else " and furniture or sources ([[furniture]], [[source]])"
+        raise InputError(
+            f'{path}: names no map; add map = "FILE.usdc" to it, or give `map_layer=FILE.usdc`, or add an '
+            f"[earth] table (latitude_deg, longitude_deg, height_m, date){more}, from which it is surveyed"
+        )
     standing = obstacles_in(lab, pieces)
     robots: list[PlacedRobot] = []
     for number, (robot_table, keys) in enumerate(zip(given.robot, table["robot"], strict=True)):
