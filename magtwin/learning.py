@@ -35,7 +35,7 @@ from magtwin.learn.evaluation.candidates import (
 )
 from magtwin.learn.evaluation.evaluate import evaluate as judge
 from magtwin.learn.evaluation.evaluation import Evaluation
-from magtwin.learn.evaluation.trials import Trial, check_apart, trials_of, unlearned, unseen
+from magtwin.learn.evaluation.trials import check_apart, trials_of, unlearned, unseen
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.models.predictor import Predictor
 from magtwin.run.run import Run
@@ -320,15 +320,15 @@ def _trials(
     recordings: Dataset | Mapping[str, Run] | Sequence[File] | File,
     learning: Dataset | None,
     candidates: Sequence[Candidate],
-) -> tuple[list[Trial], Sequence[str]]:
+) -> tuple[list[Source], Sequence[str]]:
     """Recordings to judge by, and the training recordings that baselines are fitted to."""
     learned: Sequence[str] = () if learning is None else learning.names
     is_set = isinstance(recordings, str | os.PathLike) and (Path(recordings) / MANIFEST).is_file()
     if not (isinstance(recordings, Dataset) or is_set):
         if isinstance(recordings, Mapping):
-            trials = [Trial(name, lambda run=run: run) for name, run in recordings.items()]  # type: ignore[misc]
+            trials = [Source(name, lambda run=run: run) for name, run in recordings.items()]  # type: ignore[misc]
         else:
-            trials = [Trial(source.name, source.read) for source in sources_of_files(recordings)]  # type: ignore[arg-type]
+            trials = sources_of_files(recordings)  # type: ignore[arg-type]
         return trials if learning is None else unlearned(trials, learning), learned
     judged = _dataset(recordings)  # type: ignore[arg-type]
     names, rest = unseen(judged, candidates)

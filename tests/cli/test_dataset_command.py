@@ -11,7 +11,7 @@ from magtwin.cli import main
 from magtwin.files import sha256, shipped
 from magtwin.io.formats import read_run, write_run
 from magtwin.learn.data.dataset import open_dataset
-from magtwin.learn.data.labels import labels
+from magtwin.learn.data.labels import labelled
 from magtwin.usd.maps import load_map
 
 MAP = shipped("maps", "lab", "lab.usdc")
@@ -64,8 +64,8 @@ def test_recordings_of_several_kinds_become_one_data_set_with_a_name_each(made, 
     assert found.recording("c").path == "circle"
     assert found.map_sha256 == sha256(MAP)
     ((_, run),) = found.runs(["tuesday_a"])
-    expected = labels(read_run(recorded / "tuesday" / "a.json"), load_map(MAP))
-    np.testing.assert_array_equal(run["label_nt"], expected.value_nt)
+    expected = labelled(read_run(recorded / "tuesday" / "a.json"), load_map(MAP))
+    np.testing.assert_array_equal(run["label_nt"], expected["label_nt"])
     assert np.nanmean(run["label_nt"]) == pytest.approx(300, abs=15)
 
 

@@ -19,19 +19,27 @@ _SHA = re.compile("[0-9a-f]{64}")
 
 @dataclass(frozen=True)
 class Source:
-    """A recording to put into a data set."""
+    """A recording to put into a data set, or to judge models by."""
 
     name: str
-    """Its name, of letters, digits and _ . + -; also that of its shard."""
+    """Its name; in a data set of letters, digits and _ . + -, and also that of its shard."""
 
     read: Callable[[], Run]
     """Returns the run; called once, or twice if an alignment is fitted."""
 
     session: str = ""
-    """Its session. Default: that in the run's metadata."""
+    """Its session. Default: that in the run's metadata, else the name."""
 
     path: str = ""
-    """The driven path. Default: that in the run's metadata."""
+    """The driven path. Default: that in the run's metadata, else the name."""
+
+    def session_and_path(self, run: Run) -> tuple[str, str]:
+        """Its session and path, given its run."""
+        session, metadata = self.session, run.metadata
+        if not session and "session" in metadata:
+            session = f"{metadata['session_seed']}-" if "session_seed" in metadata else ""
+            session += str(metadata["session"])
+        return session or self.name, self.path or str(metadata.get("path", "")) or self.name
 
 
 @dataclass(frozen=True)
