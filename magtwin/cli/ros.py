@@ -82,8 +82,7 @@ WallS = Annotated[float | None, Parameter(help="Duration in real time [s]. Defau
 SimTime = Annotated[bool, Parameter(negative="", help="Use the time of /clock, for a simulated robot.")]
 Stamped = Annotated[bool, Parameter(negative="", help="cmd_vel is a TwistStamped in place of a Twist.")]
 Asset = Annotated[
-    Path | None,
-    Parameter(help="USD asset of the robot, whose limits are kept. Default: the TurtleBot 4."),
+    Path | None, Parameter(help="USD asset of the robot, whose limits are kept. Default: the TurtleBot 4.")
 ]
 
 
@@ -159,11 +158,7 @@ def sim(
 
 @ros_app.command(name="magnetometer", usage="Usage: magtwin ros magnetometer [OPTIONS] SCENE [SETTING...]")
 def magnetometer(
-    scene: Path,
-    *settings: str,
-    where: Where = HERE,
-    network: Network = None,
-    duration_s: WallS = None,
+    scene: Path, *settings: str, where: Where = HERE, network: Network = None, duration_s: WallS = None
 ) -> Done:
     """Run the magnetometer alone: read a robot's sensors through map and network, and publish the field.
 

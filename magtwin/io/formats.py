@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magtwin.errors import InputError, hint
+from magtwin.extend import Registry
 from magtwin.files import existing
-from magtwin.registry import Registry
 from magtwin.run.run import Run, check_clock
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from magtwin.errors import InputError
+from magtwin.extend import Registry
 from magtwin.path.polyline import Path
-from magtwin.registry import Registry
 
 MOST_POINTS = 1_000_000
 """Most points of a path: 5 km of a spline, 16 MB."""

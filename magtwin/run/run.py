@@ -514,7 +514,7 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         if self.metadata.get("magnetometer") != "neural" or not wanted <= set(self):
             return
         truth, mean = self["b_truth_nt"], float(self.metadata.get("network_label_mean_nt", 0.0))
-        tally.than = "the map plus the mean training label" if mean else "the map alone"
+        tally.than = "the map plus the mean disturbance in the training data" if mean else "the map alone"
         tally.add(self["b_total_nt"] - truth, self["b_map_nt"] + mean - truth, self["b_sd_nt"])
 
     def _derived(self, step: str, columns: Mapping[str, NDArray[Any]] | None = None) -> "Run":

@@ -101,8 +101,11 @@ def test_a_table_of_another_program_is_read_by_its_own_names_of_columns(recorded
     ("words", "said"),
     [
         (["--column", "t=tim"], "no column 'tim'; did you mean 'time'"),
-        (["--column", "time"], "--column takes NAME=THEIRS, each once, such as yaw=heading, got 'time'"),
-        (["--column", "t=time", "--column", "yaw=time"], "got 'yaw=time'"),
+        (["--column", "time"], "--column takes NAME=THEIRS, such as yaw=heading, each once, got 'time'"),
+        (
+            ["--column", "t=time", "--column", "yaw=time"],
+            "--column names one column twice, got t=time yaw=time",
+        ),
     ],
 )
 def test_columns_that_a_table_lacks_or_that_are_named_twice_are_refused(tmp_path, capsys, words, said):

@@ -35,8 +35,7 @@ Earth = Annotated[
     ),
 ]
 Date = Annotated[
-    str | None,
-    Parameter(help="Date between the map's epochs, YYYY-MM-DD. Default: the latest epoch."),
+    str | None, Parameter(help="Date between the map's epochs, YYYY-MM-DD. Default: the latest epoch.")
 ]
 Sources = Annotated[Path, Parameter(required=True)]
 

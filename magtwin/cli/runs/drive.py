@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force, Gamepad, ModelError, Network, Seed, Session
-from magtwin.cli.runs.run import draw_run
+from magtwin.cli.runs.run import save_picture
 from magtwin.cli.terminal import Done, announce, note, silence
 from magtwin.errors import InputError
 
@@ -99,7 +99,7 @@ def drive(
             metadata={"commands_file": "commands.csv"},
             report=announce,
         )
-        Outputs(folder, picture=draw_run).write(driven)
+        Outputs(folder, picture=save_picture).write(driven)
     again = f"magtwin run {scene} --commands {out / 'commands.csv'} --seed {seed}"
     again += "" if session is None else f" --session {session}"
     return Done(driven.run.report(f"Manual drive in {scene}"), out, text=f"Wrote {out}; again: {again}")

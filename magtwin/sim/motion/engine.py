@@ -2,7 +2,7 @@
 
 from typing import Protocol
 
-from magtwin.registry import Registry
+from magtwin.extend import Registry
 from magtwin.sim.motion.closed_loop import Chassis, ClosedLoop, run_loops
 from magtwin.sim.motion.controllers import Controller
 from magtwin.sim.motion.drive import Motion
