@@ -28,9 +28,6 @@ POSE_FIELDS = frozenset(("link", "p_link_sensor", "q_link_sensor_xyzw"))
 JOINT_FIELDS = ("left_wheel_joint", "right_wheel_joint")
 """Fields of a DriveSpec that are relationships to joints."""
 
-BASE = "base_link"
-"""Name of the link whose frame is the robot's, as in REP-105."""
-
 MAP_RELATIONSHIP = "magtwin:magnetometer:map"
 MAP_CHECKSUM = "magtwin:magnetometer:mapSha256"
 """What a scene adds to a magnetometer: its map, and the checksum of the map's file."""
