@@ -173,10 +173,8 @@ def evaluate(
         InputError: A file cannot be read; the map of a model is not given; a model was trained on one of
             these recordings; or a recording lacks a column that a model or the evaluation needs.
     """
-    maps = _named_maps([anomaly_map] if _single(anomaly_map) else anomaly_map)  # type:
-    ignore[arg-type,list-item]
-    given: list[Any] = [models] if _single(models) or _is_model(models) else list(models)  # type:
-        ignore[arg-type]
+    maps = _named_maps([anomaly_map] if _single(anomaly_map) else anomaly_map)  # type: ignore[arg-type,list-item]
+    given: list[Any] = [models] if _single(models) or _is_model(models) else list(models)  # type: ignore[arg-type]
     files = iter(short_names([Path(model) for model in given if _single(model)]))
     candidates = []
     for model in given:
@@ -330,8 +328,7 @@ def _trials(
     is_set = isinstance(recordings, str | os.PathLike) and (Path(recordings) / MANIFEST).is_file()
     if not (isinstance(recordings, Dataset) or is_set):
         if isinstance(recordings, Mapping):
-            trials = [Source(name, lambda run=run: run) for name, run in recordings.items()]  # type:
-            ignore[misc]
+            trials = [Source(name, lambda run=run: run) for name, run in recordings.items()]  # type: ignore[misc]
         else:
             trials = sources_of_files(recordings)  # type: ignore[arg-type]
         return trials if learning is None else unlearned(trials, learning), learned
