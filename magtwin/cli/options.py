@@ -57,9 +57,8 @@ Session = Annotated[
     int | Literal["survey"] | None,
     Parameter(
         converter=_session,
-        help="Session to draw from the seed. Sessions differ in battery charge, IMU offsets, wheels, "
-        "odometry and the robot's own field. survey: the robot as it was when the map was surveyed. "
-        "Default: 0.",
+        help="Number of the session. It and the seed determine battery charge, IMU offsets, wheels, odometry "
+        "and the robot's own field. survey: the robot as it was when the map was surveyed. Default: 0.",
     ),
 ]
 Plant = Annotated[
@@ -74,7 +73,7 @@ Network = Annotated[
     Path | None,
     Parameter(
         name="--network",
-        help="Network of the magnetometer (.safetensors or .pth). none: a physical magnetometer. "
+        help="Network of the magnetometer (.safetensors, .pth). The word none selects a physical one. "
         "Default: the scene's.",
     ),
 ]

@@ -109,12 +109,12 @@ def export_scene(
             a package lies a folder `<name>_magtwin` with the schema plugin, README.md and the network.
         profile: A key of `PROFILES`. Default: omniverse for folders and packages, else viewer.
         animation: A run that plays over the stage; in a folder it is a separate layer, `<name>_run.usdc`.
-        to_onnx: Function of weights and output that writes a network as ONNX beside its weights. If it raises
-            InputError, the export has a note.
-        thumbnail: Function of root layer and output that draws a PNG of 256 x 256 pixels. If it raises
-            InputError, the export has a note.
-        trusted: Whether the stage was made here. Otherwise another process reads it first, since a damaged
-            layer can crash its reader; that takes a second.
+        to_onnx: Function f(weights file, output file) that writes the network as ONNX. If it raises
+            InputError, the report of the export has a note.
+        thumbnail: Function f(root layer, output file) that draws a PNG of 256 x 256 pixels. If it raises
+            InputError, the report of the export has a note.
+        trusted: Whether the stage comes from a trusted source. If not, a separate process reads it first,
+            since a damaged layer can crash its reader. That takes a second.
         force: Whether to replace existing files.
         progress: Function that is called with the name of each step.
 

@@ -92,7 +92,8 @@ def simulate(
         sensors: Custom sensors: names of registered sensors, or functions that make a sensor. Their columns
             are added to the run; see `magtwin.sim.extensions`.
         interference: Custom terms of the field at the magnetometer: names of registered ones, or functions.
-        progress: Called by slow engines as progress(steps done, most steps, simulated time as text).
+        progress: Called by slow engines as progress(steps done, maximum number of steps, simulated time
+            as text).
 
     Returns:
         A Run with the columns of `magtwin.COLUMNS`. Its metadata contain everything that is needed to

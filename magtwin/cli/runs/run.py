@@ -125,12 +125,12 @@ def run(
     meet
         What happens if robots collide: refuse the run, or flag it as a bump. Default: refuse.
     engine
-        What moves the robot: kinematic, or newton for physics in the stage.
+        What moves the robot: kinematic (motion without forces), or newton (the physics engine Newton).
     replay
         File of a run, in any format. The robot repeats the recorded motion; the sensors use the current
         settings.
     controller
-        Controller: magtwin's follower; release, the one of APRILab's released package; stanley; or
+        follower (magtwin's own controller), release (that of APRILab's published package), stanley or
         pure_pursuit.
     speed
         Forward speed on straight parts [m/s].
@@ -142,8 +142,8 @@ def run(
         .npz, .usd, .usda or .usdc. A name without a suffix is a folder with run.rrd, run.parquet and run.png.
         Default: the folder run.
     scans
-        Cast the LiDAR's rays while it spins. Scans are written to recordings and bags; for tables, to a
-        second file such as run.scans.parquet.
+        Cast the LiDAR's rays while it spins. Files .rrd, .mcap and .db3 contain the scans. For .parquet, .csv
+        and .npz, the scans go into a second file such as run.scans.parquet.
     live
         Show the run in a Rerun viewer while it goes on. Until it ends, the names of growing files contain
         "partial" or "parts". Ctrl-C ends it and keeps what was driven.
