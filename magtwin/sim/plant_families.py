@@ -231,8 +231,8 @@ def plant_of(text: str, *, which: int = 0) -> PlantSpec:
     name, colon, seed = text.partition(":")
     if colon and not (seed.isascii() and seed.isdigit() and len(seed) <= MOST_DIGITS):
         raise InputError(
-            f"plant must be NAME or NAME:SEED, SEED a whole number from 0 up of at most {MOST_DIGITS} digits; "
-            f"got {text[:60]!r}",
+            f"plant must be NAME or NAME:SEED, SEED a whole number from 0 up with at most {MOST_DIGITS} "
+            f"digits; got {text[:60]!r}",
             parameter="plant",
         )
     return draw_plant(name, int(seed or 0), which=which)
