@@ -285,7 +285,12 @@ class _Scale:
 
 def _between_headings(field: AnomalyMap, layers: Array, headings: Array) -> Array:
     """Layers at other headings, interpolated as a map lookup does."""
-    parts: dict[str, Any] = {"variance_nt2": None, "between_nt2": None, "harmonic": None, "recorded_yaw": None}
+    parts: dict[str, Any] = {
+        "variance_nt2": None,
+        "between_nt2": None,
+        "harmonic": None,
+        "recorded_yaw": None,
+    }
     x, y = np.meshgrid(field.x_m, field.y_m)
     values = replace(field, values_nt=layers, valid=np.isfinite(layers), **parts)
     return values.lookup(np.stack([x, y], axis=-1)[None], headings[:, None, None])

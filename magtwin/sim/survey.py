@@ -437,9 +437,7 @@ def survey_room(
     assert values is not None
     parameters = {**field.parameters, "seed": seed, "filled_nodes": holes}
     return Surveyed(
-        replace(
-            whole, values_nt=values, variance_nt2=variance, between_nt2=between, parameters=parameters
-        ),
+        replace(whole, values_nt=values, variance_nt2=variance, between_nt2=between, parameters=parameters),
         holes,
         len(scene.magnets),
     )

@@ -28,7 +28,7 @@ EDGE = 1e-9  # Rounding forgiven at a node, in cells; also the weight from which
 BINS_A_SPACING = 4  # Averaging cells per spacing of a scattered survey
 FLATTEST = 0.05  # Least relative spread of a heading wave within cells; waves with less are not fitted
 LEAST = 4  # Fewest readings of a map
-# Squared error of a periodic cubic spline midway between headings, over that of a line: of a cosine through four
+# Squared error of a periodic cubic spline midway between four headings over that of a line, for a cosine
 CUBIC_TURN = 0.009
 
 
@@ -147,7 +147,7 @@ class GridInterpolation(FittedModel):
                 nodes *= np.prod(_cubic_share(part), axis=1)
             variance += nodes  # a node's value is a reading, and errs as one
         else:  # as `AnomalyMap.lookup_with_sd`
-            variance = spread(nodes, *both, *part.T, between)
+            variance = spread(nodes, both[0], both[1], part[:, 0], part[:, 1], between)
         hole = ~inside | (unknown > EDGE)
         mean[hole] = variance[hole] = np.nan
         return mean.reshape(shape), variance.reshape(shape)

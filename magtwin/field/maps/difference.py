@@ -172,10 +172,7 @@ def difference(a: AnomalyMap, b: AnomalyMap) -> MapDifference:
     bias[seen] = np.nanmedian(change[seen], axis=(1, 2))
     local = change - bias[:, None, None]
     floor = float(np.spacing(np.float32(np.abs(b.values_nt[b.valid]).max())))
-    if from_variance:
-        sd = np.hypot(sd_a, sd_b)
-    else:
-        sd = np.where(known, _robust_sd(local[known]), np.nan)
+    sd = np.hypot(sd_a, sd_b) if from_variance else np.where(known, _robust_sd(local[known]), np.nan)
     sd = np.maximum(sd, floor)
     z = local / sd
     threshold = _threshold(np.abs(z[known]))

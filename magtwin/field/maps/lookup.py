@@ -69,7 +69,7 @@ class Lookup:
         self._plain = memoryview(self.table.data)  # its entries are plain floats, which Python adds up faster
 
     def spreads(self, *layers: Array) -> Array:
-        """Variances (H, Y, X) laid out for `lookup`: of the nodes, and the errors of interpolation if known."""
+        """Variances (H, Y, X) laid out for `lookup`: the nodes' own, and any errors of interpolation."""
         return np.concatenate([part.ravel() for layer in layers for part in (layer, layer[:1])])
 
     def lookup(
@@ -161,7 +161,8 @@ class Lookup:
         if len(sds):
             layers_of = spreads.reshape(-1, self.values.size)
             parts = [blend([one.take(node + way) for way in ways], wx, wy, wh) for one in layers_of]
-            sds[:] = np.sqrt(spread(*parts, wx, wy, wh) if len(parts) > 1 else parts[0])
+            whole = parts[0] if len(parts) == 1 else spread(parts[0], parts[1], parts[2], wx, wy, wh)
+            sds[:] = np.sqrt(whole)
         if not len(slopes):
             return
         rates = (np.where(inside[0], 1 / dx, 0.0), np.where(inside[1], 1 / dy, 0.0), rate)

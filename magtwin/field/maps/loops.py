@@ -113,8 +113,8 @@ def lookup(
 ) -> None:
     """`Lookup.lookup` at points x, y, x, y, ... in `q`, shape (2 N,).
 
-    `out` takes the field [nT], shape (N,), `sd` its standard deviation, shape (N,) or (0,), and `gradient` its
-    derivatives pose by pose, shape (3 N,) or (0,).
+    `out` takes the field [nT], shape (N,), `sd` its standard deviation, shape (N,) or (0,), and `gradient`
+    its derivatives pose by pose, shape (3 N,) or (0,).
     """
     x0, y0, dx, dy, edge = table[0], table[1], table[2], table[3], table[5]
     begin, end, in_row, in_layer = planes(table)

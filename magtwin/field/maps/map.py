@@ -184,7 +184,7 @@ class AnomalyMap(Summarized):
     def lookup_with_sd(
         self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan"
     ) -> tuple[Array, Array]:
-        """Field at poses, as `lookup`, and its standard deviation.
+        """Field at poses, as by `lookup`, and its standard deviation.
 
         That is the root of the interpolated variance of the nodes and, if `between_nt2` is known, of the
         error of linear interpolation between nodes and between headings. It is 0 at nodes, where only their

@@ -48,9 +48,9 @@ def sides(corners: Corners, x: Any, y: Any, h: Any, sign: float) -> tuple[Any, A
 def spread(variance: Any, cells: Any, turns: Any, x: Any, y: Any, h: Any) -> Any:
     """Variance at weights x, y, h: that of the nodes, and the errors of interpolation between them.
 
-    With `cells` the mean squared error in the middle of a cell, that elsewhere follows from f_xx x (1 - x) and
-    f_yy y (1 - y), whose correlation is 1/3 in a field that is alike in all directions; `turns` is that midway
-    between headings.
+    `cells` is the mean squared error in the middle of a cell. That elsewhere follows from f_xx x (1 - x) and
+    f_yy y (1 - y), whose correlation is 1/3 in a field that is alike in all directions. `turns` is that
+    midway between headings.
     """
     a, b, c = x * (1 - x), y * (1 - y), h * (1 - h)
     return variance + cells * (6 * (a * a + b * b) + 4 * (a * b)) + turns * (16 * (c * c))

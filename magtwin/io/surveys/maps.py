@@ -322,15 +322,15 @@ def _shared(readings: Readings, method: str) -> list[str]:
         return doubts
     if len(readings.runs) > 1 and method != "gp":
         doubts.append(
-            f"{len(readings.runs)} runs are fitted with one platform: if the robot's hard iron changed between "
-            "them, as between sessions, the map takes the difference for field; fit each session alone, or use "
-            "--method gp, in which runs may disagree"
+            f"{len(readings.runs)} runs are fitted with one platform: if the robot's hard iron changed "
+            "between them, as between sessions, the map takes the difference for field; fit each session "
+            "alone, or use --method gp, in which runs may disagree"
         )
     if readings.t is not None and method == "harmonic":
         doubts.append(
-            "readings of a drive: the standard deviations are too small for the field at rest; in the default "
-            "lab 90 % intervals held 59 % of it without the fields of motors, battery and LiDAR, and 26 % with "
-            "them; survey at rest, node by node, for intervals that hold"
+            "readings of a drive: the standard deviations are too small for the field at rest; in the "
+            "default lab 90 % intervals held 59 % of it without the fields of motors, battery and LiDAR, and "
+            "26 % with them; survey at rest, node by node, for intervals that hold"
         )
     return doubts
 

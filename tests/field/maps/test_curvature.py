@@ -83,7 +83,11 @@ def test_masked_nodes_count_for_nothing_and_get_an_error_from_those_around():
     wild = np.where(hole, field.values_nt, np.nan)
     error = interpolation_error_nt2(wild, hole, QUARTERS)
     assert np.isfinite(error).all()
-    assert_allclose(error[0, 0, 2, 2], interpolation_error_nt2(field.values_nt, field.valid, QUARTERS)[0, 0, 2, 2], rtol=0.2)
+    assert_allclose(
+        error[0, 0, 2, 2],
+        interpolation_error_nt2(field.values_nt, field.valid, QUARTERS)[0, 0, 2, 2],
+        rtol=0.2,
+    )
     nothing = interpolation_error_nt2(wild, np.zeros(hole.shape, bool), QUARTERS)
     assert_array_equal(nothing, np.zeros((2, *hole.shape)))
 
@@ -107,7 +111,8 @@ def test_all_in_one_pass_are_the_bytes_of_two_in_each_way(monkeypatch, count, ou
     in_numpy = field.lookup_all(p, yaw, outside=outside)
     one_by_one = [field.lookup_all(a, b, outside=outside) for a, b in zip(p, yaw, strict=True)]
     warm_up()
-    for got in (in_numpy, field.lookup_all(p, yaw, outside=outside), [np.array(c) for c in zip(*one_by_one)]):
+    in_python = [np.array(column) for column in zip(*one_by_one, strict=True)]
+    for got in (in_numpy, field.lookup_all(p, yaw, outside=outside), in_python):
         assert_array_equal(got[0], field.lookup(p, yaw, outside=outside))
         assert_array_equal(got[1], field.lookup_with_sd(p, yaw, outside=outside)[1])
         assert_array_equal(got[2], field.gradient(p, yaw, outside=outside))

@@ -79,8 +79,8 @@ def fit_harmonic(
         progress: Called as progress(done, total, what), once per round.
 
     Raises:
-        InputError: There are too few good readings, all are at one place, or `earth_nt`, `hard_iron_nt` or `soft_iron`
-            is not such a field.
+        InputError: There are too few good readings, all are at one place, or `earth_nt`, `hard_iron_nt` or
+            `soft_iron` is not such a field.
     """
     good = readings.take(readings.good)
     if len(good) < LEAST_READINGS:

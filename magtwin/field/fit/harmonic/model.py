@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 BLOCK = 512  # Poses predicted at a time
 # Largest distance between nodes at which the variance is computed, in the depth of the nearest layer
 COARSE = 1 / 3
-# Factor of the posterior variance of vectors: with a known platform its 90 % intervals then hold 85-95 % of
-# the components in the default lab (`benchmarks/coverage.py`). No reading tells it, since all are magnitudes.
+# Factor of the posterior variance of vectors: with a known platform 90 % intervals then hold about 90 % of
+# the components in the default lab (`benchmarks/intervals.py`). Magnitudes do not tell it.
 VECTOR_WIDTH = 1.5
 
 
@@ -58,8 +58,7 @@ class HarmonicModel(FittedModel):
     def predict_nodes(self, p_xy: Array, yaw: float) -> tuple[Array, Array]:
         """`predict` on evenly spaced nodes, several times faster.
 
-        On a fine grid the variance is computed only at nodes `COARSE` apart, and its logarithm interpolated;
-        the error is about 5 % at most nodes.
+        On a fine grid the variance is computed only at nodes `COARSE` apart, and interpolated.
 
         Args:
             p_xy: Nodes of a grid [m], shape (Y, X, 2).
@@ -78,11 +77,10 @@ class HarmonicModel(FittedModel):
         coarse = p_xy[np.ix_(rows, columns)]
         p = coarse.reshape(-1, 2)
         _, variance = self._read(p, np.full(len(p), yaw))
-        log = np.log(np.maximum(variance, np.finfo(float).tiny)).reshape(coarse.shape[:2])
         every = [np.arange(n) for n in value.shape]
-        log = np.array([np.interp(every[1], columns, row) for row in log])
-        log = np.array([np.interp(every[0], rows, column) for column in log.T]).T
-        return value, self._corrected(np.exp(log), np.array([yaw]))
+        wide = np.array([np.interp(every[1], columns, row) for row in variance.reshape(coarse.shape[:2])])
+        wide = np.array([np.interp(every[0], rows, column) for column in wide.T]).T
+        return value, self._corrected(wide, np.array([yaw]))
 
     def predict_vector(self, p_world: ArrayLike) -> tuple[Array, Array]:
         """Field without the robot, at any height between the layers of dipoles, and its variance.

@@ -54,9 +54,9 @@ class Hyperparameters:
 
 # Why magnitudes of a robot that turns about the vertical alone leave the vector field open
 UNTOLD = (
-    "unknown: from magnitudes, turns about the vertical do not tell hard iron, soft iron and the uniform field "
-    "apart; give the platform (hard_iron_nt and soft_iron of the fit), or survey with a vector sensor; the "
-    "Earth's field alone does not settle it, since the building adds a uniform part"
+    "unknown: from magnitudes, turns about the vertical do not tell hard iron, soft iron and the uniform "
+    "field apart; a known platform does (hard_iron_nt and soft_iron of the fit), and so would turns about a "
+    "second axis; the Earth's field does not, since the building adds a uniform part to it"
 )
 
 
@@ -127,7 +127,9 @@ class Problem:
             rest[3:] = 0.0  # a platform that never turned cannot be told from the field
         if platform is not None:
             prior[count + 3 : count + 6] = platform.hard_iron_nt
-            prior[count + 6 : count + 14] = np.tensordot(SOFT, platform.soft_iron, 2) / np.sum(SOFT**2, (1, 2))
+            prior[count + 6 : count + 14] = np.tensordot(SOFT, platform.soft_iron, 2) / np.sum(
+                SOFT**2, (1, 2)
+            )
             rest[3:14] = 0.0
         untold = UNTOLD if platform is None and good.b_body_nt is None else ""
         return cls(forward, layers, p, yaw, read, cell, follow, prior, rest, begins, untold)

@@ -1,14 +1,15 @@
 """Share of the true field in the 90 % intervals of maps that were fitted to surveys of the default lab.
 
-    python benchmarks/coverage.py [--seeds 2] [--spacing-m 0.25 0.4] [--method trilinear cubic gp harmonic]
+    python benchmarks/intervals.py [--seeds 2] [--spacing-m 0.25 0.4] [--method trilinear cubic gp harmonic]
 
-The lab is surveyed as `magtwin map survey` does by default: four headings, places off by 1 cm and headings by
-2 degrees. The reference is the field that the same robot reads at rest at random places and headings inside
-the map, where it can stand, without noise. `map` is `AnomalyMap.lookup_with_sd` of the map that
+The lab is surveyed as `magtwin map survey` does by default: four headings, places off by 1 cm and headings
+by 2 degrees. The reference is the field that the same robot reads at rest at random places and headings
+inside the map, where it can stand, without noise. `map` is `AnomalyMap.lookup_with_sd` of the map that
 `magtwin map fit` would save; `nodes` is the same with the variance of the nodes alone. `vector` is
 `HarmonicModel.predict_vector` at these places, by component; "platform" is given the robot's hard and soft
-iron, and without them the vector is nan. All shares are means over the seeds, with the least and the greatest.
-Then times, as ratios: value, standard deviation and gradient by `AnomalyMap.lookup_all`, and by two calls.
+iron, and without them the vector is nan. All shares are means over the seeds, with the least and the
+greatest. Then times, as ratios: value, standard deviation and gradient by `AnomalyMap.lookup_all`, and by
+two calls.
 """
 
 import argparse
@@ -128,7 +129,8 @@ def speed(rounds=15):
                 way()
                 took[name].append(time.perf_counter() - start)
         two, one = (statistics.median(took[name]) for name in ("two", "one"))
-        print(f"{count:,} poses: two calls {two / one:.2f} times as long as one, {one / count * 1e9:.0f} ns a pose")
+        each = one / count * 1e9
+        print(f"{count:,} poses: two calls {two / one:.2f} times as long as one, {each:.0f} ns a pose")
 
 
 def main():
