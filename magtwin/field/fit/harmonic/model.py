@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 BLOCK = 512  # Poses predicted at a time
 # Largest distance between nodes at which the variance is computed, in the depth of the nearest layer
 COARSE = 1 / 3
+ROOT = 2 / 3  # Power of the variance that is interpolated between them
 # Factor of the posterior variance of vectors: with a known platform 90 % intervals then hold about 90 % of
 # the components in the default lab (`benchmarks/intervals.py`). Magnitudes do not tell it.
 VECTOR_WIDTH = 1.5
@@ -78,9 +79,10 @@ class HarmonicModel(FittedModel):
         p = coarse.reshape(-1, 2)
         _, variance = self._read(p, np.full(len(p), yaw))
         every = [np.arange(n) for n in value.shape]
-        wide = np.array([np.interp(every[1], columns, row) for row in variance.reshape(coarse.shape[:2])])
-        wide = np.array([np.interp(every[0], rows, column) for column in wide.T]).T
-        return value, self._corrected(wide, np.array([yaw]))
+        root = variance.reshape(coarse.shape[:2]) ** ROOT
+        root = np.array([np.interp(every[1], columns, row) for row in root])
+        root = np.array([np.interp(every[0], rows, column) for column in root.T]).T
+        return value, self._corrected(root ** (1 / ROOT), np.array([yaw]))
 
     def predict_vector(self, p_world: ArrayLike) -> tuple[Array, Array]:
         """Field without the robot, at any height between the layers of dipoles, and its variance.
