@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 BLOCK = 512  # Poses predicted at a time
 # Largest distance between nodes at which the variance is computed, in the depth of the nearest layer
 COARSE = 1 / 3
-ROOT = 2 / 3  # Power of the variance that is interpolated between them
+ROOT = 0.5  # Power of the variance that is interpolated between them
 # Factor of the posterior variance of vectors: with a known platform 90 % intervals then hold about 90 % of
 # the components in the default lab (`benchmarks/intervals.py`). Magnitudes do not tell it.
 VECTOR_WIDTH = 1.5
