@@ -93,14 +93,14 @@ def text(values):
     return f"{100 * np.mean(values):.1f} ({low}-{high})"
 
 
-def coverage(methods, spacings, seeds):
+def coverage(methods, spacings, seeds, first):
     scene = read_scene(FILE, check_network=False)
     blocked = blocked_by(scene, read_obstacles(FILE))
     names = ("RMSE [nT]", "nodes", "map", "vector x", "vector y", "vector z", "s")
     print(f"| method | spacing [m] | {' | '.join(names)} |\n|{'---|' * (len(names) + 2)}")
     for method in methods:
         for spacing in spacings:
-            found = [measured(scene, blocked, method, spacing, seed) for seed in range(seeds)]
+            found = [measured(scene, blocked, method, spacing, seed) for seed in range(first, first + seeds)]
             columns = {name: [one[name] for one in found] for name in found[0]}
             cells = [f"{np.mean(columns.pop('RMSE')):.0f}"]
             took = np.mean(columns.pop("seconds"))
@@ -136,11 +136,12 @@ def speed(rounds=15):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--spacing-m", type=float, nargs="+", default=[0.25, 0.4])
     known = ["trilinear", "cubic", "gp", "harmonic", "harmonic, platform"]
     parser.add_argument("--method", nargs="+", choices=known, default=known)
     options = parser.parse_args()
-    coverage(options.method, options.spacing_m, options.seeds)
+    coverage(options.method, options.spacing_m, options.seeds, options.first_seed)
     speed()
 
 

@@ -19,9 +19,9 @@ BLOCK = 512  # Poses predicted at a time
 # Largest distance between nodes at which the variance is computed, in the depth of the nearest layer
 COARSE = 1 / 3
 ROOT = 0.5  # Power of the variance that is interpolated between them
-# Factor of the posterior variance of vectors: with a known platform 90 % intervals then hold about 90 % of
-# the components in the default lab (`benchmarks/intervals.py`). Magnitudes do not tell it.
-VECTOR_WIDTH = 1.5
+# Factor of the posterior variance of vectors, chosen on surveys of the default lab with a known platform, since
+# magnitudes do not tell it. No factor is right at every spacing (docs/maps.md, `benchmarks/intervals.py`).
+VECTOR_WIDTH = 2.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
