@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from magtwin.learn.models.predictor import load_predictor as load_predictor
     from magtwin.learn.training.train import train as train
     from magtwin.learning import build_dataset as build_dataset
+    from magtwin.learning import calibrate as calibrate
     from magtwin.learning import error_budget as error_budget
     from magtwin.learning import evaluate as evaluate
     from magtwin.run.run import COLUMNS as COLUMNS
@@ -60,6 +61,7 @@ _NAMES = {
     "Twin": "twin",
     "author_scene": "twin",
     "build_dataset": "learning",
+    "calibrate": "learning",
     "error_budget": "learning",
     "evaluate": "learning",
     "export_scene": "export.package",
@@ -97,6 +99,7 @@ __all__ = [
     "Twin",
     "author_scene",
     "build_dataset",
+    "calibrate",
     "error_budget",
     "evaluate",
     "export_scene",

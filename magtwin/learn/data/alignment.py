@@ -1,6 +1,6 @@
 """Alignment: the place and time of a reading relative to the pose with its stamp, and its fit to a map."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -82,6 +82,23 @@ class Alignment(Summarized):
                 ("latency", f"{self.latency_s:.4g} +- {self.latency_sd_s:.2g} s"),
             ),
         )
+
+
+def alignment_of(metadata: Mapping[str, Any], where: object = "") -> Alignment:
+    """Lever arm and latency in the metadata of weights; 0 if they have none.
+
+    Raises:
+        InputError: They are no numbers.
+    """
+    try:
+        arm = [float(part) for part in str(metadata.get("lever_arm_m", "0, 0")).split(",")]
+        forward, left = arm
+        return Alignment((forward, left), float(metadata.get("latency_s", 0.0)))
+    except ValueError as error:
+        raise InputError(
+            f"{where}: lever_arm_m {metadata.get('lever_arm_m')!r} and latency_s "
+            f"{metadata.get('latency_s')!r} of its metadata are no lengths and time ({error}); train it again"
+        ) from error
 
 
 def placed(run: Run, alignment: Alignment) -> tuple[Array, Array, Array]:

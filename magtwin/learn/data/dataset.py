@@ -181,7 +181,7 @@ class Dataset(Summarized):
         most = sum(recording.labelled for recording in chosen)
         x, y, sd = np.empty((most, len(wanted))), np.empty(most), np.empty(most)
         number_of_row, row = np.empty(most, np.intp), np.empty(most, np.intp)
-        others = np.empty((most, len(beside)))
+        others, t = np.empty((most, len(beside))), np.empty(most)
         number = {recording.name: i for i, recording in enumerate(chosen)}
         end, unlabelled, incomplete = 0, 0, 0
         columns = [*columns_of(wanted), *columns_of(beside), "label_nt", "label_sd_nt"]
@@ -201,6 +201,7 @@ class Dataset(Summarized):
                 )
             x[end:stop], y[end:stop], sd[end:stop] = values[kept], label[kept], run["label_sd_nt"][kept]
             number_of_row[end:stop], row[end:stop] = number[recording.name], first + np.flatnonzero(kept)
+            t[end:stop] = run["t"][kept]
             if beside:
                 others[end:stop] = features_of(run, beside)[kept]
             end = stop
@@ -219,6 +220,7 @@ class Dataset(Summarized):
             left_out=MappingProxyType({"without a label": unlabelled, "without an input": incomplete}),
             row=row[:end],
             beside=others[:end],
+            t=t[:end],
         )
 
     def check(self) -> None:
@@ -474,6 +476,7 @@ def _write(run: Run, source: Source, path: Path) -> Recording:
     if not session and "session" in metadata:
         seed = f"{metadata['session_seed']}-" if "session_seed" in metadata else ""
         session = f"{seed}{metadata['session']}"
+    plant = str(metadata.get("plant", ""))
     return Recording(
         name=source.name,
         session=session or source.name,
@@ -484,6 +487,7 @@ def _write(run: Run, source: Source, path: Path) -> Recording:
         sha256=sha256(path),
         label_mean_nt=float(label.mean()),
         label_sd_nt=float(label.std()),
+        plant=plant,
     )
 
 

@@ -63,8 +63,11 @@ class Recording:
     label_sd_nt: float
     """Standard deviation of its labels [nT]."""
 
+    plant: str = ""
+    """The simulated robot's plant; "" if nominal or unknown."""
+
     def __post_init__(self) -> None:
-        for name in ("name", "session", "path", "sha256"):
+        for name in ("name", "session", "path", "sha256", "plant"):
             if not isinstance(getattr(self, name), str):
                 raise InputError(f"{name} of a recording must be a text, got {getattr(self, name)!r}")
         for name in ("rows", "labelled"):
@@ -113,6 +116,9 @@ class Rows(Summarized):
 
     beside: Array
     """Other features of the same rows, shape (N, K); nan if unknown."""
+
+    t: Array
+    """Time of each row in its recording [s], shape (N,)."""
 
 
 def sources_of(recordings: Mapping[str, Run] | Sequence[Source]) -> list[Source]:

@@ -140,6 +140,7 @@ def fit(
         validation_groups=data.groups["validation"],
         options=config.options,
         rng=rng,
+        recordings={recording.name: recording for recording in dataset.recordings},
         init=init,
         freeze=config.freeze,
         device=device,
@@ -284,7 +285,7 @@ def _provenance(
         "training_rows": rows,
         "magtwin": __version__,
     }
-    if config.kind != "linear":
+    if config.kind not in ("linear", "mixed"):
         threads = config.threads or torch.get_num_threads()
         metadata |= {"threads": threads, "torch": str(torch.__version__), "device": device}
     if config.licence:
