@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from magtwin.learning import evaluate as evaluate
     from magtwin.run.run import COLUMNS as COLUMNS
     from magtwin.run.run import Run as Run
+    from magtwin.sim.plant_families import draw_plant as draw_plant
+    from magtwin.spec.plant import PlantSpec as PlantSpec
     from magtwin.spec.scene import Scene as Scene
     from magtwin.twin import Twin as Twin
     from magtwin.twin import author_scene as author_scene
@@ -55,13 +57,18 @@ _NAMES = {
     "COLUMNS": "run.run",
     "InputError": "errors",
     "MismatchWarning": "errors",
+    "PlantSpec": "spec.plant",
     "Readings": "field.survey.readings",
     "Run": "run.run",
     "Scene": "spec.scene",
     "Twin": "twin",
     "author_scene": "twin",
     "build_dataset": "learning",
+<<<<<<< HEAD
     "calibrate": "learning",
+=======
+    "draw_plant": "sim.plant_families",
+>>>>>>> plants
     "error_budget": "learning",
     "evaluate": "learning",
     "export_scene": "export.package",
@@ -93,13 +100,18 @@ __all__ = [
     "AnomalyMap",
     "InputError",
     "MismatchWarning",
+    "PlantSpec",
     "Readings",
     "Run",
     "Scene",
     "Twin",
     "author_scene",
     "build_dataset",
+<<<<<<< HEAD
     "calibrate",
+=======
+    "draw_plant",
+>>>>>>> plants
     "error_budget",
     "evaluate",
     "export_scene",

@@ -12,6 +12,7 @@ from magtwin.errors import InputError, find
 from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.motion.drive_input import drive_input
+from magtwin.spec.plant import PlantSpec
 from magtwin.spec.scene import Scene
 from magtwin.twin.opening import led_by, open_twin, opened
 from magtwin.twin.twin import (
@@ -25,6 +26,7 @@ from magtwin.twin.twin import (
     model_error_of,
     room_of,
     scene_sha256,
+    with_plant,
 )
 from magtwin.version import __version__
 
@@ -44,6 +46,7 @@ def simulate(
     *,
     seed: int = 0,
     session: Session | None = None,
+    plant: PlantSpec | str | None = None,
     speed: float = 0.2,
     duration_s: float | None = None,
     rate_hz: float | None = None,
@@ -70,6 +73,9 @@ def simulate(
             "survey" is the robot as it was during the survey of the map; a network trained on later sessions
             is not
             valid for it.
+        plant: What the robot's field has beyond the linear platform model, which no network learned:
+            "hysteresis", "warm-up", "nonlinear", "moving-part", "drawn", "all" or "nominal"; "NAME:SEED" for
+            other constants of that family; or a `PlantSpec`. Default: the scene's. See `draw_plant`.
         speed: Forward speed on straight parts [m/s].
         duration_s: Duration [s]. Default: once along the path. A longer duration drives further laps.
         rate_hz: Magnetometer readings per second [Hz]. Default: the scene's.
@@ -100,7 +106,7 @@ def simulate(
 
     seed = checked_seed(seed)
     twin = opened(twin, network, magnetometer, model_error, "simulate")
-    twin = in_session(twin, session, seed=seed)
+    twin = in_session(with_plant(twin, plant), session, seed=seed)
     check_field(twin.scene, twin.field)
     path = drive_input(path, room_of(twin))
     check_commands(path, twin.magnetometer)
@@ -135,6 +141,7 @@ def simulate_robots(
     meet: Literal["refuse", "flag"] = "refuse",
     seed: int = 0,
     session: Session | None = None,
+    plant: PlantSpec | str | None = None,
     speed: float = 0.2,
     duration_s: float | None = None,
     rate_hz: float | None = None,
@@ -159,6 +166,7 @@ def simulate_robots(
             sets flag_bump of both robots, which then drive through each other.
         seed: As for `simulate`.
         session: As for `simulate`; each robot is drawn independently.
+        plant: As for `simulate`; each robot has constants of its own.
         speed: As for `simulate`, of each robot.
         duration_s: As for `simulate`, of each robot.
         rate_hz: As for `simulate`.
@@ -181,7 +189,7 @@ def simulate_robots(
 
     seed = checked_seed(seed)
     twin = opened(twin, network, magnetometer, model_error, "simulate_robots")
-    twin = in_session(twin, session, seed=seed)
+    twin = in_session(with_plant(twin, plant), session, seed=seed)
     check_field(twin.scene, twin.field)
     placed = {other.robot.name: other for other in twin.scene.robots}
     for name in (*(paths or {}), *(robots or ())):

@@ -14,6 +14,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.path.room import Room
 from magtwin.spec.base import spelled
 from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import MagnetometerSpec
@@ -152,8 +153,42 @@ def in_session(twin: Twin, session: Session | None = None, *, seed: int = 0) -> 
     return dataclasses.replace(twin, scene=scene, session={"session": number, "session_seed": seed})
 
 
+def with_plant(twin: Twin, plant: PlantSpec | str | None) -> Twin:
+    """The twin whose robots have another plant.
+
+    Args:
+        twin: An opened twin, not yet in a session.
+        plant: A `PlantSpec`; or "NAME" or "NAME:SEED" of `magtwin.draw_plant`, from which each robot draws
+            constants of its own. None changes nothing.
+
+    Raises:
+        InputError: The text names no plant, or the twin is in a session.
+    """
+    from magtwin.sim.plant_families import plant_of, plant_text
+
+    if plant is None:
+        return twin
+    if twin.session:
+        raise InputError(
+            f"the twin is in session {twin.session['session']!r} already; give `plant` before the session",
+            parameter="plant",
+        )
+    if not isinstance(plant, PlantSpec | str):
+        raise InputError(f"plant must be a name or a PlantSpec, got {plant!r}", parameter="plant")
+    scene, text = twin.scene, plant if isinstance(plant, str) else plant_text(plant)
+    robots = [
+        dataclasses.replace(placed.robot, plant=plant_of(text, which=k))
+        for k, placed in enumerate(scene.robots)
+    ]
+    others = tuple(
+        dataclasses.replace(other, robot=robot) for other, robot in zip(scene.others, robots[1:], strict=True)
+    )
+    scene = dataclasses.replace(scene, robot=robots[0], others=others)
+    return dataclasses.replace(twin, scene=scene, metadata={**twin.metadata, "plant": text})
+
+
 def in_session_of(twin: Twin, metadata: Mapping[str, str | int | float | bool]) -> Twin:
-    """The twin in the session of a run.
+    """The twin in the session of a run, with the plant of the run.
 
     Args:
         twin: The twin of the run.
@@ -162,6 +197,8 @@ def in_session_of(twin: Twin, metadata: Mapping[str, str | int | float | bool]) 
     Raises:
         InputError: The metadata name no valid session.
     """
+    if "plant" in metadata:
+        twin = with_plant(twin, str(metadata["plant"]))
     if "session_seed" not in metadata:
         return in_session(twin, "survey")
     try:

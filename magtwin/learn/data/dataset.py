@@ -477,6 +477,9 @@ def _write(run: Run, source: Source, path: Path) -> Recording:
         seed = f"{metadata['session_seed']}-" if "session_seed" in metadata else ""
         session = f"{seed}{metadata['session']}"
     plant = str(metadata.get("plant", ""))
+    plant = "" if plant.partition(":")[0] == "nominal" else plant
+    if plant and session:
+        session = f"{plant}-{session}"
     return Recording(
         name=source.name,
         session=session or source.name,

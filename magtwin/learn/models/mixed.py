@@ -284,7 +284,7 @@ class _Fitter:
             for phi, drive in zip(self.phi, drives, strict=True)
         ]
         nominal = iter(range(len(drives)))
-        self.folds = [drive.plant.split("/")[0] or f"nominal {next(nominal) % FOLDS}" for drive in drives]
+        self.folds = [drive.plant.partition(":")[0] or f"nominal {next(nominal) % FOLDS}" for drive in drives]
 
     def without(self, left: Sequence[int]) -> Mixed:
         """The model fitted to training sessions other than those left out."""
