@@ -64,11 +64,8 @@ _NAMES = {
     "Twin": "twin",
     "author_scene": "twin",
     "build_dataset": "learning",
-<<<<<<< HEAD
     "calibrate": "learning",
-=======
     "draw_plant": "sim.plant_families",
->>>>>>> plants
     "error_budget": "learning",
     "evaluate": "learning",
     "export_scene": "export.package",
@@ -107,11 +104,8 @@ __all__ = [
     "Twin",
     "author_scene",
     "build_dataset",
-<<<<<<< HEAD
     "calibrate",
-=======
     "draw_plant",
->>>>>>> plants
     "error_budget",
     "evaluate",
     "export_scene",

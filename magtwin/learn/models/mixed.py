@@ -54,6 +54,10 @@ FOLDS = 5
 """Folds of the nominal plant's sessions when factors are fitted; another plant is a fold."""
 
 
+MOST_JUDGED = 6
+"""Most sessions of a fold that factors are fitted to."""
+
+
 @dataclass(kw_only=True, repr=False)
 class Mixed(Regressor):
     """A linear model with effects of the session, and the spread of its errors."""
@@ -303,7 +307,7 @@ class _Fitter:
             if all(i in left or not drive.learned for i, drive in enumerate(self.drives)):
                 continue
             model = self.without(left)
-            for i in left:
+            for i in left[:: math.ceil(len(left) / MOST_JUDGED)]:
                 for name, values in _judged(model, self.phi[i], self.drives[i]):
                     errors[name].append(values)
         return {
