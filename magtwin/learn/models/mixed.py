@@ -38,8 +38,8 @@ from magtwin.report import Figure
 Intervals = Literal["nominal", "unknown", "calibrated"]
 """What standard deviations hold for: the nominal plant, any plant, or the session of a drive."""
 
-FACTORS = ("unknown", "calibrated", "online")
-"""Ways of use that have a factor of the standard deviation."""
+FACTORS = ("calibrated", "online")
+"""Ways of use that have a factor of the standard deviation, at least 1."""
 
 DRIVE_S = 60.0
 """Length of the drive with which the factor of calibrated models is fitted [s]."""
@@ -76,6 +76,10 @@ class Mixed(Regressor):
 
     intervals: Intervals = "nominal"
 
+    families: int = 1
+    """Number of families of plants in the training, the nominal one included. An unknown plant may have the
+    effects of all at once."""
+
     factors: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(FACTORS, 1.0))
     """Factor c of the standard deviation by way of use, from plants left out of the fit."""
 
@@ -111,13 +115,16 @@ class Mixed(Regressor):
     def predict(self, x: ArrayLike) -> tuple[Array, Array]:
         """Disturbances and standard deviations of their errors [nT], each (N,), from features (N, F).
 
-        The standard deviation is the spread on nominal sessions, or c z sqrt(s^2 r(x) + phi' V phi).
+        The standard deviation is the spread on nominal sessions; of an unknown plant
+        sqrt(s^2 r(x) + K phi' Lambda phi) with K = `families`; after a drive c z sqrt(s^2 r(x) + phi' V phi).
         """
         phi = self.regressors(x)
         mean, variance = self.session.predict(phi)
         if self.intervals == "nominal":
             return mean, self.spread.sd_nt(phi[:, 1:])
-        factor = self.factors[self.intervals] * self.widening
+        if self.intervals == "unknown":
+            return mean, np.sqrt(self.noise_nt2(phi) + self.families * variance)
+        factor = self.factors["calibrated"] * self.widening
         return mean, factor * np.sqrt(self.noise_nt2(phi) + variance)
 
     def open_loop(self, *, unknown_plant: bool = False) -> "Mixed":
@@ -157,12 +164,12 @@ class Mixed(Regressor):
         return {
             **self.inputs.tensors(),
             **{
-                f"{name}_{part}": torch.as_tensor(np.ascontiguousarray(value))
+                f"{name}_{part}": torch.tensor(value)  # a copy: open loop, the two are one
                 for name, effects in (("prior", self.prior), ("session", self.session))
                 for part, value in (("mean_nt", effects.mean), ("covariance_nt2", effects.covariance))
             },
             **{
-                f"{name}_{part}": torch.as_tensor(np.asarray(value, float))
+                f"{name}_{part}": torch.tensor(value, dtype=torch.float64)
                 for name, spread in (("spread", self.spread), ("noise", self.noise))
                 for part, value in (("floor_nt2", spread.floor_nt2), ("slopes_nt2", spread.slopes_nt2))
             },
@@ -174,6 +181,7 @@ class Mixed(Regressor):
             "intervals": self.intervals,
             "widening": self.widening,
             "penalty": self.penalty,
+            "families": self.families,
             **{f"factor_{name}": self.factors[name] for name in FACTORS},
         }
 
@@ -254,6 +262,7 @@ class Mixeds:
         )
         fitter = _Fitter(model, drives)
         model = fitter.without(())
+        model.families = len({drive.family for drive in learned})
         model.factors = fitter.factors()
         return Fit(model)
 
@@ -276,6 +285,11 @@ class _Drive:
     t: Array
     """Time driven in the session [s], ascending."""
 
+    @property
+    def family(self) -> str:
+        """Family of the plant: "hysteresis" for "hysteresis:3"."""
+        return self.plant.partition(":")[0]
+
 
 class _Fitter:
     """Fits the prior to some sessions, and factors to the others."""
@@ -288,7 +302,7 @@ class _Fitter:
             for phi, drive in zip(self.phi, drives, strict=True)
         ]
         nominal = iter(range(len(drives)))
-        self.folds = [drive.plant.partition(":")[0] or f"nominal {next(nominal) % FOLDS}" for drive in drives]
+        self.folds = [drive.family or f"nominal {next(nominal) % FOLDS}" for drive in drives]
 
     def without(self, left: Sequence[int]) -> Mixed:
         """The model fitted to training sessions other than those left out."""
@@ -310,16 +324,13 @@ class _Fitter:
             for i in left[:: math.ceil(len(left) / MOST_JUDGED)]:
                 for name, values in _judged(model, self.phi[i], self.drives[i]):
                     errors[name].append(values)
-        return {
-            name: quantile_factor(
-                np.concatenate([error for error, _ in pairs]),
-                np.concatenate([sd for _, sd in pairs]),
-                np.repeat(np.arange(len(pairs)), [len(error) for error, _ in pairs]),
-            )
-            if pairs
-            else 1.0
-            for name, pairs in errors.items()
-        }
+        factors = dict.fromkeys(FACTORS, 1.0)
+        for name, pairs in errors.items():
+            if pairs:
+                error, sd = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
+                groups = np.repeat(np.arange(len(pairs)), [len(each) for each, _ in pairs])
+                factors[name] = max(quantile_factor(error, sd, groups), 1.0)
+        return factors
 
     def _start_nt2(self, chosen: Sequence[int]) -> float:
         """Variance of an effect to start EM from: a share of the mean square error of mu."""
@@ -331,8 +342,6 @@ class _Fitter:
 def _judged(model: Mixed, phi: Array, drive: _Drive) -> Iterator[tuple[str, tuple[Array, Array]]]:
     """Errors and standard deviations of a session without factor, by way of use [nT]."""
     noise = model.noise_nt2(phi)
-    mean, variance = model.prior.predict(phi)
-    yield "unknown", (mean - drive.y, np.sqrt(noise + variance))
     early = drive.t < drive.t[0] + DRIVE_S
     if not early.all():
         session = effects_of_drive(model.prior, phi[early], drive.y[early], noise[early], drive.t[early])
@@ -450,6 +459,7 @@ def mixed_of(weights: Weights) -> Mixed:
         intervals=intervals,  # type: ignore[arg-type]
         factors={name: weights.number(f"factor_{name}", above=0.0) for name in FACTORS},
         widening=weights.number("widening", above=0.0),
+        families=int(weights.number("families", above=0.0)),
         penalty=weights.number("penalty"),
         residual_sd_nt=weights.residual_sd_nt,
         metadata=dict(weights.about["facts"]),
