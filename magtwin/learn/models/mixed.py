@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.errors import InputError, find
+from magtwin.errors import InputError
 from magtwin.learn.data.inputs import Array, inputs_from, inputs_of, scaler_tensors
 from magtwin.learn.data.recording import Rows
 from magtwin.learn.models.calibration import Spread, quantile_factor
@@ -120,12 +120,19 @@ class Mixed(Regressor):
         """
         phi = self.regressors(x)
         mean, variance = self.session.predict(phi)
-        if self.intervals == "nominal":
+        factor, share = self.interval_factors
+        if not share:
             return mean, self.spread.sd_nt(phi[:, 1:])
-        if self.intervals == "unknown":
-            return mean, np.sqrt(self.noise_nt2(phi) + self.families * variance)
-        factor = self.factors["calibrated"] * self.widening
-        return mean, factor * np.sqrt(self.noise_nt2(phi) + variance)
+        return mean, factor * np.sqrt(self.noise_nt2(phi) + share * variance)
+
+    @property
+    def interval_factors(self) -> tuple[float, float]:
+        """Factor of the standard deviation, and of the variance of the effects; (1, 0) if nominal."""
+        return {
+            "nominal": (1.0, 0.0),
+            "unknown": (1.0, float(self.families)),
+            "calibrated": (self.factors["calibrated"] * self.widening, 1.0),
+        }[self.intervals]
 
     def open_loop(self, *, unknown_plant: bool = False) -> "Mixed":
         """The model without a drive.
@@ -138,7 +145,7 @@ class Mixed(Regressor):
             self, session=self.prior, intervals=intervals, widening=1.0, metadata=dict(self.metadata)
         )
 
-    def calibrated(self, phi: Array, y: Array, t: Array, extra_nt2: ArrayLike = 0.0) -> "Mixed":
+    def calibrated(self, phi: Array, y: Array, t: Array, extra_nt2: Array | float = 0.0) -> "Mixed":
         """The model in the session of a labelled drive.
 
         Args:
@@ -443,19 +450,24 @@ def mixed_of(weights: Weights) -> Mixed:
         if not np.allclose(covariance, covariance.T) or np.linalg.eigvalsh(covariance)[0] <= 0:
             raise InputError(f"{weights.path}: the covariance of its {name} is not positive definite")
     intervals = weights.expect("intervals", str)
-    find("kind of intervals", intervals, dict.fromkeys(get_args(Intervals)))
-    effects = {
-        name: Effects(held[f"{name}_mean_nt"], held[f"{name}_covariance_nt2"])
-        for name in ("prior", "session")
-    }
-    spreads = {
-        name: Spread(float(held[f"{name}_floor_nt2"]), held[f"{name}_slopes_nt2"])
-        for name in ("spread", "noise")
-    }
+    if intervals not in get_args(Intervals):
+        raise InputError(
+            f"{weights.path}: 'intervals' of its metadata must be one of {', '.join(get_args(Intervals))}, "
+            f"got {intervals!r}"
+        )
+
+    def effects(name: str) -> Effects:
+        return Effects(held[f"{name}_mean_nt"], held[f"{name}_covariance_nt2"])
+
+    def spread(name: str) -> Spread:
+        return Spread(float(held[f"{name}_floor_nt2"]), held[f"{name}_slopes_nt2"])
+
     return Mixed(
         inputs=inputs_from(weights.features, tensors, weights.path),
-        **effects,
-        **spreads,
+        prior=effects("prior"),
+        session=effects("session"),
+        spread=spread("spread"),
+        noise=spread("noise"),
         intervals=intervals,  # type: ignore[arg-type]
         factors={name: weights.number(f"factor_{name}", above=0.0) for name in FACTORS},
         widening=weights.number("widening", above=0.0),
