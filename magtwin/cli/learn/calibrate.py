@@ -5,20 +5,18 @@ from pathlib import Path
 from magtwin.cli.app import app
 from magtwin.cli.options import Flag, Force
 from magtwin.cli.terminal import Done, check_output, step
-from magtwin.errors import InputError
 
 
 @app.command
 def calibrate(
     weights: Path,
-    run: Path | None = None,
+    run: Path,
     *,
-    map: Path | None = None,  # noqa: A002
+    map: Path,  # noqa: A002
     out: Path,
     duration_s: float | None = None,
     pose_sd_m: float = 0.0,
     pose_from_map: Flag = False,
-    unknown_plant: Flag = False,
     force: Force = False,
 ) -> Done:
     """Calibrate a mixed model by a labelled drive at the start of a session.
@@ -42,22 +40,10 @@ def calibrate(
         Standard deviation of the drive's positions, each axis [m].
     pose_from_map
         The poses were estimated on the map: warn.
-    unknown_plant
-        In place of a drive: write weights whose intervals hold on robots other than the nominal one.
     """
-    from magtwin.learn.inference.calibrate import mixed_of_kind
-    from magtwin.learn.models.predictor import load_predictor
     from magtwin.learning import calibrate as calibrate_files
 
     check_output(out, (".safetensors",), "a network", force=force)
-    if unknown_plant:
-        if run is not None:
-            raise InputError("--unknown-plant takes the place of a drive; give one of them")
-        model = mixed_of_kind(load_predictor(weights)).open_loop(unknown_plant=True)
-        model.save(out, force=force)
-        return Done(model.report(str(out)), out)
-    if run is None or map is None:
-        raise InputError("name the drive and its map (--map), or give --unknown-plant")
     step("Calibrating")
     calibrated = calibrate_files(
         weights,

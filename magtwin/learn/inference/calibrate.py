@@ -177,7 +177,7 @@ def mixed_of_kind(model: Predictor) -> Mixed:
     """
     if not isinstance(model, Mixed):
         raise InputError(
-            f"a model of the kind {model.kind!r} cannot be calibrated; train one with --model mixed"
+            f"a model of the kind {model.kind!r} has no effects of a session; train one with --model mixed"
         )
     return model
 
