@@ -5,13 +5,17 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q install -c constraints.txt
 
+# The published survey and network, which `magtwin fetch aprilab` downloads; `make paper` uses them if they exist.
+SURVEYS ?= aprilab/map
+RELEASED ?= aprilab/models/nn_magnetometer_model_v0.0.1.pth
+
 # Largest size of the default install, PyTorch for CPU included [MiB].
 MOST_MB := 2700
 
 # Two processes whose linear algebra has threads of its own wait for each other more than they work.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 
-.PHONY: demo test test-slow readme simready ros physics lint bench wheel-test schema assets pictures clean help
+.PHONY: demo test test-slow readme simready ros physics lint paper bench wheel-test schema assets pictures clean help
 
 help:  ## Say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -51,6 +55,9 @@ lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies
 physics: $(VENV)/.dev  ## Drive converted robots in Newton (extra physics, 600 MB)
 	$(PIP) -e '.[dev,physics]'
 	$(BIN)/python -m pytest -m physics tests/sim/engines/test_newton.py tests/sim/engines/test_engine.py tests/export/test_engine_scripts.py tests/export/test_validate.py
+
+paper: $(VENV)/.dev  ## Measure the tables of docs/results.md and README again (up to an hour)
+	$(BIN)/python docs/results.py $(if $(wildcard $(SURVEYS)),--surveys $(SURVEYS)) $(if $(wildcard $(RELEASED)),--released $(RELEASED))
 
 bench: $(VENV)/.dev  ## Compare with peers; prints ratios
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done

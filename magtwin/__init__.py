@@ -24,9 +24,8 @@ if TYPE_CHECKING:
     from magtwin.field.maps.map import AnomalyMap as AnomalyMap
     from magtwin.field.survey.readings import Readings as Readings
     from magtwin.figures.plot import plot as plot
-    from magtwin.io.formats import read_run as load_run
-    from magtwin.io.formats import write_run as save_run
-    from magtwin.io.provenance import repeat_of as reproduce
+    from magtwin.io.formats import read_run, write_run
+    from magtwin.io.provenance import repeat_of
     from magtwin.io.surveys.survey import read_survey as read_survey
     from magtwin.io.sweeps import save_runs as save_runs
     from magtwin.learn.models.predictor import load_predictor as load_predictor
@@ -51,6 +50,8 @@ if TYPE_CHECKING:
     from magtwin.twin import sweep as sweep
     from magtwin.usd.maps import load_map as load_map
     from magtwin.usd.maps import save_map as save_map
+
+    load_run, save_run, reproduce = read_run, write_run, repeat_of
 
 _NAMES = {
     "AnomalyMap": "field.maps.map",
@@ -92,44 +93,7 @@ _NAMES = {
 }
 """Module of each public name, and its name there if it differs."""
 
-__all__ = [
-    "COLUMNS",
-    "AnomalyMap",
-    "InputError",
-    "MismatchWarning",
-    "PlantSpec",
-    "Readings",
-    "Run",
-    "Scene",
-    "Twin",
-    "author_scene",
-    "build_dataset",
-    "calibrate",
-    "draw_plant",
-    "error_budget",
-    "evaluate",
-    "export_scene",
-    "fit_map",
-    "from_urdf",
-    "in_session",
-    "load_map",
-    "load_predictor",
-    "load_run",
-    "new_scene",
-    "open_twin",
-    "plot",
-    "read_survey",
-    "reproduce",
-    "save_map",
-    "save_run",
-    "save_runs",
-    "scene_from_toml",
-    "simulate",
-    "simulate_robots",
-    "sweep",
-    "train",
-    "validate",
-]
+__all__ = sorted(_NAMES)
 
 
 def __getattr__(name: str) -> object:
@@ -140,4 +104,4 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return __all__

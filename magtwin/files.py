@@ -5,8 +5,8 @@ import difflib
 import errno
 import hashlib
 import os
-import re
 import shutil
+import subprocess
 import tempfile
 import tomllib
 import types
@@ -22,8 +22,6 @@ T = TypeVar("T")
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors of a disk that is full or read-only."""
-
-_COMMIT = re.compile("[0-9a-f]{40}|[0-9a-f]{64}")
 
 
 def shipped(*parts: str) -> Path:
@@ -123,43 +121,24 @@ def sha256(path: str | os.PathLike[str]) -> str:
 
 
 def git_revision(folder: str | os.PathLike[str]) -> str:
-    """The commit of the Git checkout that contains a folder, or "" if there is none.
-
-    It is read from `.git` itself, without starting a program.
-    """
-    for place in (here := Path(folder).resolve(), *here.parents):
-        git = place / ".git"
-        try:
-            if git.is_file():  # a worktree or a submodule, whose folder is elsewhere
-                git = place / git.read_text(encoding="utf-8").removeprefix("gitdir:").strip()
-            elif not git.is_dir():
-                continue
-            return _commit_of(git)
-        except (OSError, UnicodeDecodeError):
-            return ""
-    return ""
-
-
-def _commit_of(git: Path) -> str:
-    """The commit of HEAD, or "" if there is none yet."""
-    head = (git / "HEAD").read_text(encoding="utf-8").strip()
-    if _COMMIT.fullmatch(head):
-        return head
-    name = head.removeprefix("ref:").strip()
-    if not re.fullmatch(r"refs(/[^/\s]+)+", name) or ".." in name:
+    """The commit of the Git checkout that contains a folder, or "" if there is none, or no git."""
+    command = [
+        "git",
+        "-c",
+        "safe.directory=*",
+        "-C",
+        os.fspath(folder),
+        "rev-parse",
+        "--verify",
+        "-q",
+        "HEAD",
+    ]
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    except OSError:
         return ""
-    shared = git / "commondir"
-    common = git / shared.read_text(encoding="utf-8").strip() if shared.is_file() else git
-    for place in (git, common):
-        if (place / name).is_file():
-            commit = (place / name).read_text(encoding="utf-8").strip()
-            return commit if _COMMIT.fullmatch(commit) else ""
-    packed = common / "packed-refs"
-    for line in packed.read_text(encoding="utf-8").splitlines() if packed.is_file() else ():
-        commit, _, ref = line.partition(" ")
-        if ref == name and _COMMIT.fullmatch(commit):
-            return commit
-    return ""
+    return done.stdout.strip() if done.returncode == 0 else ""
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -27,8 +27,10 @@ from magtwin.sim.motion.drive_input import drive_input
 from magtwin.sim.runs.simulate import Predict
 from magtwin.sim.runs.stepped import SENSED, SteppedRobots
 from magtwin.sim.session import draw_session
+from magtwin.spec.plant import PlantSpec
 from magtwin.spec.scene import Scene
-from magtwin.twin import Kind, Twin, open_twin, room_of, without_model_error
+from magtwin.twin import Kind, Twin, room_of, with_plant
+from magtwin.twin.opening import opened
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.magnetometer import NeuralMagnetometer
@@ -129,6 +131,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         end_on_bump: bool = False,
         random_start: bool = False,
         session: Literal["drawn", "survey"] = "drawn",
+        plant: PlantSpec | str | None = None,
         render_mode: None = None,
     ) -> None:
         """Open a scene for several robots.
@@ -150,6 +153,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             session: "drawn": each episode is a new session, from `magtwin.sim.session.draw_session`: charge,
                 IMU zero, LiDAR's phase, wheels, odometry and the robot's own field. "survey": the robot as
                 in the survey of the map. A Twin that is in a session stays in it.
+            plant: As for `magtwin.simulate`; all robots and episodes have the same constants.
             render_mode: Must be None.
 
         Raises:
@@ -159,15 +163,14 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             raise InputError("MagNav needs a scene: gymnasium.make('magtwin/MagNav-v0', scene='lab.usda')")
         if render_mode is not None:
             raise InputError(f"MagNav has no render_mode, got {render_mode!r}; write a Run and view that")
-        if isinstance(scene, Twin) and (network is not None or magnetometer is not None):
-            raise InputError("give `network` and `magnetometer` to open_twin, since scene is a Twin")
-        if isinstance(scene, Twin):
-            twin = scene if model_error else without_model_error(scene)
-        else:
-            twin = open_twin(scene, network=network, magnetometer=magnetometer, model_error=model_error)
+        twin = with_plant(opened(scene, network, magnetometer, model_error, "MagNav"), plant)
         check_field(twin.scene, twin.field)
-        if twin.magnetometer:
-            _check_network(twin.magnetometer)
+        network_read = twin.magnetometer
+        if network_read and (missing := sorted(network_read.columns - SENSED)):
+            raise InputError(
+                f"{network_read.name}: reads {', '.join(missing)}, which MagNav does not simulate; give a "
+                'network of other inputs, such as the set "gradient", or take magnetometer="physical"'
+            )
         robot = twin.scene.robot
         line = drive_input(path, room_of(twin))
         if not isinstance(line, Path):
@@ -190,7 +193,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             anomaly_map=twin.field,
             obstacles=twin.obstacles,
             step_s=step_s,
-            disturbance_nt=_predictions(twin.magnetometer) if twin.magnetometer else None,
+            disturbance_nt=_predictions(network_read) if network_read else None,
             model_error=twin.model_error,
         )
         self.num_envs, self.reward, self.end_on_bump = num_envs, reward, end_on_bump
@@ -335,15 +338,6 @@ def _predictions(network: "NeuralMagnetometer") -> Predict:
     return predictions
 
 
-def _check_network(network: "NeuralMagnetometer") -> None:
-    """Refuse a network whose inputs are not simulated here."""
-    if missing := sorted(network.columns - SENSED):
-        raise InputError(
-            f"{network.name}: reads {', '.join(missing)}, which MagNav does not simulate; give a network of "
-            'other inputs, such as those of the set "gradient", or take magnetometer="physical"'
-        )
-
-
 def _first(infos: dict[str, Any]) -> dict[str, Any]:
     """The info of the first robot."""
     return {name: values[0] for name, values in infos.items() if not name.startswith("_")}
@@ -367,7 +361,5 @@ def _on_path(path: Path, s: Array, p_xy: Array) -> tuple[Array, Array]:
 
 
 gymnasium.register(
-    "magtwin/MagNav-v0",
-    entry_point="magtwin.gym:MagNavEnv",
-    vector_entry_point="magtwin.gym:MagNavVectorEnv",
+    "magtwin/MagNav-v0", entry_point="magtwin.gym:MagNavEnv", vector_entry_point="magtwin.gym:MagNavVectorEnv"
 )

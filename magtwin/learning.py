@@ -35,7 +35,7 @@ from magtwin.learn.evaluation.candidates import (
 )
 from magtwin.learn.evaluation.evaluate import evaluate as judge
 from magtwin.learn.evaluation.evaluation import Evaluation
-from magtwin.learn.evaluation.trials import Trial, check_apart, trials_of, unlearned, unseen
+from magtwin.learn.evaluation.trials import check_apart, trials_of, unlearned, unseen
 from magtwin.learn.inference.calibrate import calibrate as calibrate_model
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.models.mixed import Mixed
@@ -155,23 +155,25 @@ def evaluate(
 
     Args:
         models: Weights files, predictors or candidates.
-        recordings: A data set or its folder (its recordings that no model learned from), runs by name, or
-            files of runs.
-        anomaly_map: Maps that the models were trained on, each found by its checksum. The first is the
-            baseline's, and that of weights that record no map.
+        recordings: A data set or its folder, a mapping of runs by name, or files of runs. Of a data set,
+            only the recordings that no model was trained on are used.
+        anomaly_map: Maps that the models were trained on, each found by its checksum. The baseline
+            uses the first map. So do weights that do not name the map that they were trained on.
         baseline: The model that others are compared with: the mean training label, Tolles and Lawson's ridge
             regression, or a candidate.
-        train: Data set that baselines are fitted to. With it, Tolles and Lawson's are evaluated on each map.
-            Default: the mean label in weights that were trained on the first map.
-        cases: Paths by row of the table, beside the paper's A to E, as {"D": "lawnmower.csv"}.
-        any_map: Use the first map for weights whose own is not at hand.
+        train: Data set that baselines are fitted to. If given, the Tolles-Lawson regression is also
+            evaluated on each map. Without it, the mean label is taken from weights that were trained on the
+            first map.
+        cases: Rows of the table to add to the paper's A to E, or to replace there: name of the row and path,
+            such as {"D": "lawnmower.csv"}.
+        any_map: Use the first map for weights whose own map is not among those given.
         truth: Compare with the exact field of simulated runs instead of the reading.
-        seed: Seed of the intervals.
-        progress: Called with the recordings done, their number, and the name of the next.
+        seed: Seed of the random resampling that gives the confidence intervals.
+        progress: Called as progress(recordings done, total, name of the next recording).
 
     Raises:
-        InputError: A file cannot be read, a model's map is not at hand, it learned from a recording, or a
-            recording lacks what a model or the evaluation needs.
+        InputError: A file cannot be read; the map of a model is not given; a model was trained on one of
+            these recordings; or a recording lacks a column that a model or the evaluation needs.
     """
     maps = _named_maps([anomaly_map] if _single(anomaly_map) else anomaly_map)  # type: ignore[arg-type,list-item]
     given: list[Any] = [models] if _single(models) or _is_model(models) else list(models)  # type: ignore[arg-type]
@@ -383,15 +385,15 @@ def _trials(
     recordings: Dataset | Mapping[str, Run] | Sequence[File] | File,
     learning: Dataset | None,
     candidates: Sequence[Candidate],
-) -> tuple[list[Trial], Sequence[str]]:
+) -> tuple[list[Source], Sequence[str]]:
     """Recordings to judge by, and the training recordings that baselines are fitted to."""
     learned: Sequence[str] = () if learning is None else learning.names
     is_set = isinstance(recordings, str | os.PathLike) and (Path(recordings) / MANIFEST).is_file()
     if not (isinstance(recordings, Dataset) or is_set):
         if isinstance(recordings, Mapping):
-            trials = [Trial(name, lambda run=run: run) for name, run in recordings.items()]  # type: ignore[misc]
+            trials = [Source(name, lambda run=run: run) for name, run in recordings.items()]  # type: ignore[misc]
         else:
-            trials = [Trial(source.name, source.read) for source in sources_of_files(recordings)]  # type: ignore[arg-type]
+            trials = sources_of_files(recordings)  # type: ignore[arg-type]
         return trials if learning is None else unlearned(trials, learning), learned
     judged = _dataset(recordings)  # type: ignore[arg-type]
     names, rest = unseen(judged, candidates)

@@ -17,10 +17,10 @@ from magtwin.field.survey.readings import Readings
 from magtwin.files import shipped
 from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import build_dataset
+from magtwin.learn.data.recording import Source
 from magtwin.learn.data.split import split
 from magtwin.learn.evaluation.candidates import Candidate, Mean, named_map
 from magtwin.learn.evaluation.evaluate import evaluate
-from magtwin.learn.evaluation.trials import Trial
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.models.predictor import load_predictor
 from magtwin.learn.training.config import TrainConfig
@@ -64,7 +64,7 @@ def learnt(twin, run, tmp_path_factory):
     chart = named_map("lab", twin.field)
     baseline = Candidate("naive", Mean(0.0, 1.0), chart)
     models = [Candidate("net", NeuralMagnetometer(trained.predictor), chart)]
-    trials = [Trial(name, lambda run=run: run) for name, run in runs.items()]
+    trials = [Source(name, lambda run=run: run) for name, run in runs.items()]
     return (
         data,
         parts,

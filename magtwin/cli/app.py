@@ -93,7 +93,6 @@ def share_options(group: App = app) -> None:
 def _with_output_options(command: App, function: Callable[..., Any]) -> Callable[..., Any]:
     """A command's function that takes --json and --quiet too, and shows the `Done` that it returns."""
     signature = inspect.signature(function)
-    own = [name for name in ("json", "quiet") if name in signature.parameters]
 
     @functools.wraps(function)
     def wrapped(*args: Any, json: bool = False, quiet: bool = False, **options: Any) -> None:
@@ -101,19 +100,19 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
             if argument.name.startswith("--"):
                 _flags[argument.name.removeprefix("--").replace("-", "_")] = argument.name
         _flags.update({name: _flags[key] for name, key in ALIASES.items() if key in _flags})
-        given = {"json": json, "quiet": quiet}
-        with output_mode(json=json, quiet=quiet):
-            done = function(*args, **options, **{name: given[name] for name in own})
+        with output_mode(as_json=json, quiet=quiet):
+            done = function(*args, **options)
             if isinstance(done, Done):
                 done.show()
 
-    parameters = [p for p in signature.parameters.values() if p.name not in ("json", "quiet")]
     added = {"json": Json, "quiet": Quiet}
-    for name, annotation in added.items():
-        parameters.append(
-            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=annotation)
-        )
-    wrapped.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    parameters = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=annotation)
+        for name, annotation in added.items()
+    ]
+    wrapped.__signature__ = signature.replace(  # type: ignore[attr-defined]
+        parameters=[*signature.parameters.values(), *parameters]
+    )
     wrapped.__annotations__ = {**function.__annotations__, **added}
     return wrapped
 

@@ -27,17 +27,7 @@ ADDS = {
 }
 """What each extra is for."""
 
-PACKAGES = (
-    "usd-core",
-    "rerun-sdk",
-    "torch",
-    "numpy",
-    "scipy",
-    "numba",
-    "pyarrow",
-    "rosbags",
-    "cyclopts",
-)
+PACKAGES = ("usd-core", "rerun-sdk", "torch", "numpy", "scipy", "numba", "pyarrow", "rosbags", "cyclopts")
 """Packages whose version matters in a report of a fault."""
 
 DRIVERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
@@ -50,7 +40,12 @@ def doctor() -> Done:
     from magtwin.report import Report
 
     found = diagnose()
-    extras = {name: _line(extra) for name, extra in found["extras"].items()}
+    extras = {
+        name: f"installed: {extra['adds']}"
+        if extra["installed"]
+        else f"missing: {extra['adds']}; {extra['install']}"
+        for name, extra in found["extras"].items()
+    }
     return Done(
         Report(
             f"magtwin {found['magtwin']}, Python {found['python']}",
@@ -62,10 +57,12 @@ def doctor() -> Done:
 
 def diagnose() -> dict[str, Any]:
     """Versions, tools and extras of this installation, as a table for JSON."""
+    drivers = [file.stem for folder in DRIVERS for file in sorted(Path(folder).glob("*.json"))]
+    vulkan = ", ".join(drivers) if find_library("vulkan") else ""
     tools = (
         ("Rerun viewer", shutil.which("rerun"), "pip install rerun-sdk"),
         ("usdview", shutil.which("usdview"), "a build of OpenUSD; magtwin view opens a window without it"),
-        ("Vulkan", _vulkan(), "apt install mesa-vulkan-drivers libvulkan1; pictures of recordings need it"),
+        ("Vulkan", vulkan, "apt install mesa-vulkan-drivers libvulkan1; pictures of recordings need it"),
         ("Newton", _version("newton"), "pip install 'magtwin[physics]'"),
         ("ROS 2, rclpy", find_spec("rclpy") and "installed", "source a ROS 2 installation"),
         ("ROS 2, cyclonedds", _version("cyclonedds"), "pip install 'magtwin[ros]'"),
@@ -103,23 +100,9 @@ def _extras() -> dict[str, dict[str, Any]]:
     return extras
 
 
-def _line(extra: dict[str, Any]) -> str:
-    return (
-        f"installed: {extra['adds']}"
-        if extra["installed"]
-        else f"missing: {extra['adds']}; {extra['install']}"
-    )
-
-
 def _version(package: str) -> str:
     """Version of an installed package, "" if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:
         return ""
-
-
-def _vulkan() -> str:
-    """Vulkan drivers of this machine, "" if there are none or no loader."""
-    drivers = [file.stem for folder in DRIVERS for file in sorted(Path(folder).glob("*.json"))]
-    return ", ".join(drivers) if find_library("vulkan") else ""

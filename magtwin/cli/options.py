@@ -1,9 +1,12 @@
 """Options that several commands share: one type and one help text for each."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
+
+from magtwin.errors import InputError
 
 
 def _whole(kind: type, tokens: Any) -> int:
@@ -25,6 +28,20 @@ def _session(kind: Any, tokens: Any) -> int | str:
         raise ValueError(f"a session is a whole number, or survey; got {text!r}") from None
 
 
+def pairs(
+    option: str, texts: list[str] | None, form: str = "NAME=VALUE", *, empty: bool = False
+) -> dict[str, str]:
+    """NAME=VALUE or NAME:=VALUE texts of an option as a table; `form` is shown if one is wrong."""
+    table: dict[str, str] = {}
+    for text in texts or ():
+        name, equals, value = text.partition("=")
+        name = name.removesuffix(":")
+        if not (name and equals and (value or empty)) or name in table:
+            raise InputError(f"--{option} takes {form}, each once, got {text!r}")
+        table[name] = value
+    return table
+
+
 Whole = Annotated[int, Parameter(converter=_whole)]
 Flag = Annotated[bool, Parameter(negative="")]
 Names = Annotated[list[str] | None, Parameter(consume_multiple=True)]
@@ -40,16 +57,23 @@ Session = Annotated[
     int | Literal["survey"] | None,
     Parameter(
         converter=_session,
-        help="Session to draw from the seed. Sessions differ in battery charge, IMU offsets, wheels, "
-        "odometry and the robot's own field. survey: the robot as it was when the map was surveyed. "
-        "Default: 0.",
+        help="Number of the session. It and the seed determine battery charge, IMU offsets, wheels, odometry "
+        "and the robot's own field. survey: the robot as it was when the map was surveyed. Default: 0.",
+    ),
+]
+Plant = Annotated[
+    str | None,
+    Parameter(
+        name="--plant",
+        help="Field of the robot beyond its linear platform model: hysteresis, warm-up, nonlinear, "
+        "moving-part, drawn, all or nominal; NAME:SEED draws other constants. Default: the scene's.",
     ),
 ]
 Network = Annotated[
     Path | None,
     Parameter(
         name="--network",
-        help="Network of the magnetometer (.safetensors or .pth). none: a physical magnetometer. "
+        help="Network of the magnetometer (.safetensors, .pth). The word none selects a physical one. "
         "Default: the scene's.",
     ),
 ]
@@ -93,6 +117,7 @@ UsdFps = Annotated[
 RunScene = Annotated[
     Path | None, Parameter(help="Scene of the run. Default: the one that the run's metadata names.")
 ]
+OURS_THEIRS = "OURS:=THEIRS, such as /robot/enu/pose:=/vrpn/pose"
 Remap = Annotated[
     list[str] | None,
     Parameter(
@@ -106,3 +131,19 @@ Gamepad = Annotated[
         help="Linux gamepad such as /dev/input/js0. The left stick drives, Start ends. Default: the keyboard."
     ),
 ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensing:
+    """How a simulated robot reads its sensors; options of `magtwin run` and `magtwin sweep`."""
+
+    network: Network = None
+    magnetometer: Magnetometer = None
+    model_error: ModelError = True
+    rate_hz: RateHz = None
+    lidar: Lidar = "schedule"
+    outside: Outside = "nan"
+
+
+SensingOptions = Annotated[Sensing, Parameter(name="*")]
+SENSING = Sensing()

@@ -9,8 +9,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass, field
 from threading import Event, Lock, Thread
-from typing import Any, Protocol, TextIO
+from typing import Any, TextIO
 
 FIRST_S = 1.5
 """Silence after which the first line is printed [s]."""
@@ -31,39 +32,28 @@ LATE = 3.0
 """... and so many times the usual time between reports."""
 
 
-class Advance(Protocol):
-    """What commands call, and hand down to libraries as `progress`."""
-
-    def __call__(self, done: float, total: float | None, what: str = "") -> None:
-        """Report `done` of `total`, and in a word what comes next or how it goes."""
+Advance = Callable[..., None]
+"""What commands call and hand down to libraries as `progress`: `advance(done, total, what)`."""
 
 
+@dataclass
 class Step:
-    """Something that is being done, and how far it has got.
+    """Something that is being done, and how far it has got; times are those of the watch's clock [s]."""
 
-    Attributes:
-        title: What is being done, such as "Drawing frames".
-        unit: What is counted, such as "frames"; may be empty.
-        done: How many are done.
-        total: Of how many; None or 0 if that is unknown.
-        what: A detail for people.
-    """
-
-    def __init__(self, title: str, unit: str, now: float) -> None:
-        """Begin at a time `now` [s]."""
-        self.title, self.unit = title, unit
-        self.done: float = 0
-        self.total: float | None = None
-        self.what = ""
-        self._began = now
-        self._seen: deque[tuple[float, float]] = deque()
+    title: str
+    unit: str
+    began: float
+    done: float = 0
+    total: float | None = None
+    what: str = ""
+    seen: deque[tuple[float, float]] = field(default_factory=deque)
 
     def advance(self, now: float, done: float, total: float | None, what: str = "") -> None:
         """Take a report at a time `now` [s]."""
+        seen = self.seen
         if done < self.done:
-            self._seen.clear()  # another loop has begun
+            seen.clear()  # another loop has begun
         self.done, self.total, self.what = done, total, what
-        seen = self._seen
         if not seen or now - seen[-1][0] > TICK_S or len(seen) == 1:
             seen.append((now, done))
         else:
@@ -73,36 +63,30 @@ class Step:
 
     def rate(self, now: float) -> float | None:
         """How many are done a second; None while that is unknown, or no report came for long."""
-        if len(self._seen) < 2:
+        if len(self.seen) < 2:
             return None
-        (first, before), (last, after) = self._seen[0], self._seen[-1]
+        (first, before), (last, after) = self.seen[0], self.seen[-1]
         if after <= before or last <= first:
             return None
         rate = (after - before) / (last - first)
-        return rate if now - last < max(LATE_S, LATE * (last - first) / (len(self._seen) - 1)) else None
+        return rate if now - last < max(LATE_S, LATE * (last - first) / (len(self.seen) - 1)) else None
 
     def left_s(self, now: float) -> float | None:
         """Time left at a time `now` [s], None while that is unknown."""
         rate = self.rate(now)
         if rate is None or not self.total or self.done >= self.total:
             return None
-        return max(0.0, (self.total - self.done) / rate - (now - self._seen[-1][0]))
+        return max(0.0, (self.total - self.done) / rate - (now - self.seen[-1][0]))
 
     def line(self, now: float) -> str:
         """The step in a line, at a time `now` [s]."""
-        parts = []
-        if self.total:
-            counts = f"{self.done:,.0f} of {self.total:,.0f}"
-            parts.append(f"{counts} {self.unit}".strip())
-        elif self.done:
-            parts.append(f"{self.done:,.0f} {self.unit}".strip())
-        parts.append(self.speed(now))
-        left, gone = self.left_s(now), now - self._began
-        if left is not None:
-            parts.append(f"{in_words(left)} left")
-        elif gone >= 1:
-            parts.append(f"{in_words(gone)} so far")
-        text = ", ".join(part for part in (*parts, self.what) if part)
+        count = f"{self.done:,.0f}" if self.done or self.total else ""
+        count += f" of {self.total:,.0f}" if self.total else ""
+        left, gone = self.left_s(now), now - self.began
+        time_text = f"{in_words(gone)} so far" if gone >= 1 else ""
+        time_text = time_text if left is None else f"{in_words(left)} left"
+        counted = f"{count} {self.unit}".strip() if count else ""
+        text = ", ".join(part for part in (counted, self.speed(now), time_text, self.what) if part)
         return f"{self.title}: {text}" if text else f"{self.title} ..."
 
     def speed(self, now: float) -> str:
@@ -129,22 +113,10 @@ def in_words(seconds: float) -> str:
 class Watch:
     """What one command is doing, and when it last printed a line about it."""
 
-    def __init__(
-        self,
-        *,
-        stream: TextIO | None = None,
-        clock: Callable[[], float] = time.monotonic,
-        terminal: bool | None = None,
-    ) -> None:
-        """Begin to watch.
-
-        Args:
-            stream: Where lines go. None: stderr as it is at that time.
-            clock: Gives the time [s].
-            terminal: Whether bars can be drawn. None: whether stderr is a terminal.
-        """
+    def __init__(self, *, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic) -> None:
+        """Begin to watch. Lines go to `stream`, by default stderr; bars are drawn if that is a terminal."""
         self._stream, self._clock = stream, clock
-        self._terminal = (sys.stderr.isatty() if stream is None else False) if terminal is None else terminal
+        self._terminal = stream is None and sys.stderr.isatty()
         self._printed = clock()
         self._reported = -float("inf")
         self._base = Step("Starting", "", self._printed)
@@ -153,19 +125,7 @@ class Watch:
         self._silent = 0
         self._announces, self._mute = True, False
         self._lock = Lock()
-        self._end = Event()
-        self._thread: Thread | None = None
-
-    def start(self) -> None:
-        """Watch from a thread of its own."""
-        self._thread = Thread(target=self._run, name="magtwin-progress", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Print nothing any more."""
-        self._end.set()
-        if self._thread is not None:
-            self._thread.join()
+        self.end = Event()
 
     @contextmanager
     def reduced(self, *, steps: bool, all: bool) -> Iterator[None]:  # noqa: A002
@@ -219,7 +179,7 @@ class Watch:
         """Print a line if one is due."""
         with self._lock:
             now = self._clock()
-            if self._silent or self._mute or self._bar is not None or self._end.is_set():
+            if self._silent or self._mute or self._bar is not None or self.end.is_set():
                 return
             if now - self._printed < FIRST_S or now - self._reported < EVERY_S:
                 return
@@ -227,8 +187,9 @@ class Watch:
             self._print(f"  {step.line(now)}")
             self._printed = self._reported = now
 
-    def _run(self) -> None:
-        while not self._end.wait(TICK_S):
+    def run(self) -> None:
+        """Print the lines that are due until `end` is set."""
+        while not self.end.wait(TICK_S):
             self.tick()
 
     def _print(self, line: str) -> None:
@@ -281,12 +242,14 @@ _watches: list[Watch] = []
 def watched() -> Iterator[Watch]:
     """Watch a command until its end."""
     watch = Watch()
+    thread = Thread(target=watch.run, name="magtwin-progress", daemon=True)
     _watches.append(watch)
-    watch.start()
+    thread.start()
     try:
         yield watch
     finally:
-        watch.stop()
+        watch.end.set()
+        thread.join()
         _watches.remove(watch)
 
 
@@ -306,12 +269,7 @@ def step(text: str) -> None:
 
 
 def progress(title: str, unit: str = "") -> Any:
-    """Report progress with rate and time left; gives `advance(done, total, what)`.
-
-    Args:
-        title: What is being done.
-        unit: What is counted, such as "runs".
-    """
+    """Report progress, counted in `unit`, with rate and time left; gives `advance(done, total, what)`."""
     return current().progress(title, unit)
 
 

@@ -19,6 +19,7 @@ from magtwin.cli.options import (
     ModelError,
     Network,
     OutUnit,
+    Plant,
     RateHz,
     Seed,
     Session,
@@ -82,8 +83,7 @@ WallS = Annotated[float | None, Parameter(help="Duration in real time [s]. Defau
 SimTime = Annotated[bool, Parameter(negative="", help="Use the time of /clock, for a simulated robot.")]
 Stamped = Annotated[bool, Parameter(negative="", help="cmd_vel is a TwistStamped in place of a Twist.")]
 Asset = Annotated[
-    Path | None,
-    Parameter(help="USD asset of the robot, whose limits are kept. Default: the TurtleBot 4."),
+    Path | None, Parameter(help="USD asset of the robot, whose limits are kept. Default: the TurtleBot 4.")
 ]
 
 
@@ -96,6 +96,7 @@ def sim(
     duration_s: float | None = None,
     seed: Seed = 0,
     session: Session = None,
+    plant: Plant = None,
     network: Network = None,
     magnetometer: Literal["physical", "neural", "map-only", "none"] | None = None,
     model_error: ModelError = True,
@@ -125,11 +126,12 @@ def sim(
         Time of the messages: sim, from 0, or wall.
     """
     from magtwin.ros.simulate import Simulator
-    from magtwin.twin import open_twin
+    from magtwin.twin import open_twin, with_plant
 
     announce(f"opening {scene}")
     kind = None if magnetometer == "none" else magnetometer
     twin = open_twin(scene, network=network, magnetometer=kind, model_error=model_error)
+    twin = with_plant(twin, plant)
     with where.bus("magtwin_sim", duration_s=duration_s) as bus:
         node = Simulator(
             twin,
@@ -159,11 +161,7 @@ def sim(
 
 @ros_app.command(name="magnetometer", usage="Usage: magtwin ros magnetometer [OPTIONS] SCENE [SETTING...]")
 def magnetometer(
-    scene: Path,
-    *settings: str,
-    where: Where = HERE,
-    network: Network = None,
-    duration_s: WallS = None,
+    scene: Path, *settings: str, where: Where = HERE, network: Network = None, duration_s: WallS = None
 ) -> Done:
     """Run the magnetometer alone: read a robot's sensors through map and network, and publish the field.
 

@@ -1,6 +1,7 @@
 """Output of commands: reports on stdout, one JSON document with --json, nothing with --quiet."""
 
 import io
+import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -37,28 +38,23 @@ class Done:
 
     def show(self) -> None:
         """Print it, as JSON if --json was given, and exit if the status is not 0."""
-        wrote = self.wrote if isinstance(self.wrote, tuple) else (self.wrote,)
+        wrote = [str(path) for path in (self.wrote if isinstance(self.wrote, tuple) else (self.wrote,))]
         if _mode.json:
-            self._show_json([str(path) for path in wrote])
+            data = self.data
+            if data is None:
+                data = {} if self.report is None else json.loads(self.report.to_json())
+            if wrote and isinstance(data, dict):
+                data = {**data, "wrote": wrote}
+            print(json.dumps(data, indent=2, ensure_ascii=False))  # noqa: T201
         else:
             if self.table is not None:
                 self.table()
             elif self.report is not None:
                 print_report(self.report)
             if self.text or wrote:
-                say(self.text or f"Wrote {', '.join(map(str, wrote))}")
+                say(self.text or f"Wrote {', '.join(wrote)}")
         if self.status:
             sys.exit(self.status)
-
-    def _show_json(self, wrote: list[str]) -> None:
-        import json
-
-        data = self.data
-        if data is None and self.report is not None:
-            data = json.loads(self.report.to_json())
-        if wrote and (data is None or isinstance(data, dict)):
-            data = {**(data or {}), "wrote": wrote}
-        print(json.dumps({} if data is None else data, indent=2, ensure_ascii=False))  # noqa: T201
 
 
 @dataclass
@@ -73,12 +69,12 @@ _mode = _Mode()
 
 
 @contextmanager
-def output_mode(*, json: bool, quiet: bool) -> Iterator[None]:
+def output_mode(*, as_json: bool, quiet: bool) -> Iterator[None]:
     """Print JSON, or nothing, until the end of the block."""
     before = _mode.json, _mode.quiet
-    _mode.json, _mode.quiet = json, quiet
+    _mode.json, _mode.quiet = as_json, quiet
     try:
-        with current().reduced(steps=json or quiet, all=quiet):
+        with current().reduced(steps=as_json or quiet, all=quiet):
             yield
     finally:
         _mode.json, _mode.quiet = before
@@ -144,11 +140,8 @@ def check_output(path: Path | None, suffixes: tuple[str, ...], what: str, *, for
         check_free(path, force=force)
 
 
-def print_report(report: Any, as_json: bool = False) -> None:
-    """Print a report: a table for people, its JSON for scripts."""
-    if as_json or _mode.json:
-        print(report.to_json())  # noqa: T201
-        return
+def print_report(report: Any) -> None:
+    """Print a report as tables."""
     from rich.table import Table
     from rich.text import Text
 

@@ -28,7 +28,7 @@ def parse_day(day: str | datetime.date, what: str = "date") -> datetime.date:
 
 
 def check_day(day: str, what: str) -> None:
-    """Raise InputError unless a text is a day YYYY-MM-DD or empty; the error begins with `what`."""
+    """Raise InputError unless a text is a day YYYY-MM-DD or empty; the text begins with `what`."""
     if day != "":
         parse_day(day, what)
 

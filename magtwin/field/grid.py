@@ -1,6 +1,7 @@
 """Grid: the nodes over x, y and heading of gridded surveys and of maps."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,37 +24,15 @@ class Grid(Summarized):
     headings_rad[h].
     """
 
-    origin_m: tuple[float, float]
-    """World x and y of node [0, 0] [m]."""
-
-    cell_m: tuple[float, float]
-    """Distance between nodes along x and y [m]."""
-
-    headings_rad: tuple[float, ...]
-    """Headings [rad], ascending in [0, 2 pi)."""
-
-    rows: int
-    """Number of nodes along y."""
-
-    columns: int
-    """Number of nodes along x."""
+    origin_m: tuple[float, float]  # World x and y of node [0, 0] [m]
+    cell_m: tuple[float, float]  # Distance between nodes along x and y [m]
+    headings_rad: tuple[float, ...]  # Headings [rad], ascending in [0, 2 pi)
+    rows: int  # Number of nodes along y
+    columns: int  # Number of nodes along x
 
     def __post_init__(self) -> None:
         headings = np.asarray(self.headings_rad, float)
-        if not (
-            headings.ndim == 1
-            and headings.size
-            and np.all(np.diff(headings) > 0)
-            and headings[0] >= 0
-            and headings[-1] < TURN
-        ):
-            raise InputError(f"headings_rad of Grid must ascend in [0, 2 pi), got {self.headings_rad}")
-        for name in ("origin_m", "cell_m"):
-            pair = tuple(float(v) for v in getattr(self, name))
-            if len(pair) != 2 or not np.all(np.isfinite(pair)) or (name == "cell_m" and min(pair) <= 0):
-                above = " above 0" if name == "cell_m" else ""
-                raise InputError(f"{name} of Grid must be two lengths{above} [m], got {pair}")
-            object.__setattr__(self, name, pair)
+        check_axes(self)
         object.__setattr__(self, "headings_rad", tuple(headings.tolist()))
         if self.rows < 2 or self.columns < 2:
             raise InputError(f"a Grid needs 2 x 2 nodes at least, got {self.rows} x {self.columns}")
@@ -147,3 +126,21 @@ class Grid(Summarized):
                 ("headings", listed([f"{d:.4g}" for d in np.degrees(self.headings_rad)]) + " deg"),
             ),
         )
+
+
+def check_axes(grid: Any) -> None:
+    """Check `headings_rad` of a grid or a map, and make `origin_m` and `cell_m` pairs of floats.
+
+    Raises:
+        InputError: The headings do not ascend in [0, 2 pi), or a pair is not two lengths.
+    """
+    kind, headings = type(grid).__name__, np.asarray(grid.headings_rad, float)
+    ascend = headings.ndim == 1 and headings.size and np.all(np.diff(headings) > 0)
+    if not (ascend and headings[0] >= 0 and headings[-1] < TURN):
+        raise InputError(f"headings_rad of {kind} must ascend in [0, 2 pi), got {headings.tolist()}")
+    for name in ("origin_m", "cell_m"):
+        pair = tuple(float(v) for v in getattr(grid, name))
+        if len(pair) != 2 or not np.all(np.isfinite(pair)) or (name == "cell_m" and min(pair) <= 0):
+            above = " above 0" if name == "cell_m" else ""
+            raise InputError(f"{name} of {kind} must be two lengths{above} [m], got {pair}")
+        object.__setattr__(grid, name, pair)

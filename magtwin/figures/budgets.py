@@ -5,7 +5,7 @@ from textwrap import fill
 from typing import Any
 
 from magtwin.figures.canvas import WIDTH_IN, Picture, label, new_figure, open_frame, picture
-from magtwin.figures.evaluation_pictures import MOST_PANELS, ink, trained_models
+from magtwin.figures.evaluations import MOST_PANELS, ink, trained_models
 from magtwin.figures.page import Section, Table
 from magtwin.learn.evaluation.budget import CLOSED, TERMS, Budget, TrueError
 from magtwin.learn.evaluation.evaluation import Evaluation
@@ -15,10 +15,7 @@ SAVED, LOST = "#40916c", "#c92a2a"
 
 
 def section_of_budget(
-    evaluation: Evaluation,
-    budgets: Sequence[Budget],
-    map_errors: Sequence[TrueError],
-    order: Sequence[int],
+    evaluation: Evaluation, budgets: Sequence[Budget], map_errors: Sequence[TrueError], order: Sequence[int]
 ) -> Section:
     """The error budget of a twin, for `page_of_evaluation`.
 
@@ -89,7 +86,7 @@ def _waterfall(evaluation: Evaluation, budgets: Sequence[Budget]) -> Picture:
             now, before = mae[k], mae[k - 1]
             ax.bar(k, abs(gain), 0.7, bottom=min(now, before), color=SAVED if gain >= 0 else LOST)
             ax.plot([k - 1.35, k + 0.35], [before, before], color="0.6", lw=0.7)
-            ax.text(k, max(now, before) + 0.02 * most, _signed(-gain), **style)
+            ax.text(k, max(now, before) + 0.02 * most, f"{round(-gain):+d}" if round(gain) else "0", **style)
         title = f"{budget.name}: {budget.mae_nt / budget.naive_mae_nt:.3f} of naive"
         label(ax, y="MAE [nT]", title=title)
         ax.set_ylim(0, 1.18 * most)
@@ -97,8 +94,3 @@ def _waterfall(evaluation: Evaluation, budgets: Sequence[Budget]) -> Picture:
     axes[-1].set_xticks(range(len(TERMS) + 1), ["as it is", *(fill(term, 8) for term in TERMS)], fontsize=9)
     title = "Error budget: how much closing each term in turn reduces the mean absolute error"
     return picture(figure, title, file="budget")
-
-
-def _signed(change: float) -> str:
-    """A change in whole nT, with its sign unless it is 0."""
-    return f"{round(change):+d}" if round(change) else "0"

@@ -78,8 +78,12 @@ def picture(figure: Figure, title: str, *, alt: str = "", file: str = "", kind: 
     return Picture(title, alt or title, kind, render(figure, f".{kind}"), width / height, file)
 
 
-def save(figure: Figure, out: str | os.PathLike[str], force: bool) -> None:
-    """Write a figure as PNG or SVG, whichever its file name ends in."""
+def save(figure: Figure, out: str | os.PathLike[str], *, force: bool = False) -> None:
+    """Write a figure as PNG or SVG, whichever its file name ends in.
+
+    Raises:
+        InputError: The name has another ending, or the file exists and `force` was not given.
+    """
     suffix = Path(out).suffix.lower()
     if suffix not in SUFFIXES:
         raise InputError(f"{out}: a picture ends in {' or '.join(SUFFIXES)}")
@@ -214,7 +218,7 @@ def short_name(name: str, most: int = LONGEST_NAME) -> str:
     return name if len(name) <= most else f"{name[:half]}…{name[-half:]}"
 
 
-def short_names(names: tuple[str, str]) -> tuple[str, str]:
+def short_pair(names: tuple[str, str]) -> tuple[str, str]:
     """Short names of two runs, which always differ."""
     a, b = (short_name(name) for name in names)
     return (a, b) if a != b else (f"A: {a}", f"B: {b}")

@@ -10,27 +10,53 @@ from typing import Any
 import numpy as np
 
 from magtwin.errors import InputError
-from magtwin.field.maps.map import AnomalyMap
-from magtwin.figures.canvas import Picture
-from magtwin.figures.evaluation_pictures import (
-    CURVES,
-    EPOCH,
-    floor_plan,
-    learning_curves,
-    path_errors,
-    rank_correlations,
-    time_series,
+from magtwin.figures.canvas import (
+    INK,
+    WIDTH_IN,
+    Picture,
+    colour_bar,
+    coloured_line,
+    draw_line,
+    evenly,
+    label,
+    legend_below,
+    new_figure,
+    picture,
+    short_name,
 )
+from magtwin.figures.maps import mean_field_ut
 from magtwin.figures.page import WRITERS, Page, Section, Table
+from magtwin.figures.training import draw_correlations, label_epochs
 from magtwin.files import output
-from magtwin.learn.evaluation.evaluation import PAPER, Case, Evaluation
+from magtwin.learn.data.correlation import correlations
+from magtwin.learn.data.features import FEATURES, FULL, features
+from magtwin.learn.evaluation.evaluation import PAPER, Evaluation, Judged
 from magtwin.learn.evaluation.scores import COVERED, DRAWS, LEVEL
+from magtwin.verdict import Z_90
 
 NAME, PICTURES = "evaluation", "figures"
 """Name of the report's files, and of the folder with its pictures."""
 
 MOST_COLUMNS = 12
 """Columns of a table. One with more paths is transposed."""
+
+INKS = (
+    *("0.55", "#1971c2", "#e08214", "#2f9e44", "#9c36b5", "#d6336c", "#0c8599", "#5c4813"),
+    *("#74c0fc", "#ffc078", "#8ce99a", "#e599f7", "#faa2c1", "#66d9e8", "#c5a880"),
+)
+"""Colours of the models, that of the naive one first."""
+
+MOST_PANELS = 6
+"""Models or paths in one figure."""
+
+RANKED_HZ = 10.0
+"""Rate of the readings used for a rank correlation. Faster readings are nearly copies of each other."""
+
+SHOWN_S = 90.0
+"""Length of the part of a run that is shown against time [s]."""
+
+EPOCH, CURVES = "number", {"train_rmse_nt": ("training", "--"), "val_rmse_nt": ("validation", "-")}
+"""Columns of a learning curve as `magtwin train` writes it."""
 
 
 def page_of_evaluation(
@@ -59,12 +85,12 @@ def page_of_evaluation(
     )
     verdicts = [f"{name}: {line}" for name, line in evaluation.verdicts().items()]
     tables = (_models(evaluation), _maps(evaluation), _left_out(evaluation))
-    a_run = _known(time_series(evaluation), floor_plan(evaluation))
-    by_path = _known(path_errors(evaluation), learning_curves(evaluation, curves or {}))
+    a_run = _known(_time_series(evaluation), _floor_plan(evaluation))
+    by_path = _known(_path_errors(evaluation), _learning_curves(evaluation, curves or {}))
     sections = (
         Section("Table 1", _lead_of_table(evaluation), (), (_table(evaluation),)),
         Section("Models and maps", "", (), tables),
-        Section("Inputs and the disturbance", "", _known(rank_correlations(evaluation))),
+        Section("Inputs and the disturbance", "", _known(_rank_correlations(evaluation))),
         Section("A run", "", a_run),
         Section("Errors by path", "", by_path),
         *more,
@@ -144,7 +170,10 @@ def _lead_of_table(evaluation: Evaluation) -> str:
 def _table(evaluation: Evaluation) -> Table:
     """The paper's Table 1, transposed: one row per model."""
     cases = evaluation.cases
-    head = ["model", *(_case_name(evaluation, case) for case in cases)]
+    head = ["model"]
+    for case in cases:  # with its path if that differs
+        path = next((one.path for one in evaluation.judged if one.case == case.name), case.name)
+        head.append(case.name if path == case.name else f"{case.name} ({path})")
     rows = [["readings", *(case.scores[0].rows for case in cases)]]
     for m, name in enumerate(evaluation.names):
         scores = [case.scores[m] for case in cases]
@@ -158,12 +187,6 @@ def _table(evaluation: Evaluation) -> Table:
         head, *rows = (list(line) for line in zip(head, *rows, strict=True))
     note = "" if len(cases) < 3 else "mean: over the paths, with equal weights."
     return Table("Mean absolute errors", tuple(head), tuple(map(tuple, rows)), note)
-
-
-def _case_name(evaluation: Evaluation, case: Case) -> str:
-    """The name of a case, with its path if that differs."""
-    path = next((one.path for one in evaluation.judged if one.case == case.name), case.name)
-    return case.name if path == case.name else f"{case.name} ({path})"
 
 
 def _intervals(evaluation: Evaluation) -> Table:
@@ -212,7 +235,11 @@ def _maps(evaluation: Evaluation) -> Table:
     for named in evaluation.maps:
         mae, rms = evaluation.floor(named)
         expected = ("unknown", "unknown") if np.isnan(mae) else (mae, rms)
-        rows.append((named.name, named.field.method, *expected, *_map_errors(evaluation, named.field)))
+        m = next(i for i, one in enumerate(evaluation.candidates) if one.map.field is named.field)
+        errors = [one.map_nt[m, one.kept] - one.measured_nt[one.kept] for one in evaluation.judged]
+        error = np.concatenate(errors)
+        alone = (float(np.mean(np.abs(e))) for e in (error, error - error.mean()))
+        rows.append((named.name, named.field.method, *expected, *alone))
     head = ("map", "method", "expected MAE [nT]", "expected RMS [nT]", "map alone, MAE [nT]")
     note = (
         "expected: the map's error on these readings, according to its own variances; the noise floor of its "
@@ -221,14 +248,171 @@ def _maps(evaluation: Evaluation) -> Table:
     return Table("Maps", (*head, "less its mean [nT]"), tuple(rows), note)
 
 
-def _map_errors(evaluation: Evaluation, field: AnomalyMap) -> tuple[float, float]:
-    """MAE of a map without a model [nT], before and after its mean error on these readings is removed."""
-    m = next(i for i, one in enumerate(evaluation.candidates) if one.map.field is field)
-    error = np.concatenate([one.map_nt[m, one.kept] - one.measured_nt[one.kept] for one in evaluation.judged])
-    return float(np.mean(np.abs(error))), float(np.mean(np.abs(error - error.mean())))
-
-
 def _left_out(evaluation: Evaluation) -> Table:
     rows = tuple(evaluation.left_out.items())
     note = "All models are evaluated on the same readings." if rows else "None."
     return Table("Readings left out", ("reason", "readings"), rows, note)
+
+
+def ink(m: int) -> str:
+    """Colour of a model by its index."""
+    return INKS[m % len(INKS)]
+
+
+def trained_models(evaluation: Evaluation) -> list[int]:
+    """Indices of at most `MOST_PANELS` models from weights files; if there are none, of all but the naive."""
+    own = [i for i, one in enumerate(evaluation.candidates) if "sha256" in one.metadata]
+    own = own or list(range(1, len(evaluation.candidates))) or [0]
+    return own if len(own) <= MOST_PANELS else [own[0], *own[1 - MOST_PANELS :]]
+
+
+def _best(evaluation: Evaluation) -> int:
+    return min(trained_models(evaluation), key=lambda m: evaluation.every.scores[m].mae_nt)
+
+
+def _rank_correlations(evaluation: Evaluation) -> Picture | None:
+    """Figure 2: correlation of each input with the disturbance, on the first map."""
+    judged = evaluation.judged
+    able = [name for name in FULL if all(one.run.keys() >= set(FEATURES[name].columns) for one in judged)]
+    if not able:
+        return None
+    sessions = list(dict.fromkeys(one.session for one in judged))
+    xs, ys, groups = [], [], []
+    for one in judged:
+        step_s = float(np.median(np.diff(one.run["t"]))) if one.run.rows > 1 else 1.0
+        rows = np.flatnonzero(one.kept)[:: max(1, round(1 / (step_s * RANKED_HZ)))]
+        x, y = features(one.run.take(rows), able), (one.measured_nt - one.map_nt[0])[rows]
+        known = np.isfinite(x).all(axis=1)
+        xs.append(x[known])
+        ys.append(y[known])
+        groups.append(np.full(int(known.sum()), sessions.index(one.session)))
+    x, y = np.concatenate(xs), np.concatenate(ys)
+    if len(y) < 3 or not np.ptp(y):
+        return None
+    title = "Figure 2: Spearman's correlation of each input with the disturbance, beside the paper's"
+    figure = draw_correlations(correlations(x, y, able, np.concatenate(groups)))
+    return picture(figure, title, file="figure_2")
+
+
+def _time_series(evaluation: Evaluation) -> Picture:
+    """Figure 5: field as measured, by the map alone and by each model, and the errors with their interval."""
+    one, shown = _middle(evaluation), trained_models(evaluation)
+    t = one.run["t"] - one.run["t"][0]
+    seen = t <= SHOWN_S
+    t, kept = t[seen], one.kept[seen]
+    measured, rows = np.where(kept, one.measured_nt[seen], np.nan), evenly(len(t), 900)
+    figure = new_figure(WIDTH_IN, 0.9 + 2.6 * len(shown))
+    heights = [1.5, 1.0] * len(shown)
+    axes = figure.subplots(2 * len(shown), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    for k, m in enumerate(shown):
+        above, below = axes[2 * k : 2 * k + 2]
+        total, alone = (np.where(kept, values[m, seen], np.nan) for values in (one.total_nt, one.map_nt))
+        half, error = Z_90 * one.sd_nt[m, seen], total - measured
+        draw_line(above, t, measured / 1000, color=INK, lw=1.8, label="measured")
+        draw_line(above, t, alone / 1000, color="0.55", lw=1.0, label="map alone")
+        draw_line(above, t, total / 1000, color=ink(m), lw=1.0, label="map and model")
+        if np.isfinite(half).any():
+            band = {"color": ink(m), "alpha": 0.18, "lw": 0, "label": f"its {COVERED:.0%} interval"}
+            below.fill_between(t[rows], -half[rows], half[rows], **band)
+        draw_line(below, t, alone - measured, color="0.55", lw=0.8)
+        draw_line(below, t, error, color=ink(m))
+        below.axhline(0, color=INK, lw=0.6)
+        mae = np.nanmean(np.abs(error)) if np.isfinite(error).any() else np.nan
+        title = f"{short_name(evaluation.names[m], 40)}: MAE {mae:.0f} nT"
+        label(above, y="field [µT]", title=title)
+        label(below, y="error [nT]")
+        above.margins(x=0)
+        below.margins(x=0)
+    label(axes[-1], "time [s]")
+    lines = {name: line for ax in axes for line, name in zip(*ax.get_legend_handles_labels(), strict=True)}
+    legend_below(figure, lines.values(), lines.keys())
+    title = f"Figure 5: total field of {one.name} ({one.path}), measured and predicted, and the errors"
+    return picture(figure, title, file="figure_5")
+
+
+def _middle(evaluation: Evaluation) -> Judged:
+    """The recording in which the error of the best model is the median."""
+    best = _best(evaluation)
+    size = [float(np.mean(np.abs(one.errors().error_nt[best]))) for one in evaluation.judged]
+    return evaluation.judged[int(np.argsort(size, kind="stable")[(len(size) - 1) // 2])]
+
+
+def _floor_plan(evaluation: Evaluation) -> Picture:
+    """Figure 7: paths over the map, coloured by the field and by the error of the best model."""
+    cases = list(dict.fromkeys(one.case for one in evaluation.judged))[:MOST_PANELS]
+    shown = [next(one for one in evaluation.judged if one.case == case) for case in cases]
+    best = _best(evaluation)
+    named = evaluation.candidates[best].map
+    x0, x1, y0, y1 = named.field.extent
+    height = np.clip(2.2 * (y1 - y0) / (x1 - x0), 0.9, 5.0)
+    figure = new_figure(WIDTH_IN, 1.0 + (height + 0.35) * len(shown))
+    axes = figure.subplots(len(shown), 2, sharex=True, sharey=True, squeeze=False)
+    fields = [np.where(one.kept, one.measured_nt, np.nan) / 1000 for one in shown]
+    sizes = [np.where(one.kept, np.abs(one.total_nt[best] - one.measured_nt), np.nan) for one in shown]
+    error = f"|error| of {short_name(evaluation.names[best], 16)} [nT]"
+    for column, values, colours, text in (
+        (0, fields, "viridis", "total field [µT]"),
+        (1, sizes, "magma_r", error),
+    ):
+        low, high = np.nanquantile(np.concatenate(values), [0.01, 0.99])
+        for ax, one, value in zip(axes[:, column], shown, values, strict=True):
+            known, place = mean_field_ut(named.field), np.isfinite(one.p_xy).all(axis=1)
+            ax.pcolormesh(
+                named.field.x_m, named.field.y_m, known, shading="nearest", cmap="Greys", alpha=0.35
+            )
+            limits = (0.0 if column else low, high)
+            line = coloured_line(ax, one.p_xy[place], value[place], limits, colours, 2.2)
+            ax.set_aspect("equal")
+            label(ax)
+            ax.set_title(one.case if one.case == one.path else f"{one.case} ({one.path})", fontsize=9)
+        flat = {"orientation": "horizontal", "aspect": 30, "shrink": 1.0}
+        colour_bar(figure, line, axes[:, column].tolist(), text, **flat)
+        label(axes[-1, column], "x [m]")
+    for ax in axes[:, 0]:
+        label(ax, y="y [m]")
+    title = f"Figure 7: paths over the map {named.name} (grey, mean over headings)"
+    return picture(figure, title, file="figure_7", kind="png")
+
+
+def _path_errors(evaluation: Evaluation) -> Picture:
+    """Figure 6 a and b: errors by path, with their intervals."""
+    cases = [case for case in evaluation.cases if case.name != "all"]
+    count = len(evaluation.candidates)
+    figure = new_figure(WIDTH_IN, 2.9 + 0.13 * count)
+    ax = figure.subplots()
+    width = 0.84 / count
+    for m, name in enumerate(evaluation.names):
+        at = np.arange(len(cases)) + (m - (count - 1) / 2) * width
+        mae = np.array([case.scores[m].mae_nt for case in cases])
+        low, high = np.array([case.scores[m].mae_interval_nt for case in cases]).T
+        ax.bar(at, mae, 0.92 * width, color=ink(m), label=name)
+        spread = np.nan_to_num(np.stack([mae - low, high - mae]).clip(0))
+        ax.errorbar(at, mae, yerr=spread, fmt="none", ecolor=INK, elinewidth=0.8, capsize=1.5)
+    ax.set_xticks(np.arange(len(cases)), [case.name for case in cases], fontsize=9)
+    ax.set_ylim(bottom=0)
+    label(ax, y="mean absolute error [nT]")
+    ax.grid(axis="y", color="0.9")
+    ax.set_axisbelow(True)
+    legend_below(figure)
+    return picture(figure, f"Figure 6 a, b: errors by path, with {LEVEL:.0%} intervals", file="figure_6ab")
+
+
+def _learning_curves(
+    evaluation: Evaluation, curves: Mapping[str, Sequence[Mapping[str, float]]]
+) -> Picture | None:
+    """Figure 6 c: learning curves of the models that have one."""
+    shown = {m: curves[name] for m, name in enumerate(evaluation.names) if curves.get(name)}
+    if not shown:
+        return None
+    figure = new_figure(WIDTH_IN, 3.4)
+    ax = figure.subplots()
+    for m, rows in shown.items():
+        for column, (part, style) in CURVES.items():
+            points = [(row[EPOCH], row[column]) for row in rows if column in row]
+            if points:
+                text = f"{evaluation.names[m]}, {part}"
+                ax.plot(*zip(*points, strict=True), ls=style, color=ink(m), label=text)
+    label_epochs(ax)
+    legend_below(figure)
+    title = "Figure 6 c: error in training and on validation recordings over the epochs"
+    return picture(figure, title, file="figure_6c")

@@ -1,6 +1,5 @@
 """Maps: plots of an anomaly map, and of the difference between two surveys."""
 
-import os
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +19,7 @@ from magtwin.errors import InputError, find
 from magtwin.field.maps.difference import LISTED, MapDifference
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
-from magtwin.figures.canvas import INK, Array, colour_bar, label, new_figure, save
+from magtwin.figures.canvas import INK, Array, colour_bar, label, new_figure
 
 MOST_NODES_A_SIDE = 600
 """Nodes drawn along a side of a map. A panel has no more pixels."""
@@ -38,29 +37,6 @@ BANDS = 20
 """Approximate number of colours of a map."""
 
 VALID, MASKED, MASKED_INK, HATCH = "#8fb8a8", "0.85", "0.65", "////"
-
-
-def plot_map(
-    field: AnomalyMap,
-    out: str | os.PathLike[str],
-    *,
-    what: str = "field",
-    headings: Sequence[float] | None = None,
-    force: bool = False,
-) -> None:
-    """Write the picture of a map that `draw_map` makes.
-
-    Args:
-        field: The map.
-        out: PNG or SVG to write.
-        what: Quantity to draw, as for `draw_map`.
-        headings: Headings to show [rad], as for `draw_map`.
-        force: Whether to replace an existing file.
-
-    Raises:
-        InputError: As for `draw_map`; or `out` is not a picture or exists.
-    """
-    save(draw_map(field, what=what, headings=headings), out, force)
 
 
 def draw_map(field: AnomalyMap, *, what: str = "field", headings: Sequence[float] | None = None) -> Figure:
@@ -125,17 +101,8 @@ def draw_map(field: AnomalyMap, *, what: str = "field", headings: Sequence[float
     return figure
 
 
-def plot_difference(difference: MapDifference, out: str | os.PathLike[str], *, force: bool = False) -> None:
-    """Draw what changed between two surveys and how certain it is, with the regions of its report numbered.
-
-    Args:
-        difference: The difference.
-        out: PNG or SVG to write.
-        force: Whether to replace an existing file.
-
-    Raises:
-        InputError: `out` is not a picture or exists.
-    """
+def draw_difference(difference: MapDifference) -> Figure:
+    """Draw what changed between two surveys and how certain it is; regions have the numbers of the report."""
     grid, count = difference.grid, np.isfinite(difference.z).sum(axis=0)
     local = np.where(count, np.nansum(difference.local_nt, axis=0) / np.maximum(count, 1), np.nan)
     most = np.nanargmax(np.where(np.isfinite(difference.z), np.abs(difference.z), -1.0), axis=0)
@@ -163,7 +130,7 @@ def plot_difference(difference: MapDifference, out: str | os.PathLike[str], *, f
     figure.suptitle("\n".join(lines), fontsize=11)
     legend = [Patch(label="changed region", facecolor="none", edgecolor=INK)] if regions else []
     _legend(figure, legend + ([] if count.all() else [_hatched("not known to both surveys")]))
-    save(figure, out, force)
+    return figure
 
 
 def draw_cells(
@@ -224,18 +191,10 @@ def _field_ut(field: AnomalyMap) -> Array:
     return np.where(field.valid, field.values_nt, np.nan) / 1000
 
 
-def _gradient_ut_m(field: AnomalyMap) -> Array:
-    return np.asarray(np.hypot(*np.gradient(_field_ut(field), *field.cell_m[::-1], axis=(1, 2))))
-
-
 def _sd_nt(field: AnomalyMap) -> Array:
     if field.variance_nt2 is None:
         raise InputError(f"map {field.name!r} has no variance; fit it from its readings to get one")
     return np.sqrt(np.where(field.valid, field.variance_nt2, np.nan))
-
-
-def _mask(field: AnomalyMap) -> Array:
-    return np.where(field.valid, 1.0, np.nan)
 
 
 def _heading_difference_nt(field: AnomalyMap) -> Array:
@@ -268,10 +227,13 @@ class _Quantity:
 QUANTITIES = {
     "field": _Quantity(_field_ut, "total field [µT]"),
     "gradient": _Quantity(
-        _gradient_ut_m, "gradient along the floor [µT/m]", "magma", unknown="masked, or beside a masked node"
+        lambda field: np.hypot(*np.gradient(_field_ut(field), *field.cell_m[::-1], axis=(1, 2))),
+        "gradient along the floor [µT/m]",
+        "magma",
+        unknown="masked, or beside a masked node",
     ),
     "variance": _Quantity(_sd_nt, "standard deviation [nT]", "cividis"),
-    "mask": _Quantity(_mask, "holds field"),
+    "mask": _Quantity(lambda field: np.where(field.valid, 1.0, np.nan), "holds field"),
     "headings": _Quantity(
         _heading_difference_nt,
         "difference from the mean over headings [nT]",
@@ -323,10 +285,9 @@ class _Scale:
 
 def _between_headings(field: AnomalyMap, layers: Array, headings: Array) -> Array:
     """Layers at other headings, interpolated as a map lookup does."""
-    known = np.isfinite(layers)
     parts: dict[str, Any] = {"variance_nt2": None, "harmonic": None, "recorded_yaw": None}
     x, y = np.meshgrid(field.x_m, field.y_m)
-    values = replace(field, values_nt=layers, valid=known, **parts)
+    values = replace(field, values_nt=layers, valid=np.isfinite(layers), **parts)
     return values.lookup(np.stack([x, y], axis=-1)[None], headings[:, None, None])
 
 

@@ -4,6 +4,8 @@ import ctypes
 import itertools
 import os
 import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.figures.cutaway import Cutaway
 from magtwin.files import output
 from magtwin.frames import rotate
 from magtwin.spec.base import Vec3
@@ -48,13 +49,11 @@ BACKGROUND = "#e9edf1"
 
 INK = "#20262d"
 
-LIGHTS = (
-    ((0.6, 0.9, 1.4), 0.75),
-    ((0.9, -1.0, 0.5), 0.45),
-    ((-0.9, 0.2, 0.6), 0.4),
-    ((0.1, 0.0, -1.0), 0.3),
-)
+LIGHTS = (((0.6, 0.9, 1.4), 0.75), ((0.9, -1.0, 0.5), 0.45), ((-0.9, 0.2, 0.6), 0.4), ((0.1, 0.0, -1.0), 0.3))
 """Direction towards each light in world, and its strength."""
+
+VEIL = 0.3
+"""Opacity of an object where it stands in front of the heat-map, the robot or the trail."""
 
 AMBIENT, DIFFUSE = 0.22, 0.8
 """Share of an object's colour visible without light, and share added by light at normal incidence."""
@@ -211,8 +210,14 @@ def _draw(
             screens.append(actor)
     if ground is None:
         ground = camera.elevation_deg > 0 and all(s.link for s in shapes)
-    if ground:
-        _add_ground(plotter, everything)
+    if ground:  # just below everything, in the colour of the background: only shadows on it are visible
+        import pyvista
+
+        low, high = everything.min(axis=0), everything.max(axis=0)
+        reach = 3 * float(np.max(high - low))
+        middle = (*((low + high) / 2)[:2], low[2] - 1e-3 * reach)
+        floor = pyvista.Disc(center=middle, inner=0, outer=reach, normal=(0, 0, 1), c_res=64)
+        plotter.add_mesh(floor, color=BACKGROUND, ambient=1.0, diffuse=0.0, specular=0.0)
     light(plotter, everything)
     aim(plotter, camera, around, size, bar=scale is not None and legend)
     if scale is not None and legend:
@@ -242,19 +247,6 @@ def view_distance(
     return float(np.max(b + np.maximum(np.abs(r) / np.tan(h), np.abs(u) / np.tan(v))))
 
 
-def check_view() -> None:
-    """Refuse to draw if a package of the extra `view` is missing.
-
-    Raises:
-        InputError: One is missing; the text says how to install it.
-    """
-    missing = [name for name in ("pyvista", "vtkmodules", "imageio_ffmpeg") if find_spec(name) is None]
-    if missing:
-        raise InputError(
-            f"pictures and films of stages need {', '.join(missing)}: pip install 'magtwin[view]'"
-        )
-
-
 def plotter_of(size: tuple[int, int], *, window: bool = False) -> Any:
     """A plotter, off screen or in a window.
 
@@ -262,7 +254,11 @@ def plotter_of(size: tuple[int, int], *, window: bool = False) -> Any:
         InputError: The extra `view` is missing, or the machine has no OpenGL. VTK itself would end the
             process.
     """
-    check_view()
+    missing = [name for name in ("pyvista", "vtkmodules", "imageio_ffmpeg") if find_spec(name) is None]
+    if missing:
+        raise InputError(
+            f"pictures and films of stages need {', '.join(missing)}: pip install 'magtwin[view]'"
+        )
     import vtkmodules.vtkRenderingOpenGL2
     from vtkmodules.vtkCommonCore import vtkLogger
     from vtkmodules.vtkRenderingCore import vtkRenderWindow
@@ -288,11 +284,8 @@ def plotter_of(size: tuple[int, int], *, window: bool = False) -> Any:
 def _loads(*names: str) -> bool:
     """Whether one of the shared libraries can be loaded."""
     for name in names:
-        try:
-            ctypes.CDLL(name)
-        except OSError:
-            continue
-        return True
+        with suppress(OSError):
+            return bool(ctypes.CDLL(name))
     return False
 
 
@@ -349,17 +342,6 @@ def bake(mesh: Any) -> None:
         towards = np.array(direction) / np.linalg.norm(direction)
         shade += DIFFUSE * strength * np.maximum(normals @ towards, 0.0)
     mesh["rgb"] = np.minimum(mesh["rgb"] * shade[:, None], 255).round().astype(np.uint8)
-
-
-def _add_ground(plotter: Any, everything: NDArray) -> None:
-    """A floor just below everything, in the colour of the background: only shadows on it are visible."""
-    import pyvista
-
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    reach = 3 * float(np.max(high - low))
-    middle = (*((low + high) / 2)[:2], low[2] - 1e-3 * reach)
-    floor = pyvista.Disc(center=middle, inner=0, outer=reach, normal=(0, 0, 1), c_res=64)
-    plotter.add_mesh(floor, color=BACKGROUND, ambient=1.0, diffuse=0.0, specular=0.0)
 
 
 def light(plotter: Any, everything: NDArray, *, soft: bool = True) -> None:
@@ -429,3 +411,70 @@ def add_bar(plotter: Any, colour_map: str, least: float, greatest: float, unit: 
     bar.GetTitleTextProperty().SetBackgroundColor(background)
     bar.GetTitleTextProperty().SetBackgroundOpacity(0.7)
     bar.SetVerticalTitleSeparation(round(plotter.window_size[1] / 60))  # keeps it off the top number
+
+
+class Cutaway:
+    """Takes pictures of a plotter in which objects in front of the subject are a veil over it.
+
+    Each picture is drawn twice: whole, and with the subject alone on a transparent ground. The second is laid
+    over the first, so that walls, columns and cabinets stay solid where they hide nothing of the subject.
+    A camera below the floor sees the floor from below, without a cutaway.
+    """
+
+    def __init__(self, plotter: Any, size: tuple[int, int], screens: Sequence[Any]) -> None:
+        """Prepare the pictures of a rendered plotter; `screens` are the actors that may hide the subject."""
+        self._plotter, self._size, self._screens = plotter, size, tuple(screens)
+        window = plotter.render_window
+        window.SetAlphaBitPlanes(1)
+        self._whole, self._subject = _grabber(window, alpha=False), _grabber(window, alpha=True)
+
+    def image(self, *, whole: bool = False) -> NDArray[np.uint8]:
+        """The picture from the present camera, shape (height, width, 3); all solid if `whole`."""
+        image = self._grab(self._whole)
+        if whole or not self._screens:
+            return image
+        with self._subject_alone():
+            subject = self._grab(self._subject)
+        colour = subject[..., :3].astype(np.uint32)  # already multiplied by alpha, as its ground is black
+        alpha = subject[..., 3:].astype(np.uint32)
+        share = round(256 * (1 - VEIL))
+        mixed = (image * (256 - share * alpha // 255) + share * colour) >> 8
+        return np.minimum(mixed, 255).astype(np.uint8)
+
+    @contextmanager
+    def _subject_alone(self) -> Iterator[None]:
+        renderer = self._plotter.renderer
+        ground, shown = renderer.GetBackground(), [actor.visibility for actor in self._screens]
+        try:
+            for actor in self._screens:
+                actor.visibility = False
+            renderer.SetBackground(0.0, 0.0, 0.0)
+            renderer.SetBackgroundAlpha(0.0)
+            yield
+        finally:
+            renderer.SetBackground(*ground)
+            renderer.SetBackgroundAlpha(1.0)
+            for actor, visible in zip(self._screens, shown, strict=True):
+                actor.visibility = visible
+
+    def _grab(self, grabber: Any) -> NDArray[np.uint8]:
+        """Render the window and copy it, shape (height, width, 3 or 4)."""
+        from vtkmodules.util.numpy_support import vtk_to_numpy
+
+        self._plotter.render_window.Render()
+        grabber.Modified()
+        grabber.Update()
+        pixels = vtk_to_numpy(grabber.GetOutput().GetPointData().GetScalars())
+        return np.array(pixels.reshape(self._size[1], self._size[0], -1)[::-1], np.uint8)
+
+
+def _grabber(window: Any, *, alpha: bool) -> Any:
+    """A filter that copies a window without rendering it again, as pyvista's own would."""
+    from vtkmodules.vtkRenderingCore import vtkWindowToImageFilter
+
+    grabber = vtkWindowToImageFilter()
+    grabber.SetInput(window)
+    (grabber.SetInputBufferTypeToRGBA if alpha else grabber.SetInputBufferTypeToRGB)()
+    grabber.ReadFrontBufferOff()
+    grabber.ShouldRerenderOff()
+    return grabber

@@ -1,4 +1,4 @@
-"""Reports: one run, several runs, or two runs compared, as a page."""
+"""Reports: one run, several runs, or two runs compared, as a page; and one path driven twice."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -6,19 +6,41 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.figures.canvas import short_names
-from magtwin.figures.comparisons import correlation_text, measures, pictures_of_comparison
+from magtwin.figures.canvas import (
+    INK,
+    MAP_INK,
+    OTHER_INK,
+    POINTS,
+    WIDTH_IN,
+    Picture,
+    draw_line,
+    evenly,
+    label,
+    legend_above,
+    new_figure,
+    picture,
+    short_pair,
+)
 from magtwin.figures.page import Page, Section, Table
-from magtwin.figures.runs import pictures_of_run
-from magtwin.run.compare import ERRORS, Comparison, errors_of
-from magtwin.run.run import COLUMNS, Run
+from magtwin.figures.runs import field_name, pictures_of_run, position_name
+from magtwin.run.compare import ERRORS, Agreement, Comparison, Traversals, errors_of
+from magtwin.run.run import COLUMNS, Metadata, Run
 
 MOST_SPANS = 12
 """Times of a flag that a page lists. More are counted."""
+
+ALIGNED = {
+    "recorded": "by time from each start",
+    "timed": "by time, clocks aligned",
+    "placed": "by distance driven",
+}
+"""How two traversals of a path are aligned."""
 
 MEASURES = ("mean", "RMS", "mean absolute", "maximum")
 
@@ -87,8 +109,7 @@ def page_of_comparison(a: NamedRun, b: NamedRun, comparison: Comparison) -> Page
         "none": "Aligned by the clocks of the runs, unchanged.",
     }[comparison.align]
     rows = tuple(
-        (row.name, row.unit, *measures(row), row.count, correlation_text(row))
-        for row in comparison.agreements()
+        (row.name, row.unit, *_measures(row), row.count, _correlation(row)) for row in comparison.agreements()
     )
     head = ("quantity", "unit", *MEASURES, "readings", "correlation")
     note = "Along-track: ahead of the first run; cross-track: to its left."
@@ -100,9 +121,9 @@ def page_of_comparison(a: NamedRun, b: NamedRun, comparison: Comparison) -> Page
     )
     if differ:
         tables.append(Table("Metadata that differ", ("metadata", a.name, b.name), differ, exact=True))
-    pictures = tuple(pictures_of_comparison(a.run, b.run, comparison, (a.name, b.name)))
+    pictures = tuple(_comparison_pictures(a, b, comparison))
     return Page(
-        " and ".join(short_names((a.name, b.name))),
+        " and ".join(short_pair((a.name, b.name))),
         f"{a.name} and {b.name}: {len(comparison.at):,} readings compared. {how}",
         (Section("Comparison", "", pictures, tuple(tables)),),
         data={"a": a.name, "b": b.name, **comparison.summary(), "metadata": [dict(one), dict(other)]},
@@ -137,7 +158,7 @@ def _section(named: NamedRun, pictures: bool) -> Section:
     tables = [Table("Figures", ("quantity", "value", "standard deviation", "unit", "note"), rows)]
     errors = errors_of(run)
     if errors:
-        rows = tuple((name, ERRORS[name][2], *measures(row), row.count) for name, row in errors.items())
+        rows = tuple((name, ERRORS[name][2], *_measures(row), row.count) for name, row in errors.items())
         terms = (f"{name} = {' - '.join((ERRORS[name][0], *ERRORS[name][1]))}" for name in errors)
         note = f"Each error is the difference of columns: {'; '.join(terms)}"
         coverage = _coverage(run)
@@ -222,3 +243,155 @@ def _events(run: Run) -> list[tuple[str, int, list[tuple[float, float]]]]:
 def _times(spans: Sequence[tuple[float, float]]) -> str:
     text = ", ".join(f"{a:.2f}–{b:.2f}" if b > a else f"{a:.2f}" for a, b in spans[:MOST_SPANS])
     return text + (f" and {len(spans) - MOST_SPANS:,} more" if len(spans) > MOST_SPANS else "")
+
+
+def _measures(agreement: Agreement) -> tuple[float, float, float, float]:
+    """Mean, RMS, mean absolute and greatest difference."""
+    return agreement.mean, agreement.rms, agreement.mae, agreement.greatest
+
+
+def _correlation(agreement: Agreement) -> str:
+    """Correlation to four digits; "" if there is none."""
+    return "" if agreement.correlation is None else f"{agreement.correlation:.4f}"
+
+
+def draw_comparison(a: NamedRun, b: NamedRun, comparison: Comparison) -> Figure:
+    """Draw two runs by their own clocks, and aligned, as `magtwin.run.compare.compare` compared them."""
+    panels = _panels(a, b, comparison)
+    heights = [panel.height for panel in panels]
+    figure = new_figure(9.0, 2.3 * sum(heights))
+    axes = figure.subplots(len(panels), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for ax, panel in zip(axes, panels, strict=True):
+        panel.draw(ax)
+        ax.set_title(panel.title, fontsize=10, loc="right")
+    return figure
+
+
+def _comparison_pictures(a: NamedRun, b: NamedRun, comparison: Comparison) -> list[Picture]:
+    """The panels of `draw_comparison` as pictures for a page."""
+    pictures = []
+    for panel in _panels(a, b, comparison):
+        figure = new_figure(WIDTH_IN, 2.5 * panel.height)
+        panel.draw(figure.subplots())
+        pictures.append(picture(figure, panel.title))
+    return pictures
+
+
+def section_of_traversals(both: Traversals, names: tuple[str, str]) -> Section:
+    """A section of a report: one path driven twice, with and without alignment.
+
+    Args:
+        both: Result of `magtwin.run.compare.traversals`.
+        names: Names of the two runs.
+    """
+    runs = [f"{name}: {_driven(run.metadata)}" for name, run in zip(names, (both.a, both.b), strict=True)]
+    rows = tuple(
+        (text, row.name, row.unit, *_measures(row), _correlation(row))
+        for key, text in ALIGNED.items()
+        for row in getattr(both, key).agreements()
+    )
+    head = ("aligned", "quantity", "unit", "mean", "RMS", "MAE", "maximum", "correlation")
+    note = f"{names[1]} minus {names[0]}. Along-track: ahead of the first run; cross-track: to its left."
+    title = "One path, driven twice"
+    drawing = _traversals_picture(both, names)
+    pictures = () if drawing is None else (drawing,)
+    return Section(title, "; ".join(runs) + ".", pictures, (Table(title, head, rows, note),))
+
+
+@dataclass(frozen=True)
+class _Panel:
+    title: str
+    height: float
+    draw: Callable[[Axes], None]
+
+
+def _panels(a: NamedRun, b: NamedRun, comparison: Comparison) -> list[_Panel]:
+    """Field as recorded, field aligned, distance between the two, and both paths."""
+    column, position = field_name(a.run, b.run), position_name(a.run, b.run)
+    names = short_pair((a.name, b.name))
+    along = "distance driven [m]" if comparison.align == "path" else "time [s]"
+    lines = tuple(zip((a.run, b.run), names, (INK, OTHER_INK), strict=True))
+
+    def recorded(ax: Axes) -> None:
+        for run, name, ink in lines:
+            draw_line(ax, run["t"] - run["t"][0], run[str(column)] / 1000, color=ink, label=name)
+        _finish(ax, "time from the start of each run [s]", "field [µT]")
+
+    def aligned(ax: Axes) -> None:
+        for values, (_, name, ink) in zip(comparison.fields[str(column)], lines, strict=True):
+            draw_line(ax, comparison.at, values / 1000, color=ink, label=name)
+        _finish(ax, along, "field [µT]")
+
+    def paths(ax: Axes) -> None:
+        looks: tuple[dict[str, Any], ...] = ({"lw": 2.6, "alpha": 0.45}, {"lw": 1.0})
+        for (run, name, ink), look in zip(lines, looks, strict=True):
+            rows = evenly(run.rows, POINTS)
+            ax.plot(*run[str(position)][rows, :2].T, label=name, color=ink, **look)
+        ax.set_aspect("equal")
+        ax.margins(0.05)
+        label(ax, "x [m]", "y [m]")
+        legend_above(ax)
+
+    panels = []
+    if column is not None:
+        match = next((row for row in comparison.agreements() if row.name == column), None)
+        title = f"{names[1]} moved by {comparison.shift:+.3f} {comparison.unit}"
+        if comparison.align == "none":
+            title = "clocks unchanged"
+        if match is not None:
+            title += f": RMS {match.rms:,.0f} nT"
+            title += "" if match.correlation is None else f", correlation {match.correlation:.3f}"
+        panels += [_Panel(f"{column} as recorded", 1.0, recorded), _Panel(title, 1.0, aligned)]
+    if position is not None:
+        title = f"Distance of {names[1]} from {names[0]}"
+        panels.append(_Panel(title, 1.0, lambda ax: _draw_distance(ax, comparison, along)))
+        panels.append(_Panel("Paths", 1.5, paths))
+    return panels
+
+
+def _draw_distance(ax: Axes, comparison: Comparison, along: str) -> None:
+    for values, name, ink in (
+        (comparison.along_m, "along-track", MAP_INK),
+        (comparison.cross_m, "cross-track", INK),
+    ):
+        draw_line(ax, comparison.at, values, color=ink, label=name)
+    ax.axhline(0, color="0.7", lw=0.6, zorder=0)
+    _finish(ax, along, "distance [m]")
+
+
+def _finish(ax: Axes, x: str, y: str) -> None:
+    ax.margins(x=0)
+    label(ax, x, y)
+    legend_above(ax)
+
+
+def _driven(metadata: Metadata) -> str:
+    """How a run was driven, by its metadata."""
+    path, engine = metadata.get("path", "a custom path"), metadata.get("engine", "kinematic")
+    seed = f"seed {metadata['seed']}" if "seed" in metadata else "recorded"
+    return f"{path}, engine {engine}, {seed}"
+
+
+def _traversals_picture(both: Traversals, names: tuple[str, str]) -> Picture | None:
+    column, position = field_name(both.a, both.b), position_name(both.a, both.b)
+    if column is None or position is None:
+        return None
+    figure = new_figure(WIDTH_IN, 8.6)
+    axes = figure.subplots(4, 1, height_ratios=[1.0, 1.0, 1.0, 0.8])
+    for ax, (key, text) in zip(axes, ALIGNED.items(), strict=False):
+        comparison: Comparison = getattr(both, key)
+        for values, name, ink, width in zip(
+            comparison.fields[column], names, (INK, OTHER_INK), (1.6, 0.9), strict=True
+        ):
+            draw_line(ax, comparison.at, values / 1000, color=ink, lw=width, label=name)
+        match = next(row for row in comparison.agreements() if row.name == column)
+        shift = f" ({comparison.shift:+.3f} {comparison.unit})" if key != "recorded" else ""
+        alike = "" if match.correlation is None else f", corr. {match.correlation:.3f}"
+        x = "distance driven [m]" if comparison.align == "path" else "time [s]"
+        label(ax, x, "field [µT]", title=f"{text}{shift}: MAE {match.mae:,.0f} nT{alike}")
+        ax.margins(x=0)
+    axes[0].legend(fontsize=9, loc="best", framealpha=0.85)
+    _draw_distance(axes[3], both.recorded, "time [s]")
+    axes[3].set_title("distance between the two, by time from each start", fontsize=9, loc="right")
+    title = f"Figure 8: {column} of one path, driven twice, with and without alignment"
+    return picture(figure, title, file="figure_8")

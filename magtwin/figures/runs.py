@@ -1,6 +1,5 @@
 """Runs: the path over the map and the readings against time, as one figure or as pictures for a page."""
 
-import os
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,7 +30,6 @@ from magtwin.figures.canvas import (
     new_figure,
     open_frame,
     picture,
-    save,
     shade,
 )
 from magtwin.figures.maps import draw_cells, mean_field_ut
@@ -40,29 +38,6 @@ from magtwin.run.run import Run
 
 MOST_OTHER = 4
 """Columns drawn of a run that has none of the usual ones."""
-
-
-def plot_run(
-    run: Run,
-    field: AnomalyMap | None,
-    out: str | os.PathLike[str],
-    planned: ArrayLike | None = None,
-    *,
-    force: bool = False,
-) -> None:
-    """Write the picture of a run that `draw_run` makes.
-
-    Args:
-        run: The run.
-        field: The map below the path, as for `draw_run`.
-        out: PNG or SVG to write.
-        planned: The planned path, as for `draw_run`.
-        force: Whether to replace an existing file.
-
-    Raises:
-        InputError: As for `draw_run`; or `out` is not a picture or exists.
-    """
-    save(draw_run(run, field, planned), out, force)
 
 
 def draw_run(run: Run, field: AnomalyMap | None = None, planned: ArrayLike | None = None) -> Figure:

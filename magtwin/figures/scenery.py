@@ -6,7 +6,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,11 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
-from magtwin.figures.cutaway import Cutaway
 from magtwin.figures.pictures import (
     BACKGROUND,
     LAB_ELEVATION_DEG,
     Camera,
+    Cutaway,
     add_bar,
     add_text,
     aim,
@@ -128,14 +127,8 @@ class View:
         return Camera(azimuth_deg=40.0 + ORBIT_DEG_S * seen_s, elevation_deg=LAB_ELEVATION_DEG)
 
 
-KINDS: Mapping[str, str] = MappingProxyType(
-    {
-        "orbit": "from above at a slant, going slowly round the lab",
-        "top": "straight from above, x to the right",
-        "chase": "from behind the robot",
-    }
-)
-"""Cameras by name, with a description."""
+KINDS = ("orbit", "top", "chase")
+"""From above at a slant, slowly round the lab; straight from above, x to the right; behind the robot."""
 
 
 class Scenery:
@@ -208,10 +201,6 @@ class Scenery:
     def close(self) -> None:
         """Release the plotter."""
         self.plotter.close()
-
-    def __len__(self) -> int:
-        """Number of frames."""
-        return len(self._times)
 
     def frame(self, k: int, *, whole: bool = False) -> NDArray[np.uint8]:
         """Draw frame k.

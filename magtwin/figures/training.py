@@ -10,40 +10,21 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from magtwin.figures.canvas import (
-    INK,
-    MAP_INK,
-    OTHER_INK,
-    WIDTH_IN,
-    label,
-    legend_below,
-    new_figure,
-    save,
-)
+from magtwin.figures.canvas import INK, MAP_INK, OTHER_INK, WIDTH_IN, label, legend_below, new_figure
 from magtwin.files import output
 from magtwin.learn.data.correlation import PAPER, Correlations
 from magtwin.learn.models.descent import Epoch
 
 
-def plot_learning_curve(
-    history: Sequence[Epoch],
-    out: str | os.PathLike[str],
-    *,
-    naive_rmse_nt: float | None = None,
-    title: str = "",
-    force: bool = False,
-) -> None:
+def draw_learning_curve(
+    history: Sequence[Epoch], *, naive_rmse_nt: float | None = None, title: str = ""
+) -> Figure:
     """Draw the errors on the training and the validation rows over the epochs.
 
     Args:
         history: Result of `magtwin.learn.models.fit_network.train`.
-        out: PNG or SVG to write.
         naive_rmse_nt: Error of the mean training label on the validation rows [nT], drawn as a line.
         title: Title of the picture.
-        force: Whether to replace an existing file.
-
-    Raises:
-        InputError: `out` is not a picture or exists.
     """
     figure = new_figure(WIDTH_IN, 3.4)
     ax = figure.subplots()
@@ -59,7 +40,7 @@ def plot_learning_curve(
     ax.set_axisbelow(True)
     ax.set_title(title, fontsize=10)
     legend_below(figure)
-    save(figure, out, force)
+    return figure
 
 
 def label_epochs(ax: Axes) -> None:
@@ -84,25 +65,8 @@ def write_learning_curve(
         aside.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def plot_correlations(
-    correlations: Correlations, out: str | os.PathLike[str], *, title: str = "", force: bool = False
-) -> None:
-    """Draw the correlation of each input with the disturbance, beside the paper's values.
-
-    Args:
-        correlations: The correlations.
-        out: PNG or SVG to write.
-        title: Title of the picture.
-        force: Whether to replace an existing file.
-
-    Raises:
-        InputError: `out` is not a picture or exists.
-    """
-    save(draw_correlations(correlations, title=title), out, force)
-
-
 def draw_correlations(correlations: Correlations, *, title: str = "") -> Figure:
-    """The figure that `plot_correlations` writes."""
+    """Draw the correlation of each input with the disturbance, beside the paper's values."""
     names, count = correlations.features, len(correlations.features)
     figure = new_figure(WIDTH_IN, 1.5 + 0.24 * count)
     ax = figure.subplots()

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from magtwin.errors import InputError, MismatchWarning
+from magtwin.figures.canvas import save
 from magtwin.figures.page import write_page
-from magtwin.figures.reports import NamedRun, page_of_comparison, page_of_runs
+from magtwin.figures.reports import NamedRun, draw_comparison, page_of_comparison, page_of_runs
 from magtwin.files import check_free, existing
 from magtwin.io.convert import twin_to_show
 from magtwin.io.formats import read_run
@@ -191,16 +192,13 @@ def compare_files(
         InputError: A run cannot be read, they do not overlap, or the output cannot be written.
     """
     a, b = Path(a), Path(b)
-    runs = read_run(a), read_run(b)
-    comparison = compare(*runs, align=align)
-    names = names_of(a, b)
+    name_a, name_b = names_of(a, b)
+    named = NamedRun(name_a, read_run(a)), NamedRun(name_b, read_run(b))
+    comparison = compare(named[0].run, named[1].run, align=align)
     if out is not None and Path(out).suffix in (".png", ".svg"):
-        from magtwin.figures.comparisons import plot_comparison
-
-        plot_comparison(*runs, comparison, out, names=names, force=force)
+        save(draw_comparison(*named, comparison), out, force=force)
     elif out is not None:
-        page = page_of_comparison(NamedRun(names[0], runs[0]), NamedRun(names[1], runs[1]), comparison)
-        write_page(page, out, force=force)
+        write_page(page_of_comparison(*named, comparison), out, force=force)
     return comparison
 
 

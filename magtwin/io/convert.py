@@ -44,8 +44,8 @@ def convert_run(
         InputError: The source cannot be read, an option does not fit the formats, or the output exists.
     """
     source, out = Path(source), check_free(out, force=force)
-    given: dict[str, Any] = {"storage": storage, "units": out_unit, "fps": usd_fps}
-    options = {name: value for name, value in given.items() if value is not None}
+    given = {"storage": storage, "units": out_unit, "fps": usd_fps}
+    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if usd_fps == 0:
         options["fps"] = None
     takes = format_of(out).takes
@@ -53,7 +53,7 @@ def convert_run(
         raise InputError(f"{out}: a table shows no scene; drop `scene`", parameter="scene")
     if out.resolve() == source.resolve():
         raise InputError(f"{out}: is the run itself; name another file")
-    reading: dict[str, Any] = {"topics": topics, "unit": unit}
+    reading = {"topics": topics, "unit": unit}
     run = read_run(source, **{name: value for name, value in reading.items() if value is not None})
     twin = twin_to_show(run, source, scene) if takes & {"twin", "scene_file"} else None
     write_run(run, out, twin, force=force, **options)
@@ -82,9 +82,6 @@ def twin_to_show(run: Run, file: Path, scene: str | Path | None = None) -> Twin 
         return None
     then = run.metadata.get("scene_sha256")
     if then is not None and then != twin.metadata.get("scene_sha256") and scene != file:
-        warnings.warn(
-            f"{twin.scene_file} has changed since the run; it is shown as it is now",
-            MismatchWarning,
-            stacklevel=2,
-        )
+        text = f"{twin.scene_file} has changed since the run; it is shown as it is now"
+        warnings.warn(text, MismatchWarning, stacklevel=2)
     return twin

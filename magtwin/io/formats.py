@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magtwin.errors import InputError, hint
+from magtwin.extend import Registry
 from magtwin.files import existing
-from magtwin.registry import Registry
 from magtwin.run.run import Run, check_clock
 
 if TYPE_CHECKING:
@@ -53,21 +53,15 @@ class Format:
     given, and options, which other formats refuse."""
 
 
+_TABLES, _RERUN = "magtwin.io.tables", "magtwin.io.rerun.file"
 _NAMED = frozenset(("columns",))
 PARQUET = Format(
-    name="Parquet",
-    read="magtwin.io.tables:read_parquet",
-    write="magtwin.io.tables:write_parquet",
-    reads=_NAMED,
+    name="Parquet", read=f"{_TABLES}:read_parquet", write=f"{_TABLES}:write_parquet", reads=_NAMED
 )
-CSV = Format(name="CSV", read="magtwin.io.tables:read_csv", write="magtwin.io.tables:write_csv", reads=_NAMED)
-NPZ = Format(name="npz", read="magtwin.io.tables:read_npz", write="magtwin.io.tables:write_npz")
-RERUN = Format(
-    name="Rerun",
-    read="magtwin.io.rerun.file:read_run",
-    write="magtwin.io.rerun.file:write_rrd",
-    takes=frozenset(("twin", "planned", "scans")),
-)
+CSV = Format(name="CSV", read=f"{_TABLES}:read_csv", write=f"{_TABLES}:write_csv", reads=_NAMED)
+NPZ = Format(name="npz", read=f"{_TABLES}:read_npz", write=f"{_TABLES}:write_npz")
+_SHOWN = frozenset(("twin", "planned", "scans"))
+RERUN = Format(name="Rerun", read=f"{_RERUN}:read_run", write=f"{_RERUN}:write_rrd", takes=_SHOWN)
 RELEASE = Format(name="released package", read="magtwin.io.release:read_release")
 BAG = Format(
     name="rosbag2",

@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from magtwin.errors import InputError, hint
+from magtwin.field.maps.statistics import map_metadata
+from magtwin.field.survey.folder import read_survey
 from magtwin.files import existing
 from magtwin.io.formats import FORMATS, read_run
 from magtwin.report import Figure, Report
@@ -26,9 +28,12 @@ def info_of(path: str | os.PathLike[str]) -> Report:
     """
     file = existing(path, "file")
     if file.is_dir():
-        return _info_of_folder(file)
+        return map_metadata(read_survey(file)[0]) if any(file.glob("*_map.csv")) else info_of_run(file)
     if file.suffix in NETWORKS:
-        return _info_of_network(file)
+        from magtwin.learn.inference.onnx import report_onnx
+        from magtwin.learn.models.predictor import load_predictor
+
+        return report_onnx(file) if file.suffix == ".onnx" else load_predictor(file).report(str(file))
     if file.suffix in STAGES:
         return _info_of_usd(file)
     if file.suffix in FORMATS:
@@ -43,25 +48,14 @@ def info_of_run(file: Path) -> Report:
     report = run.report(str(file))
     columns = {}
     for name, values in run.items():
-        spec = run.spec(name)
-        shape = f" x {values.shape[1]}" if values.ndim > 1 else ""
+        spec, width = run.spec(name), f" x {values.shape[1]}" if values.ndim > 1 else ""
         words = (spec.unit or "-", spec.frame and f"in {spec.frame}", spec.doc)
-        columns[name + shape] = "  ".join(word for word in words if word)
+        columns[name + width] = "  ".join(word for word in words if word)
     figures = (*report.figures[:2], Figure("columns", len(run)), *report.figures[2:])
     return replace(report, figures=figures, metadata={**report.metadata, "columns": columns})
 
 
-def _info_of_folder(folder: Path) -> Report:
-    if not any(folder.glob("*_map.csv")):
-        return info_of_run(folder)
-    from magtwin.field.maps.statistics import map_metadata
-    from magtwin.field.survey.folder import read_survey
-
-    return map_metadata(read_survey(folder)[0])
-
-
 def _info_of_usd(file: Path) -> Report:
-    from magtwin.field.maps.statistics import map_metadata
     from magtwin.usd.animation import is_animation
     from magtwin.usd.info import info_of_stage
     from magtwin.usd.maps import is_map_layer, load_epochs
@@ -78,16 +72,6 @@ def _info_of_usd(file: Path) -> Report:
     card = map_metadata(epochs[-1], epochs)
     stage = [figure for figure in info_of_stage(file).figures if figure.value != 0]
     return replace(_with_figures(card, stage), title=f"{card.title} ({file})")
-
-
-def _info_of_network(file: Path) -> Report:
-    if file.suffix == ".onnx":
-        from magtwin.learn.inference.onnx import report_onnx
-
-        return report_onnx(file)
-    from magtwin.learn.models.predictor import load_predictor
-
-    return load_predictor(file).report(str(file))
 
 
 def _with_figures(report: Report, figures: Sequence[Figure]) -> Report:

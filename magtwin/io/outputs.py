@@ -3,7 +3,7 @@
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
 from types import MappingProxyType
@@ -11,15 +11,17 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from magtwin.errors import InputError
 from magtwin.files import check_free, output
+from magtwin.io.bags.stream import scans_at
 from magtwin.io.formats import format_of, read_run, write_run
+from magtwin.io.recorder import Recorder, Sink, in_step, partial_of
 from magtwin.path import Path as Planned
 from magtwin.run.run import Run
 from magtwin.sim.motion.commands import Commands, read_commands
 from magtwin.sim.motion.drive_input import drive_input
-from magtwin.twin import Session, Twin, in_session, open_twin, room_of, scan, simulate
+from magtwin.spec.plant import PlantSpec
+from magtwin.twin import Session, Twin, in_session, open_twin, room_of, scan, simulate, with_plant
 
 if TYPE_CHECKING:
-    from magtwin.io.recorder import Sink
     from magtwin.sim.sensors.lidar import Scans
 
 IN_FOLDER = ("run.rrd", "run.parquet")
@@ -52,6 +54,7 @@ def drive(
     model_error: bool = True,
     seed: int = 0,
     session: Session | None = None,
+    plant: PlantSpec | str | None = None,
     fit: bool = False,
     scans: bool = False,
     metadata: Mapping[str, str | int] = MappingProxyType({}),
@@ -70,6 +73,7 @@ def drive(
         model_error: As for `magtwin.open_twin`.
         seed: Seed of all noise.
         session: As for `magtwin.simulate`.
+        plant: As for `magtwin.simulate`.
         fit: Whether the path is moved and shrunk until it fits.
         scans: Whether the LiDAR's rays are cast.
         metadata: Metadata of the run, such as names of files that move with it.
@@ -88,7 +92,7 @@ def drive(
     elif path != "random":
         drive_input(path)  # refuses a wrong name before the scene is opened
     twin = open_twin(scene_file, network=network, magnetometer=magnetometer, model_error=model_error)
-    twin = in_session(twin, session, seed=seed)
+    twin = in_session(with_plant(twin, plant), session, seed=seed)
     planned = None
     if what is path and path != "random":
         what = planned = drive_input(path, room_of(twin), fit=fit)
@@ -199,35 +203,26 @@ class Outputs:
 
     def check_live(self) -> None:
         """Refuse partial files of an earlier run that was shown live."""
-        from magtwin.io.recorder import partial_of
-
         for target in self._runs():
             if target.suffix in (".rrd", ".mcap", ".db3"):
                 check_free(partial_of(target), force=self.force)
 
-    def sinks(self, driven: Driven) -> list["Sink"]:
+    def sinks(self, driven: Driven) -> list[Sink]:
         """Writers that take the run as it comes, one per growing format."""
         from magtwin.io.bags import BagWriter
         from magtwin.io.rerun.live import RrdWriter
         from magtwin.io.tables import ParquetParts
 
-        expected: dict[str, Any] = {
-            "expected": driven.run,
-            "planned": driven.planned,
-            "scans": driven.scans,
-            "force": self.force,
-        }
+        shown: dict[str, Any] = {"planned": driven.planned, "scans": driven.scans, "force": self.force}
         sinks: dict[str, Any] = {}
         for target in self._runs():
             if target.suffix == ".rrd" and ".rrd" not in sinks:
-                sinks[".rrd"] = RrdWriter(target, driven.twin, **expected)
+                sinks[".rrd"] = RrdWriter(target, driven.twin, expected=driven.run, **shown)
             elif target.suffix == ".parquet" and ".parquet" not in sinks:
                 sinks[".parquet"] = ParquetParts(target, force=self.force)
             elif target.suffix == ".mcap":
-                unit = self.out_unit or "T"
-                sinks[str(target)] = BagWriter(
-                    target, driven.twin, units=unit, scans=driven.scans, force=self.force
-                )
+                options = {"units": self.out_unit or "T", "scans": driven.scans, "force": self.force}
+                sinks[str(target)] = BagWriter(target, driven.twin, **options)  # type: ignore[arg-type]
         return list(sinks.values())
 
     def write(self, driven: Driven, *, recorded: bool = False) -> None:
@@ -238,26 +233,23 @@ class Outputs:
                 shutil.copyfile(written[target.suffix], target)
                 continue
             written[target.suffix] = target
-            if not (recorded and target.suffix in GROWING):
-                self._write_run(driven, target)
+            if recorded and target.suffix in GROWING:
+                continue
+            takes, options = format_of(target).takes, dict[str, Any]()
+            if self.out_unit is not None and "units" in takes:
+                options["units"] = self.out_unit
+            if self.usd_fps is not None and "fps" in takes:
+                options["fps"] = self.usd_fps or None
+            options |= {"planned": driven.planned, "scans": driven.scans, "force": self.force}
+            write_run(driven.run, target, driven.twin, **options)
         if driven.scans is not None:
             from magtwin.io.scans import write_scans
 
-            inside = () if self.folder is None else (_with_name(self.folder / "run.parquet", self.robot),)
+            inside = [] if self.folder is None else [_with_name(self.folder / "run.parquet", self.robot)]
             for file in (*map(_scans_of, inside), *self.scans):
                 write_scans(driven.scans, file, force=self.force)
         if self.folder is not None and self.picture is not None:
             self.picture(driven, _with_name(self.folder / "run.png", self.robot), self.force)
-
-    def _write_run(self, driven: Driven, target: Path) -> None:
-        options: dict[str, Any] = {}
-        takes = format_of(target).takes
-        if self.out_unit is not None and "units" in takes:
-            options["units"] = self.out_unit
-        if self.usd_fps is not None and "fps" in takes:
-            options["fps"] = self.usd_fps or None
-        known: dict[str, Any] = {"planned": driven.planned, "scans": driven.scans}
-        write_run(driven.run, target, driven.twin, **known, force=self.force, **options)
 
     def _runs(self) -> list[Path]:
         """Files that hold the run."""
@@ -290,12 +282,12 @@ def record_live(
     Raises:
         InputError: It was stopped before the first reading.
     """
-    from magtwin.io.recorder import Recorder, in_step
     from magtwin.io.rerun.live import LiveViewer
 
-    run, viewers = driven.run, []
+    run, viewers = driven.run, list[Sink]()
     if address is not None:
-        viewers = [LiveViewer(address, driven.twin, expected=run, planned=driven.planned, scans=driven.scans)]
+        shown: dict[str, Any] = {"planned": driven.planned, "scans": driven.scans}
+        viewers.append(LiveViewer(address, driven.twin, expected=run, **shown))
     with Recorder(outputs.sinks(driven), viewers) as recorder:
         for block in in_step(run, pace, stop=stop):
             recorder.append(block)
@@ -306,8 +298,7 @@ def record_live(
     if recorder.rows < run.rows:
         run = run.take(slice(recorder.rows))
         if scans is not None:
-            seen = scans.t <= run["t"][-1]
-            scans = type(scans)(*(getattr(scans, field.name)[seen] for field in fields(scans)))
+            scans = scans_at(scans, scans.t <= run["t"][-1])
     return replace(driven, run=run, scans=scans)
 
 

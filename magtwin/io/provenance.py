@@ -1,5 +1,6 @@
 """Provenance: reproduce a run from its metadata and compare it with the original."""
 
+import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
@@ -10,6 +11,8 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.files import sha256
+from magtwin.io.formats import read_run, write_run
 from magtwin.path import CASES, PATHS, Path, path_named, read_path_csv
 from magtwin.report import Figure, Report
 from magtwin.run.run import COLUMNS, Run
@@ -77,14 +80,15 @@ def repeat_of(file: str | FilePath, scene: str | FilePath | None = None) -> Repe
     Raises:
         InputError: The file holds no run; or as for `repeat`.
     """
-    from magtwin.io.formats import read_run
-
     file = FilePath(file)
     run = read_run(file)
     result = repeat(run, scene, near=file)
     if result.equal:
         return result
-    return replace(result, differences=differences(run, as_kept(result.again, file)))
+    with tempfile.TemporaryDirectory() as folder:  # a bag, for example, keeps a battery in single precision
+        beside = FilePath(folder) / (f"run{file.suffix}" if file.suffix and not file.is_dir() else "run")
+        write_run(result.again, beside)
+        return replace(result, differences=differences(run, read_run(beside)))
 
 
 def repeat(run: Run, scene: str | FilePath | None = None, *, near: str | FilePath | None = None) -> Repeat:
@@ -99,7 +103,15 @@ def repeat(run: Run, scene: str | FilePath | None = None, *, near: str | FilePat
         InputError: The metadata are incomplete, a file is missing, or the run used objects from Python that
             are not in a file.
     """
-    return _compared(run, made_again(run, scene, near=near))
+    again = made_again(run, scene, near=near)
+    derived = run.metadata.get("derived")
+    causes = [] if derived is None else [f"the run was made from another: {derived}"]
+    causes += [
+        f"{why}: {key} was {run.metadata.get(key, 'none')}, is {again.metadata.get(key, 'none')}"
+        for key, why in CAUSES.items()
+        if run.metadata.get(key) != again.metadata.get(key)
+    ]
+    return Repeat(run, again, tuple(causes), differences(run, again))
 
 
 def made_again(
@@ -139,63 +151,17 @@ def made_again(
     except (KeyError, ValueError) as error:
         raise InputError(f"the metadata of the run are incomplete: {error}") from error
     moved_by: Any = engine or metadata.get("engine", "kinematic")
-    options: dict[str, Any] = {
-        "lidar": metadata.get("lidar", "schedule"),
-        "outside": metadata.get("outside", "nan"),
-    }
+    options: dict[str, Any] = {"seed": seed, "speed": speed, "duration_s": asked, "rate_hz": rate}
+    options |= {"lidar": metadata.get("lidar", "schedule"), "outside": metadata.get("outside", "nan")}
     if isinstance(what, Path):
         options["controller"] = metadata.get("controller", "follower")
     if engine is None and moved_by not in ("kinematic", "newton", "replay"):
         raise InputError(f"the run used a custom engine, {moved_by!r}, which is not available")
     name = str(metadata.get("robot", ""))
     if engine is None and name and twin.scene.others:  # beside others, which drive their scene's paths
-        return simulate_robots(
-            twin,
-            {name: what},
-            robots=[name],
-            meet="flag",
-            seed=seed,
-            speed=speed,
-            duration_s=asked,
-            rate_hz=rate,
-            **options,
-        )[name]
-    return simulate(
-        twin,
-        what,
-        seed=seed,
-        speed=speed,
-        duration_s=asked,
-        rate_hz=rate,
-        engine="kinematic" if moved_by == "replay" else moved_by,
-        progress=progress,
-        **options,
-    )
-
-
-def _compared(run: Run, again: Run) -> Repeat:
-    """Compare a run with its reproduction."""
-    causes = (
-        [f"the run was made from another: {run.metadata['derived']}"] if "derived" in run.metadata else []
-    )
-    causes += [
-        f"{why}: {fact} was {run.metadata.get(fact, 'none')}, is {again.metadata.get(fact, 'none')}"
-        for fact, why in CAUSES.items()
-        if run.metadata.get(fact) != again.metadata.get(fact)
-    ]
-    return Repeat(run, again, tuple(causes), differences(run, again))
-
-
-def as_kept(run: Run, file: FilePath) -> Run:
-    """A run at the precision of a file format; a bag, for example, keeps a battery in single precision."""
-    import tempfile
-
-    from magtwin.io.formats import read_run, write_run
-
-    with tempfile.TemporaryDirectory() as folder:
-        beside = FilePath(folder) / (f"run{file.suffix}" if file.suffix and not file.is_dir() else "run")
-        write_run(run, beside)
-        return read_run(beside)
+        return simulate_robots(twin, {name: what}, robots=[name], meet="flag", **options)[name]
+    moved_by = "kinematic" if moved_by == "replay" else moved_by
+    return simulate(twin, what, engine=moved_by, progress=progress, **options)
 
 
 def map_of(
@@ -211,7 +177,6 @@ def map_of(
     Raises:
         InputError: The scene is missing, or its map changed.
     """
-    from magtwin.files import sha256
     from magtwin.usd.maps import load_map
     from magtwin.usd.scene import read_scene
 
@@ -265,7 +230,7 @@ def _driven(run: Run, near: str | FilePath | None) -> Any:
     from magtwin.sim.motion.commands import read_commands
 
     metadata = run.metadata
-    for kind, read in (("path", read_path_csv), ("commands", read_commands), ("replay", _read_run)):
+    for kind, read in (("path", read_path_csv), ("commands", read_commands), ("replay", read_run)):
         if f"{kind}_file" in metadata:
             file = str(metadata[f"{kind}_file"])
             place = locate(file, near)
@@ -273,10 +238,9 @@ def _driven(run: Run, near: str | FilePath | None) -> Any:
                 raise InputError(f"{file}: the file that the run drove is missing; put it back")
             return _placed(read(place), run)
     name = str(metadata.get("path", ""))
-    if "replay_sha256" in metadata or "commands_sha256" in metadata:
-        raise InputError(
-            f"the run drove {name!r}, which is in no file; it cannot be reproduced from its metadata"
-        )
+    if {"replay_sha256", "commands_sha256"} & metadata.keys():
+        text = "which is in no file; it cannot be reproduced from its metadata"
+        raise InputError(f"the run drove {name!r}, {text}")
     if name == "random":
         return name
     if name not in PATHS and name not in CASES:
@@ -294,9 +258,3 @@ def _placed(driven: Any, run: Run) -> Any:
         return driven.placed(numbers)  # type: ignore[arg-type]
     except ValueError as error:
         raise InputError(f"metadata path_placing must be four numbers, got {placing!r}") from error
-
-
-def _read_run(file: FilePath) -> Run:
-    from magtwin.io.formats import read_run
-
-    return read_run(file)

@@ -5,8 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from threading import Event
-from types import TracebackType
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -29,7 +28,7 @@ def partial_of(path: Path) -> Path:
 
 
 class Sink(Protocol):
-    """Takes a growing run, such as RrdWriter, ParquetParts, BagWriter."""
+    """Takes a growing run, such as RrdWriter, ParquetParts, BagWriter; a context ends it."""
 
     def append(self, run: Run) -> None:
         """Take the next rows, with the metadata; from then on they are readable, whatever happens."""
@@ -39,6 +38,12 @@ class Sink(Protocol):
 
     def abort(self) -> None:
         """Leave the output as it is, or nothing if nothing was written."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
+        (self.close if kind is None else self.abort)()
 
 
 class Recorder:
@@ -92,29 +97,21 @@ class Recorder:
         for file in self._files:
             file.append(block)
 
-    def __enter__(self) -> "Recorder":
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
         sinks = [*self._files, *self._viewers][::-1]
-        if kind is None:
-            try:
+        try:
+            if kind is None:
                 self.flush()
-                for sink in list(sinks):
-                    sink.close()
-                    sinks.remove(sink)
-                return
-            finally:
-                self._abort(sinks)
-        self._abort(sinks)
-
-    def _abort(self, sinks: Sequence[Sink]) -> None:
-        """Leave sinks that cannot be completed."""
-        for sink in sinks:
-            with suppress(InputError, OSError, RuntimeError):
-                sink.abort()
+                while sinks:
+                    sinks[0].close()
+                    sinks.pop(0)
+        finally:
+            for sink in sinks:
+                with suppress(InputError, OSError, RuntimeError):
+                    sink.abort()
 
 
 def in_step(run: Run, pace: float = 1.0, *, stop: Event | None = None) -> Iterator[Run]:

@@ -20,7 +20,7 @@ import math
 import os
 import re
 from array import array
-from collections.abc import Iterator
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -39,19 +39,20 @@ _BETWEEN = re.compile(r"[\s,]*")
 _STUMP = re.compile(r"[A-Za-z-]{0,9}\s*")
 """An incomplete word or sign at the end of half a frame."""
 
-_SHAPES: dict[str, tuple[int, ...]] = {
-    "timestamp": (),
-    "nn_magnetic_magnitude": (),
-    "map_magnetic_magnitude": (),
-    "pose_data": (3,),
+_SHAPES: dict[str, int | tuple[int, ...]] = {
+    "timestamp": 1,
+    "nn_magnetic_magnitude": 1,
+    "map_magnetic_magnitude": 1,
+    "pose_data": 3,
     "odom": (3, 3),
     "imu_data": (4, 3, 3),
-    "battery_data": (2,),
-    "lidar": (),
+    "battery_data": 2,
+    "lidar": 1,
 }
 """Shape of each entry of a frame: a number, so many numbers, or lists of so many numbers."""
 
-_WIDTH = 25
+_SIZES = [shape if isinstance(shape, int) else sum(shape) for shape in _SHAPES.values()]
+_WIDTH = sum(_SIZES)
 """Numbers in a frame."""
 
 
@@ -78,38 +79,39 @@ def read_release(path: str | os.PathLike[str]) -> Run:
     path = existing(path, "recording")
     if path.is_dir():
         raise InputError(f"{path}: a folder; name the .json file in it")
-    table, frames, kept, last = array("d"), 0, 0, -math.inf
-    reader = _Frames(path)
-    for number, start, frame in reader:
-        frames = number
-        row = _numbers(frame, f"{path}, frame {number} (at character {start})")
+    text, at, table, last = *_opened(path), array("d"), -math.inf
+    for number in count(1):
+        at = _BETWEEN.match(text, at).end()  # type: ignore[union-attr]
+        where = f"{path}, frame {number} (at character {at})"
+        frame, at = _frame(text, at, number, where)
+        if isinstance(frame, str):
+            break
+        row = _numbers(frame, where)
         if row[0] < last:
             raise InputError(
-                f"{path}, frame {number} (at character {start}): its clock goes back from {last!r} to "
-                f"{row[0]!r} s; was it set while recording? cut the file in two there"
+                f"{where}: its clock goes back from {last!r} to {row[0]!r} s; was it set while recording? "
+                "cut the file in two there"
             )
         if row[1] == 0.0 or math.isnan(row[1]):
             continue  # a message of another sensor; the next reading holds its values too
         if row[0] == last:
             del table[-_WIDTH:]
-            kept -= 1
         table.extend(row)
-        kept, last = kept + 1, row[0]
-    if not kept:
+        last = row[0]
+    if not table:
         raise InputError(
-            f"{path}: {frames} frames, and none carries a reading (nn_magnetic_magnitude is 0 in all); was "
-            "the magnetometer's node running?"
+            f"{path}: {number - 1} frames, and none carries a reading (nn_magnetic_magnitude is 0 in all); "
+            "was the magnetometer's node running?"
         )
     rows = np.frombuffer(table, float).reshape(-1, _WIDTH)
-    metadata: dict[str, Any] = {"recording": path.name, "recording_sha256": sha256(path), "frames": frames}
-    metadata |= {"start_s": float(rows[0, 0]), "recording_end": reader.end, "truth": "motion capture"}
-    return Run(_columns(rows), metadata)
+    metadata: dict[str, Any] = {"recording": path.name, "recording_sha256": sha256(path)}
+    metadata |= {"frames": number - 1, "start_s": float(rows[0, 0]), "recording_end": frame}
+    return Run(_columns(rows), {**metadata, "truth": "motion capture"})
 
 
 def _columns(rows: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
     """Columns of a Run from numbers in the order of `_SHAPES`."""
-    ends = np.cumsum([math.prod(shape) if len(shape) < 2 else sum(shape) for shape in _SHAPES.values()])
-    parts = np.split(rows, ends[:-1], axis=1)
+    parts = np.split(rows, np.cumsum(_SIZES)[:-1], axis=1)
     clock, field, on_map, pose, odom, imu, battery, lidar = parts
     yaw, q = wrap_angle(pose[:, 2]), canonical(quat_from_yaw(pose[:, 2]))
     p = np.column_stack([pose[:, :2], np.where(np.isfinite(pose[:, 0]), 0.0, np.nan)])
@@ -141,18 +143,7 @@ def _numbers(frame: dict[str, Any], where: str) -> list[float]:
         if key not in frame:
             known = list(frame)[:20]
             raise InputError(f"{where}: no {key!r} in it, which `save_json` writes; {hint(key, known)}")
-        value = frame[key]
-        if not shape:
-            row.append(_number(value, key, where))
-        elif len(shape) == 1:
-            row += _some(value, shape[0], key, where)
-        elif value is None or value == []:
-            row += [math.nan] * sum(shape)
-        elif not isinstance(value, list) or len(value) != len(shape):
-            raise InputError(f"{where}: {key} must be {len(shape)} lists of numbers, got {_quoted(value)}")
-        else:
-            for part, width in zip(value, shape, strict=True):
-                row += _some(part, width, key, where)
+        row += _flat(frame[key], shape, key, where)
     if not math.isfinite(row[0]):
         raise InputError(f"{where}: timestamp must be a time [s], got {_quoted(frame['timestamp'])}")
     if row[-1] not in (0.0, 1.0) and not math.isnan(row[-1]):
@@ -160,24 +151,24 @@ def _numbers(frame: dict[str, Any], where: str) -> list[float]:
     return row
 
 
-def _some(value: Any, size: int, key: str, where: str) -> list[float]:
+def _flat(value: Any, shape: int | tuple[int, ...], key: str, where: str) -> list[float]:
+    if shape == 1:
+        return [_number(value, key, where)]
+    parts = (1,) * shape if isinstance(shape, int) else shape
     if value is None or value == []:
-        return [math.nan] * size
-    if not isinstance(value, list) or len(value) != size:
-        raise InputError(f"{where}: {key} must be {size} numbers here, got {_quoted(value)}")
-    return [_number(number, key, where) for number in value]
+        return [math.nan] * sum(parts)
+    if not isinstance(value, list) or len(value) != len(parts):
+        what = "numbers here" if isinstance(shape, int) else "lists of numbers"
+        raise InputError(f"{where}: {key} must be {len(parts)} {what}, got {_quoted(value)}")
+    return [n for part, width in zip(value, parts, strict=True) for n in _flat(part, width, key, where)]
 
 
 def _number(value: Any, key: str, where: str) -> float:
     if value is None:
         return math.nan
-    if isinstance(value, int | float):
-        try:
-            number = float(value)
-        except OverflowError:
-            number = math.inf
-        if not math.isinf(number):
-            return number
+    with suppress(OverflowError):
+        if isinstance(value, int | float) and not math.isinf(value):
+            return float(value)
     raise InputError(f"{where}: {key} must be a finite number, got {_quoted(value)}")
 
 
@@ -187,55 +178,40 @@ def _quoted(value: Any) -> str:
     return text if len(text) <= 60 else text[:60] + " ..."
 
 
-class _Frames:
-    """The frames of a file: number from 1, position of the first character, content.
+def _opened(path: Path) -> tuple[str, int]:
+    """The text of a file, and where its list of frames begins."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file ({error}); a recording is JSON") from error
+    begin = text.lstrip()[:20]
+    if not begin.startswith("["):
+        seen = _quoted(begin) if begin else "nothing"
+        raise InputError(f"{path}: a recording of the release begins with '[', this with {seen}")
+    return text, text.index("[") + 1
+
+
+def _frame(text: str, at: int, number: int, where: str) -> tuple[dict[str, Any] | str, int]:
+    """The frame at a character, and its end; in place of the last frame, how the file ended.
 
     The list is split by hand, as its commas are not JSON's; each frame is JSON.
     """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.end = "whole"
-        """How the file ended: whole, or where it was cut."""
-
-    def __iter__(self) -> Iterator[tuple[int, int, dict[str, Any]]]:
-        try:
-            text = self.path.read_text(encoding="utf-8-sig")
-        except UnicodeDecodeError as error:
-            raise InputError(f"{self.path}: not a text file ({error}); a recording is JSON") from error
-        begin = text.lstrip()[:20]
-        if not begin.startswith("["):
-            seen = _quoted(begin) if begin else "nothing"
-            raise InputError(f"{self.path}: a recording of the release begins with '[', this with {seen}")
-        decoder, at = json.JSONDecoder(), text.index("[") + 1
-        for number in count(1):
-            at = _BETWEEN.match(text, at).end()  # type: ignore[union-attr]
-            where = f"{self.path}, frame {number} (at character {at})"
-            if at == len(text):
-                self.end = "without its bracket"
-                return
-            if text[at] == "]":
-                if rest := text[at + 1 :].strip():
-                    raise InputError(
-                        f"{self.path}: goes on after the end of its list, with {_quoted(rest[:20])}; are "
-                        "these two recordings? cut them apart"
-                    )
-                return
-            if text[at] != "{":
-                raise InputError(f"{where}: a frame begins with '{{', this with {text[at]!r}")
-            try:
-                frame, end = decoder.raw_decode(text, at)
-            except (ValueError, RecursionError) as error:
-                if _is_cut(error, text):
-                    self.end = f"within frame {number}"
-                    return
-                raise InputError(f"{where}: not JSON: {error}") from error
-            yield number, at, frame
-            at = end
-
-
-def _is_cut(error: Exception, text: str) -> bool:
-    """Whether JSON is incomplete: it ends within a text, a number or a word."""
-    if not isinstance(error, json.JSONDecodeError):
-        return False
-    return error.msg.startswith("Unterminated string") or bool(_STUMP.fullmatch(text, error.pos))
+    if at == len(text):
+        return "without its bracket", at
+    if text[at] == "]":
+        if rest := text[at + 1 :].strip():
+            raise InputError(
+                f"{where.partition(', frame')[0]}: goes on after the end of its list, with "
+                f"{_quoted(rest[:20])}; are these two recordings? cut them apart"
+            )
+        return "whole", at
+    if text[at] != "{":
+        raise InputError(f"{where}: a frame begins with '{{', this with {text[at]!r}")
+    try:
+        return json.JSONDecoder().raw_decode(text, at)
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, json.JSONDecodeError) and (
+            error.msg.startswith("Unterminated string") or _STUMP.fullmatch(text, error.pos)
+        ):
+            return f"within frame {number}", at
+        raise InputError(f"{where}: not JSON: {error}") from error

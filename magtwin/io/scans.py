@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 
 from magtwin.errors import InputError
 from magtwin.files import existing, output
-from magtwin.io.tables import check_parquet
+from magtwin.io.tables import load_parquet
 from magtwin.sim.sensors.lidar import Scans
 
 _VECTORS = {"p_world_lidar": 3, "q_world_lidar_xyzw": 4}
@@ -54,11 +54,7 @@ def read_scans(path: str | os.PathLike[str]) -> Scans:
         InputError: The file is missing, is not Parquet, is truncated, or holds no scans.
     """
     path = existing(path, "Parquet file of scans")
-    check_parquet(path)
-    try:
-        table = pq.read_table(path)
-    except (pa.ArrowException, OSError) as error:
-        raise InputError(f"{path}: damaged Parquet ({str(error).splitlines()[0]}); write it again") from error
+    table = load_parquet(path)
     values = {}
     for name in _DOCS:
         if name not in table.column_names:

@@ -9,9 +9,8 @@ import json
 import os
 import shutil
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError, find
 from magtwin.files import check_free, existing, output
+from magtwin.io.recorder import Sink
 from magtwin.run.arrow import (
     FACTS,
     metadata_from_json,
@@ -75,7 +75,7 @@ def read_parquet(path: str | os.PathLike[str], *, columns: Mapping[str, str] | N
     try:
         if path.is_dir():
             return _read_parts(path)
-        table = _table(path)
+        table = load_parquet(path)
         if columns:
             table = _on_the_floor(table.rename_columns(_renamed(table.column_names, columns, path)))
         return run_of(table, path)
@@ -87,7 +87,7 @@ def _read_parts(path: Path) -> Run:
     parts = sorted(path.glob("part-*.parquet"))
     if not parts:
         raise InputError(f"{path}: a folder without Parquet parts; name the file in it")
-    tables = [_table(part) for part in parts]
+    tables = [load_parquet(part) for part in parts]
     for part, table in zip(parts, tables, strict=True):
         if table.schema != tables[0].schema:
             raise InputError(f"{part}: has other columns than {parts[0].name}; it belongs to another run")
@@ -95,10 +95,13 @@ def _read_parts(path: Path) -> Run:
     return run_of(pa.concat_tables(tables).replace_schema_metadata(metadata), path)
 
 
-def check_parquet(path: Path) -> None:
-    """Refuse files that do not begin and end like Parquet."""
-    if path.is_dir():
-        raise InputError(f"{path}: a folder, not a Parquet file; name the file in it")
+def load_parquet(path: Path, load: Callable[[Path], Any] = pq.read_table) -> Any:
+    """A Parquet file, loaded by a function of pyarrow.
+
+    Raises:
+        InputError: It does not begin and end like Parquet, or is damaged.
+    """
+    _check_file(path, "a Parquet file")
     with open(path, "rb") as file:
         head = file.read(4)
         file.seek(max(0, path.stat().st_size - 4))
@@ -107,18 +110,19 @@ def check_parquet(path: Path) -> None:
         raise InputError(f"{path}: not a Parquet file: it begins with {head!r}, not {_MAGIC!r}")
     if tail != _MAGIC:
         raise InputError(f"{path}: Parquet cut short: its end is missing; write it again, or copy it again")
-
-
-def _table(path: Path) -> pa.Table:
-    check_parquet(path)
     try:
-        return pq.read_table(path)
+        return load(path)
     except (pa.ArrowException, OSError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"{path}: damaged Parquet ({reason}); write it again") from error
 
 
-class ParquetParts:
+def _check_file(path: Path, kind: str) -> None:
+    if path.is_dir():
+        raise InputError(f"{path}: a folder, not {kind}; name the file in it")
+
+
+class ParquetParts(Sink):
     """A Parquet file that grows: each block becomes a separate file, and at the end all become one.
 
     Until then the blocks lie in the folder `F.parquet.parts`, which `read_parquet` reads at any time; a
@@ -178,17 +182,6 @@ class ParquetParts:
         if not self._count:
             shutil.rmtree(self.folder, ignore_errors=True)
 
-    def __enter__(self) -> "ParquetParts":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self.abort()
-
 
 def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) -> None:
     """Write a run as CSV: metadata in lines that begin with #, a line of names, one line per row.
@@ -197,21 +190,15 @@ def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
     it with `read_csv(F, comment="#")` (before pandas 3, with `float_precision="round_trip"` beside), DuckDB
     with `read_csv('F', comment='#')`, polars with `read_csv(F, comment_prefix="#")`.
 
-    Args:
-        run: The run; its clock `t` must ascend.
-        path: The file to make.
-        force: Replace an existing file.
-
-    Raises:
-        InputError: As for `write_parquet`.
+    Arguments and errors are those of `write_parquet`.
     """
     table = table_of(run)
     lines = [f"# {_ABOUT} run: metadata, then columns by name with unit, frame and meaning, in JSON"]
     lines.append(f"# rows {table.num_rows}")
-    lines.append(f"# facts {_line_safe(metadata_to_json(run))}")
+    lines.append(f"# facts {_line_safe(json.loads(metadata_to_json(run)))}")
     for field in table.schema:
         about = {key.decode(): text.decode() for key, text in field.metadata.items()}
-        lines.append(f"# column {field.name} {_line_safe(_json({'type': str(field.type), **about}))}")
+        lines.append(f"# column {field.name} {_line_safe({'type': str(field.type), **about})}")
     for name in table.column_names:
         if not name.isprintable() or set(name) & set('",# '):
             raise InputError(f"column {name!r} cannot stand in a CSV file; use letters, digits and _")
@@ -237,8 +224,7 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
             run.
     """
     path = existing(path, "CSV file")
-    if path.is_dir():
-        raise InputError(f"{path}: a folder, not a CSV file; name the file in it")
+    _check_file(path, "a CSV file")
     with open(path, "rb") as file:
         about, names, skipped = _csv_head(file, path)
         file.seek(-1, os.SEEK_END)
@@ -246,7 +232,10 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
     rows, metadata, said = _csv_about(about, path)
     if columns:
         names = _renamed(names, columns, path)
-    types = {name: pa.bool_() if _is_flag(name) else pa.float64() for name in names}
+    types = {
+        name: pa.bool_() if name in COLUMNS and COLUMNS[name].unit == "bool" else pa.float64()
+        for name in names
+    }
     for name in said.keys() & types.keys():
         try:
             types[name] = pa.type_for_alias(said[name].pop("type", str(types[name])))
@@ -255,17 +244,14 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
     if cut and said:
         raise InputError(f"{path}: CSV cut short: its last line has no end; write it again, or copy it again")
     try:
-        table = pa.csv.read_csv(
-            path,
-            pa.csv.ReadOptions(column_names=names, skip_rows=skipped),
-            pa.csv.ParseOptions(),
-            pa.csv.ConvertOptions(
-                column_types=types,
-                null_values=[""],
-                true_values=["true", "True", "TRUE", "1", "1.0"],
-                false_values=["false", "False", "FALSE", "0", "0.0"],
-            ),
+        reading = pa.csv.ReadOptions(column_names=names, skip_rows=skipped)
+        conversion = pa.csv.ConvertOptions(
+            column_types=types,
+            null_values=[""],
+            true_values=["true", "True", "TRUE", "1", "1.0"],
+            false_values=["false", "False", "FALSE", "0", "0.0"],
         )
+        table = pa.csv.read_csv(path, reading, pa.csv.ParseOptions(), conversion)
     except (pa.ArrowException, OSError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: not a CSV file of a run: {_short(reason)}") from error
@@ -344,12 +330,9 @@ def _texts(text: str, where: str) -> dict[str, str]:
     return said
 
 
-def _json(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False)
-
-
-def _line_safe(text: str) -> str:
+def _line_safe(value: Any) -> str:
     """JSON on one line, also for readers that end lines at other characters."""
+    text = json.dumps(value, ensure_ascii=False)
     return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
 
 
@@ -357,22 +340,12 @@ def _short(text: str) -> str:
     return text if len(text) <= 200 else text[:200] + " ..."
 
 
-def _is_flag(name: str) -> bool:
-    return name in COLUMNS and COLUMNS[name].unit == "bool"
-
-
 def write_npz(run: Run, path: str | os.PathLike[str], *, force: bool = False) -> None:
     """Write a run as npz: one array per column, and `magtwin`, a JSON text with metadata, units and frames.
 
     Arrays are not compressed, for speed, and nothing is pickled. The same run gives the same bytes.
 
-    Args:
-        run: The run; its clock `t` must ascend.
-        path: The file to make.
-        force: Replace an existing file.
-
-    Raises:
-        InputError: As for `write_parquet`.
+    Arguments and errors are those of `write_parquet`.
     """
     check_clock(run, "the run to write")
     run.members()  # refuses other than numbers
@@ -381,7 +354,7 @@ def write_npz(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
     columns = {
         name: {**said_of(run.spec(name), name), "parts": ",".join(run.spec(name).parts)} for name in run
     }
-    about = _json({"facts": json.loads(metadata_to_json(run)), "columns": columns})
+    about = json.dumps({"facts": json.loads(metadata_to_json(run)), "columns": columns}, ensure_ascii=False)
     with output(path, force=force) as aside, open(aside, "wb") as file:
         np.savez(file, allow_pickle=False, **{_ABOUT: np.array(about)}, **run.columns)
 
@@ -397,20 +370,26 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
             never read, or holds no run.
     """
     path = existing(path, "npz file")
-    if path.is_dir():
-        raise InputError(f"{path}: a folder, not an npz file; name the file in it")
+    _check_file(path, "an npz file")
     try:
         with zipfile.ZipFile(path) as archive:
-            names = [info.filename for info in archive.infolist()]
+            names = archive.namelist()
             if twice := sorted({name for name in names if names.count(name) > 1}):
                 raise InputError(f"{path}: two arrays are called {twice[0]!r}; write it again")
             arrays = {name.removesuffix(".npy"): _array(archive, name, path) for name in names}
     except (zipfile.BadZipFile, EOFError, OSError, NotImplementedError, RuntimeError) as error:
         raise InputError(f"{path}: not an npz file, damaged, or cut short ({error})") from error
-    metadata, said = _npz_about(arrays.pop(_ABOUT, np.array("{}")), path)
+    try:
+        about = json.loads(str(arrays.pop(_ABOUT, "{}")))
+        metadata = metadata_from_json(json.dumps(about.get("facts", {})), path)
+        said = {name: _texts(json.dumps(text), str(path)) for name, text in about.get("columns", {}).items()}
+    except (ValueError, AttributeError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: array {_ABOUT!r} holds no metadata of a run ({error})") from error
     specs = {
-        name: spec_said(told, tuple(filter(None, told.get("parts", "").split(","))))
-        for name, told in said.items()
+        name: spec_said(texts, tuple(filter(None, texts.get("parts", "").split(","))))
+        for name, texts in said.items()
         if name not in COLUMNS
     }
     for name, values in arrays.items():
@@ -428,32 +407,9 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
 
 
 def _array(archive: zipfile.ZipFile, name: str, path: Path) -> NDArray[Any]:
-    """An array of an npz; memory is allocated for its bytes, not for what its header claims."""
-    data = archive.read(name)
-    file = io.BytesIO(data)
     try:
-        version = np.lib.format.read_magic(file)
-        header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        shape, fortran, dtype = header[version](file)
-    except (ValueError, KeyError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: {name} is not a numpy array ({_short(reason)})") from error
-    if dtype.hasobject:
-        raise InputError(f"{path}: {name} holds pickled objects, which are not read; save plain numbers")
-    body = data[file.tell() :]
-    if len(body) != dtype.itemsize * int(np.prod(shape, dtype=object)):
-        raise InputError(
-            f"{path}: {name} is cut short: {len(body)} bytes for {dtype} of shape {shape}; write it again"
-        )
-    return np.frombuffer(body, dtype).reshape(shape, order="F" if fortran else "C")
-
-
-def _npz_about(about: NDArray[Any], path: Path) -> tuple[Any, dict[str, dict[str, str]]]:
-    """Metadata of the run and of its columns."""
-    try:
-        told = json.loads(str(about))
-        metadata, columns = told.get("facts", {}), told.get("columns", {})
-        said = {str(name): _texts(json.dumps(text), str(path)) for name, text in columns.items()}
-    except (ValueError, AttributeError, RecursionError) as error:
-        raise InputError(f"{path}: array {_ABOUT!r} holds no metadata of a run ({error})") from error
-    return metadata_from_json(json.dumps(metadata), path), said
+        with archive.open(name) as file:
+            return np.lib.format.read_array(file, allow_pickle=False)  # type: ignore[arg-type]
+    except (ValueError, MemoryError, OverflowError) as error:
+        reason = _short(" ".join(str(error).split()))
+        raise InputError(f"{path}: {name} is no whole array of plain numbers ({reason})") from error

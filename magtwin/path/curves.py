@@ -20,17 +20,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from magtwin.errors import InputError
+from magtwin.extend import Registry
 from magtwin.path.polyline import Path
-from magtwin.registry import Registry
 
-MOST_POINTS = 1_000_000
-"""Most points of a path: 5 km of a spline, 16 MB."""
-
-PATHS: Registry[Callable[..., Path]] = Registry("path", "paths")
-"""Functions that make paths, by name."""
-
-path = PATHS.register
-"""Decorator that gives a function a name in `PATHS`."""
+MOST_POINTS = 1_000_000  # Most points of a path: 5 km of a spline, 16 MB
+PATHS: Registry[Callable[..., Path]] = Registry("path", "paths")  # Functions that make paths, by name
+path = PATHS.register  # Decorator that gives a function a name in `PATHS`
 
 
 @path("sine")
@@ -233,6 +228,7 @@ def fast_sine() -> Path:
     return Path("fast_sine", sine(amplitude_m=1.5, wavenumber_rad_m=4 * math.pi).p_xy)
 
 
+# Paths of the cases in Table 1 of the neural magnetometer paper (Penumarti et al. 2025).
 CASES: Mapping[str, str] = MappingProxyType(
     {
         "A": "fast_sine",
@@ -242,7 +238,6 @@ CASES: Mapping[str, str] = MappingProxyType(
         "E": "narrow_figure8",
     }
 )
-"""Paths of the cases in Table 1 of the neural magnetometer paper (Penumarti et al. 2025)."""
 
 
 def path_named(name: str) -> Path:

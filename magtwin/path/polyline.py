@@ -11,8 +11,7 @@ from magtwin.summary import Summarized, Summary, rectangle
 
 Array = NDArray[np.float64]
 
-SAME_M = 1e-6
-"""Points nearer than this are equal, and a line whose ends are nearer is closed [m]."""
+SAME_M = 1e-6  # Points nearer than this are equal, and a line whose ends are nearer is closed [m]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -22,23 +21,13 @@ class Path(Summarized):
     Equal neighbours are merged. A closed path repeats its first point at the end, which is added if needed.
     """
 
-    name: str
-    """Name: one of `PATHS`, or that of a file."""
-
-    p_xy: Array
-    """Points in world [m], shape (N, 2), N >= 2."""
-
-    closed: bool = False
-    """Whether the path can be repeated from its end."""
-
-    file: str = ""
-    """File that it was read from, or ""."""
-
+    name: str  # Name: one of `PATHS`, or that of a file
+    p_xy: Array  # Points in world [m], shape (N, 2), N >= 2
+    closed: bool = False  # Whether the path can be repeated from its end
+    file: str = ""  # File that it was read from, or ""
+    # Scale in x and y, then shift in x and y [m], which fitted the path to its floor; () means none
     placing: tuple[float, ...] = ()
-    """Scale in x and y, then shift in x and y [m], which fitted the path to its floor; () means none."""
-
-    s: Array = field(init=False, repr=False)
-    """Arc length at each point, from 0 [m], shape (N,)."""
+    s: Array = field(init=False, repr=False)  # Arc length at each point, from 0 [m], shape (N,)
 
     def __post_init__(self) -> None:
         p = np.array(self.p_xy, float)

@@ -16,40 +16,24 @@ from magtwin.spec.obstacles import Obstacles
 
 Array = NDArray[np.float64]
 
-FLOOR_M = (6.0, 3.5)
-"""Floor for which the named paths are designed [m]."""
-
-RADIUS_M = 0.171
-"""Robot radius for which they are designed [m]."""
-
+FLOOR_M = (6.0, 3.5)  # Floor for which the named paths are designed [m]
+RADIUS_M = 0.171  # Robot radius for which they are designed [m]
+# Clearance from obstacles, if there is room, since a robot deviates a little from its path [m]
 CLEAR_M = 0.05
-"""Clearance from obstacles, if there is room, since a robot deviates a little from its path [m]."""
-
-STEP_M = 0.03
-"""Spacing of the raster of the free floor [m]; larger on large floors."""
-
-MOST_CELLS = 400_000
-"""Most cells of that raster."""
-
+STEP_M = 0.03  # Spacing of the raster of the free floor [m]; larger on large floors
+MOST_CELLS = 400_000  # Most cells of that raster
+# Sizes to try, as fractions of the size that fits the empty floor
 SHRINK = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)
-"""Sizes to try, as fractions of the size that fits the empty floor."""
-
-SHIFTS = 13
-"""Positions to try along each axis for each size."""
+SHIFTS = 13  # Positions to try along each axis for each size
 
 
 @dataclass(frozen=True)
 class Room:
     """A floor with obstacles, and the robot that drives on it."""
 
-    floor_m: tuple[float, float]
-    """Extent of the floor in x and y, centred on the world's origin [m]."""
-
-    footprint_radius_m: float
-    """Radius of the robot [m]."""
-
-    obstacles: Obstacles
-    """Obstacles in the room."""
+    floor_m: tuple[float, float]  # Extent of the floor in x and y, centred on the world's origin [m]
+    footprint_radius_m: float  # Radius of the robot [m]
+    obstacles: Obstacles  # Obstacles in the room
 
     def refusal(self, path: Path) -> InputError | None:
         """The error if the robot cannot drive the path here; None if it can."""
@@ -234,11 +218,12 @@ class _Free:
         self._low = -half
         axes = [np.arange(-h, h + self.step_m, self.step_m) for h in half]
         at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-        inside = [k for k, o in enumerate(room.obstacles.outlines) if _meets(o, half)]
-        standing = Obstacles(
-            tuple(room.obstacles.names[k] for k in inside),
-            tuple(room.obstacles.outlines[k] for k in inside),
-        )
+        inner = half - 1e-6  # an outline that only touches the floor's edge is outside
+        pairs = zip(room.obstacles.names, room.obstacles.outlines, strict=True)
+        inside = [
+            pair for pair in pairs if np.all(pair[1].max(0) > -inner) and np.all(pair[1].min(0) < inner)
+        ]
+        standing = Obstacles(tuple(name for name, _ in inside), tuple(outline for _, outline in inside))
         # A point is at most this far from the nearest node of the raster.
         needed = room.footprint_radius_m + clear_m + self.step_m / math.sqrt(2)
         distance, _ = standing.clearance(at.reshape(-1, 2), reach_m=needed)
@@ -254,8 +239,3 @@ class _Free:
             cell = np.clip(np.rint((points + shift - self._low) / self.step_m), 0, most).astype(int)
             held.append(bool(self._free[cell[:, 0], cell[:, 1]].all()))
         return np.array(held)
-
-
-def _meets(outline: Array, half: Array) -> bool:
-    """Whether an outline overlaps the floor, not only its edge."""
-    return bool(np.all(outline.max(axis=0) > -half + 1e-6) and np.all(outline.min(axis=0) < half - 1e-6))

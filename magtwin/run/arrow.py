@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.run.resample import RULES
-from magtwin.run.run import COLUMNS, Column, Run, check_clock
+from magtwin.run.run import COLUMNS, Column, Metadata, Run, check_clock
 
 FACTS = b"magtwin_facts"
 
@@ -61,7 +61,11 @@ def run_of(table: pa.Table, path: Path) -> Run:
         vector = COLUMNS[name].width > 1 if name in COLUMNS else "part" in said
         columns[name] = np.column_stack(parts) if vector else parts[0]
         if name in COLUMNS:
-            _check_flags(columns[name], name, path)
+            wrong = (columns[name] != 0) & (columns[name] != 1) & (COLUMNS[name].unit == "bool")
+            if wrong.any():
+                row = int(np.argmax(wrong))
+                text = f"a flag is 0 or 1, got {columns[name][row]}"
+                raise InputError(f"{path}: column {name!r}, row {row}: {text}")
         elif "column" in said:
             named = tuple(_metadata(table, member)[b"part"].decode() for member in members) if vector else ()
             specs[name] = spec_said(said, named)
@@ -90,13 +94,10 @@ def metadata_to_json(run: Run) -> str:
     Raises:
         InputError: A value is not a text, number or bool.
     """
-    for key, value in run.metadata.items():
-        if not isinstance(value, str | int | float | bool):
-            raise InputError(f"metadata {key!r} must be a text, a number, or true or false, got {value!r}")
-    return json.dumps(dict(run.metadata), ensure_ascii=False)
+    return json.dumps(check_metadata(dict(run.metadata)), ensure_ascii=False)
 
 
-def metadata_from_json(text: str | bytes, path: Path) -> dict[str, str | int | float | bool]:
+def metadata_from_json(text: str | bytes, path: Path) -> Metadata:
     """The metadata from `metadata_to_json`.
 
     Raises:
@@ -106,12 +107,21 @@ def metadata_from_json(text: str | bytes, path: Path) -> dict[str, str | int | f
         metadata = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: metadata {FACTS.decode()!r} is not JSON: {error}") from error
+    return check_metadata(metadata, f"{path}: ")
+
+
+def check_metadata(metadata: Any, where: str = "") -> Metadata:
+    """Metadata of a run, if they are texts, numbers and bools by name; `where` begins the refusal.
+
+    Raises:
+        InputError: They are not.
+    """
     if not isinstance(metadata, dict):
-        raise InputError(f"{path}: metadata {FACTS.decode()!r} must be an object, got {text[:40]!r}")
+        raise InputError(f"{where}metadata {FACTS.decode()!r} must be an object, got {str(metadata)[:40]!r}")
     for key, value in metadata.items():
         if not isinstance(value, str | int | float | bool):
             raise InputError(
-                f"{path}: metadata {key!r} must be a text, a number, or true or false, got {value!r}"
+                f"{where}metadata {key!r} must be a text, a number, or true or false, got {value!r}"
             )
     return metadata
 
@@ -146,12 +156,3 @@ def _numpy(table: pa.Table, name: str, path: Path) -> NDArray[Any]:
         row = column.is_null().to_numpy().argmax()
         raise InputError(f"{path}: column {name!r}, row {row}: no value; write nan for unknown values")
     return column.to_numpy()
-
-
-def _check_flags(values: NDArray[Any], name: str, path: Path) -> None:
-    """Refuse flags other than 0 and 1."""
-    if COLUMNS[name].unit == "bool" and values.dtype.kind != "b":
-        wrong = (values != 0) & (values != 1)
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            raise InputError(f"{path}: column {name!r}, row {row}: a flag is 0 or 1, got {values[row]}")

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import signal
 
 from magtwin.errors import InputError
 from magtwin.frames import wrap_angle, yaw_from_quat
@@ -127,11 +128,8 @@ class Comparison(Summarized):
             (a.name, f"mean {a.mean:.4g}, rms {a.rms:.4g}, largest {a.greatest:.4g} {a.unit}")
             for a in self.agreements()
         ]
-        by = (
-            "as they are"
-            if self.align == "none"
-            else f"by {self.align}, B shifted by {self.shift:.4g} {self.unit}"
-        )
+        shifted = f"by {self.align}, B shifted by {self.shift:.4g} {self.unit}"
+        by = "as they are" if self.align == "none" else shifted
         return Summary(f"Comparison: {len(self.at):,} readings of A, aligned {by}", tuple(agreements))
 
 
@@ -207,8 +205,7 @@ def compare(a: Run, b: Run, *, align: Align = "time") -> Comparison:
         advice = "; align them by time, which finds the offset" if align == "none" else ""
         raise InputError(f"the runs do not overlap: {spans[0]} and {spans[1]}{advice}")
     rows, wanted = track_a.rows[over], wanted[over]
-    none = np.empty(0)
-    along, cross, heading = none, none, none
+    along = cross = heading = np.empty(0)
     if position is not None:
         x, y = (track_b.at(wanted, b[position][:, k]) - a[position][rows, k] for k in (0, 1))
         yaw_a, yaw_b = _yaw(a, position), _yaw(b, position)
@@ -217,16 +214,8 @@ def compare(a: Run, b: Run, *, align: Align = "time") -> Comparison:
             heading = wrap_angle(turned - yaw_a[rows])
         facing = _direction(a, position)[rows] if yaw_a is None else yaw_a[rows]
         along, cross = (x * np.cos(facing) + y * np.sin(facing), y * np.cos(facing) - x * np.sin(facing))
-    return Comparison(
-        align=align,
-        shift=shift,
-        at=track_a.place[over],
-        rows=rows,
-        along_m=along,
-        cross_m=cross,
-        heading_rad=heading,
-        fields={name: (a[name][rows], track_b.at(wanted, b[name])) for name in fields},
-    )
+    seen = {name: (a[name][rows], track_b.at(wanted, b[name])) for name in fields}
+    return Comparison(align, shift, track_a.place[over], rows, along, cross, heading, seen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,10 +254,8 @@ def traversals(a: Run, b: Run) -> Traversals:
         InputError: As for `compare`.
     """
     a, b = (run.with_columns(t=run["t"] - run["t"][0]) if run.rows else run for run in (a, b))
-    return Traversals(a, b, *(compare(a, b, align=how) for how in _HOW))
-
-
-_HOW: tuple[Align, ...] = ("none", "time", "path")
+    recorded, timed = compare(a, b, align="none"), compare(a, b, align="time")
+    return Traversals(a, b, recorded, timed, compare(a, b, align="path"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,11 +280,8 @@ class _Track:
             on = np.diff(place, prepend=-1.0) > 0
             rows, place = rows[on], place[on]
         if len(rows) < 2:
-            what = (
-                f"its robot moves no {STEP_M:g} m; align by time"
-                if align == "path"
-                else "its positions are unknown"
-            )
+            still = f"its robot moves no {STEP_M:g} m; align by time"
+            what = still if align == "path" else "its positions are unknown"
             raise InputError(f"the {which} run cannot be aligned: {what}")
         return cls(rows, place, p_xy[rows])
 
@@ -366,12 +350,7 @@ def _best_lag(a: Array, b: Array, size_m: float) -> int:
     centre = a.mean(axis=0)  # avoids cancellation
     a, b = a - centre, b - centre
     lags = np.arange(-(len(b) - 1), len(a))
-    size = len(a) + len(b) - 1
-    length = 1 << (size - 1).bit_length()
-    cross = sum(
-        np.fft.irfft(np.fft.rfft(a[:, k], length) * np.fft.rfft(b[::-1, k], length), length)[:size]
-        for k in (0, 1)
-    )
+    cross = sum(signal.correlate(a[:, k], b[:, k], method="fft") for k in (0, 1))
     first, last = np.maximum(lags, 0), np.minimum(lags + len(b), len(a))  # rows of A under B
     squares = [np.concatenate([[0.0], np.cumsum((curve**2).sum(axis=1))]) for curve in (a, b)]
     total = squares[0][last] - squares[0][first] + squares[1][last - lags] - squares[1][first - lags]
@@ -408,16 +387,8 @@ def agreement(name: str, unit: str, difference: Array, correlation: float | None
     if not len(known):
         return None
     size = np.abs(known)
-    return Agreement(
-        name,
-        unit,
-        len(known),
-        float(known.mean()),
-        float(np.sqrt(np.mean(known**2))),
-        float(size.mean()),
-        float(size.max()),
-        correlation,
-    )
+    mean, rms = float(known.mean()), float(np.sqrt(np.mean(known**2)))
+    return Agreement(name, unit, len(known), mean, rms, float(size.mean()), float(size.max()), correlation)
 
 
 def _correlation(a: Array, b: Array) -> float | None:

@@ -383,11 +383,7 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         """For each name in `flat`: its column, its part ("" for a scalar), and its values."""
         flat: dict[str, tuple[str, str, NDArray[Any]]] = {}
         for name, values in self.items():
-            if values.ndim not in (1, 2) or values.dtype.kind not in "bfiu":
-                raise InputError(
-                    f"column {name!r} cannot stand in a table: it needs numbers or flags of shape (N,) or "
-                    f"(N, width), got {values.dtype} of shape {values.shape}"
-                )
+            check_numbers(name, values, "stand in a table")
             parts = self.spec(name).parts if values.ndim == 2 else ()
             rows = {f"{name}_{part}": (name, part, values[:, i]) for i, part in enumerate(parts)}
             for key, (column, part, array) in (rows or {name: (name, "", values)}).items():
@@ -487,26 +483,19 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
             if len(values):
                 note = f"{values.min():.0f} to {values.max():.0f}"
                 figures.append(Figure(name, float(values.mean()), "nT", float(values.std()), note))
-        error = (
-            self["b_total_nt"] - self["b_truth_nt"]
-            if {"b_total_nt", "b_truth_nt"} <= set(self)
-            else np.array([])
-        )
+        known = {"b_total_nt", "b_truth_nt"} <= set(self)
+        error = self["b_total_nt"] - self["b_truth_nt"] if known else np.array([])
         if np.nanmax(np.abs(error), initial=0.0) > 0:
             note = "mean absolute difference of b_total_nt from b_truth_nt"
             figures.append(Figure("error", float(np.nanmean(np.abs(error))), "nT", None, note))
-        raised = [name for name in self if name.startswith("flag_") and self[name].any()]
-        figures += [
-            Figure(n, int(self[n].sum()), "readings", None, COLUMNS[n].doc if n in COLUMNS else "")
-            for n in raised
-        ]
-        return Report(title, tuple(figures), dict(self.metadata), self._verdict())
-
-    def _verdict(self) -> str:
-        """How well a network predicted the exact field of a simulated run; "" without a network."""
-        tally = Tally()
+        for name in self:
+            if name.startswith("flag_") and self[name].any():
+                note = COLUMNS[name].doc if name in COLUMNS else ""
+                figures.append(Figure(name, int(self[name].sum()), "readings", None, note))
+        tally = Tally()  # how well a network predicted the exact field, if there was one
         self.add_to(tally)
-        return tally.verdict("the exact field of this run, one session", holds=HOLDS_ONE)
+        verdict = tally.verdict("the exact field of this run, one session", holds=HOLDS_ONE)
+        return Report(title, tuple(figures), dict(self.metadata), verdict)
 
     def add_to(self, tally: Tally) -> None:
         """Add the errors of a simulated run's network against the exact field, if it has both."""
@@ -514,7 +503,7 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         if self.metadata.get("magnetometer") != "neural" or not wanted <= set(self):
             return
         truth, mean = self["b_truth_nt"], float(self.metadata.get("network_label_mean_nt", 0.0))
-        tally.than = "the map plus the mean training label" if mean else "the map alone"
+        tally.than = "the map plus the mean disturbance in the training data" if mean else "the map alone"
         tally.add(self["b_total_nt"] - truth, self["b_map_nt"] + mean - truth, self["b_sd_nt"])
 
     def _derived(self, step: str, columns: Mapping[str, NDArray[Any]] | None = None) -> "Run":
@@ -534,6 +523,15 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         """Its time span, for error messages."""
         t = self["t"]
         return f"the run goes from {t[0]:g} to {t[-1]:g} s" if len(t) else "the run has no rows"
+
+
+def check_numbers(name: str, values: NDArray[Any], use: str) -> None:
+    """Refuse a column of other than numbers or flags in rows; `use` is what it cannot do."""
+    if values.ndim not in (1, 2) or values.dtype.kind not in "bfiu" or 0 in values.shape[1:]:
+        raise InputError(
+            f"column {name!r} cannot {use}: it needs numbers or flags of shape (N,) or (N, width), "
+            f"got {values.dtype} of shape {values.shape}"
+        )
 
 
 def check_clock(run: Run, what: str) -> None:

@@ -22,17 +22,13 @@ def run_summary(
         described: Name, unit, frame and meaning of each column.
     """
     flags = _flags(columns)
-    return Summary(
-        _title(columns),
-        (
-            ("from", _origin(metadata)),
-            ("path", _driven(columns)),
-            ("field", _field_range(columns)),
-            ("flags" if flags else "columns", flags or listed(columns)),
-        ),
-        ("column", "unit", "frame", "what it is"),
-        described,
+    lines = (
+        ("from", _origin(metadata)),
+        ("path", _driven(columns)),
+        ("field", _field_range(columns)),
+        ("flags" if flags else "columns", flags or listed(columns)),
     )
+    return Summary(_title(columns), lines, ("column", "unit", "frame", "what it is"), described)
 
 
 def _title(columns: Columns) -> str:
@@ -49,11 +45,8 @@ def _title(columns: Columns) -> str:
 
 def _origin(metadata: Mapping[str, Any]) -> str:
     """Scene, path, robot and seed, as far as the metadata hold them."""
-    parts = [
-        f"{name} {metadata[name]}"
-        for name in ("scene", "path", "robot", "seed", "session")
-        if name in metadata
-    ]
+    names = ("scene", "path", "robot", "seed", "session")
+    parts = [f"{name} {metadata[name]}" for name in names if name in metadata]
     if "magnetometer" in metadata:
         parts.append(f"{metadata['magnetometer']} magnetometer")
         if "network" in metadata:

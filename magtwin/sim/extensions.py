@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.registry import Registry
+from magtwin.extend import Registry
 from magtwin.run.run import COLUMNS, Column
 from magtwin.sim.motion.controllers import CUSTOM_CONTROLLERS
 from magtwin.sim.motion.engine import ENGINES

@@ -23,6 +23,9 @@ from magtwin.spec.plant import PlantSpec
 
 Array = NDArray[np.float64]
 
+BLOCK = 2048
+"""Readings whose play is computed at a time: their arrays stay in the cache."""
+
 _DRAWN = (
     *("warm_up_nt", "warm_up_soft_iron", "warm_up_age_s", "motor_abs_nt_nm", "motor_square_nt_nm2"),
     *("lidar_speed_nt_s_m", "lidar_supply_nt_a", "moving_moment", "pan_phase"),
@@ -123,9 +126,9 @@ class Plant(Stateful):
 def play(u: ArrayLike, thresholds: ArrayLike, before: ArrayLike | None = None) -> Array:
     """Play operators: w_k = max(u_k - r, min(u_k + r, w_{k-1})).
 
-    A step limits w to [u_k - r, u_k + r], and a limit after a limit is one too. So all steps are combined in
-    log2 K passes over the array (Hillis and Steele, 1986). Limits are exact, so the result has the bytes of
-    the loop.
+    A step limits w to [u_k - r, u_k + r], and a limit after a limit is one too. So the steps of a block are
+    combined in log2 K passes (Hillis and Steele, 1986). Limits are exact, so the result has the bytes of the
+    loop.
 
     Args:
         u: Input, shape (K, ...); a nan leaves w as it is.
@@ -135,10 +138,20 @@ def play(u: ArrayLike, thresholds: ArrayLike, before: ArrayLike | None = None) -
     Returns:
         w after each sample, shape (K, ..., P, C).
     """
-    inputs = np.asarray(u, float)[..., None, :]
-    r = np.asarray(thresholds, float)[:, None]
-    low = np.where(np.isnan(inputs), -np.inf, inputs - r)
-    high = np.where(np.isnan(inputs), np.inf, inputs + r)
+    inputs, r = np.asarray(u, float), np.asarray(thresholds, float)
+    played = np.empty((*inputs.shape[:-1], len(r), inputs.shape[-1]))
+    last = 0.0 if before is None else np.asarray(before, float)
+    for first in range(0, len(inputs), BLOCK):
+        rows = slice(first, first + BLOCK)
+        played[rows] = _play_block(inputs[rows, ..., None, :], r[:, None], last)
+        last = played[rows][-1]
+    return played
+
+
+def _play_block(u: Array, r: Array, before: ArrayLike) -> Array:
+    """`play` of a block, in log2 K passes."""
+    low = np.where(np.isnan(u), -np.inf, u - r)
+    high = np.where(np.isnan(u), np.inf, u + r)
     step = 1
     while step < len(low):
         first, then = slice(None, -step), slice(step, None)
@@ -146,14 +159,9 @@ def play(u: ArrayLike, thresholds: ArrayLike, before: ArrayLike | None = None) -
         high[then] = np.maximum(low[then], np.minimum(high[then], high[first]))
         low[then] = lower
         step *= 2
-    start = np.zeros(low.shape[1:]) if before is None else np.asarray(before, float)
-    return np.asarray(np.maximum(low, np.minimum(high, start)))
+    return np.asarray(np.maximum(low, np.minimum(high, before)))
 
 
 def _turned(matrix: Array, vectors: Array) -> Array:
     """A matrix (3, 3) times vectors (..., 3)."""
     return np.stack([sum(row[k] * vectors[..., k] for k in range(3)) for row in matrix], axis=-1)
-
-
-NONE = PlantSpec()
-"""The plant without effect."""

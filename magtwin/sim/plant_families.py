@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from magtwin.errors import InputError, find
+from magtwin.files import from_table
 from magtwin.spec.base import ZERO3
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import RobotSpec
@@ -18,7 +19,10 @@ from magtwin.spec.robot import RobotSpec
 Array = NDArray[np.float64]
 
 SESSION_STD = 0.1
-"""Relative spread between sessions that all families have, like `current_std` of the TurtleBot 4."""
+"""Relative spread between sessions, like `current_std` of the TurtleBot 4."""
+
+MOST_DIGITS = 18
+"""Most digits of a seed in a text."""
 
 Entropy = tuple[int, ...]
 
@@ -67,7 +71,6 @@ def _hysteresis(entropy: Entropy) -> PlantSpec:
         play_thresholds_nt=_numbers(thresholds),
         play_weights=_numbers(weights),
         start_field_std_nt=50e3,  # carried and tilted, past steel and magnets
-        session_std=SESSION_STD,
     )
 
 
@@ -221,19 +224,16 @@ def plant_of(text: str, *, which: int = 0) -> PlantSpec:
     """
     if text.startswith("{"):
         try:
-            given: dict[str, Any] = {
-                name: tuple(value) if isinstance(value, list) else value
-                for name, value in json.loads(text).items()
-            }
-            return PlantSpec(**given)
-        except (ValueError, TypeError, RecursionError) as error:
-            raise InputError(
-                f"plant {text[:60]!r} is no plant's fields: {error}", parameter="plant"
-            ) from error
+            given = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"plant {text[:60]!r} is not JSON: {error}", parameter="plant") from error
+        return from_table(PlantSpec, given, "plant")
     name, colon, seed = text.partition(":")
-    if colon and not (seed.isascii() and seed.isdigit()):
+    if colon and not (seed.isascii() and seed.isdigit() and len(seed) <= MOST_DIGITS):
         raise InputError(
-            f"plant must be NAME or NAME:SEED, SEED a whole number from 0 up; got {text!r}", parameter="plant"
+            f"plant must be NAME or NAME:SEED, SEED a whole number from 0 up with at most {MOST_DIGITS} "
+            f"digits; got {text[:60]!r}",
+            parameter="plant",
         )
     return draw_plant(name, int(seed or 0), which=which)
 

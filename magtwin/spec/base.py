@@ -8,26 +8,16 @@ import math
 from dataclasses import MISSING, Field, fields, is_dataclass
 from typing import Any
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, hint
 
 Vec2 = tuple[float, float]
-
-
 Vec3 = tuple[float, float, float]
-
-
 Quat = tuple[float, float, float, float]
-
-
 Matrix3 = tuple[float, float, float, float, float, float, float, float, float]
 """Rows of a 3 x 3 matrix, one after the other."""
 
-
 ZERO3: Vec3 = (0.0, 0.0, 0.0)
-
-
 ZERO9: Matrix3 = (0.0,) * 9  # type: ignore[assignment]
-
 
 UNIT_TOLERANCE = 1e-6
 """Largest error of the squared length of a unit quaternion; single precision passes."""
@@ -61,6 +51,10 @@ class Spec:
         for name in names:
             value = getattr(self, name)
             self._require(name, _least(value) >= 0, "not be below 0", value)
+
+    def _named(self, name: str, known: tuple[str, ...]) -> None:
+        value = getattr(self, name)
+        self._require(name, value in known, f"be a known {name} ({hint(value, known)})", value)
 
     def _within(self, name: str, least: float, most: float) -> None:
         value = getattr(self, name)

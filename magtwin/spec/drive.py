@@ -57,6 +57,19 @@ class DriveSpec(Spec):
     wheel_errors: Vec2 = (0.0, 0.0)
     """Relative error of radius and separation in all runs of the session, in addition to that of each run."""
 
+    localization_std_m: float = 0.02
+    """Standard deviation of the position that a path follower gets, on each axis [m]; 0 disables it. Default:
+    that of a good indoor localization."""
+
+    localization_yaw_std: float = 0.01
+    """Standard deviation of the heading that a path follower gets [rad]; an estimate."""
+
+    localization_time_s: float = 5.0
+    """Correlation time of these errors [s]; an estimate."""
+
+    localization_latency_s: float = 0.1
+    """Age of the pose that a path follower gets [s], the delay of its commands included; an estimate."""
+
     command_timeout_s: float = 0.5
     """The robot stops if no command arrives for this time [s]."""
 
@@ -83,29 +96,13 @@ class DriveSpec(Spec):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._above_zero(
-            "wheel_separation_m",
-            "wheel_radius_m",
-            "v_max",
-            "w_max",
-            "a_max",
-            "alpha_max",
-            "wheel_rate_max",
-            "command_timeout_s",
-            "odometry_rate_hz",
-            "odometry_scale",
-        )
-        self._not_negative(
-            "odometry_latency_s",
-            "odometry_jitter_s",
-            "odometry_noise_std",
-            "odometry_v_noise_std",
-            "odometry_w_noise_std",
-            "motor_lag_s",
-            "slip_s2_m",
-            "wheel_radius_error_std",
-            "wheel_separation_error_std",
-        )
+        self._above_zero("wheel_separation_m", "wheel_radius_m", "v_max", "w_max", "a_max", "alpha_max")
+        self._above_zero("wheel_rate_max", "command_timeout_s", "odometry_rate_hz", "odometry_scale")
+        self._above_zero("localization_time_s")
+        self._not_negative("odometry_latency_s", "odometry_jitter_s", "odometry_noise_std")
+        self._not_negative("odometry_v_noise_std", "odometry_w_noise_std", "motor_lag_s", "slip_s2_m")
+        self._not_negative("wheel_radius_error_std", "wheel_separation_error_std")
+        self._not_negative("localization_std_m", "localization_yaw_std", "localization_latency_s")
         self._require("yaw_slip", 0 <= self.yaw_slip < 1, "be at least 0 and below 1", self.yaw_slip)
         whole = f"be below 1 when multiplied by a_max {self.a_max!r}"
         self._require("slip_s2_m", self.slip_s2_m * self.a_max < 1, whole, self.slip_s2_m)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magtwin.errors import hint
 from magtwin.frames import IDENTITY_XYZW
 from magtwin.spec.base import ZERO3, ZERO9, Matrix3, Quat, Spec, Vec3
 from magtwin.spec.mesh import check_mesh
@@ -185,14 +184,20 @@ class SourceSpec(Summarized, Spec):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        kinds = ("point", *SHAPES)
-        self._require(
-            "shape", self.shape in kinds, f"be a known shape ({hint(self.shape, kinds)})", self.shape
-        )
+        self._named("shape", ("point", *SHAPES))
         self._unit("q_world_xyzw")
         self._not_negative("susceptibility")
+        if self.shape != "mesh":
+            self._require(
+                "vertices_m", not (self.vertices_m or self.faces), "be given for shape mesh only", "some"
+            )
         if self.shape == "point":
-            self._check_point()
+            for name, none in {"size_m": ZERO3, "magnetization": ZERO3, "susceptibility": 0.0}.items():
+                value = getattr(self, name)
+                self._require(name, value == none, "be left out for a point, which has only m_world", value)
+            turned = self.q_world_xyzw != IDENTITY_XYZW
+            what = "be left out for a point: m_world is in world axes"
+            self._require("q_world_xyzw", not turned, what, "a rotation")
             return
         self._require("m_world", self.m_world == ZERO3, f"be left out for a {self.shape}", self.m_world)
         if self.shape == "mesh":
@@ -201,24 +206,9 @@ class SourceSpec(Summarized, Spec):
             object.__setattr__(self, "vertices_m", tuple(map(tuple, vertices.tolist())))
             object.__setattr__(self, "size_m", tuple(np.ptp(vertices, axis=0).tolist()))
         else:
-            self._require(
-                "vertices_m", not (self.vertices_m or self.faces), "be given for shape mesh only", "some"
-            )
             self._require("size_m", min(self.size_m) > 0, "be above 0 m each way", self.size_m)
         x, y, z = self.size_m
         if self.shape == "cylinder":
             self._require("size_m", x == y, "be equal in x and y for a cylinder", self.size_m)
         if self.shape == "sphere":
             self._require("size_m", x == y == z, "be equal each way for a sphere", self.size_m)
-
-    def _check_point(self) -> None:
-        for name, none in {"size_m": ZERO3, "magnetization": ZERO3, "susceptibility": 0.0}.items():
-            seen = getattr(self, name)
-            self._require(name, seen == none, "be left out for a point, which has only m_world", seen)
-        turned = self.q_world_xyzw != IDENTITY_XYZW
-        self._require(
-            "q_world_xyzw", not turned, "be left out for a point: m_world is in world axes", "a rotation"
-        )
-        self._require(
-            "vertices_m", not (self.vertices_m or self.faces), "be given for shape mesh only", "some"
-        )

@@ -9,8 +9,8 @@ from magtwin.spec.base import ZERO3, ZERO9, Matrix3, Spec, Vec3
 class PlantSpec(Spec):
     """What the linear platform field leaves out: hysteresis, warm-up, nonlinear currents, a moving part.
 
-    Vectors are in base_link axes. `magtwin.sim.plant` has the equations. The default has no effect. A survey
-    leaves the plant out, so a map never contains it.
+    Vectors are in base_link axes. `magtwin.sim.plant` has the equations. The default has no effect. Surveys
+    leave the plant out.
     """
 
     hysteresis: Matrix3 = ZERO9

@@ -5,13 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from magtwin.errors import InputError, hint
+from magtwin.errors import InputError
 from magtwin.frames import IDENTITY_XYZW
 from magtwin.spec.base import ZERO3, ZERO9, Matrix3, Quat, Spec, Vec2, Vec3
 
 MOST_RAYS = 100_000
 """Most rays of a scan."""
-
 
 MAGNETOMETER_KINDS = ("physical", "neural", "map-only")
 """A magnetometer reads the exact field; the map and a network's prediction; or the map alone."""
@@ -113,19 +112,11 @@ class MagnetometerSpec(MountSpec):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        kinds = MAGNETOMETER_KINDS
-        self._require("kind", self.kind in kinds, f"be a known kind ({hint(self.kind, kinds)})", self.kind)
+        self._named("kind", MAGNETOMETER_KINDS)
         self._above_zero("rate_hz")
-        self._not_negative(
-            "noise_density_nt",
-            "flicker_corner_hz",
-            "resolution_nt",
-            "bandwidth_hz",
-            "gradient_max_nt_m",
-            "gradient_relock_nt_m",
-            "stuck_std_nt",
-            "vector_noise_density_nt",
-        )
+        self._not_negative("noise_density_nt", "flicker_corner_hz", "resolution_nt", "bandwidth_hz")
+        self._not_negative("gradient_max_nt_m", "gradient_relock_nt_m", "stuck_std_nt")
+        self._not_negative("vector_noise_density_nt")
         self._within("dead_zone_axis", 0, math.pi / 2)
         self._within("dead_zone_plane", 0, math.pi / 2)
         self._within("dropout_share", 0, 1)
@@ -195,18 +186,9 @@ class ImuSpec(MountSpec):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._above_zero("rate_hz")
-        self._not_negative(
-            "latency_s",
-            "jitter_s",
-            "tilt_std",
-            "tilt_time_s",
-            "orientation_noise_std",
-            "gyro_noise_std",
-            "gyro_bias_walk",
-            "gyro_vibration",
-            "accel_noise_std",
-            "accel_vibration",
-        )
+        self._not_negative("latency_s", "jitter_s", "tilt_std", "tilt_time_s", "orientation_noise_std")
+        self._not_negative("gyro_noise_std", "gyro_bias_walk", "gyro_vibration", "accel_noise_std")
+        self._not_negative("accel_vibration")
 
 
 @dataclass(frozen=True, kw_only=True)

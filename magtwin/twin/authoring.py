@@ -140,12 +140,7 @@ def author_scene(
         return write_scene(scene, out, force=force)
     with tempfile.TemporaryDirectory() as workshop:
         read = scene_from_toml(
-            scene,
-            map_layer=map_layer,
-            network=network,
-            workshop=workshop,
-            report=report,
-            progress=progress,
+            scene, map_layer=map_layer, network=network, workshop=workshop, report=report, progress=progress
         )
         return write_scene(read, out, force=force)
 

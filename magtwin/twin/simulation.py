@@ -16,6 +16,7 @@ from magtwin.spec.plant import PlantSpec
 from magtwin.spec.scene import Scene
 from magtwin.twin.opening import led_by, open_twin, opened
 from magtwin.twin.twin import (
+    OF_SCENE,
     Kind,
     Metadata,
     Session,
@@ -91,7 +92,8 @@ def simulate(
         sensors: Custom sensors: names of registered sensors, or functions that make a sensor. Their columns
             are added to the run; see `magtwin.sim.extensions`.
         interference: Custom terms of the field at the magnetometer: names of registered ones, or functions.
-        progress: Called by slow engines as progress(steps done, most steps, simulated time as text).
+        progress: Called by slow engines as progress(steps done, maximum number of steps, simulated time
+            as text).
 
     Returns:
         A Run with the columns of `magtwin.COLUMNS`. Its metadata contain everything that is needed to
@@ -319,6 +321,8 @@ def finished(
     metadata: Metadata = {"magtwin": __version__, "numpy": np.__version__, "seed": seed}
     if duration_s is not None:
         metadata["asked_duration_s"] = float(duration_s)
+    if twin.scene.robot.plant != PlantSpec():
+        metadata["plant"] = OF_SCENE  # unless the twin's metadata name another
     metadata |= dict(twin.session) | path_metadata(path) | dict(twin.metadata)
     metadata["config_sha256"] = config_sha256 or scene_sha256(twin.scene)
     return run.with_metadata(**metadata)

@@ -35,6 +35,10 @@ Session = int | Literal["survey"]
 Metadata = dict[str, str | int | float | bool]
 
 
+OF_SCENE = "of the scene"
+"""Metadata `plant` of a run whose plant is that of its scene."""
+
+
 @dataclass(frozen=True, repr=False)
 class Twin(Summarized):
     """A scene that is ready to simulate: `open_twin` makes one."""
@@ -98,6 +102,8 @@ class Twin(Summarized):
         """The scene and its file, the robot, the map and the network."""
         robot, field = self.scene.robot, self.field._summary()
         sensor = f"{robot.name}, {robot.magnetometer.kind} magnetometer at {robot.magnetometer.rate_hz:g} Hz"
+        plant = self.metadata.get("plant", OF_SCENE if robot.plant != PlantSpec() else "")
+        sensor += f", plant {plant}" if plant else ""
         more = f", and {len(self.scene.others)} more robots" if self.scene.others else ""
         width, depth = self.scene.lab.floor_m
         network = self.magnetometer._summary().title.partition(" ")[2] if self.magnetometer else "none"
@@ -197,7 +203,7 @@ def in_session_of(twin: Twin, metadata: Mapping[str, str | int | float | bool]) 
     Raises:
         InputError: The metadata name no valid session.
     """
-    if "plant" in metadata:
+    if metadata.get("plant", OF_SCENE) != OF_SCENE:
         twin = with_plant(twin, str(metadata["plant"]))
     if "session_seed" not in metadata:
         return in_session(twin, "survey")

@@ -2,10 +2,11 @@
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
@@ -21,8 +22,8 @@ from magtwin.urdf.material import LOOKS
 from magtwin.urdf.meshes.mesh_layer import MeshLayer, free_name, gather
 from magtwin.urdf.meshes.texture import TEXTURES
 from magtwin.urdf.options import DEFAULTS, Options
-from magtwin.urdf.physics.control import define_differential, define_safety, read_commands, read_drive
-from magtwin.urdf.physics.drive import NO_WHEELS, WheelDrive, check_rules
+from magtwin.urdf.physics.control import define_differential, read_commands, read_drive
+from magtwin.urdf.physics.drive import NO_WHEELS, Wheels, check_rules
 from magtwin.urdf.physics.gazebo import (
     Surface,
     define_springs,
@@ -31,7 +32,7 @@ from magtwin.urdf.physics.gazebo import (
     self_collides,
 )
 from magtwin.urdf.physics.joint import define_fixed_joint, define_joint, define_mimic
-from magtwin.urdf.physics.link import Rider, define_body, define_frame, is_marker
+from magtwin.urdf.physics.link import SITE_API, Rider, define_body, is_marker
 from magtwin.urdf.physics.mechanism import Mechanism, read_mechanism
 from magtwin.urdf.physics.merge import WORLD, Place, carried, place_links, riders
 from magtwin.urdf.physics.wheel import find_wheels, fit_wheels, grip, not_on
@@ -55,20 +56,9 @@ ROBOT_API, ARTICULATION_API = "IsaacRobotAPI", "NewtonArticulationRootAPI"
 Finish = Callable[[Usd.Prim], Iterable[str]]
 
 
-def convert_urdf(
-    urdf: str | os.PathLike[str],
-    out: str | os.PathLike[str],
-    *,
-    options: Options = DEFAULTS,
-    force: bool = False,
-    finish: Finish | None = None,
-) -> Path:
-    """Convert a URDF to a USD articulation, as `convert_with_report` does, without the report.
-
-    Returns:
-        `out`.
-    """
-    convert_with_report(urdf, out, options=options, force=force, finish=finish)
+def convert_urdf(urdf: str | os.PathLike[str], out: str | os.PathLike[str], **choices: Any) -> Path:
+    """Convert a URDF as `convert_with_report` does, with its options; returns `out`."""
+    convert_with_report(urdf, out, **choices)
     return Path(out)
 
 
@@ -185,12 +175,7 @@ class _Author:
     ledger: Ledger = field(default_factory=Ledger)
 
     def stage(self, aside: Path, layer: str) -> tuple[Usd.Stage, ConversionReport]:
-        """Author the whole robot in one layer at `aside`, and compare it with its description.
-
-        Args:
-            aside: Layer to write.
-            layer: Asset path of the mesh layer.
-        """
+        """Author the robot in one layer at `aside`, and compare it with its description."""
         stage, description, options = Usd.Stage.CreateNew(str(aside)), self.description, self.options
         robot = self._robot(stage, layer)
         for note in self.finish(robot) if self.finish else ():
@@ -206,8 +191,11 @@ class _Author:
             poses=read_mechanism(description, options).poses(),
             lint=lint(description, mass=options.mass, vertices=self.meshes.vertices),
         )
-        if options.strict:
-            report.refuse_losses()
+        if options.strict and report.losses:
+            others = f" (and {len(report.losses) - 1} more)" if len(report.losses) > 1 else ""
+            raise InputError(
+                f"{report.source}: {report.losses[0]}{others}; convert without --strict to accept that"
+            )
         notes = Vt.StringArray(description.notes)
         stage.GetRootLayer().customLayerData = {
             **stage.GetRootLayer().customLayerData,
@@ -220,7 +208,10 @@ class _Author:
         """The robot's prim with everything below it."""
         description, ledger = self.description, self.ledger
         describe_stage(stage, f"{description.name}: converted from {description.path.name}.")
-        names = _prim_names(description)
+        names = {"": identifier(description.name)}
+        if names[""] != description.name:
+            description.note(f"{description.name!r} is called {names['']!r} in USD")
+        names |= _free_names(description.links, {JOINTS, LOOKS, VISUALS, COLLISIONS}, "", description)
         mechanism, tags = read_mechanism(description, self.options), Tags(description)
         check_rules(mechanism, self.options)
         (drive, named), commands = read_drive(tags, mechanism), read_commands(tags, mechanism)
@@ -241,18 +232,18 @@ class _Author:
                 continue
             body = _define(stage, robot.GetPath().AppendChild(names[name]), name, poses[name])
             bodies[name] = body
-            ledger.link(name, "body", body)
+            ledger.bodies[name] = "body", body.GetPath()
             parts = []
             for part, pose in riders(places, name):
                 link, surface = description.links[part], surfaces.get(part, Surface())
                 rider = Rider(link, pose)
                 for i, visual in enumerate(carried(link.visuals, pose, part, name)):
                     made = define_visual(body, visual, description, self.meshes, layer)
-                    ledger.shape(part, "visual", i, made)
+                    ledger.shapes[part, "visual", i] = [prim.GetPath() for prim in made]
                     rider.visuals.extend(made)
                 for i, collision in enumerate(carried(link.collisions, pose, part, name)):
                     made = define_collider(body, collision, surface, self.meshes, layer)
-                    ledger.shape(part, "collision", i, made)
+                    ledger.shapes[part, "collision", i] = [prim.GetPath() for prim in made]
                     rider.colliders.extend(made)
                 parts.append(rider)
             define_body(body, parts, description, options.density)
@@ -260,12 +251,20 @@ class _Author:
         for name, (above, pose) in places.items():
             if above != name:
                 frame = _define(stage, paths[above].AppendChild(names[name]), name, pose)
-                define_frame(frame)
-                ledger.link(name, "frame" if is_marker(description.links[name]) else "merged", frame)
+                frame.AddAppliedSchema(SITE_API)
+                became = "frame" if is_marker(description.links[name]) else "merged"
+                ledger.bodies[name] = became, frame.GetPath()
         wheels = fit_wheels(mechanism, driven, bodies) if driven else NO_WHEELS
         joints = self._joints(stage, mechanism, options, wheels, places, paths)
+        UsdPhysics.ArticulationRootAPI.Apply(robot)
+        robot.AddAppliedSchema(ROBOT_API)
+        robot.AddAppliedSchema(ARTICULATION_API)
+        collides = self_collides(tags)
+        for name in ("newton:selfCollisionEnabled", "physxArticulation:enabledSelfCollisions"):
+            robot.CreateAttribute(name, Sdf.ValueTypeNames.Bool, custom=False).Set(collides)
         links = [body.GetPath() for body in bodies.values()]
-        _articulate(robot, links, joints, self_collision=self_collides(tags))
+        robot.CreateRelationship("isaac:physics:robotLinks", custom=False).SetTargets(links)
+        robot.CreateRelationship("isaac:physics:robotJoints", custom=False).SetTargets(joints)
         self._equip(robot, tags, options, drive)
         return robot
 
@@ -274,14 +273,16 @@ class _Author:
         stage: Usd.Stage,
         mechanism: Mechanism,
         options: Options,
-        wheels: Mapping[str, WheelDrive],
+        wheels: Wheels,
         places: dict[str, Place],
         paths: dict[str, Sdf.Path],
     ) -> list[Sdf.Path]:
         """Author the joints between bodies, the root joint first; a floating joint has no prim."""
         description, made = self.description, dict[str, Usd.Prim]()
         scope = UsdGeom.Scope.Define(stage, paths[WORLD].AppendChild(JOINTS)).GetPath()
-        names = _joint_names(description)
+        joints = {joint.name: joint for joint in description.joints.values()}
+        names = _free_names(joints, set(), "joint ", description)
+        names[""] = free_name("root_joint", {*joints, *names.values()})
         base = next((name for name, (above, _) in places.items() if above == name), WORLD)
         if options.fix_base and places[description.root][0] != WORLD and base != WORLD:
             pose, ends = mechanism.poses()[base], (paths[WORLD], paths[base])
@@ -300,10 +301,9 @@ class _Author:
             prim = define_joint(stage, path, joint, ends, pose @ at, mechanism, options, wheels)
             _show_name(prim, joint.name)
             made[joint.name] = prim
-            self.ledger.joint(joint.name, prim)
-        joints = {joint.name: joint for joint in description.joints.values()}
+            self.ledger.joints[joint.name] = prim.GetPath()
         for name, mimic in mechanism.mimics.items():
-            define_mimic(made[name], made[mimic.leader], joints[name], joints[mimic.leader], mechanism)
+            define_mimic(made[name], made[mimic.joint], joints[name], joints[mimic.joint], mechanism)
         return [prim.GetPath() for prim in made.values()]
 
     def _equip(self, robot: Usd.Prim, tags: Tags, options: Options, drive: DriveSpec | None) -> None:
@@ -318,7 +318,6 @@ class _Author:
 
         define_springs(tags, joint_of, options)
         define_weightless(tags, link_of)
-        define_safety(tags, joint_of)
         if not options.fix_base and (drive is not None or options.profile == "diff-drive"):
             robot.CreateAttribute("isaac:robotType", Sdf.ValueTypeNames.Token, custom=False).Set("Wheeled")
         if drive is not None:
@@ -331,19 +330,6 @@ class _Author:
         if count:
             most = ", ".join(sorted(ledger.unknown_tags, key=lambda tag: -ledger.unknown_tags[tag])[:4])
             tags.description.note(f"{count} tags without a meaning here are kept as text, such as {most}")
-
-
-def _articulate(
-    robot: Usd.Prim, links: list[Sdf.Path], joints: list[Sdf.Path], *, self_collision: bool
-) -> None:
-    """Make the robot's prim an articulation."""
-    UsdPhysics.ArticulationRootAPI.Apply(robot)
-    robot.AddAppliedSchema(ROBOT_API)
-    robot.AddAppliedSchema(ARTICULATION_API)
-    for name in ("newton:selfCollisionEnabled", "physxArticulation:enabledSelfCollisions"):
-        robot.CreateAttribute(name, Sdf.ValueTypeNames.Bool, custom=False).Set(self_collision)
-    robot.CreateRelationship("isaac:physics:robotLinks", custom=False).SetTargets(links)
-    robot.CreateRelationship("isaac:physics:robotJoints", custom=False).SetTargets(joints)
 
 
 def _define(stage: Usd.Stage, path: Sdf.Path, name: str, pose: NDArray | None = None) -> Usd.Prim:
@@ -369,34 +355,10 @@ def identifier(name: str) -> str:
     return kept if Sdf.Path.IsValidIdentifier(kept) else f"_{kept}"
 
 
-def _joint_names(description: Description) -> dict[str, str]:
-    """Prim names of the root joint ("") and of the joints."""
-    joints = [joint.name for joint in description.joints.values()]
-    names, taken = _free_names(joints, set(), "joint ", description), set(joints)
-    names[""] = free_name("root_joint", taken.union(names.values()))
-    return names
-
-
-def _prim_names(description: Description) -> dict[str, str]:
-    """Prim names of the robot ("") and of its links, different from the names of scopes."""
-    robot = identifier(description.name)
-    if robot != description.name:
-        description.note(f"{description.name!r} is called {robot!r} in USD")
-    scopes = {JOINTS, LOOKS, VISUALS, COLLISIONS}
-    return {"": robot, **_free_names(description.links, scopes, "", description)}
-
-
 def _free_names(
     wanted: Iterable[str], taken: set[str], what: str, description: Description
 ) -> dict[str, str]:
-    """Unique valid names; names that need no change get precedence, changes are noted.
-
-    Args:
-        wanted: Names in the description.
-        taken: Names that may not be used.
-        what: Kind of name, for notes.
-        description: Receives the notes.
-    """
+    """Unique valid names, none in `taken`; names that need no change get precedence, changes are noted."""
     wanted = list(wanted)
     used = taken | {name for name in wanted if identifier(name) == name}
     names = {}

@@ -43,26 +43,18 @@ VARIANTS = {
 DEFAULT_VARIANT = "physx"
 """Default of Isaac Sim 6.0.1; Newton and MuJoCo read the neutral attributes below it."""
 
-FILES = {
-    "base": "base.usda",
-    "instances": "instances.usda",
-    "materials": "materials.usda",
-    "robot": "robot.usda",
-    "physics": VARIANTS["physics"],
-    "physx": VARIANTS["physx"],
-    "mujoco": VARIANTS["mujoco"],
+LAYERS = {
+    "base": ("base.usda", "links, frames and sensors"),
+    "instances": ("instances.usda", "visuals and colliders of its links"),
+    "materials": ("materials.usda", "looks"),
+    "robot": ("robot.usda", "schemas of Isaac Sim and magtwin"),
+    "physics": (VARIANTS["physics"], "bodies, joints and contact, for any engine"),
+    "physx": (VARIANTS["physx"], "attributes for PhysX only"),
+    "mujoco": (VARIANTS["mujoco"], "attributes for MuJoCo only"),
 }
-"""Layers with opinions, by the names used below."""
+"""File and contents of each layer with opinions, by the names used below."""
 
-ROLES = {
-    "base": "links, frames and sensors",
-    "instances": "visuals and colliders of its links",
-    "materials": "looks",
-    "robot": "schemas of Isaac Sim and magtwin",
-    "physics": "bodies, joints and contact, for any engine",
-    "physx": "attributes for PhysX only",
-    "mujoco": "attributes for MuJoCo only",
-}
+FILES = {name: file for name, (file, _) in LAYERS.items()}
 
 SCHEMAS = (
     ("Physx", "physx"),
@@ -181,9 +173,8 @@ class _Splitter:
     def _owner(self, spec: Sdf.PrimSpec) -> tuple[str, Sdf.Path]:
         """The layer that defines a prim, and its path there."""
         steps = spec.path.GetPrefixes()
-        if spec.typeName.startswith("Physics") or (
-            spec.typeName == "Scope" and _all_physics(spec.nameChildren)
-        ):
+        below = [child.typeName.startswith("Physics") for child in spec.nameChildren]
+        if spec.typeName.startswith("Physics") or (spec.typeName == "Scope" and below and all(below)):
             return "physics", spec.path
         if len(steps) > 1 and steps[1].name == LOOKS:
             material = self.flat.GetPrimAtPath(steps[2]) if len(steps) > 2 else None
@@ -238,11 +229,6 @@ def _by_start(name: str, table: tuple[tuple[str, str], ...], other: str) -> str:
     return next((layer for start, layer in table if name.startswith(start)), other)
 
 
-def _all_physics(specs: Sdf.PrimSpec) -> bool:
-    """Whether all prims are joints, and there is at least one."""
-    return len(specs) > 0 and all(spec.typeName.startswith("Physics") for spec in specs)
-
-
 def _prim(layer: Sdf.Layer, path: Sdf.Path) -> Sdf.PrimSpec:
     """The spec at a path, created as an `over` if missing."""
     return layer.GetPrimAtPath(path) or Sdf.CreatePrimInLayer(layer, path)
@@ -261,7 +247,7 @@ def _describe(layer: Sdf.Layer, flat: Sdf.Layer, name: str, robot: str) -> None:
         root = _prim(layer, Sdf.Path.absoluteRootPath.AppendChild(layer.defaultPrim))
         if name in ("instances", "materials"):
             root.specifier, root.typeName = Sdf.SpecifierDef, "Scope"
-    layer.documentation = f"{robot}: {ROLES[name]}."
+    layer.documentation = f"{robot}: {LAYERS[name][1]}."
     metadata = {"interface": Path(flat.realPath).name} if name == "base" else {}
     layer.customLayerData = {"creator": "magtwin", **({"magtwin": metadata} if metadata else {})}
 
@@ -286,13 +272,7 @@ def _compose(parts: dict[str, Sdf.Layer], robot: Sdf.PrimSpec) -> None:
 
 
 def _moved(here: Path, final: Path, home: Path) -> Callable[[str], str]:
-    """A function that converts asset paths of the authored layer to those of a final layer.
-
-    Args:
-        here: Temporary folder of the asset while it is written.
-        final: Final path of the interface.
-        home: Final path of the layer with the asset path.
-    """
+    """A function that converts asset paths from the temporary folder `here` to the final layer `home`."""
     own = {f"./{path}" for path in FILES.values()} | {"./physics.usda"}
     own |= {f"./{PAYLOADS}/{path}" for path in (*VARIANTS.values(), FILES["base"]) if path}
 

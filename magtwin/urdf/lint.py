@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description, origin_of
-from magtwin.urdf.description.model import Mesh, Shape
+from magtwin.urdf.description.model import Geometry, Shape
 from magtwin.urdf.meshes.mesh import bounds
 
 Array = NDArray[np.float64]
 
-Vertices = Callable[[Mesh], Array]
+Vertices = Callable[[Geometry], Array]
 """Vertices of a URDF `<mesh>`, scaled [m], shape (V, 3)."""
 
 OUTSIDE = 0.1
@@ -45,23 +45,21 @@ def lint(
         vertices: Reads a mesh; without it, or if it fails, meshes are ignored.
     """
     shapes = {
-        name: [points for part in (*link.visuals, *link.collisions) for points in _box(part, vertices)]
+        name: [_corners(p, box) for p in (*link.visuals, *link.collisions) if (box := _box(p, vertices))]
         for name, link in description.links.items()
     }
     return (
-        *_dummies(description),
-        *_weightless(description),
+        *_masses(description),
         *_frames_outside(description, shapes),
         *_swapped_sides(description),
         *_stuck_joints(description),
         *_inertias(description, shapes),
-        *_densities(description, vertices),
-        *_mass(description, mass),
+        *_densities(description, vertices, mass),
     )
 
 
-def _dummies(description: Description) -> Iterator[str]:
-    """Frames with a mass but no shape."""
+def _masses(description: Description) -> Iterator[str]:
+    """Frames with a mass but no shape, and bodies without mass or inertia."""
     dummies: dict[float, list[str]] = {}
     for name, link in description.links.items():
         fixed = name in description.joints and description.joints[name].type == "fixed"
@@ -72,10 +70,6 @@ def _dummies(description: Description) -> Iterator[str]:
             f"frames with a mass of {mass:g} kg and no shape, {len(names) * mass:g} kg in all "
             f"({len(names)}): {', '.join(names)}"
         )
-
-
-def _weightless(description: Description) -> Iterator[str]:
-    """Bodies without mass or inertia."""
     links = description.links.values()
     bare = [link.name for link in links if (link.visuals or link.collisions) and link.inertial is None]
     if bare:
@@ -103,10 +97,19 @@ def _frames_outside(description: Description, shapes: dict[str, list[Array]]) ->
 
 def _swapped_sides(description: Description) -> Iterator[str]:
     """Pairs called left and right that are swapped: left is +y (REP-103)."""
-    poses = description.poses()
+    poses, joints = description.poses(), description.joints
+
+    def is_rigid(name: str) -> bool:
+        """Whether fixed joints connect a link to the root, apart from its own joint."""
+        while name in joints:
+            name = joints[name].parent
+            if name in joints and joints[name].type != "fixed":
+                return False
+        return True
+
     for name in description.links:
         twin = next((name.replace(left, right) for left, right in SIDES if left in name), "")
-        if twin not in description.links or not _is_rigid(description, name, twin):
+        if twin not in description.links or not (is_rigid(name) and is_rigid(twin)):
             continue
         left, right = float(poses[name][1, 3]), float(poses[twin][1, 3])
         if left < -ASIDE and right > ASIDE:
@@ -114,16 +117,6 @@ def _swapped_sides(description: Description) -> Iterator[str]:
                 f"link {name!r} is at y = {left:.4g} m and {twin!r} at {right:.4g} m: "
                 "swapped? left is +y (REP-103)"
             )
-
-
-def _is_rigid(description: Description, *names: str) -> bool:
-    """Whether fixed joints connect links to the root, apart from the links' own joints."""
-    for name in names:
-        while name in description.joints:
-            name = description.joints[name].parent
-            if name in description.joints and description.joints[name].type != "fixed":
-                return False
-    return True
 
 
 def _stuck_joints(description: Description) -> Iterator[str]:
@@ -172,60 +165,50 @@ def _inertias(description: Description, shapes: dict[str, list[Array]]) -> Itera
             yield f"link {name!r} has its centre of mass {off:.3g} m outside of its shapes"
 
 
-def _densities(description: Description, vertices: Vertices | None) -> Iterator[str]:
-    """Bodies that are too heavy for their shapes."""
+def _densities(
+    description: Description, vertices: Vertices | None, data_sheet: float | None
+) -> Iterator[str]:
+    """Bodies that are too heavy for their shapes, and the total mass against the data sheet."""
+    total = 0.0
     for name, link in description.links.items():
         volume = max(_volume(link.collisions, vertices), _volume(link.visuals, vertices))
         mass = 0.0 if link.inertial is None else float(link.inertial.mass or 0.0)
+        total += mass
         if volume > 0 and mass / volume > DENSEST:
             yield (
                 f"link {name!r} weighs {mass:g} kg in {volume * 1e6:.3g} cm3 or less: "
                 f"{mass / volume:.0f} kg/m3, above copper"
             )
+    if data_sheet is not None and abs(total - data_sheet) > MASS_OFF * data_sheet:
+        more = total / data_sheet - 1
+        yield f"the links weigh {total:.6g} kg in all, the data sheet says {data_sheet:g} kg ({more:+.0%})"
 
 
-def _mass(description: Description, mass: float | None) -> Iterator[str]:
-    """Total mass against the data sheet."""
-    if mass is None:
-        return
-    links = description.links.values()
-    total = sum(float(link.inertial.mass or 0.0) for link in links if link.inertial is not None)
-    if abs(total - mass) > MASS_OFF * mass:
-        more = total / mass - 1
-        yield f"the links weigh {total:.6g} kg in all, the data sheet says {mass:g} kg ({more:+.0%})"
+def _box(part: Shape, vertices: Vertices | None) -> tuple[Array, Array] | None:
+    """Lower and upper corner of a box around a shape in its own frame; None if it cannot be read."""
+    if part.geometry.kind != "mesh":
+        half = part.geometry.half_extents(np.eye(3))
+        return -half, half
+    try:
+        return None if vertices is None else bounds(vertices(part.geometry))
+    except (InputError, KeyError):
+        return None  # the conversion reports it
 
 
-def _box(part: Shape, vertices: Vertices | None) -> list[Array]:
-    """Corners of a box around a visual or collision in its link's frame, shape (8, 3); [] if unknown."""
-    if part.geometry.mesh is None:
-        high = part.geometry.half_extents(np.eye(3))
-        low = -high
-    elif (points := _read(part.geometry.mesh, vertices)) is not None:
-        low, high = bounds(points)
-    else:
-        return []
-    return [_transformed(origin_of(part), np.array(list(product(*zip(low, high, strict=True)))))]
+def _corners(part: Shape, box: tuple[Array, Array]) -> Array:
+    """Corners of a shape's box in its link's frame, shape (8, 3)."""
+    return _transformed(origin_of(part), np.array(list(product(*zip(*box, strict=True)))))
 
 
 def _volume(parts: Iterable[Shape], vertices: Vertices | None) -> float:
     """Upper limit of the volume of shapes [m3], with boxes for meshes; inf if one is unknown."""
     total = 0.0
     for part in parts:
-        if part.geometry.mesh is None:
-            total += part.geometry.volume
-        elif (points := _read(part.geometry.mesh, vertices)) is not None:
-            total += float(np.prod(np.subtract(*bounds(points)[::-1])))
-        else:
+        box = _box(part, vertices)
+        if box is None:
             return np.inf
+        total += float(np.prod(box[1] - box[0])) if part.geometry.kind == "mesh" else part.geometry.volume
     return total
-
-
-def _read(mesh: Mesh, vertices: Vertices | None) -> Array | None:
-    """Vertices of a mesh; None if it cannot be read."""
-    try:
-        return None if vertices is None else vertices(mesh)
-    except (InputError, KeyError):
-        return None  # the conversion reports it
 
 
 def _transformed(T: Array, points: Array) -> Array:

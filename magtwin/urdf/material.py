@@ -1,12 +1,9 @@
 """Material: the look of a surface (UsdPreviewSurface) and its friction (UsdPhysics)."""
 
-from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
 
-from magtwin.urdf.meshes.piece import GREY, Rgba
+from magtwin.urdf.meshes.mesh_layer import MeshLayer
+from magtwin.urdf.meshes.piece import PLAIN, Paint
 from magtwin.urdf.physics.gazebo import Surface
 from magtwin.usd.geometry import linear_from_srgb
 
@@ -16,101 +13,59 @@ PHYSX_API = "PhysxMaterialAPI"
 LOOKS = "Looks"
 """Scope of all materials below the robot's prim."""
 
-SURFACE, TEXTURE, READER = "surface", "texture", "reader"
-"""Shaders of a look."""
 
-
-@dataclass(frozen=True)
-class Look:
-    """The look of a surface; colours are sRGB, 0 to 1, as in URDF."""
-
-    rgba: Rgba = GREY
-    """Colour and opacity; with a texture, the factor that multiplies it."""
-
-    name: str = ""
-    """Name of the material. Default: from the colour."""
-
-    texture: str = ""
-    """Asset path of the colour texture, or ""."""
-
-    mean: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Mean colour of the texture."""
-
-    roughness: float = 0.5
-    """0 is a mirror, 1 is chalk."""
-
-    metallic: float = 0.0
-    """0 is an insulator, 1 is metal."""
-
-    see_through: bool = False
-    """Whether the texture's opacity is used."""
-
-    cutoff: float = 0.0
-    """Opacity threshold between invisible and opaque; 0 blends."""
-
-    by_vertex: bool = False
-    """Whether the mesh's displayColor replaces the colour."""
-
-    @property
-    def display_colour(self) -> tuple[float, float, float]:
-        """Linear colour for viewers without materials."""
-        colour = linear_from_srgb(self.rgba[:3]) * linear_from_srgb(self.mean)
-        r, g, b = (round(float(c), 5) for c in colour)
-        return (r, g, b)
-
-
-def define_look(robot: Usd.Prim, look: Look) -> UsdShade.Material:
+def define_look(robot: Usd.Prim, look: Paint, meshes: MeshLayer) -> UsdShade.Material:
     """The material of a look, shared by all prims with that look.
 
     Args:
         robot: Root prim; looks are in a scope below it.
         look: The look.
+        meshes: Receives its texture, and the look by its path.
     """
-    stage = robot.GetStage()
+    stage, kinds = robot.GetStage(), Sdf.ValueTypeNames
     scope = UsdGeom.Scope.Define(stage, robot.GetPath().AppendChild(LOOKS)).GetPath()
-    hexed = "".join(f"{round(c * 255):02x}" for c in look.rgba)
-    stem, number = Tf.MakeValidIdentifier(look.name) if look.name else f"colour_{hexed}", 1
-    path = scope.AppendChild(stem)
-    while stage.GetPrimAtPath(path):
-        material = UsdShade.Material(stage.GetPrimAtPath(path))
-        if _shows(material, look):
-            return material
-        path = scope.AppendChild(f"{stem}_{hexed}" if number == 1 else f"{stem}_{hexed}_{number}")
-        number += 1  # two looks have the same name
-    material = UsdShade.Material.Define(stage, path)
-    surface = UsdShade.Shader.Define(stage, path.AppendChild(SURFACE))
-    surface.CreateIdAttr("UsdPreviewSurface")
-    for name, kind, value in _inputs(look):
-        surface.CreateInput(name, kind).Set(value)
-    if look.by_vertex:
-        reader = _reader(stage, path, "UsdPrimvarReader_float3", "displayColor", Sdf.ValueTypeNames.Float3)
-        surface.GetInput("diffuseColor").ConnectToSource(reader)
-    elif look.texture:
-        _connect_texture(stage, path, surface, look)
-    surface.CreateOutput("surface", Sdf.ValueTypeNames.Token)
-    material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
-    return material
-
-
-def _inputs(look: Look) -> list[tuple[str, Sdf.ValueTypeName, Any]]:
-    """Inputs of a look's UsdPreviewSurface: name, type and value."""
-    kinds = Sdf.ValueTypeNames
-    colour = look.display_colour if look.texture else linear_from_srgb(look.rgba[:3])
-    return [
+    colour = linear_from_srgb(look.rgba[:3]) if look.image is None else look.display_colour
+    inputs = [
         ("diffuseColor", kinds.Color3f, Gf.Vec3f(*(round(float(c), 5) for c in colour))),
         ("opacity", kinds.Float, round(look.rgba[3], 4)),
         ("roughness", kinds.Float, round(look.roughness, 4)),
         ("metallic", kinds.Float, round(look.metallic, 4)),
         *([("opacityThreshold", kinds.Float, round(look.cutoff, 4))] if look.cutoff else []),
     ]
+    texture = "" if look.image is None else meshes.textures.add(look.image)
+    shown = (*(value for _, _, value in inputs), texture, look.see_through, look.by_vertex)
+    hexed = "".join(f"{round(c * 255):02x}" for c in look.rgba)
+    stem, number = Tf.MakeValidIdentifier(look.name) if look.name else f"colour_{hexed}", 1
+    path = scope.AppendChild(stem)
+    while stage.GetPrimAtPath(path):
+        if meshes.looks.get(path) == shown:
+            return UsdShade.Material(stage.GetPrimAtPath(path))
+        path = scope.AppendChild(f"{stem}_{hexed}" if number == 1 else f"{stem}_{hexed}_{number}")
+        number += 1  # two looks have the same name
+    meshes.looks[path] = shown
+    material = UsdShade.Material.Define(stage, path)
+    surface = UsdShade.Shader.Define(stage, path.AppendChild("surface"))
+    surface.CreateIdAttr("UsdPreviewSurface")
+    for name, kind, value in inputs:
+        surface.CreateInput(name, kind).Set(value)
+    if look.by_vertex:
+        reader = _reader(stage, path, "UsdPrimvarReader_float3", "displayColor", kinds.Float3)
+        surface.GetInput("diffuseColor").ConnectToSource(reader)
+    elif texture:
+        _connect_texture(stage, path, surface, look, texture)
+    surface.CreateOutput("surface", kinds.Token)
+    material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
+    return material
 
 
-def _connect_texture(stage: Usd.Stage, path: Sdf.Path, surface: UsdShade.Shader, look: Look) -> None:
+def _connect_texture(
+    stage: Usd.Stage, path: Sdf.Path, surface: UsdShade.Shader, look: Paint, file: str
+) -> None:
     """Connect a texture, mapped by the mesh's `st`, to the colour and, if used, the opacity."""
     kinds = Sdf.ValueTypeNames
-    texture = UsdShade.Shader.Define(stage, path.AppendChild(TEXTURE))
+    texture = UsdShade.Shader.Define(stage, path.AppendChild("texture"))
     texture.CreateIdAttr("UsdUVTexture")
-    texture.CreateInput("file", kinds.Asset).Set(Sdf.AssetPath(look.texture))
+    texture.CreateInput("file", kinds.Asset).Set(Sdf.AssetPath(file))
     st = _reader(stage, path, "UsdPrimvarReader_float2", "st", kinds.Float2)
     texture.CreateInput("st", kinds.Float2).ConnectToSource(st)
     for side in ("wrapS", "wrapT"):
@@ -128,26 +83,10 @@ def _reader(
     stage: Usd.Stage, path: Sdf.Path, kind: str, primvar: str, type_: Sdf.ValueTypeName
 ) -> UsdShade.Output:
     """Output of a shader that reads a primvar."""
-    reader = UsdShade.Shader.Define(stage, path.AppendChild(READER))
+    reader = UsdShade.Shader.Define(stage, path.AppendChild("reader"))
     reader.CreateIdAttr(kind)
     reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set(primvar)
     return reader.CreateOutput("result", type_)
-
-
-def _shows(material: UsdShade.Material, look: Look) -> bool:
-    """Whether a material from `define_look` has this look."""
-    stage, path = material.GetPrim().GetStage(), material.GetPath()
-    surface = UsdShade.Shader(stage.GetPrimAtPath(path.AppendChild(SURFACE)))
-    texture = UsdShade.Shader(stage.GetPrimAtPath(path.AppendChild(TEXTURE)))
-    if not surface:
-        return False
-    wanted = {name: np.float32(value).tolist() for name, _, value in _inputs(look)}
-    return (
-        {i.GetBaseName(): np.float32(i.Get()).tolist() for i in surface.GetInputs()} == wanted
-        and (texture.GetInput("file").Get().path if texture else "") == look.texture
-        and surface.GetInput("opacity").HasConnectedSource() == look.see_through
-        and bool(stage.GetPrimAtPath(path.AppendChild(READER))) == bool(look.by_vertex or look.texture)
-    )
 
 
 def define_grip(robot: Usd.Prim, surface: Surface) -> UsdShade.Material:
@@ -183,13 +122,20 @@ def define_grip(robot: Usd.Prim, surface: Surface) -> UsdShade.Material:
     return material
 
 
-def wear(prim: Usd.Prim, robot: Usd.Prim, look: Look, grip: UsdShade.Material | None = None) -> None:
+def wear(
+    prim: Usd.Prim,
+    robot: Usd.Prim,
+    look: Paint | None,
+    meshes: MeshLayer,
+    grip: UsdShade.Material | None = None,
+) -> None:
     """Bind a look to a gprim or an Xform over one, and a physics material to a collider.
 
     The colour is also authored as displayColor, for viewers without materials, unless the mesh has one.
     """
+    look = look or PLAIN
     api = UsdShade.MaterialBindingAPI.Apply(prim)
-    api.Bind(define_look(robot, look))
+    api.Bind(define_look(robot, look, meshes))
     if not look.by_vertex:
         colour = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(
             "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.constant

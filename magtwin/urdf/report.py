@@ -12,7 +12,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 from magtwin.errors import InputError
 from magtwin.report import Figure, Report
 from magtwin.urdf.description.description import Description, origin_of
-from magtwin.urdf.description.model import Joint, Link, Shape
+from magtwin.urdf.description.model import Shape
 from magtwin.urdf.meshes.mesh import bounds
 from magtwin.urdf.meshes.mesh_layer import MeshLayer
 from magtwin.usd.geometry import read_vertices
@@ -147,19 +147,6 @@ class ConversionReport:
         }
         return Report(f"{self.robot}: {self.source} -> {self.stage}", tuple(figures), metadata)
 
-    def refuse_losses(self) -> None:
-        """Refuse a conversion that lost anything.
-
-        Raises:
-            InputError: Something was lost; the message gives the first loss and their number.
-        """
-        if self.losses:
-            more = len(self.losses) - 1
-            others = f" (and {more} more)" if more else ""
-            raise InputError(
-                f"{self.source}: {self.losses[0]}{others}; convert without --strict to accept that"
-            )
-
 
 @dataclass
 class Ledger:
@@ -176,18 +163,6 @@ class Ledger:
 
     unknown_tags: dict[str, int] = field(default_factory=dict)
     """Number of occurrences of each tag without a meaning here."""
-
-    def link(self, name: str, became: str, prim: Usd.Prim) -> None:
-        """Record the prim of a link."""
-        self.bodies[name] = (became, prim.GetPath())
-
-    def joint(self, name: str, prim: Usd.Prim) -> None:
-        """Record the prim of a joint."""
-        self.joints[name] = prim.GetPath()
-
-    def shape(self, link: str, role: str, index: int, prims: Sequence[Usd.Prim]) -> None:
-        """Record the prims of a visual or collider."""
-        self.shapes[link, role, index] = [prim.GetPath() for prim in prims]
 
 
 def make_report(
@@ -217,11 +192,20 @@ def make_report(
         lint: Lines of `lint.lint`.
     """
     lines = _geometries(description, meshes, stage, ledger, poses or description.poses())
-    links = tuple(_link(name_, link, stage, ledger) for name_, link in description.links.items())
-    joints = tuple(_joint(joint, stage, ledger) for joint in description.joints.values())
+    links, joints = [], []
+    for link in description.links.values():
+        became, path = ledger.bodies.get(link.name, ("nothing", Sdf.Path.emptyPath))
+        mass = UsdPhysics.MassAPI(stage.GetPrimAtPath(path)).GetMassAttr() if became == "body" else None
+        mass_out = round(float(mass.Get()), 9) if mass and mass.HasAuthoredValue() else None
+        mass_in = None if link.inertial is None else link.inertial.mass
+        links.append(LinkLine(link.name, became, str(path), mass_in, mass_out))
+    for joint in description.joints.values():
+        path = ledger.joints.get(joint.name, Sdf.Path.emptyPath)
+        kind = str(stage.GetPrimAtPath(path).GetTypeName()) if path else ""
+        joints.append(JointLine(joint.name, joint.type, kind, str(path)))
     visuals = [line for line in lines if line.role == "visual"]
-    mass_in = sum(line.mass_in_kg or 0.0 for line in links)
-    mass_out = sum(
+    given = sum(line.mass_in_kg or 0.0 for line in links)
+    total = sum(
         float(UsdPhysics.MassAPI(prim).GetMassAttr().Get() or 0.0)
         for prim in stage.Traverse()
         if prim.HasAPI(UsdPhysics.MassAPI)
@@ -232,18 +216,18 @@ def make_report(
         if line.box_in is not None and not line.kept:
             what = "did not arrive" if line.box_out is None else f"changed its box by {line.error_m:.3g} m"
             losses.append(f"{line.role} {line.index} of link {line.link!r} ({line.shape}) {what}")
-    if abs(mass_out - mass_in) > 1e-6 * max(mass_in, 1e-9) and mass_out < mass_in:
-        losses.append(f"mass {mass_in:.6g} kg became {mass_out:.6g} kg")
+    if given - total > 1e-6 * max(given, 1e-9):
+        losses.append(f"mass {given:.6g} kg became {total:.6g} kg")
     return ConversionReport(
         robot=description.name,
         source=description.path.name,
         source_sha256=sha256,
         stage=name,
-        links=links,
-        joints=joints,
+        links=tuple(links),
+        joints=tuple(joints),
         geometries=lines,
-        mass_in_kg=round(mass_in, 9),
-        mass_out_kg=round(mass_out, 9),
+        mass_in_kg=round(given, 9),
+        mass_out_kg=round(total, 9),
         box_in=_union([line.box_in for line in visuals]),
         box_out=_union([line.box_out for line in visuals]),
         notes=tuple(description.notes),
@@ -251,22 +235,6 @@ def make_report(
         lint=tuple(lint),
         unknown_tags=dict(sorted(ledger.unknown_tags.items())),
     )
-
-
-def _link(name: str, link: Link, stage: Usd.Stage, ledger: Ledger) -> LinkLine:
-    became, path = ledger.bodies.get(name, ("nothing", Sdf.Path.emptyPath))
-    mass_in, mass_out = None if link.inertial is None else link.inertial.mass, None
-    if became == "body":
-        mass = UsdPhysics.MassAPI(stage.GetPrimAtPath(path)).GetMassAttr()
-        mass_out = round(float(mass.Get()), 9) if mass and mass.HasAuthoredValue() else None
-    return LinkLine(name, became, str(path), None if mass_in is None else float(mass_in), mass_out)
-
-
-def _joint(joint: Joint, stage: Usd.Stage, ledger: Ledger) -> JointLine:
-    path = ledger.joints.get(joint.name)
-    if path is None:
-        return JointLine(joint.name, joint.type, "", "")
-    return JointLine(joint.name, joint.type, str(stage.GetPrimAtPath(path).GetTypeName()), str(path))
 
 
 def _geometries(
@@ -280,10 +248,10 @@ def _geometries(
     for name, link in description.links.items():
         for role, shapes in (("visual", link.visuals), ("collision", link.collisions)):
             for index, shape in enumerate(shapes):
-                prims, mesh = ledger.shapes.get((name, role, index), []), shape.geometry.mesh
+                prims, form = ledger.shapes.get((name, role, index), []), shape.geometry
                 box_in = _box_of(shape, poses[name] @ origin_of(shape), meshes)
                 box_out = [box for prim in prims for path, box in boxes.items() if path.HasPrefix(prim)]
-                kind = shape.geometry.kind if mesh is None else str(mesh.filename).rpartition("/")[2]
+                kind = form.filename.rpartition("/")[2] if form.kind == "mesh" else form.kind
                 paths = tuple(map(str, prims))
                 lines.append(GeometryLine(name, role, index, kind, paths, box_in, _union(box_out)))
     return tuple(lines)
@@ -291,11 +259,11 @@ def _geometries(
 
 def _box_of(shape: Shape, T: NDArray[np.float64], meshes: MeshLayer) -> Box | None:
     """The box around a URDF visual or collision at a pose (4, 4) in the robot's frame."""
-    if shape.geometry.mesh is None:
+    if shape.geometry.kind != "mesh":
         half = shape.geometry.half_extents(T[:3, :3])
         return _corners(T[:3, 3] - half, T[:3, 3] + half)
     try:
-        points = meshes.vertices(shape.geometry.mesh)
+        points = meshes.vertices(shape.geometry)
     except (InputError, KeyError):
         return None  # missing, with a note
     return _corners(*bounds(points @ T[:3, :3].T + T[:3, 3]))

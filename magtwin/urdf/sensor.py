@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdRender, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdRender, Vt
 
 from magtwin.errors import InputError, hint
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.spec.base import ZERO3
 from magtwin.spec.sensors import ImuSpec, LidarSpec, MagnetometerSpec
 from magtwin.urdf.description.tag import Element, Tags
-from magtwin.urdf.meshes.mesh_layer import free_name
+from magtwin.urdf.meshes.mesh_layer import free_child
 from magtwin.urdf.shape import pose_of
 from magtwin.usd.schema import prims_with
 from magtwin.usd.sensors import (
@@ -52,24 +52,8 @@ X_FORWARD: NDArray[np.float64] = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [
 NT_PER_T = 1e9
 
 
-@dataclass(frozen=True)
-class Fan:
-    """Rays of a LiDAR in one plane, at equal angles."""
-
-    least: float
-    """Angle of the first ray [rad]."""
-
-    most: float
-    """Angle of the last ray [rad]."""
-
-    count: int
-
-    @property
-    def angles(self) -> NDArray[np.float64]:
-        """Angle of each ray [rad], shape (count,); a single ray is in the middle."""
-        if self.count == 1:
-            return np.array([(self.least + self.most) / 2])
-        return np.linspace(self.least, self.most, self.count)
+Fan = tuple[float, float, int]
+"""Rays in one plane at equal angles: angles of the first and last [rad], and their number."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +110,7 @@ def define_sensors(tags: Tags, robot: Usd.Prim, prim_of: Callable[[str], Usd.Pri
                 continue
             tags.read(sensor)
             prim = prim_of(link)
-            site = Site(prim.GetStage(), _child(prim, name), _pose(tags, sensor))
+            site = Site(prim.GetStage(), free_child(prim, name), _pose(tags, sensor))
             try:
                 made.append(KINDS[kind](tags, sensor, site, robot))
             except InputError as error:
@@ -179,20 +163,21 @@ def _define_lidar(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> U
     if scan is None:
         raise InputError("has no <lidar> or <ray>")
     across, up = (_fan(tags, tags.find(scan, f"scan/{axis}")) for axis in ("horizontal", "vertical"))
+    (least, most, count), (lowest, highest, rows) = across, up
     near = tags.number(scan, "range/min", least=0.0) or 0.0
     far = tags.number(scan, "range/max", above=0.0)
     if far is None or not far > near:
         raise InputError(f"its farthest range {far} m is not above its nearest {near:g} m; give both")
-    if across.count * up.count > RAYS:
-        raise InputError(f"it has {across.count} x {up.count} rays, over {RAYS}")
+    if count * rows > RAYS:
+        raise InputError(f"it has {count} x {rows} rays, over {RAYS}")
     rate = _rate(tags, sensor, LidarSpec.scan_rate_hz)
     noise, step = _noise(tags, scan), tags.number(scan, "range/resolution", least=0.0) or 0.0
-    spins = across.most - across.least >= SCANNER
+    spins = most - least >= SCANNER
     if spins and not prims_with(robot, "lidar"):
         spec = LidarSpec(
             **site.mount,
             scan_rate_hz=rate,
-            rays=across.count,
+            rays=count,
             range_min_m=near,
             range_max_m=far,
             range_noise_std_m=noise,
@@ -204,46 +189,34 @@ def _define_lidar(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> U
         if spins:
             tags.description.note(f"{_say(sensor)} is a second LiDAR, which magtwin does not simulate")
     lidar = define_omni_lidar(prim, rate, (near, far), rotary=spins)
-    if spins:
-        _define_turning(lidar, across, up, rate)
-    else:
-        _define_fixed(lidar, across, up)
-    _write(lidar, "rangeResolutionM", Sdf.ValueTypeNames.Float, step)
-    _write(lidar, "rangeAccuracyM", Sdf.ValueTypeNames.Float, noise)
+    names = Sdf.ValueTypeNames
+    if spins:  # a column of emitters fires at equal angles, between two azimuths
+        full = np.isclose(most - least, 2 * np.pi, atol=1e-3)
+        start, end = (0.0, 360.0) if full else (np.degrees(a) % 360 for a in (least, most))
+        firings = max(1, count - 1) * 2 * np.pi / (most - least) * rate
+        _write(lidar, "validStartAzimuthDeg", names.Float, start)
+        _write(lidar, "validEndAzimuthDeg", names.Float, end)
+        _write(lidar, "patternFiringRateHz", names.UInt, max(1, round(float(firings))))
+        _define_emitters(lidar, np.zeros(rows), _angles(up))
+    else:  # a grid of emitters, line by line, fires at the same time
+        _write(lidar, "numLines", names.UInt, rows)
+        _write(lidar, "numRaysPerLine", names.UIntArray, Vt.UIntArray([count] * rows))
+        azimuth, elevation = np.meshgrid(_angles(across), _angles(up))
+        _define_emitters(lidar, azimuth.ravel(), elevation.ravel())
+    _write(lidar, "rangeResolutionM", names.Float, step)
+    _write(lidar, "rangeAccuracyM", names.Float, noise)
     _metadata(
         prim,
         rateHz=rate,
         noiseStdM=noise,
-        horizontalSamples=across.count,
-        horizontalMinRad=across.least,
-        horizontalMaxRad=across.most,
-        verticalSamples=up.count,
-        verticalMinRad=up.least,
-        verticalMaxRad=up.most,
+        horizontalSamples=count,
+        horizontalMinRad=least,
+        horizontalMaxRad=most,
+        verticalSamples=rows,
+        verticalMinRad=lowest,
+        verticalMaxRad=highest,
     )
     return prim
-
-
-def _define_turning(lidar: Usd.Prim, across: Fan, up: Fan, rate_hz: float) -> None:
-    """Author a column of emitters that fires at equal angles, between two azimuths."""
-    span = across.most - across.least
-    full = np.isclose(span, 2 * np.pi, atol=1e-3)
-    start, end = (0.0, 360.0) if full else (np.degrees(a) % 360 for a in (across.least, across.most))
-    firings = max(1, across.count - 1) * 2 * np.pi / span * rate_hz
-    names = Sdf.ValueTypeNames
-    _write(lidar, "validStartAzimuthDeg", names.Float, start)
-    _write(lidar, "validEndAzimuthDeg", names.Float, end)
-    _write(lidar, "patternFiringRateHz", names.UInt, max(1, round(float(firings))))
-    _define_emitters(lidar, np.zeros(up.count), up.angles)
-
-
-def _define_fixed(lidar: Usd.Prim, across: Fan, up: Fan) -> None:
-    """Author a grid of emitters, line by line, that fire at the same time."""
-    names = Sdf.ValueTypeNames
-    _write(lidar, "numLines", names.UInt, up.count)
-    _write(lidar, "numRaysPerLine", names.UIntArray, Vt.UIntArray([across.count] * up.count))
-    azimuth, elevation = np.meshgrid(across.angles, up.angles)
-    _define_emitters(lidar, azimuth.ravel(), elevation.ravel())
 
 
 def _define_emitters(lidar: Usd.Prim, azimuth: NDArray, elevation: NDArray) -> None:
@@ -291,7 +264,15 @@ def _define_camera(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> 
     camera.CreateFocalLengthAttr(APERTURE_MM / 2 / np.tan(fov / 2))
     camera.CreateClippingRangeAttr(Gf.Vec2f(near, far))
     kind = (sensor.get("type") or "").lower()
-    _define_image(prim, camera, (width, height), depth=kind != "camera", colour=not kind.startswith("depth"))
+    product = UsdRender.Product.Define(site.stage, prim.GetPath().AppendChild("image"))
+    product.CreateResolutionAttr(Gf.Vec2i(width, height))
+    product.CreateCameraRel().SetTargets([camera.GetPath()])
+    channels = [] if kind.startswith("depth") else [("colour", "LdrColor")]
+    channels += [] if kind == "camera" else [("depth", "DistanceToImagePlaneSD")]
+    paths = [product.GetPath().AppendChild(name) for name, _ in channels]
+    for path, (_, source) in zip(paths, channels, strict=True):
+        UsdRender.Var.Define(site.stage, path).CreateSourceNameAttr(source)
+    product.CreateOrderedVarsRel().SetTargets(paths)
     return _metadata(
         prim,
         type=kind,
@@ -301,26 +282,6 @@ def _define_camera(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> 
         horizontalFovRad=fov,
         noiseStd=_noise(tags, lens),
     )
-
-
-def _define_image(
-    prim: Usd.Prim, camera: UsdGeom.Camera, size: tuple[int, int], *, depth: bool, colour: bool
-) -> None:
-    """Author a render product with the resolution and channels of a camera."""
-    stage = prim.GetStage()
-    product = UsdRender.Product.Define(stage, prim.GetPath().AppendChild("image"))
-    product.CreateResolutionAttr(Gf.Vec2i(*size))
-    product.CreateCameraRel().SetTargets([camera.GetPath()])
-    made = []
-    for name, source, wanted in (
-        ("colour", "LdrColor", colour),
-        ("depth", "DistanceToImagePlaneSD", depth),
-    ):
-        if wanted:
-            var = UsdRender.Var.Define(stage, product.GetPath().AppendChild(name))
-            var.CreateSourceNameAttr(source)
-            made.append(var.GetPath())
-    product.CreateOrderedVarsRel().SetTargets(made)
 
 
 def _define_contact(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> Usd.Prim:
@@ -394,7 +355,13 @@ def _fan(tags: Tags, element: Element | None) -> Fan:
         raise InputError(
             f"its angles go from {least:g} to {most:g} rad; give them in order, at most one turn apart"
         )
-    return Fan(least, most, count)
+    return least, most, count
+
+
+def _angles(fan: Fan) -> NDArray[np.float64]:
+    """Angle of each ray [rad]; a single ray is in the middle."""
+    least, most, count = fan
+    return np.array([(least + most) / 2]) if count == 1 else np.linspace(least, most, count)
 
 
 def _pose(tags: Tags, element: Element) -> NDArray[np.float64]:
@@ -433,9 +400,3 @@ def _metadata(prim: Usd.Prim, **metadata: object) -> Usd.Prim:
 def _write(lidar: Usd.Prim, name: str, kind: Sdf.ValueTypeName, value: object) -> None:
     """Set an attribute of NVIDIA's LiDAR schema, which is not installed here."""
     lidar.CreateAttribute(f"omni:sensor:Core:{name}", kind, custom=False).Set(value)
-
-
-def _child(prim: Usd.Prim, name: str) -> Sdf.Path:
-    """A free path below a link's prim, called `name` if possible."""
-    taken = {child.GetName() for child in prim.GetChildren()}
-    return prim.GetPath().AppendChild(free_name(Tf.MakeValidIdentifier(name), taken))

@@ -6,13 +6,13 @@ applies to the other parts, such as all of an STL. The rest is GREY.
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Shape
-from magtwin.urdf.material import Look, define_grip, define_look, wear
-from magtwin.urdf.meshes.mesh_layer import MESH, Entry, MeshLayer, free_name
-from magtwin.urdf.meshes.piece import Paint
+from magtwin.urdf.material import define_grip, define_look, wear
+from magtwin.urdf.meshes.mesh_layer import MESH, Entry, MeshLayer, free_child
+from magtwin.urdf.meshes.piece import PLAIN, Paint
 from magtwin.urdf.meshes.reading import Reading
 from magtwin.urdf.meshes.texture import Image, read_image
 from magtwin.urdf.physics.gazebo import Surface
@@ -46,17 +46,15 @@ def define_visual(
         The prim; empty if its mesh is missing and the options allow that.
     """
     paint = _paint_of(visual, description)
-    if visual.geometry.mesh is None:
+    if visual.geometry.kind != "mesh":
         prim = _define_primitive(body, VISUALS, visual)
-        wear(prim, body.GetParent(), _look(_plain(paint, "a primitive", description), meshes))
+        wear(prim, body.GetParent(), _plain(paint, "a primitive", description), meshes)
         return [prim]
-    entry = meshes.try_add(visual.geometry.mesh, meshes.visual)
+    entry = meshes.try_add(visual.geometry, meshes.visual)
     if entry is None:
         return []
     if not entry.textured:
-        paint = _plain(
-            paint, f"mesh {visual.geometry.mesh.filename!r} without texture coordinates", description
-        )
+        paint = _plain(paint, f"mesh {visual.geometry.filename!r} without texture coordinates", description)
     return [_define_mesh(body, visual, entry, paint, meshes, layer)]
 
 
@@ -67,11 +65,11 @@ def define_collider(
 
     The prims have purpose guide, so that viewers hide them by default. Arguments as for `define_visual`.
     """
-    if collision.geometry.mesh is None:
+    if collision.geometry.kind != "mesh":
         made = [_define_primitive(body, COLLISIONS, collision)]
     else:
         made = []
-        for path in meshes.try_add(collision.geometry.mesh, meshes.collider) or ():
+        for path in meshes.try_add(collision.geometry, meshes.collider) or ():
             prim = body.GetStage().DefinePrim(_path(body, COLLISIONS, collision.name or path.name), "Mesh")
             prim.GetReferences().AddReference(layer, path)
             _place(prim, origin_of(collision))
@@ -81,9 +79,11 @@ def define_collider(
         UsdGeom.Imageable(prim).CreatePurposeAttr(UsdGeom.Tokens.guide)
         UsdPhysics.CollisionAPI.Apply(prim).CreateCollisionEnabledAttr(True)
         if prim.IsA(UsdGeom.Mesh):
-            UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr(APPROXIMATIONS[meshes.collision])
+            UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr(
+                APPROXIMATIONS[meshes.options.collision]
+            )
             prim.AddAppliedSchema(NEWTON_MESH_API)
-        wear(prim, robot, Look(), define_grip(robot, surface))
+        wear(prim, robot, None, meshes, define_grip(robot, surface))
     return made
 
 
@@ -99,35 +99,19 @@ def _define_mesh(
     prim = UsdGeom.Xform.Define(stage, _path(body, VISUALS, visual.name or entry.path.name)).GetPrim()
     prim.GetReferences().AddReference(layer, entry.path)
     _place(prim, origin_of(visual))
-    looks = [_look(paint or given, meshes) for paint in entry.paints]
+    looks = [paint or given or PLAIN for paint in entry.paints]
     if not entry.subsets:
-        wear(prim, robot, looks[0])
+        wear(prim, robot, looks[0], meshes)
         prim.SetInstanceable(True)
         return prim
     mesh = prim.GetPrimAtPath(MESH)
     for name, look in zip(entry.subsets, looks, strict=True):
-        UsdShade.MaterialBindingAPI.Apply(mesh.GetPrimAtPath(name)).Bind(define_look(robot, look))
+        material = define_look(robot, look, meshes)
+        UsdShade.MaterialBindingAPI.Apply(mesh.GetPrimAtPath(name)).Bind(material)
     colours = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("displayColor")
     if given is not None and None in entry.paints and colours.GetInterpolation() == UsdGeom.Tokens.uniform:
         colours.GetAttr().Set(Vt.Vec3fArray([Gf.Vec3f(*look.display_colour) for look in looks]))
     return prim
-
-
-def _look(paint: Paint | None, meshes: MeshLayer) -> Look:
-    """The look of a paint, with its texture added to the robot's; the default look for None."""
-    if paint is None:
-        return Look()
-    return Look(
-        rgba=paint.rgba,
-        name=paint.name,
-        texture="" if paint.image is None else meshes.textures.add(paint.image),
-        mean=(1.0, 1.0, 1.0) if paint.image is None else paint.image.mean,
-        roughness=paint.roughness,
-        metallic=paint.metallic,
-        see_through=paint.see_through and paint.image is not None,
-        cutoff=paint.cutoff,
-        by_vertex=paint.by_vertex,
-    )
 
 
 def _paint_of(visual: Shape, description: Description) -> Paint | None:
@@ -141,17 +125,19 @@ def _paint_of(visual: Shape, description: Description) -> Paint | None:
         return None
     name = material.name or ""
     shared = description.materials.get(name)
-    if not (material.color or material.texture or shared):
+    if material.rgba is None and not material.texture and not shared:
         given = (v.material for link in description.links.values() for v in link.visuals if v.material)
-        shared = next((m for m in given if name and m.name == name and (m.color or m.texture)), None)
-    colour = material.color or (shared.color if shared else None)
+        shared = next(
+            (m for m in given if name and m.name == name and (m.rgba is not None or m.texture)), None
+        )
+    colour = shared.rgba if shared and material.rgba is None else material.rgba
     texture = material.texture or (shared.texture if shared else None)
-    image = None if texture is None else _image(texture.filename, name, description)
+    image = None if texture is None else _image(texture, name, description)
     if image is None and colour is None:
         if texture is None and name:
             description.note(f"material {name!r} is named, but has no colour: shown without it")
         return None
-    r, g, b, a = (1.0, 1.0, 1.0, 1.0) if colour is None else (float(c) for c in colour.rgba)
+    r, g, b, a = (1.0, 1.0, 1.0, 1.0) if colour is None else (float(c) for c in colour)
     return Paint(name, (r, g, b, a)) if image is None else Paint(name, (1.0, 1.0, 1.0, a), image)
 
 
@@ -163,8 +149,8 @@ def _image(filename: str, material: str, description: Description) -> Image | No
     except MissingFileError:
         reading.lose(f"texture {filename!r} of material {material!r} is missing and is left out")
         image = None
-    for note in reading.notes:
-        description.note(note.text, lost=note.lost)
+    for note, lost in reading.notes:
+        description.note(note, lost=lost)
     return image
 
 
@@ -178,21 +164,20 @@ def _plain(paint: Paint | None, what: str, description: Description) -> Paint | 
 
 def _define_primitive(body: Usd.Prim, scope: str, shape: Shape) -> Usd.Prim:
     """Author a box, capsule, cylinder or sphere."""
-    stage, geometry = body.GetStage(), shape.geometry
-    kind = geometry.kind
-    solid, path, scale = getattr(geometry, kind), _path(body, scope, shape.name or kind), None
+    stage, form, kind, scale = body.GetStage(), shape.geometry, shape.geometry.kind, None
+    path = _path(body, scope, shape.name or kind)
     if kind == "box":
         prim = UsdGeom.Cube.Define(stage, path).GetPrim()
         UsdGeom.Cube(prim).CreateSizeAttr(1.0)
-        scale = np.asarray(solid.size, float)
+        scale = form.size
     elif kind == "sphere":
         prim = UsdGeom.Sphere.Define(stage, path).GetPrim()
-        UsdGeom.Sphere(prim).CreateRadiusAttr(solid.radius)
+        UsdGeom.Sphere(prim).CreateRadiusAttr(form.radius)
     else:
         schema = UsdGeom.Capsule if kind == "capsule" else UsdGeom.Cylinder
         prim = schema.Define(stage, path).GetPrim()
-        schema(prim).CreateRadiusAttr(solid.radius)
-        schema(prim).CreateHeightAttr(solid.length)  # without the ends of a capsule, in URDF and USD
+        schema(prim).CreateRadiusAttr(form.radius)
+        schema(prim).CreateHeightAttr(form.length)  # without the ends of a capsule, in URDF and USD
         schema(prim).CreateAxisAttr(UsdGeom.Tokens.z)
     _place(prim, origin_of(shape), scale)
     extent = UsdGeom.Boundable.ComputeExtentFromPlugins(UsdGeom.Boundable(prim), Usd.TimeCode.Default())
@@ -203,8 +188,7 @@ def _define_primitive(body: Usd.Prim, scope: str, shape: Shape) -> Usd.Prim:
 def _path(body: Usd.Prim, scope: str, name: str) -> Sdf.Path:
     """A free path in a scope of a link, called `name` if possible."""
     parent = UsdGeom.Xform.Define(body.GetStage(), body.GetPath().AppendChild(scope)).GetPrim()
-    taken = {child.GetName() for child in parent.GetChildren()}
-    return parent.GetPath().AppendChild(free_name(Tf.MakeValidIdentifier(name), taken))
+    return free_child(parent, name)
 
 
 def _place(prim: Usd.Prim, pose: NDArray, scale: NDArray | None = None) -> None:

@@ -9,6 +9,7 @@ import math
 import os
 import re
 from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -109,15 +110,13 @@ def write_urdf(asset: str | os.PathLike[str], out: str | os.PathLike[str], *, fo
     ElementTree.indent(xml)
     text = f'<?xml version="1.0"?>\n{ElementTree.tostring(xml, encoding="unicode")}\n'
     check_free(out, force=force)
-    if writer.meshes:
-        with output(folder, force=force) as aside_meshes, output(out, force=force) as aside:
+    with ExitStack() as files:
+        if writer.meshes:
+            aside_meshes = files.enter_context(output(folder, force=force))
             aside_meshes.mkdir()
             for name, triangles in writer.meshes.items():
                 (aside_meshes / name).write_bytes(_stl(triangles))
-            aside.write_text(text, encoding="utf-8")
-    else:
-        with output(out, force=force) as aside:
-            aside.write_text(text, encoding="utf-8")
+        files.enter_context(output(out, force=force)).write_text(text, encoding="utf-8")
     mass = sum(float(e.attrib["value"]) for e in xml.iter("mass"))
     figures = (
         Figure("links", len(xml.findall("link"))),
@@ -159,7 +158,18 @@ class _Writer:
                 _write_inertial(element, link.prim)
                 self._write_shapes(element, link, shapes)
         for joint in joints:
-            _write_joint(xml, joint)
+            element = Sub(xml, "joint", name=joint.name, type=joint.kind)
+            Sub(element, "parent", link=joint.parent)
+            Sub(element, "child", link=joint.child)
+            write_origin(element, joint.T)
+            if joint.axis is not None:
+                Sub(element, "axis", xyz=_text(joint.axis))
+            for tag, figures in (("limit", joint.limit), ("dynamics", joint.dynamics)):
+                if figures:
+                    Sub(element, tag, {name: _text([value]) for name, value in figures.items()})
+            if joint.mimic is not None:
+                leader, ratio, offset = joint.mimic
+                Sub(element, "mimic", joint=leader, multiplier=_text([ratio]), offset=_text([offset]))
         left = {
             name
             for prim in Usd.PrimRange(self.robot)
@@ -302,9 +312,11 @@ class _Writer:
             shown = UsdGeom.Imageable(prim).ComputePurpose() in SHOWN
             roles = {"visual": shown, "collision": prim.HasAPI(UsdPhysics.CollisionAPI)}
             primitive = self._primitive(prim, link)
+            parent = prim.GetParent()  # has the name of the shape if it refers to a mesh
+            named = parent if prim.IsInstanceProxy() and parent.IsInstance() else prim
             for role in (role for role, wanted in roles.items() if wanted):
                 for shape in parts[:1] if primitive is not None else parts:
-                    own = Sub(element, role, name=_shape_name(prim))
+                    own = Sub(element, role, name=named.GetName())
                     if primitive is not None:
                         T, tag, sizes = primitive
                         write_origin(own, T)
@@ -314,16 +326,13 @@ class _Writer:
                         self.meshes[name] = shape.vertices[shape.faces].astype(float)
                         Sub(Sub(own, "geometry"), "mesh", filename=f"{self.folder}/{name}")
                     if role == "visual":
-                        self._write_colour(own, shape)
-
-    def _write_colour(self, element: Element, shape: Shape) -> None:
-        colour = np.array(shape.colour, float)
-        if shape.vertex_colours is not None:
-            colour[:3] = shape.vertex_colours.mean(axis=0)
-            self._note("colours by vertex are replaced by their mean")
-        rgba = " ".join(f"{v:.4g}" for v in [*srgb_from_linear(colour[:3]), colour[3]])
-        material = Sub(element, "material", name=f"rgba_{rgba.replace(' ', '_')}")
-        Sub(material, "color", rgba=rgba)
+                        colour = np.array(shape.colour, float)
+                        if shape.vertex_colours is not None:
+                            colour[:3] = shape.vertex_colours.mean(axis=0)
+                            self._note("colours by vertex are replaced by their mean")
+                        rgba = " ".join(f"{v:.4g}" for v in [*srgb_from_linear(colour[:3]), colour[3]])
+                        material = Sub(own, "material", name=f"rgba_{rgba.replace(' ', '_')}")
+                        Sub(material, "color", rgba=rgba)
 
     def _primitive(self, prim: Usd.Prim, link: _Link) -> tuple[Array, str, dict[str, str]] | None:
         """Pose, tag and sizes of a gprim that URDF supports; None if it must become triangles."""
@@ -362,18 +371,8 @@ def _name(prim: Usd.Prim) -> str:
     return str(prim.GetDisplayName() or prim.GetName())
 
 
-def _shape_name(prim: Usd.Prim) -> str:
-    """Name of a shape: its prim's, or that of the Xform that refers to a mesh."""
-    parent = prim.GetParent()
-    return str((parent if prim.IsInstanceProxy() and parent.IsInstance() else prim).GetName())
-
-
 def _root(names: list[str], joints: list[_Joint], robot: Usd.Prim) -> str:
-    """The link that no joint holds.
-
-    Raises:
-        InputError: A link is held by two joints, or the links are not one tree.
-    """
+    """The link that no joint holds; refuses links that are not one tree."""
     above: dict[str, str] = {}
     for joint in joints:
         if joint.child in above:
@@ -418,7 +417,8 @@ def _token(prim: Usd.Prim, kind: str) -> str:
     free = {
         axis
         for axis in (f"{motion}{letter}" for motion in ("trans", "rot") for letter in "XYZ")
-        if not (limit := UsdPhysics.LimitAPI(prim, axis)) or not _locked(limit)
+        if not (limit := UsdPhysics.LimitAPI(prim, axis))
+        or limit.GetLowAttr().Get() <= limit.GetHighAttr().Get()
     }
     for token in "XYZ":
         if free == {f"rot{token}", *(f"trans{other}" for other in "XYZ" if other != token)}:
@@ -426,17 +426,10 @@ def _token(prim: Usd.Prim, kind: str) -> str:
     raise InputError(f"{place(prim)}: is free along {', '.join(sorted(free))}; URDF has no such joint")
 
 
-def _locked(limit: UsdPhysics.LimitAPI) -> bool:
-    low, high = limit.GetLowAttr().Get(), limit.GetHighAttr().Get()
-    return low is not None and high is not None and low > high
-
-
 def _tidy(axis: Array, authored: Any) -> Array:
     """An axis in single precision, replaced by the authored one or a frame's axis if they agree."""
-    for better in (
-        np.round(axis),
-        np.array(authored if isinstance(authored, Gf.Vec3d) else (0, 0, 0), float),
-    ):
+    given = authored if isinstance(authored, Gf.Vec3d) else (0, 0, 0)
+    for better in (np.round(axis), np.array(given, float)):
         if np.abs(axis - better).max() < SAME and np.linalg.norm(better) > 0.5:
             return better
     return axis
@@ -511,21 +504,6 @@ def _write_inertial(element: Element, prim: Usd.Prim) -> None:
     tensor = R @ np.diag(moments) @ R.T
     names = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
     Sub(inertial, "inertia", {name: repr(float(tensor[at]) + 0.0) for name, at in names.items()})
-
-
-def _write_joint(xml: Element, joint: _Joint) -> None:
-    element = Sub(xml, "joint", name=joint.name, type=joint.kind)
-    Sub(element, "parent", link=joint.parent)
-    Sub(element, "child", link=joint.child)
-    write_origin(element, joint.T)
-    if joint.axis is not None:
-        Sub(element, "axis", xyz=_text(joint.axis))
-    for tag, figures in (("limit", joint.limit), ("dynamics", joint.dynamics)):
-        if figures:
-            Sub(element, tag, {name: _text([value]) for name, value in figures.items()})
-    if joint.mimic is not None:
-        leader, ratio, offset = joint.mimic
-        Sub(element, "mimic", joint=leader, multiplier=_text([ratio]), offset=_text([offset]))
 
 
 def _stl(triangles: Array) -> bytes:

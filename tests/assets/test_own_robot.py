@@ -178,7 +178,7 @@ def test_options_of_the_command_reach_the_conversion(tmp_path, capsys):
         (["--drive", "left:fast"], "velocity, position, none"),
         (["--drive", "left:velocity:dampening=3"], "PATTERN:TYPE"),
         (["--drive", "left:velocity:damping=much"], "PATTERN:TYPE"),
-        (["--package", "mine"], "NAME=VALUE is wanted"),
+        (["--package", "mine"], "--package takes NAME=VALUE, each once, got 'mine'"),
         (["--density-kg-m3", "-1"], "density must be above 0"),
         (["--density-kg-m3", "inf"], "density must be above 0, got inf"),
         (["--report", "report.txt"], "a report ends in .json"),

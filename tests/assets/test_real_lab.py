@@ -67,7 +67,7 @@ def test_the_map_column_is_what_scipy_interpolates_and_unknown_beside_latched_no
 def test_the_disturbance_column_is_what_torch_predicts_from_the_twenty_signals(real_run):
     import torch
 
-    from magtwin.learn.models.checkpoint import read_checkpoint
+    from magtwin.learn.models.network import load_net
 
     run, real = real_run
     odometry, imu = np.hstack([run["odom_v"], run["odom_w"]]), np.hstack([run["imu_w"], run["imu_a"]])
@@ -83,15 +83,11 @@ def test_the_disturbance_column_is_what_torch_predicts_from_the_twenty_signals(r
         ]
     )
     assert x.shape[1] == 20
-    released = read_checkpoint(real / "models" / "nn_magnetometer_model_v0.0.1.pth")
-    layers = []
-    for weight, bias in released.layers:
-        linear = torch.nn.Linear(weight.shape[1], weight.shape[0], dtype=torch.float64)
-        linear.weight.data, linear.bias.data = torch.tensor(weight).double(), torch.tensor(bias).double()
-        layers += [linear, torch.nn.ReLU()]
+    released = load_net(real / "models" / "nn_magnetometer_model_v0.0.1.pth").double()
+    layers = [part for linear in released.linears for part in (linear, torch.nn.ReLU())]
     with torch.no_grad():
-        z = torch.nn.Sequential(*layers[:-1])(torch.tensor((x - released.x_mean) / released.x_scale))
-    expected = released.y_mean + released.y_scale * z.squeeze(-1).numpy()
+        z = torch.nn.Sequential(*layers[:-1])((torch.tensor(x) - released.x_mean) / released.x_scale)
+        expected = (released.y_mean + released.y_scale * z.squeeze(-1)).numpy()
     assert_allclose(run["b_disturbance_nt"], expected, atol=0.05, rtol=0)
 
 

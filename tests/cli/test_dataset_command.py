@@ -11,7 +11,7 @@ from magtwin.cli import main
 from magtwin.files import sha256, shipped
 from magtwin.io.formats import read_run, write_run
 from magtwin.learn.data.dataset import open_dataset
-from magtwin.learn.data.labels import labels
+from magtwin.learn.data.labels import labelled
 from magtwin.usd.maps import load_map
 
 MAP = shipped("maps", "lab", "lab.usdc")
@@ -64,8 +64,8 @@ def test_recordings_of_several_kinds_become_one_data_set_with_a_name_each(made, 
     assert found.recording("c").path == "circle"
     assert found.map_sha256 == sha256(MAP)
     ((_, run),) = found.runs(["tuesday_a"])
-    expected = labels(read_run(recorded / "tuesday" / "a.json"), load_map(MAP))
-    np.testing.assert_array_equal(run["label_nt"], expected.value_nt)
+    expected = labelled(read_run(recorded / "tuesday" / "a.json"), load_map(MAP))
+    np.testing.assert_array_equal(run["label_nt"], expected["label_nt"])
     assert np.nanmean(run["label_nt"]) == pytest.approx(300, abs=15)
 
 
@@ -101,8 +101,11 @@ def test_a_table_of_another_program_is_read_by_its_own_names_of_columns(recorded
     ("words", "said"),
     [
         (["--column", "t=tim"], "no column 'tim'; did you mean 'time'"),
-        (["--column", "time"], "--column takes NAME=THEIRS, each once, such as yaw=heading, got 'time'"),
-        (["--column", "t=time", "--column", "yaw=time"], "got 'yaw=time'"),
+        (["--column", "time"], "--column takes NAME=THEIRS, such as yaw=heading, each once, got 'time'"),
+        (
+            ["--column", "t=time", "--column", "yaw=time"],
+            "--column names one column twice, got t=time yaw=time",
+        ),
     ],
 )
 def test_columns_that_a_table_lacks_or_that_are_named_twice_are_refused(tmp_path, capsys, words, said):

@@ -157,7 +157,10 @@ def test_weights_for_another_map_are_refused_with_both_checksums(room, capsys):
         (["--map", "hills.usdc"], "judge by --runs or by a --dataset, one of the two"),
         (["--runs", "drive0.parquet"], "no map: name those that the weights were trained on"),
         (["--runs", "drive0.parquet", "--map", "hills.usdc", "hills.usdc"], "hills.usdc is named twice"),
-        (["--runs", "drive0.parquet", "--map", "hills.usdc", "--case", "D"], "--case is a row of the table"),
+        (
+            ["--runs", "drive0.parquet", "--map", "hills.usdc", "--case", "D"],
+            "--case takes a row of the table",
+        ),
         (
             ["--runs", "drive0.parquet", "--map", "hills.usdc", "--scene", "lab.usda"],
             "--scene adds an error budget",

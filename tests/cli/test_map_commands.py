@@ -270,12 +270,13 @@ def test_plot_shows_the_headings_and_the_day_that_are_asked_for(tmp_path, series
 
 
 def test_a_map_in_many_headings_is_drawn_in_four_unless_asked(tmp_path):
-    from magtwin.figures.maps import plot_map
+    from magtwin.figures.canvas import save
+    from magtwin.figures.maps import draw_map
 
     headings = np.radians(np.arange(0, 360, 15.0))
     values = np.repeat(a_map().values_nt[:1], 24, axis=0)
     field = AnomalyMap(values_nt=values, origin_m=(-2, -1.5), cell_m=(0.5, 0.5), headings_rad=headings)
-    plot_map(field, tmp_path / "a.svg")
+    save(draw_map(field), tmp_path / "a.svg")
     words = " ".join(ElementTree.parse(tmp_path / "a.svg").getroot().itertext())
     assert [h for h in range(0, 360, 15) if f"heading {h}°" in words] == [0, 90, 180, 270]
 

@@ -13,8 +13,8 @@ from PIL import Image
 from magtwin.author.scene import author_scene
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.figures.cutaway import VEIL
 from magtwin.figures.films import LONGEST_S, film_of_run, frame_times
+from magtwin.figures.pictures import VEIL
 from magtwin.figures.scenery import WALL_M, Scenery, View, _free_share, picture_of_run
 from magtwin.files import shipped
 from magtwin.io.tables import write_parquet

@@ -12,7 +12,7 @@ import pytest
 
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.figures.canvas import short_names, thinned
+from magtwin.figures.canvas import short_pair, thinned
 from magtwin.figures.page import to_html, to_json, to_markdown, write_page
 from magtwin.figures.reports import MOST_SPANS, NamedRun, page_of_comparison, page_of_runs
 from magtwin.figures.runs import pictures_of_run
@@ -159,8 +159,8 @@ def test_pages_are_made_for_phones_and_their_wide_tables_scroll_on_a_desk(page):
 
 def test_charts_shorten_long_names_and_tell_two_apart(runs):
     names = tuple(f"{'a_long_name_' * 8}{end}.parquet" for end in ("one", "two"))
-    assert short_names(("a.parquet", "b.parquet")) == ("a.parquet", "b.parquet")
-    alike = short_names((f"{names[0]}1{names[0]}", f"{names[0]}2{names[0]}"))
+    assert short_pair(("a.parquet", "b.parquet")) == ("a.parquet", "b.parquet")
+    alike = short_pair((f"{names[0]}1{names[0]}", f"{names[0]}2{names[0]}"))
     assert alike[0] != alike[1]
     found = compare(*runs, align="path")
     widths = []

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from magtwin.errors import InputError
-from magtwin.figures.cutaway import VEIL
-from magtwin.figures.pictures import BACKGROUND, BAR_SHARE, Camera, picture_of_stage, view_distance
+from magtwin.figures.pictures import BACKGROUND, BAR_SHARE, VEIL, Camera, picture_of_stage, view_distance
 from magtwin.files import shipped
 from magtwin.usd.geometry import srgb_from_linear
 
@@ -117,7 +116,7 @@ def test_no_wall_or_column_hides_the_map_from_any_side(
         wall.AddTranslateOp().Set((x, y, 1.25))
         wall.AddScaleOp().Set((0.2 + 3 * (abs(y) == 2), 0.2 + 3 * (abs(x) == 2), 2.5))
     veiled = draw(stage, tmp_path, camera=camera, legend=False)
-    monkeypatch.setattr("magtwin.figures.cutaway.VEIL", 1.0)
+    monkeypatch.setattr("magtwin.figures.pictures.VEIL", 1.0)
     solid = draw(stage, tmp_path, camera=camera, legend=False)
     inks = 255 * srgb_from_linear([(0.9, 0.05, 0.0), (0.0, 0.05, 0.9)])  # edges are mixed with what is beside
     on_map = np.any([np.abs(bare - ink).max(axis=-1) <= 2 for ink in inks], axis=0)

@@ -9,8 +9,9 @@ import pytest
 from magtwin.errors import InputError
 from magtwin.field.maps.difference import difference
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.figures.maps import plot_difference, plot_map
-from magtwin.figures.runs import plot_run
+from magtwin.figures.canvas import save
+from magtwin.figures.maps import draw_difference, draw_map
+from magtwin.figures.runs import draw_run
 from magtwin.run.run import Run
 
 FOUR = np.radians([0.0, 90.0, 180.0, 270.0])
@@ -38,6 +39,10 @@ def a_run(rows=400, **changed):
         "b_total_nt": 41_000 + 800 * p[:, 0] + 300 * np.cos(t),
     }
     return Run({**columns, **changed}, {"scene": "hall", "path": "figure8"})
+
+
+def plot_map(field, out, *, force=False, **options):
+    save(draw_map(field, **options), out, force=force)
 
 
 def pixels(file):
@@ -239,8 +244,8 @@ def a_difference(**more):
 
 def test_a_difference_is_red_where_the_field_rose_and_says_how_much_and_when(tmp_path):
     found = a_difference(variance_nt2=np.full((1, 15, 25), 12.5))
-    plot_difference(found, tmp_path / "a.svg")
-    plot_difference(found, tmp_path / "b.svg")
+    save(draw_difference(found), tmp_path / "a.svg")
+    save(draw_difference(found), tmp_path / "b.svg")
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
     words = texts(tmp_path / "a.svg")
     for part in (
@@ -252,7 +257,7 @@ def test_a_difference_is_red_where_the_field_rose_and_says_how_much_and_when(tmp
     ):
         assert part in words
     assert "robust spread" not in words
-    plot_difference(found, tmp_path / "a.png")
+    save(draw_difference(found), tmp_path / "a.png")
     picture = pixels(tmp_path / "a.png")[:, : 1240 // 2]
     reds = (picture[..., 0] > 0.3) & (picture[..., 1] < 0.1) & (picture[..., 2] < 0.2)
     assert reds.any()
@@ -261,7 +266,7 @@ def test_a_difference_is_red_where_the_field_rose_and_says_how_much_and_when(tmp
 def test_a_difference_without_variance_says_so_and_hatches_what_is_not_known_to_both(tmp_path):
     valid = np.ones((1, 15, 25), bool)
     valid[0, 3, 4] = False
-    plot_difference(a_difference(valid=valid), tmp_path / "a.svg")
+    save(draw_difference(a_difference(valid=valid)), tmp_path / "a.svg")
     words = texts(tmp_path / "a.svg").replace(" | ", " ")  # its lines may break anywhere
     assert "no variance is known: z by the robust spread" in words
     assert "not known to both surveys" in words
@@ -271,7 +276,7 @@ def test_a_difference_without_variance_says_so_and_hatches_what_is_not_known_to_
 def test_a_planned_path_is_drawn_and_the_same_run_gives_the_same_bytes(tmp_path, field):
     planned = np.array([[0, 0], [2, 1], [2, -1]])
     for name, plan in (("a", planned), ("b", planned), ("c", None)):
-        plot_run(a_run(), field, tmp_path / f"{name}.png", plan)
+        save(draw_run(a_run(), field, plan), tmp_path / f"{name}.png")
     a, b, c = ((tmp_path / f"{name}.png").read_bytes() for name in "abc")
     assert a == b
     assert a != c
@@ -280,9 +285,9 @@ def test_a_planned_path_is_drawn_and_the_same_run_gives_the_same_bytes(tmp_path,
 def test_a_run_off_the_map_is_drawn_with_gaps(tmp_path):
     total = np.array(a_run()["b_total_nt"])
     total[100:] = np.nan
-    plot_run(a_run(b_total_nt=total, b_map_nt=total), field_map(), tmp_path / "half.png")
-    plot_run(a_run(b_total_nt=total * np.nan), field_map(), tmp_path / "none.png")
-    plot_run(a_run(rows=1), None, tmp_path / "one.png")
+    save(draw_run(a_run(b_total_nt=total, b_map_nt=total), field_map()), tmp_path / "half.png")
+    save(draw_run(a_run(b_total_nt=total * np.nan), field_map()), tmp_path / "none.png")
+    save(draw_run(a_run(rows=1), None), tmp_path / "one.png")
 
 
 def test_a_name_with_dollars_is_a_name_and_no_formula(tmp_path):
@@ -300,9 +305,9 @@ def test_nothing_to_draw_is_refused_and_nothing_is_written(tmp_path):
     with pytest.raises(InputError, match="map 'hall' has no valid node to draw"):
         plot_map(field_map(valid=np.zeros((4, 6, 9), bool)), out)
     with pytest.raises(InputError, match="the run has no rows"):
-        plot_run(a_run(rows=0), None, out)
+        draw_run(a_run(rows=0))
     with pytest.raises(InputError, match="neither positions nor columns of numbers to draw"):
-        plot_run(Run({"t": a_run()["t"]}), None, out)
+        draw_run(Run({"t": a_run()["t"]}))
     assert not list(tmp_path.iterdir())
     out.write_text("mine")
     with pytest.raises(InputError, match=r"a\.png: exists already"):
@@ -314,9 +319,10 @@ def test_nothing_to_draw_is_refused_and_nothing_is_written(tmp_path):
 
 def test_plotting_leaves_pyplot_alone(tmp_path):
     code = (
-        "import sys; from magtwin.figures import maps;"
+        "import sys; from magtwin.figures import canvas, maps;"
         "from magtwin.field.maps.map import AnomalyMap; import numpy as np;"
         "m = AnomalyMap(values_nt=np.full((1, 2, 2), 4e4), origin_m=(0, 0), cell_m=(1, 1), headings_rad=[0]);"
-        f"maps.plot_map(m, {str(tmp_path / 'a.png')!r}); sys.exit('matplotlib.pyplot' in sys.modules)"
+        f"canvas.save(maps.draw_map(m), {str(tmp_path / 'a.png')!r});"
+        "sys.exit('matplotlib.pyplot' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

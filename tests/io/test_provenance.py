@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +21,6 @@ from magtwin.twin import open_twin, simulate, twin_of
 from magtwin.usd.layers import stage_sha256
 
 BRIEF = {"duration_s": 2.0, "rate_hz": 20.0}
-COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
 
 @pytest.fixture(scope="module")
@@ -88,29 +88,26 @@ def test_layers_that_name_each_other_have_a_checksum_too(tmp_path):
     assert len(stage_sha256(tmp_path / "a.usda")) == 64
 
 
-def test_the_commit_is_read_from_a_checkout_a_worktree_and_packed_refs(tmp_path):
-    git = tmp_path / "main" / ".git"
-    (git / "refs" / "heads").mkdir(parents=True)
-    (git / "HEAD").write_text("ref: refs/heads/main\n")
+def test_the_commit_is_that_of_the_checkout_or_worktree(tmp_path, monkeypatch):
+    def git(*words):
+        user = ("-c", "user.name=a", "-c", "user.email=a@example.org")
+        command = ["git", *user, "-C", tmp_path / "main", *words]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
     inside = tmp_path / "main" / "scenes" / "lab"
     inside.mkdir(parents=True)
+    assert git_revision(inside) == ""  # no checkout
+    git("init")
     assert git_revision(inside) == ""  # no commit yet
-    (git / "packed-refs").write_text(f"# pack-refs\n{COMMIT} refs/heads/main\n")
-    assert git_revision(inside) == COMMIT
-    (git / "refs" / "heads" / "main").write_text(COMMIT[::-1] + "\n")
-    assert git_revision(inside) == COMMIT[::-1]
-    tree = git / "worktrees" / "tree"
-    tree.mkdir(parents=True)
-    (tree / "HEAD").write_text("ref: refs/heads/main\n")
-    (tree / "commondir").write_text("../..\n")
-    (tmp_path / "tree").mkdir()
-    (tmp_path / "tree" / ".git").write_text(f"gitdir: {tree}\n")
-    assert git_revision(tmp_path / "tree") == COMMIT[::-1]
-    (git / "HEAD").write_text(COMMIT + "\n")
-    assert git_revision(inside) == COMMIT
-    (git / "HEAD").write_text("ref: refs/../../../secret\n")
-    (tmp_path / "secret").write_text(COMMIT)
-    assert git_revision(inside) == ""
+    git("commit", "--allow-empty", "-m", "first")
+    git("worktree", "add", tmp_path / "tree")
+    git("commit", "--allow-empty", "-m", "second")
+    monkeypatch.setenv("GIT_DIR", str(tmp_path / "gone"))
+    assert git_revision(tmp_path / "tree") != git_revision(inside)
+    monkeypatch.delenv("GIT_DIR")
+    assert git_revision(inside) == git("rev-parse", "HEAD")
+    monkeypatch.setenv("PATH", "")
+    assert git_revision(inside) == ""  # no git
 
 
 def test_a_run_of_every_kind_comes_out_again_to_the_bit(twin, tmp_path):

@@ -331,7 +331,7 @@ def test_convert_makes_a_table_of_a_robots_own_bag(tmp_path, capsys):
     main(["convert", str(bag), str(out), "--remap", f"{POSE}:=/vrpn/pose", "--unit", "nT"])
     assert "p_world_base" in read_run(out)
     for topic, text in {
-        "/vrpn/pose": "--remap takes OURS:=THEIRS, such as /robot/enu/pose:=/vrpn/pose, got '/vrpn/pose'",
+        "/vrpn/pose": "/robot/enu/pose:=/vrpn/pose, each once, got '/vrpn/pose'",
         f"{POSE}=/vrnp/pose": "no topic /vrnp/pose; did you mean '/vrpn/pose'",
     }.items():
         with pytest.raises(SystemExit, match="1"):

@@ -18,7 +18,7 @@ from magtwin.io.formats import read_run
 from magtwin.io.recorder import FLUSH_S, Recorder, in_step, partial_of
 from magtwin.io.rerun.file import read_run as read_rrd
 from magtwin.io.rerun.live import LiveViewer, RrdWriter
-from magtwin.io.rerun.viewer import headless_viewer, live_viewer
+from magtwin.io.rerun.viewer import live_viewer
 from magtwin.io.tables import ParquetParts, read_parquet
 from magtwin.run.run import Column, Run
 from magtwin.twin import open_twin, simulate
@@ -294,7 +294,7 @@ def test_a_live_run_that_is_refused_leaves_nothing(lab_scene, tmp_path, capsys):
 def drawable():
     """Skips where nothing can be drawn."""
     try:
-        with headless_viewer():
+        with live_viewer(headless=True):
             pass
     except InputError as error:
         pytest.skip(str(error))

@@ -24,7 +24,7 @@ from magtwin.io.rerun import recording
 from magtwin.io.rerun.file import read_run, read_runs, show_run, write_comparison, write_rrd
 from magtwin.io.rerun.live import RrdWriter
 from magtwin.io.rerun.series import DERIVED, STATES
-from magtwin.io.rerun.viewer import headless_viewer, screenshot, show
+from magtwin.io.rerun.viewer import live_viewer, screenshot, show
 from magtwin.io.tables import write_parquet
 from magtwin.path import figure8
 from magtwin.run.run import COLUMNS, Run
@@ -698,7 +698,7 @@ def test_a_run_from_any_file_is_shown_as_series_and_one_without_plotted_columns_
 def drawable():
     """Skips where nothing can be drawn."""
     try:
-        with headless_viewer():
+        with live_viewer(headless=True):
             pass
     except InputError as error:
         if "cannot draw here" not in str(error):
@@ -715,7 +715,7 @@ def test_the_viewer_draws_every_view_without_a_complaint(written, tmp_path):
 
 
 def test_what_is_no_recording_is_refused_before_a_viewer_starts(written, tmp_path, monkeypatch):
-    monkeypatch.setattr("magtwin.io.rerun.viewer.headless_viewer", lambda size: pytest.fail("was started"))
+    monkeypatch.setattr("magtwin.io.rerun.viewer.live_viewer", lambda **options: pytest.fail("was started"))
     fake, out = tmp_path / "fake.rrd", tmp_path / "run.png"
     fake.write_text("t,b\n0,1\n")
     with pytest.raises(InputError, match=r"fake\.rrd: not a Rerun recording"):
@@ -780,7 +780,7 @@ def test_the_viewer_listens_on_this_machine_only_and_ends_with_its_block():
         rows = [line.split() for table in tables for line in table.read_text().splitlines()]
         return [row[1] for row in rows if row[1].endswith(f":{port:04X}") and row[3] == "0A"]
 
-    with headless_viewer() as client:
+    with live_viewer(headless=True) as (_, client):
         port = int(client.url.rsplit(":", 1)[1].split("/")[0])
         assert listening(port) == [f"0100007F:{port:04X}"]
     assert listening(port) == []

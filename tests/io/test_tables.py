@@ -398,7 +398,7 @@ class Danger:
 def test_pickled_objects_in_an_npz_are_refused_and_never_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     np.savez(tmp_path / "run.npz", t=np.arange(1.0), yaw=np.array([Danger()], dtype=object))
-    with pytest.raises(InputError, match=r"yaw\.npy holds pickled objects, which are not read"):
+    with pytest.raises(InputError, match=r"yaw\.npy is no whole array of plain numbers \(Object arrays"):
         read_npz(tmp_path / "run.npz")
     assert not (tmp_path / "ran").exists()
 
@@ -421,7 +421,7 @@ def test_an_array_whose_header_claims_more_than_is_there_takes_no_memory(tmp_pat
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**15,)})
     with zipfile.ZipFile(tmp_path / "run.npz", "w") as archive:
         archive.writestr("t.npy", header.getvalue() + bytes(16))
-    with pytest.raises(InputError, match=r"t\.npy is cut short: 16 bytes for float64 of shape"):
+    with pytest.raises(InputError, match=r"t\.npy is no whole array"):
         read_npz(tmp_path / "run.npz")
 
 

@@ -18,6 +18,7 @@ from magtwin.sim.exact import DIP, ExactField, check_field, check_read
 from magtwin.sim.interference import draw_platform
 from magtwin.sim.runs.simulate import simulate
 from magtwin.sim.session import draw_session
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
@@ -50,7 +51,12 @@ PLATFORM = PlatformFieldSpec(
 ARM = (0.05, -0.02, 0.36)
 SENSOR = MagnetometerSpec(kind="physical")
 ROBOT = RobotSpec(
-    name="robot", asset=Path("robot.usda"), p_base_magnetometer=ARM, platform=PLATFORM, magnetometer=SENSOR
+    name="robot",
+    asset=Path("robot.usda"),
+    p_base_magnetometer=ARM,
+    platform=PLATFORM,
+    magnetometer=SENSOR,
+    drive=DriveSpec(localization_std_m=0.0, localization_yaw_std=0.0, localization_latency_s=0.0),
 )
 SURVEYED = Scene(name="surveyed", map_layer=Path("map.usdc"), robot=ROBOT)
 KNOWN = replace(SURVEYED, name="known", earth=EARTH, sources=SOURCES)

@@ -14,7 +14,7 @@ from scipy.stats import spearmanr
 from magtwin.author.scene_file import scene_from_toml
 from magtwin.files import from_table, read_toml, shipped
 from magtwin.learn.data.features import FULL, features
-from magtwin.learn.data.labels import labels
+from magtwin.learn.data.labels import labelled
 from magtwin.path import PATHS, path_named
 from magtwin.sim.interference import draw_platform, platform_field_nt
 from magtwin.sim.runs.simulate import simulate
@@ -63,9 +63,9 @@ def drives(scene):
             speed=draw_speed(robot.drive, way),
             rate_hz=5.0,
         )
-        label = labels(run, field)
-        signals.append(features(run)[label.known])
-        found.append(label.value_nt[label.known])
+        label = labelled(run, field)["label_nt"]
+        signals.append(features(run)[np.isfinite(label)])
+        found.append(label[np.isfinite(label)])
     return np.concatenate(signals), np.concatenate(found)
 
 

@@ -378,12 +378,12 @@ def real_robot(tmp_path_factory):
 
 def primitive_box(geometry):
     """Lower and upper corner of a primitive about its origin, shape (2, 3)."""
-    if geometry.box is not None:
-        half = geometry.box.size / 2
-    elif geometry.cylinder is not None:
-        half = np.array([geometry.cylinder.radius, geometry.cylinder.radius, geometry.cylinder.length / 2])
+    if geometry.kind == "box":
+        half = geometry.size / 2
+    elif geometry.kind == "cylinder":
+        half = np.array([geometry.radius, geometry.radius, geometry.length / 2])
     else:
-        half = np.full(3, geometry.sphere.radius)
+        half = np.full(3, geometry.radius)
     return np.stack([-half, half])
 
 

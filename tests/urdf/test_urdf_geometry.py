@@ -340,7 +340,7 @@ def test_a_malformed_collada_colour_is_repaired_with_a_note(tmp_path, colour, re
     mesh = read_mesh(dae(tmp_path / "n.dae", "<node>{mesh}</node>", diffuse=f"<color>{colour}</color>"))
     assert_allclose(mesh.paints[0].rgba, read)
     words = " ".join(f"{c:g}" for c in read)
-    assert [note.text for note in mesh.notes] == [f"n.dae: malformed colour {colour!r} read as {words!r}"]
+    assert [text for text, _ in mesh.notes] == [f"n.dae: malformed colour {colour!r} read as {words!r}"]
 
 
 def test_a_collada_file_whose_author_has_an_accent_in_latin_1_is_read(tmp_path):
@@ -886,7 +886,7 @@ DAMAGED = {
     "m.stl": (nan_stl, r"m\.stl: has vertices that are not finite numbers; export it again"),
     "cut.stl": (
         lambda p: cut(p, stl),
-        r"cut\.stl: has \d+ bytes, though its \d+ triangles need \d+; export it again",
+        r"cut\.stl: holds no triangle, or is cut short; export it again",
     ),
     "cut_text.stl": (
         lambda p: p.write_text("solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1"),
@@ -926,7 +926,7 @@ DAMAGED = {
     ),
     "zeros.gltf": (
         lambda p: p.write_text(ZEROS),
-        r"zeros\.gltf: accessor 0 has 10+ zeros, over \d+; export it again",
+        r"zeros\.gltf: accessor 0 is sparse or has no buffer.+; export it again",
     ),
     "json.gltf": (lambda p: p.write_text("{"), r"json\.gltf: cannot be read as a mesh: .+; export it again"),
     "doubles.dae": (

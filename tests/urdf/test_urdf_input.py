@@ -1,4 +1,5 @@
 import time
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -315,7 +316,7 @@ def test_xacro_has_arguments_properties_macros_blocks_conditions_includes_and_ya
     base, joint = description.links["left_base"], description.joints["hand"]
     assert base.inertial.mass == 3.0625
     assert_allclose(base.inertial.origin[:3, 3], [0.2, -0.2, 0.5])
-    assert_allclose(base.visuals[0].geometry.box.size, [2, 4, 6])
+    assert_allclose(base.visuals[0].geometry.size, [2, 4, 6])
     assert (joint.limit.velocity, joint.limit.upper) == (6, 1.5)
     assert_allclose(joint.limit.lower, -np.pi / 2)
     assert description.xml.find("gazebo/note").text == "${kept} quiet"
@@ -326,7 +327,7 @@ def test_xacro_has_arguments_properties_macros_blocks_conditions_includes_and_ya
 def test_the_expanded_text_is_a_urdf_of_the_same_robot(tmp_path):
     source = read_source(URDF / "input_xacro_language.xacro")
     path = tmp_path / "arm.urdf"
-    path.write_text(source.text, encoding="utf-8")
+    path.write_text(ElementTree.tostring(source.xml, encoding="unicode"), encoding="utf-8")
     again = read_source(path, packages={"arm_description": URDF / "input_packages" / "arm_description"})
     assert same(again.xml, source.xml)
     assert list(read_description(again).links) == list(read_description(source).links)
@@ -335,8 +336,8 @@ def test_the_expanded_text_is_a_urdf_of_the_same_robot(tmp_path):
 def test_small_errors_are_repaired_and_noted():
     description = read(URDF / "input_repairs.urdf")
     link = description.links["base_link"]
-    assert_allclose(link.visuals[0].geometry.box.size, [1, 2, 3])
-    assert_allclose(link.visuals[0].material.color.rgba, [1, 0, 0, 1])
+    assert_allclose(link.visuals[0].geometry.size, [1, 2, 3])
+    assert_allclose(link.visuals[0].material.rgba, [1, 0, 0, 1])
     assert len(link.visuals) == 1
     assert link.inertial.mass == 1
     dropped = [

@@ -6,7 +6,7 @@ from places import DATA
 
 from magtwin.errors import InputError
 from magtwin.urdf.description.description import read_description
-from magtwin.urdf.description.model import Geometry, Mesh
+from magtwin.urdf.description.model import Geometry
 from magtwin.urdf.lint import lint
 
 URDF = DATA / "urdf"
@@ -62,7 +62,7 @@ def test_the_mass_is_compared_with_a_data_sheet_within_5_percent():
 def test_a_mesh_counts_where_it_can_be_read():
     description = read_description(URDF / "lint_fine.urdf")
     base = description.links["base_link"]
-    mesh = Geometry(mesh=Mesh("cube", np.ones(1)))
+    mesh = Geometry("mesh", np.ones(1), filename="cube")
     visuals, collisions = (
         tuple(replace(part, geometry=mesh) for part in parts) for parts in (base.visuals, base.collisions)
     )

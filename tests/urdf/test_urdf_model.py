@@ -62,13 +62,22 @@ def same(mine, theirs):
 def same_geometry(mine, theirs):
     kind = "cylinder" if mine.kind == "capsule" else mine.kind
     assert [name for name in FORMS if getattr(theirs, name) is not None] == [kind]
-    form, peer = getattr(mine, mine.kind), getattr(theirs, kind)
+    peer = getattr(theirs, kind)
     if kind == "mesh":
-        assert form.filename == peer.filename
+        assert mine.filename == peer.filename
         scale = 1.0 if peer.scale is None else peer.scale
-        assert_array_equal(np.broadcast_to(form.scale, 3), np.broadcast_to(scale, 3))
-    else:
-        same(form, peer)
+        assert_array_equal(np.broadcast_to(mine.size, 3), np.broadcast_to(scale, 3))
+    for name in {"size", "radius", "length"} & vars(peer).keys():
+        same(getattr(mine, name), getattr(peer, name))
+
+
+def same_material(mine, theirs):
+    if theirs is None:
+        assert mine is None
+        return
+    assert mine.name == theirs.name
+    same(mine.rgba, None if theirs.color is None else theirs.color.rgba)
+    same(mine.texture, None if theirs.texture is None else theirs.texture.filename)
 
 
 def is_empty(geometry):
@@ -81,7 +90,7 @@ def same_shapes(mine, theirs):
         same_geometry(shape.geometry, peer.geometry)
         assert shape.name == peer.name
         same(shape.origin, peer.origin)
-        same(shape.material, getattr(peer, "material", None))
+        same_material(shape.material, getattr(peer, "material", None))
     return len(mine)
 
 
@@ -95,7 +104,7 @@ def compare(description):
     for theirs in peer.joints:
         same(description.joints[theirs.child], theirs)
     for theirs in peer.materials:
-        same(description.materials[theirs.name], theirs)
+        same_material(description.materials[theirs.name], theirs)
     assert len(description.links) == len(peer.links)
     assert len(description.joints) == len(peer.joints)
     return len(peer.links), shapes, len(peer.joints)

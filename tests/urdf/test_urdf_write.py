@@ -151,10 +151,10 @@ def test_merged_links_come_back_as_frames_on_the_body_that_they_became(tmp_path)
 def test_shapes_come_back_where_they_were_in_their_colours(tmp_path):
     _, after, _ = there_and_back(every(tmp_path), tmp_path)
     (tube,), (box,) = after.links["arm"].visuals, after.links["arm"].collisions
-    assert (tube.name, tube.geometry.cylinder.radius, tube.geometry.cylinder.length) == ("tube", 0.03, 0.4)
-    assert_allclose(tube.material.color.rgba, (0.8, 0.1, 0.1, 1), atol=1e-3)
+    assert (tube.name, tube.geometry.radius, tube.geometry.length) == ("tube", 0.03, 0.4)
+    assert_allclose(tube.material.rgba, (0.8, 0.1, 0.1, 1), atol=1e-3)
     assert_allclose(origin_of(tube)[:3, 3], (0.1, 0, 0.2), rtol=0, atol=1e-12)
-    assert_allclose(box.geometry.box.size, (0.1, 0.2, 0.3), rtol=0, atol=1e-7)
+    assert_allclose(box.geometry.size, (0.1, 0.2, 0.3), rtol=0, atol=1e-7)
 
 
 def test_triangles_come_back_where_they_were(tmp_path):

@@ -1,13 +1,12 @@
 """`magtwin dataset`: recordings with labels on a map, to train a magnetometer on."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Remap, Unit
+from magtwin.cli.options import OURS_THEIRS, Force, Remap, Unit, pairs
 from magtwin.cli.terminal import Done, progress, step
 from magtwin.errors import InputError
 
@@ -61,7 +60,6 @@ def build(
         Name of a column in a CSV or Parquet of another program, as NAME=THEIRS, of a vector by its parts:
         b_measured_nt=field, p_world_base_x=east. Repeatable. A p_world_base without z is on the floor.
     """
-    from magtwin.cli.runs.file import pairs
     from magtwin.files import check_free
     from magtwin.learn.data.alignment import Alignment
     from magtwin.learning import build_dataset
@@ -71,8 +69,11 @@ def build(
     if given and alignment == "fit":
         raise InputError("--alignment fit finds both; drop it, or --lever-arm-m and --latency-s")
     known: Any = Alignment(lever_arm_m or (0.0, 0.0), latency_s or 0.0) if given else None
-    reading: dict[str, Any] = {"topics": pairs("remap", remap) if remap else None, "unit": unit}
-    reading["columns"] = _columns(column) if column else None
+    reading: dict[str, Any] = {"topics": pairs("remap", remap, OURS_THEIRS), "unit": unit}
+    columns = pairs("column", column, "NAME=THEIRS, such as yaw=heading")
+    if len(set(columns.values())) < len(columns):
+        raise InputError(f"--column names one column twice, got {' '.join(column or ())}")
+    reading["columns"] = columns
     with progress("Labelling", "recordings") as advance:
         made = build_dataset(
             run,
@@ -84,7 +85,7 @@ def build(
             rate_hz=rate_hz,
             force=force,
             progress=advance,
-            **{name: value for name, value in reading.items() if value is not None},
+            **{name: value for name, value in reading.items() if value},
         )
     return Done(made.report(), out)
 
@@ -116,11 +117,7 @@ def info(dataset: Path) -> Done:
 
 @dataset_app.command
 def correlate(
-    dataset: Path,
-    *,
-    features: str = "full",
-    out: Path | None = None,
-    force: Force = False,
+    dataset: Path, *, features: str = "full", out: Path | None = None, force: Force = False
 ) -> Done:
     """Correlate each input with the disturbance: Spearman's rank correlation, as in the paper's Figure 2.
 
@@ -141,18 +138,8 @@ def correlate(
     step("Ranking the inputs")
     result = correlations_of(dataset, features)
     if out is not None:
-        from magtwin.figures.training import plot_correlations
+        from magtwin.figures.canvas import save
+        from magtwin.figures.training import draw_correlations
 
-        plot_correlations(result, out, title=f"{dataset}", force=force)
+        save(draw_correlations(result, title=f"{dataset}"), out, force=force)
     return Done(result.report(f"Correlation with the disturbance in {dataset}"), out or ())
-
-
-def _columns(given: Sequence[str]) -> dict[str, str]:
-    """Names of a table's columns by those of a Run."""
-    columns: dict[str, str] = {}
-    for word in given:
-        name, _, theirs = word.partition("=")
-        if not (name and theirs) or name in columns or theirs in columns.values():
-            raise InputError(f"--column takes NAME=THEIRS, each once, such as yaw=heading, got {word!r}")
-        columns[name] = theirs
-    return columns

@@ -1,14 +1,13 @@
 """`magtwin evaluate`: errors of models on recordings that they never saw, as in the paper's Table 1."""
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Flag, Force, Names, Seed
+from magtwin.cli.options import Flag, Force, Names, Seed, pairs
 from magtwin.cli.terminal import Done, progress, stdout_console, step
 from magtwin.errors import InputError
 
@@ -84,6 +83,7 @@ def evaluate(
     from magtwin.figures.evaluations import page_of_evaluation, read_curve, write_evaluation
     from magtwin.figures.page import to_json
     from magtwin.files import check_free
+    from magtwin.learn.evaluation.evaluation import TOTALS
     from magtwin.learning import error_budget, map_of_scene, short_names
     from magtwin.learning import evaluate as evaluate_models
 
@@ -96,6 +96,9 @@ def evaluate(
         raise InputError("judge by --runs or by a --dataset, one of the two")
     if overlay is not None and engine is not None:
         raise InputError("--overlay and --engine both name a drive to compare with; give one of them")
+    cases = pairs("case", case, "a row of the table and its path, such as D=lawnmower.csv")
+    if taken := cases.keys() & set(TOTALS):
+        raise InputError(f"--case {min(taken)} is a row of the table already; take another name")
     step("Reading maps, weights and recordings")
     with progress("Judging", "recordings") as advance:
         evaluation = evaluate_models(
@@ -103,7 +106,7 @@ def evaluate(
             dataset or runs or [],
             anomaly_map=map or ([] if scene is None else [map_of_scene(scene)]),
             train=train,
-            cases=_cases(case),
+            cases=cases,
             any_map=any_map,
             truth=truth,
             seed=seed,
@@ -130,7 +133,7 @@ def _traversals(
     evaluation: "Evaluation", scene: Path | None, overlay: Path | None, engine: str | None
 ) -> "tuple[Section, dict[str, Any]]":
     """One path driven twice, as a section and as figures."""
-    from magtwin.figures.comparisons import section_of_traversals
+    from magtwin.figures.reports import section_of_traversals
     from magtwin.io.formats import read_run
     from magtwin.io.provenance import made_again
     from magtwin.run.compare import traversals
@@ -149,19 +152,6 @@ def _traversals(
         name = f"{first.path} by {engine}"
     both = traversals(first.run, other)
     return section_of_traversals(both, (first.name, name)), both.summary()
-
-
-def _cases(given: Sequence[str] | None) -> dict[str, str]:
-    """Paths by row from words such as D=lawnmower.csv."""
-    from magtwin.learn.evaluation.evaluation import TOTALS
-
-    cases: dict[str, str] = {}
-    for word in given or ():
-        name, equals, path = word.partition("=")
-        if not (name and equals and path) or name in cases or name in TOTALS:
-            raise InputError(f"--case is a row of the table and its path, as D=lawnmower.csv, got {word!r}")
-        cases[name] = path
-    return cases
 
 
 def _print(evaluation: "Evaluation") -> None:

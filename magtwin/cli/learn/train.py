@@ -101,7 +101,11 @@ def train(
     rrd
         Rerun recording of the learning curve to write, .rrd.
     """
-    from magtwin.figures.training import plot_learning_curve, write_learning_curve
+    given: dict[str, Any] = dict(locals())
+    from dataclasses import fields
+
+    from magtwin.figures.canvas import save
+    from magtwin.figures.training import draw_learning_curve, write_learning_curve
     from magtwin.files import check_free
     from magtwin.io.rerun.learning import record_learning_curve
     from magtwin.learn.training.config import TrainConfig, read_config
@@ -112,30 +116,13 @@ def train(
         build = f"magtwin dataset build {dataset} --map MAP --out SET"
         raise InputError(f"{dataset}: is no data set; build one from the runs first: {build}")
     picture, table = (out.with_suffix(end) for end in (".png", ".csv"))
-    given = {
-        "model": model,
-        "layers": None if layers is None else _widths(layers),
-        "features": features,
-        "penalty": penalty,
-        "weighting": weighting,
-        "dropout": dropout,
-        "epochs": epochs,
-        "batch": batch,
-        "lr": lr,
-        "patience": patience,
-        "seed": seed,
-        "licence": licence,
-        "split": split,
-        "hold_out": None if hold_out is None else tuple(hold_out),
-        "threads": threads,
-        "device": device,
-        "init": init,
-        "freeze": None if freeze is None else tuple(freeze),
-    }
+    given |= {"layers": None if layers is None else _widths(layers)}
+    given |= {name: given[name] and tuple(given[name]) for name in ("hold_out", "freeze")}
     if model in ("paper", "released") and layers is not None:
         raise InputError("--model and --layers both set the widths; give one of them")
     base = TrainConfig() if config is None else read_config(config)
-    options = base.with_options(**{name: value for name, value in given.items() if value is not None})
+    names = [field.name for field in fields(base) if given.get(field.name) is not None]
+    options = base.with_options(**{name: given[name] for name in names})
     curves = () if options.model in ("linear", "mixed") else (picture, table)
     if rrd is not None:
         check_suffix(rrd, (".rrd",), "a Rerun recording")
@@ -156,7 +143,8 @@ def train(
         )
     if result.history:
         naive = result.parts[0].naive_rmse_nt
-        plot_learning_curve(result.history, picture, naive_rmse_nt=naive, title=out.name, force=force)
+        curve = draw_learning_curve(result.history, naive_rmse_nt=naive, title=out.name)
+        save(curve, picture, force=force)
         write_learning_curve(result.history, table, force=force)
         if rrd is not None:
             record_learning_curve(result.history, rrd, naive_rmse_nt=naive, title=out.name, force=force)

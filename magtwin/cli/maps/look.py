@@ -34,13 +34,14 @@ def map_plot(
         Headings to draw [deg], such as 0,90,180,270. Default: the map's, or four of them if it has more than
         eight.
     """
-    from magtwin.figures.maps import plot_map
+    from magtwin.figures.canvas import save
+    from magtwin.figures.maps import draw_map
     from magtwin.io.surveys.maps import open_map
 
     check_output(out, PICTURES, "a picture", force=force)
     angles = None if headings_deg is None else headings_rad(headings_deg)
     step("Drawing the map")
-    plot_map(open_map(file, date), out, what=quantity, headings=angles, force=force)
+    save(draw_map(open_map(file, date), what=quantity, headings=angles), out, force=force)
     return Done(wrote=out)
 
 
@@ -78,9 +79,10 @@ def map_diff(before: Path, after: Path, *, out: Path | None = None, force: Force
     step("Comparing the maps")
     change = difference(open_map(before), open_map(after))
     if out is not None:
-        from magtwin.figures.maps import plot_difference
+        from magtwin.figures.canvas import save
+        from magtwin.figures.maps import draw_difference
 
-        plot_difference(change, out, force=force)
+        save(draw_difference(change), out, force=force)
     report = change.report()
     regions = [asdict(region) for region in change.regions]
     whole = replace(report, metadata={**report.metadata, "regions": regions})

@@ -6,9 +6,8 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, OutUnit, Remap, RunScene, Unit, UsdFps
+from magtwin.cli.options import OURS_THEIRS, Force, OutUnit, Remap, RunScene, Unit, UsdFps, pairs
 from magtwin.cli.terminal import Done, progress, silence, step
-from magtwin.errors import InputError
 
 
 @app.command
@@ -88,7 +87,7 @@ def convert(
         storage=storage,
         out_unit=out_unit,
         usd_fps=usd_fps,
-        topics=pairs("remap", remap) if remap else None,
+        topics=pairs("remap", remap, OURS_THEIRS) or None,
         unit=unit,
         force=force,
     )
@@ -123,17 +122,3 @@ def fetch(
     with progress(f"Fetching {assets}", "files") as advance:
         files = fetch_files(assets, folder, base_url=base_url, force=force, progress=advance)
     return Done(wrote=folder, text=f"Wrote {len(files)} files to {folder}")
-
-
-def pairs(option: str, texts: list[str]) -> dict[str, str]:
-    """Values of an option as OURS:=THEIRS, or OURS=THEIRS, as a table."""
-    table = {}
-    for text in texts:
-        ours, _, theirs = text.partition("=")
-        ours = ours.removesuffix(":")
-        if not (ours and theirs):
-            raise InputError(
-                f"--{option} takes OURS:=THEIRS, such as /robot/enu/pose:=/vrpn/pose, got {text!r}"
-            )
-        table[ours] = theirs
-    return table

@@ -11,16 +11,14 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import (
+    SENSING,
     Flag,
     Force,
-    Lidar,
-    Magnetometer,
     ModelError,
-    Network,
-    Outside,
     OutUnit,
-    RateHz,
+    Plant,
     Seed,
+    SensingOptions,
     Session,
     UsdFps,
 )
@@ -37,11 +35,7 @@ Outs = Annotated[list[Path] | None, Parameter(consume_multiple=False)]
 
 @app.command
 def demo(
-    *,
-    out: Path = Path("demo"),
-    seed: Seed = 0,
-    model_error: ModelError = True,
-    force: Force = False,
+    *, out: Path = Path("demo"), seed: Seed = 0, model_error: ModelError = True, force: Force = False
 ) -> Done:
     """Author a lab and a TurtleBot 4, drive a figure of eight and log what the magnetometer reads.
 
@@ -54,6 +48,7 @@ def demo(
     """
     from magtwin.author.robot import build_robot
     from magtwin.author.scene import author_scene
+    from magtwin.figures.pictures import picture_of_stage
     from magtwin.files import output, shipped
     from magtwin.io.outputs import Outputs, drive
     from magtwin.twin import scene_from_toml
@@ -70,8 +65,11 @@ def demo(
         relative = {"scene_file": scene_file.relative_to(folder).as_posix()}
         driven = drive(scene_file, seed=seed, model_error=model_error, metadata=relative, report=announce)
         announce("Writing the run and pictures")
-        Outputs(folder, picture=draw_run).write(driven)
-        _picture(scene_file, folder / "lab.png")
+        Outputs(folder, picture=save_picture).write(driven)
+        try:
+            picture_of_stage(scene_file, folder / "lab.png")
+        except InputError as error:  # OpenGL is missing
+            note(f"no picture of the stage: {error}")
     pictures = ", ".join(str(file) for file in sorted(out.glob("*.png")))
     text = f"\nLook at it:  magtwin view {out / 'run.rrd'}\nPictures:    {pictures}"
     return Done(driven.run.report(f"Demo in {out}"), out, text=text)
@@ -89,16 +87,12 @@ def run(
     engine: Literal["kinematic", "newton"] = "kinematic",
     replay: Path | None = None,
     controller: Literal["follower", "release", "stanley", "pure_pursuit"] = "follower",
-    network: Network = None,
-    magnetometer: Magnetometer = None,
-    model_error: ModelError = True,
+    sensing: SensingOptions = SENSING,
     seed: Seed = 0,
     session: Session = None,
+    plant: Plant = None,
     speed: float = 0.2,
     duration_s: float | None = None,
-    rate_hz: RateHz = None,
-    lidar: Lidar = "schedule",
-    outside: Outside = "nan",
     out: Outs = None,
     out_unit: OutUnit = None,
     usd_fps: UsdFps = None,
@@ -131,12 +125,12 @@ def run(
     meet
         What happens if robots collide: refuse the run, or flag it as a bump. Default: refuse.
     engine
-        What moves the robot: kinematic, or newton for physics in the stage.
+        What moves the robot: kinematic (motion without forces), or newton (the physics engine Newton).
     replay
         File of a run, in any format. The robot repeats the recorded motion; the sensors use the current
         settings.
     controller
-        Controller: magtwin's follower; release, the one of APRILab's released package; stanley; or
+        follower (magtwin's own controller), release (that of APRILab's published package), stanley or
         pure_pursuit.
     speed
         Forward speed on straight parts [m/s].
@@ -148,8 +142,8 @@ def run(
         .npz, .usd, .usda or .usdc. A name without a suffix is a folder with run.rrd, run.parquet and run.png.
         Default: the folder run.
     scans
-        Cast the LiDAR's rays while it spins. Scans are written to recordings and bags; for tables, to a
-        second file such as run.scans.parquet.
+        Cast the LiDAR's rays while it spins. Files .rrd, .mcap and .db3 contain the scans. For .parquet, .csv
+        and .npz, the scans go into a second file such as run.scans.parquet.
     live
         Show the run in a Rerun viewer while it goes on. Until it ends, the names of growing files contain
         "partial" or "parts". Ctrl-C ends it and keeps what was driven.
@@ -164,7 +158,12 @@ def run(
 
     scene = scene_file(scene)
     outputs = Outputs.of(
-        out or [Path("run")], scans=scans, force=force, out_unit=out_unit, usd_fps=usd_fps, picture=draw_run
+        out or [Path("run")],
+        scans=scans,
+        force=force,
+        out_unit=out_unit,
+        usd_fps=usd_fps,
+        picture=save_picture,
     )
     if live and viewer:
         raise InputError("--live opens a viewer and --viewer names one; give one of them")
@@ -174,14 +173,11 @@ def run(
         raise InputError(f"--pace must be above 0 simulated seconds per second, got {pace:g}")
     what = _what(path, commands, replay)
     free = commands or replay  # driven without a path
+    no_path = free or path == "random"
     for given, option, fault in (
-        (
-            controller != "follower" and (free or path == "random"),
-            f"--controller {controller}",
-            "follows a path",
-        ),
+        (controller != "follower" and no_path, f"--controller {controller}", "follows a path"),
         (speed != 0.2 and free, "--speed", "is for a path or a driver"),
-        (fit and (free or path == "random"), "--fit", "is for a path"),
+        (fit and no_path, "--fit", "is for a path"),
         (engine == "newton" and replay, "--engine newton", "cannot repeat the motion of a run"),
     ):
         if given:
@@ -194,21 +190,9 @@ def run(
         from magtwin.io.rerun.live import check_listens
 
         check_listens(viewer)
-    options: dict[str, Any] = {
-        "commands": commands,
-        "replay": replay,
-        "network": network,
-        "magnetometer": magnetometer,
-        "model_error": model_error,
-        "seed": seed,
-        "session": session,
-        "speed": speed,
-        "duration_s": duration_s,
-        "rate_hz": rate_hz,
-        "lidar": lidar,
-        "outside": outside,
-        "controller": controller,
-    }
+    options: dict[str, Any] = {"commands": commands, "replay": replay, "seed": seed, "session": session}
+    options |= {"plant": plant, "speed": speed, "duration_s": duration_s, "controller": controller}
+    options |= vars(sensing)
     robots = robots_in(scene)
     if robot is not None:
         find("robot", robot, robots)
@@ -244,12 +228,13 @@ def run(
     return Done(driven.run.report(f"{what} in {scene}"), tuple(outputs.targets))
 
 
-def draw_run(driven: "Driven", out: Path, force: bool) -> None:
+def save_picture(driven: "Driven", out: Path, force: bool) -> None:
     """Draw run.png: the path over the map."""
-    from magtwin.figures.runs import plot_run
+    from magtwin.figures.canvas import save
+    from magtwin.figures.runs import draw_run
 
     planned = driven.planned.p_xy if driven.planned else None
-    plot_run(driven.run, driven.twin.field, out, planned=planned, force=force)
+    save(draw_run(driven.run, driven.twin.field, planned), out, force=force)
 
 
 def _run_robots(
@@ -368,13 +353,3 @@ def _what(path: str | None, commands: Path | None, replay: Path | None) -> str:
     if len(named) > 1:
         raise InputError(f"{' and '.join(named)} each name what to drive; give one of them")
     return path or str(commands or replay or "figure8")
-
-
-def _picture(scene_file: Path, out: Path) -> None:
-    """Draw a stage; if OpenGL is missing, print that and go on."""
-    from magtwin.figures.pictures import picture_of_stage
-
-    try:
-        picture_of_stage(scene_file, out)
-    except InputError as error:
-        note(f"no picture of the stage: {error}")

@@ -4,19 +4,7 @@ from pathlib import Path
 from typing import Literal
 
 from magtwin.cli.app import app
-from magtwin.cli.options import (
-    Flag,
-    Force,
-    Lidar,
-    Magnetometer,
-    ModelError,
-    Names,
-    Network,
-    Outside,
-    RateHz,
-    Seed,
-    Whole,
-)
+from magtwin.cli.options import SENSING, Flag, Force, Names, Plant, Seed, SensingOptions, Whole
 from magtwin.cli.terminal import Done, announce, progress
 from magtwin.errors import InputError
 
@@ -35,15 +23,11 @@ def sweep(
     seed: Seed = 0,
     sessions: Whole | None = None,
     session: Literal["survey"] | None = None,
+    plant: Plant = None,
     speed: float | None = None,
     duration_s: float | None = None,
-    rate_hz: RateHz = None,
     keep: Names = None,
-    network: Network = None,
-    magnetometer: Magnetometer = None,
-    model_error: ModelError = True,
-    lidar: Lidar = "schedule",
-    outside: Outside = "nan",
+    sensing: SensingOptions = SENSING,
     force: Force = False,
 ) -> Done:
     """Drive a scene's robot many times and write a data set: one Parquet file per run, and runs.csv.
@@ -93,7 +77,9 @@ def sweep(
     for name in path or MIXTURE:
         drive_input(name)  # refuses a wrong name before the scene is opened
     announce("Opening the scene")
-    twin = open_twin(scene, network=network, magnetometer=magnetometer, model_error=model_error)
+    options = vars(sensing).copy()
+    opening = {name: options.pop(name) for name in ("network", "magnetometer", "model_error")}
+    twin = open_twin(scene, **opening)
     announce(f"Driving {count} runs")
     runs = drive_many(
         twin,
@@ -101,12 +87,11 @@ def sweep(
         count,
         seed=seed,
         sessions=session or sessions or max(1, round(count / RUNS_A_SESSION)),
+        plant=plant,
         speeds=speed if speed is not None else 0.2 if session else "drawn",
         columns=keep,
         duration_s=duration_s,
-        rate_hz=rate_hz,
-        lidar=lidar,
-        outside=outside,
+        **options,
     )
     with progress("Driving", "runs") as advance:
         return Done(runs.save(out, force=force, progress=advance), out)

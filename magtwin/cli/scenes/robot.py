@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Literal
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Flag, Force
+from magtwin.cli.options import Flag, Force, pairs
 from magtwin.cli.terminal import Done, check_output, step
 from magtwin.errors import InputError
 
@@ -73,40 +73,25 @@ def robot(
     report
         Full report to write (.json).
     """
-    from magtwin.author.from_urdf import DriveRule, from_urdf
+    given = dict(locals())
+    from magtwin.author.from_urdf import DriveRule, from_urdf, write_urdf
     from magtwin.files import output
 
     if out.suffix == ".urdf":
-        given: tuple[object, ...] = (
-            settings,
-            package,
-            arg,
-            missing_meshes,
-            collision,
-            profile,
-            drive,
-            fix_base,
-            merge_fixed,
-        )
-        if any(
-            option is not None for option in (*given, density_kg_m3, mass_kg, single_file, strict, report)
-        ):
+        own = ("urdf", "out", "thumbnail", "force")
+        if any(value is not None for name, value in given.items() if name not in own):
             raise InputError("a stage is written as a URDF without other options than --force; drop them")
-        return _to_urdf(urdf, out, force=force)
+        if urdf.suffix in (".urdf", ".xacro"):
+            raise InputError(f"{urdf}: is no stage; a URDF is written from .usd, .usda, .usdc or .usdz")
+        return Done(write_urdf(urdf, out, force=force), out)
     check_output(report, (".json",), "a report", force=force)
-    choices = {
-        "packages": {k: Path(v) for k, v in _pairs("package", package).items()} if package else None,
-        "arguments": _pairs("arg", arg) if arg else None,
-        "missing_meshes": missing_meshes,
-        "collision": collision,
-        "profile": profile,
-        "drives": tuple(DriveRule.parse(text) for text in drive) if drive else None,
-        "fix_base": fix_base,
-        "merge_fixed": merge_fixed,
+    same = ("missing_meshes", "collision", "profile", "fix_base", "merge_fixed", "single_file", "strict")
+    choices = {name: given[name] for name in same} | {
+        "packages": {name: Path(folder) for name, folder in pairs("package", package).items()} or None,
+        "arguments": pairs("arg", arg, empty=True) or None,
+        "drives": tuple(DriveRule.parse(text) for text in drive or ()) or None,
         "density": density_kg_m3,
         "mass": mass_kg,
-        "single_file": single_file,
-        "strict": strict,
     }
     step("Converting the robot")
     made = from_urdf(
@@ -123,24 +108,7 @@ def robot(
     return Done(made.report.summary(), made.asset)
 
 
-def _to_urdf(stage: Path, out: Path, *, force: bool) -> Done:
-    from magtwin.author.from_urdf import write_urdf
-
-    if stage.suffix in (".urdf", ".xacro"):
-        raise InputError(f"{stage}: is no stage; a URDF is written from .usd, .usda, .usdc or .usdz")
-    return Done(write_urdf(stage, out, force=force), out)
-
-
 def _thumbnail(asset: Path, out: Path) -> None:
     from magtwin.figures.pictures import picture_of_stage
 
     picture_of_stage(asset, out, size=(256, 256))
-
-
-def _pairs(option: str, texts: list[str]) -> dict[str, str]:
-    """NAME=VALUE texts as a table."""
-    pairs = [text.partition("=") for text in texts]
-    for text, (name, equals, _) in zip(texts, pairs, strict=True):
-        if not (name and equals):
-            raise InputError(f"--{option} {text!r}: NAME=VALUE is wanted")
-    return {name: value for name, _, value in pairs}

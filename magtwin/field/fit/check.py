@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.errors import InputError, find
+from magtwin.errors import InputError, hint
 from magtwin.field.fit.fit import fit
 from magtwin.field.fit.interpolation import check_readings
 from magtwin.field.fit.methods import METHODS
@@ -22,6 +22,7 @@ Progress = Callable[[int, int, str], Any]
 
 # Options of methods in a check: held-out nodes are filled, or every cell would be unknown
 FILLED: Mapping[str, Mapping[str, Any]] = {"trilinear": {"fill": True}, "cubic": {"fill": True}}
+SPLITS = ("checkerboard", "heading", "run", "block")
 BLOCK_SPACINGS = 3  # Side of a held-out block, in spacings of the readings
 # Number of parts of a floor in blocks: block (i, j) is in part (i + 2 j) mod 5, unlike all eight around it
 BLOCKS = 5
@@ -78,7 +79,7 @@ def check(
         Figure("turns", len(turns), note=f"{min(len(a) for a, _ in turns)} readings fitted at least"),
     ]
     heading = None if readings.node is None else readings.node[tested, 0]
-    step, steps = 0, len(methods) * len(turns)
+    step, steps, say = 0, len(methods) * len(turns), progress or (lambda done, total, what: None)
     for method in ("naive", *methods):
         mean, variance = [], []
         for train, test in turns:
@@ -86,15 +87,13 @@ def check(
                 shown = readings.b_nt[train]
                 m, v = np.full(len(test), shown.mean()), np.full(len(test), shown.var())
             else:
-                if progress is not None:
-                    progress(step, steps, method)
+                say(step, steps, method)
                 step += 1
                 m, v = _predict(_shown(readings, train), readings.take(test), method, options.get(method, {}))
             mean.append(m)
             variance.append(v)
         figures += _figures(method, readings, tested, np.concatenate(mean), np.concatenate(variance), heading)
-    if progress is not None:
-        progress(steps, steps, "done")
+    say(steps, steps, "done")
     metadata: dict[str, Any] = {"split": named}
     if within_m is not None:
         metadata["within"] = f"{within_m:g} m of a reading that was fitted"
@@ -114,10 +113,7 @@ def _shown(readings: Readings, rows: Rows) -> Readings:
 
 
 def _predict(train: Readings, test: Readings, method: str, options: Mapping[str, Any]) -> tuple[Array, Array]:
-    """Mean [nT] and variance with noise [nT^2] of readings from a fit to others.
-
-    Models of nominal headings are evaluated at those.
-    """
+    """Mean [nT] and variance with noise [nT^2] of readings, at nominal headings if the method uses those."""
     model = fit(train, method, **options)
     yaw = test.yaw
     if test.grid is not None and test.node is not None and method in FILLED:
@@ -136,7 +132,7 @@ def _turns(
     if split is None:
         runs = len(np.unique(readings.run[good])) > 1
         split = "checkerboard" if readings.grid is not None else "run" if runs else "block"
-    part, description = find("split", split, SPLITS)(readings)
+    part, description = _parts(readings, split)
     parts = np.unique(part[good])
     if len(parts) < 2:
         raise InputError(
@@ -145,43 +141,25 @@ def _turns(
     return description, [(good[part[good] != k], good[part[good] == k]) for k in parts]
 
 
-def _checkerboard(readings: Readings) -> tuple[Rows, str]:
-    return _nodes(readings, "checkerboard")[:, 1:].sum(
-        axis=1
-    ) % 2, "every other node at all its headings, then the others"
-
-
-def _heading(readings: Readings) -> tuple[Rows, str]:
-    return _nodes(readings, "heading")[:, 0], "one heading at a time"
-
-
-def _nodes(readings: Readings, split: str) -> Rows:
+def _parts(readings: Readings, split: str) -> tuple[Rows, str]:
+    """Part of each reading in a split, and what a part is."""
+    if split not in SPLITS:
+        raise InputError(f"no split {split!r}; {hint(split, SPLITS)}")
+    if split == "run":
+        return readings.run, "one run at a time"
+    if split == "block":
+        side = BLOCK_SPACINGS * spacing_m(readings)
+        corner = readings.p_xy[readings.good].min(axis=0)
+        i, j = np.floor((readings.p_xy - corner) / side + 1e-9).astype(np.intp).T
+        return (i + 2 * j) % BLOCKS, f"every fifth block of {side:.3g} x {side:.3g} m, in turn"
     if readings.node is None:
         raise InputError(
             f"split {split!r} needs the nodes of a gridded survey, {readings.name!r} has none; "
             "take 'run' or 'block'"
         )
-    return readings.node
-
-
-def _run(readings: Readings) -> tuple[Rows, str]:
-    return readings.run, "one run at a time"
-
-
-def _block(readings: Readings) -> tuple[Rows, str]:
-    side = BLOCK_SPACINGS * spacing_m(readings)
-    corner = readings.p_xy[readings.good].min(axis=0)
-    i, j = np.floor((readings.p_xy - corner) / side + 1e-9).astype(np.intp).T
-    return (i + 2 * j) % BLOCKS, f"every fifth block of {side:.3g} x {side:.3g} m, in turn"
-
-
-# Functions that assign each reading to a part, by name
-SPLITS: dict[str, Callable[[Readings], tuple[Rows, str]]] = {
-    "checkerboard": _checkerboard,
-    "heading": _heading,
-    "run": _run,
-    "block": _block,
-}
+    if split == "heading":
+        return readings.node[:, 0], "one heading at a time"
+    return readings.node[:, 1:].sum(axis=1) % 2, "every other node at all its headings, then the others"
 
 
 def _near(readings: Readings, train: Rows, test: Rows, within_m: float | None) -> Rows:
@@ -203,9 +181,11 @@ def _figures(
     e, v = error[known], np.maximum(variance[known], np.finfo(float).tiny)
     inside = np.abs(e) <= Z_90 * np.sqrt(v)
     score = -0.5 * (np.log(2 * np.pi * v) + e**2 / v)
-    yield Figure(f"{method} RMSE", _nt(np.sqrt(np.mean(e**2))), "nT")
-    yield Figure(f"{method} MAE", _nt(np.mean(np.abs(e))), "nT")
-    yield Figure(f"{method} median error", _nt(np.median(np.abs(e))), "nT", note="of the absolute ones")
+    yield Figure(f"{method} RMSE", _rms(e), "nT")
+    yield Figure(f"{method} MAE", round(float(np.mean(np.abs(e))), 1), "nT")
+    yield Figure(
+        f"{method} median error", round(float(np.median(np.abs(e))), 1), "nT", note="of the absolute ones"
+    )
     yield Figure(f"{method} coverage", _percent(inside), "%", note="of readings in the 90 % interval")
     yield Figure(f"{method} log score", round(float(score.mean()), 3), note="mean log density [1/nT]")
     yield Figure(f"{method} predicted", _percent(known), "%", note="of readings")
@@ -215,13 +195,11 @@ def _figures(
         own = heading[known] == h
         if own.any():
             note = f"coverage {_percent(inside[own]):g} %"
-            yield Figure(
-                f"{method} RMSE at {angle:g} deg", _nt(np.sqrt(np.mean(e[own] ** 2))), "nT", note=note
-            )
+            yield Figure(f"{method} RMSE at {angle:g} deg", _rms(e[own]), "nT", note=note)
 
 
-def _nt(value: Any) -> float:
-    return round(float(value), 1)
+def _rms(error: Array) -> float:
+    return round(float(np.sqrt(np.mean(error**2))), 1)
 
 
 def _percent(flags: NDArray[np.bool_]) -> float:

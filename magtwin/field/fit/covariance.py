@@ -44,8 +44,9 @@ class Covariance:
 
     @property
     def size(self) -> int:
-        """Number of hyperparameters: log s_h, reach_h, u_h, noise; if any, log r and its reach, log a_0 of
-        the patches, the arm's x and y.
+        """Number of hyperparameters.
+
+        Log s_h, reach_h, u_h, noise; if any, log r and its reach, log a_0 of the patches, the arm's x and y.
         """
         return self._even + len(self.patches) + 2 * (self.harmonics > 1)
 
@@ -122,9 +123,7 @@ class Covariance:
         return out
 
     def _waves(self, a: Array, b: Array) -> list[Array]:
-        """cos(h (yaw - yaw')) of every pair, for each h, from one product: cosines of every pair would be
-        slowest.
-        """
+        """cos(h (yaw - yaw')) of every pair, for each h; one product, since cosines of pairs are slow."""
         ones = np.ones((len(a), len(b)))
         if self.harmonics == 1:
             return [ones]
@@ -134,21 +133,11 @@ class Covariance:
     def loss(
         self, figures: Array, guess: Array, p_xy: Array, yaw: Array, run: NDArray[np.intp], b_nt: Array
     ) -> tuple[float, Array]:
-        """Negative logarithm of marginal likelihood and prior, and its gradient.
+        """Negative logarithm of marginal likelihood and prior, and its gradient by `figures`, shape (size,).
 
         b K^-1 b / 2 + log |K| / 2 (Rasmussen & Williams 2006, eq. 5.8, 5.9, without a constant), plus (value
-        - guess)^2 / (2 sd^2) for every hyperparameter with a prior.
-
-        Args:
-            figures: Hyperparameters, shape (size,).
-            guess: Their first guess, shape (size,).
-            p_xy: Positions of base_link [m], shape (N, 2).
-            yaw: Headings [rad], shape (N,).
-            run: Run of each reading, shape (N,).
-            b_nt: Readings minus a constant [nT], shape (N,).
-
-        Returns:
-            The value, `UNLIKELY` if the covariance is not positive definite; its gradient, shape (size,).
+        - guess)^2 / (2 sd^2) for every hyperparameter with a prior. `b_nt` is the readings minus a constant.
+        The value is `UNLIKELY` if the covariance is not positive definite.
         """
         from scipy.linalg import cho_solve
         from scipy.linalg.lapack import dpotrf, dpotri

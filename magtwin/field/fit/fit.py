@@ -1,7 +1,7 @@
 """Fit a map method to readings, and lay the fit out as a map.
 
-Linear algebra runs on one thread here. Its own threads spin while they wait, so on a busy machine small
-matrices take twenty times as long. Whole headings run in parallel instead.
+Linear algebra runs on one thread: its threads spin while they wait, so on a busy machine small matrices take
+twenty times as long. Whole headings run in parallel instead.
 """
 
 import inspect
@@ -32,9 +32,6 @@ MOST_DOUBT = 0.5  # Largest standard deviation of a known node, as a share of th
 # Parameters of a map: RMS errors of linear interpolation
 ERRORS = ("error between nodes [nT]", "error between headings [nT]")
 MOST_THREADS = 4  # Headings of a raster that are computed in parallel: each holds blocks of 100 MB
-
-
-ON_NODES = ("trilinear",)  # Methods whose map of a gridded survey has the survey's own nodes
 
 
 def fit(
@@ -79,7 +76,8 @@ def fit_map(
         survey: Readings at known poses.
         method: One of `METHODS`: "harmonic", "gp", "trilinear", "cubic" or a registered method.
         spacing_m: Distance between nodes [m]. Default: the widest with almost no loss of accuracy.
-        headings_rad: Headings of the layers [rad]. Default: the fewest with almost no loss of accuracy.
+        headings_rad: Headings of the map's grids [rad], one grid each. Default: the fewest with almost no
+            loss of accuracy.
         progress: Called as progress(done, total, what).
         **options: Options of the method.
 
@@ -141,13 +139,12 @@ def raster(
     headings = grid.headings_rad
     predict = getattr(model, "predict_nodes", model.predict)
     threads = min(MOST_THREADS, os.cpu_count() or 1, len(headings))
+    say = progress or (lambda done, total, what: None)
     with _one_thread(), ThreadPoolExecutor(threads) as pool:
         for h, predicted in enumerate(pool.map(predict, p, headings)):
-            if progress is not None:
-                progress(h, len(headings), "headings")
+            say(h, len(headings), "headings")
             values[h], variance[h] = predicted
-    if progress is not None:
-        progress(len(headings), len(headings), "headings")
+    say(len(headings), len(headings), "headings")
     valid = np.isfinite(values) & np.isfinite(variance) & _known(model, readings, p[0], variance)
     if not valid.any():
         x0, x1, y0, y1 = grid.extent
@@ -163,15 +160,9 @@ def raster(
         origin_m=grid.origin_m,
         cell_m=grid.cell_m,
         headings_rad=np.asarray(grid.headings_rad),
-        name=readings.name,
         method=model.method,
         parameters={**model.parameters, **errors},
-        source=readings.source,
-        licence=readings.licence,
-        created=readings.created,
-        frame=readings.frame,
-        datum=readings.datum,
-        height_m=readings.height_m,
+        **readings.about,
         harmonic=getattr(model, "field", None),
     )
 
@@ -201,7 +192,7 @@ def _grid(
     extent: ArrayLike | None,
 ) -> tuple[Grid, dict[str, float]]:
     """Nodes of the map, and the errors of interpolation between them, by name with unit."""
-    own = readings.grid if model.method in ON_NODES else None
+    own = readings.grid if model.method == "trilinear" else None
     if own is not None and spacing is None and extent is None:
         if headings_rad is None:
             return own, {}
@@ -209,7 +200,9 @@ def _grid(
     if headings_rad is None:
         headings_rad = own.headings_rad if own is not None else _only_heading(readings)
     if extent is None:
-        extent = readings.grid.extent if readings.grid is not None else _box(readings)
+        low, high = (f(readings.p_xy[readings.good], axis=0) for f in (np.min, np.max))
+        box = (low[0], high[0], low[1], high[1])
+        extent = readings.grid.extent if readings.grid is not None else box
     x0, x1, y0, y1 = (float(v) for v in np.asarray(extent, float))
     if spacing is None and readings.grid is None and min(x1 - x0, y1 - y0) < spacing_m(readings) / NARROW:
         raise InputError(
@@ -217,13 +210,8 @@ def _grid(
             "m; a map needs an area"
         )
     with _one_thread():
-        chosen = resolution(
-            model,
-            readings,
-            spacing=spacing,
-            headings_rad=headings_rad,
-            largest_m=max(min(x1 - x0, y1 - y0), 0.0),
-        )
+        largest = max(min(x1 - x0, y1 - y0), 0.0)
+        chosen = resolution(model, readings, spacing=spacing, headings_rad=headings_rad, largest_m=largest)
     errors = zip(ERRORS, (chosen.nodes_nt, chosen.turn_nt), strict=True)
     known = {name: round(error, 2) for name, error in errors if np.isfinite(error)}
     lay = Grid.filling if spacing is None else Grid.over
@@ -234,15 +222,9 @@ def _only_heading(readings: Readings) -> tuple[float, ...] | None:
     """The heading of a survey that has only one, else None."""
     if readings.grid is not None:
         only = readings.grid.headings_rad
-    else:
-        yaw = readings.yaw[readings.good]
-        only = (float(yaw[0] % TURN),) if np.ptp(yaw) == 0 else ()
-    return only if len(only) == 1 else None
-
-
-def _box(readings: Readings) -> tuple[float, float, float, float]:
-    low, high = (f(readings.p_xy[readings.good], axis=0) for f in (np.min, np.max))
-    return float(low[0]), float(high[0]), float(low[1]), float(high[1])
+        return only if len(only) == 1 else None
+    yaw = readings.yaw[readings.good]
+    return (float(yaw[0] % TURN),) if np.ptp(yaw) == 0 else None
 
 
 def _known(model: FieldModel, readings: Readings, p_xy: Array, variance: Array) -> NDArray[np.bool_]:

@@ -16,6 +16,7 @@ from magtwin.field.survey.bins import GRAIN_M, Bins, bin_readings, spacing_m
 from magtwin.field.survey.readings import Readings
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
 Progress = Callable[[int, int, str], Any]
 
 MOST = 4000  # Most readings, or means of adjacent ones, in the conditioning: 128 MB of covariance
@@ -85,9 +86,6 @@ def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress
         kernel: Function of distance (`Covariance`).
         progress: Called as progress(done, total, what).
 
-    Returns:
-        The model.
-
     Raises:
         InputError: There are fewer than four good readings, they are on one line or all the same, or the
             kernel is unknown.
@@ -152,12 +150,7 @@ def _patches(p_xy: Array, spacing: float) -> tuple[Array, float]:
 
 
 def _learn(
-    covariance: Covariance,
-    bins: Bins,
-    b: Array,
-    order: NDArray[np.intp],
-    least_m: float,
-    say: Callable[[int, str], Any],
+    covariance: Covariance, bins: Bins, b: Array, order: Rows, least_m: float, say: Callable[[int, str], Any]
 ) -> Array:
     """The likeliest hyperparameters: the best of several starts on few readings, then on more.
 
@@ -175,16 +168,11 @@ def _learn(
     even = bounds.copy()
     even[covariance.of_patches] = [(0.0, 0.0)] * len(covariance.patches)
 
-    def descend(start: Array, rows: NDArray[np.intp], steps: int, bounds: Any) -> tuple[float, Array]:
+    def descend(start: Array, rows: Rows, steps: int, bounds: Any) -> tuple[float, Array]:
         data = (bins.p_xy[rows], bins.yaw[rows], bins.run[rows], b[rows])
+        begin, options = np.maximum(start, least), {"maxiter": steps}
         result = minimize(
-            covariance.loss,
-            np.maximum(start, least),
-            (guess, *data),
-            "L-BFGS-B",
-            jac=True,
-            bounds=bounds,
-            options={"maxiter": steps},
+            covariance.loss, begin, (guess, *data), "L-BFGS-B", jac=True, bounds=bounds, options=options
         )
         return float(result.fun), np.asarray(result.x)
 
@@ -212,32 +200,20 @@ def _guess(covariance: Covariance, bins: Bins, b: Array) -> Array:
     return np.array(guess)
 
 
-def _matrix(covariance: Covariance, figures: Array, bins: Bins, rows: Any = slice(None)) -> Array:
-    """Covariance of the readings, with noise and runs."""
+def _factor(covariance: Covariance, figures: Array, bins: Bins, rows: Any = slice(None)) -> Array:
+    """Cholesky factor of the covariance of the readings, with noise and runs."""
+    from scipy.linalg import cholesky
+
     poses, run = (bins.p_xy[rows], bins.yaw[rows]), bins.run[rows]
     matrix = covariance.between(figures, poses, poses)
     if covariance.runs:
         matrix += covariance.within_runs(figures, covariance.places(figures, *poses), run)
     matrix[np.diag_indices_from(matrix)] += covariance.noise_nt2(figures)
-    return matrix
-
-
-def _factor(covariance: Covariance, figures: Array, bins: Bins, rows: Any = slice(None)) -> Array:
-    from scipy.linalg import cholesky
-
-    return np.asarray(
-        cholesky(_matrix(covariance, figures, bins, rows), lower=True, overwrite_a=True, check_finite=False)
-    )
+    return np.asarray(cholesky(matrix, lower=True, overwrite_a=True, check_finite=False))
 
 
 def _missed(
-    covariance: Covariance,
-    figures: Array,
-    bins: Bins,
-    b: Array,
-    order: NDArray[np.intp],
-    lower: Array,
-    side_m: float,
+    covariance: Covariance, figures: Array, bins: Bins, b: Array, order: Rows, lower: Array, side_m: float
 ) -> tuple[Any, Array]:
     """Leave out each cell of the floor in turn: its centre, and its mean squared residual over the variance.
 
@@ -260,8 +236,7 @@ def _missed(
     places: list[Array] = []
     squares, each, place = [], [], []
     for members in np.split(np.argsort(block, kind="stable"), np.cumsum(np.bincount(block))[:-1]):
-        own = inverse[np.ix_(members, members)]
-        spread = np.linalg.inv(own)
+        spread = np.linalg.inv(inverse[np.ix_(members, members)])
         miss = spread @ pull[members]
         squares.append(float(miss @ pull[members]) / len(members))
         each.append(miss**2 / np.diag(spread))

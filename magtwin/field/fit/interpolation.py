@@ -1,20 +1,19 @@
 """Interpolation of a survey, trilinear (as in the paper) and cubic: the baselines of all other methods.
 
-A gridded survey is interpolated on its nodes and nominal headings. A scattered one is separated into a part
-that depends on the heading, a wave of two harmonics that is the same everywhere, and a part that depends on
-the position, which is interpolated over triangles.
+A gridded survey is interpolated on its nodes and nominal headings. A scattered one is split into a wave over
+heading, the same everywhere, and a part that depends on the position, interpolated over triangles.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.fit.methods import FittedModel, flat_poses
-from magtwin.field.fit.roughness import Roughness
+from magtwin.field.fit.roughness import Interpolation, Roughness
 from magtwin.field.grid import TURN, Grid
 from magtwin.field.survey.bins import Bins, bin_readings, spacing_m
 from magtwin.field.survey.node_errors import node_errors
@@ -22,7 +21,6 @@ from magtwin.field.survey.readings import Readings
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-Order = Literal["linear", "cubic"]
 
 EDGE = 1e-9  # Rounding forgiven at a node, in cells; also the weight from which an unknown node counts
 BINS_A_SPACING = 4  # Averaging cells per spacing of a scattered survey
@@ -51,7 +49,7 @@ def fit_trilinear(readings: Readings, *, fill: bool = False) -> "GridInterpolati
     Raises:
         InputError: There are fewer than four good readings, they are on one line, or all are the same.
     """
-    return _fit(readings, "linear", fill)
+    return _fit(readings, "trilinear", fill)
 
 
 def fit_cubic(readings: Readings, *, fill: bool = False) -> "GridInterpolation | ScatterInterpolation":
@@ -103,6 +101,8 @@ class GridInterpolation(FittedModel):
         """Field [nT] and its variance [nT^2] at poses; nan off the grid and in unknown cells. See
         `FieldModel`.
         """
+        from scipy.interpolate import RectBivariateSpline
+
         p, angle, shape = flat_poses(p_xy, yaw)
         u = (p - self.grid.origin_m) / self.grid.cell_m
         last = np.array([self.grid.columns - 1, self.grid.rows - 1])
@@ -114,7 +114,11 @@ class GridInterpolation(FittedModel):
         linear, between = _heading_weights(self.grid.headings_rad, angle)
         weights = _periodic_cubic(self.grid.headings_rad, angle) if self.method == "cubic" else linear
         mean, unknown, nodes = np.zeros(len(p)), np.zeros(len(p)), np.zeros(len(p))
-        splines = self._splines() if self.method == "cubic" else None
+        splines = None
+        if self.method == "cubic":
+            rows, columns = np.arange(self.grid.rows), np.arange(self.grid.columns)
+            ky, kx = min(3, self.grid.rows - 1), min(3, self.grid.columns - 1)
+            splines = [RectBivariateSpline(rows, columns, b, kx=ky, ky=kx, s=0) for b in self.values_nt]
         for h, (layer, known) in enumerate(zip(self.values_nt, self.known, strict=True)):
             nodes += weights[:, h] ** 2 * _bilinear(self.node_nt2[h], low, part, squared=True)
             unknown += np.abs(weights[:, h]) * _bilinear((~known).astype(float), low, part)
@@ -130,13 +134,6 @@ class GridInterpolation(FittedModel):
         hole = ~inside | (unknown > EDGE)
         mean[hole] = variance[hole] = np.nan
         return mean.reshape(shape), variance.reshape(shape)
-
-    def _splines(self) -> list[Any]:
-        from scipy.interpolate import RectBivariateSpline
-
-        rows, columns = np.arange(self.grid.rows), np.arange(self.grid.columns)
-        ky, kx = min(3, self.grid.rows - 1), min(3, self.grid.columns - 1)
-        return [RectBivariateSpline(rows, columns, layer, kx=ky, ky=kx, s=0) for layer in self.values_nt]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -155,44 +152,48 @@ class ScatterInterpolation(FittedModel):
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
         """Field [nT] and its variance [nT^2] at poses; nan outside the convex hull. See `FieldModel`."""
         p, angle, shape = flat_poses(p_xy, yaw)
-        order: Order = "cubic" if self.method == "cubic" else "linear"
         finite = np.all(np.isfinite(p), axis=1)
         at = np.where(finite[:, None], p, self.p_xy[0])
-        mean = _triangles(order)(self.p_xy, self.b_nt, at) + _waves(angle) @ self.wave_nt
+        mean = _triangles(self.method)(self.p_xy, self.b_nt, at) + _waves(angle) @ self.wave_nt
         variance = self.roughness.variance_nt2(at) + self.place_nt2[self.roughness.tree.query(at)[1]]
         mean[~finite] = np.nan
         variance[~np.isfinite(mean)] = np.nan
         return mean.reshape(shape), variance.reshape(shape)
 
 
-def _fit(readings: Readings, order: Order, fill: bool) -> GridInterpolation | ScatterInterpolation:
+def _fit(readings: Readings, method: str, fill: bool) -> GridInterpolation | ScatterInterpolation:
+    from scipy.spatial import cKDTree
+
     check_readings(readings)
-    if readings.grid is None:
-        return _fit_scattered(readings, order)
-    return _fit_gridded(readings, readings.grid, order, fill)
-
-
-def _fit_gridded(readings: Readings, grid: Grid, order: Order, fill: bool) -> GridInterpolation:
-    good = readings.good
+    grid, good = readings.grid, readings.good
+    if grid is None:
+        return _fit_scattered(readings, method)
     node = np.ravel_multi_index(tuple(np.asarray(readings.node)[good].T), grid.shape)
     count = np.bincount(node, minlength=int(np.prod(grid.shape))).reshape(grid.shape)
     total = np.bincount(node, weights=readings.b_nt[good], minlength=count.size).reshape(grid.shape)
     values: Array = np.asarray(total / np.maximum(count, 1), float)
     read = count > 0
     places = np.stack(np.meshgrid(grid.x_m, grid.y_m), axis=-1)
-    between = _triangles(order)
+    between = _triangles(method)
     filled, known = values.copy(), read.copy()
     for h, there in enumerate(read):
         if there.all():
             continue
-        _check_layer(grid, h, places[there])
-        if order == "linear":
+        p = places[there]
+        if len(p) < 3 or np.linalg.svd(p - p.mean(axis=0), compute_uv=False)[1] <= EDGE:
+            raise InputError(
+                f"heading {np.degrees(grid.headings_rad[h]):g} deg has {len(p)} nodes with a good reading, "
+                "not three off one line; leave the heading out, or survey it again"
+            )
+        if method == "trilinear":
             filled[h][~there] = _across(values[h], there)[~there]
+            known[h] = np.isfinite(filled[h])
         else:
-            filled[h][~there] = between(places[there], values[h][there], places[~there])
-        known[h] = np.isfinite(filled[h])
-        if order == "cubic":  # the spline needs a whole grid: beyond the hull, the nearest value
-            filled[h][~known[h]] = _nearest(places[known[h]], filled[h][known[h]], places[~known[h]])
+            filled[h][~there] = between(p, values[h][there], places[~there])
+            known[h] = np.isfinite(filled[h])
+            # the spline needs a whole grid: beyond the hull, the nearest value
+            _, nearest = cKDTree(places[known[h]]).query(places[~known[h]])
+            filled[h][~known[h]] = filled[h][known[h]][nearest]
     errors = node_errors(readings, grid, np.where(known, filled, np.nan), read)
     node_nt2 = np.where(read, errors.variance_nt2 / np.maximum(count, 1), errors.mean_nt2)
     known = known if fill else read
@@ -202,7 +203,7 @@ def _fit_gridded(readings: Readings, grid: Grid, order: Order, fill: bool) -> Gr
         for h, there in enumerate(read)
     ]
     return GridInterpolation(
-        method="trilinear" if order == "linear" else "cubic",
+        method=method,
         parameters={
             "nodes": count.size,
             "nodes_read": int(read.sum()),
@@ -217,15 +218,6 @@ def _fit_gridded(readings: Readings, grid: Grid, order: Order, fill: bool) -> Gr
         node_nt2=node_nt2,
         roughness=Roughness.joined(parts),
         turned_nt2=_turned_nt2(grid, filled, read),
-    )
-
-
-def _check_layer(grid: Grid, h: int, places: Array) -> None:
-    if len(places) >= 3 and np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] > EDGE:
-        return
-    raise InputError(
-        f"heading {np.degrees(grid.headings_rad[h]):g} deg has {len(places)} nodes with a good reading, "
-        "not three off one line; leave the heading out, or survey it again"
     )
 
 
@@ -293,15 +285,15 @@ def _cubic_share(part: Array) -> Array:
     return np.asarray(sum(w * w for w in weights) / ((1 - t) ** 2 + t**2))
 
 
-def _fit_scattered(readings: Readings, order: Order) -> ScatterInterpolation:
+def _fit_scattered(readings: Readings, method: str) -> ScatterInterpolation:
     spacing = spacing_m(readings)
     cell = spacing / BINS_A_SPACING
     wave = _wave(readings, spacing)
     still = readings.b_nt - _waves(readings.yaw) @ wave
     bins, noise, place_nt2 = _binned(readings, still, cell)
-    between = _triangles(order)
+    between = _triangles(method)
     return ScatterInterpolation(
-        method="trilinear" if order == "linear" else "cubic",
+        method=method,
         parameters={
             "readings": int(readings.good.sum()),
             "places": len(bins.p_xy),
@@ -321,9 +313,8 @@ def _fit_scattered(readings: Readings, order: Order) -> ScatterInterpolation:
 def _binned(readings: Readings, still: Array, cell_m: float) -> tuple[Bins, float, Array]:
     """Bins of the position's part; variance of a reading, and of the mean of each bin [nT^2].
 
-    Readings of one run in a bin have variance w about their mean, and the runs' means vary by r more: a
-    reading's variance is w + r. If no two runs met, r is unknown, and a bin is no more certain than a
-    reading.
+    Readings of one run in a bin have variance w about their mean, and the runs' means vary by r more. If no
+    two runs met, r is unknown, and a bin is no more certain than a reading.
     """
     bins, index = bin_readings(readings, cell_m)
     rows = np.flatnonzero(readings.good)
@@ -345,8 +336,7 @@ def _binned(readings: Readings, still: Array, cell_m: float) -> tuple[Bins, floa
 
 
 def _wave(readings: Readings, cell_m: float) -> Array:
-    """The heading's part, by least squares over differences within cells, in which the position's part
-    cancels.
+    """The heading's part, by least squares over differences within cells.
 
     Combinations of coefficients that the headings in a cell do not determine stay 0.
     """
@@ -364,12 +354,11 @@ def _waves(yaw: Array) -> Array:
     return np.column_stack([np.cos(yaw), np.sin(yaw), np.cos(2 * yaw), np.sin(2 * yaw)])
 
 
-def _triangles(order: Order) -> Callable[[Array, Array, Array], Array]:
-    """A function of positions, values and points that gives values at the points, nan outside the hull."""
+def _triangles(method: str) -> Interpolation:
     from scipy.interpolate import CloughTocher2DInterpolator, LinearNDInterpolator
     from scipy.spatial import QhullError
 
-    kind = LinearNDInterpolator if order == "linear" else CloughTocher2DInterpolator
+    kind = LinearNDInterpolator if method == "trilinear" else CloughTocher2DInterpolator
 
     def between(p_xy: Array, b_nt: Array, at: Array) -> Array:
         middle = p_xy.mean(axis=0)
@@ -399,9 +388,3 @@ def _across(values: Array, known: Flags) -> Array:
             sums[k, between] += w * (line[at[after - 1]] * b + line[at[after]] * a) / (a + b)
             weights[k, between] += w
     return np.divide(total, weight, out=np.full(values.shape, np.nan), where=weight > 0)
-
-
-def _nearest(p_xy: Array, b_nt: Array, at: Array) -> Array:
-    from scipy.spatial import cKDTree
-
-    return np.asarray(b_nt[cKDTree(p_xy).query(at)[1]])

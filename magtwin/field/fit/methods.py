@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
+from magtwin.extend import Registry
 from magtwin.field.survey.readings import Readings
-from magtwin.registry import Registry
 from magtwin.summary import Summarized, Summary, printable
 
 Array = NDArray[np.float64]

@@ -49,14 +49,9 @@ def resolution(
     """Choose the widest spacing and the fewest headings with almost no loss of accuracy.
 
     The error of linear interpolation is measured on the fitted field, at positions of the readings, and must
-    be below `SHARE` of the fit's standard deviation. If no choice reaches this, the finest is used.
-
-    Args:
-        model: The fit.
-        readings: The readings that it was fitted to.
-        spacing: Spacing chosen by the caller [m]; only its error is measured.
-        headings_rad: Headings chosen by the caller [rad].
-        largest_m: Widest spacing that leaves a cell [m].
+    be below `SHARE` of the fit's standard deviation. If no choice reaches this, the finest is used. Of a
+    spacing [m] or headings [rad] that the caller gives, only the error is measured. `largest_m` is the widest
+    spacing that leaves a cell.
     """
     p, yaw, part = _probes(readings)
     value, variance = model.predict(p, yaw)
@@ -66,10 +61,9 @@ def resolution(
     def between_nodes(step: float) -> float:
         corner = p - part[:, :2] * step
         mixed = np.zeros(len(p))
-        for i in (0, 1):
-            for j in (0, 1):
-                weight = np.abs(1 - i - part[:, 0]) * np.abs(1 - j - part[:, 1])
-                mixed += weight * model.predict(corner + step * np.array([i, j]), yaw)[0]
+        for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            weight = np.abs(1 - i - part[:, 0]) * np.abs(1 - j - part[:, 1])
+            mixed += weight * model.predict(corner + step * np.array([i, j]), yaw)[0]
         return _rms(mixed - value)
 
     def between_headings(headings: Array) -> float:
@@ -108,9 +102,7 @@ def _first_good(tried: Iterable[tuple[Choice, float]], sd: float) -> tuple[Choic
 
 
 def _probes(readings: Readings) -> tuple[Array, Array, Array]:
-    """Positions of readings (K, 2), evenly spread headings (K,), positions within a cell from 0 to 1 (K,
-    2).
-    """
+    """Positions of readings (K, 2), even headings (K,), and positions within a cell from 0 to 1 (K, 2)."""
     rows = np.flatnonzero(readings.good)
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, PROBES).astype(np.intp))]
     even = np.mod(0.5 + np.arange(1, len(rows) + 1)[:, None] * GOLDEN, 1.0)

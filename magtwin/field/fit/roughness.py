@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.verdict import Z_90
 
 Array = NDArray[np.float64]
+# Gives values at positions (third) from positions (first) and values (second); nan outside
+Interpolation = Callable[[Array, Array, Array], Array]
 
 FOLDS = 5  # Parts left out in turn: cell (i, j) is in part (i + 2 j) mod 5, unlike the eight cells around it
 NEIGHBOURS = 16  # Residuals per local mean square
@@ -34,25 +36,12 @@ class Roughness:
 
     @classmethod
     def of(
-        cls,
-        p_xy: Array,
-        b_nt: Array,
-        noise_nt2: Array,
-        cell_m: float,
-        interpolate: Callable[[Array, Array, Array], Array],
+        cls, p_xy: Array, b_nt: Array, noise_nt2: Array, cell_m: float, interpolate: Interpolation
     ) -> "Roughness":
         """Leave out each fifth of the positions in turn, and interpolate them from the rest.
 
         A residual contains the errors of the reading left out and of those beside it, 1.5 times the variance
-        of a reading, which are not roughness.
-
-        Args:
-            p_xy: Positions of readings [m], shape (N, 2).
-            b_nt: Readings [nT], shape (N,).
-            noise_nt2: Their variance [nT^2], shape (N,).
-            cell_m: Side of the cells that are left out [m].
-            interpolate: Gives values at positions (third) from positions (first) and values (second); nan
-                outside.
+        of a reading, which are not roughness. `cell_m` is the side of the cells that are left out.
         """
         from scipy.spatial import cKDTree
 
@@ -100,11 +89,7 @@ def _between(d: Array, cell_m: float) -> Array:
 def local_mean(tree: Any, squares: Array, p_xy: Array, *, skip: int = 0) -> Array:
     """Mean of the squares nearest to each point, drawn towards the mean of all, shape (...).
 
-    Args:
-        tree: A cKDTree of R positions.
-        squares: Values to average, shape (R,).
-        p_xy: Points [m], shape (..., 2).
-        skip: Nearest positions to ignore: 1 leaves each position itself out.
+    `tree` has the positions of the squares, shape (R,). The nearest `skip` positions are ignored.
     """
     count = min(NEIGHBOURS, len(squares) - skip)
     if count < 1:
@@ -124,15 +109,12 @@ def _stretch(square: Array, rough: Array, noise: Array) -> float:
     return max(float(np.quantile(factor, min(max(inside, 0.0), 1.0))), 0.0)
 
 
-def tail(tree: Any, squares: Array, each: Array, place: NDArray[np.intp] | None = None) -> float:
+def tail(tree: Any, squares: Array, each: Array, place: NDArray[np.intp]) -> float:
     """Factor on a local variance with which its 90 % intervals hold 90 % of the residuals.
 
-    Args:
-        tree: A cKDTree of R positions.
-        squares: Mean square residual at each, shape (R,).
-        each: Squares of single residuals, in the same measure, shape (E,).
-        place: Position of each of these, shape (E,). Default: the R positions.
+    `squares` are the mean square residuals at the positions of `tree`, shape (R,); `each` the squares of
+    single residuals at the positions `place`, both of shape (E,).
     """
     variance = local_mean(tree, squares, np.asarray(tree.data), skip=1)
-    ratio = each / np.maximum(variance if place is None else variance[place], np.finfo(float).tiny)
+    ratio = each / np.maximum(variance[place], np.finfo(float).tiny)
     return float(np.quantile(ratio, 0.9)) / Z_90**2

@@ -64,45 +64,42 @@ def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
     start = field.harmonic.height_m if field.harmonic is not None else field.height_m
     if abs(height_m - start) < GRAIN_M:
         return field
-    if field.harmonic is not None:
-        return _of_the_dipoles(field, start, height_m)
-    return _of_the_grid(field, start, height_m)
-
-
-def _of_the_dipoles(field: AnomalyMap, start: float, height_m: float) -> AnomalyMap:
-    harmonic = field.harmonic
-    assert harmonic is not None
-    lowest, highest = _reach_m(harmonic, start)
-    if height_m < min(lowest, start):
-        raise InputError(
-            f"height_m {height_m:g} lies too low for map {field.name!r}: below {lowest:.4g} m is the floor, "
-            "or its dipoles are so near that each shows by itself"
-        )
-    if height_m > max(highest, start):
-        raise InputError(
-            f"height_m {height_m:g} lies too high for map {field.name!r}: above {highest:.4g} m are dipoles, "
-            "which stand for iron above the robot, so near that each shows by itself"
-        )
+    harmonic, step = field.harmonic, height_m - start
+    parameters = {**field.parameters, "continued_from_m": start}
+    if harmonic is not None:
+        _check_reach(field, harmonic, start, height_m)
+        how = "by its harmonic field"
+        values = harmonic.magnitude_nt(*field.grid.poses(), height_m=height_m)
+        harmonic = replace(harmonic, p_base_sensor=np.append(harmonic.p_base_sensor[:2], height_m))
+    else:
+        _check_step(field, step, height_m)
+        how = "by the waves of its grid (Blakely 1995, eq. 12.8)"
+        layers = zip(field.values_nt, field.valid, strict=True)
+        values = np.stack([_Layer(v, valid, field.cell_m).continued(step) for v, valid in layers])
+        known = field.values_nt[field.valid]
+        parameters["second_order_nt"] = round(float(known.var() / (2 * known.mean())), 3)
     variance = None
-    if field.variance_nt2 is not None and height_m - start >= -LARGEST_STEP_DOWN * min(field.cell_m):
-        variance = _variance(field, height_m - start)
+    if field.variance_nt2 is not None and step >= -LARGEST_STEP_DOWN * min(field.cell_m):
+        nodes = zip(field.values_nt, field.valid, np.sqrt(field.variance_nt2), strict=True)
+        sds = [_Layer(v, valid, field.cell_m).deviation(sd, step) for v, valid, sd in nodes]
+        variance = np.square(sds)
+    text = f"continued from {start:g} to {height_m:g} m {how}"
     return replace(
         field,
-        values_nt=harmonic.magnitude_nt(*field.grid.poses(), height_m=height_m),
+        values_nt=values,
         variance_nt2=variance,
         recorded_yaw=None,
         height_m=height_m,
-        method=_method(field, start, height_m, "by its harmonic field"),
-        parameters={**field.parameters, "continued_from_m": start},
-        harmonic=replace(harmonic, p_base_sensor=np.append(harmonic.p_base_sensor[:2], height_m)),
+        method=f"{field.method}; {text}" if field.method else text,
+        parameters=parameters,
+        harmonic=harmonic,
     )
 
 
-def _reach_m(harmonic: HarmonicField, start: float) -> tuple[float, float]:
-    """Range of heights in which a harmonic field holds [m]: the floor, or one dipole spacing off a layer.
+def _check_reach(field: AnomalyMap, harmonic: HarmonicField, start: float, height_m: float) -> None:
+    """Refuse a height at which a harmonic field does not hold: below the floor, or near a layer of dipoles.
 
-    A layer of equivalent dipoles with spacing s has ripples of about exp(-2 pi d / s) at distance d: 0.2 % at
-    d = s. Dipoles that are alone at their height have no spacing.
+    A layer of dipoles with spacing s has ripples of about exp(-2 pi d / s) at distance d: 0.2 % at d = s.
     """
     places = harmonic.p_world_dipole
     below, above = places[places[:, 2] <= start], places[places[:, 2] > start]
@@ -113,7 +110,16 @@ def _reach_m(harmonic: HarmonicField, start: float) -> tuple[float, float]:
     if len(above):
         bottom = float(above[:, 2].min())
         highest = bottom - _apart_m(above[above[:, 2] < bottom + GRAIN_M])
-    return lowest, highest
+    if height_m < min(lowest, start):
+        raise InputError(
+            f"height_m {height_m:g} lies too low for map {field.name!r}: below {lowest:.4g} m is the floor, "
+            "or its dipoles are so near that each shows by itself"
+        )
+    if height_m > max(highest, start):
+        raise InputError(
+            f"height_m {height_m:g} lies too high for map {field.name!r}: above {highest:.4g} m are dipoles, "
+            "which stand for iron above the robot, so near that each shows by itself"
+        )
 
 
 def _apart_m(layer: Array) -> float:
@@ -123,8 +129,8 @@ def _apart_m(layer: Array) -> float:
     return float(np.median(cKDTree(layer).query(layer, 2)[0][:, 1])) if len(layer) > 1 else GRAIN_M
 
 
-def _of_the_grid(field: AnomalyMap, start: float, height_m: float) -> AnomalyMap:
-    step = height_m - start
+def _check_step(field: AnomalyMap, step: float, height_m: float) -> None:
+    """Refuse a height that is too far from the map of a grid."""
     cell = min(field.cell_m)
     if step < -LARGEST_STEP_DOWN * cell:
         raise InputError(
@@ -140,33 +146,6 @@ def _of_the_grid(field: AnomalyMap, start: float, height_m: float) -> AnomalyMap
         )
     if not field.valid.any(axis=(1, 2)).all():
         raise InputError(f"map {field.name!r} has a heading without a valid node; nothing can be continued")
-    known = field.values_nt[field.valid]
-    layers = [_Layer(*pair, field.cell_m) for pair in zip(field.values_nt, field.valid, strict=True)]
-    return replace(
-        field,
-        values_nt=np.stack([layer.continued(step) for layer in layers]),
-        variance_nt2=None if field.variance_nt2 is None else _variance(field, step),
-        recorded_yaw=None,
-        height_m=height_m,
-        method=_method(field, start, height_m, "by the waves of its grid (Blakely 1995, eq. 12.8)"),
-        parameters={
-            **field.parameters,
-            "continued_from_m": start,
-            "second_order_nt": round(float(known.var() / (2 * known.mean())), 3),
-        },
-    )
-
-
-def _method(field: AnomalyMap, start: float, height_m: float, how: str) -> str:
-    text = f"continued from {start:g} to {height_m:g} m {how}"
-    return f"{field.method}; {text}" if field.method else text
-
-
-def _variance(field: AnomalyMap, step: float) -> Array:
-    """Upper bound of the variance at `step` above the map [nT^2]."""
-    assert field.variance_nt2 is not None
-    layers = zip(field.values_nt, field.valid, np.sqrt(field.variance_nt2), strict=True)
-    return np.stack([_Layer(v, valid, field.cell_m).deviation(sd, step) ** 2 for v, valid, sd in layers])
 
 
 class _Layer:

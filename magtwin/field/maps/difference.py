@@ -1,6 +1,6 @@
 """MapDifference: compare two surveys of one floor, and find what changed and where."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -50,38 +50,18 @@ class MapDifference(Summarized):
     Arrays are nan where one of the surveys is masked.
     """
 
-    names: tuple[str, str]
-    """Names of the surveys, the earlier first."""
-
-    days: tuple[str, str]
-    """Their days, "" if unknown."""
-
-    grid: Grid
-    """Nodes of the comparison."""
-
-    change_nt: Array
-    """Later minus earlier field [nT], shape (H, Y, X)."""
-
-    bias_nt: Array
-    """Change common to all nodes of a heading, their median [nT], shape (H,)."""
-
-    sd_nt: Array
-    """Standard deviation of a change if the field did not change [nT], shape (H, Y, X)."""
-
+    names: tuple[str, str]  # Names of the surveys, the earlier first
+    days: tuple[str, str]  # Their days, "" if unknown
+    grid: Grid  # Nodes of the comparison
+    change_nt: Array  # Later minus earlier field [nT], shape (H, Y, X)
+    bias_nt: Array  # Change common to all nodes of a heading, their median [nT], shape (H,)
+    sd_nt: Array  # Standard deviation of a change if the field did not change [nT], shape (H, Y, X)
+    # Whether `sd_nt` comes from the maps' variances, or else from the spread of the changes
     from_variance: bool
-    """Whether `sd_nt` comes from the maps' variances, or else from the spread of the changes."""
-
-    z: Array
-    """Local change in standard deviations, shape (H, Y, X)."""
-
-    threshold_z: float
-    """Least |z| of a changed node."""
-
-    regions: tuple[Region, ...]
-    """Changed regions, the greatest |z| first."""
-
-    cautions: tuple[str, ...] = ()
-    """Reasons to doubt that the surveys are comparable."""
+    z: Array  # Local change in standard deviations, shape (H, Y, X)
+    threshold_z: float  # Least |z| of a changed node
+    regions: tuple[Region, ...]  # Changed regions, the greatest |z| first
+    cautions: tuple[str, ...] = ()  # Reasons to doubt that the surveys are comparable
 
     @property
     def local_nt(self) -> Array:
@@ -123,15 +103,18 @@ class MapDifference(Summarized):
         ]
         for number, region in enumerate(self.regions[:LISTED], 1):
             figures.append(Figure(f"region {number}", region.peak_nt, "nT", region.peak_sd_nt, region.text()))
-        metadata: dict[str, Any] = {}
-        for label, name, day in zip(("from", "to"), self.names, self.days, strict=True):
-            metadata[label] = " ".join(text for text in (name, day) if text)
+        metadata: dict[str, Any] = dict(zip(("from", "to"), self._surveys, strict=True))
         if self.cautions:
             metadata["caution"] = list(self.cautions)
         return Report(f"difference {self.names[0]} to {self.names[1]}", tuple(figures), metadata)
 
+    @property
+    def _surveys(self) -> list[str]:
+        """Name and day of each survey."""
+        return [" ".join(text for text in pair if text) for pair in zip(self.names, self.days, strict=True)]
+
     def _summary(self) -> Summary:
-        before, after = (" ".join(t for t in pair if t) for pair in zip(self.names, self.days, strict=True))
+        before, after = self._surveys
         known, changed = (int(a.any(axis=0).sum()) for a in (np.isfinite(self.z), self.changed))
         return Summary(
             f"MapDifference: {before} to {after}",
@@ -223,13 +206,11 @@ def _compared(a: AnomalyMap, b: AnomalyMap) -> tuple[str, ...]:
             "one to the other's height first (magtwin map upward)"
         )
     cautions = []
-    unknown = {
-        name: (getattr(a, attribute) in ("", None)) + (getattr(b, attribute) in ("", None))
-        for name, attribute in {"frame": "frame", "datum": "datum", "height": "height_m"}.items()
-    }
+    names = {"frame": "frame", "datum": "datum", "height_m": "height"}
+    unknown = {text: sum(getattr(m, name) in ("", None) for m in (a, b)) for name, text in names.items()}
     for count, which in ((1, "one map"), (2, "both maps")):
-        if names := [name for name, maps in unknown.items() if maps == count]:
-            cautions.append(f"{', '.join(names)} unknown in {which}; assumed equal")
+        if some := [name for name, maps in unknown.items() if maps == count]:
+            cautions.append(f"{', '.join(some)} unknown in {which}; assumed equal")
     return tuple(cautions)
 
 
@@ -237,14 +218,7 @@ def _common(a: AnomalyMap, b: AnomalyMap) -> Grid:
     """Nodes of the comparison."""
     coarse = b if np.prod(b.cell_m) > np.prod(a.cell_m) * (1 + 1e-9) else a
     few = b if len(b.headings_rad) < len(a.headings_rad) else a
-    rows, columns = coarse.values_nt.shape[1:]
-    return Grid(
-        origin_m=coarse.origin_m,
-        cell_m=coarse.cell_m,
-        headings_rad=few.grid.headings_rad,
-        rows=rows,
-        columns=columns,
-    )
+    return replace(coarse.grid, headings_rad=few.grid.headings_rad)
 
 
 def _robust_sd(values: Array) -> float:
@@ -278,12 +252,7 @@ def _regions(grid: Grid, local: Array, z: Array, threshold: float) -> tuple[Regi
         regions.append(
             Region(
                 centre_m=(float(np.average(x, weights=weight)), float(np.average(y, weights=weight))),
-                extent_m=(
-                    float(grid.x_m[columns.start]),
-                    float(grid.x_m[columns.stop - 1]),
-                    float(grid.y_m[rows.start]),
-                    float(grid.y_m[rows.stop - 1]),
-                ),
+                extent_m=(float(x.min()), float(x.max()), float(y.min()), float(y.max())),
                 nodes=len(j),
                 peak_nt=float(local[h, j[k], i[k]]),
                 peak_sd_nt=float(local[h, j[k], i[k]] / z[h, j[k], i[k]]),

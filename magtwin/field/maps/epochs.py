@@ -56,9 +56,10 @@ def in_order(maps: Sequence[AnomalyMap]) -> tuple[AnomalyMap, ...]:
         for name in COMMON:
             mine, theirs = getattr(first, name), getattr(other, name)
             if not _same(mine, theirs):
+                mine, theirs = (v.tolist() if isinstance(v, np.ndarray) else repr(v) for v in (mine, theirs))
                 raise InputError(
-                    f"epochs lie on one grid, but {name} is {_text(mine)} on {first.created} and "
-                    f"{_text(theirs)} on {other.created}; fit or survey both on one grid"
+                    f"epochs lie on one grid, but {name} is {mine} on {first.created} and {theirs} on "
+                    f"{other.created}; fit or survey both on one grid"
                 )
         if first.values_nt.shape != other.values_nt.shape:
             raise InputError(
@@ -135,11 +136,8 @@ def drift(maps: Sequence[AnomalyMap]) -> Report:
         weight = (days - days.mean()) / np.sum((days - days.mean()) ** 2)
         slope = sum(w * np.where(valid, m.values_nt, 0.0) for w, m in zip(weight, maps, strict=True))
         known = slope[valid]
-        figures.append(
-            Figure(
-                "drift", float(known.mean()), "nT/day", float(known.std()), "mean and spread over the nodes"
-            )
-        )
+        note = "mean and spread over the nodes"
+        figures.append(Figure("drift", float(known.mean()), "nT/day", float(known.std()), note))
         h, j, i = np.unravel_index(np.argmax(np.where(valid, np.abs(slope), -1.0)), slope.shape)
         sd = None
         variances = [m.variance_nt2 for m in maps]
@@ -160,7 +158,3 @@ def _same(a: Any, b: Any) -> bool:
 
 def _joined(first: str, second: str) -> str:
     return first if first == second else "; ".join(text for text in (first, second) if text)
-
-
-def _text(value: object) -> str:
-    return str(value.tolist()) if isinstance(value, np.ndarray) else repr(value)

@@ -42,38 +42,23 @@ def filled(field: AnomalyMap) -> AnomalyMap:
 
 def _fill(values: NDArray[np.float64], hole: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Fill a layer (Y, X) in place; returns the values on the edges of its holes."""
-    from scipy.sparse import csr_array
+    from scipy.sparse import lil_array
     from scipy.sparse.linalg import spsolve
 
     number = np.full(hole.shape, -1)
     number[hole] = np.arange(np.count_nonzero(hole))
-    rows, columns, weights = [], [], []
-    total, degree = np.zeros(number.max() + 1), np.zeros(number.max() + 1)
+    at = np.argwhere(hole)
+    total, degree, matrix = np.zeros(len(at)), np.zeros(len(at)), lil_array((len(at), len(at)))
     edge = np.zeros(hole.shape, bool)
-    for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
-        there = np.roll(number, -step, axis)
-        near = np.roll(values, -step, axis)
-        open_there = np.roll(hole, -step, axis)
-        within = np.ones(hole.shape, bool)
-        border = [slice(None), slice(None)]
-        border[axis] = slice(-1, None) if step == 1 else slice(0, 1)
-        within[tuple(border)] = False
-        inner = hole & within
-        degree += np.bincount(number[inner], minlength=len(degree))
-        known = inner & ~open_there
-        np.add.at(total, number[known], near[known])
-        edge |= np.roll(known, step, axis)
-        unknown = inner & open_there
-        rows.append(number[unknown])
-        columns.append(there[unknown])
-        weights.append(np.full(np.count_nonzero(unknown), -1.0))
-    diagonal = np.arange(len(degree))
-    matrix = csr_array(
-        (
-            np.concatenate([degree, *weights]),
-            (np.concatenate([diagonal, *rows]), np.concatenate([diagonal, *columns])),
-        ),
-        shape=(len(degree), len(degree)),
-    )
+    for step in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        near = at + step
+        row = np.flatnonzero(np.all((near >= 0) & (near < hole.shape), axis=1))
+        j, i = near[row].T
+        degree[row] += 1
+        known = ~hole[j, i]
+        total[row[known]] += values[j, i][known]
+        edge[j[known], i[known]] = True
+        matrix[row[~known], number[j, i][~known]] = -1
+    matrix.setdiag(degree)
     values[hole] = spsolve(matrix.tocsc(), total)
-    return values[edge & ~hole]
+    return values[edge]

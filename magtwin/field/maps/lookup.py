@@ -68,17 +68,10 @@ class Lookup:
         self._plain = memoryview(self.table.data)  # its entries are plain floats, which Python adds up faster
 
     def lookup(self, p: Array, yaw: Array, *, clamp: bool, gradient: bool) -> tuple[Array, Array]:
-        """Field at poses, and its gradient.
+        """Field at poses (N, 2) and (N,) [nT], (N,), and its gradient, (N, 3), or (0, 3) if not wanted.
 
-        Args:
-            p: Points in world [m], shape (N, 2).
-            yaw: Headings [rad], shape (N,).
-            clamp: Whether a point off the grid takes the field of the nearest point on it; otherwise nan.
-            gradient: Whether to compute the gradient.
-
-        Returns:
-            Field [nT], shape (N,), and dB/dx, dB/dy [nT/m], dB/dyaw [nT/rad], shape (N, 3), or (0, 3)
-            without `gradient`.
+        With `clamp`, a point off the grid takes the field of the nearest point on it, otherwise nan. The
+        gradient is dB/dx, dB/dy [nT/m] and dB/dyaw [nT/rad].
         """
         out = np.empty(len(p))
         slopes = np.empty((len(p) if gradient else 0, 3))

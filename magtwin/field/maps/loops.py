@@ -36,7 +36,7 @@ def _place(
 ) -> None:
     """Lowest node of each pose in the first layer, weights of the higher ones, angles above that layer.
 
-    The x weight is nan where the field is not known. Angles are in [0, 2 pi] and take the place of weights.
+    The x weight is nan where the field is not known; `wh` takes the angles, in [0, 2 pi].
     """
     x0, y0, dx, dy, first, edge = table[0], table[1], table[2], table[3], table[4], table[5]
     columns, right, top = table[8], table[8] - 1, table[7] - 1
@@ -109,15 +109,9 @@ def _sides(
 
 @compiled(_IN, _IN, _IN, types.boolean, _OUT, _OUT)
 def lookup(table: Array, q: Array, yaw: Array, clamp: bool, out: Array, gradient: Array) -> None:
-    """Field at poses, and its gradient if `gradient` is not empty.
+    """`Lookup.lookup` at points x, y, x, y, ... in `q`, shape (2 N,).
 
-    Args:
-        table: A map's table, see `trilinear`.
-        q: Points x, y, x, y, ... in world [m], shape (2 N,).
-        yaw: Headings [rad], shape (N,).
-        clamp: Whether a point off the grid takes the field of the nearest point on it.
-        out: Takes the field [nT], shape (N,).
-        gradient: Takes dB/dx, dB/dy [nT/m], dB/dyaw [nT/rad] pose by pose, shape (3 N,) or (0,).
+    `out` takes the field [nT], shape (N,), and `gradient` its derivatives pose by pose, shape (3 N,) or (0,).
     """
     x0, y0, dx, dy, edge = table[0], table[1], table[2], table[3], table[5]
     begin, end, in_row, in_layer = planes(table)
@@ -155,16 +149,11 @@ def lookup(table: Array, q: Array, yaw: Array, clamp: bool, out: Array, gradient
 
 @compiled(_CUBE, types.Array(types.int64, 1, "C", readonly=True), _IN, _IN, types.float64, _CUBE_OUT)
 def polynomials(table: Array, slot: Numbers, u: Array, w: Array, scale: float, out: Array) -> None:
-    """Polynomials in two variables, three at a time, and their slopes, all by Horner's rule.
+    """Polynomials in u and w (N,), three at a time, and their slopes times `scale`, all by Horner's rule.
 
-    Args:
-        table: Coefficients of each square by the power of u, and in a row by the power of w and by which of
-            the three it is, shape (S, K, 3 K).
-        slot: Which square each point is in, shape (N,).
-        u: First variable, shape (N,).
-        w: Second variable, shape (N,).
-        scale: What the slopes are multiplied by.
-        out: Takes the three values, their slopes along u and those along w, shape (N, 3, 3).
+    `table` has the coefficients of each square by the power of u, and in a row by the power of w and by which
+    of the three it is, shape (S, K, 3 K). `slot` is the square of each point. `out` takes the three values,
+    their slopes along u and those along w, shape (N, 3, 3).
     """
     powers, width = table.shape[1], table.shape[2]
     a, slope = np.empty(width), np.empty(width)

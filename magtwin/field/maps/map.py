@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.days import check_texts
-from magtwin.field.grid import Grid
+from magtwin.field.grid import Grid, check_axes
 from magtwin.field.maps.lookup import EDGE, Lookup
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.report import Figure, Report
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-TURN = 2 * np.pi
 TEXTS = ("name", "method", "source", "licence", "created", "frame", "datum")  # Metadata that are texts
 CONSTANT_NT = 1e-3  # Range of values up to which a map is constant [nT]
 
@@ -38,95 +37,54 @@ class AnomalyMap(Summarized):
     headings_rad[h]. Arrays are copied and read-only. Two maps are equal if every field is.
     """
 
+    # Field magnitude at the nodes [nT], shape (H, Y, X); any value, also nan, where not `valid`
     values_nt: Array
-    """Field magnitude at the nodes [nT], shape (H, Y, X); any value, also nan, where not `valid`."""
-
-    origin_m: tuple[float, float]
-    """World x and y of node [0, 0] [m]."""
-
-    cell_m: tuple[float, float]
-    """Distance between nodes along x and y [m]."""
-
-    headings_rad: Array
-    """Headings of the layers [rad], ascending in [0, 2 pi), shape (H,)."""
-
+    origin_m: tuple[float, float]  # World x and y of node [0, 0] [m]
+    cell_m: tuple[float, float]  # Distance between nodes along x and y [m]
+    headings_rad: Array  # Headings of the layers [rad], ascending in [0, 2 pi), shape (H,)
+    # Nodes whose value is field, shape (H, Y, X). Default: all.
     valid: NDArray[np.bool_] = None  # type: ignore[assignment]
-    """Nodes whose value is field, shape (H, Y, X). Default: all."""
-
-    variance_nt2: Array | None = None
-    """Variance of each value [nT^2], shape (H, Y, X); None if unknown."""
-
-    name: str = ""
-    """Name of the map and of its layer."""
-
-    method: str = ""
-    """How the values were obtained."""
-
-    source: str = ""
-    """Source files with checksums, or a script with its seed."""
-
-    licence: str = ""
-    """SPDX name of their licence."""
-
-    created: str = ""
-    """Day of the survey, YYYY-MM-DD; "" if unknown."""
-
-    frame: str = ""
-    """Axes of x, y and heading, such as "world: x east, y north, z up"."""
-
-    datum: str = ""
-    """Origin of that frame in the room or on Earth, and the reference of heights."""
-
-    height_m: float | None = None
-    """Height of the sensor above the floor [m]; None if unknown."""
-
+    variance_nt2: Array | None = None  # Variance of each value [nT^2], shape (H, Y, X); None if unknown
+    name: str = ""  # Name of the map and of its layer
+    method: str = ""  # How the values were obtained
+    source: str = ""  # Source files with checksums, or a script with its seed
+    licence: str = ""  # SPDX name of their licence
+    created: str = ""  # Day of the survey, YYYY-MM-DD; "" if unknown
+    frame: str = ""  # Axes of x, y and heading, such as "world: x east, y north, z up"
+    datum: str = ""  # Origin of that frame in the room or on Earth, and the reference of heights
+    height_m: float | None = None  # Height of the sensor above the floor [m]; None if unknown
+    # Recorded yaw of the robot at each node [rad], shape (H, Y, X); None if values are not single readings
     recorded_yaw: Array | None = None
-    """Recorded yaw of the robot at each node [rad], shape (H, Y, X); None if values are not single
-    readings."""
-
+    # Parameters of the method by name: numbers, texts, and lists of them, as in JSON
     parameters: Mapping[str, Any] = field(default_factory=dict)
-    """Parameters of the method by name: numbers, texts, and lists of them, as in JSON."""
-
+    # The vector field from which the values were computed; None if there is none
     harmonic: HarmonicField | None = None
-    """The vector field from which the values were computed; None if there is none."""
 
     def __post_init__(self) -> None:
         values = _frozen(self.values_nt, float)
         if values.ndim != 3 or not (values.shape[0] >= 1 and min(values.shape[1:]) >= 2):
-            raise InputError(
-                f"values_nt of AnomalyMap must have shape (H, Y, X) with at least one heading and "
-                f"2 x 2 nodes, got {values.shape}"
+            text = (
+                "values_nt of AnomalyMap must have shape (H, Y, X) with at least one heading and 2 x 2 nodes"
             )
+            raise InputError(f"{text}, got {values.shape}")
         valid = np.ones(values.shape, bool) if self.valid is None else self.valid
         arrays: dict[str, Any] = {"values_nt": values, "valid": _frozen(valid, bool)}
-        arrays["headings_rad"] = headings = _frozen(self.headings_rad, float)
-        if self.variance_nt2 is not None:
-            arrays["variance_nt2"] = _frozen(self.variance_nt2, float)
-        if self.recorded_yaw is not None:
-            arrays["recorded_yaw"] = _frozen(self.recorded_yaw, float)
+        arrays["headings_rad"] = _frozen(self.headings_rad, float)
+        for name in ("variance_nt2", "recorded_yaw"):
+            if getattr(self, name) is not None:
+                arrays[name] = _frozen(getattr(self, name), float)
         for name, array in arrays.items():
             shape = values.shape[:1] if name == "headings_rad" else values.shape
             if array.shape != shape:
                 raise InputError(f"{name} of AnomalyMap must have shape {shape}, got {array.shape}")
             object.__setattr__(self, name, array)
-        if not (np.all(np.diff(headings) > 0) and headings[0] >= 0 and headings[-1] < TURN):
-            raise InputError(f"headings_rad of AnomalyMap must ascend in [0, 2 pi), got {headings.tolist()}")
-        for name in ("origin_m", "cell_m"):
-            pair = tuple(float(v) for v in getattr(self, name))
-            if len(pair) != 2 or not np.all(np.isfinite(pair)) or (name == "cell_m" and min(pair) <= 0):
-                above = " above 0" if name == "cell_m" else ""
-                raise InputError(f"{name} of AnomalyMap must be two lengths{above} [m], got {pair}")
-            object.__setattr__(self, name, pair)
-        self._check_values()
-
-    def _check_values(self) -> None:
+        check_axes(self)
         check_texts(self, TEXTS)
         if not isinstance(self.parameters, Mapping):
             raise InputError(f"parameters of AnomalyMap must be figures by name, got {self.parameters!r}")
         if self.height_m is not None and not 0 <= self.height_m < np.inf:
-            raise InputError(
-                f"height_m of AnomalyMap is a height above the floor, 0 m or more, got {self.height_m!r}"
-            )
+            text = "height_m of AnomalyMap is a height above the floor, 0 m or more"
+            raise InputError(f"{text}, got {self.height_m!r}")
         bad = self.valid & ~np.isfinite(self.values_nt)
         if bad.any():
             h, j, i = np.argwhere(bad)[0]
@@ -146,10 +104,8 @@ class AnomalyMap(Summarized):
     def grid(self) -> Grid:
         """The nodes."""
         _, rows, columns = self.values_nt.shape
-        headings = tuple(self.headings_rad.tolist())
-        return Grid(
-            origin_m=self.origin_m, cell_m=self.cell_m, headings_rad=headings, rows=rows, columns=columns
-        )
+        axes: dict[str, Any] = {name: getattr(self, name) for name in ("origin_m", "cell_m", "headings_rad")}
+        return Grid(**axes, rows=rows, columns=columns)
 
     @property
     def x_m(self) -> Array:
@@ -199,20 +155,14 @@ class AnomalyMap(Summarized):
         return self._look(p_xy, yaw, outside, gradient=False)[0]
 
     def gradient(self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan") -> Array:
-        """Exact derivatives of `lookup` within a cell; at a border, those of the cell at greater x, y or
-        heading.
+        """Exact derivatives of `lookup` within a cell. Arguments and errors are those of `lookup`.
 
-        Args:
-            p_xy: Points in world [m], shape (..., 2).
-            yaw: Headings [rad], shape (...); the two shapes are broadcast.
-            outside: As for `lookup`; with "clamp" the field does not change across the border.
+        At a border they are those of the cell at greater x, y or heading. With "clamp" the field does not
+        change across the border of the grid.
 
         Returns:
             dB/dx, dB/dy [nT/m] and dB/dyaw [nT/rad], shape (..., 3); nan if `lookup` is, or if a masked node
             would enter.
-
-        Raises:
-            InputError: A point is off the grid and `outside` is "raise".
         """
         return self._look(p_xy, yaw, outside, gradient=True)[1]
 
@@ -225,12 +175,7 @@ class AnomalyMap(Summarized):
     def lookup_with_sd(
         self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan"
     ) -> tuple[Array, Array]:
-        """Field at poses and its standard deviation, the root of the interpolated variance.
-
-        Args:
-            p_xy: Points in world [m], shape (..., 2).
-            yaw: Headings [rad], shape (...); the two shapes are broadcast.
-            outside: As for `lookup`.
+        """Field at poses, as `lookup`, and its standard deviation, the root of the interpolated variance.
 
         Returns:
             Field magnitude and its standard deviation [nT], each of shape (...).
@@ -239,27 +184,15 @@ class AnomalyMap(Summarized):
             InputError: The map has no variance; or an error of `lookup`.
         """
         if self._variance is None:
-            raise InputError(
-                f"map {self.name!r} has no variance; fit one with `magtwin map fit`, or use lookup instead"
-            )
+            text = "has no variance; fit one with `magtwin map fit`, or use lookup instead"
+            raise InputError(f"map {self.name!r} {text}")
         mean = self.lookup(p_xy, yaw, outside=outside)
         return mean, np.sqrt(self._look(p_xy, yaw, outside, gradient=False, table=self._variance)[0])
 
     def at(self, x: float, y: float, yaw: float, *, outside: Outside = "nan") -> float:
-        """Field at one pose [nT], as `lookup`, without the overhead of arrays.
-
-        Args:
-            x: World x [m].
-            y: World y [m].
-            yaw: Heading [rad].
-            outside: As for `lookup`.
-
-        Raises:
-            InputError: The point is off the grid and `outside` is "raise".
-        """
-        if outside == "nan":
-            return self._lookup.at(x, y, yaw)
-        self._check_outside(np.array([[x, y]]), outside)
+        """Field at one pose (x, y [m], yaw [rad]) [nT], as `lookup`, without the overhead of arrays."""
+        if outside != "nan":
+            self._check_outside(np.array([[x, y]]), outside)
         return self._lookup.at(x, y, yaw, clamp=outside == "clamp")
 
     def at_with_gradient(
@@ -313,15 +246,11 @@ class AnomalyMap(Summarized):
                 Figure("greatest", round(float(known.max()), 1), "nT"),
             ]
         if slope.size:
-            figures += [
-                Figure("median gradient", round(float(np.median(slope)), 3), "uT/m"),
-                Figure("mean gradient", round(float(slope.mean()), 3), "uT/m"),
-                Figure("greatest gradient", round(float(slope.max()), 3), "uT/m"),
-            ]
+            sizes = {"median": np.median(slope), "mean": slope.mean(), "greatest": slope.max()}
+            figures += [Figure(f"{k} gradient", round(float(v), 3), "uT/m") for k, v in sizes.items()]
         everywhere = self.valid.all(axis=0)
         if len(self.headings_rad) >= 3 and everywhere.any():
-            means = self.values_nt[:, everywhere].mean(axis=1)
-            h = self.headings_rad
+            means, h = self.values_nt[:, everywhere].mean(axis=1), self.headings_rad
             waves = np.column_stack([np.ones_like(h), np.cos(h), np.sin(h)])
             _, c, s = np.linalg.lstsq(waves, means, rcond=None)[0]
             figures.append(Figure("heading amplitude", round(float(np.hypot(c, s)), 1), "nT"))
@@ -385,11 +314,10 @@ class AnomalyMap(Summarized):
 
     def _summary(self) -> Summary:
         known, (x0, x1, y0, y1) = self.values_nt[self.valid], self.extent
-        title = f"AnomalyMap {self.name or 'without a name'}: "
+        title = "no valid node"
         if known.size:
-            title += f"{span(known.min(), known.max(), 'nT')}, mean {known.mean():,.0f} nT"
-        else:
-            title += "no valid node"
+            title = f"{span(known.min(), known.max(), 'nT')}, mean {known.mean():,.0f} nT"
+        cell = f"{self.cell_m[0]:.3g} x {self.cell_m[1]:.3g} m"
         headings, rows, columns = self.values_nt.shape
         masked = int(np.count_nonzero(~self.valid))
         degrees = listed([f"{d:.4g}" for d in np.degrees(self.headings_rad)], 40)
@@ -399,13 +327,9 @@ class AnomalyMap(Summarized):
             about.append(f"sd {np.sqrt(np.median(self.variance_nt2[self.valid])):.3g} nT (median)")
         about += [self.licence] if self.licence else []
         return Summary(
-            title,
+            f"AnomalyMap {self.name or 'without a name'}: {title}",
             (
-                (
-                    "nodes",
-                    f"{columns} x {rows}, {self.cell_m[0]:.3g} x {self.cell_m[1]:.3g} m apart, "
-                    f"{rectangle(x0, x1, y0, y1)}",
-                ),
+                ("nodes", f"{columns} x {rows}, {cell} apart, {rectangle(x0, x1, y0, y1)}"),
                 ("headings", f"{headings}: {degrees} deg" + (f"; {masked:,} nodes masked" if masked else "")),
                 ("known", ", ".join(about)),
                 ("method", self.method or "unknown"),

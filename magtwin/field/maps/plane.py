@@ -92,9 +92,8 @@ class Plane:
             code.polynomials(table, slots[which], u, w, 1 / HALF_M, out)
         else:
             order = np.argsort(which, kind="stable")
-            for slot, rows in zip(
-                slots.tolist(), np.split(order, np.cumsum(np.bincount(which))[:-1]), strict=True
-            ):
+            squares = np.split(order, np.cumsum(np.bincount(which))[:-1])
+            for slot, rows in zip(slots.tolist(), squares, strict=True):
                 out[rows] = _by_numpy(table[slot], *local[rows].T)
         for k in np.flatnonzero(np.isin(slots, list(close))) if close else ():
             rows = np.flatnonzero(which == k)
@@ -133,7 +132,8 @@ class Plane:
             x, y = (key + (1 << 31)) >> 32, ((key + (1 << 31)) & 0xFFFF_FFFF) - (1 << 31)
             centre = CELL_M * (np.array([x, y, layer]) + 0.5)
             middle = np.append(centre[:2], self.height_m)
-            places, moments, near = self.bodies.seen_from(centre)
+            places, moments, close = self.bodies.seen_from(centre)
+            near = [self.bodies.solid[k] for k in close]
             clear = np.sqrt(np.square(places - middle).sum(axis=1)) >= reach
             apart = [body.clearance(middle[None])[0] >= reach for body in near]
             some = [body for body, far in zip(near, apart, strict=True) if not far]
@@ -146,12 +146,8 @@ class Plane:
             slot, middle, places, moments, whole = work
             u, w = np.meshgrid(node, node, indexing="ij")
             square = middle + HALF_M * np.stack([u, w, np.zeros_like(u)], axis=-1).reshape(-1, 3)
-            b = np.concatenate(
-                [
-                    dipole_block(square[rows], None, places, moments)[0]
-                    for rows in in_blocks(len(square), len(places))
-                ]
-            )
+            blocks = in_blocks(len(square), len(places))
+            b = np.concatenate([dipole_block(square[rows], None, places, moments)[0] for rows in blocks])
             for body in whole:
                 b += body.exact_field_nt(square)
             sums = np.einsum("ik,jl,klc->ijc", powers, powers, b.reshape(NODES, NODES, 3))

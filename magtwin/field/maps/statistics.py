@@ -1,12 +1,11 @@
 """What is known about a map: statistics per heading, metadata, colour limits."""
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.maps.epochs import drift
 from magtwin.field.maps.map import AnomalyMap
@@ -14,47 +13,36 @@ from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.report import Figure, Report
 from magtwin.summary import span
 
-
-@dataclass(frozen=True, kw_only=True)
-class HeadingStatistics:
-    """Statistics of one heading over its valid nodes; nan if there is none."""
-
-    heading_deg: float  # Heading [deg]
-    nodes: int  # Number of nodes
-    masked: int  # Nodes that are not valid
-    mean_nt: float  # Mean [nT]
-    sd_nt: float  # Standard deviation over the nodes [nT]
-    least_nt: float  # Smallest value [nT]
-    greatest_nt: float  # Largest value [nT]
-    median_gradient_nt_m: float  # Median horizontal gradient of the magnitude, by central differences [nT/m]
-    greatest_gradient_nt_m: float  # Largest gradient [nT/m]
-    median_error_nt: float  # Median standard deviation of a value [nT]; nan if unknown
+Array = NDArray[np.float64]
 
 
-def statistics(field: AnomalyMap) -> tuple[HeadingStatistics, ...]:
-    """Statistics of each heading of a map, in the order of its layers."""
-    rows = []
-    for h, heading in enumerate(np.degrees(field.headings_rad)):
-        valid = field.valid[h]
-        values = np.where(valid, field.values_nt[h], np.nan)
-        slope = np.hypot(*np.gradient(values, *field.cell_m[::-1]))
-        slope, known = slope[np.isfinite(slope)], values[valid]
-        errors = np.empty(0) if field.variance_nt2 is None else np.sqrt(field.variance_nt2[h][valid])
-        rows.append(
-            HeadingStatistics(
-                heading_deg=float(heading),
-                nodes=valid.size,
-                masked=int(np.count_nonzero(~valid)),
-                mean_nt=float(known.mean()) if known.size else np.nan,
-                sd_nt=float(known.std()) if known.size else np.nan,
-                least_nt=float(known.min()) if known.size else np.nan,
-                greatest_nt=float(known.max()) if known.size else np.nan,
-                median_gradient_nt_m=float(np.median(slope)) if slope.size else np.nan,
-                greatest_gradient_nt_m=float(slope.max()) if slope.size else np.nan,
-                median_error_nt=float(np.median(errors)) if errors.size else np.nan,
-            )
-        )
-    return tuple(rows)
+def statistics(field: AnomalyMap, heading: int) -> dict[str, float]:
+    """Statistics of one heading over its valid nodes, by name with unit.
+
+    A figure is nan if there is no such node. Errors are standard deviations, gradients are those of the
+    magnitude along the floor, by central differences.
+    """
+    valid = field.valid[heading]
+    values = np.where(valid, field.values_nt[heading], np.nan)
+    slope = np.hypot(*np.gradient(values, *field.cell_m[::-1]))
+    slope, known = slope[np.isfinite(slope)], values[valid]
+    errors = np.empty(0) if field.variance_nt2 is None else np.sqrt(field.variance_nt2[heading][valid])
+
+    def of(figure: Callable[[Array], Any], values: Array) -> float:
+        return float(figure(values)) if values.size else np.nan
+
+    return {
+        "heading_deg": float(np.degrees(field.headings_rad[heading])),
+        "nodes": valid.size,
+        "masked": int(np.count_nonzero(~valid)),
+        "mean_nt": of(np.mean, known),
+        "sd_nt": of(np.std, known),
+        "least_nt": of(np.min, known),
+        "greatest_nt": of(np.max, known),
+        "median_gradient_nt_m": of(np.median, slope),
+        "greatest_gradient_nt_m": of(np.max, slope),
+        "median_error_nt": of(np.median, errors),
+    }
 
 
 _FILE = re.compile(r"(?P<name>.+?) sha256:(?P<sha256>[0-9a-f]{64})")
@@ -80,9 +68,8 @@ def map_metadata(field: AnomalyMap, epochs: Sequence[AnomalyMap] = ()) -> Report
     figures.append(Figure("valid share", round(share, 2), "%", note="of the nodes, over all headings"))
     x0, x1, y0, y1 = field.extent
     dx, dy = field.cell_m
-    figures.append(
-        Figure("extent", f"x {x0:g}..{x1:g}, y {y0:g}..{y1:g}", "m", note=f"cells {dx:g} x {dy:g} m")
-    )
+    extent = f"x {x0:g}..{x1:g}, y {y0:g}..{y1:g}"
+    figures.append(Figure("extent", extent, "m", note=f"cells {dx:g} x {dy:g} m"))
     known = None if field.variance_nt2 is None else field.variance_nt2[field.valid]
     if known is None or not known.size:
         figures.append(Figure("standard deviation", "unknown"))
@@ -133,13 +120,14 @@ def source_files(source: str) -> dict[str, str]:
 def _headings(field: AnomalyMap) -> list[Figure]:
     """Mean and standard deviation of each heading, with its range and masked share."""
     figures = []
-    for row in statistics(field):
-        name = f"heading {row.heading_deg:.6g}"
-        if row.masked == row.nodes:
+    for row in (statistics(field, h) for h in range(len(field.headings_rad))):
+        name = f"heading {row['heading_deg']:.6g}"
+        if row["masked"] == row["nodes"]:
             figures.append(Figure(name, "no valid node"))
             continue
-        note = f"{span(row.least_nt, row.greatest_nt, 'nT')}; {100 * row.masked / row.nodes:.3g} % masked"
-        figures.append(Figure(name, round(row.mean_nt, 1), "nT", round(row.sd_nt, 1), note))
+        extremes = span(row["least_nt"], row["greatest_nt"], "nT")
+        note = f"{extremes}; {100 * row['masked'] / row['nodes']:.3g} % masked"
+        figures.append(Figure(name, round(row["mean_nt"], 1), "nT", round(row["sd_nt"], 1), note))
     return figures
 
 

@@ -113,17 +113,9 @@ def at(t: Any, x: float, y: float, yaw: float, clamp: bool) -> float:
 def at_with_gradient(
     t: Any, x: float, y: float, yaw: float, clamp: bool
 ) -> tuple[float, float, float, float]:
-    """Field at one pose and its gradient.
+    """Field at one pose [nT], dB/dx, dB/dy [nT/m] and dB/dyaw [nT/rad]; nan where they are not known.
 
-    Args:
-        t: A map's table.
-        x: Position in world [m].
-        y: Position in world [m].
-        yaw: Heading [rad].
-        clamp: Whether a point off the grid takes the field of the nearest point on it.
-
-    Returns:
-        Field [nT], dB/dx, dB/dy [nT/m] and dB/dyaw [nT/rad]; nan where they are not known.
+    `t` is a map's table. With `clamp`, a point off the grid takes the field of the nearest point on it.
     """
     nan = math.nan
     node, wx, wy, wh, h_rate = find(t, x, y, yaw, clamp)

@@ -41,36 +41,22 @@ STEP_M = 1e-5
 class Body:
     """A uniformly magnetised body in world."""
 
-    shape: str
-    """One of `magtwin.spec.magnetics.SHAPES`."""
-
-    size_m: Array
-    """Sides of its bounding box along its own axes [m], shape (3,); a cylinder's axis is z."""
-
-    p_world: Array
-    """Origin of its own axes [m], shape (3,): the centre, except for a mesh."""
-
-    q_world_xyzw: Array
-    """Rotation of its axes in world, shape (4,)."""
-
-    magnetization: Array
-    """Magnetization in its own axes [A/m], shape (3,)."""
-
-    vertices: Array | None = None
-    """Vertices of a mesh in its own axes [m], shape (V, 3)."""
-
+    shape: str  # One of `magtwin.spec.magnetics.SHAPES`
+    size_m: Array  # Sides of its bounding box along its own axes [m], shape (3,); a cylinder's axis is z
+    p_world: Array  # Origin of its own axes [m], shape (3,): the centre, except for a mesh
+    q_world_xyzw: Array  # Rotation of its axes in world, shape (4,)
+    magnetization: Array  # Magnetization in its own axes [A/m], shape (3,)
+    vertices: Array | None = None  # Vertices of a mesh in its own axes [m], shape (V, 3)
+    # Vertices of its triangles, counter-clockwise seen from outside, shape (F, 3)
     faces: Triangles | None = None
-    """Vertices of its triangles, counter-clockwise seen from outside, shape (F, 3)."""
 
     @property
     def volume_m3(self) -> float:
         """Volume [m3]."""
         if self.vertices is not None and self.faces is not None:
             return mesh_moments(self.vertices, self.faces)[0]
-        return (
-            float(np.prod(self.size_m))
-            * {"cuboid": 1, "cylinder": np.pi / 4, "sphere": np.pi / 6}[self.shape]
-        )
+        share = {"cuboid": 1, "cylinder": np.pi / 4, "sphere": np.pi / 6}[self.shape]
+        return float(np.prod(self.size_m)) * share
 
     @cached_property
     def rotation(self) -> Array:
@@ -93,36 +79,33 @@ class Body:
         Returns:
             Field in world axes [nT], shape (N, 3).
         """
+        import magpylib  # its scipy takes 0.3 s
+
         p = (np.asarray(p_world, float) - self.p_world) @ self.rotation
-        field = _magnet(self).getB(p).reshape(p.shape)
-        return np.asarray(NT_PER_T * field @ self.rotation.T)
+        polarization, magnet, size = MU_0 * self.magnetization, magpylib.magnet, self.size_m
+        body: Any
+        if self.shape == "cuboid":
+            body = magnet.Cuboid(dimension=size, polarization=polarization)
+        elif self.shape == "cylinder":
+            body = magnet.Cylinder(dimension=size[[0, 2]], polarization=polarization)
+        elif self.shape == "sphere":
+            body = magnet.Sphere(diameter=size[0], polarization=polarization)
+        else:
+            body = magnet.TriangularMesh(
+                vertices=self.vertices,
+                faces=self.faces,
+                polarization=polarization,
+                check_open="ignore",  # spec.mesh.check_mesh did
+                check_disconnected="ignore",
+                check_selfintersecting="skip",
+                reorient_faces="skip",
+            )
+        return np.asarray(NT_PER_T * body.getB(p).reshape(p.shape) @ self.rotation.T)
 
     def clearance(self, p_world: Array) -> Array:
         """Distance of points from its bounding box [m], 0 inside, shape (N, 3) -> (N,)."""
         beyond = np.abs((p_world - self.p_world) @ self.rotation - self.middle) - self.size_m / 2
         return np.asarray(np.sqrt(np.square(np.maximum(beyond, 0)).sum(axis=1)))
-
-
-def _magnet(body: Body) -> Any:
-    """The body in its own axes, as a magpylib object."""
-    import magpylib  # its scipy takes 0.3 s
-
-    polarization = MU_0 * body.magnetization
-    if body.shape == "cuboid":
-        return magpylib.magnet.Cuboid(dimension=body.size_m, polarization=polarization)
-    if body.shape == "cylinder":
-        return magpylib.magnet.Cylinder(dimension=body.size_m[[0, 2]], polarization=polarization)
-    if body.shape == "sphere":
-        return magpylib.magnet.Sphere(diameter=body.size_m[0], polarization=polarization)
-    return magpylib.magnet.TriangularMesh(
-        vertices=body.vertices,
-        faces=body.faces,
-        polarization=polarization,
-        check_open="ignore",  # spec.mesh.check_mesh did
-        check_disconnected="ignore",
-        check_selfintersecting="skip",
-        reorient_faces="skip",
-    )
 
 
 def mesh_moments(vertices: Array, faces: Triangles) -> tuple[float, Array, Array]:
@@ -258,8 +241,11 @@ def _dipoles_of(body: Body, distance: float) -> tuple[Array, Array]:
         return np.zeros((1, 3)), np.ones(1)
     if body.shape == "cylinder":
         return _of_a_cylinder(half[0], half[2], distance)
-    if body.vertices is not None and body.faces is not None:
-        return _of_a_mesh(body.vertices, body.faces)
+    if body.vertices is not None and body.faces is not None:  # two on each of the two longer principal axes
+        _, centroid, second = mesh_moments(body.vertices, body.faces)
+        spread, axes = np.linalg.eigh(second)
+        arms = [math.sqrt(2 * max(spread[k] - spread[0], 0.0)) * axes[:, k] for k in (1, 2)]
+        return centroid + np.array([sign * arm for arm in arms for sign in (-1, 1)]), np.full(4, 0.25)
     thin = float(half.min()) if _is_thin(half.min(), distance) else 0.0
     rules = [_line(h, thin, distance) for h in half]
     nodes = np.stack(np.meshgrid(*[x for x, _ in rules], indexing="ij"), -1)
@@ -302,14 +288,6 @@ def _of_a_cylinder(radius: float, half: float, distance: float) -> tuple[Array, 
     return places, np.outer(share, part).ravel()
 
 
-def _of_a_mesh(vertices: Array, faces: Triangles) -> tuple[Array, Array]:
-    """Two dipoles on either side of the centroid along each of the two longer principal axes."""
-    _, centroid, second = mesh_moments(vertices, faces)
-    spread, axes = np.linalg.eigh(second)
-    arms = [math.sqrt(2 * max(spread[k] - spread[0], 0.0)) * axes[:, k] for k in (1, 2)]
-    return centroid + np.array([sign * arm for arm in arms for sign in (-1, 1)]), np.full(4, 0.25)
-
-
 class _Cut:
     """A body and the dipoles that replace it, finer at shorter distances."""
 
@@ -329,10 +307,8 @@ class _Cut:
         """Positions [m] and moments [A m2] in world that replace it from near * LADDER^rung of its box on."""
         if rung not in self._sets:
             places, shares = _dipoles_of(self.body, self.near * LADDER**rung)
-            self._sets[rung] = (
-                self.body.p_world + places @ self.body.rotation.T,
-                shares[:, None] * self._moment,
-            )
+            at = self.body.p_world + places @ self.body.rotation.T
+            self._sets[rung] = (at, shares[:, None] * self._moment)
         return self._sets[rung]
 
 
@@ -348,17 +324,17 @@ class Bodies:
     ) -> None:
         """Take bodies, and dipoles as positions [m] and moments [A m2] in world, each of shape (D, 3)."""
         self.bodies = tuple(bodies)
-        self._cuts = [_Cut(body) for body in self.bodies if np.any(body.magnetization)]
-        self._dipoles = (
-            np.asarray(p_world_dipole, float).reshape(-1, 3),
-            np.asarray(m_world, float).reshape(-1, 3),
-        )
-        solid = [cut.body for cut in self._cuts]
+        self.solid = [body for body in self.bodies if np.any(body.magnetization)]
+        """Those that are magnetised."""
+
+        self._cuts = [_Cut(body) for body in self.solid]
+        place, moment = (np.asarray(part, float).reshape(-1, 3) for part in (p_world_dipole, m_world))
+        self._dipoles = (place, moment)
         self._near = np.array([cut.near for cut in self._cuts])
-        self._laddered = np.array([cut.body.shape in ("cuboid", "cylinder") for cut in self._cuts], bool)
-        self._rotation = np.array([b.rotation for b in solid]).reshape(-1, 3, 3)
-        self._half = np.array([b.size_m / 2 for b in solid]).reshape(-1, 3)
-        self._middle = np.array([b.p_world + b.rotation @ b.middle for b in solid]).reshape(-1, 3)
+        self._laddered = np.array([b.shape in ("cuboid", "cylinder") for b in self.solid], bool)
+        self._rotation = np.array([b.rotation for b in self.solid]).reshape(-1, 3, 3)
+        self._half = np.array([b.size_m / 2 for b in self.solid]).reshape(-1, 3)
+        self._middle = np.array([b.p_world + b.rotation @ b.middle for b in self.solid]).reshape(-1, 3)
 
     def field_nt(self, p_world: ArrayLike) -> Array:
         """Their field.
@@ -413,24 +389,20 @@ class Bodies:
             if parts:
                 k = np.concatenate(parts)
                 field[k] += cut.body.exact_field_nt(p[k])
-                if v is not None:
-                    rate[k] += _difference(cut.body, p[k], v[k])
+                if v is not None:  # by central differences along the motion
+                    speed = np.sqrt(np.square(v[k]).sum(axis=1, keepdims=True))
+                    ahead = STEP_M * np.divide(v[k], speed, out=np.zeros_like(v[k]), where=speed > 0)
+                    change = cut.body.exact_field_nt(p[k] + ahead) - cut.body.exact_field_nt(p[k] - ahead)
+                    rate[k] += change / (2 * STEP_M) * speed
         return field, rate
 
-    def seen_from(self, centre: Array) -> tuple[Array, Array, list[Body]]:
-        """What the field in a cell of space, of side `CELL_M`, is made of.
-
-        Args:
-            centre: Middle of the cell [m], shape (3,).
+    def seen_from(self, centre: Array) -> tuple[Array, Array, list[int]]:
+        """What the field in the cell of space about `centre` [m] is made of.
 
         Returns:
             Places [m] and moments [A m2] in world, each of shape (D, 3), of all dipoles and of those that
-            stand for the bodies that are far enough; and the bodies that are not.
+            replace the magnetised bodies that are far enough; and the indices of those that are not.
         """
-        places, moments, near = self._seen_from(centre)
-        return places, moments, [self._cuts[k].body for k in near]
-
-    def _seen_from(self, centre: Array) -> tuple[Array, Array, list[int]]:
         turned = np.einsum("bij,bi->bj", self._rotation, centre - self._middle)
         beyond = np.maximum(np.abs(turned) - self._half, 0)
         apart = np.sqrt(np.square(beyond).sum(axis=1)) - math.sqrt(0.75) * CELL_M
@@ -438,11 +410,8 @@ class Bodies:
         with np.errstate(divide="ignore", invalid="ignore"):
             rungs = np.log(apart / self._near) / math.log(LADDER)
         rungs = np.where(self._laddered & far, np.clip(rungs, 0, RUNGS), 0).astype(int)
-        whole = [
-            cut.dipoles(rung)
-            for cut, rung in zip(compress(self._cuts, far), rungs[far].tolist(), strict=True)
-        ]
-        whole.append(self._dipoles)
+        rung = zip(compress(self._cuts, far), rungs[far].tolist(), strict=True)
+        whole = [*(cut.dipoles(k) for cut, k in rung), self._dipoles]
         places, moments = (np.concatenate(part) for part in zip(*whole, strict=True))
         return places, moments, np.flatnonzero(~far).tolist()
 
@@ -450,7 +419,7 @@ class Bodies:
         self, p: Array, rows: Rows, centre: Array, exact: list[list[Rows]]
     ) -> list[tuple[Rows, Array, Array]]:
         """The dipoles to sum for the points of a cell; adds rows near a body to `exact`."""
-        places, moments, close = self._seen_from(centre)
+        places, moments, close = self.seen_from(centre)
         work = []
         for k in close:
             cut = self._cuts[k]
@@ -466,21 +435,9 @@ class Bodies:
 def _cells(p: Array, known: Rows) -> Iterator[tuple[Rows, Array]]:
     """The rows of `known` grouped by cell of space, with the cell's centre [m]."""
     cell = np.clip(np.floor(p[known] / CELL_M), -FARTHEST_CELL, FARTHEST_CELL - 1).astype(np.int64)
-    key = (
-        ((cell[:, 0] + FARTHEST_CELL) << 40)
-        + ((cell[:, 1] + FARTHEST_CELL) << 20)
-        + cell[:, 2]
-        + FARTHEST_CELL
-    )
+    x, y, z = (cell + FARTHEST_CELL).T
+    key = (x << 40) + (y << 20) + z
     order = np.argsort(key, kind="stable")
     for rows in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
         if len(rows):
             yield known[rows], CELL_M * (cell[rows[0]] + 0.5)
-
-
-def _difference(body: Body, p: Array, v: Array) -> Array:
-    """Rate of a body's exact field at moving points [nT/s], by central differences along the motion."""
-    speed = np.sqrt(np.square(v).sum(axis=1, keepdims=True))
-    ahead = STEP_M * np.divide(v, speed, out=np.zeros_like(v), where=speed > 0)
-    change = body.exact_field_nt(p + ahead) - body.exact_field_nt(p - ahead)
-    return np.asarray(change / (2 * STEP_M) * speed)

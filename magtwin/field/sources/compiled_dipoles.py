@@ -84,11 +84,8 @@ def moment_rows(p_world: Array, p_world_dipole: Array, ways: Array, out: Array) 
 
     w . dB/dm = mu_0 / 4 pi * (3 (w . r) r / |r|^5 - w / |r|^3),  r = p - p_d
 
-    Args:
-        p_world: Observation points [m], shape (N, 3).
-        p_world_dipole: Dipole positions [m], shape (D, 3).
-        ways: Directions w of each point's components, shape (N, C, 3).
-        out: Takes the derivatives [nT/(A m^2)], dipole by dipole, in its first 3 D columns, shape (N, C, P).
+    `ways` are the directions w of each point's components, shape (N, C, 3). `out` takes the derivatives
+    [nT/(A m^2)], dipole by dipole, in its first 3 D columns, shape (N, C, P).
     """
     _moment_rows(p_world, p_world_dipole, np.ascontiguousarray(ways), MU_0_OVER_4_PI * NT_PER_T, out)
 
@@ -119,9 +116,7 @@ def _moment_rows(p: Array, place: Array, ways: Array, factor: float, out: Array)
 
 @compiled(_IN, _IN, _IN, _OUT, _OUT)
 def _dipoles(p: Array, place: Array, moment: Array, field: Array, gradient: Array) -> None:
-    """Sums at p (N, 3) over dipoles (D, 3) without their factor; `gradient` is (N, 5), or (0, 5) if not
-    wanted.
-    """
+    """Sums at p (N, 3) over dipoles (D, 3) without their factor; `gradient` is (N, 5), or (0, 5) for none."""
     x, y, z = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
     b, g = np.empty((3, BLOCK)), np.empty((5, BLOCK))
     for start in range(0, p.shape[0], BLOCK):

@@ -12,7 +12,6 @@ from magtwin.errors import InputError
 Array = NDArray[np.float64]
 
 MU_0_OVER_4_PI = 1.00000000055e-7  # Magnetic constant over 4 pi [T m/A] (CODATA 2018)
-
 NT_PER_T = 1e9
 
 SHARED = 16  # Blocks from which a second thread pays; the results do not depend on it
@@ -59,9 +58,8 @@ def checked(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: ArrayLike) -
     if p.ndim == 0 or p.shape[-1] != 3:
         raise InputError(f"p_world must have shape (..., 3), got {p.shape}")
     if place.ndim != 2 or place.shape[1] != 3 or moment.shape != place.shape:
-        raise InputError(
-            f"p_world_dipole and m_world must have one shape (D, 3), got {place.shape} and {moment.shape}"
-        )
+        text = "p_world_dipole and m_world must have one shape (D, 3)"
+        raise InputError(f"{text}, got {place.shape} and {moment.shape}")
     return p, place, moment
 
 
@@ -86,20 +84,11 @@ def in_two_threads(work: Callable[[T], None], tasks: Sequence[T], *, pairs: int)
 
 
 def dipole_block(p: Array, v: Array | None, place: Array, moment: Array) -> tuple[Array, Array]:
-    """Field and rate of dipoles at some points, as products of narrow matrices.
+    """Field [nT] and its rate [nT/s] at points with velocities `v`, by products of narrow matrices, (N, 3).
 
     With r = p - p_d, |r|^2 = |p|^2 - 2 p . p_d + |p_d|^2, and other scalar products likewise. Sums over
     dipoles are matrix products too. This loses digits if r is much shorter than p, so |r|^2 of close pairs is
-    computed again.
-
-    Args:
-        p: Points [m], shape (N, 3).
-        v: Their velocities [m/s], shape (N, 3); None for no rate.
-        place: Dipole positions [m], shape (D, 3).
-        moment: Their moments [A m2], shape (D, 3).
-
-    Returns:
-        Field [nT] and its rate [nT/s], each of shape (N, 3); the rate is 0 without `v`.
+    computed again. Without `v` the rate is 0.
     """
     scale = MU_0_OVER_4_PI * NT_PER_T
     home = place.mean(axis=0) if len(place) else np.zeros(3)
@@ -110,7 +99,9 @@ def dipole_block(p: Array, v: Array | None, place: Array, moment: Array) -> tupl
         square = p @ (-2 * place.T)
         square += size
         square += own
-        _mend(square, p, place, own, size)
+        if square.size and square.min() < CLOSE * (own.max() + size.max()):
+            n, d = np.nonzero(square < CLOSE * (own + size))
+            square[n, d] = np.square(p[n] - place[d]).sum(axis=1)
         inverse = np.divide(1, square, out=square)
         cubed = np.sqrt(inverse)
         cubed *= inverse
@@ -134,9 +125,3 @@ def dipole_block(p: Array, v: Array | None, place: Array, moment: Array) -> tupl
         turned = along @ there
         rate = turned[:, 3:] * p - turned[:, :3] + towards @ moment + sums[:, 3:] * v
     return scale * field, scale * rate
-
-
-def _mend(square: Array, p: Array, place: Array, own: Array, size: Array) -> None:
-    if square.size and square.min() < CLOSE * (own.max() + size.max()):
-        n, d = np.nonzero(square < CLOSE * (own + size))
-        square[n, d] = np.square(p[n] - place[d]).sum(axis=1)

@@ -41,10 +41,8 @@ def earth_field_nt(
     if not first <= day <= last:
         raise InputError(f"date {day} lies beyond {MODEL}, which holds from {first} to {last}")
     if not (abs(latitude_deg) < 90 and np.isfinite(longitude_deg)):
-        raise InputError(
-            f"latitude must lie between -90 and 90 deg, both left out, and longitude be a number, "
-            f"got {latitude_deg!r}, {longitude_deg!r}"
-        )
+        text = "latitude must lie between -90 and 90 deg, both left out, and longitude be a number"
+        raise InputError(f"{text}, got {latitude_deg!r}, {longitude_deg!r}")
     if not np.isfinite(north_deg):
         raise InputError(f"north_deg must be a number, got {north_deg!r}")
     if not -10e3 <= height_m <= 1000e3:

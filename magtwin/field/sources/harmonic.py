@@ -36,34 +36,21 @@ class HarmonicField(Summarized):
     fields are equal if every array is.
     """
 
-    p_world_dipole: Array
-    """Dipole positions [m], shape (D, 3)."""
-
-    m_world: Array
-    """Dipole moments [A m^2], shape (D, 3)."""
-
-    b_uniform_nt: Array
-    """Uniform part B_0 in world axes [nT], shape (3,)."""
-
-    hard_iron_nt: Array
-    """Hard iron h of the robot, in base_link axes [nT], shape (3,)."""
-
-    soft_iron: Array
-    """Soft iron S of the robot [nT per nT], shape (3, 3)."""
-
+    p_world_dipole: Array  # Dipole positions [m], shape (D, 3)
+    m_world: Array  # Dipole moments [A m^2], shape (D, 3)
+    b_uniform_nt: Array  # Uniform part B_0 in world axes [nT], shape (3,)
+    hard_iron_nt: Array  # Hard iron h of the robot, in base_link axes [nT], shape (3,)
+    soft_iron: Array  # Soft iron S of the robot [nT per nT], shape (3, 3)
+    # Position l of the sensor in base_link, with its height above the floor as z [m], shape (3,)
     p_base_sensor: Array
-    """Position l of the sensor in base_link, with its height above the floor as z [m], shape (3,)."""
 
     def __post_init__(self) -> None:
         for name, shape in SHAPES.items():
             array = np.array(getattr(self, name), float)
-            fits = array.ndim == len(shape) and all(
-                w in (-1, g) for w, g in zip(shape, array.shape, strict=True)
-            )
+            fits = array.ndim == len(shape) and array.shape[1:] == shape[1:] and shape[0] in (-1, len(array))
             if not (fits and np.all(np.isfinite(array))):
-                raise InputError(
-                    f"{name} of HarmonicField must be finite, of shape {shape}, got {array.shape}"
-                )
+                text = f"{name} of HarmonicField must be finite, of shape {shape}"
+                raise InputError(f"{text}, got {array.shape}")
             array.flags.writeable = False
             object.__setattr__(self, name, array)
         if self.p_world_dipole.shape != self.m_world.shape:
@@ -81,74 +68,42 @@ class HarmonicField(Summarized):
         """Height of the sensor above the floor [m]."""
         return float(self.p_base_sensor[2])
 
-    def field_nt(self, p_world: ArrayLike) -> Array:
+    def field_nt(self, p_world: ArrayLike, *, compiled: bool = False) -> Array:
         """Field without the robot, in world axes.
 
         Args:
             p_world: Points above the dipoles [m], shape (..., 3).
+            compiled: Whether to use compiled code, equal up to rounding and faster for many points.
 
         Returns:
             Field [nT], shape (..., 3).
         """
-        return dipole_field_nt(p_world, self.p_world_dipole, self.m_world) + self.b_uniform_nt
+        sums = dipole_field_nt
+        if compiled:
+            from magtwin.field.sources import compiled_dipoles
 
-    def magnitude_nt(self, p_xy: ArrayLike, yaw: ArrayLike, *, height_m: float | None = None) -> Array:
+            sums = compiled_dipoles.dipole_field_nt
+        return sums(p_world, self.p_world_dipole, self.m_world) + self.b_uniform_nt
+
+    def magnitude_nt(
+        self, p_xy: ArrayLike, yaw: ArrayLike, *, height_m: float | None = None, compiled: bool = False
+    ) -> Array:
         """What the survey's robot reads at rest at a pose.
 
         Args:
             p_xy: Positions of base_link in world [m], shape (..., 2).
             yaw: Headings [rad], shape (...); the two shapes are broadcast.
             height_m: Height of the sensor above the floor [m]. Default: the survey's.
+            compiled: As for `field_nt`.
 
         Returns:
             Field magnitude [nT], shape (...).
         """
-        at, turn, _ = self._placed(p_xy, yaw, height_m)
-        b = rotate(quat_conjugate(turn), self.field_nt(at))
-        return np.asarray(np.linalg.norm(self._read(b), axis=-1))
-
-    def magnitude_with_gradient(
-        self, p_xy: ArrayLike, yaw: ArrayLike, *, height_m: float | None = None
-    ) -> tuple[Array, Array]:
-        """What the survey's robot reads, and its derivatives by position and heading; compiled.
-
-        With m = (1 + S) R^T B + h, d|m| = m . dm / |m|. In x and y, dm = (1 + S) R^T (dB/dx, dB/dy); in
-        heading, dm = (1 + S) (R^T dB (z x R l) - z x R^T B).
-
-        Args:
-            p_xy: Positions of base_link in world [m], shape (..., 2).
-            yaw: Headings [rad], shape (...); the two shapes are broadcast.
-            height_m: Height of the sensor above the floor [m]. Default: the survey's.
-
-        Returns:
-            Field magnitude [nT], as `magnitude_nt` up to rounding, shape (...), and its derivatives by x, y
-            [nT/m] and yaw [nT/rad], shape (..., 3).
-        """
-        from magtwin.field.sources.compiled_dipoles import dipole_field_and_gradient_nt
-
-        at, turn, place = self._placed(p_xy, yaw, height_m)
-        field, change = dipole_field_and_gradient_nt(at, self.p_world_dipole, self.m_world)
-        b = rotate(quat_conjugate(turn), field + self.b_uniform_nt)
-        swing = np.cross((0.0, 0.0, 1.0), place)
-        ways = [change[..., 0], change[..., 1], np.einsum("...ij,...j->...i", change, swing)]
-        moved = [rotate(quat_conjugate(turn), way) for way in ways]
-        moved[2] = moved[2] - np.cross((0.0, 0.0, 1.0), b)
-        read = self._read(b)
-        size = np.linalg.norm(read, axis=-1)
-        slopes = [np.sum(read * (way + way @ self.soft_iron.T), axis=-1) / size for way in moved]
-        return np.asarray(size), np.stack(slopes, axis=-1)
-
-    def _placed(self, p_xy: ArrayLike, yaw: ArrayLike, height_m: float | None) -> tuple[Array, Array, Array]:
-        """Sensor positions [m], shape (..., 3), the rotations, and the lever arms in world axes."""
         p, yaw = np.asarray(p_xy, float), np.asarray(yaw, float)
         shape = np.broadcast_shapes(p.shape[:-1], yaw.shape)
         turn = quat_from_yaw(np.broadcast_to(yaw, shape))
         place = self.p_base_sensor if height_m is None else np.array([*self.p_base_sensor[:2], height_m])
-        arm = rotate(turn, np.broadcast_to(place, (*shape, 3)))
-        at = arm.copy()
+        at = rotate(turn, np.broadcast_to(place, (*shape, 3)))
         at[..., :2] += p
-        return at, turn, arm
-
-    def _read(self, b_base: Array) -> Array:
-        """The field at the sensor including the robot's own, both in base_link axes."""
-        return b_base + b_base @ self.soft_iron.T + self.hard_iron_nt
+        b = rotate(quat_conjugate(turn), self.field_nt(at, compiled=compiled))
+        return np.asarray(np.linalg.norm(b + b @ self.soft_iron.T + self.hard_iron_nt, axis=-1))

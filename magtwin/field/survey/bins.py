@@ -99,29 +99,27 @@ LONGEST = 0.75
 BIN = 2 / 3  # Side of the squares in which passes are averaged, in depths of the first layer
 SECTORS = 4  # Heading sectors kept apart in a square
 MOST_BINS = 1800  # Most means of squares and sectors; the squares grow until there are so few
-
-WIDEN = 1.1
+WIDEN = 1.1  # Factor by which averaging distances grow
 
 
 def means(good: Readings, depth_m: float) -> tuple[NDArray[np.intp], bool]:
-    """Assign each reading to the mean that it belongs to.
+    """Index of each reading's mean, (N,), and whether consecutive means are consecutive parts of a drive.
 
     A reading of a gridded survey stands alone. Readings of a drive are averaged along the way. A long drive
     passes each place often; its readings are averaged by place and heading instead, since longer means along
-    the way would blur the field.
-
-    Args:
-        good: Good readings of a survey.
-        depth_m: Depth of the first layer of dipoles below the sensor [m].
-
-    Returns:
-        Index of each reading's mean, without gaps, shape (N,); and whether consecutive means are consecutive
-        parts of a drive.
+    the way would blur the field. Distances count in `depth_m`, that of the first layer of dipoles.
     """
     if good.node is not None:
         return np.arange(len(good)), False
     along = _along(good, CELL * depth_m, LONGEST * depth_m)
-    return (_in_squares(good, BIN * depth_m), False) if along is None else (along, True)
+    if along is not None:
+        return along, True
+    side = BIN * depth_m
+    while True:
+        bins, cell = bin_readings(good, side, sectors=SECTORS)
+        if len(bins.count) <= MOST_BINS:
+            return cell, False
+        side *= WIDEN
 
 
 def _along(good: Readings, way_m: float, longest_m: float) -> NDArray[np.intp] | None:
@@ -140,11 +138,3 @@ def _along(good: Readings, way_m: float, longest_m: float) -> NDArray[np.intp] |
             return cell
         way_m *= WIDEN
     return None
-
-
-def _in_squares(good: Readings, side_m: float) -> NDArray[np.intp]:
-    while True:
-        bins, cell = bin_readings(good, side_m, sectors=SECTORS)
-        if len(bins.count) <= MOST_BINS:
-            return np.asarray(cell)
-        side_m *= WIDEN

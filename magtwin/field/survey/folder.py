@@ -2,6 +2,7 @@
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -66,15 +67,20 @@ def _opened(
     headings_deg: tuple[float, ...] | None = None,
     unit: str = "nT",
     scale: float | None = None,
-    licence: str = "",
-    created: str = "",
-    height_m: float | None = None,
-    frame: str = "",
-    datum: str = "",
+    **about: Any,
 ) -> "tuple[list[_Layer], Readings]":
-    about = {"licence": licence, "created": created, "height_m": height_m, "frame": frame, "datum": datum}
-    layers = _read(folder, headings_deg, unit, scale)
-    return layers, _readings(layers, Path(folder), name, about)
+    folder = existing(folder, "survey folder")
+    if not folder.is_dir():
+        raise InputError(f"{folder}: not a folder; give the one that holds 0{SUFFIX}, 90{SUFFIX}, ...")
+    files: dict[float, Path] = {}
+    for path in sorted(folder.glob(f"*{SUFFIX}")):
+        heading = _heading(path)
+        if heading in files:
+            raise InputError(f"{path}: heading {heading:g} has two files, the other is {files[heading].name}")
+        files[heading] = path
+    _check_headings(folder, sorted(files), headings_deg)
+    layers = [_read_layer(files[heading], heading, unit, scale) for heading in sorted(files)]
+    return layers, _readings(layers, folder, name, about)
 
 
 def node_map(readings: Readings) -> AnomalyMap:
@@ -105,34 +111,22 @@ def node_map(readings: Readings) -> AnomalyMap:
         total = np.bincount(flat[rows], weights=readings.b_nt[rows], minlength=size)
         counts.append(np.maximum(count, 1).reshape(grid.shape))
         means.append(np.divide(total, count, out=np.full(size, np.nan), where=count > 0))
+    recorded = None
+    if len(flat) == size == len(np.unique(flat)):  # every node has exactly one reading
+        recorded = readings.yaw[np.argsort(flat)].reshape(grid.shape)
     valid = np.isfinite(means[0])
     errors = node_errors(readings, grid, means[0].reshape(grid.shape), valid.reshape(grid.shape))
     return AnomalyMap(
         values_nt=np.where(valid, *means).reshape(grid.shape),
         valid=valid.reshape(grid.shape),
         variance_nt2=errors.variance_nt2 / counts[0] if errors.estimated else None,
-        recorded_yaw=_recorded_yaw(readings, flat, grid),
+        recorded_yaw=recorded,
         origin_m=grid.origin_m,
         cell_m=grid.cell_m,
         headings_rad=np.asarray(grid.headings_rad),
-        name=readings.name,
         method=METHOD,
-        source=readings.source,
-        licence=readings.licence,
-        created=readings.created,
-        frame=readings.frame,
-        datum=readings.datum,
-        height_m=readings.height_m,
+        **readings.about,
     )
-
-
-def _recorded_yaw(readings: Readings, flat: NDArray[np.intp], grid: Grid) -> Array | None:
-    """Yaw of each node's reading, shape (H, Y, X); None unless every node has exactly one."""
-    if len(np.unique(flat)) < len(flat) or len(flat) < np.prod(grid.shape):
-        return None
-    yaw = np.empty(len(flat))
-    yaw[flat] = readings.yaw
-    return yaw.reshape(grid.shape)
 
 
 def write_survey(field: AnomalyMap, folder: str | os.PathLike[str], *, force: bool = False) -> list[Path]:
@@ -162,11 +156,11 @@ def write_survey(field: AnomalyMap, folder: str | os.PathLike[str], *, force: bo
     names = [f"{_degrees(heading)}{SUFFIX}" for heading in field.headings_rad]
     with output(folder, force=force) as aside:
         aside.mkdir()
+        x, y = np.meshgrid(field.x_m, field.y_m)
         for h, name in enumerate(names):
-            yaw = np.full(field.values_nt.shape[1:], field.headings_rad[h])
+            yaw = np.full(x.shape, field.headings_rad[h])
             if field.recorded_yaw is not None:
                 yaw = field.recorded_yaw[h]
-            x, y = np.meshgrid(field.x_m, field.y_m)
             rows = np.stack([x, y, yaw, field.values_nt[h]], axis=-1).reshape(-1, len(COLUMNS)).tolist()
             header = [f"# {','.join(COLUMNS)}", *header_lines(field, h)]
             lines = [*header, *(",".join(map(repr, row)) for row in rows)]
@@ -201,8 +195,12 @@ def read_survey(
     from magtwin.field.survey.stuck import mask_stuck
 
     layers, readings = _opened(folder, **options)
-    if _common(layers, "method") not in ("", METHOD):
-        field = _fitted(layers, readings)
+    parameters = _common(layers, "parameters") or {}
+    if (method := _common(layers, "method")) not in ("", METHOD):  # fitted before it was written
+        field = node_map(readings)
+        sd = np.square([layer.metadata.get(ERROR, math.nan) for layer in layers])
+        variance = np.broadcast_to(sd[:, None, None], field.grid.shape) if np.isfinite(sd).all() else None
+        field = replace(field, variance_nt2=variance, recorded_yaw=None, method=method, parameters=parameters)
         return field, _report(layers, field, folder, Report(""))
     masked, findings = mask_stuck(readings)
     if not (keep_stuck or masked.good.any()):
@@ -210,31 +208,12 @@ def read_survey(
             f"{folder}: all {len(readings)} readings are those of a sensor that was stuck; "
             "survey it again, or import them as they are with `keep_stuck=True`"
         )
-    field = node_map(readings if keep_stuck else masked)
-    field = replace(field, parameters=_common(layers, "parameters") or {})
+    field = replace(node_map(readings if keep_stuck else masked), parameters=parameters)
     return field, _report(layers, field, folder, findings)
 
 
-def _fitted(layers: "list[_Layer]", readings: Readings) -> AnomalyMap:
-    """A map that was fitted before it was written: its values are not tested for a stuck sensor."""
-    field = node_map(readings)
-    sd = [layer.metadata.get(ERROR, math.nan) for layer in layers]
-    variance = np.broadcast_to(np.square(sd)[:, None, None], field.values_nt.shape)
-    return replace(
-        field,
-        variance_nt2=variance if np.isfinite(variance).all() else None,
-        recorded_yaw=None,
-        method=_common(layers, "method"),
-        parameters=_common(layers, "parameters") or {},
-    )
-
-
 def _common(layers: "list[_Layer]", key: str) -> Any:
-    """Metadata from the files' comment lines; "" if there is none.
-
-    Raises:
-        InputError: Two files differ.
-    """
+    """Metadata from the files' comment lines, the same in all; "" if there is none."""
     given = [layer for layer in layers if key in layer.metadata]
     for other in given[1:]:
         if other.metadata[key] != given[0].metadata[key]:
@@ -247,8 +226,6 @@ def _common(layers: "list[_Layer]", key: str) -> Any:
 
 @dataclass(frozen=True)
 class _Layer:
-    """Rows of one file."""
-
     path: Path
     heading_deg: float
     lines: NDArray[np.intp]
@@ -257,23 +234,7 @@ class _Layer:
     theta: Array
     field: Array
     sha256: str
-    metadata: dict[str, Any]  # Metadata of its comment lines; see `magtwin.field.survey.header`
-
-
-def _read(
-    folder: str | os.PathLike[str], headings_deg: tuple[float, ...] | None, unit: str, scale: float | None
-) -> list[_Layer]:
-    folder = existing(folder, "survey folder")
-    if not folder.is_dir():
-        raise InputError(f"{folder}: not a folder; give the one that holds 0{SUFFIX}, 90{SUFFIX}, ...")
-    files: dict[float, Path] = {}
-    for path in sorted(folder.glob(f"*{SUFFIX}")):
-        heading = _heading(path)
-        if heading in files:
-            raise InputError(f"{path}: heading {heading:g} has two files, the other is {files[heading].name}")
-        files[heading] = path
-    _check_headings(folder, sorted(files), headings_deg)
-    return [_read_layer(files[heading], heading, unit, scale) for heading in sorted(files)]
+    metadata: dict[str, Any]  # of its comment lines, see `magtwin.field.survey.header`
 
 
 def _heading(path: Path) -> float:
@@ -294,29 +255,31 @@ def _check_headings(folder: Path, found: list[float], expected: tuple[float, ...
         others = sorted(p.name for p in folder.iterdir())[:3]
         seen = f"it holds {', '.join(others)}" if others else "it is empty"
         raise InputError(f"{folder}: no survey file in it, such as 0{SUFFIX}; {seen}")
+
+    def without(some: Sequence[float], others: Sequence[float]) -> list[float]:
+        return [h for h in some if not any(math.isclose(h, e, abs_tol=1e-9) for e in others)]
+
     if expected is None:
         least = min(np.diff([*found, found[0] + 360.0]))
         count = round(360 / min(least, WIDEST_DEG))
         expected = tuple(sorted((found[0] + 360 * k / count) % 360 for k in range(count)))
-        if not all(any(math.isclose(h, e, abs_tol=1e-9) for e in expected) for h in found):
+        if without(found, expected):
             raise InputError(
                 f"{folder}: headings {_degrees_of(found)} deg are not evenly spaced; "
                 "survey the missing ones, or name those that there are with headings_deg"
             )
-    missing = [e for e in expected if not any(math.isclose(h, e, abs_tol=1e-9) for h in found)]
-    if missing:
+    if missing := without(expected, found):
         raise InputError(
             f"{folder}: heading {_degrees_of(missing)} deg missing, found {_degrees_of(found)}; "
             f"expected {', '.join(f'{h:g}{SUFFIX}' for h in missing)}"
         )
-    beyond = [h for h in found if not any(math.isclose(h, e, abs_tol=1e-9) for e in expected)]
-    if beyond:
+    if beyond := without(found, expected):
         raise InputError(
             f"{folder}: heading {_degrees_of(beyond)} deg is not among the expected {_degrees_of(expected)}"
         )
 
 
-def _degrees_of(headings: list[float] | tuple[float, ...]) -> str:
+def _degrees_of(headings: Sequence[float]) -> str:
     return ", ".join(f"{h:g}" for h in headings)
 
 
@@ -331,12 +294,11 @@ def _read_layer(path: Path, heading_deg: float, unit: str, scale: float | None) 
     if tuple(word.strip() for word in first.lstrip("#").split(",")) != COLUMNS:
         raise InputError(f"{path}:1: must be the header '# {','.join(COLUMNS)}', got {first[:QUOTED]!r}")
     numbered = [(number, line) for number, line in enumerate(rest, 2) if line.strip()]
-    metadata = read_header(path, [(number, line) for number, line in numbered if line.startswith("#")])
-    lines = [(number, line) for number, line in numbered if not line.startswith("#")]
+    metadata = read_header(path, [row for row in numbered if row[1].startswith("#")])
+    lines = [row for row in numbered if not row[1].startswith("#")]
     if not lines:
         raise InputError(f"{path}: no rows below the header; expected one a node")
-    table = np.array([_row(path, number, line) for number, line in lines])
-    x, y, theta, field = table.T
+    x, y, theta, field = np.array([_row(path, number, line) for number, line in lines]).T
     field = nt_per(unit, scale) * field
     beyond = max(metadata.get(MASKED, []), default=0)
     if beyond >= len(x):
@@ -349,26 +311,23 @@ def _read_layer(path: Path, heading_deg: float, unit: str, scale: float | None) 
 
 
 def _row(path: Path, number: int, line: str) -> list[float]:
-    words = line.split(",")
+    words, where = line.split(","), f"{path}:{number}"
     if len(words) != len(COLUMNS):
-        raise InputError(
-            f"{path}:{number}: {len(COLUMNS)} values expected ({', '.join(COLUMNS)}), got {len(words)}"
-        )
+        columns = f"{len(COLUMNS)} values expected ({', '.join(COLUMNS)})"
+        raise InputError(f"{where}: {columns}, got {len(words)}")
     values = []
     for column, word in zip(COLUMNS, words, strict=True):
         try:
             value = float(word)
         except ValueError:
-            raise InputError(
-                f"{path}:{number}: {column} must be a number, got {word.strip()[:QUOTED]!r}"
-            ) from None
+            quoted = word.strip()[:QUOTED]
+            raise InputError(f"{where}: {column} must be a number, got {quoted!r}") from None
         if not math.isfinite(value):
-            raise InputError(
-                f"{path}:{number}: {column} is {value}; every node needs a finite value, measure it again"
-            )
+            text = "every node needs a finite value, measure it again"
+            raise InputError(f"{where}: {column} is {value}; {text}")
         values.append(value)
     if values[3] <= 0:
-        raise InputError(f"{path}:{number}: scalar_mag is a magnitude, above 0 nT, got {values[3]:g}")
+        raise InputError(f"{where}: scalar_mag is a magnitude, above 0 nT, got {values[3]:g}")
     return values
 
 
@@ -377,9 +336,10 @@ def _readings(layers: list[_Layer], folder: Path, name: str | None, about: dict[
     for layer, own in zip(layers, axes, strict=True):
         for label, first, axis in zip("xy", axes[0], own, strict=True):
             if len(first) != len(axis) or np.abs(first - axis).max() > GRAIN_M:
+                own_span, span = (f"{a[0]:g}..{a[-1]:g} m in {len(a)} nodes" for a in (axis, first))
                 raise InputError(
-                    f"{layer.path}: its grid differs from {layers[0].path.name}'s: {label} has "
-                    f"{_span(axis)}, there {_span(first)}; survey every heading on one grid"
+                    f"{layer.path}: its grid differs from {layers[0].path.name}'s: {label} has {own_span}, "
+                    f"there {span}; survey every heading on one grid"
                 )
     x, y = axes[0]
     grid = Grid(
@@ -391,9 +351,10 @@ def _readings(layers: list[_Layer], folder: Path, name: str | None, about: dict[
     )
     run = np.repeat(np.arange(len(layers)), [len(s.x) for s in layers])
     good = np.concatenate([~np.isin(np.arange(len(s.x)), s.metadata.get(MASKED, [])) for s in layers])
-    given = {key: _common(layers, key) if value in ("", None) else value for key, value in about.items()}
-    if given["height_m"] == "":
-        given["height_m"] = None
+    for key in ("licence", "created", "height_m", "frame", "datum"):
+        if about.get(key) in ("", None):
+            known = _common(layers, key)
+            about[key] = None if key == "height_m" and known == "" else known
     return Readings(
         p_xy=np.concatenate([np.column_stack([s.x, s.y]) for s in layers]),
         yaw=np.concatenate([s.theta for s in layers]),
@@ -405,7 +366,7 @@ def _readings(layers: list[_Layer], folder: Path, name: str | None, about: dict[
         good=good,
         name=(_common(layers, "name") or folder.resolve().name) if name is None else name,
         source="; ".join(f"{s.path.name} sha256:{s.sha256}" for s in layers),
-        **given,
+        **about,
     )
 
 
@@ -417,26 +378,18 @@ def _report(
     worst = max(range(len(layers)), key=lambda k: deviation[k].max())
     row = int(deviation[worst].argmax())
     layer = layers[worst]
+    where = f"{layer.path.name}:{layer.lines[row]}, at ({layer.x[row]:g}, {layer.y[row]:g}) m"
     repeated = int(np.count_nonzero(np.diff(field.values_nt, axis=2) == 0))
     every = np.concatenate(deviation)
-    return Report(
-        f"survey {folder}",
-        (
-            *field.report().figures,
-            Figure("median heading deviation", round(float(np.median(every)), 3), "deg"),
-            Figure(
-                "largest heading deviation",
-                round(float(every.max()), 3),
-                "deg",
-                note=f"{layer.path.name}:{layer.lines[row]}, at ({layer.x[row]:g}, {layer.y[row]:g}) m",
-            ),
-            Figure(
-                "repeated readings", repeated, note="equal to the one before in the row to the last digit"
-            ),
-            *findings.figures,
-        ),
-        {"files": {s.path.name: s.sha256 for s in layers}, **findings.metadata},
+    figures = (
+        *field.report().figures,
+        Figure("median heading deviation", round(float(np.median(every)), 3), "deg"),
+        Figure("largest heading deviation", round(float(every.max()), 3), "deg", note=where),
+        Figure("repeated readings", repeated, note="equal to the one before in the row to the last digit"),
+        *findings.figures,
     )
+    metadata = {"files": {s.path.name: s.sha256 for s in layers}, **findings.metadata}
+    return Report(f"survey {folder}", figures, metadata)
 
 
 def _axis(layer: _Layer, label: str, values: Array) -> Array:
@@ -455,10 +408,6 @@ def _axis(layer: _Layer, label: str, values: Array) -> Array:
             "a line of nodes is missing, or one lies off the grid"
         )
     return axis
-
-
-def _span(axis: Array) -> str:
-    return f"{axis[0]:g}..{axis[-1]:g} m in {len(axis)} nodes"
 
 
 def _nodes(layer: _Layer, x: Array, y: Array) -> NDArray[np.intp]:

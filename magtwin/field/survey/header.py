@@ -7,7 +7,6 @@ x,y,theta,scalar_mag`.
 import json
 import math
 import re
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -24,20 +23,16 @@ KEPT = (*(name for name in TEXTS if name != "source"), "height_m", "parameters")
 MASKED, ERROR = "masked_rows", "median_error_nt"
 
 _LINE = re.compile(r"#\s*(\w+):\s*(.*?)\s*$")
-_QUOTED = 60
+_QUOTED = 60  # Characters of a line that an error quotes
 
 
 def header_lines(field: AnomalyMap, heading: int) -> list[str]:
-    """Comment lines for the file of one heading: metadata, statistics and masked rows.
-
-    Args:
-        field: The map.
-        heading: Index of the heading.
+    """Comment lines for the file of one heading, by its index: metadata, statistics and masked rows.
 
     Raises:
         InputError: A parameter of the map cannot be written as JSON.
     """
-    figures = {name: value for name, value in asdict(statistics(field)[heading]).items() if _known(value)}
+    figures = {name: value for name, value in statistics(field, heading).items() if math.isfinite(value)}
     named = {name: getattr(field, name) for name in (*KEPT, "source")}
     metadata: dict[str, Any] = {name: value for name, value in named.items() if value not in ("", None)}
     metadata["parameters"] = dict(field.parameters)
@@ -53,11 +48,7 @@ def header_lines(field: AnomalyMap, heading: int) -> list[str]:
 
 
 def read_header(path: Path, lines: list[tuple[int, str]]) -> dict[str, Any]:
-    """Read the comment lines that an import restores; others are ignored.
-
-    Args:
-        path: The file, for errors.
-        lines: Line numbers and texts of its comment lines.
+    """Read the comment lines (number, text) that an import restores; others are ignored.
 
     Raises:
         InputError: A value is not JSON, has the wrong type, or its key occurs twice; with file and line.
@@ -97,10 +88,6 @@ def _fits(key: str, value: Any) -> bool:
         return whole and min(value, default=0) >= 0
     number = isinstance(value, int | float) and not isinstance(value, bool)
     return number and 0 <= value < math.inf
-
-
-def _known(value: object) -> bool:
-    return not isinstance(value, float) or math.isfinite(value)
 
 
 def _no_number(word: str) -> float:

@@ -69,11 +69,7 @@ class LocalFit:
         return cls(readings.p_xy, readings.yaw, whole, best.x, count)
 
     def left_out(self, rows: NDArray[np.intp], pool: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Compare readings with the prediction from their neighbours.
-
-        Args:
-            rows: Readings to predict, shape (R,).
-            pool: Readings that count as neighbours; a reading never predicts itself.
+        """Residuals of `rows` from the prediction by their neighbours in `pool`, without themselves.
 
         Returns:
             Residuals over their standard deviation, and residuals [nT], each of shape (R,).
@@ -83,14 +79,9 @@ class LocalFit:
         return residual / np.sqrt(variance), residual
 
     def together(self, rows: NDArray[np.intp], pool: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Predict a few readings jointly from their neighbours.
+        """Residuals of a few `rows` [nT], (R,), and their covariance with noise [nT^2], (R, R).
 
-        Args:
-            rows: Readings, none of them in `pool`.
-            pool: Readings that count as neighbours.
-
-        Returns:
-            Residuals [nT], shape (R,), and their covariance with noise [nT^2], shape (R, R).
+        The prediction is joint, from their neighbours in `pool`, which holds none of them.
         """
         far = np.linalg.norm(self.p_xy[pool] - self.p_xy[rows].mean(axis=0), axis=1)
         near = pool[np.argsort(far, kind="stable")[: self.count + len(rows)]]

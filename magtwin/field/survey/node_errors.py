@@ -45,12 +45,8 @@ def node_errors(readings: Readings, grid: Grid, values_nt: Array, read: Flags) -
     fitted to the squared differences, not below 0; on simulated surveys p is right within a tenth. With one
     heading, errors cannot be separated from the field's curvature, and p is 1 cm.
 
-    Args:
-        readings: A gridded survey.
-        grid: Its nodes.
-        values_nt: Mean reading of each node [nT], shape (H, Y, X), interpolated at nodes without one, else
-            nan.
-        read: Nodes with a good reading, shape (H, Y, X).
+    `values_nt` are the mean readings of the nodes, shape (H, Y, X), at nodes without one interpolated or nan;
+    `read` marks the nodes with a good reading.
     """
     headings = np.asarray(grid.headings_rad)
     order = min(2, (len(headings) - 1) // 2)

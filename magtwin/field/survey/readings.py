@@ -1,6 +1,6 @@
 """Readings: what a magnetometer measured at known poses, from which maps are made."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,59 +24,30 @@ class Readings(Summarized):
     A reading has a magnitude, a vector, or both. Arrays are copied and read-only.
     """
 
-    p_xy: Array
-    """Positions of base_link in world [m], shape (N, 2)."""
-
-    yaw: Array
-    """Recorded headings of the robot [rad], shape (N,)."""
-
+    p_xy: Array  # Positions of base_link in world [m], shape (N, 2)
+    yaw: Array  # Recorded headings of the robot [rad], shape (N,)
+    # Field magnitude [nT], shape (N,). Default: that of `b_body_nt`.
     b_nt: Array = None  # type: ignore[assignment]
-    """Field magnitude [nT], shape (N,). Default: that of `b_body_nt`."""
-
+    # Field in the robot's axes, forward, left, up [nT], shape (N, 3); None if only magnitudes are known
     b_body_nt: Array | None = None
-    """Field in the robot's axes, forward, left, up [nT], shape (N, 3); None if only magnitudes are known."""
-
+    # Index into `runs` of each row, shape (N,). Default: 0.
     run: NDArray[np.intp] = None  # type: ignore[assignment]
-    """Index into `runs` of each row, shape (N,). Default: 0."""
-
-    runs: tuple[str, ...] = ("",)
-    """Names of the runs or files that the rows come from."""
-
-    t: Array | None = None
-    """Time of each row in its run [s], shape (N,); None if unknown."""
-
+    runs: tuple[str, ...] = ("",)  # Names of the runs or files that the rows come from
+    t: Array | None = None  # Time of each row in its run [s], shape (N,); None if unknown
+    # Rows that are field, not a stuck sensor, shape (N,). Default: all.
     good: NDArray[np.bool_] = None  # type: ignore[assignment]
-    """Rows that are field, not a stuck sensor, shape (N,). Default: all."""
-
-    grid: Grid | None = None
-    """Nodes of a gridded survey; None for a scattered one."""
-
+    grid: Grid | None = None  # Nodes of a gridded survey; None for a scattered one
+    # Heading, row and column of each row's node, shape (N, 3); given with `grid`
     node: NDArray[np.intp] | None = None
-    """Heading, row and column of each row's node, shape (N, 3); given with `grid`."""
-
-    height_m: float | None = None
-    """Height of the sensor above the floor [m]; None if unknown."""
-
-    name: str = ""
-    """Name of the survey."""
-
-    source: str = ""
-    """Files that the rows come from, with checksums."""
-
-    licence: str = ""
-    """SPDX name of their licence."""
-
-    created: str = ""
-    """Day of the survey, YYYY-MM-DD; "" if unknown."""
-
-    frame: str = ""
-    """Axes of x, y and heading, such as "world: x east, y north, z up"; "" if unknown."""
-
-    datum: str = ""
-    """Origin of that frame in the room or on Earth; "" if unknown."""
-
+    height_m: float | None = None  # Height of the sensor above the floor [m]; None if unknown
+    name: str = ""  # Name of the survey
+    source: str = ""  # Files that the rows come from, with checksums
+    licence: str = ""  # SPDX name of their licence
+    created: str = ""  # Day of the survey, YYYY-MM-DD; "" if unknown
+    frame: str = ""  # Axes of x, y and heading, such as "world: x east, y north, z up"; "" if unknown
+    datum: str = ""  # Origin of that frame in the room or on Earth; "" if unknown
+    # The Earth's field in that frame [nT]; None if unknown
     earth_nt: tuple[float, float, float] | None = None
-    """The Earth's field in that frame [nT]; None if unknown."""
 
     def __post_init__(self) -> None:
         p = np.asarray(self.p_xy, float)
@@ -108,25 +79,20 @@ class Readings(Summarized):
         beyond = np.argwhere(np.abs(self.p_xy) > FARTHEST_M)
         if len(beyond):
             row = int(beyond[0][0])
-            raise InputError(
-                f"p_xy of Readings lies within {FARTHEST_M:g} m of the origin, got {self.p_xy[row]} in row "
-                f"{row}"
-            )
+            text = f"p_xy of Readings lies within {FARTHEST_M:g} m of the origin"
+            raise InputError(f"{text}, got {self.p_xy[row]} in row {row}")
         if not np.all(self.b_nt > 0):
-            raise InputError(
-                f"b_nt of Readings is a magnitude, above 0 nT, got {self.b_nt.min():g} in row "
-                f"{self.b_nt.argmin()}"
-            )
+            row = int(self.b_nt.argmin())
+            least = f"{self.b_nt[row]:g} in row {row}"
+            raise InputError(f"b_nt of Readings is a magnitude, above 0 nT, got {least}")
         if self.height_m is not None and not 0 <= self.height_m < np.inf:
-            raise InputError(
-                f"height_m of Readings is a height above the floor, 0 m or more, got {self.height_m!r}"
-            )
+            text = "height_m of Readings is a height above the floor, 0 m or more"
+            raise InputError(f"{text}, got {self.height_m!r}")
         if self.earth_nt is not None:
             object.__setattr__(self, "earth_nt", checked_earth_nt(self.earth_nt))
         if not (self.run.min() >= 0 and self.run.max() < len(self.runs)):
-            raise InputError(
-                f"run of Readings must index runs ({len(self.runs)}), got {self.run.min()}..{self.run.max()}"
-            )
+            text = f"run of Readings must index runs ({len(self.runs)})"
+            raise InputError(f"{text}, got {self.run.min()}..{self.run.max()}")
         check_texts(self, TEXTS)
         if (self.grid is None) != (self.node is None):
             raise InputError("Readings of a gridded survey need both grid and node, got one of them")
@@ -138,12 +104,17 @@ class Readings(Summarized):
     def __len__(self) -> int:
         return len(self.p_xy)
 
+    @property
+    def about(self) -> dict[str, Any]:
+        """Metadata that a map of the readings shares, by name."""
+        return {name: getattr(self, name) for name in (*TEXTS, "height_m")}
+
     def take(self, rows: ArrayLike) -> "Readings":
         """Select readings by their indices, or by flags of shape (N,)."""
         index = np.asarray(rows)
-        given = {f.name: getattr(self, f.name) for f in fields(self)}
-        some: dict[str, Any] = {k: None if given[k] is None else given[k][index] for k in SHAPES}
-        return Readings(**{**given, **some})
+        given = {name: getattr(self, name) for name in SHAPES}
+        some: dict[str, Any] = {k: None if rows is None else rows[index] for k, rows in given.items()}
+        return replace(self, **some)
 
     def report(self) -> Report:
         """Statistics of the good readings."""
@@ -164,7 +135,7 @@ class Readings(Summarized):
 
     def with_(self, **changes: Any) -> "Readings":
         """A copy with other values of some fields, such as `good`."""
-        return Readings(**{**{f.name: getattr(self, f.name) for f in fields(self)}, **changes})
+        return replace(self, **changes)
 
     def _summary(self) -> Summary:
         good = self.b_nt[self.good] if self.good.any() else self.b_nt
@@ -173,17 +144,14 @@ class Readings(Summarized):
         about = [self.created or "day unknown"]
         about.append("height unknown" if self.height_m is None else f"sensor at {self.height_m:.3g} m")
         about += [text for text in (self.licence, self.frame) if text]
+        vectors = "" if self.b_body_nt is None else ", with vectors"
         gridded = "" if self.grid is None else f", on a grid of {' x '.join(map(str, self.grid.shape))}"
         return Summary(
             f"Readings {self.name or 'without a name'}: {len(self):,} rows"
             + (f", {bad:,} of them not field" if bad else ""),
             (
                 ("over", rectangle(x0, x1, y0, y1) + gridded),
-                (
-                    "field",
-                    f"{span(good.min(), good.max(), 'nT')}, mean {good.mean():,.0f} nT"
-                    + (", with vectors" if self.b_body_nt is not None else ""),
-                ),
+                ("field", f"{span(good.min(), good.max(), 'nT')}, mean {good.mean():,.0f} nT{vectors}"),
                 ("runs", f"{len(self.runs):,}: {listed(self.runs)}" if any(self.runs) else ""),
                 ("known", ", ".join(about)),
                 ("source", self.source),
@@ -199,9 +167,8 @@ def checked_earth_nt(earth_nt: ArrayLike) -> tuple[float, float, float]:
     """The Earth's field in world axes [nT]; InputError unless it is three finite numbers, not all 0."""
     field = np.asarray(earth_nt, float)
     if field.shape != (3,) or not np.all(np.isfinite(field)) or not np.any(field):
-        raise InputError(
-            f"earth_nt must be three numbers [nT], those of the world's x, y and z, got {earth_nt!r}"
-        )
+        text = "earth_nt must be three numbers [nT], those of the world's x, y and z"
+        raise InputError(f"{text}, got {earth_nt!r}")
     x, y, z = field.tolist()
     return x, y, z
 

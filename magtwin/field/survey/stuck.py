@@ -38,6 +38,7 @@ from magtwin.report import Figure, Report
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
+Flags = NDArray[np.bool_]
 
 FALSE_FROZEN = 0.01  # Share of frozen stretches that are false, and of sound surveys that show any
 FALSE_FLAT = 0.01  # Expected number of sound flat stretches per survey that are masked
@@ -75,8 +76,8 @@ def mask_stuck(readings: Readings) -> tuple[Readings, Report]:
 class Findings:
     """What is wrong with which readings."""
 
-    frozen: NDArray[np.bool_]  # Repeats to the last digit, shape (N,)
-    stuck: NDArray[np.bool_]  # At the level of a sensor that lost lock, shape (N,); may also be frozen
+    frozen: Flags  # Repeats to the last digit, shape (N,)
+    stuck: Flags  # At the level of a sensor that lost lock, shape (N,); may also be frozen
     doubt: Array  # Probability that a stuck reading is field, shape (N,); 0 if it is not stuck
     outlier: Array  # Difference from the neighbours' prediction [nT], shape (N,); 0 if it is not unusual
     level_nt: float | None  # Level of the stuck sensor; None if no stretches agree on one
@@ -92,14 +93,11 @@ class Findings:
         ]
         metadata: dict[str, object] = {}
         if self.level_nt is not None:
-            figures.append(
-                Figure("stuck level", round(self.level_nt, 1), "nT", spread=round(self.spread_nt, 1))
-            )
+            level, spread = round(self.level_nt, 1), round(self.spread_nt, 1)
+            figures.append(Figure("stuck level", level, "nT", spread=spread))
         if masked.any():
-            doubt = float(self.doubt[masked].sum())
-            figures.append(
-                Figure("masked falsely", round(doubt, 2), "readings", note="expected number of them")
-            )
+            doubt = round(float(self.doubt[masked].sum()), 2)
+            figures.append(Figure("masked falsely", doubt, "readings", note="expected number of them"))
             if readings.grid is not None and readings.node is not None:
                 at = np.zeros(readings.grid.shape, bool)
                 at[tuple(readings.node[masked].T)] = True
@@ -121,9 +119,7 @@ class Findings:
             metadata["note"] = f"fewer than {LEAST} good readings: only repeats were looked for"
         if len(outliers):
             first = outliers[np.argsort(-np.abs(self.outlier[outliers]), kind="stable")][:NAMED]
-            metadata["outliers"] = [
-                _place_and_size(readings, int(row), float(self.outlier[row])) for row in first
-            ]
+            metadata["outliers"] = [_place_and_size(readings, row, self.outlier[row]) for row in first]
         return Report(f"stuck and outlying readings of {readings.name}", tuple(figures), metadata)
 
 
@@ -248,10 +244,7 @@ def _stretches(flags: NDArray[np.bool_]) -> list[slice]:
 
 def _level(levels: Array, b_nt: Array) -> tuple[float | None, float]:
     """Level on which at least three frozen stretches agree, and its spread [nT]; None if there is none."""
-    if len(levels) < 3:
-        return None, 0.0
-    spread = deviation(levels)
-    if spread > deviation(b_nt) / 10:
+    if len(levels) < 3 or (spread := deviation(levels)) > deviation(b_nt) / 10:
         return None, 0.0
     gap = float(np.diff(levels).min())
     return float(np.median(levels)), max(spread, gap)
@@ -295,9 +288,8 @@ def _flats(readings: Readings, sound: NDArray[np.bool_]) -> list[Rows]:
         b, p = readings.b_nt[rows], readings.p_xy[rows]
         if len(rows) < 8:
             continue
-        band = (
-            6 * deviation(np.diff(b, 2)) / np.sqrt(6)
-        )  # second differences have 6 times the noise's variance
+        # second differences have 6 times the noise's variance
+        band = 6 * deviation(np.diff(b, 2)) / np.sqrt(6)
         at = 0
         while at < len(rows) - 1:
             end, low, high = at, b[at], b[at]
@@ -337,13 +329,7 @@ def _places(readings: Readings, rows: NDArray[np.bool_]) -> list[Rows]:
 
 
 def _odds(
-    cells: Readings,
-    places: list[Rows],
-    known: NDArray[np.bool_],
-    fit: LocalFit,
-    pool: Rows,
-    level: float,
-    spread: float,
+    cells: Readings, places: list[Rows], known: Flags, fit: LocalFit, pool: Rows, level: float, spread: float
 ) -> tuple[Array, float, float]:
     """Probability that each place is stuck, with the level and its spread.
 
@@ -357,10 +343,9 @@ def _odds(
     for _ in range(ROUNDS):
         share = sum(p * len(cell) for p, cell in zip(sure, places, strict=True)) / len(cells)
         share = min(max(share, 1 / len(cells)), 0.5)
-        stuck = [
-            float(np.sum(_log_t1((cells.b_nt[cell] - level) / spread) - np.log(spread))) for cell in held
-        ]
-        odds = np.log(share / (1 - share)) + np.array(stuck) - field
+        scaled = [(cells.b_nt[cell] - level) / spread for cell in held]
+        stuck = np.array([float(np.sum(_log_t1(z) - np.log(spread))) for z in scaled])
+        odds = np.log(share / (1 - share)) + stuck - field
         sure = 1 / (1 + np.exp(-np.clip(odds, -500, 500)))
         on_level = np.concatenate([cells.b_nt[cell] for p, cell in zip(sure, held, strict=True) if p >= SURE])
         if len(on_level) >= 3:
@@ -431,7 +416,6 @@ def _spikes(b: Array) -> Array:
 
 
 def _place_and_size(readings: Readings, row: int, off_nt: float) -> str:
-    """Place and size of an outlier, as text."""
     x, y = readings.p_xy[row]
     run = readings.runs[readings.run[row]]
     return (

@@ -20,10 +20,11 @@ from magtwin.io.bags.topics import Topic
 from magtwin.io.bags.types import layout
 from magtwin.io.bags.writer import CUSTOM, NOTE
 from magtwin.io.recorder import PARTIAL, partial_of
+from magtwin.run.arrow import check_metadata
 from magtwin.run.resample import linear, quaternion
+from magtwin.run.run import Metadata
 
 Array = NDArray[np.float64]
-Metadata = dict[str, str | int | float | bool]
 
 LARGEST_METADATA = 1 << 24
 """Largest metadata.yaml that is read [bytes]."""
@@ -90,10 +91,8 @@ class Bag:
 
     def metadata(self) -> Metadata:
         """The metadata of the run that magtwin wrote; empty for other bags."""
-        custom = {
-            key.removeprefix(CUSTOM): text for key, text in self._custom.items() if key.startswith(CUSTOM)
-        }
-        return check_metadata({key: json.loads(text) for key, text in custom.items()})
+        texts = {key.removeprefix(CUSTOM): t for key, t in self._custom.items() if key.startswith(CUSTOM)}
+        return check_metadata({key: json.loads(text) for key, text in texts.items()})
 
     def messages(self, topics: Iterable[str]) -> dict[str, Messages]:
         """The messages of topics, each in the order of receipt."""
@@ -109,13 +108,7 @@ class Bag:
         return {topic: _joined(found) for topic, found in parts.items()}
 
     def signal(self, name: str, topic: Topic, messages: Messages) -> "Signal":
-        """The messages of a topic, decoded.
-
-        Args:
-            name: Name of the topic in this bag.
-            topic: What to read from it.
-            messages: Its messages.
-        """
+        """The messages of a topic, decoded; `name` is the topic's name in this bag."""
         kind = self.kinds[name]
         leaves = layout(kind)
         stamped = leaves[0].name == "header.stamp"
@@ -241,16 +234,6 @@ def poses_at(t: Array, pose_t: Array, pose: Array) -> tuple[Array, Array, NDArra
     share = np.clip(part, 0, 1)
     q = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
     return linear(pose[:, :3], low, share), quaternion(q, low, share), inside
-
-
-def check_metadata(metadata: Any) -> Metadata:
-    """Metadata, if they are texts and numbers by name."""
-    if not isinstance(metadata, dict):
-        raise InputError("its metadata are not a table")
-    for key, value in metadata.items():
-        if not isinstance(value, str | int | float | bool):
-            raise InputError(f"metadata {key!r} is neither a text nor a number")
-    return metadata
 
 
 @contextmanager

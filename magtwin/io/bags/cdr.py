@@ -154,10 +154,9 @@ def decode(leaves: Sequence[Leaf], messages: Messages, wanted: Iterable[str]) ->
     """
     left, values_of = set(wanted), {}
     body, room = messages.start + HEADER, messages.size - HEADER
-    if len(room) and room.min() < 0:
+    if np.any(room < 0):
         raise InputError("a message of less than 4 bytes")
-    head = messages.buffer[messages.start + 1] if len(room) else np.ones(0)
-    if np.any(head != 1) or np.any(messages.buffer[messages.start] != 0):
+    if np.any(messages.buffer[messages.start + 1] != 1) or np.any(messages.buffer[messages.start] != 0):
         raise InputError("messages are not plain little-endian CDR")
     at = np.zeros(len(messages), np.int64)
     for leaf in leaves:

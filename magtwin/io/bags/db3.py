@@ -95,9 +95,8 @@ class RosbagsReader:
         for number, (times, contents) in found.items():
             size = np.array([len(content) for content in contents], np.int64)
             buffer = np.frombuffer(b"".join(contents), np.uint8)
-            joined[number] = Messages(
-                np.array(times, np.int64), buffer, np.cumsum(size) - size, size
-            ).in_order()
+            moments = np.array(times, np.int64)
+            joined[number] = Messages(moments, buffer, np.cumsum(size) - size, size).in_order()
         return joined
 
 

@@ -158,7 +158,8 @@ class McapWriter:
                 if len(at):
                     rows = slice(done[k], done[k] + len(at))
                     done[k] = rows.stop
-                    _scatter(batch.rows[rows], content, at)
+                    kind = f"V{batch.rows.shape[1]}"
+                    _windows(content, kind)[at] = batch.rows[rows].view(kind)[:, 0]
                     entries = np.stack([batch.received[rows], at], axis=1)
                     index.setdefault(batch.connection.id, []).append(entries)
             yield times[first:last], content, {c: np.concatenate(parts) for c, parts in index.items()}
@@ -203,17 +204,10 @@ def _fill_heads(batch: Batch) -> None:
     batch.rows[:, :ROOM] = heads.view(np.uint8).reshape(count, ROOM)
 
 
-def _scatter(rows: Bytes, out: Bytes, at: Index) -> None:
-    """Copy each row of (M, S) to its offset in `out`."""
-    size = rows.shape[1]
-    places = np.ndarray((len(out) - size + 1,), f"V{size}", out, 0, (1,))
-    places[at] = rows.view(f"V{size}")[:, 0]
-
-
-def _look(kind: str, content: Bytes, at: Index) -> Any:
-    """Numbers of a kind at offsets."""
+def _windows(content: Bytes, kind: str) -> NDArray[Any]:
+    """The bytes from each offset on, as numbers of a kind."""
     size = np.dtype(kind).itemsize
-    return np.ndarray((max(len(content) - size + 1, 0),), kind, content, 0, (1,))[at]
+    return np.ndarray((max(len(content) - size + 1, 0),), kind, content, 0, (1,))
 
 
 class McapReader:
@@ -330,8 +324,8 @@ class McapReader:
                 self._learn(opcode, bytes(raw[at + 9 : after]))
             at = after
         start = np.array(places, np.int64)
-        columns = (_look("<u2", content, start + 9), _look("<u8", content, start + 15))
-        sizes = _look("<u8", content, start + 1).astype(np.int64) - (ROOM - 9)
+        sizes = _windows(content, "<u8")[start + 1].astype(np.int64) - (ROOM - 9)
+        columns = _windows(content, "<u2")[start + 9], _windows(content, "<u8")[start + 15]
         return np.stack([*(c.astype(np.int64) for c in columns), start + ROOM, sizes], axis=1)
 
     def _content(self, place: int, length: int) -> Bytes:

@@ -13,8 +13,8 @@ from magtwin.errors import InputError, find
 from magtwin.field.units import NT_PER, Unit
 from magtwin.files import sha256
 from magtwin.frames import canonical, quat_conjugate, rotate, yaw_from_quat
-from magtwin.io.bags.bag import Bag, Metadata, Signal, check_metadata, field_nt, poses_at, unit_of
-from magtwin.io.bags.cdr import NS, Index, Messages, decode
+from magtwin.io.bags.bag import Bag, Signal, field_nt, poses_at, unit_of
+from magtwin.io.bags.cdr import NS, Index, decode
 from magtwin.io.bags.sender import Sender
 from magtwin.io.bags.topics import (
     BATTERY,
@@ -32,7 +32,7 @@ from magtwin.io.bags.topics import (
     Topic,
 )
 from magtwin.io.bags.types import layout
-from magtwin.run.arrow import spec_said
+from magtwin.run.arrow import check_metadata, spec_said
 from magtwin.run.run import COLUMNS, Column, Run
 
 Array = NDArray[np.float64]
@@ -46,12 +46,7 @@ GRAVITY = 9.80665
 RECORDED = (MAGNITUDE, POSE, ODOMETRY, IMU, BATTERY, COMMAND, JOINTS, SCAN, VECTOR)
 """Topics that are read from a robot's recording."""
 
-_DTYPES = (
-    "bool",
-    *(f"{kind}{size}" for kind in ("int", "uint") for size in (8, 16, 32, 64)),
-    "float32",
-    "float64",
-)
+_DTYPES = {"bool", "float32", "float64", *(f"{k}int{n}" for k in ("", "u") for n in (8, 16, 32, 64))}
 
 
 def read_bag(
@@ -107,18 +102,16 @@ def _own(bag: Bag) -> Run:
     if not texts:
         raise InputError(f"{bag.path}: a recording into which nothing was written yet")
     table = json.loads(texts[0])
-    if len(rows):
-        data = decode(layout(READING.kind), rows, ["data"])["data"]
-    else:
+    data = decode(layout(READING.kind), rows, ["data"])["data"]
+    if not len(rows):
         data = np.zeros((0, sum(int(column["width"] or 1) for column in table["columns"])))
     names = {str(column["topic"]) for column in table["columns"] if "topic" in column}
     topics = [find("topic", name, TOPICS) for name in names]
     _check_kinds(bag, topics)
     carried: dict[str, NDArray[Any]] = {}
     for topic in topics:
-        carried |= _carried(
-            bag.signal(topic.name, topic, messages[topic.name]), rows.received, str(table["unit"])
-        )
+        signal = bag.signal(topic.name, topic, messages[topic.name])
+        carried |= _carried(signal, rows.received, str(table["unit"]))
     columns: dict[str, NDArray[Any]] = {}
     specs: dict[str, Column] = {}
     for column in table["columns"]:
@@ -203,7 +196,7 @@ def _recorded(bag: Bag, names: Mapping[str, str], unit: Unit | None) -> Run:
     columns: dict[str, NDArray[Any]] = {"t": t, "b_measured_nt": field.b_nt[first]}
     if field.vector_nt is not None:
         columns["b_vector_measured_nt"] = field.vector_nt[first]
-    metadata: Metadata = {"bag": path.name, "bag_sha256": " ".join(sha256(file) for file in bag.files)}
+    metadata: dict[str, Any] = {"bag": path.name, "bag_sha256": " ".join(sha256(file) for file in bag.files)}
     metadata |= {"clock": clock.name, "stamps": "header" if by_header else "receipt", "start_ns": str(start)}
     metadata |= {"field_unit": field.label, "field_unit_told": "given" if unit else "by its size"}
     for signal in signals.values():
@@ -234,19 +227,18 @@ def _signals(bag: Bag, names: Mapping[str, str]) -> dict[Topic, Signal]:
                 f"{bag.path}: topic {name} is a {bag.kinds[name]}; it must be {' or '.join(topic.reads)}"
             )
         chosen[topic] = name
-    messages: dict[str, Messages] = bag.messages(chosen.values())
+    messages = bag.messages(chosen.values())
+    signals = {}
     for topic, name in chosen.items():
-        if not len(messages[name]) and (topic is MAGNITUDE or topic.name in names):
+        if len(messages[name]):
+            signals[topic] = bag.signal(name, topic, messages[name])
+        elif topic is MAGNITUDE or topic.name in names:
             raise InputError(f"{bag.path}: topic {name} has no message")
-    return {
-        topic: bag.signal(name, topic, messages[name])
-        for topic, name in chosen.items()
-        if len(messages[name])
-    }
+    return signals
 
 
 def _columns(
-    signal: Signal, when: Array, t: Array, metadata: Metadata, path: Path
+    signal: Signal, when: Array, t: Array, metadata: dict[str, Any], path: Path
 ) -> dict[str, NDArray[Any]]:
     """The columns of a slower signal, held causally at the times of readings [s]."""
     at = np.searchsorted(when, t, side="right") - 1
@@ -259,11 +251,10 @@ def _columns(
     values = signal.columns()
     if signal.topic is VECTOR:
         size = np.linalg.norm(values["magnetic_field"], axis=1)
-        if not np.isfinite(size).any():
+        size = size[np.isfinite(size)]
+        if not len(size):
             return {}
-        unit = unit_of(
-            float(size[np.isfinite(size)].mean()), str(path), signal.name
-        )  # may differ from the clock's
+        unit = unit_of(float(size.mean()), str(path), signal.name)  # may differ from the clock's
         metadata["vector_unit"] = unit
         values = {"b_vector_measured_nt": values["magnetic_field"] * NT_PER[unit]}
     for name in values.keys() & {"mocap_q_xyzw", "imu_q_xyzw"}:

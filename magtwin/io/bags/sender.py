@@ -77,24 +77,14 @@ class Sender:
     """The robot's URDF; "" if unknown."""
 
 
-def sender_of(
-    robot: RobotSpec,
-    *,
-    unit: Unit = "T",
-    rate_hz: float | None = None,
-    links: tuple[FixedFrame, ...] = (),
-    wheels: tuple[FixedFrame, FixedFrame] | None = None,
-    description: str = "",
-) -> Sender:
+def sender_of(robot: RobotSpec, *, unit: Unit = "T", rate_hz: float | None = None, **rest: Any) -> Sender:
     """The sender of a robot's messages.
 
     Args:
         robot: Its sensors and drive.
         unit: Unit of magnetic fields in messages.
         rate_hz: Rate of the magnetometer [Hz]. Default: the robot's.
-        links: Links fixed in base_link.
-        wheels: The left and the right wheel at rest.
-        description: Its URDF.
+        rest: `links`, `wheels` and `description` of the sender.
     """
     mounts = {"magnetometer": robot.magnetometer, "imu": robot.imu, "lidar": robot.lidar}
     frames, tilted = {}, []
@@ -119,9 +109,7 @@ def sender_of(
         vector_std_nt=robot.magnetometer.vector_noise_density_nt * float(np.sqrt(rate / 2)),
         scan_rate_hz=robot.lidar.scan_rate_hz,
         range_m=(robot.lidar.range_min_m, robot.lidar.range_max_m),
-        links=(*links, *tilted),
-        wheels=wheels,
-        description=description,
+        **{**rest, "links": (*rest.get("links", ()), *tilted)},
     )
 
 
@@ -140,21 +128,18 @@ def sender_for(twin: "Twin | None", unit: Unit, rate_hz: Any = None) -> Sender:
 
     robot = twin.scene.robot
     joints = (robot.drive.left_wheel_joint, robot.drive.right_wheel_joint)
-    fixed, wheels = [], {}
+    frames: dict[str, FixedFrame] = {}  # by joint; links that do not turn by name
     for link in read_links(robot.asset).values():
-        if link.name == BASE_LINK:
-            continue
-        axis = link.axis_link or (0.0, 0.0, 1.0)
-        frame = FixedFrame(BASE_LINK, link.name, link.p_base_link, link.q_base_link_xyzw, axis)
-        if link.joint in joints:
-            wheels[link.joint] = frame
-        else:
-            fixed.append(frame)
+        if link.name != BASE_LINK:
+            axis = link.axis_link or (0.0, 0.0, 1.0)
+            frame = FixedFrame(BASE_LINK, link.name, link.p_base_link, link.q_base_link_xyzw, axis)
+            frames[link.joint if link.joint in joints else f"/{link.name}"] = frame
+    wheels = tuple(frames.pop(joint) for joint in joints if joint in frames)
     return sender_of(
         robot,
         unit=unit,
         rate_hz=float(rate_hz) if isinstance(rate_hz, int | float) and rate_hz > 0 else None,
-        links=tuple(fixed),
-        wheels=(wheels[joints[0]], wheels[joints[1]]) if len(wheels) == 2 else None,
+        links=tuple(frames.values()),
+        wheels=wheels if len(wheels) == 2 else None,
         description=read_description(robot.asset),
     )

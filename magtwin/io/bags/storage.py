@@ -24,11 +24,6 @@ ROOM = 31
 """Bytes left free before each message of a batch, for the head of an MCAP message record."""
 
 
-class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
-
-
 @dataclass(frozen=True)
 class Connection:
     """A topic of a bag that is written."""
@@ -51,18 +46,11 @@ class Connection:
         """The quality of service as a `rosbags.interfaces.Qos`, with infinite durations."""
         from rosbags import interfaces as ros
 
-        infinite = ros.QosTime(9223372036, 854775807)
-        return ros.Qos(
-            ros.QosHistory.KEEP_LAST,
-            self.qos.depth,
-            ros.QosReliability.RELIABLE if self.qos.reliable else ros.QosReliability.BEST_EFFORT,
-            ros.QosDurability.TRANSIENT_LOCAL if self.qos.latched else ros.QosDurability.VOLATILE,
-            infinite,
-            infinite,
-            ros.QosLiveliness.AUTOMATIC,
-            infinite,
-            avoid_ros_namespace_conventions=False,
-        )
+        infinite, qos = ros.QosTime(9223372036, 854775807), self.qos
+        reliability = ros.QosReliability.RELIABLE if qos.reliable else ros.QosReliability.BEST_EFFORT
+        durability = ros.QosDurability.TRANSIENT_LOCAL if qos.latched else ros.QosDurability.VOLATILE
+        kept = (ros.QosHistory.KEEP_LAST, qos.depth, reliability, durability)
+        return ros.Qos(*kept, infinite, infinite, ros.QosLiveliness.AUTOMATIC, infinite, False)
 
     @cached_property
     def offered_qos(self) -> str:
@@ -105,12 +93,7 @@ def bag_metadata(
 ) -> dict[str, Any]:
     """The content of metadata.yaml, below `rosbag2_bagfile_information`, of a bag of one MCAP file.
 
-    Args:
-        file: Name of the storage file.
-        connections: Topics.
-        counts: Messages by connection.
-        span: Times of the first and the last message [ns].
-        custom: Custom data, texts by name.
+    `counts` are messages by connection; `span` are the times of the first and the last message [ns].
     """
     count = sum(counts.values())
     begin = {"nanoseconds_since_epoch": span[0] if count else 0}
@@ -147,7 +130,8 @@ def bag_metadata(
 
 def to_yaml(content: Any) -> str:
     """YAML text of plain data."""
-    return yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=2**30)
+    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+    return yaml.dump(content, Dumper=dumper, sort_keys=False, allow_unicode=True, width=2**30)
 
 
 def in_time(batches: Sequence[Batch]) -> tuple[Index, NDArray[np.intp]]:

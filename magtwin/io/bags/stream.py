@@ -14,7 +14,7 @@ from magtwin.io.bags.cdr import NS, Index
 from magtwin.io.bags.sender import Sender
 from magtwin.io.bags.topics import DESCRIPTION, NAMES, READING, SCAN, TF_STATIC, TOPICS, Columns, Topic
 from magtwin.run.arrow import check_clock
-from magtwin.run.run import Run
+from magtwin.run.run import Run, check_numbers
 
 if TYPE_CHECKING:
     from magtwin.sim.sensors.lidar import Scans
@@ -44,7 +44,19 @@ Sent = tuple[Topic, Index, dict[str, Any]]
 
 
 class Stream:
-    """The messages of a run, rows after rows; remembers what was sent last."""
+    """The messages of a run, rows after rows; remembers what was sent last.
+
+    Args:
+        run: Some rows, which define the columns.
+        sender: The robot.
+        scans: The LiDAR's scans of the whole run; None sends no scans.
+        topics: Topics to send, as far as the run has their columns.
+        whole: Put every column into /magtwin/reading, not only those that no other topic carries, and the
+            run's metadata into /magtwin/columns: a recorder of live topics has no other source for them.
+
+    Raises:
+        InputError: A column cannot stand in a bag.
+    """
 
     def __init__(
         self,
@@ -55,43 +67,23 @@ class Stream:
         topics: Iterable[Topic] = tuple(TOPICS.values()),
         whole: bool = False,
     ) -> None:
-        """Begin.
-
-        Args:
-            run: Some rows, which define the columns.
-            sender: The robot.
-            scans: The LiDAR's scans of the whole run; None sends no scans.
-            topics: Topics to send, as far as the run has their columns.
-            whole: Put every column into /magtwin/reading, not only those that no other topic carries, and the
-                run's metadata into /magtwin/columns: a recorder of live topics has no other source for them.
-
-        Raises:
-            InputError: A column cannot stand in a bag.
-        """
         self._sender, self._scans = sender, scans
         self._t = -np.inf
         self._last: dict[str, _Last] = {}
         columns = set(run)
         sent = [t for t in topics if t.needs and columns.issuperset(t.needs)]
-        carried = (
-            {} if whole else {column: topic for topic in sent if topic.carried for column in topic.needs}
-        )
-        self._carried: dict[str, Topic] = carried
+        carried = [] if whole else [topic for topic in sent if topic.carried]
+        self._carried = {column: topic for topic in carried for column in topic.needs}
         self._rest = [name for name in run if name not in self._carried]
         self._columns = {name: (values.dtype, values.shape[1:]) for name, values in run.items()}
         self._table = self._columns_json(run, run.metadata if whole else {})
         for name, values in run.items():
-            if values.ndim > 2 or values.dtype.kind not in "bfiu":
-                raise InputError(
-                    f"column {name!r} cannot stand in a bag: it needs numbers or flags of shape (N,) or "
-                    f"(N, width), got {values.dtype} of shape {values.shape}"
-                )
-        once = [NAMES]
-        if sender.links:
-            once.append(TF_STATIC)
-        if sender.description:
-            once.append(DESCRIPTION)
-        self._once = once
+            check_numbers(name, values, "stand in a bag")
+        self._once = once = [
+            NAMES,
+            *[TF_STATIC] * bool(sender.links),
+            *[DESCRIPTION] * bool(sender.description),
+        ]
         self.topics = [*once, *sent, *([] if scans is None else [SCAN]), READING]
         """Topics that are sent."""
 
@@ -113,11 +105,8 @@ class Stream:
         for topic in self.topics:
             if topic.needs:
                 rows = self._rows(topic, run, t)
-                chosen = (
-                    run
-                    if len(rows) == len(t)
-                    else {name: run[name][rows] for name in self._wanted(topic, run)}
-                )
+                names = dict.fromkeys((*topic.needs, "wheel_angle", "odom_v", "b_sd_nt"))
+                chosen = {name: run[name][rows] for name in names if name in run}
                 fields = topic.write(chosen, stamps[rows], self._sender)
                 yield topic, stamps[rows], fields
         data = np.column_stack([np.asarray(run[name], float) for name in self._rest])
@@ -134,7 +123,8 @@ class Stream:
         """The scans that arrived by a time and were not sent yet."""
         if self._scans is None:
             return
-        arrived, self._scans = _arrived(self._scans, until_s)
+        k = int(np.searchsorted(self._scans.arrival, until_s, side="right"))
+        arrived, self._scans = scans_at(self._scans, slice(k)), scans_at(self._scans, slice(k, None))
         moments, came = (np.rint(t * NS).astype(np.int64) for t in (arrived.t, arrived.arrival))
         fields = SCAN.write({"ranges_m": arrived.ranges_m}, moments, self._sender)
         yield SCAN, came, fields
@@ -150,12 +140,6 @@ class Stream:
                 f"t runs from {t[0]:.9g} to {t[-1]:.9g} s, but stamps hold 0 to {LATEST_S:.0f} s; begin at 0"
             )
         return t
-
-    @staticmethod
-    def _wanted(topic: Topic, run: Run) -> list[str]:
-        """Columns that a topic's messages are made from."""
-        also = {"wheel_angle", "odom_v", "b_sd_nt"} & set(run)
-        return [*topic.needs, *(also - set(topic.needs))]
 
     def _rows(self, topic: Topic, run: Columns, t: Array) -> NDArray[np.intp]:
         """Rows at which a topic is sent."""
@@ -204,22 +188,15 @@ class Stream:
                 entry["first"] = first
                 first += shape[0] if shape else 1
             columns.append(entry)
-        table = {
-            "unit": self._sender.unit,
-            "columns": columns,
-            **({"facts": dict(metadata)} if metadata else {}),
-        }
+        table = {"unit": self._sender.unit, "columns": columns} | (
+            {"facts": dict(metadata)} if metadata else {}
+        )
         return json.dumps(table, ensure_ascii=False, indent=1)
 
 
-def _arrived(scans: "Scans", t: float) -> "tuple[Scans, Scans]":
-    """Scans that arrived by a time [s], and those that arrive later."""
-    k = int(np.searchsorted(scans.arrival, t, side="right"))
-    parts = [
-        {f.name: getattr(scans, f.name)[rows] for f in dataclasses.fields(scans)}
-        for rows in (slice(k), slice(k, None))
-    ]
-    return type(scans)(**parts[0]), type(scans)(**parts[1])
+def scans_at(scans: "Scans", rows: Any) -> "Scans":
+    """Some scans, by a slice or a mask."""
+    return type(scans)(*(getattr(scans, f.name)[rows] for f in dataclasses.fields(scans)))
 
 
 def _finite(run: Columns, names: Iterable[str]) -> NDArray[np.bool_]:

@@ -35,11 +35,9 @@ def read_bag_readings(
 
     Args:
         path: Folder of a rosbag2, or its storage file (.db3, .mcap).
-        pose_topic: Topic of the poses. Default: the only one, or the only one that is not odometry, which
-            drifts.
+        pose_topic: Topic of the poses. Default: the only one, or the only one that is not odometry.
         field_topic: Topic of the field. Default: the only one.
-        unit: Unit of the field. Default: the unit that makes it the Earth's field: 1e-5..1e-4 is T,
-            10,000..100,000 is nT, and so on; the ranges do not overlap.
+        unit: Unit of the field. Default: the unit that makes it the Earth's field.
         scale: Factor from the bag's values to nT, in place of a unit.
 
     Returns:
@@ -53,10 +51,8 @@ def read_bag_readings(
     """
     path = Path(path)
     with Bag(path) as bag:
-        pose_name, field_name = (
-            _choose(bag, "pose", pose_topic, POSE),
-            _choose(bag, "field", field_topic, MAGNITUDE),
-        )
+        pose_name = _choose(bag, "pose", pose_topic, POSE)
+        field_name = _choose(bag, "field", field_topic, MAGNITUDE)
         messages = bag.messages((pose_name, field_name))
         for name in (pose_name, field_name):
             if not len(messages[name]):
@@ -88,6 +84,7 @@ def read_bag_readings(
         level = rotate(quat_conjugate(quat_from_yaw(yaw_from_quat(q))), rotate(q, field.vector_nt))
     left = f", {np.count_nonzero(~known)} of {len(known)} fields not between poses or not a number left out"
     how = "given" if unit or scale is not None else "told by its size"
+    about = f"poses {poses.name}, field {fields.name} in {field.label}, {how}; stamps of {clock}"
     return Readings(
         p_xy=p[:, :2],
         yaw=yaw_from_quat(q),
@@ -96,8 +93,7 @@ def read_bag_readings(
         t=t - t[0],
         runs=(path.stem,),
         name=path.stem,
-        source=f"{sums} (poses {poses.name}, field {fields.name} in {field.label}, {how}; stamps of {clock}"
-        f"{left if not known.all() else ''})",
+        source=f"{sums} ({about}{left if not known.all() else ''})",
     )
 
 
@@ -113,15 +109,12 @@ def _choose(bag: Bag, kind: str, name: str | None, topic: Topic) -> str:
         return name
     if not fitting:
         raise InputError(f"{bag.path}: no topic of a {kind} ({kinds}); topics in it: {bag.listed()}")
-    if len(fitting) > 1:
-        fixed = [t for t in fitting if bag.kinds[t] != ODOMETRY.kind]
-        if len(fixed) != 1:
-            raise InputError(
-                f"{bag.path}: {len(fitting)} topics of a {kind}, {', '.join(fitting)}; choose with "
-                f"--{kind}-topic"
-            )
-        return fixed[0]
-    return fitting[0]
+    fixed = fitting if len(fitting) == 1 else [t for t in fitting if bag.kinds[t] != ODOMETRY.kind]
+    if len(fixed) != 1:
+        raise InputError(
+            f"{bag.path}: {len(fitting)} topics of a {kind}, {', '.join(fitting)}; choose with --{kind}-topic"
+        )
+    return fixed[0]
 
 
 def _in_order(signal: Signal, by_header: bool, columns: Iterable[Array]) -> tuple[Array, Array]:

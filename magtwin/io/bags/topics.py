@@ -66,11 +66,21 @@ class Topic:
     lost: str = ""
     """Column of flags that suspend sending again."""
 
-    write: Callable[[Columns, NDArray[np.int64], Sender], Fields]
-    """Fields of messages, from the columns of some rows and their stamps [ns]."""
+    frame: str = ""
+    """Attribute of the sender with the frame of the header. Default: no header."""
+
+    more: Callable[[Columns, NDArray[np.int64], Sender], Fields] = lambda c, stamp, sender: {}
+    """Fields of messages beyond the header and the columns of `reads`; also called with the stamps [ns]."""
 
     reads: Mapping[str, Mapping[str, str | tuple[str, int]]] = field(default_factory=dict)
     """By message type: the leaf of each column that is read, or a leaf and an index into it."""
+
+    def write(self, c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
+        """Fields of messages, from the columns of some rows and their stamps [ns]."""
+        fields = _header(stamp, getattr(sender, self.frame)) if self.frame else {}
+        carried = self.reads.get(self.kind, {}).items()
+        fields |= {leaf: c[name] for name, leaf in carried if name in self.needs and isinstance(leaf, str)}
+        return fields | self.more(c, stamp, sender)
 
     def leaves(self, kind: str) -> list[str]:
         """Names of the leaves of a message type that are read."""
@@ -104,24 +114,9 @@ def _diagonal(variances: Any) -> Array:
     return out
 
 
-def _pose(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
-    return {
-        **_header(stamp, sender.map_frame),
-        "pose.position": c["mocap_p"],
-        "pose.orientation": c["mocap_q_xyzw"],
-    }
-
-
 def _odometry(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
-    return {
-        **_header(stamp, sender.odom_frame),
-        "child_frame_id": sender.base_frame,
-        "pose.pose.position": c["odom_p"],
-        "pose.pose.orientation": c["odom_q_xyzw"],
-        "twist.twist.linear": c["odom_v"],
-        "twist.twist.angular": c["odom_w"],
-        "twist.covariance": _diagonal(np.square(sender.odometry_std)),
-    }
+    covariance = _diagonal(np.square(sender.odometry_std))
+    return {"child_frame_id": sender.base_frame, "twist.covariance": covariance}
 
 
 def _imu(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
@@ -130,39 +125,24 @@ def _imu(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
     rates = sender.gyro_std**2 + (speed * np.array(sender.gyro_vibration)) ** 2
     accelerations = sender.accel_std**2 + (speed * np.array(sender.accel_vibration)) ** 2
     return {
-        **_header(stamp, sender.imu_frame),
-        "orientation": c["imu_q_xyzw"],
         "orientation_covariance": _diagonal([sender.orientation_std**2] * 3),
-        "angular_velocity": c["imu_w"],
         "angular_velocity_covariance": _diagonal(rates),
-        "linear_acceleration": c["imu_a"],
         "linear_acceleration_covariance": _diagonal(accelerations),
     }
 
 
 def _battery(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
-    unknown = np.nan
-    return {
-        **_header(stamp, sender.base_frame),
-        "voltage": c["battery_v"],
-        "temperature": unknown,
-        "current": -c["battery_a"],
-        "charge": unknown,
-        "capacity": unknown,
-        "design_capacity": unknown,
-        "percentage": c["battery_fraction"],
-        "power_supply_status": 2 * (c["battery_a"] > 0),  # discharging, else unknown
-        "present": 1,
-    }
+    unknown = dict.fromkeys(("temperature", "charge", "capacity", "design_capacity"), np.nan)
+    discharging = 2 * (c["battery_a"] > 0)  # else unknown
+    return {**unknown, "current": -c["battery_a"], "power_supply_status": discharging, "present": 1}
 
 
 def _magnitude(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
     """The magnitude in x, as APRILab's robot publishes it, with its predicted variance."""
     zero = np.zeros(len(stamp))
-    variance = c["b_sd_nt"] / nt_per(sender) if "b_sd_nt" in c else zero
-    variance = np.where(np.isfinite(variance), variance, 0.0) ** 2
+    sd = c["b_sd_nt"] / nt_per(sender) if "b_sd_nt" in c else zero
+    variance = np.where(np.isfinite(sd), sd, 0.0) ** 2
     return {
-        **_header(stamp, sender.magnetometer_frame),
         "magnetic_field": np.column_stack([c["b_measured_nt"] / nt_per(sender), zero, zero]),
         "magnetic_field_covariance": np.column_stack([variance, *[zero] * 8]),
     }
@@ -170,7 +150,6 @@ def _magnitude(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
 
 def _field(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
     return {
-        **_header(stamp, sender.magnetometer_frame),
         "magnetic_field": c["b_vector_measured_nt"] / nt_per(sender),
         "magnetic_field_covariance": _diagonal([(sender.vector_std_nt / nt_per(sender)) ** 2] * 3),
     }
@@ -224,29 +203,27 @@ def _static(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
     return _transform_fields(stamp, links)
 
 
-def scan_fields(ranges_m: NDArray[np.float32], stamp: NDArray[np.int64], sender: Sender) -> Fields:
-    """LaserScans of ranges along `magtwin.sim.sensors.lidar.ray_angles`; all rays of a scan have one stamp.
-
-    Args:
-        ranges_m: Ranges [m], shape (S, rays), as in REP 117.
-        stamp: Time of each scan [ns], shape (S,).
-        sender: The robot.
-    """
-    step = 2 * np.pi / ranges_m.shape[1]
+def _scan(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
+    """Ranges along `magtwin.sim.sensors.lidar.ray_angles`, as in REP 117; one stamp per scan."""
+    step = 2 * np.pi / c["ranges_m"].shape[1]
     return {
-        **_header(stamp, sender.lidar_frame),
         "angle_min": -np.pi,
         "angle_max": np.pi - step,
         "angle_increment": step,
         "scan_time": 1 / sender.scan_rate_hz if sender.scan_rate_hz else 0.0,
         "range_min": sender.range_m[0],
         "range_max": sender.range_m[1],
-        "ranges": ranges_m,
+        "ranges": c["ranges_m"],
     }
 
 
-def _pose_at(prefix: str) -> dict[str, str]:
-    return {"mocap_p": f"{prefix}position", "mocap_q_xyzw": f"{prefix}orientation"}
+def _pose_at(prefix: str, p: str = "position", q: str = "orientation") -> dict[str, str]:
+    return {"mocap_p": prefix + p, "mocap_q_xyzw": prefix + q}
+
+
+def _carrier(kind: str, leaves: dict[str, str], **rest: Any) -> Topic:
+    """A topic whose message type holds each of its columns in a leaf."""
+    return Topic(kind=kind, needs=tuple(leaves), carried=True, reads={kind: leaves}, qos=SENSOR_DATA, **rest)
 
 
 _FIELD = "sensor_msgs/msg/MagneticField"
@@ -257,63 +234,40 @@ POSE = Topic(
     needs=("mocap_p", "mocap_q_xyzw"),
     carried=True,
     lost="flag_pose_lost",
-    write=_pose,
+    frame="map_frame",
     reads={
         "geometry_msgs/msg/PoseStamped": _pose_at("pose."),
         "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_at("pose.pose."),
-        "geometry_msgs/msg/TransformStamped": {
-            "mocap_p": "transform.translation",
-            "mocap_q_xyzw": "transform.rotation",
-        },
+        "geometry_msgs/msg/TransformStamped": _pose_at("transform.", "translation", "rotation"),
         "nav_msgs/msg/Odometry": _pose_at("pose.pose."),
     },
 )
-ODOMETRY = Topic(
+ODOMETRY = _carrier(
+    "nav_msgs/msg/Odometry",
+    {
+        "odom_p": "pose.pose.position",
+        "odom_q_xyzw": "pose.pose.orientation",
+        "odom_v": "twist.twist.linear",
+        "odom_w": "twist.twist.angular",
+    },
     name="/robot/odom",
-    kind="nav_msgs/msg/Odometry",
-    qos=SENSOR_DATA,
-    needs=("odom_p", "odom_q_xyzw", "odom_v", "odom_w"),
-    carried=True,
-    write=_odometry,
-    reads={
-        "nav_msgs/msg/Odometry": {
-            "odom_p": "pose.pose.position",
-            "odom_q_xyzw": "pose.pose.orientation",
-            "odom_v": "twist.twist.linear",
-            "odom_w": "twist.twist.angular",
-        }
-    },
+    frame="odom_frame",
+    more=_odometry,
 )
-IMU = Topic(
+IMU = _carrier(
+    "sensor_msgs/msg/Imu",
+    {"imu_q_xyzw": "orientation", "imu_w": "angular_velocity", "imu_a": "linear_acceleration"},
     name="/robot/imu",
-    kind="sensor_msgs/msg/Imu",
-    qos=SENSOR_DATA,
-    needs=("imu_q_xyzw", "imu_w", "imu_a"),
-    carried=True,
-    write=_imu,
-    reads={
-        "sensor_msgs/msg/Imu": {
-            "imu_q_xyzw": "orientation",
-            "imu_w": "angular_velocity",
-            "imu_a": "linear_acceleration",
-        }
-    },
+    frame="imu_frame",
+    more=_imu,
 )
-BATTERY = Topic(
+BATTERY = _carrier(
+    "sensor_msgs/msg/BatteryState",
+    {"battery_v": "voltage", "battery_a": "current", "battery_fraction": "percentage"},
     name="/robot/battery_state",
-    kind="sensor_msgs/msg/BatteryState",
-    qos=SENSOR_DATA,
-    needs=("battery_v", "battery_a", "battery_fraction"),
-    carried=True,
     every_s=4.0,
-    write=_battery,
-    reads={
-        "sensor_msgs/msg/BatteryState": {
-            "battery_v": "voltage",
-            "battery_a": "current",
-            "battery_fraction": "percentage",
-        }
-    },
+    frame="base_frame",
+    more=_battery,
 )
 MAGNITUDE = Topic(
     name="/robot/qtfm/magnitude",
@@ -321,7 +275,8 @@ MAGNITUDE = Topic(
     needs=("b_measured_nt",),
     carried=True,
     sent="each",
-    write=_magnitude,
+    frame="magnetometer_frame",
+    more=_magnitude,
     reads={
         _FIELD: {"magnetic_field": "magnetic_field"},
         "std_msgs/msg/Float64": {"magnetic_field": "data"},
@@ -334,14 +289,15 @@ VECTOR = Topic(
     needs=("b_vector_measured_nt",),
     carried=True,
     sent="each",
-    write=_field,
+    frame="magnetometer_frame",
+    more=_field,
     reads={_FIELD: {"magnetic_field": "magnetic_field"}},
 )
 COMMAND = Topic(
     name="/robot/cmd_vel",
     kind="geometry_msgs/msg/Twist",
     needs=("v_cmd", "w_cmd"),
-    write=_command,
+    more=_command,
     reads={
         "geometry_msgs/msg/Twist": {"v_cmd": ("linear", 0), "w_cmd": ("angular", 2)},
         "geometry_msgs/msg/TwistStamped": {"v_cmd": ("twist.linear", 0), "w_cmd": ("twist.angular", 2)},
@@ -353,7 +309,7 @@ JOINTS = Topic(
     needs=("wheel_angle",),
     sent="ticks",
     every_s=1 / 62,
-    write=_joints,
+    more=_joints,
     reads={"sensor_msgs/msg/JointState": {"names": "name", "angles": "position"}},
 )
 TF = Topic(
@@ -363,7 +319,7 @@ TF = Topic(
     needs=("odom_p", "odom_q_xyzw", "p_world_base", "q_world_base_xyzw"),
     sent="ticks",
     every_s=1 / 62,
-    write=_transforms,
+    more=_transforms,
 )
 CLOCK = Topic(
     name="/clock",
@@ -372,35 +328,30 @@ CLOCK = Topic(
     needs=("t",),
     sent="ticks",
     every_s=0.025,
-    write=lambda c, stamp, sender: {"clock": stamp},
+    more=lambda c, stamp, sender: {"clock": stamp},
 )
-TF_STATIC = Topic(name="/tf_static", kind="tf2_msgs/msg/TFMessage", qos=LATCHED, sent="once", write=_static)
+TF_STATIC = Topic(name="/tf_static", kind="tf2_msgs/msg/TFMessage", qos=LATCHED, sent="once", more=_static)
 DESCRIPTION = Topic(
     name="/robot/robot_description",
     kind="std_msgs/msg/String",
     qos=LATCHED,
     sent="once",
-    write=lambda c, stamp, sender: {"data": sender.description},
+    more=lambda c, stamp, sender: {"data": sender.description},
 )
 SCAN = Topic(
     name="/robot/scan",
     kind="sensor_msgs/msg/LaserScan",
     qos=SENSOR_DATA,
-    write=lambda c, stamp, sender: scan_fields(c["ranges_m"], stamp, sender),
+    frame="lidar_frame",
+    more=_scan,
     reads={"sensor_msgs/msg/LaserScan": {"stamp": "header.stamp"}},
 )
-NAMES = Topic(
-    name="/magtwin/columns",
-    kind="std_msgs/msg/String",
-    qos=LATCHED,
-    sent="once",
-    write=lambda c, stamp, sender: {},  # `magtwin.io.bags.stream.Stream` fills in the table
-)
+NAMES = Topic(name="/magtwin/columns", kind="std_msgs/msg/String", qos=LATCHED, sent="once")
 READING = Topic(
     name="/magtwin/reading",
     kind="std_msgs/msg/Float64MultiArray",
     sent="each",
-    write=lambda c, stamp, sender: {"data": c["data"]},
+    more=lambda c, stamp, sender: {"data": c["data"]},
 )
 
 TOTAL_FIELD = Topic(
@@ -408,7 +359,7 @@ TOTAL_FIELD = Topic(
     kind="std_msgs/msg/Float64",
     needs=("b_measured_nt",),
     sent="each",
-    write=lambda c, stamp, sender: {"data": c["b_measured_nt"]},
+    more=lambda c, stamp, sender: {"data": c["b_measured_nt"]},
 )
 """The magnitude in nT, whatever the unit of the other topics; live robots only. In bags, use MAGNITUDE."""
 

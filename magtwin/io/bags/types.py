@@ -54,14 +54,14 @@ def layout(kind: str, counts: Mapping[str, Any] | None = None) -> tuple[Leaf, ..
     Raises:
         InputError: The type is unknown.
     """
-    leaves = _plain_layout(kind)
-    if counts and any(leaf.kind == "none" for leaf in leaves):
-        return tuple(_leaves(kind, "", counts))
-    return leaves
+    plain = _layout(kind)
+    return (
+        tuple(_leaves(kind, "", counts)) if counts and any(leaf.kind == "none" for leaf in plain) else plain
+    )
 
 
 @cache
-def _plain_layout(kind: str) -> tuple[Leaf, ...]:
+def _layout(kind: str) -> tuple[Leaf, ...]:
     return tuple(_leaves(kind, "", {}))
 
 

@@ -7,7 +7,7 @@ import sqlite3
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from magtwin.io.bags.storage import ROOM, STORAGES, Batch, Connection, Storage, 
 from magtwin.io.bags.stream import Sent, Stream
 from magtwin.io.bags.topics import Qos
 from magtwin.io.bags.types import definition_of, layout
-from magtwin.io.recorder import PARTIAL, partial_of
+from magtwin.io.recorder import PARTIAL, Sink, partial_of
 from magtwin.run.arrow import metadata_to_json
 from magtwin.run.run import Run
 from magtwin.version import __version__
@@ -73,12 +73,10 @@ def write_bag(
     check_free(path, force=force)
     sender = sender_for(twin, units, run.metadata.get("rate_hz"))
     with output(path, force=force) as aside, one_line(path):
-        bag = _McapBag(aside) if kind == "mcap" else _Db3Bag(aside)
+        bag = _Bag(aside, kind)
         try:
             stream = Stream(run, sender, scans)
-            bag.note(run)
-            for topic in stream.topics:
-                bag.add(topic.name, topic.kind, topic.qos)
+            bag.begin(run, stream)
             for first in range(0, max(run.rows, 1), BLOCK):
                 bag.send(stream.messages(run.take(slice(first, first + BLOCK))))
             bag.send(stream.last())
@@ -89,11 +87,25 @@ def write_bag(
 
 
 class _Bag:
-    """A bag at exactly the given path."""
+    """A bag at exactly the given path; an MCAP bag is a file, or a folder with metadata.yaml."""
 
-    def __init__(self) -> None:
+    def __init__(self, path: Path, storage: Storage = "mcap") -> None:
         self.connections: dict[str, Connection] = {}
         self.custom: dict[str, str] = {}
+        self._folder = None if storage == "sqlite3" or path.suffix == ".mcap" else path
+        if self._folder is not None:
+            path.mkdir()
+            path = path / f"{path.name.removesuffix(PARTIAL)}_0.mcap"
+        self._file = path
+        self.store: Any = (
+            Db3Writer(path) if storage == "sqlite3" else McapWriter(path, f"magtwin {__version__}")
+        )
+
+    def begin(self, run: Run, stream: Stream) -> None:
+        """Register the metadata and the topics of a run."""
+        self.note(run)
+        for topic in stream.topics:
+            self.add(topic.name, topic.kind, topic.qos)
 
     def add(self, topic: str, kind: str, qos: Qos) -> None:
         """Register a topic, before its first message."""
@@ -104,61 +116,22 @@ class _Bag:
 
     def send(self, sent: Iterator[Sent]) -> None:
         """Write messages of a stream."""
-        self.store.write(
-            [
-                Batch(
-                    self.connections[t.name],
-                    times,
-                    encode(layout(t.kind, fields), fields, len(times), room=ROOM),
-                )
-                for t, times, fields in sent
-            ]
-        )
+        batches = []
+        for topic, times, fields in sent:
+            rows = encode(layout(topic.kind, fields), fields, len(times), room=ROOM)
+            batches.append(Batch(self.connections[topic.name], times, rows))
+        self.store.write(batches)
 
-    store: Any
-
-    def note(self, run: Run) -> bool:
-        """Keep the metadata of a run; whether they are new."""
+    def note(self, run: Run) -> None:
+        """Keep the metadata of a run."""
         entries = {name: json.dumps(value) for name, value in json.loads(metadata_to_json(run)).items()}
         custom = {CUSTOM + name: value for name, value in entries.items()}
         changed, self.custom = custom != self.custom, custom
-        return changed
-
-    def abort(self) -> None:
-        """Leave the bag as it is."""
-        with suppress(OSError, sqlite3.Error):
-            self.store.abort()
-
-
-class _Db3Bag(_Bag):
-    def __init__(self, path: Path) -> None:
-        super().__init__()
-        self.store = Db3Writer(path)
-
-    def close(self) -> None:
-        self.store.close(self.custom)
-
-
-class _McapBag(_Bag):
-    """An MCAP file, alone or in a folder with metadata.yaml."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__()
-        self._folder = None if path.suffix == ".mcap" else path
-        if self._folder is not None:
-            path.mkdir()
-            path = path / f"{path.name.removesuffix(PARTIAL)}_0.mcap"
-        self._file = path
-        self.store: McapWriter = McapWriter(path, f"magtwin {__version__}")
-
-    def note(self, run: Run) -> bool:
-        changed = super().note(run)
-        if changed or not self.store.counts:
-            self.store.note(NOTE, {name.removeprefix(CUSTOM): value for name, value in self.custom.items()})
-        return changed
+        if isinstance(self.store, McapWriter) and (changed or not self.store.counts):
+            self.store.note(NOTE, entries)
 
     def flush(self) -> None:
-        """Make everything outlive this process."""
+        """Make everything in an MCAP bag outlive this process."""
         self.store.flush()
         if self._folder is not None:
             aside = self._folder / "metadata.yaml.new"
@@ -167,9 +140,17 @@ class _McapBag(_Bag):
 
     def close(self) -> None:
         """Complete the bag."""
+        if isinstance(self.store, Db3Writer):
+            self.store.close(self.custom)
+            return
         self.store.note("rosbag2", {"serialized_metadata": to_yaml(self._metadata())})
         self.flush()
         self.store.close()
+
+    def abort(self) -> None:
+        """Leave the bag as it is."""
+        with suppress(OSError, sqlite3.Error):
+            self.store.abort()
 
     def _metadata(self) -> dict[str, Any]:
         store, connections = self.store, list(self.connections.values())
@@ -195,18 +176,18 @@ class _GrowingBag:
         check_free(self._path, force=force)
         self.partial = partial_of(self._path)
         """Path until it ends."""
-        self._bag: _McapBag | None = None
+        self._bag: _Bag | None = None
         if self.partial.exists() and not force:
             raise InputError(
                 f"{self.partial}: left by a recording that did not end; read and remove it, or give --force"
             )
 
-    def _open(self) -> _McapBag:
+    def _open(self) -> _Bag:
         if self.partial.is_dir():
             shutil.rmtree(self.partial)
         self.partial.unlink(missing_ok=True)
         self.partial.parent.mkdir(parents=True, exist_ok=True)
-        return _McapBag(self.partial)
+        return _Bag(self.partial)
 
     def _finish(self) -> None:
         assert self._bag is not None
@@ -216,7 +197,7 @@ class _GrowingBag:
             self.partial.rename(aside)
 
 
-class BagWriter(_GrowingBag):
+class BagWriter(_GrowingBag, Sink):
     """A bag that is written block by block while a run goes on.
 
     Args:
@@ -258,9 +239,7 @@ class BagWriter(_GrowingBag):
                 sender = sender_for(self._twin, self._units, run.metadata.get("rate_hz"))
                 self._stream = Stream(run, sender, self._scans)
                 self._bag = self._open()
-                self._bag.note(run)
-                for topic in self._stream.topics:
-                    self._bag.add(topic.name, topic.kind, topic.qos)
+                self._bag.begin(run, self._stream)
             else:
                 self._bag.note(run)
             self._bag.send(self._stream.messages(run))
@@ -278,15 +257,6 @@ class BagWriter(_GrowingBag):
         """Leave what there is under its partial name."""
         if self._bag is not None:
             self._bag.abort()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self.abort()
 
 
 class RawBagWriter(_GrowingBag):
@@ -336,14 +306,11 @@ class RawBagWriter(_GrowingBag):
     def flush(self) -> None:
         """Make all messages outlive this process."""
         waiting, self._waiting = self._waiting, {}
+        batches: list[Batch] = []
         with one_line(self._path):
-            self._raw.store.write(
-                [
-                    batch
-                    for topic, messages in waiting.items()
-                    for batch in _batches(self._raw.connections[topic], messages)
-                ]
-            )
+            for topic, messages in waiting.items():
+                batches += _batches(self._raw.connections[topic], messages)
+            self._raw.store.write(batches)
             self._raw.flush()
 
     def close(self) -> None:

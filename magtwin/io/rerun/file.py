@@ -1,6 +1,7 @@
 """File: a Run, or several to compare, as a Rerun recording with a layout, and back."""
 
 import os
+import shutil
 import struct
 import tempfile
 import warnings
@@ -218,30 +219,21 @@ def read_runs(path: str | os.PathLike[str]) -> dict[str, Run]:
 @contextmanager
 def _readable(path: FilePath, *, partial: bool) -> Iterator[FilePath]:
     """A file that Rerun can read; of a partial one, a copy without its last, incomplete message."""
-    end = _whole_messages(path) if partial else None
-    if end is None or end == path.stat().st_size:
+    size, end = path.stat().st_size, 12  # a header, then messages of kind, length and body
+    with open(path, "rb") as source:
+        while partial and end + 16 <= size:
+            source.seek(end)
+            length = struct.unpack("<QQ", source.read(16))[1]
+            if end + 16 + length > size:
+                break
+            end += 16 + length
+    if not partial or end >= size:
         yield path
         return
-    with tempfile.TemporaryDirectory() as folder, open(path, "rb") as source:
-        file = FilePath(folder) / path.name
-        with open(file, "wb") as target:
-            while end > 0 and (part := source.read(min(end, 1 << 20))):
-                target.write(part)
-                end -= len(part)
+    with tempfile.TemporaryDirectory() as folder:
+        file = shutil.copyfile(path, FilePath(folder) / path.name)
+        os.truncate(file, end)
         yield file
-
-
-def _whole_messages(path: FilePath) -> int:
-    """End of the last complete message [bytes]: a header of 12, then messages of kind, length and body."""
-    size, at = path.stat().st_size, 12
-    with open(path, "rb") as file:
-        while at + 16 <= size:
-            file.seek(at)
-            length = struct.unpack("<QQ", file.read(16))[1]
-            if at + 16 + length > size:
-                break
-            at += 16 + length
-    return min(at, size)
 
 
 def _check_rows(run: Run, path: str | os.PathLike[str]) -> None:

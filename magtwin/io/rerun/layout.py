@@ -41,14 +41,8 @@ _LOOKED_AT = 4000
 Colour = tuple[int, int, int]
 
 RUN_COLOURS: tuple[Colour, ...] = (
-    (86, 156, 255),
-    (255, 158, 64),
-    (92, 200, 120),
-    (226, 92, 160),
-    (170, 130, 255),
-    (224, 208, 80),
-    (80, 210, 214),
-    (240, 98, 82),
+    *((86, 156, 255), (255, 158, 64), (92, 200, 120), (226, 92, 160)),
+    *((170, 130, 255), (224, 208, 80), (80, 210, 214), (240, 98, 82)),
 )
 """Colours of runs that are compared; repeated for more runs."""
 
@@ -133,13 +127,8 @@ BATTERY_PANELS = (
     Panel("Battery charge [0..1]", (Series("battery_fraction", "charge", _GREEN),)),
 )
 PANELS = (
-    FIELD_PANEL,
-    DISTURBANCE_PANEL,
-    ERROR_PANEL,
-    SPEED_PANEL,
-    YAW_RATE_PANEL,
-    ACCELERATION_PANEL,
-    TILT_PANEL,
+    *(FIELD_PANEL, DISTURBANCE_PANEL, ERROR_PANEL),
+    *(SPEED_PANEL, YAW_RATE_PANEL, ACCELERATION_PANEL, TILT_PANEL),
     *BATTERY_PANELS,
 )
 """Every plot of a recording. Series that a run lacks, or that are all nan, are left out."""
@@ -231,7 +220,10 @@ def layout(
     )
     pages = rrb.Tabs(_event_view(), rrb.TextDocumentView(origin="metadata", name="Run"))
     about = rrb.Vertical(states, pages, row_shares=[1.2, 1.4])
-    below = [_robot_view(), _floor_view(lab, [""])] if lab else []
+    eye: dict[str, Any] = {"position": (-0.62, 0.42, 0.55), "target": (0.08, 0.0, 0.17)}
+    # from behind its left shoulder, in the robot's axes, so that it stays in view
+    robot = _view_3d("world/robot", "Robot", [""], without="world/scale", **eye)
+    below = [robot, _floor_view(lab, [""])] if lab else []
     return _blueprint(lab, heading, [""], side, [*below, about], [0.9, 1.1, 1.6])
 
 
@@ -240,10 +232,7 @@ def comparison_layout(
 ) -> rrb.Blueprint:
     """The views of several runs on a common timeline, each in its own colour.
 
-    Args:
-        runs: The runs.
-        lab: Their lab. None: no 3D views.
-        heading: Heading of the map on the floor [rad], for the title.
+    Without a lab there are no 3D views; `heading` is that of the map on the floor [rad], for the title.
     """
     whole = _whole(runs)
     rows = [
@@ -280,7 +269,11 @@ def _blueprint(
         root = rrb.Horizontal(side, *below, column_shares=[3.0, 1.0])
     else:
         lower = rrb.Horizontal(*below, column_shares=shares)
-        left = rrb.Vertical(_lab_view(lab, heading, names), lower, row_shares=[2.0, 1.0])
+        text = "readings along the path" if names == [""] else "a robot and its path for each run"
+        title = f"Lab: map of the total field at heading {np.degrees(heading):.4g}°, {text}"
+        position, target = lab_eye(lab)
+        eye: dict[str, Any] = {"without": "world/robot/sensors", "position": position, "target": target}
+        left = rrb.Vertical(_view_3d("world", title, names, **eye), lower, row_shares=[2.0, 1.0])
         root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
     return rrb.Blueprint(
         root,
@@ -318,26 +311,29 @@ def _plot(
     title: str, lines: Sequence[tuple[Shown, Series, Array]], whole: rrb.TimeAxis | None, *, tall: bool
 ) -> rrb.TimeSeriesView:
     """Lines of one unit, with the legend in the corner where it needs least room."""
-    legend = len(lines) > 1
-    corner = rrb.Corner2D.LeftTop
+    legend, corner = len(lines) > 1, rrb.Corner2D.LeftTop
     ends = value_range(np.array([(np.nanmin(values), np.nanmax(values)) for _, _, values in lines]))
     if legend and ends:
         count = len({series.name for _, series, _ in lines})
         height = min(_LEGEND_MOST, count * _LEGEND_ROW * (1.0 if tall else 2.0))
         width = _LEGEND_WIDTH + _LEGEND_LETTER * max(len(series.name) for _, series, _ in lines)
-        t, values = [], []
-        for shown, _, line in lines:
-            step = max(1, len(line) // _LOOKED_AT)
-            t.append(shown.run["t"][::step] + shown.offset_s)
-            values.append(line[::step])
-        order = np.argsort(np.concatenate(t), kind="stable")
-        corner, ends = legend_corner(
-            np.concatenate(values)[order, None], np.concatenate(t)[order], ends, (width, height)
-        )
+        parts = [
+            np.column_stack([shown.run["t"] + shown.offset_s, line])[:: max(1, len(line) // _LOOKED_AT)]
+            for shown, _, line in lines
+        ]
+        t, values = (rows := np.concatenate(parts))[np.argsort(rows[:, 0], kind="stable")].T
+        corner, ends = legend_corner(values[:, None], t, ends, (width, height))
     overrides: dict[Any, list[rrb.Visualizer]] = {}
     for shown, series, _ in lines:
         entity = entity_of(DERIVED_ENTITY if series.column in DERIVED else COLUMNS_ENTITY, shown.name)
-        overrides.setdefault(f"/{entity}", []).append(_line(series))
+        source = VisualizerComponentMapping(
+            "Scalars:scalars",
+            ComponentSourceKind.SourceComponent,
+            source_component=series.column,
+            selector=f".{series.part}" if series.part else None,
+        )
+        style = rr.SeriesLines(names=[series.name], colors=[series.colour], widths=[series.width])
+        overrides.setdefault(f"/{entity}", []).append(style.visualizer(mappings=[source]))
     return rrb.TimeSeriesView(
         origin="/",
         contents=list(overrides),
@@ -349,27 +345,10 @@ def _plot(
     )
 
 
-def _line(series: Series) -> rrb.Visualizer:
-    """Style and source of a series."""
-    source = VisualizerComponentMapping(
-        "Scalars:scalars",
-        ComponentSourceKind.SourceComponent,
-        source_component=series.column,
-        selector=f".{series.part}" if series.part else None,
-    )
-    style = rr.SeriesLines(names=[series.name], colors=[series.colour], widths=[series.width])
-    return style.visualizer(mappings=[source])
-
-
 def value_range(values: Array) -> tuple[float, float] | None:
     """Ends of an axis with room beyond the values and beyond every tick, so that no label is cut.
 
-    Args:
-        values: The plotted values, any shape; nan is ignored.
-
-    Returns:
-        Least and greatest value of the axis; None for values that do not vary, where the viewer's default
-        is as good.
+    nan is ignored. None for values that do not vary, where the viewer's default is as good.
     """
     known = values[np.isfinite(values)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
@@ -388,15 +367,10 @@ def legend_corner(
 ) -> tuple[rrb.Corner2D, tuple[float, float]]:
     """The corner for a legend that hides no line, and the axis that this needs.
 
-    Args:
-        values: Series of a plot, shape (N, S).
-        t: Ascending times [s], shape (N,).
-        ends: Ends of an axis that all values fit in.
-        size: Width and height of the legend, as shares of the plot.
-
-    Returns:
-        The corner for which the axis grows least, and the ends of that axis. One hundredth of the readings
-        beside the legend may be under it, such as the ramp at the start of a run.
+    `values` are the series of a plot, shape (N, S), at ascending times `t` [s]; all fit in an axis with these
+    `ends`; `size` is the width and height of the legend, as shares of the plot. The axis grows least in the
+    chosen corner. One hundredth of the readings beside the legend may be under it, such as the ramp at the
+    start of a run.
     """
     width, height = size
     span = (t[-1] - t[0]) * width
@@ -427,20 +401,6 @@ def lab_eye(lab: LabSpec) -> tuple[Vec3, Vec3]:
     return (0, -0.45 * y, height), (0, -0.09 * y, 0)
 
 
-def _lab_view(lab: LabSpec, heading: float, names: Sequence[str]) -> rrb.Spatial3DView:
-    """The whole lab, with the paths of the named runs."""
-    position, target = lab_eye(lab)
-    text = "readings along the path" if names == [""] else "a robot and its path for each run"
-    title = f"Lab: map of the total field at heading {np.degrees(heading):.4g}°, {text}"
-    return _view_3d("world", title, names, without="world/robot/sensors", position=position, target=target)
-
-
-def _robot_view() -> rrb.Spatial3DView:
-    """The robot from behind its left shoulder, in the robot's axes, so that it stays in view."""
-    eye = {"position": (-0.62, 0.42, 0.55), "target": (0.08, 0.0, 0.17)}
-    return _view_3d("world/robot", "Robot", [""], without="world/scale", **eye)
-
-
 def _floor_view(lab: LabSpec, names: Sequence[str]) -> rrb.Spatial2DView:
     """The map and the paths from above, x to the right and y up, in metres."""
     x, y = (0.5 * side + lab.wall_thickness_m for side in lab.floor_m)
@@ -454,11 +414,8 @@ def _floor_view(lab: LabSpec, names: Sequence[str]) -> rrb.Spatial2DView:
 
 
 def _event_view() -> rrb.TextLogView:
-    return rrb.TextLogView(
-        origin="events",
-        name="Events",
-        columns=rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"]),
-    )
+    shown = rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"])
+    return rrb.TextLogView(origin="events", name="Events", columns=shown)
 
 
 def _visible(*, all_time: bool) -> rrb.VisibleTimeRanges:

@@ -14,7 +14,7 @@ import rerun as rr
 from magtwin.errors import InputError
 from magtwin.files import check_free
 from magtwin.frames import quat_from_yaw
-from magtwin.io.recorder import partial_of
+from magtwin.io.recorder import Sink, partial_of
 from magtwin.io.rerun.layout import drive_layout
 from magtwin.io.rerun.recording import (
     APPLICATION,
@@ -38,7 +38,7 @@ Show = Callable[[float, tuple[float, float, float]], None]
 """Takes the time [s] and x [m], y [m], yaw [rad] of base_link."""
 
 
-class _Growing:
+class _Growing(Sink):
     """A recording that gets its rows block by block; the stream starts with the first of them."""
 
     def __init__(
@@ -58,6 +58,11 @@ class _Growing:
         self.rows = 0
 
     def append(self, run: Run) -> None:
+        """Add the next rows; they are in the file or the viewer when this returns.
+
+        Raises:
+            InputError: The disk is full, or the stage cannot be read.
+        """
         if self._recording is None:
             self._recording = self._stack.enter_context(self._begin(run))
         if file := self._sinks.get("file"):
@@ -70,61 +75,45 @@ class _Growing:
         self.rows += run.rows
 
     def _begin(self, run: Run) -> Any:
-        rate = run.metadata.get("rate_hz", 0.0)
-        return recording_of(
-            run,
-            uuid.uuid4().hex,
-            title_of(run) or "live run",
-            self._twin,
-            known=self._expected,
-            events=None if self._expected else list(STATES),
-            whole=self._expected is not None,
-            rate_hz=rate if isinstance(rate, float) else 0.0,
-            final=self._final,
-            **self._shown,
-            **self._sinks,
-        )
+        rate, known = run.metadata.get("rate_hz", 0.0), self._expected
+        layout = {"known": known, "events": None if known else list(STATES), "whole": known is not None}
+        more: dict[str, Any] = {**layout, **self._shown, **self._sinks, "final": self._final}
+        rate_hz = rate if isinstance(rate, float) else 0.0
+        title = title_of(run) or "live run"
+        return recording_of(run, uuid.uuid4().hex, title, self._twin, rate_hz=rate_hz, **more)
 
     def close(self) -> None:
+        """Complete the recording."""
         if self._recording is not None:
             self._recording.close()
         self._stack.close()
 
     def abort(self) -> None:
+        """Leave the recording as it is."""
         with suppress(InputError):
             self._stack.close()
 
 
-class RrdWriter:
+class RrdWriter(_Growing):
     """A recording that grows while its run goes on: a sink of a `Recorder`.
 
     Its layout is that of `write_rrd`. Until `close`, the file has the name `run.partial.rrd` and can be read
     up to the last rows, even if the process was killed.
+
+    Args:
+        path: The .rrd file to make at the end.
+        twin: Where the run takes place, as for `write_rrd`.
+        force: Whether to replace an existing file, also an unfinished one.
+        shown: `expected`, the run, if known beforehand, which sets axes and colours; `planned`, the planned
+            path; `scans`, the LiDAR scans of the whole run.
+
+    Raises:
+        InputError: The file exists and `force` was not given, or it cannot be written.
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        twin: Twin | None = None,
-        *,
-        expected: Run | None = None,
-        planned: Planned | None = None,
-        scans: Scans | None = None,
-        force: bool = False,
+        self, path: str | Path, twin: Twin | None = None, *, force: bool = False, **shown: Any
     ) -> None:
-        """Begin a file.
-
-        Args:
-            path: The .rrd file to make at the end.
-            twin: Where the run takes place, as for `write_rrd`.
-            expected: The run, if it is known beforehand: it sets axes and colours.
-            planned: The planned path, or None.
-            scans: LiDAR scans of the whole run, or None.
-            force: Whether to replace an existing file, also an unfinished one.
-
-        Raises:
-            InputError: The file exists and `force` was not given, or it cannot be written.
-        """
         self.path, self._force = check_free(path, force=force), force
         self.partial = check_free(partial_of(self.path), force=force)
         """The file while it grows."""
@@ -133,21 +122,12 @@ class RrdWriter:
             self.partial.write_bytes(b"")
         except OSError as error:
             raise InputError(f"{self.path}: cannot be written ({error.strerror})") from error
-        shown: dict[str, Any] = {"expected": expected, "planned": planned, "scans": scans}
-        self._growing = _Growing(twin, **shown, file=self.partial, final=self.path)
-
-    def append(self, run: Run) -> None:
-        """Add the next rows; they are in the file when this returns.
-
-        Raises:
-            InputError: The disk is full, or the stage cannot be read.
-        """
-        self._growing.append(run)
+        super().__init__(twin, **shown, file=self.partial, final=self.path)
 
     def close(self) -> None:
         """Complete the file and give it its name; without rows, delete it."""
-        self._growing.close()
-        if not self._growing.rows:
+        super().close()
+        if not self.rows:
             self.partial.unlink()
             return
         check_free(self.path, force=self._force)
@@ -155,64 +135,48 @@ class RrdWriter:
 
     def abort(self) -> None:
         """Keep the rows so far under the unfinished name; without rows, delete the file."""
-        self._growing.abort()
-        if not self._growing.rows:
+        super().abort()
+        if not self.rows:
             self.partial.unlink(missing_ok=True)
 
 
-class LiveViewer:
-    """A viewer that shows a run while it goes on: a sink of a `Recorder`. The run goes on without it."""
+class LiveViewer(_Growing):
+    """A viewer that shows a run while it goes on: a sink of a `Recorder`. The run goes on without it.
 
-    def __init__(
-        self,
-        address: str,
-        twin: Twin | None = None,
-        *,
-        expected: Run | None = None,
-        planned: Planned | None = None,
-        scans: Scans | None = None,
-    ) -> None:
-        """Begin.
+    Args:
+        address: Address of the viewer, such as rerun+http://127.0.0.1:9876/proxy.
+        twin: Where the run takes place, as for `write_rrd`.
+        shown: As for `RrdWriter`.
 
-        Args:
-            address: Address of the viewer, such as rerun+http://127.0.0.1:9876/proxy.
-            twin: Where the run takes place, as for `write_rrd`.
-            expected: The run, if it is known beforehand: it sets axes and colours.
-            planned: The planned path, or None.
-            scans: LiDAR scans of the whole run, or None.
+    Raises:
+        InputError: No viewer listens there.
+    """
 
-        Raises:
-            InputError: No viewer listens there.
-        """
+    def __init__(self, address: str, twin: Twin | None = None, **shown: Any) -> None:
         check_listens(address)
-        shown: dict[str, Any] = {"expected": expected, "planned": planned, "scans": scans}
-        self._growing: _Growing | None = _Growing(twin, **shown, address=address, final=Path(address))
-
-    @property
-    def shown(self) -> bool:
+        super().__init__(twin, **shown, address=address, final=Path(address))
+        self.shown = True
         """Whether the viewer is still there."""
-        return self._growing is not None
 
     def append(self, run: Run) -> None:
         """Show the next rows."""
-        if self._growing is None:
-            return
-        try:
-            self._growing.append(run)
-        except InputError:
-            self.abort()
+        if self.shown:
+            try:
+                super().append(run)
+            except InputError:
+                self.abort()
 
     def close(self) -> None:
         """Complete the run; the viewer stays open."""
-        if self._growing is not None:
+        if self.shown:
             with suppress(InputError):
-                self._growing.close()
+                super().close()
 
     def abort(self) -> None:
         """Disconnect from the viewer."""
-        if self._growing is not None:
-            growing, self._growing = self._growing, None
-            growing.abort()
+        if self.shown:
+            self.shown = False
+            super().abort()
 
 
 def check_listens(address: str) -> None:

@@ -19,7 +19,7 @@ import rerun.blueprint as rrb
 
 from magtwin.errors import InputError
 from magtwin.io.rerun.layout import layout
-from magtwin.io.rerun.series import Flags, entity_of, send_columns, send_metadata, send_rows
+from magtwin.io.rerun.series import COLUMNS_ENTITY, ROWS, Flags, entity_of, send_columns, send_metadata
 from magtwin.io.rerun.world import Feed, Interior, Robot, heading_of, send_room
 from magtwin.path import Path
 from magtwin.run.run import Run
@@ -47,10 +47,7 @@ def check_room(file: FilePath, size: int, final: FilePath | None = None) -> None
     Rerun writes from its own thread, and waits for that thread for ever after a full disk ended it. So the
     room is checked first.
 
-    Args:
-        file: The file that grows; it is not changed.
-        size: Upper bound of its size [bytes].
-        final: The file that errors name. Default: `file`.
+    `size` is an upper bound of the file's size [bytes]; errors name `final`.
 
     Raises:
         InputError: There is no room, or its folder cannot be written.
@@ -91,14 +88,9 @@ def stream(
 ) -> Iterator[rr.RecordingStream]:
     """A stream to a file, to the viewer at an address, or to both; completed and closed with the block.
 
-    Args:
-        recording_id: The viewer merges recordings of one id.
-        name: Name in the viewer.
-        views: The layout that it opens with.
-        file: The file to make; it can be read at any time up to the last flush.
-        address: Address of a viewer.
-        final: The file that errors name. Default: `file`.
-        room: Upper bound of the file's size [bytes].
+    The viewer merges recordings of one `recording_id`. `views` is the layout that it opens with, `final` the
+    file that errors name, and `room` an upper bound of the file's size [bytes]. The file can be read at any
+    time up to the last flush.
 
     Raises:
         InputError: Rerun is switched off, or the file cannot be written.
@@ -189,7 +181,8 @@ class Recording:
             self.robot.close(self._last)
         if self._feed is not None:
             self._feed.clear(float(self._last["t"][-1]))
-        send_rows(self.rec, self._rows, self.name)
+        rows: dict[str, Any] = {ROWS: [self._rows]}  # marks a complete run
+        self.rec.log(entity_of(COLUMNS_ENTITY, self.name), rr.AnyValues(**rows), static=True)
         self.rec.log(
             entity_of("metadata", self.name), metadata_page(self._last.metadata, self._rows), static=True
         )
@@ -213,19 +206,9 @@ def recording_of(
 ) -> Iterator[Recording]:
     """A recording of one run with its layout, metadata and lab; it holds no rows yet.
 
-    Args:
-        run: The run, or its first rows.
-        recording_id: As for `stream`.
-        name: Name in the viewer.
-        twin: Where the run took place. None: only series.
-        known: The run that sets axes and colours. Default: `run`.
-        planned: The planned path, or None.
-        scans: LiDAR scans, or None.
-        events: As for `layout`, like `whole`.
-        room: Upper bound of the size of the rows [bytes].
-        whole: Whether `known` is the whole run.
-        rate_hz: Rows per second. Default: the rate of the first rows.
-        sinks: `file`, `address` and `final` of `stream`.
+    `run` is the run, or its first rows; `known` sets axes and colours, and is whole if `whole`. No twin:
+    only series. `room` is an upper bound of the size of the rows [bytes]; a `rate_hz` of 0 is taken
+    from the first rows; `sinks` are `file`, `address` and `final` of `stream`.
 
     Raises:
         InputError: The stage cannot be read, or as for `stream`.
@@ -238,9 +221,8 @@ def recording_of(
         interior = Interior.of(twin)
         room += interior.size(twin.field)
     with stream(recording_id, name, views, room=room, **sinks) as rec:
-        properties: dict[str, Any] = {
-            key: [value] for key, value in run.metadata.items() if not _too_large(value)
-        }
+        kept = {k: v for k, v in run.metadata.items() if not isinstance(v, int) or -(2**63) <= v < 2**63}
+        properties: dict[str, Any] = {key: [value] for key, value in kept.items()}
         if properties:
             rec.send_property("run", rr.AnyValues(**properties))
         rec.log("metadata", metadata_page(run.metadata), static=True)
@@ -249,10 +231,6 @@ def recording_of(
             scale = send_room(rec, interior, twin.field, known, planned)
             robot = Robot(rec, interior, scale, rate_hz=rate_hz)
         yield Recording(rec, robot=robot, scans=scans)
-
-
-def _too_large(value: object) -> bool:
-    return isinstance(value, int) and not -(2**63) <= value < 2**63
 
 
 def title_of(run: Run) -> str:

@@ -9,7 +9,7 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
 from magtwin.errors import InputError
-from magtwin.run.arrow import said_of, spec_said
-from magtwin.run.run import COLUMNS, Column, Run
+from magtwin.run.arrow import check_metadata, said_of, spec_said
+from magtwin.run.run import COLUMNS, Run, check_numbers
 from magtwin.verdict import Z_90
 
 Array = NDArray[np.float64]
@@ -80,12 +80,8 @@ STATES: Mapping[str, State] = MappingProxyType(
 """Flags with states and events."""
 
 DERIVED = (
-    "interval_low_nt",
-    "interval_high_nt",
-    "error_nt",
-    "measured_error_nt",
-    "error_low_nt",
-    "error_high_nt",
+    *("interval_low_nt", "interval_high_nt", "error_nt", "measured_error_nt"),
+    *("error_low_nt", "error_high_nt"),
 )
 """Lines of the plots that are not columns: see `derived`."""
 
@@ -145,11 +141,6 @@ def send_metadata(rec: rr.RecordingStream, run: Run, name: str) -> None:
     rec.log(entity_of(COLUMNS_ENTITY, name), rr.AnyValues(**as_json | {NAME: [name]}), static=True)
 
 
-def send_rows(rec: rr.RecordingStream, rows: int, name: str) -> None:
-    """Send the number of rows of a complete run."""
-    rec.log(entity_of(COLUMNS_ENTITY, name), rr.AnyValues(**cast(Any, {ROWS: [rows]})), static=True)
-
-
 def send_columns(rec: rr.RecordingStream, run: Run, t: Array, name: str) -> None:
     """Send the columns of a run, or of a part of it, at times t [s]."""
     parts = {key: run.spec(key).parts for key in run}
@@ -183,11 +174,7 @@ def _send_table(
 
 def _arrow(name: str, values: NDArray[Any], parts: tuple[str, ...]) -> pa.Array:
     """A column as an array, or as a struct of its parts."""
-    if values.ndim > 2 or values.dtype.kind not in "bfiu" or 0 in values.shape[1:]:
-        raise InputError(
-            f"column {name!r} cannot be recorded: numbers or flags of shape (N,) or (N, width) can, "
-            f"got {values.dtype} of shape {values.shape}"
-        )
+    check_numbers(name, values, "be recorded")
     if values.ndim == 1:
         return pa.array(np.ascontiguousarray(values))
     return pa.StructArray.from_arrays([pa.array(row) for row in np.ascontiguousarray(values.T)], names=parts)
@@ -196,9 +183,7 @@ def _arrow(name: str, values: NDArray[Any], parts: tuple[str, ...]) -> pa.Array:
 def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | None]:
     """The run in the chunks of its entity: its name, the run, and its number of rows if it is complete.
 
-    Args:
-        chunks: Every chunk of the entity, in any order.
-        what: Name of the file, for errors.
+    `chunks` are all chunks of the entity, in any order; `what` names the file in errors.
 
     Raises:
         InputError: The chunks hold no run.
@@ -209,20 +194,20 @@ def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | N
         if TIMELINE in batch.schema.names:
             tables.append(batch)
         else:
-            known = [key for key in (FACTS, NAMES, NAME, ROWS) if key in batch.schema.names]
-            static |= {key: batch.column(key)[0][0].as_py() for key in known}
+            keys = [key for key in (FACTS, NAMES, NAME, ROWS) if key in batch.schema.names]
+            static |= {key: batch.column(key)[0][0].as_py() for key in keys}
     try:
         metadata, names = (json.loads(static[key]) for key in (FACTS, NAMES))
         rows = int(static[ROWS]) if ROWS in static else None
-        whole = isinstance(metadata, dict) and isinstance(names, dict)
-        if not whole or not all(isinstance(value, str | int | float | bool) for value in metadata.values()):
-            raise ValueError("metadata and columns must be tables of plain values")
+        check_metadata(metadata)
         order = np.argsort([table.column(TIMELINE)[0].value for table in tables], kind="stable")
-        columns = {
-            name: np.concatenate([_values(tables[k].column(name)) for k in order])
-            for name in (names if tables else ())
-        }
-        own = {name: _spec(tables[0].column(name), names[name]) for name in columns if name not in COLUMNS}
+        known = names if tables else ()
+        columns = {n: np.concatenate([_values(tables[k].column(n)) for k in order]) for n in known}
+        own = {}
+        for name in [name for name in columns if name not in COLUMNS]:
+            kind = tables[0].column(name).type.value_type  # the fields of a struct are the parts
+            parts = tuple(member.name for member in kind) if pa.types.is_struct(kind) else ()
+            own[name] = spec_said({key: str(text) for key, text in names[name].items()}, parts)
         run = Run(columns, metadata, own)
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError, pa.ArrowException) as error:
         raise InputError(
@@ -230,13 +215,6 @@ def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | N
             f"({type(error).__name__}: {error}); read the run's Parquet, or record it again"
         ) from error
     return str(static.get(NAME) or COLUMNS_ENTITY), run, rows
-
-
-def _spec(column: pa.Array, said: dict[str, str]) -> Column:
-    """Description of a custom column; the fields of its struct are its parts."""
-    kind = column.type.value_type
-    parts = tuple(field.name for field in kind) if pa.types.is_struct(kind) else ()
-    return spec_said({key: str(text) for key, text in said.items()}, parts)
 
 
 def _values(column: pa.Array) -> NDArray[Any]:

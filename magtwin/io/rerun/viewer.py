@@ -58,15 +58,12 @@ def show(rrd: str | os.PathLike[str], *, source: str | os.PathLike[str] | None =
     command = [_binary(), "--bind", LOCALHOST, "--port", "auto", str(rrd)]
     result = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
     if result.returncode:
-        advice = (
-            f"use a browser: rerun --web-viewer --bind {LOCALHOST} {rrd}"
-            if source is None
-            else "view the .rrd of this run, which a browser shows too"
-        )
-        raise InputError(
-            f"{source or rrd}: the Rerun viewer opened no window: {_reason(result.stderr)}; "
-            f"without a display {advice}"
-        )
+        advice = "view the .rrd of this run, which a browser shows too"
+        if source is None:
+            advice = f"use a browser: rerun --web-viewer --bind {LOCALHOST} {rrd}"
+        reason = _reason(result.stderr)
+        text = f"the Rerun viewer opened no window: {reason}; without a display {advice}"
+        raise InputError(f"{source or rrd}: {text}")
 
 
 def screenshot(
@@ -101,22 +98,22 @@ def screenshot(
         raise InputError(f"size of a recording's picture must lie in {limits}, got {size[0]} x {size[1]}")
     check_decodes(path, rrd)
     window = (size[0], size[1] + TITLE_BAR)
-    with output(png, force=force) as aside, headless_viewer(window) as client:
+    with output(png, force=force) as aside, live_viewer(headless=True, size=window) as (_, client):
         try:
             views = _draw(client, path.resolve(), rrd, aside, time_s)
         except (ConnectionError, RuntimeError) as error:
-            raise InputError(
-                f"{rrd}: the Rerun viewer ended before the picture was drawn ({error})"
-            ) from error
-    return [
-        f"{v.name}: {r.severity}: {r.summary} {r.details or ''}".strip() for v in views for r in v.reports
-    ]
+            text = f"the Rerun viewer ended before the picture was drawn ({error})"
+            raise InputError(f"{rrd}: {text}") from error
+    lines = [f"{v.name}: {r.severity}: {r.summary} {r.details or ''}" for v in views for r in v.reports]
+    return [line.strip() for line in lines]
 
 
 def _draw(
     client: ViewerClient, path: Path, source: str | os.PathLike[str], png: Path, time_s: float | None
 ) -> list[View]:
     """Open a recording, go to a time and save the picture; returns the state of the views."""
+    from matplotlib.image import imread, imsave
+
     client.open(str(path))
     _wait_until(lambda: not client.get_state().loading, f"{source}: the viewer did not load it")
     nothing = f"{source}: holds nothing that the viewer shows; if the recording was cut short, write it again"
@@ -140,45 +137,31 @@ def _draw(
     while time.monotonic() < end:  # its clock advances only while it draws
         client.take_screenshot(max_size=64)
     client.save_screenshot(str(png))
-    _crop(png)
+    picture = imread(png)[TITLE_BAR:]
+    imsave(png, picture, metadata={"Software": "magtwin"}, pil_kwargs={"optimize": True})
     return client.get_state().views
 
 
 @contextmanager
-def headless_viewer(size: tuple[int, int] = (1600, 1000)) -> Iterator[ViewerClient]:
-    """A viewer without a window that listens on localhost only; ended with the block.
-
-    Args:
-        size: Width and height of its pictures [pixels].
-
-    Raises:
-        InputError: It cannot run here; the text has its reason.
-    """
-    with _started("--headless", "--window-size", f"{size[0]}x{size[1]}") as (_, client):
-        yield client
-
-
-@contextmanager
-def live_viewer(*, headless: bool = False) -> Iterator[tuple[str, ViewerClient]]:
-    """A viewer for a run that goes on; ended with the block.
+def live_viewer(
+    *, headless: bool = False, size: tuple[int, int] = (1600, 1000)
+) -> Iterator[tuple[str, ViewerClient]]:
+    """A viewer that listens on localhost only; ended with the block.
 
     Args:
         headless: Whether it has no window, and only draws pictures.
+        size: Width and height of these pictures [pixels].
 
     Yields:
-        The address on localhost that recordings connect to, and a client.
+        The address that recordings connect to, and a client.
 
     Raises:
         InputError: It cannot run here; the text has its reason.
     """
-    with _started(*["--headless"] * headless) as viewer:
-        yield viewer
-
-
-@contextmanager
-def _started(*options: str) -> Iterator[tuple[str, ViewerClient]]:
-    """A viewer process that listens on localhost only: its address and a client; ended with the block."""
-    port = _free_port()
+    with socket.socket() as probe:
+        probe.bind((LOCALHOST, 0))
+        port = int(probe.getsockname()[1])
+    options = ["--headless", "--window-size", f"{size[0]}x{size[1]}"] if headless else []
     command = [_binary(), "--bind", LOCALHOST, "--port", str(port), "--hide-welcome-screen", *options]
     process = None
     with tempfile.TemporaryFile("w+") as log:
@@ -243,11 +226,7 @@ def check_decodes(rrd: Path, source: str | os.PathLike[str]) -> None:
     """Refuse a recording that Rerun's own verifier cannot decode.
 
     The verifier is a separate process, as changed bytes may make Rerun's decoder end its process. A missing
-    end is accepted: a recording that still grows has none.
-
-    Args:
-        rrd: The recording.
-        source: The file that errors name.
+    end is accepted: a recording that still grows has none. Errors name `source`.
 
     Raises:
         InputError: It is not a recording, was cut short, or its bytes were changed.
@@ -267,23 +246,10 @@ def check_decodes(rrd: Path, source: str | os.PathLike[str]) -> None:
         )
 
 
-def _crop(png: Path) -> None:
-    """Remove the empty title bar from a picture."""
-    from matplotlib.image import imread, imsave
-
-    imsave(png, imread(png)[TITLE_BAR:], metadata={"Software": "magtwin"}, pil_kwargs={"optimize": True})
-
-
 def _binary() -> str:
     """Path of the viewer's program."""
     name = "rerun.exe" if os.name == "nt" else "rerun"
     return str(existing(Path(rerun_cli.__file__).with_name(name), "Rerun viewer; install rerun-sdk again"))
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind((LOCALHOST, 0))
-        return int(probe.getsockname()[1])
 
 
 def _timelines(client: ViewerClient) -> list[Timeline]:

@@ -112,17 +112,9 @@ class Interior:
 def send_room(
     rec: rr.RecordingStream, interior: Interior, field: AnomalyMap, known: Run, planned: Path | None
 ) -> Scale:
-    """Send the map on the floor, its legend, walls, furniture and the planned path.
+    """Send the map on the floor, its legend, walls, furniture and the planned path; returns its colours.
 
-    Args:
-        rec: The recording.
-        interior: The lab.
-        field: The map.
-        known: The run, for the range of its readings and its first heading.
-        planned: The planned path, or None.
-
-    Returns:
-        The colours of the map.
+    The run `known` gives the range of readings and the first heading.
     """
     scale = Scale.over(field, known.get("b_total_nt", np.empty(0)))
     _send_map(rec, field, scale, heading_of(field, known))
@@ -305,9 +297,9 @@ class Robot:
         self._pose(run, np.arange(-first % poses, run.rows, poses))
         self._trail(run, np.arange(-first % dots, run.rows, dots))
 
-    def close(self, last: Run | None = None) -> None:
+    def close(self, last: Run) -> None:
         """End the path with `last`, the last row of the run."""
-        if last is None or self._strides is None:
+        if self._strides is None:
             return
         row = np.array([0])
         poses, dots = self._strides
@@ -347,9 +339,8 @@ class Robot:
         dips. Its pose is relative to the robot, as the sensor's link may have no shape and so no entity.
         """
         entity = f"{entity_of('world/robot', self.name)}/magnetometer"
-        place = _transform(
-            self.interior.robot.p_base_magnetometer, self.interior.robot.q_base_magnetometer_xyzw
-        )
+        robot = self.interior.robot
+        place = _transform(robot.p_base_magnetometer, robot.q_base_magnetometer_xyzw)
         self.rec.log(entity, place, static=True)
         style = rr.Arrows3D.from_fields(colors=[(255, 255, 255)], radii=[0.006])
         self.rec.log(f"{entity}/field", style, static=True)
@@ -403,7 +394,13 @@ def _transform(p: Any, q_xyzw: Any) -> rr.Transform3D:
 def send_still(rec: rr.RecordingStream, shapes: Sequence[Shape]) -> None:
     """Send the axes of the world, walls and furniture: one mesh per object."""
     rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    for prim, parts in _objects(shapes).items():
+    objects: dict[str, list[Shape]] = {}  # a desk, not its legs
+    for shape in shapes:
+        if not shape.link and shape.prim != str(HEAT_MAP):  # _send_map draws the map with more pixels
+            parent = shape.prim.rpartition("/")[0]
+            prim = parent if parent.count("/") > 1 else shape.prim  # below the root: an object itself
+            objects.setdefault(prim, []).append(shape)
+    for prim, parts in objects.items():
         rec.log(f"world/lab/{_entity(prim)}", mesh_of(parts), static=True)
 
 
@@ -413,33 +410,16 @@ def mesh_of(shapes: Sequence[Shape]) -> rr.Mesh3D:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
-    colours = np.concatenate([_colours(shape) for shape in shapes])
+    rgba = []
+    for shape in shapes:
+        own = shape.colour[:3] if shape.vertex_colours is None else shape.vertex_colours[shape.faces.ravel()]
+        linear = np.broadcast_to(srgb_from_linear(own), (3 * len(shape.faces), 3))
+        rgba.append(np.hstack([linear, np.full((len(linear), 1), shape.colour[3])]))
     return rr.Mesh3D(
         vertex_positions=corners.reshape(-1, 3),
         vertex_normals=np.repeat(normals, 3, axis=0),
-        vertex_colors=colours,
+        vertex_colors=(np.concatenate(rgba) * 255).round().astype(np.uint8),
     )
-
-
-def _colours(shape: Shape) -> NDArray[np.uint8]:
-    """Colour (sRGB) and opacity of each corner of a shape's triangles, shape (3 F, 4)."""
-    rgba = np.empty((3 * len(shape.faces), 4))
-    own = shape.colour[:3] if shape.vertex_colours is None else shape.vertex_colours[shape.faces.ravel()]
-    rgba[:, :3], rgba[:, 3] = srgb_from_linear(own), shape.colour[3]
-    return (rgba * 255).round().astype(np.uint8)
-
-
-def _objects(shapes: Sequence[Shape]) -> dict[str, list[Shape]]:
-    """Shapes that stand still, grouped by object: a desk, not its legs."""
-    objects: dict[str, list[Shape]] = {}
-    for shape in shapes:
-        if not shape.link and shape.prim != str(HEAT_MAP):  # _send_map draws the map with more pixels
-            parent, _, _ = shape.prim.rpartition("/")
-            whole = (
-                parent if parent.count("/") > 1 else shape.prim
-            )  # a prim below the root is an object itself
-            objects.setdefault(whole, []).append(shape)
-    return objects
 
 
 def _entity(name: str) -> str:

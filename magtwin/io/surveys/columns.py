@@ -13,19 +13,8 @@ HEADINGS = ("heading", "yaw", "theta")
 """Default names of a heading."""
 
 FIELDS = (
-    *(
-        "field",
-        "b_nt",
-        "scalar_mag",
-        "magnitude",
-        "b_total",
-        "b_total_nt",
-        "b_ut",
-        "b_total_ut",
-        "b",
-        "b_tot",
-    ),
-    *("btotal", "bt", "|b|", "b_mag", "mag", "total", "total_field", "f"),
+    *("field", "b_nt", "scalar_mag", "magnitude", "b_total", "b_total_nt", "b_ut", "b_total_ut", "b"),
+    *("b_tot", "btotal", "bt", "|b|", "b_mag", "mag", "total", "total_field", "f"),
 )
 """Default names of a magnitude; case does not matter."""
 
@@ -66,7 +55,7 @@ class Columns:
     """Axes of the vector: body (forward, left, up) or world. Default: body."""
 
     heading_unit: HeadingUnit | None = None
-    """Unit of the heading. Default: rad, with a check of its range."""
+    """Unit of the heading. Default: rad; a range above that of radians is refused."""
 
     unit: Unit | None = None
     """Unit of the field. Default: detected, as the unit in which the values have the size of the

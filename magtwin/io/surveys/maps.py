@@ -11,7 +11,10 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.survey.folder import node_map
+from magtwin.field.survey.folder import read_survey as read_folder
 from magtwin.field.survey.readings import TAKEN, Readings
+from magtwin.field.survey.stuck import mask_stuck
 from magtwin.files import check_free, sha256
 from magtwin.io.surveys.about import About
 from magtwin.io.surveys.columns import Columns
@@ -46,7 +49,6 @@ def open_map(file: Source, date: str | None = None) -> AnomalyMap:
     Raises:
         InputError: There is no map, it is damaged, or a folder is asked for a date.
     """
-    from magtwin.field.survey.folder import read_survey as read_folder
     from magtwin.usd.maps import load_map
 
     if not Path(file).is_dir():
@@ -57,33 +59,21 @@ def open_map(file: Source, date: str | None = None) -> AnomalyMap:
 
 
 def read_survey(
-    sources: Sequence[Source],
-    *,
-    columns: Columns | None = None,
-    about: About | None = None,
-    keep_stuck: bool = False,
-    pose_topic: str | None = None,
-    field_topic: str | None = None,
+    sources: Sequence[Source], *, about: About | None = None, keep_stuck: bool = False, **reading: Any
 ) -> tuple[Readings, Report]:
     """Readings of a survey of any form, with stuck readings masked, and the report on them.
 
     Args:
         sources: As for `magtwin.io.surveys.readings.read_readings`.
-        columns: Columns of tables.
         about: Metadata that the files lack.
         keep_stuck: Whether stuck readings stay in.
-        pose_topic: Topic of a bag's poses, if it has several.
-        field_topic: Topic of a bag's field, if it has several.
+        reading: `columns`, `pose_topic` and `field_topic` of `read_readings`.
 
     Raises:
         InputError: A source cannot be read, or all of its readings are stuck.
     """
-    from magtwin.field.survey.stuck import mask_stuck
-
     known = {} if about is None else {**asdict(about), "name": None}  # errors name the file
-    readings = read_readings(
-        *sources, columns=columns, pose_topic=pose_topic, field_topic=field_topic, **known
-    )
+    readings = read_readings(*sources, **reading, **known)
     masked, report = mask_stuck(readings)
     if taken := [part.removeprefix(TAKEN) for part in readings.source.split("; ") if part.startswith(TAKEN)]:
         report = replace(report, metadata={**report.metadata, "taken": taken})
@@ -97,12 +87,7 @@ def read_survey(
 
 
 def import_survey(
-    sources: Sequence[Source],
-    out: Source,
-    *,
-    about: About | None = None,
-    force: bool = False,
-    **reading: Any,
+    sources: Sequence[Source], out: Source, *, about: About | None = None, force: bool = False, **reading: Any
 ) -> Report:
     """Write a survey as a map layer, which it must be gridded for, or as readings.
 
@@ -119,20 +104,13 @@ def import_survey(
     Raises:
         InputError: A source cannot be read, or the output cannot be written.
     """
-    from magtwin.field.survey.folder import node_map
-    from magtwin.field.survey.folder import read_survey as read_folder
     from magtwin.usd.maps import save_map
 
     out, columns, about = check_free(out, force=force), reading.get("columns") or Columns(), about or About()
     name = about.name or out.stem
     if out.suffix != ".parquet" and len(sources) == 1 and _is_survey_folder(Path(sources[0]), columns):
-        field, report = read_folder(
-            sources[0],
-            **{**asdict(about), "name": name},
-            unit=columns.unit or "nT",
-            scale=columns.scale,
-            keep_stuck=reading.get("keep_stuck", False),
-        )
+        known = {**asdict(about), "name": name, "unit": columns.unit or "nT", "scale": columns.scale}
+        field, report = read_folder(sources[0], **known, keep_stuck=reading.get("keep_stuck", False))
         save_map(field, out, force=force)
         return report
     readings, found = read_survey(sources, about=about, **reading)
@@ -346,12 +324,8 @@ def _method_options(
     for name, value, method in (("kernel", kernel, "gp"), ("earth", earth, "harmonic")):
         if value is not None and method not in methods:
             raise InputError(f"`{name}` is for `method={method}`; drop it for {methods[0]}", parameter=name)
-    options: dict[str, dict[str, Any]] = {}
-    if kernel is not None:
-        options["gp"] = {"kernel": kernel}
-    if earth is not None:
-        options["harmonic"] = {"earth_nt": earth_of(earth)}
-    return options
+    options = {} if kernel is None else {"gp": dict[str, Any](kernel=kernel)}
+    return options if earth is None else {**options, "harmonic": {"earth_nt": earth_of(earth)}}
 
 
 def _joined(report: Report, *below: Report) -> Report:

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
@@ -20,6 +22,8 @@ from magtwin.files import existing, output, sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
 from magtwin.io.surveys.columns import FIELDS, HEADINGS, TIMES, VECTORS, Columns
 from magtwin.io.surveys.table import Table, read_csv, read_parquet_table
+from magtwin.io.tables import load_parquet, read_parquet
+from magtwin.run.arrow import FACTS
 from magtwin.run.run import Run
 
 Array = NDArray[np.float64]
@@ -53,15 +57,10 @@ _PLACES = ("frame", "datum")
 def read_readings(
     *sources: Source,
     columns: Columns | None = None,
-    name: str | None = None,
-    licence: str = "",
-    created: str = "",
-    height_m: float | None = None,
-    frame: str = "",
-    datum: str = "",
     headings_deg: tuple[float, ...] | None = None,
     pose_topic: str | None = None,
     field_topic: str | None = None,
+    **about: Any,
 ) -> Readings:
     """Read the readings of a survey from any supported source.
 
@@ -74,15 +73,11 @@ def read_readings(
     Args:
         sources: One or more sources.
         columns: Meaning and units of the columns of a table.
-        name: Name of the survey. Default: that of the first source.
-        licence: SPDX name of the licence; "" keeps the licence of the source.
-        created: Day of the survey, YYYY-MM-DD; likewise.
-        height_m: Height of the sensor above the floor [m]; likewise.
-        frame: Axes of x, y and heading, in words; likewise.
-        datum: Location of that frame, in words; likewise.
         headings_deg: Headings of a folder of CSVs [deg], if it is incomplete.
         pose_topic: Topic of a bag's poses, if there are several.
         field_topic: Topic of a bag's field, if there are several.
+        about: Metadata that replace those of the sources, unless None or "": `name`, `licence`, `created`,
+            `height_m` [m], `frame` and `datum`, as in `magtwin.io.surveys.about.About`.
 
     Returns:
         Readings in the order of the sources. Rows with a cell that is empty or nan are left out; `source` has
@@ -103,38 +98,26 @@ def read_readings(
         if path.suffix in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
             from magtwin.io.bags import read_bag_readings
 
-            parts.append(
-                read_bag_readings(
-                    path,
-                    pose_topic=pose_topic,
-                    field_topic=field_topic,
-                    unit=columns.unit,
-                    scale=columns.scale,
-                )
-            )
+            topics = {"pose_topic": pose_topic, "field_topic": field_topic}
+            parts.append(read_bag_readings(path, unit=columns.unit, scale=columns.scale, **topics))
         elif path.is_dir():
-            parts.append(
-                read_grid(path, headings_deg=headings_deg, unit=columns.unit or "nT", scale=columns.scale)
-            )
+            unit = columns.unit or "nT"
+            parts.append(read_grid(path, headings_deg=headings_deg, unit=unit, scale=columns.scale))
         else:
             parts.append(_of_file(str(source), path, columns))
     readings = parts[0] if len(parts) == 1 else _together(parts)
-    own = {"licence": licence, "created": created, "height_m": height_m, "name": name}
-    own |= {"frame": frame, "datum": datum}
-    return readings.with_(**{key: value for key, value in own.items() if value not in (None, "")})
+    return readings.with_(**{key: value for key, value in about.items() if value not in (None, "")})
 
 
 def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
     """The readings of a Run: its measured field at the true pose of base_link.
 
+    Rows whose field is nan (outside the map) are left out; rows with lost lock are not good.
+
     Args:
         run: A run with p_world_base, yaw and b_measured_nt, or b_total_nt.
         name: Name of the readings.
         source: Source of the run.
-
-    Returns:
-        Its readings. Rows whose field is nan (outside the map) are left out; rows with lost lock are not
-        good.
 
     Raises:
         InputError: A column is missing, or no row has a field.
@@ -173,9 +156,6 @@ def save_readings(readings: Readings, path: Source, *, force: bool = False) -> N
     Raises:
         InputError: The file exists and `force` is not set.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     fields, arrays = [], []
     for key, (width, _) in SHAPES.items():
         values = getattr(readings, key)
@@ -193,14 +173,9 @@ def save_readings(readings: Readings, path: Source, *, force: bool = False) -> N
     about["grid"] = None if readings.grid is None else asdict(readings.grid)
     schema = pa.schema(fields, metadata={_SURVEY: json.dumps(about, ensure_ascii=False)})
     split = {f.name: "BYTE_STREAM_SPLIT" for f in fields if pa.types.is_floating(f.type)}
+    table = pa.Table.from_arrays(arrays, schema=schema)
     with output(path, force=force) as aside:
-        pq.write_table(
-            pa.Table.from_arrays(arrays, schema=schema),
-            aside,
-            compression="zstd",
-            use_dictionary=False,
-            column_encoding=split,
-        )
+        pq.write_table(table, aside, compression="zstd", use_dictionary=False, column_encoding=split)
 
 
 def load_readings(path: Source) -> Readings:
@@ -246,11 +221,7 @@ def is_pattern(source: Source) -> bool:
 
 
 def _each(sources: Sequence[Source]) -> Iterator[Source]:
-    """The sources, with patterns and folders of Parquet files replaced by their files.
-
-    Raises:
-        InputError: Nothing matches a pattern.
-    """
+    """The sources, with patterns and folders of Parquet files replaced by their files."""
     for source in sources:
         path = Path(source)
         if is_pattern(source):
@@ -261,11 +232,7 @@ def _each(sources: Sequence[Source]) -> Iterator[Source]:
                 raise InputError(f"no file or folder matches {str(source)!r}; check the pattern")
             yield from matches
         elif path.is_dir() and not (path / "metadata.yaml").is_file():
-            tables = sorted(file for file in path.iterdir() if file.suffix in PARQUET)
-            if tables:
-                yield from tables
-            else:
-                yield source
+            yield from sorted(file for file in path.iterdir() if file.suffix in PARQUET) or [path]
         else:
             yield source
 
@@ -292,15 +259,12 @@ def _of_file(source: str, path: Path, columns: Columns) -> Readings:
         )
     if path.suffix in PARQUET and path == Path(source):
         metadata = _metadata(path)
-        if _SURVEY in metadata or b"magtwin_facts" in metadata:
+        if _SURVEY in metadata or FACTS in metadata:
             _only_unit(path, columns)
             if columns.scale is not None:
                 raise InputError(f"{path}: its field is in nT already; leave out --scale")
-        if _SURVEY in metadata:
-            return load_readings(path)
-        if b"magtwin_facts" in metadata:
-            from magtwin.io.tables import read_parquet
-
+            if _SURVEY in metadata:
+                return load_readings(path)
             return readings_of_run(read_parquet(path), name=path.stem, source=_sum(path))
     paths = [path]
     if path != Path(source):
@@ -354,20 +318,25 @@ def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
             )
         turn = np.zeros(len(p))
     yaw = turn if turn.ndim == 1 else yaw_from_quat(turn)
+    magnitude = table.column(columns.field or columns.several("vector")[0])
     zero = np.flatnonzero(known & (b <= 0))
     if len(zero):
-        where = _magnitude(table, columns)
-        raise InputError(f"{where.where(int(zero[0]))}: a magnitude is above 0, got {b[zero[0]]:g} nT")
+        raise InputError(f"{magnitude.where(int(zero[0]))}: a magnitude is above 0, got {b[zero[0]]:g} nT")
     check_unit(
         b[known],
         str(table.path),
-        _magnitude(table, columns).name or columns.field or columns.vector,
+        magnitude.name or columns.field or columns.vector,
         columns.unit or "nT",
-        lambda k: _magnitude(table, columns).where(int(np.flatnonzero(known)[k])),
+        lambda k: magnitude.where(int(np.flatnonzero(known)[k])),
         columns.scale,
     )
     if vector is not None:
-        _check_sizes(vector[known], b[known], table, columns)
+        ratio = float(np.median(np.linalg.norm(vector[known], axis=1) / b[known]))
+        if not 1 / APART <= ratio <= APART:
+            raise InputError(
+                f"{table.path}: {columns.vector} is {ratio:.3g} times as long as {columns.field} (median); "
+                "give both in one unit, and the components of the whole field"
+            )
         _check_axes(vector[known], yaw[known], table, columns)
     run, runs = _runs(table, columns, paths[0].stem, known)
     return Readings(
@@ -386,9 +355,7 @@ def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
 def _complete(table: Table, columns: Columns) -> tuple[Columns, list[str]]:
     """Columns and unit, with missing ones found by name and size; and what was found so."""
     taken = list[str]()
-    lower: dict[str, str] = {}
-    for label in table.names:
-        lower.setdefault(label.strip().lower(), label)
+    lower = {label.strip().lower(): label for label in reversed(table.names)}  # the first of equal names
     if not (columns.heading or columns.quaternion):
         label = next((name for name in HEADINGS if name in table.names), "")
         columns = replace(columns, heading=label or next((lower[n] for n in HEADINGS if n in lower), ""))
@@ -403,10 +370,8 @@ def _complete(table: Table, columns: Columns) -> tuple[Columns, list[str]]:
             if columns.axes is None:
                 taken.append(f"{columns.vector} as the field in the robot's axes, forward, left, up (--axes)")
         else:
-            named = [label for label in table.names if not label.isdigit()]
-            known = (
-                f"columns: {', '.join(named)}" if named else f"{len(table.columns)} columns without a header"
-            )
+            named = ", ".join(label for label in table.names if not label.isdigit())
+            known = f"columns: {named}" if named else f"{len(table.columns)} columns without a header"
             raise InputError(
                 f"{table.path}: no column of the field was found by its name ({known}); name the magnitude "
                 "with --field NAME, or the components with --vector BX,BY,BZ"
@@ -443,18 +408,11 @@ def _check_axes(vector_nt: Array, yaw: Array, table: Table, columns: Columns) ->
 def levelled(vector_nt: Array, turn: Array, axes: str) -> Array:
     """Vectors in the axes of a robot that stands upright: forward, left, up.
 
-    Args:
-        vector_nt: Field in body or world axes, shape (N, 3).
-        turn: Headings [rad], shape (N,), or orientations xyzw of the body in world, shape (N, 4).
-        axes: "body" or "world", what `vector_nt` is in.
-
-    Returns:
-        Field in level axes that are turned by the heading alone, shape (N, 3).
+    `turn` are headings [rad], shape (N,), or orientations xyzw of the body in world, shape (N, 4); `axes` are
+    those of `vector_nt`. The result, shape (N, 3), is in level axes that are turned by the heading alone.
     """
     if turn.ndim == 1:
-        if axes == "body":
-            return vector_nt
-        return rotate(quat_conjugate(quat_from_yaw(turn)), vector_nt)
+        return vector_nt if axes == "body" else rotate(quat_conjugate(quat_from_yaw(turn)), vector_nt)
     world = rotate(turn, vector_nt) if axes == "body" else vector_nt
     return rotate(quat_conjugate(quat_from_yaw(yaw_from_quat(turn))), world)
 
@@ -463,10 +421,9 @@ def _turn(table: Table, columns: Columns) -> Array | None:
     """Headings [rad], shape (N,), or quaternions xyzw, shape (N, 4); None if there is no such column."""
     if columns.quaternion:
         return np.column_stack([table.numbers(name) for name in columns.several("quaternion")])
-    name = columns.heading or next((name for name in HEADINGS if name in table.names), "")
-    if not name:
+    if not columns.heading:
         return None
-    heading = table.numbers(name)
+    name, heading = columns.heading, table.numbers(columns.heading)
     if columns.heading_unit == "deg":
         return np.radians(heading)
     beyond = np.flatnonzero(np.abs(heading) > LARGEST_TURN)
@@ -479,34 +436,13 @@ def _turn(table: Table, columns: Columns) -> Array | None:
     return heading
 
 
-def _magnitude(table: Table, columns: Columns) -> Any:
-    """The column to name in errors of the magnitude."""
-    if columns.field:
-        return table.column(columns.field)
-    if columns.vector:
-        return table.column(columns.several("vector")[0])
-    return table.column(next((name for name in FIELDS if name in table.names), FIELDS[0]))
-
-
 def _field(table: Table, columns: Columns) -> tuple[Array | None, Array]:
     """Vectors, if there are any, and magnitudes [nT], shapes (N, 3) and (N,)."""
-    vector, factor = None, nt_per(columns.unit, columns.scale)
-    if columns.vector:
-        names = columns.several("vector")
-        vector = factor * np.column_stack([table.numbers(name) for name in names])
-    if columns.field or vector is None:
-        return vector, factor * table.numbers(_magnitude(table, columns).name or columns.field)
-    return vector, np.linalg.norm(vector, axis=1)
-
-
-def _check_sizes(vector_nt: Array, b_nt: Array, table: Table, columns: Columns) -> None:
-    """Refuse vectors that differ in size from the magnitudes: another unit, or other columns."""
-    ratio = float(np.median(np.linalg.norm(vector_nt, axis=1) / b_nt))
-    if not 1 / APART <= ratio <= APART:
-        raise InputError(
-            f"{table.path}: {columns.vector} is {ratio:.3g} times as long as {columns.field} (median); "
-            "give both in one unit, and the components of the whole field"
-        )
+    factor, names = nt_per(columns.unit, columns.scale), columns.several("vector")
+    vector = factor * np.column_stack([table.numbers(name) for name in names]) if names else None
+    return vector, factor * table.numbers(columns.field) if vector is None or columns.field else (
+        np.linalg.norm(vector, axis=1)
+    )
 
 
 def _runs(table: Table, columns: Columns, stem: str, known: NDArray[np.bool_]) -> Any:
@@ -532,15 +468,10 @@ def _together(parts: Sequence[Readings]) -> Readings:
         values = [getattr(part, key) for part in parts]
         arrays[key] = None if any(v is None for v in values) else np.concatenate(values)
     same: dict[str, Any] = {}
-    for key, unknown in (
-        ("created", ""),
-        ("frame", ""),
-        ("datum", ""),
-        ("height_m", None),
-        ("earth_nt", None),
-    ):
+    unknown = {"created": "", "frame": "", "datum": "", "height_m": None, "earth_nt": None}
+    for key, default in unknown.items():
         values_of = {getattr(part, key) for part in parts}
-        same[key] = values_of.pop() if len(values_of) == 1 else unknown
+        same[key] = values_of.pop() if len(values_of) == 1 else default
     same["licence"] = "; ".join(dict.fromkeys(part.licence for part in parts if part.licence))
     runs = tuple(run for part in parts for run in part.runs)
     source = "; ".join(part.source for part in parts)
@@ -549,17 +480,7 @@ def _together(parts: Sequence[Readings]) -> Readings:
 
 def _metadata(path: Path) -> dict[bytes, bytes]:
     """The metadata of a Parquet file."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    from magtwin.io.tables import check_parquet
-
-    check_parquet(path)
-    try:
-        return dict(pq.read_schema(path).metadata or {})
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{path}: damaged Parquet ({reason}); write it again") from error
+    return dict(load_parquet(path, pq.read_schema).metadata or {})
 
 
 def _sum(path: Path) -> str:

@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, hint
 from magtwin.files import existing
+from magtwin.io.tables import load_parquet
 
 Array = NDArray[np.float64]
 
@@ -82,9 +84,8 @@ class Table:
         """
         matches = [column for column in self.columns if column.name == name]
         if len(matches) > 1:
-            raise InputError(
-                f"{self.path}: {len(matches)} columns are called {name!r}; name it by its number"
-            )
+            text = f"{len(matches)} columns are called {name!r}; name it by its number"
+            raise InputError(f"{self.path}: {text}")
         if matches:
             return matches[0]
         if name.isascii() and name.isdigit() and 1 <= int(name) <= len(self.columns):
@@ -106,23 +107,17 @@ class Table:
             values = column.cells.astype(float)
         else:
             values = np.array([_number(cell) for cell in column.cells])
-            wrong = np.flatnonzero(np.isneginf(values))
-            if len(wrong):
-                row = int(wrong[0])
-                text = column.cells[row].strip()
-                raise InputError(
-                    f"{column.where(row)}: {name} must be a finite number, got {text[:QUOTED]!r}"
-                )
-        infinite = np.flatnonzero(np.isinf(values))
-        if len(infinite):
-            row = int(infinite[0])
-            raise InputError(f"{column.where(row)}: {name} must be a finite number, got {values[row]}")
+        wrong = np.flatnonzero(np.isinf(values))
+        if len(wrong):
+            row = int(wrong[0])
+            cell = column.cells[row]
+            shown = repr(cell.strip()[:QUOTED]) if isinstance(cell, str) else values[row]
+            raise InputError(f"{column.where(row)}: {name} must be a finite number, got {shown}")
         return values
 
     def texts(self, name: str) -> list[str]:
         """The cells of a column as stripped texts."""
-        column = self.column(name)
-        return [str(cell).strip() for cell in column.cells]
+        return [str(cell).strip() for cell in self.column(name).cells]
 
     def beside(self, other: "Table") -> "Table":
         """This table with the columns of another on the right.
@@ -178,12 +173,8 @@ def read_csv(path: str | os.PathLike[str]) -> Table:
         if len(row) != width:
             raise InputError(f"{path}:{number}: {width} values expected, got {len(row)}")
     numbers = [number for number, _ in lines]
-    return Table(
-        tuple(
-            Column(name, list(cells), path, numbers)
-            for name, cells in zip(names or [""] * width, zip(*words, strict=True), strict=True)
-        )
-    )
+    pairs = zip(names or [""] * width, zip(*words, strict=True), strict=True)
+    return Table(tuple(Column(name, list(cells), path, numbers) for name, cells in pairs))
 
 
 def read_parquet_table(path: str | os.PathLike[str]) -> Table:
@@ -192,18 +183,8 @@ def read_parquet_table(path: str | os.PathLike[str]) -> Table:
     Raises:
         InputError: The file is missing, is not Parquet, is truncated, or has no rows.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    from magtwin.io.tables import check_parquet
-
     path = existing(path, "Parquet file")
-    check_parquet(path)
-    try:
-        table = pq.read_table(path)
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{path}: damaged Parquet ({reason}); write it again") from error
+    table = load_parquet(path)
     columns = []
     for field, values in zip(table.schema, table.columns, strict=True):
         kind = field.type

@@ -125,8 +125,7 @@ def fit_platform(
     )
 
 
-IRON = ("left_wheel", "right_wheel", "caster")
-"""Turning iron, by its names in a PlatformFieldSpec."""
+IRON = ("left_wheel", "right_wheel", "caster")  # Turning iron, by its names in a PlatformFieldSpec
 
 
 def _turning_iron(wheel_angle: Array, robot: RobotSpec | None) -> Array:
@@ -145,12 +144,7 @@ def _turning_iron(wheel_angle: Array, robot: RobotSpec | None) -> Array:
 def _least_squares(matrix: Array, iron: Array, b: Array) -> tuple[Array, Array]:
     """Coefficients (K, 3) of regressors per axis, and (M,) of regressors common to all axes.
 
-    min |b - A c - T m|^2: first m on the residual of A, then c.
-
-    Args:
-        matrix: A, shape (N, K).
-        iron: T, shape (N, 3, M).
-        b: Shape (N, 3).
+    min |b - A c - T m|^2, A (N, K), T (N, 3, M), b (N, 3): first m on the residual of A, then c.
     """
     size = np.linalg.norm(matrix, axis=0)
     size[size == 0] = 1.0

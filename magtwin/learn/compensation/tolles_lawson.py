@@ -49,8 +49,7 @@ simulated run."""
 RIDGES = np.logspace(-12, 3, 31)
 """Ridge penalties of the cross-validation, relative to the mean square of the standardised columns."""
 
-FOLDS = 10
-"""Number of stretches of a run for the cross-validation."""
+FOLDS = 10  # Number of stretches of a run for the cross-validation
 
 
 def design_matrix(

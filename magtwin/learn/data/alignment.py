@@ -16,32 +16,18 @@ from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
 
-UNUSABLE = ("flag_lost_lock", "flag_pose_lost")
-"""Flags of a run whose readings have no label."""
-
-BLOCK_S = 5.0
-"""Length of blocks of readings with correlated errors [s]."""
-
-LATENCIES_S = np.arange(-0.4, 0.41, 0.02)
-"""Latencies that are tried before the best are refined [s]."""
-
-LEAST_ROWS = 200
-"""Least number of labelled readings for a fit."""
-
-LEVER_ARM_PRIOR_M = 0.05
-"""Prior standard deviation of each axis of the lever arm [m]."""
-
-LATENCY_PRIOR_S = 0.1
-"""Prior standard deviation of the latency [s]."""
-
-FIT_RATE_HZ = 20.0
-"""Highest rate of readings in the fit [Hz]."""
+UNUSABLE = ("flag_lost_lock", "flag_pose_lost")  # Flags of a run whose readings have no label
+BLOCK_S = 5.0  # Length of blocks of readings with correlated errors [s]
+LATENCIES_S = np.arange(-0.4, 0.41, 0.02)  # Latencies that are tried before the best are refined [s]
+LEAST_ROWS = 200  # Least number of labelled readings for a fit
+LEVER_ARM_PRIOR_M = 0.05  # Prior standard deviation of each axis of the lever arm [m]
+LATENCY_PRIOR_S = 0.1  # Prior standard deviation of the latency [s]
+FIT_RATE_HZ = 20.0  # Highest rate of readings in the fit [Hz]
 
 SLOPE_S = 0.2
 """Time over which rates of speed and turning are taken [s]; a motor's torque lasts about as long."""
 
-STARTS = 3
-"""Number of best latencies that are refined."""
+STARTS = 3  # Number of best latencies that are refined
 
 
 @dataclass(frozen=True, repr=False)

@@ -28,7 +28,7 @@ from magtwin.learn.data.features import FEATURES, SETS, columns_of, feature_name
 from magtwin.learn.data.features import features as features_of
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.origin import map_metadata, shared_metadata
-from magtwin.learn.data.recording import Recording, Rows, Source, read, sources_of, thinned
+from magtwin.learn.data.recording import Recording, Rows, Source, plant_name, read, sources_of, thinned
 from magtwin.learn.data.split import Part, Split
 from magtwin.report import Figure, Report
 from magtwin.run.arrow import run_of, table_of
@@ -42,14 +42,9 @@ Progress = Callable[[int, int, str], None]
 KIND, VERSION = "magtwin data set", 1
 MANIFEST, RUNS = "dataset.json", "runs"
 
-BLOCK_ROWS = 65_536
-"""Rows of a row group, about 20 MB of columns."""
-
-MOST_BYTES = 64 << 20
-"""Largest manifest; 100,000 recordings take half of it."""
-
-ALIGNED_AT_HZ = 25.0
-"""Rate at which recordings are held in memory while an alignment is fitted [Hz]."""
+BLOCK_ROWS = 65_536  # Rows of a row group, about 20 MB of columns
+MOST_BYTES = 64 << 20  # Largest manifest; 100,000 recordings take half of it
+ALIGNED_AT_HZ = 25.0  # Rate at which recordings are held in memory while an alignment is fitted [Hz]
 
 ALIGNED = (
     *("t", "p_world_base", "yaw", "mocap_p", "mocap_q_xyzw", "odom_v", "odom_w"),
@@ -472,25 +467,18 @@ def _write(run: Run, source: Source, path: Path) -> Recording:
         column_encoding=floats,
     )
     label = run["label_nt"][np.isfinite(run["label_nt"])]
-    session, metadata = source.session, run.metadata
-    if not session and "session" in metadata:
-        seed = f"{metadata['session_seed']}-" if "session_seed" in metadata else ""
-        session = f"{seed}{metadata['session']}"
-    plant = str(metadata.get("plant", ""))
-    plant = "" if plant.partition(":")[0] == "nominal" else plant
-    if plant and session:
-        session = f"{plant}-{session}"
+    session, path_driven = source.session_and_path(run)
     return Recording(
         name=source.name,
-        session=session or source.name,
-        path=source.path or str(metadata.get("path", "")) or source.name,
+        session=session,
+        path=path_driven,
         rows=run.rows,
         labelled=len(label),
         duration_s=run.duration_s,
         sha256=sha256(path),
         label_mean_nt=float(label.mean()),
         label_sd_nt=float(label.std()),
-        plant=plant,
+        plant=plant_name(run.metadata),
     )
 
 

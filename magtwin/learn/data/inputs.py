@@ -14,14 +14,9 @@ from magtwin.summary import Summarized
 
 Array = NDArray[np.float64]
 
-SCALERS = ("x_mean", "x_scale", "x_min", "x_max")
-"""Tensors of a weights file that hold scaler and ranges."""
-
-FAR = 5.0
-"""Scales from the mean beyond which an input is outside if the training range is unknown."""
-
-_BLOCK = 512
-"""Rows compared at once, to stay in the cache of a core."""
+SCALERS = ("x_mean", "x_scale", "x_min", "x_max")  # Tensors of a weights file that hold scaler and ranges
+FAR = 5.0  # Scales from the mean beyond which an input is outside if the training range is unknown
+_BLOCK = 512  # Rows compared at once, to stay in the cache of a core
 
 
 @dataclass(frozen=True, repr=False)

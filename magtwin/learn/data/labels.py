@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
@@ -14,9 +13,6 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import into_base, wrap_angle, yaw_from_quat
 from magtwin.learn.data.alignment import Alignment, placed, slopes, usable
 from magtwin.run.run import Column, Run
-from magtwin.summary import Summarized
-
-Array = NDArray[np.float64]
 
 LABEL_COLUMNS: Mapping[str, Column] = MappingProxyType(
     {
@@ -27,34 +23,14 @@ LABEL_COLUMNS: Mapping[str, Column] = MappingProxyType(
 """Columns that `labelled` adds to a run beside those of `magtwin.run.run.COLUMNS`."""
 
 
-@dataclass(frozen=True, repr=False)
-class Labels(Summarized):
-    """The disturbance at each reading of a run."""
+def labelled(run: Run, field: AnomalyMap, alignment: Alignment | None = None) -> Run:
+    """A run with its labels as columns: y = |B|measured - map(p(t - latency) + R(yaw) lever arm, yaw).
 
-    value_nt: Array
-    """Measured field minus the map [nT], shape (N,); nan without a label."""
-
-    sd_nt: Array
-    """Standard deviation of the map there [nT], shape (N,): its own, and its gradient times the uncertainty
-    of the alignment; 0 for a map without variances."""
-
-    map_nt: Array
-    """Map at the sensor's place [nT], shape (N,)."""
-
-    gradient_nt_m: Array
-    """Gradient of the map there, forward and left in base_link [nT/m], shape (N, 2)."""
-
-    @property
-    def known(self) -> NDArray[np.bool_]:
-        """Readings that have a label, shape (N,)."""
-        return np.isfinite(self.value_nt)
-
-
-def labels(run: Run, field: AnomalyMap, alignment: Alignment | None = None) -> Labels:
-    """Labels of a run on a map: y = |B|measured - map(p(t - latency) + R(yaw) lever arm, yaw).
-
-    The pose is that of motion capture if the run has it, else the true pose. A reading has no label off the
-    map, on masked nodes, without lock or pose, or without a measurement.
+    label_nt and label_sd_nt are added; b_map_nt, b_map_gradient_nt_m and flag_outside_map are replaced by
+    those of this map at the sensor's place, so that b_measured_nt = b_map_nt + label_nt. label_sd_nt is the
+    map's own standard deviation, with its gradient times the uncertainty of the alignment. The pose is that
+    of motion capture if the run has it, else the true pose; a run without yaw gets that of motion capture. A
+    reading has no label off the map, on masked nodes, without lock or pose, or without a measurement.
 
     Args:
         run: Needs t, b_measured_nt, and mocap_p with mocap_q_xyzw or p_world_base with yaw.
@@ -62,7 +38,7 @@ def labels(run: Run, field: AnomalyMap, alignment: Alignment | None = None) -> L
         alignment: Lever arm and latency. Default: 0.
 
     Raises:
-        InputError: The run lacks a column.
+        InputError: The run lacks a column, or no reading has a label.
     """
     alignment = alignment or Alignment()
     p, yaw, rates = placed(run, alignment)
@@ -76,22 +52,8 @@ def labels(run: Run, field: AnomalyMap, alignment: Alignment | None = None) -> L
     if any(alignment.lever_arm_sd_m) or alignment.latency_sd_s:
         sds = np.array([*alignment.lever_arm_sd_m, alignment.latency_sd_s])
         variance = variance + np.sum((sds * slopes(gradient, yaw, rates)) ** 2, axis=1)
-    measured = np.where(np.isfinite(value) & usable(run), run["b_measured_nt"], np.nan)
-    return Labels(measured - value, np.sqrt(variance), value, into_base(gradient[:, :2], yaw))
-
-
-def labelled(run: Run, field: AnomalyMap, alignment: Alignment | None = None) -> Run:
-    """A run with its labels as columns.
-
-    label_nt and label_sd_nt are added; b_map_nt, b_map_gradient_nt_m and flag_outside_map are replaced by
-    those of this map at the sensor's place, so that b_measured_nt = b_map_nt + label_nt. A run without yaw
-    gets that of motion capture. The arguments are those of `labels`.
-
-    Raises:
-        InputError: The run lacks a column, or no reading has a label.
-    """
-    made = labels(run, field, alignment)
-    if not made.known.any():
+    label = np.where(usable(run), run["b_measured_nt"], np.nan) - value
+    if not np.isfinite(label).any():
         low_x, high_x, low_y, high_y = field.extent
         p = run["mocap_p"] if "mocap_p" in run else run["p_world_base"]
         seen = [f"{np.nanmin(v):.2f} to {np.nanmax(v):.2f}" for v in p[:, :2].T if np.isfinite(v).any()]
@@ -102,11 +64,11 @@ def labelled(run: Run, field: AnomalyMap, alignment: Alignment | None = None) ->
             f"{int((~usable(run)).sum())} had no lock or no pose; name the map of its lab, in its frame"
         )
     columns: dict[str, NDArray[Any]] = {
-        "b_map_nt": made.map_nt,
-        "b_map_gradient_nt_m": made.gradient_nt_m,
-        "flag_outside_map": np.isnan(made.map_nt),
-        "label_nt": made.value_nt,
-        "label_sd_nt": np.where(made.known, made.sd_nt, np.nan),
+        "b_map_nt": value,
+        "b_map_gradient_nt_m": into_base(gradient[:, :2], yaw),
+        "flag_outside_map": np.isnan(value),
+        "label_nt": label,
+        "label_sd_nt": np.where(np.isfinite(label), np.sqrt(variance), np.nan),
     }
     if "yaw" not in run:
         columns["yaw"] = wrap_angle(yaw_from_quat(run["mocap_q_xyzw"]))

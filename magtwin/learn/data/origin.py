@@ -29,17 +29,10 @@ UNKNOWN, SEVERAL = "unknown", "several"
 SAMPLES = 100
 """Number of poses at which a network keeps its map's values, to compare maps: the RMS is known to 7 %."""
 
-SAME_NT = 1.0
-"""Maps that differ by less are the same [nT]; samples are rounded to 1 nT."""
-
-LEAST_SAMPLES = 10
-"""Least number of poses on both maps for a comparison."""
-
-TYPICAL_M_S = 0.2
-"""Speed at which the effect of a latency is computed [m/s], the default of a run."""
-
-SMALL_SHARE = 0.25
-"""Effects below this share of the network's own error give no warning."""
+SAME_NT = 1.0  # Maps that differ by less are the same [nT]; samples are rounded to 1 nT
+LEAST_SAMPLES = 10  # Least number of poses on both maps for a comparison
+TYPICAL_M_S = 0.2  # Speed at which the effect of a latency is computed [m/s], the default of a run
+SMALL_SHARE = 0.25  # Effects below this share of the network's own error give no warning
 
 
 @dataclass(frozen=True)
@@ -127,11 +120,8 @@ def label_frame(metadata: Metadata, name: str = "") -> tuple[float, float, float
         Forward [m], left [m] and lateness [s]; all 0 if labels used the true pose. None if the offset and age
         of motion capture are unknown, as for a real robot.
     """
-    lever, late = _numbers(metadata, name, "lever_arm_m", 2), _numbers(metadata, name, "latency_s", 1)
-    offset, age = (
-        _numbers(metadata, name, "mocap_offset_m", 2),
-        _numbers(metadata, name, "mocap_latency_s", 1),
-    )
+    entries = (("lever_arm_m", 2), ("latency_s", 1), ("mocap_offset_m", 2), ("mocap_latency_s", 1))
+    lever, late, offset, age = (_numbers(metadata, name, key, count) for key, count in entries)
     if lever is None or late is None:
         return None
     if metadata.get("poses") == "true":
@@ -162,13 +152,9 @@ def same_map(metadata: Metadata, field: AnomalyMap, name: str = "") -> bool:
 
 
 def _map_difference_nt(metadata: Metadata, field: AnomalyMap, name: str) -> float | None:
-    """RMS difference of a map from the values that a network keeps [nT]; None if unknown, inf if too few
-    overlap.
-    """
-    known, extent = (
-        _numbers(metadata, name, "map_samples_nt", SAMPLES),
-        _numbers(metadata, name, "map_extent_m", 4),
-    )
+    """RMS difference from the values that a network keeps [nT]; None if unknown, inf if too few overlap."""
+    known = _numbers(metadata, name, "map_samples_nt", SAMPLES)
+    extent = _numbers(metadata, name, "map_extent_m", 4)
     if known is None or extent is None:
         return None
     low_x, high_x, low_y, high_y = extent
@@ -269,14 +255,7 @@ def _robot_mismatch(
 
 
 def _poses(extent: tuple[float, float, float, float]) -> tuple[Array, Array]:
-    """`SAMPLES` poses spread evenly over a floor and all headings, by Roberts' R3 sequence (2018).
-
-    Args:
-        extent: Smallest and largest x, then y [m].
-
-    Returns:
-        Points [m], shape (SAMPLES, 2), and headings [rad], shape (SAMPLES,).
-    """
+    """`SAMPLES` points and headings spread evenly over a floor, by Roberts' R3 sequence (2018)."""
     g = 1.22074408460575947536  # the root of g^4 = g + 1
     at = (0.5 + np.arange(1, SAMPLES + 1)[:, None] * g ** -np.arange(1.0, 4.0)) % 1.0
     low_x, high_x, low_y, high_y = extent
@@ -285,11 +264,7 @@ def _poses(extent: tuple[float, float, float, float]) -> tuple[Array, Array]:
 
 
 def _numbers(metadata: Metadata, name: str, key: str, count: int) -> list[float] | None:
-    """Numbers of a metadata entry; None if it is missing or unknown.
-
-    Raises:
-        InputError: The entry is not that many numbers.
-    """
+    """Numbers of a metadata entry; None if it is missing or unknown."""
     text = str(metadata.get(key, UNKNOWN))
     if text in (UNKNOWN, SEVERAL):
         return None

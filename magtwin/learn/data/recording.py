@@ -1,5 +1,6 @@
 """Recordings of a data set: the sources it is built from, their entries in it, and the rows read from it."""
 
+import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,19 +20,44 @@ _SHA = re.compile("[0-9a-f]{64}")
 
 @dataclass(frozen=True)
 class Source:
-    """A recording to put into a data set."""
+    """A recording to put into a data set, or to judge models by."""
 
     name: str
-    """Its name, of letters, digits and _ . + -; also that of its shard."""
+    """Its name; in a data set of letters, digits and _ . + -, and also that of its shard."""
 
     read: Callable[[], Run]
     """Returns the run; called once, or twice if an alignment is fitted."""
 
     session: str = ""
-    """Its session. Default: that in the run's metadata."""
+    """Its session. Default: that in the run's metadata, else the name."""
 
     path: str = ""
-    """The driven path. Default: that in the run's metadata."""
+    """The driven path. Default: that in the run's metadata, else the name."""
+
+    def session_and_path(self, run: Run) -> tuple[str, str]:
+        """Its session and path, given its run."""
+        session = self.session or session_name(run.metadata) or self.name
+        return session, self.path or str(run.metadata.get("path", "")) or self.name
+
+
+def session_name(metadata: Mapping[str, object]) -> str:
+    """Name of the session of a run; "" if its metadata name none. Robots with different plants differ."""
+    if "session" not in metadata:
+        return ""
+    seed = f"{metadata['session_seed']}-" if "session_seed" in metadata else ""
+    plant = _short(str(metadata.get("plant", "")))
+    return f"{seed}{metadata['session']}" + (f"-{plant}" if plant else "")
+
+
+def plant_name(metadata: Mapping[str, object]) -> str:
+    """Name of the plant of a run; "" if it is the nominal one or its metadata name none."""
+    plant = _short(str(metadata.get("plant", "")))
+    return "" if plant.partition(":")[0] == "nominal" else plant
+
+
+def _short(plant: str) -> str:
+    """The text of a plant; of its fields as JSON, a checksum."""
+    return hashlib.sha256(plant.encode()).hexdigest()[:8] if plant.startswith("{") else plant
 
 
 @dataclass(frozen=True)

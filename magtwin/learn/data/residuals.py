@@ -18,11 +18,8 @@ Array = NDArray[np.float64]
 PRIOR_SHARE, PRIOR_SESSIONS = 0.5, 2.0
 """Prior of the session's share of the variance, and the number of sessions that it counts for."""
 
-LAG_HZ = 10.0
-"""Highest rate of the autocorrelation [Hz]."""
-
-LONGEST_LAG_S = 20.0
-"""Longest lag of the autocorrelation [s]; at most a third of a recording is used."""
+LAG_HZ = 10.0  # Highest rate of the autocorrelation [Hz]
+LONGEST_LAG_S = 20.0  # Longest lag of the autocorrelation [s]; at most a third of a recording is used
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,15 @@
 """Split: the recordings of training, validation and test."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, find
+from magtwin.learn.data.recording import Recording
 from magtwin.report import Figure, Report
 from magtwin.summary import Summarized, Summary, listed
 
@@ -28,27 +29,7 @@ _DEAL = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
 """Constants of splitmix64 (Steele, Lea and Flood 2014), which assigns rows."""
 
 
-class Recorded(Protocol):
-    """The properties of a recording that a split uses."""
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-
-    @property
-    def session(self) -> str:
-        """Its session."""
-
-    @property
-    def path(self) -> str:
-        """The driven path."""
-
-    @property
-    def labelled(self) -> int:
-        """Number of rows with a label."""
-
-
-_KEYS: Mapping[str, Callable[[Recorded], str]] = MappingProxyType(
+_KEYS: Mapping[str, Callable[[Recording], str]] = MappingProxyType(
     {
         "session": lambda recording: recording.session,
         "run": lambda recording: recording.name,
@@ -80,7 +61,7 @@ class Split(Summarized):
     row_seed: int = 0
     """Seed of a split by row."""
 
-    row_shares: tuple[float, float, float] = field(default=SHARES)
+    row_shares: tuple[float, float, float] = SHARES
     """Shares of the parts of a split by row."""
 
     @property
@@ -137,7 +118,7 @@ class Split(Summarized):
 
 
 def split(
-    recordings: Sequence[Recorded],
+    recordings: Sequence[Recording],
     by: By = "session",
     shares: tuple[float, float, float] = SHARES,
     hold_out: Sequence[str] = (),
@@ -194,14 +175,14 @@ def split(
 
 
 def _dealt(
-    recordings: Sequence[Recorded],
-    key: Callable[[Recorded], str],
+    recordings: Sequence[Recording],
+    key: Callable[[Recording], str],
     shares: NDArray[np.float64],
     rng: np.random.Generator,
     by: str,
 ) -> dict[str, set[str]]:
     """Names by part."""
-    groups: dict[str, list[Recorded]] = {}
+    groups: dict[str, list[Recording]] = {}
     for recording in recordings:
         groups.setdefault(key(recording), []).append(recording)
     wanted = [part for part, share in zip(PARTS, shares, strict=True) if share > 0]
@@ -227,7 +208,7 @@ def _dealt(
     return parts
 
 
-def _in_order(recordings: Sequence[Recorded], names: set[str]) -> tuple[str, ...]:
+def _in_order(recordings: Sequence[Recording], names: set[str]) -> tuple[str, ...]:
     return tuple(each.name for each in recordings if each.name in names)
 
 

@@ -38,7 +38,7 @@ from magtwin.learn.evaluation.training_rows import aligned_runs
 from magtwin.run.run import Run
 from magtwin.sim.interference import level_field_nt, platform_field_nt, sensor_places
 from magtwin.spec.scene import Scene
-from magtwin.summary import Summarized, Summary
+from magtwin.summary import Summarized
 
 Array = NDArray[np.float64]
 
@@ -57,11 +57,8 @@ CLOSED = {
 
 _OTHERS = tuple(term for term in TERMS if term != "platform")
 
-PENALTY = 1e-3
-"""Penalty of the ridge for the expectations, relative to the curvature of the rows."""
-
-BUDGET_HZ = 20.0
-"""Highest rate of readings in a budget [Hz]; their exact field takes time."""
+PENALTY = 1e-3  # Penalty of the ridge for the expectations, relative to the curvature of the rows
+BUDGET_HZ = 20.0  # Highest rate of readings in a budget [Hz]; their exact field takes time
 
 
 @dataclass(frozen=True)
@@ -122,17 +119,6 @@ class Budget(Summarized):
                 for term, bought in zip(self.terms, self.bought, strict=True)
             ],
         }
-
-    def _summary(self) -> Summary:
-        terms = sorted(self.terms, key=lambda term: -term.rms_nt)
-        return Summary(
-            f"Budget of {self.name}: MAE {self.mae_nt:.4g} nT over {self.rows:,} readings, naive "
-            f"{self.naive_mae_nt:.4g} nT",
-            tuple(
-                (term.name, f"rms {term.rms_nt:.4g} nT, MAE {term.alone_nt:.4g} nT with it closed")
-                for term in terms
-            ),
-        )
 
 
 @dataclass(frozen=True)

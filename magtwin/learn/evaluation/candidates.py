@@ -20,8 +20,7 @@ from magtwin.learn.models.linear import fit_linear
 from magtwin.run.run import Run
 from magtwin.summary import Summarized, Summary, listed
 
-NAIVE = "naive"
-"""Name of the naive model."""
+NAIVE = "naive"  # Name of the naive model
 
 
 class Model(Protocol):
@@ -65,9 +64,6 @@ class NamedMap(Summarized):
 
     checksums: frozenset[str]
     """SHA-256 of its file and of its values."""
-
-    def _summary(self) -> Summary:
-        return Summary(f"NamedMap {self.name}", self.field._summary().rows)
 
 
 def named_map(name: str, anomaly_map: AnomalyMap, *checksums: str) -> NamedMap:
@@ -158,9 +154,9 @@ def naive(
         InputError: The mean is not known.
     """
     if dataset is not None:
-        labels = training_rows(dataset, names, named.field, (), alignment_on(dataset, named.checksums)).y
-        model = Mean(float(labels.mean()), float(labels.std()))
         alignment = alignment_on(dataset, named.checksums)
+        labels = training_rows(dataset, names, named.field, (), alignment)[1]
+        model = Mean(float(labels.mean()), float(labels.std()))
         return Candidate(NAIVE, model, named, alignment, {"fitted to": dataset.folder.name})
     for candidate in weights:
         mean = candidate.metadata.get("label_mean_nt")
@@ -203,10 +199,10 @@ def tolles_lawson(
     wanted = (*CIRCULAR, *GRADIENT, *CARRIED) if gradient else CIRCULAR
     able = set(dataset.columns) | {"yaw", "b_map_gradient_nt_m"}
     inputs = tuple(name for name in wanted if set(FEATURES[name].columns) <= able)
-    rows = training_rows(dataset, names, named.field, inputs, alignment)
-    model = fit_linear(rows.x, rows.y, rows.session, features=inputs, sd=rows.sd).model
+    x, y, sd, session = training_rows(dataset, names, named.field, inputs, alignment)
+    model = fit_linear(x, y, session, features=inputs, sd=sd).model
     kind = "Tolles-Lawson and gradient" if gradient else "Tolles-Lawson"
-    about = {"fitted to": dataset.folder.name, "penalty": model.penalty, "training rows": len(rows.y)}
+    about = {"fitted to": dataset.folder.name, "penalty": model.penalty, "training rows": len(y)}
     name = f"{kind}, {named.name}{' aligned' * given}"
     return Candidate(name, NeuralMagnetometer(model, name=name), named, alignment, about)
 

@@ -15,17 +15,17 @@ from magtwin.errors import InputError
 from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import KEPT
 from magtwin.learn.data.labels import labelled
+from magtwin.learn.data.recording import Source
 from magtwin.learn.evaluation.candidates import Candidate
 from magtwin.learn.evaluation.evaluation import TOTALS, Case, Evaluation, Judged
 from magtwin.learn.evaluation.scores import Score, scores
-from magtwin.learn.evaluation.trials import Trial, session_and_path
 from magtwin.path import CASES
 from magtwin.run.run import Run
 
 
 def evaluate(
     candidates: Sequence[Candidate],
-    trials: Sequence[Trial],
+    trials: Sequence[Source],
     *,
     baseline: Candidate,
     rng: np.random.Generator,
@@ -89,13 +89,13 @@ def _case(name: str, judged: Sequence[Judged], of_models: tuple[Score, ...]) -> 
 
 
 def _judge(
-    models: Sequence[Candidate], trial: Trial, row_of: Mapping[str, str], truth: bool
+    models: Sequence[Candidate], trial: Source, row_of: Mapping[str, str], truth: bool
 ) -> tuple[Judged, dict[str, int]]:
     """Predictions of all models for a recording, and the number of readings left out by reason."""
     run = trial.read()
     run = Run({name: run[name] for name in KEPT if name in run}, run.metadata)
     _check_readings(trial.name, run, truth)
-    session, path = session_and_path(run, trial)
+    session, path = trial.session_and_path(run)
     measured = run["b_truth_nt" if truth else "b_measured_nt"]
     kept = np.isfinite(measured)
     lost = {"hold no field": int(np.count_nonzero(~kept))}

@@ -15,7 +15,7 @@ from magtwin.files import output
 from magtwin.learn.evaluation.candidates import Candidate, NamedMap
 from magtwin.learn.evaluation.scores import Errors, Score
 from magtwin.run.run import Run
-from magtwin.summary import Summarized, Summary, listed
+from magtwin.summary import Summarized, Summary
 from magtwin.verdict import SEPARATOR, recordings_text, verdict
 
 Array = NDArray[np.float64]
@@ -31,11 +31,8 @@ PAPER: Mapping[str, tuple[float, float, float]] = MappingProxyType(
 )
 """Table 1 of the paper (Penumarti et al. 2025): MAE and naive MAE [nT], and their ratio."""
 
-TOTALS = ("all", "mean")
-"""Rows of the table that are not paths."""
-
-GAUSSIAN_MAE = math.sqrt(2 / math.pi)
-"""Mean absolute error of a normal distribution, in standard deviations."""
+TOTALS = ("all", "mean")  # Rows of the table that are not paths
+GAUSSIAN_MAE = math.sqrt(2 / math.pi)  # Mean absolute error of a normal distribution, in standard deviations
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -87,22 +84,6 @@ class Judged(Summarized):
             self.outside[:, kept],
         )
 
-    def _summary(self) -> Summary:
-        kept = int(self.kept.sum())
-        error = np.abs(self.total_nt - self.measured_nt)[:, self.kept]
-        return Summary(
-            f"Judged {self.name}: {kept:,} of {len(self.kept):,} readings, case {self.case}",
-            (
-                ("from", f"session {self.session}, path {self.path}"),
-                (
-                    "MAE",
-                    listed([f"{mae:.4g}" for mae in error.mean(axis=1)]) + " nT, one per model"
-                    if kept
-                    else "",
-                ),
-            ),
-        )
-
 
 @dataclass(frozen=True, repr=False)
 class Case(Summarized):
@@ -113,19 +94,6 @@ class Case(Summarized):
     sessions: int
     scores: tuple[Score, ...]
     """One per model, the baseline first."""
-
-    def _summary(self) -> Summary:
-        return Summary(
-            f"Case {self.name}: {self.recordings:,} recordings, {self.sessions:,} sessions",
-            (
-                (
-                    "MAE",
-                    listed([f"{score.mae_nt:.4g}" for score in self.scores])
-                    + " nT, one per model, baseline first",
-                ),
-                ("of naive", listed([f"{score.ratio:.3g}" for score in self.scores])),
-            ),
-        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -179,7 +147,7 @@ class Evaluation(Summarized):
             lines[candidate.name] = verdict(
                 score.mae_nt,
                 naive,
-                than=f"the naive mean on the map {self.candidates[0].map.name}",
+                than=f"the naive model with the map {self.candidates[0].map.name}",
                 interval=score.ratio_interval,
                 coverage=score.coverage,
                 judged_on=recordings_text(len(self.judged), sessions, paths, *learned),
@@ -238,13 +206,8 @@ class Evaluation(Summarized):
                 for case in self.cases
             ],
             "recordings": [
-                {
-                    "name": recording.name,
-                    "session": recording.session,
-                    "path": recording.path,
-                    "case": recording.case,
-                    "rows": int(recording.kept.sum()),
-                }
+                {name: getattr(recording, name) for name in ("name", "session", "path", "case")}
+                | {"rows": int(recording.kept.sum())}
                 for recording in self.judged
             ],
             "left_out": dict(self.left_out),

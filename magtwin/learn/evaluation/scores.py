@@ -18,14 +18,9 @@ BLOCK_S = 5.0
 """Length of the blocks of time that are resampled [s]: the robot's own field changes within seconds, and the
 map's error within 1 m."""
 
-DRAWS = 1000
-"""Number of resamples."""
-
-LEVEL = 0.95
-"""Confidence level of intervals."""
-
-COVERED = 0.9
-"""Nominal coverage of a predicted interval."""
+DRAWS = 1000  # Number of resamples
+LEVEL = 0.95  # Confidence level of intervals
+COVERED = 0.9  # Nominal coverage of a predicted interval
 
 _ABS, _SQUARE, _SUM, _KNOWN, _WITHIN, _OUTSIDE = range(6)
 
@@ -129,16 +124,16 @@ def scores(
     for group in groups:
         own = [run for run in runs if run.group == group]
         rows, whole, drawn = _resampled(own, [group], next(children), draws)
-        by_group[group] = _scored(rows[0], whole[0], drawn[0])
+        by_group[group] = _scores(rows[0], _figures(whole[0]), _figures(drawn[0]))
     rows, whole, drawn = _resampled(runs, groups, next(children), draws)
-    every = _scored(rows.sum(), whole.sum(axis=0), drawn.sum(axis=0))
+    every = _scores(rows.sum(), _figures(whole.sum(axis=0)), _figures(drawn.sum(axis=0)))
     if len(groups) == 1:
         return by_group, every, every
-    figures = [_figures(whole[i]) for i in range(len(groups))]
-    spreads = [_figures(drawn[i]) for i in range(len(groups))]
-    mean = [np.mean([each[k] for each in figures], axis=0) for k in range(len(_FIGURES))]
-    spread = [np.mean([each[k] for each in spreads], axis=0) for k in range(len(_FIGURES))]
-    return by_group, every, _scores(int(rows.sum()), mean, spread)
+    mean, spread = (
+        [np.mean(parts, axis=0) for parts in zip(*map(_figures, sums), strict=True)]
+        for sums in (whole, drawn)
+    )
+    return by_group, every, _scores(rows.sum(), mean, spread)
 
 
 def _resampled(
@@ -166,11 +161,11 @@ def _resampled(
     return rows, whole, drawn
 
 
-_FIGURES = ("mae", "ratio", "rmse", "bias", "coverage", "outside")
-
-
 def _figures(sums: Array) -> list[Array]:
-    """Values of `_FIGURES` from sums (..., M, 7), each (..., M); nan for a draw without readings."""
+    """MAE, ratio, RMSE, bias, coverage and share outside, each (..., M), from sums (..., M, 7).
+
+    They are nan for a draw without readings.
+    """
     with np.errstate(invalid="ignore", divide="ignore"):
         count = sums[..., 6]
         mae = sums[..., _ABS] / count
@@ -185,27 +180,16 @@ def _figures(sums: Array) -> list[Array]:
         ]
 
 
-def _scored(rows: np.intp, whole: Array, drawn: Array) -> tuple[Score, ...]:
-    return _scores(int(rows), _figures(whole), _figures(drawn))
-
-
-def _scores(rows: int, figures: Sequence[Array], spreads: Sequence[Array]) -> tuple[Score, ...]:
+def _scores(rows: np.intp, figures: Sequence[Array], spreads: Sequence[Array]) -> tuple[Score, ...]:
     """A Score for each model from its figures (M,) and those of the draws (D, M)."""
-    return tuple(
-        Score(
-            rows=rows,
-            mae_nt=float(figures[0][m]),
-            mae_interval_nt=_interval(spreads[0][:, m]),
-            ratio=float(figures[1][m]),
-            ratio_interval=_interval(spreads[1][:, m]),
-            rmse_nt=float(figures[2][m]),
-            bias_nt=float(figures[3][m]),
-            coverage=float(figures[4][m]),
-            coverage_interval=_interval(spreads[4][:, m]),
-            outside=float(figures[5][m]),
+    scores = []
+    for m in range(len(figures[0])):
+        mae, ratio, rmse, bias, coverage, outside = (float(values[m]) for values in figures)
+        of_mae, of_ratio, of_coverage = (_interval(spreads[k][:, m]) for k in (0, 1, 4))
+        scores.append(
+            Score(int(rows), mae, of_mae, ratio, of_ratio, rmse, bias, coverage, of_coverage, outside)
         )
-        for m in range(len(figures[0]))
-    )
+    return tuple(scores)
 
 
 def _interval(values: Array) -> Interval:

@@ -1,7 +1,6 @@
 """Training recordings labelled anew on a map, for baselines and error budgets."""
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,30 +20,13 @@ TRAINED_AT_HZ = 10.0
 """Highest rate of training rows of a baseline [Hz]; nearer rows are too alike to add information."""
 
 
-@dataclass(frozen=True, eq=False)
-class TrainingRows:
-    """Rows of training recordings on a map."""
-
-    x: Array
-    """Inputs, shape (N, F)."""
-
-    y: Array
-    """Labels [nT], shape (N,)."""
-
-    sd: Array
-    """Standard deviation of the map there [nT], shape (N,)."""
-
-    session: NDArray[np.intp]
-    """Session of each row, shape (N,)."""
-
-
 def training_rows(
     dataset: Dataset,
     names: Sequence[str] | None,
     anomaly_map: AnomalyMap,
     inputs: Sequence[str],
     alignment: Alignment,
-) -> TrainingRows:
+) -> tuple[Array, Array, Array, NDArray[np.intp]]:
     """Inputs and labels of training recordings on a map, at most `TRAINED_AT_HZ` rows per second.
 
     Args:
@@ -54,6 +36,10 @@ def training_rows(
         inputs: Names of features.
         alignment: Lever arm and latency of the labels.
 
+    Returns:
+        Inputs, shape (N, F), labels [nT], standard deviations of the map there [nT], and the session of each
+        row, shape (N,).
+
     Raises:
         InputError: No row has a label and all inputs.
     """
@@ -62,14 +48,14 @@ def training_rows(
     for name, run in aligned_runs(dataset, names, anomaly_map, alignment):
         x, y = features(run, inputs), run["label_nt"]
         known = np.isfinite(y) & np.isfinite(x).all(axis=1)
-        session = sessions.index(dataset.recording(name).session)
-        parts.append((x[known], y[known], run["label_sd_nt"][known], np.full(int(known.sum()), session)))
-    rows = TrainingRows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    if not len(rows.y):
+        number = sessions.index(dataset.recording(name).session)
+        parts.append((x[known], y[known], run["label_sd_nt"][known], np.full(int(known.sum()), number)))
+    x, y, sd, session = (np.concatenate(column) for column in zip(*parts, strict=True))
+    if not len(y):
         raise InputError(
             f"{dataset.folder}: no training row has a label on {anomaly_map.name} and all inputs"
         )
-    return rows
+    return x, y, sd, session
 
 
 def aligned_runs(

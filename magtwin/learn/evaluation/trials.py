@@ -1,8 +1,8 @@
 """Trials: recordings that models are judged by, and checks that no model learned from them."""
 
 import tomllib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.files import sha256
 from magtwin.learn.data.dataset import MANIFEST, Dataset
+from magtwin.learn.data.recording import Source
 from magtwin.learn.data.split import split
 from magtwin.learn.evaluation.candidates import Candidate
 from magtwin.run.run import Run
@@ -19,36 +20,15 @@ from magtwin.run.run import Run
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Trial:
-    """A recording to judge by."""
-
-    name: str
-    read: Callable[[], Run]
-    session: str = ""
-    """Its session. Default: that in the run's metadata, else the name."""
-    path: str = ""
-    """The path that was driven. Default: that in the run's metadata, else the name."""
-
-
-def session_and_path(run: Run, trial: Trial) -> tuple[str, str]:
-    """Session and path of a trial; see `Trial`."""
-    session, metadata = trial.session, run.metadata
-    if not session and "session" in metadata:
-        session = f"{metadata['session_seed']}-" if "session_seed" in metadata else ""
-        session += str(metadata["session"])
-    return session or trial.name, trial.path or str(metadata.get("path", "")) or trial.name
-
-
-def trials_of(dataset: Dataset, names: Sequence[str]) -> list[Trial]:
-    """Trials of recordings of a data set."""
+def trials_of(dataset: Dataset, names: Sequence[str]) -> list[Source]:
+    """Recordings of a data set, to judge by."""
 
     def read(name: str) -> Run:
         return next(run for _, run in dataset.runs([name]))
 
     recordings = [dataset.recording(name) for name in names]
     return [
-        Trial(recording.name, partial(read, recording.name), recording.session, recording.path)
+        Source(recording.name, partial(read, recording.name), recording.session, recording.path)
         for recording in recordings
     ]
 
@@ -91,8 +71,8 @@ def unseen(dataset: Dataset, candidates: Sequence[Candidate]) -> tuple[tuple[str
     return tuple(names), tuple(learned)
 
 
-def unlearned(trials: Sequence[Trial], dataset: Dataset, names: Sequence[str] | None = None) -> list[Trial]:
-    """Trials that refuse to be read if a training set holds them, under any name.
+def unlearned(trials: Sequence[Source], dataset: Dataset, names: Sequence[str] | None = None) -> list[Source]:
+    """Recordings that refuse to be read if a training set holds them, under any name.
 
     Args:
         trials: Recordings to judge by.
@@ -104,7 +84,7 @@ def unlearned(trials: Sequence[Trial], dataset: Dataset, names: Sequence[str] | 
         t, b = run["t"], run["b_measured_nt"]
         learned.setdefault(_first(t, b), []).append((recording.name, t, b))
 
-    def read(trial: Trial) -> Run:
+    def read(trial: Source) -> Run:
         run = trial.read()
         t, b = run["t"], run.get("b_measured_nt")
         if b is None or not run.rows:

@@ -13,8 +13,7 @@ from magtwin.compiled import compiled
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
 
-FUSED = {"contract"}
-"""Allows fused multiplications."""
+FUSED = {"contract"}  # Allows fused multiplications
 
 _ARRAY = types.Array(types.float64, 1, "C")
 _RANGES = types.Array(types.float64, 2, "C", readonly=True)

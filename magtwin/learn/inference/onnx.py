@@ -29,24 +29,16 @@ from magtwin.version import __version__
 if TYPE_CHECKING:
     import onnx
 
-OPSET = 17
-"""Version of ONNX's operators; runtimes of 2022 and later have them."""
-
-IR_VERSION = 8
-"""Version of the file's own form, as old as the operators."""
+OPSET = 17  # Version of ONNX's operators; runtimes of 2022 and later have them
+IR_VERSION = 8  # Version of the file's own form, as old as the operators
 
 INPUT = "features"
 MEAN = "disturbance_nt"
 SD = "sd_nt"
 
-AGREES_NT = 1e-3
-"""Largest difference between onnxruntime and torch [nT], beside rounding."""
-
-ROUNDING = 1e-6
-"""Relative rounding of a float32 sum of products."""
-
-PROBE = 512
-"""Rows on which that is checked before a file is written."""
+AGREES_NT = 1e-3  # Largest difference between onnxruntime and torch [nT], beside rounding
+ROUNDING = 1e-6  # Relative rounding of a float32 sum of products
+PROBE = 512  # Rows on which that is checked before a file is written
 
 EXTRA = "onnx and onnxruntime are not both installed: pip install 'magtwin[onnx]'"
 
@@ -159,9 +151,7 @@ def inputs_of(predictor: Predictor) -> Inputs:
     Raises:
         InputError: A kind that has no graph.
     """
-    if isinstance(predictor, Hybrid):
-        return predictor.base.inputs
-    if isinstance(predictor, FieldNet | Linear | Mixed):
+    if isinstance(predictor, FieldNet | Linear | Hybrid | Mixed):
         return predictor.inputs
     raise InputError(f"a predictor of the kind {predictor.kind!r} has no ONNX graph")
 

@@ -10,14 +10,9 @@ from magtwin.errors import InputError
 from magtwin.learn.data.inputs import Array
 from magtwin.verdict import Z_90
 
-WITHIN = 0.9
-"""Nominal coverage of intervals."""
-
-MOST_FACTOR = 3.0
-"""Largest factor by which few recordings change an interval."""
-
-MOST_ROWS = 200_000
-"""Most rows that a spread is fitted to; of more, every k-th is used."""
+WITHIN = 0.9  # Nominal coverage of intervals
+MOST_FACTOR = 3.0  # Largest factor by which few recordings change an interval
+MOST_ROWS = 200_000  # Most rows that a spread is fitted to; of more, every k-th is used
 
 
 @dataclass(frozen=True)

@@ -10,24 +10,19 @@ import os
 import re
 import zipfile
 import zlib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy._core import multiarray
-from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.files import existing
 
-MOST_BYTES = 1 << 30
-"""Largest checkpoint that is read, unpacked."""
+MOST_BYTES = 1 << 30  # Largest checkpoint that is read, unpacked
 
 KEYS = ("model_state_dict", "scaler_X", "scaler_y")
-
-Layer = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 class StoredScaler:
@@ -46,69 +41,36 @@ SAFE_GLOBALS: list[Any] = [
 """What a checkpoint may name beside tensors."""
 
 
-@dataclass(frozen=True)
-class Checkpoint:
-    """A multilayer perceptron with its scalers: y = y_mean + y_scale net((x - x_mean) / x_scale)."""
-
-    layers: tuple[Layer, ...]
-    """Weight (out, in) and bias (out,) of each linear layer, first to last; ReLU between them."""
-
-    x_mean: NDArray[np.float64]
-    """Means of the inputs, in their units, shape (F,)."""
-
-    x_scale: NDArray[np.float64]
-    """Scales of the inputs, above 0, shape (F,)."""
-
-    y_mean: float
-    """Mean of the label [nT]."""
-
-    y_scale: float
-    """Scale of the label [nT]."""
-
-    samples: int
-    """Rows that the input scaler was fitted to; 0 if unknown."""
-
-    written_by: str
-    """What wrote the scalers, such as "scikit-learn 1.5.2"."""
-
-
-def read_checkpoint(path: str | os.PathLike[str], inputs: int | None = None) -> Checkpoint:
+def read_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dict[str, str | int]]:
     """Read a released checkpoint without executing anything in it.
 
     Args:
         path: A `.pth` as `torch.save` writes it.
-        inputs: Number of inputs that the network must have. `None` accepts any number.
+
+    Returns:
+        Tensors by the names of a FieldNet, not yet checked against each other, and metadata: what wrote the
+        scalers, and the rows that they were fitted to (0 if unknown).
 
     Raises:
-        InputError: Not a checkpoint, damaged, or its pickle names a global that no network needs; or layers
-            and scalers that do not fit each other.
+        InputError: Not a checkpoint, damaged, or its pickle names a global that no network needs.
     """
     path = existing(path, "checkpoint")
     saved = _load(path)
     try:
-        layers = _layers(saved["model_state_dict"])
-        x_mean, x_scale = _scaler("scaler_X", saved["scaler_X"])
-        y_mean, y_scale = _scaler("scaler_y", saved["scaler_y"])
-        width = layers[0][0].shape[1]
-        if inputs is not None and width != inputs:
-            raise InputError(f"its first layer takes {width} inputs; the released format has {inputs}")
-        for name, mean, count in (("scaler_X", x_mean, width), ("scaler_y", y_mean, 1)):
-            if len(mean) != count:
-                raise InputError(f"{name} is for {len(mean)} columns, the network has {count}")
+        tensors = _layers(saved["model_state_dict"])
+        for name in ("x", "y"):
+            mean, scale = _scaler(f"scaler_{'X' if name == 'x' else name}", saved)
+            tensors |= {f"{name}_mean": mean, f"{name}_scale": scale}
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+    tensors |= {name: torch.full_like(tensors["x_mean"], torch.nan) for name in ("x_min", "x_max")}
     scaler = vars(saved["scaler_X"])
-    seen, version = scaler.get("n_samples_seen_"), scaler.get("_sklearn_version")
+    rows, version = scaler.get("n_samples_seen_"), scaler.get("_sklearn_version")
     known = isinstance(version, str) and re.fullmatch(r"[\w.+-]{1,40}", version)
-    return Checkpoint(
-        layers,
-        x_mean,
-        x_scale,
-        float(y_mean[0]),
-        float(y_scale[0]),
-        int(seen) if isinstance(seen, int | np.integer) else 0,
-        f"scikit-learn {version}" if known else "scikit-learn",
-    )
+    return tensors, {
+        "scalers_by": f"scikit-learn {version}" if known else "scikit-learn",
+        "training_rows": int(rows) if isinstance(rows, int | np.integer) else 0,
+    }
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -142,51 +104,31 @@ def _load(path: Path) -> dict[str, Any]:
     return dict(saved)
 
 
-def _layers(state: Any) -> tuple[Layer, ...]:
-    """Linear layers of a state dict `name.weight`, `name.bias`, in the order of the file."""
+def _layers(state: Any) -> dict[str, torch.Tensor]:
+    """Linear layers of a state dict `name.weight`, `name.bias`, numbered in the order of the file."""
     if not isinstance(state, dict) or not state:
         raise InputError("model_state_dict holds no tensors")
-    tensors: dict[str, NDArray[np.float32]] = {}
+    numbers: dict[str, int] = {}
+    tensors = {}
     for name, tensor in state.items():
-        if not isinstance(tensor, torch.Tensor) or not str(name).endswith((".weight", ".bias")):
+        layer, _, part = str(name).rpartition(".")
+        if not isinstance(tensor, torch.Tensor) or part not in ("weight", "bias"):
             raise InputError(f"{ascii(name)[:60]} is neither weight nor bias of a linear layer")
         if tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
             raise InputError(f"tensor {name!r} is larger than what the file stores for it")
-        if not bool(torch.isfinite(tensor).all()):
-            raise InputError(f"tensor {name!r} has numbers that are nan or infinite")
-        tensors[name] = tensor.float().contiguous().numpy()
-    layers: list[Layer] = []
-    for name in dict.fromkeys(name.rpartition(".")[0] for name in tensors):
-        weight, bias = tensors.get(f"{name}.weight"), tensors.get(f"{name}.bias")
-        if weight is None or bias is None:
-            raise InputError(f"layer {name!r} has no {'weight' if weight is None else 'bias'}")
-        if weight.ndim != 2 or bias.shape != weight.shape[:1] or not weight.size:
-            raise InputError(f"layer {name!r} is not linear: weight {weight.shape}, bias {bias.shape}")
-        if layers and weight.shape[1] != len(layers[-1][1]):
-            raise InputError(
-                f"layer {name!r} takes {weight.shape[1]} numbers, the one before gives {len(layers[-1][1])}"
-            )
-        layers.append((weight, bias))
-    if len(layers[-1][1]) != 1:
-        raise InputError(f"its last layer gives {len(layers[-1][1])} numbers; a magnetometer gives 1")
-    return tuple(layers)
+        tensors[f"layers.{numbers.setdefault(layer, len(numbers))}.{part}"] = tensor.float().contiguous()
+    return tensors
 
 
-def _scaler(name: str, scaler: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean and scale of a StandardScaler, each (F,)."""
-    if not isinstance(scaler, StoredScaler):
+def _scaler(name: str, saved: dict[str, Any]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean and scale of a StandardScaler, each (F,), or () for one column."""
+    if not isinstance(saved[name], StoredScaler):
         raise InputError(f"{name} is not a StandardScaler")
-    values = vars(scaler)
+    values = vars(saved[name])
     try:
-        mean, scale = (np.asarray(values.get(key), float) for key in ("mean_", "scale_"))
+        mean, scale = (np.asarray(values.get(key), float).squeeze() for key in ("mean_", "scale_"))
     except (TypeError, ValueError):
         raise InputError(f"{name} has a mean or a scale that is no array of numbers") from None
-    if mean.ndim != 1 or mean.shape != scale.shape or not mean.size:
-        raise InputError(f"{name} has {mean.shape} means and {scale.shape} scales; was it fitted?")
-    if values.get("with_mean") is False:
-        mean = np.zeros_like(mean)
-    if values.get("with_std") is False:
-        scale = np.ones_like(scale)
-    if not (np.isfinite(mean).all() and np.isfinite(scale).all() and (scale > 0).all()):
-        raise InputError(f"{name} has a mean that is not finite, or a scale that is not above 0")
-    return mean, scale
+    mean = np.zeros_like(mean) if values.get("with_mean") is False else mean
+    scale = np.ones_like(mean) if values.get("with_std") is False else scale
+    return torch.tensor(mean), torch.tensor(scale)

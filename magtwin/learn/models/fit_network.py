@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError, find
 from magtwin.learn.data.features import feature_names
-from magtwin.learn.models.descent import Course, Epoch, check_device, descend
-from magtwin.learn.models.network import FieldNet, MetadataValue
+from magtwin.learn.models.descent import Course, Dropout, Epoch, Learner, check_device, descend
+from magtwin.learn.models.network import FieldNet
 from magtwin.learn.models.state import digest
 
 Array = NDArray[np.float64]
@@ -32,7 +32,6 @@ def train(
     batch: int = 1024,
     lr: float = 1e-3,
     patience: int | None = None,
-    metadata: Mapping[str, MetadataValue] | None = None,
     init: FieldNet | None = None,
     freeze: Sequence[str] = (),
     checkpoint: str | os.PathLike[str] | None = None,
@@ -62,7 +61,6 @@ def train(
         batch: Rows per step.
         lr: Largest step size of Adam.
         patience: Stop after this many epochs without improvement; None runs all epochs.
-        metadata: Provenance to keep in the weights file.
         init: Network of the same inputs and layers to continue from, with its scalers. It is epoch 0, so that
             the result is never worse on the validation rows.
         freeze: Names of layers that stay as in `init`: "layers.0" is the first.
@@ -98,7 +96,7 @@ def train(
     seed = int(rng.integers(2**62))
     with torch.random.fork_rng(devices=[]):  # torch draws initial weights from its global generator
         torch.manual_seed(seed)
-        net = FieldNet(names, layers, dropout=dropout, metadata=metadata)
+        net = FieldNet(names, layers, dropout=dropout)
     if init is None:
         net.set_scalers(x, y)
     else:
@@ -117,7 +115,7 @@ def train(
         settings["rows"] = digest(x, y, x_val, y_val, *([] if counts is None else [counts]))
         settings["init"] = digest(*init.state_dict().values()) if init is not None else ""
     history = descend(
-        _Rows(
+        Learner(
             net, x, y, counts, x_val, y_val, Dropout(dropout, torch.Generator(device).manual_seed(seed + 1))
         ),
         Course(epochs=epochs, batch=batch, lr=lr, patience=patience, seed=seed),
@@ -131,80 +129,6 @@ def train(
     net.requires_grad_(True)
     net.residual_sd_nt = min(epoch.val_rmse_nt for epoch in history)
     return net, history
-
-
-class _Rows:
-    """Scaled rows on the device of training."""
-
-    def __init__(
-        self,
-        net: FieldNet,
-        x: Array,
-        y: Array,
-        weight: Array | None,
-        x_val: Array,
-        y_val: Array,
-        drop: "Dropout",
-    ) -> None:
-        self.module, self.drop, device = net, drop, drop.generator.device
-        self.z = ((torch.from_numpy(x) - net.x_mean) / net.x_scale).float().to(device)
-        self.label = ((torch.from_numpy(y) - net.y_mean) / net.y_scale).float().to(device)
-        self.weight = None if weight is None else torch.from_numpy(weight).float().to(device)
-        self.x_val, self.y_val = torch.from_numpy(x_val).to(device), y_val
-        self.square_nt2 = float(net.y_scale) ** 2
-        self.generators = {"dropout": drop.generator}
-        net.to(device)
-
-    @property
-    def rows(self) -> int:
-        return len(self.z)
-
-    def loss(self, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        z, label = self.z[chosen], self.label[chosen]
-        out = self._forward(z) if self.module.training else self.module.body(z)
-        if self.weight is None:
-            loss = torch.nn.functional.mse_loss(out, label)
-            return loss, loss.detach() * (len(chosen) * self.square_nt2)
-        squares = (out - label) ** 2
-        return (self.weight[chosen] * squares).mean(), squares.detach().sum() * self.square_nt2
-
-    def errors_nt(self) -> Array:
-        parts = [self.module(part).cpu().numpy() for part in self.x_val.split(8192)]
-        return np.concatenate(parts) - self.y_val
-
-    def _forward(self, z: torch.Tensor) -> torch.Tensor:
-        """Scaled labels, shape (B,), from scaled features, shape (B, F), with dropout."""
-        *inner, last = self.module.linears
-        for i, layer in enumerate(inner):
-            z = torch.relu(layer(z))
-            if i < len(inner) - 1:
-                z = self.drop(z)
-        return last(z).squeeze(-1)
-
-
-class Dropout:
-    """Dropout by 16 random bits per unit, four times as fast as torch's own on a CPU."""
-
-    def __init__(self, share: float, generator: torch.Generator) -> None:
-        """Drop a share of the units, to the nearest 65,536th."""
-        self.generator = generator
-        dropped = min(round(share * 65_536), 65_535)
-        self._least = dropped - 32_768
-        """A unit is kept if its 16 bits, as a signed number, are at least this."""
-
-        self._scale = 65_536 / (65_536 - dropped)
-        self._bits = torch.empty(0, dtype=torch.int64, device=generator.device)
-
-    def __call__(self, h: torch.Tensor) -> torch.Tensor:
-        """Drop units of an array of any shape, and scale the others up."""
-        if self._scale == 1:
-            return h
-        words = -(-h.numel() // 4)
-        if len(self._bits) < words:
-            self._bits = torch.empty(words, dtype=torch.int64, device=h.device)
-        bits = self._bits[:words].random_(-(2**63), None, generator=self.generator)
-        kept = bits.view(torch.int16)[: h.numel()].view(h.shape) >= self._least
-        return h * kept.to(h.dtype).mul_(self._scale)
 
 
 def _continue_from(net: FieldNet, init: FieldNet, x: Array) -> None:
@@ -227,8 +151,6 @@ def _freeze(net: FieldNet, names: Sequence[str], init: FieldNet | None) -> None:
     layers = {f"layers.{i}": layer for i, layer in enumerate(net.linears)}
     for name in names:
         find("layer", name, layers).requires_grad_(False)
-    if set(names) == set(layers):
-        raise InputError("every layer is frozen; there is nothing left to train")
 
 
 def _rows(kind: str, x: ArrayLike, y: ArrayLike, names: Sequence[str]) -> tuple[Array, Array]:

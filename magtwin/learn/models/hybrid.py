@@ -1,7 +1,6 @@
 """Hybrid: a linear base, and a small network for its residual if that does better."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,6 +13,7 @@ from magtwin.learn.data.inputs import Array, Inputs
 from magtwin.learn.models.linear import Linear, like, linear_from
 from magtwin.learn.models.network import FieldNet, net_of
 from magtwin.learn.models.regressor import Regressor
+from magtwin.learn.models.state import tensors_below
 from magtwin.learn.models.weights import Weights
 from magtwin.report import Figure
 
@@ -88,7 +88,7 @@ def hybrid_of(weights: Weights) -> Hybrid:
     Raises:
         InputError: Its parts do not fit each other.
     """
-    parts = {part: _part(weights.tensors, f"{part}.") for part in ("base", "net")}
+    parts = {part: tensors_below(weights.tensors, f"{part}.") for part in ("base", "net")}
     extra = [name for name in weights.tensors if not name.startswith(("base.", "net."))]
     if extra:
         raise InputError(f"{weights.path}: tensor {extra[0]!r} belongs to no layer of a hybrid")
@@ -101,7 +101,3 @@ def hybrid_of(weights: Weights) -> Hybrid:
         residual_sd_nt=weights.residual_sd_nt,
         metadata=dict(weights.about["facts"]),
     )
-
-
-def _part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

@@ -15,7 +15,6 @@ from magtwin.learn.models.hybrid import Hybrid, hybrid_of
 from magtwin.learn.models.linear import FittedLinear, Linear, fit_linear, linear_of
 from magtwin.learn.models.network import FieldNet, net_of
 from magtwin.learn.models.predictor import Array, Choice, Fit, FitTask
-from magtwin.learn.models.weights import Weights
 
 DESCENT: Mapping[str, Any] = MappingProxyType({"epochs": 20, "batch": 1024, "lr": 1e-3, "patience": None})
 TORCH: Mapping[str, Any] = MappingProxyType({"threads": None, "device": "auto", "freeze": ()})
@@ -29,6 +28,7 @@ class Perceptrons:
     options = MappingProxyType(
         {"features": "full", "layers": (512, 512, 512, 512), "dropout": 0.3, **DESCENT, **TORCH}
     )
+    load = staticmethod(net_of)
 
     @staticmethod
     def fit(task: FitTask) -> Fit:
@@ -39,17 +39,13 @@ class Perceptrons:
         )
         return Fit(net, history)
 
-    @staticmethod
-    def load(weights: Weights) -> FieldNet:
-        """The network of a weights file."""
-        return net_of(weights)
-
 
 class Linears:
     """Tolles and Lawson's terms by ridge regression."""
 
     description = "A linear model by ridge regression"
     options = MappingProxyType({"features": "circular", **RIDGE})
+    load = staticmethod(linear_of)
 
     @staticmethod
     def fit(task: FitTask) -> Fit:
@@ -62,11 +58,6 @@ class Linears:
         model = replace(model, spread=model.spread.scaled(scale))
         return Fit(model, held_out_nt=_left_out(fitted))
 
-    @staticmethod
-    def load(weights: Weights) -> Linear:
-        """The linear model of a weights file."""
-        return linear_of(weights)
-
 
 class Hybrids:
     """A linear base and a small network for its residual, kept only if it does better on validation."""
@@ -75,6 +66,7 @@ class Hybrids:
     options = MappingProxyType(
         {"features": "platform", **RIDGE, "layers": (64, 64), "dropout": 0.1, **DESCENT, **TORCH}
     )
+    load = staticmethod(hybrid_of)
 
     @staticmethod
     def fit(task: FitTask) -> Fit:
@@ -112,11 +104,6 @@ class Hybrids:
         model.sd_factor = transferred_factor(error, base_sd, task.validation_groups, reference)
         return Fit(model, history, choice, _left_out(base) if "base" not in task.freeze else None)
 
-    @staticmethod
-    def load(weights: Weights) -> Hybrid:
-        """The hybrid of a weights file."""
-        return hybrid_of(weights)
-
 
 def _train(
     task: FitTask, x: Array, y: Array, x_val: Array, y_val: Array, **options: Any
@@ -153,14 +140,7 @@ def _ridge(task: FitTask, start: Linear | None) -> FittedLinear:
 
 
 def _yardstick(task: FitTask, fitted: FittedLinear, mean_nt: Array, sd_nt: Array) -> Yardstick:
-    """How well the standard deviations of a linear model held on recordings that it had not seen.
-
-    Args:
-        task: What it was fitted to.
-        fitted: The fit.
-        mean_nt: Its predictions of the validation rows [nT].
-        sd_nt: Their standard deviations [nT].
-    """
+    """How well the standard deviations of a linear model held on unseen recordings."""
     learned, stops = task.train, task.validation
     error = np.concatenate([fitted.held_out_nt - learned.y, mean_nt - stops.y])
     sd = np.concatenate([fitted.model.predict(learned.x)[1], sd_nt])

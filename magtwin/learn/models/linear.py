@@ -21,14 +21,9 @@ from magtwin.learn.models.regressor import Regressor
 from magtwin.learn.models.weights import Weights
 from magtwin.report import Figure
 
-PENALTIES = tuple(float(p) for p in np.logspace(-8, 1, 19))
-"""Penalties that cross-validation chooses from."""
-
-FALLBACK_PENALTY = 1e-3
-"""Penalty if there is one group of recordings, so that cross-validation is impossible."""
-
-MOST_FOLDS = 10
-"""Most folds of the cross-validation; with fewer groups, each group is a fold."""
+PENALTIES = tuple(float(p) for p in np.logspace(-8, 1, 19))  # Penalties that cross-validation chooses from
+FALLBACK_PENALTY = 1e-3  # Penalty if there is one group of recordings, so that cross-validation is impossible
+MOST_FOLDS = 10  # Most folds of the cross-validation; with fewer groups, each group is a fold
 
 Weighting = Literal["auto", "label_sd", "none"]
 

@@ -3,9 +3,8 @@
 import itertools
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -92,14 +91,8 @@ class FieldNet(Summarized, torch.nn.Module):
         widths = [len(self.features), *hidden, 1]
         self.layers = torch.nn.ModuleList(torch.nn.Linear(a, b) for a, b in itertools.pairwise(widths))
         ones = torch.ones(len(self.features), dtype=torch.float64)
-        for name, value in (
-            ("x_mean", 0 * ones),
-            ("x_scale", ones),
-            ("x_min", math.nan * ones),
-            ("x_max", math.nan * ones),
-            ("y_mean", 0 * ones[0]),
-            ("y_scale", ones[0].clone()),
-        ):
+        start = (0 * ones, ones, math.nan * ones, math.nan * ones, 0 * ones[0], ones[0].clone())
+        for name, value in zip(_SCALERS, start, strict=True):
             self.register_buffer(name, value)
 
     @property
@@ -122,13 +115,15 @@ class FieldNet(Summarized, torch.nn.Module):
         h = ((x - self.x_mean) / self.x_scale).to(self.linears[0].weight.dtype)
         return self.y_mean + self.y_scale * self.body(h).to(self.y_mean.dtype)
 
-    def body(self, z: torch.Tensor) -> torch.Tensor:
-        """Scaled labels, shape (B,), from scaled features, shape (B, F)."""
+    def body(
+        self, z: torch.Tensor, drop: Callable[[torch.Tensor], torch.Tensor] | None = None
+    ) -> torch.Tensor:
+        """Scaled labels, shape (B,), from scaled features, shape (B, F); `drop` replaces torch's dropout."""
         *inner, last = self.linears
         for i, layer in enumerate(inner):
             z = torch.relu(layer(z))
             if i < len(inner) - 1:
-                z = torch.nn.functional.dropout(z, self.dropout, self.training)
+                z = drop(z) if drop else torch.nn.functional.dropout(z, self.dropout, self.training)
         return last(z).squeeze(-1)
 
     @property
@@ -166,14 +161,8 @@ class FieldNet(Summarized, torch.nn.Module):
         """
         x, y = np.asarray(x, float), np.asarray(y, float)
         of = inputs_of(x, self.features)
-        for name, value in (
-            ("x_mean", of.mean),
-            ("x_scale", of.scale),
-            ("x_min", of.low),
-            ("x_max", of.high),
-            ("y_mean", y.mean()),
-            ("y_scale", y.std()),
-        ):
+        values = (of.mean, of.scale, of.low, of.high, y.mean(), y.std())
+        for name, value in zip(_SCALERS, values, strict=True):
             getattr(self, name).copy_(torch.as_tensor(value))
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -257,25 +246,10 @@ def net_of_checkpoint(path: str | os.PathLike[str]) -> FieldNet:
         InputError: Not such a checkpoint.
     """
     path = Path(path)
-    saved = read_checkpoint(path, len(FULL))
-    net = FieldNet(
-        FULL,
-        [len(bias) for _, bias in saved.layers[:-1]],
-        metadata={
-            "source": path.name,
-            "source_sha256": sha256(path),
-            "scalers_by": saved.written_by,
-            "training_rows": saved.samples,
-        },
-    )
-    state: dict[str, Any] = {}
-    for i, (weight, bias) in enumerate(saved.layers):
-        state |= {f"layers.{i}.weight": weight, f"layers.{i}.bias": bias}
-    nan = np.full(len(FULL), math.nan)
-    state |= {"x_mean": saved.x_mean, "x_scale": saved.x_scale, "x_min": nan, "x_max": nan}
-    state |= {"y_mean": np.float64(saved.y_mean), "y_scale": np.float64(saved.y_scale)}
-    net.load_state_dict({name: torch.tensor(value) for name, value in state.items()})
-    return net.eval()
+    tensors, metadata = read_checkpoint(path)
+    facts = {"source": path.name, "source_sha256": sha256(path), **metadata}
+    about = {"features": FULL, "residual_sd_nt": None, "dropout": 0.3, "facts": facts}
+    return net_of(Weights(path, "mlp", about, tensors))
 
 
 def net_of(weights: Weights) -> FieldNet:
@@ -299,17 +273,18 @@ def net_of(weights: Weights) -> FieldNet:
                 f"{path}: tensor 'layers.{i}.weight' is {say(weight)}; a layer's have shape (out, in)"
             )
     try:
-        net = FieldNet(
-            weights.features,
-            [len(weight) for weight in held[:-1]],
-            dropout=dropout,
-            residual_sd_nt=weights.residual_sd_nt,
-            metadata=weights.about["facts"],
-        )
+        with torch.device("meta"):  # no memory before the shapes are checked
+            net = FieldNet(
+                weights.features,
+                [len(weight) for weight in held[:-1]],
+                dropout=dropout,
+                residual_sd_nt=weights.residual_sd_nt,
+                metadata=weights.about["facts"],
+            )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     state = weights.fit(net.state_dict())
     if not (bool((tensors["x_scale"] > 0).all()) and bool(tensors["y_scale"] > 0)):
         raise InputError(f"{path}: a scale of its scalers is not above 0")
-    net.load_state_dict(state)
+    net.load_state_dict(state, assign=True)
     return net.eval()

@@ -2,8 +2,8 @@
 
 import itertools
 import math
-import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -15,8 +15,7 @@ Array = NDArray[np.float64]
 Layer = tuple[torch.Tensor, torch.Tensor]
 """Weights (out, in) and biases (out,), float32."""
 
-CHUNK = 512
-"""Rows of a block: layers of 512 then stay in a core's cache."""
+CHUNK = 512  # Rows of a block: layers of 512 then stay in a core's cache
 
 TILE = 16
 """Rows of the last block are padded to a multiple of this, a multiple of the rows that matrix kernels take at
@@ -33,32 +32,19 @@ def in_threads(work: Callable[[], None], threads: int) -> None:
         threads: Number of threads; with 1 or fewer, `work` runs in the calling thread.
 
     Raises:
-        BaseException: The first exception of a thread, after all threads have ended.
+        BaseException: An exception of a thread, after all threads have ended.
     """
     if threads <= 1:
         work()
         return
-    failures: list[BaseException] = []
-
-    def guarded() -> None:
-        try:
-            work()
-        except BaseException as error:
-            failures.append(error)
-
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        others = [threading.Thread(target=guarded) for _ in range(threads - 1)]
-        for thread in others:
-            thread.start()
-        guarded()
-        for thread in others:
-            thread.join()
+        with ThreadPoolExecutor(threads) as pool:
+            for job in [pool.submit(work) for _ in range(threads)]:
+                job.result()
     finally:
         torch.set_num_threads(before)
-    if failures:
-        raise failures[0]
 
 
 def outputs(layers: Sequence[Layer], inputs: Inputs, x: Array) -> Array:

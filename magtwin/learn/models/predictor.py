@@ -27,11 +27,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
+from magtwin.extend import Registry
 from magtwin.learn.data.recording import Recording, Rows
 from magtwin.learn.models.descent import Epoch
 from magtwin.learn.models.network import net_of_checkpoint
 from magtwin.learn.models.weights import MetadataValue, Weights, is_checkpoint, read_weights
-from magtwin.registry import Registry
 from magtwin.report import Report
 
 Array = NDArray[np.float64]

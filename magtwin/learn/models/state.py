@@ -15,10 +15,14 @@ from safetensors.torch import save
 from magtwin.errors import InputError
 from magtwin.files import existing, output
 
-FORMAT_VERSION = 1
-"""Version of the file; other versions are refused."""
+FORMAT_VERSION = 1  # Version of the file; other versions are refused
 
 Tensors = Mapping[str, torch.Tensor]
+
+
+def tensors_below(tensors: Tensors, prefix: str) -> dict[str, torch.Tensor]:
+    """The tensors whose names start with a prefix, by the rest of their names."""
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
 def digest(*arrays: NDArray[Any] | torch.Tensor) -> str:

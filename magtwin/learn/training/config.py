@@ -27,11 +27,8 @@ PRESETS: Mapping[str, tuple[str, Mapping[str, Any]]] = MappingProxyType(
 )
 """Models that are a kind of predictor with other defaults; all other models are named by their kind."""
 
-MOST_WEIGHTS = 100_000_000
-"""Largest network; with gradients and Adam's moments it takes 1.6 GB."""
-
-COMMON = ("model", "seed", "split", "hold_out", "init", "licence")
-"""Options that every model reads."""
+MOST_WEIGHTS = 100_000_000  # Largest network; with gradients and Adam's moments it takes 1.6 GB
+COMMON = ("model", "seed", "split", "hold_out", "init", "licence")  # Options that every model reads
 
 
 def models() -> list[str]:

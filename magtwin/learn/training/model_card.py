@@ -7,8 +7,7 @@ from magtwin.learn.data.split import PARTS
 from magtwin.learn.models.predictor import PREDICTORS
 from magtwin.learn.training.result import TrainingResult
 
-MOST_NAMES = 40
-"""Most paths, and most test recordings, that a card lists."""
+MOST_NAMES = 40  # Most paths, and most test recordings, that a card lists
 
 
 def model_card(result: TrainingResult, name: str, checksum: str) -> str:

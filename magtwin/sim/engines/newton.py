@@ -83,7 +83,8 @@ class Newton:
             for k in range(closed_loop.steps):
                 if self.progress is not None and k % max(1, round(0.1 / dt)) == 0:
                     self.progress(k, closed_loop.steps, f"{k * dt:.1f} s driven")
-                command = guide.command(k * dt, rows[-1][0], rows[-1][1], yaw, *wheels)
+                pose = closed_loop.pose_error.perceived(k * dt, (rows[-1][0], rows[-1][1], yaw), *wheels)
+                command = guide.command(k * dt, *pose, *wheels)
                 age = 0.0 if command is not None else age + dt
                 if command is not None:
                     last = float(command[0]), float(command[1])

@@ -14,6 +14,7 @@ from magtwin.field.maps import lookup
 from magtwin.sim.motion import loop
 from magtwin.sim.motion.controllers import Guide
 from magtwin.sim.motion.drive import Motion, Pose, limits
+from magtwin.sim.motion.pose_error import EXACT, PoseError
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
 
@@ -74,6 +75,9 @@ class ClosedLoop:
     wheel_errors: tuple[float, float] = (0.0, 0.0)
     """Relative errors of the wheels' radius and separation."""
 
+    pose_error: PoseError = EXACT
+    """Error of the pose that the controller gets."""
+
     def figures(self) -> list[float]:
         """Figures for `loop.drive_on`."""
         drive, dt = self.drive, self.dt
@@ -90,7 +94,10 @@ class ClosedLoop:
             radius / separation * (1.0 - drive.yaw_slip),
             drive.command_timeout_s,
             self.footprint_radius_m,
-            *self.guide.gains,
+            *self.guide.gains[:5],
+            (math.sqrt(self.guide.gains[5]) + self.pose_error.reach_m(drive.v_max)) ** 2,
+            *self.guide.gains[6:],
+            *self.pose_error.figures,
         ]
 
     def state(self) -> list[float]:

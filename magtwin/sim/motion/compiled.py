@@ -6,7 +6,7 @@ from typing import Any
 from numba import types
 
 from magtwin.compiled import compiled, inlined
-from magtwin.sim.motion import loop
+from magtwin.sim.motion import loop, walls
 
 _MATRIX = types.Array(types.float64, 2, "C")
 _NUMBERS = types.Array(types.int64, 1, "C")
@@ -31,8 +31,9 @@ _IN_PLACE: tuple[Callable[..., Any], ...] = (loop.towards_point, loop.along_path
 _CALLED: tuple[Callable[..., Any], ...] = (
     loop.wrapped,
     loop.limited,
-    loop.clearance,
-    loop.free_way,
+    loop.perceived,
+    walls.clearance,
+    walls.free_way,
     loop.drive_on,
 )
 for _function in _IN_PLACE:

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError, find
+from magtwin.extend import Registry
 from magtwin.path import Path
-from magtwin.registry import Registry
 from magtwin.sim.motion import loop
 from magtwin.sim.motion.plan import LIMIT_SHARE, drivable, plan
 from magtwin.spec.drive import DriveSpec

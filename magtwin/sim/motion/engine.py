@@ -2,7 +2,7 @@
 
 from typing import Protocol
 
-from magtwin.registry import Registry
+from magtwin.extend import Registry
 from magtwin.sim.motion.closed_loop import Chassis, ClosedLoop, run_loops
 from magtwin.sim.motion.controllers import Controller
 from magtwin.sim.motion.drive import Motion
@@ -56,7 +56,9 @@ class Kinematic:
             return run_loops([closed_loop], obstacles)[0]
         chassis = Chassis(closed_loop, obstacles)
         for k in range(closed_loop.steps):
-            chassis.step(controller.command(k * closed_loop.dt, *chassis.pose, *chassis.twist))
+            t = k * closed_loop.dt
+            pose = closed_loop.pose_error.perceived(t, chassis.pose, *chassis.twist)
+            chassis.step(controller.command(t, *pose, *chassis.twist))
             if controller.done and chassis.twist == (0.0, 0.0):
                 break
         return chassis.motion()

@@ -18,6 +18,7 @@ from magtwin.sim.motion.controllers import (
 from magtwin.sim.motion.drive import Pose
 from magtwin.sim.motion.engine import KINEMATIC, Engine, Travel
 from magtwin.sim.motion.plan import SLOWEST, drivable
+from magtwin.sim.motion.pose_error import EXACT, PoseError
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
 
@@ -40,6 +41,7 @@ def loop_along(
     obstacles: Obstacles | None = None,
     footprint_radius_m: float = 0.0,
     wheel_errors: tuple[float, float] = (0.0, 0.0),
+    pose_error: PoseError = EXACT,
 ) -> ClosedLoop:
     """The closed loop along a path, ready to run; arguments and refusals are those of `follow`."""
     dt = _step(rate_hz, drive)
@@ -76,6 +78,7 @@ def loop_along(
         least_steps=int(least_s / dt),
         footprint_radius_m=footprint_radius_m,
         wheel_errors=wheel_errors,
+        pose_error=pose_error,
     )
 
 
@@ -91,6 +94,7 @@ def follow(
     obstacles: Obstacles | None = None,
     footprint_radius_m: float = 0.0,
     wheel_errors: tuple[float, float] = (0.0, 0.0),
+    pose_error: PoseError = EXACT,
     engine: Engine | None = None,
 ) -> Travel:
     """Drive along a path.
@@ -109,6 +113,7 @@ def follow(
         obstacles: What stops the robot.
         footprint_radius_m: Radius of the circle that they stop [m].
         wheel_errors: Relative errors of the wheels' radius and separation.
+        pose_error: Error of the pose that the controller gets. Default: it gets the exact pose.
         engine: What moves the robot. Default: the kinematic engine.
 
     Raises:
@@ -131,6 +136,7 @@ def follow(
         obstacles=obstacles,
         footprint_radius_m=footprint_radius_m,
         wheel_errors=wheel_errors,
+        pose_error=pose_error,
     )
     motion = (engine or KINEMATIC).drive(closed_loop, custom, obstacles)
     if duration_s is None:

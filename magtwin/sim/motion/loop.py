@@ -18,13 +18,12 @@ import math
 from collections.abc import MutableSequence, Sequence
 from typing import Any
 
-Numbers = Sequence[float]
-Columns = Sequence[Numbers]
+from magtwin.sim.motion.walls import Columns, Numbers, clearance, free_way
 
 COMMANDS, RELEASE, FOLLOWER, STANLEY, PURE_PURSUIT = range(5)
 """Numbers of the built-in controllers; see `controllers.py`."""
 
-FIGURES = 22
+FIGURES = 22 + 4 + 2 * 3 * 3
 """Number of figures of a robot and its controller; see `drive_on`."""
 
 TABLE = 6
@@ -38,13 +37,13 @@ RECORD = 10
 """Columns of a step: x, y, yaw at its end; v, w of the body; v, w of the wheels at their nominal size;
 commanded v, w; whether an obstacle was touched."""
 
+WAVES = 3
+"""Sine waves of the error of each coordinate of a pose; see `perceived`."""
+
 TURN = 2 * math.pi
 
 REST_M_S = 1e-3
 """Speed of the rims below which friction stops a robot that is commanded to stand [m/s]."""
-
-GRAZE = 1e-6
-"""Share of the distance driven by which a touching robot may approach an obstacle, against rounding."""
 
 A1, A2, A3 = 1 / 6, 1 / 20, 1 / 42
 """sin(x)/x = 1 - A1 x^2 (1 - A2 x^2 (1 - A3 x^2 ...))."""
@@ -299,6 +298,47 @@ def along_path(
     return planned, v * bent, i, driven
 
 
+def perceived(
+    errors: Numbers, first: int, t: float, x: float, y: float, yaw: float, v: float, w: float
+) -> tuple[float, float, float]:
+    """The pose that a path follower gets: late, and with the slow errors of a localization.
+
+    It is the pose of `latency` ago if v and w were constant, plus a e(t) for each of x, y and yaw with
+    e(t) = sqrt(2 / M) sum_m cos(W_m t + F_m), the spectral representation of a stationary process
+    (Shinozuka and Deodatis 1991). `closed_loop.PoseError` draws W and F.
+
+    Args:
+        errors: From `first` on: latency [s]; a of x [m], y [m] and yaw [rad], each times sqrt(2 / M); then
+            W [rad/s] and F [rad] of the M waves of x, of y, and of yaw.
+        first: Where they begin.
+        t: Time since the start [s].
+        x: Position in world [m].
+        y: Position in world [m].
+        yaw: Heading in world [rad].
+        v: Forward speed [m/s].
+        w: Yaw rate [rad/s].
+    """
+    late = errors[first]
+    at = first + 4
+    x -= late * v * math.cos(yaw - 0.5 * late * w)
+    y -= late * v * math.sin(yaw - 0.5 * late * w)
+    yaw -= late * w
+    wave = 0.0
+    for m in range(WAVES):
+        wave += math.cos(errors[at + 2 * m] * t + errors[at + 2 * m + 1])
+    x += errors[first + 1] * wave
+    at += 2 * WAVES
+    wave = 0.0
+    for m in range(WAVES):
+        wave += math.cos(errors[at + 2 * m] * t + errors[at + 2 * m + 1])
+    y += errors[first + 2] * wave
+    at += 2 * WAVES
+    wave = 0.0
+    for m in range(WAVES):
+        wave += math.cos(errors[at + 2 * m] * t + errors[at + 2 * m + 1])
+    return x, y, yaw + errors[first + 3] * wave
+
+
 def commanded(
     law: int,
     table: Columns,
@@ -339,88 +379,6 @@ def commanded(
     return table[1][node], table[2][node], node, driven
 
 
-def clearance(fence: Columns, spans: Sequence[int], x: float, y: float, most: float) -> float:
-    """Distance of a point outside of all obstacles from the nearest of them, or `most` [m].
-
-    Args:
-        fence: Edges of all outlines x0, y0, x1, y1 [m], of E numbers each; then the box about each outline,
-            x and y of its lower and of its upper corner [m], of O numbers each.
-        spans: Edge that begins each outline, and E, of O + 1 numbers.
-        x: Position in world [m].
-        y: Position in world [m].
-        most: Largest distance of interest [m].
-    """
-    x0s, y0s, x1s, y1s, low_x, low_y, high_x, high_y = fence
-    best = most * most
-    for o in range(len(low_x)):
-        dx = low_x[o] - x if x < low_x[o] else x - high_x[o] if x > high_x[o] else 0.0
-        dy = low_y[o] - y if y < low_y[o] else y - high_y[o] if y > high_y[o] else 0.0
-        if dx * dx + dy * dy >= best:
-            continue
-        for e in range(spans[o], spans[o + 1]):
-            sx, sy = x1s[e] - x0s[e], y1s[e] - y0s[e]
-            px, py = x - x0s[e], y - y0s[e]
-            along = (px * sx + py * sy) / (sx * sx + sy * sy)
-            if along > 1.0:
-                along = 1.0
-            if along > 0.0:
-                px, py = px - along * sx, py - along * sy
-            away2 = px * px + py * py
-            if away2 < best:
-                best = away2
-    return math.sqrt(best)
-
-
-def free_way(
-    fence: Columns, spans: Sequence[int], radius: float, x: float, y: float, ux: float, uy: float, way: float
-) -> float:
-    """Distance that a round footprint can go in a direction until it touches an obstacle, at most `way` [m].
-
-    The centre of the footprint meets outlines grown by the radius: sides pushed out, a circle about every
-    corner. Obstacles that it already touches count only if it comes nearer.
-
-    Args:
-        fence: As for `clearance`.
-        spans: As for `clearance`.
-        radius: Radius of the footprint [m].
-        x: Position of its centre in world [m].
-        y: Position of its centre in world [m].
-        ux: Direction, a unit vector.
-        uy: Direction, a unit vector.
-        way: Wanted distance [m].
-    """
-    x0s, y0s, x1s, y1s, low_x, low_y, high_x, high_y = fence
-    reach = radius + way
-    for o in range(len(low_x)):
-        if x < low_x[o] - reach or x > high_x[o] + reach or y < low_y[o] - reach or y > high_y[o] + reach:
-            continue
-        for e in range(spans[o], spans[o + 1]):
-            px, py = x - x0s[e], y - y0s[e]
-            nearing = px * ux + py * uy
-            if nearing < -GRAZE * radius:
-                beyond = px * px + py * py - radius * radius
-                within = nearing * nearing - beyond
-                if beyond <= 0.0:
-                    way = 0.0
-                elif within > 0.0:
-                    until = -nearing - math.sqrt(within)
-                    if until < way:
-                        way = until
-            sx, sy = x1s[e] - x0s[e], y1s[e] - y0s[e]
-            length = math.sqrt(sx * sx + sy * sy)
-            nearing = (ux * sy - uy * sx) / length  # outward, as outlines are anticlockwise
-            height = (px * sy - py * sx) / length
-            if nearing < -GRAZE and height > 0.0:
-                until = (height - radius) / -nearing
-                if until < 0.0:
-                    until = 0.0
-                if until < way:
-                    along = (px + until * ux) * sx + (py + until * uy) * sy
-                    if 0.0 <= along <= length * length:
-                        way = until
-    return way
-
-
 def drive_on(
     law: int,
     figures: Numbers,
@@ -439,7 +397,7 @@ def drive_on(
         figures: dt [s]; the six limits of `limited`; share of the last speed that is left at the end of a
             step, and its share in the mean of the step; slip per change of speed in a step [s/m]; scales of v
             and w; age at which a command is void [s]; radius of the footprint [m]; the eight
-            `gains` of `along_path`.
+            `gains` of `along_path`; the errors of `perceived`, which scripts ignore.
         table: For COMMANDS time [s], v [m/s], w [rad/s] of each; for RELEASE x, y of each point [m]; for
             the others as in `along_path`. Other columns are not read.
         fence: As for `clearance`.
@@ -467,6 +425,9 @@ def drive_on(
         figures[20],
         figures[21],
     )
+    blurred = law != COMMANDS and (
+        figures[22] != 0.0 or figures[23] != 0.0 or figures[24] != 0.0 or figures[25] != 0.0
+    )
     count = len(table[0])
     x, y, yaw = state[0], state[1], state[2]
     v_told, w_told, v, w, v_mean, free = state[3], state[4], state[5], state[6], state[7], state[8]
@@ -476,8 +437,12 @@ def drive_on(
     half_dt = dt / 2
     made = steps
     for k in range(steps):
+        t = (first + k) * dt
+        px, py, pyaw = x, y, yaw
+        if blurred:
+            px, py, pyaw = perceived(figures, 22, t, x, y, yaw, v, w)
         v_cmd, w_cmd, node, driven = commanded(
-            law, table, gains, timeout, node, driven, (first + k) * dt, x, y, yaw, v, w
+            law, table, gains, timeout, node, driven, t, px, py, pyaw, v, w
         )
         v_told, w_told = limited(limits, v_cmd, w_cmd, v_told, w_told)
         was = v_mean

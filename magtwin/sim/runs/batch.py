@@ -25,6 +25,7 @@ from magtwin.sim.motion.drive import Pose, draw_wheel_errors
 from magtwin.sim.motion.drive_input import DriveInput
 from magtwin.sim.motion.engine import Travel
 from magtwin.sim.motion.follow import check_arrived, loop_along, loop_by_commands
+from magtwin.sim.motion.pose_error import draw_pose_error
 from magtwin.sim.runs.sensing import Conditions, Sensing, streams
 from magtwin.sim.runs.simulate import Metadata, Sensed, check_run, sense_all, travel
 from magtwin.spec.drive import DriveSpec
@@ -152,7 +153,8 @@ class Runs(Summarized, Sequence[Run]):
             if (planned := self._loops[i]) is not None:
                 drive = self._jobs[i].scene.robot.drive
                 errors = draw_wheel_errors(drive, draws[i]["drive"])
-                loops[i] = replace(planned, drive=drive, wheel_errors=errors)
+                pose_error = draw_pose_error(drive, draws[i]["drive"])
+                loops[i] = replace(planned, drive=drive, wheel_errors=errors, pose_error=pose_error)
         motions = dict(zip(loops, run_loops(list(loops.values()), common.obstacles), strict=True))
         sensed = []
         for i in numbers:

@@ -21,6 +21,7 @@ from magtwin.sim.motion.drive_input import DriveInput
 from magtwin.sim.motion.driver import Driver
 from magtwin.sim.motion.engine import KINEMATIC, Engine, Travel
 from magtwin.sim.motion.follow import follow, play
+from magtwin.sim.motion.pose_error import draw_pose_error
 from magtwin.sim.runs.sensing import Conditions, LidarMode, Outside, Predicted, Sensing, streams
 from magtwin.sim.sensors.lidar import lidar_on
 from magtwin.sim.sensors.model_error import ModelError
@@ -142,7 +143,8 @@ def travel(
     metadata = {} if engine.name == "kinematic" else {"engine": engine.name}
     if isinstance(path, Path):
         name = controller if isinstance(controller, str) else type(controller).__name__
-        motion = follow(path, robot.drive, speed=speed, controller=controller, **room)
+        errors = draw_pose_error(robot.drive, draws["drive"])
+        motion = follow(path, robot.drive, speed=speed, controller=controller, pose_error=errors, **room)
         return motion, {"path": path.name, "controller": name, "speed_m_s": float(speed), **metadata}
     if isinstance(path, Commands):
         motion = play(path.rows, robot.drive, start=scene.start, **room)

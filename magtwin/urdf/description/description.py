@@ -148,13 +148,24 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
         for part in source.xml
         if part.tag in ("link", "joint", "material")
     ]
-    links = [_without_empty(read_link(e), description) for e in clean if e.tag == "link"]
+    links = [read_link(e) for e in clean if e.tag == "link"]
+    for link in links:
+        for role, shapes in (("visual", link.visuals), ("collision", link.collisions)):
+            for kind in (shape.geometry.kind for shape in shapes if shape.geometry.empty):
+                description.note(f"link {link.name!r}: a {role} {kind} of size 0 is left out", lost=True)
     joints = [read_joint(e) for e in clean if e.tag == "joint"]
     materials = [read_material(e) for e in clean if e.tag == "material"]
     held = {joint.child: joint for joint in joints}
     description = replace(
         description,
-        links={link.name: link for link in links},
+        links={
+            link.name: replace(
+                link,
+                visuals=tuple(shape for shape in link.visuals if not shape.geometry.empty),
+                collisions=tuple(shape for shape in link.collisions if not shape.geometry.empty),
+            )
+            for link in links
+        },
         joints=held,
         materials=MappingProxyType({m.name: m for m in materials}),
     )
@@ -205,48 +216,30 @@ def _check_names(source: Source) -> None:
                 raise InputError(f"{where(joint)}: joint {joint.get('name')!r} has no <{end} link=>")
 
 
-def _without_empty(link: Link, description: Description) -> Link:
-    """A link without primitives of size 0; they are noted."""
-
-    def kept(shapes: Sequence[Shape], role: str) -> tuple[Shape, ...]:
-        for shape in shapes:
-            if shape.geometry.empty:
-                text = f"link {link.name!r}: a {role} {shape.geometry.kind} of size 0 is left out"
-                description.note(text, lost=True)
-        return tuple(shape for shape in shapes if not shape.geometry.empty)
-
-    return replace(link, visuals=kept(link.visuals, "visual"), collisions=kept(link.collisions, "collision"))
-
-
 def _check_joints(description: Description, joints: Sequence[Joint]) -> None:
     """Check types, links, axes, limits and mimics of joints."""
     held: dict[str, str] = {}
     named = {joint.name: joint for joint in joints}
     for joint in joints:
-        problem = _problem(joint, description, held)
+        limit, problem = joint.limit, ""
+        missing = next((link for link in (joint.parent, joint.child) if link not in description.links), None)
+        if joint.type not in JOINT_TYPES:
+            problem = f"is of type {joint.type!r}; known: {', '.join(JOINT_TYPES)}"
+        elif missing is not None:
+            problem = f"names no link {missing!r}; {hint(missing, description.links)}"
+        elif joint.child in held:
+            problem = f"holds {joint.child!r}, which {held[joint.child]!r} holds already"
+        elif joint.type in AXIAL and not np.linalg.norm(joint.axis) > 0:
+            problem = "moves about an axis of length 0"
+        elif limit is not None and joint.type not in ("fixed", "continuous"):
+            low, high = limit.lower, limit.upper
+            if low is not None and high is not None and low > high:
+                problem = f"has its lower limit {low:g} above its upper {high:g}"
         if problem:
             raise description.refused("joint", joint.name, problem)
         held[joint.child] = joint.name
         if joint.mimic is not None:
             _check_mimic(description, joint, named)
-
-
-def _problem(joint: Joint, description: Description, held: Mapping[str, str]) -> str:
-    """The first problem of a joint; "" for none."""
-    limit = joint.limit
-    if joint.type not in JOINT_TYPES:
-        return f"is of type {joint.type!r}; known: {', '.join(JOINT_TYPES)}"
-    for link in (joint.parent, joint.child):
-        if link not in description.links:
-            return f"names no link {link!r}; {hint(link, description.links)}"
-    if joint.child in held:
-        return f"holds {joint.child!r}, which {held[joint.child]!r} holds already"
-    if joint.type in AXIAL and not np.linalg.norm(joint.axis) > 0:
-        return "moves about an axis of length 0"
-    ends = None if limit is None or joint.type in ("fixed", "continuous") else (limit.lower, limit.upper)
-    if ends and ends[0] is not None and ends[1] is not None and ends[0] > ends[1]:
-        return f"has its lower limit {ends[0]:g} above its upper {ends[1]:g}"
-    return ""
 
 
 def _check_mimic(description: Description, joint: Joint, named: Mapping[str, Joint]) -> None:

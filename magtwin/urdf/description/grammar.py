@@ -6,7 +6,6 @@ Follows the URDF XML specification (wiki.ros.org/urdf/XML), with the capsule of 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 from xml.etree import ElementTree
 
 from magtwin.errors import InputError, hint
@@ -14,11 +13,8 @@ from magtwin.errors import InputError, hint
 Element = ElementTree.Element
 
 
-class Note(Protocol):
-    """Receives a note for the user; `lost` if something was left out."""
-
-    def __call__(self, text: str, *, lost: bool = False) -> None:
-        """Add the note."""
+Note = Callable[..., None]
+"""Receives a note for the user; with `lost=True` if something was left out."""
 
 
 @dataclass(frozen=True)

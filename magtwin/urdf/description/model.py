@@ -4,7 +4,7 @@ They are read here and not by yourdfpy, whose import takes longer than a whole c
 every link and joint with yourdfpy's.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from xml.etree import ElementTree
 
 import numpy as np
@@ -15,80 +15,38 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Box:
-    """A `<box>`."""
-
-    size: Array
-    """Edges [m], shape (3,)."""
-
-
-@dataclass(frozen=True)
-class Cylinder:
-    """A `<cylinder>` along z."""
-
-    radius: float
-    length: float
-
-
-@dataclass(frozen=True)
-class Capsule:
-    """A `<capsule>`; yourdfpy has none."""
-
-    radius: float
-    """Radius of the cylinder and of its round ends [m]."""
-
-    length: float
-    """Length along z without the ends [m]."""
-
-
-@dataclass(frozen=True)
-class Sphere:
-    """A `<sphere>`."""
-
-    radius: float
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """A `<mesh>`."""
-
-    filename: str
-
-    scale: Array
-    """One factor or three, shape (1,) or (3,)."""
-
-
-@dataclass(frozen=True)
 class Geometry:
-    """A `<geometry>`: exactly one field is not None."""
+    """A `<geometry>`; its kind determines which of the other values it has."""
 
-    box: Box | None = None
-    capsule: Capsule | None = None
-    cylinder: Cylinder | None = None
-    mesh: Mesh | None = None
-    sphere: Sphere | None = None
+    kind: str
+    """box, capsule, cylinder, mesh or sphere; capsules and cylinders are along z."""
 
-    @property
-    def kind(self) -> str:
-        """Its tag."""
-        return next(name for name, form in vars(self).items() if form is not None)
+    size: Array = field(default_factory=lambda: np.ones(3))
+    """Edges of a box [m], shape (3,); factors of a mesh, shape (1,) or (3,)."""
+
+    radius: float = 0.0
+    """[m]."""
+
+    length: float = 0.0
+    """Length of a cylinder, or of a capsule without its round ends [m]."""
+
+    filename: str = ""
+    """File of a mesh."""
 
     @property
     def empty(self) -> bool:
         """Whether it is a primitive of size 0; a capsule of length 0 is a ball."""
-        sizes = [] if self.box is None else [*self.box.size]
-        sizes += [form.radius for form in (self.capsule, self.cylinder, self.sphere) if form]
-        return 0 in sizes or (self.cylinder is not None and self.cylinder.length == 0)
+        if self.kind in ("box", "mesh"):
+            return self.kind == "box" and 0 in self.size
+        return self.radius == 0 or (self.kind == "cylinder" and self.length == 0)
 
     @property
     def volume(self) -> float:
         """Volume of a primitive [m3]."""
-        if self.box is not None:
-            return float(np.prod(self.box.size))
-        form = self.sphere or self.cylinder or self.capsule
-        assert form is not None
-        ball = 0.0 if self.cylinder else 4 / 3 * np.pi * form.radius**3
-        return ball + np.pi * form.radius**2 * getattr(form, "length", 0.0)
+        if self.kind == "box":
+            return float(np.prod(self.size))
+        ball = 0.0 if self.kind == "cylinder" else 4 / 3 * np.pi * self.radius**3
+        return ball + np.pi * self.radius**2 * self.length
 
     def half_extents(self, R: Array) -> Array:
         """Half the edges of the axis-aligned box around a primitive at the origin [m], shape (3,).
@@ -98,31 +56,11 @@ class Geometry:
         Args:
             R: Rotation of the primitive, shape (3, 3).
         """
-        if self.box is not None:
-            return np.abs(R) @ (self.box.size / 2)
-        if self.sphere is not None:
-            return np.full(3, self.sphere.radius)
+        if self.kind == "box":
+            return np.abs(R) @ (self.size / 2)
         n = R[:, 2]
-        if self.cylinder is not None:
-            rim = self.cylinder.radius * np.sqrt(np.clip(1 - n**2, 0, 1))
-            return rim + np.abs(n) * self.cylinder.length / 2
-        assert self.capsule is not None
-        return self.capsule.radius + np.abs(n) * self.capsule.length / 2
-
-
-@dataclass(frozen=True)
-class Color:
-    """A `<color>`."""
-
-    rgba: Array
-    """Red, green, blue (sRGB) and opacity, 0 to 1, shape (4,)."""
-
-
-@dataclass(frozen=True)
-class Texture:
-    """A `<texture>`."""
-
-    filename: str
+        rim = np.sqrt(np.clip(1 - n**2, 0, 1)) if self.kind == "cylinder" else np.ones(3)
+        return self.radius * rim + np.abs(n) * self.length / 2
 
 
 @dataclass(frozen=True)
@@ -130,8 +68,12 @@ class Material:
     """A `<material>` of a visual or of the robot."""
 
     name: str | None
-    color: Color | None
-    texture: Texture | None
+
+    rgba: Array | None
+    """Red, green, blue (sRGB) and opacity of its `<color>`, 0 to 1, shape (4,)."""
+
+    texture: str | None
+    """File of its `<texture>`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,8 +137,13 @@ class Mimic:
     """A `<mimic>`: q = multiplier q_joint + offset."""
 
     joint: str
+    """Name of the leader."""
+
     multiplier: float
+    """Ratio of the two values [1; rad/m or m/rad if one rotates and the other slides]."""
+
     offset: float
+    """Value when the leader is at 0 [rad or m]."""
 
 
 @dataclass(frozen=True)
@@ -243,13 +190,12 @@ def read_joint(element: Element) -> Joint:
         axis=np.array([1.0, 0.0, 0.0]) if axis is None else _numbers(axis, "xyz", "1 0 0"),
         limit=None if limits is None else Limit(*limits),
         dynamics=None if dynamics_values is None else Dynamics(*dynamics_values),
-        mimic=None if mimic is None else _mimic(mimic),
+        mimic=None
+        if mimic is None
+        else Mimic(
+            mimic.attrib["joint"], float(mimic.get("multiplier", 1.0)), float(mimic.get("offset", 0.0))
+        ),
     )
-
-
-def _mimic(element: Element) -> Mimic:
-    factor, offset = float(element.get("multiplier", 1.0)), float(element.get("offset", 0.0))
-    return Mimic(element.attrib["joint"], factor, offset)
 
 
 def read_material(element: Element) -> Material:
@@ -257,8 +203,8 @@ def read_material(element: Element) -> Material:
     color, texture = element.find("color"), element.find("texture")
     return Material(
         element.get("name"),
-        None if color is None else Color(_numbers(color, "rgba")),
-        None if texture is None else Texture(texture.attrib["filename"]),
+        None if color is None else _numbers(color, "rgba"),
+        None if texture is None else texture.attrib["filename"],
     )
 
 
@@ -275,15 +221,11 @@ def _shape(element: Element) -> Shape:
 
 def _geometry(form: Element) -> Geometry:
     if form.tag == "box":
-        return Geometry(box=Box(_numbers(form, "size")))
+        return Geometry("box", _numbers(form, "size"))
     if form.tag == "mesh":
-        return Geometry(mesh=Mesh(form.attrib["filename"], _numbers(form, "scale", "1")))
-    radius, length = float(form.attrib["radius"]), _number(form, "length") or 0.0
-    if form.tag == "sphere":
-        return Geometry(sphere=Sphere(radius))
-    if form.tag == "capsule":
-        return Geometry(capsule=Capsule(radius, length))
-    return Geometry(cylinder=Cylinder(radius, length))
+        return Geometry("mesh", _numbers(form, "scale", "1"), filename=form.attrib["filename"])
+    length = 0.0 if form.tag == "sphere" else float(form.attrib["length"])
+    return Geometry(form.tag, radius=float(form.attrib["radius"]), length=length)
 
 
 def _inertial(element: Element | None) -> Inertial | None:

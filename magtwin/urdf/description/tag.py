@@ -34,9 +34,7 @@ class Tags:
 
     def blocks(self, tag: str) -> list[Element]:
         """Elements called `tag` directly below `<robot>`; marks them, but not their children."""
-        elements = self.description.xml.findall(tag)
-        self._read.update(elements)
-        return elements
+        return self.findall(self.description.xml, tag)
 
     def find(self, element: Element | None, *paths: str) -> Element | None:
         """The first element at one of the paths below another, or None; marks it and its parents."""
@@ -60,11 +58,6 @@ class Tags:
     def read(self, element: Element) -> Element:
         """Mark an element, but not its children."""
         self._read.add(element)
-        return element
-
-    def take(self, element: Element) -> Element:
-        """Mark an element and everything in it."""
-        self._read.update(element.iter())
         return element
 
     def text(self, element: Element | None, *paths: str) -> str:
@@ -135,7 +128,7 @@ class Tags:
         texts: dict[str, list[str]] = {}
         counts: Counter[str] = Counter()
         for name, element in self._foreign():
-            for way, left in self._unread(element, ()):
+            for way, left in self._unread(element):
                 counts["/".join((*(e.tag for e in way), left.tag))] += 1
                 inside = "/".join(_label(e) for e in way)
                 texts.setdefault(name, []).append(f"{inside}: {_plain(left)}" if inside else _plain(left))
@@ -156,15 +149,13 @@ class Tags:
                     if child.tag not in known:
                         yield element.get("name", ""), child
 
-    def _unread(
-        self, element: Element, way: tuple[Element, ...]
-    ) -> Iterator[tuple[tuple[Element, ...], Element]]:
+    def _unread(self, element: Element, *way: Element) -> Iterator[tuple[tuple[Element, ...], Element]]:
         """The outermost unmarked elements, with their parents."""
         if element not in self._read:
             yield way, element
             return
         for child in element:
-            yield from self._unread(child, (*way, element))
+            yield from self._unread(child, *way, element)
 
 
 def _text_of(element: Element) -> str:

@@ -6,8 +6,7 @@ pycollada is not used, because it loses meshes: it drops a geometry whose materi
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -35,19 +34,18 @@ LUMINANCE = (0.212671, 0.715160, 0.072169)
 """Weights of linear red, green and blue, from the specification."""
 
 
-def read_collada(reading: Reading) -> list[Piece]:
-    """The triangles of a COLLADA file, for `read_mesh`."""
-    return _Collada(reading).pieces()
-
-
-@dataclass(frozen=True)
-class _Input:
+class _Input(NamedTuple):
     """An `<input>` of a primitive."""
 
     semantic: str
     source: str
     offset: int
     set: int
+
+
+def read_collada(reading: Reading) -> list[Piece]:
+    """The triangles of a COLLADA file, for `read_mesh`."""
+    return _Collada(reading).pieces()
 
 
 class _Collada:
@@ -139,17 +137,19 @@ class _Collada:
         """Product of a node's transforms in file order, shape (4, 4)."""
         T = np.eye(4)
         for child in node:
+            step = np.eye(4)
             if child.tag == "matrix":
-                T = T @ self._floats(child, 16).reshape(4, 4)
+                step = self._floats(child, 16).reshape(4, 4)
             elif child.tag == "translate":
-                T = T @ _affine(p=self._floats(child, 3))
+                step[:3, 3] = self._floats(child, 3)
             elif child.tag == "scale":
-                T = T @ _affine(np.diag(self._floats(child, 3)))
+                step[:3, :3] = np.diag(self._floats(child, 3))
             elif child.tag == "rotate":
                 x, y, z, degrees = self._floats(child, 4)
-                T = T @ _affine(_rotation(np.array([x, y, z]), np.radians(degrees)))
+                step[:3, :3] = _rotation(np.array([x, y, z]), np.radians(degrees))
             elif child.tag in ("lookat", "skew"):
                 self._reading.lose(f"<{child.tag}> of node {node.get('id')!r} is not applied")
+            T = T @ step
         return T
 
     def _geometry(self, geometry: Element, instance: Element, shown: set[Element]) -> Iterator[Piece]:
@@ -183,7 +183,9 @@ class _Collada:
         binding = bound.get(primitive.get("material"))
         paint, uvs, colours = self._paint(primitive, binding), None, None
         if paint is None or paint.image is not None:
-            uvs = self._picked(inputs, "TEXCOORD", 2, index, triangles, self._uv_set(binding))
+            binds = [] if binding is None else binding.findall("bind_vertex_input")
+            of_uvs = (b.get("input_set", 0) for b in binds if b.get("input_semantic") == "TEXCOORD")
+            uvs = self._picked(inputs, "TEXCOORD", 2, index, triangles, int(next(of_uvs, -1)))
         if paint is None:
             colours = self._picked(inputs, "COLOR", 3, index, triangles)
         return Piece(
@@ -266,13 +268,6 @@ class _Collada:
                 )
             self._sources[given.source] = values.reshape(count, stride)
         return self._sources[given.source][:, :width]
-
-    def _uv_set(self, binding: Element | None) -> int:
-        """The set of texture coordinates bound to a material; -1 if unspecified."""
-        for bind in () if binding is None else binding.findall("bind_vertex_input"):
-            if bind.get("input_semantic") == "TEXCOORD":
-                return int(bind.get("input_set", 0))
-        return -1
 
     def _paint(self, primitive: Element, binding: Element | None) -> Paint | None:
         """The paint of a primitive's material; None if it has no material or no colour."""
@@ -386,14 +381,6 @@ def _part(word: str) -> list[str]:
     """Split two numbers written without a space: "0.01.0" is 0.0 and 1.0."""
     fused = re.fullmatch(r"(\d+\.\d+?)(\d\.\d+)", word)
     return [fused[1], fused[2]] if fused else [word]
-
-
-def _affine(A: NDArray | None = None, p: NDArray | None = None) -> NDArray:
-    """An affine map with linear part A, shape (3, 3), and translation p, shape (3,); shape (4, 4)."""
-    T = np.eye(4)
-    T[:3, :3] = np.eye(3) if A is None else A
-    T[:3, 3] = 0 if p is None else p
-    return T
 
 
 def _rotation(axis: NDArray, angle: float) -> NDArray:

@@ -1,7 +1,5 @@
 """Collider: the solids of a mesh collider: its convex hull, convex parts, or the mesh itself."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,28 +13,43 @@ CONCAVITY = 0.05
 """Largest depth of a hollow, relative to the mesh, that a convex part may fill (coacd's threshold)."""
 
 
-@dataclass(frozen=True)
-class Solid:
-    """Triangles of a collider."""
-
-    points: NDArray[np.float32]
-    """Vertices [m], shape (V, 3)."""
-
-    faces: NDArray[np.int64]
-    """Corners of the triangles, counter-clockwise from outside, shape (F, 3)."""
+Solid = tuple[NDArray[np.float32], NDArray[np.int64]]
+"""Vertices [m], shape (V, 3), and triangles, counter-clockwise from outside, shape (F, 3)."""
 
 
 def solids_of(mesh: Mesh, collision: Collision) -> tuple[Solid, ...]:
     """The solids of a mesh: one, or the parts of a convex decomposition.
 
+    The decomposition is coacd's (Wei et al. 2022, doi:10.1145/3528223.3530103). A hull has its faces in a
+    fixed order and none without an area.
+
     Raises:
         InputError: The mesh is flat and has no hull; or coacd is not installed.
     """
     if collision == "mesh":
-        return (Solid(mesh.points, mesh.faces),)
+        return ((mesh.points, mesh.faces),)
     if collision == "decomposition":
-        return _decomposition(mesh)
-    return (_hull(mesh),)
+        try:
+            import coacd
+        except ImportError as error:
+            raise InputError(
+                f"a convex decomposition needs coacd, which is not installed: {EXTRA}"
+            ) from error
+        coacd.set_log_level("off")
+        whole = coacd.Mesh(mesh.points.astype(float), mesh.faces.astype(np.int32))
+        parts = coacd.run_coacd(whole, threshold=CONCAVITY, seed=0)
+        if not parts:
+            raise InputError(f"{mesh.path}: coacd finds no convex parts in it; use --collision hull")
+        return tuple((np.asarray(v, np.float32), np.asarray(f, np.int64)) for v, f in parts)
+    faces = hull_faces(mesh.points.astype(float))
+    if faces is None:
+        raise InputError(f"{mesh.path}: is flat and has no convex hull to collide with; use a box instead")
+    first = np.argmin(faces, axis=1)[:, None]
+    faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
+    faces = faces[np.lexsort(faces.T[::-1])]
+    faces = faces[has_area(mesh.points, faces)]
+    used, index = np.unique(faces, return_inverse=True)
+    return ((mesh.points[used], index.reshape(-1, 3)),)
 
 
 def hull_faces(points: NDArray) -> NDArray[np.int64] | None:
@@ -51,31 +64,3 @@ def hull_faces(points: NDArray) -> NDArray[np.int64] | None:
     a, b, c = (points[faces[:, i]] for i in range(3))
     inwards = np.sum(np.cross(b - a, c - a) * hull.equations[:, :3], axis=1) < 0
     return np.where(inwards[:, None], faces[:, ::-1], faces)
-
-
-def _hull(mesh: Mesh) -> Solid:
-    """The convex hull, its faces in a fixed order and without those that have no area."""
-    faces = hull_faces(mesh.points.astype(float))
-    if faces is None:
-        raise InputError(f"{mesh.path}: is flat and has no convex hull to collide with; use a box instead")
-    first = np.argmin(faces, axis=1)[:, None]
-    faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
-    faces = faces[np.lexsort(faces.T[::-1])]
-    faces = faces[has_area(mesh.points, faces)]
-    used, index = np.unique(faces, return_inverse=True)
-    return Solid(mesh.points[used], index.reshape(-1, 3))
-
-
-def _decomposition(mesh: Mesh) -> tuple[Solid, ...]:
-    """Convex parts by coacd (Wei et al. 2022, doi:10.1145/3528223.3530103)."""
-    try:
-        import coacd
-    except ImportError as error:
-        raise InputError(f"a convex decomposition needs coacd, which is not installed: {EXTRA}") from error
-    coacd.set_log_level("off")
-    parts = coacd.run_coacd(
-        coacd.Mesh(mesh.points.astype(float), mesh.faces.astype(np.int32)), threshold=CONCAVITY, seed=0
-    )
-    if not parts:
-        raise InputError(f"{mesh.path}: coacd finds no convex parts in it; use --collision hull")
-    return tuple(Solid(np.asarray(v, np.float32), np.asarray(f, np.int64)) for v, f in parts)

@@ -36,9 +36,6 @@ TRIANGLES, STRIP, FAN = 4, 5, 6
 SUPPORTED = ("KHR_materials_unlit", "KHR_mesh_quantization", "KHR_materials_emissive_strength")
 """Required extensions that are supported or do not change the shape."""
 
-EMPTY = 2**22
-"""Most zeros of an accessor without a buffer."""
-
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
 
@@ -85,7 +82,7 @@ class _Gltf:
         while pending:
             index, above = pending.pop()
             if index in seen:
-                raise InputError(f"{self._reading.path}: node {index} has two parents; export it again")
+                raise self._refused(f"node {index} has two parents")
             seen.add(index)
             node = self._json["nodes"][index]
             T = above @ _local(node)
@@ -108,10 +105,7 @@ class _Gltf:
             )
             faces = _triangles(order, mode)
             if len(faces) and not faces.max() < len(points):
-                raise InputError(
-                    f"{self._reading.path}: a face names vertex {faces.max()} of {len(points)}; "
-                    "export it again"
-                )
+                raise self._refused(f"a face names vertex {faces.max()} of {len(points)}")
             at = {
                 name: self._numbers(attributes[name])[faces]
                 for name in ("NORMAL", "TEXCOORD_0", "COLOR_0")
@@ -144,15 +138,13 @@ class _Gltf:
                 texture = surface["baseColorTexture"]
                 moved = "KHR_texture_transform" in texture.get("extensions", {})
                 if texture.get("texCoord", 0) != 0 or moved:
-                    self._reading.lose(
-                        f"material {index}'s texture uses other coordinates than the first set"
-                    )
+                    text = f"material {index}'s texture uses other coordinates than the first set"
+                    self._reading.lose(text)
                 image = self._image(self._json["textures"][texture["index"]])
-            for other in ("normalTexture", "occlusionTexture", "emissiveTexture"):
-                if other in material:
+            kinds = ("normalTexture", "occlusionTexture", "emissiveTexture", "metallicRoughnessTexture")
+            for other in kinds:
+                if other in material or other in surface:
                     self._reading.lose(f"material {index}'s {other} is left out")
-            if "metallicRoughnessTexture" in surface:
-                self._reading.lose(f"material {index}'s metallicRoughnessTexture is left out")
             red, green, blue = (float(c) for c in srgb_from_linear((r, g, b)))
             alpha = material.get("alphaMode", "OPAQUE")
             self._paints[index] = Paint(
@@ -185,42 +177,24 @@ class _Gltf:
         accessor = self._json["accessors"][index]
         dtype, width = np.dtype(COMPONENTS[accessor["componentType"]]), WIDTHS[accessor["type"]]
         count = accessor["count"]
-        if "bufferView" in accessor:
-            view = self._json["bufferViews"][accessor["bufferView"]]
-            data = self._view(accessor["bufferView"])[accessor.get("byteOffset", 0) :]
-            stride = view.get("byteStride", dtype.itemsize * width)
-            if count and len(data) < stride * (count - 1) + dtype.itemsize * width:
-                raise InputError(
-                    f"{self._reading.path}: accessor {index} is longer than its buffer; export it again"
-                )
-            values = np.ndarray((count, width), dtype, data, 0, (stride, dtype.itemsize))
-        else:
-            if count > EMPTY:
-                raise InputError(
-                    f"{self._reading.path}: accessor {index} has {count} zeros, over {EMPTY}; export it again"
-                )
-            values = np.zeros((count, width), dtype)
-        if "sparse" in accessor:
-            values = self._replaced(np.array(values), accessor["sparse"])
+        if "bufferView" not in accessor or "sparse" in accessor:
+            raise self._refused(f"accessor {index} is sparse or has no buffer, which is not supported")
+        view = self._json["bufferViews"][accessor["bufferView"]]
+        data = self._view(accessor["bufferView"])[accessor.get("byteOffset", 0) :]
+        stride = view.get("byteStride", dtype.itemsize * width)
+        if count and len(data) < stride * (count - 1) + dtype.itemsize * width:
+            raise self._refused(f"accessor {index} is longer than its buffer")
+        values = np.ndarray((count, width), dtype, data, 0, (stride, dtype.itemsize))
         if accessor.get("normalized"):
             return np.maximum(values / np.iinfo(dtype).max, -1.0)
         return values.astype(float) if dtype.kind == "f" else values.astype(np.int64)
-
-    def _replaced(self, values: NDArray, sparse: dict[str, Any]) -> NDArray:
-        """Values with the rows of a sparse accessor replaced."""
-        count, where, what = sparse["count"], sparse["indices"], sparse["values"]
-        kind = COMPONENTS[where["componentType"]]
-        rows = np.frombuffer(self._view(where["bufferView"]), kind, count, where.get("byteOffset", 0))
-        new, start = self._view(what["bufferView"]), what.get("byteOffset", 0)
-        values[rows] = np.frombuffer(new, values.dtype, count * values.shape[1], start).reshape(count, -1)
-        return values
 
     def _view(self, index: int) -> bytes:
         view = self._json["bufferViews"][index]
         start = view.get("byteOffset", 0)
         data = self._buffer(view["buffer"])[start : start + view["byteLength"]]
         if len(data) < view["byteLength"]:
-            raise InputError(f"{self._reading.path}: buffer {view['buffer']} is cut short; export it again")
+            raise self._refused(f"buffer {view['buffer']} is cut short")
         return data
 
     def _buffer(self, index: int) -> bytes:
@@ -240,6 +214,9 @@ class _Gltf:
                     raise InputError(f"{self._reading.path}: buffer {uri!r} is missing; looked for {file}")
                 self._buffers[index] = file.read_bytes()
         return self._buffers[index]
+
+    def _refused(self, text: str) -> InputError:
+        return InputError(f"{self._reading.path}: {text}; export it again")
 
 
 def _parse(path: Path) -> tuple[dict[str, Any], bytes]:

@@ -57,9 +57,7 @@ class Mesh:
             return self.normals
         computed = corner_normals(self.points, self.faces)
         return (
-            np.where(np.isfinite(self.normals), self.normals, computed)
-            if self.normals is not None
-            else computed
+            computed if self.normals is None else np.where(np.isfinite(self.normals), self.normals, computed)
         )
 
 
@@ -203,9 +201,6 @@ def bounds(points: NDArray) -> tuple[NDArray, NDArray]:
 def distinct(rows: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The distinct rows of an array of floats, in the order of first occurrence.
 
-    Sorting one 64-bit word per row, its hash and its index, is many times faster than sorting rows. If two
-    different rows have the same hash, rows are sorted instead.
-
     Args:
         rows: Taken in single precision, shape (N, K).
 
@@ -213,21 +208,12 @@ def distinct(rows: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         Index of the first row of each kind, shape (D,), and the kind of each row, shape (N,).
     """
     words = np.ascontiguousarray(rows + np.float32(0), np.float32).view(np.uint32)  # + 0 makes -0 into 0
-    hashed, here = np.zeros(len(words), np.uint64), np.arange(len(words))
-    for column in words.T:
-        hashed = (hashed ^ column) * np.uint64(0x9E3779B97F4A7C15)
-        hashed ^= hashed >> np.uint64(32)
-    low = np.uint64(len(words).bit_length())
-    keys = np.sort(hashed >> low << low | here.astype(np.uint64))
-    row, hashed = (keys & ~(~np.uint64(0) << low)).astype(np.int64), keys >> low
-    starts = np.append(True, hashed[1:] != hashed[:-1])[: len(row)]  # of rows of one hash, the first is first
-    first = np.empty_like(here)
-    first[row] = row[starts][np.cumsum(starts) - 1]
-    if not np.array_equal(words[first], words):
-        _, least, kind = np.unique(words, axis=0, return_index=True, return_inverse=True)
-        first = least[kind.reshape(-1)]
-    is_first = first == here
-    return here[is_first], (np.cumsum(is_first) - 1)[first]
+    order = np.lexsort(words.T)  # is stable: of equal rows, the first is first
+    starts = np.append(True, (words[order[1:]] != words[order[:-1]]).any(axis=1))[: len(order)]
+    first = np.empty_like(order)
+    first[order] = order[starts][np.cumsum(starts) - 1]
+    is_first = first == np.arange(len(order))
+    return np.flatnonzero(is_first), (np.cumsum(is_first) - 1)[first]
 
 
 def face_normals(points: NDArray, faces: NDArray) -> NDArray[np.float64]:

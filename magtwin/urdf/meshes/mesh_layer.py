@@ -6,7 +6,7 @@ The readable root layer references it, since large arrays do not belong in text.
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,13 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 
 from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description
-from magtwin.urdf.description.model import Mesh as UrdfMesh
+from magtwin.urdf.description.model import Geometry
 from magtwin.urdf.meshes.collider import Solid, solids_of
 from magtwin.urdf.meshes.mesh import SUFFIXES, Mesh, distinct, face_normals, read_mesh
-from magtwin.urdf.meshes.piece import GREY, Paint
+from magtwin.urdf.meshes.piece import PLAIN, Paint
 from magtwin.urdf.meshes.texture import Textures
 from magtwin.urdf.options import DEFAULTS, Collision, Options
 from magtwin.urdf.source.source import MissingFileError
-from magtwin.usd.geometry import linear_from_srgb
 from magtwin.usd.layers import describe_stage
 
 T = TypeVar("T")
@@ -65,7 +64,9 @@ class MeshLayer:
             textures: Asset path of the folder for textures, relative to the robot's layer.
         """
         self.textures = Textures(textures)
-        self._description, self._options = description, options
+        self.looks: dict[Sdf.Path, tuple[Any, ...]] = {}
+        """Values of each material on the robot's stage by its path, see `material`."""
+        self._description, self.options = description, options
         self._stage = Usd.Stage.CreateInMemory()
         describe_stage(self._stage, f"{description.name}: triangles of its meshes.")
         self._stage.SetDefaultPrim(UsdGeom.Scope.Define(self._stage, ROOT).GetPrim())
@@ -76,15 +77,10 @@ class MeshLayer:
         self._colliders: dict[tuple[Path, tuple[float, ...]], tuple[Sdf.Path, ...]] = {}
         self._solids: dict[Path, tuple[Solid, ...]] = {}
 
-    @property
-    def collision(self) -> Collision:
-        """Type of mesh colliders."""
-        return self._options.collision
-
     def __len__(self) -> int:
         return len(self._visuals) + len(self._colliders)
 
-    def visual(self, mesh: UrdfMesh) -> Entry:
+    def visual(self, mesh: Geometry) -> Entry:
         """The prim of a URDF `<mesh>` as a visual.
 
         Raises:
@@ -97,7 +93,7 @@ class MeshLayer:
             self._visuals[key] = self._define_visual(self._read(path), np.array(scale))
         return self._visuals[key]
 
-    def collider(self, mesh: UrdfMesh) -> tuple[Sdf.Path, ...]:
+    def collider(self, mesh: Geometry) -> tuple[Sdf.Path, ...]:
         """The prims of a URDF `<mesh>` as a collider, several for a convex decomposition.
 
         Raises as `visual` does.
@@ -106,14 +102,19 @@ class MeshLayer:
         key = (path, scale)
         if key not in self._colliders:
             if path not in self._solids:
-                self._solids[path] = solids_of(self._read(path), self._options.collision)
-            self._colliders[key] = tuple(
-                self._define_solid(solid, np.array(scale), f"{path.stem}_{FORMS[self.collision]}")
-                for solid in self._solids[path]
-            )
+                self._solids[path] = solids_of(self._read(path), self.options.collision)
+            made = []
+            for solid in self._solids[path]:
+                points, faces = _scaled(*solid, np.array(scale))
+                free = self._free(f"{path.stem}_{FORMS[self.options.collision]}")
+                normals = np.round(face_normals(points, faces), 4)
+                prim = self._define_mesh(free, points, faces)
+                _primvar(prim, "normals", Sdf.ValueTypeNames.Normal3fArray, normals, UsdGeom.Tokens.uniform)
+                made.append(free)
+            self._colliders[key] = tuple(made)
         return self._colliders[key]
 
-    def try_add(self, mesh: UrdfMesh, add: Callable[[UrdfMesh], T], label: str = "") -> T | None:
+    def try_add(self, mesh: Geometry, add: Callable[[Geometry], T], label: str = "") -> T | None:
         """The result of `visual` or `collider`; None if the file is missing and the options allow that.
 
         Args:
@@ -124,14 +125,14 @@ class MeshLayer:
         try:
             return add(mesh)
         except MissingFileError:
-            if self._options.missing_meshes != "note":
+            if self.options.missing_meshes != "note":
                 raise
             if label:
                 text = f"{label} is left out: its mesh {mesh.filename!r} is missing"
                 self._description.note(text, lost=True)
             return None
 
-    def vertices(self, mesh: UrdfMesh) -> NDArray[np.float64]:
+    def vertices(self, mesh: Geometry) -> NDArray[np.float64]:
         """Vertices of the file of an added `<mesh>`, scaled [m], shape (V, 3)."""
         path, scale = self._file(mesh)
         return self._files[path].points.astype(float) * scale
@@ -140,24 +141,24 @@ class MeshLayer:
         """Write the layer."""
         self._stage.GetRootLayer().Export(str(path))
 
-    def _file(self, mesh: UrdfMesh) -> tuple[Path, tuple[float, ...]]:
+    def _file(self, mesh: Geometry) -> tuple[Path, tuple[float, ...]]:
         """File and scale of a URDF `<mesh>`."""
         name, urdf = mesh.filename, self._description.path
         if Path(name).suffix.lower() not in SUFFIXES:
             raise InputError(f"{urdf}: mesh {name!r} is of no known format ({', '.join(SUFFIXES)})")
         if name not in self._found:
             self._found[name] = self._description.find_file(name, "mesh")
-        if not mesh.scale.all():
+        if not mesh.size.all():
             raise InputError(
-                f"{urdf}: mesh {name!r} has scale {mesh.scale.tolist()}; give numbers other than 0"
+                f"{urdf}: mesh {name!r} has scale {mesh.size.tolist()}; give numbers other than 0"
             )
-        return self._found[name], tuple(float(f) for f in np.broadcast_to(mesh.scale, 3))
+        return self._found[name], tuple(float(f) for f in np.broadcast_to(mesh.size, 3))
 
     def _read(self, path: Path) -> Mesh:
         if path not in self._files:
             self._files[path] = read_mesh(path, self._description.source.packages.holds)
-            for note in self._files[path].notes:
-                self._description.note(note.text, lost=note.lost)
+            for note, lost in self._files[path].notes:
+                self._description.note(note, lost=lost)
         return self._files[path]
 
     def _define_visual(self, file: Mesh, scale: NDArray) -> Entry:
@@ -172,31 +173,25 @@ class MeshLayer:
             mesh.CreateDoubleSidedAttr(True)
         if file.uvs is not None:
             _primvar(mesh, "st", Sdf.ValueTypeNames.TexCoord2fArray, np.nan_to_num(file.uvs[:, corners]))
-        subsets = _subsets(mesh, file) if len(file.paints) > 1 else []
-        self._define_colours(mesh, file, corners)
-        return Entry(xform.GetPath(), file.paints, tuple(subsets), file.uvs is not None)
-
-    def _define_colours(self, mesh: UsdGeom.Mesh, file: Mesh, corners: slice) -> None:
-        """Author colours at corners, and colours of paints for viewers without materials.
-
-        A mesh of one colour has none here, since its visual has it.
-        """
+        subsets, taken = list[str](), set[str]()
         kind, tokens = Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens
-        by_paint = np.array([display_colour(paint) for paint in file.paints], np.float32)
+        by_paint = np.array([(paint or PLAIN).display_colour for paint in file.paints], np.float32)
+        if len(file.paints) > 1:
+            api = UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim())
+            for i, paint in enumerate(file.paints):
+                name = Tf.MakeValidIdentifier((paint.name if paint else "") or "plain")
+                subsets.append(free_name(name, taken))
+                of_paint = Vt.IntArray.FromNumpy(np.flatnonzero(file.paint == i).astype(np.int32))
+                api.CreateMaterialBindSubset(subsets[-1], of_paint)
+            api.SetMaterialBindSubsetsFamilyType(tokens.partition)
         if file.colours is not None:
             colours = np.where(np.isfinite(file.colours), file.colours, by_paint[file.paint][:, None])
             _primvar(mesh, "displayColor", kind, np.round(colours[:, corners], 4))
-        elif len(file.paints) > 1:
+        elif subsets:  # a mesh of one colour has none here, since its visual has it
             primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("displayColor", kind, tokens.uniform)
             primvar.Set(Vt.Vec3fArray.FromNumpy(by_paint))
             primvar.SetIndices(Vt.IntArray.FromNumpy(file.paint.astype(np.int32)))
-
-    def _define_solid(self, solid: Solid, scale: NDArray, name: str) -> Sdf.Path:
-        points, faces = _scaled(solid.points, solid.faces, scale)
-        mesh = self._define_mesh(self._free(name), points, faces)
-        normals = np.round(face_normals(points, faces), 4)
-        _primvar(mesh, "normals", Sdf.ValueTypeNames.Normal3fArray, normals, UsdGeom.Tokens.uniform)
-        return mesh.GetPath()
+        return Entry(xform.GetPath(), file.paints, tuple(subsets), file.uvs is not None)
 
     def _define_mesh(self, path: Sdf.Path, points: NDArray, faces: NDArray) -> UsdGeom.Mesh:
         mesh = UsdGeom.Mesh.Define(self._stage, path)
@@ -221,13 +216,13 @@ def gather(description: Description, options: Options, textures: str) -> MeshLay
     meshes = MeshLayer(description, options, textures)
     colliding = False
     for name, link in description.links.items():
-        for visual in link.visuals:
-            if visual.geometry.mesh is not None:
-                meshes.try_add(visual.geometry.mesh, meshes.visual, f"link {name!r}: visual")
-        for collision in link.collisions:
-            if collision.geometry.mesh is not None:
-                meshes.try_add(collision.geometry.mesh, meshes.collider, f"link {name!r}: collision")
-                colliding = True
+        for role, shapes, add in (
+            ("visual", link.visuals, meshes.visual),
+            ("collision", link.collisions, meshes.collider),
+        ):
+            for form in (shape.geometry for shape in shapes if shape.geometry.kind == "mesh"):
+                meshes.try_add(form, add, f"link {name!r}: {role}")
+                colliding |= role == "collision"
     if options.collision == "mesh" and colliding:
         description.note(
             "meshes collide as they are; PhysX does this for static bodies only, others become convex hulls"
@@ -245,14 +240,10 @@ def free_name(name: str, taken: set[str]) -> str:
     return unique
 
 
-def display_colour(paint: Paint | None) -> tuple[float, float, float]:
-    """Linear colour of a paint for viewers without materials."""
-    if paint is None:
-        r, g, b = linear_from_srgb(GREY[:3])
-    else:
-        mean = (1.0, 1.0, 1.0) if paint.image is None else paint.image.mean
-        r, g, b = linear_from_srgb(paint.rgba[:3]) * linear_from_srgb(mean)
-    return (round(float(r), 5), round(float(g), 5), round(float(b), 5))
+def free_child(prim: Usd.Prim, name: str) -> Sdf.Path:
+    """A free path below a prim, called `name` if possible."""
+    taken = {child.GetName() for child in prim.GetChildren()}
+    return prim.GetPath().AppendChild(free_name(Tf.MakeValidIdentifier(name), taken))
 
 
 def _scaled(points: NDArray, faces: NDArray, scale: NDArray) -> tuple[NDArray[np.float32], NDArray]:
@@ -275,17 +266,3 @@ def _primvar(
     primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(name, kind, interpolation)
     primvar.Set(arrays[rows.shape[1]].FromNumpy(np.ascontiguousarray(rows[first])))
     primvar.SetIndices(Vt.IntArray.FromNumpy(index.astype(np.int32)))
-
-
-def _subsets(mesh: UsdGeom.Mesh, file: Mesh) -> list[str]:
-    """One GeomSubset for each paint, with its name."""
-    api = UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim())
-    taken: set[str] = set()
-    names: list[str] = []
-    for i, paint in enumerate(file.paints):
-        name = free_name(Tf.MakeValidIdentifier((paint.name if paint else "") or "plain"), taken)
-        faces = Vt.IntArray.FromNumpy(np.flatnonzero(file.paint == i).astype(np.int32))
-        api.CreateMaterialBindSubset(name, faces)
-        names.append(name)
-    api.SetMaterialBindSubsetsFamilyType(UsdGeom.Tokens.partition)
-    return names

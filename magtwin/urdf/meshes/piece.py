@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.urdf.meshes.texture import Image
+from magtwin.usd.geometry import linear_from_srgb
 
 Rgba = tuple[float, float, float, float]
 
@@ -15,10 +16,10 @@ GREY: Rgba = (0.5, 0.5, 0.5, 1.0)
 
 @dataclass(frozen=True)
 class Paint:
-    """A material of a mesh file."""
+    """The look of a surface: a material of a mesh file, or of the URDF."""
 
     name: str = ""
-    """Its name in the file."""
+    """Its name in the file. Default: from the colour."""
 
     rgba: Rgba = (1.0, 1.0, 1.0, 1.0)
     """Colour (sRGB) and opacity, 0 to 1; with a texture, the factor that multiplies it."""
@@ -43,6 +44,17 @@ class Paint:
 
     by_vertex: bool = False
     """Whether the colours at the corners replace `rgba`."""
+
+    @property
+    def display_colour(self) -> tuple[float, float, float]:
+        """Linear colour for viewers without materials."""
+        mean = (1.0, 1.0, 1.0) if self.image is None else self.image.mean
+        r, g, b = (round(float(c), 5) for c in linear_from_srgb(self.rgba[:3]) * linear_from_srgb(mean))
+        return (r, g, b)
+
+
+PLAIN = Paint(rgba=GREY)
+"""The look of a surface without a material."""
 
 
 @dataclass(frozen=True)

@@ -8,15 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-
-@dataclass(frozen=True)
-class Note:
-    """A note for the user on a file."""
-
-    text: str
-
-    lost: bool = False
-    """Whether something of the file was left out."""
+Note = tuple[str, bool]
+"""A note for the user on a file, and whether something of the file was left out."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +26,7 @@ class Reading:
 
     def note(self, text: str, *, lost: bool = False) -> None:
         """Add a note on a repair or guess, or an omission if `lost`."""
-        note = Note(f"{self.path.name}: {text}", lost)
+        note = (f"{self.path.name}: {text}", lost)
         if note not in self.notes:
             self.notes.append(note)
 

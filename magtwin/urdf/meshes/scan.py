@@ -1,6 +1,5 @@
 """Scan: STL and PLY, triangles without materials, read by trimesh."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,31 +26,11 @@ def read_scan(reading: Reading) -> list[Piece]:
             from trimesh.exchange.ply import load_ply
 
             read = load_ply(stream)
-    parts = _parts(read)
-    if not parts and reading.path.suffix.lower() == ".stl":
-        raise InputError(f"{reading.path}: {_why_empty(reading.path)}; export it again, or use a primitive")
-    return [_piece(part) for part in parts]
-
-
-def _why_empty(path: Path) -> str:
-    """Why an STL has no triangle; a binary one has a header of 84 bytes and 50 bytes a triangle."""
-    size = path.stat().st_size
-    with path.open("rb") as stream:
-        head = stream.read(84)
-    if head.lstrip()[:5].lower() == b"solid" or len(head) < 84:
-        return "holds no triangle, or is cut short"
-    count = int.from_bytes(head[80:], "little")
-    return (
-        f"has {size} bytes, though its {count} triangles need {84 + 50 * count}"
-        if count
-        else "holds no triangle"
-    )
-
-
-def _parts(read: dict[str, Any]) -> list[dict[str, Any]]:
-    """The meshes that trimesh returns; an ASCII STL may have several."""
-    parts = list(read["geometry"].values()) if "geometry" in read else [read]
-    return [part for part in parts if part.get("faces") is not None and len(part["faces"])]
+    parts = read["geometry"].values() if "geometry" in read else [read]  # an ASCII STL may have several
+    pieces = [_piece(part) for part in parts if part.get("faces") is not None and len(part["faces"])]
+    if not pieces and reading.path.suffix.lower() == ".stl":
+        raise InputError(f"{reading.path}: holds no triangle, or is cut short; export it again")
+    return pieces
 
 
 def _piece(part: dict[str, Any]) -> Piece:

@@ -100,30 +100,17 @@ def _absolute(word: str, rows: dict[str, list[str]]) -> str:
 
 def _corners(group: _Group, path: Path) -> NDArray[np.int64]:
     """Vertex, texture coordinate and normal of each corner, from 0; -1 if missing; shape (N, 3)."""
-    words = group.words
-    corners = np.zeros((len(words), 3), np.int64)
-    slashes = {word.count("/") for word in words}
-    doubled = sum("//" in word for word in words)
-    if slashes in ({0}, {1}, {2}) and doubled in (0, len(words)):
-        columns = [0, 2] if doubled else list(range(max(slashes) + 1))
-        values = numbers(" ".join(words).replace("/", " "), np.int64)
-        if len(values) == len(words) * len(columns):
-            corners[:, columns] = values.reshape(len(words), len(columns))
-            if (corners[:, columns] > 0).all():
-                return corners - 1
-    first = 0  # corners of several kinds, or malformed ones
+    words = [word + "/0" * (2 - word.count("/")) for word in group.words]
+    text = f"{' '.join(words)} ".replace("//", "/0/").replace("/ ", "/0 ")
+    values = numbers(text.replace("/", " "), np.int64)
+    if len(values) == 3 * len(words) and values.min() >= 0 and values[::3].min() >= 1:
+        return values.reshape(-1, 3) - 1
+    first = 0
     for number, count in zip(group.lines, group.counts, strict=True):
-        for i in range(first, first + count):
-            parts = words[i].split("/")
-            try:
-                corners[i, : len(parts)] = [int(part or 0) for part in parts]
-            except ValueError:
-                corners[i, 0] = 0
-            if corners[i, 0] < 1 or corners[i].min() < 0:
-                polygon = " ".join(words[first : first + count])
-                raise InputError(f"{path}:{number}: face {polygon!r} is malformed; export it again")
-        first += count
-    return corners - 1
+        polygon, first = group.words[first : first + count], first + count
+        if not all(re.fullmatch(r"0*[1-9]\d*(/\d*){0,2}", word) for word in polygon):
+            raise InputError(f"{path}:{number}: face {' '.join(polygon)!r} is malformed; export it again")
+    raise InputError(f"{path}: has a malformed face; export it again")
 
 
 def _table(rows: list[str], kind: str, least: int, path: Path) -> NDArray:

@@ -4,7 +4,7 @@ Follows the documentation of gz-sim's DiffDrive, gazebo_plugins' diff_drive, ros
 diff_drive_controller and URDF's `<transmission>`.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +23,19 @@ from magtwin.usd.sensors import define_drive
 PLUGINS = ("diff_drive", "diff-drive", "diffdrive")
 """Words in the name or file of a plugin that drives two wheels, old or new Gazebo."""
 
-SEPARATION = ("wheel_separation", "wheelSeparation")
 RADIUS, DIAMETER = ("wheel_radius",), ("wheel_diameter", "wheelDiameter")
 LEFT, RIGHT = ("left_joint", "leftJoint"), ("right_joint", "rightJoint")
-V_MAX = ("max_linear_velocity", "max_velocity")
-W_MAX = ("max_angular_velocity",)
-A_MAX = ("max_linear_acceleration", "max_acceleration", "max_wheel_acceleration", "wheelAcceleration")
-ALPHA_MAX = ("max_angular_acceleration",)
-RATE = ("odom_publish_frequency", "update_rate", "updateRate")
-"""Names of each parameter in a plugin."""
+FIGURES = {
+    "wheel_separation_m": ("wheel_separation", "wheelSeparation"),
+    "v_max": ("max_linear_velocity", "max_velocity"),
+    "w_max": ("max_angular_velocity",),
+    "alpha_max": ("max_angular_acceleration",),
+}
+OR_ZERO = {
+    "a_max": ("max_linear_acceleration", "max_acceleration", "max_wheel_acceleration", "wheelAcceleration"),
+    "odometry_rate_hz": ("odom_publish_frequency", "update_rate", "updateRate"),
+}
+"""Names of each parameter in a plugin; 0 leaves out those in OR_ZERO."""
 
 LIMITS = {
     "v_max": ("linear.x", "velocity"),
@@ -104,24 +108,6 @@ def define_differential(robot: Usd.Prim, spec: DriveSpec, prim_names: Mapping[st
     return define_drive(robot, DriveSpec(**{**vars(spec), **named}))
 
 
-def define_safety(tags: Tags, joint_of: Callable[[str], Usd.Prim | None]) -> None:
-    """Keep the soft limits of `<safety_controller>` as custom data of their joints.
-
-    They limit the commands of the robot's controller, not the joint, so engines have no attribute for them.
-    """
-    for element in tags.description.xml.findall("joint"):
-        safety, name = element.find("safety_controller"), element.get("name", "")
-        prim = None if safety is None else joint_of(name)
-        if safety is None or prim is None:
-            continue
-        tags.take(safety)
-        for key, value in safety.items():
-            prim.SetCustomDataByKey(f"magtwin:safetyController:{key}", float(value))
-        tags.description.note(
-            f"joint {name!r}: its safety controller is kept as metadata; it does not limit the joint"
-        )
-
-
 def _commands(tags: Tags) -> Iterator[tuple[str, str]]:
     """Joint and type of drive of each command."""
     for tag in ("ros2_control", "transmission"):
@@ -153,19 +139,10 @@ def _from_plugin(tags: Tags, plugin: Element, mechanism: Mechanism, driven: list
     driven += sides[0] + sides[1]
     diameter = tags.number(plugin, *DIAMETER, above=0.0)
     radius = tags.number(plugin, *RADIUS, above=0.0)
-    return _spec(
-        tags,
-        mechanism,
-        (sides[0][0], sides[1][0]),
-        where=where,
-        wheel_radius_m=diameter / 2 if radius is None and diameter is not None else radius,
-        wheel_separation_m=tags.number(plugin, *SEPARATION, above=0.0),
-        v_max=tags.number(plugin, *V_MAX, above=0.0),
-        w_max=tags.number(plugin, *W_MAX, above=0.0),
-        a_max=tags.number(plugin, *A_MAX, least=0.0) or None,
-        alpha_max=tags.number(plugin, *ALPHA_MAX, above=0.0),
-        odometry_rate_hz=tags.number(plugin, *RATE, least=0.0) or None,
-    )
+    figures = {field: tags.number(plugin, *names, above=0.0) for field, names in FIGURES.items()}
+    figures |= {field: tags.number(plugin, *names, least=0.0) or None for field, names in OR_ZERO.items()}
+    figures["wheel_radius_m"] = diameter / 2 if radius is None and diameter is not None else radius
+    return _spec(tags, mechanism, (sides[0][0], sides[1][0]), where, figures)
 
 
 def _from_settings(tags: Tags, plugin: Element, mechanism: Mechanism, driven: list[str]) -> DriveSpec | None:
@@ -218,25 +195,18 @@ def _from_controller(
         separation *= number("wheel_separation_multiplier") or 1.0
     if radius is not None:
         radius *= sum(number(f"{side}_wheel_radius_multiplier") or 1.0 for side in ("left", "right")) / 2
-    return _spec(
-        tags,
-        mechanism,
-        (sides[0], sides[1]),
-        where=str(path),
-        wheel_separation_m=separation,
-        wheel_radius_m=radius,
-        command_timeout_s=number("cmd_vel_timeout"),
-        odometry_rate_hz=number("publish_rate"),
-        **{
-            field: number(f"{axis}.max_{what}")
-            for field, (axis, what) in LIMITS.items()
-            if table.get(f"{axis}.has_{what}_limits", True)
-        },
-    )
+    figures = {
+        field: number(f"{axis}.max_{what}")
+        for field, (axis, what) in LIMITS.items()
+        if table.get(f"{axis}.has_{what}_limits", True)
+    }
+    figures |= {"wheel_separation_m": separation, "wheel_radius_m": radius}
+    figures |= {"command_timeout_s": number("cmd_vel_timeout"), "odometry_rate_hz": number("publish_rate")}
+    return _spec(tags, mechanism, (sides[0], sides[1]), str(path), figures)
 
 
 def _spec(
-    tags: Tags, mechanism: Mechanism, sides: tuple[str, str], *, where: str, **figures: float | None
+    tags: Tags, mechanism: Mechanism, sides: tuple[str, str], where: str, figures: dict[str, float | None]
 ) -> DriveSpec:
     """A drive; missing values are measured on the robot, or the defaults are used with a note."""
     description = tags.description
@@ -275,8 +245,8 @@ def _spec(
 
 def _radius(link: Link) -> float | None:
     """Radius of a wheel's first cylinder or sphere [m]."""
-    forms = (part.geometry.cylinder or part.geometry.sphere for part in (*link.collisions, *link.visuals))
-    return next((float(form.radius) for form in forms if form is not None), None)
+    forms = (part.geometry for part in (*link.collisions, *link.visuals))
+    return next((form.radius for form in forms if form.kind in ("cylinder", "sphere")), None)
 
 
 def _known(tags: Tags, name: str, element: Element) -> str:

@@ -3,11 +3,9 @@
 Gains of rotary joints are per degree in UsdPhysics, and per radian in URDF and here.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
 from types import MappingProxyType
-from typing import Literal
 
 import numpy as np
 from pxr import Usd, UsdPhysics
@@ -29,38 +27,10 @@ DEFAULT_EFFORT = 10.0
 """Default maximum effort of a drive [N m, N]."""
 
 
-@dataclass(frozen=True)
-class WheelDrive:
-    """Default drive of a driven wheel."""
+Wheels = Mapping[str, tuple[float, float]]
+"""Default gain [N m s/rad] and maximum torque [N m] of driven wheels, by joint name."""
 
-    damping: float = WHEEL_DAMPING
-    """Gain on the velocity error [N m s/rad]."""
-
-    max_force: float = DEFAULT_EFFORT
-    """Maximum torque [N m]."""
-
-
-NO_WHEELS: Mapping[str, WheelDrive] = MappingProxyType({})
-
-
-@dataclass(frozen=True)
-class Drive:
-    """A drive: effort = stiffness (q_target - q) + damping (v_target - v), up to max_force."""
-
-    type: Literal["velocity", "position", "none"]
-    """What the drive holds; "none" leaves the joint free."""
-
-    stiffness: float
-    """Gain on the position error [N m/rad or N/m]."""
-
-    damping: float
-    """Gain on the velocity error [N m s/rad or N s/m]."""
-
-    max_force: float
-    """Maximum torque or force [N m or N]."""
-
-    target: float = 0.0
-    """Target position [rad or m]; target velocities start at 0."""
+NO_WHEELS: Wheels = MappingProxyType({})
 
 
 def check_rules(mechanism: Mechanism, options: Options) -> None:
@@ -84,29 +54,34 @@ def check_rules(mechanism: Mechanism, options: Options) -> None:
             )
 
 
-def choose_drive(
-    joint: Joint, mechanism: Mechanism, options: Options, wheels: Mapping[str, WheelDrive] = NO_WHEELS
-) -> Drive | None:
-    """The drive of a joint that moves; None for a joint that follows another or has several axes.
+def define_drive(
+    prim: Usd.Prim,
+    axes: Iterable[str],
+    joint: Joint,
+    mechanism: Mechanism,
+    options: Options,
+    wheels: Wheels = NO_WHEELS,
+) -> None:
+    """Author the drive of a joint that moves, unless it follows another or has several axes and no rule.
 
     The first rule that matches wins. By default, wheels and continuous joints hold a velocity and limited
     joints a position; with the profile diff-drive, continuous joints that are not wheels are left free.
 
     Args:
+        prim: Prim of the joint.
+        axes: Names of its free axes in UsdPhysics: angular, linear, transX, rotX, and so on.
         joint: The joint.
         mechanism: Joints of the description, which receives notes.
         options: Rules and profile.
-        wheels: Drives of driven wheels by joint name.
+        wheels: Driven wheels.
 
     Raises:
         InputError: The URDF's effort is below 0; the message gives the line.
     """
-    if joint.name in mechanism.mimics:
-        return None
     rule = next((r for r in options.drives if fnmatchcase(joint.name, r.joints)), None)
-    if joint.type not in SINGLE and rule is None:
-        return None
-    wheel = wheels.get(joint.name, WheelDrive())
+    if joint.name in mechanism.mimics or (joint.type not in SINGLE and rule is None):
+        return
+    damping, force = wheels.get(joint.name, (WHEEL_DAMPING, DEFAULT_EFFORT))
     if rule is None and joint.type != "continuous":
         gain = POSITION_STIFFNESS
         rule = DriveRule(joints=joint.name, type="position", stiffness=gain, damping=gain / 10)
@@ -114,31 +89,19 @@ def choose_drive(
         rule = DriveRule(joints=joint.name, type="none")
         mechanism.description.note(f"joint {joint.name!r} is not a driven wheel: it turns freely")
     elif rule is None:
-        rule = DriveRule(joints=joint.name, type="velocity", damping=wheel.damping)
-    force = rule.max_force
-    if force is None:
-        force = _effort(joint, wheel.max_force, mechanism.description)
-    return Drive(rule.type, rule.stiffness, rule.damping, force, _target(joint))
-
-
-def define_drive(prim: Usd.Prim, axis: str, drive: Drive) -> None:
-    """Author a drive.
-
-    Args:
-        prim: Prim of the joint.
-        axis: Name of the drive in UsdPhysics: angular, linear, transX, rotX, and so on.
-        drive: The drive; its target position is authored only if it holds a position.
-    """
-    unit = np.pi / 180 if axis == "angular" or axis.startswith("rot") else 1.0
-    made = UsdPhysics.DriveAPI.Apply(prim, axis)
-    made.CreateTypeAttr(UsdPhysics.Tokens.force)
-    made.CreateMaxForceAttr(drive.max_force)
-    made.CreateStiffnessAttr(round(drive.stiffness * unit, 9))
-    made.CreateDampingAttr(round(drive.damping * unit, 9))
-    if drive.type == "position":
-        made.CreateTargetPositionAttr(drive.target / unit)
-    else:
-        made.CreateTargetVelocityAttr(0.0)
+        rule = DriveRule(joints=joint.name, type="velocity", damping=damping)
+    force = _effort(joint, force, mechanism.description) if rule.max_force is None else rule.max_force
+    for axis in axes:
+        unit = np.pi / 180 if axis == "angular" or axis.startswith("rot") else 1.0
+        made = UsdPhysics.DriveAPI.Apply(prim, axis)
+        made.CreateTypeAttr(UsdPhysics.Tokens.force)
+        made.CreateMaxForceAttr(force)
+        made.CreateStiffnessAttr(round(rule.stiffness * unit, 9))
+        made.CreateDampingAttr(round(rule.damping * unit, 9))
+        if rule.type == "position":
+            made.CreateTargetPositionAttr(_target(joint) / unit)
+        else:
+            made.CreateTargetVelocityAttr(0.0)
 
 
 def _effort(joint: Joint, default: float, description: Description) -> float:

@@ -1,14 +1,16 @@
-"""Inertia: mass properties of bodies, and inertia tensors as principal moments and axes."""
+"""Inertia: mass properties of bodies and of filled shapes; inertia tensors as principal moments and axes."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pxr import Usd, UsdGeom
 
 from magtwin.errors import InputError
 from magtwin.frames import canonical
+from magtwin.urdf.meshes.collider import hull_faces
 
 NEAR_MISS = 0.02
 """Relative excess of the largest moment over the sum of the others that is still repaired."""
@@ -100,3 +102,92 @@ def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
         ]
     )
     return canonical(np.linalg.eigh(K)[1][:, -1])
+
+
+def box(size: ArrayLike) -> MassProperties:
+    """A box at the origin of 1 kg/m3 with edges `size` [m], shape (3,)."""
+    edges = np.asarray(size, float)
+    mass, squares = float(edges.prod()), edges**2
+    return MassProperties(mass, np.zeros(3), mass / 12 * np.diag(squares.sum() - squares))
+
+
+def sphere(radius: float) -> MassProperties:
+    """A ball at the origin of 1 kg/m3 [m]."""
+    mass = 4 / 3 * np.pi * radius**3
+    return MassProperties(mass, np.zeros(3), 2 / 5 * mass * radius**2 * np.eye(3))
+
+
+def cylinder(radius: float, length: float) -> MassProperties:
+    """A cylinder along z at the origin of 1 kg/m3 [m]."""
+    mass, across = np.pi * radius**2 * length, radius**2 / 4 + length**2 / 12
+    return MassProperties(mass, np.zeros(3), mass * np.diag([across, across, radius**2 / 2]))
+
+
+def capsule(radius: float, length: float) -> MassProperties:
+    """A `cylinder` with half a ball on each end, which `length` does not count [m]."""
+    middle, ends = cylinder(radius, length), sphere(radius)
+    apart = ends.mass * (length**2 / 4 + 3 / 8 * length * radius)
+    inertia = middle.inertia + ends.inertia + np.diag([apart, apart, 0])
+    return MassProperties(middle.mass + ends.mass, np.zeros(3), inertia)
+
+
+def polyhedron(points: NDArray, faces: NDArray) -> MassProperties:
+    """A closed surface of triangles, filled with 1 kg/m3.
+
+    Args:
+        points: Corners [m], shape (V, 3).
+        faces: Triangles, counter-clockwise from outside, shape (F, 3).
+    """
+    from trimesh.triangles import mass_properties
+
+    found = mass_properties(points[faces])
+    return MassProperties(float(found.volume), np.asarray(found.center_mass), np.asarray(found.inertia))
+
+
+def read_solid(prims: Iterable[Usd.Prim], frame: Usd.Prim) -> MassProperties | None:
+    """Gprims filled with 1 kg/m3, in the frame of a prim above them; None if they have no volume.
+
+    Overlaps count twice. A mesh that is not closed counts as its convex hull.
+
+    Args:
+        prims: Gprims, or prims above gprims.
+        frame: Prim whose frame is used.
+    """
+    cache, solids = UsdGeom.XformCache(), []
+    to_frame = cache.GetLocalToWorldTransform(frame).GetInverse()
+    for top in prims:
+        for prim in Usd.PrimRange(top, Usd.TraverseInstanceProxies()):
+            T = np.array(cache.GetLocalToWorldTransform(prim) * to_frame).T
+            solid = _read_gprim(prim, T)
+            if solid is not None and solid.mass > 0:
+                solids.append(solid)
+    return combined(solids) if solids else None
+
+
+def _read_gprim(prim: Usd.Prim, T: NDArray) -> MassProperties | None:
+    """The solid of a gprim with pose T, shape (4, 4); boxes and meshes may be scaled."""
+    if prim.IsA(UsdGeom.Mesh):
+        return _read_mesh(UsdGeom.Mesh(prim), T)
+    scale = np.linalg.norm(T[:3, :3], axis=0)
+    T = T @ np.diag([*1 / scale, 1])
+    if prim.IsA(UsdGeom.Cube):
+        return box(scale * UsdGeom.Cube(prim).GetSizeAttr().Get()).moved(T)
+    if prim.IsA(UsdGeom.Sphere):
+        return sphere(UsdGeom.Sphere(prim).GetRadiusAttr().Get()).moved(T)
+    for schema, shape in ((UsdGeom.Cylinder, cylinder), (UsdGeom.Capsule, capsule)):
+        if prim.IsA(schema):  # along z, as the conversion authors them
+            gprim = schema(prim)
+            return shape(gprim.GetRadiusAttr().Get(), gprim.GetHeightAttr().Get()).moved(T)
+    return None
+
+
+def _read_mesh(mesh: UsdGeom.Mesh, T: NDArray) -> MassProperties | None:
+    """The solid of a closed mesh of triangles under T, or of its hull; None if that is flat."""
+    from trimesh import Trimesh
+
+    points = np.array(mesh.GetPointsAttr().Get(), float) @ T[:3, :3].T + T[:3, 3]
+    faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    if Trimesh(points, faces).is_volume:  # merges equal points
+        return polyhedron(points, faces)
+    hull = hull_faces(points)
+    return None if hull is None else polyhedron(points, hull)

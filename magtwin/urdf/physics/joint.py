@@ -4,7 +4,6 @@ URDF's joint frame is the frame of the child link. UsdPhysics needs an axis X, Y
 body, so an oblique axis turns both frames. Angles are radians in URDF and degrees in UsdPhysics.
 """
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from magtwin.frames import wxyz_from_xyzw
 from magtwin.urdf.description.description import Description
 from magtwin.urdf.description.model import Joint
 from magtwin.urdf.options import DEFAULTS, Options
-from magtwin.urdf.physics.drive import NO_WHEELS, WheelDrive, choose_drive, define_drive
+from magtwin.urdf.physics.drive import NO_WHEELS, Wheels, define_drive
 from magtwin.urdf.physics.inertia import quaternion
 from magtwin.urdf.physics.mechanism import Mechanism
 
@@ -52,7 +51,7 @@ def define_joint(
     T: NDArray,
     mechanism: Mechanism,
     options: Options = DEFAULTS,
-    wheels: Mapping[str, WheelDrive] = NO_WHEELS,
+    wheels: Wheels = NO_WHEELS,
 ) -> Usd.Prim:
     """Author a joint between two bodies; `define_mimic` adds its mimic later.
 
@@ -68,7 +67,7 @@ def define_joint(
         T: Pose of the joint in the parent's body, at 0, or at rest if welded, shape (4, 4).
         mechanism: Joints of the description, which receives notes.
         options: Drives and profile.
-        wheels: Drives of driven wheels by joint name, see `choose_drive`.
+        wheels: Driven wheels.
 
     Raises:
         InputError: A limit is missing; the message gives the line.
@@ -84,10 +83,7 @@ def define_joint(
     if abs(length - 1) > 1e-3:
         description.note(f"joint {joint.name!r} has an axis of length {length:.3g}: used as a direction")
     axes = _free_axes(made, joint, token, description)
-    drive = choose_drive(joint, mechanism, options, wheels)
-    if drive is not None:
-        for axis in axes:
-            define_drive(prim, axis, drive)
+    define_drive(prim, axes, joint, mechanism, options, wheels)
     _tune(prim, joint, axes, joint.name in wheels, description)
     prim.AddAppliedSchema(JOINT_API)
     return prim
@@ -171,14 +167,25 @@ def _free_axes(made: Any, joint: Joint, token: str, description: Description) ->
     """Author axis and limits of a joint that moves; returns the names of the free axes."""
     if joint.type != "planar":
         made.CreateAxisAttr(token)
-        _limit(made, joint, description)
+        limit = joint.limit
+        if joint.type == "continuous":
+            return ["angular"]
+        if limit is None or limit.lower is None or limit.upper is None:
+            raise description.refused("joint", joint.name, f"is {joint.type} and needs <limit lower= upper=>")
+        if not limit.lower <= 0 <= limit.upper:
+            description.note(
+                f"joint {joint.name!r} stands at 0, outside its limits {limit.lower:g} to {limit.upper:g}: "
+                "engines push it inside at their first step"
+            )
+        made.CreateLowerLimitAttr(limit.lower * _unit(joint))
+        made.CreateUpperLimitAttr(limit.upper * _unit(joint))
         return ["linear" if joint.type == "prismatic" else "angular"]
     free = [f"trans{other}" for other in "XYZ" if other != token] + [f"rot{token}"]
     for axis in (f"{kind}{letter}" for kind in ("trans", "rot") for letter in "XYZ"):
-        limit = UsdPhysics.LimitAPI.Apply(made.GetPrim(), axis)
+        api = UsdPhysics.LimitAPI.Apply(made.GetPrim(), axis)
         low, high = (-np.inf, np.inf) if axis in free else LOCKED
-        limit.CreateLowAttr(low)
-        limit.CreateHighAttr(high)
+        api.CreateLowAttr(low)
+        api.CreateHighAttr(high)
     return free
 
 
@@ -207,26 +214,14 @@ def _write(prim: Usd.Prim, name: str, value: float) -> None:
     prim.CreateAttribute(name, Sdf.ValueTypeNames.Float, custom=False).Set(value)
 
 
-def _limit(made: Any, joint: Joint, description: Description) -> None:
-    """Range of a revolute or prismatic joint; a continuous joint has none."""
-    if joint.type == "continuous":
-        return
-    limit = joint.limit
-    if limit is None or limit.lower is None or limit.upper is None:
-        raise description.refused("joint", joint.name, f"is {joint.type} and needs <limit lower= upper=>")
-    if not limit.lower <= 0 <= limit.upper:
-        description.note(
-            f"joint {joint.name!r} stands at 0, outside its limits {limit.lower:g} to {limit.upper:g}: "
-            "engines push it inside at their first step"
-        )
-    made.CreateLowerLimitAttr(limit.lower * _unit(joint))
-    made.CreateUpperLimitAttr(limit.upper * _unit(joint))
-
-
 def _tune(prim: Usd.Prim, joint: Joint, axes: list[str], wheel: bool, description: Description) -> None:
     """Maximum speed, damping and friction of a joint, for Newton and PhysX."""
     unit = _unit(joint)
-    speed = None if joint.type == "planar" else _speed(joint, wheel, description)
+    speed = None if joint.limit is None or joint.type == "planar" else joint.limit.velocity
+    speed = speed if speed and np.isfinite(speed) else None
+    if speed is None and wheel:
+        description.note(f"joint {joint.name!r} gives no velocity: it may turn at {WHEEL_SPEED:g} rad/s")
+        speed = WHEEL_SPEED
     prim.AddAppliedSchema(NEWTON_API)
     if speed is not None:
         _write(prim, "newton:velocityLimit", speed * unit)
@@ -245,14 +240,3 @@ def _tune(prim: Usd.Prim, joint: Joint, axes: list[str], wheel: bool, descriptio
         _write(prim, f"{space}:viscousFrictionCoefficient", damping / per)
         if speed is not None:
             _write(prim, f"{space}:maxJointVelocity", speed * unit)
-
-
-def _speed(joint: Joint, wheel: bool, description: Description) -> float | None:
-    """The URDF's maximum speed [rad/s or m/s]; None if it gives none, except for a driven wheel."""
-    speed = None if joint.limit is None else joint.limit.velocity
-    if speed and np.isfinite(speed):
-        return float(speed)
-    if wheel:
-        description.note(f"joint {joint.name!r} gives no velocity: it may turn at {WHEEL_SPEED:g} rad/s")
-        return WHEEL_SPEED
-    return None

@@ -11,8 +11,7 @@ from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, wxyz_from_xyzw
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Link
-from magtwin.urdf.physics.inertia import MassProperties, combined, principal_axes
-from magtwin.urdf.physics.solid import read_solid
+from magtwin.urdf.physics.inertia import MassProperties, combined, principal_axes, read_solid
 
 LINK_API, SITE_API = "IsaacLinkAPI", "IsaacSiteAPI"
 """Isaac Sim's applied schemas; their plugins are not installed here."""
@@ -74,12 +73,6 @@ def define_body(
     return prim
 
 
-def define_frame(prim: Usd.Prim) -> Usd.Prim:
-    """Make an Xform a site: a named frame on the body above it."""
-    prim.AddAppliedSchema(SITE_API)
-    return prim
-
-
 def _mass_properties(
     part: Rider, body: Usd.Prim, description: Description, density: float | None, alone: bool
 ) -> MassProperties | None:
@@ -104,7 +97,7 @@ def _mass_properties(
         description.note(f"link {link.name!r} has no <inertia> and no shape: its mass counts as a point")
         return MassProperties(mass, centre, np.zeros((3, 3)))
     description.note(f"link {link.name!r} has no <inertia>: taken from its shape, filled evenly")
-    return MassProperties(mass, centre, solid.mass_properties(mass / solid.volume).inertia)
+    return MassProperties(mass, centre, mass / solid.mass * solid.inertia)
 
 
 def _from_shapes(
@@ -124,22 +117,13 @@ def _from_shapes(
     if solid is None:
         description.note(f"link {name!r} has no <inertial> and no shape to fill: it has no mass")
         return None
-    filled = solid.mass_properties(density)
-    description.note(
-        f"link {name!r} has no <inertial>: {filled.mass:.3g} kg, its {used} at {density:g} kg/m3"
-    )
-    return filled
+    mass = density * solid.mass
+    description.note(f"link {name!r} has no <inertial>: {mass:.3g} kg, its {used} at {density:g} kg/m3")
+    return MassProperties(mass, solid.centre, density * solid.inertia)
 
 
 def _checked(link: Link, tensor: NDArray, origin: NDArray, description: Description) -> NDArray[np.float64]:
-    """An inertia in its link's axes, repaired if slightly impossible.
-
-    Args:
-        link: The link.
-        tensor: In the axes of the `<inertial>`, shape (3, 3).
-        origin: Pose of the `<inertial>` in the link, shape (4, 4).
-        description: Receives a note of a repair.
-    """
+    """A tensor (3, 3) at an `origin` (4, 4) in its link's axes, repaired if slightly impossible."""
     turned = origin[:3, :3] @ tensor @ origin[:3, :3].T
     cleared = np.where(np.abs(turned) < 1e-9 * np.abs(turned).max(), 0.0, turned)
     try:

@@ -7,25 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.urdf.description.description import Description, origin_of
-from magtwin.urdf.description.model import Joint
+from magtwin.urdf.description.model import Joint, Mimic
 from magtwin.urdf.options import DEFAULTS, Options
 
 SINGLE = ("revolute", "continuous", "prismatic")
 """Joints with one degree of freedom: only these can have mimics and default drives."""
-
-
-@dataclass(frozen=True)
-class Mimic:
-    """A joint follows another: q = multiplier q_leader + offset."""
-
-    leader: str
-    """Name of the leading joint, which follows no other."""
-
-    multiplier: float
-    """Ratio of the two values [1; rad/m or m/rad if one rotates and the other slides]."""
-
-    offset: float
-    """Value when the leader is at 0 [rad or m]."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +24,7 @@ class Mechanism:
     """Joints that cannot move, with the reason; "" for joints of type fixed."""
 
     mimics: Mapping[str, Mimic]
-    """Joints that follow another."""
+    """Joints that follow another, which follows none."""
 
     rests: Mapping[str, float]
     """Authored value of joints that do not rest at 0 [rad or m]."""
@@ -89,12 +75,12 @@ def read_mechanism(description: Description, options: Options = DEFAULTS) -> Mec
         if joint.mimic is None:
             continue
         mimic = _resolved(joint, joints, description)
-        if mimic.leader in welded:
-            welded[name] = f"follows {mimic.leader!r}, which cannot move"
+        if mimic.joint in welded:
+            welded[name] = f"follows {mimic.joint!r}, which cannot move"
             description.note(f"joint {name!r} {welded[name]}: welded")
         else:
             mimics[name] = mimic
-        start = mimic.multiplier * _welded_value(joints[mimic.leader], welded) + mimic.offset
+        start = mimic.multiplier * _welded_value(joints[mimic.joint], welded) + mimic.offset
         if start:
             rests[name] = start
     return Mechanism(description, welded, mimics, rests)
@@ -117,15 +103,11 @@ def displacement(axis: ArrayLike, value: float, *, slides: bool) -> NDArray[np.f
 def _weld_reason(joint: Joint, options: Options) -> str | None:
     """Why a joint cannot move; "" if it is fixed, None if it can move."""
     limit = joint.limit
-    if joint.type == "fixed":
-        return ""
-    if limit is None:
-        return None
+    if joint.type == "fixed" or limit is None:
+        return "" if joint.type == "fixed" else None
     powerless = limit.effort == 0 and limit.velocity == 0 and joint.type != "continuous"
-    closed = (
-        joint.type in ("revolute", "prismatic") and limit.lower is not None and limit.lower == limit.upper
-    )
-    if powerless or closed:
+    closed = limit.lower is not None and limit.lower == limit.upper
+    if powerless or (closed and joint.type in ("revolute", "prismatic")):
         return "cannot move by its own limits"
     if options.profile == "diff-drive" and joint.type == "prismatic" and 0 in (limit.effort, limit.velocity):
         return "is a suspension without effort or speed"
@@ -136,11 +118,10 @@ def _resolved(joint: Joint, joints: Mapping[str, Joint], description: Descriptio
     """The first joint of a chain of mimics, with the total ratio; the description has no circle."""
     multiplier, offset, at = 1.0, 0.0, joint
     while at.mimic is not None:
-        ratio = 1.0 if at.mimic.multiplier is None else float(at.mimic.multiplier)
-        if ratio == 0:
+        if at.mimic.multiplier == 0:
             raise description.refused("joint", at.name, "mimics with multiplier 0; make it fixed")
-        offset += multiplier * float(at.mimic.offset or 0.0)
-        multiplier *= ratio
+        offset += multiplier * at.mimic.offset
+        multiplier *= at.mimic.multiplier
         at = joints[at.mimic.joint]
     if joint.type not in SINGLE:
         text = f"is {joint.type} and has no single value to mimic {at.name!r} with"

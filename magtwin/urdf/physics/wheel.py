@@ -12,7 +12,7 @@ from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Joint, Link
 from magtwin.urdf.options import DriveRule
-from magtwin.urdf.physics.drive import WheelDrive
+from magtwin.urdf.physics.drive import DEFAULT_EFFORT, WHEEL_DAMPING, Wheels
 from magtwin.urdf.physics.gazebo import Surface
 from magtwin.urdf.physics.mechanism import Mechanism
 
@@ -75,9 +75,7 @@ def not_on(wheels: Iterable[str], rules: Iterable[DriveRule]) -> tuple[DriveRule
     return tuple(rule for rule in rules if not any(fnmatchcase(name, rule.joints) for name in names))
 
 
-def fit_wheels(
-    mechanism: Mechanism, wheels: Iterable[str], bodies: Mapping[str, Usd.Prim]
-) -> dict[str, WheelDrive]:
+def fit_wheels(mechanism: Mechanism, wheels: Iterable[str], bodies: Mapping[str, Usd.Prim]) -> Wheels:
     """Drives of the wheels, from the robot's mass m, the number of wheels n and their radius r.
 
     Gain kd = m r^2 / (n t): the robot reaches a commanded speed within about t = RESPONSE. Torque
@@ -91,22 +89,22 @@ def fit_wheels(
         bodies: Prims of the bodies by link name, with masses and shapes.
 
     Returns:
-        Drives by joint name; the default where a wheel has no shape or the robot no mass.
+        Gains and torques by joint name; the default where a wheel has no shape or the robot no mass.
     """
     masses = [
         UsdPhysics.MassAPI(p).GetMassAttr().Get() for p in bodies.values() if p.HasAPI(UsdPhysics.MassAPI)
     ]
     names = tuple(wheels)
-    share, fitted = sum(masses) / len(names), {}
+    share, fitted = sum(masses) / len(names), dict[str, tuple[float, float]]()
     joints = {joint.name: joint for joint in mechanism.description.joints.values()}
     for name in names:
         body = bodies.get(joints[name].child)
         radius = 0.0 if body is None else _radius(body, joints[name].axis)
-        fitted[name] = WheelDrive()
+        fitted[name] = (WHEEL_DAMPING, DEFAULT_EFFORT)
         if share * radius > 0:
             torque = WHEEL_FRICTION * share * GRAVITY * radius
             damping = share * radius**2 / RESPONSE
-            fitted[name] = WheelDrive(float(f"{damping:.3g}"), float(f"{torque:.3g}"))
+            fitted[name] = (float(f"{damping:.3g}"), float(f"{torque:.3g}"))
     return fitted
 
 
@@ -159,5 +157,5 @@ def _above(joint: Joint, description: Description) -> Iterable[Joint]:
 def _lowest(link: Link, pose: NDArray) -> float:
     """Height of the lowest point of a link's primitive colliders in the root's frame [m]; inf for none."""
     poses = ((pose @ origin_of(part), part.geometry) for part in link.collisions)
-    heights = [T[2, 3] - form.half_extents(T[:3, :3])[2] for T, form in poses if form.mesh is None]
+    heights = [T[2, 3] - form.half_extents(T[:3, :3])[2] for T, form in poses if form.kind != "mesh"]
     return float(min(heights, default=np.inf))

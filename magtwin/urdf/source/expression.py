@@ -47,10 +47,6 @@ class Budget:
             raise ExpressionError(f"expands without end (over {self._units} steps); look for a repetition")
 
 
-def _as_list(function: Callable[..., Any]) -> Callable[..., list[Any]]:
-    return lambda *arguments, **options: list(function(*arguments, **options))
-
-
 def _range(*arguments: int) -> list[int]:
     steps = range(*arguments)
     if len(steps) > LARGEST:
@@ -79,7 +75,7 @@ _PLAIN = (abs, all, any, bool, dict, divmod, float, int, len, list, max, min, or
 
 PYTHON: Mapping[str, Any] = {
     **{f.__name__: f for f in _PLAIN},
-    **{f.__name__: _as_list(f) for f in (enumerate, filter, map, reversed, zip)},
+    **{f.__name__: lambda *a, f=f, **b: list(f(*a, **b)) for f in (enumerate, filter, map, reversed, zip)},
     "range": _range,
     "round": _round,
     "set": lambda values=(): list(dict.fromkeys(values)),  # in a fixed order, so that output is reproducible
@@ -189,8 +185,7 @@ def check_size(value: Any, budget: Budget, *, plain: bool = False) -> Any:
                 pending += [*entry.keys(), *entry.values()] if isinstance(entry, dict) else entry
         elif plain and not isinstance(entry, int | float | None):
             raise ExpressionError(f"a {type(entry).__name__} is not a value")
-        if size > LARGEST:
-            raise ExpressionError(f"a value of over {LARGEST} characters or entries")
+        _check_length(size)
     budget.spend(1 + size)
     return value
 
@@ -233,7 +228,11 @@ class _Interpreter:
             case ast.IfExp():
                 return self.value(node.body if self.value(node.test) else node.orelse)
             case ast.Subscript():
-                return self._entries(self.value(node.value))[self._index(node.slice)]
+                values = _entries(self.value(node.value))
+                if not isinstance(node.slice, ast.Slice):
+                    return values[self.value(node.slice)]
+                ends = (node.slice.lower, node.slice.upper, node.slice.step)
+                return values[slice(*(None if end is None else self.value(end) for end in ends))]
             case ast.List() | ast.Tuple():
                 values = [self.value(entry) for entry in node.elts]
                 return check_size(tuple(values) if isinstance(node, ast.Tuple) else values, self._budget)
@@ -313,17 +312,6 @@ class _Interpreter:
             raise ExpressionError("a format of over two digits is not allowed")
         return check_size(OPERATORS[type(kind)](left, right), self._budget)
 
-    def _index(self, node: ast.expr) -> Any:
-        if not isinstance(node, ast.Slice):
-            return self.value(node)
-        ends = (node.lower, node.upper, node.step)
-        return slice(*(None if end is None else self.value(end) for end in ends))
-
-    def _entries(self, values: Any) -> Any:
-        if not isinstance(values, str | list | tuple | dict):
-            raise ExpressionError(f"a {type(values).__name__} has no entries")
-        return values
-
     def _inside(self, names: dict[str, Any]) -> "_Interpreter":
         return _Interpreter(ChainMap(names, self._names), self._budget)  # type: ignore[arg-type]
 
@@ -333,11 +321,17 @@ class _Interpreter:
             yield self
             return
         first, *others = generators
-        for value in self._entries(self.value(first.iter)):
+        for value in _entries(self.value(first.iter)):
             self._budget.spend()
             scope = self._inside(_bind(first.target, value))
             if all(scope.value(condition) for condition in first.ifs):
                 yield from scope._scopes(others)
+
+
+def _entries(values: Any) -> Any:
+    if not isinstance(values, str | list | tuple | dict):
+        raise ExpressionError(f"a {type(values).__name__} has no entries")
+    return values
 
 
 def _check_length(length: int) -> None:

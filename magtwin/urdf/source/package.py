@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from magtwin.errors import InputError, hint
@@ -85,7 +86,7 @@ class Packages:
         if self._found is None:
             self._found, left = {}, FOLDERS
             for folder in self._above:
-                self._add(folder, self._found)
+                _add(folder, self._found)
             for base in [p.parent for p in self._above] or [self._folder]:
                 for folder in _below(base, DEPTH):
                     left -= 1
@@ -93,14 +94,14 @@ class Packages:
                         self._complete = False
                         return self._found
                     if folder not in self._above and (folder / MANIFEST).is_file():
-                        self._add(folder, self._found)
+                        _add(folder, self._found)
         return self._found
 
-    def _add(self, folder: Path, found: dict[str, list[Path]]) -> None:
-        try:
-            name = (read_markup(folder / MANIFEST, "package manifest").root.findtext("name") or "").strip()
-        except InputError:
-            return  # an unreadable manifest names no package
+
+def _add(folder: Path, found: dict[str, list[Path]]) -> None:
+    """Add a folder to the packages by the name in its manifest; an unreadable one names no package."""
+    with suppress(InputError):
+        name = (read_markup(folder / MANIFEST, "package manifest").root.findtext("name") or "").strip()
         folders = found.setdefault(name or folder.name, [])
         if folder not in folders:
             folders.append(folder)

@@ -38,11 +38,6 @@ class Source:
     notes: tuple[str, ...] = ()
     """Notes on the expansion, one line each."""
 
-    @property
-    def text(self) -> str:
-        """The description as URDF, without comments."""
-        return ElementTree.tostring(self.xml, encoding="unicode")
-
     def where(self, element: ElementTree.Element | None) -> str:
         """File and line of an element, as `file:line`; the file alone if it has none."""
         if element is None or element not in self.places:
@@ -77,7 +72,7 @@ class Source:
         scheme, separator, rest = filename.partition("://")
         if separator and scheme not in ("package", "model", "file"):
             raise InputError(f"{start} has scheme {scheme!r}; known: file, model, package")
-        if scheme in ("package", "model") and separator:
+        if separator and scheme != "file":
             name, _, rest = rest.partition("/")
             try:
                 folder = self.packages.find(name)

@@ -76,7 +76,25 @@ class _Expansion:
         self._at: Place = (path, 1)
         self._notes: list[str] = []
         self._library = _library()
-        self._replace_access()
+        library = self._library
+        ours: dict[str, Callable[..., Any]] = {  # of every function that evaluates, reads or prints
+            **dict.fromkeys(("safe_eval", "eval_extension", "load_yaml"), _forbidden),
+            **dict.fromkeys(("warning", "message", "error"), self._note),
+            "eval_text": self._text,
+            "parse": self._parse,
+            "get_include_files": self._included,
+            "print_location": lambda: None,
+        }
+        for name in ("check_attrs", "eval_all", "handle_macro_call", "reqd_attrs"):
+            ours[name] = self._followed(getattr(library, name))
+        for name, replacement in ours.items():
+            if not hasattr(library, name):
+                raise InputError(f"xacro: this version has no {name}; install xacro 2.1")
+            setattr(library, name, replacement)
+        shown = {"abs_filename": library.abs_filename_spec, "dotify": dict, "load_yaml": self._yaml}
+        names = dict.fromkeys(("warning", "message", "error"), self._note)
+        xacro = {**shown, **names, "arg": self._argument, "fatal": _fatal, "tokenize": _tokenize}
+        vars(library)["_global_symbols"] = {**GLOBALS, **shown, "xacro": xacro}
 
     def run(self) -> tuple[ElementTree.Element, dict[ElementTree.Element, Place], tuple[str, ...]]:
         library = self._library
@@ -105,35 +123,6 @@ class _Expansion:
     def _refused(self, text: str) -> InputError:
         file, line = self._at
         return InputError(f"{file}:{line}: {text}")
-
-    def _replace_access(self) -> None:
-        """Replace every function of the library that evaluates, reads or prints."""
-        library = self._library
-        ours: dict[str, Callable[..., Any]] = {
-            **dict.fromkeys(("safe_eval", "eval_extension", "load_yaml"), _forbidden),
-            **dict.fromkeys(("warning", "message", "error"), self._note),
-            "eval_text": self._text,
-            "parse": self._parse,
-            "get_include_files": self._included,
-            "print_location": lambda: None,
-        }
-        for name in ("check_attrs", "eval_all", "handle_macro_call", "reqd_attrs"):
-            ours[name] = self._followed(getattr(library, name))
-        for name, replacement in ours.items():
-            if not hasattr(library, name):
-                raise InputError(f"xacro: this version has no {name}; install xacro 2.1")
-            setattr(library, name, replacement)
-        xacro = {
-            **dict.fromkeys(("warning", "message", "error"), self._note),
-            "abs_filename": library.abs_filename_spec,
-            "arg": self._argument,
-            "dotify": dict,
-            "fatal": self._fatal,
-            "load_yaml": self._yaml,
-            "tokenize": _tokenize,
-        }
-        shown = {name: xacro[name] for name in ("abs_filename", "dotify", "load_yaml")}
-        vars(library)["_global_symbols"] = {**GLOBALS, **shown, "xacro": xacro}
 
     def _followed(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """The library's function; records the current node and pays for it."""
@@ -183,12 +172,9 @@ class _Expansion:
             return str(evaluate(rest, _Arguments(self), self._budget))
         if command in ("find", "arg", "env") and len(words) != 1:
             raise ExpressionError(f"$({text}): {command} takes one name")
-        if command == "find":
-            return self._find(words[0])
-        if command == "arg":
-            return str(self._argument(words[0]))
-        if command == "env":
-            return self._variable(words[0])
+        if command in ("find", "arg", "env"):
+            read = {"find": self._find, "arg": self._argument, "env": self._variable}[command]
+            return str(read(words[0]))
         if command == "optenv" and words:
             return self._variable(words[0], " ".join(words[1:]))
         if command == "dirname":
@@ -292,9 +278,6 @@ class _Expansion:
             self._notes.append(text)
         return ""
 
-    def _fatal(self, *words: Any) -> None:
-        raise ExpressionError(" ".join(map(str, words)))
-
 
 class _Arguments(dict[str, Any]):
     """Names in `$(eval ...)`: a few functions, and arguments, as numbers where they are numbers."""
@@ -341,6 +324,10 @@ def _library() -> ModuleType:
 
 def _forbidden(*_: Any, **__: Any) -> Any:
     raise ExpressionError("this version of xacro evaluates text without a guard; install xacro 2.1")
+
+
+def _fatal(*words: Any) -> None:
+    raise ExpressionError(" ".join(map(str, words)))
 
 
 def _tokenize(text: str, sep: str = ",; ", skip_empty: bool = True) -> list[str]:

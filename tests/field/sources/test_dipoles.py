@@ -12,7 +12,6 @@ from magtwin.field.sources import compiled_dipoles as dipoles
 from magtwin.field.sources import dipoles as sources
 from magtwin.field.sources.bodies import Bodies
 from magtwin.field.sources.compiled_dipoles import dipole_field_and_gradient_nt, dipole_field_nt
-from magtwin.field.sources.harmonic import HarmonicField
 
 
 def below(count, seed=0):
@@ -90,29 +89,3 @@ def test_shapes_that_are_no_points_or_dipoles_are_refused():
         dipole_field_nt((0.0, 1.0), place, moment)
     with pytest.raises(InputError, match=r"one shape \(D, 3\), got \(2, 3\) and \(1, 3\)"):
         dipole_field_nt((0.0, 1.0, 2.0), place, moment[:1])
-
-
-@pytest.mark.parametrize("height_m", [None, 0.9])
-def test_the_gradient_of_what_a_robot_reads_is_its_change_over_a_small_step(height_m):
-    place, moment = below(40)
-    field = HarmonicField(
-        p_world_dipole=place,
-        m_world=moment,
-        b_uniform_nt=(500.0, 20_000.0, -36_000.0),
-        hard_iron_nt=(300.0, -500.0, 800.0),
-        soft_iron=0.02 * np.random.default_rng(2).standard_normal((3, 3)),
-        p_base_sensor=(0.1, -0.05, 0.4),
-    )
-    rng = np.random.default_rng(3)
-    p, yaw = rng.uniform(-2, 2, (20, 2)), rng.uniform(-4, 4, 20)
-    b, slopes = field.magnitude_with_gradient(p, yaw, height_m=height_m)
-    assert_allclose(b, field.magnitude_nt(p, yaw, height_m=height_m), rtol=1e-12)
-    step = 1e-5
-    for axis, (dx, dy, dyaw) in enumerate(step * np.eye(3)):
-        pair = [
-            field.magnitude_nt(p + s * np.array([dx, dy]), yaw + s * dyaw, height_m=height_m) for s in (-1, 1)
-        ]
-        assert_allclose((pair[1] - pair[0]) / (2 * step), slopes[:, axis], rtol=1e-5, atol=0.05)
-    one, slope = field.magnitude_with_gradient((0.3, 0.2), 1.0)
-    assert one.shape == ()
-    assert slope.shape == (3,)

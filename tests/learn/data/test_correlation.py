@@ -4,7 +4,8 @@ from numpy.testing import assert_allclose
 from scipy.stats import spearmanr
 
 from magtwin.errors import InputError
-from magtwin.figures.training import plot_correlations
+from magtwin.figures.canvas import save
+from magtwin.figures.training import draw_correlations
 from magtwin.learn.data.correlation import correlations
 
 
@@ -46,7 +47,8 @@ def test_the_spread_is_that_between_groups_not_that_of_so_many_alike_rows():
 def test_the_picture_is_the_same_every_time(tmp_path, suffix):
     x, y, groups = some()
     for name in ("a", "b"):
-        plot_correlations(correlations(x, y, NAMES, groups), tmp_path / f"{name}{suffix}", title="eight runs")
+        figure = draw_correlations(correlations(x, y, NAMES, groups), title="eight runs")
+        save(figure, tmp_path / f"{name}{suffix}")
     drawn = (tmp_path / f"a{suffix}").read_bytes()
     assert drawn == (tmp_path / f"b{suffix}").read_bytes()
     if suffix == ".svg":

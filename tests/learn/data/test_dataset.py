@@ -11,7 +11,7 @@ from magtwin.learn.data import dataset as rooms
 from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import build_dataset, open_dataset
 from magtwin.learn.data.features import SETS, features
-from magtwin.learn.data.labels import labels
+from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.recording import Source
 from magtwin.learn.data.split import split
 from magtwin.run.run import COLUMNS, Run
@@ -67,10 +67,9 @@ def made(tmp_path_factory):
 def test_a_recording_comes_back_with_its_labels_to_the_last_bit(made):
     for (one, run), (name, before) in zip(made.runs(), RUNS.items(), strict=True):
         assert one.name == name
-        found = labels(before, FIELD)
-        assert_array_equal(run["label_nt"], found.value_nt)
-        assert_array_equal(run["b_map_nt"], found.map_nt)
-        assert_array_equal(run["b_map_gradient_nt_m"], found.gradient_nt_m)
+        expected = labelled(before, FIELD)
+        for column in ("label_nt", "b_map_nt", "b_map_gradient_nt_m"):
+            assert_array_equal(run[column], expected[column])
         assert_allclose(run["label_sd_nt"], 20.0)
         for column in ("t", "p_world_base", "imu_q_xyzw", "battery_a", "b_measured_nt", "b_truth_nt"):
             assert_array_equal(run[column], before[column])
@@ -204,7 +203,7 @@ def test_the_report_says_what_there_is_to_learn_from(made):
             "a: its readings come from a neural magnetometer, and training on them would learn that model",
         ),
         (
-            {"a": RUNS["a"].with_columns(b_measured_nt=labels(RUNS["a"], FIELD).map_nt)},
+            {"a": RUNS["a"].with_columns(b_measured_nt=labelled(RUNS["a"], FIELD)["b_map_nt"])},
             "every label on the map 'hills' is 0 nT: there is nothing to learn",
         ),
     ],

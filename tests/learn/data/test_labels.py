@@ -8,7 +8,7 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import quat_from_yaw
 from magtwin.learn.data.alignment import Alignment, fit_alignment
-from magtwin.learn.data.labels import labelled, labels
+from magtwin.learn.data.labels import labelled
 from magtwin.run.run import Run
 
 
@@ -59,21 +59,19 @@ def test_a_label_is_what_was_measured_less_the_map_at_the_sensor():
     run = a_run((0.1, -0.04), 0.15)
     given = Alignment((0.1, -0.04), 0.15)
     robot = 300 * np.cos(run["yaw"]) - 120 * np.sin(2 * run["yaw"])
-    found = labels(run, FIELD, given)
-    assert found.known.mean() > 0.98
-    assert np.abs(found.value_nt - robot)[found.known].std() < 8
-    raw = labels(run, FIELD)
-    assert np.abs(raw.value_nt - robot)[raw.known].std() > 100
-    assert_allclose((found.map_nt + found.value_nt)[found.known], run["b_measured_nt"][found.known])
+    label, raw = labelled(run, FIELD, given)["label_nt"], labelled(run, FIELD)["label_nt"]
+    assert np.isfinite(label).mean() > 0.98
+    assert np.nanstd(np.abs(label - robot)) < 8
+    assert np.nanstd(np.abs(raw - robot)) > 100
 
 
 def test_a_label_carries_the_maps_own_error_and_that_of_the_alignment():
     run = a_run()
-    assert not labels(run, FIELD).sd_nt.any()
-    assert_allclose(labels(run, a_map(variance=900.0)).sd_nt, 30.0)
-    unsure = labels(run, a_map(variance=900.0), Alignment(lever_arm_sd_m=(0.01, 0.02)))
-    forward, left = unsure.gradient_nt_m.T
-    assert_allclose(unsure.sd_nt, np.sqrt(900 + (0.01 * forward) ** 2 + (0.02 * left) ** 2))
+    assert_array_equal(labelled(run, FIELD)["label_sd_nt"], 0.0)
+    assert_allclose(labelled(run, a_map(variance=900.0))["label_sd_nt"], 30.0)
+    unsure = labelled(run, a_map(variance=900.0), Alignment(lever_arm_sd_m=(0.01, 0.02)))
+    forward, left = unsure["b_map_gradient_nt_m"].T
+    assert_allclose(unsure["label_sd_nt"], np.sqrt(900 + (0.01 * forward) ** 2 + (0.02 * left) ** 2))
 
 
 def test_readings_without_lock_pose_or_map_have_no_label():
@@ -82,7 +80,7 @@ def test_readings_without_lock_pose_or_map_have_no_label():
     b = np.where(none, np.nan, run["b_measured_nt"])
     p = np.where((np.arange(run.rows) % 10 == 3)[:, None], 9.0, run["p_world_base"])
     run = run.with_columns(flag_lost_lock=lost, flag_pose_lost=gone, b_measured_nt=b, p_world_base=p)
-    assert_array_equal(labels(run, FIELD).known, np.arange(run.rows) % 10 >= 4)
+    assert_array_equal(np.isfinite(labelled(run, FIELD)["label_nt"]), np.arange(run.rows) % 10 >= 4)
 
 
 def test_motion_capture_is_the_pose_where_there_is_one():
@@ -90,7 +88,7 @@ def test_motion_capture_is_the_pose_where_there_is_one():
     q = quat_from_yaw(run["yaw"])
     moved = run.with_columns(mocap_p=run["p_world_base"] + [0.1, 0, 0], mocap_q_xyzw=q)
     elsewhere = FIELD.lookup(run["p_world_base"][:, :2] + [0.1, 0], run["yaw"])
-    assert_allclose(labels(moved, FIELD).map_nt, elsewhere)
+    assert_allclose(labelled(moved, FIELD)["b_map_nt"], elsewhere)
     taken = labelled(Run({k: v for k, v in moved.items() if k != "yaw"}), FIELD)
     assert_allclose(taken["yaw"], run["yaw"], atol=1e-12)
 

@@ -9,11 +9,11 @@ from numpy.testing import assert_allclose
 from magtwin.errors import InputError
 from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import build_dataset
-from magtwin.learn.data.labels import labels
+from magtwin.learn.data.labels import labelled
+from magtwin.learn.data.recording import Source
 from magtwin.learn.evaluation.budget import TERMS, Truth, budgets, steps, true_errors
 from magtwin.learn.evaluation.candidates import NAIVE, Candidate, Mean, naive, named_map, tolles_lawson
 from magtwin.learn.evaluation.evaluate import evaluate
-from magtwin.learn.evaluation.trials import Trial
 from magtwin.run.run import Run
 from magtwin.sim.survey import field_at_rest_nt
 from magtwin.twin import check_scene, in_session_of, open_twin, simulate
@@ -61,7 +61,7 @@ def train(drives, named, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(drives, named, train):
-    trials = [Trial("d2", lambda: drives["d2"])]
+    trials = [Source("d2", lambda: drives["d2"])]
     baseline = naive(named, dataset=train)
     return evaluate([tolles_lawson(named, train)], trials, baseline=baseline, rng=np.random.default_rng(0))
 
@@ -73,10 +73,12 @@ def made(found, truth, train):
 
 def test_the_parts_of_a_label_add_up_to_it(truth, drives, named):
     run, alignment = drives["d2"], Alignment((0.03, 0.01), -0.02)
-    label = labels(run, named.field, alignment)
-    rows = np.flatnonzero(label.known)
-    parts = truth.parts("d2 moved", run, rows, label.map_nt[rows], alignment, run["b_measured_nt"][rows])
-    assert_allclose(parts.sum(axis=0), -label.value_nt[rows], atol=1e-6)  # fields of 4e4 nT, double precision
+    run = labelled(run, named.field, alignment)
+    rows = np.flatnonzero(np.isfinite(run["label_nt"]))
+    parts = truth.parts("d2 moved", run, rows, run["b_map_nt"][rows], alignment, run["b_measured_nt"][rows])
+    assert_allclose(
+        parts.sum(axis=0), -run["label_nt"][rows], atol=1e-6
+    )  # fields of 4e4 nT, double precision
 
 
 def test_the_exact_field_is_that_of_a_robot_at_rest(truth, twin):
@@ -110,9 +112,9 @@ def test_all_terms_closed_leave_nothing_and_what_each_bought_adds_up(made):
 def test_closing_the_map_leaves_what_naive_errs_by_on_an_exact_map(made, found, truth, train, drives):
     def exact_label(run):
         p = run["mocap_p"][:, :2]
-        label = labels(run, found.maps[0].field)
+        label = labelled(run, found.maps[0].field)["label_nt"]
         yaw = 2 * np.arctan2(run["mocap_q_xyzw"][:, 2], run["mocap_q_xyzw"][:, 3])
-        return np.where(label.known, run["b_measured_nt"] - truth.at_rest(p, yaw), np.nan)
+        return np.where(np.isfinite(label), run["b_measured_nt"] - truth.at_rest(p, yaw), np.nan)
 
     mean = np.mean(np.concatenate([v[np.isfinite(v)] for _, run in train.runs() for v in [exact_label(run)]]))
     error = mean - exact_label(drives["d2"])

@@ -10,6 +10,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import build_dataset
 from magtwin.learn.data.labels import labelled
+from magtwin.learn.data.recording import Source
 from magtwin.learn.data.split import split
 from magtwin.learn.evaluation.candidates import (
     NAIVE,
@@ -21,7 +22,7 @@ from magtwin.learn.evaluation.candidates import (
     tolles_lawson,
 )
 from magtwin.learn.evaluation.evaluate import evaluate
-from magtwin.learn.evaluation.trials import Trial, check_apart, trials_of, unseen
+from magtwin.learn.evaluation.trials import check_apart, trials_of, unseen
 from magtwin.learn.training.config import TrainConfig
 from magtwin.learn.training.train import fit
 from magtwin.run.run import COLUMNS, Run
@@ -65,7 +66,7 @@ def a_run(seed=0, rows=300, **metadata):
 
 def trial(name="one", run=None, **told):
     run = a_run(7, path="figure8") if run is None else run
-    return Trial(name, lambda: run, **told)
+    return Source(name, lambda: run, **told)
 
 
 def judged(models, *trials, **options):

@@ -71,7 +71,6 @@ def test_derivatives_of_a_map_are_what_small_steps_say(degrees):
     p = torch.tensor(at * (0.25, 0.1) + (-1.0, 0.5), requires_grad=True)
     yaw = torch.tensor(rng.uniform(0.62, 1.5, 20), requires_grad=True)
     assert torch.autograd.gradcheck(torch_map.lookup, (p, yaw), rtol=1e-6)
-    assert torch.autograd.gradgradcheck(torch_map.lookup, (p, yaw), rtol=1e-5)
 
 
 def test_a_pose_can_be_found_by_descending_to_a_known_field():
@@ -89,7 +88,7 @@ def test_a_pose_can_be_found_by_descending_to_a_known_field():
     assert_allclose(p.detach(), (0.6, 1.3), atol=0.15)  # the least node's cell and half a step
 
 
-def test_single_precision_is_good_to_a_hundredth_nt_in_values_of_double():
+def test_poses_in_single_precision_are_looked_up_in_double():
     field = field_map()
     rng = np.random.default_rng(3)
     p = rng.uniform(field.extent[::2], field.extent[1::2], (500, 2)).astype(np.float32)
@@ -98,14 +97,6 @@ def test_single_precision_is_good_to_a_hundredth_nt_in_values_of_double():
     double = TorchMap(field).lookup(torch.tensor(p), torch.tensor(yaw))
     assert double.dtype == torch.float32
     assert_allclose(double, want, rtol=0, atol=0.004)  # half a unit in the last place of 65,536 nT
-    single = TorchMap(field).float().lookup(torch.tensor(p), torch.tensor(yaw))
-    assert_allclose(single, want, rtol=0, atol=0.5)  # 1e4 nT a cell times 10 cells of 2^-23, and 3 rad
-
-
-def test_the_border_belongs_to_the_map_in_single_precision_too():
-    field = AnomalyMap(values_nt=np.ones((1, 4, 4)), origin_m=(0, 0), cell_m=(0.1, 0.1), headings_rad=[0])
-    got = TorchMap(field).float().lookup(torch.tensor([[0.3, 0.3], [0.0, 0.3], [0.31, 0.0]]), 0.0)
-    assert_array_equal(got.isnan(), [False, False, True])
 
 
 def test_shapes_are_broadcast_and_kept_in_torch():
@@ -123,6 +114,4 @@ def test_what_torch_cannot_look_up_is_refused():
         torch_map(torch.zeros(2), 0.0, outside="zero")
     with pytest.raises(InputError, match=r"^1 of 2 points lie off the map 'lab'.*\(9\.000, 0\.700\)"):
         torch_map(torch.tensor([[0.0, 0.7], [9.0, 0.7]]), 0.0, outside="raise")
-    with pytest.raises(InputError, match="p_xy is on meta, the field on cpu"):
-        torch_map(torch.zeros(2, device="meta"), 0.0)
     assert torch_map(torch.tensor([0.0, 0.7]), 0.0, outside="raise") > 0

@@ -17,7 +17,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
-from magtwin.learn.models.checkpoint import read_checkpoint
+from magtwin.learn.models.network import load_net, net_of_checkpoint
 
 RELEASED = "aprilab/models/nn_magnetometer_model_v0.0.1.pth"
 
@@ -63,9 +63,9 @@ def pth(path, held, *, pickled=None):
     return path
 
 
-def refusal(path, inputs=20):
+def refusal(path):
     with pytest.raises(InputError) as refused:
-        read_checkpoint(path, inputs)
+        net_of_checkpoint(path)
     text = str(refused.value)
     assert "\n" not in text
     assert text.startswith(f"{path}: ")
@@ -73,13 +73,13 @@ def refusal(path, inputs=20):
 
 
 def test_the_released_network_has_601857_parameters_in_5_layers(real_data):
-    net = read_checkpoint(real_data / RELEASED, 20)
-    assert [w.shape for w, _ in net.layers] == [(512, 20), (512, 512), (512, 512), (128, 512), (1, 128)]
-    assert sum(w.size + b.size for w, b in net.layers) == 601_857
+    net = load_net(real_data / RELEASED)
+    assert net.layers_text == "20-512-512-512-128-1"
+    assert net.parameters_count == 601_857
 
 
 def test_the_released_scalers_are_the_published_figures(real_data):
-    net = read_checkpoint(real_data / RELEASED)
+    net = load_net(real_data / RELEASED)
     # Mean and scale of each input, to the digits that were noted when the file was first looked at.
     figures = """
         180.295 101.551   .232589 .0658757  3.06e-4 2.75e-3  -2.6e-6 1.35e-4  4.3e-5 .010961
@@ -92,20 +92,20 @@ def test_the_released_scalers_are_the_published_figures(real_data):
     assert_allclose(net.x_mean[[0, 1, 17, 18, 19]], mean[[0, 1, 17, 18, 19]], rtol=1e-5)
     assert_allclose(net.x_scale, scale, rtol=3e-3)
     assert_allclose([net.y_mean, net.y_scale], [366.662, 524.898], rtol=1e-6)
-    assert net.samples == 591_952
-    assert net.written_by == "scikit-learn 1.5.2"
+    assert net.metadata["training_rows"] == 591_952
+    assert net.metadata["scalers_by"] == "scikit-learn 1.5.2"
 
 
 def test_a_checkpoint_gives_back_what_was_saved(tmp_path):
     state = layers(20, 8, 4, 1)
     state["layer0.weight"] = state["layer0.weight"].T.contiguous().T  # stored by columns
-    net = read_checkpoint(pth(tmp_path / "a.pth", saved(state)), 20)
-    assert len(net.layers) == 3
-    for i, (weight, bias) in enumerate(net.layers):
-        assert_array_equal(weight, state[f"layer{i}.weight"])
-        assert_array_equal(bias, state[f"layer{i}.bias"])
+    net = load_net(pth(tmp_path / "a.pth", saved(state)))
+    assert len(net.linears) == 3
+    for i, layer in enumerate(net.linears):
+        assert_array_equal(layer.weight.detach(), state[f"layer{i}.weight"])
+        assert_array_equal(layer.bias.detach(), state[f"layer{i}.bias"])
     assert_array_equal(net.x_mean, np.arange(20))
-    assert (net.y_mean, net.y_scale, net.samples) == (300.0, 500.0, 7)
+    assert (net.y_mean, net.y_scale, net.metadata["training_rows"]) == (300.0, 500.0, 7)
 
 
 # Pickles that would run something. Each leaves a mark if it does.
@@ -192,6 +192,7 @@ def test_a_flipped_bit_in_a_tensor_is_refused_by_its_checksum(tmp_path):
 # Networks that do not fit together
 
 GOOD = layers(20, 4, 1)
+ASK = "the 20 features and the other layers ask for"
 NAN = GOOD["layer0.weight"].clone()
 NAN[1, 2] = np.nan
 
@@ -201,23 +202,32 @@ NAN[1, 2] = np.nan
     [
         (
             saved(layers(19, 4, 1), scaler_X=scaler(np.zeros(19), np.ones(19))),
-            "its first layer takes 19 inputs; the released format has 20",
+            f"tensor 'x_mean' is float64 (19,), {ASK} float64 (20,)",
         ),
         (
             saved(GOOD | {"layer1.weight": torch.ones(1, 5)}),
-            "layer 'layer1' takes 5 numbers, the one before gives 4",
+            f"tensor 'layers.1.weight' is float32 (1, 5), {ASK} float32 (1, 4)",
         ),
-        (saved(layers(20, 4, 2)), "its last layer gives 2 numbers; a magnetometer gives 1"),
-        (saved({"layer0.weight": torch.ones(4, 20)}), "layer 'layer0' has no bias"),
+        (
+            saved(layers(20, 4, 2)),
+            f"tensor 'layers.1.weight' is float32 (2, 4), {ASK} float32 (1, 4)",
+        ),
+        (
+            saved({"layer0.weight": torch.ones(4, 20)}),
+            "tensor 'layers.0.bias' is missing; train or convert the network again",
+        ),
         (
             saved(GOOD | {"layer0.weight": torch.ones(20)}),
-            "layer 'layer0' is not linear: weight (20,), bias (4,)",
+            "tensor 'layers.0.weight' is float32 (20,); a layer's have shape (out, in)",
         ),
         (
             saved(GOOD | {"norm.running_mean": torch.ones(4)}),
             "'norm.running_mean' is neither weight nor bias of a linear layer",
         ),
-        (saved(GOOD | {"layer0.weight": NAN}), "tensor 'layer0.weight' has numbers that are nan or infinite"),
+        (
+            saved(GOOD | {"layer0.weight": NAN}),
+            "tensor 'layers.0.weight' has numbers that are nan or infinite",
+        ),
         (saved(GOOD | {"layer0.weight": 3}), "'layer0.weight' is neither weight nor bias of a linear layer"),
         (
             saved(GOOD | {"layer0.weight": torch.zeros(1).expand(10**6, 10**6)}),
@@ -228,14 +238,17 @@ NAN[1, 2] = np.nan
         (saved(scaler_X={}), "scaler_X is not a StandardScaler"),
         (
             saved(scaler_X=scaler(np.zeros(4), np.ones(4))),
-            "scaler_X is for 4 columns, the network has 20",
+            f"tensor 'x_mean' is float64 (4,), {ASK} float64 (20,)",
         ),
-        (saved(scaler_y=scaler([0, 0], [1, 1])), "scaler_y is for 2 columns, the network has 1"),
+        (
+            saved(scaler_y=scaler([0, 0], [1, 1])),
+            f"tensor 'y_mean' is float64 (2,), {ASK} float64 ()",
+        ),
         (
             saved(scaler_X=scaler(np.zeros(20), np.zeros(20))),
-            "scaler_X has a mean that is not finite, or a scale that is not above 0",
+            "a scale of its scalers is not above 0",
         ),
-        (saved(scaler_y=StandardScaler()), "scaler_y has () means and () scales; was it fitted?"),
+        (saved(scaler_y=StandardScaler()), "tensor 'y_mean' has numbers that are nan or infinite"),
     ],
 )
 def test_a_network_that_does_not_fit_together_is_refused(tmp_path, held, text):

@@ -1,5 +1,7 @@
 """The algebra of session effects, against independent computations."""
 
+import itertools
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -96,7 +98,7 @@ def test_em_never_lowers_the_likelihood():
         return total
 
     found = [likelihood(rounds) for rounds in (1, 2, 4, 8)]
-    assert all(after > before for before, after in zip(found, found[1:], strict=False))
+    assert all(after > before for before, after in itertools.pairwise(found))
 
 
 def test_a_drive_in_blocks_has_the_posterior_of_all_its_readings():

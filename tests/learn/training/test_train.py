@@ -4,7 +4,8 @@ import torch
 from numpy.testing import assert_allclose
 
 from magtwin.errors import InputError
-from magtwin.learn.models.fit_network import Dropout, train
+from magtwin.learn.models.descent import Dropout
+from magtwin.learn.models.fit_network import train
 
 NAMES = ("yaw_deg", "odom_v_x")
 SMALL = {"features": NAMES, "layers": (32, 32), "dropout": 0.0, "batch": 256, "lr": 3e-3}

@@ -49,7 +49,15 @@ IRON = PlatformFieldSpec(
     soft_iron=(0.008, 0.001, 0.0, 0.001, -0.004, 0.0005, 0.0, 0.0005, 0.002),
     eddy_s=(0.004, 0.0, 0.0, 0.0, 0.004, 0.0, 0.0, 0.0, 0.006),
 )
-EXACT = DriveSpec(wheel_radius_error_std=0.0, wheel_separation_error_std=0.0, slip_s2_m=0.0, yaw_slip=0.0)
+EXACT = DriveSpec(
+    localization_std_m=0.0,
+    localization_yaw_std=0.0,
+    localization_latency_s=0.0,
+    wheel_radius_error_std=0.0,
+    wheel_separation_error_std=0.0,
+    slip_s2_m=0.0,
+    yaw_slip=0.0,
+)
 RATE_HZ = 50.0
 
 

@@ -14,6 +14,7 @@ from magtwin.path import Path, path_named
 from magtwin.run.run import COLUMNS, Run
 from magtwin.sim.interference import ambient_gradient_nt_m
 from magtwin.sim.runs.simulate import simulate
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.lab import LabSpec
 from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
 from magtwin.spec.robot import RobotSpec
@@ -33,6 +34,7 @@ ROBOT = RobotSpec(
     asset=FilePath("robot.usda"),
     p_base_magnetometer=(0.05, 0.0, 0.36),
     platform=PlatformFieldSpec(hard_iron_nt=(620.0, -430.0, 250.0), lidar_nt=(160.0, -90.0, 130.0)),
+    drive=DriveSpec(localization_std_m=0.0, localization_yaw_std=0.0, localization_latency_s=0.0),
 )
 SOURCES = (
     SourceSpec(name="chair", p_world=(0.5, 0.3, -0.5), m_world=(5.0, -3.0, 20.0)),

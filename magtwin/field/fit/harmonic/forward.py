@@ -70,13 +70,9 @@ class Forward:
         return jacobian
 
     def read(self, unknowns: Array, p_xy: Array, yaw: Array, *, vectors: bool) -> Reading:
-        """What the robot reads at poses, with all derivatives.
+        """What the robot reads at poses of base_link, with all derivatives.
 
-        Args:
-            unknowns: Moments [A m^2], uniform field [nT] and platform, shape (P,).
-            p_xy: Positions of base_link [m], shape (N, 2).
-            yaw: Headings [rad], shape (N,).
-            vectors: Whether to read vectors in base_link axes, or magnitudes.
+        The unknowns have shape (P,). With `vectors`, it reads them in base_link axes, otherwise magnitudes.
         """
         m, uniform, hard, soft, lever = self._parts(unknowns)
         turn, swing = _turns(yaw)

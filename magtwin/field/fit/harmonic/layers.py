@@ -1,14 +1,11 @@
 """Layers of the equivalent dipoles of a harmonic fit."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.errors import InputError
-from magtwin.field.survey.bins import means
-from magtwin.field.survey.bins import spacing_m as survey_spacing_m
+from magtwin.field.survey.bins import means, spacing_m
 from magtwin.field.survey.readings import Readings
 
 Array = NDArray[np.float64]
@@ -51,41 +48,22 @@ class Layers:
         return shares
 
 
-def ladders(
-    depth_m: float | Sequence[float] | None, good: Readings, height_m: float
-) -> list[tuple[float, ...]]:
-    """Sets of depths to try [m]: the given one, else `LADDERS` for the survey's spacing.
-
-    Raises:
-        InputError: A depth is 0 or not finite.
-    """
-    if depth_m is None:
-        spacings = DRIVE_SPACINGS if good.grid is None else DEPTH_SPACINGS
-        first = max(spacings * survey_spacing_m(good), LEAST_DEPTH_M, height_m)
-        return [tuple(first * step for step in ladder) for ladder in LADDERS]
-    depths = tuple(float(d) for d in np.atleast_1d(np.asarray(depth_m, float)))
-    if not depths or not all(np.isfinite(d) and d != 0 for d in depths):
-        raise InputError(f"depth_m must be depths below the sensor [m], other than 0, got {depth_m!r}")
-    return [depths]
+def ladders(good: Readings, height_m: float) -> list[tuple[float, ...]]:
+    """Sets of depths to try [m]: `LADDERS` for the survey's spacing."""
+    spacings = DRIVE_SPACINGS if good.grid is None else DEPTH_SPACINGS
+    first = max(spacings * spacing_m(good), LEAST_DEPTH_M, height_m)
+    return [tuple(first * step for step in ladder) for ladder in LADDERS]
 
 
-def layers_below(
-    good: Readings, depths: tuple[float, ...], spacing_m: float | None, height_m: float
-) -> Layers:
-    """Layers below (and above) the bounding box of the readings, thinned if there are too many dipoles.
-
-    Args:
-        good: Good readings of a survey.
-        depths: Depth of each layer below the sensor [m].
-        spacing_m: Distance between the dipoles of the first layer [m]; None: `SHEET` of its depth.
-        height_m: Height of the sensor [m].
-
-    Raises:
-        InputError: The given spacing needs too many dipoles.
-    """
+def layers_below(good: Readings, depths: tuple[float, ...], height_m: float) -> Layers:
+    """Layers below (and above) the bounding box of the readings, thinned if there are too many dipoles."""
     low, high = good.p_xy.min(axis=0), good.p_xy.max(axis=0)
-    part = SHEET if spacing_m is None else spacing_m / abs(depths[0])
-    most = _most(good, min(map(abs, depths)))
+    part = SHEET
+    most = DIPOLES_OF_DRIVE
+    if good.node is not None or good.b_body_nt is not None:
+        rows = 1 + int(means(good, min(map(abs, depths)))[0].max())
+        rows *= 1 if good.b_body_nt is None else 3
+        most = MOST_DIPOLES if rows <= FEW_ROWS else DIPOLES_OF_MANY
     while True:
         places, areas, layer = [], [], []
         for k, depth in enumerate(depths):
@@ -99,14 +77,4 @@ def layers_below(
         count = sum(map(len, places))
         if count <= most:
             return Layers(np.concatenate(places), np.concatenate(areas), np.concatenate(layer), depths)
-        if spacing_m is not None:
-            raise InputError(f"spacing_m {spacing_m:g} makes {count:,} dipoles, more than {most:,}; widen it")
         part *= max(np.sqrt(count / most), 1.02)
-
-
-def _most(good: Readings, depth_m: float) -> int:
-    """Most dipoles for a survey."""
-    if good.node is None and good.b_body_nt is None:
-        return DIPOLES_OF_DRIVE
-    rows = (1 if good.b_body_nt is None else 3) * (1 + int(means(good, depth_m)[0].max()))
-    return MOST_DIPOLES if rows <= FEW_ROWS else DIPOLES_OF_MANY

@@ -35,31 +35,21 @@ class HarmonicModel(FittedModel):
     # shape (P, K)
     learnt: Array
 
-    @property
-    def method(self) -> str:
-        """Name of the method."""
-        return "harmonic"
-
     width: float  # Factor of the posterior variance where it is large against the noise, see `widened`
     headings_rad: Array  # Surveyed headings, ascending, if they are few and far apart; else empty, shape (H,)
     # Added variance between these headings, over (d g)^2 with the angles d and g to the two beside, estimated
     # from headings left out in turn [nT^2/rad^4]. Few headings determine it loosely: of the APRILab survey's
     # four, each left out, 73 % of the readings lie in the 90 % intervals from the other three.
     turned: float
+    method: str = "harmonic"  # Name of the method
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
         """Field magnitude as the survey's robot reads it [nT], and its variance without noise [nT^2]. See
         `FieldModel`.
         """
         p, yaw, shape = flat_poses(p_xy, yaw)
-        value, variance = np.empty(len(p)), np.empty(len(p))
-        for start in range(0, len(p), BLOCK):
-            part = slice(start, start + BLOCK)
-            read = self.forward.read(self.unknowns, p[part], yaw[part], vectors=False)
-            value[part] = read.values_nt[:, 0]
-            variance[part] = widened(self._variance(read.jacobian[:, 0]), self.noise_nt2, self.width)
-            variance[part] += self.turned * between(self.headings_rad, yaw[part])
-        return value.reshape(shape), variance.reshape(shape)
+        value, variance = self._read(p, yaw)
+        return value.reshape(shape), self._corrected(variance, yaw).reshape(shape)
 
     def predict_nodes(self, p_xy: Array, yaw: float) -> tuple[Array, Array]:
         """`predict` on evenly spaced nodes, several times faster.
@@ -74,7 +64,7 @@ class HarmonicModel(FittedModel):
         Returns:
             Magnitude [nT] and its variance [nT^2], each of shape (Y, X).
         """
-        value, _ = self.field.magnitude_with_gradient(p_xy, yaw)
+        value = self.field.magnitude_nt(p_xy, yaw, compiled=True)
         depth = np.abs(self.forward.p_world_dipole[:, 2] - self.forward.height_m).min()
         cell = np.linalg.norm(p_xy[1, 0] - p_xy[0, 0]), np.linalg.norm(p_xy[0, 1] - p_xy[0, 0])
         strides = [max(1, int(COARSE * depth / step + 1e-9)) for step in cell]
@@ -82,18 +72,13 @@ class HarmonicModel(FittedModel):
             np.unique([*range(0, n, stride), n - 1]) for n, stride in zip(value.shape, strides, strict=True)
         )
         coarse = p_xy[np.ix_(rows, columns)]
-        p, variance = coarse.reshape(-1, 2), np.empty(coarse[..., 0].size)
-        for start in range(0, len(p), BLOCK):
-            part = slice(start, start + BLOCK)
-            at = p[part]
-            read = self.forward.read(self.unknowns, at, np.full(len(at), yaw), vectors=False)
-            variance[part] = self._variance(read.jacobian[:, 0])
+        p = coarse.reshape(-1, 2)
+        _, variance = self._read(p, np.full(len(p), yaw))
         log = np.log(np.maximum(variance, np.finfo(float).tiny)).reshape(coarse.shape[:2])
         every = [np.arange(n) for n in value.shape]
         log = np.array([np.interp(every[1], columns, row) for row in log])
         log = np.array([np.interp(every[0], rows, column) for column in log.T]).T
-        whole = widened(np.exp(log), self.noise_nt2, self.width)
-        return value, whole + self.turned * between(self.headings_rad, np.array([yaw]))
+        return value, self._corrected(np.exp(log), np.array([yaw]))
 
     def predict_vector(self, p_world: ArrayLike) -> tuple[Array, Array]:
         """Field without the robot, at any height between the layers of dipoles, and its variance.
@@ -113,6 +98,19 @@ class HarmonicModel(FittedModel):
             rows = self.forward.vectors(points[part])
             flat[part] = self._variance(rows.reshape(-1, rows.shape[-1])).reshape(-1, 3)
         return value, variance
+
+    def _read(self, p: Array, yaw: Array) -> tuple[Array, Array]:
+        """Magnitude [nT] and its posterior variance [nT^2] at poses (N, 2), (N,)."""
+        value, variance = np.empty(len(p)), np.empty(len(p))
+        for start in range(0, len(p), BLOCK):
+            part = slice(start, start + BLOCK)
+            read = self.forward.read(self.unknowns, p[part], yaw[part], vectors=False)
+            value[part], variance[part] = read.values_nt[:, 0], self._variance(read.jacobian[:, 0])
+        return value, variance
+
+    def _corrected(self, variance: Array, yaw: Array) -> Array:
+        whole = widened(variance, self.noise_nt2, self.width)
+        return whole + self.turned * between(self.headings_rad, yaw)
 
     def _variance(self, jacobian: Array) -> Array:
         """Posterior variances of linear functions `jacobian` (N, P) of the unknowns, shape (N,)."""
@@ -137,14 +135,9 @@ STRAY = 0.05  # Largest share of readings at a heading that is ignored
 
 
 def surveyed(yaw: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Group headings that lie together.
+    """Mean headings of groups of headings that lie together [rad], (H,), and each reading's group, (N,).
 
-    Args:
-        yaw: Headings of the readings [rad], shape (N,).
-
-    Returns:
-        Mean heading of each group [rad], ascending, shape (H,); and the group of each reading, -1 for strays,
-        shape (N,). No groups if the headings are all around, or fewer than 3.
+    Strays are in group -1. There are no groups if the headings are all around, or fewer than 3.
     """
     angle = np.mod(yaw, TURN)
     sorted_angles = np.sort(angle)
@@ -167,14 +160,9 @@ def surveyed(yaw: Array) -> tuple[Array, NDArray[np.intp]]:
 
 
 def between(headings_rad: Array, yaw: Array) -> Array:
-    """(d g)^2, where d and g are the angles from a heading to the nearest surveyed one on each side.
+    """(d g)^2 for the angles d and g from each heading to the surveyed ones beside it [rad^4], shape (N,).
 
-    Args:
-        headings_rad: Surveyed headings [rad], shape (H,); if empty, the result is 0.
-        yaw: Headings [rad], shape (N,).
-
-    Returns:
-        Squared product of the two angles [rad^4], shape (N,).
+    It is 0 without surveyed headings.
     """
     if not len(headings_rad):
         return np.zeros(len(yaw))

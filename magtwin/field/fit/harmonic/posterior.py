@@ -24,7 +24,7 @@ class Posterior:
 
     @classmethod
     def of(cls, rows: Array) -> "Posterior":
-        """The posterior of a problem; factors the matrix."""
+        """Factor the matrix of a problem."""
         whole = rows @ rows.T if len(rows) <= rows.shape[1] else rows.T @ rows
         whole[np.diag_indices(len(whole))] += 1
         return cls(rows, np.asarray(np.linalg.cholesky(whole)))
@@ -43,7 +43,7 @@ class Posterior:
         return np.asarray(cho_solve((self.lower, True), self.rows.T @ target))
 
     def half_log_det(self) -> float:
-        """Half the log determinant, which is equal for both matrices."""
+        """Half the log determinant, equal for both matrices."""
         return float(np.log(np.diag(self.lower)).sum())
 
     def known(self) -> Array:

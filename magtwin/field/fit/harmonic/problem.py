@@ -17,6 +17,7 @@ WEAK = 0.1  # Initial strength of layers above relative to layers below: what bo
 # Compass directions and dip of the starts beside straight down, if the Earth's field is unknown: several
 # fields explain magnitudes, and the steps find the nearest one
 BEGINNINGS, BEGUN_DIP = 4, np.radians(60.0)
+EARTH_SD_NT = 1000.0  # Prior standard deviation of the uniform field about the Earth's, per component [nT]
 # Prior standard deviations of the platform's unknowns, about 0
 HARD_IRON_SD_NT, SOFT_IRON_SD, LEVER_SD_M = 3000.0, 0.03, 0.05
 # Length of a drive that is left out together, in the first layer's depth: over half a minute at 0.2 m/s
@@ -67,15 +68,8 @@ class Problem:
     begins: list[Array]  # uniform fields to begin with
 
     @classmethod
-    def of(
-        cls,
-        good: Readings,
-        layers: Layers,
-        height: float,
-        earth_nt: Sequence[float] | None,
-        earth_sd_nt: float,
-    ) -> "Problem":
-        """The problem of good readings over layers of dipoles; see `fit_harmonic` for the arguments."""
+    def of(cls, good: Readings, layers: Layers, height: float, earth_nt: Sequence[float] | None) -> "Problem":
+        """The problem of good readings over layers of dipoles."""
         read = good.b_nt[:, None] if good.b_body_nt is None else good.b_body_nt
         cell, follow = means(good, min(map(abs, layers.depths)))
         size = np.bincount(cell)
@@ -88,9 +82,11 @@ class Problem:
         yaw = np.arctan2(mean(np.sin(good.yaw)), mean(np.cos(good.yaw)))
         typical = float(np.median(good.b_nt))
         uniform, sd = np.array([0.0, 0.0, -typical]), typical / 2
-        begins = [uniform, *_tilted(typical)]
+        level, down = typical * np.cos(BEGUN_DIP), typical * np.sin(BEGUN_DIP)
+        angles = 2 * np.pi * np.arange(BEGINNINGS) / BEGINNINGS
+        begins = [uniform, *(np.array([level * np.cos(a), level * np.sin(a), -down]) for a in angles)]
         if earth_nt is not None:
-            uniform, sd = np.asarray(earth_nt, float), earth_sd_nt
+            uniform, sd = np.asarray(earth_nt, float), EARTH_SD_NT
             begins = [uniform]
         elif good.b_body_nt is not None:
             c, s = np.cos(yaw), np.sin(yaw)
@@ -151,10 +147,3 @@ class Problem:
             freedom=8.0,
             strength=density * np.sqrt(self.layers.area_m2) * np.where(above, WEAK, 1.0),
         )
-
-
-def _tilted(magnitude_nt: float) -> list[Array]:
-    """Fields that dip by `BEGUN_DIP` towards several compass directions."""
-    level, down = magnitude_nt * np.cos(BEGUN_DIP), magnitude_nt * np.sin(BEGUN_DIP)
-    angles = 2 * np.pi * np.arange(BEGINNINGS) / BEGINNINGS
-    return [np.array([level * np.cos(a), level * np.sin(a), -down]) for a in angles]

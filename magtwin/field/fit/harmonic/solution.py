@@ -1,6 +1,7 @@
 """Solution of a harmonic fit: Gauss-Newton steps, learning of hyperparameters, and the resulting model."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,7 @@ Array = NDArray[np.float64]
 DRAWN = 0.005  # Weight of the layer's strength relative to that of the dipoles around
 TAILS = np.geomspace(4.0, 48.0, 13)  # Degrees of freedom of Student's t that are tried
 SETTLED = 0.2  # Gain of the log posterior below which Gauss-Newton has converged
-
-STEPS = 30
-
+STEPS = 30  # Most steps until then
 FIRST_STEPS = 4  # Gauss-Newton steps before learning begins
 # Logarithms of the widths that are tried, as factors of the posterior's variances
 WIDTHS = np.linspace(-np.log(16), np.log(16), 161)
@@ -67,6 +66,16 @@ class Solution:
         """Residuals (N, C)."""
         return self.problem.read_nt - self.reading.values_nt
 
+    @cached_property
+    def variance(self) -> Array:
+        """Squared scales of the readings [nT^2], (N, C)."""
+        return self.figures.variance(self.reading)
+
+    @property
+    def precision(self) -> Array:
+        """Precisions of the readings [1/nT^2], (N, C)."""
+        return np.asarray(self.weights(self.variance)[:, None] / self.variance)
+
     def weights(self, variance: Array) -> Array:
         """Expected relative precision of each reading under Student's t, (N,)."""
         freedom, parts = self.figures.freedom, variance.shape[1]
@@ -81,10 +90,8 @@ class Solution:
 
     def posterior(self, precision: Array) -> Posterior:
         """Posterior of the unknowns, in units of their priors, for reading precisions (N, C)."""
-        return Posterior.of(self._rows() * np.sqrt(precision).reshape(-1, 1))
-
-    def _rows(self) -> Array:
-        return self.reading.jacobian.reshape(-1, self.reading.jacobian.shape[-1]) * self.prior_sd
+        rows = self.reading.jacobian.reshape(-1, self.reading.jacobian.shape[-1]) * self.prior_sd
+        return Posterior.of(rows * np.sqrt(precision).reshape(-1, 1))
 
     def _scaled(self) -> Array:
         """Unknowns minus their priors' means, in prior standard deviations; 0 for fixed ones."""
@@ -93,21 +100,24 @@ class Solution:
 
     def _towards(self, precision: Array) -> Array:
         """Unknowns that solve the linearised problem."""
-        posterior, root = self.posterior(precision), np.sqrt(precision).ravel()
-        best = posterior.mean(root * self.off.ravel() + posterior.rows @ self._scaled())
+        posterior = self.posterior(precision)
+        best = posterior.mean(self._target(posterior, precision))
         return np.asarray(self.problem.mean + self.prior_sd * best)
+
+    def _target(self, posterior: Posterior, precision: Array) -> Array:
+        """Readings of the linearised problem, (R,)."""
+        return np.sqrt(precision).ravel() * self.off.ravel() + posterior.rows @ self._scaled()
 
     def _moved(self, towards: Array, part: float) -> "Solution":
         unknowns = self.unknowns + part * (towards - self.unknowns)
         return Solution(self.problem, self.figures, unknowns, self.problem.at(unknowns))
 
     def _stepped(self) -> tuple["Solution", float]:
-        variance = self.figures.variance(self.reading)
-        towards = self._towards(self.weights(variance)[:, None] / variance)
-        before, part = self.objective(variance), 1.0
+        towards = self._towards(self.precision)
+        before, part = self.objective(self.variance), 1.0
         while part > 0.05:
             after = self._moved(towards, part)
-            gain = before - after.objective(variance)
+            gain = before - after.objective(self.variance)
             if gain >= 0:
                 return after, gain
             part /= 2
@@ -130,10 +140,8 @@ class Solution:
         """The same unknowns with more likely hyperparameters."""
         from scipy.special import gammaln, psi
 
-        figures, layers = self.figures, self.problem.layers
-        variance = figures.variance(self.reading)
-        weights = self.weights(variance)
-        precision = weights[:, None] / variance
+        figures, layers, variance = self.figures, self.problem.layers, self.variance
+        weights, precision = self.weights(variance), self.precision
         posterior = self.posterior(precision)
         count = len(figures.strength)
         known = posterior.known()[: 3 * count].reshape(count, 3).mean(axis=1)
@@ -172,18 +180,15 @@ class Solution:
         """Log evidence by Laplace's approximation (Rasmussen & Williams 2006, eq. 3.32)."""
         from scipy.special import gammaln
 
-        variance = self.figures.variance(self.reading)
+        variance = self.variance
         freedom, parts = self.figures.freedom, variance.shape[1]
         constant = gammaln((freedom + parts) / 2) - gammaln(freedom / 2) - parts / 2 * np.log(freedom * np.pi)
         fit = len(variance) * constant - np.log(variance).sum() / 2 - self.objective(variance)
-        precision = self.weights(variance)[:, None] / variance
-        return float(fit - self.posterior(precision).half_log_det())
+        return float(fit - self.posterior(self.precision).half_log_det())
 
     def model(self, good: Readings) -> HarmonicModel:
         """The fitted model."""
-        figures, problem = self.figures, self.problem
-        variance = figures.variance(self.reading)
-        precision = self.weights(variance)[:, None] / variance
+        figures, problem, precision = self.figures, self.problem, self.precision
         posterior = self.posterior(precision)
         learnt, (louder, width) = posterior.directions(), self._calibrated(posterior, precision)
         headings, turned = self._turned(posterior, precision)
@@ -194,13 +199,13 @@ class Solution:
         off = good.b_nt - field.magnitude_nt(good.p_xy, good.yaw)
         within = off - (np.bincount(problem.cell, off) / np.bincount(problem.cell))[problem.cell]
         noise += float(np.mean(within**2))
+        parameters = self._parameters(learnt, width, len(good))
+        parameters["added between headings [nT/rad^2]"] = round(float(np.sqrt(turned)), 2)
+        if louder != 1:
+            parameters["factor of the noise along a drive"] = round(float(np.sqrt(louder)), 3)
         return HarmonicModel(
             field=field,
-            parameters=self._parameters(learnt, width, len(good))
-            | {"added between headings [nT/rad^2]": round(float(np.sqrt(turned)), 2)}
-            | (
-                {} if louder == 1 else {"factor of the noise along a drive": round(float(np.sqrt(louder)), 3)}
-            ),
+            parameters=parameters,
             noise_nt2=noise,
             figures=figures,
             forward=problem.forward,
@@ -213,20 +218,18 @@ class Solution:
         )
 
     def _calibrated(self, posterior: Posterior, precision: Array) -> tuple[float, float]:
-        """Factors of the noise's and of the field's variance, from readings left out in turn.
+        """Likeliest factors of the noise's and of the field's variance, from readings left out in turn.
 
-        The likeliest under Student's t, with each place counting once; near 1 if the readings do not
-        determine them. Consecutive readings of a drive share errors from motors, battery and LiDAR, so whole
-        stretches are left out, and the noise grows by what they share.
+        Each place counts once. Consecutive readings of a drive share errors from motors, battery and LiDAR,
+        so whole stretches are left out, and the noise grows by what they share.
         """
         root, problem = np.sqrt(precision).ravel(), self.problem
         places, stretches = problem.places(), problem.stretches()
-        target = root * self.off.ravel() + posterior.rows @ self._scaled()
-        off, field = posterior.left_out(target, stretches or places)
+        off, field = posterior.left_out(self._target(posterior, precision), stretches or places)
         share = np.empty(len(root))
         for rows in places:
             share[rows] = 1 / len(rows)
-        noise, freedom = self.figures.variance(self.reading).ravel(), self.figures.freedom
+        noise, freedom = self.variance.ravel(), self.figures.freedom
         square, field = (off / root) ** 2, field / root**2
         best = np.inf, 1.0, 1.0
         for factor in NOISES if stretches else NOISES[:1]:
@@ -245,10 +248,9 @@ class Solution:
         if not len(heading) or not np.any(self.problem.rest_sd[3:]):
             return np.empty(0), 0.0
         root = np.sqrt(precision).ravel()
-        target = root * self.off.ravel() + posterior.rows @ self._scaled()
         rows = np.arange(len(root)).reshape(precision.shape)
         groups = [rows[group == h].ravel() for h in range(len(heading))]
-        off, field = posterior.left_out(target, groups)
+        off, field = posterior.left_out(self._target(posterior, precision), groups)
         beyond, away = 0.0, 0.0
         for h, part in enumerate(groups):
             beyond += float(np.sum((off[part] ** 2 - field[part] - 1) / root[part] ** 2))
@@ -262,12 +264,8 @@ class Solution:
         sd = problem.rest_sd * np.sqrt(np.maximum(1 - np.sum(last**2, axis=1), 0))
         uniform, hard, soft, lever = np.split(self.unknowns[-len(problem.rest_sd) :], [3, 6, 14])
         layers = problem.layers
-        density = [
-            float(
-                np.sqrt(np.mean(figures.strength[layers.layer == k] ** 2 / layers.area_m2[layers.layer == k]))
-            )
-            for k in range(len(layers.depths))
-        ]
+        square = figures.strength**2 / layers.area_m2
+        density = [float(np.sqrt(square[layers.layer == k].mean())) for k in range(len(layers.depths))]
         return {
             "readings": count,
             "means of readings": len(problem.p_xy),

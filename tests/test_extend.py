@@ -5,9 +5,9 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from magtwin import registry
+from magtwin import extend
 from magtwin.errors import InputError, UnknownNameError
-from magtwin.registry import Registry
+from magtwin.extend import Registry
 
 
 def things(monkeypatch, **installed):
@@ -15,7 +15,7 @@ def things(monkeypatch, **installed):
         assert group == "magtwin.things"
         return [EntryPoint(name, value, group) for name, value in installed.items()]
 
-    monkeypatch.setattr(registry, "entry_points", entry_points)
+    monkeypatch.setattr(extend, "entry_points", entry_points)
     return Registry("thing", "things", {"decoder": "json:JSONDecoder"})
 
 
