@@ -91,6 +91,13 @@ ModelError = Annotated[
         "outside its training set. With --no-model-error a reading is the prediction plus sensor noise."
     ),
 ]
+TrackingError = Annotated[
+    bool,
+    Parameter(
+        help="Give path followers poses with the latency and errors of a localization, so that they stay "
+        "within some centimetres of the path. With --no-tracking-error they get exact poses."
+    ),
+]
 Lidar = Annotated[
     Literal["schedule", "on", "off"],
     Parameter(help="Whether the LiDAR follows its schedule, or stays on or off."),
@@ -140,6 +147,7 @@ class Sensing:
     network: Network = None
     magnetometer: Magnetometer = None
     model_error: ModelError = True
+    tracking_error: TrackingError = True
     rate_hz: RateHz = None
     lidar: Lidar = "schedule"
     outside: Outside = "nan"

@@ -52,6 +52,7 @@ def drive(
     network: str | Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
     model_error: bool = True,
+    tracking_error: bool = True,
     seed: int = 0,
     session: Session | None = None,
     plant: PlantSpec | str | None = None,
@@ -71,6 +72,7 @@ def drive(
         network: As for `magtwin.open_twin`.
         magnetometer: As for `magtwin.open_twin`.
         model_error: As for `magtwin.open_twin`.
+        tracking_error: As for `magtwin.open_twin`.
         seed: Seed of all noise.
         session: As for `magtwin.simulate`.
         plant: As for `magtwin.simulate`.
@@ -91,7 +93,13 @@ def drive(
         metadata = {"replay_file": Path(replay).as_posix(), **metadata}
     elif path != "random":
         drive_input(path)  # refuses a wrong name before the scene is opened
-    twin = open_twin(scene_file, network=network, magnetometer=magnetometer, model_error=model_error)
+    twin = open_twin(
+        scene_file,
+        network=network,
+        magnetometer=magnetometer,
+        model_error=model_error,
+        tracking_error=tracking_error,
+    )
     twin = in_session(with_plant(twin, plant), session, seed=seed)
     planned = None
     if what is path and path != "random":

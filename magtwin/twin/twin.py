@@ -193,8 +193,23 @@ def with_plant(twin: Twin, plant: PlantSpec | str | None) -> Twin:
     return dataclasses.replace(twin, scene=scene, metadata={**twin.metadata, "plant": text})
 
 
+def without_tracking_error(twin: Twin) -> Twin:
+    """The twin whose controllers get exact poses."""
+
+    def changed(robot: RobotSpec) -> RobotSpec:
+        drive = dataclasses.replace(
+            robot.drive, localization_std_m=0.0, localization_yaw_std=0.0, localization_latency_s=0.0
+        )
+        return dataclasses.replace(robot, drive=drive)
+
+    scene = twin.scene
+    others = tuple(dataclasses.replace(other, robot=changed(other.robot)) for other in scene.others)
+    scene = dataclasses.replace(scene, robot=changed(scene.robot), others=others)
+    return dataclasses.replace(twin, scene=scene, metadata={**twin.metadata, "tracking_error": False})
+
+
 def in_session_of(twin: Twin, metadata: Mapping[str, str | int | float | bool]) -> Twin:
-    """The twin in the session of a run, with the plant of the run.
+    """The twin in the session of a run, with the plant and the tracking of the run.
 
     Args:
         twin: The twin of the run.
@@ -205,6 +220,8 @@ def in_session_of(twin: Twin, metadata: Mapping[str, str | int | float | bool]) 
     """
     if metadata.get("plant", OF_SCENE) != OF_SCENE:
         twin = with_plant(twin, str(metadata["plant"]))
+    if not metadata.get("tracking_error", True):
+        twin = without_tracking_error(twin)
     if "session_seed" not in metadata:
         return in_session(twin, "survey")
     try:

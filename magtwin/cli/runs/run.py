@@ -258,7 +258,9 @@ def _run_robots(
     from magtwin.twin import led_by, open_twin, room_of, scan, simulate_robots
 
     commands, replay = options.pop("commands"), options.pop("replay")
-    opening = {name: options.pop(name) for name in ("network", "magnetometer", "model_error")}
+    opening = {
+        name: options.pop(name) for name in ("network", "magnetometer", "model_error", "tracking_error")
+    }
     twin = open_twin(scene, **opening)
     ways: dict[str, Any] = {spec.robot.name: spec.path or "figure8" for spec in twin.scene.robots}
     if robot is not None and (commands or replay or path):

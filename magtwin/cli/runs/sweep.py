@@ -78,7 +78,9 @@ def sweep(
         drive_input(name)  # refuses a wrong name before the scene is opened
     announce("Opening the scene")
     options = vars(sensing).copy()
-    opening = {name: options.pop(name) for name in ("network", "magnetometer", "model_error")}
+    opening = {
+        name: options.pop(name) for name in ("network", "magnetometer", "model_error", "tracking_error")
+    }
     twin = open_twin(scene, **opening)
     announce(f"Driving {count} runs")
     runs = drive_many(
