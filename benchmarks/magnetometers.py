@@ -1,4 +1,4 @@
-"""Magnetometer models on plants that they never saw: the tables of docs/calibrate.md.
+"""Magnetometer models on plants that they never saw: the tables of docs/results.md.
 
 A twin of the default lab is surveyed, and its robot drives in many worlds: the nominal plant, and plants of
 the families of `magtwin.draw_plant`. Models learn on nominal sessions; a mixed model also learns how sessions
@@ -8,18 +8,18 @@ drive, and those that become known 10 s late online, have an error of 3 cm on ea
 
 Ratios are the MAE divided by that of the naive model (trilinear map and mean training label), averaged over
 the paths; beside them stands the share of readings in the models' own 90 % intervals. "all" has every effect
-at once; its model has learned from the single families.
+at once; its model has learned from the single families. "hybrid" is the shipped network, which learned on
+other nominal sessions, and "its base" the linear part of it.
 
-    python benchmarks/plants.py [--sessions 4] [--draws 12] [--out FOLDER]
+    python benchmarks/magnetometers.py [--sessions 4] [--draws 12] [--out FOLDER]
 
-FOLDER keeps data sets and weights. Takes some minutes.
+It prints three tables, after about ten minutes. FOLDER keeps data set and weights.
 """
 
 import argparse
 import contextlib
 import math
 import tempfile
-import time
 import warnings
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -28,11 +28,11 @@ from pathlib import Path
 import numpy as np
 
 import magtwin as mt
-from magtwin.errors import MismatchWarning
+from magtwin.errors import CalibrationWarning, MismatchWarning
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files import shipped
 from magtwin.learn.data.alignment import Alignment, alignment_of, fit_alignment
-from magtwin.learn.data.labels import labelled, labels
+from magtwin.learn.data.labels import labelled
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.inference.online import read_online
 from magtwin.learn.models.mixed import Mixed
@@ -65,11 +65,22 @@ DRAWN_PATHS = ("B", "C", "E")
 """The short paths, on which the freshly drawn plants are judged."""
 
 MODELS = (
-    *("naive + offset", "ridge", "ridge + offset", "hybrid", "hybrid + offset"),
-    *("mixed", "mixed, unknown plant", "mixed, calibrated", "mixed, online"),
+    *("naive + offset", "ridge, open loop", "ridge + offset", "hybrid's base", "hybrid", "hybrid + offset"),
+    *("mixed, unknown plant", "mixed, calibrated", "mixed, online"),
 )
-Scores = dict[str, tuple[float, float]]
-"""Ratio and coverage of each model."""
+VARIANTS = (
+    ("10 s", 10.0, 0.03, 2.0, 0.03),
+    ("20 s", 20.0, 0.03, 2.0, 0.03),
+    ("30 s", 30.0, 0.03, 2.0, 0.03),
+    ("60 s, exact poses", 60.0, 0.0, 2.0, 0.0),
+    ("60 s, 3 cm", 60.0, 0.03, 2.0, 0.03),
+    ("60 s, 3 cm, white", 60.0, 0.03, 0.0, 0.03),
+    ("60 s, 10 cm", 60.0, 0.1, 2.0, 0.1),
+    ("60 s, 10 cm, not told", 60.0, 0.1, 2.0, 0.0),
+)
+"""Drives: name, length [s], error of positions [m], its correlation time [s], the stated `pose_sd_m` [m]."""
+Judged = dict[str, tuple[float, float]]
+"""Error or ratio, and coverage, of each model."""
 
 
 def world(twin: Twin, plant: str, session: int, seed: int) -> Twin:
@@ -98,27 +109,27 @@ def judged_run(twin: Twin, plant: str, session: int, case: str) -> Run:
     return mt.simulate(world(twin, plant, session, 777), np.vstack(points), seed=seed, rate_hz=RATE_HZ)
 
 
-def with_pose_error(run: Run, seed: int) -> Run:
-    """The run with errors of its poses, an Ornstein-Uhlenbeck process on each axis."""
-    rng = np.random.default_rng(seed)
-    a = math.exp(-1 / (RATE_HZ * POSE_S))
+def with_pose_error(run: Run, sd_m: float = POSE_SD_M, time_s: float = POSE_S) -> Run:
+    """The run with errors of its poses, an Ornstein-Uhlenbeck process on each axis; white if `time_s` is 0."""
+    rng = np.random.default_rng(int(run.metadata["seed"]))
+    a = math.exp(-1 / (RATE_HZ * time_s)) if time_s else 0.0
     error = rng.standard_normal((run.rows, 2))
     for k in range(1, run.rows):
         error[k] = a * error[k - 1] + math.sqrt(1 - a * a) * error[k]
-    return run.with_columns(mocap_p=run["mocap_p"] + POSE_SD_M * np.column_stack([error, np.zeros(run.rows)]))
+    return run.with_columns(mocap_p=run["mocap_p"] + sd_m * np.column_stack([error, np.zeros(run.rows)]))
 
 
 def judge(
     run: Run, mixed: Mixed, hybrid: NeuralMagnetometer, maps: tuple[AnomalyMap, AnomalyMap], naive_nt: float
-) -> dict[str, tuple[float, float]]:
+) -> Judged:
     """MAE [nT] and coverage of every model on the path, and of the naive model."""
     trilinear, harmonic = maps
-    rough = with_pose_error(run, int(run.metadata["seed"]))
+    rough = with_pose_error(run)
     early, late = run["t"] < DRIVE_S, run["t"] > DRIVE_S + 5
     exact = labelled(run, harmonic, alignment_of(mixed.metadata))
     label, noisy = exact["label_nt"], labelled(rough, harmonic, alignment_of(mixed.metadata))["label_nt"]
     late &= np.isfinite(label)
-    plain, plain_noisy = labels(run, trilinear).value_nt, labels(rough, trilinear).value_nt
+    plain, plain_noisy = labelled(run, trilinear)["label_nt"], labelled(rough, trilinear)["label_nt"]
     scores = {}
 
     def score(name: str, error: np.ndarray, sd: np.ndarray | None = None) -> None:
@@ -130,19 +141,21 @@ def judge(
     score("naive + offset", np.nanmean(plain_noisy[early]) - plain)
     own = labelled(run, harmonic, alignment_of(hybrid.net.metadata))
     own_noisy = labelled(rough, harmonic, alignment_of(hybrid.net.metadata))["label_nt"]
+    base = NeuralMagnetometer(hybrid.net.base)
     for name, net, truth, given in (
-        ("ridge", NeuralMagnetometer(mixed), exact, noisy),
+        ("ridge, open loop", NeuralMagnetometer(mixed), exact, noisy),
+        ("hybrid's base", base, own, own_noisy),
         ("hybrid", hybrid, own, own_noisy),
     ):
         read = net.read([truth], outside=False)[0]
         error = read.disturbance_nt - truth["label_nt"]
         score(name, error, read.sd_nt)
-        score(f"{name} + offset", error - np.nanmean((read.disturbance_nt - given)[early]))
+        offset = np.nanmean((read.disturbance_nt - given)[early])
+        score(f"{name.removesuffix(', open loop')} + offset", error - offset)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         drive = mt.calibrate(mixed, rough, anomaly_map=harmonic, duration_s=DRIVE_S, pose_sd_m=POSE_SD_M)
     for name, model in (
-        ("mixed", mixed),
         ("mixed, unknown plant", mixed.open_loop(unknown_plant=True)),
         ("mixed, calibrated", drive),
     ):
@@ -153,25 +166,54 @@ def judge(
     return scores
 
 
-def table(scores: Iterator[tuple[str, dict[str, tuple[float, float]]]]) -> Scores:
+def drives(run: Run, mixed: Mixed, maps: tuple[AnomalyMap, AnomalyMap], naive_nt: float) -> Judged:
+    """MAE [nT] and coverage after drives of several lengths and poses, and of the naive model."""
+    trilinear, harmonic = maps
+    exact = labelled(run, harmonic, alignment_of(mixed.metadata))
+    late = (run["t"] > DRIVE_S + 5) & np.isfinite(exact["label_nt"])
+    scores = {
+        "naive": (float(np.nanmean(np.abs(naive_nt - labelled(run, trilinear)["label_nt"])[late])), math.nan)
+    }
+    for name, seconds, error_m, time_s, told_m in VARIANTS:
+        rough = with_pose_error(run, error_m, time_s)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CalibrationWarning)
+            model = mt.calibrate(mixed, rough, anomaly_map=harmonic, duration_s=seconds, pose_sd_m=told_m)
+        read = NeuralMagnetometer(model).read([exact], outside=False)[0]
+        error = np.abs(read.disturbance_nt - exact["label_nt"])[late]
+        scores[name] = float(np.mean(error)), float(np.mean(error < Z_90 * read.sd_nt[late]))
+    return scores
+
+
+def means(scores: Iterator[tuple[str, Judged]]) -> Judged:
     """Ratios and coverages, each path with the same weight."""
     by_path: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
     for path, models in scores:
         for name, values in models.items():
             by_path[path][name].append(values)
-    means = {p: {n: np.mean(v, axis=0) for n, v in models.items()} for p, models in by_path.items()}
+    paths = [{name: np.mean(values, axis=0) for name, values in of.items()} for of in by_path.values()]
     return {
         name: (
-            float(np.mean([models[name][0] / models["naive"][0] for models in means.values()])),
-            float(np.mean([models[name][1] for models in means.values()])),
+            float(np.mean([models[name][0] / models["naive"][0] for models in paths])),
+            float(np.mean([models[name][1] for models in paths])),
         )
-        for name in MODELS
+        for name in paths[0]
+        if name != "naive"
     }
 
 
-def show(title: str, scores: Scores) -> None:
-    cells = (f"{name} {ratio:.3f}/{held:.2f}" for name, (ratio, held) in scores.items())
-    print(f"{title:24s} {'  '.join(cells)}".replace("/nan", ""), flush=True)
+def print_table(title: str, rows: dict[str, Judged], names: Sequence[str]) -> None:
+    """Models by row and plants by column, in Markdown."""
+    print(f"| {title} | {' | '.join(rows)} |\n|---|{'---|' * len(rows)}")
+    for name in names:
+        cells = []
+        for scores in rows.values():
+            ratio, held = scores[name]
+            cells.append(
+                f"{ratio:.3f}".removeprefix("0") + ("" if math.isnan(held) else f" / {100 * held:.0f} %")
+            )
+        print(f"| {name} | {' | '.join(cells)} |")
+    print(flush=True)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -179,9 +221,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--sessions", type=int, default=4, help="judged sessions of each plant")
     parser.add_argument("--draws", type=int, default=12, help="freshly drawn plants of each family")
     parser.add_argument("--plants", nargs="+", choices=JUDGED, default=JUDGED)
-    parser.add_argument("--out", type=Path, help="folder of data sets and weights")
+    parser.add_argument("--out", type=Path, help="folder of data set and weights")
     given = parser.parse_args(argv)
-    begun = time.perf_counter()
     twin = mt.open_twin(shipped("scenes", "lab", "lab.usda"), magnetometer="physical")
     harmonic = mt.load_map(shipped("maps", "lab", "lab.usdc"))
     with contextlib.ExitStack() as stack:
@@ -190,28 +231,39 @@ def main(argv: Sequence[str] | None = None) -> None:
         maps = trilinear_map(twin, out), harmonic
         data, naive_nt = training_set(twin, out, maps)
         hybrid = NeuralMagnetometer.load(shipped("weights", "turtlebot4_hybrid.safetensors"))
+        first, median, worst, driven = {}, {}, {}, {}
         for family in given.plants:
-            left = [r.session for r in data.recordings if r.plant.startswith(f"{family}:")]
+            left = tuple(r.session for r in data.recordings if r.plant.startswith(f"{family}:"))
             weights = out / f"without_{family}.safetensors"
-            model = mt.train(data, out=weights, model="mixed", hold_out=tuple(left), force=True).predictor
-            assert isinstance(model, Mixed)
+            model = mt.train(data, out=weights, model="mixed", hold_out=left, force=True).predictor
+
+            def runs(plant: str, cases: Sequence[str], count: int) -> Iterator[tuple[str, Run]]:
+                return ((c, judged_run(twin, plant, k, c)) for k in range(count) for c in cases)
+
             plant = "nominal" if family == "nominal" else f"{family}:0"
-
-            def scored(plant: str, cases: Sequence[str], sessions: int, model: Mixed = model) -> Scores:
-                return table(
-                    (case, judge(judged_run(twin, plant, k, case), model, hybrid, maps, naive_nt))
-                    for k in range(sessions)
-                    for case in cases
+            every = list(runs(plant, tuple(PATHS), given.sessions))
+            first[family] = means((c, judge(run, model, hybrid, maps, naive_nt)) for c, run in every)
+            short = [(c, run) for c, run in every if c in DRAWN_PATHS]
+            driven[family] = means((c, drives(run, model, maps, naive_nt)) for c, run in short)
+            if family == "nominal" or not given.draws:
+                continue
+            draws = [
+                means(
+                    (c, judge(run, model, hybrid, maps, naive_nt))
+                    for c, run in runs(f"{family}:{k}", DRAWN_PATHS, 1)
                 )
-
-            show(family, scored(plant, tuple(PATHS), given.sessions))
-            if family != "nominal" and given.draws:
-                draws = [scored(f"{family}:{k}", DRAWN_PATHS, 1) for k in range(1, given.draws + 1)]
-                every = {name: np.array([draw[name] for draw in draws]) for name in MODELS}
-                show("  median of draws", {n: tuple(np.median(v, axis=0)) for n, v in every.items()})
-                worst = {n: (float(v[:, 0].max()), float(v[:, 1].min())) for n, v in every.items()}
-                show("  worst of draws", worst)
-    print(f"{(time.perf_counter() - begun) / 60:.1f} min")
+                for k in range(1, given.draws + 1)
+            ]
+            arrays = {name: np.array([draw[name] for draw in draws]) for name in MODELS}
+            median[family] = {
+                n: (float(np.median(v[:, 0])), float(np.median(v[:, 1]))) for n, v in arrays.items()
+            }
+            worst[family] = {n: (float(v[:, 0].max()), float(v[:, 1].min())) for n, v in arrays.items()}
+        print_table("one plant of each family, paths A to E", first, MODELS)
+        if median:
+            for name, table in (("median", median), ("worst", worst)):
+                print_table(f"{name} of {given.draws} other plants, paths B, C, E", table, MODELS)
+        print_table("calibrated by other drives, paths B, C, E", driven, [name for name, *_ in VARIANTS])
 
 
 def trilinear_map(twin: Twin, out: Path) -> AnomalyMap:
@@ -234,7 +286,7 @@ def training_set(
     runs = training_runs(twin)
     nominal = [run for name, run in runs.items() if name.startswith("nominal")]
     alignment: Alignment = fit_alignment(nominal, maps[1])
-    naive_nt = np.nanmean(np.concatenate([labels(run, maps[0]).value_nt for run in nominal]))
+    naive_nt = np.nanmean(np.concatenate([labelled(run, maps[0])["label_nt"] for run in nominal]))
     data = mt.build_dataset(runs, out=out / "set", anomaly_map=maps[1], alignment=alignment, force=True)
     return data, float(naive_nt)
 
