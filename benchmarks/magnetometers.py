@@ -110,7 +110,7 @@ def judged_run(twin: Twin, plant: str, session: int, case: str) -> Run:
 
 
 def with_pose_error(run: Run, sd_m: float = POSE_SD_M, time_s: float = POSE_S) -> Run:
-    """The run with errors of its poses, an Ornstein-Uhlenbeck process on each axis; white if `time_s` is 0."""
+    """The run with errors of its poses on each axis: an Ornstein-Uhlenbeck process, or white noise."""
     rng = np.random.default_rng(int(run.metadata["seed"]))
     a = math.exp(-1 / (RATE_HZ * time_s)) if time_s else 0.0
     error = rng.standard_normal((run.rows, 2))
