@@ -92,6 +92,13 @@ class Mixed(Regressor):
     kind = "mixed"
 
     @property
+    def judged_on(self) -> str:
+        """What `residual_sd_nt` was measured on."""
+        return (
+            "blocks of its drive that were left out" if self.intervals == "calibrated" else super().judged_on
+        )
+
+    @property
     def layers_text(self) -> str:
         """Number of terms and what they hold for."""
         calibrated = ", calibrated" if self.intervals == "calibrated" else ""
@@ -156,7 +163,8 @@ class Mixed(Regressor):
         """
         variance = self.noise_nt2(phi) + extra_nt2
         drive = effects_of_drive(self.prior, phi, y, variance, t)
-        kept = {name: value for name, value in self.metadata.items() if not name.startswith("residual_")}
+        of_parent = ("residual_", "validation_", "test_")  # errors before the drive
+        kept = {name: value for name, value in self.metadata.items() if not name.startswith(of_parent)}
         return replace(
             self,
             session=drive.effects,
@@ -204,8 +212,8 @@ class Mixed(Regressor):
         figures = [
             Figure("intervals", self.intervals, note=about[self.intervals]),
             Figure("constant", float(self.prior.mean[0]), "nT", between, "at the means; between sessions"),
-            Figure("sd within a session", math.sqrt(self.noise.floor_nt2), "nT", note="at the means"),
-            Figure("sd, nominal plant", math.sqrt(self.spread.floor_nt2), "nT", note="at the means"),
+            Figure("sd within a session", self.noise.mean_nt, "nT", note="of training rows"),
+            Figure("sd, nominal plant", self.spread.mean_nt, "nT", note="of training rows"),
             *(Figure(f"interval factor, {name}", self.factors[name]) for name in FACTORS),
             Figure("ridge penalty", self.penalty),
         ]
