@@ -35,7 +35,7 @@ from magtwin.learn.data.alignment import Alignment, alignment_of, fit_alignment
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.inference.online import read_online
-from magtwin.learn.models.mixed import Mixed
+from magtwin.learn.mixed.mixed import Mixed
 from magtwin.path import loops, path_named
 from magtwin.run.run import Run
 from magtwin.twin import Twin, in_session, with_plant

@@ -38,7 +38,7 @@ from magtwin.learn.evaluation.evaluation import Evaluation
 from magtwin.learn.evaluation.trials import check_apart, trials_of, unlearned, unseen
 from magtwin.learn.inference.calibrate import calibrate as calibrate_model
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
-from magtwin.learn.models.mixed import Mixed
+from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.predictor import Predictor, load_predictor
 from magtwin.run.run import Run
 from magtwin.spec.scene import Scene

@@ -16,9 +16,9 @@ from magtwin.learn.data.features import columns_of, features
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.origin import same_map
 from magtwin.learn.data.recording import Source, read
-from magtwin.learn.models.mixed import Mixed
+from magtwin.learn.mixed.mixed import Mixed
+from magtwin.learn.mixed.session_effects import RATE_HZ, thinned_rows
 from magtwin.learn.models.predictor import Predictor
-from magtwin.learn.models.session_effects import RATE_HZ, thinned_rows
 from magtwin.learn.models.weights import MetadataValue
 from magtwin.run.run import Run
 

@@ -8,9 +8,9 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.inference.calibrate import labelled_drive, mixed_of_kind
 from magtwin.learn.inference.magnetometer import Read
 from magtwin.learn.inference.reader import Reader, Reading, Signals
-from magtwin.learn.models.mixed import DELAY_S, Mixed, followed
+from magtwin.learn.mixed.mixed import Mixed
+from magtwin.learn.mixed.session_effects import DELAY_S, MEMORY_S, FollowedEffects, followed
 from magtwin.learn.models.predictor import Predictor
-from magtwin.learn.models.session_effects import MEMORY_S, FollowedEffects
 from magtwin.run.run import Run
 
 

@@ -17,10 +17,10 @@ from magtwin.errors import InputError
 from magtwin.files import check_free, existing, output, sha256
 from magtwin.learn.data.features import FEATURES
 from magtwin.learn.data.inputs import Inputs
+from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.calibration import Spread
 from magtwin.learn.models.hybrid import Hybrid
 from magtwin.learn.models.linear import Linear
-from magtwin.learn.models.mixed import Mixed
 from magtwin.learn.models.network import FieldNet
 from magtwin.learn.models.predictor import Predictor, load_predictor
 from magtwin.report import Figure, Report

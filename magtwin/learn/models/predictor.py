@@ -200,7 +200,7 @@ PREDICTORS: Registry[PredictorKind] = Registry(
         "mlp": "magtwin.learn.models.kinds:Perceptrons",
         "linear": "magtwin.learn.models.kinds:Linears",
         "hybrid": "magtwin.learn.models.kinds:Hybrids",
-        "mixed": "magtwin.learn.models.mixed:Mixeds",
+        "mixed": "magtwin.learn.mixed.fit_mixed:Mixeds",
     },
 )
 """Kinds of predictors by name."""

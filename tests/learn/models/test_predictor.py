@@ -16,11 +16,11 @@ from magtwin.errors import InputError
 from magtwin.learn.data.features import SETS, features
 from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
+from magtwin.learn.mixed.effects import Effects
+from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.calibration import Spread
-from magtwin.learn.models.effects import Effects
 from magtwin.learn.models.hybrid import Hybrid
 from magtwin.learn.models.linear import Linear
-from magtwin.learn.models.mixed import Mixed
 from magtwin.learn.models.network import load_net
 from magtwin.learn.models.predictor import PREDICTORS, load_predictor
 from magtwin.learn.models.weights import write_weights

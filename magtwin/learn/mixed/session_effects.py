@@ -1,13 +1,14 @@
 """The effects of one session: from a labelled drive at its start, or followed while it lasts."""
 
+import itertools
 import math
 from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
+from magtwin.learn.mixed.effects import Array, Effects, posterior, sums_of
 from magtwin.learn.models.calibration import quantile_factor
-from magtwin.learn.models.effects import Array, Effects, posterior, sums_of
 
 CORRELATION_S = 2.5
 """Time over which errors are correlated [s]: a reading counts for its share of it, at 4 Hz for a tenth."""
@@ -20,6 +21,9 @@ BLOCK_S = 10.0
 
 MEMORY_S = 600.0
 """Time over which followed effects return to their prior mean [s]."""
+
+DELAY_S = 10.0
+"""Age of the newest pose when a prediction is made online [s]."""
 
 LEAST_WIDENING, MOST_WIDENING = 0.7, 4.0
 """Least and largest factor by which a session's own errors change its intervals."""
@@ -113,7 +117,7 @@ class FollowedEffects:
         *,
         start: Effects | None = None,
         memory_s: float = MEMORY_S,
-        delay_s: float = 10.0,
+        delay_s: float = DELAY_S,
     ) -> None:
         """Begin at the prior.
 
@@ -196,3 +200,38 @@ class FollowedEffects:
     def _aged(self, a: float) -> Effects:
         mean = self.prior.mean + a * (self.mean - self.prior.mean)
         return Effects(mean, a * a * self.covariance + (1 - a * a) * self.prior.covariance)
+
+
+def followed(
+    effects: FollowedEffects,
+    phi: Array,
+    y: Array,
+    variance_nt2: Array,
+    t: Array,
+    *,
+    predicted_nt2: Array | None = None,
+) -> tuple[Array, Array]:
+    """Predictions of the rows of a drive whose poses become known `effects.delay_s` later.
+
+    Args:
+        effects: Filter to update.
+        phi: Regressors, shape (N, P).
+        y: Labels [nT], shape (N,); nan if unknown.
+        variance_nt2: Variance of the error of each label [nT^2], shape (N,).
+        t: Times [s], ascending, shape (N,).
+        predicted_nt2: Variance of the errors to predict. Default: `variance_nt2`.
+
+    Returns:
+        Disturbances and their standard deviations [nT], with the filter's widening, each (N,).
+    """
+    noise = variance_nt2 if predicted_nt2 is None else predicted_nt2
+    mean, sd, ready = np.empty(len(t)), np.empty(len(t)), 0
+    known = np.searchsorted(t, t - effects.delay_s, side="right")
+    starts = np.flatnonzero(np.diff(known, prepend=-1)).tolist()
+    for start, stop in itertools.pairwise([*starts, len(t)]):
+        for k in range(ready, known[start]):
+            effects.update(float(t[k]), phi[k], float(y[k]), float(variance_nt2[k]))
+        ready = int(known[start])
+        mean[start:stop], variance = effects.effects(float(t[start])).predict(phi[start:stop])
+        sd[start:stop] = effects.widening * np.sqrt(noise[start:stop] + variance)
+    return mean, sd

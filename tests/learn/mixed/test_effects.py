@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from magtwin.learn.models.effects import Effects, fit_effects, posterior, sums_of
-from magtwin.learn.models.session_effects import (
+from magtwin.learn.mixed.effects import Effects, fit_effects, posterior, sums_of
+from magtwin.learn.mixed.session_effects import (
     CORRELATION_S,
     MEMORY_S,
     FollowedEffects,
