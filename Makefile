@@ -77,7 +77,7 @@ assets: $(VENV)/.dev  ## Build robots/, maps/, weights/ and scenes/ anew
 	$(BIN)/python robots/turtlebot4/build.py
 	$(BIN)/python maps/lab/build.py
 	$(BIN)/python scenes/build.py  # names the new map; its network is the old one until the last line
-	rm -rf build/protocol && $(BIN)/python weights/protocol.py --out build/protocol --ship
+	rm -rf build/paper/lab && $(BIN)/python weights/protocol.py --out build/paper/lab --ship
 	$(BIN)/python scenes/build.py
 
 pictures: $(VENV)/.installed  ## Draw the README's pictures again

@@ -155,17 +155,17 @@ def evaluate(
 
     Args:
         models: Weights files, predictors or candidates.
-        recordings: A data set or its folder, a mapping of runs by name, or files of runs. Of a data set,
-            only the recordings that no model was trained on are used.
-        anomaly_map: Maps that the models were trained on, each found by its checksum. The baseline
-            uses the first map. So do weights that do not name the map that they were trained on.
+        recordings: A data set or its folder, a mapping of runs by name, or files of runs. If it is a data
+            set, only those recordings are used that were not in the training data of any model.
+        anomaly_map: Maps that the models were trained on. The map of each model is identified by its
+            checksum. The first map is used for the baseline, and for weights that name no map.
         baseline: The model that others are compared with: the mean training label, Tolles and Lawson's ridge
             regression, or a candidate.
         train: Data set that baselines are fitted to. If given, the Tolles-Lawson regression is also
             evaluated on each map. Without it, the mean label is taken from weights that were trained on the
             first map.
-        cases: Rows of the table to add to the paper's A to E, or to replace there: name of the row and path,
-            such as {"D": "lawnmower.csv"}.
+        cases: Further rows of the table: path by name of the row. A name from A to E replaces that row of the
+            paper, as in {"D": "lawnmower.csv"}.
         any_map: Use the first map for weights whose own map is not among those given.
         truth: Compare with the exact field of simulated runs instead of the reading.
         seed: Seed of the random resampling that gives the confidence intervals.

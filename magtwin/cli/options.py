@@ -65,16 +65,17 @@ Plant = Annotated[
     str | None,
     Parameter(
         name="--plant",
-        help="Field of the robot beyond its linear platform model: hysteresis, warm-up, nonlinear, "
-        "moving-part, drawn, all or nominal; NAME:SEED draws other constants. Default: the scene's.",
+        help="Effects in the robot's field that its linear platform model lacks: hysteresis, warm-up, "
+        "nonlinear, moving-part, drawn (sessions differ more), all, or nominal (none). NAME:SEED draws other "
+        "constants. Default: the scene's.",
     ),
 ]
 Network = Annotated[
     Path | None,
     Parameter(
         name="--network",
-        help="Network of the magnetometer (.safetensors, .pth). The word none selects a physical one. "
-        "Default: the scene's.",
+        help="Network of the magnetometer (.safetensors, .pth). none: no network, but a physical "
+        "magnetometer. Default: the scene's.",
     ),
 ]
 Magnetometer = Annotated[
@@ -94,8 +95,8 @@ ModelError = Annotated[
 TrackingError = Annotated[
     bool,
     Parameter(
-        help="Give path followers poses with the latency and errors of a localization, so that they stay "
-        "within some centimetres of the path. With --no-tracking-error they get exact poses."
+        help="The path follower gets poses with the latency and errors of a real localization, so the robot "
+        "deviates from the path by some centimetres. With --no-tracking-error it gets exact poses."
     ),
 ]
 Lidar = Annotated[

@@ -119,8 +119,9 @@ def export_scene(
         progress: Function that is called with the name of each step.
 
     Raises:
-        InputError: The stage cannot be opened, names missing files, differs from its checksums, or is not in
-            metres with Z up; or `out` exists, or cannot hold the stage. Nothing is written.
+        InputError: The stage cannot be opened, refers to files that do not exist, does not match its
+            checksums, or is not in metres with Z up; or `out` exists, or cannot hold the stage. Nothing is
+            written.
     """
     scene_file, out = Path(scene_file), Path(out)
     if (kind := KINDS.get(out.suffix)) is None:

@@ -70,13 +70,12 @@ def simulate(
             a `Path`; "random" for a random drive; `Commands` to play back; or a `Run` to drive again as
             recorded, with the scene's sensors.
         seed: Seed of all noise. The same seed gives byte-identical output.
-        session: Session of the robot; see the function `in_session`. Default: one drawn from the seed.
-            "survey" is the robot as it was during the survey of the map; a network trained on later sessions
-            is not
-            valid for it.
-        plant: What the robot's field has beyond the linear platform model, which no network learned:
-            "hysteresis", "warm-up", "nonlinear", "moving-part", "drawn", "all" or "nominal"; "NAME:SEED" for
-            other constants of that family; or a `PlantSpec`. Default: the scene's. See `draw_plant`.
+        session: Session of the robot; see the function `in_session`. Default: session 0 of the seed.
+            "survey" is the robot as it was during the survey of the map; a network trained on later
+            sessions is not valid for it.
+        plant: Effects in the robot's field that the linear platform model lacks and no network was trained
+            on: "hysteresis", "warm-up", "nonlinear", "moving-part", "drawn", "all" or "nominal" (none);
+            "NAME:SEED" for other constants; or a `PlantSpec`. Default: the scene's. See `draw_plant`.
         speed: Forward speed on straight parts [m/s].
         duration_s: Duration [s]. Default: once along the path. A longer duration drives further laps.
         rate_hz: Magnetometer readings per second [Hz]. Default: the scene's.
