@@ -27,7 +27,7 @@ BENCHMARKS = {"plants": "benchmarks/plants.py", "magnetometers": "benchmarks/mag
 
 ROWS = {
     "turtlebot4_paper": "the paper's network, trilinear map",
-    "released": "the network that APRILab released, not trained on this twin",
+    "nn_magnetometer_model_v0.0.1": "the network that APRILab released, not trained on this twin",
     "Tolles-Lawson, trilinear": "Tolles-Lawson ridge, trilinear map",
     "Tolles-Lawson, {harmonic} aligned": "Tolles-Lawson ridge, harmonic map, fitted lever arm and latency",
     "turtlebot4_hybrid": "the hybrid of magtwin, on the same map",
