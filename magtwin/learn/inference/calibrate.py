@@ -1,5 +1,6 @@
 """Calibrate a mixed model by a short labelled drive at the start of a session."""
 
+import datetime
 import math
 import warnings
 from collections.abc import Mapping
@@ -15,7 +16,7 @@ from magtwin.learn.data.alignment import alignment_of
 from magtwin.learn.data.features import columns_of, features
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.origin import same_map
-from magtwin.learn.data.recording import Source, read
+from magtwin.learn.data.recording import Source, read, session_name
 from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.mixed.session_effects import RATE_HZ, thinned_rows
 from magtwin.learn.models.predictor import Predictor
@@ -154,6 +155,8 @@ def calibrate(
         **calibrated.metadata,
         **(parent or {}),
         "calibration_drive": name,
+        "calibration_session": session_name(run.metadata),
+        "calibration_date": _date(run),
         "calibration_start_s": float(drive.t[0]),
         "calibration_duration_s": float(drive.t[-1] - drive.t[0]),
         "calibration_readings": len(drive.t),
@@ -163,10 +166,17 @@ def calibrate(
         "calibration_residual_nt": calibrated.residual_sd_nt,
         "calibration_warnings": "; ".join(cautions),
     }
-    for key, source in (("calibration_session", "session"), ("calibration_date", "date")):
-        metadata[key] = str(run.metadata.get(source, ""))
-    calibrated.metadata = {key: value for key, value in metadata.items() if value not in ("", math.nan)}
+    known = {key: value for key, value in metadata.items() if value != "" and value == value}  # not nan
+    calibrated.metadata = known
     return calibrated
+
+
+def _date(run: Run) -> str:
+    """Date of a recorded bag, or that in the metadata; "" if neither is known."""
+    start = str(run.metadata.get("start_ns", ""))
+    if start.isdigit():
+        return datetime.datetime.fromtimestamp(int(start) // 10**9, datetime.UTC).date().isoformat()
+    return str(run.metadata.get("date", ""))
 
 
 def mixed_of_kind(model: Predictor) -> Mixed:

@@ -122,7 +122,7 @@ def test_a_calibrated_file_records_its_drive_and_its_parent(weights, tmp_path):
     again = load_predictor(out)
     assert again.metadata == calibrated.metadata
     kept = again.metadata
-    assert (kept["calibration_drive"], kept["calibration_session"]) == ("drive.parquet", "7")
+    assert (kept["calibration_drive"], kept["calibration_session"]) == ("drive.parquet", "7-hysteresis")
     assert kept["parent_sha256"] == sha256(weights)
     assert kept["calibration_duration_s"] == pytest.approx(59.8, abs=0.3)
     assert kept["calibration_residual_nt"] < 25 < kept["calibration_residual_before_nt"]
@@ -133,6 +133,16 @@ def test_a_calibrated_file_records_its_drive_and_its_parent(weights, tmp_path):
     assert_array_equal(
         again.open_loop().predict(np.zeros((1, 3))), load_predictor(weights).predict(np.zeros((1, 3)))
     )
+
+
+def test_the_date_of_a_bag_is_recorded_and_the_error_of_a_single_block_is_unknown(model, tmp_path):
+    run = a_run(3, seconds=14.0)
+    bag = Run(dict(run), {"start_ns": str(1_790_000_000 * 10**9)})
+    with pytest.warns(CalibrationWarning):
+        calibrated = mt.calibrate(model, bag, anomaly_map=FIELD, out=tmp_path / "a.safetensors")
+    assert calibrated.metadata["calibration_date"] == "2026-09-21"
+    assert "calibration_residual_nt" not in calibrated.metadata
+    assert np.isnan(load_predictor(tmp_path / "a.safetensors").residual_sd_nt)
 
 
 def test_a_poor_drive_is_warned_of(model):
