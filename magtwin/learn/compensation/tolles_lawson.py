@@ -85,7 +85,7 @@ PRESETS: Mapping[str, Convention] = MappingProxyType(
         "magnav": Convention(50_000.0, True, True, 2, 24, 20, True, False),
     }
 )
-"""Named conventions. "magnav" is that of `create_TL_A` and `create_TL_coef` of MagNav.jl (Gnadt et al. 2022)."""
+"""Named conventions. "magnav" follows `create_TL_A` and `create_TL_coef` of MagNav.jl (Gnadt et al. 2022)."""
 
 RIDGES = np.logspace(-12, 3, 31)
 """Ridge penalties of the cross-validation, relative to the mean square of the standardised columns."""

@@ -22,6 +22,7 @@ BLOCK_S = 5.0  # Length of blocks of readings with correlated errors [s]
 TILES = 4  # Number of tiles along each side of the driven area; errors of the map and platform stay in place
 DEGREE = 2  # Degree of the fields of the platform that vary over the driven area
 LATENCIES_S = np.arange(-0.4, 0.41, 0.02)  # Latencies that are tried before the best are refined [s]
+END_S = 0.5  # Time at each end of a run that a latency is not fitted to [s]; no pose may lie beyond
 LEAST_ROWS = 200  # Least number of labelled readings for a fit
 LEVER_ARM_PRIOR_M = 0.05  # Prior standard deviation of each axis of the lever arm [m]
 LATENCY_PRIOR_S = 0.1  # Prior standard deviation of the latency [s]
@@ -144,10 +145,10 @@ def fit_alignment(
     platform's terms are the same whenever the robot comes to a place. They come from the jackknife over
     J = `TILES`^2 tiles of the driven area (Efron and Stein 1981), each with all of its recordings,
 
-        V_J = (J - 1) / J sum over j of (b_-j - b) (b_-j - b)^T,  cov = G V_J G^T + (I - G) P (I - G)^T,
+        V_J = (J - 1) / J sum over j of (b_-j - b) (b_-j - b)^T,  cov = V_J + (I - G) P (I - G)^T,
 
-    with b_-j the least squares without tile j. V_J is at least V, and is scaled so that a normal interval of
-    90 % is as wide as that of Student's t with J - 1 degrees of freedom.
+    with b the estimate and b_-j that without tile j. V_J is at least G V G^T, and is scaled so that a normal
+    interval of 90 % is as wide as that of Student's t with J - 1 degrees of freedom.
 
     Args:
         runs: Runs of one robot that turns and drives at several speeds, as for `magtwin.learn.data.labels`.
@@ -243,7 +244,7 @@ class _Fit:
 
     def __init__(self, runs: Sequence[Run], field: AnomalyMap, free: NDArray[np.bool_], prior: Array) -> None:
         self.field, self.free, self.prior = field, free, prior
-        self.alike = 1.0
+        self.alike, self.readings = 1.0, 0
         self.runs = []
         self.corners = np.full((2, 2), np.nan)
         for run in runs:
@@ -254,7 +255,11 @@ class _Fit:
                 self.corners[1] = np.fmax(self.corners[1], p.max(axis=0))
             step = float(np.median(np.diff(run["t"]))) if run.rows > 1 else 1.0
             every = max(1, round(1 / (step * FIT_RATE_HZ)))
-            self.runs.append((run, np.arange(0, run.rows, every), usable(run)))
+            rows = np.arange(0, run.rows, every)
+            if free[2]:  # the same readings whatever the latency; else the cost favours those with fewer
+                t = run["t"]
+                rows = rows[(t[rows] >= t[0] + END_S) & (t[rows] <= t[-1] - END_S)]
+            self.runs.append((run, rows, usable(run)))
 
     def at(self, place: Array, jackknife: bool = False) -> _Linearised:
         """The least squares around a place; the covariance is that of blocks, or of the jackknife."""
@@ -289,13 +294,18 @@ class _Fit:
         count = len(self.prior)
         left = _residual(x[:, count:], np.column_stack([x[:, :count], y]))
         tile = np.unique(np.concatenate(parts_tile), return_inverse=True)[1]
-        spread = _jackknife(x, y, tile, count) if jackknife else None
+        spread = (lambda noise: _jackknife(x, y, tile, noise / self.prior)) if jackknife else None
         return self._solved(place, left[:, :-1], left[:, -1], block, spread)
 
     def _solved(
-        self, place: Array, x: Array, y: Array, block: NDArray[np.intp], spread: Array | None
+        self,
+        place: Array,
+        x: Array,
+        y: Array,
+        block: NDArray[np.intp],
+        spread: Callable[[float], Array] | None,
     ) -> _Linearised:
-        rows, at = len(y), place[self.free]
+        at = place[self.free]
         scale = np.sqrt(np.mean(x**2, axis=0))
         scale[scale == 0] = 1.0  # on a constant map all places are alike
         x = x / scale
@@ -325,22 +335,32 @@ class _Fit:
             covariance = prior - gain(blocked) @ prior
         else:
             seen = np.eye(len(prior)) - blind @ blind.T
-            spread = _at_least(seen @ (spread * np.outer(scale, scale)) @ seen, blocked)
+            known = shrunk @ (seen @ (blocked / np.outer(scale, scale)) @ seen) @ shrunk.T
             missed = np.eye(len(prior)) - shrunk
-            covariance = shrunk @ (spread / np.outer(scale, scale)) @ shrunk.T + missed @ prior @ missed.T
+            covariance = _at_least(spread(self.alike * promised), known) + missed @ prior @ missed.T
         left = max(float(np.mean(y**2)), 1e-12)
-        cost = rows / self.alike * np.log(left) + float(np.sum(at**2 / self.prior))
+        self.readings = self.readings or len(y)
+        cost = self.readings / self.alike * np.log(left) + float(np.sum(at**2 / self.prior))
         return _Linearised(place, wanted, (covariance + covariance.T) / 2, cost, promised, max(alike, 1.0))
 
 
-def _jackknife(x: Array, y: Array, group: NDArray[np.intp], count: int) -> Array:
-    """Covariance (count, count) of the first coefficients of least squares, by leaving out groups of rows.
+def _jackknife(x: Array, y: Array, group: NDArray[np.intp], penalty: Array) -> Array:
+    """Covariance of the first coefficients of a ridge regression, by leaving out groups of rows.
 
     It is scaled so that normal intervals of 90 % are as wide as those of Student's t; 0 for one group.
+
+    Args:
+        x: Regressors, shape (N, K).
+        y: Values, shape (N,).
+        group: Number of the group of each row, 0 to G - 1, shape (N,).
+        penalty: Penalties of the squares of the first coefficients, shape (M,).
+
+    Returns:
+        Covariance, shape (M, M).
     """
     from scipy.special import ndtri, stdtrit  # slow import
 
-    groups = int(group.max()) + 1
+    groups, count = int(group.max()) + 1, len(penalty)
     if groups < 2:
         return np.zeros((count, count))
     scale = np.sqrt(np.mean(x**2, axis=0))
@@ -349,14 +369,15 @@ def _jackknife(x: Array, y: Array, group: NDArray[np.intp], count: int) -> Array
     rows = [group == k for k in range(groups)]
     normals, alongs = [x[r].T @ x[r] for r in rows], [x[r].T @ y[r] for r in rows]
     normal, along = np.sum(normals, axis=0), np.sum(alongs, axis=0)
+    normal[range(count), range(count)] += penalty / scale[:count] ** 2
 
     def solved(a: Array, b: Array) -> Array:
-        return np.linalg.lstsq(a, b, rcond=1e-12)[0][:count] / scale[:count]
+        return np.asarray(np.linalg.lstsq(a, b, rcond=1e-12)[0][:count] / scale[:count])
 
     full = solved(normal, along)
-    off = [solved(normal - a, along - b) - full for a, b in zip(normals, alongs, strict=True)]
+    off = np.array([solved(normal - a, along - b) - full for a, b in zip(normals, alongs, strict=True)])
     wider = float(stdtrit(groups - 1, 0.95) / ndtri(0.95))
-    return wider**2 * (groups - 1) / groups * np.transpose(off) @ np.array(off)
+    return np.asarray(wider**2 * (groups - 1) / groups * off.T @ off)
 
 
 def _at_least(covariance: Array, least: Array) -> Array:
