@@ -45,7 +45,7 @@ class Alignment(Summarized):
     """Age of the reading at its stamp, beside the age of the pose [s]."""
 
     lever_arm_sd_m: tuple[float, float] = (0.0, 0.0)
-    """Standard deviations of `lever_arm_m` [m], from the differences between places; 0 if it was given."""
+    """Standard deviations of `lever_arm_m` [m], robust to errors of places and recordings; 0 if given."""
 
     latency_sd_s: float = 0.0
     """Standard deviation of `latency_s` [s]; 0 if it was given."""
@@ -141,14 +141,13 @@ def fit_alignment(
     latency are the same, so both have a weak prior of covariance P around 0. The estimate is G times that of
     least squares, G = P (P + V)^-1, with V from blocks of `BLOCK_S` with correlated errors.
 
-    The standard deviations include errors that more readings do not reduce: those of the map and of the
-    platform's terms are the same whenever the robot comes to a place. They come from the jackknife over
-    J = `TILES`^2 tiles of the driven area (Efron and Stein 1981), each with all of its recordings,
-
-        V_J = (J - 1) / J sum over j of (b_-j - b) (b_-j - b)^T,  cov = V_J + (I - G) P (I - G)^T,
-
-    with b the estimate and b_-j that without tile j. V_J is at least G V G^T, and is scaled so that a normal
-    interval of 90 % is as wide as that of Student's t with J - 1 degrees of freedom.
+    The standard deviations include errors that more readings do not reduce. Errors of the map and of the
+    platform's terms are the same whenever the robot comes to a place, and those of a session last a whole
+    recording. So their covariance W is the sum of the sandwich estimates for errors correlated within each
+    of `TILES`^2 tiles of the driven area, and within each recording (Cameron, Gelbach and Miller 2011,
+    without the subtraction of the part that both have). With one recording its blocks take the recordings'
+    place. Few tiles or recordings widen it by Student's t. The reported covariance is G W G^T +
+    (I - G) P (I - G)^T.
 
     Args:
         runs: Runs of one robot that turns and drives at several speeds, as for `magtwin.learn.data.labels`.
@@ -195,7 +194,7 @@ def fit_alignment(
         return _descend(fit, start, rounds, lambda j: progress(done + j, before + most, "rounds"))
 
     best = min((descended(k, start) for k, start in enumerate(starts)), key=lambda result: result.cost)
-    covariance = fit.at(best.place, jackknife=True).covariance
+    covariance = fit.at(best.place, robust=True).covariance
     progress(before + most, before + most, "rounds")
     sd = np.zeros(3)
     sd[free] = np.sqrt(np.diag(covariance))
@@ -261,8 +260,8 @@ class _Fit:
                 rows = rows[(t[rows] >= t[0] + END_S) & (t[rows] <= t[-1] - END_S)]
             self.runs.append((run, rows, usable(run)))
 
-    def at(self, place: Array, jackknife: bool = False) -> _Linearised:
-        """The least squares around a place; the covariance is that of blocks, or of the jackknife."""
+    def at(self, place: Array, robust: bool = False) -> _Linearised:
+        """The least squares around a place; the covariance is that of blocks, or of tiles and recordings."""
         alignment = Alignment((float(place[0]), float(place[1])), float(place[2]))
         parts_x, parts_y, parts_block, parts_tile, blocks = [], [], [], [], 0
         for run, rows, good in self.runs:
@@ -293,9 +292,13 @@ class _Fit:
         x, y, block = np.vstack(parts_x), np.concatenate(parts_y), np.concatenate(parts_block)
         count = len(self.prior)
         left = _residual(x[:, count:], np.column_stack([x[:, :count], y]))
-        tile = np.unique(np.concatenate(parts_tile), return_inverse=True)[1]
-        spread = (lambda noise: _jackknife(x, y, tile, noise / self.prior)) if jackknife else None
-        return self._solved(place, left[:, :-1], left[:, -1], block, spread)
+        groups: list[NDArray[np.intp]] = []
+        if robust:
+            alike = parts_block if len(parts_y) == 1 else [np.full(len(y), k) for k, y in enumerate(parts_y)]
+            groups = [
+                np.unique(np.concatenate(parts), return_inverse=True)[1] for parts in (parts_tile, alike)
+            ]
+        return self._solved(place, left[:, :-1], left[:, -1], block, groups)
 
     def _solved(
         self,
@@ -303,7 +306,7 @@ class _Fit:
         x: Array,
         y: Array,
         block: NDArray[np.intp],
-        spread: Callable[[float], Array] | None,
+        groups: Sequence[NDArray[np.intp]],
     ) -> _Linearised:
         at = place[self.free]
         scale = np.sqrt(np.mean(x**2, axis=0))
@@ -331,62 +334,33 @@ class _Fit:
 
         wanted, shrunk = place.copy(), gain(self.alike * promised * inverse)
         wanted[self.free] = shrunk @ (at + solved / scale)
-        if spread is None:
-            covariance = prior - gain(blocked) @ prior
-        else:
-            seen = np.eye(len(prior)) - blind @ blind.T
-            known = shrunk @ (seen @ (blocked / np.outer(scale, scale)) @ seen) @ shrunk.T
+        if groups:
+            spread = np.sum([_sandwich(inverse, x, error, group) for group in groups], axis=0)
             missed = np.eye(len(prior)) - shrunk
-            covariance = _at_least(spread(self.alike * promised), known) + missed @ prior @ missed.T
+            covariance = shrunk @ (spread / np.outer(scale, scale)) @ shrunk.T + missed @ prior @ missed.T
+        else:
+            covariance = prior - gain(blocked) @ prior
         left = max(float(np.mean(y**2)), 1e-12)
         self.readings = self.readings or len(y)
         cost = self.readings / self.alike * np.log(left) + float(np.sum(at**2 / self.prior))
         return _Linearised(place, wanted, (covariance + covariance.T) / 2, cost, promised, max(alike, 1.0))
 
 
-def _jackknife(x: Array, y: Array, group: NDArray[np.intp], penalty: Array) -> Array:
-    """Covariance of the first coefficients of a ridge regression, by leaving out groups of rows.
+def _sandwich(inverse: NDArray[Any], x: Array, error: Array, group: NDArray[np.intp]) -> Array:
+    """Covariance of least squares whose errors are correlated within groups; 0 for one group.
 
-    It is scaled so that normal intervals of 90 % are as wide as those of Student's t; 0 for one group.
-
-    Args:
-        x: Regressors, shape (N, K).
-        y: Values, shape (N,).
-        group: Number of the group of each row, 0 to G - 1, shape (N,).
-        penalty: Penalties of the squares of the first coefficients, shape (M,).
-
-    Returns:
-        Covariance, shape (M, M).
+    g / (g - 1) N^-1 (sum over groups of s s^T) N^-1, with s = X^T e of a group (Liang and Zeger 1986), scaled
+    so that normal intervals of 90 % are as wide as those of Student's t with g - 1 degrees of freedom.
     """
     from scipy.special import ndtri, stdtrit  # slow import
 
-    groups, count = int(group.max()) + 1, len(penalty)
+    groups = int(group.max()) + 1
     if groups < 2:
-        return np.zeros((count, count))
-    scale = np.sqrt(np.mean(x**2, axis=0))
-    scale[scale == 0] = 1.0
-    x = x / scale
-    rows = [group == k for k in range(groups)]
-    normals, alongs = [x[r].T @ x[r] for r in rows], [x[r].T @ y[r] for r in rows]
-    normal, along = np.sum(normals, axis=0), np.sum(alongs, axis=0)
-    normal[range(count), range(count)] += penalty / scale[:count] ** 2
-
-    def solved(a: Array, b: Array) -> Array:
-        return np.asarray(np.linalg.lstsq(a, b, rcond=1e-12)[0][:count] / scale[:count])
-
-    full = solved(normal, along)
-    off = np.array([solved(normal - a, along - b) - full for a, b in zip(normals, alongs, strict=True)])
+        return np.zeros_like(inverse)
+    score = np.zeros((groups, x.shape[1]))
+    np.add.at(score, group, x * error[:, None])
     wider = float(stdtrit(groups - 1, 0.95) / ndtri(0.95))
-    return np.asarray(wider**2 * (groups - 1) / groups * off.T @ off)
-
-
-def _at_least(covariance: Array, least: Array) -> Array:
-    """A covariance, with each standard deviation raised to that of another where it is below."""
-    sd, floor = (np.sqrt(np.diag(matrix)) for matrix in (covariance, least))
-    if not (sd > 0).all():
-        return least
-    up = np.maximum(floor / sd, 1.0)
-    return covariance * np.outer(up, up)
+    return np.asarray(wider**2 * groups / (groups - 1) * inverse @ (score.T @ score) @ inverse)
 
 
 def _filled(yaw: Array) -> Array:
