@@ -414,6 +414,18 @@ def test_compensate_says_which_vectors_it_took(calibration, tmp_path, capsys):
     assert told == {"measured": ("b_vector_measured_nt",) * 2, "exact": ("b_vector_nt",) * 2}
 
 
+def test_compensate_takes_a_preset_and_keeps_it(calibration, tmp_path, capsys):
+    run, model = tmp_path / "run.parquet", tmp_path / "model.json"
+    write_parquet(calibration("figure8", 1), run)
+    main(["compensate", "fit", str(run), "--preset", "magnav", "--no-band", "--out", str(model), "--json"])
+    assert json.loads(capsys.readouterr().out)["metadata"]["preset"] == "magnav"
+    assert TollesLawson.load(model).preset == "magnav"
+    assert TollesLawson.load(model) == fit_run(calibration("figure8", 1), band_hz=None, preset="magnav")
+    model.write_text(model.read_text().replace('"magnav"', '"magnaw"'))
+    with pytest.raises(InputError, match="no preset 'magnaw'"):
+        TollesLawson.load(model)
+
+
 def test_the_page_on_compensation_takes_out_what_it_says():
     page = DOCS / "compensate.md"
     (code,) = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
