@@ -19,7 +19,7 @@ BLOCK = 512  # Poses predicted at a time
 # Largest distance between nodes at which the variance is computed, in the depth of the nearest layer
 COARSE = 1 / 3
 ROOT = 0.5  # Power of the variance that is interpolated between them
-# Factor of the posterior variance of vectors, chosen on surveys of the default lab with a known platform, since
+# Factor of the posterior variance of vectors, chosen on surveys of the default lab with a known platform:
 # magnitudes do not tell it. No factor is right at every spacing (docs/maps.md, `benchmarks/intervals.py`).
 VECTOR_WIDTH = 2.0
 
