@@ -46,6 +46,7 @@ def fit_harmonic(
     readings: Readings,
     *,
     earth_nt: Sequence[float] | None = None,
+    above: bool | None = None,
     progress: Progress | None = None,
 ) -> HarmonicModel:
     """Fit a field without curl or divergence, and the platform, to a survey.
@@ -68,6 +69,7 @@ def fit_harmonic(
     Args:
         readings: A survey; only its good readings are used.
         earth_nt: The Earth's field in world axes [nT]. Default: that of the readings.
+        above: Whether a layer of dipoles lies above the sensor. Default: if the evidence is for it.
         progress: Called as progress(done, total, what), once per round.
 
     Raises:
@@ -81,7 +83,7 @@ def fit_harmonic(
         )
     height = readings.height_m or 0.0
     earth = readings.earth_nt if earth_nt is None else checked_earth_nt(earth_nt)
-    tries = ladders(good, height)
+    tries = [d for d in ladders(good, height) if above is None or above == (min(d) < 0)]
     fits: list[Solution] = []
     for k, depths in enumerate(tries):
         problem = Problem.of(good, layers_below(good, depths, height), height, earth)
