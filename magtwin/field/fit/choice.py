@@ -69,8 +69,12 @@ class Trial:
 
     def joined(self, other: "Trial") -> "Trial":
         """This trial with the readings of another."""
-        both = {k: np.append(getattr(self, k), getattr(other, k)) for k in ("mean", "variance", "off")}
-        return replace(self, **both)
+        return replace(
+            self,
+            mean=np.append(self.mean, other.mean),
+            variance=np.append(self.variance, other.variance),
+            off=np.append(self.off, other.off),
+        )
 
     @property
     def rmse_nt(self) -> float:
@@ -274,8 +278,8 @@ def _common(trials: Sequence[Trial]) -> list[Trial]:
     if not kept:
         raise InputError("no map method predicts 90 % of the readings left out; give a method")
     rows = np.logical_and.reduce([known[k] for k in kept])
-    cut = lambda trial: {name: getattr(trial, name)[rows] for name in ("mean", "variance", "off")}  # noqa: E731
-    return [replace(trials[k], **cut(trials[k])) for k in kept]
+    some = [trials[k] for k in kept]
+    return [replace(t, mean=t.mean[rows], variance=t.variance[rows], off=t.off[rows]) for t in some]
 
 
 def _best(trials: Sequence[Trial]) -> list[Trial]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.survey.changes import changes_line
 from magtwin.field.survey.folder import node_map
 from magtwin.field.survey.folder import read_survey as read_folder
 from magtwin.field.survey.readings import TAKEN, Readings
@@ -307,6 +308,8 @@ def _doubts(readings: Readings, source: Source) -> list[str]:
         doubts.append(f"only {count} good readings: the map is valid only next to them")
     if (span := float(np.ptp(readings.p_xy, axis=0).max())) > USUAL_SPAN_M:
         doubts.append(f"the readings span {span:,.0f} m: are their positions in metres?")
+    if line := changes_line(readings):
+        doubts.append(line)
     mean = np.exp(1j * yaw).mean()
     if np.abs(mean) >= ONE_HEADING:
         doubts.append(
