@@ -5,13 +5,17 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q install -c constraints.txt
 
+# The published survey and network, which `magtwin fetch aprilab` downloads; `make paper` uses them if they exist.
+SURVEYS ?= aprilab/map
+RELEASED ?= aprilab/models/nn_magnetometer_model_v0.0.1.pth
+
 # Largest size of the default install, PyTorch for CPU included [MiB].
 MOST_MB := 2700
 
 # Two processes whose linear algebra has threads of its own wait for each other more than they work.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 
-.PHONY: demo test test-slow readme simready ros physics lint bench wheel-test schema assets pictures clean help
+.PHONY: demo test test-slow readme simready ros physics lint paper bench wheel-test schema assets pictures clean help
 
 help:  ## Say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -52,6 +56,9 @@ physics: $(VENV)/.dev  ## Drive converted robots in Newton (extra physics, 600 M
 	$(PIP) -e '.[dev,physics]'
 	$(BIN)/python -m pytest -m physics tests/sim/engines/test_newton.py tests/sim/engines/test_engine.py tests/export/test_engine_scripts.py tests/export/test_validate.py
 
+paper: $(VENV)/.dev  ## Measure the tables of docs/results.md and README again (up to an hour)
+	$(BIN)/python docs/results.py $(if $(wildcard $(SURVEYS)),--surveys $(SURVEYS)) $(if $(wildcard $(RELEASED)),--released $(RELEASED))
+
 bench: $(VENV)/.dev  ## Compare with peers; prints ratios
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
 
@@ -70,7 +77,7 @@ assets: $(VENV)/.dev  ## Build robots/, maps/, weights/ and scenes/ anew
 	$(BIN)/python robots/turtlebot4/build.py
 	$(BIN)/python maps/lab/build.py
 	$(BIN)/python scenes/build.py  # names the new map; its network is the old one until the last line
-	rm -rf build/protocol && $(BIN)/python weights/protocol.py --out build/protocol --ship
+	rm -rf build/paper/lab && $(BIN)/python weights/protocol.py --out build/paper/lab --ship
 	$(BIN)/python scenes/build.py
 
 pictures: $(VENV)/.installed  ## Draw the README's pictures again

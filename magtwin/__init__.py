@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from magtwin.learning import evaluate as evaluate
     from magtwin.run.run import COLUMNS as COLUMNS
     from magtwin.run.run import Run as Run
+    from magtwin.sim.plant_families import draw_plant as draw_plant
+    from magtwin.spec.plant import PlantSpec as PlantSpec
     from magtwin.spec.scene import Scene as Scene
     from magtwin.twin import Twin as Twin
     from magtwin.twin import author_scene as author_scene
@@ -55,12 +57,14 @@ _NAMES = {
     "COLUMNS": "run.run",
     "InputError": "errors",
     "MismatchWarning": "errors",
+    "PlantSpec": "spec.plant",
     "Readings": "field.survey.readings",
     "Run": "run.run",
     "Scene": "spec.scene",
     "Twin": "twin",
     "author_scene": "twin",
     "build_dataset": "learning",
+    "draw_plant": "sim.plant_families",
     "error_budget": "learning",
     "evaluate": "learning",
     "export_scene": "export.package",

@@ -153,23 +153,25 @@ def evaluate(
 
     Args:
         models: Weights files, predictors or candidates.
-        recordings: A data set or its folder (its recordings that no model learned from), runs by name, or
-            files of runs.
-        anomaly_map: Maps that the models were trained on, each found by its checksum. The first is the
-            baseline's, and that of weights that record no map.
+        recordings: A data set or its folder, a mapping of runs by name, or files of runs. If it is a data
+            set, only those recordings are used that were not in the training data of any model.
+        anomaly_map: Maps that the models were trained on. The map of each model is identified by its
+            checksum. The first map is used for the baseline, and for weights that name no map.
         baseline: The model that others are compared with: the mean training label, Tolles and Lawson's ridge
             regression, or a candidate.
-        train: Data set that baselines are fitted to. With it, Tolles and Lawson's are evaluated on each map.
-            Default: the mean label in weights that were trained on the first map.
-        cases: Paths by row of the table, beside the paper's A to E, as {"D": "lawnmower.csv"}.
-        any_map: Use the first map for weights whose own is not at hand.
+        train: Data set that baselines are fitted to. If given, the Tolles-Lawson regression is also
+            evaluated on each map. Without it, the mean label is taken from weights that were trained on the
+            first map.
+        cases: Further rows of the table: path by name of the row. A name from A to E replaces that row of the
+            paper, as in {"D": "lawnmower.csv"}.
+        any_map: Use the first map for weights whose own map is not among those given.
         truth: Compare with the exact field of simulated runs instead of the reading.
-        seed: Seed of the intervals.
-        progress: Called with the recordings done, their number, and the name of the next.
+        seed: Seed of the random resampling that gives the confidence intervals.
+        progress: Called as progress(recordings done, total, name of the next recording).
 
     Raises:
-        InputError: A file cannot be read, a model's map is not at hand, it learned from a recording, or a
-            recording lacks what a model or the evaluation needs.
+        InputError: A file cannot be read; the map of a model is not given; a model was trained on one of
+            these recordings; or a recording lacks a column that a model or the evaluation needs.
     """
     maps = _named_maps([anomaly_map] if _single(anomaly_map) else anomaly_map)  # type: ignore[arg-type,list-item]
     given: list[Any] = [models] if _single(models) or _is_model(models) else list(models)  # type: ignore[arg-type]

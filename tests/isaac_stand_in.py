@@ -9,6 +9,7 @@ import math
 import runpy
 import sys
 import types
+from pathlib import Path
 
 import numpy as np
 from pxr import Usd
@@ -116,4 +117,5 @@ module(
 
 if __name__ == "__main__":
     del sys.argv[0]
+    sys.path.insert(0, str(Path(sys.argv[0]).parent))
     runpy.run_path(sys.argv[0], run_name="__main__")

@@ -9,7 +9,7 @@ import magtwin
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.files import shipped
-from magtwin.twin import in_session, open_twin, simulate, sweep
+from magtwin.twin import in_session, in_session_of, open_twin, simulate, sweep
 
 
 def test_a_run_is_in_a_session_of_its_seed_unless_another_is_chosen(lab_scene):
@@ -115,3 +115,18 @@ def test_a_twin_opens_its_stage_once_and_survives_another_process(lab_scene, mon
     monkeypatch.setattr("magtwin.usd.scene.open_stage", lambda *_: pytest.fail("opened the stage again"))
     assert twin.geometry()[1] is links
     assert run.rows
+
+
+def test_without_tracking_error_a_robot_follows_its_path_to_millimetres(lab_scene):
+    exact = open_twin(lab_scene, magnetometer="map-only", tracking_error=False)
+    usual = open_twin(lab_scene, magnetometer="map-only")
+    line = np.array([[-1.0, 0.0], [0.5, 0.0]])
+    beside = [
+        np.abs(simulate(twin, line, seed=1, rate_hz=10.0)["p_world_base"][:, 1]).max()
+        for twin in (exact, usual)
+    ]
+    assert beside[0] < 0.005 < 0.01 < beside[1] < 0.1
+    run = simulate(exact, line, seed=1, rate_hz=10.0)
+    assert run.metadata["tracking_error"] is False
+    again = simulate(in_session_of(usual, run.metadata), line, seed=1, rate_hz=10.0)
+    np.testing.assert_array_equal(again["p_world_base"], run["p_world_base"])

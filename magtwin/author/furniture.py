@@ -85,12 +85,8 @@ class FurnitureTable(Spec):
         self._require("yaw", not both, "be left out beside q_world_xyzw", self.yaw)
         self._require("seed", self.seed is None or self.seed >= 0, "not be below 0", self.seed)
         strong = max(map(abs, self.magnetization or ()), default=0.0)
-        self._require(
-            "magnetization",
-            strong <= SATURATION_A_M,
-            "be in A/m; iron saturates at 1.7e6",
-            self.magnetization,
-        )
+        per_metre = "be in A/m; iron saturates at 1.7e6"
+        self._require("magnetization", strong <= SATURATION_A_M, per_metre, self.magnetization)
         if self.kind == "mesh" and self.file is None:
             raise InputError('kind "mesh" needs file = "FILE.stl"')
         if self.kind != "mesh" and (self.file is not None or self.scale != 1):
@@ -99,26 +95,23 @@ class FurnitureTable(Spec):
 
     def _made(self) -> FurnitureSpec:
         """The piece, with the magnetization of the table or none."""
-        given = {
-            f.name: getattr(self, f.name)
-            for f in fields(FurnitureSpec)
-            if hasattr(self, f.name) and f.name != "magnetization"
-        }
+        given = {f.name: getattr(self, f.name) for f in fields(FurnitureSpec) if hasattr(self, f.name)}
         given["magnetization"] = self.magnetization or ()
         if self.yaw:
             given["q_world_xyzw"] = tuple(map(float, quat_from_yaw(self.yaw)))
         if self.file is not None:
-            points, faces = _mesh_of(self.file, self.scale)
+            mesh = read_mesh(existing(self.file, "mesh file"))
+            points, faces = mesh.points.astype(float) * self.scale, mesh.faces
+            if mesh_moments(points, faces)[0] < 0:
+                faces = faces[:, ::-1]  # outwards
             largest = float(np.ptp(points, axis=0).max())
             if largest > LARGEST_M:
                 raise InputError(
                     f"scale is missing: {self.file.name} would be {largest:,.0f} m large; if it is in mm, "
                     "give scale = 0.001"
                 )
-            given |= {
-                "vertices_m": tuple(map(tuple, points.tolist())),
-                "faces": tuple(map(tuple, faces.tolist())),
-            }
+            given["vertices_m"] = tuple(map(tuple, points.tolist()))
+            given["faces"] = tuple(map(tuple, faces.tolist()))
         return FurnitureSpec(**given)
 
     def spec(self, seed: int) -> FurnitureSpec:
@@ -128,13 +121,6 @@ class FurnitureTable(Spec):
             return piece
         drawn = drawn_magnetization(self.name, piece.parts, seed=seed if self.seed is None else self.seed)
         return replace(piece, magnetization=drawn)
-
-
-def _mesh_of(file: Path, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [m] and triangles of a mesh file, facing outwards."""
-    mesh = read_mesh(existing(file, "mesh file"))
-    points, faces = mesh.points.astype(float) * scale, mesh.faces
-    return points, faces[:, ::-1] if mesh_moments(points, faces)[0] < 0 else faces
 
 
 def drawn_magnetization(name: str, parts: Iterable[Part], *, seed: int = 0) -> tuple[float, ...]:
@@ -182,9 +168,7 @@ def check_stands(piece: FurnitureSpec, lab: LabSpec) -> None:
         InputError: It does not; the text has the size of the slab.
     """
     signs = np.array(np.meshgrid((-1, 1), (-1, 1), (-1, 1))).reshape(3, -1).T
-    corners = np.concatenate(
-        [np.asarray(part.p) + signs * np.asarray(part.size_m) / 2 for part in piece.parts]
-    )
+    corners = np.concatenate([np.array(p.p) + signs * np.array(p.size_m) / 2 for p in piece.parts])
     world = rotate(piece.q_world_xyzw, corners) + piece.p_world
     half = np.array(lab.floor_m) / 2 + lab.wall_thickness_m + lab.apron_m
     beyond = float(np.max(np.abs(world[:, :2]) - half))
@@ -220,18 +204,3 @@ def placed_furniture(
         except InputError as error:
             raise refused_at(path, "p_world", str(error), section="furniture", number=number) from error
     return tuple(pieces)
-
-
-def check_names(pieces: Iterable[FurnitureSpec], path: str | os.PathLike[str]) -> None:
-    """Refuse two pieces of furniture with the same name.
-
-    Raises:
-        InputError: Two have the same name.
-    """
-    seen = set()
-    for piece in pieces:
-        if piece.name in seen:
-            raise InputError(
-                f"{path}: two pieces of furniture are called {piece.name!r}; give each its own name"
-            )
-        seen.add(piece.name)

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,11 @@ from pxr import Sdf, Usd, UsdPhysics
 from magtwin.author.shape import drive_of, footprint_of, stand_on_floor
 from magtwin.errors import InputError, hint
 from magtwin.files import from_table, read_toml
+from magtwin.sim.plant_families import draw_plant
 from magtwin.spec.base import Spec
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.magnetics import PlatformFieldSpec
+from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec, MountSpec
 from magtwin.urdf.convert import convert_with_report
@@ -31,11 +33,43 @@ from magtwin.usd.sensors import (
     define_lidar,
     define_magnetometer,
     define_mocap,
+    define_plant,
     define_platform,
     read_drive,
 )
 
 _DEFAULTS = RobotSpec(name="", asset=Path())
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlantTable(PlantSpec):
+    """The robot's field beyond its linear platform field. Name a family, or give the figures."""
+
+    family: str = ""
+    """Family to draw the figures from: hysteresis, warm-up, nonlinear, moving-part, drawn or all."""
+
+    seed: int = 0
+    """Seed of the draw."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.family or self.seed:
+            draw_plant(self.family or "nominal", self.seed)
+            self._require("family", not (self.family and self._figures), "come without figures", self.family)
+
+    @property
+    def _figures(self) -> dict[str, Any]:
+        default, known = PlantSpec(), {f.name for f in fields(PlantSpec)}
+        return {
+            name: value
+            for name, value in vars(self).items()
+            if name in known and value != getattr(default, name)
+        }
+
+    @property
+    def spec(self) -> PlantSpec:
+        """The spec, drawn if a family is named."""
+        return draw_plant(self.family, self.seed) if self.family else PlantSpec(**self._figures)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +93,7 @@ class RobotSettings(Spec):
     imu: ImuSpec | None = None
     lidar: LidarSpec | None = None
     mocap: MocapSpec = field(default_factory=MocapSpec)
+    plant: PlantTable = field(default_factory=PlantTable)
 
     conversion: Options = DEFAULTS
     """Options of the URDF conversion."""
@@ -157,6 +192,7 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
     notes += stand_on_floor(robot, read_drive(robot))
     define_platform(robot, settings.platform)
     define_mocap(robot, settings.mocap)
+    define_plant(robot, settings.plant.spec)
     define_battery(stage, _free(links, _base(robot), "battery"), settings.battery)
     sensors: tuple[tuple[str, Any, Any, Any], ...] = (
         ("imu", settings.imu, ImuSpec(), define_imu),

@@ -82,13 +82,7 @@ def _nearest_free(
 def lab_of(
     lab: LabSpec, table: Mapping[str, Any], path: str | os.PathLike[str], map_layer: Path | None
 ) -> LabSpec:
-    """The room of a TOML. If the TOML gives no floor_m, the floor covers the map.
-
-    Args:
-        lab: The [lab] table.
-        table: The whole TOML.
-        path: The file, for error messages.
-        map_layer: The map of the scene; None if there is none.
+    """The room of a TOML `table` read from `path`. If it has no floor_m, the floor covers the map.
 
     Raises:
         InputError: The floor cannot be in metres.
@@ -101,15 +95,6 @@ def lab_of(
         text = f"floor_m must be in metres, at most {LARGEST_M:g} each way, got {lab.floor_m}"
         raise refused_at(path, "floor_m", text, section="lab")
     return lab
-
-
-def no_map(path: str | os.PathLike[str], *, furnished: bool) -> InputError:
-    """The error for a scene that has no map and cannot be surveyed."""
-    more = "" if furnished else " and furniture or sources ([[furniture]], [[source]])"
-    return InputError(
-        f'{path}: names no map; add map = "FILE.usdc" to it, or give `map_layer=FILE.usdc`, or add an '
-        f"[earth] table (latitude_deg, longitude_deg, height_m, date){more}, from which it is surveyed"
-    )
 
 
 def asset_named(file: Path, text: str, where: str) -> Path:

@@ -8,9 +8,7 @@ from pathlib import Path
 
 from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
 
-from magtwin.author.room import (
-    check_name,
-)
+from magtwin.author.room import check_name
 from magtwin.errors import InputError
 from magtwin.field.sources.magnets import body_of
 from magtwin.files import existing, output
@@ -38,6 +36,7 @@ from magtwin.usd.sensors import (
     define_magnetometer,
     define_mocap,
     define_path,
+    define_plant,
     define_platform,
 )
 from magtwin.usd.sources import LOOKS, SOURCES, define_sources
@@ -81,8 +80,7 @@ def author_scene(
     with output(folder, force=force) as aside:
         aside.mkdir()
         placed = scene if by_reference else _with_copies(scene, aside)
-        sublayers = [_write_room(scene, aside), *_write_furniture(scene, aside)]
-        sublayers += [*_write_magnetics(scene, aside), placed.map_layer]
+        sublayers = [*_write_parts(scene, aside), placed.map_layer]
         root = Sdf.Layer.CreateNew(str(aside / f"{scene.name}.usda"))
         stage = Usd.Stage.Open(root)
         names = ", ".join(placed.robot.name for placed in scene.robots)
@@ -192,38 +190,43 @@ def _copied_asset(asset: Path, folder: Path) -> Path:
     return folder / asset.relative_to(common)
 
 
-def _part(scene: Scene, folder: Path, name: str) -> Path:
-    """File of a layer, not that of the root layer."""
-    taken = scene.name.casefold() == name
-    return folder / (f"{name}_layer.usda" if taken else f"{name}.usda")
+def _write_parts(scene: Scene, folder: Path) -> list[Path]:
+    """The layers of room, furniture and field, the strongest first; those without content are left out."""
 
-
-def _write_room(scene: Scene, folder: Path) -> Path:
-    path = _part(scene, folder, "room")
-    with new_stage(path, "The room, its lights and its physics, by magtwin") as stage:
-        define_lab(stage, scene.lab)
-    return path
-
-
-def _write_magnetics(scene: Scene, folder: Path) -> list[Path]:
-    if scene.earth is None and not scene.sources:
-        return []
-    path = _part(scene, folder, "magnetics")
-    with new_stage(path, "What makes the magnetic field: the Earth and magnetised things") as stage:
+    def field(stage: Usd.Stage) -> None:
         if scene.earth is not None:
             define_earth(stage, EARTH, scene.earth)
         if scene.sources:
             define_sources(stage, scene.sources)
-    return [path]
 
-
-def _write_furniture(scene: Scene, folder: Path) -> list[Path]:
-    if not scene.furniture:
-        return []
-    path = _part(scene, folder, "furniture")
-    with new_stage(path, "Furniture and columns, and how they are magnetised") as stage:
-        define_furniture(stage, scene.furniture)
-    return [path]
+    parts: list[tuple[str, object, str, Callable[[Usd.Stage], object]]] = [
+        (
+            "room",
+            True,
+            "The room, its lights and its physics, by magtwin",
+            lambda s: define_lab(s, scene.lab),
+        ),
+        (
+            "furniture",
+            scene.furniture,
+            "Furniture and columns, and how they are magnetised",
+            lambda stage: define_furniture(stage, scene.furniture),
+        ),
+        (
+            "magnetics",
+            scene.earth or scene.sources,
+            "What makes the magnetic field: the Earth and magnetised things",
+            field,
+        ),
+    ]
+    paths = []
+    for name, content, about, define in parts:
+        if content:  # the root layer may have the name
+            taken = scene.name.casefold() == name
+            paths.append(folder / (f"{name}_layer.usda" if taken else f"{name}.usda"))
+            with new_stage(paths[-1], about) as stage:
+                define(stage)
+    return paths
 
 
 def _define_robot(stage: Usd.Stage, placed: PlacedRobot, map_sha256: str) -> None:
@@ -238,6 +241,7 @@ def _define_robot(stage: Usd.Stage, placed: PlacedRobot, map_sha256: str) -> Non
     define_drive(prim, robot.drive)
     define_platform(prim, robot.platform)
     define_mocap(prim, robot.mocap)
+    define_plant(prim, robot.plant)
     for part, define in PARTS.items():
         define(stage, only_prim_with(prim, part).GetPath(), getattr(robot, part))
     magnetometer = only_prim_with(prim, "magnetometer")

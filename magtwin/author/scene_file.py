@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from magtwin.author.furniture import FurnitureTable, check_names, placed_furniture
+from magtwin.author.furniture import FurnitureTable, placed_furniture
 from magtwin.author.robot import RobotSettings, build_robot
-from magtwin.author.room import asset_named, check_name, check_start, lab_of, no_map, obstacles_in
+from magtwin.author.room import asset_named, check_name, check_start, lab_of, obstacles_in
 from magtwin.author.scene import check_things
 from magtwin.errors import InputError
 from magtwin.files import existing, from_table, read_toml, refused_at, sha256
@@ -62,11 +62,6 @@ class _EarthTable(EarthFieldSpec):
     b_world_nt: Vec3 = ZERO3
     """Field in world axes [nT], if it was measured. Unless measured is true, it must agree with the model
     within 1 nT."""
-
-    @property
-    def spec(self) -> EarthFieldSpec:
-        """The spec, with its field computed or checked."""
-        return checked(EarthFieldSpec(**vars(self)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,8 +154,11 @@ def scene_from_toml(
         listed = read_sources(given.sources.file, seed=given.seed, lab=lab)
         sources, pieces = (*listed[0], *sources), (*listed[1], *pieces)
     if layer is None and (given.earth is None or survey_of is None):
-        raise no_map(path, furnished=bool(pieces or sources))
-    check_names(pieces, path)
+        more = "" if pieces or sources else " and furniture or sources ([[furniture]], [[source]])"
+        raise InputError(
+            f'{path}: names no map; add map = "FILE.usdc" to it, or give `map_layer=FILE.usdc`, or add an '
+            f"[earth] table (latitude_deg, longitude_deg, height_m, date){more}, from which it is surveyed"
+        )
     standing = obstacles_in(lab, pieces)
     robots: list[PlacedRobot] = []
     for number, (robot_table, keys) in enumerate(zip(given.robot, table["robot"], strict=True)):
@@ -171,29 +169,38 @@ def scene_from_toml(
         start, of_robot = robot_table.start, True
         if start is None:
             of_robot = not (alone or (not robots and "start" in table))
-            room = Room(lab.floor_m, robot.footprint_radius_m, standing)
-            start = _path_start(drives, room) if of_robot else given.start
+            start = ZERO3 if of_robot else given.start
+            if of_robot and drives not in ("", "random"):  # so that robots do not start inside each other
+                way = path_in(Room(lab.floor_m, robot.footprint_radius_m, standing), drives)
+                start = float(way.p_xy[0, 0]), float(way.p_xy[0, 1]), float(way.heading(0.0))
         robots.append(PlacedRobot(robot=robot, start=start, path=drives))
         try:
             check_start(robots[-1], lab, standing)
         except InputError as error:
             section = {"section": "robot", "number": number} if of_robot else {}
             raise refused_at(path, "start", str(error), **section) from error  # type: ignore[arg-type]
+    try:
+        earth = checked(EarthFieldSpec(**vars(given.earth))) if given.earth else None
+    except InputError as error:
+        raise InputError(f"{path}: [earth] {error}") from error
     scene = Scene(
         name=given.name,
         map_layer=Path("surveyed") if layer is None else existing(layer, "map layer"),
         map_sha256="" if layer is None else sha256(layer),
         robot=robots[0].robot,
         lab=lab,
-        earth=_earth(given.earth, path) if given.earth else None,
+        earth=earth,
         sources=sources,
         furniture=pieces,
         start=robots[0].start,
         path=robots[0].path,
         others=tuple(robots[1:]),
     )
-    if layer is None and survey_of is not None:
+    try:
         check_things(scene)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    if layer is None and survey_of is not None:
         try:
             surveyed = survey_of(scene, given.survey or SurveySpec(), given.seed, standing)
         except InputError as error:
@@ -214,26 +221,27 @@ def _robot(
     if named and not table.name:
         raise InputError(f'{where} needs name = "NAME", the name of its prim')
     if table.asset is not None and table.urdf is None:
-        known = {"asset", "network", "kind", "start", "path", *(["name"] if named else [])}
+        known = {"asset", "network", "kind", "start", "path", "plant", *(["name"] if named else [])}
         if others := sorted(set(keys) - known):
             raise InputError(f"{where} {others[0]} goes with urdf; an asset has it already")
         robot = load_robot(asset_named(table.asset, keys["asset"], where))
-        return replace(robot, name=table.name) if named else robot
-    if table.urdf is None or table.asset is not None:
+        robot = replace(robot, plant=table.plant.spec) if "plant" in keys else robot
+    elif table.urdf is None or table.asset is not None:
         raise InputError(f'{where} needs asset = "FILE.usda" or urdf = "FILE.urdf", and not both')
-    if workshop is None:
+    elif workshop is None:
         raise InputError(f"{where} names a URDF; give `workshop=DIR`, a folder to build the robot in")
-    settings = RobotSettings(**{f.name: getattr(table, f.name) for f in fields(RobotSettings)})
-    if named:
-        settings = replace(settings, name="")  # accept any name in the URDF
-    folder = Path(workshop) / table.name if named else Path(workshop)
-    asset = folder / f"{table.urdf.name.split('.')[0]}.usda"
-    asset.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        build_robot(table.urdf, settings, asset)
-    except InputError as error:
-        raise InputError(f"{where} {error}") from error
-    robot = load_robot(asset)
+    else:
+        settings = RobotSettings(**{f.name: getattr(table, f.name) for f in fields(RobotSettings)})
+        if named:
+            settings = replace(settings, name="")  # accept any name in the URDF
+        folder = Path(workshop) / table.name if named else Path(workshop)
+        folder.mkdir(parents=True, exist_ok=True)
+        asset = folder / f"{table.urdf.name.split('.')[0]}.usda"
+        try:
+            build_robot(table.urdf, settings, asset)
+        except InputError as error:
+            raise InputError(f"{where} {error}") from error
+        robot = load_robot(asset)
     return replace(robot, name=table.name) if named else robot
 
 
@@ -274,22 +282,6 @@ def _path(path: str, folder: Path, where: str) -> str | Path:
     except InputError as error:
         raise InputError(f"{where} path: {error}") from error
     return path if named else file
-
-
-def _path_start(drives: str | Path, room: Room) -> Vec3:
-    """Position and heading at the start of a path, so that robots do not start inside each other."""
-    if drives in ("", "random"):
-        return ZERO3
-    path = path_in(room, drives)
-    x, y = path.p_xy[0].tolist()
-    return x, y, float(path.heading(0.0))
-
-
-def _earth(table: _EarthTable, path: str | os.PathLike[str]) -> EarthFieldSpec:
-    try:
-        return table.spec
-    except InputError as error:
-        raise InputError(f"{path}: [earth] {error}") from error
 
 
 def read_sources(

@@ -57,17 +57,25 @@ Session = Annotated[
     int | Literal["survey"] | None,
     Parameter(
         converter=_session,
-        help="Session to draw from the seed. Sessions differ in battery charge, IMU offsets, wheels, "
-        "odometry and the robot's own field. survey: the robot as it was when the map was surveyed. "
-        "Default: 0.",
+        help="Number of the session. It and the seed determine battery charge, IMU offsets, wheels, odometry "
+        "and the robot's own field. survey: the robot as it was when the map was surveyed. Default: 0.",
+    ),
+]
+Plant = Annotated[
+    str | None,
+    Parameter(
+        name="--plant",
+        help="Effects in the robot's field that its linear platform model lacks: hysteresis, warm-up, "
+        "nonlinear, moving-part, drawn (sessions differ more), all, or nominal (none). NAME:SEED draws other "
+        "constants. Default: the scene's.",
     ),
 ]
 Network = Annotated[
     Path | None,
     Parameter(
         name="--network",
-        help="Network of the magnetometer (.safetensors or .pth). none: a physical magnetometer. "
-        "Default: the scene's.",
+        help="Network of the magnetometer (.safetensors, .pth). none: no network, but a physical "
+        "magnetometer. Default: the scene's.",
     ),
 ]
 Magnetometer = Annotated[
@@ -82,6 +90,13 @@ ModelError = Annotated[
     Parameter(
         help="Add a random model error to neural readings, as large as the network's error on recordings "
         "outside its training set. With --no-model-error a reading is the prediction plus sensor noise."
+    ),
+]
+TrackingError = Annotated[
+    bool,
+    Parameter(
+        help="The path follower gets poses with the latency and errors of a real localization, so the robot "
+        "deviates from the path by some centimetres. With --no-tracking-error it gets exact poses."
     ),
 ]
 Lidar = Annotated[
@@ -133,6 +148,7 @@ class Sensing:
     network: Network = None
     magnetometer: Magnetometer = None
     model_error: ModelError = True
+    tracking_error: TrackingError = True
     rate_hz: RateHz = None
     lidar: Lidar = "schedule"
     outside: Outside = "nan"

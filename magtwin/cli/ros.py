@@ -19,6 +19,7 @@ from magtwin.cli.options import (
     ModelError,
     Network,
     OutUnit,
+    Plant,
     RateHz,
     Seed,
     Session,
@@ -95,6 +96,7 @@ def sim(
     duration_s: float | None = None,
     seed: Seed = 0,
     session: Session = None,
+    plant: Plant = None,
     network: Network = None,
     magnetometer: Literal["physical", "neural", "map-only", "none"] | None = None,
     model_error: ModelError = True,
@@ -124,11 +126,12 @@ def sim(
         Time of the messages: sim, from 0, or wall.
     """
     from magtwin.ros.simulate import Simulator
-    from magtwin.twin import open_twin
+    from magtwin.twin import open_twin, with_plant
 
     announce(f"opening {scene}")
     kind = None if magnetometer == "none" else magnetometer
     twin = open_twin(scene, network=network, magnetometer=kind, model_error=model_error)
+    twin = with_plant(twin, plant)
     with where.bus("magtwin_sim", duration_s=duration_s) as bus:
         node = Simulator(
             twin,

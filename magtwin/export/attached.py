@@ -177,13 +177,10 @@ def _remove(layers: list[Sdf.Layer], scope: Sdf.Path) -> None:
         users = [
             (u, n) for u in layers for n in u.subLayerPaths if u.ComputeAbsolutePath(n) == layer.realPath
         ]
-        if users and _is_empty(layer):
+        if users and not (
+            layer.subLayerPaths or any(p.nameChildren or p.properties for p in layer.rootPrims)
+        ):
             for user, name in users:
                 user.subLayerPaths.remove(name)
             layer.Save()
             Path(layer.realPath).unlink()
-
-
-def _is_empty(layer: Sdf.Layer) -> bool:
-    """Whether a layer is empty apart from its default prim."""
-    return not layer.subLayerPaths and not any(p.nameChildren or p.properties for p in layer.rootPrims)

@@ -4,9 +4,9 @@ import os
 import re
 import shutil
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
+from typing import NamedTuple
 
 from pxr import Sdf, UsdUtils
 from safetensors import SafetensorError, safe_open
@@ -57,11 +57,15 @@ def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> P
     """
     open_stage(root)  # raises if a layer is missing
     root = root.resolve()
-    layers, assets, lost = dependencies(root)
+    diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
+    try:
+        layers, assets, lost = UsdUtils.ComputeAllDependencies(str(root))
+    finally:
+        diagnostics.TakeUncoalescedDiagnostics()
     files = {Path(layer.realPath).resolve(): layer for layer in layers}
     others = [Path(asset).resolve() for asset in assets]
     for name in lost:
-        if not _is_library(name):
+        if Path(name).suffix != ".mdl" or "/" in name:  # a material of Omniverse, such as OmniPBR.mdl
             raise InputError(
                 f"{_namer(layers, name)}: names {name}, which does not exist; add the file or remove the name"
             )
@@ -75,25 +79,11 @@ def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> P
     return folder / places[root]
 
 
-def dependencies(root: Path) -> tuple[list[Sdf.Layer], list[str], list[str]]:
-    """Layers of a stage in any variant, other files that they name, and names of missing files."""
-    diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
-    try:
-        layers, assets, lost = UsdUtils.ComputeAllDependencies(str(root))
-    finally:
-        diagnostics.TakeUncoalescedDiagnostics()
-    return layers, assets, lost
-
-
-@dataclass(frozen=True)
-class NamedFile:
-    """A file that a layer names."""
+class NamedFile(NamedTuple):
+    """The path of a file as a layer writes it, and the prim or property that names it ("": the layer)."""
 
     path: str
-    """The asset path, as it is written."""
-
     where: str
-    """Path of the prim or property that names it; "" for the layer itself."""
 
 
 def named_files(layer: Sdf.Layer) -> list[NamedFile]:
@@ -129,28 +119,18 @@ def named_files(layer: Sdf.Layer) -> list[NamedFile]:
 _ASSETS = (Sdf.ValueTypeNames.Asset, Sdf.ValueTypeNames.AssetArray)
 
 
-def _is_library(name: str) -> bool:
-    """Whether a name is a material of Omniverse, such as OmniPBR.mdl."""
-    return Path(name).suffix == ".mdl" and "/" not in name
-
-
 def _check_carried(file: Path, layers: Iterable[Sdf.Layer], within: Path | None) -> None:
     """Refuse a file that must not be exported."""
     if "[" in file.as_posix() or file.suffix == ".usdz":
-        raise InputError(
-            f"{_namer(layers, str(file))}: names {file}, a part of a package; unpack that with "
-            "`magtwin export FILE.usdz --out DIR`, and name a layer in it"
-        )
-    if within is not None and not file.is_relative_to(within.resolve()):
-        raise InputError(
-            f"{_namer(layers, str(file))}: names {file}, outside its package"
-            "; a package must contain all of its files"
-        )
-    if file.suffix not in SUFFIXES and not kind_of(file):
-        raise InputError(
-            f"{_namer(layers, str(file))}: names {file}, which is no layer, texture, network or path, so it "
-            "is not exported; remove the name"
-        )
+        text = "a part of a package; unpack that with `magtwin export FILE.usdz --out DIR`, and name a "
+        text += "layer in it"
+    elif within is not None and not file.is_relative_to(within.resolve()):
+        text = "outside its package; a package must contain all of its files"
+    elif file.suffix not in SUFFIXES and not kind_of(file):
+        text = "which is no layer, texture, network or path, so it is not exported; remove the name"
+    else:
+        return
+    raise InputError(f"{_namer(layers, str(file))}: names {file}, {text}")
 
 
 def _namer(layers: Iterable[Sdf.Layer], name: str) -> str:

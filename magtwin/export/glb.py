@@ -7,7 +7,7 @@ map name the accessor of its values. Time samples become an animation.
 
 import json
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -58,8 +58,15 @@ def write_glb(stage_file: Path, out: Path) -> None:
     shapes = [shape for shape in read_shapes(stage) if len(shape.faces)]
     if not shapes:
         raise InputError(f"{stage_file}: has no visible surface")
+    homes: dict[Sdf.Path, list[Shape]] = {}  # prim of the node: the body, or a child of the default prim
+    for shape in shapes:
+        body = prim = stage.GetPrimAtPath(shape.prim)
+        while body and not body.HasAPI(UsdPhysics.RigidBodyAPI):
+            body = body.GetParent()
+        home = body.GetPath() if body else prim.GetPath().GetPrefixes()[:2][-1]
+        homes.setdefault(home, []).append(shape)
     scene = _Scene(stage)
-    for home, own in _gathered(stage, shapes).items():
+    for home, own in homes.items():
         scene.show(home, own)
     for noun in NOUNS_SHOWN:
         for prim in prims_with(stage.GetPseudoRoot(), noun):
@@ -68,26 +75,14 @@ def write_glb(stage_file: Path, out: Path) -> None:
     out.write_bytes(scene.glb())
 
 
-def _gathered(stage: Usd.Stage, shapes: Iterable[Shape]) -> dict[Sdf.Path, list[Shape]]:
-    """Shapes by the prim of their node: their body, or a child of the default prim."""
-    homes: dict[Sdf.Path, list[Shape]] = {}
-    for shape in shapes:
-        prim = stage.GetPrimAtPath(shape.prim)
-        body = prim
-        while body and not body.HasAPI(UsdPhysics.RigidBodyAPI):
-            body = body.GetParent()
-        home = body.GetPath() if body else prim.GetPath().GetPrefixes()[:2][-1]
-        homes.setdefault(home, []).append(shape)
-    return homes
-
-
 class _Scene:
     """A glTF that is being built."""
 
     def __init__(self, stage: Usd.Stage) -> None:
         self.stage, self.rest = stage, UsdGeom.XformCache()
         self.data = bytearray()
-        root = {"name": _root_name(stage), "rotation": _plain(Y_UP), "children": []}
+        name = Path(stage.GetRootLayer().realPath).stem
+        root = {"name": name, "rotation": _plain(Y_UP), "children": []}
         self.nodes: list[dict[str, Any]] = [root]
         self.index: dict[Sdf.Path, int] = {Sdf.Path.absoluteRootPath: 0}
         self.parts: dict[str, list[Any]] = {
@@ -189,20 +184,16 @@ class _Scene:
             for name, array in numbers.items():
                 extras[attribute_name("anomalyMap", name)] = {"accessor": self._accessor(array)}
             for child in prim.GetChildren():
-                if colours := _colour_scale(child):
-                    extras["colours"] = colours
+                scale = child.GetCustomDataByKey("magtwin") or {}
+                if "colourMap" in scale:
+                    extras["colours"] = {key: _json_value(value) for key, value in scale.items()}
 
     def animate(self) -> None:
         """Animate the nodes of prims with time samples."""
-        moving = [
-            prim
-            for prim in self.stage.Traverse()
-            if UsdGeom.Xformable(prim) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying()
-        ]
+        forms = [form for prim in self.stage.Traverse() if (form := UsdGeom.Xformable(prim))]
+        moving = [form.GetPrim() for form in forms if form.TransformMightBeTimeVarying()]
         rate, start = self.stage.GetTimeCodesPerSecond(), self.stage.GetStartTimeCode()
-        channels: list[dict[str, Any]] = []
-        samplers: list[dict[str, Any]] = []
-        clocks: dict[bytes, int] = {}
+        channels, samplers, clocks = list[dict[str, Any]](), list[dict[str, Any]](), dict[bytes, int]()
         for prim in moving:
             times = np.array(UsdGeom.Xformable(prim).GetTimeSamples())
             cache, poses = UsdGeom.XformCache(), []
@@ -264,13 +255,8 @@ class _Scene:
         text += b" " * (-len(text) % 4)
         size = 12 + 8 + len(text) + 8 + len(self.data)
         head = struct.pack("<4sII", b"glTF", 2, size)
-        return b"".join(
-            (
-                head,
-                struct.pack("<I4s", len(text), b"JSON") + text,
-                struct.pack("<I4s", len(self.data), b"BIN\0") + bytes(self.data),
-            )
-        )
+        chunks = [struct.pack("<I4s", len(d), k) + d for k, d in ((b"JSON", text), (b"BIN\0", self.data))]
+        return head + b"".join(chunks)
 
 
 def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float64]:
@@ -310,11 +296,6 @@ def _roughness(prim: Usd.Prim) -> float:
     return 0.5 if value is None else round(float(value), 6)
 
 
-def _colour_scale(prim: Usd.Prim) -> dict[str, Any]:
-    metadata: Mapping[str, Any] = prim.GetCustomDataByKey("magtwin") or {}
-    return {key: _json_value(value) for key, value in metadata.items()} if "colourMap" in metadata else {}
-
-
 def _json_value(value: Any) -> Any:
     """A value for JSON; None unless it is a number, text or short list of them."""
     if isinstance(value, bool | int | str):
@@ -336,7 +317,3 @@ def _json_value(value: Any) -> Any:
 def _plain(numbers: Iterable[float]) -> list[float]:
     """Numbers for JSON, to nine digits, as single precision needs."""
     return [float(f"{float(x):.9g}") + 0.0 for x in numbers]
-
-
-def _root_name(stage: Usd.Stage) -> str:
-    return Path(stage.GetRootLayer().realPath).stem

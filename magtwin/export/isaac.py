@@ -7,8 +7,7 @@ definitions of its nodes, see `magtwin.export.ogn`.
 """
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from pxr import Sdf, Usd, UsdPhysics
 
@@ -20,9 +19,10 @@ from magtwin.spec.base import ZERO3
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import BatterySpec, MountSpec
+from magtwin.usd.geometry import BASE_LINK
 from magtwin.usd.layers import WORLD
 from magtwin.usd.schema import only_prim_with, place, prims_with
-from magtwin.usd.sensors import BASE, IMU_TYPE, LIDAR_TYPE
+from magtwin.usd.sensors import IMU_TYPE, LIDAR_TYPE
 
 GRAPHS = WORLD.AppendChild("Graphs")
 """Scope of the graphs; each has the name of its robot."""
@@ -47,8 +47,7 @@ DEFAULT_QOS, SENSOR_QOS, CLOCK_QOS = "qos", "sensor_qos", "clock_qos"
 """Nodes with the QoS of topics."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Parts:
+class _Parts(NamedTuple):
     """Prims of a robot for its graph."""
 
     root: Sdf.Path
@@ -73,47 +72,41 @@ def author_graph(stage: Usd.Stage, scene: Scene) -> list[Usd.Prim]:
         InputError: A robot is not on the stage, lacks Isaac Sim's robot schema, or lacks a sensor.
     """
     robots = {prim.GetName(): prim for prim in prims_with(stage.GetPseudoRoot(), "robot")}
-    alone, graphs = len(scene.robots) == 1, []
-    for k, placed in enumerate(scene.robots):
-        robot = placed.robot
+    alone, graphs = len(scene.robots) == 1, list[Usd.Prim]()
+    for robot in (placed.robot for placed in scene.robots):
         if robot.name not in robots:
             raise InputError(f"the stage has no robot {robot.name!r}; it has {', '.join(robots) or 'none'}")
         parts = _parts(robots[robot.name])
         if not stage.GetPrimAtPath(GRAPHS):
             stage.DefinePrim(GRAPHS, "Scope")
-        graph = Graph(stage, GRAPHS.AppendChild(robot.name))
-        _author(graph, robot, parts, ROBOT if alone else robot.name, clock=k == 0)
+        graph, topics = Graph(stage, GRAPHS.AppendChild(robot.name)), f"/{ROBOT if alone else robot.name}"
+        _clocks(graph, publish=not graphs)
+        _odometry(graph, parts, f"{topics}/odom")
+        _imu(graph, parts, f"{topics}/imu", frame_of(robot.imu, "imu"))
+        _pose(graph, parts, f"{topics}/enu/pose")
+        _battery(graph, robot.battery, f"{topics}/battery_state")
+        _joints(graph, parts, f"{topics}/joint_states")
+        _scan(graph, parts, f"{topics}/scan", frame_of(robot.lidar, "lidar"))
+        _drive(graph, robot, parts, f"{topics}/cmd_vel")
         graphs.append(stage.GetPrimAtPath(graph.path))
     return graphs
 
 
-def _author(graph: Graph, robot: RobotSpec, parts: _Parts, namespace: str, *, clock: bool) -> None:
-    """The nodes of one robot's graph."""
+def _clocks(graph: Graph, *, publish: bool) -> None:
+    """Ticks, time stamps, and the QoS of `magtwin.io.bags.topics`."""
     graph.node("tick", "omni.graph.action.OnPlaybackTick")
     graph.node("time", f"{CORE}IsaacReadSimulationTime", resetOnStop=True)
     graph.node("stamp", f"{CORE}IsaacTimeSplitter")
     graph.connect("time.simulationTime", "stamp.time")
     graph.node("context", f"{BRIDGE}ROS2Context", useDomainIDEnvVar=True)
-    _qos(graph)
-    if clock:
-        graph.node("clock", f"{BRIDGE}ROS2PublishClock", topicName="/clock")
-        _published(graph, "clock", CLOCK_QOS)
-    _odometry(graph, parts, f"/{namespace}/odom")
-    _imu(graph, parts, f"/{namespace}/imu", frame_of(robot.imu, "imu"))
-    _pose(graph, parts, f"/{namespace}/enu/pose")
-    _battery(graph, robot.battery, f"/{namespace}/battery_state")
-    _joints(graph, parts, f"/{namespace}/joint_states")
-    _scan(graph, parts, f"/{namespace}/scan", frame_of(robot.lidar, "lidar"))
-    _drive(graph, robot, parts, f"/{namespace}/cmd_vel")
-
-
-def _qos(graph: Graph) -> None:
-    """QoS as in `magtwin.io.bags.topics`."""
     kind = f"{BRIDGE}ROS2QoSProfile"
     reliable, best = {"reliability": "reliable"}, {"reliability": "bestEffort"}
     graph.node(DEFAULT_QOS, kind, createProfile="Default for publishers/subscribers", depth=10, **reliable)
     graph.node(SENSOR_QOS, kind, createProfile="Sensor Data", depth=5, **best)
     graph.node(CLOCK_QOS, kind, createProfile="Custom", depth=1, **best)
+    if publish:
+        graph.node("clock", f"{BRIDGE}ROS2PublishClock", topicName="/clock")
+        _published(graph, "clock", CLOCK_QOS)
 
 
 def _published(graph: Graph, node: str, qos: str, after: str = "tick.tick", *, stamp: bool = True) -> None:
@@ -133,7 +126,7 @@ def _odometry(graph: Graph, parts: _Parts, topic: str) -> None:
         f"{BRIDGE}ROS2PublishOdometry",
         topicName=topic,
         odomFrameId="odom",
-        chassisFrameId=BASE,
+        chassisFrameId=BASE_LINK,
         publishRawVelocities=True,  # they are in the robot's axes already
     )
     graph.connect("tick.tick", "odometry.execIn")
@@ -157,7 +150,8 @@ def _pose(graph: Graph, parts: _Parts, topic: str) -> None:
     graph.node("pose", f"{CORE}IsaacReadWorldPose", prim=parts.base)
     graph.node("place", f"{BREAK}3")
     graph.node("turn", f"{BREAK}4")
-    _message(graph, "publish_pose", "geometry_msgs/msg/PoseStamped", topic, "map", DEFAULT_QOS)
+    values = {"topicName": topic, "header:frame_id": "map"}
+    _message(graph, "publish_pose", "geometry_msgs/msg/PoseStamped", DEFAULT_QOS, **values)
     graph.connect("pose.translation", "place.tuple")
     graph.connect("pose.orientation", "turn.tuple")
     for axis in "xyz":
@@ -170,39 +164,25 @@ def _battery(graph: Graph, spec: BatterySpec, topic: str) -> None:
     """The battery at the start of a run, with the load of the electronics: it does not discharge."""
     charge = spec.initial_fraction
     current = float(current_a(spec, spec.load_w, charge))
-    unknown = math.nan
     graph.node("seldom", f"{CORE}IsaacSimulationGate", step=max(1, round(FRAMES_HZ / spec.rate_hz)))
     graph.connect("tick.tick", "seldom.execIn")
-    _message(
-        graph,
-        "publish_battery",
-        "sensor_msgs/msg/BatteryState",
-        topic,
-        BASE,
-        SENSOR_QOS,
-        after="seldom.execOut",
-        voltage=float(open_voltage(spec, charge)) - spec.resistance_ohm * current,
-        current=-current,  # ROS counts current into the battery
-        percentage=charge,
-        **dict.fromkeys(("temperature", "charge", "capacity", "design_capacity"), unknown),
-        power_supply_status=DISCHARGING,
-        present=True,
-    )
+    values = {
+        "topicName": topic,
+        "header:frame_id": BASE_LINK,
+        "voltage": float(open_voltage(spec, charge)) - spec.resistance_ohm * current,
+        "current": -current,  # ROS counts current into the battery
+        "percentage": charge,
+        **dict.fromkeys(("temperature", "charge", "capacity", "design_capacity"), math.nan),
+        "power_supply_status": DISCHARGING,
+        "present": True,
+    }
+    kind = "sensor_msgs/msg/BatteryState"
+    _message(graph, "publish_battery", kind, SENSOR_QOS, after="seldom.execOut", **values)
 
 
-def _message(
-    graph: Graph,
-    node: str,
-    message: str,
-    topic: str,
-    frame: str,
-    qos: str,
-    after: str = "tick.tick",
-    **values: Any,
-) -> None:
+def _message(graph: Graph, node: str, kind: str, qos: str, after: str = "tick.tick", **values: Any) -> None:
     """A generic publisher of a message with a header."""
-    values |= {"topicName": topic, "header:frame_id": frame}
-    graph.node(node, f"{BRIDGE}ROS2Publisher", message=message, **values)
+    graph.node(node, f"{BRIDGE}ROS2Publisher", message=kind, **values)
     _published(graph, node, qos, after, stamp=False)
     graph.connect("stamp.seconds", f"{node}.header:stamp:sec")
     graph.connect("stamp.nanoseconds", f"{node}.header:stamp:nanosec")
@@ -273,11 +253,7 @@ def frame_of(mount: MountSpec, name: str) -> str:
 
 
 def _parts(root: Usd.Prim) -> _Parts:
-    """The prims of a robot that Isaac Sim needs.
-
-    Raises:
-        InputError: One is missing.
-    """
+    """The prims of a robot that Isaac Sim needs."""
     if ROBOT_API not in root.GetMetadata("apiSchemas").GetAppliedItems():
         raise InputError(
             f"{place(root)}: has no {ROBOT_API}, so Isaac Sim does not see a robot; convert its URDF "

@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Literal
 
 from jinja2 import Template
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Sdf, UsdGeom
 
 from magtwin.errors import InputError, find
 from magtwin.export.attached import attach, detach
@@ -55,7 +55,9 @@ GENERATED = ("plugInfo.json", "generatedSchema.usda")
 README = "README.md"
 
 SCRIPTS = Path(__file__).resolve().parent / "scripts"
-"""Examples that need no magtwin; the ones whose names begin with the profile are exported too."""
+"""Examples that need no magtwin; those whose names begin with the profile are exported with `SHARED`."""
+
+SHARED = SCRIPTS / "magnetometer.py"
 
 
 @dataclass(frozen=True)
@@ -81,9 +83,8 @@ class Exported:
         for file in self.files:
             inside = [f for f in file.rglob("*") if f.is_file()] if file.is_dir() else [file]
             size = sum(f.stat().st_size for f in inside) / 1e6
-            figures.append(
-                Figure(str(file), size, "MB", note=f"{len(inside)} files" if file.is_dir() else "")
-            )
+            note = f"{len(inside)} files" if file.is_dir() else ""
+            figures.append(Figure(str(file), size, "MB", note=note))
         metadata = {"licences": self.licences, "notes": list(self.notes)}
         return Report(str(self.files[0]), tuple(figures), {k: v for k, v in metadata.items() if v})
 
@@ -108,21 +109,23 @@ def export_scene(
             a package lies a folder `<name>_magtwin` with the schema plugin, README.md and the network.
         profile: A key of `PROFILES`. Default: omniverse for folders and packages, else viewer.
         animation: A run that plays over the stage; in a folder it is a separate layer, `<name>_run.usdc`.
-        to_onnx: Function of weights and output that writes a network as ONNX beside its weights. If it raises
-            InputError, the export has a note.
-        thumbnail: Function of root layer and output that draws a PNG of 256 x 256 pixels. If it raises
-            InputError, the export has a note.
-        trusted: Whether the stage was made here. Otherwise another process reads it first, since a damaged
-            layer can crash its reader; that takes a second.
+        to_onnx: Function f(weights file, output file) that writes the network as ONNX. If it raises
+            InputError, the report of the export has a note.
+        thumbnail: Function f(root layer, output file) that draws a PNG of 256 x 256 pixels. If it raises
+            InputError, the report of the export has a note.
+        trusted: Whether the stage comes from a trusted source. If not, a separate process reads it first,
+            since a damaged layer can crash its reader. That takes a second.
         force: Whether to replace existing files.
         progress: Function that is called with the name of each step.
 
     Raises:
-        InputError: The stage cannot be opened, names missing files, differs from its checksums, or is not in
-            metres with Z up; or `out` exists, or cannot hold the stage. Nothing is written.
+        InputError: The stage cannot be opened, refers to files that do not exist, does not match its
+            checksums, or is not in metres with Z up; or `out` exists, or cannot hold the stage. Nothing is
+            written.
     """
     scene_file, out = Path(scene_file), Path(out)
-    kind = KINDS.get(out.suffix) or _no_kind(out)
+    if (kind := KINDS.get(out.suffix)) is None:
+        raise InputError(f"{out}: an export is a folder (no suffix), or ends in .usdz, .usd, .usdc or .glb")
     name: str = profile or ("omniverse" if kind in ("folder", "package") else "viewer")
     find("profile", name, PROFILES)
     if kind in ("layer", "web") and name != "viewer":
@@ -167,10 +170,6 @@ def export_scene(
         shown = work.run or work.root
     root = out / shown.name if kind == "folder" else out
     return Exported((out, *([beside] if beside else [])), root, name, work.licences, tuple(work.notes))
-
-
-def _no_kind(out: Path) -> str:
-    raise InputError(f"{out}: an export is a folder (no suffix), or ends in .usdz, .usd, .usdc or .glb")
 
 
 @contextmanager
@@ -243,7 +242,8 @@ class _Work:
             read_map(prim)
             self.map = self.map or str(prim.GetPath())
             licence = prim.GetAttribute(attribute_name("anomalyMap", "licence")).Get()
-            self.licences[self._relative(_values_layer(prim))] = licence or UNKNOWN
+            values = prim.GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack()[0].layer
+            self.licences[self._relative(Path(values.realPath))] = licence or UNKNOWN
         magnetometers = prims_with(world, "magnetometer")
         self.magnetometer = str(magnetometers[0].GetPath()) if magnetometers else ""
         self.networks: list[Path] = []
@@ -384,9 +384,8 @@ class _Work:
         if not viewer:
             for name in GENERATED:
                 copied(SCHEMA / name, folder / PLUGIN / name)
-        template = Template(
-            (Path(__file__).with_name("readme.md.jinja")).read_text(encoding="utf-8"), trim_blocks=True
-        )
+        text = Path(__file__).with_name("readme.md.jinja").read_text(encoding="utf-8")
+        template = Template(text, trim_blocks=True)
         page = template.render(
             name=self.source.stem,
             version=__version__,
@@ -407,14 +406,8 @@ class _Work:
             notes=self.notes,
         )
         (folder / README).write_text(page, encoding="utf-8")
-        for script in self.scripts:
+        for script in (*self.scripts, SHARED) if self.scripts else ():
             copied(script, folder / script.name)
-
-
-def _values_layer(prim: Usd.Prim) -> Path:
-    """The file that holds a map's values."""
-    specs = prim.GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack()
-    return Path(specs[0].layer.realPath)
 
 
 def licence_of(network: Path) -> str:

@@ -40,7 +40,8 @@ def pack(root: Path, out: Path) -> None:
         InputError: A file is of another kind, or the package would be too large.
     """
     folder = root.parent
-    files = sorted(f for f in folder.rglob("*") if f.is_file() and not _is_hidden(f.relative_to(folder)))
+    hidden = {f for f in folder.rglob("*") if any(p.startswith(".") for p in f.relative_to(folder).parts)}
+    files = sorted(f for f in folder.rglob("*") if f.is_file() and f not in hidden)
     for file in files:
         if file.suffix.lower() not in ALLOWED:
             raise InputError(
@@ -116,7 +117,3 @@ def _check(package: Path, entries: list[zipfile.ZipInfo]) -> None:
     size = package.stat().st_size
     if sum(entry.file_size for entry in entries) > size:
         raise InputError(f"{package}: its entries say that they are larger than it is; it is damaged")
-
-
-def _is_hidden(path: Path) -> bool:
-    return any(part.startswith(".") for part in path.parts)

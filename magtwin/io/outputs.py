@@ -18,7 +18,8 @@ from magtwin.path import Path as Planned
 from magtwin.run.run import Run
 from magtwin.sim.motion.commands import Commands, read_commands
 from magtwin.sim.motion.drive_input import drive_input
-from magtwin.twin import Session, Twin, in_session, open_twin, room_of, scan, simulate
+from magtwin.spec.plant import PlantSpec
+from magtwin.twin import Session, Twin, in_session, open_twin, room_of, scan, simulate, with_plant
 
 if TYPE_CHECKING:
     from magtwin.sim.sensors.lidar import Scans
@@ -51,8 +52,10 @@ def drive(
     network: str | Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
     model_error: bool = True,
+    tracking_error: bool = True,
     seed: int = 0,
     session: Session | None = None,
+    plant: PlantSpec | str | None = None,
     fit: bool = False,
     scans: bool = False,
     metadata: Mapping[str, str | int] = MappingProxyType({}),
@@ -69,8 +72,10 @@ def drive(
         network: As for `magtwin.open_twin`.
         magnetometer: As for `magtwin.open_twin`.
         model_error: As for `magtwin.open_twin`.
+        tracking_error: As for `magtwin.open_twin`.
         seed: Seed of all noise.
         session: As for `magtwin.simulate`.
+        plant: As for `magtwin.simulate`.
         fit: Whether the path is moved and shrunk until it fits.
         scans: Whether the LiDAR's rays are cast.
         metadata: Metadata of the run, such as names of files that move with it.
@@ -88,8 +93,14 @@ def drive(
         metadata = {"replay_file": Path(replay).as_posix(), **metadata}
     elif path != "random":
         drive_input(path)  # refuses a wrong name before the scene is opened
-    twin = open_twin(scene_file, network=network, magnetometer=magnetometer, model_error=model_error)
-    twin = in_session(twin, session, seed=seed)
+    twin = open_twin(
+        scene_file,
+        network=network,
+        magnetometer=magnetometer,
+        model_error=model_error,
+        tracking_error=tracking_error,
+    )
+    twin = in_session(with_plant(twin, plant), session, seed=seed)
     planned = None
     if what is path and path != "random":
         what = planned = drive_input(path, room_of(twin), fit=fit)

@@ -76,27 +76,26 @@ class Message:
 Handler = Callable[[Message], None]
 
 
-class Publisher(Protocol):
+@dataclass(frozen=True)
+class Publisher:
     """Sends messages of one topic."""
 
     topic: str
     kind: str
+    publish: Callable[[bytes], object]
+    """Send a message, in CDR."""
 
-    def publish(self, data: bytes) -> None:
-        """Send a message, in CDR."""
-
-    def subscribers(self) -> int:
-        """Number of subscribers."""
+    subscribers: Callable[[], int]
+    """Number of subscribers."""
 
 
-class Subscription(Protocol):
+@dataclass(frozen=True)
+class Subscription:
     """Receives messages of one topic."""
 
     topic: str
-    kind: str
-
-    def publishers(self) -> int:
-        """Number of publishers."""
+    publishers: Callable[[], int]
+    """Number of publishers."""
 
 
 class Timer(Protocol):
@@ -111,6 +110,7 @@ class Bus(Protocol):
 
     name: str
     backend: str
+    _names: "Names"
 
     def publisher(self, topic: str, kind: str, qos: Qos) -> Publisher:
         """Advertise a topic; `Names` resolves its name."""
@@ -123,6 +123,7 @@ class Bus(Protocol):
 
         cyclonedds cannot: each ROS 2 middleware addresses answers in a different way.
         """
+        return False
 
     def settable(
         self, table: Mapping[str, Parameter], values: Mapping[str, Any], changed: Callable[[str, Any], None]
@@ -136,12 +137,14 @@ class Bus(Protocol):
             values: Their values.
             changed: Called with name and value of each valid change, in the thread that spins.
         """
+        return False
 
     def knows(self, kind: str) -> bool:
         """Whether messages of a type can be sent and received."""
 
     def resolve(self, topic: str) -> str:
         """The full name of a topic on the network."""
+        return self._names.resolve(topic)
 
     def types(self, topic: str) -> tuple[str, ...]:
         """Types in which a topic is published, as far as discovered."""
@@ -182,17 +185,10 @@ class Names:
         `magtwin.io.bags.topics.TOPICS` counts as relative.
         """
         relative = name.removeprefix("/robot/")
-        whole = relative if relative.startswith("/") else f"{self._space}/{relative}"
-        for candidate in (name, relative, whole):
-            if candidate in self.remaps:
-                target = self.remaps[candidate]
-                return target if target.startswith("/") else f"{self._space}/{target}"
-        return whole
-
-    @property
-    def _space(self) -> str:
-        space = self.namespace.strip("/")
-        return f"/{space}" if space else ""
+        space = f"/{self.namespace.strip('/')}".rstrip("/")
+        whole = relative if relative.startswith("/") else f"{space}/{relative}"
+        target = next((self.remaps[n] for n in (name, relative, whole) if n in self.remaps), whole)
+        return target if target.startswith("/") else f"{space}/{target}"
 
 
 def names_of(namespace: str = "robot", remaps: Iterable[str] = ()) -> Names:
@@ -251,24 +247,19 @@ def open_bus(
         domain = int(text)
     if not 0 <= domain <= 232:
         raise InputError(f"a domain of ROS must be from 0 to 232, got {domain}")
-    opened = _backend(backend)
-    bus: Bus = opened(name, names or Names(), sim_time=sim_time, domain=domain)
-    return bus
-
-
-def _backend(name: Backend) -> Any:
-    """The class of a backend: of that name, or the first that can be imported."""
-    installed = available()
-    if name != "auto" and name not in installed:
-        find("backend", name, BACKENDS)
-        raise InputError(f"{name} cannot be imported; {installed[0]} can" if installed else MISSING)
-    broken = []
-    for candidate in installed if name == "auto" else (name,):
+    installed, broken = available(), []
+    if backend != "auto" and backend not in installed:
+        find("backend", backend, BACKENDS)
+        raise InputError(f"{backend} cannot be imported; {installed[0]} can" if installed else MISSING)
+    for candidate in installed if backend == "auto" else (backend,):
         module, kind = BACKENDS[candidate]
         try:
-            return getattr(importlib.import_module(module), kind)
+            opened = getattr(importlib.import_module(module), kind)
         except ImportError as error:
             broken.append(f"{candidate} is installed but cannot be imported: {str(error).splitlines()[0]}")
+            continue
+        bus: Bus = opened(name, names or Names(), sim_time=sim_time, domain=domain)
+        return bus
     raise InputError("; ".join(broken) or MISSING)
 
 

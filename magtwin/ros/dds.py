@@ -7,7 +7,7 @@ does not show it, and it has no parameters.
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -32,9 +32,8 @@ from magtwin.errors import InputError
 from magtwin.io.bags.cdr import NS
 from magtwin.io.bags.topics import CLOCK, Qos
 from magtwin.io.bags.types import typestore
-from magtwin.ros.bus import Handler, Message, Names, localhost_only
+from magtwin.ros.bus import Bus, Handler, Message, Names, Publisher, Subscription, localhost_only
 from magtwin.ros.clock import Alarm, Clock
-from magtwin.ros.parameters import Parameter
 from magtwin.ros.types import raw, ros_name, struct_of
 
 MOST_TAKEN = 256
@@ -70,33 +69,7 @@ def qos_of(qos: Qos) -> DdsQos:
     )
 
 
-class DdsPublisher:
-    """As `magtwin.ros.bus.Publisher`."""
-
-    def __init__(self, topic: str, kind: str, writer: DataWriter[Any]) -> None:
-        self.topic, self.kind, self._writer = topic, kind, writer
-
-    def publish(self, data: bytes) -> None:
-        """Send a message."""
-        self._writer.write(raw(self.kind, data))
-
-    def subscribers(self) -> int:
-        """Number of subscribers."""
-        return len(self._writer.get_matched_subscriptions())
-
-
-class DdsSubscription:
-    """As `magtwin.ros.bus.Subscription`."""
-
-    def __init__(self, topic: str, kind: str, reader: DataReader[Any], handler: Handler) -> None:
-        self.topic, self.kind, self.reader, self.handler = topic, kind, reader, handler
-
-    def publishers(self) -> int:
-        """Number of publishers."""
-        return len(self.reader.get_matched_publications())
-
-
-class DdsBus:
+class DdsBus(Bus):
     """As `magtwin.ros.bus.Bus`."""
 
     backend = "cyclonedds"
@@ -116,8 +89,8 @@ class DdsBus:
             ) from error
         self._waiting = WaitSet(self._participant)
         self._topics: dict[str, tuple[str, DdsTopic[Any]]] = {}
-        self._publishers: list[DdsPublisher] = []
-        self._subscriptions: list[DdsSubscription] = []
+        self._writers: list[DataWriter[Any]] = []
+        self._readers: list[tuple[DataReader[Any], str, Handler]] = []
         self._conditions: list[ReadCondition] = []
         self._offers: BuiltinDataReader | None = None
         self._offered: dict[Any, tuple[str, str]] = {}
@@ -125,42 +98,31 @@ class DdsBus:
         if sim_time:
             self.subscribe(CLOCK.name, CLOCK.kind, self._tick, replace(CLOCK.qos, depth=CLOCK_DEPTH))
 
-    def publisher(self, topic: str, kind: str, qos: Qos) -> DdsPublisher:
+    def publisher(self, topic: str, kind: str, qos: Qos) -> Publisher:
         """As for `Bus`."""
         whole = self._names.resolve(topic)
         writer: DataWriter[Any] = DataWriter(self._participant, self._topic(whole, kind), qos_of(qos))
-        publisher = DdsPublisher(whole, kind, writer)
-        self._publishers.append(publisher)  # its latched message lives as long as its writer
-        return publisher
+        self._writers.append(writer)  # its latched message lives as long as it does
+        return Publisher(
+            whole,
+            kind,
+            lambda data: writer.write(raw(kind, data)),
+            lambda: len(writer.get_matched_subscriptions()),
+        )
 
-    def subscribe(self, topic: str, kind: str, handler: Handler, qos: Qos) -> DdsSubscription:
+    def subscribe(self, topic: str, kind: str, handler: Handler, qos: Qos) -> Subscription:
         """As for `Bus`."""
         whole = self._names.resolve(topic)
         reader: DataReader[Any] = DataReader(self._participant, self._topic(whole, kind), qos_of(qos))
-        subscription = DdsSubscription(whole, kind, reader, handler)
         fresh = ReadCondition(reader, SampleState.NotRead | ViewState.Any | InstanceState.Any)
         self._waiting.attach(fresh)
         self._conditions.append(fresh)
-        self._subscriptions.append(subscription)
-        return subscription
-
-    def service(self, name: str, called: Callable[[], None]) -> bool:
-        """As for `Bus`."""
-        return False
-
-    def settable(
-        self, table: Mapping[str, Parameter], values: Mapping[str, Any], changed: Callable[[str, Any], None]
-    ) -> bool:
-        """As for `Bus`."""
-        return False
+        self._readers.append((reader, kind, handler))
+        return Subscription(whole, lambda: len(reader.get_matched_publications()))
 
     def knows(self, kind: str) -> bool:
         """As for `Bus`: the types of ROS 2 Humble."""
         return kind in typestore().fielddefs
-
-    def resolve(self, topic: str) -> str:
-        """As for `Bus`."""
-        return self._names.resolve(topic)
 
     def types(self, topic: str) -> tuple[str, ...]:
         """As for `Bus`."""
@@ -194,12 +156,8 @@ class DdsBus:
 
     def close(self) -> None:
         """As for `Bus`."""
-        for subscription in self._subscriptions:
-            subscription.handler = _ignore
-        self._conditions.clear()
-        self._subscriptions.clear()
-        self._publishers.clear()
-        self._topics.clear()
+        for held in (self._conditions, self._readers, self._writers, self._topics):
+            held.clear()  # type: ignore[attr-defined]
         del self._waiting, self._participant
 
     def _offers_of(self, topic: str) -> list[str]:
@@ -226,27 +184,20 @@ class DdsBus:
 
     def _take(self) -> None:
         """Handle all received messages in the order of sending."""
-        received: list[tuple[int, int, DdsSubscription, bytes]] = []
-        for subscription in reversed(
-            self._subscriptions
-        ):  # /clock, the first one, last: it gives the others their time
-            while taken := subscription.reader.take(N=MOST_TAKEN):
-                for sample in taken:
-                    if sample.sample_info.valid_data:
-                        sent_ns = sample.sample_info.source_timestamp
-                        received.append((sent_ns, len(received), subscription, sample.cdr))
+        received: list[tuple[int, str, Handler, bytes]] = []
+        # /clock, the first reader, comes last: it gives the others their time.
+        for reader, kind, handler in reversed(self._readers):
+            while taken := reader.take(N=MOST_TAKEN):
+                infos = [(sample.sample_info, sample.cdr) for sample in taken]
+                received += [(i.source_timestamp, kind, handler, cdr) for i, cdr in infos if i.valid_data]
                 if len(taken) < MOST_TAKEN:
                     break
-        received.sort(key=lambda entry: entry[:2])
         now = time.time_ns()
-        for sent_ns, _, subscription, data in received:
-            subscription.handler(Message(subscription.kind, data, sent_ns, now))
+        for sent_ns, kind, handler, data in sorted(received, key=lambda entry: entry[0]):
+            if self._readers:  # a handler may close the node
+                handler(Message(kind, data, sent_ns, now))
 
     def _tick(self, message: Message) -> None:
         with suppress(InputError):  # a damaged message
             self.clock.tell(int(message.read(["clock"])["clock"]), message.sent_ns)
         self.clock.run_due()  # at each tick, even if several arrive at once
-
-
-def _ignore(message: Message) -> None:
-    """Handler of a closed bus."""

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from magtwin.io.bags.topics import Qos
-from magtwin.ros.bus import Bus, Message, to_bytes
+from magtwin.ros.bus import Bus, to_bytes
 
 Level = Literal["ok", "warn", "error", "stale"]
 
@@ -69,26 +69,6 @@ def to_fields(statuses: Sequence[Status], stamp_ns: int, hardware: str = "") -> 
             parts |= {f"values.{n}.key": key, f"values.{n}.value": value}
         fields |= {f"status.{k}.{name}": value for name, value in parts.items()}
     return fields
-
-
-def from_message(message: Message) -> list[Status]:
-    """The statuses of a DiagnosticArray."""
-    counts = {"status": 0}
-    total = int(message.read(["status"], counts)["status"])
-    for k in range(total):
-        name = f"status.{k}.values"
-        counts |= {"status": k + 1, name: 0}
-        counts[name] = int(message.read([name], counts)[name])
-    names = list(LEVELS)
-    statuses = []
-    for k in range(total):
-        keys = [f"status.{k}.values.{n}" for n in range(counts[f"status.{k}.values"])]
-        parts = [f"status.{k}.{part}" for part in ("level", "name", "message")]
-        read = message.read([*parts, *(f"{key}.{part}" for key in keys for part in ("key", "value"))], counts)
-        level: Any = names[int(read[parts[0]])]
-        values = {read[f"{key}.key"]: read[f"{key}.value"] for key in keys}
-        statuses.append(Status(read[parts[1]], level, read[parts[2]], values))
-    return statuses
 
 
 class Reporter:

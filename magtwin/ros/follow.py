@@ -177,7 +177,10 @@ class Follower:
         v, w = self._last if twist is None else (float(twist["odom_v"][0, 0]), float(twist["odom_w"][0, 2]))
         wanted = self._guide.command((now - self._begin_ns) / NS, x, y, yaw, v, w)
         self._command(*wanted)
-        self._measure(x, y)
+        if self._guide.node > 0:  # not on the way to the beginning
+            self._off = float(self.path.nearest(np.array([[x, y]]))[1][0])
+            self._squares += self._off**2
+            self._count += 1
         if self._guide.done:
             self._lap()
 
@@ -213,13 +216,6 @@ class Follower:
         if count:
             away = np.hypot(ahead[0, :count] - x, ahead[1, :count] - y)
             guide.node, guide.driven_m = guide.node + int(np.argmin(away)), 0.0
-
-    def _measure(self, x: float, y: float) -> None:
-        _, off = self.path.nearest(np.array([[x, y]]))
-        if self._guide.node > 0:  # not on the way to the beginning
-            self._off = float(off[0])
-            self._squares += self._off**2
-            self._count += 1
 
     def _lap(self) -> None:
         self._laps += 1

@@ -31,8 +31,8 @@ from magtwin.io.bags.topics import (
 )
 from magtwin.ros.bus import Bus, Timer, to_bytes
 from magtwin.ros.diagnostics import Level, Reporter, status_of
-from magtwin.ros.inputs import Input, Scanning, newest_sent_ns
-from magtwin.ros.network import Following
+from magtwin.ros.inputs import Input, Scanning
+from magtwin.ros.network import read_rows
 from magtwin.ros.parameters import Parameter
 from magtwin.run.run import Run
 from magtwin.twin import Twin
@@ -123,7 +123,6 @@ class Magnetometer:
         if twin.magnetometer and "lidar_on" in twin.magnetometer.columns:
             lidar = twin.scene.robot.lidar
             self._scans = Scanning(bus, SCAN, gap_s=lidar.latency_s + 2.5 / max(lidar.scan_rate_hz, 0.1))
-        self._network = Following(twin.magnetometer) if twin.magnetometer else None
         self._reader: Reader | None = None  # if no context and no map border is needed
         self._magnitude = bus.publisher(MAGNITUDE.name, MAGNITUDE.kind, MAGNITUDE.qos)
         self._total = bus.publisher(TOTAL_FIELD.name, TOTAL_FIELD.kind, TOTAL_FIELD.qos)
@@ -207,8 +206,10 @@ class Magnetometer:
         if not np.isfinite(reading.b_total_nt):
             self._skip("the network gave no number")
             return
-        self._publish(now, reading.b_total_nt, reading.b_sd_nt)
-        begun = max(self._bus.due_wall_ns(), newest_sent_ns(self.inputs))
+        values = {"b_measured_nt": np.array([reading.b_total_nt]), "b_sd_nt": np.array([reading.b_sd_nt])}
+        for publisher, topic in ((self._magnitude, MAGNITUDE), (self._total, TOTAL_FIELD)):
+            publisher.publish(to_bytes(topic.kind, topic.write(values, np.array([now]), self._sender)))
+        begun = max(self._bus.due_wall_ns(), *(source.sent_ns for source in self.inputs.values()))
         self.latencies_s.append((time.time_ns() - begun) / NS)
         if self._missing:
             self._say(f"reading again, after: {self._missing}")
@@ -229,9 +230,9 @@ class Magnetometer:
             return reading._replace(b_sd_nt=self._with_noise(reading.b_sd_nt))
         rows = self._rows(now, columns, spins)
         b_map = float(rows["b_map_nt"][0])
-        if self._network is None or not np.isfinite(b_map):
+        if self._twin.magnetometer is None or not np.isfinite(b_map):
             return Reading(b_map, b_map, 0.0, self._noise_nt, outside_training=False)
-        (gave,), (spread,), strange = self._network(rows)
+        (gave,), (spread,), strange = read_rows(self._twin.magnetometer, rows)
         outside = bool(strange is not None and strange[0])
         return Reading(b_map + float(gave), b_map, float(gave), self._with_noise(float(spread)), outside)
 
@@ -255,13 +256,6 @@ class Magnetometer:
             columns["imu_q_xyzw"] = canonical(columns["imu_q_xyzw"])
         return Run(made | {name: columns[name] for name in self._needed}, {"rate_hz": self._rate})
 
-    def _publish(self, now: int, total_nt: float, sd_nt: float) -> None:
-        columns = {"b_measured_nt": np.array([total_nt]), "b_sd_nt": np.array([sd_nt])}
-        stamp = np.array([now])
-        for publisher, topic in ((self._magnitude, MAGNITUDE), (self._total, TOTAL_FIELD)):
-            fields = topic.write(columns, stamp, self._sender)
-            publisher.publish(to_bytes(topic.kind, fields))
-
     def _skip(self, why: str) -> None:
         self._skipped += 1
         if why != self._missing and self._published:
@@ -274,8 +268,6 @@ class Magnetometer:
         self._say("time jumped back: earlier inputs are dropped")
         for source in self.inputs.values():
             source.forget()
-        if self._twin.magnetometer is not None:
-            self._network = Following(self._twin.magnetometer)
         self._last_ns = 0
 
     def _report(self, clock: str) -> None:

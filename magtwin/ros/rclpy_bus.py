@@ -16,7 +16,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from magtwin.errors import InputError
 from magtwin.io.bags.topics import Qos
-from magtwin.ros.bus import Handler, Message, Names
+from magtwin.ros.bus import Bus, Handler, Message, Names, Publisher, Subscription
 from magtwin.ros.parameters import Parameter, checked
 
 MOST_AT_ONCE = 256
@@ -49,45 +49,7 @@ def class_of(kind: str) -> Any:
         ) from error
 
 
-def _descriptor(parameter: Parameter) -> Any:
-    """Description of a parameter for `ros2 param describe`."""
-    descriptor = ParameterDescriptor(
-        description=parameter.doc, additional_constraints=" or ".join(parameter.words)
-    )
-    if parameter.low is not None and parameter.high is not None:
-        descriptor.floating_point_range = [
-            FloatingPointRange(from_value=float(parameter.low), to_value=float(parameter.high))
-        ]
-    return descriptor
-
-
-class RclpyPublisher:
-    """As `magtwin.ros.bus.Publisher`."""
-
-    def __init__(self, topic: str, kind: str, publisher: Any) -> None:
-        self.topic, self.kind, self._publisher = topic, kind, publisher
-
-    def publish(self, data: bytes) -> None:
-        """Send a message; rclpy takes bytes as a serialized message."""
-        self._publisher.publish(data)
-
-    def subscribers(self) -> int:
-        """Number of subscribers."""
-        return int(self._publisher.get_subscription_count())
-
-
-class RclpySubscription:
-    """As `magtwin.ros.bus.Subscription`."""
-
-    def __init__(self, topic: str, kind: str, node: Node) -> None:
-        self.topic, self.kind, self._node = topic, kind, node
-
-    def publishers(self) -> int:
-        """Number of publishers."""
-        return int(self._node.count_publishers(self.topic))
-
-
-class RclpyBus:
+class RclpyBus(Bus):
     """As `magtwin.ros.bus.Bus`."""
 
     backend = "rclpy"
@@ -107,12 +69,13 @@ class RclpyBus:
         self._executor.add_node(self._node)
         self._calls, self._due_ns = 0, 0
 
-    def publisher(self, topic: str, kind: str, qos: Qos) -> RclpyPublisher:
+    def publisher(self, topic: str, kind: str, qos: Qos) -> Publisher:
         """As for `Bus`."""
         whole = self._names.resolve(topic)
-        return RclpyPublisher(whole, kind, self._node.create_publisher(class_of(kind), whole, qos_of(qos)))
+        sender = self._node.create_publisher(class_of(kind), whole, qos_of(qos))  # takes CDR bytes
+        return Publisher(whole, kind, sender.publish, sender.get_subscription_count)
 
-    def subscribe(self, topic: str, kind: str, handler: Handler, qos: Qos) -> RclpySubscription:
+    def subscribe(self, topic: str, kind: str, handler: Handler, qos: Qos) -> Subscription:
         """As for `Bus`."""
         whole = self._names.resolve(topic)
 
@@ -121,7 +84,7 @@ class RclpyBus:
             handler(Message(kind, bytes(data), int(info["source_timestamp"]), time.time_ns()))
 
         self._node.create_subscription(class_of(kind), whole, receive, qos_of(qos), raw=True)
-        return RclpySubscription(whole, kind, self._node)
+        return Subscription(whole, lambda: int(self._node.count_publishers(whole)))
 
     def service(self, name: str, called: Callable[[], None]) -> bool:
         """As for `Bus`; needs std_srvs."""
@@ -155,8 +118,14 @@ class RclpyBus:
                 changed(parameter.name, parameter.value)
             return SetParametersResult(successful=True)
 
-        for name, parameter in own.items():
-            self._node.declare_parameter(name, values[name], _descriptor(parameter))
+        for name, parameter in own.items():  # the description is for `ros2 param describe`
+            described = ParameterDescriptor(
+                description=parameter.doc, additional_constraints=" or ".join(parameter.words)
+            )
+            if parameter.low is not None and parameter.high is not None:
+                span = FloatingPointRange(from_value=float(parameter.low), to_value=float(parameter.high))
+                described.floating_point_range = [span]
+            self._node.declare_parameter(name, values[name], described)
         self._node.add_on_set_parameters_callback(wanted)
         return True
 
@@ -166,10 +135,6 @@ class RclpyBus:
             return class_of(kind) is not None
         except InputError:
             return False
-
-    def resolve(self, topic: str) -> str:
-        """As for `Bus`."""
-        return self._names.resolve(topic)
 
     def types(self, topic: str) -> tuple[str, ...]:
         """As for `Bus`."""

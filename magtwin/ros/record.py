@@ -1,6 +1,5 @@
 """Record topics to a bag, which is a run; replay a run to topics."""
 
-import heapq
 import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
@@ -91,9 +90,8 @@ class Recorder:
             if len(kinds) > 1:
                 self._say(f"{name} is published as {' and as '.join(kinds)}; recording {kind}")
             latched = topic is not None and topic.qos.latched
-            qos = Qos(
-                depth=DEPTH, reliable=latched or (topic is not None and topic.qos.reliable), latched=latched
-            )
+            reliable = latched or (topic is not None and topic.qos.reliable)
+            qos = Qos(depth=DEPTH, reliable=reliable, latched=latched)
             self._writer.add(name, kind, qos)
             self._bus.subscribe(name, kind, partial(self._heard, name), qos)
 
@@ -150,7 +148,13 @@ class Player:
         count = 0
         for row in range(0, self._run.rows, AT_A_TIME):
             rows = self._run.take(slice(row, row + AT_A_TIME))
-            for t, publisher, data in self._messages(rows):
+            messages: list[tuple[int, Publisher, bytes]] = []
+            for topic, times, fields in self._stream.messages(rows):
+                if topic.name in self._publishers and len(times):
+                    encoded = encode(layout(topic.kind, fields), fields, len(times))
+                    for t, data in zip(np.asarray(times).tolist(), encoded, strict=True):
+                        messages.append((t, self._publishers[topic.name], data.tobytes()))
+            for t, publisher, data in sorted(messages, key=lambda message: message[0]):
                 while (left := begin + (t / NS - first) / speed - time.monotonic()) > 0:
                     self._bus.spin_once(left)
                 if until():
@@ -158,12 +162,3 @@ class Player:
                 publisher.publish(data)
                 count += 1
         return count
-
-    def _messages(self, rows: Run) -> list[tuple[int, Publisher, bytes]]:
-        events: list[tuple[int, int, Publisher, bytes]] = []
-        for topic, times, fields in self._stream.messages(rows):
-            if topic.name in self._publishers and len(times):
-                encoded = encode(layout(topic.kind, fields), fields, len(times))
-                for t, data in zip(np.asarray(times).tolist(), encoded, strict=True):
-                    heapq.heappush(events, (t, len(events), self._publishers[topic.name], data.tobytes()))
-        return [(t, publisher, data) for t, _, publisher, data in sorted(events, key=lambda e: e[:2])]

@@ -5,6 +5,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -14,20 +15,11 @@ from magtwin.errors import InputError
 from magtwin.io.bags.cdr import NS, encode
 from magtwin.io.bags.sender import Unit, sender_for
 from magtwin.io.bags.stream import Sent, Stream
-from magtwin.io.bags.topics import (
-    COMMAND,
-    IMU,
-    MAGNITUDE,
-    SCAN,
-    TOTAL_FIELD,
-    VECTOR,
-    Qos,
-    Topic,
-)
+from magtwin.io.bags.topics import COMMAND, IMU, MAGNITUDE, SCAN, TOTAL_FIELD, VECTOR, Qos, Topic
 from magtwin.io.bags.types import layout
 from magtwin.ros.bus import Bus, Message, Publisher
 from magtwin.ros.diagnostics import Reporter, status_of
-from magtwin.ros.network import Following
+from magtwin.ros.network import read_rows
 from magtwin.ros.topics import READ, SAMPLED, TICKS
 from magtwin.run.run import Run
 from magtwin.sim.exact import check_field
@@ -52,8 +44,6 @@ WARM = 5
 
 REPORT_S = 1.0
 """Wall time between diagnostics [s]."""
-
-Say = Callable[[str], None]
 
 
 @dataclass
@@ -96,7 +86,7 @@ class Simulator:
         stamps: Literal["sim", "wall"] = "sim",
         stamped_commands: bool = False,
         magnetometer: bool = True,
-        say: Say = lambda text: None,
+        say: Callable[[str], None] = lambda text: None,
     ) -> None:
         """Advertise its topics; `run` starts it.
 
@@ -193,7 +183,7 @@ class Simulator:
             rng=np.random.default_rng(self._seed),
             obstacles=twin.obstacles,
             rate_hz=self._rate,
-            network=Following(twin.magnetometer) if twin.magnetometer else None,
+            network=partial(read_rows, twin.magnetometer) if twin.magnetometer else None,
             model_error=model_error_of(twin, self._seed),
             lidar=self._lidar,
         )
@@ -231,9 +221,7 @@ class Simulator:
         if topic.lost:
             taken &= ~samples.columns[topic.lost]
         columns = {name: values[taken] for name, values in samples.columns.items()}
-        if (
-            topic is IMU and self._moved is not None
-        ):  # its noise depends on the speed, and so do its covariances
+        if topic is IMU and self._moved is not None:  # its covariances depend on the speed
             columns["odom_v"] = np.repeat(self._moved, taken.sum(), axis=0)
         stamps, arrivals = (np.rint(t[taken] * NS).astype(np.int64) for t in (samples.t, samples.arrival))
         self._queue((topic, arrivals, topic.write(columns, stamps, self._sender)))

@@ -26,7 +26,7 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import CONSTANT_NT, AnomalyMap, Outside
 from magtwin.run.run import Run
 from magtwin.sim.interference import (
-    field_at_sensor_nt,
+    ambient_at_sensor_nt,
     into_base_axes,
     own_field_nt,
     sensor_places,
@@ -110,8 +110,9 @@ class ExactField:
         lidar_on: ArrayLike,
         supply_a: ArrayLike,
         at_rest_nt: Array | None = None,
+        ambient: tuple[Array, Array | float] | None = None,
     ) -> Array:
-        """The field at the magnetometer of a robot that drives.
+        """The field at the magnetometer of a robot that drives, without its plant.
 
         Args:
             scene: The scene, with its robot as it is in this session.
@@ -122,23 +123,37 @@ class ExactField:
             supply_a: Current drawn from the battery [A], shape (N,).
             at_rest_nt: The map at each pose [nT], shape (N,), if the caller has looked it up. A map of one
                 heading is looked up at the sensor instead.
+            ambient: What `ambient_nt` gave for this motion, if the caller has it.
 
         Returns:
             Field in base_link axes [nT], shape (N, 3); nan where the map is nan or nothing is known.
         """
         if self.of == "none":
             return np.full((len(true.pose), 3), np.nan)
-        if self.of == "sources":
-            return field_at_sensor_nt(scene, motion, t, true=true, lidar_on=lidar_on, supply_a=supply_a)
-        robot, held = scene.robot, self.holds_robot
-        eddy = any(np.ravel(robot.platform.eddy_s))
-        b_base, b_rate = self._mapped(scene, true, at_rest_nt, eddy=eddy)
-        if held:
+        b_base, b_rate = ambient or self.ambient_nt(scene, true, at_rest_nt)
+        robot = scene.robot
+        if self.of == "map" and self.holds_robot:
             platform = replace(
                 robot.platform, hard_iron_nt=robot.platform.hard_iron_change_nt, soft_iron=ZERO9
             )
             robot = replace(robot, platform=platform)
         return own_field_nt(robot, motion, t, b_base, b_rate, true=true, lidar_on=lidar_on, supply_a=supply_a)
+
+    def ambient_nt(
+        self, scene: Scene, true: Moment, at_rest_nt: Array | None = None
+    ) -> tuple[Array, Array | float]:
+        """The field at the magnetometer before the robot adds its own, and its rate of change.
+
+        Arguments as for `at_sensor_nt`. A map that holds its surveying robot gives the field with that robot.
+
+        Returns:
+            Field [nT] and rate [nT/s] in base_link axes, shape (N, 3) each; the rate is 0 if no eddy currents
+            need it.
+        """
+        if self.of == "sources":
+            return ambient_at_sensor_nt(scene, true)
+        eddy = any(np.ravel(scene.robot.platform.eddy_s))
+        return self._mapped(scene, true, at_rest_nt, eddy=eddy)
 
     def magnitude_nt(self, vector_nt: Array, at_rest_nt: Array) -> Array:
         """Magnitudes of vectors (N, 3) [nT], shape (N,); the exact bytes of the map if nothing is added."""

@@ -306,26 +306,20 @@ def rest_current_a(battery: BatterySpec) -> float:
     return float(current_a(battery, battery.load_w, 1.0))
 
 
-def field_at_sensor_nt(
-    scene: Scene, motion: Moving, t: ArrayLike, *, true: Moment, lidar_on: ArrayLike, supply_a: ArrayLike
-) -> Array:
-    """Exact field at the magnetometer of a robot that drives: the lab's, and its own.
+def ambient_at_sensor_nt(scene: Scene, true: Moment) -> tuple[Array, Array]:
+    """The lab's field at the magnetometer of a robot, and its rate of change, in base_link axes.
 
-    The rate of the ambient field in base_link axes is d/dt (R^T B) = R^T dB/dt - w x R^T B, with
-    dB/dt = (u . grad) B for the magnetometer's velocity u, that of the twist from t on.
+    The rate is d/dt (R^T B) = R^T dB/dt - w x R^T B, with dB/dt = (u . grad) B for the magnetometer's
+    velocity u, that of the twist from now on.
 
     Args:
         scene: A scene whose Earth's field is known.
-        motion: What the robot did.
-        t: Times of the readings, ascending [s], shape (N,).
-        true: The motion at these times.
-        lidar_on: Whether the LiDAR spins, shape (N,).
-        supply_a: Current drawn from the battery [A], shape (N,).
+        true: The motion of its robot, N moments.
 
     Returns:
-        Field in base_link axes [nT], shape (N, 3).
+        Field [nT] and rate [nT/s], shape (N, 3) each.
     """
-    robot, t = scene.robot, np.asarray(t, float)
+    robot = scene.robot
     cos, sin = np.cos(true.pose[:, 2]), np.sin(true.pose[:, 2])
     p_world = sensor_places(robot, true.pose)
     vx = true.v * cos - true.w * (p_world[:, 1] - true.pose[:, 1])
@@ -336,7 +330,7 @@ def field_at_sensor_nt(
     b_rate = into_base_axes(change, cos, sin)
     b_rate[:, 0] += true.w * b_base[:, 1]
     b_rate[:, 1] -= true.w * b_base[:, 0]
-    return own_field_nt(robot, motion, t, b_base, b_rate, true=true, lidar_on=lidar_on, supply_a=supply_a)
+    return b_base, b_rate
 
 
 def own_field_nt(
@@ -350,7 +344,7 @@ def own_field_nt(
     lidar_on: ArrayLike,
     supply_a: ArrayLike,
 ) -> Array:
-    """The field at the magnetometer of a robot that drives, from the ambient field there.
+    """The field at the magnetometer of a robot that drives, from the ambient field there, without its plant.
 
     Args:
         robot: The robot.
@@ -366,11 +360,12 @@ def own_field_nt(
         Field in base_link axes [nT], shape (N, 3).
     """
     t = np.asarray(t, float)
+    motors = np.any(robot.platform.left_motor_nt_nm) or np.any(robot.platform.right_motor_nt_nm)
     field = platform_field_nt(
         robot.platform,
         b_base,
         b_rate=b_rate,
-        motor_nm=_torques(robot, motion, t, true),
+        motor_nm=torques_nm(robot, motion, t, true) if motors else (0.0, 0.0),
         lidar_on=lidar_on,
         lidar_angle=lidar_angle(robot, t),
         battery_a=np.asarray(supply_a, float) - rest_current_a(robot.battery),
@@ -454,10 +449,8 @@ def platforms_of_rows(platforms: Sequence[PlatformFieldSpec]) -> PlatformFieldSp
     return replace(platforms[0], **rows)  # type: ignore[arg-type]
 
 
-def _torques(robot: RobotSpec, motion: Moving, t: Array, true: Moment) -> Array:
+def torques_nm(robot: RobotSpec, motion: Moving, t: Array, true: Moment) -> Array:
     """Torques of the wheels, with their accelerations over the last `TORQUE_S` [N m], shape (N, 2)."""
-    if not (np.any(robot.platform.left_motor_nt_nm) or np.any(robot.platform.right_motor_nt_nm)):
-        return np.zeros((len(t), 2))
     before = moment_at(motion, t - TORQUE_S)
     rate = wheel_rates(true.v, true.w, robot.drive)
     acceleration = (rate - wheel_rates(before.v, before.w, robot.drive)) / TORQUE_S

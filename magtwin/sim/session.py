@@ -12,7 +12,9 @@ import numpy as np
 
 from magtwin.sim.interference import draw_platform
 from magtwin.sim.motion.drive import draw_wheel_errors
+from magtwin.sim.plant_families import draw_session_plant
 from magtwin.spec.drive import DriveSpec
+from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import RobotSpec
 
 YAW_ZERO = (np.pi, 0.3)
@@ -51,7 +53,7 @@ def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
         The robot with `initial_fraction`, `yaw_zero`, `gyro_bias`, `phase_s`, `wheel_errors` and
         `odometry_scale` drawn, and its platform from `magtwin.sim.interference.draw_platform`. The standard
         deviations from which a run would draw wheels and odometry are 0. Motion capture has drifted since the
-        survey.
+        survey. A plant is drawn by `magtwin.sim.plant_families.draw_session_plant`.
     """
     drive, imu, lidar, mocap = robot.drive, robot.imu, robot.lidar, robot.mocap
     draws = dict(zip(_STREAMS, rng.spawn(len(_STREAMS)), strict=True))
@@ -63,7 +65,7 @@ def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
     scale = 1.0 + drive.odometry_noise_std * draws["drive"].standard_normal(2)
     left, right = np.array(drive.odometry_scale) * scale
     forward, leftward = np.add(mocap.offset_m, mocap.offset_drift_m).tolist()
-    return replace(
+    drawn = replace(
         robot,
         battery=replace(robot.battery, initial_fraction=max(1.0 - missing, LEAST_CHARGE)),
         imu=replace(imu, yaw_zero=yaw_zero, gyro_bias=tuple(bias.tolist())),
@@ -85,6 +87,10 @@ def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
             odometry_noise_std=0.0,
         ),
     )
+    if robot.plant == PlantSpec():
+        return drawn
+    (own,) = draws["platform"].spawn(1)  # a child of this stream, so that no other draw changes
+    return draw_session_plant(drawn, own)
 
 
 def session_of(robot: RobotSpec, seed: int, session: int, *, which: int = 0) -> RobotSpec:

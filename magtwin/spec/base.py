@@ -5,7 +5,7 @@ is checked when the spec is made. Lengths are metres, angles radians, fields nT.
 """
 
 import math
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, Field, fields, is_dataclass
 from typing import Any
 
 from magtwin.errors import InputError, hint
@@ -21,6 +21,10 @@ ZERO9: Matrix3 = (0.0,) * 9  # type: ignore[assignment]
 
 UNIT_TOLERANCE = 1e-6
 """Largest error of the squared length of a unit quaternion; single precision passes."""
+
+
+LATER = "later"
+"""Metadata of a field that a later version added: `spelled` leaves it out while it has its default."""
 
 
 class Spec:
@@ -67,6 +71,12 @@ def _least(value: float | tuple[float, ...]) -> float:
     return min(value) if isinstance(value, tuple) else value
 
 
+def _is_default(spec: Any, f: Field[Any]) -> bool:
+    """Whether a field of a spec has its default."""
+    default = f.default if f.default_factory is MISSING else f.default_factory()
+    return bool(getattr(spec, f.name) == default)
+
+
 def spelled(value: Any) -> str:
     """Every value of a spec as text, the input of its checksum.
 
@@ -74,7 +84,8 @@ def spelled(value: Any) -> str:
     the spelling must not change.
     """
     if is_dataclass(value) and not isinstance(value, type):
-        values = ", ".join(f"{f.name}={spelled(getattr(value, f.name))}" for f in fields(value) if f.repr)
+        kept = [f for f in fields(value) if f.repr and not (LATER in f.metadata and _is_default(value, f))]
+        values = ", ".join(f"{f.name}={spelled(getattr(value, f.name))}" for f in kept)
         return f"{type(value).__qualname__}({values})"
     if type(value) is tuple:
         return f"({', '.join(map(spelled, value))}{',' * (len(value) == 1)})"

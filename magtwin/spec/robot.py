@@ -4,9 +4,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from magtwin.frames import IDENTITY_XYZW, quat_multiply
-from magtwin.spec.base import ZERO3, Quat, Spec, Vec3
+from magtwin.spec.base import LATER, ZERO3, Quat, Spec, Vec3
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.magnetics import PlatformFieldSpec
+from magtwin.spec.plant import PlantSpec
 from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec
 from magtwin.summary import Summarized, Summary
 
@@ -49,6 +50,7 @@ class RobotSpec(Summarized, Spec):
     imu: ImuSpec = field(default_factory=ImuSpec)
     lidar: LidarSpec = field(default_factory=LidarSpec)
     mocap: MocapSpec = field(default_factory=MocapSpec)
+    plant: PlantSpec = field(default_factory=PlantSpec, metadata={LATER: True})
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -15,6 +15,7 @@ from magtwin.twin.twin import (
     in_session_of,
     model_error_of,
     room_of,
+    with_plant,
     without_model_error,
 )
 
@@ -43,5 +44,6 @@ __all__ = [
     "simulate_robots",
     "sweep",
     "twin_of",
+    "with_plant",
     "without_model_error",
 ]

@@ -15,7 +15,14 @@ from magtwin.files import existing, git_revision, sha256, shipped
 from magtwin.run.run import Run
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
-from magtwin.twin.twin import Kind, Metadata, Twin, scene_sha256, without_model_error
+from magtwin.twin.twin import (
+    Kind,
+    Metadata,
+    Twin,
+    scene_sha256,
+    without_model_error,
+    without_tracking_error,
+)
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.magnetometer import NeuralMagnetometer
@@ -29,6 +36,7 @@ def open_twin(
     network: str | FilePath | None = None,
     magnetometer: Kind | None = None,
     model_error: bool = True,
+    tracking_error: bool = True,
 ) -> Twin:
     """Open a scene with the map and the network that it names.
 
@@ -46,11 +54,15 @@ def open_twin(
         model_error: Whether a random model error is added to the readings of a neural magnetometer, as large
             as the network's error on recordings outside its training set; see
             `magtwin.sim.sensors.model_error`.
+        tracking_error: Whether controllers get poses with the latency and the errors of a localization, by
+            the figures `localization_*` of the drive. If not, robots follow their paths to a few
+            millimetres.
 
     Raises:
         InputError: The stage, its map or its weights are missing or broken, or a checksum does not match.
     """
     options: Any = {"network": network, "magnetometer": magnetometer, "model_error": model_error}
+    options["tracking_error"] = tracking_error
     if isinstance(scene, Scene):
         return _open_in_memory(scene, **options)
     from magtwin.usd.scene import open_scene
@@ -74,7 +86,7 @@ def open_twin(
     platforms = {placed.robot.name: _platform_sha256(placed.robot) for placed in read.robots}
     metadata["platform_sha256"] = platforms[read.robot.name]
     twin = Twin(read, file, field, predictor, stage.obstacles, metadata, platforms, model_error, opened=stage)
-    twin = _with_network(twin)
+    twin = _with_network(twin if tracking_error else without_tracking_error(twin))
     if predictor and network is not None:
         named = {**twin.metadata, "network_file": FilePath(network).as_posix()}
         return dataclasses.replace(twin, metadata=named)

@@ -12,9 +12,11 @@ from magtwin.errors import InputError, find
 from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.motion.drive_input import drive_input
+from magtwin.spec.plant import PlantSpec
 from magtwin.spec.scene import Scene
 from magtwin.twin.opening import led_by, open_twin, opened
 from magtwin.twin.twin import (
+    OF_SCENE,
     Kind,
     Metadata,
     Session,
@@ -25,6 +27,7 @@ from magtwin.twin.twin import (
     model_error_of,
     room_of,
     scene_sha256,
+    with_plant,
 )
 from magtwin.version import __version__
 
@@ -44,6 +47,7 @@ def simulate(
     *,
     seed: int = 0,
     session: Session | None = None,
+    plant: PlantSpec | str | None = None,
     speed: float = 0.2,
     duration_s: float | None = None,
     rate_hz: float | None = None,
@@ -66,10 +70,12 @@ def simulate(
             a `Path`; "random" for a random drive; `Commands` to play back; or a `Run` to drive again as
             recorded, with the scene's sensors.
         seed: Seed of all noise. The same seed gives byte-identical output.
-        session: Session of the robot; see the function `in_session`. Default: one drawn from the seed.
-            "survey" is the robot as it was during the survey of the map; a network trained on later sessions
-            is not
-            valid for it.
+        session: Session of the robot; see the function `in_session`. Default: session 0 of the seed.
+            "survey" is the robot as it was during the survey of the map; a network trained on later
+            sessions is not valid for it.
+        plant: Effects in the robot's field that the linear platform model lacks and no network was trained
+            on: "hysteresis", "warm-up", "nonlinear", "moving-part", "drawn", "all" or "nominal" (none);
+            "NAME:SEED" for other constants; or a `PlantSpec`. Default: the scene's. See `draw_plant`.
         speed: Forward speed on straight parts [m/s].
         duration_s: Duration [s]. Default: once along the path. A longer duration drives further laps.
         rate_hz: Magnetometer readings per second [Hz]. Default: the scene's.
@@ -85,7 +91,8 @@ def simulate(
         sensors: Custom sensors: names of registered sensors, or functions that make a sensor. Their columns
             are added to the run; see `magtwin.sim.extensions`.
         interference: Custom terms of the field at the magnetometer: names of registered ones, or functions.
-        progress: Called by slow engines as progress(steps done, most steps, simulated time as text).
+        progress: Called by slow engines as progress(steps done, maximum number of steps, simulated time
+            as text).
 
     Returns:
         A Run with the columns of `magtwin.COLUMNS`. Its metadata contain everything that is needed to
@@ -100,7 +107,7 @@ def simulate(
 
     seed = checked_seed(seed)
     twin = opened(twin, network, magnetometer, model_error, "simulate")
-    twin = in_session(twin, session, seed=seed)
+    twin = in_session(with_plant(twin, plant), session, seed=seed)
     check_field(twin.scene, twin.field)
     path = drive_input(path, room_of(twin))
     check_commands(path, twin.magnetometer)
@@ -135,6 +142,7 @@ def simulate_robots(
     meet: Literal["refuse", "flag"] = "refuse",
     seed: int = 0,
     session: Session | None = None,
+    plant: PlantSpec | str | None = None,
     speed: float = 0.2,
     duration_s: float | None = None,
     rate_hz: float | None = None,
@@ -159,6 +167,7 @@ def simulate_robots(
             sets flag_bump of both robots, which then drive through each other.
         seed: As for `simulate`.
         session: As for `simulate`; each robot is drawn independently.
+        plant: As for `simulate`; each robot has constants of its own.
         speed: As for `simulate`, of each robot.
         duration_s: As for `simulate`, of each robot.
         rate_hz: As for `simulate`.
@@ -181,7 +190,7 @@ def simulate_robots(
 
     seed = checked_seed(seed)
     twin = opened(twin, network, magnetometer, model_error, "simulate_robots")
-    twin = in_session(twin, session, seed=seed)
+    twin = in_session(with_plant(twin, plant), session, seed=seed)
     check_field(twin.scene, twin.field)
     placed = {other.robot.name: other for other in twin.scene.robots}
     for name in (*(paths or {}), *(robots or ())):
@@ -311,6 +320,8 @@ def finished(
     metadata: Metadata = {"magtwin": __version__, "numpy": np.__version__, "seed": seed}
     if duration_s is not None:
         metadata["asked_duration_s"] = float(duration_s)
+    if twin.scene.robot.plant != PlantSpec():
+        metadata["plant"] = OF_SCENE  # unless the twin's metadata name another
     metadata |= dict(twin.session) | path_metadata(path) | dict(twin.metadata)
     metadata["config_sha256"] = config_sha256 or scene_sha256(twin.scene)
     return run.with_metadata(**metadata)

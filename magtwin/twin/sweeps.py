@@ -12,6 +12,7 @@ from magtwin.errors import InputError
 from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.motion.drive_input import drive_inputs
+from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.twin.opening import opened
@@ -24,6 +25,7 @@ from magtwin.twin.twin import (
     model_error_of,
     room_of,
     scene_sha256,
+    with_plant,
     without_model_error,
 )
 
@@ -43,6 +45,7 @@ def sweep(
     *,
     seed: int = 0,
     sessions: int | Literal["survey"] | None = None,
+    plant: PlantSpec | str | None = None,
     speeds: float | Iterable[float] | Literal["drawn"] = 0.2,
     robots: RobotSpec | Twin | Iterable[RobotSpec | Twin] | None = None,
     columns: Iterable[str] | None = None,
@@ -71,6 +74,7 @@ def sweep(
         sessions: Number of sessions, drawn from `seed`; each takes an equal share of the runs, one after the
             other. "survey" is the robot as it was when the map was surveyed. Default: each run has its own
             session, drawn from its seed.
+        plant: As for `simulate`; all runs have the same constants.
         speeds: Forward speed of each run on straight parts [m/s], or one for all; "drawn" draws a speed for
             each run, as people drive.
         robots: What drives each run, or one for all: a `RobotSpec`, or a twin in a session. Default: the
@@ -98,6 +102,9 @@ def sweep(
     from magtwin.sim.runs.sensing import Conditions
 
     twin = opened(twin, network, magnetometer, model_error, "sweep")
+    if plant is not None and robots is not None:
+        raise InputError("robots are used as they are; give robots or plant, not both", parameter="plant")
+    twin = with_plant(twin, plant)
     check_field(twin.scene, twin.field)
     if not isinstance(controller, str):
         raise InputError(

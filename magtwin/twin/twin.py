@@ -14,6 +14,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.path.room import Room
 from magtwin.spec.base import spelled
 from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import MagnetometerSpec
@@ -32,6 +33,10 @@ Session = int | Literal["survey"]
 """Number of a session, or the robot as it was when the map was surveyed."""
 
 Metadata = dict[str, str | int | float | bool]
+
+
+OF_SCENE = "of the scene"
+"""Metadata `plant` of a run whose plant is that of its scene."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -97,6 +102,8 @@ class Twin(Summarized):
         """The scene and its file, the robot, the map and the network."""
         robot, field = self.scene.robot, self.field._summary()
         sensor = f"{robot.name}, {robot.magnetometer.kind} magnetometer at {robot.magnetometer.rate_hz:g} Hz"
+        plant = self.metadata.get("plant", OF_SCENE if robot.plant != PlantSpec() else "")
+        sensor += f", plant {plant}" if plant else ""
         more = f", and {len(self.scene.others)} more robots" if self.scene.others else ""
         width, depth = self.scene.lab.floor_m
         network = self.magnetometer._summary().title.partition(" ")[2] if self.magnetometer else "none"
@@ -152,8 +159,57 @@ def in_session(twin: Twin, session: Session | None = None, *, seed: int = 0) -> 
     return dataclasses.replace(twin, scene=scene, session={"session": number, "session_seed": seed})
 
 
+def with_plant(twin: Twin, plant: PlantSpec | str | None) -> Twin:
+    """The twin whose robots have another plant.
+
+    Args:
+        twin: An opened twin, not yet in a session.
+        plant: A `PlantSpec`; or "NAME" or "NAME:SEED" of `magtwin.draw_plant`, from which each robot draws
+            constants of its own. None changes nothing.
+
+    Raises:
+        InputError: The text names no plant, or the twin is in a session.
+    """
+    from magtwin.sim.plant_families import plant_of, plant_text
+
+    if plant is None:
+        return twin
+    if twin.session:
+        raise InputError(
+            f"the twin is in session {twin.session['session']!r} already; give `plant` before the session",
+            parameter="plant",
+        )
+    if not isinstance(plant, PlantSpec | str):
+        raise InputError(f"plant must be a name or a PlantSpec, got {plant!r}", parameter="plant")
+    scene, text = twin.scene, plant if isinstance(plant, str) else plant_text(plant)
+    robots = [
+        dataclasses.replace(placed.robot, plant=plant_of(text, which=k))
+        for k, placed in enumerate(scene.robots)
+    ]
+    others = tuple(
+        dataclasses.replace(other, robot=robot) for other, robot in zip(scene.others, robots[1:], strict=True)
+    )
+    scene = dataclasses.replace(scene, robot=robots[0], others=others)
+    return dataclasses.replace(twin, scene=scene, metadata={**twin.metadata, "plant": text})
+
+
+def without_tracking_error(twin: Twin) -> Twin:
+    """The twin whose controllers get exact poses."""
+
+    def changed(robot: RobotSpec) -> RobotSpec:
+        drive = dataclasses.replace(
+            robot.drive, localization_std_m=0.0, localization_yaw_std=0.0, localization_latency_s=0.0
+        )
+        return dataclasses.replace(robot, drive=drive)
+
+    scene = twin.scene
+    others = tuple(dataclasses.replace(other, robot=changed(other.robot)) for other in scene.others)
+    scene = dataclasses.replace(scene, robot=changed(scene.robot), others=others)
+    return dataclasses.replace(twin, scene=scene, metadata={**twin.metadata, "tracking_error": False})
+
+
 def in_session_of(twin: Twin, metadata: Mapping[str, str | int | float | bool]) -> Twin:
-    """The twin in the session of a run.
+    """The twin in the session of a run, with the plant and the tracking of the run.
 
     Args:
         twin: The twin of the run.
@@ -162,6 +218,10 @@ def in_session_of(twin: Twin, metadata: Mapping[str, str | int | float | bool]) 
     Raises:
         InputError: The metadata name no valid session.
     """
+    if metadata.get("plant", OF_SCENE) != OF_SCENE:
+        twin = with_plant(twin, str(metadata["plant"]))
+    if not metadata.get("tracking_error", True):
+        twin = without_tracking_error(twin)
     if "session_seed" not in metadata:
         return in_session(twin, "survey")
     try:

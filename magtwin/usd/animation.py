@@ -1,9 +1,7 @@
 """A Run as a USD layer of time samples over its scene, which any USD viewer plays.
 
-The layer moves the robot, turns its wheels, and samples the sensors' readings on their prims. Time code 0 is
-the run's first row. The prim `Run` also holds every column as one exact array at full rate;
-`read_animation` reads these. Samples are authored on the layer itself, since a stage would recompose for
-each.
+Time code 0 is the run's first row. The prim `Run` also holds every column as one exact array at full rate.
+Samples are authored on the layer itself, since a stage would recompose for each.
 """
 
 import json
@@ -12,6 +10,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import repeat
 from pathlib import Path
@@ -42,11 +41,7 @@ MOST_FPS = 10_000.0
 RUN = "Run"
 """Name of the prim that holds the columns."""
 
-POSES = (
-    ("p_world_base", "q_world_base_xyzw"),
-    ("mocap_p", "mocap_q_xyzw"),
-    ("odom_p", "odom_q_xyzw"),
-)
+POSES = (("p_world_base", "q_world_base_xyzw"), ("mocap_p", "mocap_q_xyzw"), ("odom_p", "odom_q_xyzw"))
 """Columns of the robot's pose, best first."""
 
 READINGS: Mapping[str, tuple[str, ...]] = MappingProxyType(
@@ -71,9 +66,6 @@ READINGS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 _BARE = WORLD.AppendChild("robot")
 """Robot of a run without a scene."""
 
-_CRATE = b"PXR-USDC"
-"""First bytes of a binary USD file."""
-
 _PROBE = """
 import sys
 from pxr import Sdf
@@ -87,17 +79,9 @@ PATIENCE_S = 60.0
 """Time limit of that script, plus 1 s per megabyte [s]."""
 
 _FACTS = "magtwinFacts"
-_KINDS = {
-    "f8": Sdf.ValueTypeNames.DoubleArray,
-    "f4": Sdf.ValueTypeNames.FloatArray,
-    "f2": Sdf.ValueTypeNames.HalfArray,
-    "i4": Sdf.ValueTypeNames.IntArray,
-    "i8": Sdf.ValueTypeNames.Int64Array,
-    "u1": Sdf.ValueTypeNames.UCharArray,
-    "u4": Sdf.ValueTypeNames.UIntArray,
-    "u8": Sdf.ValueTypeNames.UInt64Array,
-    "b1": Sdf.ValueTypeNames.BoolArray,
-}
+_DTYPES = ("f8", "f4", "f2", "i4", "i8", "u1", "u4", "u8", "b1")
+_NAMES = ("double", "float", "half", "int", "int64", "uchar", "uint", "uint64", "bool")
+_KINDS = {d: Sdf.ValueTypeNames.Find(f"{name}[]") for d, name in zip(_DTYPES, _NAMES, strict=True)}
 """USD's arrays by numpy's dtypes."""
 
 
@@ -153,22 +137,41 @@ def write_animation(
     if not len(t):
         raise InputError("the run has no rows, there is nothing to play")
     rate = fps or (round(1 / float(np.median(np.diff(t))), 6) if len(t) > 1 else 1.0)
-    frames = run if fps is None else _frames(run, grid(t[0], t[-1], fps))
-    codes = (frames["t"] - t[0]) * rate if fps is None else np.arange(frames.rows, dtype=float)
+    if fps is None:
+        frames, codes = run, (t - t[0]) * rate
+    else:
+        p_name, q_name = _pose_columns(run)
+        sampled = (n for names in READINGS.values() for n in names if COLUMNS[n].interpolation != "hold")
+        wanted = [name for name in (p_name, q_name, "wheel_angle", *sampled) if name in run]
+        rules: Any = {p_name: "linear", q_name: "quaternion"}  # it moves between recorded poses
+        frames = run.select(*wanted).resample(grid(t[0], t[-1], fps), interpolation=rules)
+        codes = np.arange(frames.rows, dtype=float)
     stand = _Stand()
     if scene_file is not None:
         stage = open_stage(scene_file)
-        _check_apart(path, stage)
+        if path.resolve() in (Path(layer.realPath).resolve() for layer in stage.GetUsedLayers()):
+            raise InputError(f"{path}: is a part of the scene; give another name")
         stand = _stand(stage, str(run.metadata.get("robot", "")))
     with output(path, force=force) as aside:
         layer = Sdf.Layer.CreateNew(str(aside))
         if layer is None:
             raise InputError(f"{path}: cannot be made as a USD layer")
-        _describe(layer, run, stand, rate, (t[-1] - t[0]) * rate)
+        about = "A run of magtwin: poses of the robot and readings of its sensors over time"
+        describe_stage(Usd.Stage.Open(layer), about)
+        metadata = json.dumps(dict(run.metadata), ensure_ascii=False)
+        layer.customLayerData = {"creator": "magtwin", _FACTS: metadata}
+        layer.defaultPrim = stand.world.name
+        layer.startTimeCode, layer.endTimeCode = 0.0, float((t[-1] - t[0]) * rate)
+        layer.timeCodesPerSecond = layer.framesPerSecond = float(rate)
         if scene_file is not None:
-            layer.subLayerPaths = [_relative(Path(scene_file), path)]
+            # Relative to the final place of the layer.
+            below = os.path.relpath(Path(scene_file).resolve(), path.resolve().parent)
+            below = Path(below).as_posix()
+            layer.subLayerPaths = [below if below.startswith("../") else f"./{below}"]
         else:
-            _define_bare(layer, stand)
+            for bare in (stand.world, stand.robot, stand.sensors["magnetometer"]):
+                spec = Sdf.CreatePrimInLayer(layer, bare)
+                spec.specifier, spec.typeName = Sdf.SpecifierDef, "Xform"
         _animate(layer, stand, frames, codes.tolist())
         _sample_readings(layer, stand, run, frames, codes.tolist(), rate)
         _store(layer, stand.world.AppendChild(RUN), run)
@@ -212,7 +215,7 @@ def _check_decodes(path: str | os.PathLike[str]) -> None:
     if path.is_dir():
         return
     with open(path, "rb") as file:
-        if file.read(len(_CRATE)) != _CRATE:
+        if file.read(8) != b"PXR-USDC":  # text
             return
     command = [sys.executable, "-P", "-c", _PROBE, str(path)]
     patience = PATIENCE_S + path.stat().st_size / 1e6
@@ -229,13 +232,11 @@ def _open_layer(path: str | os.PathLike[str]) -> Sdf.Layer:
     path = existing(path, "USD file")
     if path.is_dir():
         raise InputError(f"{path}: a folder; give a USD file in it")
-    try:
+    with suppress(Tf.ErrorException):
         layer = Sdf.Layer.OpenAsAnonymous(str(path))
-    except Tf.ErrorException as error:
-        raise InputError(f"{path}: cannot be opened as USD; it is damaged, cut short, or not USD") from error
-    if layer is None:
-        raise InputError(f"{path}: cannot be opened as USD; it is damaged, cut short, or not USD")
-    return layer
+        if layer is not None:
+            return layer
+    raise InputError(f"{path}: cannot be opened as USD; it is damaged, cut short, or not USD")
 
 
 def _read(layer: Sdf.Layer, path: str | os.PathLike[str]) -> Run:
@@ -244,16 +245,20 @@ def _read(layer: Sdf.Layer, path: str | os.PathLike[str]) -> Run:
     if not prim:
         raise InputError(f"{path}: plays no run: it has no prim {_run_path(layer)} that holds one")
     columns, specs = {}, {}
-    for attribute in sorted(prim.properties, key=_number):
+    for attribute in sorted(prim.properties, key=lambda column: column.customData.get("number", np.inf)):
         name = attribute.name.removeprefix("magtwin:run:")
         if name == attribute.name:
             continue
         columns[name] = _array(attribute, path)
         if name not in COLUMNS:
-            specs[name] = _column_spec(attribute)
+            said = {key: str(value) for key, value in attribute.customData.items()}
+            parts = tuple(filter(None, said.get("parts", "").split(",")))
+            rule: Any = said.get("interpolation", "linear")
+            unit, frame = said.get("unit", ""), said.get("frame", "")
+            specs[name] = Column(unit, frame, attribute.documentation, len(parts) or 1, parts, rule)
     metadata = json.loads(layer.customLayerData.get(_FACTS, "{}"))
     try:
-        return Run(columns, {key: value for key, value in metadata.items() if _is_metadata(value)}, specs)
+        return Run(columns, {k: v for k, v in metadata.items() if isinstance(v, str | int | float)}, specs)
     except InputError as error:
         raise InputError(f"{path}: holds a damaged run: {error}") from error
 
@@ -263,18 +268,6 @@ def _run_path(layer: Sdf.Layer) -> Sdf.Path:
     if layer.defaultPrim and Sdf.Path.IsValidIdentifier(layer.defaultPrim):
         world = Sdf.Path.absoluteRootPath.AppendChild(layer.defaultPrim)
     return world.AppendChild(RUN)
-
-
-def _frames(run: Run, at: NDArray[np.float64]) -> Run:
-    """The poses and readings of a run at the times of the frames [s]."""
-    pose = _pose_columns(run)
-    sampled = (n for names in READINGS.values() for n in names if COLUMNS[n].interpolation != "hold")
-    wanted = [name for name in (*pose, "wheel_angle", *sampled) if name in run]
-    rules: Any = {
-        pose[0]: "linear",
-        pose[1]: "quaternion",
-    }  # it moves between recorded poses
-    return run.select(*wanted).resample(at, interpolation=rules)
 
 
 def _pose_columns(run: Run) -> tuple[str, str]:
@@ -302,12 +295,10 @@ def _stand(stage: Usd.Stage, name: str) -> _Stand:
     cache = UsdGeom.XformCache()
     if cache.GetLocalToWorldTransform(default) != Gf.Matrix4d(1):
         raise InputError(f"{place(default)}: is moved or scaled; place it at the origin")
-    to_root = cache.ComputeRelativeTransform(_base(prim), prim)[0].RemoveScaleShear()
+    base = next((body for body in Usd.PrimRange(prim) if body.GetName() == BASE_LINK), prim)
+    to_root = cache.ComputeRelativeTransform(base, prim)[0].RemoveScaleShear()
     turn, offset = to_root.ExtractRotationQuat(), to_root.ExtractTranslation()
-    sensors = {}
-    for noun in READINGS:
-        if prims := prims_with(prim, noun):
-            sensors[noun] = prims[0].GetPath()
+    sensors = {noun: prims[0].GetPath() for noun in READINGS if (prims := prims_with(prim, noun))}
     x, y, z = map(float, offset)
     return _Stand(
         world=default.GetPath(),
@@ -319,49 +310,14 @@ def _stand(stage: Usd.Stage, name: str) -> _Stand:
     )
 
 
-def _base(robot: Usd.Prim) -> Usd.Prim:
-    """The body whose pose is in a run: base_link, or else the root."""
-    return next((prim for prim in Usd.PrimRange(robot) if prim.GetName() == BASE_LINK), robot)
-
-
 def _wheel(robot: Usd.Prim, joint_field: str, stage: Usd.Stage) -> tuple[Sdf.Path, Vec3, Quat, Vec3]:
     joint = target(robot, attribute_name("drive", joint_field))
     body = target(joint, "physics:body1")
-    axis = next(
-        (link.axis_link for link in read_links(stage).values() if link.joint == joint.GetName()), None
-    )
+    links = read_links(stage).values()
+    axis = next((link.axis_link for link in links if link.joint == joint.GetName()), None)
     if axis is None:
         raise InputError(f"{place(joint)}: is no revolute joint between two bodies, as a wheel needs")
     return body.GetPath(), *read_pose(body), axis
-
-
-def _check_apart(path: Path, stage: Usd.Stage) -> None:
-    """Refuse to replace a layer of the scene."""
-    for layer in stage.GetUsedLayers():
-        if layer.realPath and Path(layer.realPath).resolve() == path.resolve():
-            raise InputError(f"{path}: is a part of the scene; give another name")
-
-
-def _relative(scene_file: Path, path: Path) -> str:
-    """The scene's file relative to the final place of the layer."""
-    relative = Path(os.path.relpath(scene_file.resolve(), path.resolve().parent)).as_posix()
-    return relative if relative.startswith("../") else f"./{relative}"
-
-
-def _describe(layer: Sdf.Layer, run: Run, stand: _Stand, rate: float, end: float) -> None:
-    stage = Usd.Stage.Open(layer)
-    describe_stage(stage, "A run of magtwin: poses of the robot and readings of its sensors over time")
-    layer.customLayerData = {"creator": "magtwin", _FACTS: json.dumps(dict(run.metadata), ensure_ascii=False)}
-    layer.defaultPrim = stand.world.name
-    layer.startTimeCode, layer.endTimeCode = 0.0, float(end)
-    layer.timeCodesPerSecond = layer.framesPerSecond = float(rate)
-
-
-def _define_bare(layer: Sdf.Layer, stand: _Stand) -> None:
-    """The Xforms of a run without a scene."""
-    for path in (stand.world, stand.robot, stand.sensors["magnetometer"]):
-        spec = Sdf.CreatePrimInLayer(layer, path)
-        spec.specifier, spec.typeName = Sdf.SpecifierDef, "Xform"
 
 
 def _animate(layer: Sdf.Layer, stand: _Stand, frames: Run, codes: list[float]) -> None:
@@ -451,12 +407,6 @@ def _store(layer: Sdf.Layer, path: Sdf.Path, run: Run) -> None:
         attribute.default = kind.type.pythonClass.FromNumpy(np.ascontiguousarray(values).reshape(-1))
 
 
-def _number(attribute: Sdf.PropertySpec) -> float:
-    """Position of a column in the table."""
-    number = attribute.customData.get("number")
-    return float(number) if isinstance(number, int) else np.inf
-
-
 def _array(attribute: Sdf.AttributeSpec, path: str | os.PathLike[str]) -> NDArray[Any]:
     """The values of a column."""
     dtype = next((dtype for dtype, kind in _KINDS.items() if kind == attribute.typeName), None)
@@ -468,15 +418,3 @@ def _array(attribute: Sdf.AttributeSpec, path: str | os.PathLike[str]) -> NDArra
     if len(values) % width:
         raise InputError(f"{path}: <{attribute.path}> has {len(values)} numbers in rows of {width}")
     return values.reshape(-1, width) if parts else values
-
-
-def _column_spec(attribute: Sdf.AttributeSpec) -> Column:
-    said = {key: str(value) for key, value in attribute.customData.items()}
-    parts = tuple(filter(None, said.get("parts", "").split(",")))
-    rule: Any = said.get("interpolation", "linear")
-    unit, frame = said.get("unit", ""), said.get("frame", "")
-    return Column(unit, frame, attribute.documentation, len(parts) or 1, parts, rule)
-
-
-def _is_metadata(value: Any) -> bool:
-    return isinstance(value, str | int | float | bool)

@@ -128,10 +128,8 @@ def _usd_value(attribute: Usd.Attribute, value: Any) -> Any:
         return Sdf.AssetPath(relative_asset(layer, value) if value is not None else "")
     if kind == Sdf.ValueTypeNames.Matrix3d:
         return Gf.Matrix3d(*value)
-    if kind == Sdf.ValueTypeNames.StringArray:
-        return Vt.StringArray(value)
-    if kind == Sdf.ValueTypeNames.DoubleArray:
-        return Vt.DoubleArray(value)
+    if kind.isArray:
+        return kind.type.pythonClass(value)
     return tuple(value) if isinstance(value, tuple) else value
 
 
@@ -146,18 +144,13 @@ def plain_value(attribute: Usd.Attribute) -> Any:
         raise InputError(
             f"{place(attribute.GetPrim())}: {attribute.GetName()} must be a {kind}, got {value!r}"
         )
-    if isinstance(value, Sdf.AssetPath):
-        return _anchored(attribute, value) if value.path else None
+    if isinstance(value, Sdf.AssetPath):  # the file need not exist
+        if not value.path:
+            return None
+        layer = attribute.GetPropertyStack()[0].layer
+        return Path(value.resolvedPath or Sdf.ComputeAssetPathRelativeToLayer(layer, value.path)).resolve()
     if isinstance(value, Gf.Matrix3d):
         return tuple(float(x) for row in value for x in row)
     if isinstance(value, Gf.Vec3d | Gf.Vec2d):
         return tuple(map(float, value))
     return tuple(value) if isinstance(value, Vt.StringArray | Vt.DoubleArray) else value
-
-
-def _anchored(attribute: Usd.Attribute, value: Sdf.AssetPath) -> Path:
-    """The file that an asset path names, which need not exist."""
-    if value.resolvedPath:
-        return Path(value.resolvedPath).resolve()
-    layer = attribute.GetPropertyStack()[0].layer
-    return Path(Sdf.ComputeAssetPathRelativeToLayer(layer, value.path)).resolve()

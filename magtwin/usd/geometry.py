@@ -198,9 +198,7 @@ def read_colour_scale(stage: Usd.Stage) -> ColourScale | None:
     for prim in _prims(stage):
         metadata = prim.GetCustomDataByKey("magtwin") or {}
         if "colourMap" in metadata and UsdGeom.Imageable(prim).ComputeVisibility() != "invisible":
-            name, least, greatest, unit = (
-                metadata[key] for key in ("colourMap", "least", "greatest", "unit")
-            )
+            name, least, greatest, unit = map(metadata.get, ("colourMap", "least", "greatest", "unit"))
             return ColourScale(name, least, greatest, unit, str(prim.GetPath()))
     return None
 
@@ -219,9 +217,14 @@ def _shown(
     cache, bodies = UsdGeom.XformCache(), _bodies(stage)
     for prim in _prims(stage):
         gprim = UsdGeom.Gprim(prim)
-        if not gprim or not _is_shown(gprim, purposes):
+        if not gprim or gprim.ComputePurpose() not in purposes:
             continue
-        body = _carrier(prim, bodies)
+        if gprim.ComputeVisibility() == UsdGeom.Tokens.invisible:
+            continue
+        body = prim
+        while body and body.GetPath() not in bodies:
+            body = body.GetParent()
+        body = body or None
         if not wanted(prim, body is not None):
             continue
         solid = _solid(gprim)
@@ -241,13 +244,6 @@ def _bodies(stage: Usd.Stage) -> dict:
             taken = prim.GetName() in names.values()
             names[prim.GetPath()] = str(prim.GetPath()) if taken else prim.GetName()
     return names
-
-
-def _carrier(prim: Usd.Prim, bodies: dict) -> Usd.Prim | None:
-    """The nearest rigid body at or above a prim."""
-    while prim and prim.GetPath() not in bodies:
-        prim = prim.GetParent()
-    return prim if prim else None
 
 
 def _joints(stage: Usd.Stage, bodies: dict) -> Iterator[tuple]:
@@ -295,10 +291,6 @@ def _pose(matrix: Gf.Matrix4d) -> tuple[Vec3, Quat]:
     return (float(px), float(py), float(pz)), (x, y, z, w)
 
 
-def _is_shown(gprim: UsdGeom.Gprim, purposes: Sequence[str]) -> bool:
-    return gprim.ComputeVisibility() != UsdGeom.Tokens.invisible and gprim.ComputePurpose() in purposes
-
-
 @dataclass(frozen=True)
 class Solid:
     """Points of a gprim, and the triangles between them, each with the face that it was cut from."""
@@ -329,12 +321,10 @@ def _solid(gprim: UsdGeom.Gprim) -> Solid | None:
         return _faces(*_plane(get["width"], get["length"], axis))
     if kind == "Sphere":
         return _faces(*_revolved(_arc(get["radius"], -90, 90), "Z"))
-    if kind == "Cylinder":
+    if kind in ("Cylinder", "Cone"):
         r, h = get["radius"], get["height"] / 2
-        return _faces(*_revolved(np.array([[0, -h], [r, -h], [r, h], [0, h]]), axis))
-    if kind == "Cone":
-        r, h = get["radius"], get["height"] / 2
-        return _faces(*_revolved(np.array([[0, -h], [r, -h], [0, h]]), axis))
+        rim = [[r, -h], [r, h]] if kind == "Cylinder" else [[r, -h]]
+        return _faces(*_revolved(np.array([[0, -h], *rim, [0, h]]), axis))
     if kind == "Capsule":
         lift = np.array([0, get["height"] / 2])
         halves = [_arc(get["radius"], -90, 0) - lift, _arc(get["radius"], 0, 90) + lift]
@@ -351,9 +341,8 @@ def mesh_solid(mesh: UsdGeom.Mesh) -> Solid:
     points = np.array(mesh.GetPointsAttr().Get() or np.empty((0, 3)), float)
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [], int)
     corners = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [], int)
-    if counts.sum() != len(corners) or (
-        len(corners) and not 0 <= corners.min() <= corners.max() < len(points)
-    ):
+    outside = len(corners) and not 0 <= corners.min() <= corners.max() < len(points)
+    if counts.sum() != len(corners) or outside:
         raise InputError(
             f"its {counts.sum()} corners, {len(corners)} indices and {len(points)} points do not fit together"
             "; export the mesh again"
@@ -371,10 +360,8 @@ def mesh_solid(mesh: UsdGeom.Mesh) -> Solid:
 
 def _faces(points: NDArray, triangles: NDArray) -> Solid:
     """A solid made of triangles."""
-    count = len(triangles)
-    return Solid(
-        points, np.arange(3 * count).reshape(count, 3), np.asarray(triangles, int).ravel(), np.arange(count)
-    )
+    index = np.arange(triangles.size).reshape(-1, 3)
+    return Solid(points, index, np.asarray(triangles, int).ravel(), np.arange(len(index)))
 
 
 def _box(size: float) -> tuple[NDArray, NDArray]:

@@ -38,9 +38,14 @@ def define_lab(stage: Usd.Stage, spec: LabSpec) -> Usd.Prim:
         The prim of the lab.
     """
     lab = write_spec(apply_api(UsdGeom.Xform.Define(stage, LAB).GetPrim(), "lab"), "lab", spec)
-    _define_physics_scene(stage)
+    scene = UsdPhysics.Scene.Define(stage, PHYSICS_SCENE)
+    scene.CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
+    scene.CreateGravityMagnitudeAttr(GRAVITY_M_S2)
     define_looks(stage, LOOKS, [look.name for look in (FLOOR, WALL, POST, CAMERA, LENS)])
-    _define_floor(stage, spec)
+    x, y = spec.floor_m
+    edge = 2 * (spec.wall_thickness_m + spec.apron_m)  # walls and posts stand on the slab too
+    size = (x + edge, y + edge, FLOOR_THICKNESS_M)
+    define_box(stage, LAB.AppendChild("Floor"), (0, 0, -FLOOR_THICKNESS_M / 2), size, FLOOR, collides=True)
     _define_walls(stage, spec)
     _define_frame(stage, spec)
     _define_lights(stage, spec)
@@ -54,19 +59,6 @@ def read_lab(prim: Usd.Prim) -> LabSpec:
         InputError: The prim is no lab, or a value is out of range.
     """
     return read_spec(LabSpec, prim, "lab")
-
-
-def _define_physics_scene(stage: Usd.Stage) -> None:
-    scene = UsdPhysics.Scene.Define(stage, PHYSICS_SCENE)
-    scene.CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
-    scene.CreateGravityMagnitudeAttr(GRAVITY_M_S2)
-
-
-def _define_floor(stage: Usd.Stage, spec: LabSpec) -> None:
-    x, y = spec.floor_m
-    edge = 2 * (spec.wall_thickness_m + spec.apron_m)  # walls and posts stand on the slab too
-    size = (x + edge, y + edge, FLOOR_THICKNESS_M)
-    define_box(stage, LAB.AppendChild("Floor"), (0, 0, -FLOOR_THICKNESS_M / 2), size, FLOOR, collides=True)
 
 
 def _define_walls(stage: Usd.Stage, spec: LabSpec) -> None:
@@ -99,12 +91,9 @@ def _define_frame(stage: Usd.Stage, spec: LabSpec) -> None:
         define_box(stage, root.AppendChild(f"Post_{i}"), (x, y, high / 2), size, POST, collides=True)
         _camera(stage, root.AppendChild(f"Camera_{i}"), np.array([x, y, high]))
     rail = high - width / 2
-    for name, side in (("South", -1), ("North", 1)):
-        size = (2 * half[0] - width, width, width)
-        define_box(stage, root.AppendChild(f"Rail_{name}"), (0, side * half[1], rail), size, POST)
-    for name, side in (("West", -1), ("East", 1)):
-        size = (width, 2 * half[1] - width, width)
-        define_box(stage, root.AppendChild(f"Rail_{name}"), (side * half[0], 0, rail), size, POST)
+    for name, x, y in (("South", 0, -1), ("North", 0, 1), ("West", -1, 0), ("East", 1, 0)):
+        size = (width, 2 * half[1] - width, width) if x else (2 * half[0] - width, width, width)
+        define_box(stage, root.AppendChild(f"Rail_{name}"), (x * half[0], y * half[1], rail), size, POST)
 
 
 def _camera(stage: Usd.Stage, path: Sdf.Path, post_top: np.ndarray) -> None:

@@ -220,9 +220,15 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
             f"{place(prim)}: {attribute_name('anomalyMap', 'headings')} must ascend in [0, 360) deg, got "
             f"{str(headings.tolist())[:MOST_CHARACTERS]}; make the map anew"
         )
+    recorded = _read_recorded(prim, RECORDED[0], sample, shape)
+    if recorded is not None and not np.array_equal(recorded.ravel().astype("f4"), values, equal_nan=True):
+        raise InputError(
+            f"{place(prim)}: the map's values are not those that were recorded, in single precision; make "
+            "the map anew"
+        )
     try:
         return AnomalyMap(
-            values_nt=_exact(prim, values.reshape(shape), _read_recorded(prim, RECORDED[0], sample, shape)),
+            values_nt=values.reshape(shape).astype(float) if recorded is None else recorded,
             valid=valid.reshape(shape).astype(bool),
             variance_nt2=variance.reshape(shape).astype(float) if variance.size else None,
             recorded_yaw=_read_recorded(prim, RECORDED[1], sample, shape),
@@ -230,7 +236,7 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
             cell_m=tuple(_get(prim, "cellSize")),
             headings_rad=np.deg2rad(headings),
             height_m=_read_height(prim),
-            parameters=_read_parameters(prim, _get(prim, "parameters", sample)),
+            parameters=_read_parameters(_get(prim, "parameters", sample)),
             harmonic=None if harmonic is None else HarmonicField(**harmonic),
             **{name: _get(prim, name) for name in PLACES},
             **{name: _get(prim, name, sample) for name in TEXTS},
@@ -255,18 +261,6 @@ def _read_recorded(
     return recorded.reshape(shape)
 
 
-def _exact(prim: Usd.Prim, values: NDArray, recorded: NDArray | None) -> NDArray[np.float64]:
-    """Values in their recorded precision, shape (H, Y, X)."""
-    if recorded is None:
-        return values.astype(float)
-    if not np.array_equal(recorded.astype(np.float32), values, equal_nan=True):
-        raise InputError(
-            f"{place(prim)}: the map's values are not those that were recorded, in single precision; make "
-            "the map anew"
-        )
-    return recorded
-
-
 def _read_height(prim: Usd.Prim) -> float | None:
     attribute = prim.GetAttribute(attribute_name("anomalyMap", "height_m"))
     height = attribute.Get()
@@ -279,25 +273,20 @@ def _read_height(prim: Usd.Prim) -> float | None:
     return height
 
 
-def _read_parameters(prim: Usd.Prim, text: str) -> dict[str, Any]:
+def _read_parameters(text: str) -> dict[str, Any]:
     """Parameters from their JSON; empty if there is none."""
-    if not text:
-        return {}
-    name = attribute_name("anomalyMap", "parameters")
+    name, got = (
+        attribute_name("anomalyMap", "parameters"),
+        f"got {text[:MOST_CHARACTERS]!r}; make the map anew",
+    )
     try:
-        figures = json.loads(text, parse_constant=_no_number)
-        json.dumps(figures, allow_nan=False)  # 1e999 is a number to JSON, and infinite
+        figures = json.loads(text or "{}")
+        json.dumps(figures, allow_nan=False)  # refuses NaN, and 1e999, which is infinite
     except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"{name} is not JSON ({error}), got {text[:MOST_CHARACTERS]!r}; make the map anew"
-        ) from error
+        raise InputError(f"{name} is not JSON ({error}), {got}") from error
     if not isinstance(figures, dict):
-        raise InputError(f"{name} must be a JSON object, got {text[:MOST_CHARACTERS]!r}; make the map anew")
+        raise InputError(f"{name} must be a JSON object, {got}")
     return figures
-
-
-def _no_number(word: str) -> float:
-    raise ValueError(f"{word} is no JSON number")
 
 
 def _read_harmonic(prim: Usd.Prim, sample: _Sample | None) -> dict[str, NDArray] | None:
@@ -307,9 +296,8 @@ def _read_harmonic(prim: Usd.Prim, sample: _Sample | None) -> dict[str, NDArray]
     arrays = {}
     for name, shape in HARMONIC.items():
         attribute = prim.GetAttribute(attribute_name("harmonic", name))
-        authored = (
-            attribute.GetResolveInfo(Usd.TimeCode.Default()).GetSource() == Usd.ResolveInfoSourceDefault
-        )
+        source = attribute.GetResolveInfo(Usd.TimeCode.Default()).GetSource()
+        authored = source == Usd.ResolveInfoSourceDefault
         value = sample.get(attribute.GetName()) if sample else attribute.Get() if authored else None
         if value is None:
             continue
@@ -336,7 +324,17 @@ def _save(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], force: bool)
         prim = apply_api(UsdGeom.Xform.Define(stage, MAP).GetPrim(), "anomalyMap")
         if any(m.harmonic is not None for m in maps):
             apply_api(prim, "harmonic")
-        for name, value in {**_shared_values(latest), **samples[-1]}.items():
+        shared = {
+            "shape": Vt.IntArray(latest.values_nt.shape),
+            "origin": Gf.Vec2d(*latest.origin_m),
+            "cellSize": Gf.Vec2d(*latest.cell_m),
+            "headings": Vt.DoubleArray(np.rad2deg(latest.headings_rad).tolist()),
+            "unit": UNIT,
+            "height_m": latest.height_m,
+            **{name: getattr(latest, name) for name in PLACES},
+        }
+        named = {attribute_name("anomalyMap", name): value for name, value in shared.items()}
+        for name, value in {**named, **samples[-1]}.items():
             if value is not None:
                 prim.GetAttribute(name).Set(value)
         for time, sample in zip(times, samples, strict=bool(times)):
@@ -351,20 +349,6 @@ def _save(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], force: bool)
         _define_heat_map(stage, maps, times)
 
 
-def _shared_values(field: AnomalyMap) -> dict[str, Any]:
-    """Values of the attributes that the epochs of a map share, by name."""
-    given = {
-        "shape": Vt.IntArray(field.values_nt.shape),
-        "origin": Gf.Vec2d(*field.origin_m),
-        "cellSize": Gf.Vec2d(*field.cell_m),
-        "headings": Vt.DoubleArray(np.rad2deg(field.headings_rad).tolist()),
-        "unit": UNIT,
-        "height_m": field.height_m,
-        **{name: getattr(field, name) for name in PLACES},
-    }
-    return {attribute_name("anomalyMap", name): value for name, value in given.items()}
-
-
 def _epoch_values(field: AnomalyMap) -> dict[str, Any]:
     """Values of the attributes that differ between epochs, by name; None if there is no value."""
     values = field.values_nt.astype(np.float32).ravel()
@@ -377,16 +361,21 @@ def _epoch_values(field: AnomalyMap) -> dict[str, Any]:
         recorded = [Vt.DoubleArray.FromNumpy(a.ravel()) for a in (field.values_nt, field.recorded_yaw)]
         if np.array_equal(values, field.values_nt.ravel(), equal_nan=True):
             recorded[0] = None
-    harmonic = None
-    if field.harmonic is not None:
-        harmonic = {name: getattr(field.harmonic, name) for name in HARMONIC}
+    harmonic = {n: getattr(field.harmonic, n) for n in HARMONIC} if field.harmonic is not None else None
+    parameters = dict(field.parameters or {})
+    try:
+        text = json.dumps(parameters, allow_nan=False, ensure_ascii=False) if parameters else ""
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"parameters of map {field.name!r} must be finite numbers, texts and lists of them ({error})"
+        ) from error
     given = {
         "values": Vt.FloatArray.FromNumpy(values),
         "valid": Vt.BoolArray.FromNumpy(valid),
         "variance": Vt.FloatArray.FromNumpy(variance),
         **dict(zip(RECORDED, recorded, strict=True)),
         "checksum": _checksum(values, valid, variance, harmonic),
-        "parameters": _written_parameters(field),
+        "parameters": text,
         **{name: getattr(field, name) for name in TEXTS},
     }
     return {
@@ -400,29 +389,15 @@ def _epoch_values(field: AnomalyMap) -> dict[str, Any]:
 
 def _usd_array(array: NDArray, shape: tuple[int, ...]) -> Any:
     """An array of a harmonic field as the type of its attribute; -1 in `shape` is any number of rows."""
-    if shape == (3, 3):
-        return Gf.Matrix3d(*array.ravel().tolist())
-    return (
-        Gf.Vec3d(*array.tolist()) if shape == (3,) else Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(array))
-    )
-
-
-def _written_parameters(field: AnomalyMap) -> str:
-    if not field.parameters:
-        return ""
-    try:
-        return json.dumps(dict(field.parameters), allow_nan=False, ensure_ascii=False)
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"parameters of map {field.name!r} must be finite numbers, texts and lists of them ({error})"
-        ) from error
+    if shape in ((3, 3), (3,)):
+        return (Gf.Matrix3d if len(shape) == 2 else Gf.Vec3d)(*array.ravel().tolist())
+    return Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(array))
 
 
 def _get(prim: Usd.Prim, name: str, sample: _Sample | None = None) -> Any:
     """Value of one of the map's attributes, of the schema's type."""
     attribute = prim.GetAttribute(attribute_name("anomalyMap", name))
-    value = sample.get(attribute.GetName()) if sample else attribute.Get()
-    return _check_type(attribute, value)
+    return _check_type(attribute, sample.get(attribute.GetName()) if sample else attribute.Get())
 
 
 def _check_type(attribute: Usd.Attribute, value: Any) -> Any:
@@ -448,8 +423,9 @@ def _define_heat_map(stage: Usd.Stage, maps: Sequence[AnomalyMap], times: Sequen
     """A grid of quads with a vertex at every node, or every few, and one colour variant per heading."""
     latest = maps[-1]
     _, rows, columns = latest.values_nt.shape
-    every = _every(rows, columns)
-    j, i = _kept(rows, every), _kept(columns, every)
+    every = 1
+    while (len(j := _kept(rows, every)) - 1) * (len(i := _kept(columns, every)) - 1) > MOST_QUADS:
+        every += 1
     rows, columns = len(j), len(i)
     x, y = np.meshgrid(latest.x_m[i], latest.y_m[j])
     points = np.stack([x, y, np.full_like(x, HEAT_MAP_HEIGHT_M)], axis=-1).reshape(-1, 3).astype(np.float32)
@@ -466,17 +442,8 @@ def _define_heat_map(stage: Usd.Stage, maps: Sequence[AnomalyMap], times: Sequen
     mesh.CreateDoubleSidedAttr(True)
     UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(_define_material(stage))
     low, high = colour_limits(np.concatenate([m.values_nt[m.valid] for m in maps]))
-    mesh.GetPrim().SetCustomData(
-        {
-            "magtwin": {
-                "colourMap": COLOUR_MAP,
-                "least": low,
-                "greatest": high,
-                "unit": UNIT,
-                "everyNode": every,  # stride of the vertices over the nodes
-            }
-        }
-    )
+    scale = {"colourMap": COLOUR_MAP, "least": low, "greatest": high, "unit": UNIT}
+    mesh.GetPrim().SetCustomData({"magtwin": scale | {"everyNode": every}})  # stride over the nodes
     primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
         "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex
     )
@@ -494,14 +461,6 @@ def _define_heat_map(stage: Usd.Stage, maps: Sequence[AnomalyMap], times: Sequen
             for time, row in zip(times, index, strict=bool(times)):
                 primvar.SetIndices(Vt.IntArray.FromNumpy(row), time)
     variants.SetVariantSelection(names[0])
-
-
-def _every(rows: int, columns: int) -> int:
-    """The smallest stride over the nodes with at most `MOST_QUADS` quads."""
-    every = 1
-    while (len(_kept(rows, every)) - 1) * (len(_kept(columns, every)) - 1) > MOST_QUADS:
-        every += 1
-    return every
 
 
 def _kept(count: int, every: int) -> NDArray[np.intp]:

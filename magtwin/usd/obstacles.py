@@ -46,7 +46,10 @@ def read_obstacles(stage: Usd.Stage | str | os.PathLike[str], *, height_m: float
     stage = stage if isinstance(stage, Usd.Stage) else open_stage(stage)
     purposes = (*SHOWN, UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy)
     collider = functools.cache(_collider)
-    height = _tallest_m(stage) if height_m is None else height_m
+    if height_m is None:
+        cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), list(purposes))
+        bounds = map(cache.ComputeWorldBound, prims_with(stage.GetPseudoRoot(), "robot"))
+        height_m = max([ROBOT_HEIGHT_M, *(bound.ComputeAlignedRange().GetMax()[2] for bound in bounds)])
     names, outlines, triangles = [], [], []
     for path, corners in read_triangles(
         stage, purposes=purposes, wanted=lambda prim, carried: not carried and bool(collider(prim))
@@ -54,7 +57,7 @@ def read_obstacles(stage: Usd.Stage | str | os.PathLike[str], *, height_m: float
         prim = stage.GetPrimAtPath(path)
         triangles.append(corners)
         for piece in _pieces(corners) if prim.IsA(UsdGeom.Mesh) else [corners]:
-            outline = _outline(piece, height)
+            outline = _outline(piece, height_m)
             if outline is not None:
                 names.append(collider(prim))
                 outlines.append(outline)
@@ -70,16 +73,6 @@ def _collider(prim: Usd.Prim) -> str:
             return str(prim.GetPath()) if enabled is not False else ""
         prim = prim.GetParent()
     return ""
-
-
-def _tallest_m(stage: Usd.Stage) -> float:
-    """Height of the tallest robot of a stage, at least `ROBOT_HEIGHT_M` [m]."""
-    cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), [*SHOWN, UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy])
-    tops = [
-        cache.ComputeWorldBound(prim).ComputeAlignedRange().GetMax()[2]
-        for prim in prims_with(stage.GetPseudoRoot(), "robot")
-    ]
-    return max([ROBOT_HEIGHT_M, *tops])
 
 
 def _pieces(corners: np.ndarray) -> list[np.ndarray]:

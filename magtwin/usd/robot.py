@@ -11,10 +11,10 @@ from magtwin.files import existing, sha256
 from magtwin.frames import IDENTITY_XYZW, canonical, xyzw_from_wxyz
 from magtwin.spec.base import Quat, Vec3
 from magtwin.spec.robot import RobotSpec
+from magtwin.usd.geometry import BASE_LINK
 from magtwin.usd.layers import open_stage
 from magtwin.usd.schema import only_prim_with, place
 from magtwin.usd.sensors import (
-    BASE,
     read_battery,
     read_drive,
     read_footprint,
@@ -22,6 +22,7 @@ from magtwin.usd.sensors import (
     read_lidar,
     read_magnetometer,
     read_mocap,
+    read_plant,
     read_platform,
 )
 
@@ -65,6 +66,7 @@ def read_robot(prim: Usd.Prim, asset: Path | None = None) -> RobotSpec:
         "imu": read_imu(imu),
         "lidar": read_lidar(lidar),
         "mocap": read_mocap(prim),
+        "plant": read_plant(prim),
     }
     try:
         return RobotSpec(
@@ -105,7 +107,7 @@ def _conversion(asset: str | os.PathLike[str]) -> dict[str, Any]:
 
 def _base(root: Usd.Prim) -> Usd.Prim:
     """The body of a robot called base_link, or else the root."""
-    return next((p for p in Usd.PrimRange(root) if p.GetName() == BASE), root)
+    return next((p for p in Usd.PrimRange(root) if p.GetName() == BASE_LINK), root)
 
 
 def _p_root(root: Usd.Prim, prim: Usd.Prim) -> Vec3:

@@ -15,6 +15,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdPhysics, Vt
 from magtwin.errors import InputError, hint
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.magnetics import PlatformFieldSpec
+from magtwin.spec.plant import PlantSpec
 from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec, MountSpec
 from magtwin.usd.attributes import read_pose, read_spec, target, write_pose, write_spec
 from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, require_api
@@ -26,9 +27,6 @@ POSE_FIELDS = frozenset(("link", "p_link_sensor", "q_link_sensor_xyzw"))
 
 JOINT_FIELDS = ("left_wheel_joint", "right_wheel_joint")
 """Fields of a DriveSpec that are relationships to joints."""
-
-BASE = "base_link"
-"""Name of the link whose frame is the robot's, as in REP-105."""
 
 MAP_RELATIONSHIP = "magtwin:magnetometer:map"
 MAP_CHECKSUM = "magtwin:magnetometer:mapSha256"
@@ -242,6 +240,20 @@ def define_platform(prim: Usd.Prim, spec: PlatformFieldSpec) -> Usd.Prim:
 def read_platform(prim: Usd.Prim) -> PlatformFieldSpec:
     """The spec of an authored platform field; errors as for `read_magnetometer`."""
     return read_spec(PlatformFieldSpec, prim, "platform")
+
+
+def define_plant(prim: Usd.Prim, spec: PlantSpec) -> Usd.Prim:
+    """Apply the field beyond the linear platform field to a robot's root prim, unless there is none."""
+    if spec == PlantSpec() and not prim.HasAPI(NOUNS["plant"]):
+        return prim
+    return write_spec(apply_api(prim, "plant"), "plant", spec)
+
+
+def read_plant(prim: Usd.Prim) -> PlantSpec:
+    """The plant of the robot rooted at `prim`, or one without effect."""
+    if not prim.HasAPI(NOUNS["plant"]):
+        return PlantSpec()
+    return read_spec(PlantSpec, prim, "plant")
 
 
 def define_mocap(prim: Usd.Prim, spec: MocapSpec) -> Usd.Prim:

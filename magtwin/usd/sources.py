@@ -136,7 +136,8 @@ def read_source(prim: Usd.Prim, *, name: str | None = None, local: bool = False)
             f"{place(prim)}: a {prim.GetTypeName() or 'prim without type'} cannot be a magnetic source; "
             f"put MagtwinMagneticSourceAPI on {', '.join(SHAPES)}"
         )
-    if any(above.IsA(UsdGeom.PointInstancer) for above in _above(prim)):
+    above = map(prim.GetStage().GetPrimAtPath, prim.GetPath().GetParentPath().GetPrefixes())
+    if any(parent.IsA(UsdGeom.PointInstancer) for parent in above):
         raise InputError(
             f"{place(prim)}: a magnetic source below a PointInstancer has no single place; reference it "
             "at its place, as an instance if needed"
@@ -156,7 +157,8 @@ def read_source(prim: Usd.Prim, *, name: str | None = None, local: bool = False)
         if own["moment"] != ZERO3:
             if own["magnetization"] != ZERO3:
                 raise InputError("has both a moment and a magnetization; give one of them")
-            own["magnetization"] = _over(own["moment"], body_of(SourceSpec(**spec)).volume_m3)
+            volume_m3 = body_of(SourceSpec(**spec)).volume_m3
+            own["magnetization"] = _vec3(part / volume_m3 for part in own["moment"])
         return SourceSpec(
             **spec, magnetization=own["magnetization"], susceptibility=figures["susceptibility"]
         )
@@ -182,10 +184,8 @@ def _geometry(prim: Usd.Prim, shape: str, scale: Vec3) -> tuple[dict[str, Any], 
         points, faces = _triangles(UsdGeom.Mesh(prim), scale)
         if len(faces) and mesh_moments(points, faces)[0] < 0:
             faces = faces[:, ::-1]
-        return {
-            "vertices_m": tuple(map(tuple, points.tolist())),
-            "faces": tuple(map(tuple, faces.tolist())),
-        }, (IDENTITY_XYZW)
+        vertices, corners = (tuple(map(tuple, array.tolist())) for array in (points, faces))
+        return {"vertices_m": vertices, "faces": corners}, IDENTITY_XYZW
     if shape == "cuboid":
         size = UsdGeom.Cube(prim).GetSizeAttr().Get()
         return {"size_m": (size * scale[0], size * scale[1], size * scale[2])}, IDENTITY_XYZW
@@ -266,14 +266,6 @@ def read_transform(prim: Usd.Prim, *, local: bool = False) -> Transform:
     return (x, y, z), IDENTITY_XYZW if straight else _quat(q), _vec3(lengths)
 
 
-def _above(prim: Usd.Prim) -> list[Usd.Prim]:
-    """The prims above one."""
-    above = []
-    while (prim := prim.GetParent()) and not prim.IsPseudoRoot():
-        above.append(prim)
-    return above
-
-
 def _quat(turn: Gf.Quatd) -> Quat:
     """A quaternion as xyzw."""
     x, y, z, w = xyzw_from_wxyz((turn.GetReal(), *turn.GetImaginary())).tolist()
@@ -288,7 +280,3 @@ def _product(a: Quat, b: Quat) -> Quat:
 def _vec3(v: Any) -> Vec3:
     x, y, z = (float(c) + 0.0 for c in v)
     return (x, y, z)
-
-
-def _over(moment: Vec3, volume_m3: float) -> Vec3:
-    return (moment[0] / volume_m3, moment[1] / volume_m3, moment[2] / volume_m3)

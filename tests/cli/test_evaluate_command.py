@@ -231,7 +231,7 @@ def test_the_example_of_the_docs_runs(room, tmp_path, monkeypatch, capsys):
 
 
 def test_two_drives_of_one_path_lie_over_each_other_once_they_are_aligned(lab_scene):
-    twin = open_twin(lab_scene, magnetometer="physical")
+    twin = open_twin(lab_scene, magnetometer="physical", tracking_error=False)
     a = simulate(twin, "figure8", seed=0, duration_s=30.0, rate_hz=20.0)
     faster = simulate(twin, "figure8", seed=1, speed=0.25, duration_s=25.0, rate_hz=20.0)
     again = made_again(a, lab_scene, engine="kinematic", seed=1)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from nodes import DOMAINS, spin
+from nodes import DOMAINS, from_message, spin
 
 from magtwin.errors import InputError
 from magtwin.files import shipped
@@ -14,7 +14,7 @@ from magtwin.frames import quat_from_yaw
 from magtwin.io.bags.topics import CLOCK, COMMAND, ODOMETRY, POSE, Qos
 from magtwin.path import PATHS, Path
 from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
-from magtwin.ros.diagnostics import KIND, Status, from_message
+from magtwin.ros.diagnostics import KIND, Status
 from magtwin.ros.follow import Follower
 from magtwin.ros.simulate import Simulator
 from magtwin.ros.teleop import Teleop

@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from nodes import DOMAINS, spin
+from nodes import DOMAINS, from_message, spin
 
 from magtwin.errors import InputError
 from magtwin.files import shipped
 from magtwin.frames import into_base, quat_from_yaw
 from magtwin.io.bags.topics import BATTERY, CLOCK, IMU, MAGNITUDE, ODOMETRY, POSE, Qos, Topic
 from magtwin.ros.bus import Bus, Message, Publisher, names_of, open_bus, to_bytes
-from magtwin.ros.diagnostics import KIND, Status, from_message
+from magtwin.ros.diagnostics import KIND, Status
 from magtwin.ros.inputs import GRAVITY, Gravity, Input
 from magtwin.ros.magnetometer import PARAMETERS, Magnetometer
 from magtwin.ros.parameters import settings

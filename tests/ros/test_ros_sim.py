@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from nodes import DOMAINS, SLOWEST_S, spin
+from nodes import DOMAINS, SLOWEST_S, from_message, spin
 
 from magtwin.errors import InputError
 from magtwin.files import shipped
@@ -21,7 +21,7 @@ from magtwin.io.formats import read_run
 from magtwin.learn.data.recording import Source
 from magtwin.learn.data.recording import read as read_source
 from magtwin.ros.bus import Bus, Message, names_of, open_bus, to_bytes
-from magtwin.ros.diagnostics import KIND, Status, from_message, to_fields
+from magtwin.ros.diagnostics import KIND, Status, to_fields
 from magtwin.ros.record import Player, Recorder
 from magtwin.ros.simulate import RESET, Simulator
 from magtwin.run.run import Run

@@ -9,12 +9,13 @@ from magtwin.errors import InputError
 from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.sim import interference
 from magtwin.sim.interference import (
+    ambient_at_sensor_nt,
     ambient_field_nt,
     ambient_gradient_nt_m,
     draw_platform,
-    field_at_sensor_nt,
     level_field_nt,
     level_gradient_nt_m,
+    own_field_nt,
     platform_field_nt,
     rest_current_a,
     turning_iron_nt,
@@ -237,7 +238,9 @@ def test_a_robot_that_speeds_up_draws_more_torque_than_one_that_cruises():
     t = np.array([0.5, 1.5])
     true = motion.at(t)
     rest = rest_current_a(battery)
-    b = field_at_sensor_nt(scene, motion, t, true=true, lidar_on=np.zeros(2), supply_a=np.full(2, rest))
+    b_base, b_rate = ambient_at_sensor_nt(scene, true)
+    known = {"true": true, "lidar_on": np.zeros(2), "supply_a": np.full(2, rest)}
+    b = own_field_nt(scene.robot, motion, t, b_base, b_rate, **known)
     # r (F / 2 + m a / 2) = 0.03575 x (1 + 2 x 0.3) while it speeds up at 0.3 m/s2, then 0.03575 x 1
     added = (b - EARTH.b_world_nt)[:, :2] / 1e4
     assert_allclose(added, drive.wheel_radius_m * np.array([[1.6, 1.6], [1.0, 1.0]]), rtol=1e-9)

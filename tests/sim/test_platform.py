@@ -39,6 +39,9 @@ def scene() -> Scene:
     robot = replace(
         lab.robot,
         platform=from_table(PlatformFieldSpec, tables["platform"], SETTINGS, "platform"),
+        drive=replace(
+            lab.robot.drive, localization_std_m=0.0, localization_yaw_std=0.0, localization_latency_s=0.0
+        ),
         magnetometer=replace(magnetometer, **mount),
     )
     return replace(lab, robot=robot)

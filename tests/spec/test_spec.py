@@ -16,6 +16,7 @@ from magtwin.spec.drive import DriveSpec
 from magtwin.spec.furniture import FurnitureSpec
 from magtwin.spec.lab import LabSpec, SurveySpec
 from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
+from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import PlacedRobot, RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec, MountSpec
@@ -30,6 +31,13 @@ SPECS = (
     LidarSpec(),
     BatterySpec(),
     MocapSpec(),
+    PlantSpec(
+        play_thresholds_nt=(1.0,),
+        play_weights=(1.0,),
+        warm_up_s=(1.0,),
+        warm_up_nt=(0.0,) * 3,
+        warm_up_soft_iron=(0.0,),
+    ),
     SurveySpec(),
     DriveSpec(),
     PlatformFieldSpec(),

@@ -502,7 +502,7 @@ def test_a_stage_without_a_map_is_refused(tmp_path):
         ("magtwin:anomalyMap:headings", Sdf.ValueTypeNames.DoubleArray, [], "must ascend in .* got \\[\\]"),
         (VALUES, Sdf.ValueTypeNames.String, "many", r"values must be a float\[\]"),
         (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": 1', "parameters is not JSON"),
-        (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": NaN}', r"not JSON \(NaN is no JSON number\)"),
+        (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": NaN}', r"not JSON \(Out of range float"),
         (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": 1e999}', "parameters is not JSON"),
         (PARAMETERS, Sdf.ValueTypeNames.String, "[" * 10_000, "parameters is not JSON"),
         (PARAMETERS, Sdf.ValueTypeNames.String, "[1]", "parameters must be a JSON object"),

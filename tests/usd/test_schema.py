@@ -15,6 +15,7 @@ from magtwin.files import shipped
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.lab import LabSpec
 from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
+from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec
 from magtwin.usd import schema, sensors
@@ -31,6 +32,7 @@ SPECS = {
     "battery": BatterySpec,
     "mocap": MocapSpec,
     "drive": DriveSpec,
+    "plant": PlantSpec,
     "platform": PlatformFieldSpec,
     "lab": LabSpec,
     "harmonic": HarmonicField,

@@ -95,8 +95,9 @@ def map_fit(
         Spacing of the map's nodes [m]. Default for trilinear: that of the survey. Default for other methods:
         the widest with almost no loss of accuracy. The report gives the interpolation error.
     headings_deg
-        Headings of the map [deg], such as 0,90,180,270. Default: the survey's for trilinear, else the fewest
-        of 4, 6, 8, 12 or 24 that cost almost no accuracy.
+        Headings of the map [deg], such as 0,90,180,270. Default for trilinear: the headings of the
+        survey. Default for other methods: the smallest of 4, 6, 8, 12 or 24 headings with almost no loss of
+        accuracy.
     """
     from magtwin.io.surveys.maps import fit_survey
 

@@ -28,10 +28,10 @@ Kernel = Annotated[
 Earth = Annotated[
     str | None,
     Parameter(
-        help="The Earth's field for the harmonic fit: that of a scene (its file); of a place and date, as "
+        help="The Earth's field for the harmonic fit, in one of three forms: the file of a scene; "
         "latitude,longitude,height,date [deg, deg, m, YYYY-MM-DD], if the world's y axis points to true "
-        "north; or its components x,y,z in the world [nT]. Default: the one stored in the survey, if a twin "
-        "was surveyed."
+        "north; or components x,y,z in world axes [nT]. Default: the field stored in the survey, as in "
+        "surveys of a simulated lab."
     ),
 ]
 Date = Annotated[

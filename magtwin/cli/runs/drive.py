@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Gamepad, ModelError, Network, Seed, Session
+from magtwin.cli.options import Force, Gamepad, ModelError, Network, Plant, Seed, Session
 from magtwin.cli.runs.run import save_picture
 from magtwin.cli.terminal import Done, announce, note, silence
 from magtwin.errors import InputError
@@ -32,6 +32,7 @@ def drive(
     model_error: ModelError = True,
     seed: Seed = 0,
     session: Session = None,
+    plant: Plant = None,
     live: bool = True,
     force: Force = False,
 ) -> Done:
@@ -60,13 +61,14 @@ def drive(
     from magtwin.sim.motion.follow import CONTROL_RATE_HZ
     from magtwin.sim.motion.manual import HELP, Gamepad, Keyboard, Recorder, at_start
     from magtwin.sim.runs.sensing import streams
-    from magtwin.twin import in_session, open_twin, scene_file
+    from magtwin.twin import in_session, open_twin, scene_file, with_plant
 
     scene = scene_file(scene)
     if gamepad is not None and existing(gamepad, "gamepad").is_dir():
         raise InputError(f"{gamepad}: a folder; name a gamepad in it, such as /dev/input/js0")
     with output(out, force=force) as folder:
-        twin = in_session(open_twin(scene, network=network, model_error=model_error), session, seed=seed)
+        twin = with_plant(open_twin(scene, network=network, model_error=model_error), plant)
+        twin = in_session(twin, session, seed=seed)
         robot, dt = twin.scene.robot, 1.0 / CONTROL_RATE_HZ
         errors = draw_wheel_errors(robot.drive, streams(np.random.default_rng(seed))["drive"])
         chassis = at_start(
@@ -96,12 +98,14 @@ def drive(
             model_error=model_error,
             seed=seed,
             session=session,
+            plant=plant,
             metadata={"commands_file": "commands.csv"},
             report=announce,
         )
         Outputs(folder, picture=save_picture).write(driven)
     again = f"magtwin run {scene} --commands {out / 'commands.csv'} --seed {seed}"
     again += "" if session is None else f" --session {session}"
+    again += "" if plant is None else f" --plant {plant}"
     return Done(driven.run.report(f"Manual drive in {scene}"), out, text=f"Wrote {out}; again: {again}")
 
 

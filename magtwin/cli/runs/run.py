@@ -16,6 +16,7 @@ from magtwin.cli.options import (
     Force,
     ModelError,
     OutUnit,
+    Plant,
     Seed,
     SensingOptions,
     Session,
@@ -89,6 +90,7 @@ def run(
     sensing: SensingOptions = SENSING,
     seed: Seed = 0,
     session: Session = None,
+    plant: Plant = None,
     speed: float = 0.2,
     duration_s: float | None = None,
     out: Outs = None,
@@ -123,12 +125,12 @@ def run(
     meet
         What happens if robots collide: refuse the run, or flag it as a bump. Default: refuse.
     engine
-        What moves the robot: kinematic, or newton for physics in the stage.
+        What moves the robot: kinematic (motion without forces), or newton (the physics engine Newton).
     replay
         File of a run, in any format. The robot repeats the recorded motion; the sensors use the current
         settings.
     controller
-        Controller: magtwin's follower; release, the one of APRILab's released package; stanley; or
+        follower (magtwin's own controller), release (that of APRILab's published package), stanley or
         pure_pursuit.
     speed
         Forward speed on straight parts [m/s].
@@ -140,8 +142,8 @@ def run(
         .npz, .usd, .usda or .usdc. A name without a suffix is a folder with run.rrd, run.parquet and run.png.
         Default: the folder run.
     scans
-        Cast the LiDAR's rays while it spins. Scans are written to recordings and bags; for tables, to a
-        second file such as run.scans.parquet.
+        Cast the LiDAR's rays while it spins. Files .rrd, .mcap and .db3 contain the scans. For .parquet, .csv
+        and .npz, the scans go into a second file such as run.scans.parquet.
     live
         Show the run in a Rerun viewer while it goes on. Until it ends, the names of growing files contain
         "partial" or "parts". Ctrl-C ends it and keeps what was driven.
@@ -189,7 +191,8 @@ def run(
 
         check_listens(viewer)
     options: dict[str, Any] = {"commands": commands, "replay": replay, "seed": seed, "session": session}
-    options |= {"speed": speed, "duration_s": duration_s, "controller": controller, **vars(sensing)}
+    options |= {"plant": plant, "speed": speed, "duration_s": duration_s, "controller": controller}
+    options |= vars(sensing)
     robots = robots_in(scene)
     if robot is not None:
         find("robot", robot, robots)
@@ -255,7 +258,9 @@ def _run_robots(
     from magtwin.twin import led_by, open_twin, room_of, scan, simulate_robots
 
     commands, replay = options.pop("commands"), options.pop("replay")
-    opening = {name: options.pop(name) for name in ("network", "magnetometer", "model_error")}
+    opening = {
+        name: options.pop(name) for name in ("network", "magnetometer", "model_error", "tracking_error")
+    }
     twin = open_twin(scene, **opening)
     ways: dict[str, Any] = {spec.robot.name: spec.path or "figure8" for spec in twin.scene.robots}
     if robot is not None and (commands or replay or path):

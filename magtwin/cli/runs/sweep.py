@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Literal
 
 from magtwin.cli.app import app
-from magtwin.cli.options import SENSING, Flag, Force, Names, Seed, SensingOptions, Whole
+from magtwin.cli.options import SENSING, Flag, Force, Names, Plant, Seed, SensingOptions, Whole
 from magtwin.cli.terminal import Done, announce, progress
 from magtwin.errors import InputError
 
@@ -23,6 +23,7 @@ def sweep(
     seed: Seed = 0,
     sessions: Whole | None = None,
     session: Literal["survey"] | None = None,
+    plant: Plant = None,
     speed: float | None = None,
     duration_s: float | None = None,
     keep: Names = None,
@@ -77,7 +78,9 @@ def sweep(
         drive_input(name)  # refuses a wrong name before the scene is opened
     announce("Opening the scene")
     options = vars(sensing).copy()
-    opening = {name: options.pop(name) for name in ("network", "magnetometer", "model_error")}
+    opening = {
+        name: options.pop(name) for name in ("network", "magnetometer", "model_error", "tracking_error")
+    }
     twin = open_twin(scene, **opening)
     announce(f"Driving {count} runs")
     runs = drive_many(
@@ -86,6 +89,7 @@ def sweep(
         count,
         seed=seed,
         sessions=session or sessions or max(1, round(count / RUNS_A_SESSION)),
+        plant=plant,
         speeds=speed if speed is not None else 0.2 if session else "drawn",
         columns=keep,
         duration_s=duration_s,

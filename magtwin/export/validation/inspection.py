@@ -74,14 +74,9 @@ def inspect(
         job_file.write_text(json.dumps(job), encoding="utf-8")
         command = [sys.executable, "-P", "-m", "magtwin.export.validation.inspection", str(job_file)]
         try:
-            done = subprocess.run(
-                command,
-                capture_output=True,
-                check=False,
-                timeout=PATIENCE_S + file.stat().st_size / 1e6,
-                text=True,
-                errors="replace",
-            )
+            patience = PATIENCE_S + file.stat().st_size / 1e6
+            options: Any = {"capture_output": True, "text": True, "errors": "replace"}
+            done = subprocess.run(command, check=False, timeout=patience, **options)
         except subprocess.TimeoutExpired as error:
             raise InputError(f"{file}: damaged: USD does not finish reading it; copy it again") from error
         if not answer.is_file():
@@ -182,10 +177,8 @@ def _core(stage: Any) -> Check:
     findings = []
     for error in UsdValidation.ValidationContext(validators).Validate(stage):
         kind = error.GetType()
-        severity: Any = {
-            UsdValidation.ValidationErrorType.Error: "error",
-            UsdValidation.ValidationErrorType.Warn: "warning",
-        }.get(kind, "note")
+        types = UsdValidation.ValidationErrorType
+        severity: Any = {types.Error: "error", types.Warn: "warning"}.get(kind, "note")
         places = [site.GetPrim().GetPath() for site in error.GetSites() if site.GetPrim()]
         text = " ".join(error.GetMessage().split())
         findings.append(Finding(error.GetName(), text, str(places[0]) if places else "", "", severity))

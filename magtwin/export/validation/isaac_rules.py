@@ -1,14 +1,13 @@
-"""Isaac Sim's rules for robots, sensors and graphs, by its "Asset Structure" and "Robot Schema" pages.
-
-What SimReady's profiles ask of a robot's own asset is theirs to say; these hold of a whole stage, composed.
-"""
+"""Isaac Sim's rules for robots, sensors and graphs, by its "Asset Structure" and "Robot Schema" pages."""
 
 import math
 from collections.abc import Iterator
 
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 
+from magtwin.export.ogn import faults, ports
 from magtwin.export.validation.rule import Subject, Wrong, rule
+from magtwin.export.validation.rules import applied
 from magtwin.usd.sensors import IMU_TYPE, LIDAR_API, LIDAR_TYPE
 
 ROBOT_API, LINK_API, JOINT_API = "IsaacRobotAPI", "IsaacLinkAPI", "IsaacJointAPI"
@@ -27,19 +26,9 @@ EMITTER_STATE, ROI = f"{CORE}emitterState:", "isRoiState"
 MOVING = ("PhysicsRevoluteJoint", "PhysicsPrismaticJoint")
 
 
-def applied(prim: Usd.Prim) -> list[str]:
-    """Names of the schemas applied to a prim, those that are not known here too."""
-    return list(prim.GetPrimTypeInfo().GetAppliedAPISchemas())
-
-
 def robots(subject: Subject) -> list[Usd.Prim]:
     """Prims that Isaac Sim takes for robots."""
     return [prim for prim in subject.prims if ROBOT_API in applied(prim)]
-
-
-def below(prim: Usd.Prim) -> list[Usd.Prim]:
-    """A prim and all below it."""
-    return list(Usd.PrimRange(prim))
 
 
 @rule("isaac", "magtwin robot authors this")
@@ -53,7 +42,7 @@ def robot_schema(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"is an articulation without {ROBOT_API}", str(prim.GetPath()))
     for robot in found:
         where = str(robot.GetPath())
-        roots = [prim for prim in below(robot) if prim.HasAPI(UsdPhysics.ArticulationRootAPI)]
+        roots = [prim for prim in Usd.PrimRange(robot) if prim.HasAPI(UsdPhysics.ArticulationRootAPI)]
         if len(roots) != 1:
             yield Wrong(f"has {len(roots)} articulation roots, Isaac Sim wants one", where)
         if not robot.GetAttribute("isaac:robotType").Get():
@@ -64,7 +53,7 @@ def robot_schema(subject: Subject) -> Iterator[Wrong]:
 def robot_lists(subject: Subject) -> Iterator[Wrong]:
     """Every robot lists all its bodies and all its joints, each once, and no missing prim."""
     for robot in robots(subject):
-        prims, where = below(robot), str(robot.GetPath())
+        prims, where = list(Usd.PrimRange(robot)), str(robot.GetPath())
         bodies = {prim.GetPath() for prim in prims if prim.HasAPI(UsdPhysics.RigidBodyAPI)}
         joints = {prim.GetPath() for prim in prims if prim.IsA(UsdPhysics.Joint)}
         for name, wanted, api in ((LINKS, bodies, LINK_API), (JOINTS, joints, JOINT_API)):
@@ -88,8 +77,7 @@ def joint_bodies(subject: Subject) -> Iterator[Wrong]:
     for prim in subject.prims:
         if not prim.IsA(UsdPhysics.Joint):
             continue
-        joint, where = UsdPhysics.Joint(prim), str(prim.GetPath())
-        held = 0
+        joint, where, held = UsdPhysics.Joint(prim), str(prim.GetPath()), 0
         for name, relationship in (("body0", joint.GetBody0Rel()), ("body1", joint.GetBody1Rel())):
             for path in relationship.GetTargets():
                 end = subject.stage.GetPrimAtPath(path)
@@ -109,7 +97,8 @@ def joint_drives(subject: Subject) -> Iterator[Wrong]:
         if prim.GetTypeName() not in MOVING or any(api.startswith(MIMIC_APIS) for api in apis):
             continue
         axis = "linear" if prim.GetTypeName() == "PhysicsPrismaticJoint" else "angular"
-        force = UsdPhysics.DriveAPI(prim, axis).GetMaxForceAttr().Get() if _driven(apis, axis) else None
+        driven = f"PhysicsDriveAPI:{axis}" in apis
+        force = UsdPhysics.DriveAPI(prim, axis).GetMaxForceAttr().Get() if driven else None
         if force is None:
             yield Wrong(f"has no {axis} drive", str(prim.GetPath()))
         elif not 0 < force < math.inf:
@@ -153,7 +142,8 @@ def sensor_mounts(subject: Subject) -> Iterator[Wrong]:
         kind, where = prim.GetTypeName(), str(prim.GetPath())
         if kind not in (IMU_TYPE, LIDAR_TYPE):
             continue
-        if not any(_rigid(subject.stage.GetPrimAtPath(path)) for path in prim.GetPath().GetAncestorsRange()):
+        above = map(subject.stage.GetPrimAtPath, prim.GetPath().GetAncestorsRange())
+        if not any(end and end.HasAPI(UsdPhysics.RigidBodyAPI) for end in above):
             yield Wrong("rides on no rigid body", where)
         if kind == IMU_TYPE:
             period = prim.GetAttribute("sensorPeriod").Get()
@@ -210,8 +200,6 @@ def materials(subject: Subject) -> Iterator[Wrong]:
 @rule("isaac", "author it with magtwin export --target isaac")
 def action_graph(subject: Subject) -> Iterator[Wrong]:
     """Every node of an Action Graph matches its definition, and its connections fit."""
-    from magtwin.export.ogn import faults, ports
-
     for prim in subject.prims:
         if prim.GetTypeName() != NODE:
             continue
@@ -222,14 +210,6 @@ def action_graph(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"is of the type {kind!r}, of which nothing is known here", where, severity="warning")
         for text in faults(prim):
             yield Wrong(text, where)
-
-
-def _driven(apis: list[str], axis: str) -> bool:
-    return f"PhysicsDriveAPI:{axis}" in apis
-
-
-def _rigid(prim: Usd.Prim) -> bool:
-    return bool(prim) and prim.HasAPI(UsdPhysics.RigidBodyAPI)
 
 
 def _few(paths: list[Sdf.Path]) -> str:

@@ -27,6 +27,8 @@ from magtwin.usd.schema import prims_with
 MOST_CHARACTERS = 120
 """Characters of a Python or USD error that a finding quotes."""
 
+_NOT_ITS_TYPE = (Tf.ErrorException, ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+
 _WHERE = re.compile(r"^(?P<file>[^<]*)<(?P<prim>/[^>]*)>:? ?(?P<text>.*)$", re.S)
 """How errors of usd/ begin, see `magtwin.usd.schema.place`."""
 
@@ -76,6 +78,10 @@ class Subject:
         """Every layer that was read from a file."""
         return [layer for layer in self.stage.GetUsedLayers() if layer.realPath]
 
+    def owns(self, layer: Sdf.Layer) -> bool:
+        """Whether a layer is in the stage's folder."""
+        return Path(layer.realPath).resolve().is_relative_to(self.folder)
+
     def having(self, noun: str) -> list[Usd.Prim]:
         """The prims that have one of magtwin's schemas, by its noun."""
         return prims_with(self.stage.GetPseudoRoot(), noun)
@@ -83,7 +89,7 @@ class Subject:
     def name_of(self, layer: Sdf.Layer) -> str:
         """A layer's file, relative to the folder."""
         path = Path(layer.realPath).resolve()
-        return path.relative_to(self.folder).as_posix() if path.is_relative_to(self.folder) else str(path)
+        return path.relative_to(self.folder).as_posix() if self.owns(layer) else str(path)
 
 
 @dataclass(frozen=True)
@@ -91,13 +97,11 @@ class Rule:
     """A rule."""
 
     name: str
-
     sentence: str
     """What is true of a stage that keeps the rule."""
 
     advice: str
     """What to do if it is broken."""
-
     look: Callable[[Subject], Iterator[Wrong]]
 
     def findings(self, subject: Subject) -> list[Finding]:
@@ -107,21 +111,11 @@ class Rule:
             wrongs.extend(self.look(subject))
         except InputError as error:
             wrongs.append(wrong_of(error))
-        except (
-            Tf.ErrorException,
-            ArithmeticError,
-            AttributeError,
-            LookupError,
-            TypeError,
-            ValueError,
-        ) as error:
+        except _NOT_ITS_TYPE as error:
             reason = f"{type(error).__name__}: {' '.join(str(error).split())[:MOST_CHARACTERS]}"
             text = f"cannot be checked, a value is not of its type ({reason})"
             wrongs.append(Wrong(text, advice="author it anew; docs/schema.md lists the type of each value"))
-        return [
-            Finding(self.name, wrong.text, wrong.where, wrong.advice or self.advice, wrong.severity)
-            for wrong in wrongs
-        ]
+        return [Finding(self.name, w.text, w.where, w.advice or self.advice, w.severity) for w in wrongs]
 
 
 RULES: dict[str, dict[str, Rule]] = {"isaac": {}, "magtwin": {}}
@@ -131,15 +125,9 @@ Look = Callable[[Subject], Iterator[Wrong]]
 
 
 def rule(validator: str, advice: str) -> Callable[[Look], Look]:
-    """Register a function as a rule of a validator.
+    """Decorator that enters a function in `RULES`.
 
-    Args:
-        validator: A key of `RULES`.
-        advice: What to do if the rule is broken.
-
-    Returns:
-        The decorator. The rule's name is the function's, with hyphens; its sentence is the first line of the
-        docstring.
+    The rule's name is the function's, with hyphens; its sentence is the first line of the docstring.
     """
 
     def register(look: Look) -> Look:
@@ -152,6 +140,5 @@ def rule(validator: str, advice: str) -> Callable[[Look], Look]:
 
 def wrong_of(error: InputError) -> Wrong:
     """An error as what is wrong, with its prim taken out of the text."""
-    text = str(error)
-    match = _WHERE.match(text)
-    return Wrong(match["text"], match["prim"]) if match else Wrong(text)
+    match = _WHERE.match(str(error))
+    return Wrong(match["text"], match["prim"]) if match else Wrong(str(error))

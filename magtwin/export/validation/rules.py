@@ -1,9 +1,4 @@
-"""Rules of magtwin's own: what a lab, its map and its robots must hold to, so that others find them.
-
-The checksum in a map's layer covers its arrays, not the grid that they lie on. That its shape, origin, cell
-and headings are right too is seen from the coloured floor, which was made from them (`map_grid`), and from
-the checksum of the whole file, which the magnetometer keeps (`map_file`).
-"""
+"""Rules of magtwin's own: what a lab, its map and its robots must hold to, so that others find them."""
 
 import json
 import math
@@ -12,20 +7,16 @@ import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
 from magtwin.export.attached import attached_sha256
 from magtwin.export.contents import named_files, weights_metadata
 from magtwin.export.validation.findings import Severity
-from magtwin.export.validation.rule import (
-    Subject,
-    Wrong,
-    rule,
-    wrong_of,
-)
+from magtwin.export.validation.rule import Subject, Wrong, rule, wrong_of
 from magtwin.files import sha256
 from magtwin.usd.attributes import plain_value, target
 from magtwin.usd.earth import read_earth
@@ -47,8 +38,6 @@ from magtwin.usd.sensors import (
 )
 
 NETWORK = attribute_name("magnetometer", "network")
-NETWORK_SHA256 = attribute_name("magnetometer", "network_sha256")
-INPUTS = attribute_name("magnetometer", "inputs")
 
 NEEDED = ("values", "valid", "shape", "origin", "cell_size", "headings", "unit", "checksum")
 """Attributes that a map's layer must author: a fallback would be a grid that is not its own."""
@@ -58,19 +47,6 @@ SAME_M = 1e-6
 
 UPRIGHT = 1 - 1e-9
 """Cosine of the tilt of a robot that stands."""
-
-
-@rule("magtwin", "put the file there, or export the scene again")
-def references(subject: Subject) -> Iterator[Wrong]:
-    """Every layer, texture and other file that is named exists."""
-    networks = {_path(prim, NETWORK) for prim in subject.having("magnetometer")}
-    _, _, unresolved = UsdUtils.ComputeAllDependencies(str(subject.file))
-    told = [" ".join(str(error).split()) for error in subject.stage.GetCompositionErrors()]
-    for text in told:
-        yield Wrong(text)
-    for path in unresolved:
-        if path not in networks and not any(path in text for text in told):
-            yield Wrong(f"names {path}, which is not there")
 
 
 @rule("magtwin", "make the path relative to the layer; --fix does this if the file exists")
@@ -86,33 +62,26 @@ def absolute_paths(subject: Subject) -> Iterator[Wrong]:
 def climbing_paths(subject: Subject) -> Iterator[Wrong]:
     """No path leads out of the stage's folder. In a folder this is a warning, in a .usdz an error."""
     for layer in subject.layers:
-        if not Path(layer.realPath).resolve().is_relative_to(subject.folder):
+        if not subject.owns(layer):
             continue  # told where it was named
         for named in named_files(layer):
             if named.path and not is_absolute(named.path) and climbs(named.path, layer, subject.folder):
                 severity: Severity = "error" if subject.packed else "warning"
-                yield Wrong(
-                    f"{subject.name_of(layer)} names {named.path}, outside the stage's folder",
-                    named.where,
-                    severity=severity,
-                )
+                text = f"{subject.name_of(layer)} names {named.path}, outside the stage's folder"
+                yield Wrong(text, named.where, severity=severity)
 
 
 @rule("magtwin", "convert it to metres with Z up in the program that made it")
 def units(subject: Subject) -> Iterator[Wrong]:
     """The stage is authored in metres and kilograms with Z up, and no layer below differs."""
-    root = subject.stage.GetRootLayer()
-    stage, advice = subject.stage, "--fix says so where magtwin made the stage"
-    if not stage.HasAuthoredMetadata("metersPerUnit"):
-        yield Wrong("does not say metersPerUnit, and counts as centimetres", advice=advice)
-    if not stage.HasAuthoredMetadata("upAxis"):
-        yield Wrong("does not say upAxis, and counts as Y up", advice=advice)
+    root, advice = subject.stage.GetRootLayer(), "--fix says so where magtwin made the stage"
+    for name, default in (("metersPerUnit", "centimetres"), ("upAxis", "Y up")):
+        if not subject.stage.HasAuthoredMetadata(name):
+            yield Wrong(f"does not say {name}, and counts as {default}", advice=advice)
+    defaults: dict[str, Any] = {"metersPerUnit": 1.0, "upAxis": "Z", "kilogramsPerUnit": 1.0}
     for layer in subject.layers:
-        said = layer.pseudoRoot
-        name = "" if layer == root else f"{subject.name_of(layer)} "
-        metres = said.GetInfo("metersPerUnit") if said.HasInfo("metersPerUnit") else 1.0
-        up = said.GetInfo("upAxis") if said.HasInfo("upAxis") else "Z"
-        kilograms = said.GetInfo("kilogramsPerUnit") if said.HasInfo("kilogramsPerUnit") else 1.0
+        said, name = layer.pseudoRoot, "" if layer == root else f"{subject.name_of(layer)} "
+        metres, up, kilograms = (said.GetInfo(k) if said.HasInfo(k) else d for k, d in defaults.items())
         if not UsdGeom.LinearUnitsAre(metres, UsdGeom.LinearUnits.meters):
             yield Wrong(f"{name}is in units of {metres:g} m; USD does not convert them")
         if up != UsdGeom.Tokens.z:
@@ -121,19 +90,11 @@ def units(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"{name}is in units of {kilograms:g} kg; USD does not convert them")
 
 
-@rule("magtwin", "set it to the prim that holds all others; --fix does this if there is only one")
-def default_prim(subject: Subject) -> Iterator[Wrong]:
-    """The stage has a default prim, so that other stages can refer to it."""
-    if not subject.stage.GetDefaultPrim():
-        name = subject.stage.GetRootLayer().defaultPrim
-        yield Wrong(f"its default prim {name!r} is not there" if name else "has no default prim")
-
-
 @rule("magtwin", "use a name that is in docs/schema.md")
 def schema_names(subject: Subject) -> Iterator[Wrong]:
     """Every schema and attribute with magtwin's prefix is defined, and its prim has the schema."""
     for prim in subject.prims:
-        for api in prim.GetPrimTypeInfo().GetAppliedAPISchemas():
+        for api in applied(prim):
             if api.startswith("Magtwin") and api not in NOUNS.values():
                 yield Wrong(f"has the schema {api}, which there is not", str(prim.GetPath()))
         for prop in prim.GetAuthoredPropertiesInNamespace("magtwin"):
@@ -150,29 +111,21 @@ def targets(subject: Subject) -> Iterator[Wrong]:
     """Every relationship and every connection points to something that exists."""
     for prim in subject.prims:
         for prop in prim.GetAuthoredProperties():
-            if isinstance(prop, Usd.Relationship):
-                ends = prop.GetTargets()
-            else:
-                ends = prop.GetConnections() if prop.HasAuthoredConnections() else []
+            ends = prop.GetTargets() if isinstance(prop, Usd.Relationship) else prop.GetConnections()
             for end in ends:
                 if not subject.stage.GetObjectAtPath(end):
-                    yield Wrong(
-                        f"{prop.GetName()} points to <{end}>, which is not there", str(prim.GetPath())
-                    )
+                    text = f"{prop.GetName()} points to <{end}>, which is not there"
+                    yield Wrong(text, str(prim.GetPath()))
 
 
 @rule("magtwin", "make the map again with magtwin map")
 def map_complete(subject: Subject) -> Iterator[Wrong]:
     """Every map authors its arrays, grid and unit, and they match each other."""
     for prim in subject.having("anomalyMap"):
-        where = str(prim.GetPath())
-        lost = [
-            name
-            for name in (attribute_name("anomalyMap", field) for field in NEEDED)
-            if not prim.GetAttribute(name).HasAuthoredValue()
-        ]
+        names = [attribute_name("anomalyMap", field) for field in NEEDED]
+        lost = [name for name in names if not prim.GetAttribute(name).HasAuthoredValue()]
         if lost:
-            yield Wrong(f"does not say {', '.join(lost)}", where)
+            yield Wrong(f"does not say {', '.join(lost)}", str(prim.GetPath()))
         elif all(said == taken for said, taken in checksums(prim)):  # what else is wrong with it
             read_map(prim)
 
@@ -183,10 +136,10 @@ def map_checksum(subject: Subject) -> Iterator[Wrong]:
     for prim in subject.having("anomalyMap"):
         for said, taken in checksums(prim):
             if said != taken:
-                yield Wrong(
-                    f"its arrays have SHA-256 {taken[:12]}..., its checksum says {said[:12] or 'nothing'}...",
-                    str(prim.GetPath()),
+                text = (
+                    f"its arrays have SHA-256 {taken[:12]}..., its checksum says {said[:12] or 'nothing'}..."
                 )
+                yield Wrong(text, str(prim.GetPath()))
 
 
 @rule("magtwin", "the checksum does not cover the grid: make the map again with magtwin map")
@@ -206,42 +159,32 @@ def map_grid(subject: Subject) -> Iterator[Wrong]:
         least, most = origin, origin + cell * (shape[[2, 1]] - 1)
         seen = points.min(axis=0), points.max(axis=0)
         if not np.allclose([least, most], seen, rtol=0, atol=max(SAME_M, 1e-6 * float(np.abs(most).max()))):
-            yield Wrong(
-                f"its grid spans {_span(least, most)}, its coloured floor {_span(*seen)}",
-                str(floor.GetPath()),
-            )
+            spans = (f"x {a[0]:g} to {b[0]:g} m, y {a[1]:g} to {b[1]:g} m" for a, b in ((least, most), seen))
+            yield Wrong(f"its grid spans {', its coloured floor '.join(spans)}", str(floor.GetPath()))
         variants = floor.GetVariantSets().GetVariantSet("heading").GetVariantNames()
         if variants and sorted(variants) != sorted(heading_variants(np.deg2rad(headings))):
             degrees = ", ".join(f"{heading:g}" for heading in headings)
-            yield Wrong(
-                f"its headings are {degrees} deg, its coloured floor has {', '.join(variants)}",
-                str(floor.GetPath()),
-            )
+            text = f"its headings are {degrees} deg, its coloured floor has {', '.join(variants)}"
+            yield Wrong(text, str(floor.GetPath()))
 
 
 @rule("magtwin", "restore the map that the scene was made with, or make the scene again with this one")
 def map_file(subject: Subject) -> Iterator[Wrong]:
     """The file of the map's layer matches the checksum in the magnetometer."""
     for prim in subject.having("magnetometer"):
-        file = map_file_of(subject, prim)
         said = str(plain_value(prim.GetAttribute(MAP_CHECKSUM)) or "").lower()
-        if file is not None and said and (seen := sha256(file)) != said:
-            yield Wrong(
-                f"{file.name} has SHA-256 {seen[:12]}..., it names {said[:12]}...", str(prim.GetPath())
-            )
-
-
-def map_file_of(subject: Subject, magnetometer: Usd.Prim) -> Path | None:
-    """The file that holds a magnetometer's map; None where that is the stage's own, or there is no map."""
-    ends = magnetometer.GetRelationship(MAP_RELATIONSHIP).GetTargets()
-    prim = subject.stage.GetPrimAtPath(ends[0]) if len(ends) == 1 else None
-    if not prim or not prim.HasAPI(NOUNS["anomalyMap"]):
-        return None
-    stack = prim.GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack()
-    layer = stack[0].layer if stack else None
-    if layer is None or layer == subject.stage.GetRootLayer() or not layer.realPath:
-        return None  # a flattened stage is its own map
-    return Path(layer.realPath)
+        ends = prim.GetRelationship(MAP_RELATIONSHIP).GetTargets()
+        end = subject.stage.GetPrimAtPath(ends[0]) if len(ends) == 1 else None
+        if not said or not end or not end.HasAPI(NOUNS["anomalyMap"]):
+            continue
+        stack = end.GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack()
+        layer = stack[0].layer if stack else subject.stage.GetRootLayer()
+        if layer == subject.stage.GetRootLayer() or not layer.realPath:
+            continue  # a flattened stage is its own map
+        file = Path(layer.realPath)
+        if (seen := sha256(file)) != said:
+            text = f"{file.name} has SHA-256 {seen[:12]}..., it names {said[:12]}..."
+            yield Wrong(text, str(prim.GetPath()))
 
 
 @rule("magtwin", "point magtwin:magnetometer:map to the map's prim")
@@ -264,37 +207,21 @@ def network_file(subject: Subject) -> Iterator[Wrong]:
         spec, where = read_magnetometer(prim), str(prim.GetPath())
         if spec.kind != "neural":
             continue
-        file = network_of(prim)
-        attached = attached_sha256(prim.GetAttribute(NETWORK))
-        if spec.network is None and attached:  # in a layer that brings its network as bytes
+        attached, file = attached_sha256(prim.GetAttribute(NETWORK)), spec.network
+        said = f"{spec.network_sha256[:12]}..."
+        if file is None and attached:  # in a layer that brings its network as bytes
             if attached != spec.network_sha256.lower():
-                yield Wrong(
-                    f"its attached network has SHA-256 {attached[:12]}..., it names "
-                    f"{spec.network_sha256[:12]}...",
-                    where,
-                    "export the layer anew",
-                )
-        elif spec.network is None and spec.network_sha256:
-            yield Wrong(
-                f"keeps the checksum {spec.network_sha256[:12]}... of a network that it does not name",
-                where,
-                "name it again to read this magnetometer",
-                severity="warning",
-            )
-        elif spec.network is None:
-            yield Wrong("is neural and names no network", where)
+                text = f"its attached network has SHA-256 {attached[:12]}..., it names {said}"
+                yield Wrong(text, where, "export the layer anew")
+        elif file is None and spec.network_sha256:
+            text = f"keeps the checksum {said} of a network that it does not name"
+            yield Wrong(text, where, "name it again to read this magnetometer", "warning")
         elif file is None:
-            yield Wrong(f"names the network {spec.network.name}, which is not there", where)
+            yield Wrong("is neural and names no network", where)
+        elif not file.is_file():
+            yield Wrong(f"names the network {file.name}, which is not there", where)
         elif spec.network_sha256 and (seen := sha256(file)) != spec.network_sha256.lower():
-            yield Wrong(
-                f"{file.name} has SHA-256 {seen[:12]}..., it names {spec.network_sha256[:12]}...", where
-            )
-
-
-def network_of(magnetometer: Usd.Prim) -> Path | None:
-    """The file of a magnetometer's weights; None where it is not there."""
-    network = read_magnetometer(magnetometer).network
-    return network if network is not None and network.is_file() else None
+            yield Wrong(f"{file.name} has SHA-256 {seen[:12]}..., it names {said}", where)
 
 
 @rule("magtwin", "train it on inputs of magtwin.learn.data.features.FEATURES")
@@ -309,19 +236,14 @@ def network_inputs(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"has the inputs {', '.join(unknown)}, which are not known", where)
         if len(set(spec.inputs)) < len(spec.inputs):
             yield Wrong("has an input twice", where)
-        file = network_of(prim)
-        own = _inputs_of(file) if file is not None and file.suffix == ".safetensors" else None
-        if own is not None and spec.inputs and own != spec.inputs:
+        if spec.network is None or spec.network.suffix != ".safetensors" or not spec.inputs:
+            continue
+        try:
+            own = json.loads(weights_metadata(spec.network)["features"])
+        except (ValueError, KeyError, TypeError):
+            continue  # it has no names, or is not there
+        if isinstance(own, list) and tuple(map(str, own)) != spec.inputs:
             yield Wrong("names other inputs than its file of weights, or in another order", where)
-
-
-def _inputs_of(weights: Path) -> tuple[str, ...] | None:
-    """Names of the inputs in the header of a safetensors file; None if it has none."""
-    try:
-        names = json.loads(weights_metadata(weights)["features"])
-    except (ValueError, KeyError, TypeError):
-        return None
-    return tuple(map(str, names)) if isinstance(names, list) else None
 
 
 @rule("magtwin", "move the lab or the map to the origin of the world, without rotation or scale")
@@ -338,11 +260,8 @@ def frames(subject: Subject) -> Iterator[Wrong]:
         x0, x1, y0, y1 = (field := read_map(prim)).extent
         beyond = max(float(np.max(np.abs([[x0, y0], [x1, y1]]) - half)), 0.0)
         if beyond > max(field.cell_m) / 2 + SAME_M:
-            yield Wrong(
-                f"reaches {beyond:.3g} m beyond the floor of {2 * half[0]:g} x {2 * half[1]:g} m",
-                str(prim.GetPath()),
-                "say the lab's size and the map's origin in one frame",
-            )
+            text = f"reaches {beyond:.3g} m beyond the floor of {2 * half[0]:g} x {2 * half[1]:g} m"
+            yield Wrong(text, str(prim.GetPath()), "say the lab's size and the map's origin in one frame")
 
 
 @rule("magtwin", "start it upright on the floor, clear of the walls")
@@ -358,9 +277,8 @@ def robot_inside(subject: Subject) -> Iterator[Wrong]:
         x, y, z = at.ExtractTranslation()
         where, radius = str(prim.GetPath()), read_footprint(prim)
         if np.any(np.abs([x, y]) + radius > half + SAME_M):
-            yield Wrong(
-                f"stands at ({x:g}, {y:g}) m and needs {radius:g} m about it: it is off the floor", where
-            )
+            text = f"stands at ({x:g}, {y:g}) m and needs {radius:g} m about it: it is off the floor"
+            yield Wrong(text, where)
         if abs(z) > SAME_M:
             yield Wrong(f"stands {z:g} m above the floor", where)
         if at.TransformDir(Gf.Vec3d(0, 0, 1)).GetNormalized()[2] < UPRIGHT:
@@ -379,10 +297,8 @@ def robot_clear(subject: Subject) -> Iterator[Wrong]:
     for i, prim in enumerate(robots):
         distance, which = obstacles.clearance(places[i][None], reach_m=radii[i] + 1.0)
         if distance[0] < radii[i] - SAME_M:
-            what = obstacles.names[int(which[0])]
-            yield Wrong(
-                f"is {distance[0]:.3g} m from {what}, and needs {radii[i]:g} m about it", str(prim.GetPath())
-            )
+            text = f"is {distance[0]:.3g} m from {obstacles.names[int(which[0])]}"
+            yield Wrong(f"{text}, and needs {radii[i]:g} m about it", str(prim.GetPath()))
         for j in range(i):
             apart = float(np.linalg.norm(places[i] - places[j]))
             if apart < radii[i] + radii[j] - SAME_M:
@@ -411,32 +327,35 @@ def figures(subject: Subject) -> Iterator[Wrong]:
 @rule("magtwin", "author the sensor again with magtwin robot or magtwin scene")
 def sensor_types(subject: Subject) -> Iterator[Wrong]:
     """Isaac Sim's sensor prims have the rates and ranges of the magtwin sensors above them."""
-    single = {"rel_tol": 1e-6, "abs_tol": 1e-9}
+
+    def differs(prim: Usd.Prim, kind: str, name: str, wanted: float) -> tuple[bool, Any]:
+        sensor = next((p for p in prim.GetChildren() if p.GetTypeName() == kind), None)
+        seen = sensor.GetAttribute(name).Get() if sensor else None
+        return seen is None or not math.isclose(seen, wanted, rel_tol=1e-6, abs_tol=1e-9), seen
+
     for prim in subject.having("imu"):
-        sensor = next((p for p in prim.GetChildren() if p.GetTypeName() == IMU_TYPE), None)
-        period = sensor.GetAttribute("sensorPeriod").Get() if sensor else None
         rate = read_imu(prim).rate_hz
-        if period is None or not math.isclose(period, 1 / rate, **single):
-            yield Wrong(f"reads {rate:g} Hz, its {IMU_TYPE} has a period of {period} s", str(prim.GetPath()))
+        wrong, seen = differs(prim, IMU_TYPE, "sensorPeriod", 1 / rate)
+        if wrong:
+            yield Wrong(f"reads {rate:g} Hz, its {IMU_TYPE} has a period of {seen} s", str(prim.GetPath()))
     for prim in subject.having("lidar"):
         spec = read_lidar(prim)
-        sensor = next((p for p in prim.GetChildren() if p.GetTypeName() == LIDAR_TYPE), None)
         for name, wanted in (("nearRangeM", spec.range_min_m), ("farRangeM", spec.range_max_m)):
-            seen = sensor.GetAttribute(f"omni:sensor:Core:{name}").Get() if sensor else None
-            if seen is None or not math.isclose(seen, wanted, **single):
-                yield Wrong(
-                    f"ranges to {wanted:g} m, its {LIDAR_TYPE} has {name} {seen}", str(prim.GetPath())
-                )
+            wrong, seen = differs(prim, LIDAR_TYPE, f"omni:sensor:Core:{name}", wanted)
+            if wrong:
+                text = f"ranges to {wanted:g} m, its {LIDAR_TYPE} has {name} {seen}"
+                yield Wrong(text, str(prim.GetPath()))
 
 
 def robot_assets(subject: Subject) -> dict[str, Path | None]:
     """File of the asset of each robot by its prim's path; None where it is part of the stage's own layer."""
     found: dict[str, Path | None] = {}
-    for prim in subject.having("robot") or _articulations(subject):
+    default = subject.stage.GetDefaultPrim()
+    strangers = [default] if default and "IsaacRobotAPI" in applied(default) else []
+    for prim in subject.having("robot") or strangers:
         arcs = Usd.PrimCompositionQuery.GetDirectReferences(prim).GetCompositionArcs()
         file = Path(arcs[0].GetTargetLayer().realPath) if arcs else None
-        whole = prim == subject.stage.GetDefaultPrim()
-        found[str(prim.GetPath())] = subject.file if whole else file
+        found[str(prim.GetPath())] = subject.file if prim == default else file
     return found
 
 
@@ -451,20 +370,6 @@ def climbs(path: str, layer: Sdf.Layer, folder: Path) -> bool:
     return not target.is_relative_to(folder)
 
 
-def _articulations(subject: Subject) -> list[Usd.Prim]:
-    """Robots of a stage that magtwin knows nothing of."""
-    default = subject.stage.GetDefaultPrim()
-    return [default] if default and "IsaacRobotAPI" in _applied(default) else []
-
-
-def _applied(prim: Usd.Prim) -> list[str]:
+def applied(prim: Usd.Prim) -> list[str]:
+    """Names of the schemas applied to a prim, including those that are not known here."""
     return list(prim.GetPrimTypeInfo().GetAppliedAPISchemas())
-
-
-def _path(prim: Usd.Prim, name: str) -> str:
-    value = prim.GetAttribute(name).Get()
-    return (value.resolvedPath or value.path) if isinstance(value, Sdf.AssetPath) else ""
-
-
-def _span(least: np.ndarray, most: np.ndarray) -> str:
-    return f"x {least[0]:g} to {most[0]:g} m, y {least[1]:g} to {most[1]:g} m"

@@ -34,12 +34,8 @@ GET_SIMREADY = (
 )
 GET_NEWTON = "newton is not installed; pip install 'magtwin[physics]'"
 
-_SEVERITIES: Mapping[str, Severity] = {
-    "ERROR": "error",
-    "FAILURE": "error",
-    "WARNING": "warning",
-    "INFO": "note",
-}
+_SEVERITIES: Mapping[str, Severity] = {"WARNING": "warning", "INFO": "note"}
+"""Our severities by NVIDIA's; others are errors."""
 
 
 def nvidia(file: Path) -> Check:
@@ -53,17 +49,11 @@ def nvidia(file: Path) -> Check:
         if not report.is_file():
             return Check("nvidia", (_unfinished("nvidia_usd_validate", result),))
         rules = json.loads(report.read_text(encoding="utf-8"))["rules"]
-    findings = [
-        Finding(
-            issue["rule"]["name"],
-            " ".join(issue["message"].split()),
-            (issue.get("at") or {}).get("path") or "",
-            (issue.get("suggestion") or {}).get("message") or "",
-            _SEVERITIES.get(issue["severity"], "error"),
-        )
-        for rule in rules
-        for issue in rule["issues"]
-    ]
+    findings = []
+    for issue in (issue for rule in rules for issue in rule["issues"]):
+        where, advice = (issue.get("at") or {}).get("path"), (issue.get("suggestion") or {}).get("message")
+        text, severity = " ".join(issue["message"].split()), _SEVERITIES.get(issue["severity"], "error")
+        findings.append(Finding(issue["rule"]["name"], text, where or "", advice or "", severity))
     findings.sort(key=lambda finding: (finding.rule, finding.where, finding.text))
     return Check("nvidia", tuple(findings), scope=_version("usd-validation-nvidia"))
 
@@ -77,20 +67,17 @@ def simready(robots: Mapping[str, Path | None], *, packed: bool = False) -> list
             package may not hold.
     """
     command = os.environ.get(SIMREADY) or shutil.which("simready-validate")
-    checks = []
-    for profile, version in PROFILES:
-        name = f"simready {profile} {version}"
-        if not command or not Path(command).is_file():
-            checks.append(Check(name, not_run=GET_SIMREADY))
-        elif not robots:
-            checks.append(Check(name, not_run="the stage has no robot"))
-        elif packed:
-            checks.append(Check(name, not_run="the profile needs the folder of an asset, not a package"))
-        elif any(asset is None for asset in robots.values()):
-            checks.append(Check(name, not_run="the profile needs a robot in a separate asset"))
-        else:
-            checks.append(_profile(command, profile, version, robots))
-    return checks
+    if not command or not Path(command).is_file():
+        why = GET_SIMREADY
+    elif not robots:
+        why = "the stage has no robot"
+    elif packed:
+        why = "the profile needs the folder of an asset, not a package"
+    elif any(asset is None for asset in robots.values()):
+        why = "the profile needs a robot in a separate asset"
+    else:
+        return [_profile(command, profile, version, robots) for profile, version in PROFILES]
+    return [Check(f"simready {profile} {version}", not_run=why) for profile, version in PROFILES]
 
 
 def _profile(command: str, profile: str, version: str, robots: Mapping[str, Path | None]) -> Check:
@@ -100,13 +87,10 @@ def _profile(command: str, profile: str, version: str, robots: Mapping[str, Path
     for asset, prim in assets.items():
         with tempfile.TemporaryDirectory() as folder:
             report = Path(folder, "report.json")
-            result = _run(
-                [command, "--profile", profile, "--version", version, "--output", str(report), str(asset)]
-            )
+            options = ["--profile", profile, "--version", version, "--output", str(report)]
+            result = _run([command, *options, str(asset)])
             metadata = _metadata(report)
-        if (
-            metadata is None and "is not registered" in result.stdout + result.stderr
-        ):  # its tier is not installed
+        if metadata is None and "is not registered" in result.stdout + result.stderr:  # no tier installed
             get = f"{command} lacks the profile; `make simready` installs it"
             return Check(f"simready {profile} {version}", not_run=get)
         if metadata is None:
@@ -190,15 +174,8 @@ def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
     """Run a program without PYTHONPATH, and capture its output."""
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     try:
-        return subprocess.run(
-            command,
-            capture_output=True,
-            check=False,
-            text=True,
-            errors="replace",
-            env=clean,
-            timeout=PATIENCE_S,
-        )
+        options: Any = {"capture_output": True, "text": True, "errors": "replace", "env": clean}
+        return subprocess.run(command, check=False, timeout=PATIENCE_S, **options)
     except subprocess.TimeoutExpired:
         return subprocess.CompletedProcess(command, 1, "", f"took longer than {PATIENCE_S:g} s")
 

@@ -77,7 +77,8 @@ def fit_map(
         method: One of `METHODS`: "auto" (the best at readings left out, see `magtwin.field.fit.choice`),
             "harmonic", "gp", "trilinear", "cubic" or a registered method.
         spacing_m: Distance between nodes [m]. Default: the widest with almost no loss of accuracy.
-        headings_rad: Headings of the layers [rad]. Default: the fewest with almost no loss of accuracy.
+        headings_rad: Headings of the map's grids [rad], one grid each. Default: the fewest with almost no
+            loss of accuracy.
         progress: Called as progress(done, total, what).
         **options: Options of the method.
 

@@ -175,7 +175,7 @@ class AnomalyMap(Summarized):
     def lookup_with_sd(
         self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan"
     ) -> tuple[Array, Array]:
-        """Field at poses, as `lookup`, and its standard deviation, the root of the interpolated variance.
+        """Field at poses, as by `lookup`, and its standard deviation: the root of the interpolated variance.
 
         Returns:
             Field magnitude and its standard deviation [nT], each of shape (...).

@@ -55,7 +55,7 @@ class Columns:
     """Axes of the vector: body (forward, left, up) or world. Default: body."""
 
     heading_unit: HeadingUnit | None = None
-    """Unit of the heading. Default: rad, with a check of its range."""
+    """Unit of the heading. Default: rad; headings that are too large for radians are refused."""
 
     unit: Unit | None = None
     """Unit of the field. Default: detected, as the unit in which the values have the size of the

@@ -1,5 +1,6 @@
 """Recordings of a data set: the sources it is built from, their entries in it, and the rows read from it."""
 
+import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,11 +36,19 @@ class Source:
 
     def session_and_path(self, run: Run) -> tuple[str, str]:
         """Its session and path, given its run."""
-        session, metadata = self.session, run.metadata
-        if not session and "session" in metadata:
-            session = f"{metadata['session_seed']}-" if "session_seed" in metadata else ""
-            session += str(metadata["session"])
-        return session or self.name, self.path or str(metadata.get("path", "")) or self.name
+        session = self.session or session_name(run.metadata) or self.name
+        return session, self.path or str(run.metadata.get("path", "")) or self.name
+
+
+def session_name(metadata: Mapping[str, object]) -> str:
+    """Name of the session of a run; "" if its metadata name none. Robots with different plants differ."""
+    if "session" not in metadata:
+        return ""
+    seed = f"{metadata['session_seed']}-" if "session_seed" in metadata else ""
+    plant = str(metadata.get("plant", ""))
+    if plant.startswith("{"):
+        plant = hashlib.sha256(plant.encode()).hexdigest()[:8]
+    return f"{seed}{metadata['session']}" + (f"-{plant}" if plant else "")
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,12 @@ from magtwin.frames import into_base, quat_from_yaw, wrap_angle
 from magtwin.run.run import COLUMNS, Column
 from magtwin.sim.exact import ExactField
 from magtwin.sim.extensions import INTERFERENCE, Interference, SensorFactory, start_sensors
-from magtwin.sim.interference import level_gradient_nt_m, sensor_places
+from magtwin.sim.interference import level_gradient_nt_m, rest_current_a, sensor_places, torques_nm
 from magtwin.sim.motion.controllers import Controller
 from magtwin.sim.motion.drive import Moment
 from magtwin.sim.motion.engine import KINEMATIC, Engine
 from magtwin.sim.motion.sampling import Moving, into_sensor
+from magtwin.sim.plant import Plant
 from magtwin.sim.runs.neighbours import Neighbour, neighbours_field_nt, touching
 from magtwin.sim.sensors.battery import Battery
 from magtwin.sim.sensors.clock import SampledSensor
@@ -34,6 +35,7 @@ from magtwin.sim.sensors.model_error import ModelError
 from magtwin.sim.sensors.noise import GaussMarkov
 from magtwin.sim.sensors.odometry import Odometry
 from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.plant import PlantSpec
 from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
@@ -130,11 +132,13 @@ class Sensing:
         self._exact = ExactField(scene=scene, anomaly_map=self._map, outside=self._outside)
         self._physical = not network and spec.kind == "physical"
         self._neighbours, self._near = neighbours, neighbours if scene.earth is not None else ()
-        added = bool(self._near or terms)
-        if terms and self._exact.of == "none":
+        self._plant = None if robot.plant == PlantSpec() else Plant(robot.plant, draws["interference"])
+        added = bool(self._near or terms or self._plant)
+        if (terms or self._plant) and self._exact.of == "none":
+            what = "interference" if terms else "the robot's plant"
             raise InputError(
-                f"scene {scene.name!r} has a constant map and no Earth field, so interference has nothing to "
-                "add to; give the scene an Earth field"
+                f"scene {scene.name!r} has a constant map and no Earth field, so {what} has nothing to add "
+                "to; give the scene an Earth field"
             )
         self._reads = bool(self.wanted & _READ)
         self._reads_axes = network and "b_vector_measured_nt" in needed
@@ -278,20 +282,35 @@ class Sensing:
         unknown = {"b_vector_nt": np.full((len(t), 3), np.nan), "b_truth_nt": np.full(len(t), np.nan)}
         if not self._known or not len(t):
             return unknown
+        supply_a, ambient = self._battery.supply_a(t), None
+        if self._plant:
+            ambient = self._exact.ambient_nt(self.scene, now, columns["b_map_nt"])
         base = self._exact.at_sensor_nt(
             self.scene,
             motion,
             t,
             true=now,
             lidar_on=columns["lidar_on"],
-            supply_a=self._battery.supply_a(t),
+            supply_a=supply_a,
             at_rest_nt=columns["b_map_nt"],
+            ambient=ambient,
         )
         mount = self.scene.robot.q_base_magnetometer_xyzw
         vector = into_sensor(base, mount)
         size = self._exact.magnitude_nt(base, columns["b_map_nt"])
-        if self._near or self._terms:
+        if self._near or self._terms or self._plant:
             added = np.zeros((len(t), 3))
+            if self._plant and ambient:
+                robot = self.scene.robot
+                needed = self._plant.needs_torques
+                added += self._plant.field_nt(
+                    t,
+                    ambient[0],
+                    torques_nm=torques_nm(robot, motion, t, now) if needed else (0.0, 0.0),
+                    speed=now.v,
+                    lidar_on=columns["lidar_on"],
+                    supply_a=supply_a - rest_current_a(robot.battery),
+                )
             if self._near:
                 added += neighbours_field_nt(self.scene, self._near, motion, t, now)
             for term, rng in self._terms:

@@ -26,6 +26,7 @@ NOUNS = {
     "mocap": "MagtwinMotionCaptureAPI",
     "robot": "MagtwinRobotAPI",
     "drive": "MagtwinDifferentialDriveAPI",
+    "plant": "MagtwinPlantAPI",
     "platform": "MagtwinPlatformFieldAPI",
     "lab": "MagtwinLabAPI",
 }
