@@ -103,11 +103,11 @@ def fit_auto(
 
     Candidates are trilinear interpolation (gridded surveys), Gaussian processes with both kernels, the
     harmonic fit, the harmonic fit of magnitudes (surveys of vectors), and mixtures of the best harmonic fit
-    with the best Gaussian process. The harmonic fit is tried with and without a layer of dipoles above the
+    with a Gaussian process. The harmonic fit is tried with and without a layer of dipoles above the
     sensor. Each is fitted to a part of the survey. Left out is every fifth node of a gridded survey at all
     headings; else one run of several; else every fifth block of the floor. A drive is thinned to
-    `MOST_FITTED` means for the trials. For gridded surveys, the best harmonic fit and the best Gaussian
-    process are tried a second time, with other nodes left out. The candidate with the greatest mean log
+    `MOST_FITTED` means for the trials. For gridded surveys, the best harmonic fit and the others are tried a
+    second time, with other nodes left out. The candidate with the greatest mean log
     predictive density of the readings left out is fitted to the whole survey. Surveys with fewer than
     `LEAST_READINGS` good readings get a harmonic fit.
 
@@ -128,7 +128,7 @@ def fit_auto(
     if not held:
         model = Candidate("harmonic", "harmonic", {"earth_nt": earth_nt}).fit(readings, progress)
         return _told(model, {CHOSEN: "harmonic: too few readings to leave some out"})
-    steps, turn = TICKS * (len(tried) + 2 * len(held)), 0
+    steps, turn = TICKS * (len(tried) + 4 * (len(held) - 1) + 2), 0
     trials, refused = list[Trial](), list[InputError]()
     for candidate in tried:
         try:
@@ -140,7 +140,7 @@ def fit_auto(
     if not trials:
         raise refused[-1]
     trials = _common(trials)
-    finalists = _best(trials)
+    finalists = _finalists(trials)
     for pair in held[1:]:
         more = []
         for trial in finalists:
@@ -282,26 +282,26 @@ def _common(trials: Sequence[Trial]) -> list[Trial]:
     return [replace(t, mean=t.mean[rows], variance=t.variance[rows], off=t.off[rows]) for t in some]
 
 
-def _best(trials: Sequence[Trial]) -> list[Trial]:
-    """The best trial of each method, in the order of their scores."""
+def _finalists(trials: Sequence[Trial]) -> list[Trial]:
+    """The best trial of each method but all Gaussian processes, in the order of their scores."""
     best: dict[str, Trial] = {}
     for trial in sorted(trials, key=lambda trial: -trial.score):
-        best.setdefault(trial.of[0].method, trial)
+        method = trial.of[0].method
+        best.setdefault(trial.name if method == "gp" else method, trial)
     return list(best.values())
 
 
 def _mixtures(trials: Sequence[Trial]) -> list[Trial]:
-    """The best mixture of the harmonic fit with the Gaussian process, if there are both."""
-    by_method = {trial.of[0].method: trial for trial in trials}
-    if not {"harmonic", "gp"} <= by_method.keys():
-        return []
-    two, found = (by_method["harmonic"], by_method["gp"]), []
-    for weight in WEIGHTS:
-        weights = (weight, 1 - weight)
-        mean, variance = mixed(weights, [t.mean for t in two], [t.variance for t in two])
-        off = two[0].off + two[0].mean - mean
-        found.append(Trial((two[0].of[0], two[1].of[0]), mean, variance, off, weights))
-    return [max(found, key=lambda trial: trial.score)]
+    """The best mixture of the harmonic fit with a Gaussian process, if there are both."""
+    found = []
+    for one in (trial for trial in trials if trial.of[0].method == "harmonic"):
+        for other in (trial for trial in trials if trial.of[0].method == "gp"):
+            for weight in WEIGHTS:
+                weights = (weight, 1 - weight)
+                mean, variance = mixed(weights, [one.mean, other.mean], [one.variance, other.variance])
+                off = one.off + one.mean - mean
+                found.append(Trial((one.of[0], other.of[0]), mean, variance, off, weights))
+    return [max(found, key=lambda trial: trial.score)] if found else []
 
 
 def _told(model: FieldModel, more: Mapping[str, Any]) -> FieldModel:
