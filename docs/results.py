@@ -22,12 +22,12 @@ PAGE, README = ROOT / "docs" / "results.md", ROOT / "README.md"
 
 PAPER = "| in the paper, the real robot | .966 | .756 | .700 | .855 | .791 | .81 | |"
 
-BENCHMARKS = {"plants": "benchmarks/plants.py"}
-"""Scripts that print a table, by the block of docs/results.md that gets it."""
+BENCHMARKS = {"plants": "benchmarks/plants.py", "magnetometers": "benchmarks/magnetometers.py"}
+"""Scripts that print tables, by the block of docs/results.md that gets it."""
 
 ROWS = {
     "turtlebot4_paper": "the paper's network, trilinear map",
-    "released": "the network that APRILab released, not trained on this twin",
+    "nn_magnetometer_model_v0.0.1": "the network that APRILab released, not trained on this twin",
     "Tolles-Lawson, trilinear": "Tolles-Lawson ridge, trilinear map",
     "Tolles-Lawson, {harmonic} aligned": "Tolles-Lawson ridge, harmonic map, fitted lever arm and latency",
     "turtlebot4_hybrid": "the hybrid of magtwin, on the same map",
@@ -135,7 +135,8 @@ def main() -> None:
         kept = given.work / f"{block}.md"
         if not kept.is_file():
             printed = run(script).splitlines()
-            kept.write_text("\n".join(line for line in printed if line.startswith("|")), encoding="utf-8")
+            tables = [line for line in printed if line.startswith("|") or not line]
+            kept.write_text("\n".join(tables).strip(), encoding="utf-8")
         put(PAGE, block, kept.read_text(encoding="utf-8"))
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from magtwin.learn.models.predictor import load_predictor as load_predictor
     from magtwin.learn.training.train import train as train
     from magtwin.learning import build_dataset as build_dataset
+    from magtwin.learning import calibrate as calibrate
     from magtwin.learning import error_budget as error_budget
     from magtwin.learning import evaluate as evaluate
     from magtwin.run.run import COLUMNS as COLUMNS
@@ -64,6 +65,7 @@ _NAMES = {
     "Twin": "twin",
     "author_scene": "twin",
     "build_dataset": "learning",
+    "calibrate": "learning",
     "draw_plant": "sim.plant_families",
     "error_budget": "learning",
     "evaluate": "learning",

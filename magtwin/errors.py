@@ -50,6 +50,10 @@ class MismatchWarning(UserWarning):
     """A network is used with a map, at a place or on a robot that it was not trained on."""
 
 
+class CalibrationWarning(UserWarning):
+    """A drive is poorly suited to calibrate a model."""
+
+
 class UnknownNameError(InputError, KeyError):
     """A name that is not in a table. It is also a KeyError, as Python's mappings raise."""
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import existing, sha256
+from magtwin.files import check_free, existing, sha256
 from magtwin.io.formats import read_run
 from magtwin.io.surveys.maps import open_map
 from magtwin.learn.data.alignment import Alignment
@@ -36,8 +36,10 @@ from magtwin.learn.evaluation.candidates import (
 from magtwin.learn.evaluation.evaluate import evaluate as judge
 from magtwin.learn.evaluation.evaluation import Evaluation
 from magtwin.learn.evaluation.trials import check_apart, trials_of, unlearned, unseen
+from magtwin.learn.inference.calibrate import calibrate as calibrate_model
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
-from magtwin.learn.models.predictor import Predictor
+from magtwin.learn.mixed.mixed import Mixed
+from magtwin.learn.models.predictor import Predictor, load_predictor
 from magtwin.run.run import Run
 from magtwin.spec.scene import Scene
 from magtwin.twin import Twin, check_scene, in_session_of, open_twin
@@ -162,8 +164,8 @@ def evaluate(
         train: Data set that baselines are fitted to. If given, the Tolles-Lawson regression is also
             evaluated on each map. Without it, the mean label is taken from weights that were trained on the
             first map.
-        cases: Further rows of the table: path by name of the row. A name from A to E replaces that row of the
-            paper, as in {"D": "lawnmower.csv"}.
+        cases: Further rows of the table, as a mapping from the name of the row to its path. A name from A to
+            E replaces that row of the paper, as in {"D": "lawnmower.csv"}.
         any_map: Use the first map for weights whose own map is not among those given.
         truth: Compare with the exact field of simulated runs instead of the reading.
         seed: Seed of the random resampling that gives the confidence intervals.
@@ -207,6 +209,67 @@ def evaluate(
         progress=progress,
     )
     return replace(evaluation, learned=tuple(learned))
+
+
+def calibrate(
+    model: File | Predictor,
+    run: Run | File,
+    *,
+    anomaly_map: AnomalyMap | File,
+    duration_s: float | None = None,
+    pose_sd_m: float = 0.0,
+    pose_from_map: bool = False,
+    out: File | None = None,
+    force: bool = False,
+    **reading: Any,
+) -> Mixed:
+    """Calibrate a mixed model by a labelled drive at the start of a session.
+
+    The effects of the session get the posterior given the labels of the drive: measured total field minus the
+    map. A minute of curves in all directions suffices. The result is a predictor of the session; its metadata
+    record the drive, its session and date, the residuals and the checksum of the model.
+
+    A `magtwin.errors.CalibrationWarning` is given if the drive is shorter than 30 s, has few headings, or has
+    poses that were estimated on the map.
+
+    Args:
+        model: A mixed model or its weights file (`magtwin train --model mixed`).
+        run: The drive or its file, with poses from another source than the map.
+        anomaly_map: The map that the model was trained on: a map layer, a stage, or a folder of survey CSVs.
+        duration_s: Length of the part to use, from the start [s]. Default: all.
+        pose_sd_m: Standard deviation of the drive's positions, each axis [m]. It adds (gradient x sd)^2 to
+            the variance of the labels.
+        pose_from_map: Whether the poses were estimated on the map. Default: as in the run's metadata.
+        out: Weights file to write, .safetensors.
+        force: Replace an existing file.
+        **reading: Options of `magtwin.io.formats.read_run`: topics, unit, columns.
+
+    Raises:
+        InputError: A file cannot be read, the model is of another kind, the drive has fewer than 20 labelled
+            readings (at most 4 a second), or the file exists.
+    """
+    if out is not None:
+        check_free(out, force=force)
+    name, parent = str(getattr(run, "metadata", {}).get("name", "")), {}
+    if isinstance(model, str | os.PathLike):
+        path = existing(model, "weights file")
+        model, parent = load_predictor(path), {"parent": path.name, "parent_sha256": sha256(path)}
+    if not isinstance(run, Run):
+        name, run = Path(run).name, read_run(Path(run), **reading)
+    field = anomaly_map if isinstance(anomaly_map, AnomalyMap) else open_map(existing(anomaly_map, "map"))
+    calibrated = calibrate_model(
+        model,
+        run,
+        field,
+        duration_s=duration_s,
+        pose_sd_m=pose_sd_m,
+        pose_from_map=pose_from_map,
+        parent=parent,
+        name=name,
+    )
+    if out is not None:
+        calibrated.save(out, force=force)
+    return calibrated
 
 
 @dataclass(frozen=True)

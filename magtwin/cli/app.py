@@ -17,7 +17,7 @@ from magtwin.cli.options import Json, Quiet
 from magtwin.cli.progress import watched
 from magtwin.cli.renamed import renamed
 from magtwin.cli.terminal import Done, output_mode, print_error
-from magtwin.errors import InputError, MismatchWarning
+from magtwin.errors import CalibrationWarning, InputError, MismatchWarning
 from magtwin.version import __version__
 
 app = App(
@@ -132,14 +132,15 @@ def _help_options(arguments: list[str]) -> dict[str, Any]:
 
 @contextmanager
 def _warnings_in_lines() -> Iterator[None]:
-    """Print each MismatchWarning once, as a line on stderr; other warnings as usual."""
+    """Print each warning of magtwin's own once, as a line on stderr; other warnings as usual."""
     printed: set[str] = set()
     with warnings.catch_warnings():
-        warnings.simplefilter("always", MismatchWarning)
+        for own in (MismatchWarning, CalibrationWarning):
+            warnings.simplefilter("always", own)
         show = warnings.showwarning
 
         def line(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
-            if not issubclass(category, MismatchWarning):
+            if not issubclass(category, MismatchWarning | CalibrationWarning):
                 show(message, category, *where, **more)
             elif str(message) not in printed:
                 printed.add(str(message))

@@ -66,8 +66,8 @@ Plant = Annotated[
     Parameter(
         name="--plant",
         help="Effects in the robot's field that its linear platform model lacks: hysteresis, warm-up, "
-        "nonlinear, moving-part, drawn (sessions differ more), all, or nominal (none). NAME:SEED draws other "
-        "constants. Default: the scene's.",
+        "nonlinear, moving-part; drawn: larger random differences between sessions; all; or nominal: none. "
+        "NAME:SEED draws the constants of an effect from another seed. Default: the scene's.",
     ),
 ]
 Network = Annotated[

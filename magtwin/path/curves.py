@@ -166,6 +166,29 @@ def continuous_cycle(
     return Path("continuous_cycle", np.vstack([there, back]), closed=True)
 
 
+@path("loops")
+def loops(
+    *, count: int = 5, radius_m: float = 0.5, half_length_m: float = 2.3, half_width_m: float = 1.2
+) -> Path:
+    """Loops across the floor, to calibrate a magnetometer by: every heading in every part, in a minute.
+
+    A point on a circle whose middle moves along a sine wave, u from 0 to 1,
+
+        x = (a - r) (2 u - 1) + r cos(2 pi n u),   y = (b - r) sin(2 pi u) + r sin(2 pi n u)
+
+    Args:
+        count: Number of loops n.
+        radius_m: Radius r [m].
+        half_length_m: a [m].
+        half_width_m: b [m].
+    """
+    u = np.linspace(0.0, 1.0, 4001)
+    turn = 2 * np.pi * count * u
+    x = (half_length_m - radius_m) * (2 * u - 1) + radius_m * np.cos(turn)
+    y = (half_width_m - radius_m) * np.sin(2 * np.pi * u) + radius_m * np.sin(turn)
+    return Path("loops", np.column_stack([x, y]))
+
+
 @path("curvilinear")
 def curvilinear(
     *, half_length_m: float = 2.6, half_width_m: float = 1.55, lobes: int = 5, depth: float = 0.15

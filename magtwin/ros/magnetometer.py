@@ -127,7 +127,7 @@ class Magnetometer:
         self._magnitude = bus.publisher(MAGNITUDE.name, MAGNITUDE.kind, MAGNITUDE.qos)
         self._total = bus.publisher(TOTAL_FIELD.name, TOTAL_FIELD.kind, TOTAL_FIELD.qos)
         self._reporter = Reporter(bus)
-        self._last_ns = 0
+        self._last_ns, self._begun_ns = 0, 0
         self._published, self._published_before = 0, 0
         self._skipped, self._outside, self._strange, self._resets = 0, 0, 0, 0
         self._missing = ""
@@ -224,7 +224,8 @@ class Magnetometer:
         lidar = self._settings["lidar"]
         spins = lidar == "on" or (lidar == "scan" and self._scans is not None and self._scans.on(now))
         if self._reader is not None:
-            signals = {name: column[0] for name, column in columns.items()} | {"lidar_on": float(spins)}
+            signals = {name: column[0] for name, column in columns.items()}
+            signals |= {"t": self._seconds(now), "lidar_on": float(spins)}
             x, y = columns["mocap_p"][0, :2].tolist()
             reading = self._reader.read((x, y), float(yaw_from_quat(columns["mocap_q_xyzw"])[0]), signals)
             return reading._replace(b_sd_nt=self._with_noise(reading.b_sd_nt))
@@ -236,6 +237,11 @@ class Magnetometer:
         outside = bool(strange is not None and strange[0])
         return Reading(b_map + float(gave), b_map, float(gave), self._with_noise(float(spread)), outside)
 
+    def _seconds(self, now: int) -> float:
+        """Time since the first reading [s], which stands for the time since the robot was switched on."""
+        self._begun_ns = self._begun_ns or now
+        return (now - self._begun_ns) / NS
+
     def _with_noise(self, sd_nt: float) -> float:
         return float(np.hypot(sd_nt, self._noise_nt)) if np.isfinite(sd_nt) else 0.0
 
@@ -246,7 +252,7 @@ class Magnetometer:
         outside: Literal["clamp", "nan"] = "clamp" if self._settings["outside"] == "clamp" else "nan"
         b_map, slopes = self._twin.field.lookup_with_gradient(xy, yaw, outside=outside)
         made = {
-            "t": np.array([now / NS]),
+            "t": np.array([self._seconds(now)]),
             "yaw": yaw,
             "lidar_on": np.array([spins]),
             "b_map_nt": b_map,
@@ -268,7 +274,7 @@ class Magnetometer:
         self._say("time jumped back: earlier inputs are dropped")
         for source in self.inputs.values():
             source.forget()
-        self._last_ns = 0
+        self._last_ns, self._begun_ns = 0, 0
 
     def _report(self, clock: str) -> None:
         now = self._bus.now_ns()

@@ -74,8 +74,9 @@ def simulate(
             "survey" is the robot as it was during the survey of the map; a network trained on later
             sessions is not valid for it.
         plant: Effects in the robot's field that the linear platform model lacks and no network was trained
-            on: "hysteresis", "warm-up", "nonlinear", "moving-part", "drawn", "all" or "nominal" (none);
-            "NAME:SEED" for other constants; or a `PlantSpec`. Default: the scene's. See `draw_plant`.
+            on: "hysteresis", "warm-up", "nonlinear", "moving-part", or "drawn" for larger differences between
+            sessions; "all" of these; or "nominal" for none. "NAME:SEED" draws the constants of an effect from
+            another seed. Or a `PlantSpec`. Default: the scene's. See `draw_plant`.
         speed: Forward speed on straight parts [m/s].
         duration_s: Duration [s]. Default: once along the path. A longer duration drives further laps.
         rate_hz: Magnetometer readings per second [Hz]. Default: the scene's.

@@ -345,7 +345,7 @@ def test_a_gpu_that_is_not_there_is_refused_and_auto_takes_the_cpu(data, kinds, 
     ("words", "text"),
     [
         (["--model", "linear", "--epochs", "3"], "epochs is no option of 'linear'; leave it out, or choose"),
-        (["--model", "forest"], "no model 'forest'; known: hybrid, linear, paper, released"),
+        (["--model", "forest"], "no model 'forest'; known: hybrid, linear, mixed, paper, released"),
         (["--model", "linear", "--penalty", "-1"], "penalty must be 0 or more and finite, got -1.0"),
         (["--model", "linear", "--resume"], "a linear model is fitted at once"),
         (["--model", "hybrid", "--init", "KINDS/linear.safetensors"], "holds a linear, but the training"),

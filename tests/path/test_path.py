@@ -392,3 +392,11 @@ def test_a_registered_path_has_a_name_like_any_other(monkeypatch):
     assert resolve_path("triangle").name == "triangle"
     with pytest.raises(UnknownNameError, match="no path 'triangl'; did you mean 'triangle'"):
         path_named("triangl")
+
+
+def test_loops_have_every_heading_in_each_third_of_the_floor():
+    path = path_named("loops")
+    s = np.linspace(0, min(path.length, 16.0), 2000)
+    x, sector = path.at(s)[:, 0], np.floor(path.heading(s) / (np.pi / 4)) % 8
+    for low in np.linspace(-2.3, 2.3, 4)[:-1]:
+        assert len(np.unique(sector[(x >= low) & (x < low + 4.6 / 3)])) == 8

@@ -6,11 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from nodes import DOMAINS, from_message, spin
+from test_predictor import a_predictor
 
 from magtwin.errors import InputError
 from magtwin.files import shipped
 from magtwin.frames import into_base, quat_from_yaw
 from magtwin.io.bags.topics import BATTERY, CLOCK, IMU, MAGNITUDE, ODOMETRY, POSE, Qos, Topic
+from magtwin.learn.data.features import SETS
+from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.ros.bus import Bus, Message, Publisher, names_of, open_bus, to_bytes
 from magtwin.ros.diagnostics import KIND, Status
 from magtwin.ros.inputs import GRAVITY, Gravity, Input
@@ -46,7 +49,7 @@ class World:
         self.ear.subscribe(MAGNITUDE.name, MAGNITUDE.kind, self.readings.append, many)
         self.ear.subscribe("qtfm/total_field_nt", "std_msgs/msg/Float64", self.totals.append, many)
         self.ear.subscribe("/diagnostics", KIND, self._hear, many)
-        self.t, self.pose = 5.0, (0.2, 0.1, 0.7)
+        self.t, self.pose, self.begun = 5.0, (0.2, 0.1, 0.7), 0.0
         self.nodes: list[Magnetometer] = []
         self.lines: list[str] = []
 
@@ -120,7 +123,7 @@ class World:
         x, y, yaw = self.pose
         b_map, slopes = self.twin.field.lookup_with_gradient(np.array([[x, y]]), np.array([yaw]))
         row = {
-            "t": [self.t],
+            "t": [self.t - self.begun],
             "yaw": [yaw],
             "v_cmd": [0.0],
             "w_cmd": [0.0],
@@ -170,6 +173,18 @@ def test_a_reading_is_map_and_network_at_what_was_heard(world: World) -> None:
     np.testing.assert_allclose(read["magnetic_field"], [1e-9 * nt, 0, 0], rtol=1e-12)
     sd_nt = 1e9 * np.sqrt(read["magnetic_field_covariance"][0])
     assert sd_nt == pytest.approx(expected_sd_nt, rel=1e-6)
+
+
+def test_a_calibrated_model_is_read_with_the_time_since_the_first_reading(world: World) -> None:
+    mixed = a_predictor("mixed", SETS["session"])
+    world.twin = replace(world.twin, magnetometer=NeuralMagnetometer(mixed))
+    bus = world.start("max_age_s:=5")
+    world.tick(bus, 400)
+    assert world.heard(bus) >= 2
+    world.begun = world.readings[0].read(["header.stamp"])["header.stamp"] / NS
+    assert world.t - world.begun > 1
+    nt = float(world.totals[-1].read(["data"])["data"])
+    assert nt == pytest.approx(world.expected()[0], abs=0.01)
 
 
 def test_in_nt_it_says_so(world: World) -> None:

@@ -1,6 +1,7 @@
 """`magtwin compensate`: remove the platform's field from a run's readings, by Tolles and Lawson's model."""
 
 from pathlib import Path
+from typing import Literal
 
 from cyclopts import App
 
@@ -21,6 +22,7 @@ def fit(
     band_hz: tuple[float, float] = (0.1, 0.9),
     no_band: Flag = False,
     penalty: float | None = None,
+    preset: Literal["magtwin", "magnav"] = "magtwin",
     truth: Flag = False,
     force: Force = False,
 ) -> Done:
@@ -43,7 +45,9 @@ def fit(
     no_band
         Fit all frequencies.
     penalty
-        Penalty of the regression. Default: by cross-validation.
+        Penalty of the regression. Default: by cross-validation, or 0 with --preset magnav.
+    preset
+        Conventions of the regressors, the filter and the penalty: magtwin's own, or those of MagNav.jl.
     truth
         Use the exact field of a simulated run, b_vector_nt, instead of the reading of the vector axes,
         b_vector_measured_nt, to see the cost of their errors.
@@ -61,6 +65,7 @@ def fit(
         terms=names,
         band_hz=None if no_band else band_hz,
         ridge=penalty,
+        preset=preset,
     )
     with output(out, force=force) as aside:
         model.save(aside)

@@ -54,3 +54,25 @@ def net_export(weights: Path, *, out: Path, force: Force = False) -> Done:
     step("Exporting the network")
     report = export_onnx(weights, out, force=force)
     return Done(report, out)
+
+
+@net_app.command(name="widen")
+def net_widen(weights: Path, *, out: Path, force: Force = False) -> Done:
+    """Write a mixed model without a drive whose intervals hold on plants other than the nominal one.
+
+    Its predictions are those for the nominal plant, with the spread of all plants that it was trained with.
+
+    Parameters
+    ----------
+    weights
+        Weights of a mixed model, .safetensors (`magtwin train --model mixed`).
+    out
+        File to write, .safetensors.
+    """
+    from magtwin.learn.inference.calibrate import mixed_of_kind
+    from magtwin.learn.models.predictor import load_predictor
+
+    check_output(out, (".safetensors",), "a network", force=force)
+    model = mixed_of_kind(load_predictor(weights)).open_loop(unknown_plant=True)
+    model.save(out, force=force)
+    return Done(model.report(str(out)), out)

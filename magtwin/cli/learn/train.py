@@ -56,12 +56,13 @@ def train(
     model
         paper: 20-512-512-512-512-1 (default); released: 20-512-512-512-128-1; linear: Tolles-Lawson terms by
         ridge regression; hybrid: a linear base and a small network for its residual, kept only if it does
-        better on validation; or a predictor kind of an installed package.
+        better on validation; mixed: a linear model whose coefficients differ between sessions, for
+        `magtwin calibrate`; or a predictor kind of an installed package.
     layers
         Widths of the hidden layers, such as 256,256.
     features
         Set of inputs, or names separated by commas. Default: full (the paper's 20); circular for a linear
-        model, platform for a hybrid.
+        model, platform for a hybrid, session for a mixed model.
     penalty
         Ridge penalty of a linear model or a hybrid. Default: chosen by cross-validation over recordings.
     weighting
@@ -122,11 +123,11 @@ def train(
     base = TrainConfig() if config is None else read_config(config)
     names = [field.name for field in fields(base) if given.get(field.name) is not None]
     options = base.with_options(**{name: given[name] for name in names})
-    curves = () if options.model == "linear" else (picture, table)
+    curves = () if options.model in ("linear", "mixed") else (picture, table)
     if rrd is not None:
         check_suffix(rrd, (".rrd",), "a Rerun recording")
         if not curves:
-            raise InputError("--rrd: a linear model is fitted at once and has no learning curve")
+            raise InputError(f"--rrd: a {options.model} model is fitted at once and has no learning curve")
     for path in (*curves, *([rrd] if rrd else [])):
         check_free(path, force=force)
     with progress("Training", "rows") as show:

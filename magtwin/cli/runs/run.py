@@ -109,8 +109,8 @@ def run(
     scene
         USD stage to drive in, or the name of a scene that ships with magtwin: lab.
     path
-        sine, fast_sine, lawnmower, split_lawnmower, figure8, narrow_figure8, continuous_cycle, curvilinear,
-        curvilinear_2; A to E (Table 1 of
+        sine, fast_sine, lawnmower, split_lawnmower, figure8, narrow_figure8, continuous_cycle, loops,
+        curvilinear, curvilinear_2; A to E (Table 1 of
         Penumarti et al. 2025); random (like a human driver, for one minute or --duration-s); or a CSV file of
         x,y [m]. Named paths are scaled to the floor. Default: the path of the
         scene, else figure8.

@@ -35,7 +35,7 @@ TERMS: Mapping[str, int] = MappingProxyType(
     }
 )
 """Number of columns of each term. induced5 drops yy and induced3 keeps xx, yy, zz; eddy8 drops y dy/dt and
-eddy3 keeps x dx/dt, y dy/dt, z dz/dt."""
+eddy3 keeps x dx/dt, y dy/dt, z dz/dt. The preset "magnav" drops zz and z dz/dt instead."""
 
 DEFAULT_TERMS = ("permanent", "induced6", "eddy9")
 DEFAULT_BAND_HZ = (0.1, 0.9)
@@ -46,6 +46,47 @@ VECTORS: Mapping[str, str] = MappingProxyType({"measured": "b_vector_measured_nt
 """Columns of a run for the direction cosines: the reading of the vector axes, or the exact field of a
 simulated run."""
 
+Preset = Literal["magtwin", "magnav"]
+
+
+@dataclass(frozen=True)
+class Convention:
+    """How regressors are made, filtered and fitted."""
+
+    scale_nt: float = 1.0
+    """Induced and eddy terms are divided by this field [nT]."""
+
+    field_rate: bool = False
+    """Eddy terms are u_i dB_j/dt, instead of |B| u_i du_j/dt."""
+
+    per_sample: bool = False
+    """Derivatives are per sample, instead of per second."""
+
+    dropped: int = 1
+    """Axis of the term that induced5 and eddy8 drop; 1 is y."""
+
+    padding: int | None = None
+    """Samples of odd extension at each end of the filter. Default: that of `scipy.signal.sosfiltfilt`."""
+
+    trim: int = 0
+    """Filtered samples to discard at each end; their values depend on the padding."""
+
+    absolute_ridge: bool = False
+    """The penalty r is that of |F(b - A c)|^2 + r |c|^2, 0 by default, instead of relative to the columns'
+    mean squares and by cross-validation. A fit of all frequencies is not centred."""
+
+    centred: bool = True
+    """The interference is minus its mean, unless the terms have a bias."""
+
+
+PRESETS: Mapping[str, Convention] = MappingProxyType(
+    {
+        "magtwin": Convention(),
+        "magnav": Convention(50_000.0, True, True, 2, 24, 20, True, False),
+    }
+)
+"""Named conventions. "magnav" follows `create_TL_A` and `create_TL_coef` of MagNav.jl (Gnadt et al. 2022)."""
+
 RIDGES = np.logspace(-12, 3, 31)
 """Ridge penalties of the cross-validation, relative to the mean square of the standardised columns."""
 
@@ -53,7 +94,11 @@ FOLDS = 10  # Number of stretches of a run for the cross-validation
 
 
 def design_matrix(
-    b_vector_nt: ArrayLike, rate_hz: float, terms: Sequence[str] = DEFAULT_TERMS
+    b_vector_nt: ArrayLike,
+    rate_hz: float,
+    terms: Sequence[str] = DEFAULT_TERMS,
+    *,
+    preset: str = "magtwin",
 ) -> tuple[Array, tuple[str, ...]]:
     """The regressors of Tolles and Lawson (1950), in the form of Leliak (1961).
 
@@ -65,15 +110,18 @@ def design_matrix(
         b_vector_nt: Field of a vector magnetometer in the platform's axes [nT], shape (N, 3).
         rate_hz: Readings a second [Hz].
         terms: Names of `TERMS`, in the order of the columns.
+        preset: A name of `PRESETS`. With "magnav", induced terms are u_i B_j / 50,000 nT and eddy terms
+            u_i dB_j / 50,000 nT, with the difference dB of B per sample.
 
     Returns:
         Matrix of shape (N, K), and the names of the K columns. Coefficients are in nT for permanent terms and
-        the bias, without unit for induced terms, and in s for eddy terms.
+        the bias, without unit for induced terms, and in s for eddy terms; with "magnav" all are in nT.
 
     Raises:
         InputError: A term is unknown or given twice, the field is not (N, 3), is zero or not finite, or there
             are fewer than three readings.
     """
+    by = find("preset", preset, PRESETS)
     b = np.asarray(b_vector_nt, float)
     if b.ndim != 2 or b.shape[1] != 3 or len(b) < 3:
         raise InputError(f"b_vector_nt must have shape (N, 3) with N at least 3, got {b.shape}")
@@ -89,7 +137,9 @@ def design_matrix(
             f"terms must name at least one kind, and each once, got {', '.join(terms) or 'none'}"
         )
     u = b / size[:, None]
-    rate = np.gradient(u, 1 / rate_hz, axis=0)
+    rate = np.gradient(b if by.field_rate else u, 1.0 if by.per_sample else 1 / rate_hz, axis=0)
+    induced, eddy = size / by.scale_nt, (np.ones_like(size) if by.field_rate else size) / by.scale_nt
+    dropped = (by.dropped, by.dropped)
     columns: list[Array] = []
     names: list[str] = []
     for term in terms:
@@ -101,13 +151,13 @@ def design_matrix(
             columns.append(np.ones((len(b), 1)))
             names.append("bias")
         elif term.startswith("induced"):
-            kept = [p for p in PAIRS if width == 6 or (p != (1, 1) if width == 5 else p[0] == p[1])]
-            columns += [(size * u[:, i] * u[:, j])[:, None] for i, j in kept]
+            kept = [p for p in PAIRS if width == 6 or (p != dropped if width == 5 else p[0] == p[1])]
+            columns += [(induced * u[:, i] * u[:, j])[:, None] for i, j in kept]
             names += [f"induced {'xyz'[i]}{'xyz'[j]}" for i, j in kept]
         else:
             grid = [(i, j) for i in range(3) for j in range(3)]
-            kept = [p for p in grid if width == 9 or (p != (1, 1) if width == 8 else p[0] == p[1])]
-            columns += [(size * u[:, i] * rate[:, j])[:, None] for i, j in kept]
+            kept = [p for p in grid if width == 9 or (p != dropped if width == 8 else p[0] == p[1])]
+            columns += [(eddy * u[:, i] * rate[:, j])[:, None] for i, j in kept]
             names += [f"eddy {'xyz'[i]}d{'xyz'[j]}" for i, j in kept]
     return np.hstack(columns), tuple(names)
 
@@ -126,7 +176,7 @@ class TollesLawson:
     """Pass band of the fit [Hz]; None for all frequencies."""
 
     ridge: float
-    """Penalty of the fit, relative to the mean square of the standardised columns."""
+    """Penalty of the fit, in the units of its preset."""
 
     residual_sd_nt: float
     """Standard deviation of the residual, in its band [nT]."""
@@ -134,8 +184,13 @@ class TollesLawson:
     vector: Vector = "measured"
     """Field of a run that it is fitted to and compensates by, a name of `VECTORS`."""
 
+    preset: Preset = "magtwin"
+    """Conventions of the regressors and the fit, a name of `PRESETS`."""
+
     def interference_nt(self, b_vector_nt: ArrayLike, rate_hz: float) -> Array:
         """Part of the magnitude from the platform, minus its mean unless the terms have a bias.
+
+        The preset "magnav" does not subtract the mean.
 
         Args:
             b_vector_nt: Field of the vector magnetometer in the platform's axes [nT], shape (N, 3).
@@ -144,9 +199,10 @@ class TollesLawson:
         Returns:
             Interference [nT], shape (N,).
         """
-        matrix, _ = design_matrix(b_vector_nt, rate_hz, self.terms)
+        matrix, _ = design_matrix(b_vector_nt, rate_hz, self.terms, preset=self.preset)
         modelled = matrix @ np.asarray(self.coefficients)
-        return modelled if "bias" in self.terms else modelled - modelled.mean()
+        centred = PRESETS[self.preset].centred and "bias" not in self.terms
+        return modelled - modelled.mean() if centred else modelled
 
     def compensate(self, b_nt: ArrayLike, b_vector_nt: ArrayLike, rate_hz: float) -> Array:
         """Scalar readings without the platform's part [nT], shape (N,)."""
@@ -173,8 +229,10 @@ class TollesLawson:
                 float(data["ridge"]),
                 float(data["residual_sd_nt"]),
                 data.get("vector", "measured"),
+                data.get("preset", "magtwin"),
             )
             find("vector of a Tolles-Lawson model", str(model.vector), VECTORS)
+            find("preset", str(model.preset), PRESETS)
         except (ValueError, KeyError, TypeError, IndexError, OSError, RecursionError) as error:
             raise InputError(
                 f"{file}: not a Tolles-Lawson model as `magtwin compensate fit` writes it "
@@ -198,7 +256,7 @@ class TollesLawson:
                 Figure("ridge", self.ridge),
                 Figure("residual", self.residual_sd_nt, "nT", note=f"standard deviation, {band}"),
             ),
-            {"terms": list(self.terms), "vector": VECTORS[self.vector]},
+            {"terms": list(self.terms), "vector": VECTORS[self.vector], "preset": self.preset},
         )
 
 
@@ -210,6 +268,7 @@ def fit_tolles_lawson(
     terms: Sequence[str] = DEFAULT_TERMS,
     band_hz: tuple[float, float] | None = DEFAULT_BAND_HZ,
     ridge: float | None = None,
+    preset: Preset = "magtwin",
 ) -> TollesLawson:
     """Fit the coefficients by ridge regression between band-passed readings and regressors.
 
@@ -217,20 +276,26 @@ def fit_tolles_lawson(
     of each column, and r by default from cross-validation over ten contiguous stretches, because neighbouring
     readings are correlated.
 
+    With the preset "magnav" the fit is that of MagNav.jl's `create_TL_coef`: min |F(b - A c)|^2 + r |c|^2,
+    with r = 0 by default, the filter's signals extended by 24 samples, and 20 filtered samples trimmed at
+    each end.
+
     Args:
         b_nt: Readings of the scalar magnetometer, possibly minus a map [nT], shape (N,).
         b_vector_nt: Field of the vector magnetometer in the platform's axes [nT], shape (N, 3).
         rate_hz: Readings a second [Hz].
         terms: Names of `TERMS`.
         band_hz: Pass band [Hz]; None fits all frequencies.
-        ridge: Penalty r. Default: by cross-validation.
+        ridge: Penalty r. Default: by cross-validation, or 0 with "magnav".
+        preset: A name of `PRESETS`.
 
     Raises:
-        InputError: Shapes do not fit, a value is not finite, the band does not fit the rate, a bias is asked
-            for in a band, or there are fewer readings than coefficients.
+        InputError: Shapes do not fit, the preset is unknown, a value is not finite, the band does not fit the
+            rate, a bias is asked for in a band without "magnav", or there are fewer readings than
+            coefficients.
     """
-    b = np.asarray(b_nt, float)
-    matrix, names = design_matrix(b_vector_nt, rate_hz, terms)
+    b, by = np.asarray(b_nt, float), find("preset", preset, PRESETS)
+    matrix, names = design_matrix(b_vector_nt, rate_hz, terms, preset=preset)
     if b.shape != (len(matrix),):
         raise InputError(f"b_nt must have shape ({len(matrix)},), as b_vector_nt has rows, got {b.shape}")
     if not np.all(np.isfinite(b)):
@@ -240,15 +305,23 @@ def fit_tolles_lawson(
         raise InputError(f"{len(b)} readings are too few for {len(names)} coefficients")
     if ridge is not None and not 0 <= ridge < np.inf:
         raise InputError(f"ridge must not be below 0, and finite, got {ridge!r}")
-    if band_hz is not None and "bias" in terms:
+    if band_hz is not None and "bias" in terms and by.centred:
         raise InputError(
             "a pass band excludes a bias, so it cannot be fitted; leave the bias out, or fit all "
             "frequencies (band_hz=None, --no-band)"
         )
     if band_hz is not None:
-        matrix, b = (_band_pass(v, band_hz, rate_hz) for v in (matrix, b))
-    elif "bias" not in terms:
+        matrix, b = (band_pass(v, band_hz, rate_hz, preset=preset) for v in (matrix, b))
+        if len(b) <= len(names):
+            raise InputError(f"{len(b)} trimmed readings are too few for {len(names)} coefficients")
+    elif "bias" not in terms and by.centred:
         matrix, b = matrix - matrix.mean(axis=0), b - b.mean()
+    if by.absolute_ridge:
+        penalty = 0.0 if ridge is None else float(ridge)
+        rows = np.vstack([matrix, np.sqrt(penalty) * np.eye(len(names))])
+        c = np.linalg.lstsq(rows, np.concatenate([b, np.zeros(len(names))]), rcond=None)[0]
+        sd = float(np.std(b - matrix @ c))
+        return TollesLawson(tuple(terms), tuple(c.tolist()), band_hz, penalty, sd, preset=preset)
     size = np.sqrt(np.mean(matrix * matrix, axis=0))
     size[size <= 1e-9 * size.max()] = np.inf  # a constant column gets no coefficient
     scaled = matrix / size
@@ -310,20 +383,40 @@ def compensate_run(run: Run, model: TollesLawson) -> tuple[Run, Report]:
     return compensated.with_metadata(**metadata), Report("Compensation", figures, about, line)
 
 
-def _band_pass(values: Array, band_hz: tuple[float, float], rate_hz: float) -> Array:
-    """Zero-phase Butterworth filter of order 4 of values (N, ...)."""
+def band_pass(
+    values: ArrayLike, band_hz: tuple[float, float], rate_hz: float, *, preset: str = "magtwin"
+) -> Array:
+    """Filter signals as `fit_tolles_lawson` does: forward and backward by a Butterworth filter of order 4.
+
+    Args:
+        values: Signals, shape (N, ...).
+        band_hz: Pass band [Hz].
+        rate_hz: Readings a second [Hz].
+        preset: A name of `PRESETS`. "magnav" leaves constant signals as they are.
+
+    Returns:
+        Filtered and trimmed signals, shape (N - 2 trim, ...).
+
+    Raises:
+        InputError: The preset is unknown, the band does not fit the rate, or there are too few readings.
+    """
     from scipy.signal import butter, sosfiltfilt  # slow import
 
+    by, values = find("preset", preset, PRESETS), np.asarray(values, float)
     low, high = band_hz
     if not 0 < low < high < rate_hz / 2:
         raise InputError(
             f"band_hz must ascend between 0 and half the rate, {rate_hz / 2:g} Hz, got {low:g}, {high:g}"
         )
     stages = butter(4, band_hz, btype="bandpass", fs=rate_hz, output="sos")
-    least = 3 * (2 * len(stages) + 1)
+    padding = 3 * (2 * len(stages) + 1) if by.padding is None else by.padding
+    least = max(padding, 2 * by.trim)
     if len(values) <= least:
         raise InputError(f"{len(values)} readings are too few for the band-pass, {least + 1} are needed")
-    return np.asarray(sosfiltfilt(stages, values, axis=0))
+    filtered = np.asarray(sosfiltfilt(stages, values, axis=0, padlen=padding))
+    if not by.centred:
+        filtered = np.where(values.std(axis=0) <= np.finfo(float).eps, values, filtered)
+    return filtered[by.trim : len(filtered) - by.trim]
 
 
 def _ridge(gram: Array, along: Array, penalty: float) -> Array:

@@ -1,10 +1,11 @@
 """Alignment: the place and time of a reading relative to the pose with its stamp, and its fit to a map."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
@@ -18,7 +19,10 @@ Array = NDArray[np.float64]
 
 UNUSABLE = ("flag_lost_lock", "flag_pose_lost")  # Flags of a run whose readings have no label
 BLOCK_S = 5.0  # Length of blocks of readings with correlated errors [s]
+TILES = 4  # Number of tiles along each side of the driven area; errors of the map and platform stay in place
+DEGREE = 1  # Degree of the fields of the platform that vary over the driven area
 LATENCIES_S = np.arange(-0.4, 0.41, 0.02)  # Latencies that are tried before the best are refined [s]
+END_S = 0.5  # Time at each end of a run that a latency is not fitted to [s]; no pose may lie beyond
 LEAST_ROWS = 200  # Least number of labelled readings for a fit
 LEVER_ARM_PRIOR_M = 0.05  # Prior standard deviation of each axis of the lever arm [m]
 LATENCY_PRIOR_S = 0.1  # Prior standard deviation of the latency [s]
@@ -41,7 +45,7 @@ class Alignment(Summarized):
     """Age of the reading at its stamp, beside the age of the pose [s]."""
 
     lever_arm_sd_m: tuple[float, float] = (0.0, 0.0)
-    """Standard deviations of `lever_arm_m` [m]; 0 if it was given."""
+    """Standard deviations of `lever_arm_m` [m], robust to errors of places and recordings; 0 if given."""
 
     latency_sd_s: float = 0.0
     """Standard deviation of `latency_s` [s]; 0 if it was given."""
@@ -70,8 +74,25 @@ class Alignment(Summarized):
         )
 
 
+def alignment_of(metadata: Mapping[str, Any], where: object = "") -> Alignment:
+    """Lever arm and latency in the metadata of weights; 0 if they have none.
+
+    Raises:
+        InputError: They are no numbers.
+    """
+    try:
+        arm = [float(part) for part in str(metadata.get("lever_arm_m", "0, 0")).split(",")]
+        forward, left = arm
+        return Alignment((forward, left), float(metadata.get("latency_s", 0.0)))
+    except ValueError as error:
+        raise InputError(
+            f"{where}: lever_arm_m {metadata.get('lever_arm_m')!r} and latency_s "
+            f"{metadata.get('latency_s')!r} of its metadata are no lengths and time ({error}); train it again"
+        ) from error
+
+
 def placed(run: Run, alignment: Alignment) -> tuple[Array, Array, Array]:
-    """Sensor's place (N, 2), heading (N,) and rates of x, y, yaw (N, 3) at the time of each reading.
+    """Sensor's place (N, 2), heading (N,) and their rates of change (N, 3) at the time of each reading.
 
     The pose is that of motion capture if the run has it, else the true pose.
     """
@@ -84,10 +105,15 @@ def placed(run: Run, alignment: Alignment) -> tuple[Array, Array, Array]:
     rates = np.gradient(pose, t, axis=0) if len(t) > 1 else np.zeros_like(pose)
     if alignment.latency_s:
         then = t - alignment.latency_s
-        pose = np.column_stack([np.interp(then, t, column, np.nan, np.nan) for column in pose.T])
+        pose, rates = (
+            np.column_stack([np.interp(then, t, column, np.nan, np.nan) for column in columns.T])
+            for columns in (pose, rates)
+        )
     forward, left = alignment.lever_arm_m
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    place = pose[:, :2] + np.column_stack([c * forward - s * left, s * forward + c * left])
+    arm = np.column_stack([c * forward - s * left, s * forward + c * left])
+    place = pose[:, :2] + arm
+    rates[:, :2] += rates[:, 2:] * np.column_stack([-arm[:, 1], arm[:, 0]])
     return place, wrap_angle(pose[:, 2]), rates
 
 
@@ -126,9 +152,19 @@ def fit_alignment(
     linearised again until they converge, from the `STARTS` best of `LATENCIES_S`; the likeliest result is
     returned. The platform terms are fixed to the robot and depend on its heading: iron, turning, speed, their
     rates, LiDAR and battery current. Without them iron would pass for a lever arm, and the motors' torque
-    before a turn for a latency. The covariance V comes from blocks of `BLOCK_S` with correlated errors. On a
-    straight line at one speed a forward lever arm and a latency are the same, so both have a weak prior of
-    covariance P around 0. The estimate is P (P + V)^-1 times the least squares'.
+    before a turn for a latency. A robot whose iron has changed since the survey also adds a field that varies
+    with the direction of the lab's field, so polynomials of the place, of degree `DEGREE`, times constant,
+    sine and cosine of the heading are fitted too. On a straight line at one speed a forward lever arm and a
+    latency are the same, so both have a weak prior of covariance P around 0. The estimate is G times that of
+    least squares, G = P (P + V)^-1, with V from blocks of `BLOCK_S` with correlated errors.
+
+    The standard deviations include errors that more readings do not reduce. Errors of the map and of the
+    platform's terms are the same whenever the robot comes to a place, and those of a session last a whole
+    recording. So their covariance W is the sum of the sandwich estimates for errors correlated within each
+    of `TILES`^2 tiles of the driven area, and within each recording (Cameron, Gelbach and Miller 2011,
+    without the subtraction of the part that both have). With one recording its blocks take the recordings'
+    place. Few tiles or recordings widen it by Student's t. The reported covariance is G W G^T +
+    (I - G) P (I - G)^T.
 
     Args:
         runs: Runs of one robot that turns and drives at several speeds, as for `magtwin.learn.data.labels`.
@@ -175,9 +211,10 @@ def fit_alignment(
         return _descend(fit, start, rounds, lambda j: progress(done + j, before + most, "rounds"))
 
     best = min((descended(k, start) for k, start in enumerate(starts)), key=lambda result: result.cost)
+    covariance = fit.at(best.place, robust=True).covariance
     progress(before + most, before + most, "rounds")
     sd = np.zeros(3)
-    sd[free] = np.sqrt(np.diag(best.covariance))
+    sd[free] = np.sqrt(np.diag(covariance))
     forward, left, late = best.place.tolist()
     return Alignment((forward, left), late, (float(sd[0]), float(sd[1])), float(sd[2]))
 
@@ -223,23 +260,38 @@ class _Fit:
 
     def __init__(self, runs: Sequence[Run], field: AnomalyMap, free: NDArray[np.bool_], prior: Array) -> None:
         self.field, self.free, self.prior = field, free, prior
-        self.alike = 1.0
+        self.alike, self.readings = 1.0, 0
         self.runs = []
+        self.corners = np.full((2, 2), np.nan)
         for run in runs:
+            p = placed(run, Alignment())[0][usable(run)]
+            p = p[field.contains(p)]
+            if len(p):
+                self.corners[0] = np.fmin(self.corners[0], p.min(axis=0))
+                self.corners[1] = np.fmax(self.corners[1], p.max(axis=0))
             step = float(np.median(np.diff(run["t"]))) if run.rows > 1 else 1.0
             every = max(1, round(1 / (step * FIT_RATE_HZ)))
-            self.runs.append((run, np.arange(0, run.rows, every), usable(run)))
+            rows = np.arange(0, run.rows, every)
+            if free[2]:  # the same readings whatever the latency; else the cost favours those with fewer
+                t = run["t"]
+                rows = rows[(t[rows] >= t[0] + END_S) & (t[rows] <= t[-1] - END_S)]
+            self.runs.append((run, rows, usable(run)))
 
-    def at(self, place: Array) -> _Linearised:
-        """The least squares around a place."""
+    def at(self, place: Array, robust: bool = False) -> _Linearised:
+        """The least squares around a place; the covariance is that of blocks, or of tiles and recordings."""
         alignment = Alignment((float(place[0]), float(place[1])), float(place[2]))
-        parts_x, parts_y, parts_block, blocks = [], [], [], 0
+        parts_x, parts_y, parts_block, parts_tile, blocks = [], [], [], [], 0
         for run, rows, good in self.runs:
             p, yaw, rates = (values[rows] for values in placed(run, alignment))
             value, gradient = self.field.lookup_with_gradient(p, yaw)
             label = run["b_measured_nt"][rows] - value
+            unit = (p - self.corners[0]) / np.maximum(np.ptp(self.corners, axis=0), 1e-9)
             matrix = np.column_stack(
-                [slopes(gradient, yaw, rates)[:, self.free], _platform(run, rows, yaw, rates)]
+                [
+                    slopes(gradient, yaw, rates)[:, self.free],
+                    _platform(run, rows, yaw, rates),
+                    _over_the_area(2 * unit - 1, yaw),
+                ]
             )
             kept = good[rows] & np.isfinite(label) & np.isfinite(gradient).all(axis=1)
             kept &= np.isfinite(matrix).all(axis=1)
@@ -251,15 +303,29 @@ class _Fit:
             block = ((run["t"][rows][kept] - run["t"][0]) // BLOCK_S).astype(int)
             parts_block.append(blocks + np.unique(block, return_inverse=True)[1])
             blocks = int(parts_block[-1][-1]) + 1
+            parts_tile.append(np.clip(unit[kept] * TILES, 0, TILES - 1).astype(int) @ [TILES, 1])
         if not parts_x:
             return _Linearised(place, place, np.diag(self.prior), np.inf, np.inf, 1.0)
         x, y, block = np.vstack(parts_x), np.concatenate(parts_y), np.concatenate(parts_block)
         count = len(self.prior)
         left = _residual(x[:, count:], np.column_stack([x[:, :count], y]))
-        return self._solved(place, left[:, :-1], left[:, -1], block)
+        groups: list[NDArray[np.intp]] = []
+        if robust:
+            alike = parts_block if len(parts_y) == 1 else [np.full(len(y), k) for k, y in enumerate(parts_y)]
+            groups = [
+                np.unique(np.concatenate(parts), return_inverse=True)[1] for parts in (parts_tile, alike)
+            ]
+        return self._solved(place, left[:, :-1], left[:, -1], block, groups)
 
-    def _solved(self, place: Array, x: Array, y: Array, block: NDArray[np.intp]) -> _Linearised:
-        rows, at = len(y), place[self.free]
+    def _solved(
+        self,
+        place: Array,
+        x: Array,
+        y: Array,
+        block: NDArray[np.intp],
+        groups: Sequence[NDArray[np.intp]],
+    ) -> _Linearised:
+        at = place[self.free]
         scale = np.sqrt(np.mean(x**2, axis=0))
         scale[scale == 0] = 1.0  # on a constant map all places are alike
         x = x / scale
@@ -280,16 +346,38 @@ class _Fit:
         unknown = 1e12 * blind @ blind.T
         prior = np.diag(self.prior)
 
-        def gain(spread: NDArray[Any]) -> Array:
-            spread = (spread + unknown) / np.outer(scale, scale)
-            return prior @ np.linalg.inv(prior + spread)
+        def gain(known: NDArray[Any]) -> Array:
+            return prior @ np.linalg.inv(prior + (known + unknown) / np.outer(scale, scale))
 
-        wanted = place.copy()
-        wanted[self.free] = gain(self.alike * promised * inverse) @ (at + solved / scale)
-        covariance = prior - gain(blocked) @ prior
+        wanted, shrunk = place.copy(), gain(self.alike * promised * inverse)
+        wanted[self.free] = shrunk @ (at + solved / scale)
+        if groups:
+            spread = np.sum([_sandwich(inverse, x, error, group) for group in groups], axis=0)
+            missed = np.eye(len(prior)) - shrunk
+            covariance = shrunk @ (spread / np.outer(scale, scale)) @ shrunk.T + missed @ prior @ missed.T
+        else:
+            covariance = prior - gain(blocked) @ prior
         left = max(float(np.mean(y**2)), 1e-12)
-        cost = rows / self.alike * np.log(left) + float(np.sum(at**2 / self.prior))
+        self.readings = self.readings or len(y)
+        cost = self.readings / self.alike * np.log(left) + float(np.sum(at**2 / self.prior))
         return _Linearised(place, wanted, (covariance + covariance.T) / 2, cost, promised, max(alike, 1.0))
+
+
+def _sandwich(inverse: NDArray[Any], x: Array, error: Array, group: NDArray[np.intp]) -> Array:
+    """Covariance of least squares whose errors are correlated within groups; 0 for one group.
+
+    g / (g - 1) N^-1 (sum over groups of s s^T) N^-1, with s = X^T e of a group (Liang and Zeger 1986), scaled
+    so that normal intervals of 90 % are as wide as those of Student's t with g - 1 degrees of freedom.
+    """
+    from scipy.special import ndtri, stdtrit  # slow import
+
+    groups = int(group.max()) + 1
+    if groups < 2:
+        return np.zeros_like(inverse)
+    score = np.zeros((groups, x.shape[1]))
+    np.add.at(score, group, x * error[:, None])
+    wider = float(stdtrit(groups - 1, 0.95) / ndtri(0.95))
+    return np.asarray(wider**2 * groups / (groups - 1) * inverse @ (score.T @ score) @ inverse)
 
 
 def _filled(yaw: Array) -> Array:
@@ -318,6 +406,14 @@ def _platform(run: Run, rows: NDArray[np.intp], yaw: Array, rates: Array) -> Arr
     return np.column_stack(
         [*(current * way for current in currents for way in ways), np.cos(2 * yaw), np.sin(2 * yaw)]
     )
+
+
+def _over_the_area(unit: Array, yaw: Array) -> Array:
+    """Columns (M, K) for fields that vary slowly with the place, -1 to 1 along each axis, by heading."""
+    x, y = (legvander(u, DEGREE) for u in unit.T)
+    ways = (np.ones(len(yaw)), np.cos(yaw), np.sin(yaw))
+    shapes = [x[:, i] * y[:, j] for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if i + j]
+    return np.column_stack([shape * way for shape in shapes for way in ways])
 
 
 def _slope(values: Array, t: Array, at: Array) -> Array:

@@ -28,7 +28,7 @@ from magtwin.learn.data.features import FEATURES, SETS, columns_of, feature_name
 from magtwin.learn.data.features import features as features_of
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.origin import map_metadata, shared_metadata
-from magtwin.learn.data.recording import Recording, Rows, Source, read, sources_of, thinned
+from magtwin.learn.data.recording import Recording, Rows, Source, plant_name, read, sources_of, thinned
 from magtwin.learn.data.split import Part, Split
 from magtwin.report import Figure, Report
 from magtwin.run.arrow import run_of, table_of
@@ -176,7 +176,7 @@ class Dataset(Summarized):
         most = sum(recording.labelled for recording in chosen)
         x, y, sd = np.empty((most, len(wanted))), np.empty(most), np.empty(most)
         number_of_row, row = np.empty(most, np.intp), np.empty(most, np.intp)
-        others = np.empty((most, len(beside)))
+        others, t = np.empty((most, len(beside))), np.empty(most)
         number = {recording.name: i for i, recording in enumerate(chosen)}
         end, unlabelled, incomplete = 0, 0, 0
         columns = [*columns_of(wanted), *columns_of(beside), "label_nt", "label_sd_nt"]
@@ -196,6 +196,7 @@ class Dataset(Summarized):
                 )
             x[end:stop], y[end:stop], sd[end:stop] = values[kept], label[kept], run["label_sd_nt"][kept]
             number_of_row[end:stop], row[end:stop] = number[recording.name], first + np.flatnonzero(kept)
+            t[end:stop] = run["t"][kept]
             if beside:
                 others[end:stop] = features_of(run, beside)[kept]
             end = stop
@@ -214,6 +215,7 @@ class Dataset(Summarized):
             left_out=MappingProxyType({"without a label": unlabelled, "without an input": incomplete}),
             row=row[:end],
             beside=others[:end],
+            t=t[:end],
         )
 
     def check(self) -> None:
@@ -476,6 +478,7 @@ def _write(run: Run, source: Source, path: Path) -> Recording:
         sha256=sha256(path),
         label_mean_nt=float(label.mean()),
         label_sd_nt=float(label.std()),
+        plant=plant_name(run.metadata),
     )
 
 

@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 
 Convert = Callable[..., NDArray[Any]]
 
+WARM_S = (100.0, 400.0)
+"""Time constants of `warming` [s]."""
+
 
 @dataclass(frozen=True)
 class Feature:
@@ -121,6 +124,15 @@ def eddy_products(b_vector_nt: NDArray[Any], imu_w: NDArray[Any]) -> Array:
     return np.column_stack([u[:, i] * rate[:, j] for i in range(3) for j in range(2)])
 
 
+def warming(t: NDArray[Any], yaw: NDArray[Any]) -> Array:
+    """1 - exp(-t / tau) times 1, cos and sin of the heading, for each tau of `WARM_S`, shape (N, 6).
+
+    The field of parts that warm up after switching on, t = 0: iron and magnets fixed to the robot.
+    """
+    ways = (np.ones_like(yaw), np.cos(yaw), np.sin(yaw))
+    return np.column_stack([-np.expm1(-t / tau) * way for tau in WARM_S for way in ways])
+
+
 def _canonical(q: NDArray[Any]) -> Array:
     """Quaternions (N, 4) with w >= 0."""
     return q * np.where(q[:, 3:] < 0, -1.0, 1.0)
@@ -149,6 +161,7 @@ TURNED_MOTION = tuple(
     f"{signal}_yaw_{part}" for signal in ("odom_v_x", "odom_w_z", "turning") for part in ("sin", "cos")
 )
 TURNED_LAGS = tuple(f"{signal}_yaw_{part}" for signal in LAGS for part in ("sin", "cos"))
+WARM = tuple(f"warm_{tau:.0f}{way}" for tau in WARM_S for way in ("", "_yaw_cos", "_yaw_sin"))
 EDDY = ("eddy_xdx", "eddy_xdy", "eddy_ydx", "eddy_ydy", "eddy_zdx", "eddy_zdy")
 
 FEATURES: Mapping[str, Feature] = MappingProxyType(
@@ -188,6 +201,7 @@ FEATURES: Mapping[str, Feature] = MappingProxyType(
         **_named(dict.fromkeys(COSINES, ""), direction_cosines, _B),
         **_named(dict.fromkeys(INDUCED, ""), induced_products, _B),
         **_named(dict.fromkeys(EDDY, "1/s"), eddy_products, _B, "imu_w"),
+        **_named(dict.fromkeys(WARM, ""), warming, "t", "yaw"),
     }
 )
 """Every feature by name. Weights keep the names, so their meaning never changes."""
@@ -214,19 +228,27 @@ CIRCULAR: tuple[str, ...] = (
 """What a robot's field depends on, without inputs that identify a session: no charge or voltage, and no
 orientation relative to the IMU's own zero."""
 
+PLATFORM: tuple[str, ...] = (
+    *(*CIRCULAR, *GRADIENT, *CARRIED, *LAGS),
+    *("turning", *TURNED, *TURNED_MOTION, *TURNED_LAGS),
+)
+"""`CIRCULAR`, the map's gradient, and currents, torques and the LiDAR by heading."""
+
 SETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "full": FULL,
         "correlated": ("yaw_deg", "odom_v_x", "imu_q_x", "imu_q_y", "imu_q_z", "imu_q_w"),
         "circular": CIRCULAR,
         "gradient": (*CIRCULAR, *GRADIENT, *CARRIED),
-        "platform": (*CIRCULAR, *GRADIENT, *CARRIED, *LAGS, "turning", *TURNED, *TURNED_MOTION, *TURNED_LAGS),
+        "platform": PLATFORM,
+        "session": (*PLATFORM, *WARM),
         "vector": (*CIRCULAR, *GRADIENT, *CARRIED, *COSINES, *INDUCED, *EDDY),
     }
 )
 """Sets of features by name. "correlated": those with a Spearman correlation with the disturbance above 0.04
 in the paper's Figure 2. "gradient": "circular" and the map's gradient, for a lever arm and a latency.
-"platform": also currents, torques and the LiDAR by heading. "vector": "gradient" and the platform's attitude
+"platform": also currents, torques and the LiDAR by heading. "session": also parts that warm up after
+switching on. "vector": "gradient" and the platform's attitude
 in the field, from the vector axes."""
 
 

@@ -45,10 +45,19 @@ def session_name(metadata: Mapping[str, object]) -> str:
     if "session" not in metadata:
         return ""
     seed = f"{metadata['session_seed']}-" if "session_seed" in metadata else ""
-    plant = str(metadata.get("plant", ""))
-    if plant.startswith("{"):
-        plant = hashlib.sha256(plant.encode()).hexdigest()[:8]
+    plant = _short(str(metadata.get("plant", "")))
     return f"{seed}{metadata['session']}" + (f"-{plant}" if plant else "")
+
+
+def plant_name(metadata: Mapping[str, object]) -> str:
+    """Name of the plant of a run; "" if it is the nominal one or its metadata name none."""
+    plant = _short(str(metadata.get("plant", "")))
+    return "" if plant.partition(":")[0] == "nominal" else plant
+
+
+def _short(plant: str) -> str:
+    """The text of a plant; of its fields as JSON, a checksum."""
+    return hashlib.sha256(plant.encode()).hexdigest()[:8] if plant.startswith("{") else plant
 
 
 @dataclass(frozen=True)
@@ -80,8 +89,11 @@ class Recording:
     label_sd_nt: float
     """Standard deviation of its labels [nT]."""
 
+    plant: str = ""
+    """The simulated robot's plant; "" if nominal or unknown."""
+
     def __post_init__(self) -> None:
-        for name in ("name", "session", "path", "sha256"):
+        for name in ("name", "session", "path", "sha256", "plant"):
             if not isinstance(getattr(self, name), str):
                 raise InputError(f"{name} of a recording must be a text, got {getattr(self, name)!r}")
         for name in ("rows", "labelled"):
@@ -130,6 +142,9 @@ class Rows(Summarized):
 
     beside: Array
     """Other features of the same rows, shape (N, K); nan if unknown."""
+
+    t: Array
+    """Time of each row in its recording [s], shape (N,)."""
 
 
 def sources_of(recordings: Mapping[str, Run] | Sequence[Source]) -> list[Source]:

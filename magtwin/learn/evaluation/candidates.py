@@ -10,7 +10,7 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.learn.data.alignment import Alignment
+from magtwin.learn.data.alignment import Alignment, alignment_of
 from magtwin.learn.data.dataset import Dataset, values_sha256
 from magtwin.learn.data.features import CARRIED, CIRCULAR, FEATURES, GRADIENT
 from magtwin.learn.data.origin import same_map
@@ -132,23 +132,6 @@ def candidate_of(
     about = {"sha256": magnetometer.sha256, **metadata} if magnetometer.sha256 else metadata
     name = name or magnetometer.name or magnetometer.net.kind
     return Candidate(name, magnetometer, used, alignment_of(metadata, name), about)
-
-
-def alignment_of(metadata: Mapping[str, Any], where: object = "") -> Alignment:
-    """Lever arm and latency in the metadata of weights; 0 if they have none.
-
-    Raises:
-        InputError: They are no numbers.
-    """
-    try:
-        arm = [float(part) for part in str(metadata.get("lever_arm_m", "0, 0")).split(",")]
-        forward, left = arm
-        return Alignment((forward, left), float(metadata.get("latency_s", 0.0)))
-    except ValueError as error:
-        raise InputError(
-            f"{where}: lever_arm_m {metadata.get('lever_arm_m')!r} and latency_s "
-            f"{metadata.get('latency_s')!r} of its metadata are no lengths and time ({error}); train it again"
-        ) from error
 
 
 def naive(

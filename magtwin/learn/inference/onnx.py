@@ -17,6 +17,8 @@ from magtwin.errors import InputError
 from magtwin.files import check_free, existing, output, sha256
 from magtwin.learn.data.features import FEATURES
 from magtwin.learn.data.inputs import Inputs
+from magtwin.learn.mixed.mixed import Mixed
+from magtwin.learn.models.calibration import Spread
 from magtwin.learn.models.hybrid import Hybrid
 from magtwin.learn.models.linear import Linear
 from magtwin.learn.models.network import FieldNet
@@ -149,7 +151,7 @@ def inputs_of(predictor: Predictor) -> Inputs:
     Raises:
         InputError: A kind that has no graph.
     """
-    if isinstance(predictor, FieldNet | Linear | Hybrid):
+    if isinstance(predictor, FieldNet | Linear | Hybrid | Mixed):
         return predictor.inputs
     raise InputError(f"a predictor of the kind {predictor.kind!r} has no ONNX graph")
 
@@ -182,6 +184,8 @@ class _Graph:
             return mean, self.add("Expand", sd, self.add("Shape", mean))
         if isinstance(predictor, Linear):
             return self.linear(predictor)
+        if isinstance(predictor, Mixed):
+            return self.mixed(predictor)
         if isinstance(predictor, Hybrid):
             mean, sd = self.linear(predictor.base)
             if predictor.net is not None:
@@ -218,9 +222,28 @@ class _Graph:
         z = self.scaled(linear.inputs, INPUT)
         mean = self.add("MatMul", z, self.constant(linear.coefficients_nt))
         mean = self.add("Add", mean, self.constant(linear.constant_nt))
-        variance = self.add("MatMul", self.add("Mul", z, z), self.constant(linear.spread.slopes_nt2))
-        variance = self.add("Add", variance, self.constant(linear.spread.floor_nt2))
-        return mean, self.add("Sqrt", variance)
+        return mean, self.add("Sqrt", self.variance(linear.spread, z))
+
+    def mixed(self, mixed: Mixed) -> tuple[str, str]:
+        """Disturbance and standard deviation of a mixed model, each (rows,)."""
+        z, effects = self.scaled(mixed.inputs, INPUT), mixed.session
+        mean = self.add("MatMul", z, self.constant(effects.mean[1:]))
+        mean = self.add("Add", mean, self.constant(effects.mean[0]))
+        factor, share = mixed.interval_factors
+        if not share:
+            return mean, self.add("Sqrt", self.variance(mixed.spread, z))
+        cross = self.add("MatMul", z, self.constant(effects.covariance[1:, 1:]))
+        cross = self.add("Mul", self.add("Add", cross, self.constant(2 * effects.covariance[0, 1:])), z)
+        variance = self.add("ReduceSum", cross, self.constant(np.array([1])), keepdims=0)
+        variance = self.add("Add", variance, self.constant(effects.covariance[0, 0]))
+        variance = self.add("Mul", variance, self.constant(share))
+        variance = self.add("Add", variance, self.variance(mixed.noise, z))
+        return mean, self.add("Mul", self.add("Sqrt", variance), self.constant(factor))
+
+    def variance(self, spread: Spread, z: str) -> str:
+        """Variance of a spread at scaled inputs, (rows,)."""
+        variance = self.add("MatMul", self.add("Mul", z, z), self.constant(spread.slopes_nt2))
+        return self.add("Add", variance, self.constant(spread.floor_nt2))
 
 
 def _report(model: Any, title: str) -> Report:

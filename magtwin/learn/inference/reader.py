@@ -65,6 +65,19 @@ class Reading(NamedTuple):
     """Whether an input left the range of the training rows."""
 
 
+class Row(NamedTuple):
+    """Inputs of a predictor at one pose."""
+
+    x: Array
+    """Features, shape (F,); the next row overwrites them."""
+
+    b_map_nt: float
+    """The map at the sensor [nT]; nan off the map."""
+
+    p_xy: tuple[float, float]
+    """Place of the sensor in world [m]."""
+
+
 class Reader:
     """Reads a predictor on a map, pose by pose. Not thread-safe.
 
@@ -100,7 +113,18 @@ class Reader:
         return tuple(column for column in columns if column not in POSE)
 
     def read(self, p_xy: Sequence[float], yaw: float, signals: Signals) -> Reading:
-        """One reading.
+        """One reading; the arguments are those of `row`."""
+        _, field_nt, _ = self.row(p_xy, yaw, signals)
+        if self._predict_row is not None:
+            mean, sd, outside = self._predict_row(self._x)
+        else:
+            row = self._x[None]
+            mean, sd = (float(value[0]) for value in self.predictor.predict(row))
+            outside = bool(self.predictor.outside(row)[0])
+        return Reading(field_nt + mean, field_nt, mean, sd, outside)
+
+    def row(self, p_xy: Sequence[float], yaw: float, signals: Signals) -> Row:
+        """Inputs of the predictor at one pose.
 
         Args:
             p_xy: Position of base_link in world when the field was measured [m]. If the labels have a
@@ -130,13 +154,7 @@ class Reader:
         except (KeyError, TypeError, ValueError):
             self._check(signals)
             raise
-        if self._predict_row is not None:
-            mean, sd, outside = self._predict_row(self._x)
-        else:
-            row = self._x[None]
-            mean, sd = (float(value[0]) for value in self.predictor.predict(row))
-            outside = bool(self.predictor.outside(row)[0])
-        return Reading(field_nt + mean, field_nt, mean, sd, outside)
+        return Row(self._x, field_nt, (x, y))
 
     def _check(self, signals: Signals) -> None:
         """Refuse signals that are missing or have the wrong number of parts."""

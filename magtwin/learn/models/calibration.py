@@ -38,6 +38,11 @@ class Spread:
             variance += slope * z[:, j] ** 2
         return np.sqrt(variance)
 
+    @property
+    def mean_nt(self) -> float:
+        """Root mean square of the standard deviations of training rows, whose inputs have unit variance."""
+        return math.sqrt(self.floor_nt2 + float(np.sum(self.slopes_nt2)))
+
     def scaled(self, factor: float) -> "Spread":
         """The spread with standard deviations `factor` times as large."""
         return Spread(self.floor_nt2 * factor**2, self.slopes_nt2 * factor**2)

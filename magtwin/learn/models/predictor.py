@@ -20,7 +20,7 @@ forest` trains it, and every command reads its weights.
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.extend import Registry
-from magtwin.learn.data.recording import Rows
+from magtwin.learn.data.recording import Recording, Rows
 from magtwin.learn.models.descent import Epoch
 from magtwin.learn.models.network import net_of_checkpoint
 from magtwin.learn.models.weights import MetadataValue, Weights, is_checkpoint, read_weights
@@ -124,6 +124,9 @@ class FitTask:
     rng: np.random.Generator
     """Source of all randomness."""
 
+    recordings: Mapping[str, Recording] = field(default_factory=dict)
+    """Recordings of the rows by name, with their sessions and plants."""
+
     init: Any = None
     """Predictor of the same kind to continue from, or None."""
 
@@ -197,6 +200,7 @@ PREDICTORS: Registry[PredictorKind] = Registry(
         "mlp": "magtwin.learn.models.kinds:Perceptrons",
         "linear": "magtwin.learn.models.kinds:Linears",
         "hybrid": "magtwin.learn.models.kinds:Hybrids",
+        "mixed": "magtwin.learn.mixed.fit_mixed:Mixeds",
     },
 )
 """Kinds of predictors by name."""

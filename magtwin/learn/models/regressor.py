@@ -64,11 +64,16 @@ class Regressor(Summarized, ABC):
             **self.settings(),
         )
 
+    @property
+    def judged_on(self) -> str:
+        """What `residual_sd_nt` was measured on."""
+        return "held-out recordings"
+
     def report(self, title: str) -> Report:
         """Its kind, its parts, and its error on held-out recordings if known."""
         figures = [Figure("kind", self.kind), *self.figures()]
         if not math.isnan(self.residual_sd_nt):
-            figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note="on held-out recordings"))
+            figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note=f"on {self.judged_on}"))
         return Report(title, tuple(figures), shown(self.metadata))
 
     def _summary(self) -> Summary:

@@ -57,8 +57,8 @@ class TrainConfig:
 
     model: str = "paper"
     """The model: "paper" or "released" (multilayer perceptrons of the paper's or the released shape),
-    "linear" (Tolles-Lawson by ridge regression), "hybrid", or a kind of
-    `magtwin.learn.models.predictor.PREDICTORS`."""
+    "linear" (Tolles-Lawson by ridge regression), "hybrid", "mixed" (coefficients that differ between
+    sessions), or a kind of `magtwin.learn.models.predictor.PREDICTORS`."""
 
     layers: tuple[int, ...] = ()
     """Widths of the hidden layers."""

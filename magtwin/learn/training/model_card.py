@@ -59,7 +59,8 @@ def _data(result: TrainingResult) -> str:
     points = (
         f"Data set `{dataset}`, SHA-256 of its manifest `{metadata['dataset_sha256']}`.",
         f"Labelled on the map `{field}`, SHA-256 `{metadata['map_sha256']}`: measured field minus map, "
-        f"at a lever arm of {metadata['lever_arm_m']} m and a latency of {metadata['latency_s']:g} s.",
+        f"at a lever arm of {metadata['lever_arm_m']} m and a latency of {metadata['latency_s']:g} s "
+        f"(standard deviations {metadata['lever_arm_sd_m']} m and {metadata['latency_sd_s']:g} s).",
         f"{result.rows:,} training rows, labels {label}.",
         f"Recordings split by {split.by}: {counts}.",
         f"Test: {names}.",

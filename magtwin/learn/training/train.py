@@ -140,6 +140,7 @@ def fit(
         validation_groups=data.groups["validation"],
         options=config.options,
         rng=rng,
+        recordings={recording.name: recording for recording in dataset.recordings},
         init=init,
         freeze=config.freeze,
         device=device,
@@ -276,7 +277,9 @@ def _provenance(
         "map": dataset.map_name,
         "map_sha256": dataset.map_sha256,
         "lever_arm_m": ", ".join(f"{c:g}" for c in dataset.alignment.lever_arm_m),
+        "lever_arm_sd_m": ", ".join(f"{c:g}" for c in dataset.alignment.lever_arm_sd_m),
         "latency_s": dataset.alignment.latency_s,
+        "latency_sd_s": dataset.alignment.latency_sd_s,
         **{name: dataset.metadata[name] for name in ORIGIN if name in dataset.metadata},
         "config": stored.to_toml(),
         "seed": config.seed,
@@ -284,7 +287,7 @@ def _provenance(
         "training_rows": rows,
         "magtwin": __version__,
     }
-    if config.kind != "linear":
+    if config.kind not in ("linear", "mixed"):
         threads = config.threads or torch.get_num_threads()
         metadata |= {"threads": threads, "torch": str(torch.__version__), "device": device}
     if config.licence:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from places import DOCS
+from scipy.signal import butter, sosfilt, sosfilt_zi
 from scipy.spatial.transform import Rotation
 
 from magtwin.cli import main
@@ -18,6 +19,7 @@ from magtwin.io.tables import write_parquet
 from magtwin.learn.compensation.platform import fit_platform, platform_of_run
 from magtwin.learn.compensation.tolles_lawson import (
     TollesLawson,
+    band_pass,
     compensate_run,
     design_matrix,
     fit_run,
@@ -371,6 +373,7 @@ def test_a_model_whose_coefficients_do_not_fit_its_terms_is_refused(tmp_path):
         ({"band_hz": (0.9, 0.1)}, "band_hz must ascend"),
         ({"band_hz": (0.1, 10.0)}, "half the rate, 10 Hz"),
         ({"terms": ("permanent", "bias")}, "a pass band excludes a bias"),
+        ({"preset": "magnaw"}, "no preset 'magnaw'; did you mean 'magnav'"),
         ({"ridge": -1.0}, "ridge must not be below 0"),
         ({"b_nt": np.full(400, np.nan)}, "b_nt must be finite, got nan in row 0"),
         ({"b_nt": np.ones(3)}, r"must have shape \(400,\)"),
@@ -411,6 +414,18 @@ def test_compensate_says_which_vectors_it_took(calibration, tmp_path, capsys):
     assert told == {"measured": ("b_vector_measured_nt",) * 2, "exact": ("b_vector_nt",) * 2}
 
 
+def test_compensate_takes_a_preset_and_keeps_it(calibration, tmp_path, capsys):
+    run, model = tmp_path / "run.parquet", tmp_path / "model.json"
+    write_parquet(calibration("figure8", 1), run)
+    main(["compensate", "fit", str(run), "--preset", "magnav", "--no-band", "--out", str(model), "--json"])
+    assert json.loads(capsys.readouterr().out)["metadata"]["preset"] == "magnav"
+    assert TollesLawson.load(model).preset == "magnav"
+    assert TollesLawson.load(model) == fit_run(calibration("figure8", 1), band_hz=None, preset="magnav")
+    model.write_text(model.read_text().replace('"magnav"', '"magnaw"'))
+    with pytest.raises(InputError, match="no preset 'magnaw'"):
+        TollesLawson.load(model)
+
+
 def test_the_page_on_compensation_takes_out_what_it_says():
     page = DOCS / "compensate.md"
     (code,) = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
@@ -429,3 +444,58 @@ def test_the_page_on_compensation_takes_out_what_it_says():
     removed = compensate_run(told["drive"]("curvilinear", seed=2), wrong)[1].figures[-1]
     assert removed.value < 0
     assert removed.note.startswith("below 0: more variance than before")
+
+
+def magnav_reference(b: np.ndarray, readings: np.ndarray, rate_hz: float, penalty: float):
+    """Regressors, filtered regressors and compensated readings, from the equations of MagNav.jl."""
+    total = np.linalg.norm(b, axis=1)
+    change = np.vstack([b[1] - b[0], (b[2:] - b[:-2]) / 2, b[-1] - b[-2]])
+    x, y, z = (b / total[:, None]).T
+    columns = [x, y, z]
+    pairs = ((x, 0), (x, 1), (x, 2), (y, 1), (y, 2), (z, 2))
+    columns += [unit * b[:, axis] / 50_000 for unit, axis in pairs]
+    columns += [unit * change[:, axis] / 50_000 for unit in (x, y, z) for axis in range(3)]
+    matrix = np.column_stack(columns)
+    stages = butter(4, [0.1 / (rate_hz / 2), 0.9 / (rate_hz / 2)], "bandpass", output="sos")
+    start = sosfilt_zi(stages)
+
+    def filtered(signal):
+        ends = 2 * signal[0] - signal[24:0:-1], 2 * signal[-1] - signal[-2:-26:-1]
+        long = np.concatenate([ends[0], signal, ends[1]])
+        for _ in range(2):
+            long = sosfilt(stages, long, zi=start * long[0])[0][::-1]
+        return long[24:-24][20:-20]
+
+    along = np.column_stack([filtered(column) for column in matrix.T])
+    normal = along.T @ along + penalty * np.eye(18)
+    return matrix, along, readings - matrix @ np.linalg.solve(normal, along.T @ filtered(readings))
+
+
+@pytest.mark.parametrize("penalty", [0.0, 1e-3])
+def test_the_preset_magnav_gives_its_arrays(penalty, tmp_path):
+    b, readings = figure_of_merit_flight(10.0)
+    matrix, along, compensated = magnav_reference(b, readings, 10.0, penalty)
+    ours, names = design_matrix(b, 10.0, preset="magnav")
+    assert len(names) == 18
+    assert_allclose(ours, matrix, rtol=1e-12, atol=1e-12 * np.abs(matrix).max())
+    filtered = band_pass(ours, (0.1, 0.9), 10.0, preset="magnav")
+    assert_allclose(filtered, along, rtol=0, atol=1e-12 * np.abs(matrix).max())
+    model = fit_tolles_lawson(readings, b, 10.0, ridge=penalty, preset="magnav")
+    model.save(tmp_path / "model.json")
+    got = TollesLawson.load(tmp_path / "model.json").compensate(readings, b, 10.0)
+    assert np.std(got - compensated) < 1e-3  # nT; MagNav.jl allows its own arrays 0.1
+    assert np.mean(got) == pytest.approx(np.mean(compensated), abs=0.1)
+    default = fit_tolles_lawson(readings, b, 10.0, ridge=0.0).compensate(readings, b, 10.0)
+    assert np.std(default - compensated) > 0.01
+
+
+def test_the_preset_magnav_drops_the_terms_along_z_and_takes_a_bias():
+    b, readings = figure_of_merit_flight(10.0)
+    _, names = design_matrix(b, 10.0, ("induced5", "eddy8", "bias"), preset="magnav")
+    assert "induced yy" in names
+    assert not {"induced zz", "eddy zdz"} & set(names)
+    both = [
+        fit_tolles_lawson(readings, b, 10.0, terms=terms, preset="magnav").compensate(readings, b, 10.0)
+        for terms in (("permanent", "induced6", "eddy9"), ("permanent", "induced6", "eddy9", "bias"))
+    ]
+    assert np.std(both[0] - both[1]) < 0.5

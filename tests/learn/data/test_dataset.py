@@ -175,7 +175,9 @@ def test_the_report_says_what_there_is_to_learn_from(made):
     assert figures["labels"].value == 720
     assert figures["sessions"].value == 3
     assert figures["label"].spread == pytest.approx(np.std(made.rows("full").y), rel=1e-6)
-    assert report.metadata["feature sets"] == "full, correlated, circular, gradient, platform, vector"
+    assert (
+        report.metadata["feature sets"] == "full, correlated, circular, gradient, platform, session, vector"
+    )
 
 
 @pytest.mark.parametrize(

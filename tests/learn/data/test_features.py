@@ -13,6 +13,7 @@ from magtwin.learn.data.features import (
     columns_of,
     feature_names,
     features,
+    warming,
 )
 from magtwin.run.run import COLUMNS, Run
 
@@ -183,3 +184,10 @@ def test_names_in_one_text_are_a_set_a_feature_or_several_with_commas():
     assert feature_names("yaw_deg, lidar_on") == ("yaw_deg", "lidar_on")
     with pytest.raises(InputError, match="no feature 'lidar_of'; did you mean 'lidar_on'"):
         feature_names("yaw_deg,lidar_of")
+
+
+def test_what_warms_up_has_63_percent_of_its_field_after_one_time_constant():
+    x = warming(np.array([0.0, 100.0, 400.0]), np.array([0.3, np.pi, np.pi / 2]))
+    assert_allclose(x[0], 0.0, atol=1e-15)
+    assert_allclose(x[1, :3], (1 - np.exp(-1)) * np.array([1, -1, 0]), atol=1e-15)
+    assert_allclose(x[2, 3:], (1 - np.exp(-1)) * np.array([1, 0, 1]), atol=1e-15)

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+import magtwin
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.files import shipped
 from magtwin.frames import quat_from_yaw
-from magtwin.learn.data.alignment import Alignment, fit_alignment
+from magtwin.learn.data.alignment import Alignment, _sandwich, fit_alignment
 from magtwin.learn.data.labels import labelled
 from magtwin.run.run import Run
 
@@ -113,6 +115,48 @@ def test_lever_arm_and_latency_are_found_together_to_their_stated_spread():
     assert_allclose(got, truth, atol=0.004)
     assert (np.abs(got - truth) < 4 * sd + 0.002).all()
     assert (sd < 0.01).all()
+
+
+def test_errors_shared_within_groups_make_the_spread_of_students_t():
+    rng, x, group = np.random.default_rng(0), np.ones((60, 1)), np.repeat(np.arange(6), 10)
+    within = 0
+    for _ in range(2000):
+        y = rng.normal(0, 1, 6)[group]
+        spread = _sandwich(np.array([[1 / 60]]), x, y - y.mean(), group)
+        within += abs(y.mean()) < 1.645 * np.sqrt(spread[0, 0])
+    assert within / 2000 == pytest.approx(0.9, abs=0.02)
+    assert_array_equal(_sandwich(np.eye(1), x, y, 0 * group), 0.0)
+
+
+def test_more_readings_of_the_same_places_do_not_hide_the_errors_of_a_map():
+    """The map errs by waves of 1 m; the robot drives the same way again and again."""
+    rng = np.random.default_rng(1)
+    x, y = np.meshgrid(FIELD.x_m, FIELD.y_m)
+    bumps = [
+        12 * np.cos(kx * x + ky * y + phase)
+        for kx, ky, phase in zip(*rng.normal(0, 6, (2, 20)), rng.uniform(0, 6, 20), strict=True)
+    ]
+    wrong = dataclasses.replace(FIELD, values_nt=FIELD.values_nt + np.sum(bumps, axis=0))
+    few, many = (
+        np.array(fit_alignment([a_run(seed=k, seconds=40) for k in range(n)], wrong, rounds=3).lever_arm_sd_m)
+        for n in (2, 8)
+    )
+    assert (many > 0.8 * few).all()
+
+
+@pytest.mark.slow
+def test_stated_spreads_of_the_twin_hold_its_true_lever_arm_and_latency():
+    """20 independent data sets of 8 min; the markers are attached anew and motion capture lags by 75 ms."""
+    twin = magtwin.open_twin(shipped("scenes", "lab", "lab.usda"), magnetometer="physical")
+    field = magtwin.load_map(shipped("maps", "lab", "lab.usdc"))
+    truth, scores = np.array([0.055, -0.03, -0.0752]), []
+    for k in range(20):
+        runs = magtwin.sweep(twin, None, 12, seed=10_000 + 1000 * k, sessions=4, duration_s=40, rate_hz=10)
+        found = fit_alignment(list(runs), field)
+        error = np.array([*found.lever_arm_m, found.latency_s]) - truth
+        scores.append(error / [*found.lever_arm_sd_m, found.latency_sd_s])
+    assert 0.6 < np.sqrt(np.mean(np.square(scores))) < 1.2
+    assert 0.85 <= np.count_nonzero(np.abs(scores) < 1.645) / 60 <= 0.98
 
 
 def test_what_is_not_asked_for_stays_0_and_the_other_takes_nothing_of_it():

@@ -16,6 +16,8 @@ from magtwin.errors import InputError
 from magtwin.learn.data.features import SETS, features
 from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
+from magtwin.learn.mixed.effects import Effects
+from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.calibration import Spread
 from magtwin.learn.models.hybrid import Hybrid
 from magtwin.learn.models.linear import Linear
@@ -25,7 +27,7 @@ from magtwin.learn.models.weights import write_weights
 from magtwin.twin import open_twin, simulate, sweep
 
 NAMES = SETS["gradient"]
-KINDS = ("mlp", "linear", "hybrid", "base alone")
+KINDS = ("mlp", "linear", "hybrid", "base alone", "mixed")
 
 
 def a_predictor(kind, names=NAMES):
@@ -37,11 +39,27 @@ def a_predictor(kind, names=NAMES):
     base = Linear(
         inputs=of, constant_nt=333.0, coefficients_nt=coefficients, spread=spread, penalty=0.01, weighted=True
     )
+
+    def effects(scale):
+        root = rng.normal(0, 5, (len(names) + 1, len(names) + 1))
+        return Effects(rng.normal(0, 90, len(names) + 1), scale * (root @ root.T + np.eye(len(root))))
+
     found = {
         "mlp": lambda: a_net(names, (6, 5), residual_sd_nt=44.0),
         "linear": lambda: base,
         "hybrid": lambda: Hybrid(base=base, net=a_net(names, (6, 5), dropout=0.2), sd_factor=1.5),
         "base alone": lambda: Hybrid(base=base, net=None, sd_factor=1.5),
+        "mixed": lambda: Mixed(
+            inputs=of,
+            prior=effects(1.0),
+            session=effects(0.5),
+            spread=spread,
+            noise=spread.scaled(0.5),
+            intervals="calibrated",
+            widening=1.2,
+            families=3,
+            factors={"calibrated": 1.1, "online": 1.3},
+        ),
     }[kind]()
     found.residual_sd_nt = 44.0
     found.metadata.update(source="here", rows=7)
@@ -156,7 +174,7 @@ def changed(tmp_path, kind, *, about=None, drop=None, **tensors):
         (
             "mlp",
             {"about": {"kind": "oracle", "format_version": 2}},
-            "no predictor kind 'oracle'; known: hybrid, linear, mlp; update magtwin, or install",
+            "no predictor kind 'oracle'; known: hybrid, linear, mixed, mlp; update magtwin, or install",
         ),
         ("mlp", {"about": {"kind": ["mlp"]}}, "'kind' of its metadata must be text, got ['mlp']"),
         (
@@ -171,6 +189,9 @@ def changed(tmp_path, kind, *, about=None, drop=None, **tensors):
         ("hybrid", {"about": {"sd_factor": True}}, "'sd_factor' of its metadata must be above 0 and finite"),
         ("hybrid", {"drop": "net.layers.1.weight"}, "tensor 'layers.1.weight' is missing; train or convert"),
         ("hybrid", {"drop": "base.constant_nt"}, "tensor 'constant_nt' is missing; train the hybrid again"),
+        ("mixed", {"about": {"intervals": "wide"}}, "'intervals' of its metadata must be one of"),
+        ("mixed", {"drop": "noise_floor_nt2"}, "tensor 'noise_floor_nt2' is missing; train the mixed again"),
+        ("mixed", {"prior_covariance_nt2": -torch.eye(3).double()}, "of its prior is not positive definite"),
         ("hybrid", {"spare": torch.ones(1)}, "tensor 'spare' belongs to no layer of a hybrid"),
     ],
 )

@@ -61,7 +61,7 @@ def test_weights_to_go_on_from_lie_beside_the_file_that_names_them(tmp_path):
         ('features = "yaw_sin, lidar"', "no feature 'lidar'; did you mean 'lidar_on'?"),
         ('model = "linear"\nepochs = 3', "c.toml:2: epochs is no option of 'linear'; leave it out, or "
          "choose paper, released, hybrid"),
-        ('model = "rigde"', "c.toml:1: no model 'rigde'; known: hybrid, linear, paper, released"),
+        ('model = "rigde"', "c.toml:1: no model 'rigde'; known: hybrid, linear, mixed, paper, released"),
         ('model = "hybrid"\npenalty = -1', "c.toml:2: penalty must be 0 or more and finite, got -1.0"),
         ('device = "gpu"', "c.toml:1: device must be one of 'cpu', 'cuda', 'auto', got 'gpu'"),
         ('freeze = ["layers.0"]', "freeze keeps layers of trained weights: give init too"),

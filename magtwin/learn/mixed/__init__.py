@@ -1,0 +1,1 @@
+"""Mixed models: linear models whose coefficients differ between sessions."""

@@ -1,0 +1,275 @@
+"""Mixed models from a data set, calibrated by a drive, followed online, and used like any predictor."""
+
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import magtwin as mt
+from magtwin.cli import main
+from magtwin.errors import CalibrationWarning, InputError
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.files import sha256
+from magtwin.learn.inference.calibrate import labelled_drive
+from magtwin.learn.inference.magnetometer import NeuralMagnetometer
+from magtwin.learn.inference.online import OnlineMagnetometer, read_online
+from magtwin.learn.models.linear import fit_linear
+from magtwin.learn.models.predictor import load_predictor
+from magtwin.run.run import Run
+
+NAMES = "yaw_sin,yaw_cos,odom_v_x"
+X, Y = np.meshgrid(np.linspace(-3, 3, 13), np.linspace(-3, 3, 13))
+FIELD = AnomalyMap(
+    values_nt=(41e3 + 300 * X**2 - 400 * Y)[None],
+    origin_m=(-3.0, -3.0),
+    cell_m=(0.5, 0.5),
+    headings_rad=np.zeros(1),
+    name="trough",
+)
+
+
+def a_run(seed, plant="", seconds=60.0, sector=2 * np.pi):
+    """A drive at 10 Hz whose disturbance is linear, with a constant and slopes that a session draws."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0, seconds, 0.1)
+    yaw = (sector * (0.5 + 0.499 * np.sin(0.4 * t + rng.uniform(0, 6))) + np.pi) % (2 * np.pi) - np.pi
+    speed = 0.2 + 0.1 * np.sin(0.7 * t)
+    p = np.column_stack([2.5 * np.sin(0.21 * t), 2.0 * np.sin(0.13 * t + 1), 0 * t])
+    size = 4.0 if plant else 1.0
+    beta = np.array([300, 80, -40, 100]) + size * rng.normal(0, [60, 20, 20, 100])
+    label = beta[0] + beta[1] * np.sin(yaw) + beta[2] * np.cos(yaw) + beta[3] * speed
+    field = FIELD.lookup(p[:, :2], yaw)
+    still = np.zeros((len(t), 3))
+    columns = {
+        "t": t,
+        "p_world_base": p,
+        "yaw": yaw,
+        "odom_v": np.column_stack([speed, still[:, :2]]),
+        "b_measured_nt": field + label + rng.normal(0, 15, len(t)),
+    }
+    about = {"session": seed, "path": "loops", **({"plant": plant} if plant else {})}
+    return Run(columns, about)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """A mixed model of 20 nominal sessions and 4 worlds, as a file."""
+    folder = tmp_path_factory.mktemp("mixed")
+    runs = {f"n{k}": a_run(k) for k in range(20)}
+    for world in range(4):
+        runs |= {f"w{world}_{k}": a_run(100 + 10 * world + k, f"warm-up:{world}") for k in range(4)}
+    data = mt.build_dataset(runs, out=folder / "set", anomaly_map=FIELD)
+    out = folder / "mixed.safetensors"
+    result = mt.train(data, out=out, model="mixed", features=NAMES, seed=1)
+    assert "mixed model" in out.with_suffix(".md").read_text()
+    assert result.predictor.kind == "mixed"
+    return out
+
+
+@pytest.fixture(scope="module")
+def model(weights):
+    return load_predictor(weights)
+
+
+def errors(model, run):
+    label = run["b_measured_nt"] - FIELD.lookup(run["p_world_base"][:, :2], run["yaw"])
+    read = NeuralMagnetometer(model).read([run])[0]
+    return read.disturbance_nt - label, read.sd_nt
+
+
+def test_its_mean_is_ridge_on_the_nominal_sessions_alone(model):
+    assert_allclose(model.prior.mean[0], 300 + 100 * 0.2, atol=3 * 60 / np.sqrt(14))
+    assert model.families == 2
+    nominal = [a_run(k) for k in range(20)]
+    drives = [labelled_drive(model, run, FIELD) for run in nominal]
+    x, y = (np.concatenate([getattr(drive, part) for drive in drives]) for part in "xy")
+    groups = np.repeat(np.arange(20), [len(drive.y) for drive in drives])
+    every = fit_linear(x, y, groups, features=NAMES, penalty=0.0).model.predict(x)[0]
+    assert np.abs(every - model.predict(x)[0]).mean() < 40  # 14 of the 20 sessions, with another penalty
+
+
+def test_a_minute_of_labels_makes_a_new_plant_as_good_as_its_noise(model):
+    held = []
+    for seed in range(200, 230):
+        run = a_run(seed, "hysteresis", seconds=120.0)
+        calibrated = mt.calibrate(model, run, anomaly_map=FIELD, duration_s=60.0)
+        late = run["t"] > 60
+        error, sd = errors(calibrated, run)
+        before, narrow = errors(model, run)
+        assert np.abs(error[late]).mean() < 25 < np.abs(before[late]).mean()
+        assert narrow[0] > sd[0]
+        held.append(np.mean(np.abs(error[late]) < 1.645 * sd[late]))
+    assert 0.85 < np.mean(held) < 0.97
+
+
+def test_intervals_for_an_unknown_plant_hold_where_nominal_ones_fail(model):
+    runs = [a_run(seed, "hysteresis") for seed in range(200, 230)]
+    held = {}
+    for name, chosen in (("nominal", model), ("unknown", model.open_loop(unknown_plant=True))):
+        found = [errors(chosen, run) for run in runs]
+        held[name] = np.mean([np.abs(error) < 1.645 * sd for error, sd in found])
+    assert held["nominal"] < 0.7
+    assert held["unknown"] > 0.85
+    nominal = [errors(model, a_run(seed)) for seed in range(300, 330)]
+    assert np.mean([np.abs(error) < 1.645 * sd for error, sd in nominal]) == pytest.approx(0.9, abs=0.08)
+
+
+def test_a_calibrated_file_records_its_drive_and_its_parent(weights, tmp_path):
+    a_run(7, "hysteresis").save(tmp_path / "drive.parquet")
+    out = tmp_path / "now.safetensors"
+    calibrated = mt.calibrate(weights, tmp_path / "drive.parquet", anomaly_map=FIELD, out=out)
+    again = load_predictor(out)
+    assert again.metadata == calibrated.metadata
+    kept = again.metadata
+    assert (kept["calibration_drive"], kept["calibration_session"]) == ("drive.parquet", "7-hysteresis")
+    assert kept["parent_sha256"] == sha256(weights)
+    assert kept["calibration_duration_s"] == pytest.approx(59.8, abs=0.3)
+    assert kept["calibration_residual_nt"] < 25 < kept["calibration_residual_before_nt"]
+    assert kept["map"] == "trough"
+    assert "calibration_warnings" not in kept
+    run = a_run(8)
+    assert_array_equal(errors(again, run)[0], errors(calibrated, run)[0])
+    assert_array_equal(
+        again.open_loop().predict(np.zeros((1, 3))), load_predictor(weights).predict(np.zeros((1, 3)))
+    )
+
+
+def test_the_date_of_a_bag_is_recorded_and_the_error_of_a_single_block_is_unknown(model, tmp_path):
+    run = a_run(3, seconds=14.0)
+    bag = Run(dict(run), {"start_ns": str(1_790_000_000 * 10**9)})
+    with pytest.warns(CalibrationWarning):
+        calibrated = mt.calibrate(model, bag, anomaly_map=FIELD, out=tmp_path / "a.safetensors")
+    assert calibrated.metadata["calibration_date"] == "2026-09-21"
+    assert "calibration_residual_nt" not in calibrated.metadata
+    assert np.isnan(load_predictor(tmp_path / "a.safetensors").residual_sd_nt)
+
+
+def test_a_poor_drive_is_warned_of(model):
+    for run, options, text in (
+        (a_run(3, seconds=20.0), {}, "it lasts 20 s, and 30 s are needed"),
+        (a_run(3, sector=np.pi / 4), {}, "its headings lie in 2 of 12 sectors"),
+        (
+            a_run(3),
+            {"pose_from_map": True},
+            "were estimated on the magnetic map, so the calibration is circular",
+        ),
+        (Run(dict(a_run(3)), {"pose_from_map": True}), {}, "were estimated on the magnetic map"),
+    ):
+        with pytest.warns(CalibrationWarning, match=text) as given:
+            calibrated = mt.calibrate(model, run, anomaly_map=FIELD, **options)
+        assert len(given) == 1
+        assert text.split(",")[0] in calibrated.metadata["calibration_warnings"]
+    other = AnomalyMap(
+        values_nt=FIELD.values_nt[:, ::-1],
+        origin_m=(-3.0, -3.0),
+        cell_m=(0.5, 0.5),
+        headings_rad=np.zeros(1),
+        name="b",
+    )
+    with pytest.warns(
+        CalibrationWarning, match="trained on the map 'trough' and is calibrated on another, 'b'"
+    ):
+        mt.calibrate(model, a_run(3), anomaly_map=other)
+
+
+def test_what_cannot_calibrate_is_refused_in_a_line(model, weights, tmp_path):
+    run = a_run(3)
+    x = np.random.default_rng(0).normal(size=(50, 3))
+    linear = fit_linear(x, x[:, 0], np.arange(50) % 3, features=NAMES).model
+    far = run.with_columns(p_world_base=run["p_world_base"] + 50)
+    simulated = Run(dict(run), {"magnetometer": "neural"})
+    (tmp_path / "there.safetensors").write_bytes(b"")
+    for refused, options, text in (
+        (linear, {}, "kind 'linear' has no effects of a session; train one with --model mixed"),
+        (model, {"duration_s": 2.0}, "labelled readings at most 4 a second, and 20 are needed"),
+        (model, {"run": far}, "none of 600 readings has a label on the map"),
+        (model, {"run": simulated}, "its readings come from a neural magnetometer"),
+        (model, {"run": run.select("t", "p_world_base", "yaw", "b_measured_nt")}, "no column 'odom_v'"),
+        (model, {"pose_sd_m": -1.0}, "pose_sd_m must be 0 or more and finite, got -1.0"),
+        (weights, {"out": tmp_path / "there.safetensors"}, "exists"),
+    ):
+        with pytest.raises(InputError) as error:
+            mt.calibrate(refused, options.pop("run", run), anomaly_map=FIELD, **options)
+        assert text in str(error.value)
+        assert "\n" not in str(error.value)
+
+
+def test_told_of_poses_that_are_off_it_errs_less_and_says_so(model):
+    """Errors of 20 cm, which make up to 360 nT where the map is steep."""
+    found = {0.0: [], 0.2: []}
+    for seed in range(400, 430):
+        run = a_run(seed, "hysteresis", seconds=120.0)
+        slow = np.repeat(np.random.default_rng(seed).normal(0, 0.2, (48, 2)), 25, axis=0)
+        moved = run.with_columns(p_world_base=run["p_world_base"] + np.column_stack([slow, np.zeros(1200)]))
+        for told, kept in found.items():
+            calibrated = mt.calibrate(model, moved, anomaly_map=FIELD, duration_s=60.0, pose_sd_m=told)
+            late = run["t"] > 60
+            error, sd = errors(calibrated, run)
+            kept.append((np.abs(error[late]).mean(), sd[late].mean()))
+    untold, told = (np.mean(kept, axis=0) for kept in found.values())
+    assert told[0] < untold[0]
+    assert told[1] < untold[1]  # untold errors widen by the blocks that were left out
+
+
+def test_online_it_follows_a_session_that_changes(model):
+    first, second = a_run(500, seconds=300.0), a_run(501, "hysteresis", seconds=300.0)
+    later = {name: np.concatenate([first[name], second[name]]) for name in first if name != "t"}
+    run = Run({"t": np.arange(6000) / 10, **later}, {"session": 1})
+    read = read_online(model, run, FIELD, delay_s=10.0)
+    label = run["b_measured_nt"] - FIELD.lookup(run["p_world_base"][:, :2], run["yaw"])
+    error, t = np.abs(read.disturbance_nt - label), run["t"]
+    assert error[(t > 60) & (t < 300)].mean() < 25
+    assert error[t > 480].mean() < 60 < error[(t > 300) & (t < 310)].mean()
+    inside = error < 1.645 * read.sd_nt
+    assert inside[(t > 60) & (t < 300)].mean() > 0.85
+
+
+def test_live_it_reads_what_a_whole_run_gives(model):
+    """A robot whose poses become known 10 s late, at the rate of the run."""
+    run = a_run(600, "hysteresis", seconds=90.0)
+    whole = read_online(model, run, FIELD, delay_s=9.95)
+    online = OnlineMagnetometer(model, FIELD, delay_s=9.95)  # so that rounding chooses no row
+    assert online.signals == ("odom_v",)
+
+    def at(k):
+        return run["p_world_base"][k, :2], float(run["yaw"][k]), {"odom_v": run["odom_v"][k]}
+
+    for k in range(run.rows):
+        if k >= 100:
+            online.update(run["t"][k - 100], *at(k - 100), run["b_measured_nt"][k - 100])
+        reading = online.read(run["t"][k], *at(k))
+        assert_allclose(reading.b_disturbance_nt, whole.disturbance_nt[k], rtol=1e-6)
+        assert_allclose(reading.b_sd_nt, whole.sd_nt[k], rtol=1e-4)
+    assert online.effects.count > 200
+
+
+def test_training_needs_sessions_and_a_nominal_plant(tmp_path):
+    for count, plant, text in (
+        (4, "", "a mixed model learns how sessions differ"),
+        (9, "all", "nominal plant"),
+    ):
+        runs = {f"r{k}": a_run(k, plant) for k in range(count)}
+        data = mt.build_dataset(runs, out=tmp_path / f"set{count}", anomaly_map=FIELD)
+        with pytest.raises(InputError, match=text):
+            mt.train(data, model="mixed", features=NAMES)
+
+
+def test_the_commands_calibrate_and_widen(weights, tmp_path, capsys):
+    a_run(7, "hysteresis", seconds=20.0).save(tmp_path / "drive.parquet")
+    mt.save_map(FIELD, tmp_path / "map.usdc")
+    words = [
+        weights,
+        tmp_path / "drive.parquet",
+        "--map",
+        tmp_path / "map.usdc",
+        "--out",
+        tmp_path / "now.safetensors",
+    ]
+    main(["calibrate", *map(str, words), "--json"])
+    out, err = capsys.readouterr()
+    assert "it lasts 20 s" in err
+    assert json.loads(out)
+    assert load_predictor(tmp_path / "now.safetensors").intervals == "calibrated"
+    main(["network", "widen", str(weights), "--out", str(tmp_path / "wide.safetensors"), "--quiet"])
+    assert load_predictor(tmp_path / "wide.safetensors").intervals == "unknown"

@@ -1,0 +1,192 @@
+"""The algebra of session effects, against independent computations."""
+
+import itertools
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.learn.mixed.effects import Effects, fit_effects, posterior, sums_of
+from magtwin.learn.mixed.session_effects import (
+    CORRELATION_S,
+    MEMORY_S,
+    FollowedEffects,
+    effects_of_drive,
+    shares,
+    thinned_rows,
+)
+
+P = 5
+
+
+def a_prior(seed=0, size=40.0):
+    rng = np.random.default_rng(seed)
+    root = size * rng.normal(size=(P, P))
+    return Effects(rng.normal(0, 100, P), root @ root.T + np.eye(P))
+
+
+def a_session(prior, rows, seed, noise_nt=20.0):
+    rng = np.random.default_rng(seed)
+    beta = rng.multivariate_normal(prior.mean, prior.covariance)
+    phi = np.column_stack([np.ones(rows), rng.normal(size=(rows, P - 1))])
+    variance = noise_nt**2 * np.exp(0.5 * rng.normal(size=rows))
+    return phi, phi @ beta + np.sqrt(variance) * rng.normal(size=rows), variance
+
+
+def dense(prior, phi, y, noise, at):
+    """Gaussian process regression in the space of readings: k = phi' Lambda phi (Rasmussen, eq. 2.25-26)."""
+    cross = at @ prior.covariance @ phi.T
+    whole = phi @ prior.covariance @ phi.T + np.diag(noise)
+    mean = at @ prior.mean + cross @ np.linalg.solve(whole, y - phi @ prior.mean)
+    return mean, np.diag(at @ prior.covariance @ at.T - cross @ np.linalg.solve(whole, cross.T))
+
+
+def test_the_posterior_is_that_of_regression_in_the_space_of_readings():
+    prior = a_prior()
+    phi, y, variance = a_session(prior, 30, 1)
+    at = np.random.default_rng(2).normal(size=(7, P))
+    found = posterior(prior, sums_of(phi, y, variance, 0.1)).predict(at)
+    mean, spread = dense(prior, phi, y, variance / 0.1, at)
+    assert_allclose(found[0], mean, rtol=1e-8)
+    assert_allclose(found[1], spread, rtol=1e-7)
+
+
+def test_sums_of_parts_add_up_and_no_reading_leaves_the_prior():
+    prior = a_prior()
+    phi, y, variance = a_session(prior, 30, 1)
+    parts = [sums_of(phi[at], y[at], variance[at], 0.2) for at in (slice(0, 11), slice(11, 30))]
+    whole, added = sums_of(phi, y, variance, 0.2), parts[0] + parts[1]
+    for name in vars(whole):
+        assert_allclose(getattr(added, name), getattr(whole, name), rtol=1e-12)
+    none = posterior(prior, sums_of(phi[:0], y[:0], variance[:0]))
+    assert_allclose(none.mean, prior.mean, rtol=1e-9)
+    assert_allclose(none.covariance, prior.covariance, rtol=1e-7)
+
+
+def test_a_prediction_does_not_depend_on_other_rows_to_the_bit():
+    effects, phi = a_prior(), np.random.default_rng(3).normal(size=(600, P))
+    mean, variance = effects.predict(phi)
+    alone = [effects.predict(phi[k : k + 1]) for k in (0, 255, 256, 599)]
+    assert_array_equal([float(m[0]) for m, _ in alone], mean[[0, 255, 256, 599]])
+    assert_array_equal([float(v[0]) for _, v in alone], variance[[0, 255, 256, 599]])
+
+
+def test_em_recovers_the_spread_between_sessions_and_the_noise():
+    prior, sessions = a_prior(size=30.0), []
+    for seed in range(400):
+        phi, y, variance = a_session(prior, 40, seed)
+        sessions.append(sums_of(phi, y, variance / 400.0))  # shape known, the factor 400 nT^2 unknown
+    fitted = fit_effects(sessions, prior.mean, start_nt2=np.full(P, 50.0))
+    assert fitted.factor == pytest.approx(400.0, rel=0.03)  # 16,000 readings: 1.1 % (one sd)
+    size = np.linalg.norm(prior.covariance)
+    assert np.linalg.norm(fitted.prior.covariance - prior.covariance) < 0.2 * size  # 400 draws: 7 % an entry
+
+
+def test_em_never_lowers_the_likelihood():
+    """Of sessions whose readings are independent, up to the shrinkage of correlations."""
+    prior = a_prior(size=10.0)
+    data = [a_session(prior, 12, seed) for seed in range(60)]
+    sessions = [sums_of(phi, y, variance / 400.0) for phi, y, variance in data]
+
+    def likelihood(rounds):
+        fitted = fit_effects(sessions, prior.mean, start_nt2=np.full(P, 1e4), rounds=rounds)
+        total = 0.0
+        for phi, y, variance in data:
+            whole = phi @ fitted.prior.covariance @ phi.T + np.diag(fitted.factor * variance / 400.0)
+            left = y - phi @ prior.mean
+            total -= 0.5 * (np.linalg.slogdet(whole)[1] + left @ np.linalg.solve(whole, left))
+        return total
+
+    found = [likelihood(rounds) for rounds in (1, 2, 4, 8)]
+    assert all(after > before for before, after in itertools.pairwise(found))
+
+
+def test_a_drive_in_blocks_has_the_posterior_of_all_its_readings():
+    prior, t = a_prior(), np.arange(240) / 4
+    phi, y, variance = a_session(prior, 240, 5)
+    drive = effects_of_drive(prior, phi, y, variance, t)
+    assert shares(t) == pytest.approx(0.25 / CORRELATION_S)
+    expected = posterior(prior, sums_of(phi, y, variance, shares(t)))
+    assert_allclose(drive.effects.mean, expected.mean, rtol=1e-9)
+    assert drive.left_out_nt == pytest.approx(20.0, rel=0.4)
+
+
+def test_a_drive_whose_noise_is_greater_than_thought_widens_its_intervals():
+    prior, t = a_prior(size=5.0), np.arange(240) / 4
+    phi, y, variance = a_session(prior, 240, 6)
+    calm = effects_of_drive(prior, phi, y, variance, t).widening
+    assert effects_of_drive(prior, phi, y, variance / 9, t).widening > 2 * calm
+
+
+def test_intervals_hold_on_sessions_of_the_prior():
+    prior, held = a_prior(), []
+    for seed in range(60):
+        phi, y, variance = a_session(prior, 300, seed)
+        early, t = np.arange(300) < 240, np.arange(300) / 4
+        drive = effects_of_drive(prior, phi[early], y[early], variance[early], t[early])
+        mean, spread = drive.effects.predict(phi[~early])
+        sd = drive.widening * np.sqrt(variance[~early] + spread)
+        held.append(np.mean(np.abs(mean - y[~early]) < 1.645 * sd))
+    assert np.mean(held) == pytest.approx(0.9, abs=0.04)
+
+
+def kernel_of_time(prior, phi, t, at, t_at):
+    """Covariance of phi' beta at two times: beta is an Ornstein-Uhlenbeck process about mu."""
+    return (at @ prior.covariance @ phi.T) * np.exp(-np.abs(t_at[:, None] - t) / MEMORY_S)
+
+
+def test_followed_effects_are_regression_with_the_kernel_of_their_process():
+    """A peer without recursion: all readings at once, with the covariance of the process between times."""
+    prior, t = a_prior(), np.cumsum(np.random.default_rng(0).uniform(0.25, 40.0, 60))
+    phi, y, variance = a_session(prior, 60, 7)
+    filtered = FollowedEffects(prior)
+    for k in range(60):
+        assert filtered.update(t[k], phi[k], y[k], variance[k])
+    weight = np.minimum(np.diff(t, prepend=t[0] - 0.25), CORRELATION_S) / CORRELATION_S
+    at, later = np.random.default_rng(8).normal(size=(4, P)), np.full(4, t[-1] + 100.0)
+    cross = kernel_of_time(prior, phi, t, at, later)
+    whole = kernel_of_time(prior, phi, t, phi, t) + np.diag(variance / weight)
+    mean = at @ prior.mean + cross @ np.linalg.solve(whole, y - phi @ prior.mean)
+    spread = at @ prior.covariance @ at.T - cross @ np.linalg.solve(whole, cross.T)
+    found = filtered.effects(later[0]).predict(at)
+    assert_allclose(found[0], mean, rtol=1e-6)
+    assert_allclose(found[1], np.diag(spread), rtol=1e-6)
+
+
+def test_readings_that_are_too_close_late_or_unknown_are_skipped():
+    filtered = FollowedEffects(a_prior())
+    one = np.ones(P)
+    assert filtered.update(0.0, one, 100.0, 400.0)
+    assert not filtered.update(0.1, one, 100.0, 400.0)
+    assert not filtered.update(-5.0, one, 100.0, 400.0)
+    assert not filtered.update(1.0, one, np.nan, 400.0)
+    assert not filtered.update(1.0, one * np.nan, 100.0, 400.0)
+    assert filtered.update(1.0, one, 100.0, 400.0)
+    assert filtered.count == 2
+
+
+def test_long_without_readings_it_returns_to_the_prior():
+    prior = a_prior()
+    filtered = FollowedEffects(prior)
+    filtered.update(0.0, np.ones(P), 1e4, 1.0)
+    assert np.abs(filtered.mean - prior.mean).max() > 1.0
+    assert_allclose(filtered.effects(20 * MEMORY_S).mean, prior.mean, atol=1e-3)
+
+
+def test_errors_larger_than_thought_widen_what_follows():
+    prior, rng = a_prior(size=1.0), np.random.default_rng(0)
+
+    def widening(noise_nt):
+        filtered = FollowedEffects(prior)
+        for k in range(800):
+            phi = np.append(1.0, rng.normal(size=P - 1))
+            filtered.update(k / 4, phi, phi @ prior.mean + noise_nt * rng.normal(), 400.0)
+        return filtered.widening
+
+    assert widening(20.0) == pytest.approx(1.0, abs=0.15)
+    assert widening(60.0) == pytest.approx(2.7, abs=0.5)  # a prior of 30 s pulls towards 1
+
+
+def test_thinned_rows_are_a_quarter_second_apart_and_begin_anew_with_time():
+    t = np.append(np.arange(100) / 100, np.arange(100) / 100)
+    assert thinned_rows(t).tolist() == [0, 25, 50, 75, 100, 125, 150, 175]
