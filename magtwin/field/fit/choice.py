@@ -24,7 +24,7 @@ Rows = NDArray[np.intp]
 Progress = Callable[[int, int, str], Any]
 
 LEAST_READINGS = 40  # Fewest good readings of which some are left out; below, the method is harmonic
-MOST_FITTED = 450  # Most means of readings of a drive that the trials are fitted to
+MOST_FITTED = 400  # Most means of readings of a drive that the trials are fitted to
 MOST_TESTED = 2000  # Most readings of a drive that the trials predict
 NEAR = 2.0  # Only readings this near to a fitted one count, in spacings: a map is masked beyond
 NODE_PARTS, NODES_LEFT_OUT = 5, (0, 2)  # Parts of a grid's nodes, and those that are left out in turn
@@ -197,8 +197,9 @@ def _candidates(readings: Readings, earth_nt: Any, kernel: Kernel | None) -> lis
     for above in (False, True):
         harmonic, layer = {"earth_nt": earth_nt, "above": above}, ", layer above" * above
         found.append(Candidate(f"harmonic{layer}", "harmonic", harmonic))
-        if readings.b_body_nt is not None:
-            found.append(Candidate(f"harmonic of magnitudes{layer}", "harmonic", harmonic, magnitudes=True))
+    if readings.b_body_nt is not None:
+        options = {"earth_nt": earth_nt, "above": False}
+        found.append(Candidate("harmonic of magnitudes", "harmonic", options, magnitudes=True))
     kernels: tuple[Kernel, ...] = ("poisson", "matern") if kernel is None else (kernel,)
     found += [Candidate(f"gp {name}", "gp", {"kernel": name}) for name in kernels]
     if readings.grid is not None:
