@@ -164,8 +164,8 @@ def evaluate(
         train: Data set that baselines are fitted to. If given, the Tolles-Lawson regression is also
             evaluated on each map. Without it, the mean label is taken from weights that were trained on the
             first map.
-        cases: Further rows of the table, as a mapping from the name of the row to its path. A name from A to
-            E replaces that row of the paper, as in {"D": "lawnmower.csv"}.
+        cases: Further rows of the table: from the name of a row to the path that the robot drives. If the
+            name is one of A to E, this path is used instead of the paper's, as in {"D": "lawnmower.csv"}.
         any_map: Use the first map for weights whose own map is not among those given.
         truth: Compare with the exact field of simulated runs instead of the reading.
         seed: Seed of the random resampling that gives the confidence intervals.

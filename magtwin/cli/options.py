@@ -65,8 +65,8 @@ Plant = Annotated[
     str | None,
     Parameter(
         name="--plant",
-        help="Effects in the robot's field that its linear platform model lacks: hysteresis, warm-up, "
-        "nonlinear, moving-part; drawn: larger random differences between sessions; all; or nominal: none. "
+        help="Effects in the robot's field that its linear platform model lacks: one of hysteresis, "
+        "warm-up, nonlinear, moving-part, drawn (larger random differences between sessions), all, nominal (none). "
         "NAME:SEED draws the constants of an effect from another seed. Default: the scene's.",
     ),
 ]

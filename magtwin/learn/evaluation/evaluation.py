@@ -147,7 +147,7 @@ class Evaluation(Summarized):
             lines[candidate.name] = verdict(
                 score.mae_nt,
                 naive,
-                than=f"the naive model with the map {self.candidates[0].map.name}",
+                than=f"the naive model, which uses the map {self.candidates[0].map.name!r}",
                 interval=score.ratio_interval,
                 coverage=score.coverage,
                 judged_on=recordings_text(len(self.judged), sessions, paths, *learned),
