@@ -70,7 +70,7 @@ def map_import(
 def map_fit(
     *sources: Sources,
     out: Path,
-    method: Literal["trilinear", "cubic", "gp", "harmonic"] = "harmonic",
+    method: Literal["auto", "trilinear", "cubic", "gp", "harmonic"] = "auto",
     kernel: Kernel = None,
     earth: Earth = None,
     spacing_m: float | None = None,
@@ -88,8 +88,9 @@ def map_fit(
     out
         Map layer to write (.usdc).
     method
-        trilinear interpolation between nodes, cubic, a Gaussian process (gp), or the field of equivalent
-        dipoles with the robot's own field (harmonic).
+        trilinear interpolation between nodes, cubic, a Gaussian process (gp), the field of equivalent dipoles
+        with the robot's own field (harmonic), or the one of these, or mixture of two, that best predicts
+        readings left out (auto).
     spacing_m
         Spacing of the map's nodes [m]. Default for trilinear: that of the survey. Default for other methods:
         the widest with almost no loss of accuracy. The report gives the interpolation error.
@@ -102,7 +103,7 @@ def map_fit(
 
     check_output(out, LAYERS, "a map layer", force=force)
     angles = None if headings_deg is None else headings_rad(headings_deg)
-    with progress(f"Fitting {method}") as advance:
+    with progress("Fitting" if method == "auto" else f"Fitting {method}") as advance:
         report = fit_survey(
             sources,
             out,
@@ -122,7 +123,7 @@ def map_fit(
 @map_app.command(name="validate")
 def map_validate(
     *sources: Sources,
-    method: list[Literal["trilinear", "cubic", "gp", "harmonic"]] | None = None,
+    method: list[Literal["auto", "trilinear", "cubic", "gp", "harmonic"]] | None = None,
     split: Literal["checkerboard", "heading", "run", "block"] | None = None,
     kernel: Kernel = None,
     earth: Earth = None,
@@ -136,7 +137,7 @@ def map_validate(
     sources
         Readings in any format that `magtwin map import` reads, or the .parquet files that it writes.
     method
-        Method to validate. May be repeated. Default: all methods.
+        Method to validate. May be repeated. Default: all but auto.
     split
         What is left out at a time: every other node, one heading, one run, or blocks of the floor. Default:
         nodes of a gridded survey, runs if there are several, else blocks.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError, hint
 from magtwin.field.fit.fit import fit
 from magtwin.field.fit.interpolation import check_readings
-from magtwin.field.fit.methods import METHODS
+from magtwin.field.fit.methods import METHODS, FieldModel
 from magtwin.field.survey.bins import spacing_m
 from magtwin.field.survey.readings import Readings
 from magtwin.report import Figure, Report
@@ -44,7 +44,7 @@ def check(
 
     Args:
         readings: A survey.
-        methods: Names of map methods. Default: all.
+        methods: Names of map methods. Default: all but "auto".
         split: "checkerboard": every other node of a gridded survey at all headings, then the others.
             "heading": one nominal heading of a gridded survey at a time. "run": one run at a time. "block":
             every fifth block of three spacings, in five turns. Or the rows to fit and to predict of each
@@ -62,7 +62,7 @@ def check(
     Raises:
         InputError: No such method or split, the split does not fit the survey, or nothing is left to predict.
     """
-    methods = list(METHODS) if methods is None else list(methods)
+    methods = [name for name in METHODS if name != "auto"] if methods is None else list(methods)
     for name in methods:
         METHODS[name]  # refuses unknown names
     if not methods or len(set(methods)) < len(methods):
@@ -84,12 +84,13 @@ def check(
         mean, variance = [], []
         for train, test in turns:
             if method == "naive":
-                shown = readings.b_nt[train]
-                m, v = np.full(len(test), shown.mean()), np.full(len(test), shown.var())
+                seen = readings.b_nt[train]
+                m, v = np.full(len(test), seen.mean()), np.full(len(test), seen.var())
             else:
                 say(step, steps, method)
                 step += 1
-                m, v = _predict(_shown(readings, train), readings.take(test), method, options.get(method, {}))
+                model = fit(shown(readings, train), method, **options.get(method, {}))
+                m, v = predict_readings(model, readings.take(test), method)
             mean.append(m)
             variance.append(v)
         figures += _figures(method, readings, tested, np.concatenate(mean), np.concatenate(variance), heading)
@@ -100,21 +101,20 @@ def check(
     return Report(f"check of {readings.name or 'survey'}", tuple(figures), metadata)
 
 
-def _shown(readings: Readings, rows: Rows) -> Readings:
+def shown(readings: Readings, rows: Rows) -> Readings:
     """Some readings, on a grid of only the headings that they have."""
-    shown = readings.take(rows)
-    if shown.grid is None or shown.node is None:
-        return shown
-    left, heading = np.unique(shown.node[:, 0], return_inverse=True)
-    if len(left) == len(shown.grid.headings_rad):
-        return shown
-    grid = replace(shown.grid, headings_rad=tuple(shown.grid.headings_rad[h] for h in left))
-    return shown.with_(grid=grid, node=np.column_stack([heading.ravel(), shown.node[:, 1:]]))
+    some = readings.take(rows)
+    if some.grid is None or some.node is None:
+        return some
+    left, heading = np.unique(some.node[:, 0], return_inverse=True)
+    if len(left) == len(some.grid.headings_rad):
+        return some
+    grid = replace(some.grid, headings_rad=tuple(some.grid.headings_rad[h] for h in left))
+    return some.with_(grid=grid, node=np.column_stack([heading.ravel(), some.node[:, 1:]]))
 
 
-def _predict(train: Readings, test: Readings, method: str, options: Mapping[str, Any]) -> tuple[Array, Array]:
+def predict_readings(model: FieldModel, test: Readings, method: str) -> tuple[Array, Array]:
     """Mean [nT] and variance with noise [nT^2] of readings, at nominal headings if the method uses those."""
-    model = fit(train, method, **options)
     yaw = test.yaw
     if test.grid is not None and test.node is not None and method in FILLED:
         yaw = np.asarray(test.grid.headings_rad)[test.node[:, 0]]
@@ -132,16 +132,16 @@ def _turns(
     if split is None:
         runs = len(np.unique(readings.run[good])) > 1
         split = "checkerboard" if readings.grid is not None else "run" if runs else "block"
-    part, description = _parts(readings, split)
-    parts = np.unique(part[good])
-    if len(parts) < 2:
+    part, description = parts(readings, split)
+    names = np.unique(part[good])
+    if len(names) < 2:
         raise InputError(
             f"split {split!r} leaves nothing out of {readings.name!r}: all readings are in one part"
         )
-    return description, [(good[part[good] != k], good[part[good] == k]) for k in parts]
+    return description, [(good[part[good] != k], good[part[good] == k]) for k in names]
 
 
-def _parts(readings: Readings, split: str) -> tuple[Rows, str]:
+def parts(readings: Readings, split: str) -> tuple[Rows, str]:
     """Part of each reading in a split, and what a part is."""
     if split not in SPLITS:
         raise InputError(f"no split {split!r}; {hint(split, SPLITS)}")

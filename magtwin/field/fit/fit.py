@@ -36,7 +36,7 @@ MOST_THREADS = 4  # Headings of a raster that are computed in parallel: each hol
 
 
 def fit(
-    readings: Readings, method: str = "harmonic", *, progress: Progress | None = None, **options: Any
+    readings: Readings, method: str = "auto", *, progress: Progress | None = None, **options: Any
 ) -> FieldModel:
     """Fit a method to the good readings of a survey.
 
@@ -64,7 +64,7 @@ def fit(
 
 def fit_map(
     survey: Readings,
-    method: str = "harmonic",
+    method: str = "auto",
     *,
     spacing_m: float | None = None,
     headings_rad: ArrayLike | None = None,
@@ -75,7 +75,8 @@ def fit_map(
 
     Args:
         survey: Readings at known poses.
-        method: One of `METHODS`: "harmonic", "gp", "trilinear", "cubic" or a registered method.
+        method: One of `METHODS`: "auto" (the best at readings left out, see `magtwin.field.fit.choice`),
+            "harmonic", "gp", "trilinear", "cubic" or a registered method.
         spacing_m: Distance between nodes [m]. Default: the widest with almost no loss of accuracy.
         headings_rad: Headings of the map's grids [rad], one grid each. Default: the fewest with almost no
             loss of accuracy.

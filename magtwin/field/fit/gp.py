@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 Progress = Callable[[int, int, str], Any]
 
-MOST = 4000  # Most readings, or means of adjacent ones, in the conditioning: 128 MB of covariance
+MOST = 2500  # Most readings, or means of adjacent ones, in the conditioning: 50 MB of covariance
 MOST_LEARNT = 800  # Most of these from which the hyperparameters are learnt
 MOST_TRIED = 240  # Most of these on which the starts are tried
 STARTS = (1.0, 0.4, 2.5)  # Initial reaches of the optimisation, as factors of the first guess

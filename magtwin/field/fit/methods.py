@@ -74,6 +74,7 @@ METHODS: Registry[MapMethod] = Registry(
         "cubic": "magtwin.field.fit.interpolation:fit_cubic",
         "gp": "magtwin.field.fit.gp:fit_gp",
         "harmonic": "magtwin.field.fit.harmonic.inversion:fit_harmonic",
+        "auto": "magtwin.field.fit.choice:fit_auto",
     },
 )
 map_method = METHODS.register  # Decorator that names a map method

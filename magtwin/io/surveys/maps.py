@@ -11,6 +11,7 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.survey.changes import changes_line
 from magtwin.field.survey.folder import node_map
 from magtwin.field.survey.folder import read_survey as read_folder
 from magtwin.field.survey.readings import TAKEN, Readings
@@ -21,7 +22,7 @@ from magtwin.io.surveys.columns import Columns
 from magtwin.io.surveys.readings import is_pattern, read_readings, save_readings
 from magtwin.report import Report
 
-Method = Literal["trilinear", "cubic", "gp", "harmonic"]
+Method = Literal["auto", "trilinear", "cubic", "gp", "harmonic"]
 Split = Literal["checkerboard", "heading", "run", "block"]
 Source = str | os.PathLike[str]
 Progress = Callable[..., None]
@@ -127,7 +128,7 @@ def fit_survey(
     sources: Sequence[Source],
     out: Source,
     *,
-    method: Method = "harmonic",
+    method: Method = "auto",
     kernel: Literal["matern", "poisson"] | None = None,
     earth: str | None = None,
     spacing_m: float | None = None,
@@ -142,8 +143,8 @@ def fit_survey(
     Args:
         sources: As for `import_survey`.
         out: Map layer to write (.usdc).
-        method: One of `magtwin.field.fit.fit.METHODS`.
-        kernel: Covariance of the Gaussian process. None: poisson.
+        method: One of `magtwin.field.fit.fit.METHODS`; "auto" is the best at readings left out.
+        kernel: Covariance of the Gaussian process. None: poisson; for "auto", the better one.
         earth: The Earth's field for the harmonic fit, as for `magtwin.author.earth.earth_of`.
         spacing_m: Spacing of the map's nodes [m]. None: chosen by accuracy.
         headings_rad: Headings of the map [rad]. None: chosen by accuracy.
@@ -158,6 +159,7 @@ def fit_survey(
     Raises:
         InputError: A source cannot be read, has too few good readings, or the output cannot be written.
     """
+    from magtwin.field.fit.choice import choice_report
     from magtwin.field.fit.fit import fit, grid_report, raster
     from magtwin.usd.maps import save_map
 
@@ -170,7 +172,7 @@ def fit_survey(
     named = readings.with_(name=about.name or out.stem)
     field = raster(model, named, spacing_m=spacing_m, headings_rad=headings_rad, progress=progress)
     save_map(field, out, force=force)
-    return _joined(field.report(), grid_report(field), report)
+    return _joined(field.report(), choice_report(field.parameters), grid_report(field), report)
 
 
 def validate_methods(
@@ -188,7 +190,7 @@ def validate_methods(
 
     Args:
         sources: As for `import_survey`.
-        methods: Methods to validate. None: all.
+        methods: Methods to validate. None: all but "auto".
         split: What is left out. None: nodes of a gridded survey, runs if there are several, else blocks.
         kernel: Covariance of the Gaussian process. None: poisson.
         earth: The Earth's field for the harmonic fit, as for `magtwin.author.earth.earth_of`.
@@ -202,7 +204,7 @@ def validate_methods(
     from magtwin.field.fit.check import FILLED, check
     from magtwin.field.fit.fit import METHODS
 
-    chosen = list(methods or METHODS)
+    chosen = list(methods or (name for name in METHODS if name != "auto"))
     options = {**FILLED, **_method_options(chosen, kernel, earth)}
     readings, _ = read_survey(sources, **reading)
     if split is None:
@@ -306,6 +308,8 @@ def _doubts(readings: Readings, source: Source) -> list[str]:
         doubts.append(f"only {count} good readings: the map is valid only next to them")
     if (span := float(np.ptp(readings.p_xy, axis=0).max())) > USUAL_SPAN_M:
         doubts.append(f"the readings span {span:,.0f} m: are their positions in metres?")
+    if line := changes_line(readings):
+        doubts.append(line)
     mean = np.exp(1j * yaw).mean()
     if np.abs(mean) >= ONE_HEADING:
         doubts.append(
@@ -342,10 +346,15 @@ def _method_options(
     from magtwin.author.earth import earth_of
 
     for name, value, method in (("kernel", kernel, "gp"), ("earth", earth, "harmonic")):
-        if value is not None and method not in methods:
+        if value is not None and not {method, "auto"} & set(methods):
             raise InputError(f"`{name}` is for `method={method}`; drop it for {methods[0]}", parameter=name)
-    options = {} if kernel is None else {"gp": dict[str, Any](kernel=kernel)}
-    return options if earth is None else {**options, "harmonic": {"earth_nt": earth_of(earth)}}
+    options: dict[str, dict[str, Any]] = {"auto": {}}
+    if kernel is not None:
+        options["gp"] = options["auto"] = {"kernel": kernel}
+    if earth is not None:
+        options["harmonic"] = {"earth_nt": earth_of(earth)}
+        options["auto"] = {**options["auto"], **options["harmonic"]}
+    return options
 
 
 def _joined(report: Report, *below: Report) -> Report:

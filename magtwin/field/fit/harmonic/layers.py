@@ -25,7 +25,7 @@ REACH = 0.6  # Distance over which dipoles share one strength, in their layer's 
 MOST_DIPOLES = 1500  # Most dipoles; larger layers are thinned
 FEW_ROWS = 2700  # Most reading components whose matrix is factored; beyond, that of the unknowns is
 DIPOLES_OF_MANY = 800  # Most dipoles if there are more rows than `FEW_ROWS`
-# Most dipoles for the magnitudes of a drive: more took 15 times as long and predicted no better
+# Most dipoles for a drive: more took 4 times (vectors) to 15 times as long and predicted no better
 DIPOLES_OF_DRIVE = 500
 
 
@@ -60,7 +60,7 @@ def layers_below(good: Readings, depths: tuple[float, ...], height_m: float) -> 
     low, high = good.p_xy.min(axis=0), good.p_xy.max(axis=0)
     part = SHEET
     most = DIPOLES_OF_DRIVE
-    if good.node is not None or good.b_body_nt is not None:
+    if good.node is not None:
         rows = 1 + int(means(good, min(map(abs, depths)))[0].max())
         rows *= 1 if good.b_body_nt is None else 3
         most = MOST_DIPOLES if rows <= FEW_ROWS else DIPOLES_OF_MANY

@@ -1,0 +1,151 @@
+"""The choice of a method by readings left out, and mixtures of two."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from test_fit import drive
+from test_gp import survey
+
+from magtwin.field.fit import choice
+from magtwin.field.fit.choice import CANDIDATES, CHOSEN, RMSE, SCORE, choice_report, fit_auto
+from magtwin.field.fit.fit import fit, raster
+from magtwin.field.fit.methods import METHODS, FittedModel
+from magtwin.field.fit.mixture import Mixture, mixed
+
+
+class Told(FittedModel):
+    """Predicts a constant with a given sd."""
+
+    def __init__(self, method, value, sd, noise=0.0):
+        self.method, self.value, self.sd = method, value, sd
+        self.noise_nt2, self.parameters = noise, {"value": value}
+
+    def predict(self, p_xy, yaw):
+        shape = np.broadcast_shapes(np.shape(p_xy)[:-1], np.shape(yaw))
+        return np.full(shape, self.value), np.full(shape, self.sd**2)
+
+
+@pytest.fixture(scope="module")
+def chosen():
+    readings = survey()
+    heard = []
+    model = fit_auto(readings, progress=lambda done, total, what: heard.append((done, total, what)))
+    return readings, model, heard
+
+
+def test_the_best_at_left_out_readings_is_fitted_to_all_of_them(chosen):
+    readings, model, _ = chosen
+    told = model.parameters
+    names, score, rmse = told[CANDIDATES], told[SCORE], told[RMSE]
+    assert {"harmonic", "harmonic, layer above", "gp poisson", "gp matern"} <= set(names)
+    assert len(names) == len(score) == len(rmse)
+    assert len([name for name in names if "+" in name]) == 1
+    finalists = [score[k] for k, name in enumerate(names) if "+" in name or name == told[CHOSEN]]
+    assert max(finalists) == score[names.index(told[CHOSEN])]
+    assert rmse[names.index(told[CHOSEN])] < 100
+    assert model.parameters["readings"] == readings.good.sum()
+
+
+def test_a_choice_is_repeated_to_the_last_bit(chosen):
+    readings, model, _ = chosen
+    again = fit_auto(readings)
+    assert again.parameters == model.parameters
+    for a, b in zip(*(m.predict(readings.p_xy, readings.yaw) for m in (again, model)), strict=True):
+        assert_array_equal(a, b)
+
+
+def test_progress_never_goes_back_and_names_what_is_tried(chosen):
+    _, _, heard = chosen
+    done = [d for d, _, _ in heard]
+    assert done == sorted(done)
+    assert heard[-1][0] == heard[-1][1]
+    assert any(what.startswith("trying gp matern") for *_, what in heard)
+    assert any(what.startswith("fitting ") for *_, what in heard)
+
+
+def test_the_report_has_a_line_for_every_candidate(chosen):
+    _, model, _ = chosen
+    figures = {f.name: f for f in choice_report(model.parameters).figures}
+    assert figures["chosen method"].value == model.parameters[CHOSEN]
+    assert "leads the next by" in figures["chosen method"].note
+    assert "log score" in figures["held out, gp matern"].note
+    assert figures["held out, gp matern"].unit == "nT"
+    assert choice_report({}).figures == ()
+
+
+def test_a_map_keeps_the_choice(chosen):
+    readings, model, _ = chosen
+    field = raster(model, readings, spacing_m=0.25, headings_rad=(0.0, 1.5))
+    assert field.parameters[CHOSEN] == model.parameters[CHOSEN]
+    assert field.method == model.method
+
+
+def test_few_readings_get_a_harmonic_fit():
+    readings = drive(30)
+    model = fit(readings, "auto")
+    assert model.method == "harmonic"
+    assert "too few readings" in model.parameters[CHOSEN]
+
+
+def test_a_drive_is_thinned_and_tested_only_near_its_readings():
+    readings = drive(3000)
+    ((rest, test),) = choice._held_out(readings)
+    assert len(rest) <= choice.MOST_FITTED
+    assert 100 < len(test) <= choice.MOST_TESTED
+
+
+def test_one_of_several_runs_is_left_out():
+    readings = drive(900).with_(run=np.repeat([0, 1, 2], 300), runs=("a", "b", "c"))
+    ((rest, test),) = choice._held_out(readings)
+    assert set(test.run) == {1}
+    assert set(rest.run) == {0, 2}
+
+
+def test_every_fifth_node_is_left_out_at_all_its_headings_twice():
+    readings = survey()
+    nodes = [set(map(tuple, test.node[:, 1:])) for _, test in choice._held_out(readings)]
+    assert len(nodes) == 2
+    assert not nodes[0] & nodes[1]
+    for (rest, test), own in zip(choice._held_out(readings), nodes, strict=True):
+        assert len(test) == 4 * len(own)
+        assert not own & set(map(tuple, rest.node[:, 1:]))
+
+
+def test_vectors_are_tried_with_and_without_directions():
+    readings = survey()
+    body = np.column_stack([0 * readings.b_nt, 0 * readings.b_nt, -readings.b_nt])
+    names = [c.name for c in choice._candidates(readings.with_(b_body_nt=body), None, "matern")]
+    assert "harmonic of magnitudes" in names
+    assert "gp poisson" not in names
+
+
+def test_a_method_that_refuses_the_survey_is_left_out_of_the_choice(monkeypatch):
+    from magtwin.errors import InputError
+
+    def refuse(readings, *, earth_nt=None, above=None, kernel=None, fill=False):
+        raise InputError("no")
+
+    monkeypatch.setitem(METHODS._loaded, "harmonic", refuse)
+    model = fit_auto(survey(), kernel="matern")
+    assert model.parameters[CHOSEN] == "gp matern"
+    monkeypatch.setitem(METHODS._loaded, "gp", refuse)
+    monkeypatch.setitem(METHODS._loaded, "trilinear", refuse)
+    with pytest.raises(InputError, match="no"):
+        fit_auto(survey())
+
+
+def test_a_mixture_is_the_weighted_mean_with_the_sd_of_fully_correlated_errors():
+    mean, variance = mixed(
+        (0.25, 0.75), [np.array([100.0]), np.array([200.0])], [np.array([16.0]), np.array([4.0])]
+    )
+    assert_allclose(mean, 175)
+    assert_allclose(variance, (0.25 * 4 + 0.75 * 2) ** 2)
+    model = Mixture.of([Told("one", 100.0, 4.0, 9.0), Told("two", 200.0, 2.0, 1.0)], (0.25, 0.75))
+    value, variance = model.predict(np.zeros((3, 2)), np.zeros(3))
+    assert_allclose(value, 175)
+    assert_allclose(variance, 6.25)
+    assert_allclose(model.noise_nt2, (0.25 * 3 + 0.75) ** 2)
+    assert (model.method, model.field) == ("one + two", None)
+    assert model.parameters == {"value": 100.0, "two value": 200.0, "weights": [0.25, 0.75]}
+    value, _ = model.predict_nodes(np.zeros((2, 4, 2)), 0.5)
+    assert value.shape == (2, 4)
