@@ -11,7 +11,7 @@ from magtwin.errors import InputError
 from magtwin.field.fit.check import parts, predict_readings, shown
 from magtwin.field.fit.covariance import Kernel
 from magtwin.field.fit.fit import fit
-from magtwin.field.fit.harmonic.layers import LEAST_DEPTH_M
+from magtwin.field.fit.harmonic.layers import DIPOLES_OF_DRIVE, LEAST_DEPTH_M
 from magtwin.field.fit.methods import FieldModel
 from magtwin.field.fit.mixture import Mixture, mixed
 from magtwin.field.survey.bins import means, spacing_m
@@ -194,11 +194,12 @@ def _lead(parameters: Mapping[str, Any]) -> str:
 
 def _candidates(readings: Readings, earth_nt: Any, kernel: Kernel | None) -> list[Candidate]:
     found = list[Candidate]()
+    common = {"earth_nt": earth_nt, "most_dipoles": DIPOLES_OF_DRIVE if readings.grid is None else None}
     for above in (False, True):
-        harmonic, layer = {"earth_nt": earth_nt, "above": above}, ", layer above" * above
-        found.append(Candidate(f"harmonic{layer}", "harmonic", harmonic))
+        layer = ", layer above" * above
+        found.append(Candidate(f"harmonic{layer}", "harmonic", {**common, "above": above}))
     if readings.b_body_nt is not None:
-        options = {"earth_nt": earth_nt, "above": False}
+        options = {**common, "above": False}
         found.append(Candidate("harmonic of magnitudes", "harmonic", options, magnitudes=True))
     kernels: tuple[Kernel, ...] = ("poisson", "matern") if kernel is None else (kernel,)
     found += [Candidate(f"gp {name}", "gp", {"kernel": name}) for name in kernels]

@@ -49,43 +49,43 @@ def fit_harmonic(
     hard_iron_nt: ArrayLike | None = None,
     soft_iron: ArrayLike | None = None,
     above: bool | None = None,
+    most_dipoles: int | None = None,
     progress: Progress | None = None,
 ) -> HarmonicModel:
     """Fit a field without curl or divergence, and the platform, to a survey.
 
-        Vectors are fitted if the survey has them, else magnitudes. A platform is fitted if the headings differ;
-        otherwise it is part of the field. Readings of a drive within a short distance are averaged. If the
-        sensor's height is unknown, heights count from the sensor.
+    Vectors are fitted if the survey has them, else magnitudes. A platform is fitted if the headings differ;
+    otherwise it is part of the field. Readings of a drive within a short distance are averaged. If the
+    sensor's height is unknown, heights count from the sensor.
 
-        Layers of dipoles are 1.8 spacings of the survey (0.9 of a drive) below the sensor, at least
-        `LEAST_DEPTH_M` and the sensor's height, at twice and four times that, and, if the evidence is for it,
-        above the sensor at twice that.
+    Layers of dipoles are 1.8 spacings of the survey (0.9 of a drive) below the sensor, at least
+    `LEAST_DEPTH_M` and the sensor's height, at twice and four times that, and, if the evidence is for it,
+    above the sensor at twice that.
 
-        Magnitudes leave the field's sign open: B and -B read the same with the hard iron reversed. If the Earth's
-        field is unknown, the uniform field is assumed to point down with the readings' median magnitude, with a
-        standard deviation of half of it per component (valid on the northern hemisphere). The fit starts from
-        several directions and continues from the likeliest. Give the Earth's field if it is known
-        (`magtwin.field.sources.earth`). For vector readings, the uniform field is assumed near their mean.
+    Magnitudes leave the field's sign open: B and -B read the same with the hard iron reversed. If the Earth's
+    field is unknown, the uniform field is assumed to point down with the readings' median magnitude, with a
+    standard deviation of half of it per component (valid on the northern hemisphere). The fit starts from
+    several directions and continues from the likeliest. Give the Earth's field if it is known
+    (`magtwin.field.sources.earth`). For vector readings, the uniform field is assumed near their mean.
 
-        Magnitudes of a robot that turns about the vertical alone do not tell its hard and soft iron from the
-        uniform field. The magnitudes of the map hardly depend on how they are shared, but the vectors do: without
-        a known platform `HarmonicModel.predict_vector` gives nan.
+    Magnitudes of a robot that turns about the vertical alone do not tell its hard and soft iron from the
+    uniform field. The magnitudes of the map hardly depend on how they are shared, but the vectors do: without
+    a known platform `HarmonicModel.predict_vector` gives nan.
 
-        Args:
-            readings: A survey; only its good readings are used.
-            earth_nt: The Earth's field in world axes [nT]. Default: that of the readings.
-    <<<<<<< HEAD
-            hard_iron_nt: The robot's hard iron in base_link axes [nT], shape (3,), if it is known. An error of 50
-                nT moves the vector field by 2,000 nT.
-            soft_iron: Its soft iron [nT per nT], shape (3, 3), given with `hard_iron_nt`. Default: 0 then.
-    =======
-            above: Whether a layer of dipoles lies above the sensor. Default: if the evidence is for it.
-    >>>>>>> auto
-            progress: Called as progress(done, total, what), once per round.
+    Args:
+        readings: A survey; only its good readings are used.
+        earth_nt: The Earth's field in world axes [nT]. Default: that of the readings.
+        hard_iron_nt: The robot's hard iron in base_link axes [nT], shape (3,), if it is known. An error of 50
+            nT moves the vector field by 2,000 nT.
+        soft_iron: Its soft iron [nT per nT], shape (3, 3), given with `hard_iron_nt`. Default: 0 then.
+        above: Whether a layer of dipoles lies above the sensor. Default: if the evidence is for it.
+        most_dipoles: Most dipoles. Default: 500 for the magnitudes of a drive, 1,500 otherwise, or 800 if
+            there are many readings.
+        progress: Called as progress(done, total, what), once per round.
 
-        Raises:
-            InputError: There are too few good readings, all are at one place, or `earth_nt`, `hard_iron_nt` or
-                `soft_iron` is not such a field.
+    Raises:
+        InputError: There are too few good readings, all are at one place, or `earth_nt`, `hard_iron_nt` or
+            `soft_iron` is not such a field.
     """
     good = readings.take(readings.good)
     if len(good) < LEAST_READINGS:
@@ -99,7 +99,7 @@ def fit_harmonic(
     tries = [d for d in ladders(good, height) if above is None or above == (min(d) < 0)]
     fits: list[Solution] = []
     for k, depths in enumerate(tries):
-        problem = Problem.of(good, layers_below(good, depths, height), height, earth, platform)
+        problem = Problem.of(good, layers_below(good, depths, height, most_dipoles), height, earth, platform)
         begins = [fits[0].uniform] if fits else problem.begins
         fits.append(_solve(problem, begins, progress, k, len(tries)))
     return max(fits, key=Solution.evidence).model(good)

@@ -25,7 +25,7 @@ REACH = 0.6  # Distance over which dipoles share one strength, in their layer's 
 MOST_DIPOLES = 1500  # Most dipoles; larger layers are thinned
 FEW_ROWS = 2700  # Most reading components whose matrix is factored; beyond, that of the unknowns is
 DIPOLES_OF_MANY = 800  # Most dipoles if there are more rows than `FEW_ROWS`
-# Most dipoles for a drive: more took 4 times (vectors) to 15 times as long and predicted no better
+# Most dipoles for the magnitudes of a drive: more took 15 times as long and predicted no better
 DIPOLES_OF_DRIVE = 500
 
 
@@ -55,12 +55,15 @@ def ladders(good: Readings, height_m: float) -> list[tuple[float, ...]]:
     return [tuple(first * step for step in ladder) for ladder in LADDERS]
 
 
-def layers_below(good: Readings, depths: tuple[float, ...], height_m: float) -> Layers:
-    """Layers below (and above) the bounding box of the readings, thinned if there are too many dipoles."""
+def layers_below(
+    good: Readings, depths: tuple[float, ...], height_m: float, most: int | None = None
+) -> Layers:
+    """Layers below (and above) the bounding box of the readings, thinned to at most `most` dipoles."""
     low, high = good.p_xy.min(axis=0), good.p_xy.max(axis=0)
     part = SHEET
-    most = DIPOLES_OF_DRIVE
-    if good.node is not None:
+    if most is None and good.node is None and good.b_body_nt is None:
+        most = DIPOLES_OF_DRIVE
+    elif most is None:
         rows = 1 + int(means(good, min(map(abs, depths)))[0].max())
         rows *= 1 if good.b_body_nt is None else 3
         most = MOST_DIPOLES if rows <= FEW_ROWS else DIPOLES_OF_MANY
