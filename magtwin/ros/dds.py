@@ -188,8 +188,8 @@ class DdsBus(Bus):
         # /clock, the first reader, comes last: it gives the others their time.
         for reader, kind, handler in reversed(self._readers):
             while taken := reader.take(N=MOST_TAKEN):
-                infos = [(sample.sample_info, sample.cdr) for sample in taken]
-                received += [(i.source_timestamp, kind, handler, cdr) for i, cdr in infos if i.valid_data]
+                valid = [sample for sample in taken if sample.sample_info.valid_data]
+                received += [(s.sample_info.source_timestamp, kind, handler, s.cdr) for s in valid]
                 if len(taken) < MOST_TAKEN:
                     break
         now = time.time_ns()

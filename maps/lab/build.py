@@ -240,12 +240,22 @@ def lab_map(scene: Scene) -> AnomalyMap:
         spacing_m=SPACING_M,
         headings_rad=np.radians(np.arange(0.0, 360.0, HEADING_STEP_DEG)),
     )
-    variance = field.variance_nt2
+    assert field.variance_nt2 is not None
+    assert field.between_nt2 is not None
     return replace(
         field,
         values_nt=field.values_nt.astype(np.float32),
-        variance_nt2=None if variance is None else variance.astype(np.float32),
+        variance_nt2=stepped(field.variance_nt2),
+        between_nt2=stepped(field.between_nt2),
     )
+
+
+def stepped(variance_nt2: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Variances in steps of 4 %, of at least 1e-3 nT^2 or 0; USD packs arrays of few distinct numbers."""
+    known = np.isfinite(variance_nt2) & (variance_nt2 >= 1e-3)
+    steps = np.round(np.log(np.where(known, variance_nt2, 1.0)) / 0.04)
+    rounded = np.where(known, np.exp(0.04 * steps), np.where(np.isfinite(variance_nt2), 0.0, variance_nt2))
+    return np.asarray(rounded, np.float32)
 
 
 def build(folder: Path, *, force: bool = False) -> Report:

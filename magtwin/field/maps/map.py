@@ -73,6 +73,8 @@ class AnomalyMap(Summarized):
         valid = np.ones(values.shape, bool) if self.valid is None else self.valid
         arrays: dict[str, Any] = {"values_nt": values, "valid": _frozen(valid, bool)}
         arrays["headings_rad"] = _frozen(self.headings_rad, float)
+        if self.variance_nt2 is None:  # without the variance of the nodes, that between them has no use
+            object.__setattr__(self, "between_nt2", None)
         for name in ("variance_nt2", "between_nt2", "recorded_yaw"):
             if getattr(self, name) is not None:
                 arrays[name] = _frozen(getattr(self, name), float)
@@ -98,11 +100,8 @@ class AnomalyMap(Summarized):
             )
         if self.variance_nt2 is not None and not np.all(self.variance_nt2[self.valid] >= 0):
             raise InputError("variance_nt2 of AnomalyMap must not be below 0, nor nan, at valid nodes")
-        if self.between_nt2 is not None:
-            if self.variance_nt2 is None:
-                raise InputError("between_nt2 of AnomalyMap needs variance_nt2, that of the nodes")
-            if not np.all(self.between_nt2[:, self.valid] >= 0):
-                raise InputError("between_nt2 of AnomalyMap must not be below 0, nor nan, at valid nodes")
+        if self.between_nt2 is not None and not np.all(self.between_nt2[:, self.valid] >= 0):
+            raise InputError("between_nt2 of AnomalyMap must not be below 0, nor nan, at valid nodes")
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, AnomalyMap):
