@@ -7,6 +7,7 @@ does not show it, and it has no parameters.
 
 import os
 import time
+import weakref
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -103,11 +104,12 @@ class DdsBus(Bus):
         whole = self._names.resolve(topic)
         writer: DataWriter[Any] = DataWriter(self._participant, self._topic(whole, kind), qos_of(qos))
         self._writers.append(writer)  # its latched message lives as long as it does
+        held = weakref.proxy(writer)  # a publisher that outlives its closed bus must not keep the participant
         return Publisher(
             whole,
             kind,
-            lambda data: writer.write(raw(kind, data)),
-            lambda: len(writer.get_matched_subscriptions()),
+            lambda data: held.write(raw(kind, data)),
+            lambda: len(held.get_matched_subscriptions()),
         )
 
     def subscribe(self, topic: str, kind: str, handler: Handler, qos: Qos) -> Subscription:
@@ -118,7 +120,8 @@ class DdsBus(Bus):
         self._waiting.attach(fresh)
         self._conditions.append(fresh)
         self._readers.append((reader, kind, handler))
-        return Subscription(whole, lambda: len(reader.get_matched_publications()))
+        held = weakref.proxy(reader)
+        return Subscription(whole, lambda: len(held.get_matched_publications()))
 
     def knows(self, kind: str) -> bool:
         """As for `Bus`: the types of ROS 2 Humble."""
@@ -158,6 +161,7 @@ class DdsBus(Bus):
         """As for `Bus`."""
         for held in (self._conditions, self._readers, self._writers, self._topics):
             held.clear()  # type: ignore[attr-defined]
+        self._offers = None
         del self._waiting, self._participant
 
     def _offers_of(self, topic: str) -> list[str]:

@@ -39,6 +39,17 @@ def pair(domain: int) -> Iterator[tuple[Bus, Bus]]:
         node.close()
 
 
+def test_a_closed_node_leaves_no_publisher_behind_even_if_its_publishers_are_kept(domain: int) -> None:
+    one, other = (open_bus(name, backend="cyclonedds", domain=domain) for name in ("one", "other"))
+    kept = one.publisher("field", FIELD, Qos()), one.subscribe("other", FIELD, lambda m: None, Qos())
+    spin(lambda: other.publishers("field") == 1, one, other)
+    assert one.publishers("field") == 1
+    one.close()
+    spin(lambda: other.publishers("field") == 0, other)
+    assert len(kept) == 2
+    other.close()
+
+
 KINDS = sorted({kind for topic in TOPICS.values() for kind in (topic.kind, *topic.reads)})
 
 
