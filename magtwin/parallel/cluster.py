@@ -9,7 +9,7 @@ from itertools import islice
 from typing import Any, Self
 
 from magtwin.errors import InputError
-from magtwin.parallel.pool import C, Failure, Limit, Outcome, R
+from magtwin.parallel.pool import C, Failure, Limit, Outcome, R, WorkerError
 from magtwin.parallel.processes import Processes
 from magtwin.version import __version__
 
@@ -104,7 +104,7 @@ class Cluster:
 
         say(0, len(chunks))
         try:
-            completed = as_completed(send())
+            completed = as_completed(send(), loop=client.loop)
             for future in completed:
                 index, _ = sent.pop(future.key)
                 outcome = self._outcome(index, future)
@@ -140,6 +140,9 @@ _lent: list[Processes] = []
 _used: list[tuple[str, Processes]] = []
 """In a dask worker: those that a thread uses, and for which session."""
 
+_ended: set[str] = set()
+"""In a dask worker: sessions whose program has ended."""
+
 
 def _same(value: bytes) -> bytes:
     return value
@@ -161,6 +164,8 @@ def _lend(
 ) -> Outcome[Any]:
     """In a thread of a dask worker: call a function for one chunk, in a process of its own."""
     _check_version(version, "the program that sends the work")
+    if session in _ended:
+        raise WorkerError("the program that sent the work has ended")
     try:
         pool = _lent.pop()
     except IndexError:
@@ -168,14 +173,20 @@ def _lend(
     _used.append((session, pool))
     try:
         (outcome,) = pool.run_pickled(work, 1, lambda k: chunk, lambda k: limit_s, lambda done, total: None)
+        _lent.append(pool)
+    except BaseException:
+        pool.close()
+        raise
     finally:
         _used.remove((session, pool))
-    _lent.append(pool)
+        if session in _ended:
+            _end_lent(session)
     return replace(outcome, index=index)
 
 
 def _end_lent(session: str) -> None:
     """In a dask worker: end the processes that work for a session, and those that do not work."""
+    _ended.add(session)
     for owner, pool in tuple(_used):
         if owner == session:
             pool.stop()

@@ -144,10 +144,10 @@ class Processes:
         progress(0, count)
         try:
             while done < count:
+                if self._stopped:
+                    raise WorkerError("the pool was stopped")
                 self._assign(waiting, work, chunk)
                 for outcome in self._outcomes(limit_s):
-                    if self._stopped:
-                        raise WorkerError("the pool was stopped")
                     if outcome.failure is not None and outcome.failure.kind == "lost":
                         tries[outcome.index] += 1
                         if tries[outcome.index] <= RETRIES:

@@ -63,7 +63,7 @@ def test_an_exception_is_the_outcome_of_its_chunk_only():
     with pytest.raises(InputError, match="x must not be 1") as refused:
         outcomes[1].result()
     assert refused.value.parameter == "x"
-    with pytest.raises(WorkerError, match="ZeroDivisionError: two(.|\n)*in refuse"):
+    with pytest.raises(WorkerError, match=r"ZeroDivisionError: two(.|\n)*in refuse"):
         outcomes[2].result()
     assert outcomes[3].failure.reason == "SystemExit: 3"
 
@@ -184,7 +184,7 @@ def test_a_script_without_a_guard_is_told_so(tmp_path):
 def test_shards_split_all_chunks():
     for count in (1, 2, 7):
         shards = [[k for k in range(20) if in_shard(k, parse_shard(f"{i}/{count}"))] for i in range(count)]
-        assert sorted(sum(shards, [])) == list(range(20))
+        assert sorted(k for shard in shards for k in shard) == list(range(20))
 
 
 @pytest.mark.parametrize("text", ["2/2", "1", "a/b", "-1/2", "0/0", "1/2/3"])
