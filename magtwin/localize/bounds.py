@@ -16,6 +16,7 @@ any entries, so the map's error is correlated between all places, also those tha
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -115,7 +116,7 @@ def bounds(
     out |= {"smoothed": np.empty(len(t)), "heading": np.empty(len(t))}
     ends: dict[str, Array | None] = {"exact": None, "white": None, "correlated": None, "oracle": None}
     alone = None
-    for begin, end in zip(edges, edges[1:], strict=False):
+    for begin, end in pairwise(edges):
         part, anew = slice(begin, end), begin in starts
         spread, drift, h = path.walked(part), path.drift(part), path.rows[part]
         first = path.first(begin, anew, alone)
@@ -274,7 +275,7 @@ class _Path:
 
 
 def _across(g: Array, p: Array) -> Array:
-    """g J p, shape (N,)."""
+    """Products g J p, shape (N,)."""
     return np.asarray(g[:, 1] * p[:, 0] - g[:, 0] * p[:, 1])
 
 

@@ -1,4 +1,4 @@
-"""Bounds, against a Kalman filter and against the joint Gaussian of a whole path, both written out plainly."""
+"""Bounds, against a Kalman filter and the joint Gaussian of a whole path, both written out plainly."""
 
 import math
 from dataclasses import replace
