@@ -17,6 +17,9 @@ from magtwin.localize.localizers import load_localizer
 from magtwin.localize.scores import Scores, score
 from magtwin.localize.track import LocalizerError, Track, track
 
+WITHIN_S = 30.0
+"""Time within which a localizer must find its pose after an unknown start or a kidnapping [s]."""
+
 TRACK_HZ = 2.0
 """Rate of the errors over time that are kept for the report [Hz]."""
 
@@ -63,6 +66,8 @@ def run_chunk(
                     "status": "failed" if reason else "ok",
                     "reason": reason,
                     "readings": case.readings.rows,
+                    "global_start": scenario.prior != "tracking",
+                    "recovered_in_time": sum(after <= WITHIN_S for after in scores.recovery_s),
                     **row,
                 }
             )
