@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from magtwin.errors import InputError
-from magtwin.parallel import TimeLimitError, beat, time_limit
+from magtwin.parallel import beat
 
 
 def square(x):
@@ -65,18 +65,6 @@ def beating(x):
         time.sleep(0.1)
         beat()
     return x
-
-
-def limited(x):
-    try:
-        with time_limit(0.2):
-            while True:
-                try:
-                    time.sleep(5)
-                except Exception:  # does not catch the limit
-                    continue
-    except TimeLimitError:
-        return "late"
 
 
 def big(x):

@@ -28,14 +28,13 @@ from magtwin.errors import InputError
 from magtwin.parallel.machine import free_memory, processors
 from magtwin.parallel.pool import RETRIES, Failure, Outcome, Pool, WorkerError
 from magtwin.parallel.shard import checked_shard, in_shard, parse_shard
-from magtwin.parallel.worker import TimeLimitError, beat, time_limit
+from magtwin.parallel.worker import beat
 
 __all__ = [
     "RETRIES",
     "Failure",
     "Outcome",
     "Pool",
-    "TimeLimitError",
     "WorkerError",
     "beat",
     "checked_shard",
@@ -44,7 +43,6 @@ __all__ = [
     "open_pool",
     "parse_shard",
     "processors",
-    "time_limit",
 ]
 
 

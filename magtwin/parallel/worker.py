@@ -1,15 +1,12 @@
 """The life of a worker process, and what a task may call in it."""
 
 import contextlib
-import math
 import multiprocessing
 import os
 import pickle
 import signal
 import threading
 import traceback
-import types
-from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -18,33 +15,6 @@ from magtwin.errors import InputError
 
 _beating: Connection | None = None
 """Where `beat` reports to, in a worker."""
-
-
-class TimeLimitError(BaseException):
-    """The time of a `time_limit` has passed. Not an `Exception`: code that catches those must not go on."""
-
-
-@contextlib.contextmanager
-def time_limit(seconds: float) -> Iterator[None]:
-    """Raise `TimeLimitError` in the block after a time, at the next step of Python code.
-
-    It does nothing outside the main thread, and cannot interrupt compiled code. There the limit of the pool
-    kills the worker.
-    """
-    if threading.current_thread() is not threading.main_thread() or not 0 < seconds < math.inf:
-        yield
-        return
-
-    def raise_it(signum: int, frame: types.FrameType | None) -> None:
-        raise TimeLimitError
-
-    before = signal.signal(signal.SIGALRM, raise_it)
-    try:
-        signal.setitimer(signal.ITIMER_REAL, seconds)
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
 
 
 def beat(what: str = "") -> None:
@@ -80,7 +50,7 @@ def serve(connection: Connection, idle_s: float | None) -> None:
                 answer = ("done", pickle.dumps(work(pickle.loads(chunk)), pickle.HIGHEST_PROTOCOL))
             except InputError as error:
                 answer = ("raised", str(error), "", error.parameter, True)
-            except (Exception, SystemExit, TimeLimitError) as error:
+            except BaseException as error:
                 reason = f"{type(error).__name__}: {error}".rstrip(": ")
                 answer = ("raised", " ".join(reason.split()), traceback.format_exc(), None, False)
             connection.send(answer)

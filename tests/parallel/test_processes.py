@@ -117,11 +117,6 @@ def test_a_beat_gives_a_chunk_its_time_again():
     assert outcome.result() == 1
 
 
-def test_a_time_limit_in_a_task_is_not_caught_as_an_exception():
-    with open_pool(1) as pool:
-        assert [o.result() for o in pool.run(chunk_work.limited, range(2))] == ["late", "late"]
-
-
 def test_large_results_arrive_and_stdout_is_kept_apart(capfd):
     with open_pool(2) as pool:
         sizes = {o.result()[-1]: len(o.result()) for o in pool.run(chunk_work.big, range(3))}
