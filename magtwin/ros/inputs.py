@@ -171,7 +171,7 @@ class Input:
         if self._kept and stamp == self._kept[-1][0]:
             self._kept.pop()
         self._kept.append((stamp, columns))
-        while len(self._kept) > KEPT and self._kept[1][0] < stamp - self.history_s * NS:
+        while len(self._kept) > KEPT and self._kept[1][0] < stamp - round(self.history_s * NS):
             self._kept.popleft()
 
     def _read(self, message: Message) -> tuple[int, Columns]:
@@ -252,5 +252,5 @@ class Scanning:
         self.heard += 1
         now = self._bus.now_ns()
         self._times_ns.append(now)
-        while self._times_ns[0] < now - (self.history_s + self._gap_s) * NS:
+        while self._times_ns[0] < now - round((self.history_s + self._gap_s) * NS):
             self._times_ns.popleft()

@@ -24,6 +24,7 @@ from magtwin.ros.inputs import AHEAD_S, JUMP_S, MOST_KEPT, OTHER_S
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.reader import Reading, Signals
+    from magtwin.learn.mixed.session_effects import FollowedEffects
     from magtwin.learn.models.predictor import Predictor
 
 QUIET_S = 30.0
@@ -78,7 +79,8 @@ class Online:
         self._seconds, self._signals, self._say = seconds, signals, say
         self._alignment = alignment_of(model.metadata, "the model")
         self._late_ns = round(self._alignment.latency_s * NS)
-        self._poses = _Source(bus, "online", poses, tuple(POSE.reads), self._pose_heard)
+        self.poses = _Source(bus, "online", poses, tuple(POSE.reads), self._pose_heard)
+        """Their topic."""
         self.measured = Measured(bus, measured)
         self.used = 0
         """Number of poses that updated the effects."""
@@ -87,6 +89,11 @@ class Online:
         self._newest_s = math.nan
         self.forget()
         self.look()
+
+    @property
+    def effects(self) -> "FollowedEffects":
+        """The effects of the session."""
+        return self._online.effects
 
     def forget(self) -> None:
         """Begin again with the effects of the model, after a restart of time."""
@@ -103,7 +110,7 @@ class Online:
         Raises:
             InputError: A topic is published in a type that is not supported.
         """
-        self._poses.look()
+        self.poses.look()
         self.measured.look()
 
     def read(
@@ -113,7 +120,7 @@ class Online:
         return self._online.read(t, p_xy, yaw, signals, outside=outside)
 
     def _pose_heard(self, message: Message) -> None:
-        self._poses.heard += 1
+        self.poses.heard += 1
         now = self._bus.now_ns()
         fields = self._fields(message)
         if fields is None:
@@ -123,11 +130,11 @@ class Online:
         if frame not in ("", self._settings["map_frame"]):
             if not self.used:
                 raise InputError(
-                    f"`online={self._poses.name}`: its poses are in frame {frame!r}, and the map is in "
+                    f"`online={self.poses.name}`: its poses are in frame {frame!r}, and the map is in "
                     f"{self._settings['map_frame']!r}; transform them, or set map_frame:={frame} if the two "
                     "are the same"
                 )
-            self._unused[f"were in the frame {frame!r}"] += 1
+            self._unused[f"were in frame {frame!r}"] += 1
             return
         stamp = int(fields["header.stamp"])
         self._newest_s = (now - stamp) / NS
@@ -156,7 +163,7 @@ class Online:
             return f"were older than the buffer of {buffer_s:g} s{self._other_clock()}"
         taken = stamp + self._late_ns  # the reading of this pose
         t = self._seconds(taken)
-        if not self._online.effects.due(t):
+        if not self.effects.due(t):
             return ""
         b_nt = self.measured.nearest(taken)
         if b_nt is None:
@@ -173,7 +180,7 @@ class Online:
         self.used += 1
         self._quiet_ns = self._bus.now_ns()
         self._ages_s.append(max(self._newest_s, 0.0))
-        self._online.effects.delay_s = self._delay_s
+        self.effects.delay_s = self._delay_s
         return ""
 
     @property
@@ -195,23 +202,23 @@ class Online:
         """State of the two topics since the previous call."""
         self._quiet_ns = self._quiet_ns or now_ns
         quiet_s = (now_ns - self._quiet_ns) / NS
-        why = "" if self._poses.subscription else ": nobody publishes it"
+        why = "" if self.poses.subscription else ": nobody publishes it"
         problems = (
             (quiet_s > QUIET_S, f"no pose was used for {quiet_s:.0f} s{why}"),
             *((count, f"{count} poses {reason}") for reason, count in self._unused.items()),
-            (self._poses.publishers > 1, f"{self._poses.publishers} publishers"),
+            (self.poses.publishers > 1, f"{self.poses.publishers} publishers"),
         )
         values = {
-            **self._poses.values,
-            "poses": str(self._poses.heard),
+            **self.poses.values,
+            "poses": str(self.poses.heard),
             "poses used": str(self.used),
             "age of the newest [s]": f"{self._newest_s:.2f}",
             "median age [s]": f"{self._delay_s:.2f}",
-            "interval factor": f"{self._online.effects.widening:.2f}",
+            "interval factor": f"{self.effects.widening:.2f}",
         }
         self._unused.clear()
         fine = "following the session" if self.used else "no pose yet: the effects are those of the model"
-        name = f"online {self._poses.name}"
+        name = f"online {self.poses.name}"
         return [status_of(name, problems, fine=fine, values=values), self.measured.status(now_ns)]
 
 
@@ -286,7 +293,7 @@ class Measured:
                 return  # late or repeated
             self._kept.clear()
         self._kept.append((stamp, b_nt))
-        while self._kept[0][0] < stamp - self.history_s * NS:
+        while self._kept[0][0] < stamp - round(self.history_s * NS):
             self._kept.popleft()
 
 
