@@ -14,13 +14,14 @@ from test_predictor import a_predictor
 import magtwin as mt
 from magtwin.cli import main
 from magtwin.errors import InputError
+from magtwin.frames import yaw_from_quat
 from magtwin.io.bags.sender import Sender
 from magtwin.io.bags.topics import BATTERY, CLOCK, COMMAND, IMU, MAGNITUDE, ODOMETRY, POSE, SCAN, Qos, Topic
 from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.features import CIRCULAR, GRADIENT, LAGS
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
-from magtwin.learn.inference.online import read_online
+from magtwin.learn.inference.online import OnlineMagnetometer, read_online
 from magtwin.learn.models.predictor import load_predictor
 from magtwin.ros.bus import Bus, Message, Publisher, open_bus, to_bytes
 from magtwin.ros.diagnostics import KIND, Status
@@ -285,6 +286,30 @@ def test_a_calibrated_model_reads_as_directly(
     nt, sd_nt = np.array([robot.read[int(robot.stamps[row])] for row in heard]).T
     np.testing.assert_allclose(nt, (run["b_map_nt"] + direct.disturbance_nt)[heard], atol=0.01)
     np.testing.assert_allclose(sd_nt, np.hypot(direct.sd_nt, noise_nt)[heard], atol=0.01)
+
+
+def test_with_a_latency_a_pose_is_joined_with_the_reading_that_much_later(drive: Drive, robot: Robot) -> None:
+    model = load_predictor(drive.weights)
+    model.metadata = {**model.metadata, "latency_s": 1 / RATE_HZ}
+    following = follow(robot, replace(drive.twin, magnetometer=NeuralMagnetometer(model)))
+    following.play(range(40))
+    following.send(lambda: robot.late_pose(20))
+    following.play(range(40, 42))
+    spin(lambda: int(robot.stamps[41]) in robot.read, robot.ear)
+
+    direct = OnlineMagnetometer(model, drive.twin.field, lever_arm_m=ARM.lever_arm_m)
+    yaw = yaw_from_quat(drive.run["mocap_q_xyzw"])
+
+    def at(row: int) -> tuple[float, Any, float, dict[str, Any]]:
+        """The time of a row since the first with a pose, the pose before it, and its signals."""
+        t = float(drive.run["t"][row] - drive.run["t"][1])
+        signals = {name: drive.run[name][row] for name in direct.signals if name != "t"}
+        return t, drive.run["mocap_p"][row - 1, :2], float(yaw[row - 1]), signals | {"t": t}
+
+    assert direct.update(*at(21), float(drive.run["b_measured_nt"][21]))
+    nt = direct.read(*at(41)).b_total_nt
+    assert min(robot.read) == robot.stamps[1]
+    assert robot.read[int(robot.stamps[41])][0] == pytest.approx(nt, abs=0.01)
 
 
 def test_without_poses_for_30_s_there_is_a_warning(drive: Drive, robot: Robot) -> None:
