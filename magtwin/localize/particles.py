@@ -57,7 +57,7 @@ class RaoBlackwell:
     `lost` is set while the particles spread over more than 0.5 m.
 
     Args:
-        particles: Least number of particles. Default: 1,500; 6,000 for the bootstrap filter.
+        particles: Least number of particles. Default: 2,500; 6,000 for the bootstrap filter.
         per_m2: Particles per square metre of an unknown position with known heading at the start; four times
             as many if the heading is unknown. Default: 500; 2,000 for the bootstrap filter.
         most: Greatest number of particles.
@@ -71,7 +71,7 @@ class RaoBlackwell:
     sampled: ClassVar[bool] = False
     iron: ClassVar[bool] = False
     network: ClassVar[bool] = False
-    least: int = 1500
+    least: int = 2500
     start_per_m2: float = 500.0
 
     def __init__(
@@ -388,4 +388,5 @@ def _mean_variance(table: Array, spreads: Array) -> Array:
     total = spreads[:plane].copy()
     if len(spreads) > plane:
         total += BETWEEN_CELLS * spreads[plane : 2 * plane] + BETWEEN_TURNS * spreads[2 * plane : 3 * plane]
-    return np.where(np.isfinite(total), total, 0.0)
+    total = np.where(np.isfinite(total), total, 0.0)
+    return total if total.any() else total[:0]
