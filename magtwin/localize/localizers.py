@@ -14,6 +14,7 @@ LOCALIZERS: Registry[Any] = Registry(
     "localizers",
     {
         "bootstrap": "magtwin.localize.particles:Bootstrap",
+        "ekf": "magtwin.localize.ekf:Ekf",
         "odometry": "magtwin.localize.odometry:Odometry",
         "rbpf": "magtwin.localize.particles:RaoBlackwell",
         "rbpf-iron": "magtwin.localize.particles:RaoBlackwellIron",
