@@ -13,7 +13,11 @@ LOCALIZERS: Registry[Any] = Registry(
     "localizer",
     "localizers",
     {
+        "bootstrap": "magtwin.localize.particles:Bootstrap",
         "odometry": "magtwin.localize.odometry:Odometry",
+        "rbpf": "magtwin.localize.particles:RaoBlackwell",
+        "rbpf-iron": "magtwin.localize.particles:RaoBlackwellIron",
+        "rbpf-network": "magtwin.localize.particles:RaoBlackwellNetwork",
     },
 )
 """Classes of localizers and smoothers by name."""

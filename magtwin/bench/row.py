@@ -1,0 +1,171 @@
+"""Row: run the localizers of a chunk, and score each run as one row of the results."""
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magtwin.bench.case import Case
+from magtwin.bench.suite import Chunk, Entry, Scenario, Suite
+from magtwin.errors import InputError
+from magtwin.localize.bounds import Bounds, bounds
+from magtwin.localize.localizers import load_localizer
+from magtwin.localize.scores import Scores, score
+from magtwin.localize.track import LocalizerError, Track, track
+
+WITHIN_S = 30.0
+"""Time within which a localizer must find its pose after an unknown start or a kidnapping [s]."""
+
+TRACK_HZ = 2.0
+"""Rate of the errors over time that are kept for the report [Hz]."""
+
+Row = dict[str, Any]
+
+
+class TimeLimitError(BaseException):
+    """A localizer took longer than its time limit; localizers cannot catch it as an Exception."""
+
+
+def run_chunk(
+    suite: Suite, chunk: Chunk, fields: Path | None = None
+) -> tuple[list[Row], list[Row], list[Row]]:
+    """Run and score a chunk of a suite.
+
+    Args:
+        suite: The suite.
+        chunk: One of its chunks.
+        fields: Folder with a folder of `magtwin.bench.world.fit_field` for each survey in the suite's data.
+
+    Returns:
+        Rows of the results, one per run and localizer; rows with the processor times of the same runs; and
+        rows with their errors over time. All but the times are the same in every call.
+    """
+    scenario = suite.scenarios[chunk.scenario]
+    rows: list[Row] = []
+    times: list[Row] = []
+    tracks: list[Row] = []
+    for run in range(chunk.first, chunk.first + chunk.runs):
+        case = make_case(suite, scenario, run, fields)
+        limits = bounds_of(case)
+        for name in chunk.entries:
+            entry = suite.localizers[name]
+            key = {"scenario": scenario.name, "localizer": name, "run": run}
+            made, scores = run_localizer(entry, case, suite.time_limit_s, limits, scenario)
+            row = scores.row()
+            times.append({**key, "step_us": row.pop("step_us")})
+            reason = row.pop("failed")
+            rows.append(
+                {
+                    **key,
+                    "seed": suite.first_seed + run,
+                    "session": run % scenario.sessions,
+                    "status": "failed" if reason else "ok",
+                    "reason": reason,
+                    "readings": case.readings.rows,
+                    "global_start": scenario.prior != "tracking",
+                    "recovered_in_time": sum(after <= WITHIN_S for after in scores.recovery_s),
+                    **row,
+                }
+            )
+            tracks.append({**key, **_over_time(case, made, limits)})
+    return rows, times, tracks
+
+
+def make_case(suite: Suite, scenario: Scenario, run: int, fields: Path | None = None) -> Case:
+    """One run of a scenario; the arguments are those of `run_chunk`, with the number of the run."""
+    seed = suite.first_seed + run
+    if scenario.source == "twin":
+        from magtwin.bench.twin_case import twin_case
+
+        own = None if scenario.data == "lab" or fields is None else fields / scenario.data
+        session = suite.first_seed + run % scenario.sessions
+        return twin_case(scenario, seed, session, own)
+    raise InputError(f"scenario {scenario.name!r}: source {scenario.source!r} is not known")
+
+
+def bounds_of(case: Case) -> Bounds | None:
+    """Bounds of a case; None for SLAM, which has no map."""
+    truth = case.truth
+    field = truth.field if truth.field is not None else case.problem.belief
+    if field is None or case.problem.belief is None:
+        return None
+    return bounds(
+        case.problem,
+        truth.pose,
+        truth.t,
+        field,
+        used=np.isfinite(case.readings["b_measured_nt"]),
+        kidnapped_s=truth.kidnapped_s,
+    )
+
+
+def run_localizer(
+    entry: Entry, case: Case, limit_s: float, limits: Bounds | None, scenario: Scenario
+) -> tuple[Track | None, Scores]:
+    """A track and its scores; None and the reason if the localizer failed."""
+    try:
+        with time_limit(limit_s):
+            readings = case.readings
+            if entry.compensator != "none":
+                from magtwin.localize.compensators import COMPENSATORS, compensated
+
+                if case.problem.calibration is None or case.problem.belief is None:
+                    raise LocalizerError(
+                        f"compensator {entry.compensator!r} needs a calibration drive and a map"
+                    )
+                fitted = COMPENSATORS[entry.compensator]().fit(case.problem.calibration, case.problem.belief)
+                readings = compensated(readings, fitted)
+            made = track(load_localizer(entry.method, entry.options), case.problem, readings)
+    except (InputError, MemoryError) as error:
+        return None, Scores(failed=str(error))
+    except TimeLimitError:
+        return None, Scores(failed=f"took longer than the time limit of {limit_s:g} s")
+    return made, score(
+        made,
+        case.truth.pose,
+        global_start=scenario.prior != "tracking",
+        kidnapped_s=case.truth.kidnapped_s,
+        bounds=limits,
+    )
+
+
+@contextmanager
+def time_limit(seconds: float) -> Iterator[None]:
+    """Raise `TimeLimitError` after a time, in the main thread of a process; elsewhere the runner ends it."""
+    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
+        yield
+        return
+
+    def late(*_: object) -> None:
+        raise TimeLimitError
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _over_time(case: Case, made: Track | None, limits: Bounds | None) -> Row:
+    """Time, position error, bound, true place and flag at `TRACK_HZ`, as float32."""
+    truth = case.truth
+    every = max(1, round(case.problem.rate_hz / TRACK_HZ))
+    rows = slice(None, None, every)
+    unknown = np.full(len(truth.t), np.nan)
+    error = unknown if made is None else np.hypot(*(made.pose - truth.pose)[:, :2].T)
+    lost = unknown if made is None else made.lost
+    arrays = {
+        "t": truth.t - truth.t[0],
+        "error_m": error,
+        "bound_m": unknown if limits is None else limits.correlated,
+        "x": truth.pose[:, 0],
+        "y": truth.pose[:, 1],
+        "lost": lost,
+    }
+    return {name: np.asarray(values[rows], np.float32) for name, values in arrays.items()}
