@@ -2,7 +2,7 @@
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,10 @@ from magtwin.localize.bounds import Bounds, bounds
 from magtwin.localize.localizers import load_localizer
 from magtwin.localize.scores import Scores, score
 from magtwin.localize.track import LocalizerError, Track, track
+from magtwin.parallel import beat
+
+WITHIN_S = 30.0
+"""Time within which a localizer must find its pose after an unknown start or a kidnapping [s]."""
 
 TRACK_HZ = 2.0
 """Rate of the errors over time that are kept for the report [Hz]."""
@@ -28,7 +32,10 @@ class TimeLimitError(BaseException):
 
 
 def run_chunk(
-    suite: Suite, chunk: Chunk, fields: Path | None = None
+    suite: Suite,
+    chunk: Chunk,
+    fields: Path | None = None,
+    failures: Mapping[tuple[int, str], str] | None = None,
 ) -> tuple[list[Row], list[Row], list[Row]]:
     """Run and score a chunk of a suite.
 
@@ -36,6 +43,8 @@ def run_chunk(
         suite: The suite.
         chunk: One of its chunks.
         fields: Folder with a folder of `magtwin.bench.world.fit_field` for each survey in the suite's data.
+        failures: Reasons by run and localizer of those that are known to fail and are not run, as they would
+            end the process.
 
     Returns:
         Rows of the results, one per run and localizer; rows with the processor times of the same runs; and
@@ -46,12 +55,17 @@ def run_chunk(
     times: list[Row] = []
     tracks: list[Row] = []
     for run in range(chunk.first, chunk.first + chunk.runs):
+        beat(f"{run}")
         case = make_case(suite, scenario, run, fields)
         limits = bounds_of(case)
         for name in chunk.entries:
             entry = suite.localizers[name]
             key = {"scenario": scenario.name, "localizer": name, "run": run}
-            made, scores = run_localizer(entry, case, suite.time_limit_s, limits, scenario)
+            beat(f"{run} {name}")
+            if failures and (run, name) in failures:
+                made, scores = None, Scores(failed=failures[run, name])
+            else:
+                made, scores = run_localizer(entry, case, suite.time_limit_s, limits, scenario)
             row = scores.row()
             times.append({**key, "step_us": row.pop("step_us")})
             reason = row.pop("failed")
@@ -63,6 +77,8 @@ def run_chunk(
                     "status": "failed" if reason else "ok",
                     "reason": reason,
                     "readings": case.readings.rows,
+                    "global_start": scenario.prior != "tracking",
+                    "recovered_in_time": sum(after <= WITHIN_S for after in scores.recovery_s),
                     **row,
                 }
             )
@@ -139,7 +155,7 @@ def time_limit(seconds: float) -> Iterator[None]:
         raise TimeLimitError
 
     before = signal.signal(signal.SIGALRM, late)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)  # again and again: callbacks of libraries swallow it
     try:
         yield
     finally:

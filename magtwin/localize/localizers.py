@@ -13,7 +13,12 @@ LOCALIZERS: Registry[Any] = Registry(
     "localizer",
     "localizers",
     {
+        "bootstrap": "magtwin.localize.particles:Bootstrap",
+        "ekf": "magtwin.localize.ekf:Ekf",
         "odometry": "magtwin.localize.odometry:Odometry",
+        "rbpf": "magtwin.localize.particles:RaoBlackwell",
+        "rbpf-iron": "magtwin.localize.particles:RaoBlackwellIron",
+        "rbpf-network": "magtwin.localize.particles:RaoBlackwellNetwork",
         "ros": "magtwin.ros.ros_node:RosNode",
     },
 )
