@@ -34,11 +34,11 @@ from magtwin.localize.problem import (
     SensorModel,
     Smoother,
 )
-from magtwin.localize.scores import AWAY_S, FAR_M, Scores, score
+from magtwin.localize.scores import AWAY_S, FAR_M, HELD_S, NEAR_M, Scores, score
 from magtwin.localize.track import EST_COLUMNS, Track, track
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run
-from magtwin.twin import scene_file
+from magtwin.twin import Twin, scene_file
 from magtwin.verdict import EVEN
 
 RATE_HZ = 5.0
@@ -243,6 +243,46 @@ def _localization(
     return Localization(estimated.with_metadata(localizer=name, localizer_seed=seed), problem, made, name)
 
 
+def live_problem(
+    twin: Twin,
+    anomaly_map: FieldBelief | Source | None = None,
+    *,
+    sensor: Mapping[str, Any] | None = None,
+    odometry: OdometryModel | None = None,
+    map_length_m: float = 0.3,
+    seed: int = 0,
+) -> Problem:
+    """What a method is told when it localizes the robot of a twin live; its prior is the default one.
+
+    Args:
+        twin: Gives the map, the floor and the place of the magnetometer.
+        anomaly_map: Map in place of the twin's, as for `localize`; "none": no map (SLAM).
+        sensor: Arguments of `SensorModel`. Default of the lever arm: that of the robot.
+        odometry: As for `localize`.
+        map_length_m: As for `localize`.
+        seed: As for `localize`.
+
+    Raises:
+        InputError: There is no such map.
+    """
+    belief: FieldBelief | None = twin.field
+    if isinstance(anomaly_map, str | os.PathLike):
+        belief = None if str(anomaly_map) == "none" else open_map(map_file(anomaly_map))
+    elif anomaly_map is not None:
+        belief = anomaly_map
+    x, y = (side / 2 for side in twin.scene.lab.floor_m)
+    return Problem(
+        belief=belief,
+        extent=belief.extent if isinstance(belief, AnomalyMap) else (-x, x, -y, y),
+        sensor=SensorModel(
+            **{"lever_arm_m": tuple(twin.scene.robot.p_base_magnetometer[:2]), **(sensor or {})}
+        ),
+        odometry=odometry or OdometryModel(),
+        map_length_m=map_length_m,
+        seed=seed,
+    )
+
+
 def new_localizer(out: Source, *, force: bool = False) -> Path:
     """Write a commented localizer to start from: a particle filter that runs as it is.
 
@@ -324,7 +364,8 @@ def verdict_of(scores: Scores, dead_m: float, start: str = "") -> str:
         words = [f"Better than {name}: {sizes}, {less:.0%} less."]
     else:
         words = [f"WORSE than {name}: {sizes}."]
-    figure = f"ANEES {scores.anees:.2f} per state"
+    size = f"{scores.anees:.2f}" if scores.anees < 1e3 else f"{scores.anees:.0e}"
+    figure = f"ANEES {size} per state"
     if not math.isfinite(scores.anees):
         words.append("Its covariance is unknown." if math.isnan(scores.anees) else "Its covariance is WRONG.")
     elif scores.anees > scores.anees_high:
@@ -333,6 +374,8 @@ def verdict_of(scores: Scores, dead_m: float, start: str = "") -> str:
         words.append(f"Too cautious: {figure}, at least {scores.anees_low:.2f} expected.")
     else:
         words.append(f"Consistent: {figure}.")
+    if not math.isfinite(scores.converged_s) and not scores.diverged:
+        words.append(f"It never stayed within {NEAR_M:g} m for {HELD_S:g} s.")
     if scores.diverged:
         flagged = "" if scores.diverged_unflagged else ", and flagged it"
         words.append(f"LOST: its error stayed above {FAR_M:g} m for more than {AWAY_S:g} s{flagged}.")
@@ -434,7 +477,14 @@ def map_file(source: Source) -> Path:
     path = Path(source)
     if path.is_dir() and not (path / f"{path.resolve().name}.usda").is_file():
         return path
-    return path if path.is_file() else Path(scene_file(path))
+    if path.is_file():
+        return path
+    try:
+        return Path(scene_file(path))
+    except InputError as error:
+        raise InputError(
+            f"{source}: no map layer, stage, folder of CSVs or shipped scene: {error}"
+        ) from error
 
 
 def check_map(run: Run, anomaly_map: AnomalyMap, file: Path) -> None:

@@ -143,9 +143,7 @@ class PointMass:
             if not value > 0:
                 raise InputError(f"{name} of PointMass must be above 0, got {value}", parameter=name)
         if not (nodes >= 9 and nodes % 2 == 1):
-            raise InputError(
-                f"nodes of PointMass must be odd and at least 9, got {nodes}", parameter="nodes"
-            )
+            raise InputError(f"nodes of PointMass must be odd and at least 9, got {nodes}", parameter="nodes")
         if temper is not None and not temper > 0:
             raise InputError(f"temper of PointMass must be above 0, got {temper}", parameter="temper")
         if not 0 <= scale_m < math.inf:
@@ -166,9 +164,7 @@ class PointMass:
         self._code = LOOPS.open()
         self._problem = problem
         table, spreads = table_of(problem.belief, problem.extent)
-        self._likelihood = Likelihood(
-            problem, table, spreads, self._temper or (1.5 if len(spreads) else 1.0)
-        )
+        self._likelihood = Likelihood(problem, table, spreads, self._temper or (1.5 if len(spreads) else 1.0))
         self._last: Reading | None = None
         self._surprise = 0.0
         self._begin(problem.prior.mean, problem.prior.sd)

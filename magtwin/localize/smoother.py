@@ -227,7 +227,12 @@ class Graph:
         parts, known = [], []
         for column, keeps, sd in processes:
             noise = sd * np.sqrt(np.maximum(1 - keeps**2, 1e-8))
-            parts.append(np.append(local[0, column] / sd, (np.diff(local[:, column]) + (1 - keeps) * local[:-1, column]) / noise))
+            parts.append(
+                np.append(
+                    local[0, column] / sd,
+                    (np.diff(local[:, column]) + (1 - keeps) * local[:-1, column]) / noise,
+                )
+            )
             known.append((column, keeps, np.append(sd, noise)))
         return np.concatenate(parts), known
 
@@ -398,13 +403,14 @@ class MapSmoother:
             weights = self._weights(graph, local, common, looseness)
         return local, common, cost, weights
 
-
     def _weights(self, graph: Graph, local: Array, common: Array, looseness: float) -> tuple[Array, Array]:
         """Weights of the factors: derivative of the loss by half the squared residual."""
         field = graph.fields(local, common)[0] ** 2
         motion = np.sum(graph.motions(local, common)[0] ** 2, axis=1)
         if self._robust == "huber":
-            return tuple(HUBER * d / np.maximum(np.sqrt(s), HUBER * d) for s, d in ((field, 1), (motion, math.sqrt(3))))  # type: ignore[return-value]
+            return tuple(
+                HUBER * d / np.maximum(np.sqrt(s), HUBER * d) for s, d in ((field, 1), (motion, math.sqrt(3)))
+            )  # type: ignore[return-value]
         if self._robust == "gnc":
             made = []
             for s, d in ((field, 1), (motion, 3)):
@@ -439,7 +445,9 @@ class MapSmoother:
         found = int(np.argmin(lost)) if not lost.all() else 0
         predicted = np.array([moved(p, m) for p, m in zip(poses[:-1], graph.motion, strict=True)])
         jumps = np.hypot(*(poses[1:, :2] - predicted[:, :2]).T) if len(poses) > 1 else np.zeros(0)
-        late = np.flatnonzero((jumps > JUMP_M) & (np.arange(1, len(t)) > found) & (t[1:] < t[found] + SETTLES_S))
+        late = np.flatnonzero(
+            (jumps > JUMP_M) & (np.arange(1, len(t)) > found) & (t[1:] < t[found] + SETTLES_S)
+        )
         found = int(late[-1]) + 1 if len(late) else found
         for k in range(found - 1, -1, -1):
             poses[k] = moved_back(poses[k + 1], graph.motion[k])

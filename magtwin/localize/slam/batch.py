@@ -199,7 +199,9 @@ class Batch:
         solution = arrow.solve()
         roots = [self._root_start, self._root_steps, self._root_constants]
         known = self._root_readings[self._known]
-        spread = -sum(float(np.log(root).sum()) for root in roots) - self.model.width * float(np.log(known).sum())
+        spread = -sum(float(np.log(root).sum()) for root in roots) - self.model.width * float(
+            np.log(known).sum()
+        )
         return solution, r.cost + 0.5 * solution.log_determinant() + spread
 
 
@@ -211,5 +213,3 @@ def joined(states: list[State]) -> State:
     """One trajectory of consecutive states, with the constants of the last one."""
     p, R, drift = (np.concatenate([getattr(s, name) for s in states]) for name in ("p", "R", "drift"))
     return State(p, R, drift, states[-1].g)
-
-

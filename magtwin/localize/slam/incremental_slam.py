@@ -69,5 +69,3 @@ class IncrementalSlam(EkfSlam):
         solution, _ = batch.posterior(state)
         self.state = State(state.p[-1:], state.R[-1:], state.drift[-1:], state.g)
         self.covariance = np.ascontiguousarray(solution.last_covariance())
-
-
