@@ -15,9 +15,12 @@ LOCALIZERS: Registry[Any] = Registry(
     {
         "bootstrap": "magtwin.localize.particles:Bootstrap",
         "odometry": "magtwin.localize.odometry:Odometry",
+        "point-mass": "magtwin.localize.point_mass:PointMass",
         "rbpf": "magtwin.localize.particles:RaoBlackwell",
         "rbpf-iron": "magtwin.localize.particles:RaoBlackwellIron",
         "rbpf-network": "magtwin.localize.particles:RaoBlackwellNetwork",
+        "sequence": "magtwin.localize.sequence:Sequence",
+        "smoother": "magtwin.localize.smoother:MapSmoother",
     },
 )
 """Classes of localizers and smoothers by name."""
