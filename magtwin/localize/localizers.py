@@ -18,10 +18,13 @@ LOCALIZERS: Registry[Any] = Registry(
         "bootstrap": "magtwin.localize.particles:Bootstrap",
         "ekf": "magtwin.localize.ekf:Ekf",
         "odometry": "magtwin.localize.odometry:Odometry",
+        "point-mass": "magtwin.localize.point_mass:PointMass",
         "rbpf": "magtwin.localize.particles:RaoBlackwell",
         "rbpf-iron": "magtwin.localize.particles:RaoBlackwellIron",
         "rbpf-network": "magtwin.localize.particles:RaoBlackwellNetwork",
         "ros": "magtwin.ros.ros_node:RosNode",
+        "sequence": "magtwin.localize.sequence:Sequence",
+        "smoother": "magtwin.localize.smoother:MapSmoother",
     },
 )
 """Classes of localizers and smoothers by name."""
