@@ -29,6 +29,9 @@ WITHIN_S = 30.0
 TRACK_HZ = 2.0
 """Rate of the errors over time that are kept for the report [Hz]."""
 
+SETUP = 10.0
+"""Time to make a case, in time limits of a localizer: the first case opens a scene and compiles loops."""
+
 Row = dict[str, Any]
 
 
@@ -60,7 +63,7 @@ def run_chunk(
     times: list[Row] = []
     tracks: list[Row] = []
     for run in range(chunk.first, chunk.first + chunk.runs):
-        beat(f"{run}")
+        beat(f"{run}", times=SETUP)
         case = make_case(suite, scenario, run, fields)
         limits = bounds_of(case)
         for name in chunk.entries:
