@@ -64,7 +64,8 @@ class Scenario:
     magnetometer, with the robot's own field of the session, motors and LiDAR."""
 
     belief: Literal["exact", "trilinear", "none"] = "exact"
-    """Map that localizers get: the true field, or with `truth` "scene" the scene's map; trilinear interpolation of a survey of it; or none (SLAM)."""
+    """Map that localizers get: the true field, or with `truth` "scene" the scene's map; trilinear
+    interpolation of a survey of it; or none (SLAM)."""
 
     survey_spacing_m: float = 0.5
     """Distance between nodes of the trilinear map [m], unless `data` is a survey, whose nodes are used."""
