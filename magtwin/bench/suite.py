@@ -295,11 +295,11 @@ class Suite:
         Raises:
             InputError: One is unknown or refuses its options, or data are missing.
         """
-        from magtwin.localize.compensators import COMPENSATORS
-
         for entry in self.localizer:
             load_localizer(entry.method, entry.options)
             if entry.compensator != "none":
+                from magtwin.localize.compensators import COMPENSATORS
+
                 find("compensator", entry.compensator, COMPENSATORS)
         for scenario in self.scenario:
             if scenario.data != "lab" or scenario.source != "twin":
@@ -330,12 +330,17 @@ def load_suite(file: str | os.PathLike[str]) -> Suite:
     Raises:
         InputError: There is no such file; a key is unknown or missing; a value has the wrong type or range.
     """
-    path = Path(file)
-    if not path.exists() and (SUITES / f"{path.name}.toml").is_file() and path.name == str(file):
-        path = SUITES / f"{path.name}.toml"
+    path = suite_file(file)
     suite = from_table(Suite, read_toml(path), path)
     folder = path.resolve().parent
     return replace(suite, data={name: str(folder / where) for name, where in suite.data.items()})
+
+
+def suite_file(file: str | os.PathLike[str]) -> Path:
+    """The file of a suite: `file`, or that of a suite that ships with magtwin, by name."""
+    path = Path(file)
+    shipped = SUITES / f"{path.name}.toml"
+    return shipped if not path.exists() and shipped.is_file() and path.name == str(file) else path
 
 
 def _plain(value: Any) -> Any:
