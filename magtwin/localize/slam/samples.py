@@ -37,7 +37,10 @@ class Samples:
     def followed_by(self, other: "Samples") -> "Samples":
         """These samples and later ones."""
         return Samples(
-            *[np.concatenate([getattr(self, name), getattr(other, name)]) for name in self.__dataclass_fields__]
+            *[
+                np.concatenate([getattr(self, name), getattr(other, name)])
+                for name in self.__dataclass_fields__
+            ]
         )
 
     def take(self, rows: slice) -> "Samples":
