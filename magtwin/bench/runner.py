@@ -11,7 +11,7 @@ from typing import Any
 
 from magtwin.bench import results
 from magtwin.bench.results import Results, Run, runs_of
-from magtwin.bench.row import Row, run_chunk
+from magtwin.bench.row import Row, run_chunk, warm_up
 from magtwin.bench.suite import Chunk, Seeds, Suite, load_suite, suite_file
 from magtwin.errors import InputError
 from magtwin.files import output
@@ -179,6 +179,9 @@ def _run(
     """Run tasks and write their parts."""
     names = set(whole.chunks())
     total, count = sum(_size(task) for task in tasks), 0
+    progress(0, total, "compiling")
+    for name in dict.fromkeys(name for task in tasks for name in task.chunk.entries):
+        warm_up(suite.localizers[name])
     progress(0, total, tasks[0].chunk.scenario)
     with open_pool(jobs, dask=dask) as pool:
         work = partial(run_task, suite, _fields(suite, out))

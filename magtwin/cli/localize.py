@@ -1,7 +1,6 @@
 """`magtwin localize` and `magtwin ros localize`: estimate the pose along a run, or live."""
 
 import json
-import sys
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -73,7 +72,6 @@ def localize(
     from magtwin.localize.problem import OdometryModel, SensorModel
 
     check_free(out, force=force)
-    _find_here(method)
     announce(f"Reading {run}")
     whole = read_run(run)
     told = _values("sensor", sensor, SensorModel)
@@ -145,7 +143,6 @@ def localize_live(
     from magtwin.twin import open_twin
 
     values = settings_of(PARAMETERS, settings)
-    _find_here(method)
     announce(f"opening {scene}")
     twin = open_twin(scene, magnetometer="map-only")
     problem = live_problem(
@@ -162,12 +159,6 @@ def localize_live(
         announce(f"localizing by {bus.backend}; Ctrl-C ends")
         spin(bus, duration_s)
     return Done()
-
-
-def _find_here(method: str) -> None:
-    """Let MODULE:CLASS be found in the current folder."""
-    if ":" in method and str(Path.cwd()) not in sys.path:
-        sys.path.insert(0, str(Path.cwd()))
 
 
 def _values(option: str, texts: list[str] | None, model: Any = None) -> dict[str, Any]:
