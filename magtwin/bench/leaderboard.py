@@ -19,6 +19,10 @@ CONSISTENT = (0.8, 1.3)
 """ANEES per state that counts as consistent."""
 
 
+SHOWN = 0.05
+"""p-value below which a difference counts as shown."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Standing:
     """A localizer on a scenario, over all runs. Failed runs count in `failed` and in no error."""
@@ -149,7 +153,7 @@ class Difference:
     @property
     def verdict(self) -> str:
         """Which is better, in words."""
-        if self.rmse_m.p >= 0.05:
+        if self.rmse_m.p >= SHOWN:
             return "no difference shown"
         better, worse = (self.b, self.a) if self.rmse_m.difference > 0 else (self.a, self.b)
         return f"{better} is better than {worse}"

@@ -72,7 +72,8 @@ def ship_case(folder: str | os.PathLike[str], loop: int, seed: int) -> Recording
     Args:
         folder: Folder of the files.
         loop: 1 to 4.
-        seed: Seed of the odometry's noise.
+        seed: Seed of the odometry's noise. An odd seed has the noise of the one before with the opposite sign
+            (antithetic pairs), which makes means over an even number of seeds more precise.
 
     Raises:
         InputError: There is no such loop, or its file is missing or wrong.
@@ -82,11 +83,11 @@ def ship_case(folder: str | os.PathLike[str], loop: int, seed: int) -> Recording
     data = _matlab(Path(folder) / f"Aligned_SquareLoop_{loop}.mat", ("p", "q", "p_0", "q_0", "T", "y_mag"))
     p, rotation, dt = data["p"].T, _rotation(data["q"].T), float(data["T"].item())
     y_nt = SHIP_UNIT_NT * data["y_mag"].T
-    rng = np.random.default_rng([loop, seed])
+    rng, sign = np.random.default_rng([loop, seed // 2]), 1 - 2 * (seed % 2)
     sd = np.sqrt([SHIP_STEP_VARIANCE_M2, SHIP_STEP_VARIANCE_M2, SHIP_HEIGHT_VARIANCE_M2])
-    moved = np.diff(p, axis=0) + SHIP_BIAS_M + sd * rng.standard_normal((len(p) - 1, 3))
+    moved = np.diff(p, axis=0) + SHIP_BIAS_M + sign * sd * rng.standard_normal((len(p) - 1, 3))
     turned = (rotation[1:] * rotation[:-1].inv()).as_rotvec()
-    turned += math.sqrt(SHIP_TURN_VARIANCE) * rng.standard_normal(turned.shape)
+    turned += sign * math.sqrt(SHIP_TURN_VARIANCE) * rng.standard_normal(turned.shape)
     p0, R0 = data["p_0"][:, 0], _rotation(data["q_0"].T)[0]
     odom_p = np.vstack([p0, p0 + np.cumsum(moved, axis=0)])
     odom_q = _accumulated(R0, Rotation.from_rotvec(turned))
@@ -183,9 +184,7 @@ def _readings(t: Array, p: Array, q: Array, y_nt: Array) -> Run:
 
 def _truth(t: Array, p: Array, q: Array) -> Run:
     R = Rotation.from_quat(q).as_matrix()
-    return Run(
-        {"t": t, "p_world_base": p, "q_world_base_xyzw": q, "yaw": np.arctan2(R[:, 1, 0], R[:, 0, 0])}
-    )
+    return Run({"t": t, "p_world_base": p, "q_world_base_xyzw": q, "yaw": np.arctan2(R[:, 1, 0], R[:, 0, 0])})
 
 
 Loop = Literal["eight", "square"]

@@ -1,8 +1,9 @@
 """Row: run the localizers of a chunk, and score each run as one row of the results."""
 
+import contextlib
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,16 +13,24 @@ import numpy as np
 from magtwin.bench.case import Case
 from magtwin.bench.suite import Chunk, Entry, Scenario, Suite
 from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.frames import quat_from_yaw
 from magtwin.localize.bounds import Bounds, bounds
 from magtwin.localize.localizers import load_localizer
+from magtwin.localize.problem import Problem, SensorModel
 from magtwin.localize.scores import Scores, score
 from magtwin.localize.track import LocalizerError, Track, track
+from magtwin.parallel import beat
+from magtwin.run.run import Run
 
 WITHIN_S = 30.0
 """Time within which a localizer must find its pose after an unknown start or a kidnapping [s]."""
 
 TRACK_HZ = 2.0
 """Rate of the errors over time that are kept for the report [Hz]."""
+
+SETUP = 10.0
+"""Time to make a case, in time limits of a localizer: the first case opens a scene and compiles loops."""
 
 Row = dict[str, Any]
 
@@ -31,7 +40,10 @@ class TimeLimitError(BaseException):
 
 
 def run_chunk(
-    suite: Suite, chunk: Chunk, fields: Path | None = None
+    suite: Suite,
+    chunk: Chunk,
+    fields: Path | None = None,
+    failures: Mapping[tuple[int, str], str] | None = None,
 ) -> tuple[list[Row], list[Row], list[Row]]:
     """Run and score a chunk of a suite.
 
@@ -39,6 +51,8 @@ def run_chunk(
         suite: The suite.
         chunk: One of its chunks.
         fields: Folder with a folder of `magtwin.bench.world.fit_field` for each survey in the suite's data.
+        failures: Reasons by run and localizer of those that are known to fail and are not run, as they would
+            end the process.
 
     Returns:
         Rows of the results, one per run and localizer; rows with the processor times of the same runs; and
@@ -49,12 +63,17 @@ def run_chunk(
     times: list[Row] = []
     tracks: list[Row] = []
     for run in range(chunk.first, chunk.first + chunk.runs):
+        beat(f"{run}", times=SETUP)
         case = make_case(suite, scenario, run, fields)
         limits = bounds_of(case)
         for name in chunk.entries:
             entry = suite.localizers[name]
             key = {"scenario": scenario.name, "localizer": name, "run": run}
-            made, scores = run_localizer(entry, case, suite.time_limit_s, limits, scenario)
+            beat(f"{run} {name}")
+            if failures and (run, name) in failures:
+                made, scores = None, Scores(failed=failures[run, name])
+            else:
+                made, scores = run_localizer(entry, case, suite.time_limit_s, limits, scenario)
             row = scores.row()
             times.append({**key, "step_us": row.pop("step_us")})
             reason = row.pop("failed")
@@ -81,9 +100,9 @@ def make_case(suite: Suite, scenario: Scenario, run: int, fields: Path | None = 
     if scenario.source == "twin":
         from magtwin.bench.twin_case import twin_case
 
-        own = None if scenario.data == "lab" or fields is None else fields / scenario.data
+        own = fields / scenario.data if scenario.data and fields is not None else None
         session = suite.first_seed + run % scenario.sessions
-        return twin_case(scenario, seed, session, own)
+        return twin_case(scenario, str(suite.scene(scenario)), seed, session, own)
     raise InputError(f"scenario {scenario.name!r}: source {scenario.source!r} is not known")
 
 
@@ -133,6 +152,29 @@ def run_localizer(
     )
 
 
+def warm_up(entry: Entry) -> None:
+    """Run a localizer of magtwin on a few readings, so that no run's time has compilation in it.
+
+    Localizers of others are left alone: what they do wrong counts in their runs.
+    """
+    if ":" in entry.method:
+        return
+    values = np.fromfunction(lambda h, j, i: 4e4 + 100 * np.sin(i) * np.cos(j), (1, 21, 21))
+    field = AnomalyMap(
+        values_nt=values,
+        variance_nt2=np.full(values.shape, 100.0),
+        origin_m=(-1.0, -1.0),
+        cell_m=(0.1, 0.1),
+        headings_rad=np.zeros(1),
+    )
+    t = np.arange(4) / 5
+    still = np.zeros((4, 3))
+    run = Run({"t": t, "odom_p": still, "odom_q_xyzw": quat_from_yaw(t * 0), "b_measured_nt": 4e4 + t})
+    problem = Problem(belief=field, extent=field.extent, sensor=SensorModel(iron_nt=100.0))
+    with contextlib.suppress(InputError):  # such as one that needs a vector field, which its runs will say
+        track(load_localizer(entry.method, entry.options), problem, run)
+
+
 @contextmanager
 def time_limit(seconds: float) -> Iterator[None]:
     """Raise `TimeLimitError` after a time, in the main thread of a process; elsewhere the runner ends it."""
@@ -144,7 +186,7 @@ def time_limit(seconds: float) -> Iterator[None]:
         raise TimeLimitError
 
     before = signal.signal(signal.SIGALRM, late)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)  # again and again: callbacks of libraries swallow it
     try:
         yield
     finally:

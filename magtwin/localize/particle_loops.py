@@ -24,8 +24,8 @@ BLOCK = 256
 
 X, Y, YAW, SCALE, LOG_WEIGHT, LIKELIHOOD, WEIGHT, LINEAR = range(8)
 """Rows of the state: pose, mean of the odometry's scale error, log weight, log likelihood of the last
-reading, weight relative to its block; then the means of the linear states, and their covariance by rows of its lower
-triangle."""
+reading, weight relative to its block; then the means of the linear states, and their covariance by rows of
+its lower triangle."""
 
 CONSTANT, COSINE, SINE, MAP_SD = range(4)
 """Factors by which a linear state enters the reading: 1, cos(yaw), sin(yaw), the map's standard deviation."""
@@ -76,7 +76,8 @@ CONSTANT, COSINE, SINE, MAP_SD = range(4)
 ) = range(18)
 """Sums of a block, in this order in its row: greatest log weight; sum of the weights relative to it, and of
 weight times offsets from the reference pose, their products; sum of squared weights; of weight times
-cos(yaw), sin(yaw), log S, mean of the first linear state; greatest log weight and sum of the weights without KAPPA."""
+cos(yaw), sin(yaw), log S, mean of the first linear state; greatest log weight and sum of the weights without
+KAPPA."""
 
 GOLDEN, MIX_1, MIX_2 = (np.uint64(k) for k in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
 _S20, _S27, _S30, _S31, _S32, _S52 = (np.uint64(k) for k in (20, 27, 30, 31, 32, 52))

@@ -16,6 +16,9 @@ from magtwin.localize.problem import Array, Estimate, Problem, Reading
 SHARE = 32
 """Blocks of 256 particles that a thread takes at a time."""
 
+WALK_S = 500.0
+"""Correlation time of constants where they are sampled [s]."""
+
 SETTLED_M = 0.5
 """Spread of the particles, sqrt(var x + var y), below which the pose counts as known [m]."""
 
@@ -54,9 +57,9 @@ class RaoBlackwell:
     `lost` is set while the particles spread over more than 0.5 m.
 
     Args:
-        particles: Least number of particles.
+        particles: Least number of particles. Default: 2,500; 6,000 for the bootstrap filter.
         per_m2: Particles per square metre of an unknown position with known heading at the start; four times
-            as many if the heading is unknown.
+            as many if the heading is unknown. Default: 500; 2,000 for the bootstrap filter.
         most: Greatest number of particles.
         kappa: Divisor of the log likelihood (tempering): above 1 for a map whose errors depend on each other
             more than their model, as at a place that is passed again. Default: 1 + v / (v + r), with v the
@@ -68,25 +71,29 @@ class RaoBlackwell:
     sampled: ClassVar[bool] = False
     iron: ClassVar[bool] = False
     network: ClassVar[bool] = False
+    least: int = 2500
+    start_per_m2: float = 500.0
 
     def __init__(
         self,
         *,
-        particles: int = 1500,
-        per_m2: float = 500.0,
+        particles: int | None = None,
+        per_m2: float | None = None,
         most: int = 100_000,
         kappa: float | None = None,
         map_correlated: float = 0.8,
         resets: bool = True,
     ) -> None:
-        if not 2 <= particles <= most:
-            raise InputError(f"particles must be between 2 and most = {most}, got {particles}")
-        if not (per_m2 > 0 and (kappa is None or kappa > 0) and 0 <= map_correlated <= 1):
+        self.least = self.least if particles is None else particles
+        self.start_per_m2 = self.start_per_m2 if per_m2 is None else per_m2
+        if not 2 <= self.least <= most:
+            raise InputError(f"particles must be between 2 and most = {most}, got {self.least}")
+        if not (self.start_per_m2 > 0 and (kappa is None or kappa > 0) and 0 <= map_correlated <= 1):
             raise InputError(
                 "per_m2 and kappa must be above 0 and map_correlated between 0 and 1, got "
-                f"{per_m2}, {kappa}, {map_correlated}"
+                f"{self.start_per_m2}, {kappa}, {map_correlated}"
             )
-        self.least, self.most, self.per_m2 = particles, most, per_m2
+        self.most = most
         self.kappa, self.map_correlated, self.resets = kappa, map_correlated, resets
 
     def reset(self, problem: Problem) -> None:
@@ -133,6 +140,10 @@ class RaoBlackwell:
         if correlated > 0:
             states.append((correlated, math.inf, problem.map_length_m, k.MAP_SD))
         variances, times, lengths, kinds = zip(*states, strict=True)
+        if self.sampled:  # a sampled constant would run out of values
+            times = tuple(
+                WALK_S if math.isinf(t) and math.isinf(d) else t for t, d in zip(times, lengths, strict=True)
+            )
         self._prior_variances = np.array(variances, float)
         self._rates = 1 / np.array(times), 1 / np.array(lengths)
         self._kinds = np.array(kinds, np.int64)
@@ -144,7 +155,7 @@ class RaoBlackwell:
         wide = [math.sqrt(2 * math.pi * math.e) * s for s in sd]  # side of the uniform of the same entropy
         area = (x1 - x0) * (y1 - y0) if math.isinf(sd[0]) else wide[0] * wide[1]
         turn = min(1.0, wide[2] / (2 * math.pi))
-        wanted = self.per_m2 * area * (1 + 3 * turn)
+        wanted = self.start_per_m2 * area * (1 + 3 * turn)
         count = int(min(max(wanted, self.least), self.most))
         size = len(self._kinds)
         k = self._loops
@@ -317,13 +328,13 @@ class RaoBlackwell:
 class Bootstrap(RaoBlackwell):
     """Bootstrap particle filter: the errors of the magnetometer are sampled, not marginalised.
 
-    (Gordon, Salmond and Smith 1993, IEE Proc. F 140.) Otherwise as `RaoBlackwell`.
+    (Gordon, Salmond and Smith 1993, IEE Proc. F 140.) The offset is a FOGM of 500 s, so that resampling does
+    not use up its values. Otherwise as `RaoBlackwell`.
     """
 
     sampled = True
-
-    def __init__(self, *, particles: int = 6000, per_m2: float = 2000.0, **options: Any) -> None:
-        super().__init__(particles=particles, per_m2=per_m2, **options)
+    least = 6000
+    start_per_m2 = 2000.0
 
 
 class RaoBlackwellIron(RaoBlackwell):
@@ -377,4 +388,5 @@ def _mean_variance(table: Array, spreads: Array) -> Array:
     total = spreads[:plane].copy()
     if len(spreads) > plane:
         total += BETWEEN_CELLS * spreads[plane : 2 * plane] + BETWEEN_TURNS * spreads[2 * plane : 3 * plane]
-    return np.where(np.isfinite(total), total, 0.0)
+    total = np.where(np.isfinite(total), total, 0.0)
+    return total if total.any() else total[:0]

@@ -86,6 +86,7 @@ def climb(table: Array, layer: int, wh: Array, slope: Array, node: Numbers) -> N
 def blends(
     t: Array, row: np.uint64, layer: np.uint64, node: Numbers, wx: Array, wy: Array, wh: Array, out: Array
 ) -> None:
+    """`trilinear.blend` at the cells that `place` and `climb` found."""
     for n in range(out.shape[0]):
         out[n] = blend(corners(t, np.uint64(node[n]), _ONE, row, layer), wx[n], wy[n], wh[n])
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from magtwin.localize.localizers import localizer
 from magtwin.localize.problem import Estimate, Problem, Reading
 from magtwin.localize.slam.model import Model
-from magtwin.localize.slam.samples import Samples, is_vector, samples_of
+from magtwin.localize.slam.samples import Samples, followed_by, is_vector, samples_of
 from magtwin.localize.slam.settings import Settings
 
 Array = NDArray[np.float64]
@@ -55,7 +55,7 @@ class EkfSlam(Settings):
     def _move(self, sample: Samples) -> None:
         assert self.model is not None and self._last is not None
         size, motion = self.model.size, self.model.layout.motion.stop
-        steps = self.model.steps(self._last.followed_by(sample))
+        steps = self.model.steps(followed_by([self._last, sample]))
         self.state, by_state, by_constants = self.model.move(self.state, steps)
         covariance = self.covariance
         rows = by_state[0] @ covariance[:size]

@@ -34,17 +34,17 @@ class Samples:
     extra_nt2: Array
     """Variance of the predicted disturbance [nT^2], shape (N,)."""
 
-    def followed_by(self, other: "Samples") -> "Samples":
-        """These samples and later ones."""
-        return Samples(
-            *[np.concatenate([getattr(self, name), getattr(other, name)]) for name in self.__dataclass_fields__]
-        )
-
     def take(self, rows: slice) -> "Samples":
         """Some of the samples."""
         return Samples(
             self.t[rows], self.p_odom[rows], self.R_odom[rows], self.y_nt[rows], self.extra_nt2[rows]
         )
+
+
+def followed_by(parts: Sequence[Samples]) -> Samples:
+    """Consecutive samples as one."""
+    names = Samples.__dataclass_fields__
+    return Samples(*[np.concatenate([getattr(part, name) for part in parts]) for name in names])
 
 
 def has_vector(reading: Reading) -> bool:
