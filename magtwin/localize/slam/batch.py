@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.localize.slam.arrow import Arrow, Solution
+from magtwin.localize.slam.arrow import Arrow, Solution, gram
 from magtwin.localize.slam.model import Model, State, cross
 from magtwin.localize.slam.samples import Samples
 
@@ -123,7 +123,7 @@ class Batch:
         np.matmul(ht, hg, out=border[:, :, :-1])
         border[:, :, -1] = (ht @ r.readings[..., None])[..., 0]
         flat = hg.reshape(-1, constants)
-        corner = flat.T @ flat
+        corner = gram(flat)
         right = flat.T @ r.readings.ravel()
         corner[range(constants), range(constants)] += self._root_constants**2
         right -= self._root_constants * r.constants
@@ -173,17 +173,18 @@ class Batch:
         Returns:
             The state and its cost.
         """
-        cost = math.nan
+        state, cost, _ = self.solved(state, most)
+        return state, cost
+
+    def solved(self, state: State, most: int) -> tuple[State, float, Solution]:
+        """As `iterate`, with the linear system of the last iteration."""
         for _ in range(most):
             arrow, r = self.linearised(state)
             step = arrow.solve()
-            cost = r.cost
-            state, lower = self._shortened(state, step, cost)
-            done = cost - lower < DONE
-            cost = lower
-            if done:
+            state, cost = self._shortened(state, step, r.cost)
+            if r.cost - cost < DONE:
                 break
-        return state, cost
+        return state, cost, step
 
     def _shortened(self, state: State, step: Solution, cost: float) -> tuple[State, float]:
         share = 1.0

@@ -23,10 +23,10 @@ class IncrementalSlam(EkfSlam):
 
     Between two solutions it is `EkfSlam`. At a solution, Gauss-Newton relinearises every pose since the start
     (`magtwin.localize.slam.batch`), and the filter takes the joint mean and covariance of the last pose and
-    the constants. An estimate uses no later reading.
+    the constants, as of the last iteration. An estimate uses no later reading.
     """
 
-    every: int = 10
+    every: int = 15
     """Readings between two solutions."""
 
     iterations: int = 2
@@ -71,19 +71,14 @@ class IncrementalSlam(EkfSlam):
         samples, state = self.trajectory()
         self._samples = [samples]
         batch = Batch(self.model, samples)
-        state, cost = batch.iterate(state, self.iterations)
+        state, cost, solution = batch.solved(state, self.iterations)
         if self._since >= self.restart:
             self._since = 0
-            state = self._better(batch, state, cost)
+            found, lower = batch.annealed(batch.dead_reckoning(), (*FAR, (1.0, LAST)))
+            if lower < cost:
+                state, _, solution = batch.solved(found, 1)
         self._states = [state]
-        solution, _ = batch.posterior(state)
         self.state = State(state.p[-1:], state.R[-1:], state.drift[-1:], state.g)
         self.covariance = np.ascontiguousarray(solution.last_covariance())
 
 
-
-    def _better(self, batch: Batch, state: State, cost: float) -> State:
-        """The state of least cost among this one and one found from dead reckoning."""
-        last = (1.0, LAST)
-        other, lower = batch.annealed(batch.dead_reckoning(), (*FAR, last))
-        return other if lower < cost else state
