@@ -100,9 +100,9 @@ def make_case(suite: Suite, scenario: Scenario, run: int, fields: Path | None = 
     if scenario.source == "twin":
         from magtwin.bench.twin_case import twin_case
 
-        own = None if scenario.data == "lab" or fields is None else fields / scenario.data
+        own = fields / scenario.data if scenario.data and fields is not None else None
         session = suite.first_seed + run % scenario.sessions
-        return twin_case(scenario, seed, session, own)
+        return twin_case(scenario, str(suite.scene(scenario)), seed, session, own)
     raise InputError(f"scenario {scenario.name!r}: source {scenario.source!r} is not known")
 
 

@@ -135,7 +135,7 @@ def folder_sha256(folder: Path) -> str:
 
 def _data(suite: Suite) -> dict[str, Path]:
     """Folders of the data that a suite's scenarios need, by name."""
-    needed = [each for each in suite.scenario if each.data != "lab" or each.source != "twin"]
+    needed = [each for each in suite.scenario if each.data or each.source != "twin"]
     return {each.data: suite.folder(each) for each in needed}
 
 
@@ -234,11 +234,7 @@ def _fields(suite: Suite, out: Path) -> Path | None:
     """Folder of the true fields that are fitted to surveys, made once; None if the suite needs none."""
     from magtwin.bench.world import fit_field
 
-    needed = {
-        each.data: suite.folder(each)
-        for each in suite.scenario
-        if each.source == "twin" and each.data != "lab"
-    }
+    needed = {each.data: suite.folder(each) for each in suite.scenario if each.source == "twin" and each.data}
     folder = out / "fields"
     for name, survey in needed.items():
         if not (folder / name).is_dir():
