@@ -29,6 +29,9 @@ WITHIN_S = 30.0
 TRACK_HZ = 2.0
 """Rate of the errors over time that are kept for the report [Hz]."""
 
+SETUP = 10.0
+"""Time to make a case, in time limits of a localizer: the first case opens a scene and compiles loops."""
+
 Row = dict[str, Any]
 
 
@@ -60,7 +63,7 @@ def run_chunk(
     times: list[Row] = []
     tracks: list[Row] = []
     for run in range(chunk.first, chunk.first + chunk.runs):
-        beat(f"{run}")
+        beat(f"{run}", times=SETUP)
         case = make_case(suite, scenario, run, fields)
         limits = bounds_of(case)
         for name in chunk.entries:
@@ -97,9 +100,9 @@ def make_case(suite: Suite, scenario: Scenario, run: int, fields: Path | None = 
     if scenario.source == "twin":
         from magtwin.bench.twin_case import twin_case
 
-        own = None if scenario.data == "lab" or fields is None else fields / scenario.data
+        own = fields / scenario.data if scenario.data and fields is not None else None
         session = suite.first_seed + run % scenario.sessions
-        return twin_case(scenario, seed, session, own)
+        return twin_case(scenario, str(suite.scene(scenario)), seed, session, own)
     raise InputError(f"scenario {scenario.name!r}: source {scenario.source!r} is not known")
 
 
