@@ -29,6 +29,10 @@ MOST_TESTED = 2000  # Most readings of a drive that the trials predict
 NEAR = 2.0  # Only readings this near to a fitted one count, in spacings: a map is masked beyond
 NODE_PARTS, NODES_LEFT_OUT = 5, (0, 2)  # Parts of a grid's nodes, and those that are left out in turn
 WEIGHTS = (0.25, 0.5, 0.75)  # Weights of the harmonic fit in a mixture with a Gaussian process
+# Candidates are dropped before the second turn if neither they nor a mixture with them come as near to the best
+# in mean log density as this many standard errors of the difference
+NEARLY = 2.0
+RESUMED = ("harmonic", "gp")  # Methods whose fits start from an earlier fit
 TICKS = 100  # Steps of progress per fit
 # Parameters of a map with the figures of the candidates, in the order of their names
 CANDIDATES, CHOSEN, LEAD = "candidates", "chosen", "lead in log score"
@@ -44,8 +48,12 @@ class Candidate:
     options: Mapping[str, Any] = field(default_factory=dict)
     magnitudes: bool = False  # Whether vectors are left out of the readings
 
-    def fit(self, readings: Readings, progress: Progress | None, **more: Any) -> FieldModel:
-        """Fit the readings."""
+    def fit(
+        self, readings: Readings, progress: Progress | None, like: FieldModel | None = None, **more: Any
+    ) -> FieldModel:
+        """Fit the readings, from an earlier fit if there is one."""
+        if like is not None and self.method in RESUMED:
+            more["like"] = like
         own = readings.with_(b_body_nt=None) if self.magnitudes else readings
         return fit(own, self.method, progress=progress, **{**self.options, **more})
 
@@ -59,6 +67,7 @@ class Trial:
     variance: Array  # Their variances with noise [nT^2], shape (N,)
     off: Array  # Readings minus predictions [nT], shape (N,)
     weights: tuple[float, ...] = (1.0,)
+    models: tuple[FieldModel, ...] = ()  # The fits
 
     @property
     def name(self) -> str:
@@ -70,7 +79,7 @@ class Trial:
     def joined(self, other: "Trial") -> "Trial":
         """This trial with the readings of another."""
         return replace(
-            self,
+            other,
             mean=np.append(self.mean, other.mean),
             variance=np.append(self.variance, other.variance),
             off=np.append(self.off, other.off),
@@ -82,9 +91,14 @@ class Trial:
         return float(np.sqrt(np.mean(self.off**2)))
 
     @property
+    def densities(self) -> Array:
+        """Log predictive densities [log 1/nT], shape (N,)."""
+        return -0.5 * (np.log(2 * np.pi * self.variance) + self.off**2 / self.variance)
+
+    @property
     def score(self) -> float:
         """Mean log predictive density [log 1/nT]."""
-        return float(np.mean(-0.5 * (np.log(2 * np.pi * self.variance) + self.off**2 / self.variance)))
+        return float(np.mean(self.densities))
 
     @property
     def coverage(self) -> float:
@@ -131,9 +145,10 @@ def fit_auto(
     steps, turn = TICKS * (len(tried) + 4 * (len(held) - 1) + 2), 0
     trials, refused = list[Trial](), list[InputError]()
     for candidate in tried:
+        like = _like(candidate, trials)
         try:
             part = _part(progress, turn, steps, f"trying {candidate.name}")
-            trials.append(_try(candidate, *held[0], part))
+            trials.append(_try(candidate, *held[0], part, like))
         except InputError as error:
             refused.append(error)
         turn += 1
@@ -142,10 +157,10 @@ def fit_auto(
     trials = _common(trials)
     finalists = _finalists(trials)
     for pair in held[1:]:
-        more = []
+        finalists, more = _leaders(finalists), []
         for trial in finalists:
             part = _part(progress, turn, steps, f"trying {trial.name} again")
-            more.append(_try(trial.of[0], *pair, part))
+            more.append(_try(trial.of[0], *pair, part, trial.models[0]))
             turn += 1
         more = _common(more)
         finalists = [trial.joined(other) for trial, other in zip(finalists, more, strict=True)]
@@ -154,7 +169,7 @@ def fit_auto(
     models = []
     for k, candidate in enumerate(best.of):
         part = _part(progress, turn + k, steps, f"fitting {candidate.name}")
-        models.append(candidate.fit(readings, part))
+        models.append(candidate.fit(readings, part, best.models[k]))
     if progress is not None:
         progress(steps, steps, "done")
     model = models[0] if len(models) == 1 else Mixture.of(models, best.weights)
@@ -265,12 +280,24 @@ def _near(rest: Readings, test: Readings) -> Rows:
     return near[np.unique(rows)] if len(near) else near
 
 
-def _try(candidate: Candidate, rest: Readings, test: Readings, progress: Progress | None) -> Trial:
+def _like(candidate: Candidate, trials: Sequence[Trial]) -> FieldModel | None:
+    """The fit that a candidate's can start from: the same without a layer above."""
+    if candidate.options.get("above"):
+        for trial in trials:
+            if trial.of[0].method == candidate.method:
+                return trial.models[0]
+    return None
+
+
+def _try(
+    candidate: Candidate, rest: Readings, test: Readings, progress: Progress | None, like: FieldModel | None
+) -> Trial:
     """Fit a candidate to `rest` and predict `test`."""
     more: dict[str, Any] = {"fill": True} if candidate.method == "trilinear" else {}
-    model = candidate.fit(rest, progress, **more)
+    model = candidate.fit(rest, progress, like, **more)
     mean, variance = predict_readings(model, test, candidate.method)
-    return Trial((candidate,), mean, np.maximum(variance, np.finfo(float).tiny), test.b_nt - mean)
+    variance = np.maximum(variance, np.finfo(float).tiny)
+    return Trial((candidate,), mean, variance, test.b_nt - mean, models=(model,))
 
 
 def _common(trials: Sequence[Trial]) -> list[Trial]:
@@ -293,8 +320,21 @@ def _finalists(trials: Sequence[Trial]) -> list[Trial]:
     return list(best.values())
 
 
-def _mixtures(trials: Sequence[Trial]) -> list[Trial]:
-    """The best mixture of the harmonic fit with a Gaussian process, if there are both."""
+def _leaders(trials: Sequence[Trial]) -> list[Trial]:
+    """The trials that, alone or in a mixture, are nearly as good as the best."""
+    mixtures = _mixtures(trials, every=True)
+    best = max([*trials, *mixtures], key=lambda trial: trial.score).densities
+
+    def near(trial: Trial) -> bool:
+        behind = best - trial.densities
+        return float(behind.mean()) <= NEARLY * float(behind.std()) / np.sqrt(len(behind))
+
+    near_ones = {candidate.name for t in (*trials, *mixtures) if near(t) for candidate in t.of}
+    return [trial for trial in trials if trial.name in near_ones]
+
+
+def _mixtures(trials: Sequence[Trial], *, every: bool = False) -> list[Trial]:
+    """The best mixture of the harmonic fit with a Gaussian process, or every one; none without both."""
     found = []
     for one in (trial for trial in trials if trial.of[0].method == "harmonic"):
         for other in (trial for trial in trials if trial.of[0].method == "gp"):
@@ -302,8 +342,9 @@ def _mixtures(trials: Sequence[Trial]) -> list[Trial]:
                 weights = (weight, 1 - weight)
                 mean, variance = mixed(weights, [one.mean, other.mean], [one.variance, other.variance])
                 off = one.off + one.mean - mean
-                found.append(Trial((one.of[0], other.of[0]), mean, variance, off, weights))
-    return [max(found, key=lambda trial: trial.score)] if found else []
+                pair, models = (one.of[0], other.of[0]), (one.models[0], other.models[0])
+                found.append(Trial(pair, mean, variance, off, weights, models))
+    return found if every else [max(found, key=lambda trial: trial.score)] if found else []
 
 
 def _told(model: FieldModel, more: Mapping[str, Any]) -> FieldModel:

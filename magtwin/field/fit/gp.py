@@ -23,7 +23,9 @@ MOST = 2500  # Most readings, or means of adjacent ones, in the conditioning: 50
 MOST_LEARNT = 800  # Most of these from which the hyperparameters are learnt
 MOST_TRIED = 240  # Most of these on which the starts are tried
 STARTS = (1.0, 0.4, 2.5)  # Initial reaches of the optimisation, as factors of the first guess
-STEPS = 60  # Steps of L-BFGS from the best start
+START_STEPS = 30  # Steps of L-BFGS from each start
+STEPS = 15  # Steps of L-BFGS from the best start; 60 predicted readings left out no better
+RESUMED_STEPS = 8  # The same from an earlier fit
 PATCHES = 8  # Most patches along the longer side of the floor, each with its own field strength
 # Least distance between patches, in spacings of the readings: smaller ones cannot tell strength from noise
 PATCH_SPACINGS = 3.0
@@ -74,7 +76,13 @@ class GpModel(FittedModel):
         return mean.reshape(shape), variance.reshape(shape)
 
 
-def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress | None = None) -> GpModel:
+def fit_gp(
+    readings: Readings,
+    *,
+    kernel: Kernel = "poisson",
+    like: GpModel | None = None,
+    progress: Progress | None = None,
+) -> GpModel:
     """Condition a Gaussian process on the good readings, with the likeliest hyperparameters.
 
     Recorded headings are used. More than `MOST` readings, and those of a drive, are averaged per run, cell
@@ -84,6 +92,8 @@ def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress
     Args:
         readings: A survey.
         kernel: Function of distance (`Covariance`).
+        like: A fit with the same kernel to other readings of the same survey. The optimisation starts from its
+            hyperparameters, which saves the starts.
         progress: Called as progress(done, total, what).
 
     Raises:
@@ -104,7 +114,7 @@ def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress
     spacing = spacing_m(readings)
     covariance = Covariance(kernel, 3 if turned else 1, several, *_patches(bins.p_xy, spacing))
     order = np.random.default_rng(0).permutation(len(b))  # a fixed draw: which rows are learnt from
-    figures = _learn(covariance, bins, b, order, spacing, lambda done, what: say(done, total, what))
+    figures = _learn(covariance, bins, b, order, spacing, like, lambda done, what: say(done, total, what))
     say(total - 2, total, "conditioning")
     lower = _factor(covariance, figures, bins)
     from scipy.linalg import cho_solve
@@ -150,11 +160,17 @@ def _patches(p_xy: Array, spacing: float) -> tuple[Array, float]:
 
 
 def _learn(
-    covariance: Covariance, bins: Bins, b: Array, order: Rows, least_m: float, say: Callable[[int, str], Any]
+    covariance: Covariance,
+    bins: Bins,
+    b: Array,
+    order: Rows,
+    least_m: float,
+    like: GpModel | None,
+    say: Callable[[int, str], Any],
 ) -> Array:
     """The likeliest hyperparameters: the best of several starts on few readings, then on more.
 
-    The starts have one strength everywhere. No reach is below the readings' spacing: such a part would be
+    An earlier fit with as many hyperparameters is the only start. The others have one strength everywhere. No reach is below the readings' spacing: such a part would be
     noise.
     """
     from scipy.optimize import minimize
@@ -176,16 +192,19 @@ def _learn(
         )
         return float(result.fun), np.asarray(result.x)
 
-    tried = np.sort(order[:MOST_TRIED])
-    starts = []
-    for k, factor in enumerate(STARTS):
-        say(k, "starts")
-        start = guess.copy()
-        start[h : 2 * h] += np.log(factor)
-        starts.append(descend(start, tried, STEPS // 2, even))
-    best = min(starts, key=lambda start: start[0])[1]
+    if like is not None and like.covariance.size == covariance.size and like.covariance.runs == covariance.runs:
+        best, steps = like.figures, RESUMED_STEPS
+    else:
+        tried = np.sort(order[:MOST_TRIED])
+        starts = []
+        for k, factor in enumerate(STARTS):
+            say(k, "starts")
+            start = guess.copy()
+            start[h : 2 * h] += np.log(factor)
+            starts.append(descend(start, tried, START_STEPS, even))
+        best, steps = min(starts, key=lambda start: start[0])[1], STEPS
     say(len(STARTS), "figures")
-    return descend(best, np.sort(order[:MOST_LEARNT]), STEPS, bounds)[1]
+    return descend(best, np.sort(order[:MOST_LEARNT]), steps, bounds)[1]
 
 
 def _guess(covariance: Covariance, bins: Bins, b: Array) -> Array:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.fit.harmonic.forward import Forward
+from magtwin.field.fit.harmonic.layers import Layers
 from magtwin.field.fit.harmonic.problem import Hyperparameters
 from magtwin.field.fit.methods import FittedModel, flat_poses
 from magtwin.field.grid import TURN
@@ -33,6 +34,7 @@ class HarmonicModel(FittedModel):
     noise_nt2: float  # Variance of one reading of the magnitude about the field, mean over the survey [nT^2]
     figures: Hyperparameters  # Hyperparameters
     forward: Forward  # How readings follow from the unknowns
+    layers: Layers  # Layers of its dipoles
     unknowns: Array  # Most likely unknowns, shape (P,)
     prior_sd: Array  # Prior standard deviations of the unknowns, shape (P,)
     # Information of the readings: in units of `prior_sd` the posterior covariance is 1 - learnt learnt^T,
