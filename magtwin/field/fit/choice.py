@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import lgamma
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,9 @@ WEIGHTS = (0.25, 0.5, 0.75)  # Weights of the harmonic fit in a mixture with a G
 # Candidates are dropped before the second turn if neither they nor a mixture with them come as near to the best
 # in mean log density as this many standard errors of the difference
 NEARLY = 2.0
+# Degrees of freedom of the log score. Errors have heavy tails, and under a normal density a few readings beside
+# gaps of the survey would decide.
+FREEDOM = 5.0
 RESUMED = ("harmonic", "gp")  # Methods whose fits start from an earlier fit
 TICKS = 100  # Steps of progress per fit
 # Parameters of a map with the figures of the candidates, in the order of their names
@@ -92,8 +96,10 @@ class Trial:
 
     @property
     def densities(self) -> Array:
-        """Log predictive densities [log 1/nT], shape (N,)."""
-        return -0.5 * (np.log(2 * np.pi * self.variance) + self.off**2 / self.variance)
+        """Log predictive densities of Student's t [log 1/nT], shape (N,); the variance is its squared scale."""
+        half = (FREEDOM + 1) / 2
+        level = lgamma(half) - lgamma(FREEDOM / 2) - np.log(FREEDOM * np.pi * self.variance) / 2
+        return np.asarray(level - half * np.log1p(self.off**2 / (FREEDOM * self.variance)))
 
     @property
     def score(self) -> float:
