@@ -12,6 +12,7 @@ from magtwin.errors import InputError
 from magtwin.field.fit.check import parts, predict_readings, shown
 from magtwin.field.fit.covariance import Kernel
 from magtwin.field.fit.fit import fit
+from magtwin.field.fit.harmonic.inversion import GAIN
 from magtwin.field.fit.harmonic.layers import DIPOLES_OF_DRIVE, LEAST_DEPTH_M
 from magtwin.field.fit.methods import FieldModel
 from magtwin.field.fit.mixture import Mixture, mixed
@@ -30,12 +31,15 @@ MOST_TESTED = 2000  # Most readings of a drive that the trials predict
 NEAR = 2.0  # Only readings this near to a fitted one count, in spacings: a map is masked beyond
 NODE_PARTS, NODES_LEFT_OUT = 5, (0, 2)  # Parts of a grid's nodes, and those that are left out in turn
 WEIGHTS = (0.25, 0.5, 0.75)  # Weights of the harmonic fit in a mixture with a Gaussian process
-# Candidates are dropped before the second turn if neither they nor a mixture with them come as near to the best
-# in mean log density as this many standard errors of the difference
+# Candidates are dropped before the second turn if they, and mixtures with them, are behind the best in mean
+# log density by more than this many standard errors of the difference
 NEARLY = 2.0
-# Degrees of freedom of the log score. Errors have heavy tails, and under a normal density a few readings beside
-# gaps of the survey would decide.
+# Degrees of freedom of the log score. Errors have heavy tails, and under a normal density a few readings
+# beside gaps of the survey would decide.
 FREEDOM = 5.0
+# Options that end the learning of a trial early: more learning predicted readings left out no better. The fit
+# to the whole survey continues from there.
+SHORT: Mapping[str, Mapping[str, Any]] = {"harmonic": {"gain": GAIN}, "gp": {"steps": 15}}
 RESUMED = ("harmonic", "gp")  # Methods whose fits start from an earlier fit
 TICKS = 100  # Steps of progress per fit
 # Parameters of a map with the figures of the candidates, in the order of their names
@@ -58,6 +62,8 @@ class Candidate:
         """Fit the readings, from an earlier fit if there is one."""
         if like is not None and self.method in RESUMED:
             more["like"] = like
+        else:
+            more |= SHORT.get(self.method, {})
         own = readings.with_(b_body_nt=None) if self.magnitudes else readings
         return fit(own, self.method, progress=progress, **{**self.options, **more})
 
@@ -96,7 +102,7 @@ class Trial:
 
     @property
     def densities(self) -> Array:
-        """Log predictive densities of Student's t [log 1/nT], shape (N,); the variance is its squared scale."""
+        """Log predictive densities [log 1/nT], shape (N,): Student's t, scaled by the standard deviation."""
         half = (FREEDOM + 1) / 2
         level = lgamma(half) - lgamma(FREEDOM / 2) - np.log(FREEDOM * np.pi * self.variance) / 2
         return np.asarray(level - half * np.log1p(self.off**2 / (FREEDOM * self.variance)))
@@ -146,7 +152,7 @@ def fit_auto(
     tried = _candidates(readings, earth_nt, kernel)
     held = _held_out(readings)
     if not held:
-        model = Candidate("harmonic", "harmonic", {"earth_nt": earth_nt}).fit(readings, progress)
+        model = fit(readings, "harmonic", progress=progress, earth_nt=earth_nt)
         return _told(model, {CHOSEN: "harmonic: too few readings to leave some out"})
     steps, turn = TICKS * (len(tried) + 4 * (len(held) - 1) + 2), 0
     trials, refused = list[Trial](), list[InputError]()

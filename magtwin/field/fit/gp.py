@@ -25,7 +25,7 @@ MOST_LEARNT = 800  # Most of these from which the hyperparameters are learnt
 MOST_TRIED = 240  # Most of these on which the starts are tried
 STARTS = (1.0, 0.4, 2.5)  # Initial reaches of the optimisation, as factors of the first guess
 START_STEPS = 30  # Steps of L-BFGS from each start
-STEPS = 15  # Steps of L-BFGS from the best start; 60 predicted readings left out no better
+STEPS = 60  # Most steps of L-BFGS from the best start
 RESUMED_STEPS = 8  # The same from an earlier fit
 PATCHES = 8  # Most patches along the longer side of the floor, each with its own field strength
 # Least distance between patches, in spacings of the readings: smaller ones cannot tell strength from noise
@@ -106,6 +106,7 @@ def fit_gp(
     *,
     kernel: Kernel = "poisson",
     like: GpModel | None = None,
+    steps: int | None = None,
     progress: Progress | None = None,
 ) -> GpModel:
     """Condition a Gaussian process on the good readings, with the likeliest hyperparameters.
@@ -117,8 +118,9 @@ def fit_gp(
     Args:
         readings: A survey.
         kernel: Function of distance (`Covariance`).
-        like: A fit with the same kernel to other readings of the same survey. The optimisation starts from its
-            hyperparameters, which saves the starts.
+        like: A fit with the same kernel to other readings of the same survey. The optimisation starts from
+            its hyperparameters, which saves the starts.
+        steps: Most steps of the optimisation. Default: `STEPS`, or `RESUMED_STEPS` from an earlier fit.
         progress: Called as progress(done, total, what).
 
     Raises:
@@ -139,7 +141,9 @@ def fit_gp(
     spacing = spacing_m(readings)
     covariance = Covariance(kernel, 3 if turned else 1, several, *_patches(bins.p_xy, spacing))
     order = np.random.default_rng(0).permutation(len(b))  # a fixed draw: which rows are learnt from
-    figures = _learn(covariance, bins, b, order, spacing, like, lambda done, what: say(done, total, what))
+    figures = _learn(
+        covariance, bins, b, order, spacing, like, steps, lambda done, what: say(done, total, what)
+    )
     say(total - 2, total, "conditioning")
     lower = _factor(covariance, figures, bins)
     from scipy.linalg import cho_solve
@@ -192,12 +196,13 @@ def _learn(
     order: Rows,
     least_m: float,
     like: GpModel | None,
+    steps: int | None,
     say: Callable[[int, str], Any],
 ) -> Array:
     """The likeliest hyperparameters: the best of several starts on few readings, then on more.
 
-    An earlier fit with as many hyperparameters is the only start. The others have one strength everywhere. No reach is below the readings' spacing: such a part would be
-    noise.
+    An earlier fit with as many hyperparameters is the only start. The others have one strength everywhere. No
+    reach is below the readings' spacing: such a part would be noise.
     """
     from scipy.optimize import minimize
 
@@ -210,16 +215,26 @@ def _learn(
     even = bounds.copy()
     even[covariance.of_patches] = [(0.0, 0.0)] * len(covariance.patches)
 
-    def descend(start: Array, rows: Rows, steps: int, bounds: Any) -> tuple[float, Array]:
+    def descend(start: Array, rows: Rows, steps: int, bounds: Any, turn: int) -> tuple[float, Array]:
         data = (bins.p_xy[rows], bins.yaw[rows], bins.run[rows], b[rows])
-        begin, options = np.maximum(start, least), {"maxiter": steps}
         result = minimize(
-            covariance.loss, begin, (guess, *data), "L-BFGS-B", jac=True, bounds=bounds, options=options
+            covariance.loss,
+            np.maximum(start, least),
+            (guess, *data),
+            "L-BFGS-B",
+            jac=True,
+            bounds=bounds,
+            options={"maxiter": steps},
+            callback=lambda _: say(turn, "learning"),
         )
         return float(result.fun), np.asarray(result.x)
 
-    if like is not None and like.covariance.size == covariance.size and like.covariance.runs == covariance.runs:
-        best, steps = like.figures, RESUMED_STEPS
+    if (
+        like is not None
+        and like.covariance.size == covariance.size
+        and like.covariance.runs == covariance.runs
+    ):
+        best, most = like.figures, RESUMED_STEPS
     else:
         tried = np.sort(order[:MOST_TRIED])
         starts = []
@@ -227,10 +242,10 @@ def _learn(
             say(k, "starts")
             start = guess.copy()
             start[h : 2 * h] += np.log(factor)
-            starts.append(descend(start, tried, START_STEPS, even))
-        best, steps = min(starts, key=lambda start: start[0])[1], STEPS
+            starts.append(descend(start, tried, START_STEPS, even, k))
+        best, most = min(starts, key=lambda start: start[0])[1], STEPS
     say(len(STARTS), "figures")
-    return descend(best, np.sort(order[:MOST_LEARNT]), steps, bounds)[1]
+    return descend(best, np.sort(order[:MOST_LEARNT]), steps or most, bounds, len(STARTS))[1]
 
 
 def _guess(covariance: Covariance, bins: Bins, b: Array) -> Array:

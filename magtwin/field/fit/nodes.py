@@ -1,4 +1,4 @@
-"""Nodes of a map: variances at some of them, and between those by interpolation, since variances cost the most."""
+"""Nodes of a map: their variances, which cost the most, are computed at some and interpolated between."""
 
 from collections.abc import Callable
 

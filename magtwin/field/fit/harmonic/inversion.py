@@ -15,9 +15,9 @@ moments have normal priors, so the field is a Gaussian process with curl- and di
   width of intervals is learnt from positions left out in turn, and between headings that are far apart from
   headings left out in turn, since a platform is more than iron.
 
-The magnitude is not linear in the field. Gauss-Newton steps, halved until the posterior grows, solve it. A round
-of learning is one such step and one step of the hyperparameters. It needs one factorisation, of a matrix as large
-as the number of readings or of unknowns, whichever is smaller.
+The magnitude is not linear in the field. Gauss-Newton steps, halved until the posterior grows, solve it. A
+round of learning is one such step and one of the hyperparameters. It needs one factorisation, of a matrix as
+large as the number of readings or of unknowns, whichever is smaller.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,8 +40,10 @@ Known = tuple[Layers, Hyperparameters, Array]  # An earlier fit: its layers, hyp
 LEAST_READINGS = 8
 ROUNDS = 30  # Most rounds of learning
 LAYERWISE = 4  # First rounds, in which a layer has one strength
-# Gain of the log evidence in a round below which learning ends: less is no strong evidence (Kass & Raftery 1995:
-# twice the logarithm of a Bayes factor of 6 or more). Further rounds predict readings left out no better.
+# Change of the logarithms of hyperparameters in a round (of strengths, in the mean) at which learning ends
+STILL = 0.03
+# Gain of the log evidence in a round below which learning from an earlier fit ends: less is no strong
+# evidence (Kass & Raftery 1995: a Bayes factor of 20)
 GAIN = 3.0
 
 
@@ -54,6 +56,7 @@ def fit_harmonic(
     above: bool | None = None,
     most_dipoles: int | None = None,
     like: HarmonicModel | None = None,
+    gain: float | None = None,
     progress: Progress | None = None,
 ) -> HarmonicModel:
     """Fit a field without curl or divergence, and the platform, to a survey.
@@ -86,6 +89,8 @@ def fit_harmonic(
         most_dipoles: Most dipoles. Default: 500 for the magnitudes of a drive, 1,500 otherwise, or 800 if
             there are many readings.
         like: A fit to other readings of the same survey. Learning starts from it, which saves most rounds.
+        gain: Gain of the log evidence in a round below which learning ends. Default: it ends when the
+            hyperparameters hardly change, or at `GAIN` from an earlier fit.
         progress: Called as progress(done, total, what), once per round.
 
     Raises:
@@ -103,11 +108,12 @@ def fit_harmonic(
     platform = _platform(hard_iron_nt, soft_iron)
     tries = [d for d in ladders(good, height) if above is None or above == (min(d) < 0)]
     known = None if like is None else (like.layers, like.figures, like.unknowns)
+    least = GAIN if gain is None and like is not None else gain
     fits = list[Solution]()
     for k, depths in enumerate(tries):
         problem = Problem.of(good, layers_below(good, depths, height, most_dipoles), height, earth, platform)
-        fits.append(_solve(problem, known, progress, k, len(tries)))
-        known = known or (problem.layers, fits[0].figures, fits[0].unknowns)
+        begins = [fits[0].uniform] if fits else problem.begins
+        fits.append(_solve(problem, known or begins, least, progress, k, len(tries)))
     return max(fits, key=Solution.evidence).model(good)
 
 
@@ -129,13 +135,18 @@ def _platform(hard_iron_nt: ArrayLike | None, soft_iron: ArrayLike | None) -> Pl
 
 
 def _solve(
-    problem: Problem, like: Known | None, progress: Progress | None, turn: int, turns: int
+    problem: Problem,
+    begin: list[Array] | Known,
+    gain: float | None,
+    progress: Progress | None,
+    turn: int,
+    turns: int,
 ) -> Solution:
-    """Fit from each uniform field to begin with, continue from the likeliest, and learn the hyperparameters.
+    """Fit from each of several uniform fields, continue from the likeliest, and learn the hyperparameters.
 
-    With an earlier fit, continue from that.
+    With an earlier fit to begin with, continue from that.
     """
-    begins = problem.begins if like is None else []
+    begins, like = (begin, None) if isinstance(begin, list) else ([], begin)
     tried = len(begins) if len(begins) > 1 else 0
     total = tried * (1 + LAYERWISE) + ROUNDS
 
@@ -159,9 +170,14 @@ def _solve(
     layerwise = LAYERWISE if like is None else 0
     for done in range(ROUNDS):
         report(total - ROUNDS + done)
+        old, before = solution.figures, evidence
         solution = solution.learnt(shares if done >= layerwise else None)
-        before, evidence = evidence, solution.evidence()
-        if done > layerwise and evidence - before < GAIN:
+        if gain is not None:
+            evidence = solution.evidence()
+            still = evidence - before < gain
+        else:
+            still = solution.figures.change(old) < STILL
+        if done > layerwise and still:
             break
     solution = solution.settle()
     report(total)

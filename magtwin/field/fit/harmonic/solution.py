@@ -21,7 +21,7 @@ DRAWN = 0.005  # Weight of the layer's strength relative to that of the dipoles 
 TAILS = np.geomspace(4.0, 48.0, 13)  # Degrees of freedom of Student's t that are tried
 SETTLED = 0.2  # Gain of the log posterior below which Gauss-Newton has converged
 STEPS = 30  # Most steps until then
-FIRST_STEPS = 1  # Gauss-Newton steps before learning begins
+FIRST_STEPS = 4  # Gauss-Newton steps before learning begins
 # Logarithms of the widths that are tried, as factors of the posterior's variances
 WIDTHS = np.linspace(-np.log(16), np.log(16), 161)
 NOISES = np.geomspace(1.0, 16.0, 25)  # Factors of the noise's variance that are tried for a drive
@@ -54,8 +54,8 @@ class Solution:
     ) -> "Solution":
         """Start from a fit to other readings of the survey, or with fewer layers.
 
-        Dipoles take the strength per area of the nearest one of their layer. Moments are kept if the layers are
-        the same.
+        Dipoles take the strength per area of the nearest one of their layer. Moments are kept if the layers
+        are the same.
         """
         from scipy.spatial import cKDTree
 
