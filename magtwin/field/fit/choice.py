@@ -31,9 +31,6 @@ MOST_TESTED = 2000  # Most readings of a drive that the trials predict
 NEAR = 2.0  # Only readings this near to a fitted one count, in spacings: a map is masked beyond
 NODE_PARTS, NODES_LEFT_OUT = 5, (0, 2)  # Parts of a grid's nodes, and those that are left out in turn
 WEIGHTS = (0.25, 0.5, 0.75)  # Weights of the harmonic fit in a mixture with a Gaussian process
-# Candidates are dropped before the second turn if they, and mixtures with them, are behind the best in mean
-# log density by more than this many standard errors of the difference
-NEARLY = 2.0
 # Degrees of freedom of the log score. Errors have heavy tails, and under a normal density a few readings
 # beside gaps of the survey would decide.
 FREEDOM = 5.0
@@ -101,16 +98,11 @@ class Trial:
         return float(np.sqrt(np.mean(self.off**2)))
 
     @property
-    def densities(self) -> Array:
-        """Log predictive densities [log 1/nT], shape (N,): Student's t, scaled by the standard deviation."""
+    def score(self) -> float:
+        """Mean log predictive density [log 1/nT], of Student's t scaled by the standard deviation."""
         half = (FREEDOM + 1) / 2
         level = lgamma(half) - lgamma(FREEDOM / 2) - np.log(FREEDOM * np.pi * self.variance) / 2
-        return np.asarray(level - half * np.log1p(self.off**2 / (FREEDOM * self.variance)))
-
-    @property
-    def score(self) -> float:
-        """Mean log predictive density [log 1/nT]."""
-        return float(np.mean(self.densities))
+        return float(np.mean(level - half * np.log1p(self.off**2 / (FREEDOM * self.variance))))
 
     @property
     def coverage(self) -> float:
@@ -133,8 +125,9 @@ def fit_auto(
     sensor. Each is fitted to a part of the survey. Left out is every fifth node of a gridded survey at all
     headings; else one run of several; else every fifth block of the floor. A drive is thinned to
     `MOST_FITTED` means for the trials. For gridded surveys, the best harmonic fit and the others are tried a
-    second time, with other nodes left out. The candidate with the greatest mean log
-    predictive density of the readings left out is fitted to the whole survey. Surveys with fewer than
+    second time, with other nodes left out. The candidate with the greatest mean log predictive density of the
+    readings left out, of Student's t, is fitted to the whole survey. Trials learn only until the evidence
+    grows slowly, and each later fit of a candidate continues from its earlier one. Surveys with fewer than
     `LEAST_READINGS` good readings get a harmonic fit.
 
     Args:
@@ -169,7 +162,7 @@ def fit_auto(
     trials = _common(trials)
     finalists = _finalists(trials)
     for pair in held[1:]:
-        finalists, more = _leaders(finalists), []
+        more = []
         for trial in finalists:
             part = _part(progress, turn, steps, f"trying {trial.name} again")
             more.append(_try(trial.of[0], *pair, part, trial.models[0]))
@@ -332,21 +325,8 @@ def _finalists(trials: Sequence[Trial]) -> list[Trial]:
     return list(best.values())
 
 
-def _leaders(trials: Sequence[Trial]) -> list[Trial]:
-    """The trials that, alone or in a mixture, are nearly as good as the best."""
-    mixtures = _mixtures(trials, every=True)
-    best = max([*trials, *mixtures], key=lambda trial: trial.score).densities
-
-    def near(trial: Trial) -> bool:
-        behind = best - trial.densities
-        return float(behind.mean()) <= NEARLY * float(behind.std()) / np.sqrt(len(behind))
-
-    near_ones = {candidate.name for t in (*trials, *mixtures) if near(t) for candidate in t.of}
-    return [trial for trial in trials if trial.name in near_ones]
-
-
-def _mixtures(trials: Sequence[Trial], *, every: bool = False) -> list[Trial]:
-    """The best mixture of the harmonic fit with a Gaussian process, or every one; none without both."""
+def _mixtures(trials: Sequence[Trial]) -> list[Trial]:
+    """The best mixture of the harmonic fit with a Gaussian process, if there are both."""
     found = []
     for one in (trial for trial in trials if trial.of[0].method == "harmonic"):
         for other in (trial for trial in trials if trial.of[0].method == "gp"):
@@ -356,7 +336,7 @@ def _mixtures(trials: Sequence[Trial], *, every: bool = False) -> list[Trial]:
                 off = one.off + one.mean - mean
                 pair, models = (one.of[0], other.of[0]), (one.models[0], other.models[0])
                 found.append(Trial(pair, mean, variance, off, weights, models))
-    return found if every else [max(found, key=lambda trial: trial.score)] if found else []
+    return [max(found, key=lambda trial: trial.score)] if found else []
 
 
 def _told(model: FieldModel, more: Mapping[str, Any]) -> FieldModel:
