@@ -16,6 +16,7 @@ from magtwin.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from magtwin.author.from_urdf import from_urdf as from_urdf
+    from magtwin.bench.runner import benchmark as benchmark
     from magtwin.errors import InputError as InputError
     from magtwin.errors import MismatchWarning as MismatchWarning
     from magtwin.export.package import export_scene as export_scene
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from magtwin.learning import calibrate as calibrate
     from magtwin.learning import error_budget as error_budget
     from magtwin.learning import evaluate as evaluate
+    from magtwin.localization import localize as localize
     from magtwin.run.run import COLUMNS as COLUMNS
     from magtwin.run.run import Run as Run
     from magtwin.sim.plant_families import draw_plant as draw_plant
@@ -64,6 +66,7 @@ _NAMES = {
     "Scene": "spec.scene",
     "Twin": "twin",
     "author_scene": "twin",
+    "benchmark": "bench.runner",
     "build_dataset": "learning",
     "calibrate": "learning",
     "draw_plant": "sim.plant_families",
@@ -74,6 +77,7 @@ _NAMES = {
     "from_urdf": "author.from_urdf",
     "in_session": "twin",
     "load_map": "usd.maps",
+    "localize": "localization",
     "load_predictor": "learn.models.predictor",
     "load_run": "io.formats:read_run",
     "new_scene": "twin",

@@ -47,6 +47,11 @@ def arguments(monkeypatch: pytest.MonkeyPatch):
             "--ros-args --log-level warn -p scene:=lab.usda -p duration_s:=5 --disable-stdout-logs odom:=o",
             "ros magnetometer lab.usda --duration-s=5 --remap odom:=o",
         ),
+        (
+            "magnetometer",
+            "lab.usda --ros-args -p online:=/slam/pose -p measured:=qtfm/magnitude -p map_frame:=world",
+            "ros magnetometer lab.usda --online=/slam/pose --measured=qtfm/magnitude map_frame:=world",
+        ),
         ("replay", "a.mcap --ros-args -p use_sim_time:=true -r x:__ns:=/", "ros replay a.mcap --namespace="),
     ],
 )

@@ -210,6 +210,24 @@ class AnomalyMap(Summarized):
         value, slopes, sd = self._look(p_xy, yaw, outside, gradient=True, spreads=self._spreads)
         return value, sd, slopes
 
+    def mean(self, p_xy: ArrayLike, yaw: ArrayLike) -> Array:
+        """Same as `lookup`; with `gradient` and `variance` the map is a belief of the field."""
+        return self.lookup(p_xy, yaw)
+
+    def variance(self, p_xy: ArrayLike, yaw: ArrayLike) -> Array:
+        """Square of the standard deviation of `lookup_with_sd` [nT^2]; 0 for a map without variance."""
+        if self.variance_nt2 is None:
+            return self.lookup(p_xy, yaw) * 0.0
+        return self.lookup_with_sd(p_xy, yaw)[1] ** 2
+
+    def tables(self) -> tuple[Array, Array]:
+        """Values and variances as flat read-only arrays, for compiled code; see `trilinear`.
+
+        Returns:
+            The table of the map, and the planes of its variance, of length 0 if it has none.
+        """
+        return self._lookup.table, np.empty(0) if self.variance_nt2 is None else self._spreads
+
     def at(self, x: float, y: float, yaw: float, *, outside: Outside = "nan") -> float:
         """Field at one pose (x, y [m], yaw [rad]) [nT], as `lookup`, without the overhead of arrays."""
         if outside != "nan":

@@ -19,7 +19,7 @@ FIRST = {
 }
 """Executables, and the parameter of each that is the positional argument of its command."""
 
-OPTIONS = {"magnetometer": ("network", "duration_s")}
+OPTIONS = {"magnetometer": ("network", "online", "measured", "duration_s")}
 """Parameters of the magnetometer that are options; its other parameters are settings, name:=value."""
 
 UNTIMED = ("sim", "replay")

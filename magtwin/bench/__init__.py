@@ -1,0 +1,1 @@
+"""The testbed: localizers on scenarios, their metrics, results and reports."""

@@ -1,0 +1,190 @@
+"""Recorded loops for SLAM without a map: the model ship and the hand-held loops.
+
+Model ship: Viset, Helmons and Kok 2022, An extended Kalman filter for magnetic field SLAM using Gaussian
+process regression, Sensors 22(8), 2833; files `Aligned_SquareLoop_1.mat` to `_4.mat` of
+github.com/fridaviset/EKFMagSLAM, which has no licence. Hand-held: Kok and Solin 2024, Online one-dimensional
+magnetic field SLAM with loop-closure detection, `eight.mat` and `square.mat`, MIT licence.
+magtwin ships neither; give the folder that holds them.
+"""
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from magtwin.errors import InputError
+from magtwin.localize.problem import OdometryModel, Prior, Problem, SensorModel
+from magtwin.run.run import Run
+
+Array = NDArray[np.float64]
+
+SHIP_UNIT_NT = 50_000.0
+"""Field that one unit of the ship's normalised readings is taken for [nT]. No result depends on it."""
+
+SHIP_STEP_VARIANCE_M2, SHIP_HEIGHT_VARIANCE_M2, SHIP_TURN_VARIANCE = 1.01e-3, 1e-7, 1e-5
+"""Variances of the ship's odometry a step, as published: x and y, z [m^2], each axis of rotation [rad^2]."""
+
+SHIP_BIAS_M = (0.003, 0.003, 0.0)
+"""Constant error of the ship's odometry a step, as published [m]."""
+
+SHIP_NOISE, SHIP_LENGTH_M, SHIP_POTENTIAL_SD, SHIP_UNIFORM_SD = 0.1, 0.8, 1.0, 1.0
+"""Published noise, length scale, sd of the potential and sd of the uniform field, in units of the ship."""
+
+SHIP_OFFSET = 0.1
+"""Prior standard deviation of the magnetometer's offset: the noise of one reading, in units of the ship."""
+
+SHIP_FUNCTIONS = {1: 50, 2: 50, 3: 100, 4: 50}
+"""Published number of eigenfunctions of each loop."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A recorded loop as a localization task."""
+
+    problem: Problem
+    """What an algorithm is told."""
+
+    readings: Run
+    """On-board columns only."""
+
+    truth: Run
+    """`t`, `p_world_base` and `q_world_base_xyzw`."""
+
+    vertical_std_s: float
+    """Random walk of odometry's height [m/sqrt(s)], an option of the SLAM methods."""
+
+    tilt_std_s: float
+    """Random walk of odometry's roll and pitch [rad/sqrt(s)], an option of the SLAM methods."""
+
+
+def ship_case(folder: str | os.PathLike[str], loop: int, seed: int) -> Recording:
+    """A loop of the model ship with the published random odometry.
+
+    Each increment of the position in world axes is the true one plus the bias `SHIP_BIAS_M` and normal noise;
+    each increment of the rotation in world axes is the true one plus normal noise. The start is known. The
+    extent is that of the true positions, as published.
+
+    Args:
+        folder: Folder of the files.
+        loop: 1 to 4.
+        seed: Seed of the odometry's noise. An odd seed has the noise of the one before with the opposite sign
+            (antithetic pairs), which makes means over an even number of seeds more precise.
+
+    Raises:
+        InputError: There is no such loop, or its file is missing or wrong.
+    """
+    if loop not in SHIP_FUNCTIONS:
+        raise InputError(f"loop must be 1, 2, 3 or 4, got {loop}", parameter="loop")
+    data = _matlab(Path(folder) / f"Aligned_SquareLoop_{loop}.mat", ("p", "q", "p_0", "q_0", "T", "y_mag"))
+    p, rotation, dt = data["p"].T, _rotation(data["q"].T), float(data["T"].item())
+    y_nt = SHIP_UNIT_NT * data["y_mag"].T
+    rng, sign = np.random.default_rng([loop, seed // 2]), 1 - 2 * (seed % 2)
+    sd = np.sqrt([SHIP_STEP_VARIANCE_M2, SHIP_STEP_VARIANCE_M2, SHIP_HEIGHT_VARIANCE_M2])
+    moved = np.diff(p, axis=0) + SHIP_BIAS_M + sign * sd * rng.standard_normal((len(p) - 1, 3))
+    turned = (rotation[1:] * rotation[:-1].inv()).as_rotvec()
+    turned += sign * math.sqrt(SHIP_TURN_VARIANCE) * rng.standard_normal(turned.shape)
+    p0, R0 = data["p_0"][:, 0], _rotation(data["q_0"].T)[0]
+    odom_p = np.vstack([p0, p0 + np.cumsum(moved, axis=0)])
+    odom_q = _accumulated(R0, Rotation.from_rotvec(turned))
+    problem = Problem(
+        belief=None,
+        extent=(p[:, 0].min(), p[:, 0].max(), p[:, 1].min(), p[:, 1].max()),
+        prior=_start(p0, R0),
+        sensor=SensorModel(
+            white_nt=SHIP_NOISE * SHIP_UNIT_NT, drift_nt=0.0, offset_nt=SHIP_OFFSET * SHIP_UNIT_NT
+        ),
+        odometry=OdometryModel(
+            position_std=0.0,
+            yaw_std=0.0,
+            turn_std=0.0,
+            position_std_s=math.sqrt(SHIP_STEP_VARIANCE_M2 / dt),
+            yaw_std_s=math.sqrt(SHIP_TURN_VARIANCE / dt),
+            scale_std=0.0,
+        ),
+        map_length_m=SHIP_LENGTH_M,
+        rate_hz=1 / dt,
+        seed=seed,
+    )
+    t = dt * np.arange(len(p))
+    return Recording(
+        problem,
+        _readings(t, odom_p, odom_q, y_nt),
+        _truth(t, p, rotation.as_quat()),
+        math.sqrt(SHIP_HEIGHT_VARIANCE_M2 / dt),
+        math.sqrt(SHIP_TURN_VARIANCE / dt),
+    )
+
+
+def ship_options(loop: int | None = None) -> dict[str, Any]:
+    """The published settings as options of the SLAM methods.
+
+    Args:
+        loop: Also give the published number of functions of this loop.
+    """
+    options: dict[str, Any] = {
+        "length_m": SHIP_LENGTH_M,
+        "sd_nt": SHIP_POTENTIAL_SD / SHIP_LENGTH_M * SHIP_UNIT_NT,
+        "uniform_sd_nt": SHIP_UNIFORM_SD * SHIP_UNIT_NT,
+        "kernel": "se",
+        "margin_m": 1.0,
+        "odometry_axes": "world",
+    }
+    if loop is not None:
+        options["functions"] = SHIP_FUNCTIONS[loop]
+    return options
+
+
+def _matlab(path: Path, names: tuple[str, ...]) -> dict[str, Array]:
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        data = loadmat(path)
+    except (OSError, ValueError, MatReadError, NotImplementedError) as error:
+        raise InputError(f"{path}: cannot be read as a MATLAB file ({error})") from error
+    for name in names:
+        if name not in data:
+            raise InputError(f"{path}: has no array {name!r}")
+    return {name: np.asarray(data[name], float) for name in names}
+
+
+def _rotation(wxyz: Array) -> Rotation:
+    return Rotation.from_quat(wxyz[:, [1, 2, 3, 0]])
+
+
+def _accumulated(first: Rotation, increments: Rotation) -> Array:
+    """Orientations x, y, z, w after increments in world axes, shape (N + 1, 4)."""
+    R = [first.as_matrix()]
+    for increment in increments.as_matrix():
+        R.append(increment @ R[-1])
+    return np.asarray(Rotation.from_matrix(np.array(R)).as_quat())
+
+
+def _start(p: Array, R: Rotation, sd: tuple[float, float, float] = (1e-3, 1e-3, 1e-3)) -> Prior:
+    m = R.as_matrix()
+    return Prior(mean=(float(p[0]), float(p[1]), math.atan2(m[1, 0], m[0, 0])), sd=sd)
+
+
+def _readings(t: Array, p: Array, q: Array, y_nt: Array) -> Run:
+    return Run(
+        {
+            "t": t,
+            "odom_p": p,
+            "odom_q_xyzw": q,
+            "b_measured_nt": np.linalg.norm(y_nt, axis=1),
+            "b_vector_measured_nt": y_nt,
+        }
+    )
+
+
+def _truth(t: Array, p: Array, q: Array) -> Run:
+    R = Rotation.from_quat(q).as_matrix()
+    return Run({"t": t, "p_world_base": p, "q_world_base_xyzw": q, "yaw": np.arctan2(R[:, 1, 0], R[:, 0, 0])})
+
+
+Loop = Literal["eight", "square"]

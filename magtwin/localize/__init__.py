@@ -1,0 +1,1 @@
+"""Localization on the magnetic field: protocols, filters, smoothers, bounds and scores."""

@@ -1,0 +1,1 @@
+"""Magnetic SLAM without a map: a reduced-rank Gaussian process of the field, estimated with the poses."""

@@ -1,0 +1,71 @@
+"""Incremental SLAM: a causal filter that is relinearised at the most probable trajectory until now."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magtwin.errors import InputError
+from magtwin.localize.localizers import localizer
+from magtwin.localize.problem import Estimate, Problem, Reading
+from magtwin.localize.slam.batch import Batch, joined
+from magtwin.localize.slam.ekf_slam import EkfSlam
+from magtwin.localize.slam.model import State
+from magtwin.localize.slam.samples import Samples, followed_by
+
+
+@localizer("incremental-slam")
+@dataclass(kw_only=True)
+class IncrementalSlam(EkfSlam):
+    """EKF-SLAM that solves for all poses until now at regular intervals, and goes on from the solution.
+
+    Between two solutions it is `EkfSlam`. At a solution, Gauss-Newton relinearises every pose since the start
+    (`magtwin.localize.slam.batch`), and the filter takes the joint mean and covariance of the last pose and
+    the constants. An estimate uses no later reading.
+    """
+
+    every: int = 10
+    """Readings between two solutions."""
+
+    iterations: int = 2
+    """Gauss-Newton iterations of a solution."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("every", "iterations"):
+            if not (isinstance(getattr(self, name), int) and getattr(self, name) >= 1):
+                raise InputError(f"{name} must be a whole number from 1", parameter=name)
+
+    def reset(self, problem: Problem) -> None:
+        """Begin a run."""
+        super().reset(problem)
+        self._samples: list[Samples] = []
+        self._states: list[State] = []
+        self._fresh = 0
+
+    def step(self, reading: Reading) -> Estimate:
+        """Move and update as `EkfSlam`; solve for all poses when it is time."""
+        estimate = super().step(reading)
+        assert self._last is not None
+        self._samples.append(self._last)
+        self._states.append(self.state)
+        self._fresh += 1
+        if self._fresh < self.every:
+            return estimate
+        self._solve()
+        return self._estimate(reading.t)
+
+    def trajectory(self) -> tuple[Samples, State]:
+        """All samples and the most probable states until now, as of the last solution."""
+        return followed_by(self._samples), joined(self._states)
+
+    def _solve(self) -> None:
+        assert self.model is not None
+        self._fresh = 0
+        samples, state = self.trajectory()
+        self._samples = [samples]
+        batch = Batch(self.model, samples)
+        state, _ = batch.iterate(state, self.iterations)
+        self._states = [state]
+        solution, _ = batch.posterior(state)
+        self.state = State(state.p[-1:], state.R[-1:], state.drift[-1:], state.g)
+        self.covariance = np.ascontiguousarray(solution.last_covariance())
