@@ -334,15 +334,15 @@ class MapSmoother:
         sum |r_field|^2 + sum |r_odometry|^2 + sum |r_drift|^2 + sum |r_error|^2 + |r_prior|^2
 
     by Levenberg-Marquardt (Marquardt 1963). The normal equations are block tridiagonal with a border, so
-    that a step costs O(N). It starts at the forward pass of a filter, with dead reckoning back from the time at
-    which that is no longer lost, and at dead reckoning from the prior if there is one; the lower cost wins. The
-    covariances are those of the linearised problem.
+    that a step costs O(N). It starts at the forward pass of a filter, with dead reckoning back from the time
+    at which that is no longer lost, and at dead reckoning from the prior if there is one; the lower cost
+    wins. The covariances are those of the linearised problem.
 
     Args:
         start: Localizer of the forward pass. Default: the point-mass filter.
         robust: "huber": Huber's loss on readings and odometry; "gnc": graduated non-convexity with the loss
-            of Geman and McClure (Yang et al. 2020, IEEE RA-L 5:1127), which also ignores gross outliers; None:
-            least squares.
+            of Geman and McClure (Yang et al. 2020, IEEE RA-L 5:1127), which also ignores gross outliers;
+            None: least squares.
         iterations: Most steps per start.
     """
 

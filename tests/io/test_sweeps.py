@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 
+import chunk_work
 import pytest
 
 from magtwin.cli import main
@@ -124,13 +125,11 @@ def test_what_does_not_fit_is_refused(runs, whole, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_that_cannot_be_made_leaves_nothing(warm, lab_scene, tmp_path):
-    twin = open_twin(lab_scene, magnetometer="physical")
-    far = [[3.0, 3.0], [60.0, 3.0]]
-    with pytest.raises(InputError, match="outside"):
-        save_runs(
-            sweep(twin, [far], 2, duration_s=200.0, rate_hz=2.0, outside="raise"), tmp_path / "runs", jobs=2
-        )
+def test_a_run_that_cannot_be_made_leaves_nothing(warm, lab_scene, tmp_path, monkeypatch):
+    broken = runs_of(lab_scene, 2)
+    monkeypatch.setattr(broken, "_finish", chunk_work.Refusing())
+    with pytest.raises(InputError, match="the robot is out of the map"):
+        save_runs(broken, tmp_path / "runs", jobs=2)
     assert not list(tmp_path.iterdir())
 
 

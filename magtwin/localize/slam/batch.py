@@ -188,6 +188,15 @@ class Batch:
             share /= 2
         return state, cost
 
+    def fit_constants(self, state: State) -> State:
+        """The constants that fit best with all poses held, in one linear step.
+
+        Without it a trajectory is lost at once: with weights of 0, no reading holds the poses.
+        """
+        arrow, _ = self.linearised(state)
+        g = np.linalg.solve(arrow.corner, arrow.right)
+        return state._replace(g=state.g + g)
+
     def posterior(self, state: State) -> tuple[Solution, float]:
         """Linearisation at a state: covariances, and the Laplace approximation of -log p(y).
 
