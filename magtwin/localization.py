@@ -6,7 +6,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -34,11 +34,11 @@ from magtwin.localize.problem import (
     SensorModel,
     Smoother,
 )
-from magtwin.localize.scores import AWAY_S, FAR_M, Scores, score
+from magtwin.localize.scores import AWAY_S, FAR_M, HELD_S, NEAR_M, Scores, score
 from magtwin.localize.track import EST_COLUMNS, Track, track
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run
-from magtwin.twin import scene_file
+from magtwin.twin import Twin, scene_file
 from magtwin.verdict import EVEN
 
 RATE_HZ = 5.0
@@ -46,6 +46,11 @@ RATE_HZ = 5.0
 
 START_SD = (0.1, 0.1, math.radians(5))
 """Standard deviation of a known start: x, y [m] and yaw [rad]."""
+
+ROBOT_NOISE = SensorModel(white_nt=100.0, drift_nt=250.0, drift_s=2.5, offset_nt=500.0, iron_nt=400.0)
+"""Default noise model of a magnetometer on a robot: the own field of the shipped TurtleBot 4 in new sessions.
+In six simulated drives the difference of the readings from the map had a mean of 190 to 520 nT, 290 to 500 nT
+along the heading, and the rest 180 to 280 nT with a correlation of 0.4 to 0.6 after 2 s."""
 
 LEAST_ON_MAP = 0.5
 """Share of the readings that must be on the map."""
@@ -147,7 +152,7 @@ def localize(
         method: A name in `magtwin.localize.localizers.LOCALIZERS`, "module:Class", or an object.
         options: Keyword arguments of the method's class.
         prior: The pose at the first reading, or a text of `prior_of`. Default: "tracking".
-        sensor: Noise model of the magnetometer. Default: `SensorModel()`, with the lever arm in the run's
+        sensor: Noise model of the magnetometer. Default: `ROBOT_NOISE`, with the lever arm in the run's
             metadata.
         odometry: Noise model of the odometry.
         map_length_m: Correlation length of the map's error [m].
@@ -226,7 +231,7 @@ def _localization(
         belief=anomaly_map,
         extent=extent_of(run, anomaly_map),
         prior=prior if isinstance(prior, Prior) else prior_of(run, prior or "tracking", seed=seed),
-        sensor=sensor or SensorModel(lever_arm_m=lever_arm),
+        sensor=sensor or replace(ROBOT_NOISE, lever_arm_m=lever_arm),
         odometry=odometry or OdometryModel(),
         map_length_m=map_length_m,
         rate_hz=rate_hz or (run.rows - 1) / max(run.duration_s, 1e-9),
@@ -241,6 +246,46 @@ def _localization(
     name = method if isinstance(method, str) else type(method).__name__
     estimated = run.with_columns(**made.columns()).with_specs(**EST_COLUMNS)
     return Localization(estimated.with_metadata(localizer=name, localizer_seed=seed), problem, made, name)
+
+
+def live_problem(
+    twin: Twin,
+    anomaly_map: FieldBelief | Source | None = None,
+    *,
+    sensor: Mapping[str, Any] | None = None,
+    odometry: OdometryModel | None = None,
+    map_length_m: float = 0.3,
+    seed: int = 0,
+) -> Problem:
+    """What a method is told when it localizes the robot of a twin live; its prior is the default one.
+
+    Args:
+        twin: Gives the map, the floor and the place of the magnetometer.
+        anomaly_map: Map in place of the twin's, as for `localize`; "none": no map (SLAM).
+        sensor: Figures of `SensorModel` that differ from `ROBOT_NOISE` and the robot's lever arm.
+        odometry: As for `localize`.
+        map_length_m: As for `localize`.
+        seed: As for `localize`.
+
+    Raises:
+        InputError: There is no such map.
+    """
+    belief: FieldBelief | None = twin.field
+    if isinstance(anomaly_map, str | os.PathLike):
+        belief = None if str(anomaly_map) == "none" else open_map(map_file(anomaly_map))
+    elif anomaly_map is not None:
+        belief = anomaly_map
+    x, y = (side / 2 for side in twin.scene.lab.floor_m)
+    return Problem(
+        belief=belief,
+        extent=belief.extent if isinstance(belief, AnomalyMap) else (-x, x, -y, y),
+        sensor=replace(
+            ROBOT_NOISE, **{"lever_arm_m": tuple(twin.scene.robot.p_base_magnetometer[:2]), **(sensor or {})}
+        ),
+        odometry=odometry or OdometryModel(),
+        map_length_m=map_length_m,
+        seed=seed,
+    )
 
 
 def new_localizer(out: Source, *, force: bool = False) -> Path:
@@ -324,7 +369,8 @@ def verdict_of(scores: Scores, dead_m: float, start: str = "") -> str:
         words = [f"Better than {name}: {sizes}, {less:.0%} less."]
     else:
         words = [f"WORSE than {name}: {sizes}."]
-    figure = f"ANEES {scores.anees:.2f} per state"
+    size = f"{scores.anees:.2f}" if scores.anees < 1e3 else f"{scores.anees:.0e}"
+    figure = f"ANEES {size} per state"
     if not math.isfinite(scores.anees):
         words.append("Its covariance is unknown." if math.isnan(scores.anees) else "Its covariance is WRONG.")
     elif scores.anees > scores.anees_high:
@@ -333,6 +379,8 @@ def verdict_of(scores: Scores, dead_m: float, start: str = "") -> str:
         words.append(f"Too cautious: {figure}, at least {scores.anees_low:.2f} expected.")
     else:
         words.append(f"Consistent: {figure}.")
+    if not math.isfinite(scores.converged_s) and not scores.diverged:
+        words.append(f"It never stayed within {NEAR_M:g} m for {HELD_S:g} s.")
     if scores.diverged:
         flagged = "" if scores.diverged_unflagged else ", and flagged it"
         words.append(f"LOST: its error stayed above {FAR_M:g} m for more than {AWAY_S:g} s{flagged}.")
@@ -434,7 +482,14 @@ def map_file(source: Source) -> Path:
     path = Path(source)
     if path.is_dir() and not (path / f"{path.resolve().name}.usda").is_file():
         return path
-    return path if path.is_file() else Path(scene_file(path))
+    if path.is_file():
+        return path
+    try:
+        return Path(scene_file(path))
+    except InputError as error:
+        raise InputError(
+            f"{source}: no map layer, stage, folder of CSVs or shipped scene: {error}"
+        ) from error
 
 
 def check_map(run: Run, anomaly_map: AnomalyMap, file: Path) -> None:

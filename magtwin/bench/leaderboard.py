@@ -19,6 +19,10 @@ CONSISTENT = (0.8, 1.3)
 """ANEES per state that counts as consistent."""
 
 
+SHOWN = 0.05
+"""p-value below which a difference counts as shown."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Standing:
     """A localizer on a scenario, over all runs. Failed runs count in `failed` and in no error."""
@@ -40,7 +44,7 @@ class Standing:
     """Root mean square of the heading error."""
 
     bound_m: float
-    """Root mean square of the bound: with the map's error as correlated."""
+    """Root mean square of the bound with the map's error as correlated; of the smoothed one for smoothers."""
 
     anees: float
     """Mean over runs of the normalised squared error per state."""
@@ -120,7 +124,7 @@ def _standing(scenario: str, localizer: str, rows: Columns, step_us: float) -> S
         median_m=float(np.median(errors)) if len(errors) else math.nan,
         p95_m=float(np.percentile(errors, 95)) if len(errors) else math.nan,
         heading_rad=_rms(rows["heading_rad"][good]),
-        bound_m=_rms(rows["bound_correlated_m"][good]),
+        bound_m=_rms(rows["bound_smoothed_m" if rows["smoother"].any() else "bound_correlated_m"][good]),
         anees=_mean(rows["anees"][good]),
         coverage=_mean(rows["coverage"][good]),
         diverged=rate(diverged, count),
@@ -149,7 +153,7 @@ class Difference:
     @property
     def verdict(self) -> str:
         """Which is better, in words."""
-        if self.rmse_m.p >= 0.05:
+        if self.rmse_m.p >= SHOWN:
             return "no difference shown"
         better, worse = (self.b, self.a) if self.rmse_m.difference > 0 else (self.a, self.b)
         return f"{better} is better than {worse}"

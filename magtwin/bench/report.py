@@ -1,6 +1,7 @@
 """Report: results of a benchmark as one page, with tables, and pictures of how errors are distributed."""
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -8,7 +9,8 @@ import numpy as np
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from magtwin.bench.leaderboard import Columns, Difference, Standing, compare_rows, standings
+from magtwin.bench.leaderboard import SHOWN, Columns, Difference, Standing, compare_rows, standings
+from magtwin.bench.results import read_results
 from magtwin.bench.statistics import Interval
 from magtwin.bench.suite import Scenario
 from magtwin.figures.canvas import (
@@ -22,7 +24,9 @@ from magtwin.figures.canvas import (
     picture,
 )
 from magtwin.figures.evaluations import INKS
-from magtwin.figures.page import Page, Section, Table
+from magtwin.figures.page import Page, Section, Table, write_page, write_pages
+from magtwin.files import check_free
+from magtwin.report import Report
 
 Array = NDArray[np.float64]
 
@@ -30,6 +34,90 @@ CELL_M = 0.25  # Side of the cells in which errors are averaged over the floor [
 MOST_PANELS = 6  # Localizers in one figure of floors
 LEAST_M, MOST_M = 0.01, 5.0  # Range of errors in figures [m]
 BOUND_INK = "0.35"
+
+
+NAME = "bench"
+"""Name of a report's files."""
+
+
+def report_results(
+    folders: Sequence[str | os.PathLike[str]], out: str | os.PathLike[str], *, force: bool = False
+) -> None:
+    """Write the report of results as a folder: bench.html, bench.md and bench.json.
+
+    Args:
+        folders: Folders of results of one suite.
+        out: The folder to make.
+        force: Whether to replace an existing folder.
+
+    Raises:
+        InputError: A folder holds no results or those of another suite, or `out` exists.
+    """
+    check_free(out, force=force)
+    made = read_results(*folders)
+    rows = made.rows
+    pairs = dict.fromkeys(zip(rows["scenario"].tolist(), rows["localizer"].tolist(), strict=True))
+    tracks = [
+        {"scenario": scenario, "localizer": localizer, **track}
+        for scenario, localizer in pairs
+        for track in made.tracks(scenario, localizer)
+    ]
+    about = made.about
+    origin = (
+        f"Suite {about['name']}, version {about['version']}, {about['seeds']} seeds, checksum "
+        f"{about['sha256'][:12]}; magtwin {about['magtwin']}."
+    )
+    if made.missing:
+        origin += f" {made.missing:,} runs of the suite are missing."
+    page = page_of_results(
+        rows, made.times, tracks, made.suite.scenarios, title=f"Benchmark {about['name']}", origin=origin
+    )
+    write_pages(page, out, NAME, force=force)
+
+
+def compare_results(
+    a: str | os.PathLike[str],
+    b: str | os.PathLike[str],
+    out: str | os.PathLike[str] | None = None,
+    *,
+    force: bool = False,
+) -> Report:
+    """Compare two results of one suite, run by run.
+
+    Args:
+        a: Folder of results.
+        b: Folder of other results.
+        out: Page to write: .html, .md or .json. None: none.
+        force: Whether to replace an existing page.
+
+    Raises:
+        InputError: A folder holds no results, they share no run, or `out` exists.
+    """
+    if out is not None:
+        check_free(out, force=force)
+    first, second = read_results(a), read_results(b)
+    if out is not None:
+        write_page(page_of_comparison(first.rows, second.rows, (str(a), str(b))), out, force=force)
+    lines = {}
+    for d in compare_rows(first.rows, second.rows):
+        lines[f"{d.scenario}, {d.a}"] = (
+            f"A - B {d.rmse_m.difference:+.4f} m ({d.rmse_m.low:+.4f} to {d.rmse_m.high:+.4f}), "
+            f"p {d.rmse_m.p:.2g}, {d.runs} runs: "
+            + (
+                "no difference shown"
+                if d.rmse_m.p >= SHOWN
+                else "B is better"
+                if d.rmse_m.difference > 0
+                else "A is better"
+            )
+        )
+    same = first.about["sha256"] == second.about["sha256"]
+    notes = (
+        {}
+        if same
+        else {"note": "the suites differ; only runs with the same scenario name and seed are compared"}
+    )
+    return Report(f"RMSE of {a} (A) and {b} (B)", (), {"differences": lines, **notes})
 
 
 def page_of_results(
@@ -153,7 +241,7 @@ def _lead(rows: Columns) -> str:
     )
     return text + (
         "Trajectories are not aligned. The bound is the posterior Cramer-Rao bound with the map's error as "
-        "correlated. Intervals: 95 %, by bootstrap over sessions."
+        "correlated; that of all readings for smoothers. Intervals: 95 %, by bootstrap over sessions."
     )
 
 

@@ -1,16 +1,23 @@
-"""`magtwin bench`."""
+"""`magtwin bench`, its report, and comparisons."""
 
 from pathlib import Path
 from typing import Annotated, Literal
 
-from cyclopts import Parameter
+from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Dask, Flag, Force, Jobs, Names, Shard, Whole, pairs
 from magtwin.cli.terminal import Done, announce, progress
 
+Results = Annotated[Path, Parameter(required=True)]
 
-@app.command
+bench_app = App(
+    name="bench", help="Benchmark localizers on simulated and recorded drives, and report the results."
+)
+app.command(bench_app)
+
+
+@bench_app.default
 def bench(
     suite: str,
     *,
@@ -73,3 +80,42 @@ def bench(
             progress=advance,
         )
     return Done(made.report(standings(made.rows, made.times)), out)
+
+
+@bench_app.command
+def report(*folders: Results, out: Path | None = None, force: Force = False) -> Done:
+    """Write a page about results: leaderboard, distributions, errors over time and over the floor.
+
+    The folder gets bench.html, which needs no other file, bench.md with its pictures, and bench.json.
+
+    Parameters
+    ----------
+    folders
+        Folders of results of one suite, as of shards on several machines.
+    out
+        Folder to make. Default: report, in the first folder.
+    """
+    from magtwin.bench.report import report_results
+
+    announce("Reading the results")
+    made = folders[0] / "report" if out is None else out
+    report_results(folders, made, force=force)
+    return Done(wrote=made)
+
+
+@bench_app.command
+def compare(a: Path, b: Path, *, out: Path | None = None, force: Force = False) -> Done:
+    """Compare two results of one suite, run by run: paired differences with intervals and p-values.
+
+    Parameters
+    ----------
+    a
+        Folder of results.
+    b
+        Folder of other results with the same scenarios and seeds, as of another version of a localizer.
+    out
+        Page to write: .html, .md or .json. Default: only print.
+    """
+    from magtwin.bench.report import compare_results
+
+    return Done(compare_results(a, b, out, force=force), wrote=out or ())

@@ -1,13 +1,13 @@
-"""`magtwin localize`: estimate the pose along a run."""
+"""`magtwin localize` and `magtwin ros localize`: estimate the pose along a run, or live."""
 
 import json
-import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force, Names, Seed, pairs
+from magtwin.cli.ros import HERE, WallS, Where, ros_app, spin
 from magtwin.cli.terminal import Done, announce, progress
 from magtwin.errors import InputError, hint
 
@@ -56,8 +56,9 @@ def localize(
     rate_hz
         Readings per second that the method gets [Hz].
     sensor
-        Figure of the magnetometer's noise model that the method is told, as NAME=VALUE: white_nt, drift_nt,
-        drift_s, offset_nt, iron_nt. May be repeated.
+        Figure of the magnetometer's noise model that the method is told, as NAME=VALUE: white_nt (100),
+        drift_nt (250), drift_s (2.5), offset_nt (500), iron_nt (400). May be repeated. The defaults are those
+        of the shipped robot's own field.
     odometry
         Figure of the odometry's noise model, as NAME=VALUE: position_std, yaw_std, turn_std, position_std_s,
         yaw_std_s, scale_std. May be repeated.
@@ -67,12 +68,10 @@ def localize(
     from magtwin.figures.localization import save_localization
     from magtwin.files import check_free
     from magtwin.io.formats import read_run
-    from magtwin.localization import lever_arm_of, localization
+    from magtwin.localization import ROBOT_NOISE, lever_arm_of, localization
     from magtwin.localize.problem import OdometryModel, SensorModel
 
     check_free(out, force=force)
-    if ":" in method and str(Path.cwd()) not in sys.path:
-        sys.path.insert(0, str(Path.cwd()))
     announce(f"Reading {run}")
     whole = read_run(run)
     told = _values("sensor", sensor, SensorModel)
@@ -83,7 +82,7 @@ def localize(
             method=method,
             options=_values("option", option),
             prior=prior,
-            sensor=SensorModel(**{"lever_arm_m": lever_arm_of(whole), **told}),
+            sensor=replace(ROBOT_NOISE, **{"lever_arm_m": lever_arm_of(whole), **told}),
             odometry=OdometryModel(**_values("odometry", odometry, OdometryModel)),
             map_length_m=map_length_m,
             rate_hz=rate_hz,
@@ -94,6 +93,72 @@ def localize(
     announce("Writing the estimate")
     save_localization(result, out, force=force)
     return Done(result.report(), out)
+
+
+@ros_app.command(name="localize", usage="Usage: magtwin ros localize [OPTIONS] SCENE [SETTING...]")
+def localize_live(
+    scene: Path,
+    *settings: str,
+    where: Where = HERE,
+    method: str = "rbpf",
+    option: Names = None,
+    map: str | None = None,  # noqa: A002
+    sensor: Names = None,
+    odometry: Names = None,
+    map_length_m: float = 0.3,
+    seed: Seed = 0,
+    duration_s: WallS = None,
+) -> Done:
+    """Localize a robot live by its magnetometer and odometry, with any method of `magtwin localize`.
+
+    It reads qtfm/magnitude and odom, and passes IMU, battery, commands and scans on to the method. It
+    publishes estimate/pose (PoseWithCovarianceStamped), estimate/lost (Bool), estimate/particles (PoseArray)
+    and the transform from map to odom, and its state in /diagnostics. A pose on /initialpose makes it begin
+    anew there. Settings have the form of ROS, name:=value: rate_hz (5), use_sim_time, prior (wait, global,
+    or x,y,yaw), max_age_s (0.5), silent_s (0.5), tf_broadcast (true), cloud_hz (1), particles (500).
+
+    Parameters
+    ----------
+    scene
+        USD stage that names the robot and the map, or the name of a scene that ships with magtwin: lab.
+    settings
+        Settings, such as prior:=global use_sim_time:=true.
+    method
+        As for `magtwin localize`.
+    option
+        Option of the method, as NAME=VALUE. May be repeated.
+    map
+        Map in place of the scene's; none: no map.
+    sensor
+        As for `magtwin localize`.
+    odometry
+        As for `magtwin localize`.
+    map_length_m
+        Correlation length of the map's error that the method is told [m].
+    """
+    from magtwin.localization import live_problem
+    from magtwin.localize.problem import OdometryModel, SensorModel
+    from magtwin.ros.localize import PARAMETERS, LocalizerNode
+    from magtwin.ros.parameters import settings as settings_of
+    from magtwin.twin import open_twin
+
+    values = settings_of(PARAMETERS, settings)
+    announce(f"opening {scene}")
+    twin = open_twin(scene, magnetometer="map-only")
+    problem = live_problem(
+        twin,
+        map,
+        sensor=_values("sensor", sensor, SensorModel),
+        odometry=OdometryModel(**_values("odometry", odometry, OdometryModel)),
+        map_length_m=map_length_m,
+        seed=seed,
+    )
+    options = _values("option", option)
+    with where.bus("magtwin_localize", sim_time=values["use_sim_time"], duration_s=duration_s) as bus:
+        LocalizerNode(twin, bus, values, method=method, options=options, problem=problem, say=announce)
+        announce(f"localizing by {bus.backend}; Ctrl-C ends")
+        spin(bus, duration_s)
+    return Done()
 
 
 def _values(option: str, texts: list[str] | None, model: Any = None) -> dict[str, Any]:

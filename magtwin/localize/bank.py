@@ -78,7 +78,7 @@ class Likelihood:
 
 
 def moments(stats: Array) -> tuple[Array, Array]:
-    """Mean, as difference from the reference, and covariance of x, y and yaw from sums of compiled updates."""
+    """Mean, minus the reference, and covariance of x, y and yaw from the sums of a compiled update."""
     shift = stats[4:7] / stats[3]
     second = np.empty((3, 3))
     second[np.triu_indices(3)] = stats[7:13]
@@ -138,8 +138,8 @@ class Bank:
         states = np.zeros((logw.size, self.n + self.n**2))
         states[:, 0], states[:, 1], states[:, 2] = x.ravel(), y.ravel(), yaw.ravel()
         states[:, self.n :: self.n + 1] = variances
-        self.logw = (logw - np.log(np.exp(logw).sum())).ravel()
-        self._state = states.ravel()
+        self.logw: Array = (logw - np.log(np.exp(logw).sum())).ravel()
+        self._state: Array = states.ravel()
 
     @property
     def means(self) -> Array:

@@ -1,4 +1,4 @@
-"""Compiled loops of the point-mass filter and of sequence matching. Only `point_mass.LOOPS` opens this module.
+"""Compiled loops of the point-mass filter and of sequence matching, which `point_mass.LOOPS` opens.
 
 A grid is a stack of layers, one per heading. Node (h, j, i) lies at origin_h + A (i, j), with the same axes A
 in all layers. `layers` has heading, origin x and origin y of each layer, shape (3 H,); `axes` has A by rows
@@ -239,7 +239,7 @@ def mix(
             for side in range(2):
                 if sources[side] >= 0:
                     for dj in range(-1, 3):
-                        v = int(math.floor(j + shift_j[side])) + dj
+                        v = math.floor(j + shift_j[side]) + dj
                         near = near or (0 <= v < rows and full[sources[side] * rows + v] > 0)
             if not near:
                 for i in range(columns):
@@ -266,7 +266,7 @@ def mix(
                     if sources[side] < 0:
                         continue
                     u, v = i + shift_i[side], j + shift_j[side]
-                    iu, jv = int(math.floor(u)), int(math.floor(v))
+                    iu, jv = math.floor(u), math.floor(v)
                     fu, fv = u - iu, v - jv
                     for dj in range(2):
                         for di in range(2):
@@ -321,7 +321,7 @@ def regrid(
     for t in range(shape_out[0]):
         level = (layers_out[3 * t] - layers[0]) / axes[4]
         inside = -1.0 <= level <= layers_
-        low = min(max(int(math.floor(level)), 0), layers_ - 2)
+        low = min(max(math.floor(level), 0), layers_ - 2)
         up, high = level - low, low + 1
         ox = layers[3 * low + 1] + up * (layers[3 * high + 1] - layers[3 * low + 1])
         oy = layers[3 * low + 2] + up * (layers[3 * high + 2] - layers[3 * low + 2])
@@ -335,8 +335,8 @@ def regrid(
                 v = (axes[0] * dy - axes[2] * dx) / determinant
                 if not (inside and -1 <= u <= columns and -1 <= v <= rows):
                     continue
-                iu = min(max(int(math.floor(u)), 0), columns - 2)
-                jv = min(max(int(math.floor(v)), 0), rows - 2)
+                iu = min(max(math.floor(u), 0), columns - 2)
+                jv = min(max(math.floor(v), 0), rows - 2)
                 fu, fv = u - iu, v - jv
                 cu, cv, cw = min(max(fu, 0.0), 1.0), min(max(fv, 0.0), 1.0), min(max(up, 0.0), 1.0)
                 # linear: of the states, and of the mass where the expansion fails
@@ -360,9 +360,9 @@ def regrid(
                 for a in range(size):
                     state_out[m + a] /= shares
                 # second order about the nearest node
-                ci = min(max(int(math.floor(u + 0.5)), 1), columns - 2)
-                cj = min(max(int(math.floor(v + 0.5)), 1), rows - 2)
-                ch = min(max(int(math.floor(level + 0.5)), 1), layers_ - 2)
+                ci = min(max(math.floor(u + 0.5), 1), columns - 2)
+                cj = min(max(math.floor(v + 0.5), 1), rows - 2)
+                ch = min(max(math.floor(level + 0.5), 1), layers_ - 2)
                 smooth = True
                 for near in range(27):
                     ni, nj, nh = ci + near % 3 - 1, cj + near // 3 % 3 - 1, ch + near // 9 - 1
@@ -597,3 +597,60 @@ def splat(
                         p += 1
         for a in range(size):
             state[k * size + a] = total[a]
+
+
+@compiled(_IN, _IN, _IN, _IN, _IN, _IN, _IN, _REAL, _OUT)
+def match(
+    table: Array,
+    path: Array,
+    residual: Array,
+    whitening: Array,
+    xs: Array,
+    ys: Array,
+    yaws: Array,
+    margin: float,
+    costs: Array,
+) -> None:
+    """Misfit of a sequence of readings at all placements of its path.
+
+    Args:
+        table: The map.
+        path: x, y of the sensor and heading at each reading relative to the newest pose, shape (3 N,).
+        residual: The readings [nT], shape (N,).
+        whitening: Inverse of the Cholesky factor of the readings' covariance, by rows, shape (N N,).
+        xs: Places of the newest pose.
+        ys: The same along y.
+        yaws: Headings of the newest pose.
+        margin: A placement is given up once its misfit exceeds the least one by this.
+        costs: Output by heading, y and x: squared Mahalanobis distance, infinite if given up.
+    """
+    n = residual.shape[0]
+    misfit = np.empty(n)
+    least = np.inf
+    for h in range(yaws.shape[0]):
+        c, s = math.cos(yaws[h]), math.sin(yaws[h])
+        for j in range(ys.shape[0]):
+            for i in range(xs.shape[0]):
+                total = 0.0
+                for k in range(n):
+                    dx, dy = path[3 * k], path[3 * k + 1]
+                    field = at(
+                        table,
+                        xs[i] + c * dx - s * dy,
+                        ys[j] + s * dx + c * dy,
+                        yaws[h] + path[3 * k + 2],
+                        False,
+                    )
+                    if field == field:
+                        misfit[k] = residual[k] - field
+                        white = 0.0
+                        for m in range(k + 1):
+                            white += whitening[k * n + m] * misfit[m]
+                    else:  # as a misfit of three standard deviations
+                        white = 3.0
+                        misfit[k] = misfit[k - 1] if k > 0 else 0.0
+                    total += white * white
+                    if total > least + margin:
+                        break
+                costs[(h * ys.shape[0] + j) * xs.shape[0] + i] = total if total <= least + margin else np.inf
+                least = min(least, total)

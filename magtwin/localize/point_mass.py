@@ -1,6 +1,7 @@
 """Point-mass filter: the posterior on a grid over x, y and heading that follows it."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,7 +9,7 @@ from magtwin.compiled import Loops
 from magtwin.errors import InputError
 from magtwin.localize.bank import CUT, SPAN, WHITE_SHARE, Bank, Likelihood, moments
 from magtwin.localize.belief import table_of
-from magtwin.localize.odometry import increment
+from magtwin.localize.odometry import increment, repeats
 from magtwin.localize.problem import Array, Estimate, Problem, Reading
 
 LOOPS = Loops("magtwin.localize.grid_loops", pays=0.0)
@@ -59,7 +60,7 @@ class Grid:
 
     def poses(self) -> Array:
         """x, y and heading of all nodes, shape (H Y X, 3)."""
-        h, j, i = np.indices(self.shape[:3])
+        h, j, i = np.indices(self.shape[:3].tolist())
         yaw, ox, oy = self.layers.reshape(-1, 3).T
         a = self.axes
         x, y = ox[h] + a[0] * i + a[1] * j, oy[h] + a[2] * i + a[3] * j
@@ -119,12 +120,14 @@ class PointMass:
     The window is sheared and scaled as the posterior. Until the posterior is compact, a bank of Kalman
     filters on a grid of starts (`magtwin.localize.bank`) stands for it: as cells with a slope.
 
+    A reading that repeats itself to the bit while the robot moves is not used, nor is nan.
+
     Args:
         nodes: Nodes of the window along each of its three axes, odd.
         cell_m: Greatest distance of starts [m].
         heading_deg: Greatest distance of their headings [deg].
-        temper: Divisor of the log-likelihood, above 1 to allow for errors that the noise model lacks. Default:
-            1, or 1.5 if the map has a variance.
+        temper: Divisor of the log-likelihood, above 1 to allow for errors that the noise model lacks.
+            Default: 1, or 1.5 if the map has a variance.
         reset_at: Surprise [nats] at which the filter starts again from an unknown pose; infinity never does.
         scale_m: Distance over which the odometry's scale error counts as random [m].
     """
@@ -143,15 +146,14 @@ class PointMass:
             if not value > 0:
                 raise InputError(f"{name} of PointMass must be above 0, got {value}", parameter=name)
         if not (nodes >= 9 and nodes % 2 == 1):
-            raise InputError(
-                f"nodes of PointMass must be odd and at least 9, got {nodes}", parameter="nodes"
-            )
+            raise InputError(f"nodes of PointMass must be odd and at least 9, got {nodes}", parameter="nodes")
         if temper is not None and not temper > 0:
             raise InputError(f"temper of PointMass must be above 0, got {temper}", parameter="temper")
         if not 0 <= scale_m < math.inf:
             raise InputError(
                 f"scale_m of PointMass must be finite and not negative, got {scale_m}", parameter="scale_m"
             )
+        self._mean, self._lost = np.zeros(3), True
         self._nodes, self._cell, self._heading = nodes, cell_m, math.radians(heading_deg)
         self._temper, self._reset_at, self._scale_m = temper, reset_at, scale_m
 
@@ -166,9 +168,9 @@ class PointMass:
         self._code = LOOPS.open()
         self._problem = problem
         table, spreads = table_of(problem.belief, problem.extent)
-        self._likelihood = Likelihood(
-            problem, table, spreads, self._temper or (1.5 if len(spreads) else 1.0)
-        )
+        spreads = spreads if spreads.any() else spreads[:0]
+        temper = self._temper or (1.5 if len(spreads) else 1.0)
+        self._likelihood = Likelihood(problem, table, spreads, temper)
         self._last: Reading | None = None
         self._surprise = 0.0
         self._begin(problem.prior.mean, problem.prior.sd)
@@ -176,6 +178,8 @@ class PointMass:
     def step(self, reading: Reading) -> Estimate:
         """Move by the odometry, use the field, and fit the window to the posterior."""
         last, self._last = self._last, reading
+        if repeats(last, reading):
+            reading = replace(reading, b_nt=math.nan)
         if self.grid is not None:
             stats = self._step_grid(last, reading)
             if not stats[3] > 0 or self._surprised(stats[0], reading):
@@ -218,7 +222,8 @@ class PointMass:
 
     def _step_grid(self, last: Reading | None, reading: Reading) -> Array:
         grid = self.grid
-        assert grid is not None and last is not None
+        assert grid is not None
+        assert last is not None
         motion, dt = increment(last.odometry, reading.odometry), reading.t - last.t
         grid.move(*motion)
         distance = math.hypot(motion[0], motion[1])
@@ -237,7 +242,8 @@ class PointMass:
     @staticmethod
     def _moved(pose: Array, forward: float, left: float, turn: float) -> Array:
         c, s = math.cos(pose[2] + turn / 2), math.sin(pose[2] + turn / 2)
-        return pose + (forward * c - left * s, forward * s + left * c, turn)
+        made: Array = pose + np.array([forward * c - left * s, forward * s + left * c, turn])
+        return made
 
     def _convolve(self, grid: Grid, variances: Array, distance: float) -> None:
         """Collect the noise of motions; once it is enough, spread the mass with a kernel of its variance."""
@@ -261,7 +267,7 @@ class PointMass:
         taps[:, 0, 1] = taps[:, 2, 1] = (vv - np.abs(uv)) / 2
         taps[:, 0, 0] = taps[:, 2, 2] = np.maximum(uv, 0) / 2
         taps[:, 0, 2] = taps[:, 2, 0] = np.maximum(-uv, 0) / 2
-        taps /= rounds
+        taps /= rounds - turns  # only the mass that keeps its heading moves
         taps[:, 1, 1] = 1 - taps.sum(axis=(1, 2))
         for _ in range(rounds):
             logw, state = np.empty_like(grid.logw), np.empty_like(grid.state)

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.frames import yaw_from_quat
-from magtwin.localize.belief import as_map
-from magtwin.localize.odometry import increment
+from magtwin.localize.belief import as_map, table_of
+from magtwin.localize.odometry import STILL_M, increment
 from magtwin.localize.point_mass import PointMass
 from magtwin.localize.problem import Array, Estimate, Localizer, Problem
 from magtwin.localize.readings import readings_of
@@ -18,8 +18,11 @@ from magtwin.run.run import Run
 WHITE_SHARE = 0.16
 """Share of the map's variance that differs from reading to reading; the rest is correlated along the path."""
 
-STILL_M = 1e-4
+LEAST_SD = 1e-4
 """Least standard deviation of a step of odometry [m, rad]."""
+
+UNKNOWN = 100.0
+"""Standard deviation that stands for an infinite one in covariances [m, rad]."""
 
 JUMP_M = 0.5
 """Jump of the forward pass that shows that it was wrong before [m]."""
@@ -95,9 +98,25 @@ class Arrow:
         made += y @ corner @ y.transpose(0, 2, 1)
         return 0.5 * (made + made.transpose(0, 2, 1)), 0.5 * (corner + corner.T)
 
+    def last_covariance(self) -> tuple[Array, float]:
+        """The last of the blocks of `covariances` (b, b), and the logarithm of the determinant."""
+        from scipy.linalg import cho_solve_banded, cholesky_banded
+
+        n, b, g = self.border.shape
+        factor = cholesky_banded(self._banded(), lower=True, check_finite=False)
+        ends = np.zeros((n * b, b))
+        ends[-b:] = np.eye(b)
+        columns = np.concatenate([self.border.reshape(n * b, g), ends], axis=1)
+        made = cho_solve_banded((factor, True), columns, check_finite=False)
+        y, last = made[:, :g], made[-b:, g:]
+        schur = self.corner - self.border.reshape(n * b, g).T @ y
+        covariance = last + y[-b:] @ np.linalg.solve(schur, y[-b:].T)
+        determinant = 2 * float(np.log(factor[0]).sum()) + float(np.linalg.slogdet(schur)[1])
+        return 0.5 * (covariance + covariance.T), determinant
+
     def damped(self, factor: float) -> "Arrow":
         """The matrix with its diagonal grown by a factor (Marquardt 1963)."""
-        n, b, g = self.border.shape
+        _, b, g = self.border.shape
         diagonal, corner = self.diagonal.copy(), self.corner.copy()
         diagonal[:, range(b), range(b)] *= 1 + factor
         corner[range(g), range(g)] *= 1 + factor
@@ -127,7 +146,7 @@ class Graph:
             raise InputError("the smoother needs a map; the problem has none")
         self.problem = problem
         self.map = as_map(problem.belief, problem.extent)
-        self.mapped = self.map.variance_nt2 is not None
+        self.mapped = bool(table_of(self.map, problem.extent).variance.any())
         sensor, model = problem.sensor, problem.odometry
         t = readings["t"]
         yaw = np.unwrap(yaw_from_quat(readings["odom_q_xyzw"]))
@@ -135,7 +154,7 @@ class Graph:
         pairs = zip(odometry[:-1].tolist(), odometry[1:].tolist(), strict=True)
         self.motion = np.array([increment(tuple(a), tuple(b)) for a, b in pairs]).reshape(-1, 3)
         distance, dt = np.hypot(self.motion[:, 0], self.motion[:, 1]), np.diff(t)
-        self.motion_sd = np.sqrt(model.variances(distance, self.motion[:, 2], dt) + STILL_M**2)
+        self.motion_sd = np.sqrt(model.variances(distance, self.motion[:, 2], dt) + LEAST_SD**2)
         self.drift_sd = max(sensor.drift_nt, 1e-3)
         self.drift_keeps = np.exp(-dt / sensor.drift_s)
         self.error_keeps = np.exp(-distance / problem.map_length_m)
@@ -144,6 +163,8 @@ class Graph:
         self.z = readings["b_measured_nt"] - np.where(np.isfinite(disturbance), disturbance, 0.0)
         white = sensor.white_nt**2 + np.where(np.isfinite(disturbance) & np.isfinite(sd), sd, 0.0) ** 2
         self.read = np.isfinite(self.z)
+        stuck = (np.diff(self.z) == 0) & (distance + 0.1 * np.abs(self.motion[:, 2]) > STILL_M)
+        self.read[1:] &= ~stuck
         self.z, self.white = np.where(self.read, self.z, 0.0), white
         self.local = 5 if self.mapped else 4
         self.common_sd = np.array(
@@ -170,7 +191,7 @@ class Graph:
         return poses[:, :2] + arm, poses[:, 2], np.column_stack([-arm[:, 1], arm[:, 0]])
 
     def fields(self, local: Array, common: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-        """Residuals of the readings, whitened (N,), their derivatives (N, b) and (N, g), and which are used."""
+        """Residuals of the readings, whitened (N,), derivatives (N, b) and (N, g), and which are used."""
         p, yaw, arm = self._sensor(local[:, :3])
         if self.mapped:
             value, sd, slopes = self.map.lookup_all(p, yaw)
@@ -227,7 +248,12 @@ class Graph:
         parts, known = [], []
         for column, keeps, sd in processes:
             noise = sd * np.sqrt(np.maximum(1 - keeps**2, 1e-8))
-            parts.append(np.append(local[0, column] / sd, (np.diff(local[:, column]) + (1 - keeps) * local[:-1, column]) / noise))
+            parts.append(
+                np.append(
+                    local[0, column] / sd,
+                    (np.diff(local[:, column]) + (1 - keeps) * local[:-1, column]) / noise,
+                )
+            )
             known.append((column, keeps, np.append(sd, noise)))
         return np.concatenate(parts), known
 
@@ -290,10 +316,12 @@ class Graph:
             gradient[1:, column] += miss * inverse[1:]
             gradient[:-1, column] -= keeps * miss * inverse[1:]
         first = self.prior(local, common)[:3]
-        for k, sd in enumerate(self.problem.prior.sd):
-            if math.isfinite(sd):
-                diagonal[0, k, k] += 1 / sd**2
-                gradient[0, k] += first[k] / sd
+        for k, spread in enumerate(self.problem.prior.sd):
+            if math.isfinite(spread):
+                diagonal[0, k, k] += 1 / spread**2
+                gradient[0, k] += first[k] / spread
+            else:
+                diagonal[0, k, k] += 1 / UNKNOWN**2
         return Arrow(diagonal, below, border, corner), gradient, common_gradient
 
 
@@ -305,16 +333,16 @@ class MapSmoother:
 
         sum |r_field|^2 + sum |r_odometry|^2 + sum |r_drift|^2 + sum |r_error|^2 + |r_prior|^2
 
-    by Levenberg-Marquardt (Marquardt 1963). The normal equations are block tridiagonal with a border, so that a
-    step costs O(N). It starts at the forward pass of a filter, with dead reckoning back from the time at which
-    that is no longer lost, and at dead reckoning from the prior if there is one; the lower cost wins. The
-    covariances are those of the linearised problem.
+    by Levenberg-Marquardt (Marquardt 1963). The normal equations are block tridiagonal with a border, so
+    that a step costs O(N). It starts at the forward pass of a filter, with dead reckoning back from the time
+    at which that is no longer lost, and at dead reckoning from the prior if there is one; the lower cost
+    wins. The covariances are those of the linearised problem.
 
     Args:
         start: Localizer of the forward pass. Default: the point-mass filter.
-        robust: "huber": Huber's loss on readings and odometry; "gnc": graduated non-convexity with the loss of
-            Geman and McClure (Yang et al. 2020, IEEE RA-L 5:1127), which also ignores gross outliers; None:
-            least squares.
+        robust: "huber": Huber's loss on readings and odometry; "gnc": graduated non-convexity with the loss
+            of Geman and McClure (Yang et al. 2020, IEEE RA-L 5:1127), which also ignores gross outliers;
+            None: least squares.
         iterations: Most steps per start.
     """
 
@@ -356,8 +384,10 @@ class MapSmoother:
         covariance, _ = graph.normal_equations(local, common, *weights)[0].covariances()
         bias = common[1] + local[:, 3]
         return [
-            Estimate(t, *local[k, :3].tolist(), covariance[k, :3, :3], float(bias[k]), bool(lost[-1]))
-            for k, t in enumerate(readings["t"].tolist())
+            Estimate(t, x, y, yaw, covariance[k, :3, :3], float(bias[k]), bool(lost[-1]))
+            for k, (t, (x, y, yaw)) in enumerate(
+                zip(readings["t"].tolist(), local[:, :3].tolist(), strict=True)
+            )
         ]
 
     def minimise(
@@ -398,13 +428,14 @@ class MapSmoother:
             weights = self._weights(graph, local, common, looseness)
         return local, common, cost, weights
 
-
     def _weights(self, graph: Graph, local: Array, common: Array, looseness: float) -> tuple[Array, Array]:
         """Weights of the factors: derivative of the loss by half the squared residual."""
         field = graph.fields(local, common)[0] ** 2
         motion = np.sum(graph.motions(local, common)[0] ** 2, axis=1)
         if self._robust == "huber":
-            return tuple(HUBER * d / np.maximum(np.sqrt(s), HUBER * d) for s, d in ((field, 1), (motion, math.sqrt(3))))  # type: ignore[return-value]
+            return tuple(
+                HUBER * d / np.maximum(np.sqrt(s), HUBER * d) for s, d in ((field, 1), (motion, math.sqrt(3)))
+            )  # type: ignore[return-value]
         if self._robust == "gnc":
             made = []
             for s, d in ((field, 1), (motion, 3)):
@@ -439,7 +470,9 @@ class MapSmoother:
         found = int(np.argmin(lost)) if not lost.all() else 0
         predicted = np.array([moved(p, m) for p, m in zip(poses[:-1], graph.motion, strict=True)])
         jumps = np.hypot(*(poses[1:, :2] - predicted[:, :2]).T) if len(poses) > 1 else np.zeros(0)
-        late = np.flatnonzero((jumps > JUMP_M) & (np.arange(1, len(t)) > found) & (t[1:] < t[found] + SETTLES_S))
+        late = np.flatnonzero(
+            (jumps > JUMP_M) & (np.arange(1, len(t)) > found) & (t[1:] < t[found] + SETTLES_S)
+        )
         found = int(late[-1]) + 1 if len(late) else found
         for k in range(found - 1, -1, -1):
             poses[k] = moved_back(poses[k + 1], graph.motion[k])
@@ -456,12 +489,12 @@ class MapSmoother:
 def moved(pose: Array, motion: Array) -> Array:
     """A pose after a motion (forward, left, turn); see `magtwin.localize.odometry.increment`."""
     c, s = math.cos(pose[2] + motion[2] / 2), math.sin(pose[2] + motion[2] / 2)
-    made: Array = pose + (motion[0] * c - motion[1] * s, motion[0] * s + motion[1] * c, motion[2])
+    made: Array = pose + np.array([motion[0] * c - motion[1] * s, motion[0] * s + motion[1] * c, motion[2]])
     return made
 
 
 def moved_back(pose: Array, motion: Array) -> Array:
     """The pose from which a motion leads to `pose`."""
     c, s = math.cos(pose[2] - motion[2] / 2), math.sin(pose[2] - motion[2] / 2)
-    made: Array = pose - (motion[0] * c - motion[1] * s, motion[0] * s + motion[1] * c, motion[2])
+    made: Array = pose - np.array([motion[0] * c - motion[1] * s, motion[0] * s + motion[1] * c, motion[2]])
     return made
