@@ -6,7 +6,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,11 @@ RATE_HZ = 5.0
 
 START_SD = (0.1, 0.1, math.radians(5))
 """Standard deviation of a known start: x, y [m] and yaw [rad]."""
+
+ROBOT_NOISE = SensorModel(white_nt=100.0, drift_nt=250.0, drift_s=2.5, offset_nt=500.0, iron_nt=400.0)
+"""Default noise model of a magnetometer on a robot: the own field of the shipped TurtleBot 4 in new sessions.
+In six simulated drives the difference of the readings from the map had a mean of 190 to 520 nT, 290 to 500 nT
+along the heading, and the rest 180 to 280 nT with a correlation of 0.4 to 0.6 after 2 s."""
 
 LEAST_ON_MAP = 0.5
 """Share of the readings that must be on the map."""
@@ -147,7 +152,7 @@ def localize(
         method: A name in `magtwin.localize.localizers.LOCALIZERS`, "module:Class", or an object.
         options: Keyword arguments of the method's class.
         prior: The pose at the first reading, or a text of `prior_of`. Default: "tracking".
-        sensor: Noise model of the magnetometer. Default: `SensorModel()`, with the lever arm in the run's
+        sensor: Noise model of the magnetometer. Default: `ROBOT_NOISE`, with the lever arm in the run's
             metadata.
         odometry: Noise model of the odometry.
         map_length_m: Correlation length of the map's error [m].
@@ -226,7 +231,7 @@ def _localization(
         belief=anomaly_map,
         extent=extent_of(run, anomaly_map),
         prior=prior if isinstance(prior, Prior) else prior_of(run, prior or "tracking", seed=seed),
-        sensor=sensor or SensorModel(lever_arm_m=lever_arm),
+        sensor=sensor or replace(ROBOT_NOISE, lever_arm_m=lever_arm),
         odometry=odometry or OdometryModel(),
         map_length_m=map_length_m,
         rate_hz=rate_hz or (run.rows - 1) / max(run.duration_s, 1e-9),
@@ -257,7 +262,7 @@ def live_problem(
     Args:
         twin: Gives the map, the floor and the place of the magnetometer.
         anomaly_map: Map in place of the twin's, as for `localize`; "none": no map (SLAM).
-        sensor: Arguments of `SensorModel`. Default of the lever arm: that of the robot.
+        sensor: Figures of `SensorModel` that differ from `ROBOT_NOISE` and the robot's lever arm.
         odometry: As for `localize`.
         map_length_m: As for `localize`.
         seed: As for `localize`.
@@ -274,8 +279,8 @@ def live_problem(
     return Problem(
         belief=belief,
         extent=belief.extent if isinstance(belief, AnomalyMap) else (-x, x, -y, y),
-        sensor=SensorModel(
-            **{"lever_arm_m": tuple(twin.scene.robot.p_base_magnetometer[:2]), **(sensor or {})}
+        sensor=replace(
+            ROBOT_NOISE, **{"lever_arm_m": tuple(twin.scene.robot.p_base_magnetometer[:2]), **(sensor or {})}
         ),
         odometry=odometry or OdometryModel(),
         map_length_m=map_length_m,

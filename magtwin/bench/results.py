@@ -74,34 +74,37 @@ class Results(Summarized):
         """The rows as a table of pyarrow."""
         return pa.table({name: pa.array(values) for name, values in self.rows.items()})
 
-    def tracks(self, scenario: str, localizer: str, run: int | None = None) -> list[dict[str, Any]]:
-        """Errors over time of a localizer on a scenario.
+    def tracks(
+        self, scenario: str | None = None, localizer: str | None = None, run: int | None = None
+    ) -> list[dict[str, Any]]:
+        """Errors over time.
 
         Args:
-            scenario: Name of the scenario.
-            localizer: Name of the localizer.
+            scenario: Name of a scenario. Default: all.
+            localizer: Name of a localizer. Default: all.
             run: Number of a run. Default: all.
 
         Returns:
-            A table per run, in order: its number `run`, and the float32 arrays t [s], error_m, bound_m, x, y,
-            lost. [] if the benchmark kept no tracks.
+            A table per run and localizer, in the order of the rows: scenario, localizer, run, and the float32
+            arrays t [s], error_m, bound_m, x, y and lost. [] if the benchmark kept none.
 
         Raises:
             InputError: There is no such scenario or localizer.
         """
-        find("scenario", scenario, dict.fromkeys(self.rows["scenario"].tolist()))
-        find("localizer", localizer, dict.fromkeys(self.rows["localizer"].tolist()))
-        match = pc.field("localizer") == localizer
-        if run is not None:
-            match &= pc.field("run") == run
-        made: dict[int, dict[str, Any]] = {}
-        for file in (part for folder in self.folders for part in _parts(folder, TRACKS, scenario)):
-            for row in pq.read_table(file, filters=match).to_pylist():
-                arrays = {
-                    name: np.array(values, np.float32) for name, values in row.items() if name not in KEY
-                }
-                made.setdefault(row["run"], {"run": row["run"], **arrays})
-        return [made[number] for number in sorted(made)]
+        match = pc.scalar(True)
+        for name, value in (("scenario", scenario), ("localizer", localizer), ("run", run)):
+            if value is not None:
+                find(name, str(value), dict.fromkeys(map(str, self.rows[name].tolist())))
+                match &= pc.field(name) == value
+        made: dict[Run, dict[str, Any]] = {}
+        for name in self.suite.scenarios if scenario is None else (scenario,):
+            for file in (part for folder in self.folders for part in _parts(folder, TRACKS, name)):
+                for row in pq.read_table(file, filters=match).to_pylist():
+                    key = (row.pop("scenario"), row.pop("localizer"), row.pop("run"))
+                    arrays = {column: np.array(values, np.float32) for column, values in row.items()}
+                    made.setdefault(key, dict(zip(KEY, key, strict=True)) | arrays)
+        keys = zip(*(self.rows[name].tolist() for name in KEY), strict=True)
+        return [made[key] for key in keys if key in made]
 
     def report(self, standings: Sequence["Standing"]) -> Report:
         """Numbers of runs, and each localizer on each scenario in a line, worst problem first.

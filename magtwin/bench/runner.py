@@ -11,11 +11,11 @@ from typing import Any
 
 from magtwin.bench import results
 from magtwin.bench.results import Results, Run, runs_of
-from magtwin.bench.row import Row, run_chunk, warm_up
+from magtwin.bench.row import SETUP, Row, run_chunk, warm_up
 from magtwin.bench.suite import Chunk, Seeds, Suite, load_suite, suite_file
 from magtwin.errors import InputError
 from magtwin.files import output
-from magtwin.parallel import Failure, checked_shard, free_memory, in_shard, open_pool, processors
+from magtwin.parallel import Failure, Pool, beat, checked_shard, free_memory, in_shard, open_pool, processors
 from magtwin.version import __version__
 
 WORKER_BYTES = 500_000_000
@@ -26,6 +26,9 @@ GRACE_S = 60.0
 whose compiled code hangs does not notice the suite's limit [s]."""
 
 Progress = Callable[[int, int, str], Any]
+
+_warm: set[str] = set()
+"""Localizers that this worker has compiled or loaded."""
 
 
 @dataclass(frozen=True)
@@ -81,28 +84,27 @@ def benchmark(
         InputError: The suite or an option is wrong, data are missing, `out` holds other results, or there is
             too little memory for `jobs`.
     """
+    if runs is not None and runs < 1:
+        raise InputError(f"`runs` must be at least 1, got {runs}", parameter="runs")
     file, out = suite_file(suite), Path(out)
     whole = load_suite(file)
     chosen = whole.limited(scenarios=scenarios, localizers=localizers, runs=runs, seeds=seeds, data=data)
     chosen.check()
-    if runs is not None and runs < 1:
-        raise InputError(f"`runs` must be at least 1, got {runs}", parameter="runs")
     if shard is not None:
         checked_shard(shard)
         if force:
             text = "other shards may have written there; remove the folder yourself, and drop `force`"
             raise InputError(text, parameter="force")
-    if dask is None:
-        jobs = checked_jobs(jobs)
-    if force and (out / results.ABOUT).is_file():
-        shutil.rmtree(out)
     whole = whole.limited(seeds=seeds)
-    results.begin_results(out, file.read_bytes(), about(whole, chosen))
-    chunks = [chunk for k, chunk in enumerate(chosen.chunks()) if in_shard(k, shard)]
-    done = results.done_runs(out, chosen.scenarios)
-    tasks = [Task(part) for chunk in chunks for part in without(chunk, done)]
-    if tasks:
-        _run(chosen, whole, tasks, out, jobs, dask, tracks, progress or (lambda done, total, what: None))
+    with open_pool(jobs if dask else checked_jobs(jobs), dask=dask) as pool:
+        if force and (out / results.ABOUT).is_file():
+            shutil.rmtree(out)
+        results.begin_results(out, file.read_bytes(), about(whole, chosen))
+        chunks = [chunk for k, chunk in enumerate(chosen.chunks()) if in_shard(k, shard)]
+        done = results.done_runs(out, chosen.scenarios)
+        tasks = [Task(part) for chunk in chunks for part in without(chunk, done)]
+        if tasks:
+            _run(pool, chosen, whole, tasks, out, tracks, progress or (lambda done, total, what: None))
     return results.results_in(out)
 
 
@@ -133,7 +135,7 @@ def folder_sha256(folder: Path) -> str:
 
 def _data(suite: Suite) -> dict[str, Path]:
     """Folders of the data that a suite's scenarios need, by name."""
-    needed = [each for each in suite.scenario if each.data != "lab" or each.source != "twin"]
+    needed = [each for each in suite.scenario if each.data or each.source != "twin"]
     return {each.data: suite.folder(each) for each in needed}
 
 
@@ -167,38 +169,30 @@ def without(chunk: Chunk, done: Iterable[Run]) -> list[Chunk]:
 
 
 def _run(
-    suite: Suite,
-    whole: Suite,
-    tasks: list[Task],
-    out: Path,
-    jobs: int | None,
-    dask: str | None,
-    tracks: bool,
-    progress: Progress,
+    pool: Pool, suite: Suite, whole: Suite, tasks: list[Task], out: Path, tracks: bool, progress: Progress
 ) -> None:
     """Run tasks and write their parts."""
     names = set(whole.chunks())
-    total, count = sum(_size(task) for task in tasks), 0
+    total, count = sum(map(_size, tasks)), 0
     progress(0, total, "compiling")
     for name in dict.fromkeys(name for task in tasks for name in task.chunk.entries):
         warm_up(suite.localizers[name])
     progress(0, total, tasks[0].chunk.scenario)
-    with open_pool(jobs, dask=dask) as pool:
-        work = partial(run_task, suite, _fields(suite, out))
-        while tasks:
-            again = []
-            for outcome in pool.run(work, tasks, limit_s=2 * suite.time_limit_s + GRACE_S):
-                task = tasks[outcome.index]
-                if outcome.failure is not None and outcome.failure.refused is None:
-                    again.append(_blamed(task, outcome.failure))
-                    continue
-                rows, times, kept = outcome.result()
-                more = {results.TIMES: times, **({results.TRACKS: kept} if tracks else {})}
-                name = results.part_name(task.chunk, names)
-                results.write_part(out, task.chunk.scenario, name, rows, **more)
-                count += _size(task)
-                progress(count, total, task.chunk.scenario)
-            tasks = again
+    work = partial(run_task, suite, _fields(suite, out))
+    while tasks:
+        again = []
+        for outcome in pool.run(work, tasks, limit_s=2 * suite.time_limit_s + GRACE_S):
+            task = tasks[outcome.index]
+            if outcome.failure is not None and outcome.failure.refused is None:
+                again.append(_blamed(task, outcome.failure))
+                continue
+            rows, times, kept = outcome.result()
+            more = {results.TIMES: times, **({results.TRACKS: kept} if tracks else {})}
+            name = results.part_name(task.chunk, names)
+            results.write_part(out, task.chunk.scenario, name, rows, **more)
+            count += _size(task)
+            progress(count, total, task.chunk.scenario)
+        tasks = again
 
 
 def _size(task: Task) -> int:
@@ -210,6 +204,11 @@ def run_task(suite: Suite, fields: Path | None, task: Task) -> tuple[list[Row], 
     if fields is not None and not fields.is_dir():
         text = f"{fields}: this machine does not see the folder of results; put it where all workers do"
         raise InputError(text, parameter="out")
+    beat(times=SETUP)
+    for entry in (suite.localizers[name] for name in task.chunk.entries):
+        if repr(entry) not in _warm:
+            warm_up(entry)
+            _warm.add(repr(entry))
     return run_chunk(suite, task.chunk, fields, task.failures)
 
 
@@ -235,11 +234,7 @@ def _fields(suite: Suite, out: Path) -> Path | None:
     """Folder of the true fields that are fitted to surveys, made once; None if the suite needs none."""
     from magtwin.bench.world import fit_field
 
-    needed = {
-        each.data: suite.folder(each)
-        for each in suite.scenario
-        if each.source == "twin" and each.data != "lab"
-    }
+    needed = {each.data: suite.folder(each) for each in suite.scenario if each.source == "twin" and each.data}
     folder = out / "fields"
     for name, survey in needed.items():
         if not (folder / name).is_dir():

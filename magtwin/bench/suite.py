@@ -13,6 +13,7 @@ from magtwin.errors import InputError, find
 from magtwin.files import from_table, read_toml
 from magtwin.localize.localizers import load_localizer
 from magtwin.localize.problem import OdometryModel, SensorModel
+from magtwin.twin import scene_file
 
 HELD_OUT = 1_000_000_000
 """Added to the seed of the suite for the held-out seeds."""
@@ -33,8 +34,9 @@ class Scenario:
     source: Literal["twin", "magnetic-data", "ship", "1d"] = "twin"
     """Simulated in a twin, or recorded data."""
 
-    data: str = "lab"
-    """Field of the twin, or the recorded data: `lab`, or a name in `[data]`."""
+    data: str = ""
+    """Name of a folder in `[data]`: recorded data, or a survey whose harmonic fit is the true field of the
+    twin. Default: the map of the scene is."""
 
     runs: int = 100
     """Number of runs."""
@@ -52,17 +54,18 @@ class Scenario:
     """First pose: known to 0.1 m and 5 deg; heading within 10 deg and no position; or nothing."""
 
     scene: str = "lab"
-    """Scene in which the robot drives: a shipped name or a stage."""
+    """Scene in which the robot drives: the name of a shipped one, or a stage."""
 
     paths: tuple[str, ...] = ("sine", "lawnmower", "figure8", "continuous_cycle", "random")
     """Paths driven in turn."""
 
     truth: Literal["map", "scene"] = "map"
-    """Readings: drawn from the map of `data` with the noise of `sensor`; or those of the scene's physical
+    """Readings: drawn from the true field with the noise of `sensor`; or those of the scene's physical
     magnetometer, with the robot's own field of the session, motors and LiDAR."""
 
     belief: Literal["exact", "trilinear", "none"] = "exact"
-    """Map that localizers get: that of `data`; trilinear interpolation of a survey of it; or none (SLAM)."""
+    """Map that localizers get: the true field, or with `truth` "scene" the scene's map; trilinear
+    interpolation of a survey of it; or none (SLAM)."""
 
     survey_spacing_m: float = 0.5
     """Distance between nodes of the trilinear map [m], unless `data` is a survey, whose nodes are used."""
@@ -194,7 +197,10 @@ class Suite:
     """Longest time of a localizer for one run [s]; then its run counts as failed."""
 
     data: dict[str, str] = field(default_factory=dict)
-    """Folders of data by name, relative to the suite's file."""
+    """Folders of data by name, relative to `base`."""
+
+    base: str = ""
+    """Folder to which scenes and data are relative. Default: that of the suite's file."""
 
     scenario: tuple[Scenario, ...] = ()
     localizer: tuple[Entry, ...] = ()
@@ -232,7 +238,9 @@ class Suite:
     @property
     def sha256(self) -> str:
         """Checksum of all values, without the folders of data."""
-        return hashlib.sha256(json.dumps(_plain(replace(self, data={})), sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(
+            json.dumps(_plain(replace(self, data={}, base="")), sort_keys=True).encode()
+        ).hexdigest()
 
     def chunks(self) -> list[Chunk]:
         """All work, in order."""
@@ -302,8 +310,19 @@ class Suite:
 
                 find("compensator", entry.compensator, COMPENSATORS)
         for scenario in self.scenario:
-            if scenario.data != "lab" or scenario.source != "twin":
+            if scenario.source == "twin":
+                self.scene(scenario)
+            if scenario.data or scenario.source != "twin":
                 self.folder(scenario)
+
+    def scene(self, scenario: Scenario) -> Path:
+        """Stage of a scenario's scene.
+
+        Raises:
+            InputError: There is no such scene.
+        """
+        beside = Path(self.base) / scenario.scene
+        return scene_file(beside if beside.exists() else scenario.scene)
 
     def folder(self, scenario: Scenario) -> Path:
         """Folder of a scenario's data.
@@ -311,6 +330,8 @@ class Suite:
         Raises:
             InputError: It is not named or not there.
         """
+        if not scenario.data:
+            raise InputError(f"scenario {scenario.name!r} has recorded data; name them by its key data")
         if scenario.data not in self.data:
             text = (
                 f"scenario {scenario.name!r} needs the data {scenario.data!r}; give their folder with `data`"
@@ -332,8 +353,9 @@ def load_suite(file: str | os.PathLike[str]) -> Suite:
     """
     path = suite_file(file)
     suite = from_table(Suite, read_toml(path), path)
-    folder = path.resolve().parent
-    return replace(suite, data={name: str(folder / where) for name, where in suite.data.items()})
+    base = path.resolve().parent / suite.base
+    data = {name: str(base / where) for name, where in suite.data.items()}
+    return replace(suite, data=data, base=str(base))
 
 
 def suite_file(file: str | os.PathLike[str]) -> Path:

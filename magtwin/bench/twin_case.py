@@ -39,21 +39,23 @@ SESSION = 7
 """Second word of the seed of what a session has in common."""
 
 
-def twin_case(scenario: Scenario, seed: int, session: int, fields: Path | None = None) -> Case:
+def twin_case(scenario: Scenario, scene: str, seed: int, session: int, fields: Path | None = None) -> Case:
     """One run of a scenario in a twin.
 
     Args:
         scenario: The scenario.
+        scene: Stage of its scene.
         seed: Seed of the run.
         session: Number of its session.
-        fields: Folder of `world.fit_field` if the scenario's data are a survey. None: the shipped map.
+        fields: Folder of `world.fit_field` if the scenario's data are a survey. None: the scene's map is the
+            true field.
 
     Raises:
         InputError: A path or the scene is unknown, or the drive leaves no room for a kidnap.
     """
     rngs = dict(zip(STREAMS, np.random.default_rng((seed, 1)).spawn(len(STREAMS)), strict=True))
-    field = world.shipped_field() if fields is None else world.fitted_field(fields / "truth.npz")
-    drive = _drive(scenario, seed, session)
+    field = _field(scene, fields)
+    drive = _drive(scenario, scene, seed, session)
     t, pose, cuts, rows = _kidnapped(scenario, drive, rngs["kidnap"])
     true_field = world.certain(field)
     if scenario.moved_nt:
@@ -94,21 +96,21 @@ def twin_case(scenario: Scenario, seed: int, session: int, fields: Path | None =
         }
     )
     problem = Problem(
-        belief=_belief(scenario, field, fields, rngs["map"]),
+        belief=_belief(scenario, scene, fields, rngs["map"]),
         extent=field.extent,
         prior=_prior(scenario, pose[0], rngs["prior"]),
         sensor=replace(scenario.sensor, lever_arm_m=_lever(drive)),
         odometry=scenario.told_odometry,
         map_length_m=scenario.map_length_m,
         rate_hz=scenario.rate_hz,
-        calibration=_calibration(scenario, session),
+        calibration=_calibration(scenario, scene, session),
         seed=int(rngs["localizer"].integers(2**31)),
     )
     truth = Truth(t, pose, true_field, tuple(t[cuts].tolist()), scenario.map_error_nt)
     return Case(problem, readings, truth, {"path": str(drive.metadata.get("path", "")), "session": session})
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=4)
 def _twin(scene: str, magnetometer: str) -> "Twin":
     from magtwin.twin import open_twin
 
@@ -122,13 +124,22 @@ def _in_session(scene: str, magnetometer: str, session: int) -> "Twin":
     return in_session(_twin(scene, magnetometer), session)
 
 
-def _drive(scenario: Scenario, seed: int, session: int, *, duration_s: float | None = None) -> Run:
+def _field(scene: str, fields: Path | None) -> AnomalyMap:
+    """The true field of the twin, or of a survey."""
+    if fields is None:
+        return _twin(scene, "map-only").field
+    return world.fitted_field(fields / "truth.npz")
+
+
+def _drive(
+    scenario: Scenario, scene: str, seed: int, session: int, *, duration_s: float | None = None
+) -> Run:
     """A simulated drive, long enough for the kidnaps."""
     from magtwin.sim.motion.drive_input import drive_input
     from magtwin.twin import room_of, simulate
 
     kind = "map-only" if scenario.truth == "map" else "physical"
-    twin = _in_session(scenario.scene, kind, session)
+    twin = _in_session(scene, kind, session)
     path = drive_input(scenario.paths[seed % len(scenario.paths)], room_of(twin), fit=True)
     length = scenario.duration_s * (2 if scenario.kidnaps else 1) if duration_s is None else duration_s
     run = simulate(twin, path, seed=seed, duration_s=length, rate_hz=scenario.rate_hz, outside="clamp")
@@ -269,30 +280,30 @@ def fogm(t: Array, sensor: SensorModel, rng: np.random.Generator) -> Array:
 
 
 def _belief(
-    scenario: Scenario, field: AnomalyMap, fields: Path | None, rng: np.random.Generator
+    scenario: Scenario, scene: str, fields: Path | None, rng: np.random.Generator
 ) -> AnomalyMap | None:
+    """What the localizer gets."""
     if scenario.belief == "none":
         return None
     if scenario.belief == "trilinear":
         if fields is not None:
             return world.fitted_field(fields / "nodes.npz")
-        return _sparse(scenario.survey_spacing_m)
+        return _sparse(scene, scenario.survey_spacing_m)
     if scenario.map_error_nt:
-        return world.with_error(field, scenario.map_error_nt, scenario.map_length_m, rng)
+        return world.with_error(_field(scene, fields), scenario.map_error_nt, scenario.map_length_m, rng)
     if scenario.truth == "scene":
-        return field  # the survey's map, with its own variance
-    return _certain(fields)
+        return _field(scene, fields)  # with the variance of its survey
+    return _certain(scene, fields)
 
 
 @lru_cache(maxsize=4)
-def _certain(fields: Path | None) -> AnomalyMap:
-    field = world.shipped_field() if fields is None else world.fitted_field(fields / "truth.npz")
-    return world.certain(field)
+def _certain(scene: str, fields: Path | None) -> AnomalyMap:
+    return world.certain(_field(scene, fields))
 
 
 @lru_cache(maxsize=4)
-def _sparse(spacing_m: float) -> AnomalyMap:
-    return world.trilinear(world.shipped_field(), spacing_m)
+def _sparse(scene: str, spacing_m: float) -> AnomalyMap:
+    return world.trilinear(_field(scene, None), spacing_m)
 
 
 def _prior(scenario: Scenario, first: Array, rng: np.random.Generator) -> Prior:
@@ -306,13 +317,15 @@ def _prior(scenario: Scenario, first: Array, rng: np.random.Generator) -> Prior:
     return Prior(sd=(math.inf, math.inf, math.inf))
 
 
-def _calibration(scenario: Scenario, session: int) -> Run | None:
+def _calibration(scenario: Scenario, scene: str, session: int) -> Run | None:
     """A labelled drive of the session, with true poses."""
     if not scenario.calibration_s:
         return None
     if scenario.truth != "scene":
         raise InputError(f'scenario {scenario.name!r}: calibration_s needs truth = "scene"')
-    drive = _drive(replace(scenario, paths=("figure8",)), session, session, duration_s=scenario.calibration_s)
+    drive = _drive(
+        replace(scenario, paths=("figure8",)), scene, session, session, duration_s=scenario.calibration_s
+    )
     return drive.select(
         "p_world_base",
         "q_world_base_xyzw",

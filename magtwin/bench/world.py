@@ -10,7 +10,6 @@ from scipy.ndimage import gaussian_filter
 from magtwin.errors import InputError
 from magtwin.field.maps.curvature import interpolation_error_nt2
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import shipped
 
 Array = NDArray[np.float64]
 
@@ -18,14 +17,6 @@ CELL_M = 0.05  # Nodes of a true field [m]
 HEADINGS = 24  # Headings of a true field that is fitted to a survey
 SURVEY_HEADINGS = 4  # Headings of a trilinear survey
 DEPTH_M = 0.3  # Depth below the sensor of an object that is moved [m]
-
-
-@lru_cache(maxsize=4)
-def shipped_field() -> AnomalyMap:
-    """The map of the shipped scene."""
-    from magtwin.io.surveys.maps import open_map
-
-    return open_map(shipped("maps", "lab", "lab.usdc"))
 
 
 def fit_field(folder: Path, out: Path) -> None:

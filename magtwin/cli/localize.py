@@ -1,7 +1,7 @@
 """`magtwin localize` and `magtwin ros localize`: estimate the pose along a run, or live."""
 
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +56,9 @@ def localize(
     rate_hz
         Readings per second that the method gets [Hz].
     sensor
-        Figure of the magnetometer's noise model that the method is told, as NAME=VALUE: white_nt, drift_nt,
-        drift_s, offset_nt, iron_nt. May be repeated.
+        Figure of the magnetometer's noise model that the method is told, as NAME=VALUE: white_nt (100),
+        drift_nt (250), drift_s (2.5), offset_nt (500), iron_nt (400). May be repeated. The defaults are those
+        of the shipped robot's own field.
     odometry
         Figure of the odometry's noise model, as NAME=VALUE: position_std, yaw_std, turn_std, position_std_s,
         yaw_std_s, scale_std. May be repeated.
@@ -67,7 +68,7 @@ def localize(
     from magtwin.figures.localization import save_localization
     from magtwin.files import check_free
     from magtwin.io.formats import read_run
-    from magtwin.localization import lever_arm_of, localization
+    from magtwin.localization import ROBOT_NOISE, lever_arm_of, localization
     from magtwin.localize.problem import OdometryModel, SensorModel
 
     check_free(out, force=force)
@@ -81,7 +82,7 @@ def localize(
             method=method,
             options=_values("option", option),
             prior=prior,
-            sensor=SensorModel(**{"lever_arm_m": lever_arm_of(whole), **told}),
+            sensor=replace(ROBOT_NOISE, **{"lever_arm_m": lever_arm_of(whole), **told}),
             odometry=OdometryModel(**_values("odometry", odometry, OdometryModel)),
             map_length_m=map_length_m,
             rate_hz=rate_hz,

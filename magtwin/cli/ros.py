@@ -188,7 +188,7 @@ def magnetometer(
         PoseWithCovarianceStamped, TransformStamped or Odometry, whose stamps may lie some seconds in the
         past. Readings are then published on predicted/magnitude and predicted/total_field_nt.
     measured
-        Topic of the field that a real sensor measures, for --online: MagneticField, or Float64 in nT.
+        Topic of the field that a real sensor measures, for --online: MagneticField or Float64, in T or nT.
         Default: qtfm/magnitude.
     """
     from magtwin.ros.magnetometer import PARAMETERS, Magnetometer

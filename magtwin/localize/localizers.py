@@ -2,7 +2,9 @@
 
 import importlib
 import inspect
+import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from magtwin.errors import InputError, hint
@@ -35,7 +37,8 @@ def load_localizer(name: str, options: Mapping[str, Any] | None = None) -> Local
     """A new localizer or smoother.
 
     Args:
-        name: A name in `LOCALIZERS`, or "module:Class" of an importable module.
+        name: A name in `LOCALIZERS`, or "module:Class" of an importable module or of a file in the current
+            folder.
         options: Keyword arguments of its class.
 
     Raises:
@@ -68,6 +71,8 @@ def _class_of(name: str) -> Any:
     if ":" not in name:
         return LOCALIZERS[name]
     module, _, attribute = name.partition(":")
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.append(here)  # last, so that a file here hides no installed module
     try:
         made: Any = importlib.import_module(module)
         for part in attribute.split("."):

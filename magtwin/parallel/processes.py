@@ -50,12 +50,13 @@ class _Worker:
         self.work: bytes | None = None
         self.chunk: int | None = None
         self.since = time.monotonic()
-        self.at = ""
+        self.at, self.times = "", 1.0
 
     def take(self, index: int, work: bytes, chunk: bytes) -> None:
         """Begin with a chunk; a worker that has ended is noticed later."""
         new_work = None if work == self.work else work
-        self.work, self.chunk, self.since, self.at = work, index, time.monotonic(), ""
+        self.work, self.chunk, self.since = work, index, time.monotonic()
+        self.at, self.times = "", 1.0
         with contextlib.suppress(OSError):
             self.connection.send((new_work, chunk))
 
@@ -181,7 +182,7 @@ class Processes:
         for worker in self._workers:
             limit = None if worker.chunk is None else limit_s(worker.chunk)
             if limit is not None:
-                ends[id(worker)] = worker.since + limit
+                ends[id(worker)] = worker.since + limit * worker.times
         left = min(ends.values(), default=math.inf) - time.monotonic()
         ready = set(wait([w.connection for w in self._workers], None if left == math.inf else max(0.0, left)))
         for worker in list(self._workers):
@@ -201,7 +202,8 @@ class Processes:
                 if message[0] == "ready":
                     worker.ready, self._failed_starts = True, 0
                 elif message[0] == "beat":
-                    worker.since, worker.at = time.monotonic(), message[1]
+                    worker.since = time.monotonic()
+                    _, worker.at, worker.times = message
                 else:
                     assert index is not None
                     outcomes.append(_outcome(index, message, worker.at))

@@ -17,14 +17,15 @@ _beating: Connection | None = None
 """Where `beat` reports to, in a worker."""
 
 
-def beat(what: str = "") -> None:
+def beat(what: str = "", *, times: float = 1.0) -> None:
     """Report from a worker that its chunk goes on, and give it its time limit again.
 
     Args:
-        what: What is done next; `Failure.at` has it if that takes too long. Outside a worker nothing happens.
+        what: What is done next; `Failure.at` has it if that fails. Outside a worker nothing happens.
+        times: Factor of the time limit until the next beat.
     """
     if _beating is not None:
-        _beating.send(("beat", what))
+        _beating.send(("beat", what, times))
 
 
 def serve(connection: Connection, idle_s: float | None) -> None:

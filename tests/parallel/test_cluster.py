@@ -2,8 +2,6 @@
 
 import os
 import signal
-import socket
-import subprocess
 import sys
 import threading
 import time
@@ -12,6 +10,7 @@ from pathlib import Path
 
 import chunk_work
 import pytest
+from dask_cluster import Cluster
 
 from magtwin.errors import InputError
 from magtwin.parallel import open_pool
@@ -19,45 +18,6 @@ from magtwin.parallel import open_pool
 pytest.importorskip("distributed")
 
 pytestmark = pytest.mark.filterwarnings("default")  # of dask
-
-
-class Cluster:
-    """A scheduler and its workers, each in a process."""
-
-    def __init__(self, folder):
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-        self.folder = folder
-        tests = str(Path(chunk_work.__file__).parent)
-        self.environment = {
-            **os.environ,
-            "PYTHONPATH": os.pathsep.join([tests, *filter(None, sys.path)]),
-            "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "2",
-        }
-        port = self.address.rpartition(":")[2]
-        self.processes = [self.start("scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")]
-
-    def start(self, kind, *options, **environment):
-        return subprocess.Popen(
-            [sys.executable, "-m", "dask", kind, *options],
-            env={**self.environment, **environment},
-            stderr=subprocess.DEVNULL,
-            cwd=self.folder,
-            start_new_session=True,
-        )
-
-    def add_worker(self, *options, **environment):
-        common = ["--nthreads", "1", "--no-dashboard", "--local-directory", str(self.folder)]
-        worker = self.start("worker", self.address, *common, *options, **environment)
-        self.processes.append(worker)
-        return worker
-
-    def close(self):
-        for process in self.processes[::-1]:
-            os.killpg(process.pid, signal.SIGTERM)
-        for process in self.processes:
-            process.wait(10)
 
 
 @pytest.fixture(scope="module")
