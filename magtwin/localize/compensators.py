@@ -44,7 +44,7 @@ SHARES = (0.5, 0.8, 0.9, 0.95, 0.98)
 """Shares of correlated errors in their variance that are tried."""
 
 MOST_ROWS = 400
-"""Most readings of a fit, evenly from the drive: drift and errors of the map are alike at neighbouring ones."""
+"""Most readings of a fit, evenly from the drive: errors are alike at neighbouring ones."""
 
 FOLDS = 8
 """Stretches of the drive for the cross-validation."""
@@ -249,8 +249,7 @@ def _shrinkage(gram: Array, penalty: float) -> Array:
 def _ridge(design: Array, y: Array, penalty: float) -> Array:
     """Least squares with a penalty on all coefficients but the first."""
     gram = design.T @ design
-    made: Array = np.linalg.lstsq(gram + _shrinkage(gram, penalty), design.T @ y, rcond=1e-12)[0]
-    return made
+    return np.asarray(np.linalg.lstsq(gram + _shrinkage(gram, penalty), design.T @ y, rcond=1e-12)[0], float)
 
 
 def _best_penalty(design: Array, y: Array) -> float:
@@ -288,6 +287,6 @@ def _whitening(t: Array, design: Array, y: Array) -> tuple[Array, float]:
         likelihood = -np.log(np.diag(root)).sum() - np.log(strengths).sum()
         likelihood -= 0.5 * (n - rank) * math.log(variance)
         if best is None or likelihood > best[0]:
-            best = float(likelihood), root, variance
+            best = float(likelihood), np.asarray(root, float), variance
     assert best is not None
-    return np.linalg.inv(best[1]), best[2]
+    return np.asarray(np.linalg.inv(best[1]), float), best[2]

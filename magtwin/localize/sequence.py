@@ -252,7 +252,7 @@ class Sequence:
             cell, turn, kept = cell / 2, turn / 2, 2
             reach = [min(max(3 * sd[0], 3 * self._cell), 1.0), min(max(3 * sd[1], 3 * self._cell), 1.0)]
             x0, x1, y0, y1 = pose[0] - reach[0], pose[0] + reach[0], pose[1] - reach[1], pose[1] + reach[1]
-            yaws = pose[2] + turn * np.arange(-3, 4)
+            yaws = np.asarray(pose[2] + turn * np.arange(-3, 4), float)
         ranges = ((x0, x1, math.ceil((x1 - x0) / cell)), (y0, y1, math.ceil((y1 - y0) / cell)))
         xs, ys = (low + (high - low) * (np.arange(n) + 0.5) / n for low, high, n in ranges)
         costs = np.empty(len(yaws) * len(ys) * len(xs))

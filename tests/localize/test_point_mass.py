@@ -65,9 +65,11 @@ def test_the_convolution_is_that_of_a_plain_loop_over_gaussian_mixtures():
             if not 0 <= g < count:
                 continue
             u, v = np.linalg.solve(grid.cell, origins[h] + grid.cell @ (i, j) - origins[g])
-            for jj in (math.floor(v), math.floor(v) + 1):
-                for ii in (math.floor(u), math.floor(u) + 1):
-                    sources.append((g, jj, ii, turn * (1 - abs(u - ii)) * (1 - abs(v - jj))))
+            sources += [
+                (g, jj, ii, turn * (1 - abs(u - ii)) * (1 - abs(v - jj)))
+                for jj in (math.floor(v), math.floor(v) + 1)
+                for ii in (math.floor(u), math.floor(u) + 1)
+            ]
         mass, first, second = 0.0, np.zeros(2), np.zeros((2, 2))
         for g, jj, ii, share in sources:
             if 0 <= jj < count and 0 <= ii < count:
