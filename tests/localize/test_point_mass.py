@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from magtwin.errors import InputError
 from magtwin.frames import quat_from_yaw, yaw_from_quat
 from magtwin.localize import point_mass
-from magtwin.localize.bank import Bank, Likelihood
+from magtwin.localize.bank import STATS, Bank, Likelihood
 from magtwin.localize.belief import table_of
 from magtwin.localize.bounds import bounds
 from magtwin.localize.particles import RaoBlackwell
@@ -121,7 +121,7 @@ def test_the_update_is_a_kalman_update_in_each_node():
     reading = Reading(0.2, 41_234.0, (0, 0, 0), disturbance_nt=20.0, disturbance_sd_nt=7.0)
     decay, noise = likelihood.dynamics(0.2, 0.04)
     numbers = np.array([*likelihood.numbers(reading, np.zeros(3)), *decay, *noise], float)
-    stats = np.empty(CODE.STATS)
+    stats = np.empty(STATS)
     layout = grid.layers, grid.axes, grid.shape
     CODE.update(likelihood.table, likelihood.spreads, grid.logw, grid.state, *layout, numbers, stats)
 
@@ -211,7 +211,7 @@ def test_one_start_of_the_bank_is_an_extended_kalman_filter():
     prior = case.problem.prior
     table, spreads = table_of(field, field.extent)
     bank = Bank(
-        CODE, Likelihood(case.problem, table, spreads, 1.0), prior.mean, prior.sd, cell_m=0.08, step_rad=0.13
+        Likelihood(case.problem, table, spreads, 1.0), prior.mean, prior.sd, cell_m=0.08, step_rad=0.13
     )
     means, covariances = synthetic.kalman(case, gradient)
     last = None
