@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from magtwin.errors import InputError
-from magtwin.localize.localizers import localizer
 from magtwin.localize.problem import Estimate, Problem, Reading
 from magtwin.localize.readings import readings_of
 from magtwin.localize.slam.batch import FAR, NEAR, Batch
@@ -20,7 +19,6 @@ LAST = 15
 """Most iterations at the true noise."""
 
 
-@localizer("slam-smoother")
 @dataclass(kw_only=True)
 class SlamSmoother(Settings):
     """Batch Gauss-Newton over all poses and the constants of `magtwin.localize.slam.model`.
