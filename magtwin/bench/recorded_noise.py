@@ -63,7 +63,7 @@ def choose(
     folder: str | os.PathLike[str],
     *,
     training: tuple[int, ...] = TRAINING,
-    seeds: int = 4,
+    seeds: int = 2,
     method: str = "rbpf",
     progress: Progress = lambda done, total, what: None,
 ) -> list[Candidate]:
