@@ -241,7 +241,7 @@ def _lead(rows: Columns) -> str:
     )
     return text + (
         "Trajectories are not aligned. The bound is the posterior Cramer-Rao bound with the map's error as "
-        "correlated. Intervals: 95 %, by bootstrap over sessions."
+        "correlated; that of all readings for smoothers. Intervals: 95 %, by bootstrap over sessions."
     )
 
 

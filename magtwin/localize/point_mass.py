@@ -267,7 +267,7 @@ class PointMass:
         taps[:, 0, 1] = taps[:, 2, 1] = (vv - np.abs(uv)) / 2
         taps[:, 0, 0] = taps[:, 2, 2] = np.maximum(uv, 0) / 2
         taps[:, 0, 2] = taps[:, 2, 0] = np.maximum(-uv, 0) / 2
-        taps /= rounds
+        taps /= rounds - turns  # only the mass that keeps its heading moves
         taps[:, 1, 1] = 1 - taps.sum(axis=(1, 2))
         for _ in range(rounds):
             logw, state = np.empty_like(grid.logw), np.empty_like(grid.state)

@@ -269,7 +269,7 @@ def test_what_cannot_run_is_refused_before_anything_is_written(suite, whole, tmp
     for options, text in (
         (("--only", "exat"), "did you mean 'exact'"),
         (("--localizer", "odometri"), "did you mean 'odometry'"),
-        (("--localizer", "bad_localizers:None"), "cannot be imported"),
+        (("--localizer", "bad_localizers:None"), "there is no 'None'"),
         (("--shard", "2/2"), "--shard goes from 0/2 to 1/2"),
         (("--shard", "0/2", "--force"), "drop --force"),
         (("--jobs", "0"), "--jobs must be a whole number from 1 up"),
