@@ -13,7 +13,10 @@ LOCALIZERS: Registry[Any] = Registry(
     "localizer",
     "localizers",
     {
+        "ekf-slam": "magtwin.localize.slam.ekf_slam:EkfSlam",
+        "incremental-slam": "magtwin.localize.slam.incremental_slam:IncrementalSlam",
         "odometry": "magtwin.localize.odometry:Odometry",
+        "slam-smoother": "magtwin.localize.slam.slam_smoother:SlamSmoother",
     },
 )
 """Classes of localizers and smoothers by name."""

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.localize.localizers import localizer
 from magtwin.localize.problem import Estimate, Problem, Reading
 from magtwin.localize.slam.model import Model
 from magtwin.localize.slam.samples import Samples, followed_by, is_vector, samples_of
@@ -14,7 +13,6 @@ from magtwin.localize.slam.settings import Settings
 Array = NDArray[np.float64]
 
 
-@localizer("ekf-slam")
 @dataclass(kw_only=True)
 class EkfSlam(Settings):
     """Extended Kalman filter over the robot's state and the constants of `magtwin.localize.slam.model`.
@@ -53,7 +51,8 @@ class EkfSlam(Settings):
         self._noise = self._problem.sensor.white_nt**2
 
     def _move(self, sample: Samples) -> None:
-        assert self.model is not None and self._last is not None
+        assert self.model is not None
+        assert self._last is not None
         size, motion = self.model.size, self.model.layout.motion.stop
         steps = self.model.steps(followed_by([self._last, sample]))
         self.state, by_state, by_constants = self.model.move(self.state, steps)

@@ -54,7 +54,9 @@ def spectral_density(kernel: Kernel, frequency: ArrayLike, *, sd: float, length_
     w, d = np.asarray(frequency, float), axes
     nu = smoothness(kernel)
     if math.isinf(nu):
-        return np.asarray(sd**2 * (math.sqrt(2 * math.pi) * length_m) ** d * np.exp(-((length_m * w) ** 2) / 2))
+        return np.asarray(
+            sd**2 * (math.sqrt(2 * math.pi) * length_m) ** d * np.exp(-((length_m * w) ** 2) / 2)
+        )
     scale = 2**d * math.pi ** (d / 2) * math.gamma(nu + d / 2) * (2 * nu) ** nu
     scale /= math.gamma(nu) * length_m ** (2 * nu)
     return np.asarray(sd**2 * scale * (2 * nu / length_m**2 + w**2) ** -(nu + d / 2))
@@ -67,9 +69,7 @@ def smoothness(kernel: Kernel) -> float:
         InputError: There is no such kernel.
     """
     if kernel not in SMOOTHNESS:
-        raise InputError(
-            f"kernel must be one of {', '.join(SMOOTHNESS)}, got {kernel!r}", parameter="kernel"
-        )
+        raise InputError(f"kernel must be one of {', '.join(SMOOTHNESS)}, got {kernel!r}", parameter="kernel")
     return SMOOTHNESS[kernel]
 
 
@@ -122,9 +122,7 @@ class Basis:
         """Gradients of the functions, shape (..., d, M); the arguments are those of `values`."""
         sines, cosines = self._waves(p)
         axes = range(len(self.low))
-        parts = [
-            np.prod([cosines[..., a] if a == b else sines[..., b] for b in axes], axis=0) for a in axes
-        ]
+        parts = [np.prod([cosines[..., a] if a == b else sines[..., b] for b in axes], axis=0) for a in axes]
         return np.stack(parts, axis=-2)
 
     def hessians(self, p: ArrayLike, weights: ArrayLike) -> Array:
@@ -175,7 +173,8 @@ def basis(low: Sequence[float], high: Sequence[float], count: int) -> Basis:
     An isotropic spectral density that falls with frequency gives these weights the greatest variance.
 
     Args:
-        low, high: Corners of the box [m], shape (d,).
+        low: Lower corner of the box [m], shape (d,).
+        high: Upper corner [m].
         count: Number of functions.
 
     Raises:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from magtwin.errors import InputError
-from magtwin.localize.localizers import localizer
 from magtwin.localize.problem import Estimate, Problem, Reading
 from magtwin.localize.slam.batch import FAR, Batch, joined
 from magtwin.localize.slam.ekf_slam import EkfSlam
@@ -16,7 +15,6 @@ LAST = 6
 """Iterations at the true noise after annealing."""
 
 
-@localizer("incremental-slam")
 @dataclass(kw_only=True)
 class IncrementalSlam(EkfSlam):
     """EKF-SLAM that solves for all poses until now at regular intervals, and goes on from the solution.
@@ -80,5 +78,3 @@ class IncrementalSlam(EkfSlam):
         self._states = [state]
         self.state = State(state.p[-1:], state.R[-1:], state.drift[-1:], state.g)
         self.covariance = np.ascontiguousarray(solution.last_covariance())
-
-

@@ -61,7 +61,9 @@ class Settings:
         for name in ("velocity_sd_m_s", "soft_iron_sd"):
             _refuse(name, getattr(self, name), 0.0)
         if isinstance(self.functions, bool) or self.functions != int(self.functions) or self.functions < 1:
-            raise InputError(f"functions must be a whole number from 1, got {self.functions}", parameter="functions")
+            raise InputError(
+                f"functions must be a whole number from 1, got {self.functions}", parameter="functions"
+            )
         smoothness(self.kernel)
         for name, known in (("field", ("auto", "vector", "scalar")), ("odometry_axes", ("body", "world"))):
             if getattr(self, name) not in known:
@@ -79,6 +81,3 @@ def _refuse(name: str, value: float, least: float, *, above: bool = False) -> No
     if not good:
         word = "above" if above else "at least"
         raise InputError(f"{name} must be a finite number {word} {least:g}, got {value!r}", parameter=name)
-
-
-check_number = _refuse
