@@ -16,6 +16,7 @@ from magtwin.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from magtwin.author.from_urdf import from_urdf as from_urdf
+    from magtwin.bench.runner import benchmark as benchmark
     from magtwin.errors import InputError as InputError
     from magtwin.errors import MismatchWarning as MismatchWarning
     from magtwin.export.package import export_scene as export_scene
@@ -65,6 +66,7 @@ _NAMES = {
     "Scene": "spec.scene",
     "Twin": "twin",
     "author_scene": "twin",
+    "benchmark": "bench.runner",
     "build_dataset": "learning",
     "calibrate": "learning",
     "draw_plant": "sim.plant_families",

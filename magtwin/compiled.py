@@ -39,6 +39,9 @@ OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 NUMBA_SHARE = 20  # Opening a module is this many times cheaper if numba is already imported
 MOST_THREADS = 8  # Most threads that share a loop; beyond, memory limits the speed
 
+_limit = MOST_THREADS
+"""Most threads that share work in this process."""
+
 
 class Loops:
     """A module of compiled functions that is imported when that pays. Threads may share it.
@@ -118,6 +121,17 @@ def inlined(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     return marked
 
 
+def limit_threads(count: int) -> None:
+    """Let at most `count` threads share work in this process, as where other processes use the processors."""
+    global _limit
+    _limit = count
+
+
+def threads(most: int) -> int:
+    """Number of threads that may share work: at most `most`, and one for each processor."""
+    return max(1, min(most, os.cpu_count() or 1, _limit))  # cpu_count takes 3 us
+
+
 def in_threads(work: Callable[[slice], Any], rows: int, share: int) -> None:
     """Call `work` on slices that cover all rows, on several threads if there is work for them.
 
@@ -127,8 +141,8 @@ def in_threads(work: Callable[[slice], Any], rows: int, share: int) -> None:
         share: Rows that a thread takes at a time; the first thread that is free takes the next share.
     """
     count = rows // share
-    threads = 1 if count < 2 else min(count, MOST_THREADS, os.cpu_count() or 1)  # cpu_count takes 3 us
-    if threads < 2:
+    workers = 1 if count < 2 else threads(min(count, MOST_THREADS))
+    if workers < 2:
         work(slice(0, rows))
         return
     starts = iter(range(0, rows, share))
@@ -137,8 +151,8 @@ def in_threads(work: Callable[[slice], Any], rows: int, share: int) -> None:
         for start in starts:
             work(slice(start, min(start + share, rows)))
 
-    with ThreadPoolExecutor(threads - 1) as pool:
-        others = [pool.submit(take) for _ in range(threads - 1)]
+    with ThreadPoolExecutor(workers - 1) as pool:
+        others = [pool.submit(take) for _ in range(workers - 1)]
         take()
         for other in others:
             other.result()

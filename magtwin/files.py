@@ -280,7 +280,7 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
         return float(value)
     if kind is Path and isinstance(value, str):
         return (where.path.parent / value).resolve()
-    if kind in (str, int, bool) and type(value) is kind:
+    if kind is Any or (kind in (str, int, bool) and type(value) is kind):
         return value
     raise wrong
 

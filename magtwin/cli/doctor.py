@@ -13,6 +13,7 @@ from magtwin.cli.app import app
 from magtwin.cli.terminal import Done
 
 ADDS = {
+    "cluster": "work on a dask cluster (magtwin bench --dask, magtwin sweep --dask)",
     "decomposition": "convex decomposition of collision meshes (magtwin robot --collision decomposition)",
     "gym": "a Gymnasium environment (magtwin.gym)",
     "onnx": "networks as ONNX (magtwin network export, magtwin export)",

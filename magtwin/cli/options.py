@@ -52,6 +52,24 @@ Json = Annotated[
 Quiet = Annotated[
     bool, Parameter(name="--quiet", negative="", help="Print no report and no progress; errors remain.")
 ]
+Jobs = Annotated[
+    int | None,
+    Parameter(converter=_whole, help="Number of processes. Default: one for each processor."),
+]
+Shard = Annotated[
+    str | None,
+    Parameter(
+        help="I/N: do every N-th part of the work, from the I-th, counted from 0; another machine does the "
+        "others, into the same folder."
+    ),
+]
+Dask = Annotated[
+    str | None,
+    Parameter(
+        help="Let the workers of a dask cluster do the work: address of its scheduler, such as "
+        "tcp://10.0.0.1:8786. Needs the extra cluster."
+    ),
+]
 Seed = Annotated[int, Parameter(converter=_whole, help="Seed of all random draws.")]
 Session = Annotated[
     int | Literal["survey"] | None,

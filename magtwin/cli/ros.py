@@ -161,7 +161,13 @@ def sim(
 
 @ros_app.command(name="magnetometer", usage="Usage: magtwin ros magnetometer [OPTIONS] SCENE [SETTING...]")
 def magnetometer(
-    scene: Path, *settings: str, where: Where = HERE, network: Network = None, duration_s: WallS = None
+    scene: Path,
+    *settings: str,
+    where: Where = HERE,
+    network: Network = None,
+    online: str | None = None,
+    measured: str | None = None,
+    duration_s: WallS = None,
 ) -> Done:
     """Run the magnetometer alone: read a robot's sensors through map and network, and publish the field.
 
@@ -169,7 +175,7 @@ def magnetometer(
     publishes qtfm/magnitude and qtfm/total_field_nt while its inputs are fresh, and its state in
     /diagnostics. Inputs may come and go. Settings have the form of ROS, name:=value: rate_hz (135), units
     (T or nT), use_sim_time, max_age_s (0.5), battery_max_age_s (30), lidar (scan, on, off), outside
-    (silent, clamp).
+    (silent, clamp); with --online also buffer_s (60), pose_sd_m (0), map_frame (map).
 
     Parameters
     ----------
@@ -177,6 +183,13 @@ def magnetometer(
         USD stage that names the map, the network and the robot.
     settings
         Settings, such as units:=nT use_sim_time:=true.
+    online
+        Topic of late poses, by which a mixed model follows its session: PoseStamped,
+        PoseWithCovarianceStamped, TransformStamped or Odometry, whose stamps may lie some seconds in the
+        past. Readings are then published on predicted/magnitude and predicted/total_field_nt.
+    measured
+        Topic of the field that a real sensor measures, for --online: MagneticField or Float64, in T or nT.
+        Default: qtfm/magnitude.
     """
     from magtwin.ros.magnetometer import PARAMETERS, Magnetometer
     from magtwin.ros.parameters import settings as settings_of
@@ -186,7 +199,7 @@ def magnetometer(
     announce(f"opening {scene}")
     twin = open_twin(scene, network=network, model_error=False)  # it predicts for a robot that reads
     with where.bus("magtwin_magnetometer", sim_time=values["use_sim_time"], duration_s=duration_s) as bus:
-        Magnetometer(twin, bus, values, say=announce)
+        Magnetometer(twin, bus, values, online=online, measured=measured, say=announce)
         announce(f"reading by {bus.backend}; Ctrl-C ends")
         spin(bus, duration_s)
     return Done()

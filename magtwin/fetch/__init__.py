@@ -12,6 +12,9 @@ from urllib.parse import urlsplit
 from magtwin.errors import InputError, find
 from magtwin.files import output
 
+UNSTATED = "NOASSERTION"
+"""SPDX's word for a licence that the publisher does not state."""
+
 _GITHUB = "https://raw.githubusercontent.com"
 
 
@@ -55,8 +58,28 @@ SOURCES = {
             "BSD-3-Clause",
         ),
     ),
+    "magnetic-data": (
+        Source(
+            "magnetic_data.txt",
+            f"{_GITHUB}/AaltoML/magnetic-data/b45da3bc7ab623fdef6e01247021daebf7983f29",
+            UNSTATED,
+        ),
+    ),
+    "magslam": (
+        Source(
+            "magslam_ship.txt",
+            f"{_GITHUB}/fridaviset/EKFMagSLAM/77a390260052f7d73d8cc31b750d388764386869",
+            UNSTATED,
+        ),
+        Source(
+            "magslam_1d.txt",
+            f"{_GITHUB}/manonkok/1d-magnetic-field-slam/2cd608c6403d46c392a5c61d9bbf567861d7c2c4",
+            "MIT",
+        ),
+    ),
 }
-"""Sources by name: the APRILab survey, network and paths; the TurtleBot 4's description."""
+"""Sources by name: the APRILab survey, network and paths; the TurtleBot 4's description; drives of a robot
+with a magnetometer and true positions; recordings with published results of magnetic SLAM."""
 
 
 def fetch(

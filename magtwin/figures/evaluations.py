@@ -3,7 +3,6 @@
 import csv
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,17 +24,16 @@ from magtwin.figures.canvas import (
     short_name,
 )
 from magtwin.figures.maps import mean_field_ut
-from magtwin.figures.page import WRITERS, Page, Section, Table
+from magtwin.figures.page import Page, Section, Table, write_pages
 from magtwin.figures.training import draw_correlations, label_epochs
-from magtwin.files import output
 from magtwin.learn.data.correlation import correlations
 from magtwin.learn.data.features import FEATURES, FULL, features
 from magtwin.learn.evaluation.evaluation import PAPER, Evaluation, Judged
 from magtwin.learn.evaluation.scores import COVERED, DRAWS, LEVEL
 from magtwin.verdict import Z_90
 
-NAME, PICTURES = "evaluation", "figures"
-"""Name of the report's files, and of the folder with its pictures."""
+NAME = "evaluation"
+"""Name of the report's files."""
 
 MOST_COLUMNS = 12
 """Columns of a table. One with more paths is transposed."""
@@ -111,19 +109,7 @@ def write_evaluation(page: Page, folder: str | os.PathLike[str], *, force: bool 
     Raises:
         InputError: The folder exists and `force` was not given.
     """
-    with output(folder, force=force) as aside:
-        (aside / PICTURES).mkdir(parents=True)
-        sections = []
-        for section in page.sections:
-            pictures = []
-            for k, picture in enumerate(section.pictures):
-                file = f"{PICTURES}/{picture.file or f'picture_{k}'}.{picture.kind}"
-                (aside / file).write_bytes(picture.data)
-                pictures.append(replace(picture, file=file))
-            sections.append(replace(section, pictures=tuple(pictures)))
-        page = replace(page, sections=tuple(sections))
-        for suffix, writer in WRITERS.items():
-            (aside / f"{NAME}{suffix}").write_text(writer(page), encoding="utf-8")
+    write_pages(page, folder, NAME, force=force)
 
 
 def read_curve(weights: str | os.PathLike[str]) -> tuple[Mapping[str, float], ...]:

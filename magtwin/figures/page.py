@@ -10,7 +10,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +25,9 @@ from magtwin.version import __version__
 
 LONGEST_TEXT = 500
 """Characters of a cell that a page shows. JSON holds all of them."""
+
+PICTURES = "figures"
+"""Folder of the pictures of a Markdown page."""
 
 LONG_CELL = 24
 """Characters above which a table gives a cell's column more width."""
@@ -109,6 +112,33 @@ def write_page(page: Page, path: str | os.PathLike[str], *, force: bool = False)
     text = WRITERS[suffix](page)
     with output(path, force=force) as aside:
         aside.write_text(text, encoding="utf-8")
+
+
+def write_pages(page: Page, folder: str | os.PathLike[str], name: str, *, force: bool = False) -> None:
+    """Write a page as a folder: NAME.html, .md and .json, and the pictures of the Markdown page.
+
+    Args:
+        page: The page.
+        folder: The folder to make.
+        name: Name of the files.
+        force: Whether to replace an existing folder.
+
+    Raises:
+        InputError: The folder exists and `force` was not given.
+    """
+    with output(folder, force=force) as aside:
+        (aside / PICTURES).mkdir(parents=True)
+        sections = []
+        for section in page.sections:
+            pictures = []
+            for k, picture in enumerate(section.pictures):
+                file = f"{PICTURES}/{picture.file or f'picture_{k}'}.{picture.kind}"
+                (aside / file).write_bytes(picture.data)
+                pictures.append(replace(picture, file=file))
+            sections.append(replace(section, pictures=tuple(pictures)))
+        page = replace(page, sections=tuple(sections))
+        for suffix, writer in WRITERS.items():
+            (aside / f"{name}{suffix}").write_text(writer(page), encoding="utf-8")
 
 
 def to_html(page: Page) -> str:

@@ -1,19 +1,113 @@
-"""Sweeps on disk: a folder with a Parquet file per run, and runs.csv, which lists them."""
+"""Sweeps on disk: a folder with a Parquet file per run, and runs.csv, which lists them.
+
+Processes, shards and clusters write to OUT.parts first. Whoever finishes the last block of runs renames that
+folder to OUT, which then has the same files as those of one process.
+"""
 
 import csv
+import io
+import json
 import os
+import shutil
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
 from typing import Any
 
-from magtwin.files import output
-from magtwin.io.tables import write_parquet
+from magtwin.errors import InputError
+from magtwin.files import check_free, output
+from magtwin.io.tables import parquet_of, write_parquet
+from magtwin.parallel import checked_shard, in_shard, open_pool
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run
 from magtwin.verdict import HOLDS, HOLDS_ONE, Tally
+from magtwin.version import __version__
 
 LISTING = "runs.csv"
 LISTED = ("path", "seed", "session", "speed_m_s")
+ABOUT = "sweep.json"
+
+BLOCKS, BLOCK = 32, 16
+"""Processes get blocks of runs: at least so many blocks, of at most so many runs."""
+
+Progress = Callable[[int, int], Any]
+
+
+@dataclass
+class Listed:
+    """What is said of some runs."""
+
+    rows: list[list[Any]] = field(default_factory=list)
+    """Rows of runs.csv."""
+
+    paths: dict[str, None] = field(default_factory=dict)
+    sessions: dict[str, str] = field(default_factory=dict)
+    """Session by session and its seed."""
+
+    driven_s: float = 0.0
+    tally: Tally = field(default_factory=Tally)
+
+    def add(self, name: str, run: Run) -> None:
+        """Add a run."""
+        run.add_to(self.tally)
+        self.rows.append([name, *(run.metadata.get(key, "") for key in LISTED), run.rows])
+        self.paths[str(run.metadata.get("path", ""))] = None
+        session, seed = (str(run.metadata.get(key)) for key in ("session", "session_seed"))
+        self.sessions[f"{session} {seed}"] = session
+        self.driven_s += float(run.metadata["duration_s"])
+
+    def extend(self, other: "Listed") -> None:
+        """Add what is said of other runs."""
+        self.rows += other.rows
+        self.paths |= other.paths
+        self.sessions |= other.sessions
+        self.driven_s += other.driven_s
+        for name in ("readings", "error_nt", "naive_nt", "within", "with_sd"):
+            setattr(self.tally, name, getattr(self.tally, name) + getattr(other.tally, name))
+        self.tally.than = other.tally.than if other.tally.readings else self.tally.than
+
+    def to_json(self) -> bytes:
+        """As `from_json` reads it."""
+        return json.dumps(asdict(self)).encode()
+
+    @classmethod
+    def from_json(cls, text: bytes) -> "Listed":
+        """What `to_json` gave."""
+        values = json.loads(text)
+        return cls(**{**values, "tally": Tally(**values["tally"])})
+
+    def csv(self) -> bytes:
+        """The file runs.csv."""
+        file = io.StringIO(newline="")
+        table: Any = csv.writer(file, lineterminator="\n")
+        table.writerow(("file", *LISTED, "readings"))
+        table.writerows(self.rows)
+        return file.getvalue().encode()
+
+    def report(self, title: str, took_s: float, made: int) -> Report:
+        """Numbers of runs and readings, duration, rate, and how well 90 % intervals hold."""
+        names = set(self.sessions.values())
+        count = len(self.rows)
+        return Report(
+            title,
+            (
+                Figure("runs", count),
+                Figure("readings", sum(row[-1] for row in self.rows)),
+                Figure("driven", self.driven_s, "s"),
+                Figure("took", round(took_s, 3), "s"),
+                Figure("rate", made / took_s, "runs/s"),
+            ),
+            {
+                "paths": ", ".join(self.paths),
+                "sessions": "survey" if names == {"survey"} else len(self.sessions),
+            },
+            self.tally.verdict(
+                f"the exact field of {count} runs in {len(self.sessions)} sessions",
+                holds=HOLDS_ONE if len(self.sessions) == 1 else HOLDS,
+            ),
+        )
 
 
 def save_runs(
@@ -21,56 +115,155 @@ def save_runs(
     out: str | os.PathLike[str],
     *,
     force: bool = False,
-    progress: Callable[[int, int], Any] = lambda done, total: None,
+    jobs: int | None = None,
+    shard: tuple[int, int] | None = None,
+    dask: str | None = None,
+    progress: Progress = lambda done, total: None,
 ) -> Report:
     """Write runs to a folder: run_00000.parquet and so on, and runs.csv.
 
-    runs.csv has a row per run with file, path, seed, session, speed_m_s and readings.
+    runs.csv has a row per run with file, path, seed, session, speed_m_s and readings. The files are the same
+    with any number of jobs and shards. With jobs, shards or dask, unfinished work is kept in the folder
+    OUT.parts, and a repeat continues it.
 
     Args:
         runs: Runs, such as `magtwin.sweep` gives. They are made one block at a time.
         out: Folder to make.
         force: Whether to replace a folder that exists.
+        jobs: Processes that make the runs. Default: this process makes them, with several threads.
+        shard: (i, n) makes every n-th block of runs, from the i-th, counted from 0; others make the rest.
+        dask: Address of a dask scheduler whose workers make the runs.
         progress: Called with runs done and runs in all.
 
     Returns:
         Number of runs and readings, duration, speed, and how well the 90 % intervals hold.
 
     Raises:
-        InputError: The folder exists, or a run cannot be made.
+        InputError: The folder exists, OUT.parts is of another sweep, or a run cannot be made.
     """
-    tally, readings, driven_s, start = Tally(), 0, 0.0, time.monotonic()
-    paths: dict[str, None] = {}
-    sessions = set()
+    if jobs is None and shard is None and dask is None:
+        return _save_here(runs, out, force, progress)
+    identity = getattr(runs, "identity", None)
+    if identity is None:
+        text = "`jobs`, `shard` and `dask` need the runs that magtwin.sweep gives, not a list of runs"
+        raise InputError(text, parameter="jobs")
+    if shard is not None and force:
+        text = "other shards may have written there; remove the folder yourself, and drop `force`"
+        raise InputError(text, parameter="force")
+    check_free(out, force=force)
+    if shard is not None:
+        checked_shard(shard)
+        jobs = 1 if jobs is None and dask is None else jobs
+    with open_pool(jobs, dask=dask) as pool:
+        return _Parts(runs, Path(out), force).save(pool, shard, progress)
+
+
+def _save_here(runs: Sequence[Run], out: str | os.PathLike[str], force: bool, progress: Progress) -> Report:
+    """Make runs in this process and write them."""
+    said, start = Listed(), time.monotonic()
     with output(out, force=force) as folder:
         folder.mkdir()
-        with open(folder / LISTING, "w", encoding="utf-8", newline="") as file:
-            table: Any = csv.writer(file, lineterminator="\n")
-            table.writerow(("file", *LISTED, "readings"))
-            progress(0, len(runs))
-            for k, run in enumerate(runs):
-                name = f"run_{k:05d}.parquet"
-                write_parquet(run, folder / name)
-                run.add_to(tally)
-                table.writerow((name, *(run.metadata.get(key, "") for key in LISTED), run.rows))
-                paths[str(run.metadata.get("path", ""))] = None
-                sessions.add(tuple(run.metadata.get(key) for key in ("session", "session_seed")))
-                readings, driven_s = readings + run.rows, driven_s + float(run.metadata["duration_s"])
-                progress(k + 1, len(runs))
-    took_s = time.monotonic() - start
-    names = {str(session) for session, _ in sessions}
-    return Report(
-        f"{len(runs)} runs in {out}",
-        (
-            Figure("runs", len(runs)),
-            Figure("readings", readings),
-            Figure("driven", driven_s, "s"),
-            Figure("took", round(took_s, 3), "s"),
-            Figure("rate", len(runs) / took_s, "runs/s"),
-        ),
-        {"paths": ", ".join(paths), "sessions": "survey" if names == {"survey"} else len(sessions)},
-        tally.verdict(
-            f"the exact field of {len(runs)} runs in {len(sessions)} sessions",
-            holds=HOLDS_ONE if len(sessions) == 1 else HOLDS,
-        ),
-    )
+        progress(0, len(runs))
+        for k, run in enumerate(runs):
+            name = _file(k)
+            write_parquet(run, folder / name)
+            said.add(name, run)
+            progress(k + 1, len(runs))
+        (folder / LISTING).write_bytes(said.csv())
+    return said.report(f"{len(runs)} runs in {out}", time.monotonic() - start, len(runs))
+
+
+def _file(number: int) -> str:
+    return f"run_{number:05d}.parquet"
+
+
+def make_block(runs: Sequence[Run], numbers: range) -> tuple[list[tuple[str, bytes]], Listed]:
+    """Names and contents of the files of some runs, and what is said of them; in a worker."""
+    files, said = [], Listed()
+    for number, run in zip(numbers, runs[numbers.start : numbers.stop], strict=True):
+        files.append((_file(number), parquet_of(run)))
+        said.add(_file(number), run)
+    return files, said
+
+
+class _Parts:
+    """The folder OUT.parts of an unfinished sweep: runs, a part-00000.json per block, and sweep.json."""
+
+    def __init__(self, runs: Any, out: Path, force: bool) -> None:
+        self.runs, self.out, self.force = runs, out, force
+        self.folder = out.with_name(f"{out.name}.parts")
+        size = max(1, min(BLOCK, len(runs) // BLOCKS))
+        self.blocks = [range(k, min(k + size, len(runs))) for k in range(0, len(runs), size)]
+        self.about = {"magtwin": __version__, "sweep": runs.identity, "runs": len(runs)}
+
+    def save(self, pool: Any, shard: tuple[int, int] | None, progress: Progress) -> Report:
+        """Make the blocks of a shard that are not there yet; rename the folder once all are."""
+        self._begin()
+        blocks = [k for k in range(len(self.blocks)) if in_shard(k, shard) and not self._part(k).exists()]
+        total, made, start = sum(len(self.blocks[k]) for k in blocks), 0, time.monotonic()
+        progress(0, total)
+        try:
+            for outcome in pool.run(partial(make_block, self.runs), [self.blocks[k] for k in blocks]):
+                files, said = outcome.result()
+                block = blocks[outcome.index]
+                for name, content in (*files, (self._part(block).name, said.to_json())):
+                    with output(self.folder / name, force=True) as aside:
+                        aside.write_bytes(content)
+                made += len(files)
+                progress(made, total)
+        except BaseException:
+            if not any(self.folder.glob("part-*.json")):
+                shutil.rmtree(self.folder, ignore_errors=True)
+            raise
+        took_s = max(time.monotonic() - start, 1e-9)
+        said = Listed()
+        whole = True
+        for k in range(len(self.blocks)):
+            try:
+                said.extend(Listed.from_json(self._part(k).read_bytes()))
+            except FileNotFoundError:
+                whole = False
+        if whole and self._finish(said):
+            return said.report(f"{len(self.runs)} runs in {self.out}", took_s, made)
+        title = f"{len(said.rows)} of {len(self.runs)} runs in {self.folder}; other shards make the rest"
+        return said.report(title, took_s, made)
+
+    def _part(self, block: int) -> Path:
+        return self.folder / f"part-{block:05d}.json"
+
+    def _begin(self) -> None:
+        """Make the folder, or check that it is of this sweep."""
+        file = self.folder / ABOUT
+        if self.folder.exists():
+            try:
+                same = json.loads(file.read_text(encoding="utf-8")) == self.about
+            except (OSError, ValueError):
+                same = False
+            if same:
+                return
+            if any(self.folder.iterdir()) and not self.force:
+                text = "unfinished runs of another sweep; give `force=True` to replace them, or another name"
+                raise InputError(f"{self.folder}: {text}", parameter="force")
+            shutil.rmtree(self.folder)
+        with output(file, force=True) as aside:
+            aside.write_text(json.dumps(self.about), encoding="utf-8")
+
+    def _finish(self, said: Listed) -> bool:
+        """Rename the folder, which has all runs; False if another shard does so at the same time."""
+        try:
+            with output(self.folder / LISTING, force=True) as aside:
+                aside.write_bytes(said.csv())
+            if self.out.exists():  # checked in the beginning: to be replaced
+                old = self.out.with_name(f".{self.out.name}.{os.getpid()}.old")
+                self.out.rename(old)
+                self.folder.rename(self.out)
+                shutil.rmtree(old)
+            else:
+                self.folder.rename(self.out)
+        except (FileNotFoundError, InputError):
+            if self.folder.exists():
+                raise
+            return self.out.exists()
+        for file in (*self.out.glob("part-*.json"), self.out / ABOUT):
+            file.unlink()
+        return True

@@ -54,9 +54,21 @@ def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool = False
             in a table.
     """
     table = table_of(run)
-    split = {f.name: "BYTE_STREAM_SPLIT" for f in table.schema if pa.types.is_floating(f.type)}
     with output(path, force=force) as aside:
-        pq.write_table(table, aside, compression="zstd", use_dictionary=False, column_encoding=split)
+        _write_table(table, aside)
+
+
+def parquet_of(run: Run) -> bytes:
+    """The content of the file that `write_parquet` writes; arguments and errors are its own."""
+    sink = pa.BufferOutputStream()
+    _write_table(table_of(run), sink)
+    content: bytes = sink.getvalue().to_pybytes()
+    return content
+
+
+def _write_table(table: pa.Table, where: Any) -> None:
+    split = {f.name: "BYTE_STREAM_SPLIT" for f in table.schema if pa.types.is_floating(f.type)}
+    pq.write_table(table, where, compression="zstd", use_dictionary=False, column_encoding=split)
 
 
 def read_parquet(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None = None) -> Run:

@@ -2,7 +2,9 @@
 
 import importlib
 import inspect
+import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from magtwin.errors import InputError, hint
@@ -13,10 +15,19 @@ LOCALIZERS: Registry[Any] = Registry(
     "localizer",
     "localizers",
     {
+        "bootstrap": "magtwin.localize.particles:Bootstrap",
+        "ekf": "magtwin.localize.ekf:Ekf",
         "ekf-slam": "magtwin.localize.slam.ekf_slam:EkfSlam",
         "incremental-slam": "magtwin.localize.slam.incremental_slam:IncrementalSlam",
         "odometry": "magtwin.localize.odometry:Odometry",
+        "point-mass": "magtwin.localize.point_mass:PointMass",
+        "rbpf": "magtwin.localize.particles:RaoBlackwell",
+        "rbpf-iron": "magtwin.localize.particles:RaoBlackwellIron",
+        "rbpf-network": "magtwin.localize.particles:RaoBlackwellNetwork",
+        "ros": "magtwin.ros.ros_node:RosNode",
+        "sequence": "magtwin.localize.sequence:Sequence",
         "slam-smoother": "magtwin.localize.slam.slam_smoother:SlamSmoother",
+        "smoother": "magtwin.localize.smoother:MapSmoother",
     },
 )
 """Classes of localizers and smoothers by name."""
@@ -29,7 +40,8 @@ def load_localizer(name: str, options: Mapping[str, Any] | None = None) -> Local
     """A new localizer or smoother.
 
     Args:
-        name: A name in `LOCALIZERS`, or "module:Class" of an importable module.
+        name: A name in `LOCALIZERS`, or "module:Class" of an importable module or of a file in the current
+            folder.
         options: Keyword arguments of its class.
 
     Raises:
@@ -45,7 +57,8 @@ def load_localizer(name: str, options: Mapping[str, Any] | None = None) -> Local
     if known is not None and not any(p.kind is p.VAR_KEYWORD for p in known.values()):
         for key in options:
             if key not in known:
-                raise InputError(f"localizer {name!r} has no option {key!r}; {hint(key, known)}")
+                near = hint(key, known) if known else "it has none"
+                raise InputError(f"localizer {name!r} has no option {key!r}; {near}")
     try:
         algorithm = made(**options)
     except InputError:
@@ -61,10 +74,17 @@ def _class_of(name: str) -> Any:
     if ":" not in name:
         return LOCALIZERS[name]
     module, _, attribute = name.partition(":")
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.append(here)  # last, so that a file here hides no installed module
     try:
         made: Any = importlib.import_module(module)
         for part in attribute.split("."):
+            if not hasattr(made, part):
+                classes = [word for word, value in vars(made).items() if inspect.isclass(value)]
+                raise InputError(f"localizer {name!r}: there is no {part!r}; {hint(part, classes)}")
             made = getattr(made, part)
+    except InputError:
+        raise
     except Exception as error:
         raise InputError(f"localizer {name!r} cannot be imported: {type(error).__name__}: {error}") from error
     return made

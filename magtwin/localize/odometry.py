@@ -9,6 +9,9 @@ from magtwin.localize.problem import Array, Estimate, Problem, Reading
 MOST_SD = 1e3
 """Standard deviation that stands for an unknown start [m, rad]."""
 
+STILL_M = 1e-3
+"""Motion within which a reading may repeat itself to the bit: metres, and radians / 10."""
+
 
 def increment(
     before: tuple[float, float, float], now: tuple[float, float, float]
@@ -28,6 +31,14 @@ def increment(
     dx, dy = now[0] - before[0], now[1] - before[1]
     c, s = math.cos(middle), math.sin(middle)
     return dx * c + dy * s, dy * c - dx * s, turn
+
+
+def repeats(before: Reading | None, now: Reading) -> bool:
+    """Whether a reading equals the one before to the bit although the robot moved: the sensor is stuck."""
+    if before is None or before.b_nt != now.b_nt:
+        return False
+    forward, left, turn = increment(before.odometry, now.odometry)
+    return math.hypot(forward, left) + 0.1 * abs(turn) > STILL_M
 
 
 class Odometry:

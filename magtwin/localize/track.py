@@ -122,7 +122,7 @@ def track(
                 clouds.append(np.array(algorithm.particles(), float))
             if progress is not None:
                 progress(k + 1, run.rows)
-    made = _checked(name, estimates, run["t"])
+    made = checked_estimates(name, estimates, run["t"])
     return Track(run["t"], *made, spent / run.rows, tuple(clouds))
 
 
@@ -133,7 +133,9 @@ def _called(what: str, work: Callable[[], Any]) -> Any:
         raise LocalizerError(f"{what} raised {type(error).__name__}: {error}") from error
 
 
-def _checked(name: str, estimates: list[Any], t: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+def checked_estimates(
+    name: str, estimates: list[Any], t: Array
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
     """Pose, covariance, bias and lost of all estimates."""
     for k, estimate in enumerate(estimates):
         if not isinstance(estimate, Estimate):

@@ -200,15 +200,16 @@ def names_of(namespace: str = "robot", remaps: Iterable[str] = ()) -> Names:
     table = {}
     for remap in remaps:
         left, sign, right = remap.partition(":=")
-        if not sign or not _is_name(left) or not _is_name(right):
+        if not sign or not is_name(left) or not is_name(right):
             raise InputError(f"a remap is a name:=another, such as odom:=/vicon/odom; got {remap!r}")
         table[left] = right
-    if namespace and not _is_name(namespace):
+    if namespace and not is_name(namespace):
         raise InputError(f"namespace {namespace!r} is not a ROS name: use letters, digits, _ and /")
     return Names(namespace, table)
 
 
-def _is_name(name: str) -> bool:
+def is_name(name: str) -> bool:
+    """Whether a text is a ROS name."""
     parts = name.strip("/").split("/")
     return all(part.isidentifier() and part.isascii() for part in parts)
 

@@ -17,7 +17,10 @@ from magtwin.ros.diagnostics import Level, Status, status_of
 Columns = dict[str, NDArray[Any]]
 
 KEPT = 64
-"""Messages kept per topic."""
+"""Messages kept per topic, beside those of `Input.history_s`."""
+
+MOST_KEPT = 50_000
+"""Most messages kept per topic."""
 
 JUMP_S = 1.0
 """A stamp older than the last one by more than this means a restart of the robot or the clock [s]."""
@@ -54,7 +57,9 @@ class Input:
         """Its name on the network."""
         self._kind = ""
         self._subscription: Subscription | None = None
-        self._kept: deque[tuple[int, Columns]] = deque(maxlen=KEPT)
+        self._kept: deque[tuple[int, Columns]] = deque(maxlen=MOST_KEPT)
+        self.history_s = 0.0
+        """Time for which messages are kept [s], to be joined with a time that long ago."""
         self.heard, self.broken, self.jumps, self.ahead = 0, 0, 0, 0
         self.sent_ns = 0
         self._heard_before, self._reported_ns = 0, 0
@@ -163,7 +168,11 @@ class Input:
             self.jumps += 1
             self._kept.clear()
         self.sent_ns = message.sent_ns
+        if self._kept and stamp == self._kept[-1][0]:
+            self._kept.pop()
         self._kept.append((stamp, columns))
+        while len(self._kept) > KEPT and self._kept[1][0] < stamp - round(self.history_s * NS):
+            self._kept.popleft()
 
     def _read(self, message: Message) -> tuple[int, Columns]:
         stamped = layout(message.kind)[0].name == "header.stamp"
@@ -213,7 +222,9 @@ class Scanning:
         """Start to search for scans; `gap_s` is the longest time between two while it spins [s]."""
         self._bus, self._topic, self._gap_s = bus, topic, gap_s
         self._subscription: Subscription | None = None
-        self._last_ns: int | None = None
+        self._times_ns: deque[int] = deque(maxlen=MOST_KEPT)
+        self.history_s = 0.0
+        """As for `Input`."""
         self.heard = 0
 
     def look(self) -> None:
@@ -225,7 +236,12 @@ class Scanning:
 
     def on(self, now_ns: int) -> bool:
         """Whether it spins at a time [ns]."""
-        return self._last_ns is not None and abs(now_ns - self._last_ns) < self._gap_s * NS
+        latest = next((t_ns for t_ns in reversed(self._times_ns) if t_ns <= now_ns), None)
+        return latest is not None and now_ns - latest < self._gap_s * NS
+
+    def forget(self) -> None:
+        """As for `Input`."""
+        self._times_ns.clear()
 
     def status(self, now_ns: int) -> Status:
         """As for `Input`; silence means that it does not spin, so it is never stale."""
@@ -234,4 +250,7 @@ class Scanning:
 
     def _hear(self, message: Message) -> None:
         self.heard += 1
-        self._last_ns = self._bus.now_ns()
+        now = self._bus.now_ns()
+        self._times_ns.append(now)
+        while self._times_ns[0] < now - round((self.history_s + self._gap_s) * NS):
+            self._times_ns.popleft()

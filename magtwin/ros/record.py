@@ -132,7 +132,7 @@ class Player:
         """
         self._run = run
         sender = sender_for(twin, units, run.metadata.get("rate_hz"))
-        self._stream = Stream(run, sender, None, topics=(*READ, *SAMPLED.values()), whole=True)
+        self._stream = Stream(run, sender, None, topics=(*SAMPLED.values(), *READ), whole=True)
         chosen = [t for t in self._stream.topics if bus.knows(t.kind) and (not topics or t.name in topics)]
         if not chosen:
             raise InputError(f"the run has no columns of {', '.join(topics) or 'any topic'}")

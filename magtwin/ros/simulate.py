@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +19,15 @@ from magtwin.io.bags.topics import COMMAND, IMU, MAGNITUDE, SCAN, TOTAL_FIELD, V
 from magtwin.io.bags.types import layout
 from magtwin.ros.bus import Bus, Message, Publisher
 from magtwin.ros.diagnostics import Reporter, status_of
-from magtwin.ros.network import read_rows
 from magtwin.ros.topics import READ, SAMPLED, TICKS
 from magtwin.run.run import Run
 from magtwin.sim.exact import check_field
 from magtwin.sim.runs.live import LiveRobot
 from magtwin.sim.sensors.clock import Samples
 from magtwin.twin import Session, Twin, in_session, model_error_of
+
+if TYPE_CHECKING:
+    from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 
 RESET = "/robot/reset"
 """Topic (std_msgs/Empty), and with rclpy service (std_srvs/Empty), that resets robot and time."""
@@ -183,7 +185,7 @@ class Simulator:
             rng=np.random.default_rng(self._seed),
             obstacles=twin.obstacles,
             rate_hz=self._rate,
-            network=partial(read_rows, twin.magnetometer) if twin.magnetometer else None,
+            network=partial(_read_rows, twin.magnetometer) if twin.magnetometer else None,
             model_error=model_error_of(twin, self._seed),
             lidar=self._lidar,
         )
@@ -292,3 +294,13 @@ class Simulator:
         stamp = self._begin_ns + round(self.online.t * NS)
         self._reporter.report([status_of("simulator", problems, fine="running", values=values)], stamp)
         self._slips = self._refused = 0
+
+
+def _read_rows(
+    magnetometer: "NeuralMagnetometer", run: Run
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_] | None]:
+    """Disturbances, their standard deviations [nT], and whether the rows are outside the training range."""
+    if not run.rows:
+        return np.zeros(0), np.zeros(0), np.zeros(0, bool)
+    (read,) = magnetometer.read([run.select("t", *sorted(magnetometer.columns - {"t"}))])
+    return read.disturbance_nt, read.sd_nt, read.outside

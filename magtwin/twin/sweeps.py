@@ -1,6 +1,7 @@
 """Sweep: many runs of one scene, driven at once and made when asked for."""
 
 import dataclasses
+import functools
 from collections.abc import Iterable, Sequence
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
 from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.motion.drive_input import drive_inputs
@@ -30,8 +32,9 @@ from magtwin.twin.twin import (
 )
 
 if TYPE_CHECKING:
+    from magtwin.learn.inference.magnetometer import NeuralMagnetometer
     from magtwin.sim.motion.commands import Commands
-    from magtwin.sim.runs.batch import Runs
+    from magtwin.sim.runs.batch import Job, Runs
     from magtwin.sim.runs.simulate import Sensed
 
 MIXTURE = ("sine", "lawnmower", "figure8", "continuous_cycle", "random")
@@ -97,7 +100,7 @@ def sweep(
         InputError: There is no run, the numbers of speeds or robots differ from that of the runs, a robot's
             magnetometer is not the twin's, or `simulate` would refuse a run.
     """
-    from magtwin.sim.exact import check_field, check_read
+    from magtwin.sim.exact import check_field
     from magtwin.sim.runs.batch import BLOCK, Job, Runs
     from magtwin.sim.runs.sensing import Conditions
 
@@ -126,7 +129,8 @@ def sweep(
         if speeds != "drawn":
             raise InputError(f'speeds must be numbers or "drawn", got {speeds!r}')
         speeds = _drawn_speeds(twin, count, first)
-    jobs, known = [], {}
+    jobs: list[Job] = []
+    known: dict[int, tuple[Twin, str]] = {}
     for k, (number, speed, own) in enumerate(
         zip(numbers, _each("speeds", speeds, count), twins, strict=True)
     ):
@@ -136,22 +140,7 @@ def sweep(
         check_commands(path, twin.magnetometer)
         jobs.append(Job(own.scene, path, number, speed))
     predictor = twin.magnetometer
-
-    def finish(jobs: Sequence[Job], sensed: Sequence["Sensed"]) -> list[Run]:
-        flagged = "flag_out_of_distribution" in sensed[0].wanted
-        rows = [each.run for each in sensed]
-        reads = predictor.read(rows, outside=flagged) if predictor else [None] * len(rows)
-        runs = []
-        for job, each, read in zip(jobs, sensed, reads, strict=True):
-            own, config = known[id(job.scene)]
-            run = each.read(
-                (read.disturbance_nt, read.sd_nt) if read else None, model_error_of(own, job.seed)
-            )
-            check_read(run, twin.field)
-            options: Any = {"duration_s": duration_s, "config_sha256": config, "add": False}
-            runs.append(finished(own, run, job.path, read, seed=job.seed, **options))
-        return runs
-
+    finish = _Finish(predictor, twin.field, tuple(known.values()), duration_s)
     conditions = Conditions(
         anomaly_map=twin.field,
         obstacles=twin.obstacles,
@@ -164,6 +153,49 @@ def sweep(
         outside=outside,
     )
     return Runs(jobs, conditions, finish, columns=columns, block=BLOCK if block is None else block)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Finish:
+    """Makes whole runs of sensed ones; an object, so that other processes can have it."""
+
+    predictor: "NeuralMagnetometer | None"
+    field: AnomalyMap
+
+    twins: tuple[tuple[Twin, str], ...]
+    """Twins of the runs, each with the checksum of its scene."""
+
+    duration_s: float | None
+
+    def __call__(self, jobs: Sequence["Job"], sensed: Sequence["Sensed"]) -> list[Run]:
+        from magtwin.sim.exact import check_read
+
+        predictor, known = self.predictor, self._known
+        flagged = "flag_out_of_distribution" in sensed[0].wanted
+        rows = [each.run for each in sensed]
+        reads = predictor.read(rows, outside=flagged) if predictor else [None] * len(rows)
+        runs = []
+        for job, each, read in zip(jobs, sensed, reads, strict=True):
+            own, config = known[id(job.scene)]
+            run = each.read(
+                (read.disturbance_nt, read.sd_nt) if read else None, model_error_of(own, job.seed)
+            )
+            check_read(run, self.field)
+            options: Any = {"duration_s": self.duration_s, "config_sha256": config, "add": False}
+            runs.append(finished(own, run, job.path, read, seed=job.seed, **options))
+        return runs
+
+    def identity(self, job: "Job") -> str:
+        """What tells a run of a job from others, but for what all runs of the sweep have in common."""
+        own, config = self._known[id(job.scene)]
+        return f"{config} {own.errors} {sorted(own.metadata.items())} {sorted(own.session.items())}"
+
+    @functools.cached_property
+    def _known(self) -> dict[int, tuple[Twin, str]]:
+        return {id(own.scene): (own, config) for own, config in self.twins}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_known"}
 
 
 def _twins(

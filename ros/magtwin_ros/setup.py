@@ -2,7 +2,7 @@
 
 from setuptools import setup
 
-NODES = ("sim", "magnetometer", "follow", "record", "replay", "teleop")
+NODES = ("sim", "magnetometer", "localize", "follow", "record", "replay", "teleop")
 
 setup(
     name="magtwin_ros",
@@ -17,6 +17,6 @@ setup(
     install_requires=["setuptools", "pyyaml"],
     zip_safe=True,
     license="Apache-2.0",
-    description="ROS 2 nodes of magtwin: simulator, neural-network magnetometer, path follower, recorder.",
+    description="ROS 2 nodes of magtwin: simulator, neural magnetometer, localizer, path follower, recorder.",
     entry_points={"console_scripts": [f"{node} = magtwin_ros.nodes:{node}" for node in NODES]},
 )

@@ -46,6 +46,16 @@ def test_the_magnetometer_waits_for_a_robot(capsys: pytest.CaptureFixture[str]) 
     assert "reading by cyclonedds" in capsys.readouterr().err
 
 
+def test_the_localizer_waits_for_a_robot_and_runs_any_method(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    main(["new", "own_filter.py", "--quiet"])
+    own = ["--method", "own_filter:MyLocalizer", "--option", "particles=10"]
+    main(["ros", "localize", "lab", "prior:=0,0,0.5", *own, "--duration-s", "0.3"])
+    assert "localizing by cyclonedds" in capsys.readouterr().err
+
+
 def test_a_run_is_replayed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     t = np.arange(20) / 135
     write_run(Run({"t": t, "b_measured_nt": 4e4 + t}, {}), tmp_path / "run.parquet")
@@ -73,6 +83,10 @@ def test_a_recording_of_nothing_is_said(tmp_path: Path, capsys: pytest.CaptureFi
         (["magnetometer", SCENE, "--duration-s", "-1"], "--duration-s must be above 0 s, got -1.0"),
         (["magnetometer", SCENE, "rate_hz:=0"], "parameter rate_hz must be from 1 to 1000"),
         (["magnetometer", SCENE, "--network", "none"], "is physical, which needs the lab itself"),
+        (["localize", SCENE, "--method", "odometri"], "did you mean 'odometry'?"),
+        (["localize", SCENE, "--method", "odometry", "prior:=here"], "prior is wait, global or x,y,yaw"),
+        (["localize", SCENE, "--method", "odometry", "rate_hz:=0"], "rate_hz must be from 0.1 to 1000"),
+        (["localize", SCENE, "--method", "smoother"], "is a smoother, which needs a whole run"),
         (["follow", "figur8"], "did you mean 'figure8'"),
         (["follow", "figure8", "--speed", "3"], "speed must be above 0"),
         (["replay", "nothing.parquet"], "nothing.parquet"),

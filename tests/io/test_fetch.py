@@ -103,4 +103,9 @@ def test_the_tables_agree_with_the_real_files(real_data):
             if real.is_file():
                 assert hashlib.sha256(real.read_bytes()).hexdigest() == checksum
                 checked += 1
-    assert checked > 40
+    for name in ("magnetic-data", "magslam"):
+        for source in SOURCES[name]:
+            for file, checksum, _ in source.files():
+                assert hashlib.sha256((real_data / name / file).read_bytes()).hexdigest() == checksum
+                checked += 1
+    assert checked > 60

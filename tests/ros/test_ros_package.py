@@ -13,7 +13,7 @@ from places import ROOT
 from magtwin.ros.magnetometer import PARAMETERS
 
 PACKAGE = ROOT / "ros" / "magtwin_ros"
-NODES = ("sim", "magnetometer", "follow", "record", "replay", "teleop")
+NODES = ("sim", "magnetometer", "localize", "follow", "record", "replay", "teleop")
 
 
 @pytest.fixture
@@ -46,6 +46,16 @@ def arguments(monkeypatch: pytest.MonkeyPatch):
             "magnetometer",
             "--ros-args --log-level warn -p scene:=lab.usda -p duration_s:=5 --disable-stdout-logs odom:=o",
             "ros magnetometer lab.usda --duration-s=5 --remap odom:=o",
+        ),
+        (
+            "magnetometer",
+            "lab.usda --ros-args -p online:=/slam/pose -p measured:=qtfm/magnitude -p map_frame:=world",
+            "ros magnetometer lab.usda --online=/slam/pose --measured=qtfm/magnitude map_frame:=world",
+        ),
+        (
+            "localize",
+            "lab --ros-args -p method:=ekf -p prior:=global -p use_sim_time:=true -r __ns:=/tb4",
+            "ros localize lab --method=ekf prior:=global use_sim_time:=true --namespace=tb4",
         ),
         ("replay", "a.mcap --ros-args -p use_sim_time:=true -r x:__ns:=/", "ros replay a.mcap --namespace="),
     ],

@@ -98,7 +98,7 @@ def convert(
 
 @app.command
 def fetch(
-    assets: Literal["aprilab", "turtlebot4"],
+    assets: Literal["aprilab", "turtlebot4", "magnetic-data", "magslam"],
     *,
     out: Path | None = None,
     base_url: str | None = None,
@@ -110,7 +110,8 @@ def fetch(
     ----------
     assets
         aprilab: survey, released network and paths (MIT). turtlebot4: description packages (Apache-2.0,
-        BSD-3-Clause).
+        BSD-3-Clause). magnetic-data: five drives of a robot in a room, with true positions (no licence
+        stated). magslam: loops of a model ship (no licence stated) and hand-held loops (MIT).
     out
         Folder to make. Default: the name of the assets.
     base_url

@@ -4,7 +4,19 @@ from pathlib import Path
 from typing import Literal
 
 from magtwin.cli.app import app
-from magtwin.cli.options import SENSING, Flag, Force, Names, Plant, Seed, SensingOptions, Whole
+from magtwin.cli.options import (
+    SENSING,
+    Dask,
+    Flag,
+    Force,
+    Jobs,
+    Names,
+    Plant,
+    Seed,
+    SensingOptions,
+    Shard,
+    Whole,
+)
 from magtwin.cli.terminal import Done, announce, progress
 from magtwin.errors import InputError
 
@@ -27,6 +39,9 @@ def sweep(
     speed: float | None = None,
     duration_s: float | None = None,
     keep: Names = None,
+    jobs: Jobs = None,
+    shard: Shard = None,
+    dask: Dask = None,
     sensing: SensingOptions = SENSING,
     force: Force = False,
 ) -> Done:
@@ -35,6 +50,9 @@ def sweep(
     Run k, in run_00000.parquet and so on, has the seed SEED + k and drives the next path in turn. runs.csv
     lists file, path, seed, session, speed and readings. In a scene of several robots the first one drives,
     alone.
+
+    With --jobs, --shard or --dask, other processes make the runs; the files are the same. Until all are there
+    they are in OUT.parts, and the same command continues an interrupted sweep.
 
     Parameters
     ----------
@@ -61,8 +79,11 @@ def sweep(
         Length of each run [s]; more than once along the path gives further laps. Default: once along it.
     keep
         Columns to write beside t. Default: all.
+    jobs
+        Number of processes. Default: one, with several threads.
     """
     from magtwin.files import check_free
+    from magtwin.parallel import parse_shard
     from magtwin.sim.motion.drive_input import drive_input
     from magtwin.twin import MIXTURE, open_twin, room_of, scene_file
     from magtwin.twin import sweep as drive_many
@@ -95,5 +116,7 @@ def sweep(
         duration_s=duration_s,
         **options,
     )
+    part = None if shard is None else parse_shard(shard)
     with progress("Driving", "runs") as advance:
-        return Done(runs.save(out, force=force, progress=advance), out)
+        made = runs.save(out, force=force, jobs=jobs, shard=part, dask=dask, progress=advance)
+    return Done(made, out if out.exists() else Path(f"{out}.parts"))

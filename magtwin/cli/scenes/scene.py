@@ -12,22 +12,31 @@ from magtwin.cli.terminal import Done, announce, check_output, progress
 
 @app.command
 def new(out: Path, *, force: Force = False) -> Done:
-    """Write a commented TOML of a small furnished room to start from.
+    """Write a file to start from: a TOML of a small furnished room, or a localizer in Python.
 
-    Author it with `magtwin scene room.toml --out room`.
+    Author a room with `magtwin scene room.toml --out room`. Test a localizer with `magtwin localize RUN --map
+    lab --method localizer:MyLocalizer`.
 
     Parameters
     ----------
     out
-        TOML file to write; the scene gets its name.
+        File to write: .toml for a room, whose scene gets the file's name; .py for a localizer.
     """
+    check_output(out, (".toml", ".py"), "a room or a localizer", force=force)
+    if out.suffix == ".py":
+        from magtwin.localization import new_localizer
+
+        new_localizer(out, force=force)
+        try_it = f"magtwin localize localizer_run/run.parquet --map lab --method {out.stem}:MyLocalizer"
+        folder = "" if out.parent == Path() else f"cd {shlex.quote(str(out.parent))}\n       "
+        drive = "magtwin run lab --out localizer_run"
+        return Done(wrote=out, text=f"Wrote {out}\nNext:  {folder}{drive}\n       {try_it}")
     from magtwin.twin import new_scene
 
-    check_output(out, (".toml",), "a scene's description", force=force)
     new_scene(out, force=force)
-    folder = out.with_suffix("")
-    stage = shlex.quote(str(folder / f"{out.stem}.usda"))
-    author = f"magtwin scene {shlex.quote(str(out))} --out {shlex.quote(str(folder))}"
+    room = out.with_suffix("")
+    stage = shlex.quote(str(room / f"{out.stem}.usda"))
+    author = f"magtwin scene {shlex.quote(str(out))} --out {shlex.quote(str(room))}"
     return Done(wrote=out, text=f"Wrote {out}\nNext:  {author}\n       magtwin run {stage}")
 
 

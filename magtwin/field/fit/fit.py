@@ -5,7 +5,6 @@ twenty times as long. Whole headings run in parallel instead.
 """
 
 import inspect
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.compiled import threads
 from magtwin.errors import InputError, hint
 from magtwin.field.fit.methods import METHODS, FieldModel
 from magtwin.field.fit.resolution import resolution
@@ -135,14 +135,15 @@ def raster(
     Raises:
         InputError: The spacing leaves no cell, the headings do not ascend, or no node is valid.
     """
+    say = progress or (lambda done, total, what: None)
+    say(0, 1, "resolution")
     grid, errors = _grid(model, readings, spacing_m, headings_rad, extent)
     p, _ = grid.poses()
     values, variance = np.empty(grid.shape), np.empty(grid.shape)
     headings = grid.headings_rad
     predict = getattr(model, "predict_nodes", model.predict)
-    threads = min(MOST_THREADS, os.cpu_count() or 1, len(headings))
-    say = progress or (lambda done, total, what: None)
-    with _one_thread(), ThreadPoolExecutor(threads) as pool:
+    workers = threads(min(MOST_THREADS, len(headings)))
+    with _one_thread(), ThreadPoolExecutor(workers) as pool:
         for h, predicted in enumerate(pool.map(predict, p, headings)):
             say(h, len(headings), "headings")
             values[h], variance[h] = predicted

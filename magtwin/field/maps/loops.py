@@ -31,7 +31,7 @@ at_with_gradient = compiled(*_POSE)(trilinear.at_with_gradient)
 
 
 @inlined
-def _place(
+def place(
     table: Array, q: Array, yaw: Array, clamp: bool, wx: Array, wy: Array, wh: Array, node: Numbers
 ) -> None:
     """Lowest node of each pose in the first layer, weights of the higher ones, angles above that layer.
@@ -58,7 +58,7 @@ def _place(
 
 
 @inlined
-def _climb(table: Array, layer: int, wh: Array, slope: Array, node: Numbers) -> None:
+def climb(table: Array, layer: int, wh: Array, slope: Array, node: Numbers) -> None:
     """Go up from the first layer to the one below each angle; `slope` takes the slope of its weight."""
     layers, per_rad = int(table[6]), table[9]
     if per_rad >= 0:
@@ -83,9 +83,10 @@ def _climb(table: Array, layer: int, wh: Array, slope: Array, node: Numbers) -> 
 
 
 @inlined
-def _blend(
+def blends(
     t: Array, row: np.uint64, layer: np.uint64, node: Numbers, wx: Array, wy: Array, wh: Array, out: Array
 ) -> None:
+    """`trilinear.blend` at the cells that `place` and `climb` found."""
     for n in range(out.shape[0]):
         out[n] = blend(corners(t, np.uint64(node[n]), _ONE, row, layer), wx[n], wy[n], wh[n])
 
@@ -128,19 +129,19 @@ def lookup(
         count = stop - start
         p, b = q[2 * start : 2 * stop], out[start:stop]
         wx, wy, wh, node, hole = wxs[:count], wys[:count], whs[:count], nodes_at[:count], holes[:count]
-        _place(table, p, yaw[start:stop], clamp, wx, wy, wh, node)
-        _climb(table, in_layer, wh, slopes, node)
-        _blend(values, row, up, node, wx, wy, wh, b)
+        place(table, p, yaw[start:stop], clamp, wx, wy, wh, node)
+        climb(table, in_layer, wh, slopes, node)
+        blends(values, row, up, node, wx, wy, wh, b)
         if masked.shape[0] > 0:
-            _blend(masked, row, up, node, wx, wy, wh, hole)
+            blends(masked, row, up, node, wx, wy, wh, hole)
             for n in range(count):
                 b[n] = np.nan if hole[n] > edge else b[n]
         if sd.shape[0] > 0:
             one, plane = sd[start:stop], end - begin
-            _blend(spreads[:plane], row, up, node, wx, wy, wh, one)
+            blends(spreads[:plane], row, up, node, wx, wy, wh, one)
             if spreads.shape[0] > plane:
-                _blend(spreads[plane : 2 * plane], row, up, node, wx, wy, wh, cells[:count])
-                _blend(spreads[2 * plane :], row, up, node, wx, wy, wh, turns[:count])
+                blends(spreads[plane : 2 * plane], row, up, node, wx, wy, wh, cells[:count])
+                blends(spreads[2 * plane :], row, up, node, wx, wy, wh, turns[:count])
                 for n in range(count):
                     one[n] = spread(one[n], cells[n], turns[n], wx[n], wy[n], wh[n])
             for n in range(count):

@@ -7,6 +7,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.compiled import threads
 from magtwin.errors import InputError
 
 Array = NDArray[np.float64]
@@ -76,7 +77,7 @@ def in_two_threads(work: Callable[[T], None], tasks: Sequence[T], *, pairs: int)
         for task in some:
             work(task)
 
-    if pairs < SHARED * PAIRS:
+    if pairs < SHARED * PAIRS or threads(2) < 2:
         several(tasks)
         return
     with ThreadPoolExecutor(2) as pool:

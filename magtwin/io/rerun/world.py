@@ -117,7 +117,7 @@ def send_room(
     The run `known` gives the range of readings and the first heading.
     """
     scale = Scale.over(field, known.get("b_total_nt", np.empty(0)))
-    _send_map(rec, field, scale, heading_of(field, known))
+    send_map(rec, field, scale, heading_of(field, known))
     _send_scale(rec, field, scale)
     send_still(rec, interior.shapes)
     if planned is not None:
@@ -129,7 +129,7 @@ def send_room(
     return scale
 
 
-def _send_map(rec: rr.RecordingStream, field: AnomalyMap, scale: Scale, heading: float) -> None:
+def send_map(rec: rr.RecordingStream, field: AnomalyMap, scale: Scale, heading: float) -> None:
     """The floor in the colours of the map at a heading [rad], interpolated between nodes."""
     x0, x1, y0, y1 = field.extent
     cell, width, height = _pixels(field)
@@ -396,7 +396,7 @@ def send_still(rec: rr.RecordingStream, shapes: Sequence[Shape]) -> None:
     rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     objects: dict[str, list[Shape]] = {}  # a desk, not its legs
     for shape in shapes:
-        if not shape.link and shape.prim != str(HEAT_MAP):  # _send_map draws the map with more pixels
+        if not shape.link and shape.prim != str(HEAT_MAP):  # send_map draws the map with more pixels
             parent = shape.prim.rpartition("/")[0]
             prim = parent if parent.count("/") > 1 else shape.prim  # below the root: an object itself
             objects.setdefault(prim, []).append(shape)

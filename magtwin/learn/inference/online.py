@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 from magtwin.errors import InputError
-from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.map import AnomalyMap, Outside
 from magtwin.learn.inference.calibrate import labelled_drive, mixed_of_kind
 from magtwin.learn.inference.magnetometer import Read
 from magtwin.learn.inference.reader import Reader, Reading, Signals
@@ -62,7 +62,14 @@ class OnlineMagnetometer:
         return self._reader.signals
 
     def update(
-        self, t: float, p_xy: Sequence[float], yaw: float, signals: Signals, b_measured_nt: float
+        self,
+        t: float,
+        p_xy: Sequence[float],
+        yaw: float,
+        signals: Signals,
+        b_measured_nt: float,
+        *,
+        pose_sd_m: float | None = None,
     ) -> bool:
         """Use an earlier reading whose pose has become known.
 
@@ -72,6 +79,7 @@ class OnlineMagnetometer:
             yaw: Heading then [rad].
             signals: Values of `signals` then.
             b_measured_nt: The field that was measured [nT].
+            pose_sd_m: Standard deviation of this position, each axis [m]. Default: that of all.
 
         Returns:
             Whether it was used. At most 4 readings a second are; not those off the map or with nan.
@@ -82,19 +90,22 @@ class OnlineMagnetometer:
         row = self._reader.row(p_xy, yaw, signals)
         phi = self.model.regressors(row.x[None])
         noise = float(self.model.noise_nt2(phi)[0])
-        if self.pose_sd_m:
+        sd_m = self.pose_sd_m if pose_sd_m is None else pose_sd_m
+        if sd_m:
             slope = self._reader.field.at_with_gradient(*row.p_xy, yaw)[1:3]
-            noise += (slope[0] ** 2 + slope[1] ** 2) * self.pose_sd_m**2
+            noise += (slope[0] ** 2 + slope[1] ** 2) * sd_m**2
         return self.effects.update(t, phi[0], b_measured_nt - row.b_map_nt, noise)
 
-    def read(self, t: float, p_xy: Sequence[float], yaw: float, signals: Signals) -> Reading:
-        """One reading with the effects of now; the arguments are those of `update`."""
-        row = self._reader.row(p_xy, yaw, signals)
+    def read(
+        self, t: float, p_xy: Sequence[float], yaw: float, signals: Signals, *, outside: Outside = "nan"
+    ) -> Reading:
+        """One reading with the effects of now; the arguments are those of `update` and `Reader.row`."""
+        row = self._reader.row(p_xy, yaw, signals, outside=outside)
         phi = self.model.regressors(row.x[None])
         mean, variance = self.effects.effects(t).predict(phi)
         sd = self._factor * math.sqrt(float(self.model.noise_nt2(phi)[0]) + float(variance[0]))
-        outside = bool(self.model.outside(row.x[None])[0])
-        return Reading(row.b_map_nt + float(mean[0]), row.b_map_nt, float(mean[0]), sd, outside)
+        beyond = bool(self.model.outside(row.x[None])[0])
+        return Reading(row.b_map_nt + float(mean[0]), row.b_map_nt, float(mean[0]), sd, beyond)
 
     @property
     def _factor(self) -> float:

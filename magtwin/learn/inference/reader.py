@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from magtwin.compiled import Loops
 from magtwin.errors import InputError, hint
 from magtwin.field.maps import lookup
-from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.map import AnomalyMap, Outside
 from magtwin.learn.data.features import (
     FEATURES,
     carried,
@@ -112,18 +112,20 @@ class Reader:
         columns = dict.fromkeys(c for name in self.predictor.features for c in FEATURES[name].columns)
         return tuple(column for column in columns if column not in POSE)
 
-    def read(self, p_xy: Sequence[float], yaw: float, signals: Signals) -> Reading:
+    def read(
+        self, p_xy: Sequence[float], yaw: float, signals: Signals, *, outside: Outside = "nan"
+    ) -> Reading:
         """One reading; the arguments are those of `row`."""
-        _, field_nt, _ = self.row(p_xy, yaw, signals)
+        _, field_nt, _ = self.row(p_xy, yaw, signals, outside=outside)
         if self._predict_row is not None:
-            mean, sd, outside = self._predict_row(self._x)
+            mean, sd, beyond = self._predict_row(self._x)
         else:
             row = self._x[None]
             mean, sd = (float(value[0]) for value in self.predictor.predict(row))
-            outside = bool(self.predictor.outside(row)[0])
-        return Reading(field_nt + mean, field_nt, mean, sd, outside)
+            beyond = bool(self.predictor.outside(row)[0])
+        return Reading(field_nt + mean, field_nt, mean, sd, beyond)
 
-    def row(self, p_xy: Sequence[float], yaw: float, signals: Signals) -> Row:
+    def row(self, p_xy: Sequence[float], yaw: float, signals: Signals, *, outside: Outside = "nan") -> Row:
         """Inputs of the predictor at one pose.
 
         Args:
@@ -132,6 +134,7 @@ class Reader:
             yaw: Heading then [rad].
             signals: Latest values by column name, at least those of `Reader.signals`: a number, or one number
                 for each part of the column, in its unit and frame.
+            outside: Field off the map: "nan", or "clamp" for that of its border.
 
         Raises:
             InputError: A signal is missing or has the wrong number of parts.
@@ -142,10 +145,10 @@ class Reader:
         y += sin * self._forward + cos * self._left
         slopes = (0.0, 0.0)
         if self._slopes:
-            field_nt, along_x, along_y, _ = self.field.at_with_gradient(x, y, yaw)
+            field_nt, along_x, along_y, _ = self.field.at_with_gradient(x, y, yaw, outside=outside)
             slopes = (cos * along_x + sin * along_y, cos * along_y - sin * along_x)
         else:
-            field_nt = self.field.at(x, y, yaw)
+            field_nt = self.field.at(x, y, yaw, outside=outside)
         values: list[float] = []
         try:
             for make in self._parts:

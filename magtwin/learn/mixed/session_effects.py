@@ -149,6 +149,10 @@ class FollowedEffects:
         a = 1.0 if t is None or math.isnan(self.t) else math.exp(-max(t - self.t, 0.0) / self.memory_s)
         return self._aged(a)
 
+    def due(self, t: float) -> bool:
+        """Whether a reading at a time [s] is late enough after the last one to be used."""
+        return math.isnan(self.t) or t - self.t >= 0.99 / RATE_HZ
+
     def update(self, t: float, phi: Array, y: float, variance_nt2: float) -> bool:
         """Use one reading with a label.
 
@@ -163,7 +167,7 @@ class FollowedEffects:
         """
         first = math.isnan(self.t)
         step = 1 / RATE_HZ if first else t - self.t
-        if step < 0.99 / RATE_HZ or not math.isfinite(y) or not math.isfinite(float(phi.sum())):
+        if not self.due(t) or not math.isfinite(y + variance_nt2 + float(phi.sum())):
             return False
         weight = min(step, CORRELATION_S) / CORRELATION_S
         if not first:

@@ -5,6 +5,7 @@ were alone, sensors draw from their own generators, and a network treats each ro
 made in any order and in blocks of any size, and any run can be made again.
 """
 
+import hashlib
 import importlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -105,6 +106,10 @@ class Runs(Summarized, Sequence[Run]):
                     check_run(job.scene, job.path, conditions)
                     checked.add(key)
                 self._loops.append(self._closed_loop(job))
+        self._open_loops()
+
+    def _open_loops(self) -> None:
+        """Open compiled loops if that pays."""
         if sum(planned.least_steps for planned in self._loops if planned) >= LOOPS.pays:
             with suppress(ImportError):  # plain Python gives the same bytes
                 warm_up()
@@ -126,6 +131,27 @@ class Runs(Summarized, Sequence[Run]):
 
     def __iter__(self) -> Iterator[Run]:
         return self._made(range(len(self)))
+
+    @property
+    def identity(self) -> str | None:
+        """SHA-256 of what is driven, where and how, the same in every process; None if that is unknown.
+
+        Processes that share a folder check with it that they make the same runs.
+        """
+        told = getattr(self._finish, "identity", None)
+        if told is None:
+            return None
+        common, total = self._conditions, hashlib.sha256()
+        options = (common.duration_s, common.rate_hz, common.controller, common.lidar, common.outside)
+        total.update(repr((options, sorted(self._columns))).encode())
+        paths = {id(job.path): _content(job.path) for job in self._jobs}
+        for job in self._jobs:
+            total.update(repr((told(job), job.seed, float(job.speed), paths[id(job.path)])).encode())
+        return total.hexdigest()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._open_loops()
 
     def save(self, out: str | os.PathLike[str], **options: Any) -> Any:
         """Write the runs to a folder as Parquet files; see `magtwin.io.sweeps.save_runs`."""
@@ -252,3 +278,18 @@ class Runs(Summarized, Sequence[Run]):
                 ("columns", listed([name for name in COLUMNS if name in self._columns])),
             ),
         )
+
+
+def _content(path: DriveInput) -> str:
+    """What is driven, as a text: a name, or a name with a checksum of the points, commands or columns."""
+    if isinstance(path, str):
+        return path
+    arrays = (
+        path.columns.values()
+        if isinstance(path, Run)
+        else (path.p_xy if isinstance(path, Path) else path.rows,)
+    )
+    total = hashlib.sha256()
+    for array in arrays:
+        total.update(np.ascontiguousarray(array).tobytes())
+    return f"{getattr(path, 'name', 'run')} {total.hexdigest()}"

@@ -12,6 +12,7 @@ import yaml
 FIRST = {
     "sim": "scene",
     "magnetometer": "scene",
+    "localize": "scene",
     "follow": "path",
     "record": "out",
     "replay": "run",
@@ -19,8 +20,11 @@ FIRST = {
 }
 """Executables, and the parameter of each that is the positional argument of its command."""
 
-OPTIONS = {"magnetometer": ("network", "duration_s")}
-"""Parameters of the magnetometer that are options; its other parameters are settings, name:=value."""
+OPTIONS = {
+    "magnetometer": ("network", "online", "measured", "duration_s"),
+    "localize": ("method", "option", "map", "sensor", "odometry", "map_length_m", "seed", "duration_s"),
+}
+"""Parameters of these nodes that are options; their other parameters are settings, name:=value."""
 
 UNTIMED = ("sim", "replay")
 """Nodes that publish the time and ignore use_sim_time."""
@@ -73,7 +77,7 @@ def arguments(node: str, given: list[str]) -> list[str]:
     for name, value in parameters.items():
         if name == FIRST[node]:
             first = [value]
-        elif node == "magnetometer" and name not in OPTIONS[node]:
+        elif node in OPTIONS and name not in OPTIONS[node]:
             own.append(f"{name}:={value}")
         elif name != "use_sim_time":
             own.append(f"--{name.replace('_', '-')}={value}")
@@ -144,4 +148,4 @@ def _starter(node: str) -> Callable[[], None]:
     return lambda: start(node)
 
 
-sim, magnetometer, follow, record, replay, teleop = map(_starter, FIRST)
+sim, magnetometer, localize, follow, record, replay, teleop = map(_starter, FIRST)

@@ -161,6 +161,7 @@ def test_readings_that_are_too_close_late_or_unknown_are_skipped():
     assert not filtered.update(-5.0, one, 100.0, 400.0)
     assert not filtered.update(1.0, one, np.nan, 400.0)
     assert not filtered.update(1.0, one * np.nan, 100.0, 400.0)
+    assert not filtered.update(1.0, one, 100.0, np.nan)
     assert filtered.update(1.0, one, 100.0, 400.0)
     assert filtered.count == 2
 

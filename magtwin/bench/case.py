@@ -1,0 +1,49 @@
+"""Case: one run of a benchmark, as a localizer gets it, and the truth that it is scored by."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.localize.problem import FieldBelief, Problem
+from magtwin.run.run import Run
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What no localizer is told."""
+
+    t: Array
+    """Times of the readings [s], shape (N,)."""
+
+    pose: Array
+    """x, y [m] and yaw [rad] of base_link in world, shape (N, 3)."""
+
+    field: FieldBelief | None = None
+    """The field of the surveying robot; None if only readings are known."""
+
+    kidnapped_s: tuple[float, ...] = ()
+    """Times at which the robot was put elsewhere [s]."""
+
+    map_error_nt: float = 0.0
+    """Standard deviation of the belief's error [nT], for the bounds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A problem, its readings and its truth."""
+
+    problem: Problem
+    """What the localizer is told."""
+
+    readings: Run
+    """On-board columns."""
+
+    truth: Truth
+    """Poses at the readings."""
+
+    metadata: Mapping[str, str | int | float | bool] = field(default_factory=dict)
+    """Origin of the case: scene, path, session, checksums."""

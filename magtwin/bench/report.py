@@ -1,0 +1,532 @@
+"""Report: results of a benchmark as one page, with tables, and pictures of how errors are distributed."""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.ticker import FuncFormatter
+from numpy.typing import NDArray
+
+from magtwin.bench.leaderboard import Columns, Difference, Standing, compare_rows, standings
+from magtwin.bench.results import read_results
+from magtwin.bench.statistics import Interval
+from magtwin.bench.suite import Scenario
+from magtwin.figures.canvas import (
+    WIDTH_IN,
+    Picture,
+    colour_bar,
+    label,
+    legend_below,
+    new_figure,
+    open_frame,
+    picture,
+)
+from magtwin.figures.evaluations import INKS
+from magtwin.figures.page import Page, Section, Table, write_page, write_pages
+from magtwin.files import check_free
+from magtwin.report import Report
+
+Array = NDArray[np.float64]
+
+CELL_M = 0.25  # Side of the cells in which errors are averaged over the floor [m]
+MOST_PANELS = 6  # Localizers in one figure of floors
+LEAST_M, MOST_M = 0.01, 5.0  # Range of errors in figures [m]
+BOUND_INK = "0.35"
+
+
+NAME = "bench"
+"""Name of a report's files."""
+
+
+def report_results(
+    folders: Sequence[str | os.PathLike[str]], out: str | os.PathLike[str], *, force: bool = False
+) -> None:
+    """Write the report of results as a folder: bench.html, bench.md and bench.json.
+
+    Args:
+        folders: Folders of results of one suite.
+        out: The folder to make.
+        force: Whether to replace an existing folder.
+
+    Raises:
+        InputError: A folder holds no results or those of another suite, or `out` exists.
+    """
+    check_free(out, force=force)
+    made = read_results(*folders)
+    rows = made.rows
+    pairs = dict.fromkeys(zip(rows["scenario"].tolist(), rows["localizer"].tolist(), strict=True))
+    tracks = [
+        {"scenario": scenario, "localizer": localizer, **track}
+        for scenario, localizer in pairs
+        for track in made.tracks(scenario, localizer)
+    ]
+    about = made.about
+    origin = (
+        f"Suite {about['name']}, version {about['version']}, {about['seeds']} seeds, checksum "
+        f"{about['sha256'][:12]}; magtwin {about['magtwin']}."
+    )
+    if made.missing:
+        origin += f" {made.missing:,} runs of the suite are missing."
+    page = page_of_results(
+        rows, made.times, tracks, made.suite.scenarios, title=f"Benchmark {about['name']}", origin=origin
+    )
+    write_pages(page, out, NAME, force=force)
+
+
+def compare_results(
+    a: str | os.PathLike[str],
+    b: str | os.PathLike[str],
+    out: str | os.PathLike[str] | None = None,
+    *,
+    force: bool = False,
+) -> Report:
+    """Compare two results of one suite, run by run.
+
+    Args:
+        a: Folder of results.
+        b: Folder of other results.
+        out: Page to write: .html, .md or .json. None: none.
+        force: Whether to replace an existing page.
+
+    Raises:
+        InputError: A folder holds no results, they share no run, or `out` exists.
+    """
+    if out is not None:
+        check_free(out, force=force)
+    first, second = read_results(a), read_results(b)
+    if out is not None:
+        write_page(page_of_comparison(first.rows, second.rows, (str(a), str(b))), out, force=force)
+    lines = {}
+    for d in compare_rows(first.rows, second.rows):
+        lines[f"{d.scenario}, {d.a}"] = (
+            f"A - B {d.rmse_m.difference:+.4f} m ({d.rmse_m.low:+.4f} to {d.rmse_m.high:+.4f}), "
+            f"p {d.rmse_m.p:.2g}, {d.runs} runs: {d.verdict}"
+        )
+    notes = {}
+    if first.about["sha256"] != second.about["sha256"]:
+        notes["note"] = "the suites differ; runs with the same scenario name and seed are compared"
+    return Report(f"RMSE of {a} (A) and {b} (B)", (), {"differences": lines, **notes})
+
+
+def page_of_results(
+    rows: Columns,
+    times: Columns | None,
+    tracks: Sequence[Mapping[str, Any]],
+    scenarios: Mapping[str, Scenario],
+    *,
+    title: str,
+    origin: str = "",
+) -> Page:
+    """The report of a benchmark.
+
+    Args:
+        rows: Rows of the results, as arrays by name.
+        times: Processor times of the same runs.
+        tracks: Errors over time, one mapping per run and localizer.
+        scenarios: Scenarios by name.
+        title: Title of the page.
+        origin: Suite, version, seeds and checksum, in one sentence.
+    """
+    all_of_them = standings(rows, times)
+    names = list(dict.fromkeys(s.localizer for s in all_of_them))
+    inks = {name: INKS[k % len(INKS)] for k, name in enumerate(names)}
+    sections = [
+        Section("Leaderboard", _lead(rows), _overview_pictures(all_of_them, inks), (_overview(all_of_them),))
+    ]
+    for scenario in dict.fromkeys(s.scenario for s in all_of_them):
+        here = [s for s in all_of_them if s.scenario == scenario]
+        mine = [t for t in tracks if t["scenario"] == scenario]
+        pictures = [_cdf(here, rows, inks), _over_time(here, mine, inks), _floor(here, mine)]
+        best = _best(here)
+        tables = [_accuracy(here), _reliability(here)]
+        if best is not None and len(here) > 1:
+            pairs = [(best.localizer, s.localizer) for s in here if s is not best]
+            kept = {k: v[rows["scenario"] == scenario] for k, v in rows.items()}
+            tables.append(_differences(compare_rows(kept, kept, localizers=pairs)))
+        if failures := _failures(rows, scenario):
+            tables.append(failures)
+        sections.append(
+            Section(
+                scenario,
+                describe(scenarios[scenario]) if scenario in scenarios else "",
+                tuple(p for p in pictures if p is not None),
+                tuple(tables),
+            )
+        )
+    return Page(title, origin, tuple(sections), data={"standings": [_plain(s) for s in all_of_them]})
+
+
+def page_of_comparison(a: Columns, b: Columns, names: tuple[str, str]) -> Page:
+    """Two results of one suite, run by run.
+
+    Args:
+        a: Rows of the first results.
+        b: Rows of the second.
+        names: Names of the two.
+
+    Raises:
+        InputError: They share no run.
+    """
+    found = compare_rows(a, b)
+    lead = f"A: {names[0]}. B: {names[1]}. Differences of the RMSE on the same runs, A minus B."
+    return Page(
+        "Comparison of benchmarks",
+        lead,
+        (Section("By localizer", "", (), (_differences(found),)),),
+        data={"differences": [_plain(d) for d in found]},
+    )
+
+
+def describe(scenario: Scenario) -> str:
+    """A scenario in words."""
+    starts = {
+        "tracking": "The start is known to 0.1 m and 5 deg.",
+        "heading": "The start is unknown, its heading is known within 10 deg.",
+        "global": "Position and heading at the start are unknown.",
+    }
+    parts = [
+        f"{scenario.runs} runs of {scenario.duration_s:g} s in {min(scenario.runs, scenario.sessions)} "
+        f"sessions, {scenario.rate_hz:g} readings per second.",
+        starts[scenario.prior],
+    ]
+    if scenario.source != "twin":
+        parts.append(f"Recorded data: {scenario.source}, recording {scenario.number}.")
+        if scenario.odometry_factor != 1:
+            parts.append(f"The noise of the odometry is {scenario.odometry_factor:g} times as large.")
+        return " ".join(parts)
+    if scenario.truth == "map":
+        sensor = scenario.sensor
+        parts.append(
+            f"Readings: the map, {sensor.white_nt:g} nT white noise, {sensor.drift_nt:g} nT drift over "
+            f"{sensor.drift_s:g} s, an offset of {sensor.offset_nt:g} nT"
+            + (f", and {sensor.iron_nt:g} nT of iron that turns with the robot." if sensor.iron_nt else ".")
+        )
+    else:
+        parts.append("Readings: the simulated robot's, with its iron of the session, motors and LiDAR.")
+    maps = {"exact": "Map: exact.", "none": "No map.", "trilinear": "Map: trilinear, of a sparse survey."}
+    surveyed = scenario.belief == "exact" and scenario.truth == "scene"
+    known = "Map: surveyed." if surveyed else maps[scenario.belief]
+    if scenario.map_error_nt:
+        known = f"Map: with an error of {scenario.map_error_nt:g} nT, alike over {scenario.map_length_m:g} m."
+    parts.append(known)
+    if scenario.kidnaps:
+        parts.append(f"The robot is put elsewhere {scenario.kidnaps} times.")
+    if scenario.stuck_s:
+        parts.append(f"The sensor repeats one value for {scenario.stuck_s:g} s.")
+    if scenario.offset_s:
+        parts.append(f"Readings are {scenario.offset_s:g} s late, which nobody is told.")
+    if any(scenario.lever_error_m):
+        parts.append("The sensor is not where the robot's description says.")
+    if scenario.moved_nt:
+        parts.append(f"An object of {scenario.moved_nt:g} nT was moved after the survey.")
+    return " ".join(parts)
+
+
+def _lead(rows: Columns) -> str:
+    failed = int(np.count_nonzero(rows["status"] != "ok"))
+    text = (
+        f"{len(rows['run']):,} runs, {failed:,} of which failed. RMSE of the position [m], pooled over runs. "
+    )
+    return text + (
+        "Trajectories are not aligned. The bound is the posterior Cramer-Rao bound with the map's error as "
+        "correlated; that of all readings for smoothers. Intervals: 95 %, by bootstrap over sessions."
+    )
+
+
+def _best(here: Sequence[Standing]) -> Standing | None:
+    """The localizer with the least RMSE among those that seldom diverge, else among all."""
+    known = [s for s in here if s.rmse_m is not None]
+    sound = [s for s in known if s.diverged.value <= 0.05 and not s.failed]
+    return min(sound or known, key=lambda s: s.rmse_m.value if s.rmse_m else math.inf, default=None)
+
+
+def _overview(every: Sequence[Standing]) -> Table:
+    scenarios = list(dict.fromkeys(s.scenario for s in every))
+    names = list(dict.fromkeys(s.localizer for s in every))
+    by = {(s.localizer, s.scenario): s for s in every}
+    rows = []
+    for name in names:
+        cells = []
+        for scenario in scenarios:
+            s = by.get((name, scenario))
+            cells.append("" if s is None else "failed" if s.rmse_m is None else f"{s.rmse_m.value:.3f}")
+        rows.append((name, *cells))
+    bounds = []
+    for scenario in scenarios:
+        best = _best([s for s in every if s.scenario == scenario])
+        bounds.append("" if best is None or not best.bound_m > 0 else f"{best.bound_m:.3f}")
+    rows.append(("bound", *bounds))
+    return Table("RMSE of the position [m]", ("localizer", *scenarios), tuple(rows))
+
+
+def _accuracy(here: Sequence[Standing]) -> Table:
+    head = (
+        "localizer",
+        "RMSE [m]",
+        "median [m]",
+        "95th percentile [m]",
+        "RMSE / bound",
+        "heading [deg]",
+        "us a step",
+    )
+    rows = [
+        (
+            s.localizer,
+            _interval(s.rmse_m),
+            _number(s.median_m),
+            _number(s.p95_m),
+            _number(s.ratio, 2),
+            _number(math.degrees(s.heading_rad), 1),
+            _number(s.step_us, 0),
+        )
+        for s in here
+    ]
+    return Table("Accuracy", head, tuple(rows))
+
+
+def _reliability(here: Sequence[Standing]) -> Table:
+    unknown_start = any(s.converged is not None for s in here)
+    kidnapped = any(s.recovered is not None for s in here)
+    head = ["localizer", "ANEES per state", "in 90 % ellipse", "diverged [%]"]
+    head += ["found in 30 s [%]"] if unknown_start else []
+    head += ["recovered in 30 s [%]"] if kidnapped else []
+    head += ["lost", "failed", "remarks"]
+    rows = []
+    for s in here:
+        row = [s.localizer, _number(s.anees, 2), _percent(s.coverage), _rate(s.diverged)]
+        row += [_rate(s.converged)] if unknown_start else []
+        row += [_rate(s.recovered)] if kidnapped else []
+        row += [_percent(s.lost_share), str(s.failed), s.verdict()]
+        rows.append(tuple(row))
+    note = (
+        "A start counts as found, and a kidnapping as recovered from, once the error stays below 0.25 m for "
+        "10 s. A run has diverged if its error was above 0.5 m for more than 5 s after that; failed runs "
+        "count as diverged. lost: share of readings that the localizer flagged."
+    )
+    return Table("Reliability", tuple(head), tuple(rows), note)
+
+
+def _differences(found: Sequence[Difference]) -> Table:
+    rows = tuple(
+        (
+            d.scenario,
+            d.a,
+            d.b,
+            d.runs,
+            f"{d.rmse_m.difference:+.4f} ({d.rmse_m.low:+.4f} to {d.rmse_m.high:+.4f})",
+            f"{d.rmse_m.p:.3g}",
+            d.verdict,
+        )
+        for d in found
+    )
+    head = ("scenario", "A", "B", "runs of both", "RMSE of A - B [m] (95 %)", "p", "verdict")
+    return Table("Paired differences", head, rows, "Mean over runs; p by permutation of sessions.")
+
+
+def _failures(rows: Columns, scenario: str) -> Table | None:
+    mine = (rows["scenario"] == scenario) & (rows["status"] != "ok")
+    if not mine.any():
+        return None
+    counted: dict[tuple[str, str], int] = {}
+    for name, reason in zip(rows["localizer"][mine].tolist(), rows["reason"][mine].tolist(), strict=True):
+        counted[name, reason] = counted.get((name, reason), 0) + 1
+    found = sorted(counted.items(), key=lambda item: -item[1])[:20]
+    return Table("Failures", ("localizer", "runs", "reason"), tuple((k[0], n, k[1]) for k, n in found))
+
+
+def _overview_pictures(every: Sequence[Standing], inks: Mapping[str, str]) -> tuple[Picture, ...]:
+    """Ratio of RMSE to the bound, a point per localizer and scenario."""
+    known = [s for s in every if s.ratio > 0]
+    if not known:
+        return ()
+    scenarios = list(dict.fromkeys(s.scenario for s in known))
+    figure = new_figure(WIDTH_IN, 1.2 + 0.45 * len(scenarios))
+    ax = figure.subplots()
+    for name in dict.fromkeys(s.localizer for s in known):
+        mine = [s for s in known if s.localizer == name]
+        ax.plot(
+            [s.ratio for s in mine],
+            [scenarios.index(s.scenario) for s in mine],
+            "o",
+            ms=7,
+            color=inks[name],
+            alpha=0.85,
+            label=name,
+        )
+    ax.axvline(1, color=BOUND_INK, lw=1, ls="--")
+    ax.set_xscale("log")
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+    ax.xaxis.set_minor_formatter(FuncFormatter(lambda v, _: f"{v:g}" if f"{v:e}"[0] in "25" else ""))
+    ax.set_yticks(range(len(scenarios)), scenarios)
+    ax.set_ylim(len(scenarios) - 0.5, -0.5)
+    ax.grid(axis="x", color="0.9", lw=0.6)
+    label(ax, "RMSE / bound (1 is the bound)")
+    ax.tick_params(which="minor", labelsize=8)
+    open_frame(ax)
+    legend_below(figure)
+    return (picture(figure, "RMSE of each localizer divided by the bound of the scenario", file="ratios"),)
+
+
+def _cdf(here: Sequence[Standing], rows: Columns, inks: Mapping[str, str]) -> Picture | None:
+    figure = new_figure(WIDTH_IN / 2 + 0.6, 3.4)
+    ax = figure.subplots()
+    drawn = False
+    for s in here:
+        mine = (rows["scenario"] == s.scenario) & (rows["localizer"] == s.localizer)
+        errors = np.sort(rows["rmse_m"][mine & (rows["status"] == "ok")])
+        if not len(errors):
+            continue
+        share = np.arange(1, len(errors) + 1) / s.runs
+        ax.step(
+            np.clip(errors, LEAST_M, MOST_M),
+            share,
+            where="post",
+            color=inks[s.localizer],
+            lw=1.4,
+            label=s.localizer,
+        )
+        drawn = True
+    if not drawn:
+        return None
+    bound = next((s.bound_m for s in here if s.bound_m > 0), None)
+    if bound:
+        ax.axvline(bound, color=BOUND_INK, lw=1, ls="--", label="bound")
+    ax.set_xscale("log")
+    _error_axis(ax.xaxis)
+    ax.set_ylim(0, 1.02)
+    label(ax, "RMSE of a run [m]", "share of runs")
+    open_frame(ax)
+    legend_below(figure)
+    scenario = here[0].scenario
+    return picture(figure, f"{scenario}: share of runs below an RMSE", file=f"{scenario}_cdf")
+
+
+def _over_time(
+    here: Sequence[Standing], tracks: Sequence[Mapping[str, Any]], inks: Mapping[str, str]
+) -> Picture | None:
+    if not tracks:
+        return None
+    figure = new_figure(WIDTH_IN / 2 + 0.6, 3.4)
+    ax = figure.subplots()
+    bound = None
+    for s in here:
+        mine = [t for t in tracks if t["localizer"] == s.localizer]
+        errors = _stacked(mine, "error_m")
+        if errors is None or not np.isfinite(errors).any():
+            continue
+        t = max((m["t"] for m in mine), key=len)
+        ax.plot(t, _middle(errors, 50), color=inks[s.localizer], lw=1.4, label=s.localizer)
+        ax.plot(t, _middle(errors, 95), color=inks[s.localizer], lw=0.8, ls=":")
+        bound = _stacked(mine, "bound_m")
+    if bound is not None and np.isfinite(bound).any():
+        ax.plot(t, np.sqrt(np.nanmean(bound**2, axis=0)), color=BOUND_INK, lw=1.2, ls="--", label="bound")
+    ax.set_yscale("log")
+    ax.set_ylim(LEAST_M, MOST_M)
+    _error_axis(ax.yaxis)
+    label(ax, "time [s]", "position error [m]")
+    open_frame(ax)
+    legend_below(figure)
+    scenario = here[0].scenario
+    text = f"{scenario}: position error over time, median of runs (line) and 95th percentile (dots)"
+    return picture(figure, text, file=f"{scenario}_time")
+
+
+def _floor(here: Sequence[Standing], tracks: Sequence[Mapping[str, Any]]) -> Picture | None:
+    """Root mean square error over the floor, a panel per localizer, best first."""
+    known = sorted((s for s in here if s.rmse_m), key=lambda s: s.rmse_m.value if s.rmse_m else math.inf)
+    known = known[:MOST_PANELS]
+    places = [(t["x"], t["y"]) for t in tracks]
+    if not known or not places:
+        return None
+    x, y = (np.concatenate([p[k] for p in places]) for k in (0, 1))
+    x0, y0 = np.floor(x.min() / CELL_M) * CELL_M, np.floor(y.min() / CELL_M) * CELL_M
+    edges = [np.arange(low, high + CELL_M, CELL_M) for low, high in ((x0, x.max()), (y0, y.max()))]
+    if min(map(len, edges)) < 2:
+        return None
+    columns = min(3, len(known))
+    lines = -(-len(known) // columns)
+    tall = (edges[1][-1] - edges[1][0]) / (edges[0][-1] - edges[0][0])
+    figure = new_figure(WIDTH_IN, min((WIDTH_IN - 1) / columns * tall + 0.6, 4.5) * lines + 0.4)
+    axes = np.atleast_1d(figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).ravel())
+    drawn = None
+    for k, (ax, s) in enumerate(zip(axes, known, strict=False)):
+        mine = [t for t in tracks if t["localizer"] == s.localizer]
+        parts = {
+            name: np.concatenate([t[name] for t in mine]).astype(float) for name in ("x", "y", "error_m")
+        }
+        good = np.isfinite(parts["error_m"])
+        weights = np.square(parts["error_m"][good])
+        places_of = (parts["y"][good], parts["x"][good])
+        total, *_ = np.histogram2d(*places_of, bins=(edges[1], edges[0]), weights=weights)
+        count, *_ = np.histogram2d(*places_of, bins=(edges[1], edges[0]))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            layer = np.sqrt(total / count)
+        drawn = ax.pcolormesh(
+            edges[0], edges[1], np.ma.masked_invalid(layer), cmap="magma_r", norm="log", vmin=0.02, vmax=2.0
+        )
+        ax.set_aspect("equal")
+        label(
+            ax,
+            "x [m]" if k >= len(known) - columns else "",
+            "y [m]" if k % columns == 0 else "",
+            title=s.localizer,
+        )
+    for ax in axes[len(known) :]:
+        ax.set_axis_off()
+    if drawn is not None:
+        colour_bar(figure, drawn, axes.tolist(), "RMS error [m]", format=FuncFormatter(lambda v, _: f"{v:g}"))
+    scenario = here[0].scenario
+    return picture(
+        figure, f"{scenario}: position error over the floor, the best localizers", file=f"{scenario}_floor"
+    )
+
+
+def _stacked(tracks: Sequence[Mapping[str, Any]], name: str) -> Array | None:
+    """Values over time of all runs, shape (runs, N), nan after the end of shorter ones."""
+    if not tracks:
+        return None
+    longest = max(len(t[name]) for t in tracks)
+    out = np.full((len(tracks), longest), np.nan)
+    for row, t in zip(out, tracks, strict=True):
+        row[: len(t[name])] = t[name]
+    return out
+
+
+def _middle(values: Array, percent: float) -> Array:
+    known = np.isfinite(values).any(axis=0)
+    out = np.full(values.shape[1], np.nan)
+    out[known] = np.nanpercentile(values[:, known], percent, axis=0)
+    return np.clip(out, LEAST_M, MOST_M)
+
+
+def _error_axis(axis: Any) -> None:
+    ticks = [0.01, 0.03, 0.1, 0.3, 1, 3]
+    axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
+    axis.set_ticks([], minor=True)
+
+
+def _interval(value: Interval | None) -> str:
+    return "" if value is None else f"{value.value:.3f} ({value.low:.3f} to {value.high:.3f})"
+
+
+def _rate(value: Interval | None) -> str:
+    if value is None:
+        return ""
+    return f"{100 * value.value:.1f} ({100 * value.low:.1f} to {100 * value.high:.1f})"
+
+
+def _number(value: float, digits: int = 3) -> str:
+    return "" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def _percent(value: float) -> str:
+    return "" if math.isnan(value) else f"{100 * value:.0f} %"
+
+
+def _plain(value: Standing | Difference) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for name, entry in vars(value).items():
+        out[name] = entry._asdict() if hasattr(entry, "_asdict") else entry
+    return out

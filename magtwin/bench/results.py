@@ -1,0 +1,366 @@
+"""Results: the rows of a benchmark in a folder of Parquet files, which shards fill together.
+
+    suite.toml                          the suite's file
+    suite.json                          name, version and checksums of suite and data, version of magtwin
+    rows/SCENARIO/part-00000.parquet    one row per run and localizer; the same bytes on every machine
+    times/SCENARIO/part-00000.parquet   processor times of the same runs
+    tracks/SCENARIO/part-00000.parquet  their errors over time, thinned
+
+A part holds a chunk of the suite. One that holds another selection of runs and localizers, as with fewer
+runs, has a checksum of the selection in its name. Every file is written aside and renamed, the rows last, so
+that a part with rows is whole.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from magtwin.bench.suite import Chunk, Suite, load_suite
+from magtwin.errors import InputError, find
+from magtwin.files import existing, output
+from magtwin.report import Figure, Report
+from magtwin.summary import Summarized, Summary, listed
+
+if TYPE_CHECKING:
+    from magtwin.bench.leaderboard import Standing
+
+SUITE, ABOUT = "suite.toml", "suite.json"
+ROWS, TIMES, TRACKS = "rows", "times", "tracks"
+KEY = ("scenario", "localizer", "run")
+
+Columns = dict[str, NDArray[Any]]
+Run = tuple[str, str, int]
+"""Scenario, localizer and number of a run."""
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Results(Summarized):
+    """Rows of a benchmark, from one folder or several."""
+
+    folders: tuple[Path, ...]
+    suite: Suite
+    about: Mapping[str, Any]
+    """Content of suite.json."""
+
+    rows: Columns
+    """Arrays by name, of one value per run and localizer, in the order of the suite."""
+
+    times: Columns
+    """Processor times of the same runs, in the same order; nan where unknown."""
+
+    @property
+    def missing(self) -> int:
+        """Runs of the suite's localizers that the rows lack."""
+        done = set(zip(*(self.rows[name].tolist() for name in KEY), strict=True))
+        return sum(
+            (chunk.scenario, name, run) not in done
+            for chunk in self.suite.chunks()
+            for name in chunk.entries
+            for run in runs_of(chunk)
+        )
+
+    @property
+    def table(self) -> pa.Table:
+        """The rows as a table of pyarrow."""
+        return pa.table({name: pa.array(values) for name, values in self.rows.items()})
+
+    def tracks(
+        self, scenario: str | None = None, localizer: str | None = None, run: int | None = None
+    ) -> list[dict[str, Any]]:
+        """Errors over time.
+
+        Args:
+            scenario: Name of a scenario. Default: all.
+            localizer: Name of a localizer. Default: all.
+            run: Number of a run. Default: all.
+
+        Returns:
+            A table per run and localizer, in the order of the rows: scenario, localizer, run, and the float32
+            arrays t [s], error_m, bound_m, x, y and lost. [] if the benchmark kept none.
+
+        Raises:
+            InputError: There is no such scenario or localizer.
+        """
+        match = pc.scalar(True)
+        for name, value in (("scenario", scenario), ("localizer", localizer), ("run", run)):
+            if value is not None:
+                find(name, str(value), dict.fromkeys(map(str, self.rows[name].tolist())))
+                match &= pc.field(name) == value
+        made: dict[Run, dict[str, Any]] = {}
+        for name in self.suite.scenarios if scenario is None else (scenario,):
+            for file in (part for folder in self.folders for part in _parts(folder, TRACKS, name)):
+                for row in pq.read_table(file, filters=match).to_pylist():
+                    key = (row.pop("scenario"), row.pop("localizer"), row.pop("run"))
+                    arrays = {column: np.array(values, np.float32) for column, values in row.items()}
+                    made.setdefault(key, dict(zip(KEY, key, strict=True)) | arrays)
+        keys = zip(*(self.rows[name].tolist() for name in KEY), strict=True)
+        return [made[key] for key in keys if key in made]
+
+    def report(self, standings: Sequence["Standing"]) -> Report:
+        """Numbers of runs, and each localizer on each scenario in a line, worst problem first.
+
+        Args:
+            standings: What `magtwin.bench.leaderboard.standings` says of the rows.
+        """
+        failed = int(np.count_nonzero(self.rows["status"] != "ok"))
+        lines: dict[str, str] = {}
+        for each in standings:
+            error = "no run finished" if each.rmse_m is None else f"RMSE {each.rmse_m.value:.3f} m"
+            bound = f", bound {each.bound_m:.3f} m" if each.bound_m > 0 else ""
+            said = each.verdict()
+            lines[f"{each.scenario}, {each.localizer}"] = error + bound + (f"; {said}" if said else "")
+        figures = (
+            Figure("runs", len(self.rows["run"])),
+            Figure("failed", failed),
+            Figure("missing", self.missing, note="runs of the suite that are not in the folder"),
+        )
+        title = f"Suite {self.suite.name}, version {self.suite.version}, {self.suite.seeds} seeds"
+        return Report(title, figures, {"localizers": lines})
+
+    def _summary(self) -> Summary:
+        rows = self.rows
+        failed = int(np.count_nonzero(rows["status"] != "ok"))
+        of_rows = f"{len(rows['run']):,}" + (f", {failed:,} of them failed" if failed else "")
+        return Summary(
+            f"Results of suite {self.suite.name}, version {self.suite.version}",
+            (
+                ("runs", of_rows + (f"; {self.missing:,} are missing" if self.missing else "")),
+                ("scenarios", listed(list(dict.fromkeys(rows["scenario"].tolist())))),
+                ("localizers", listed(list(dict.fromkeys(rows["localizer"].tolist())))),
+                ("in", ", ".join(map(str, self.folders))),
+            ),
+        )
+
+
+def read_results(*folders: str | os.PathLike[str]) -> Results:
+    """Read results, from one folder or from several of the same suite, as shards on several machines make.
+
+    A run that is in several folders counts once.
+
+    Raises:
+        InputError: A folder is missing, holds no results or no rows yet, is damaged, or is of another suite,
+            version or data than the first.
+    """
+    if not folders:
+        raise InputError("no folder of results; give at least one")
+    made = results_in(*(existing(folder, "folder of results") for folder in folders))
+    if not len(made.rows["run"]):
+        raise InputError(f"{folders[0]}: no rows yet; let magtwin bench go on")
+    return made
+
+
+def results_in(*places: Path) -> Results:
+    """As `read_results`, of folders that may have no rows yet."""
+    about = read_about(places[0])
+    for place in places[1:]:
+        check_about(place, about)
+    suite = load_suite(places[0] / SUITE)
+    if about["seeds"] != suite.seeds:
+        suite = suite.limited(seeds=about["seeds"])
+    order = _order(suite)
+    rows = _read(places, ROWS, order)
+    return Results(places, suite, about, rows, _aligned(_read(places, TIMES, order), rows))
+
+
+def read_about(folder: Path) -> dict[str, Any]:
+    """Content of the suite.json of results.
+
+    Raises:
+        InputError: The folder holds no results.
+    """
+    file = folder / ABOUT
+    try:
+        about = json.loads(file.read_text(encoding="utf-8"))
+        known = (
+            isinstance(about, dict)
+            and {"name", "version", "sha256", "seeds", "magtwin", "data"} <= about.keys()
+        )
+    except (OSError, ValueError):
+        known = False
+    if not known or not (folder / SUITE).is_file():
+        raise InputError(f"{folder}: no results of magtwin bench; give the folder that it wrote (--out)")
+    return dict(about)
+
+
+def check_about(folder: Path, about: Mapping[str, Any]) -> None:
+    """Refuse a folder of results that does not match.
+
+    Args:
+        folder: Folder of results.
+        about: What its suite.json must have.
+
+    Raises:
+        InputError: It is of another suite, version, seeds or data, or was made by another magtwin.
+    """
+    found = read_about(folder)
+    names = (
+        ("name", "suite"),
+        ("version", "version of the suite"),
+        ("seeds", "seeds"),
+        ("magtwin", "version of magtwin"),
+        ("sha256", "content of the suite"),
+    )
+    remedy = "give another folder, or `force=True` to replace them"
+    for key, what in names:
+        if found[key] != about[key]:
+            values = "" if key == "sha256" else f" ({found[key]}, not {about[key]})"
+            raise InputError(f"{folder}: results with another {what}{values}; {remedy}", parameter="force")
+    for name, checksum in found["data"].items():
+        if about["data"].get(name, checksum) != checksum:
+            raise InputError(f"{folder}: results on other data {name!r}; {remedy}", parameter="force")
+
+
+def begin_results(folder: Path, suite_text: bytes, about: Mapping[str, Any]) -> None:
+    """Make a folder of results, or check the one that exists; shards may do so at the same time.
+
+    Raises:
+        InputError: The folder holds something else, or results that do not match.
+    """
+    if folder.exists() and not (folder.is_dir() and (folder / ABOUT).is_file()):
+        if not folder.is_dir():
+            raise InputError(f"{folder}: a file; give a folder")
+        others = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+        if any(name != SUITE for name in others):
+            raise InputError(f"{folder}: holds no results but {listed(others)}; give another folder")
+    if (folder / ABOUT).is_file():
+        check_about(folder, about)
+        about = {**about, "data": {**read_about(folder)["data"], **about["data"]}}
+    write_file(folder / SUITE, suite_text)
+    write_file(folder / ABOUT, (json.dumps(about, indent=2, sort_keys=True) + "\n").encode())
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Write a file aside and rename it, over one that exists."""
+    with output(path, force=True) as aside:
+        aside.write_bytes(content)
+
+
+def runs_of(chunk: Chunk) -> range:
+    """Numbers of the runs of a chunk."""
+    return range(chunk.first, chunk.first + chunk.runs)
+
+
+def part_name(chunk: Chunk, whole: Iterable[Chunk]) -> str:
+    """Name of the file of a chunk.
+
+    Args:
+        chunk: The chunk.
+        whole: All chunks of the suite; the name of others has a checksum of their runs and localizers.
+    """
+    if chunk in whole:
+        return f"part-{chunk.part:05d}.parquet"
+    text = json.dumps([chunk.first, chunk.runs, chunk.entries])
+    return f"part-{chunk.part:05d}-{hashlib.sha256(text.encode()).hexdigest()[:8]}.parquet"
+
+
+def write_part(
+    folder: Path, scenario: str, name: str, rows: Sequence[dict[str, Any]], **more: Sequence[dict[str, Any]]
+) -> None:
+    """Write the rows of a chunk, and before them other tables of it by name: times, tracks."""
+    for kind, part in (*more.items(), (ROWS, rows)):
+        table = pa.Table.from_pylist(list(part), schema=_schema(part))
+        sink = pa.BufferOutputStream()
+        pq.write_table(table, sink, compression="zstd")
+        write_file(folder / kind / scenario / name, sink.getvalue().to_pybytes())
+
+
+def _schema(rows: Sequence[Mapping[str, Any]]) -> pa.Schema:
+    """Names in the order of the rows; whole numbers, numbers, flags, texts and float32 arrays."""
+    kinds: dict[str, pa.DataType] = {}
+    for row in rows:
+        for name, value in row.items():
+            if isinstance(value, np.ndarray):
+                kind = pa.list_(pa.float32())
+            elif isinstance(value, bool | np.bool_):
+                kind = pa.bool_()
+            elif isinstance(value, int | np.integer):
+                kind = pa.int64()
+            elif isinstance(value, float | np.floating):
+                kind = pa.float64()
+            elif isinstance(value, str):
+                kind = pa.string()
+            else:
+                raise TypeError(f"column {name!r} of results: {type(value).__name__}")
+            if kind == pa.int64() and kinds.get(name) == pa.float64():
+                continue
+            kinds[name] = kind
+    return pa.schema(list(kinds.items()))
+
+
+def done_runs(folder: Path, scenarios: Iterable[str]) -> set[Run]:
+    """The runs of some scenarios that a folder has rows of.
+
+    Raises:
+        InputError: A file is damaged.
+    """
+    done: set[Run] = set()
+    for scenario in scenarios:
+        for file in _parts(folder, ROWS, scenario):
+            table = _read_part(file, columns=["localizer", "run"])
+            done.update((scenario, *pair) for pair in zip(*table.to_pydict().values(), strict=True))
+    return done
+
+
+def _parts(folder: Path, kind: str, scenario: str) -> list[Path]:
+    return sorted((folder / kind / scenario).glob("part-*.parquet"))
+
+
+def _read_part(file: Path, columns: list[str] | None = None) -> pa.Table:
+    try:
+        return pq.read_table(file, columns=columns)
+    except (pa.ArrowException, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{file}: damaged ({reason}); remove it and repeat magtwin bench") from error
+
+
+def _order(suite: Suite) -> tuple[dict[str, int], dict[str, int]]:
+    """Places of scenarios and localizers in a suite."""
+    return (
+        {name: k for k, name in enumerate(suite.scenarios)},
+        {name: k for k, name in enumerate(suite.localizers)},
+    )
+
+
+def _read(folders: Sequence[Path], kind: str, order: tuple[dict[str, int], dict[str, int]]) -> Columns:
+    """All rows of a kind, each run once, in the order of the suite: scenario, localizer, run."""
+    scenarios, localizers = order
+    tables = [
+        _read_part(file) for folder in folders for name in scenarios for file in _parts(folder, kind, name)
+    ]
+    if not tables:
+        return {name: np.empty(0, object) for name in (*KEY, "status")}
+    table = pa.concat_tables(tables, promote_options="permissive")
+    columns = {}
+    for name in table.column_names:
+        values = table[name].to_numpy(zero_copy_only=False)
+        columns[name] = values.astype(str) if pa.types.is_string(table[name].type) else values
+    names = {name: k for k, name in enumerate(sorted(set(columns["localizer"].tolist()) - localizers.keys()))}
+    place = localizers | {name: len(localizers) + k for name, k in names.items()}
+    keys = [
+        (scenarios[s], place[entry], run)
+        for s, entry, run in zip(*(columns[name].tolist() for name in KEY), strict=True)
+    ]
+    first = {key: row for row, key in reversed(list(enumerate(keys)))}
+    picked = [first[key] for key in sorted(first)]
+    return {name: values[picked] for name, values in columns.items()}
+
+
+def _aligned(times: Columns, rows: Columns) -> Columns:
+    """Times in the order of the rows, nan where a run has none."""
+    at = {key: k for k, key in enumerate(zip(*(times[name].tolist() for name in KEY), strict=True))}
+    picked = [at.get(key, -1) for key in zip(*(rows[name].tolist() for name in KEY), strict=True)]
+    made = {name: rows[name] for name in KEY}
+    for name in times.keys() - rows.keys():
+        values = np.append(times[name].astype(float), np.nan)
+        made[name] = values[picked]
+    return made

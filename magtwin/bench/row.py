@@ -1,0 +1,242 @@
+"""Row: run the localizers of a chunk, and score each run as one row of the results."""
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magtwin.bench.case import Case, Truth
+from magtwin.bench.suite import Chunk, Entry, Scenario, Suite
+from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.frames import quat_from_yaw, yaw_from_quat
+from magtwin.localize.bounds import Bounds, bounds
+from magtwin.localize.localizers import load_localizer
+from magtwin.localize.problem import Localizer, Problem, SensorModel, Smoother
+from magtwin.localize.scores import Scores, score
+from magtwin.localize.track import LocalizerError, Track, track
+from magtwin.parallel import beat
+from magtwin.run.run import Run
+
+WITHIN_S = 30.0
+"""Time within which a localizer must find its pose after an unknown start or a kidnapping [s]."""
+
+TRACK_HZ = 2.0
+"""Rate of the errors over time that are kept for the report [Hz]."""
+
+SETUP = 10.0
+"""Time to make a case, in time limits of a localizer: the first case opens a scene and compiles loops."""
+
+Row = dict[str, Any]
+
+
+class TimeLimitError(BaseException):
+    """A localizer took longer than its time limit; localizers cannot catch it as an Exception."""
+
+
+def run_chunk(
+    suite: Suite,
+    chunk: Chunk,
+    fields: Path | None = None,
+    failures: Mapping[tuple[int, str], str] | None = None,
+) -> tuple[list[Row], list[Row], list[Row]]:
+    """Run and score a chunk of a suite.
+
+    Args:
+        suite: The suite.
+        chunk: One of its chunks.
+        fields: Folder with a folder of `magtwin.bench.world.fit_field` for each survey in the suite's data.
+        failures: Reasons by run and localizer of those that are known to fail and are not run, as they would
+            end the process.
+
+    Returns:
+        Rows of the results, one per run and localizer; rows with the processor times of the same runs; and
+        rows with their errors over time. All but the times are the same in every call.
+    """
+    scenario = suite.scenarios[chunk.scenario]
+    rows: list[Row] = []
+    times: list[Row] = []
+    tracks: list[Row] = []
+    for run in range(chunk.first, chunk.first + chunk.runs):
+        beat(f"{run}", times=SETUP)
+        case = make_case(suite, scenario, run, fields)
+        limits = bounds_of(case)
+        for name in chunk.entries:
+            entry = suite.localizers[name]
+            key = {"scenario": scenario.name, "localizer": name, "run": run}
+            beat(f"{run} {name}")
+            if failures and (run, name) in failures:
+                made, scores = None, Scores(failed=failures[run, name])
+            else:
+                made, scores = run_localizer(entry, case, suite.time_limit_s, limits, scenario)
+            row = scores.row()
+            times.append({**key, "step_us": row.pop("step_us")})
+            reason = row.pop("failed")
+            rows.append(
+                {
+                    **key,
+                    "seed": suite.first_seed + run,
+                    "session": run % scenario.sessions,
+                    "status": "failed" if reason else "ok",
+                    "reason": reason,
+                    "readings": case.readings.rows,
+                    "smoother": smooths(entry),
+                    "global_start": scenario.prior != "tracking",
+                    "recovered_in_time": sum(after <= WITHIN_S for after in scores.recovery_s),
+                    **row,
+                }
+            )
+            tracks.append({**key, **_over_time(case, made, limits)})
+    return rows, times, tracks
+
+
+def make_case(suite: Suite, scenario: Scenario, run: int, fields: Path | None = None) -> Case:
+    """One run of a scenario; the arguments are those of `run_chunk`, with the number of the run."""
+    seed = suite.first_seed + run
+    if scenario.source == "twin":
+        from magtwin.bench.twin_case import twin_case
+
+        own = fields / scenario.data if scenario.data and fields is not None else None
+        session = suite.first_seed + run % scenario.sessions
+        return twin_case(scenario, str(suite.scene(scenario)), seed, session, own)
+    folder = suite.folder(scenario)
+    if scenario.source == "magnetic-data":
+        from magtwin.bench.magnetic_data import magnetic_data_case
+
+        return magnetic_data_case(
+            folder,
+            scenario.number,
+            seed,
+            start=scenario.prior,
+            odometry=scenario.odometry_model,
+            odometry_factor=scenario.odometry_factor,
+            rate_hz=scenario.rate_hz,
+        )
+    from magtwin.bench.magslam import ship_case
+
+    loop = ship_case(folder, scenario.number, seed)
+    pose = np.column_stack(
+        [loop.truth["p_world_base"][:, :2], np.unwrap(yaw_from_quat(loop.truth["q_world_base_xyzw"]))]
+    )
+    return Case(loop.problem, loop.readings, Truth(loop.truth["t"], pose))
+
+
+def bounds_of(case: Case) -> Bounds | None:
+    """Bounds of a case; None for SLAM, which has no map."""
+    truth = case.truth
+    field = truth.field if truth.field is not None else case.problem.belief
+    if field is None or case.problem.belief is None:
+        return None
+    return bounds(
+        case.problem,
+        truth.pose,
+        truth.t,
+        field,
+        used=np.isfinite(case.readings["b_measured_nt"]),
+        kidnapped_s=truth.kidnapped_s,
+    )
+
+
+def run_localizer(
+    entry: Entry, case: Case, limit_s: float, limits: Bounds | None, scenario: Scenario
+) -> tuple[Track | None, Scores]:
+    """A track and its scores; None and the reason if the localizer failed."""
+    try:
+        with time_limit(limit_s):
+            readings = case.readings
+            if entry.compensator != "none":
+                from magtwin.localize.compensators import COMPENSATORS, compensated
+
+                if case.problem.calibration is None or case.problem.belief is None:
+                    raise LocalizerError(
+                        f"compensator {entry.compensator!r} needs a calibration drive and a map"
+                    )
+                fitted = COMPENSATORS[entry.compensator]().fit(case.problem.calibration, case.problem.belief)
+                readings = compensated(readings, fitted)
+            made = track(load_localizer(entry.method, entry.options), case.problem, readings)
+    except (InputError, MemoryError) as error:
+        return None, Scores(failed=str(error))
+    except TimeLimitError:
+        return None, Scores(failed=f"took longer than the time limit of {limit_s:g} s")
+    return made, score(
+        made,
+        case.truth.pose,
+        global_start=scenario.prior != "tracking",
+        kidnapped_s=case.truth.kidnapped_s,
+        bounds=limits,
+    )
+
+
+def smooths(entry: Entry) -> bool:
+    """Whether an algorithm uses later readings for its estimates, and so has another bound."""
+    try:
+        algorithm = load_localizer(entry.method, entry.options)
+    except InputError:
+        return False
+    return isinstance(algorithm, Smoother) and not isinstance(algorithm, Localizer)
+
+
+def warm_up(entry: Entry) -> None:
+    """Run a localizer of magtwin on a few readings, so that no run's time has compilation in it.
+
+    Localizers of others are left alone: what they do wrong counts in their runs.
+    """
+    if ":" in entry.method:
+        return
+    values = np.fromfunction(lambda h, j, i: 4e4 + 100 * np.sin(i) * np.cos(j), (1, 21, 21))
+    field = AnomalyMap(
+        values_nt=values,
+        variance_nt2=np.full(values.shape, 100.0),
+        origin_m=(-1.0, -1.0),
+        cell_m=(0.1, 0.1),
+        headings_rad=np.zeros(1),
+    )
+    t = np.arange(4) / 5
+    still = np.zeros((4, 3))
+    run = Run({"t": t, "odom_p": still, "odom_q_xyzw": quat_from_yaw(t * 0), "b_measured_nt": 4e4 + t})
+    problem = Problem(belief=field, extent=field.extent, sensor=SensorModel(iron_nt=100.0))
+    with contextlib.suppress(InputError):  # such as one that needs a vector field, which its runs will say
+        track(load_localizer(entry.method, entry.options), problem, run)
+
+
+@contextmanager
+def time_limit(seconds: float) -> Iterator[None]:
+    """Raise `TimeLimitError` after a time, in the main thread of a process; elsewhere the runner ends it."""
+    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
+        yield
+        return
+
+    def late(*_: object) -> None:
+        raise TimeLimitError
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)  # again and again: callbacks of libraries swallow it
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _over_time(case: Case, made: Track | None, limits: Bounds | None) -> Row:
+    """Time, position error, bound, true place and flag at `TRACK_HZ`, as float32."""
+    truth = case.truth
+    every = max(1, round(case.problem.rate_hz / TRACK_HZ))
+    rows = slice(None, None, every)
+    unknown = np.full(len(truth.t), np.nan)
+    error = unknown if made is None else np.hypot(*(made.pose - truth.pose)[:, :2].T)
+    lost = unknown if made is None else made.lost
+    arrays = {
+        "t": truth.t - truth.t[0],
+        "error_m": error,
+        "bound_m": unknown if limits is None else limits.correlated,
+        "x": truth.pose[:, 0],
+        "y": truth.pose[:, 1],
+        "lost": lost,
+    }
+    return {name: np.asarray(values[rows], np.float32) for name, values in arrays.items()}

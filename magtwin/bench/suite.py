@@ -1,0 +1,375 @@
+"""Suite: which localizers run on which scenarios, from a TOML file."""
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from magtwin.errors import InputError, find
+from magtwin.files import from_table, read_toml
+from magtwin.localize.localizers import load_localizer
+from magtwin.localize.problem import OdometryModel, SensorModel
+from magtwin.twin import scene_file
+
+HELD_OUT = 1_000_000_000
+"""Added to the seed of the suite for the held-out seeds."""
+
+SUITES = Path(__file__).parent / "suites"
+"""Suites that ship with magtwin, NAME.toml."""
+
+Seeds = Literal["public", "held-out"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """A task, from which runs are drawn by seed. Keys of a `[[scenario]]` table."""
+
+    name: str
+    """Name in results: lower-case letters, digits and hyphens."""
+
+    source: Literal["twin", "magnetic-data", "ship", "1d"] = "twin"
+    """Simulated in a twin, or recorded data."""
+
+    data: str = ""
+    """Name of a folder in `[data]`: recorded data, or a survey whose harmonic fit is the true field of the
+    twin. Default: the map of the scene is."""
+
+    runs: int = 100
+    """Number of runs."""
+
+    sessions: int = 50
+    """Number of sessions; run k is in session k modulo it."""
+
+    duration_s: float = 90.0
+    """Duration of a run [s]."""
+
+    rate_hz: float = 5.0
+    """Readings per second [Hz]."""
+
+    prior: Literal["tracking", "heading", "global"] = "tracking"
+    """First pose: known to 0.1 m and 5 deg; heading within 10 deg and no position; or nothing."""
+
+    scene: str = "lab"
+    """Scene in which the robot drives: the name of a shipped one, or a stage."""
+
+    paths: tuple[str, ...] = ("sine", "lawnmower", "figure8", "continuous_cycle", "random")
+    """Paths driven in turn."""
+
+    truth: Literal["map", "scene"] = "map"
+    """Readings: drawn from the true field with the noise of `sensor`; or those of the scene's physical
+    magnetometer, with the robot's own field of the session, motors and LiDAR."""
+
+    belief: Literal["exact", "trilinear", "none"] = "exact"
+    """Map that localizers get: the true field, or with `truth` "scene" the scene's map; trilinear
+    interpolation of a survey of it; or none (SLAM)."""
+
+    survey_spacing_m: float = 0.5
+    """Distance between nodes of the trilinear map [m], unless `data` is a survey, whose nodes are used."""
+
+    map_error_nt: float = 0.0
+    """Standard deviation of a random error that is added to the localizer's map [nT]."""
+
+    map_length_m: float = 0.3
+    """Its correlation length: exp(-d^2 / (2 length^2)) [m]."""
+
+    sensor: SensorModel = field(default_factory=SensorModel)
+    """Noise model that localizers are told, and from which readings are drawn if `truth` is "map"."""
+
+    odometry: Literal["model", "robot"] = "model"
+    """Odometry: true motion with the noise of `odometry_model`, or that of the robot's wheels."""
+
+    odometry_model: OdometryModel = field(default_factory=OdometryModel)
+    """Noise model that localizers are told."""
+
+    odometry_factor: float = 1.0
+    """Factor of all standard deviations of `odometry_model`."""
+
+    kidnaps: int = 0
+    """How often the robot is put elsewhere, at equal intervals."""
+
+    kidnap_m: tuple[float, float] = (0.5, 4.0)
+    """Least and largest distance of a kidnap [m]."""
+
+    stuck_s: float = 0.0
+    """Time for which the sensor repeats one value, from a third of the run on [s]."""
+
+    offset_s: float = 0.0
+    """Delay of the magnetometer's readings that nobody is told [s]."""
+
+    lever_error_m: tuple[float, float] = (0.0, 0.0)
+    """Error of the sensor's position in base_link that nobody is told [m]."""
+
+    moved_nt: float = 0.0
+    """Largest change of the field by an iron object that was moved by 0.6 m since the survey [nT]."""
+
+    calibration_s: float = 0.0
+    """Length of the labelled drive at the start of the session [s]."""
+
+    number: int = 1
+    """Recording of recorded data."""
+
+    def __post_init__(self) -> None:
+        if not self.name or not all(c.islower() or c.isdigit() or c == "-" for c in self.name):
+            raise InputError(f"name must have lower-case letters, digits and hyphens only, got {self.name!r}")
+        for key in ("runs", "sessions"):
+            if getattr(self, key) < 1:
+                raise InputError(f"{key} must be at least 1, got {getattr(self, key)}")
+        for key in ("duration_s", "rate_hz", "map_length_m", "survey_spacing_m", "odometry_factor"):
+            if not 0 < getattr(self, key) < math.inf:
+                raise InputError(f"{key} must be above 0, got {getattr(self, key)}")
+        if self.kidnaps < 0 or not 0 <= self.kidnap_m[0] < self.kidnap_m[1]:
+            raise InputError(f"kidnap_m must be two ascending distances, got {self.kidnap_m}")
+        if not self.paths:
+            raise InputError("paths must name at least one path")
+        if self.duration_s * self.rate_hz > 1e6:
+            raise InputError(
+                f"duration_s {self.duration_s:g} at {self.rate_hz:g} Hz is over a million readings"
+            )
+
+    @property
+    def told_odometry(self) -> OdometryModel:
+        """The odometry model with its factor."""
+        scaled = {
+            f.name: getattr(self.odometry_model, f.name) * self.odometry_factor for f in fields(OdometryModel)
+        }
+        return OdometryModel(**scaled)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """A localizer of a suite. Keys of a `[[localizer]]` table."""
+
+    method: str
+    """Name of a localizer, or "module:Class"."""
+
+    name: str = ""
+    """Name in results. Default: the method."""
+
+    compensator: str = "none"
+    """Model of the robot's own field that predicts it from on-board signals."""
+
+    options: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the localizer."""
+
+    scenarios: tuple[str, ...] = ()
+    """Scenarios to run. Default: all."""
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            object.__setattr__(self, "name", self.method)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chunk:
+    """The unit of work: some runs of one scenario, by some localizers, which share each simulated run."""
+
+    scenario: str
+    part: int
+    """Number of the chunk in its scenario, and of its file."""
+
+    first: int
+    """Its first run."""
+
+    runs: int
+    """Its number of runs."""
+
+    entries: tuple[str, ...]
+    """Names of localizers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Suite:
+    """Scenarios and localizers. Keys of the top of a suite file."""
+
+    name: str
+    version: int = 1
+    seed: int = 0
+    """First seed; run k of a scenario has the seed `seed` + k."""
+
+    chunk: int = 10
+    """Runs per chunk of work."""
+
+    time_limit_s: float = 60.0
+    """Longest time of a localizer for one run [s]; then its run counts as failed."""
+
+    data: dict[str, str] = field(default_factory=dict)
+    """Folders of data by name, relative to `base`."""
+
+    base: str = ""
+    """Folder to which scenes and data are relative. Default: that of the suite's file."""
+
+    scenario: tuple[Scenario, ...] = ()
+    localizer: tuple[Entry, ...] = ()
+    seeds: Seeds = "public"
+
+    def __post_init__(self) -> None:
+        for kind, items in (("scenario", self.scenario), ("localizer", self.localizer)):
+            names = [item.name for item in items]
+            if not names:
+                raise InputError(f"a suite needs at least one [[{kind}]]")
+            if twice := [name for name in names if names.count(name) > 1]:
+                raise InputError(f"two of [[{kind}]] are called {twice[0]!r}; give one another name")
+        if self.seed < 0 or self.chunk < 1 or not self.time_limit_s > 0:
+            raise InputError("seed must not be negative; chunk and time_limit_s must be above 0")
+        known = {s.name: s for s in self.scenario}
+        for entry in self.localizer:
+            for name in entry.scenarios:
+                find("scenario", name, known)
+
+    @property
+    def scenarios(self) -> Mapping[str, Scenario]:
+        """Scenarios by name."""
+        return {s.name: s for s in self.scenario}
+
+    @property
+    def localizers(self) -> Mapping[str, Entry]:
+        """Localizers by name."""
+        return {e.name: e for e in self.localizer}
+
+    @property
+    def first_seed(self) -> int:
+        """Seed of run 0 of every scenario."""
+        return self.seed + (HELD_OUT if self.seeds == "held-out" else 0)
+
+    @property
+    def sha256(self) -> str:
+        """Checksum of all values, without the folders of data."""
+        return hashlib.sha256(
+            json.dumps(_plain(replace(self, data={}, base="")), sort_keys=True).encode()
+        ).hexdigest()
+
+    def chunks(self) -> list[Chunk]:
+        """All work, in order."""
+        made = []
+        for scenario in self.scenario:
+            entries = tuple(e.name for e in self.localizer if not e.scenarios or scenario.name in e.scenarios)
+            for part, first in enumerate(range(0, scenario.runs, self.chunk)):
+                runs = min(self.chunk, scenario.runs - first)
+                if entries:
+                    made.append(
+                        Chunk(scenario=scenario.name, part=part, first=first, runs=runs, entries=entries)
+                    )
+        return made
+
+    def limited(
+        self,
+        *,
+        scenarios: Sequence[str] = (),
+        localizers: Sequence[str] = (),
+        runs: int | None = None,
+        seeds: Seeds = "public",
+        data: Mapping[str, str] | None = None,
+    ) -> "Suite":
+        """A part of the suite.
+
+        Args:
+            scenarios: Names to keep. Default: all.
+            localizers: Names to keep, or new ones to add by their method's name. Default: all.
+            runs: Most runs of each scenario.
+            seeds: Which seeds.
+            data: Folders by name, which replace those of the file.
+
+        Raises:
+            InputError: A name is unknown.
+        """
+        kept = [find("scenario", name, self.scenarios) for name in scenarios] or list(self.scenario)
+        if runs is not None:
+            kept = [replace(s, runs=min(s.runs, runs)) for s in kept]
+        entries = list(self.localizer)
+        if localizers:
+            known = self.localizers
+            entries = [known[n] if n in known else Entry(method=n) for n in localizers]
+        names = {s.name for s in kept}
+        entries = [
+            replace(e, scenarios=tuple(n for n in e.scenarios if n in names)) if e.scenarios else e
+            for e in entries
+            if not e.scenarios or names & set(e.scenarios)
+        ]
+        return replace(
+            self,
+            scenario=tuple(kept),
+            localizer=tuple(entries),
+            seeds=seeds,
+            data={**self.data, **(data or {})},
+        )
+
+    def check(self) -> None:
+        """Make every localizer and compensator once, and look for the data.
+
+        Raises:
+            InputError: One is unknown or refuses its options, or data are missing.
+        """
+        for entry in self.localizer:
+            load_localizer(entry.method, entry.options)
+            if entry.compensator != "none":
+                from magtwin.localize.compensators import COMPENSATORS
+
+                find("compensator", entry.compensator, COMPENSATORS)
+        for scenario in self.scenario:
+            if scenario.source == "twin":
+                self.scene(scenario)
+            if scenario.data or scenario.source != "twin":
+                self.folder(scenario)
+
+    def scene(self, scenario: Scenario) -> Path:
+        """Stage of a scenario's scene.
+
+        Raises:
+            InputError: There is no such scene.
+        """
+        beside = Path(self.base) / scenario.scene
+        return scene_file(beside if beside.exists() else scenario.scene)
+
+    def folder(self, scenario: Scenario) -> Path:
+        """Folder of a scenario's data.
+
+        Raises:
+            InputError: It is not named or not there.
+        """
+        if not scenario.data:
+            raise InputError(f"scenario {scenario.name!r} has recorded data; name them by its key data")
+        if scenario.data not in self.data:
+            text = (
+                f"scenario {scenario.name!r} needs the data {scenario.data!r}; give their folder with `data`"
+            )
+            raise InputError(f"{text}, such as {scenario.data}=FOLDER (magtwin fetch)", parameter="data")
+        path = Path(self.data[scenario.data])
+        if not path.is_dir():
+            raise InputError(
+                f"{path}: no such folder of data {scenario.data!r} (magtwin fetch)", parameter="data"
+            )
+        return path
+
+
+def load_suite(file: str | os.PathLike[str]) -> Suite:
+    """The suite of a TOML file, or one that ships with magtwin, by name: standard.
+
+    Raises:
+        InputError: There is no such file; a key is unknown or missing; a value has the wrong type or range.
+    """
+    path = suite_file(file)
+    suite = from_table(Suite, read_toml(path), path)
+    base = path.resolve().parent / suite.base
+    data = {name: str(base / where) for name, where in suite.data.items()}
+    return replace(suite, data=data, base=str(base))
+
+
+def suite_file(file: str | os.PathLike[str]) -> Path:
+    """The file of a suite: `file`, or that of a suite that ships with magtwin, by name."""
+    path = Path(file)
+    shipped = SUITES / f"{path.name}.toml"
+    return shipped if not path.exists() and shipped.is_file() and path.name == str(file) else path
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, tuple | list):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    return value

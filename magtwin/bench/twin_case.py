@@ -1,0 +1,340 @@
+"""Twin case: a drive in a twin, with the errors of a scenario, as a problem with its truth.
+
+All draws of a run come from its seed, so that a run is the same in any order and on any machine.
+"""
+
+import math
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.bench import world
+from magtwin.bench.case import Case, Truth
+from magtwin.bench.suite import Scenario
+from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.frames import quat_from_yaw, wrap_angle, yaw_from_quat
+from magtwin.localize.problem import HEADING_WITHIN, OdometryModel, Prior, Problem, SensorModel
+from magtwin.run.run import Run
+
+if TYPE_CHECKING:
+    from magtwin.twin import Twin
+
+Array = NDArray[np.float64]
+
+STREAMS = ("odometry", "noise", "prior", "map", "kidnap", "moved", "localizer")
+"""Who draws, each from its own child generator. Append only: the order is part of the seed."""
+
+SD_M, SD_YAW = 0.1, math.radians(5)
+"""Prior of tracking."""
+
+WITHIN = math.radians(10)
+"""Largest error of a known heading."""
+
+SESSION = 7
+"""Second word of the seed of what a session has in common."""
+
+
+def twin_case(scenario: Scenario, scene: str, seed: int, session: int, fields: Path | None = None) -> Case:
+    """One run of a scenario in a twin.
+
+    Args:
+        scenario: The scenario.
+        scene: Stage of its scene.
+        seed: Seed of the run.
+        session: Number of its session.
+        fields: Folder of `world.fit_field` if the scenario's data are a survey. None: the scene's map is the
+            true field.
+
+    Raises:
+        InputError: A path or the scene is unknown, or the drive leaves no room for a kidnap.
+    """
+    rngs = dict(zip(STREAMS, np.random.default_rng((seed, 1)).spawn(len(STREAMS)), strict=True))
+    field = _field(scene, fields)
+    drive = _drive(scenario, scene, seed, session)
+    t, pose, cuts, rows = _kidnapped(scenario, drive, rngs["kidnap"])
+    true_field = world.certain(field)
+    if scenario.moved_nt:
+        true_field = world.with_moved_object(field, scenario.moved_nt, rngs["moved"])
+    odometry = _odometry(scenario, drive, pose, rows, cuts, t, rngs["odometry"])
+    if scenario.truth == "map":
+        iron = np.random.default_rng((session, SESSION)).normal(0.0, 1.0, 2) * scenario.sensor.iron_nt
+        lever = np.add(_lever(drive), scenario.lever_error_m)
+        b = _readings(scenario, true_field, t, pose, lever, iron, rngs["noise"])
+    else:
+        b = drive["b_measured_nt"][rows]
+        if scenario.offset_s:
+            b = np.interp(t - scenario.offset_s, t, b)
+    if scenario.stuck_s:
+        begin = t[0] + (t[-1] - t[0]) / 3
+        held = (t >= begin) & (t < begin + scenario.stuck_s)
+        if held.any():
+            b = np.where(held, b[np.argmax(held)], b)
+    keep = (
+        "imu_q_xyzw",
+        "imu_w",
+        "imu_a",
+        "odom_v",
+        "odom_w",
+        "battery_v",
+        "battery_a",
+        "lidar_on",
+        "v_cmd",
+        "w_cmd",
+    )
+    readings = Run(
+        {
+            "t": t,
+            "odom_p": np.column_stack([odometry[:, :2], np.zeros(len(t))]),
+            "odom_q_xyzw": quat_from_yaw(odometry[:, 2]),
+            "b_measured_nt": b,
+            **{name: drive[name][rows] for name in keep},
+        }
+    )
+    problem = Problem(
+        belief=_belief(scenario, scene, fields, rngs["map"]),
+        extent=field.extent,
+        prior=_prior(scenario, pose[0], rngs["prior"]),
+        sensor=replace(scenario.sensor, lever_arm_m=_lever(drive)),
+        odometry=scenario.told_odometry,
+        map_length_m=scenario.map_length_m,
+        rate_hz=scenario.rate_hz,
+        calibration=_calibration(scenario, scene, session),
+        seed=int(rngs["localizer"].integers(2**31)),
+    )
+    truth = Truth(t, pose, true_field, tuple(t[cuts].tolist()), scenario.map_error_nt)
+    return Case(problem, readings, truth, {"path": str(drive.metadata.get("path", "")), "session": session})
+
+
+@lru_cache(maxsize=4)
+def _twin(scene: str, magnetometer: str) -> "Twin":
+    from magtwin.twin import open_twin
+
+    return open_twin(scene, magnetometer=magnetometer)  # type: ignore[arg-type]
+
+
+@lru_cache(maxsize=64)
+def _in_session(scene: str, magnetometer: str, session: int) -> "Twin":
+    from magtwin.twin import in_session
+
+    return in_session(_twin(scene, magnetometer), session)
+
+
+def _field(scene: str, fields: Path | None) -> AnomalyMap:
+    """The true field of the twin, or of a survey."""
+    if fields is None:
+        return _twin(scene, "map-only").field
+    return world.fitted_field(fields / "truth.npz")
+
+
+def _drive(
+    scenario: Scenario, scene: str, seed: int, session: int, *, duration_s: float | None = None
+) -> Run:
+    """A simulated drive, long enough for the kidnaps."""
+    from magtwin.sim.motion.drive_input import drive_input
+    from magtwin.twin import room_of, simulate
+
+    kind = "map-only" if scenario.truth == "map" else "physical"
+    twin = _in_session(scene, kind, session)
+    path = drive_input(scenario.paths[seed % len(scenario.paths)], room_of(twin), fit=True)
+    length = scenario.duration_s * (2 if scenario.kidnaps else 1) if duration_s is None else duration_s
+    run = simulate(twin, path, seed=seed, duration_s=length, rate_hz=scenario.rate_hz, outside="clamp")
+    if run.rows < 2:
+        raise InputError(f"scenario {scenario.name!r}: a drive of {length:g} s has fewer than two readings")
+    return run
+
+
+def _pose(run: Run) -> Array:
+    return np.column_stack([run["p_world_base"][:, :2], np.unwrap(run["yaw"])])
+
+
+def _lever(run: Run) -> tuple[float, float]:
+    words = str(run.metadata["sensor_m"]).split(",")
+    return float(words[0]), float(words[1])
+
+
+def _kidnapped(
+    scenario: Scenario, drive: Run, rng: np.random.Generator
+) -> tuple[Array, Array, NDArray[np.intp], NDArray[np.intp]]:
+    """Times, true poses, rows after a kidnap, and the rows of the drive."""
+    pose = _pose(drive)
+    count = min(round(scenario.duration_s * scenario.rate_hz), drive.rows)
+    if not scenario.kidnaps:
+        rows = np.arange(count)
+        return drive["t"][rows], pose[rows], np.empty(0, np.intp), rows
+    length = count // (scenario.kidnaps + 1)
+    begin = int(rng.integers(drive.rows - length))
+    pieces = [np.arange(begin, begin + length)]
+    least, most = scenario.kidnap_m
+    for k in range(scenario.kidnaps):
+        last = k == scenario.kidnaps - 1
+        rest = count - (scenario.kidnaps) * length if last else length
+        starts = np.arange(drive.rows - rest)
+        away = np.hypot(*(pose[starts, :2] - pose[pieces[-1][-1], :2]).T)
+        near = starts[(away >= least) & (away <= most)]
+        if not len(near):
+            raise InputError(f"scenario {scenario.name!r}: no place {least:g} to {most:g} m away on the path")
+        begin = int(rng.choice(near))
+        pieces.append(np.arange(begin, begin + rest))
+    rows = np.concatenate(pieces)
+    cuts = np.cumsum([len(piece) for piece in pieces])[:-1]
+    t = drive["t"][0] + np.arange(len(rows)) / scenario.rate_hz
+    return t, pose[rows], cuts, rows
+
+
+def moves(pose: Array) -> Array:
+    """Increments between poses: forward, leftward [m] and turn [rad], in axes halfway through the turn."""
+    turn = np.diff(pose[:, 2])
+    middle = pose[:-1, 2] + turn / 2
+    dx, dy = np.diff(pose[:, 0]), np.diff(pose[:, 1])
+    c, s = np.cos(middle), np.sin(middle)
+    return np.column_stack([dx * c + dy * s, dy * c - dx * s, turn])
+
+
+def chained(steps: Array) -> Array:
+    """Poses from (0, 0, 0) by increments; the inverse of `moves`."""
+    yaw = np.concatenate([[0.0], np.cumsum(steps[:, 2])])
+    middle = yaw[:-1] + steps[:, 2] / 2
+    c, s = np.cos(middle), np.sin(middle)
+    xy = np.column_stack([steps[:, 0] * c - steps[:, 1] * s, steps[:, 0] * s + steps[:, 1] * c])
+    return np.column_stack([np.vstack([[0.0, 0.0], np.cumsum(xy, axis=0)]), yaw])
+
+
+def noisy_odometry(pose: Array, t: Array, model: OdometryModel, rng: np.random.Generator) -> Array:
+    """Odometry of a true trajectory with the errors of a model.
+
+    Args:
+        pose: True x, y [m] and yaw [rad], shape (N, 3).
+        t: Times [s], shape (N,).
+        model: The errors.
+        rng: Source of the errors.
+
+    Returns:
+        Poses in odom, from (0, 0, 0), shape (N, 3).
+    """
+    steps = moves(pose)
+    scale = 1.0 + model.scale_std * rng.standard_normal()
+    sd = np.sqrt(model.variances(np.hypot(steps[:, 0], steps[:, 1]), steps[:, 2], np.diff(t)))
+    noise = sd * rng.standard_normal(steps.shape)
+    steps[:, :2] *= scale
+    return chained(steps + noise)
+
+
+def _odometry(
+    scenario: Scenario,
+    drive: Run,
+    pose: Array,
+    rows: NDArray[np.intp],
+    cuts: NDArray[np.intp],
+    t: Array,
+    rng: np.random.Generator,
+) -> Array:
+    """Poses in odom; a kidnap is not seen by the wheels."""
+    if scenario.odometry == "model":
+        steps = moves(pose)
+        steps[cuts - 1] = 0.0
+        return noisy_odometry(chained(steps), t, scenario.told_odometry, rng)
+    yaw = np.unwrap(yaw_from_quat(drive["odom_q_xyzw"]))
+    steps = moves(np.column_stack([drive["odom_p"][:, :2], yaw])[rows])
+    steps[:, 2] = wrap_angle(steps[:, 2])
+    steps[cuts - 1] = 0.0
+    return chained(steps)
+
+
+def _readings(
+    scenario: Scenario,
+    field: AnomalyMap,
+    t: Array,
+    pose: Array,
+    lever: Array,
+    iron: Array,
+    rng: np.random.Generator,
+) -> Array:
+    """Readings of the field with the noise of the sensor's model."""
+    at = pose
+    if scenario.offset_s:
+        at = np.column_stack([np.interp(t - scenario.offset_s, t, pose[:, k]) for k in range(3)])
+    c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
+    place = at[:, :2] + np.column_stack([c * lever[0] - s * lever[1], s * lever[0] + c * lever[1]])
+    b = field.lookup(place, at[:, 2], outside="clamp")
+    offset = scenario.sensor.offset_nt * rng.standard_normal()
+    drift = fogm(t, scenario.sensor, rng)
+    white = scenario.sensor.white_nt * rng.standard_normal(len(t))
+    return b + offset + drift + white + iron[0] * c + iron[1] * s
+
+
+def fogm(t: Array, sensor: SensorModel, rng: np.random.Generator) -> Array:
+    """A first-order Gauss-Markov process at times t [s]: the drift of a sensor [nT], shape (N,)."""
+    from scipy.signal import lfilter
+
+    z = rng.standard_normal(len(t))
+    if len(t) < 2:
+        return sensor.drift_nt * z
+    keep = math.exp(-float(np.median(np.diff(t))) / sensor.drift_s)
+    z[1:] *= math.sqrt(1 - keep**2)
+    return sensor.drift_nt * np.asarray(lfilter([1.0], [1.0, -keep], z))
+
+
+def _belief(
+    scenario: Scenario, scene: str, fields: Path | None, rng: np.random.Generator
+) -> AnomalyMap | None:
+    """What the localizer gets."""
+    if scenario.belief == "none":
+        return None
+    if scenario.belief == "trilinear":
+        if fields is not None:
+            return world.fitted_field(fields / "nodes.npz")
+        return _sparse(scene, scenario.survey_spacing_m)
+    if scenario.map_error_nt:
+        return world.with_error(_field(scene, fields), scenario.map_error_nt, scenario.map_length_m, rng)
+    if scenario.truth == "scene":
+        return _field(scene, fields)  # with the variance of its survey
+    return _certain(scene, fields)
+
+
+@lru_cache(maxsize=4)
+def _certain(scene: str, fields: Path | None) -> AnomalyMap:
+    return world.certain(_field(scene, fields))
+
+
+@lru_cache(maxsize=4)
+def _sparse(scene: str, spacing_m: float) -> AnomalyMap:
+    return world.trilinear(_field(scene, None), spacing_m)
+
+
+def _prior(scenario: Scenario, first: Array, rng: np.random.Generator) -> Prior:
+    x, y, yaw = first.tolist()
+    dx, dy, turn = rng.standard_normal(3).tolist()
+    within = float(rng.uniform(-WITHIN, WITHIN))
+    if scenario.prior == "tracking":
+        return Prior(mean=(x + SD_M * dx, y + SD_M * dy, yaw + SD_YAW * turn), sd=(SD_M, SD_M, SD_YAW))
+    if scenario.prior == "heading":
+        return Prior(mean=(0.0, 0.0, yaw + within), sd=(math.inf, math.inf, HEADING_WITHIN))
+    return Prior(sd=(math.inf, math.inf, math.inf))
+
+
+def _calibration(scenario: Scenario, scene: str, session: int) -> Run | None:
+    """A labelled drive of the session, with true poses."""
+    if not scenario.calibration_s:
+        return None
+    if scenario.truth != "scene":
+        raise InputError(f'scenario {scenario.name!r}: calibration_s needs truth = "scene"')
+    drive = _drive(
+        replace(scenario, paths=("figure8",)), scene, session, session, duration_s=scenario.calibration_s
+    )
+    return drive.select(
+        "p_world_base",
+        "q_world_base_xyzw",
+        "yaw",
+        "odom_*",
+        "imu_*",
+        "battery_*",
+        "lidar_on",
+        "v_cmd",
+        "w_cmd",
+        "b_measured_nt",
+    )

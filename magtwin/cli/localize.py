@@ -1,0 +1,189 @@
+"""`magtwin localize` and `magtwin ros localize`: estimate the pose along a run, or live."""
+
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from magtwin.cli.app import app
+from magtwin.cli.options import Force, Names, Seed, pairs
+from magtwin.cli.ros import HERE, WallS, Where, ros_app, spin
+from magtwin.cli.terminal import Done, announce, progress
+from magtwin.errors import InputError, hint
+
+
+@app.command
+def localize(
+    run: Path,
+    *,
+    map: str,  # noqa: A002 - the option is called --map
+    method: str = "rbpf",
+    option: Names = None,
+    out: Path = Path("localized"),
+    prior: str = "tracking",
+    rate_hz: float = 5.0,
+    sensor: Names = None,
+    odometry: Names = None,
+    map_length_m: float = 0.3,
+    compensator: str = "none",
+    calibration: Path | None = None,
+    seed: Seed = 0,
+    force: Force = False,
+) -> Done:
+    """Localize a robot along a run by its magnetometer and odometry, and score the estimate.
+
+    The method gets the on-board columns only, one row after another. The output is a folder with run.parquet
+    (the readings with columns est_*), localize.rrd, localize.png, and estimate.tum and truth.tum for evo.
+    docs/localize.md has the methods and how to write one; `magtwin new localizer.py` writes one to start
+    from.
+
+    Parameters
+    ----------
+    run
+        A run in any format that magtwin reads.
+    map
+        Map layer, stage, folder of survey CSVs, or the name of a scene that ships with magtwin: lab. none:
+        no map (simultaneous localization and mapping).
+    method
+        Name of a method, such as rbpf or odometry; or MODULE:CLASS of your own, which is also looked for in
+        the current folder.
+    option
+        Option of the method, as NAME=VALUE. May be repeated.
+    out
+        Folder to make.
+    prior
+        What the method knows of the start: tracking (the true pose with errors of 0.1 m and 5 deg), heading
+        (the heading within 10 deg), global (nothing), or a pose x,y,yaw [m, m, rad]. For a negative x, write
+        --prior=-1,0,0.
+    rate_hz
+        Readings per second that the method gets [Hz].
+    sensor
+        Figure of the magnetometer's noise model that the method is told, as NAME=VALUE: white_nt (100),
+        drift_nt (250), drift_s (2.5), offset_nt (500), iron_nt (400). May be repeated. The defaults are those
+        of the shipped robot's own field.
+    odometry
+        Figure of the odometry's noise model, as NAME=VALUE: position_std, yaw_std, turn_std, position_std_s,
+        yaw_std_s, scale_std. May be repeated.
+    map_length_m
+        Correlation length of the map's error that the method is told [m].
+    compensator
+        Model of the robot's own field for the method rbpf-network, fitted to --calibration: iron, ridge or
+        tolles-lawson.
+    calibration
+        Run earlier in the same session, with true poses.
+    """
+    from magtwin.figures.localization import save_localization
+    from magtwin.files import check_free
+    from magtwin.io.formats import read_run
+    from magtwin.localization import ROBOT_NOISE, lever_arm_of, localization
+    from magtwin.localize.problem import OdometryModel, SensorModel
+
+    check_free(out, force=force)
+    announce(f"Reading {run}")
+    whole = read_run(run)
+    told = _values("sensor", sensor, SensorModel)
+    with progress("Localizing", "readings") as advance:
+        result = localization(
+            whole,
+            None if map == "none" else map,
+            method=method,
+            options=_values("option", option),
+            prior=prior,
+            sensor=replace(ROBOT_NOISE, **{"lever_arm_m": lever_arm_of(whole), **told}),
+            odometry=OdometryModel(**_values("odometry", odometry, OdometryModel)),
+            map_length_m=map_length_m,
+            compensator=compensator,
+            calibration=calibration,
+            rate_hz=rate_hz,
+            seed=seed,
+            keep_particles=True,
+            progress=advance,
+        )
+    announce("Writing the estimate")
+    save_localization(result, out, force=force)
+    return Done(result.report(), out)
+
+
+@ros_app.command(name="localize", usage="Usage: magtwin ros localize [OPTIONS] SCENE [SETTING...]")
+def localize_live(
+    scene: Path,
+    *settings: str,
+    where: Where = HERE,
+    method: str = "rbpf",
+    option: Names = None,
+    map: str | None = None,  # noqa: A002
+    sensor: Names = None,
+    odometry: Names = None,
+    map_length_m: float = 0.3,
+    seed: Seed = 0,
+    duration_s: WallS = None,
+) -> Done:
+    """Localize a robot live by its magnetometer and odometry, with any method of `magtwin localize`.
+
+    It reads qtfm/magnitude and odom, and passes IMU, battery, commands and scans on to the method. It
+    publishes estimate/pose (PoseWithCovarianceStamped), estimate/lost (Bool), estimate/particles (PoseArray)
+    and the transform from map to odom, and its state in /diagnostics. A pose on /initialpose makes it begin
+    anew there. Settings have the form of ROS, name:=value: rate_hz (5), use_sim_time, prior (wait, global,
+    or x,y,yaw), max_age_s (0.5), silent_s (0.5), tf_broadcast (true), cloud_hz (1), particles (500).
+
+    Parameters
+    ----------
+    scene
+        USD stage that names the robot and the map, or the name of a scene that ships with magtwin: lab.
+    settings
+        Settings, such as prior:=global use_sim_time:=true.
+    method
+        As for `magtwin localize`.
+    option
+        Option of the method, as NAME=VALUE. May be repeated.
+    map
+        Map in place of the scene's; none: no map.
+    sensor
+        As for `magtwin localize`.
+    odometry
+        As for `magtwin localize`.
+    map_length_m
+        Correlation length of the map's error that the method is told [m].
+    """
+    from magtwin.localization import live_problem
+    from magtwin.localize.problem import OdometryModel, SensorModel
+    from magtwin.ros.localize import PARAMETERS, LocalizerNode
+    from magtwin.ros.parameters import settings as settings_of
+    from magtwin.twin import open_twin
+
+    values = settings_of(PARAMETERS, settings)
+    announce(f"opening {scene}")
+    twin = open_twin(scene, magnetometer="map-only")
+    problem = live_problem(
+        twin,
+        map,
+        sensor=_values("sensor", sensor, SensorModel),
+        odometry=OdometryModel(**_values("odometry", odometry, OdometryModel)),
+        map_length_m=map_length_m,
+        seed=seed,
+    )
+    options = _values("option", option)
+    with where.bus("magtwin_localize", sim_time=values["use_sim_time"], duration_s=duration_s) as bus:
+        LocalizerNode(twin, bus, values, method=method, options=options, problem=problem, say=announce)
+        announce(f"localizing by {bus.backend}; Ctrl-C ends")
+        spin(bus, duration_s)
+    return Done()
+
+
+def _values(option: str, texts: list[str] | None, model: Any = None) -> dict[str, Any]:
+    """NAME=VALUE texts with numbers, true, false and lists as in JSON; other values are texts."""
+    values: dict[str, Any] = {}
+    for name, text in pairs(option, texts).items():
+        try:
+            value = json.loads(text)
+        except ValueError:
+            value = text
+        values[name] = tuple(value) if isinstance(value, list) else value
+    known = () if model is None else [field.name for field in fields(model)]
+    for name, value in values.items() if model is not None else ():
+        if name not in known:
+            raise InputError(f"--{option} has no {name!r}; {hint(name, known)}")
+        parts = value if name == "lever_arm_m" and isinstance(value, tuple) else (value,)
+        if not all(isinstance(part, int | float) and not isinstance(part, bool) for part in parts):
+            raise InputError(f"--{option} {name} is a number, got {value!r}")
+    return values

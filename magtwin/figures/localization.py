@@ -1,0 +1,282 @@
+"""Localization: the estimated path over the map, and its errors against time beside the bound."""
+
+import math
+import os
+import textwrap
+from pathlib import Path
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.gridspec import GridSpec
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
+from magtwin.figures.canvas import (
+    INK,
+    Array,
+    colour_bar,
+    draw_line,
+    evenly,
+    label,
+    new_figure,
+    open_frame,
+    save,
+    short_name,
+)
+from magtwin.figures.maps import draw_cells, mean_field_ut
+from magtwin.files import output
+from magtwin.frames import wrap_angle
+from magtwin.io.rerun.localization import write_localization
+from magtwin.localization import Localization
+from magtwin.localize.tum import save_tum
+
+ESTIMATE_INK, TRUTH_INK, DEAD_INK, BOUND_INK, LOST_INK = "#e8590c", INK, "#1971c2", "#2b8a3e", "#f3d9fa"
+BAND_INK = "#ffd8a8"
+
+ELLIPSE_S = 5.0
+"""Least time between ellipses [s]."""
+
+MOST_ELLIPSES = 40
+
+WIDE = 30.0
+"""Ratio of the largest error to the median from which the axis is logarithmic."""
+
+WIDTH_IN = 10.0
+
+TITLE_WIDTH = 105
+"""Most characters of a line of the title."""
+
+
+def draw_localization(result: Localization) -> Figure:
+    """Draw a localization: paths over the map, and errors against time with the bound.
+
+    The ellipses hold 2 standard deviations along each of their axes (86 % of the poses, if the covariance is
+    right) and are drawn every 5 s at most. The band of the position error is twice the root of the
+    estimate's variances along x and y. The bound is the least standard deviation that any unbiased method
+    can have with this map, see `magtwin.localize.bounds`.
+
+    Args:
+        result: Result of `magtwin.localization.localization`. Without a true pose, the errors are left out
+            and the standard deviations are drawn alone.
+
+    Returns:
+        A matplotlib figure.
+
+    Raises:
+        InputError: There is no estimate.
+    """
+    if not len(result.track.t):
+        raise InputError("the run has no readings to draw")
+    belief = result.problem.belief
+    field = belief if isinstance(belief, AnomalyMap) else None
+    x0, x1, y0, y1 = _extent(result, field)
+    tall = float(np.clip((WIDTH_IN - 2.2) * (y1 - y0) / (x1 - x0), 2.5, 7.0))
+    figure = new_figure(WIDTH_IN, tall + 5.7)
+    figure.set_layout_engine("constrained", h_pad=0.1)
+    grid = GridSpec(3, 1, figure, height_ratios=[tall + 0.5, 2.3, 1.4])
+    top, position, heading = (figure.add_subplot(grid[k]) for k in range(3))
+    _draw_floor(figure, top, result, field)
+    top.set(xlim=(x0, x1), ylim=(y0, y1))
+    _draw_position(position, result)
+    _draw_heading(heading, result)
+    heading.sharex(position)
+    label(heading, "time [s]")
+    position.tick_params(labelbottom=False)
+    figure.suptitle(_title(result), fontsize=11)
+    return figure
+
+
+def _extent(result: Localization, field: AnomalyMap | None) -> tuple[float, float, float, float]:
+    """The map, and what of the paths lies beside it."""
+    parts = [result.track.pose[:, :2]]
+    if result.truth is not None:
+        parts.append(result.truth[:, :2])
+    if field is not None:
+        parts = [np.reshape(field.extent, (2, 2)).T]
+    p = np.concatenate(parts)
+    low, high = np.nanmin(p, axis=0), np.nanmax(p, axis=0)
+    room = 0.0 if field is not None else 0.05 * float(max(*(high - low), 0.5))
+    return float(low[0] - room), float(high[0] + room), float(low[1] - room), float(high[1] + room)
+
+
+def _draw_floor(figure: Figure, ax: Axes, result: Localization, field: AnomalyMap | None) -> None:
+    t, pose = result.track.t, result.track.pose
+    if field is not None:
+        known = mean_field_ut(field)
+        low, high = colour_limits(known)
+        colours = 0.45 * colormaps[COLOUR_MAP](np.linspace(0, 1, 64)) + 0.55  # lighter than the paths
+        pale = LinearSegmentedColormap.from_list("pale", np.minimum(colours, 1.0))
+        mesh = draw_cells(ax, field.x_m, field.y_m, known, pale, vmin=low, vmax=high)
+        colour_bar(figure, mesh, ax, "map, mean over headings [µT]")
+    entries: list[Line2D | Patch] = []
+
+    def path(p: Array, name: str, ink: str, **look: object) -> None:
+        rows = evenly(len(p), 3000)
+        entries.extend(ax.plot(*p[rows, :2].T, color=ink, label=name, **look))  # type: ignore[arg-type]
+
+    if result.dead_reckoning is not None:
+        path(result.dead_reckoning.pose, _dead_name(result), DEAD_INK, lw=1.2, ls=(0, (4, 2)), zorder=3)
+    if result.truth is not None:
+        path(result.truth, "true path", TRUTH_INK, lw=2.0, zorder=4)
+    trusted = np.where(result.track.lost[:, None], np.nan, pose)
+    path(trusted, "estimate", ESTIMATE_INK, lw=1.4, zorder=5)
+    rows = _ellipse_rows(t, result.track.lost)
+    rows = rows[np.isfinite(result.track.covariance[rows]).all(axis=(1, 2))]
+    if len(rows):
+        lines = [ellipse(pose[k, :2], result.track.covariance[k, :2, :2]) for k in rows]
+        ax.add_collection(LineCollection(lines, colors=ESTIMATE_INK, lw=1.0, zorder=6))
+        entries.append(Line2D([], [], color=ESTIMATE_INK, lw=1.0, marker="o", mfc="none", ms=9, ls=""))
+        entries[-1].set_label("its 2-sigma ellipse")
+    start = result.truth if result.truth is not None else pose
+    entries.extend(
+        ax.plot(*start[0, :2], marker="s", ms=7, mfc="white", mec=INK, ls="", zorder=7, label="start")
+    )
+    ax.set_aspect("equal")
+    label(ax, "x [m]", "y [m]")
+    _legend_above(ax, handles=entries)
+
+
+def ellipse(p_xy: Array, covariance: Array, sigmas: float = 2.0) -> Array:
+    """Points of the ellipse of a covariance [m^2], shape (2, 2), about p_xy [m]; shape (49, 2)."""
+    values, axes = np.linalg.eigh(covariance)
+    angle = np.linspace(0, 2 * np.pi, 49)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.asarray(p_xy + sigmas * (circle * np.sqrt(np.maximum(values, 0.0))) @ axes.T)
+
+
+def _ellipse_rows(t: Array, lost: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Rows at which ellipses are drawn: at even times, without those at which the pose is lost."""
+    every = max(ELLIPSE_S, (t[-1] - t[0]) / MOST_ELLIPSES)
+    ticks = np.arange(t[0], t[-1] + 1e-9, every)
+    rows = np.unique(np.searchsorted(t, ticks))
+    return rows[~lost[rows]]
+
+
+def _draw_position(ax: Axes, result: Localization) -> None:
+    t, track = result.track.t, result.track
+    sd = 2 * np.sqrt(track.covariance[:, 0, 0] + track.covariance[:, 1, 1])
+    error = dead = None
+    if result.truth is not None:
+        error = np.hypot(*(track.pose - result.truth)[:, :2].T)
+        if result.dead_reckoning is not None:
+            dead = np.hypot(*(result.dead_reckoning.pose - result.truth)[:, :2].T)
+    ends = [values for values in (error, sd) if values is not None and np.isfinite(values).any()]
+    most = max((float(np.nanmax(values)) for values in ends), default=1.0)
+    middle = min((float(np.nanmedian(values)) for values in ends), default=1.0)
+    log = most > WIDE * max(middle, 1e-6)
+    floor = max(middle / 20, 1e-4) if log else 0.0
+    if np.isfinite(sd).any():
+        ax.fill_between(t, floor, np.maximum(sd, floor), color=BAND_INK, lw=0, label="2 sigma")
+    if dead is not None:
+        draw_line(ax, t, dead, color=DEAD_INK, ls=(0, (4, 2)), label=_dead_name(result))
+    if error is not None:
+        draw_line(ax, t, error, color=ESTIMATE_INK, lw=1.2, label="estimate")
+    if result.bounds is not None:
+        draw_line(ax, t, result.bounds.correlated, color=BOUND_INK, lw=1.6, label="bound, 1 sigma")
+    _shade_lost(ax, result)
+    most = max(most, float(np.nanmax(dead)) if dead is not None else 0.0)
+    if log:
+        ax.set_yscale("log")
+        ax.set_ylim(floor, 1.5 * most)
+        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    else:
+        ax.set_ylim(0, 1.08 * most)
+    ax.set_xlim(t[0], t[-1])
+    open_frame(ax)
+    label(ax, y="position\nerror [m]")
+    _legend_above(ax)
+
+
+def _draw_heading(ax: Axes, result: Localization) -> None:
+    t, track = result.track.t, result.track
+    sd = np.degrees(2 * np.sqrt(track.covariance[:, 2, 2]))
+    most = 1.0
+    if np.isfinite(sd).any():
+        ax.fill_between(t, -sd, sd, color=BAND_INK, lw=0)
+        most = float(np.nanquantile(sd, 0.9))
+    if result.truth is not None:
+        error = np.degrees(wrap_angle(track.pose[:, 2] - result.truth[:, 2]))
+        draw_line(ax, t, error, color=ESTIMATE_INK, lw=1.2)
+        most = max(most, float(np.nanquantile(np.abs(error), 0.98)))
+    if result.bounds is not None:
+        for sign in (-1, 1):
+            draw_line(ax, t, sign * np.degrees(result.bounds.heading), color=BOUND_INK, lw=1.2)
+    _shade_lost(ax, result)
+    ax.set_ylim(-1.25 * most, 1.25 * most)
+    open_frame(ax)
+    label(ax, y="heading\nerror [°]")
+
+
+def _shade_lost(ax: Axes, result: Localization) -> None:
+    """Shade the times at which the method does not trust its pose."""
+    lost, t = result.track.lost, result.track.t
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]]).astype(int)))
+    name = "flagged lost"
+    for first, last in edges.reshape(-1, 2):
+        end = t[min(last, len(t) - 1)]
+        ax.axvspan(t[first], end, color=LOST_INK, lw=0, zorder=-1, label=name)
+        name = "_"
+
+
+def _dead_name(result: Localization) -> str:
+    """Name of dead reckoning, whose start the prior may not give."""
+    known = all(map(math.isfinite, result.problem.prior.sd))
+    return "dead reckoning" if known else "dead reckoning from the true start"
+
+
+def _legend_above(ax: Axes, **options: object) -> None:
+    place = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2, "columnspacing": 1.4}
+    ax.legend(ncols=6, fontsize=9, frameon=False, **place, **options)  # type: ignore[arg-type]
+
+
+def _title(result: Localization) -> str:
+    run = result.run
+    where = ", ".join(str(run.metadata[key]) for key in ("scene", "path") if run.metadata.get(key))
+    seed = f"seed {result.problem.seed}"
+    belief = result.problem.belief
+    on = "without a map" if belief is None else f"on map {getattr(belief, 'name', '') or 'belief'}"
+    head = f"{short_name(result.method, 40)} {on}, {seed}; run {where or 'recorded'}, {run.duration_s:.0f} s"
+    lines = [head] if result.truth is None else [head, *textwrap.wrap(result.report().verdict, TITLE_WIDTH)]
+    return "\n".join(lines)
+
+
+def save_localization(result: Localization, out: str | os.PathLike[str], *, force: bool = False) -> Path:
+    """Write the folder of a localization.
+
+    Args:
+        result: Result of `magtwin.localization.localization`.
+        out: Folder to make, with run.parquet, localize.rrd, localize.png, estimate.tum and, if the true pose
+            is known, truth.tum.
+        force: Whether to replace an existing folder.
+
+    Raises:
+        InputError: The folder exists, or cannot be written.
+    """
+    belief = result.problem.belief
+    with output(out, force=force) as folder:
+        folder.mkdir()
+        result.run.save(folder / "run.parquet")
+        write_localization(
+            result.run,
+            folder / "localize.rrd",
+            anomaly_map=belief if isinstance(belief, AnomalyMap) else None,
+            truth=result.truth,
+            dead_reckoning=None if result.dead_reckoning is None else result.dead_reckoning.pose,
+            bound_m=None if result.bounds is None else result.bounds.correlated,
+            particles=result.track.particles,
+        )
+        save(draw_localization(result), folder / "localize.png")
+        save_tum(folder / "estimate.tum", result.track.t, result.track.pose)
+        if result.truth is not None:
+            known = np.isfinite(result.truth).all(axis=1)
+            save_tum(folder / "truth.tum", result.track.t[known], result.truth[known])
+    return Path(out)

@@ -1,0 +1,36 @@
+"""Processors and memory that this process may use."""
+
+import contextlib
+import math
+import os
+from pathlib import Path
+
+
+def processors() -> int:
+    """Processors that this process may use: its affinity, and the quota of its control group."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quota, _, period = _cgroup("cpu.max").partition(" ")
+    if quota.isdecimal() and period.strip().isdecimal():
+        count = min(count, math.ceil(int(quota) / int(period)))
+    return max(1, count)
+
+
+def free_memory() -> int | None:
+    """Memory that this process and its workers can still take [bytes]; None if that is unknown."""
+    free = []
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        free.append(1024 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")))
+    most, used = _cgroup("memory.max"), _cgroup("memory.current")
+    if most.isdecimal() and used.isdecimal():
+        cached = dict(line.split() for line in _cgroup("memory.stat").splitlines())
+        free.append(max(0, int(most) - int(used) + int(cached.get("inactive_file", 0))))
+    return min(free, default=None)
+
+
+def _cgroup(name: str) -> str:
+    """A setting of the control group (version 2) that this process is in, as a container sees it."""
+    try:
+        return Path("/sys/fs/cgroup", name).read_text(encoding="ascii").strip()
+    except OSError:
+        return ""

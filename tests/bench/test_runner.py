@@ -1,0 +1,318 @@
+"""The runner of benchmarks: the same rows over jobs, shards and interruptions, and localizers that fail."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import bad_localizers
+import numpy as np
+import pytest
+
+from magtwin.bench import runner
+from magtwin.bench.results import read_results
+from magtwin.bench.runner import benchmark
+from magtwin.bench.suite import load_suite
+from magtwin.cli import main
+from magtwin.errors import InputError
+from magtwin.parallel import open_pool
+
+SUITE = """
+name = "small"
+seed = 5
+chunk = 2
+time_limit_s = {limit}
+
+[[scenario]]
+name = "exact"
+runs = 5
+sessions = 2
+duration_s = 4.0
+
+[[scenario]]
+name = "global"
+runs = 3
+duration_s = 4.0
+prior = "global"
+
+[[localizer]]
+method = "odometry"
+"""
+MORE = '\n[[localizer]]\nmethod = "bad_localizers:{}"\n'
+
+
+def suite_in(folder, *bad, limit=20.0):
+    file = folder / "small.toml"
+    file.write_text(SUITE.format(limit=limit) + "".join(MORE.format(name) for name in bad))
+    return file
+
+
+def files_in(folder, *without):
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.relative_to(folder).parts[0] not in without
+    }
+
+
+class Kept:
+    """A pool whose workers stay for the next benchmark, which so need not open the scene again."""
+
+    def __init__(self, pool):
+        self.pool, self.run = pool, pool.run
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+
+@pytest.fixture(scope="module")
+def workers():
+    with open_pool(2) as pool:
+        yield Kept(pool)
+
+
+@pytest.fixture
+def warm(workers, monkeypatch):
+    monkeypatch.setattr(runner, "open_pool", lambda *_, **__: workers)
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory):
+    return suite_in(tmp_path_factory.mktemp("suite"), "Raises")
+
+
+@pytest.fixture(scope="module")
+def whole(suite, tmp_path_factory):
+    """Results of one process."""
+    out = tmp_path_factory.mktemp("whole") / "results"
+    benchmark(suite, out, jobs=1)
+    return out
+
+
+def test_a_folder_of_results_has_rows_times_and_tracks_of_every_chunk(whole, suite):
+    names = {"exact": 3, "global": 2}
+    parts = {f"{s}/part-{k:05d}.parquet" for s, count in names.items() for k in range(count)}
+    expected = {f"{kind}/{part}" for kind in ("rows", "times", "tracks") for part in parts}
+    assert files_in(whole).keys() == expected | {"suite.toml", "suite.json"}
+    assert (whole / "suite.toml").read_bytes() == suite.read_bytes()
+    about = json.loads((whole / "suite.json").read_text())
+    assert about["sha256"] == load_suite(suite).sha256
+
+
+def test_rows_are_in_the_order_of_the_suite_with_one_per_run(whole):
+    results = read_results(whole)
+    keys = list(zip(*(results.rows[name].tolist() for name in ("scenario", "localizer", "run")), strict=True))
+    names = ("odometry", "bad_localizers:Raises")
+    assert keys == [
+        (s, name, k) for s, n in (("exact", 5), ("global", 3)) for name in names for k in range(n)
+    ]
+    assert results.missing == 0
+    assert (results.rows["seed"] == 5 + results.rows["run"]).all()
+    good = results.rows["localizer"] == "odometry"
+    assert set(results.rows["status"][good]) == {"ok"}
+    assert set(results.rows["status"][~good]) == {"failed"}
+    assert "ZeroDivisionError at t = 2.2 s: no particles left" in results.rows["reason"][~good][0]
+    assert np.isfinite(results.rows["rmse_m"][good]).all()
+    assert np.isnan(results.rows["rmse_m"][~good]).all()
+    assert (results.times["step_us"][good] > 0).all()
+    assert results.table.num_rows == 16
+    assert "8 of them failed" in repr(results)
+
+
+def test_tracks_are_thinned_errors_whose_mean_square_is_that_of_the_row(whole):
+    results = read_results(whole)
+    (track,) = results.tracks("exact", "odometry", 3)
+    assert track["t"].dtype == np.float32
+    assert np.allclose(np.diff(track["t"]), 0.4)  # every second of 5 Hz
+    row = np.flatnonzero((results.rows["localizer"] == "odometry") & (results.rows["run"] == 3))[0]
+    assert np.sqrt(np.mean(track["error_m"] ** 2)) == pytest.approx(results.rows["rmse_m"][row], rel=0.3)
+    assert [each["run"] for each in results.tracks("global", "odometry")] == [0, 1, 2]
+    names = ("scenario", "localizer", "run")
+    assert [tuple(each[name] for name in names) for each in results.tracks()] == list(
+        zip(*(results.rows[name].tolist() for name in names), strict=True)
+    )
+    with pytest.raises(InputError, match="did you mean 'exact'"):
+        results.tracks("exat", "odometry")
+
+
+@pytest.mark.parametrize("shards", [1, 2, 7])
+def test_two_jobs_and_any_number_of_shards_give_the_bytes_of_one(warm, suite, whole, tmp_path, shards):
+    out = tmp_path / "results"
+    for k in reversed(range(shards)):
+        benchmark(suite, out, shard=(k, shards))
+    assert files_in(out, "times") == files_in(whole, "times")
+    assert not [path for path in out.rglob("*") if path.name.startswith(".")]
+
+
+def test_shards_in_folders_of_their_own_are_read_together(warm, suite, whole, tmp_path):
+    folders = [tmp_path / str(k) for k in range(2)]
+    for k, folder in enumerate(folders):
+        assert benchmark(suite, folder, shard=(k, 2)).missing > 0
+    rows, expected = read_results(*folders).rows, read_results(whole).rows
+    assert rows.keys() == expected.keys()
+    for name, values in expected.items():
+        np.testing.assert_array_equal(rows[name], values)
+
+
+def test_a_repeat_runs_what_is_missing_only(warm, suite, whole, tmp_path, monkeypatch):
+    out = tmp_path / "results"
+    benchmark(suite, out, localizers=["odometry"], scenarios=["global"], runs=2)
+    done = files_in(out)
+    assert [name for name in done if "rows" in name] == [
+        next(name for name in done if name.startswith("rows/global/part-00000-"))
+    ]
+    sizes, run = [], runner._run
+
+    def counted(pool, chosen, whole, tasks, *more):
+        sizes.append(sum(map(runner._size, tasks)))
+        run(pool, chosen, whole, tasks, *more)
+
+    monkeypatch.setattr(runner, "_run", counted)
+    results = benchmark(suite, out)
+    assert {name: files_in(out)[name] for name in done} == done
+    for name, values in read_results(whole).rows.items():
+        np.testing.assert_array_equal(results.rows[name], values)
+    benchmark(suite, out)
+    assert sizes == [16 - 2]  # and nothing the second time
+
+
+def test_localizers_that_fail_in_any_way_have_rows_and_the_suite_goes_on(warm, tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "GRACE_S", 4.0)
+    reasons = {
+        "Hangs": "took longer than its time limit, and did not stop",
+        "Crashes": "the process was killed by SIGSEGV, 3 times",
+        "Exits": "SystemExit: 3",
+        "Nan": "not finite",
+        "Future": "from the future",
+        "Shape": "shape (2, 2)",
+        "Sleeps": "took longer than the time limit of 3 s",
+    }
+    suite = suite_in(tmp_path, *reasons, limit=3.0)
+    results = benchmark(suite, tmp_path / "results", scenarios=["exact"], runs=1)
+    rows = dict(
+        zip(
+            results.rows["localizer"],
+            zip(results.rows["status"], results.rows["reason"], strict=True),
+            strict=True,
+        )
+    )
+    assert rows.pop("odometry") == ("ok", "")
+    assert {name: status for name, (status, _) in rows.items()} == {
+        f"bad_localizers:{name}": "failed" for name in reasons
+    }
+    for name, reason in reasons.items():
+        assert reason in rows[f"bad_localizers:{name}"][1]
+
+
+def test_an_interruption_leaves_whole_files_and_a_repeat_goes_on(suite, whole, tmp_path):
+    out = tmp_path / "results"
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(Path(bad_localizers.__file__).parent), *sys.path]),
+    }
+    command = [sys.executable, "-m", "magtwin", "bench", str(suite), "--out", str(out), "--jobs", "2"]
+    for end in (signal.SIGINT, signal.SIGKILL):
+        program = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
+        before, patience = len(list(out.glob("rows/*/*.parquet"))), time.monotonic() + 60
+        while len(list(out.glob("rows/*/*.parquet"))) == before and program.poll() is None:
+            assert time.monotonic() < patience
+            time.sleep(0.005)
+        program.send_signal(end)
+        program.communicate(timeout=20)
+        done = files_in(out, "times")
+        expected = files_in(whole, "times")
+        assert all(expected[name] == content for name, content in done.items() if "/." not in name)
+    benchmark(suite, out)
+    done = {name: content for name, content in files_in(out, "times").items() if "/." not in name}
+    assert done == files_in(whole, "times")
+
+
+def test_the_command_prints_a_line_per_localizer(warm, suite, tmp_path, capsys):
+    out = tmp_path / "results"
+    main(["bench", str(suite), "--out", str(out), "--only", "exact", "--runs", "2", "--jobs", "1", "--json"])
+    made = json.loads(capsys.readouterr().out)
+    assert made["figures"]["runs"]["value"] == 4
+    assert made["figures"]["failed"]["value"] == 2
+    assert made["metadata"]["localizers"]["exact, bad_localizers:Raises"].startswith("no run finished")
+    main(
+        [
+            "bench",
+            str(suite),
+            "--out",
+            str(out),
+            "--shard",
+            "5/7",
+            "--jobs",
+            "1",
+            "--only",
+            "exact",
+            "--quiet",
+        ]
+    )
+
+
+def refused(*arguments, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["bench", *map(str, arguments)])
+    assert end.value.code == 1
+    return capsys.readouterr().err
+
+
+def test_what_cannot_run_is_refused_before_anything_is_written(suite, whole, tmp_path, capsys):
+    out = tmp_path / "results"
+    for options, text in (
+        (("--only", "exat"), "did you mean 'exact'"),
+        (("--localizer", "odometri"), "did you mean 'odometry'"),
+        (("--localizer", "bad_localizers:None"), "there is no 'None'"),
+        (("--shard", "2/2"), "--shard goes from 0/2 to 1/2"),
+        (("--shard", "0/2", "--force"), "drop --force"),
+        (("--jobs", "0"), "--jobs must be a whole number from 1 up"),
+        (("--jobs", "100000"), "of memory, and"),
+        (("--runs", "0"), "--runs must be at least 1"),
+        (("--jobs", "2", "--dask", "tcp://127.0.0.1:9"), "drop --jobs"),
+    ):
+        assert text in refused(suite, "--out", out, *options, capsys=capsys)
+        assert not out.exists()
+    other = tmp_path / "other.toml"
+    other.write_text(suite.read_text().replace("duration_s = 4.0", "duration_m = 4.0", 1))
+    assert "other.toml:11: " in refused(other, "--out", out, capsys=capsys)
+    other.write_text(suite.read_text().replace("duration_s = 4.0", "duration_s = 5.0", 1))
+    before = files_in(whole)
+    assert "another content of the suite" in refused(other, "--out", whole, capsys=capsys)
+    other.write_text(suite.read_text().replace("seed = 5", "seed = 5\nversion = 2", 1))
+    text = refused(other, "--out", whole, capsys=capsys)
+    assert "another version of the suite (1, not 2); give another folder, or --force" in text
+    assert "another seeds" in refused(suite, "--out", whole, "--seeds", "held-out", capsys=capsys)
+    (tmp_path / "holiday.jpg").touch()
+    assert "holds no results" in refused(suite, "--out", tmp_path, "--force", capsys=capsys)
+    assert files_in(whole) == before
+
+
+def test_results_of_another_version_of_magtwin_are_refused(suite, whole, tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "__version__", "9.9")
+    with pytest.raises(InputError, match=r"another version of magtwin \(.*, not 9\.9\)"):
+        benchmark(suite, whole)
+
+
+def test_force_replaces_results(warm, suite, tmp_path):
+    out = tmp_path / "results"
+    benchmark(suite, out, scenarios=["exact"], runs=1)
+    part = next(out.glob("rows/exact/*.parquet"))
+    part.write_bytes(part.read_bytes()[:100])
+    with pytest.raises(InputError, match="damaged"):
+        read_results(out)
+    results = benchmark(suite, out, scenarios=["exact"], runs=1, force=True)
+    assert len(results.rows["run"]) == 2
+
+
+def test_a_folder_without_results_is_refused(tmp_path):
+    with pytest.raises(InputError, match="no results of magtwin bench"):
+        read_results(tmp_path)
+    with pytest.raises(InputError, match="no such folder of results"):
+        read_results(tmp_path / "none")

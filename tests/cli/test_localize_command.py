@@ -1,0 +1,221 @@
+"""`magtwin localize` and `magtwin new localizer.py`: what a user types, and what is printed and written."""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import magtwin as mt
+from magtwin.cli import main
+from magtwin.errors import InputError, MismatchWarning
+from magtwin.localization import Localization, localization, prior_of, thinned, verdict_of
+from magtwin.localize.problem import Prior
+from magtwin.localize.scores import Scores
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a run in the shipped lab, and a localizer that `magtwin new` wrote."""
+    folder = tmp_path_factory.mktemp("localize")
+    main(["run", "lab", "--duration-s", "20", "--seed", "3", "--out", str(folder / "run.parquet"), "--quiet"])
+    main(["new", str(folder / "my_filter.py"), "--quiet"])
+    return folder
+
+
+@pytest.fixture
+def here(place: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(place)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    return place
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line of a refusal."""
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 1
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("magtwin: ")]
+    return lines[-1]
+
+
+def test_a_new_localizer_runs_as_it_stands_and_beats_dead_reckoning(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["localize", "run.parquet", "--map", "lab", "--method", "my_filter:MyLocalizer"]
+    main([*arguments, "--option", "particles=1000", "--out", "out"])
+    printed = capsys.readouterr().out
+    names = {file.name for file in (here / "out").iterdir()}
+    assert names == {"run.parquet", "localize.rrd", "localize.png", "estimate.tum", "truth.tum"}
+    result = localization("run.parquet", "lab", method="my_filter:MyLocalizer", options={"particles": 1000})
+    assert result.scores is not None
+    assert result.scores.rmse_m < 0.15
+    assert printed.splitlines()[-2] == result.report().verdict
+    assert printed.splitlines()[-2].startswith("Better than dead reckoning: ")
+    run = mt.load_run(here / "out" / "run.parquet")
+    assert run.metadata["localizer"] == "my_filter:MyLocalizer"
+    for name in ("est_p_world_base", "est_yaw", "est_covariance", "est_lost"):
+        np.testing.assert_array_equal(run[name], result.run[name])
+    truth = np.loadtxt(here / "out" / "truth.tum")
+    np.testing.assert_allclose(truth[:, 1:3], run["p_world_base"][:, :2], atol=1e-8)
+
+
+def test_the_errors_are_those_of_the_columns_beside_their_bound(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["localize", "run.parquet", "--map", "lab", "--method", "odometry", "--out", "dead", "--json"])
+    printed = json.loads(capsys.readouterr().out)
+    run = mt.load_run(here / "dead" / "run.parquet")
+    off = np.hypot(*(run["est_p_world_base"] - run["p_world_base"])[:, :2].T)
+    figures = {name: figure["value"] for name, figure in printed["figures"].items()}
+    assert figures["position error, RMSE"] == pytest.approx(np.sqrt(np.mean(off**2)))
+    assert figures["dead reckoning, RMSE"] == pytest.approx(figures["position error, RMSE"])
+    assert 0.01 < figures["bound"] < figures["position error, RMSE"]
+    assert printed["verdict"].startswith("No better than dead reckoning: ")
+
+
+def test_without_a_map_it_is_slam_and_has_no_bound(here: Path) -> None:
+    main(["localize", "run.parquet", "--map", "none", "--method", "odometry", "--out", "slam", "--quiet"])
+    result = localization("run.parquet", None, method="odometry")
+    assert result.bounds is None
+    assert "bound" not in {figure.name for figure in result.report().figures}
+    assert (here / "slam" / "localize.png").stat().st_size > 10_000
+
+
+def test_without_a_true_pose_it_estimates_and_gives_no_verdict(here: Path) -> None:
+    run = mt.load_run("run.parquet").select("t", "b_measured_nt", "odom_p", "odom_q_xyzw")
+    run.save("bare.parquet", force=True)
+    with pytest.raises(InputError, match="no true pose to start from; give a `prior`"):
+        localization("bare.parquet", "lab", method="odometry")
+    main(
+        [
+            *("localize", "bare.parquet", "--map", "lab", "--method", "odometry"),
+            *("--prior=0,0,0.8", "--out", "bare", "--quiet"),
+        ]
+    )
+    assert not (here / "bare" / "truth.tum").exists()
+    result = localization("bare.parquet", "lab", method="odometry", prior="0,0,0.8")
+    assert result.report().verdict == "No verdict: the run has no true pose to compare with."
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["--method", "odometri"], "no localizer 'odometri'; did you mean 'odometry'?"),
+        (["--method", "my_filter:MyLocaliser"], "did you mean 'MyLocalizer'?"),
+        (["--method", "nowhere:Thing"], "'nowhere:Thing' cannot be imported: ModuleNotFoundError"),
+        (["--method", "odometry", "--option", "speed=3"], "has no option 'speed'; it has none"),
+        (["--method", "my_filter:MyLocalizer", "--option", "particls=3"], "did you mean 'particles'?"),
+        (["--prior", "glob"], "no prior 'glob'; did you mean 'global'?"),
+        (["--prior", "9,0,0"], "the --prior x, y = 9, 0 m is off the floor"),
+        (["--prior", "1,a,0"], "a --prior is x,y,yaw [m, m, rad], got '1,a,0'"),
+        (["--map", "lap"], "lap: no map layer, stage, folder of CSVs or shipped scene"),
+        (["--rate-hz", "0"], "--rate-hz must be above 0 Hz, got 0.0"),
+        (["--sensor", "whit_nt=3"], "--sensor has no 'whit_nt'; did you mean 'white_nt'?"),
+        (["--sensor", "white_nt=much"], "--sensor white_nt is a number, got 'much'"),
+        (["--odometry", "yaw_std=-1"], "yaw_std of OdometryModel must be finite and not negative"),
+        (["--out", "run.parquet"], "run.parquet: exists already; give --force"),
+    ],
+)
+def test_a_wrong_input_is_refused_in_one_line(
+    here: Path, capsys: pytest.CaptureFixture[str], given: list[str], said: str
+) -> None:
+    arguments = ["localize", "run.parquet", "--quiet"]
+    for option, default in (("--map", "lab"), ("--method", "odometry"), ("--out", "refused")):
+        arguments += [] if option in given else [option, default]
+    assert said in refused([*arguments, *given], capsys)
+    assert not (here / "refused").exists()
+
+
+def test_a_run_off_the_map_or_without_odometry_is_refused(here: Path) -> None:
+    run, field = mt.load_run("run.parquet"), mt.open_twin("lab").field
+    far = dataclasses.replace(field, origin_m=(50.0, 50.0), harmonic=None, name="far")
+    with pytest.raises(InputError, match=r"off the map: 0% .* on map 'far', which covers x 50.00 to 56.00 m"):
+        localization(run, far, method="odometry")
+    half = dataclasses.replace(field, origin_m=(-4.2, -1.75), harmonic=None, name="half")
+    with pytest.warns(MismatchWarning, match="readings are off the map or on masked nodes"):
+        localization(run, half, method="odometry", prior="0,0,0.8")
+    without = mt.Run({name: run[name] for name in run if not name.startswith("odom_")}, run.metadata)
+    with pytest.raises(InputError, match="no column 'odom_p', which localization needs"):
+        localization(without, field, method="odometry")
+
+
+def test_a_compensator_predicts_the_robots_own_field_from_a_drive_of_the_session(here: Path) -> None:
+    twin = mt.in_session(mt.open_twin("lab"), 4)
+    drive, run = (mt.simulate(twin, path, seed=4, duration_s=30) for path in ("figure8", "loops"))
+    told: dict[str, object] = {"method": "odometry", "compensator": "iron", "calibration": drive}
+    result = localization(run, twin.field, **told)
+    own = result.run["b_measured_nt"] - result.run["b_map_nt"]
+    left = own - result.run["disturbance_nt"]
+    assert np.std(left) < 0.8 * np.std(own)
+    assert result.problem.calibration is not None
+    with pytest.raises(InputError, match="needs a map and a `calibration` drive"):
+        localization(run, twin.field, method="odometry", compensator="iron")
+
+
+def test_a_map_of_another_checksum_is_told_of(here: Path) -> None:
+    field = mt.open_twin("lab").field
+    other = dataclasses.replace(field, values_nt=field.values_nt + 5, harmonic=None, name="other")
+    other.save("other.usdc", force=True)
+    with pytest.warns(MismatchWarning, match="map 'other' is not the map 'lab' of scene 'lab'"):
+        localization("run.parquet", "other.usdc", method="odometry")
+
+
+def test_a_prior_is_drawn_about_the_truth_with_the_spread_that_it_states(here: Path) -> None:
+    run = thinned(mt.load_run("run.parquet"), 5.0)
+    true = np.array([*run["p_world_base"][0, :2], run["yaw"][0]])
+    drawn = [prior_of(run, seed=seed) for seed in range(300)]
+    z = (np.array([prior.mean for prior in drawn]) - true) / drawn[0].sd
+    np.testing.assert_allclose(z.mean(axis=0), 0, atol=4 / np.sqrt(300))
+    np.testing.assert_allclose(z.std(axis=0), 1, atol=0.17)  # 4 standard deviations of a spread of 300 draws
+    headings = [prior_of(run, "heading", seed=seed) for seed in range(100)]
+    away = np.degrees([prior.mean[2] - true[2] for prior in headings])
+    assert np.abs(away).max() <= 10
+    assert np.abs(away).max() > 8
+    assert all(prior.is_global for prior in headings)
+    assert prior_of(run, "global").sd == (np.inf,) * 3
+    assert prior_of(run, "1,-2,0.5").mean == (1.0, -2.0, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("scores", "said"),
+    [
+        (
+            Scores(rmse_m=0.05, anees=1.1, anees_low=0.8, anees_high=1.3, converged_s=0.0, lost_share=0.0),
+            "Better than dead reckoning: 5.0 cm RMSE against 20.0 cm, 75% less. Consistent: ANEES 1.10 per "
+            "state. Not lost.",
+        ),
+        (
+            Scores(
+                rmse_m=0.8, anees=2.0, anees_low=0.8, anees_high=1.3, diverged=True, diverged_unflagged=True
+            ),
+            "WORSE than dead reckoning: 80.0 cm RMSE against 20.0 cm. TOO CONFIDENT: ANEES 2.00 per state, "
+            "at most 1.30 expected. LOST: its error stayed above 0.5 m for more than 5 s.",
+        ),
+        (
+            Scores(rmse_m=0.2, anees=0.2, anees_low=0.8, anees_high=1.3, converged_s=3.0, lost_share=0.1),
+            "No better than dead reckoning: 20.0 cm RMSE against 20.0 cm. Too cautious: ANEES 0.20 per "
+            "state, at least 0.80 expected. Not lost, but flagged so in 10% of the readings.",
+        ),
+    ],
+)
+def test_a_verdict_says_whether_it_is_better_consistent_and_lost(scores: Scores, said: str) -> None:
+    assert verdict_of(scores, 0.2) == said
+
+
+def test_dead_reckoning_of_a_global_start_begins_at_the_true_pose(here: Path) -> None:
+    result = localization("run.parquet", "lab", method="odometry", prior=Prior(sd=(np.inf,) * 3))
+    assert isinstance(result, Localization)
+    assert result.dead_reckoning is not None
+    assert result.truth is not None
+    np.testing.assert_allclose(result.dead_reckoning.pose[0], result.truth[0], atol=1e-12)
+    assert "dead reckoning from the true start" in result.report().verdict
+
+
+@pytest.mark.parametrize("name", ["random.py", "my-filter.py", "class.py"])
+def test_a_localizer_has_the_name_of_a_module(tmp_path: Path, name: str) -> None:
+    with pytest.raises(SystemExit):
+        main(["new", str(tmp_path / name)])
+    assert not list(tmp_path.iterdir())
