@@ -45,7 +45,7 @@ def published(case):
 
 
 def chosen(case):
-    """The published settings, but for the length scale, the field's variation and odometry's velocity error."""
+    """The published settings, with the length scale, sd and velocity error of the other rows."""
     own = {"length_m": LENGTH_M, "sd_nt": SD * SHIP_UNIT_NT, "velocity_sd_m_s": BIAS_M * case.problem.rate_hz}
     return published(case) | own
 
@@ -132,7 +132,8 @@ def evidence(folder, loops):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     parser.add_argument("--data", type=Path, default=DATA, help="folder with ship/ and 1d/")
     parser.add_argument("--runs", type=int, default=20, help="runs of each loop")
     parser.add_argument("--loops", type=int, nargs="*", default=[1, 2, 3, 4], help="loops of the ship")

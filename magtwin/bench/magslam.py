@@ -116,7 +116,7 @@ def ship_case(folder: str | os.PathLike[str], loop: int, seed: int) -> Recording
         rate_hz=1 / dt,
         seed=seed,
     )
-    t = dt * np.arange(len(p))
+    t = np.asarray(dt * np.arange(len(p)), float)
     return Recording(
         problem,
         _readings(t, odom_p, odom_q, y_nt),
@@ -151,8 +151,8 @@ def hand_case(folder: str | os.PathLike[str], name: Literal["eight", "square"]) 
     The files have no true pose. The reference is the telephone's own visual-inertial tracking, which corrects
     itself when it sees a place again (`dPos`); odometry is the same without these corrections
     (`dPosSmooth`). Orientations are those of the telephone in both. The magnetometer's axes are turned by
-    90 deg about z from those of the orientation: of the 24 right-handed ways this one makes the field in world
-    axes vary least, in both files.
+    90 deg about z from those of the orientation: of the 24 right-handed ways this one makes the field in
+    world axes vary least, in both files.
 
     Args:
         folder: Folder of the files.
