@@ -44,7 +44,7 @@ class Standing:
     """Root mean square of the heading error."""
 
     bound_m: float
-    """Root mean square of the bound: with the map's error as correlated."""
+    """Root mean square of the bound with the map's error as correlated; of the smoothed one for smoothers."""
 
     anees: float
     """Mean over runs of the normalised squared error per state."""
@@ -124,7 +124,7 @@ def _standing(scenario: str, localizer: str, rows: Columns, step_us: float) -> S
         median_m=float(np.median(errors)) if len(errors) else math.nan,
         p95_m=float(np.percentile(errors, 95)) if len(errors) else math.nan,
         heading_rad=_rms(rows["heading_rad"][good]),
-        bound_m=_rms(rows["bound_correlated_m"][good]),
+        bound_m=_rms(rows["bound_smoothed_m" if rows["smoother"].any() else "bound_correlated_m"][good]),
         anees=_mean(rows["anees"][good]),
         coverage=_mean(rows["coverage"][good]),
         diverged=rate(diverged, count),
@@ -155,7 +155,9 @@ class Difference:
         """Which is better, in words."""
         if self.rmse_m.p >= SHOWN:
             return "no difference shown"
-        better, worse = (self.b, self.a) if self.rmse_m.difference > 0 else (self.a, self.b)
+        better, worse = ("B", "A") if self.rmse_m.difference > 0 else ("A", "B")
+        if self.a != self.b:
+            better, worse = {"A": self.a, "B": self.b}[better], {"A": self.a, "B": self.b}[worse]
         return f"{better} is better than {worse}"
 
 

@@ -115,7 +115,7 @@ def read_recording(folder: str | os.PathLike[str], number: int) -> Recording:
     Raises:
         InputError: A file is missing or does not hold as many numbers as the others.
     """
-    tables = []
+    tables: list[Array] = []
     for what, columns in (("time", 1), ("loc", 2), ("mag", 3)):
         path = existing(Path(folder) / f"{number}-{what}.csv", "file of magnetic-data")
         try:
@@ -282,10 +282,10 @@ class Noise:
 
 
 NOISE = Noise(white_nt=501.0, drift_nt=0.0, drift_s=1.0, map_factor=1.0, map_length_m=0.207)
-"""Noise that `magtwin.bench.recorded_noise.choose` chose by leaving out each of the runs 1, 3 and 5 in turn."""
+"""Noise that `magtwin.bench.recorded_noise.choose` chose by leaving out runs 1, 3 and 5 in turn."""
 
-KAPPA = 16.0
-"""Option `kappa` of the particle filters that it chose, with `map_correlated` = 1: errors of the map are more
+KAPPA = 8.0
+"""Option `kappa` of the particle filters that `preferred` picked of its candidates, with `map_correlated` = 1: errors of the map are more
 alike than their model, and a drive passes many places again."""
 
 OFFSET_NT = 300.0
@@ -364,7 +364,11 @@ def magnetic_data_case(
         rate_hz=rate_hz,
         seed=seed,
     )
-    about = {"data": "magnetic-data", "run": number, "map of runs": " ".join(map(str, training))}
+    about: dict[str, str | int | float | bool] = {
+        "data": "magnetic-data",
+        "run": number,
+        "map of runs": " ".join(map(str, training)),
+    }
     return Case(problem, readings, Truth(t, pose), about)
 
 

@@ -41,6 +41,12 @@ SHIP_OFFSET = 0.1
 SHIP_FUNCTIONS = {1: 50, 2: 50, 3: 100, 4: 50}
 """Published number of eigenfunctions of each loop."""
 
+HAND_NOISE_NT = 2_000.0
+"""Noise assumed for the hand-held loops [nT]."""
+
+HAND_POSITION_STD_S, HAND_TURN_STD_S = 0.05, 1e-3
+"""Random walks assumed for the odometry of the hand-held loops [m/sqrt(s), rad/sqrt(s)]."""
+
 
 @dataclass(frozen=True, eq=False)
 class Recording:
@@ -139,6 +145,57 @@ def ship_options(loop: int | None = None) -> dict[str, Any]:
     return options
 
 
+def hand_case(folder: str | os.PathLike[str], name: Literal["eight", "square"]) -> Recording:
+    """A hand-held loop: smoothed visual-inertial odometry, three axes of a telephone.
+
+    The files have no true pose. The reference is the telephone's own visual-inertial tracking, which corrects
+    itself when it sees a place again (`dPos`); odometry is the same without these corrections
+    (`dPosSmooth`). Orientations are those of the telephone in both. The magnetometer's axes are turned by
+    90 deg about z from those of the orientation: of the 24 right-handed ways this one makes the field in world
+    axes vary least, in both files.
+
+    Args:
+        folder: Folder of the files.
+        name: "eight" or "square".
+
+    Raises:
+        InputError: There is no such loop, or its file is missing or wrong.
+    """
+    if name not in ("eight", "square"):
+        raise InputError(f"name must be eight or square, got {name!r}", parameter="name")
+    names = ("dPos", "dPosSmooth", "initPos", "m", "quat", "t")
+    data = _matlab(Path(folder) / f"{name}.mat", names)
+    start, t, rotation = data["initPos"][0], data["t"][:, 0], _rotation(data["quat"])
+    reference, odometry = (
+        np.vstack([start, start + np.cumsum(data[key], axis=0)]) for key in ("dPos", "dPosSmooth")
+    )
+    x, y, z = 1e3 * data["m"].T  # from microtesla
+    low, high = odometry.min(axis=0), odometry.max(axis=0)
+    problem = Problem(
+        belief=None,
+        extent=(low[0], high[0], low[1], high[1]),
+        prior=_start(start, rotation[0]),
+        sensor=SensorModel(white_nt=HAND_NOISE_NT, drift_nt=0.0, offset_nt=HAND_NOISE_NT),
+        odometry=OdometryModel(
+            position_std=0.0,
+            yaw_std=0.0,
+            turn_std=0.0,
+            position_std_s=HAND_POSITION_STD_S,
+            yaw_std_s=HAND_TURN_STD_S,
+            scale_std=0.0,
+        ),
+        map_length_m=SHIP_LENGTH_M,
+        rate_hz=(len(t) - 1) / (t[-1] - t[0]),
+    )
+    return Recording(
+        problem,
+        _readings(t, odometry, rotation.as_quat(), np.column_stack([-y, x, z])),
+        _truth(t, reference, rotation.as_quat()),
+        HAND_POSITION_STD_S,
+        HAND_TURN_STD_S,
+    )
+
+
 def _matlab(path: Path, names: tuple[str, ...]) -> dict[str, Array]:
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
@@ -185,6 +242,3 @@ def _readings(t: Array, p: Array, q: Array, y_nt: Array) -> Run:
 def _truth(t: Array, p: Array, q: Array) -> Run:
     R = Rotation.from_quat(q).as_matrix()
     return Run({"t": t, "p_world_base": p, "q_world_base_xyzw": q, "yaw": np.arctan2(R[:, 1, 0], R[:, 0, 0])})
-
-
-Loop = Literal["eight", "square"]

@@ -4,8 +4,9 @@ The runs to localize have no part in it.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from magtwin.bench.magnetic_data import (
     OFFSET_NT,
     TRAINING,
     Noise,
+    Start,
     magnetic_data_case,
     read_recording,
     recorded_field,
@@ -27,11 +29,14 @@ from magtwin.localize.track import track
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], Any]
 
-KAPPAS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+KAPPAS = (2.0, 4.0, 8.0, 16.0, 32.0)
 """Divisors of the log likelihood that are tried."""
 
 RATE_HZ = 5.0
 """Rate of the residuals [Hz]."""
+
+STARTS: tuple[Start, ...] = ("tracking", "heading", "global")
+"""Priors from which every candidate starts: one choice has to serve all of them."""
 
 STEPS = 150
 """Most evaluations of the likelihood of the residuals."""
@@ -48,17 +53,20 @@ class Candidate:
     """Option `kappa` of the particle filter."""
 
     log_loss: float
-    """Mean over runs and readings of -log N(true position; estimate, covariance) [nats]."""
+    """Mean over starts, runs and readings of -log N(true position; estimate, covariance) [nats]."""
+
+    log_loss_se: float
+    """Standard error of `log_loss`, from its scatter between tracks [nats]."""
 
     rmse_m: float
-    """Pooled RMSE of the position [m]."""
+    """Pooled RMSE of the position from a known start [m]."""
 
 
 def choose(
     folder: str | os.PathLike[str],
     *,
     training: tuple[int, ...] = TRAINING,
-    seeds: int = 4,
+    seeds: int = 2,
     method: str = "rbpf",
     progress: Progress = lambda done, total, what: None,
 ) -> list[Candidate]:
@@ -75,7 +83,7 @@ def choose(
         progress: Called as progress(done, total, what).
 
     Returns:
-        All candidates, the one of least log loss first.
+        All candidates, the one of least log loss first. `preferred` picks one of them.
     """
     folds = [(tuple(n for n in training if n != left), left) for left in training]
     total = 2 + 2 * len(KAPPAS)
@@ -87,20 +95,35 @@ def choose(
         for kappa in KAPPAS:
             progress(done, total, f"kappa {kappa:g}")
             losses, squares = [], []
-            for rest, left in folds:
-                for seed in range(seeds):
-                    case = magnetic_data_case(folder, left, seed, training=rest, noise=noise)
-                    algorithm = load_localizer(method, {"kappa": kappa, "map_correlated": 1.0})
-                    made = track(algorithm, case.problem, case.readings)
-                    off, P = (made.pose - case.truth.pose)[:, :2], made.covariance[:, :2, :2]
+            for start, (rest, left), seed in product(STARTS, folds, range(seeds)):
+                case = magnetic_data_case(folder, left, seed, start=start, training=rest, noise=noise)
+                algorithm = load_localizer(method, {"kappa": kappa, "map_correlated": 1.0})
+                made = track(algorithm, case.problem, case.readings)
+                off, P = (made.pose - case.truth.pose)[:, :2], made.covariance[:, :2, :2]
+                losses.append(np.mean(nees(off, P) + np.linalg.slogdet(2 * np.pi * P)[1]) / 2)
+                if start == "tracking":
                     squares.append(np.mean(np.sum(off**2, axis=1)))
-                    losses.append(np.mean(nees(off, P) + np.linalg.slogdet(2 * np.pi * P)[1]) / 2)
-            candidates.append(
-                Candidate(noise, kappa, float(np.mean(losses)), float(np.sqrt(np.mean(squares))))
-            )
+            rmse = float(np.sqrt(np.mean(squares)))
+            error = float(np.std(losses, ddof=1) / np.sqrt(len(losses)))
+            candidates.append(Candidate(noise, kappa, float(np.mean(losses)), error, rmse))
             done += 1
     progress(total, total, "")
     return sorted(candidates, key=lambda candidate: candidate.log_loss)
+
+
+def preferred(candidates: Sequence[Candidate]) -> Candidate:
+    """The least tempering within one standard error of the best.
+
+    That is the one-standard-error rule (Breiman, Friedman, Olshen and Stone 1984, Classification and
+    Regression Trees, section 3.4.3): candidates so close cannot be told apart, and kappa = 1 is the model
+    itself. Between candidates of one kappa the log loss decides.
+
+    Args:
+        candidates: Results of `choose`.
+    """
+    best = min(candidates, key=lambda candidate: candidate.log_loss)
+    close = [c for c in candidates if c.log_loss <= best.log_loss + best.log_loss_se]
+    return min(close, key=lambda candidate: (candidate.kappa, candidate.log_loss))
 
 
 def likeliest_noise(
@@ -128,8 +151,8 @@ def likeliest_noise(
     def loss(logs: Array) -> float:
         white, factor, length, *more = np.exp(logs).tolist()
         total = 0.0
-        for apart, far, off, product in parts:
-            matrix = factor**2 * product * map_correlation(far, length) + OFFSET_NT**2
+        for apart, far, off, sds in parts:
+            matrix = factor**2 * sds * map_correlation(far, length) + OFFSET_NT**2
             if more:
                 matrix += more[0] ** 2 * np.exp(-apart / more[1])
             matrix.flat[:: len(off) + 1] += white**2

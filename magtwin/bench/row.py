@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from magtwin.bench.case import Case
+from magtwin.bench.case import Case, Truth
 from magtwin.bench.suite import Chunk, Entry, Scenario, Suite
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.frames import quat_from_yaw
+from magtwin.frames import quat_from_yaw, yaw_from_quat
 from magtwin.localize.bounds import Bounds, bounds
 from magtwin.localize.localizers import load_localizer
-from magtwin.localize.problem import Problem, SensorModel
+from magtwin.localize.problem import Localizer, Problem, SensorModel, Smoother
 from magtwin.localize.scores import Scores, score
 from magtwin.localize.track import LocalizerError, Track, track
 from magtwin.parallel import beat
@@ -85,6 +85,7 @@ def run_chunk(
                     "status": "failed" if reason else "ok",
                     "reason": reason,
                     "readings": case.readings.rows,
+                    "smoother": smooths(entry),
                     "global_start": scenario.prior != "tracking",
                     "recovered_in_time": sum(after <= WITHIN_S for after in scores.recovery_s),
                     **row,
@@ -103,7 +104,26 @@ def make_case(suite: Suite, scenario: Scenario, run: int, fields: Path | None = 
         own = fields / scenario.data if scenario.data and fields is not None else None
         session = suite.first_seed + run % scenario.sessions
         return twin_case(scenario, str(suite.scene(scenario)), seed, session, own)
-    raise InputError(f"scenario {scenario.name!r}: source {scenario.source!r} is not known")
+    folder = suite.folder(scenario)
+    if scenario.source == "magnetic-data":
+        from magtwin.bench.magnetic_data import magnetic_data_case
+
+        return magnetic_data_case(
+            folder,
+            scenario.number,
+            seed,
+            start=scenario.prior,
+            odometry=scenario.odometry_model,
+            odometry_factor=scenario.odometry_factor,
+            rate_hz=scenario.rate_hz,
+        )
+    from magtwin.bench.magslam import ship_case
+
+    loop = ship_case(folder, scenario.number, seed)
+    pose = np.column_stack(
+        [loop.truth["p_world_base"][:, :2], np.unwrap(yaw_from_quat(loop.truth["q_world_base_xyzw"]))]
+    )
+    return Case(loop.problem, loop.readings, Truth(loop.truth["t"], pose))
 
 
 def bounds_of(case: Case) -> Bounds | None:
@@ -150,6 +170,15 @@ def run_localizer(
         kidnapped_s=case.truth.kidnapped_s,
         bounds=limits,
     )
+
+
+def smooths(entry: Entry) -> bool:
+    """Whether an algorithm uses later readings for its estimates, and so has another bound."""
+    try:
+        algorithm = load_localizer(entry.method, entry.options)
+    except InputError:
+        return False
+    return isinstance(algorithm, Smoother) and not isinstance(algorithm, Localizer)
 
 
 def warm_up(entry: Entry) -> None:

@@ -2,6 +2,7 @@
 
 import math
 import os
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,9 @@ WIDE = 30.0
 """Ratio of the largest error to the median from which the axis is logarithmic."""
 
 WIDTH_IN = 10.0
+
+TITLE_WIDTH = 105
+"""Most characters of a line of the title."""
 
 
 def draw_localization(result: Localization) -> Figure:
@@ -241,7 +245,8 @@ def _title(result: Localization) -> str:
     belief = result.problem.belief
     on = "without a map" if belief is None else f"on map {getattr(belief, 'name', '') or 'belief'}"
     head = f"{short_name(result.method, 40)} {on}, {seed}; run {where or 'recorded'}, {run.duration_s:.0f} s"
-    return "\n".join([head, result.report().verdict]) if result.truth is not None else head
+    lines = [head] if result.truth is None else [head, *textwrap.wrap(result.report().verdict, TITLE_WIDTH)]
+    return "\n".join(lines)
 
 
 def save_localization(result: Localization, out: str | os.PathLike[str], *, force: bool = False) -> Path:

@@ -6,7 +6,7 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.field.maps.trilinear import sd_at
-from magtwin.localize.belief import as_map
+from magtwin.localize.belief import Table, as_map, mean_variance, tempering
 from magtwin.localize.odometry import increment
 from magtwin.localize.problem import Array, Estimate, Problem, Reading
 
@@ -42,7 +42,7 @@ class Ekf:
         gate: Readings with nu^2 / S above this are not used. Default: none.
         map_correlated: Share of the map's variance that is correlated; the rest is white.
         kappa: Factor of the white variance, above 1 for a map whose errors depend on each other more than
-            their model. Default: that of `RaoBlackwell`.
+            their model. Default: `magtwin.localize.belief.tempering`.
     """
 
     def __init__(
@@ -89,13 +89,9 @@ class Ekf:
             self._iron = len(variances)
             variances += [sensor.iron_nt**2] * 2
             self._rates += [(0.0, 0.0)] * 2
-        v = (
-            0.0
-            if self._map.variance_nt2 is None
-            else float(np.median(self._map.variance_nt2[self._map.valid]))
-        )
-        self._kappa = self.kappa or 1 + v / (v + sensor.white_nt**2)
-        if v > 0 and self.map_correlated > 0 and problem.map_length_m > 0:
+        variance = mean_variance(Table(table, spreads))
+        self._kappa = self.kappa or tempering(variance, sensor.white_nt)
+        if len(variance) and self.map_correlated > 0 and problem.map_length_m > 0:
             self._error = len(variances)
             variances.append(self.map_correlated)
             self._rates.append((0.0, 1 / problem.map_length_m))

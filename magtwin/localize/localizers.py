@@ -17,6 +17,8 @@ LOCALIZERS: Registry[Any] = Registry(
     {
         "bootstrap": "magtwin.localize.particles:Bootstrap",
         "ekf": "magtwin.localize.ekf:Ekf",
+        "ekf-slam": "magtwin.localize.slam.ekf_slam:EkfSlam",
+        "incremental-slam": "magtwin.localize.slam.incremental_slam:IncrementalSlam",
         "odometry": "magtwin.localize.odometry:Odometry",
         "point-mass": "magtwin.localize.point_mass:PointMass",
         "rbpf": "magtwin.localize.particles:RaoBlackwell",
@@ -24,6 +26,7 @@ LOCALIZERS: Registry[Any] = Registry(
         "rbpf-network": "magtwin.localize.particles:RaoBlackwellNetwork",
         "ros": "magtwin.ros.ros_node:RosNode",
         "sequence": "magtwin.localize.sequence:Sequence",
+        "slam-smoother": "magtwin.localize.slam.slam_smoother:SlamSmoother",
         "smoother": "magtwin.localize.smoother:MapSmoother",
     },
 )

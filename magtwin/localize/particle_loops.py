@@ -69,15 +69,17 @@ CONSTANT, COSINE, SINE, MAP_SD = range(4)
     SQUARES,
     COS,
     SIN,
-    LOG_S,
     OFFSET,
+    NU,
+    NU_NU,
+    PRIOR_S,
     PLAIN_TOP,
     PLAIN_SUM,
-) = range(18)
+) = range(20)
 """Sums of a block, in this order in its row: greatest log weight; sum of the weights relative to it, and of
 weight times offsets from the reference pose, their products; sum of squared weights; of weight times
-cos(yaw), sin(yaw), log S, mean of the first linear state; greatest log weight and sum of the weights without
-KAPPA."""
+cos(yaw), sin(yaw), mean of the first linear state; sum of the weights before the step times nu, nu^2 and S;
+greatest log weight and sum of the weights without KAPPA."""
 
 GOLDEN, MIX_1, MIX_2 = (np.uint64(k) for k in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
 _S20, _S27, _S30, _S31, _S32, _S52 = (np.uint64(k) for k in (20, 27, 30, 31, 32, 52))
@@ -247,7 +249,7 @@ def step(
         last: Block after the last.
         count: Number of particles.
         state: Particles, one per column, with the rows X, Y, ... and at least `count` columns.
-        sums: Takes the sums of each block, shape (blocks, 18).
+        sums: Takes the sums of each block, shape (blocks, 20).
         table: Table of the map's field; see `magtwin.field.maps.trilinear`.
         variance: Variance of the nodes, laid out as the values of the table; of length 0 if it has none.
         numbers: The numbers DISTANCE, ... of the step. USED is 0 if there is no reading. SHIFT is subtracted
@@ -381,6 +383,7 @@ def step(
                     if i < k:
                         for n in range(m):
                             gi[n] += p[n] * h[n]
+        prior_nu = prior_nu_nu = prior_s = 0.0
         if used:
             if not sampled:
                 for k in range(size):
@@ -388,7 +391,12 @@ def step(
                     for n in range(m):
                         big_s[n] += g[n] * h[n]
             for n in range(m):
+                prior_nu += weight[n] * nu[n]
+                prior_nu_nu += weight[n] * nu[n] * nu[n]
+                prior_s += weight[n] * big_s[n]
+            for n in range(m):
                 log_s[n] = big_s[n]
+            for n in range(m):
                 big_s[n] = 1 / big_s[n]
             logarithms(log_s, bit_rows[11, :m], w0, w1, f0, f1)
             for n in range(m):
@@ -406,10 +414,11 @@ def step(
                             p[n] -= g[n] * gi[n] * big_s[n]
         else:
             for n in range(m):
-                like[n] = log_s[n] = 0.0
+                like[n] = 0.0
 
         out = sums[block]
         out[:] = 0.0
+        out[NU], out[NU_NU], out[PRIOR_S] = prior_nu, prior_nu_nu, prior_s
         top = -np.inf
         for n in range(m):
             top = max(top, log_w[n] + like[n])
@@ -432,17 +441,16 @@ def step(
             e1[n] = log_w[n] - top
         exponentials(e1, f0, w0, weight)
         add_moments(weight, x, y, yaw, x_ref, y_ref, yaw_ref, out)
-        squares = cos = sin = logs = offset = 0.0
+        squares = cos = sin = offset = 0.0
         for n in range(m):
             squares += weight[n] * weight[n]
             cos += weight[n] * c[n]
             sin += weight[n] * s[n]
-            logs += weight[n] * log_s[n]
         if size > 0:
             first_mean = state[LINEAR, start:stop]
             for n in range(m):
                 offset += weight[n] * first_mean[n]
-        out[SQUARES], out[COS], out[SIN], out[LOG_S], out[OFFSET] = squares, cos, sin, logs, offset
+        out[SQUARES], out[COS], out[SIN], out[OFFSET] = squares, cos, sin, offset
         if kappa == 1 or not used:
             out[PLAIN_TOP], out[PLAIN_SUM] = out[TOP], out[SUM]
 

@@ -8,25 +8,32 @@ import numpy as np
 
 from magtwin.compiled import in_threads
 from magtwin.errors import InputError
-from magtwin.field.maps.trilinear import planes
-from magtwin.localize.belief import table_of
+from magtwin.localize.belief import known_values, mean_variance, table_of, tempering
 from magtwin.localize.odometry import increment
 from magtwin.localize.problem import Array, Estimate, Problem, Reading
 
 SHARE = 32
 """Blocks of 256 particles that a thread takes at a time."""
 
+FORGET_S = 1000.0
+"""Correlation time of the offset and of hard iron [s]. They are constant in the model, but the particles soon
+descend from a single one and share its estimate of the constants, whose error they do not spread over."""
+
 WALK_S = 500.0
-"""Correlation time of constants where they are sampled [s]."""
+"""The same where they are sampled, whose values would run out [s]."""
+
+KEEP_S = 5.0
+"""Time between two memories of the constants, for a start after a kidnapping [s]. The last but one is used:
+what was learned after the kidnapping is wrong."""
+
+INFLATE = 4.0
+"""Factor of their covariance then."""
 
 SETTLED_M = 0.5
 """Spread of the particles, sqrt(var x + var y), below which the pose counts as known [m]."""
 
 STILL_M = 1e-3
 """Motion, in metres and in radians / 10, within which a reading may repeat itself to the bit."""
-
-BETWEEN_CELLS, BETWEEN_TURNS = 2 * 6 / 30 + 4 / 36, 16 / 30
-"""Means over a cell of the weights of the errors of interpolation in `trilinear.spread`."""
 
 _GOLDEN = 0x9E3779B97F4A7C15
 _WORD = (1 << 64) - 1
@@ -50,20 +57,21 @@ class RaoBlackwell:
     * Map error: the share `map_correlated` of the map's variance is the FOGM state of length
       `Problem.map_length_m`, the rest is white.
     * Where the map is unknown, a reading has the mean and the variance of the whole map.
-    * Kidnapping: a cumulative sum of surprise, c = max(0, c + ref - log p(reading) - 1.5), with ref the mean
-      log likelihood if the particles are right. Above 12, the filter starts again over the whole floor.
+    * Kidnapping: a cumulative sum of surprise, c = max(0, c + ref - log p - 1.5), with p the likelihood of a
+      reading and ref the mean log likelihood of a Gaussian with the variance of the readings that the
+      particles predict. Above 12, the filter starts again over the whole floor, half of the particles with
+      the offset and hard iron that were known 5 to 10 s before.
     * A reading that repeats itself to the bit while the robot moves is not used, nor is nan.
 
     `lost` is set while the particles spread over more than 0.5 m.
 
     Args:
-        particles: Least number of particles. Default: 2,500; 6,000 for the bootstrap filter.
+        particles: Least number of particles. Default: 3,000; 6,000 for the bootstrap filter.
         per_m2: Particles per square metre of an unknown position with known heading at the start; four times
             as many if the heading is unknown. Default: 500; 2,000 for the bootstrap filter.
         most: Greatest number of particles.
         kappa: Divisor of the log likelihood (tempering): above 1 for a map whose errors depend on each other
-            more than their model, as at a place that is passed again. Default: 1 + v / (v + r), with v the
-            median variance of the map and r that of the white noise; 1 for an exact map.
+            more than their model, as at a place that is passed again. Default: `tempering`.
         map_correlated: Share of the map's variance that is correlated.
         resets: Whether to test for kidnapping.
     """
@@ -71,7 +79,7 @@ class RaoBlackwell:
     sampled: ClassVar[bool] = False
     iron: ClassVar[bool] = False
     network: ClassVar[bool] = False
-    least: int = 2500
+    least: int = 3000
     start_per_m2: float = 500.0
 
     def __init__(
@@ -108,14 +116,13 @@ class RaoBlackwell:
         self._problem = problem
         self._rng = np.random.default_rng(problem.seed)
         self._seed, self._count_steps = int(self._rng.integers(1 << 63)), 0
-        table, spreads = table_of(problem.belief, problem.extent)
-        self._table, self._variance = table, _mean_variance(table, spreads)
-        known = _known(table)
+        table = table_of(problem.belief, problem.extent)
+        self._table, self._variance = table.field, mean_variance(table)
+        known = known_values(table)
         self._field_mean, self._field_variance = float(known.mean()), float(known.var())
         sensor = problem.sensor
-        v = float(np.median(self._variance)) if len(self._variance) else 0.0
-        self._kappa = self.kappa or 1 + v / (v + sensor.white_nt**2)
-        self._states(v > 0)
+        self._kappa = self.kappa or tempering(self._variance, sensor.white_nt)
+        self._states(len(self._variance) > 0)
         self._scale_variance = problem.odometry.scale_std**2
         self._numbers = np.zeros(20)
         self._numbers[[self._loops.ARM_X, self._loops.ARM_Y]] = sensor.lever_arm_m
@@ -140,17 +147,26 @@ class RaoBlackwell:
         if correlated > 0:
             states.append((correlated, math.inf, problem.map_length_m, k.MAP_SD))
         variances, times, lengths, kinds = zip(*states, strict=True)
-        if self.sampled:  # a sampled constant would run out of values
-            times = tuple(
-                WALK_S if math.isinf(t) and math.isinf(d) else t for t, d in zip(times, lengths, strict=True)
-            )
+        slow = WALK_S if self.sampled else FORGET_S
+        times = tuple(
+            slow if math.isinf(t) and math.isinf(d) else t for t, d in zip(times, lengths, strict=True)
+        )
         self._prior_variances = np.array(variances, float)
         self._rates = 1 / np.array(times), 1 / np.array(lengths)
         self._kinds = np.array(kinds, np.int64)
+        self._constant = np.isin(times, (FORGET_S, WALK_S)) & np.isinf(lengths)
         self._numbers_map_white = 1 - correlated
 
-    def _start(self, mean: tuple[float, float, float], sd: tuple[float, float, float]) -> None:
-        """Draw all particles: Gaussian, and R3 where the standard deviation is infinite."""
+    def _start(
+        self,
+        mean: tuple[float, float, float],
+        sd: tuple[float, float, float],
+        errors: tuple[Array, Array] | None = None,
+    ) -> None:
+        """Draw all particles: Gaussian, and R3 where the standard deviation is infinite.
+
+        Every other particle gets the mean and covariance `errors` of the constants, the rest their prior.
+        """
         x0, x1, y0, y1 = self._problem.extent
         wide = [math.sqrt(2 * math.pi * math.e) * s for s in sd]  # side of the uniform of the same entropy
         area = (x1 - x0) * (y1 - y0) if math.isinf(sd[0]) else wide[0] * wide[1]
@@ -173,11 +189,12 @@ class RaoBlackwell:
                 state[row] = mean[row] + sd[row] * normal[row]
         state[k.SCALE : k.LINEAR] = 0.0
         state[k.LINEAR :] = 0.0
-        for i, variance in enumerate(self._prior_variances):
-            if self.sampled:
-                state[k.LINEAR + i] = math.sqrt(variance) * self._rng.standard_normal(count)
-            else:
-                state[k.LINEAR + size + i * (i + 1) // 2 + i] = variance
+        self._draw_errors(state, slice(None), np.zeros(size), np.diag(self._prior_variances))
+        if errors is not None:
+            known, covariance = np.zeros(size), np.diag(self._prior_variances)
+            known[self._constant] = errors[0]
+            covariance[np.ix_(self._constant, self._constant)] = errors[1]
+            self._draw_errors(state, slice(None, None, 2), known, covariance)
         self._scale_variance = self._problem.odometry.scale_std**2
         self._shift = math.log(count)
         self._scales = np.full(_blocks(count), 1.0 / count)
@@ -186,6 +203,34 @@ class RaoBlackwell:
             (middle[0], middle[1], mean[2]) if math.isinf(sd[0]) else (mean[0], mean[1], mean[2])
         )
         self._surprise, self._settled = 0.0, False
+        self._kept: list[tuple[Array, Array]] = []
+        self._kept_t = -math.inf
+
+    def _draw_errors(self, state: Array, part: slice, mean: Array, covariance: Array) -> None:
+        """Give some particles a mean and a covariance of the linear states, or draws of them."""
+        k, size = self._loops, len(mean)
+        means, triangle = state[k.LINEAR : k.LINEAR + size, part], state[k.LINEAR + size :, part]
+        if self.sampled:
+            root = np.linalg.cholesky(covariance + 1e-12 * np.eye(size))
+            means[:] = mean[:, None] + root @ self._rng.standard_normal(means.shape)
+        else:
+            means[:] = mean[:, None]
+            triangle[:] = covariance[np.tril_indices(size)][:, None]
+
+    def _errors(self) -> tuple[Array, Array]:
+        """Mean and covariance of the constants: offset and hard iron."""
+        k, count, size = self._loops, self._count, len(self._kinds)
+        w = self._state[k.WEIGHT, :count] * np.repeat(self._scales, k.BLOCK)[:count]
+        rows = np.flatnonzero(self._constant)
+        means = self._state[k.LINEAR + rows, :count]
+        mean = means @ w
+        covariance = (w * (means - mean[:, None])) @ (means - mean[:, None]).T
+        for i, high in enumerate(rows.tolist()):
+            for j, low in enumerate(rows[: i + 1].tolist()):
+                inner = float(self._state[k.LINEAR + size + high * (high + 1) // 2 + low, :count] @ w)
+                covariance[i, j] += inner
+                covariance[j, i] = covariance[i, j]
+        return mean, covariance
 
     def step(self, reading: Reading) -> Estimate:
         """Move the particles, weigh them by the reading, and resample if need be."""
@@ -258,7 +303,7 @@ class RaoBlackwell:
         """Weighted mean and covariance; the sum of surprise."""
         k, sums = self._loops, self._sums
         top = float(sums[:, k.TOP].max())
-        scales = np.exp(sums[:, k.TOP] - top)
+        scales, before = np.exp(sums[:, k.TOP] - top), self._scales
         total = scales @ sums
         weight = float(total[k.SUM])
         self._effective = weight**2 / float(scales**2 @ sums[:, k.SQUARES])
@@ -282,8 +327,10 @@ class RaoBlackwell:
         if used and self._settled:
             top = float(sums[:, k.PLAIN_TOP].max())
             likelihood = top + math.log(float(np.exp(sums[:, k.PLAIN_TOP] - top) @ sums[:, k.PLAIN_SUM]))
-            expected = -0.5 - 0.5 * float(total[k.LOG_S]) / weight
-            self._surprise = max(0.0, self._surprise + min(expected - likelihood - 1.5, MOST_SURPRISE))
+            mean = float(before @ sums[:, k.NU])
+            variance = float(before @ sums[:, k.NU_NU]) - mean**2 + float(before @ sums[:, k.PRIOR_S])
+            expected = -0.5 - 0.5 * math.log(variance)
+            self._surprise = max(0.0, self._surprise + expected - likelihood - SLACK)
         lost = self.spread > SETTLED_M
         bias = float(total[k.OFFSET]) / weight
         return Estimate(t, *pose, covariance, bias, lost)
@@ -292,8 +339,11 @@ class RaoBlackwell:
         """Resample, shrink, or start again."""
         if self.resets and self._surprise > RESET_ABOVE:
             self.reset_count += 1
-            self._start((0.0, 0.0, 0.0), (math.inf, math.inf, math.inf))
+            errors = None if len(self._kept) < 2 else (self._kept[0][0], INFLATE * self._kept[0][1])
+            self._start((0.0, 0.0, 0.0), (math.inf, math.inf, math.inf), errors)
             return
+        if self._settled and estimate.t >= self._kept_t + KEEP_S:
+            self._kept, self._kept_t = [*self._kept[-1:], self._errors()], estimate.t
         wanted = self._count
         if self.spread < SETTLED_M:
             wanted = max(self.least, int(0.7 * self._count))
@@ -349,8 +399,8 @@ class RaoBlackwellNetwork(RaoBlackwellIron):
     network = True
 
 
-MOST_SURPRISE = 6.0
-"""Most surprise that one reading can add: an outlier alone does not start the filter again."""
+SLACK = 1.5
+"""Surprise of a reading that is ignored."""
 
 RESET_ABOVE = 12.0
 """Sum of surprise at which the filter starts again."""
@@ -367,26 +417,3 @@ def _padded(count: int) -> int:
 
 def _wrapped(angle: float) -> float:
     return angle - 2 * math.pi * math.floor(angle / (2 * math.pi) + 0.5)
-
-
-def _known(table: Array) -> Array:
-    """Values of the valid nodes of a table."""
-    begin, end, _, _ = planes(table)
-    values = table[begin:end]
-    good = np.isfinite(values)
-    if len(table) > end:
-        good &= table[end:] == 0
-    return values[good]
-
-
-def _mean_variance(table: Array, spreads: Array) -> Array:
-    """Variance at the nodes with the mean error of interpolation around them; of length 0 if unknown."""
-    if not len(spreads):
-        return spreads
-    begin, end, _, _ = planes(table)
-    plane = end - begin
-    total = spreads[:plane].copy()
-    if len(spreads) > plane:
-        total += BETWEEN_CELLS * spreads[plane : 2 * plane] + BETWEEN_TURNS * spreads[2 * plane : 3 * plane]
-    total = np.where(np.isfinite(total), total, 0.0)
-    return total if total.any() else total[:0]

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import lgamma
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from magtwin.errors import InputError
 from magtwin.field.fit.check import parts, predict_readings, shown
 from magtwin.field.fit.covariance import Kernel
 from magtwin.field.fit.fit import fit
+from magtwin.field.fit.harmonic.inversion import GAIN
 from magtwin.field.fit.harmonic.layers import DIPOLES_OF_DRIVE, LEAST_DEPTH_M
 from magtwin.field.fit.methods import FieldModel
 from magtwin.field.fit.mixture import Mixture, mixed
@@ -29,6 +31,13 @@ MOST_TESTED = 2000  # Most readings of a drive that the trials predict
 NEAR = 2.0  # Only readings this near to a fitted one count, in spacings: a map is masked beyond
 NODE_PARTS, NODES_LEFT_OUT = 5, (0, 2)  # Parts of a grid's nodes, and those that are left out in turn
 WEIGHTS = (0.25, 0.5, 0.75)  # Weights of the harmonic fit in a mixture with a Gaussian process
+# Degrees of freedom of the log score. Errors have heavy tails, and under a normal density a few readings
+# beside gaps of the survey would decide.
+FREEDOM = 5.0
+# Options that end the learning of a trial early: more learning predicted readings left out no better. The fit
+# to the whole survey continues from there.
+SHORT: Mapping[str, Mapping[str, Any]] = {"harmonic": {"gain": GAIN}, "gp": {"steps": 15}}
+RESUMED = ("harmonic", "gp")  # Methods whose fits start from an earlier fit
 TICKS = 100  # Steps of progress per fit
 # Parameters of a map with the figures of the candidates, in the order of their names
 CANDIDATES, CHOSEN, LEAD = "candidates", "chosen", "lead in log score"
@@ -44,8 +53,14 @@ class Candidate:
     options: Mapping[str, Any] = field(default_factory=dict)
     magnitudes: bool = False  # Whether vectors are left out of the readings
 
-    def fit(self, readings: Readings, progress: Progress | None, **more: Any) -> FieldModel:
-        """Fit the readings."""
+    def fit(
+        self, readings: Readings, progress: Progress | None, like: FieldModel | None = None, **more: Any
+    ) -> FieldModel:
+        """Fit the readings, from an earlier fit if there is one."""
+        if like is not None and self.method in RESUMED:
+            more["like"] = like
+        else:
+            more |= SHORT.get(self.method, {})
         own = readings.with_(b_body_nt=None) if self.magnitudes else readings
         return fit(own, self.method, progress=progress, **{**self.options, **more})
 
@@ -59,6 +74,7 @@ class Trial:
     variance: Array  # Their variances with noise [nT^2], shape (N,)
     off: Array  # Readings minus predictions [nT], shape (N,)
     weights: tuple[float, ...] = (1.0,)
+    models: tuple[FieldModel, ...] = ()  # The fits
 
     @property
     def name(self) -> str:
@@ -70,7 +86,7 @@ class Trial:
     def joined(self, other: "Trial") -> "Trial":
         """This trial with the readings of another."""
         return replace(
-            self,
+            other,
             mean=np.append(self.mean, other.mean),
             variance=np.append(self.variance, other.variance),
             off=np.append(self.off, other.off),
@@ -83,8 +99,10 @@ class Trial:
 
     @property
     def score(self) -> float:
-        """Mean log predictive density [log 1/nT]."""
-        return float(np.mean(-0.5 * (np.log(2 * np.pi * self.variance) + self.off**2 / self.variance)))
+        """Mean log predictive density [log 1/nT], of Student's t scaled by the standard deviation."""
+        half = (FREEDOM + 1) / 2
+        level = lgamma(half) - lgamma(FREEDOM / 2) - np.log(FREEDOM * np.pi * self.variance) / 2
+        return float(np.mean(level - half * np.log1p(self.off**2 / (FREEDOM * self.variance))))
 
     @property
     def coverage(self) -> float:
@@ -107,8 +125,9 @@ def fit_auto(
     sensor. Each is fitted to a part of the survey. Left out is every fifth node of a gridded survey at all
     headings; else one run of several; else every fifth block of the floor. A drive is thinned to
     `MOST_FITTED` means for the trials. For gridded surveys, the best harmonic fit and the others are tried a
-    second time, with other nodes left out. The candidate with the greatest mean log
-    predictive density of the readings left out is fitted to the whole survey. Surveys with fewer than
+    second time, with other nodes left out. The candidate with the greatest mean log predictive density of the
+    readings left out, of Student's t, is fitted to the whole survey. Trials learn only until the evidence
+    grows slowly, and each later fit of a candidate continues from its earlier one. Surveys with fewer than
     `LEAST_READINGS` good readings get a harmonic fit.
 
     Args:
@@ -126,14 +145,15 @@ def fit_auto(
     tried = _candidates(readings, earth_nt, kernel)
     held = _held_out(readings)
     if not held:
-        model = Candidate("harmonic", "harmonic", {"earth_nt": earth_nt}).fit(readings, progress)
+        model = fit(readings, "harmonic", progress=progress, earth_nt=earth_nt)
         return _told(model, {CHOSEN: "harmonic: too few readings to leave some out"})
     steps, turn = TICKS * (len(tried) + 4 * (len(held) - 1) + 2), 0
     trials, refused = list[Trial](), list[InputError]()
     for candidate in tried:
+        like = _like(candidate, trials)
         try:
             part = _part(progress, turn, steps, f"trying {candidate.name}")
-            trials.append(_try(candidate, *held[0], part))
+            trials.append(_try(candidate, *held[0], part, like))
         except InputError as error:
             refused.append(error)
         turn += 1
@@ -145,7 +165,7 @@ def fit_auto(
         more = []
         for trial in finalists:
             part = _part(progress, turn, steps, f"trying {trial.name} again")
-            more.append(_try(trial.of[0], *pair, part))
+            more.append(_try(trial.of[0], *pair, part, trial.models[0]))
             turn += 1
         more = _common(more)
         finalists = [trial.joined(other) for trial, other in zip(finalists, more, strict=True)]
@@ -154,7 +174,7 @@ def fit_auto(
     models = []
     for k, candidate in enumerate(best.of):
         part = _part(progress, turn + k, steps, f"fitting {candidate.name}")
-        models.append(candidate.fit(readings, part))
+        models.append(candidate.fit(readings, part, best.models[k]))
     if progress is not None:
         progress(steps, steps, "done")
     model = models[0] if len(models) == 1 else Mixture.of(models, best.weights)
@@ -265,12 +285,24 @@ def _near(rest: Readings, test: Readings) -> Rows:
     return near[np.unique(rows)] if len(near) else near
 
 
-def _try(candidate: Candidate, rest: Readings, test: Readings, progress: Progress | None) -> Trial:
+def _like(candidate: Candidate, trials: Sequence[Trial]) -> FieldModel | None:
+    """The fit that a candidate's can start from: the same without a layer above."""
+    if candidate.options.get("above"):
+        for trial in trials:
+            if trial.of[0].method == candidate.method:
+                return trial.models[0]
+    return None
+
+
+def _try(
+    candidate: Candidate, rest: Readings, test: Readings, progress: Progress | None, like: FieldModel | None
+) -> Trial:
     """Fit a candidate to `rest` and predict `test`."""
     more: dict[str, Any] = {"fill": True} if candidate.method == "trilinear" else {}
-    model = candidate.fit(rest, progress, **more)
+    model = candidate.fit(rest, progress, like, **more)
     mean, variance = predict_readings(model, test, candidate.method)
-    return Trial((candidate,), mean, np.maximum(variance, np.finfo(float).tiny), test.b_nt - mean)
+    variance = np.maximum(variance, np.finfo(float).tiny)
+    return Trial((candidate,), mean, variance, test.b_nt - mean, models=(model,))
 
 
 def _common(trials: Sequence[Trial]) -> list[Trial]:
@@ -302,7 +334,8 @@ def _mixtures(trials: Sequence[Trial]) -> list[Trial]:
                 weights = (weight, 1 - weight)
                 mean, variance = mixed(weights, [one.mean, other.mean], [one.variance, other.variance])
                 off = one.off + one.mean - mean
-                found.append(Trial((one.of[0], other.of[0]), mean, variance, off, weights))
+                pair, models = (one.of[0], other.of[0]), (one.models[0], other.models[0])
+                found.append(Trial(pair, mean, variance, off, weights, models))
     return [max(found, key=lambda trial: trial.score)] if found else []
 
 

@@ -114,10 +114,11 @@ class Covariance:
         out = np.zeros_like(r)
         for k, wave in enumerate(self._waves(a[1], b[1])):
             part = _value(self.kernel, r, float(np.exp(figures[h + k])))
-            part *= np.exp(2 * figures[k])
             if k == 0 and len(self.patches):
-                part *= self._strength(figures, a[0])[:, None]
+                part *= np.exp(2 * figures[k]) * self._strength(figures, a[0])[:, None]
                 part *= self._strength(figures, b[0])
+            else:
+                part *= np.exp(2 * figures[k])
             part += np.exp(2 * figures[2 * h + k])
             out += part if k == 0 else np.multiply(part, wave, out=part)
         return out
@@ -202,10 +203,19 @@ def _distance(a: Array, b: Array) -> Array:
 
 def _value(kernel: Kernel, r: Array, reach: float) -> Array:
     if kernel == "matern":
-        a = ROOT5 / reach * r
-        return np.asarray((1 + a + a * a / 3) * np.exp(-a))
-    q = 1 + (r / reach) ** 2
-    return np.asarray(1 / (q * np.sqrt(q)))
+        a = (ROOT5 / reach) * r
+        value = a / 3  # the arrays are large: in place, each step takes half the time
+        value += 1
+        value *= a
+        value += 1
+        value *= np.exp(np.negative(a, out=a), out=a)
+        return np.asarray(value)
+    q = r / reach
+    q *= q
+    q += 1
+    root = np.sqrt(q)
+    root *= q
+    return np.asarray(np.divide(1, root, out=root))
 
 
 def _with_slopes(kernel: Kernel, r: Array, reach: float) -> tuple[Array, Array, Array]:

@@ -135,13 +135,14 @@ def raster(
     Raises:
         InputError: The spacing leaves no cell, the headings do not ascend, or no node is valid.
     """
+    say = progress or (lambda done, total, what: None)
+    say(0, 1, "resolution")
     grid, errors = _grid(model, readings, spacing_m, headings_rad, extent)
     p, _ = grid.poses()
     values, variance = np.empty(grid.shape), np.empty(grid.shape)
     headings = grid.headings_rad
     predict = getattr(model, "predict_nodes", model.predict)
     workers = threads(min(MOST_THREADS, len(headings)))
-    say = progress or (lambda done, total, what: None)
     with _one_thread(), ThreadPoolExecutor(workers) as pool:
         for h, predicted in enumerate(pool.map(predict, p, headings)):
             say(h, len(headings), "headings")

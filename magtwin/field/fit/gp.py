@@ -11,6 +11,7 @@ from magtwin.errors import InputError
 from magtwin.field.fit.covariance import Covariance, Kernel
 from magtwin.field.fit.interpolation import check_readings
 from magtwin.field.fit.methods import FittedModel, flat_poses
+from magtwin.field.fit.nodes import variance_at_nodes
 from magtwin.field.fit.roughness import local_mean, tail
 from magtwin.field.survey.bins import GRAIN_M, Bins, bin_readings, spacing_m
 from magtwin.field.survey.readings import Readings
@@ -23,7 +24,9 @@ MOST = 2500  # Most readings, or means of adjacent ones, in the conditioning: 50
 MOST_LEARNT = 800  # Most of these from which the hyperparameters are learnt
 MOST_TRIED = 240  # Most of these on which the starts are tried
 STARTS = (1.0, 0.4, 2.5)  # Initial reaches of the optimisation, as factors of the first guess
-STEPS = 60  # Steps of L-BFGS from the best start
+START_STEPS = 30  # Steps of L-BFGS from each start
+STEPS = 60  # Most steps of L-BFGS from the best start
+RESUMED_STEPS = 8  # The same from an earlier fit
 PATCHES = 8  # Most patches along the longer side of the floor, each with its own field strength
 # Least distance between patches, in spacings of the readings: smaller ones cannot tell strength from noise
 PATCH_SPACINGS = 3.0
@@ -31,7 +34,8 @@ PATCH_SPACINGS = 3.0
 WIDEST = 6.0
 SECTORS = 24  # Heading sectors in which adjacent readings are averaged separately
 FINEST = 8  # Averaging cells per spacing for readings of a drive, at least
-BLOCK = 1024  # Poses predicted at a time
+BLOCK = 256  # Poses predicted at a time: their covariances stay in the cache
+COARSE = 0.6  # Largest distance between nodes at which the variance is computed, in spacings of the readings
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -49,6 +53,7 @@ class GpModel(FittedModel):
     alpha: Array  # Inverse of that covariance times the readings minus their mean, shape (N,)
     # Positions left out in turn, a cKDTree, and the mean squared residual over the variance at each
     missed: tuple[Any, Array]
+    spacing_m: float  # Spacing of the readings [m]
     method: str = "gp"  # Name of the method
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
@@ -58,23 +63,52 @@ class GpModel(FittedModel):
         residuals of positions left out, since real fields are rougher in some places, and so that 90 % of all
         readings left out lie in their 90 % intervals.
         """
+        p, angle, shape = flat_poses(p_xy, yaw)
+        mean, variance = self._at(p, angle)
+        return mean.reshape(shape), variance.reshape(shape)
+
+    def predict_values(self, p_xy: ArrayLike, yaw: ArrayLike) -> Array:
+        """The field of `predict` alone [nT]."""
+        p, angle, shape = flat_poses(p_xy, yaw)
+        return self._at(p, angle, sure=False)[0].reshape(shape)
+
+    def predict_nodes(self, p_xy: Array, yaw: float) -> tuple[Array, Array]:
+        """`predict` on evenly spaced nodes at one heading, shape (Y, X, 2), several times faster.
+
+        On a fine grid the variance is computed only at nodes `COARSE` apart, and interpolated.
+        """
+        value = self.predict_values(p_xy, yaw)
+        one = np.array([yaw])
+        step = COARSE * self.spacing_m
+        return value, variance_at_nodes(p_xy, step, lambda p: self._at(p, np.repeat(one, len(p)))[1])
+
+    def _at(self, p: Array, angle: Array, *, sure: bool = True) -> tuple[Array, Array]:
+        """Field [nT] and, if `sure`, its variance [nT^2] at poses (N, 2), (N,)."""
         from scipy.linalg import solve_triangular
 
-        p, angle, shape = flat_poses(p_xy, yaw)
         mean, variance = np.full(len(p), np.nan), np.full(len(p), np.nan)
         finite = np.flatnonzero(np.isfinite(p).all(axis=1) & np.isfinite(angle))
         for start in range(0, len(finite), BLOCK):
             rows = finite[start : start + BLOCK]
             across = self.covariance.between(self.figures, self.poses, (p[rows], angle[rows]))
             mean[rows] = self.mean_nt + across.T @ self.alpha
+            if not sure:
+                continue
             half = solve_triangular(self.lower, across, lower=True, overwrite_b=True, check_finite=False)
             prior = self.covariance.variance_nt2(self.figures, p[rows])
             own = np.maximum(prior - np.einsum("ij,ij->j", half, half), 0.0)
             variance[rows] = own * local_mean(*self.missed, p[rows])
-        return mean.reshape(shape), variance.reshape(shape)
+        return mean, variance
 
 
-def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress | None = None) -> GpModel:
+def fit_gp(
+    readings: Readings,
+    *,
+    kernel: Kernel = "poisson",
+    like: GpModel | None = None,
+    steps: int | None = None,
+    progress: Progress | None = None,
+) -> GpModel:
     """Condition a Gaussian process on the good readings, with the likeliest hyperparameters.
 
     Recorded headings are used. More than `MOST` readings, and those of a drive, are averaged per run, cell
@@ -84,6 +118,9 @@ def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress
     Args:
         readings: A survey.
         kernel: Function of distance (`Covariance`).
+        like: A fit with the same kernel to other readings of the same survey. The optimisation starts from
+            its hyperparameters, which saves the starts.
+        steps: Most steps of the optimisation. Default: `STEPS`, or `RESUMED_STEPS` from an earlier fit.
         progress: Called as progress(done, total, what).
 
     Raises:
@@ -104,7 +141,9 @@ def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress
     spacing = spacing_m(readings)
     covariance = Covariance(kernel, 3 if turned else 1, several, *_patches(bins.p_xy, spacing))
     order = np.random.default_rng(0).permutation(len(b))  # a fixed draw: which rows are learnt from
-    figures = _learn(covariance, bins, b, order, spacing, lambda done, what: say(done, total, what))
+    figures = _learn(
+        covariance, bins, b, order, spacing, like, steps, lambda done, what: say(done, total, what)
+    )
     say(total - 2, total, "conditioning")
     lower = _factor(covariance, figures, bins)
     from scipy.linalg import cho_solve
@@ -124,6 +163,7 @@ def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress
         lower=lower,
         alpha=alpha,
         missed=missed,
+        spacing_m=spacing,
     )
 
 
@@ -150,12 +190,19 @@ def _patches(p_xy: Array, spacing: float) -> tuple[Array, float]:
 
 
 def _learn(
-    covariance: Covariance, bins: Bins, b: Array, order: Rows, least_m: float, say: Callable[[int, str], Any]
+    covariance: Covariance,
+    bins: Bins,
+    b: Array,
+    order: Rows,
+    least_m: float,
+    like: GpModel | None,
+    steps: int | None,
+    say: Callable[[int, str], Any],
 ) -> Array:
     """The likeliest hyperparameters: the best of several starts on few readings, then on more.
 
-    The starts have one strength everywhere. No reach is below the readings' spacing: such a part would be
-    noise.
+    An earlier fit with as many hyperparameters is the only start. The others have one strength everywhere. No
+    reach is below the readings' spacing: such a part would be noise.
     """
     from scipy.optimize import minimize
 
@@ -168,24 +215,37 @@ def _learn(
     even = bounds.copy()
     even[covariance.of_patches] = [(0.0, 0.0)] * len(covariance.patches)
 
-    def descend(start: Array, rows: Rows, steps: int, bounds: Any) -> tuple[float, Array]:
+    def descend(start: Array, rows: Rows, steps: int, bounds: Any, turn: int) -> tuple[float, Array]:
         data = (bins.p_xy[rows], bins.yaw[rows], bins.run[rows], b[rows])
-        begin, options = np.maximum(start, least), {"maxiter": steps}
         result = minimize(
-            covariance.loss, begin, (guess, *data), "L-BFGS-B", jac=True, bounds=bounds, options=options
+            covariance.loss,
+            np.maximum(start, least),
+            (guess, *data),
+            "L-BFGS-B",
+            jac=True,
+            bounds=bounds,
+            options={"maxiter": steps},
+            callback=lambda _: say(turn, "learning"),
         )
         return float(result.fun), np.asarray(result.x)
 
-    tried = np.sort(order[:MOST_TRIED])
-    starts = []
-    for k, factor in enumerate(STARTS):
-        say(k, "starts")
-        start = guess.copy()
-        start[h : 2 * h] += np.log(factor)
-        starts.append(descend(start, tried, STEPS // 2, even))
-    best = min(starts, key=lambda start: start[0])[1]
+    if (
+        like is not None
+        and like.covariance.size == covariance.size
+        and like.covariance.runs == covariance.runs
+    ):
+        best, most = like.figures, RESUMED_STEPS
+    else:
+        tried = np.sort(order[:MOST_TRIED])
+        starts = []
+        for k, factor in enumerate(STARTS):
+            say(k, "starts")
+            start = guess.copy()
+            start[h : 2 * h] += np.log(factor)
+            starts.append(descend(start, tried, START_STEPS, even, k))
+        best, most = min(starts, key=lambda start: start[0])[1], STEPS
     say(len(STARTS), "figures")
-    return descend(best, np.sort(order[:MOST_LEARNT]), STEPS, bounds)[1]
+    return descend(best, np.sort(order[:MOST_LEARNT]), steps or most, bounds, len(STARTS))[1]
 
 
 def _guess(covariance: Covariance, bins: Bins, b: Array) -> Array:

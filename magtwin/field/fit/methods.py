@@ -25,9 +25,10 @@ Array = NDArray[np.float64]
 
 
 class FieldModel(Protocol):
-    """A fit's total field over a floor, and how certain it is. It may have two more members.
+    """A fit's total field over a floor, and how certain it is. It may have three more members.
 
     `predict_nodes(p_xy, yaw)`, with the arguments and results of `predict`, is used for the nodes of a map.
+    `predict_values(p_xy, yaw)`, the field of `predict` alone, is used where no variance is needed.
     `field`, a `HarmonicField`, becomes the map's.
     """
 
@@ -95,6 +96,12 @@ class FittedModel(Summarized):
             ("parameter", "value"),
             [(name, str(value)) for name, value in self.parameters.items()],
         )
+
+
+def values_of(model: FieldModel, p_xy: ArrayLike, yaw: ArrayLike) -> Array:
+    """Field at poses [nT], without its variance where the model can leave that out."""
+    fast = getattr(model, "predict_values", None)
+    return np.asarray(model.predict(p_xy, yaw)[0] if fast is None else fast(p_xy, yaw))
 
 
 def flat_poses(p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:

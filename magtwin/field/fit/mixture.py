@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.field.fit.methods import FieldModel, FittedModel
+from magtwin.field.fit.methods import FieldModel, FittedModel, values_of
 
 Array = NDArray[np.float64]
 
@@ -65,6 +65,11 @@ class Mixture(FittedModel):
     def predict_nodes(self, p_xy: Array, yaw: float) -> tuple[Array, Array]:
         """`predict` on evenly spaced nodes at one heading, shape (Y, X, 2)."""
         return self._mixed([getattr(m, "predict_nodes", m.predict)(p_xy, yaw) for m in self.models])
+
+    def predict_values(self, p_xy: ArrayLike, yaw: ArrayLike) -> Array:
+        """The field of `predict` alone [nT]."""
+        values = (values_of(model, p_xy, yaw) for model in self.models)
+        return np.asarray(sum(w * value for w, value in zip(self.weights, values, strict=True)))
 
     def _mixed(self, predicted: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
         return mixed(self.weights, [value for value, _ in predicted], [variance for _, variance in predicted])

@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.field.fit.methods import FieldModel
+from magtwin.field.fit.methods import FieldModel, values_of
 from magtwin.field.grid import TURN
 from magtwin.field.survey.bins import spacing_m
 from magtwin.field.survey.readings import Readings
@@ -63,7 +63,7 @@ def resolution(
         mixed = np.zeros(len(p))
         for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
             weight = np.abs(1 - i - part[:, 0]) * np.abs(1 - j - part[:, 1])
-            mixed += weight * model.predict(corner + step * np.array([i, j]), yaw)[0]
+            mixed += weight * values_of(model, corner + step * np.array([i, j]), yaw)
         return _rms(mixed - value)
 
     def between_headings(headings: Array) -> float:
@@ -73,7 +73,7 @@ def resolution(
         low = turned.argmin(axis=1)
         high = (low + 1) % len(headings)
         weight = turned.min(axis=1) / np.mod(headings[high] - headings[low] - 1e-12, TURN)
-        below, above = (model.predict(p, headings[k])[0] for k in (low, high))
+        below, above = (values_of(model, p, headings[k]) for k in (low, high))
         return _rms(below + weight * (above - below) - value)
 
     if spacing is None:

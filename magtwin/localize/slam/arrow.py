@@ -13,10 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, cholesky
+from scipy.linalg.blas import dsyrk
 
 from magtwin.compiled import Loops
 
 Array = NDArray[np.float64]
+
+
+def gram(flat: Array) -> Array:
+    """flat' flat of a contiguous array, by half the products."""
+    upper = dsyrk(1.0, flat.T)
+    return np.asarray(np.triu(upper) + np.triu(upper, 1).T)
+
 
 LOOPS = Loops("magtwin.localize.slam.arrow_loops", pays=0)
 """Compiled loops; plain Python would take seconds for each system."""
@@ -51,7 +59,7 @@ class Arrow:
         if code.eliminate(self.diagonal, self.below, self.border) >= 0:
             raise np.linalg.LinAlgError("the block of a pose is not positive definite")
         flat = self.border.reshape(-1, self.border.shape[2])
-        square = flat.T @ flat
+        square = gram(flat)
         factor = cholesky(self.corner - square[:-1, :-1], lower=True, check_finite=False)
         g = cho_solve((factor, True), self.right - square[:-1, -1], check_finite=False)
         x = (self.border[:, :, -1] - self.border[:, :, :-1] @ g)[..., None]

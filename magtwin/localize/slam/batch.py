@@ -9,12 +9,13 @@ with the functions of `magtwin.localize.slam.model`. Every iteration relinearise
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.localize.slam.arrow import Arrow, Solution
+from magtwin.localize.slam.arrow import Arrow, Solution, gram
 from magtwin.localize.slam.model import Model, State, cross
 from magtwin.localize.slam.samples import Samples
 
@@ -22,6 +23,12 @@ Array = NDArray[np.float64]
 
 HALVINGS = 6
 """Times that a step is halved before the iteration ends."""
+
+FAR = ((10.0, 4), (5.0, 4), (3.0, 3), (2.0, 3), (1.4, 3))
+"""Noise and iterations from dead reckoning, which may be far off."""
+
+NEAR = ((3.0, 4), (2.0, 3), (1.4, 3))
+"""Noise and iterations from a trajectory that is about right."""
 
 DONE = 1e-3
 """Fall of the cost at which iterations end."""
@@ -86,7 +93,7 @@ class Batch:
 
     def residuals(self, state: State) -> Residuals:
         """Residuals of a trajectory."""
-        expected = self.model.measure(state)[0]
+        expected = self.model.expected(state)
         moved = self.model.move(_rows(state, slice(0, -1)), self._steps)[0]
         return self._residuals(state, moved, expected)
 
@@ -116,7 +123,7 @@ class Batch:
         np.matmul(ht, hg, out=border[:, :, :-1])
         border[:, :, -1] = (ht @ r.readings[..., None])[..., 0]
         flat = hg.reshape(-1, constants)
-        corner = flat.T @ flat
+        corner = gram(flat)
         right = flat.T @ r.readings.ravel()
         corner[range(constants), range(constants)] += self._root_constants**2
         right -= self._root_constants * r.constants
@@ -166,17 +173,18 @@ class Batch:
         Returns:
             The state and its cost.
         """
-        cost = math.nan
+        state, cost, _ = self.solved(state, most)
+        return state, cost
+
+    def solved(self, state: State, most: int) -> tuple[State, float, Solution]:
+        """As `iterate`, with the linear system of the last iteration."""
         for _ in range(most):
             arrow, r = self.linearised(state)
             step = arrow.solve()
-            cost = r.cost
-            state, lower = self._shortened(state, step, cost)
-            done = cost - lower < DONE
-            cost = lower
-            if done:
+            state, cost = self._shortened(state, step, r.cost)
+            if r.cost - cost < DONE:
                 break
-        return state, cost
+        return state, cost, step
 
     def _shortened(self, state: State, step: Solution, cost: float) -> tuple[State, float]:
         share = 1.0
@@ -196,6 +204,23 @@ class Batch:
         arrow, _ = self.linearised(state)
         g = np.linalg.solve(arrow.corner, arrow.right)
         return state._replace(g=state.g + g)
+
+    def annealed(self, state: State, levels: Sequence[tuple[float, int]]) -> tuple[State, float]:
+        """Iterations at falling noise, which makes wide basins of what are narrow ones at the true noise.
+
+        Args:
+            state: Start. Its constants are fitted to its poses first.
+            levels: Factors on the standard deviation of readings, and most iterations at each.
+
+        Returns:
+            The state and its cost at the last level.
+        """
+        self.set_noise(levels[0][0])
+        state, cost = self.fit_constants(state), math.inf
+        for factor, most in levels:
+            self.set_noise(factor)
+            state, cost = self.iterate(state, most)
+        return state, cost
 
     def posterior(self, state: State) -> tuple[Solution, float]:
         """Linearisation at a state: covariances, and the Laplace approximation of -log p(y).

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.localize.localizers import localizer
 from magtwin.localize.problem import Estimate, Problem, Reading
 from magtwin.localize.slam.model import Model
 from magtwin.localize.slam.samples import Samples, followed_by, is_vector, samples_of
@@ -14,7 +13,6 @@ from magtwin.localize.slam.settings import Settings
 Array = NDArray[np.float64]
 
 
-@localizer("ekf-slam")
 @dataclass(kw_only=True)
 class EkfSlam(Settings):
     """Extended Kalman filter over the robot's state and the constants of `magtwin.localize.slam.model`.

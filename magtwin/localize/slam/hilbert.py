@@ -19,10 +19,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.compiled import Loops
 from magtwin.errors import InputError
 
 Array = NDArray[np.float64]
 Kernel = Literal["se", "matern32", "matern52"]
+
+LOOPS = Loops("magtwin.localize.slam.hilbert_loops", pays=0)
+"""Compiled loops: a solution takes a quarter of the time of that with numpy."""
 
 SMOOTHNESS = {"se": math.inf, "matern32": 1.5, "matern52": 2.5}
 """Smoothness nu of each kernel; the squared exponential is the limit of the Matern kernels."""
@@ -135,6 +139,20 @@ class Basis:
                 mixed = np.prod([cosines[..., c] if c in (a, b) else sines[..., c] for c in axes], axis=0)
                 out[..., a, b] = out[..., b, a] = mixed @ w
         return out
+
+    def slopes(self, p: Array, weights: Array) -> Array:
+        """Gradient of sum_j weights_j phi_j in space, compiled; shape (N, 3)."""
+        slope = np.empty(p.shape)
+        none = np.empty((0, 3, self.count)), np.empty((0, 3, 3))
+        LOOPS.open().potential(p, self.low, self.sides, self.order, weights, none[0], slope, none[1])
+        return slope
+
+    def derivatives(self, p: Array, weights: Array) -> tuple[Array, Array, Array]:
+        """`gradients`, `slopes` and `hessians` in space, compiled; shapes (N, 3, M), (N, 3) and (N, 3, 3)."""
+        gradients, hessian = np.empty((len(p), 3, self.count)), np.empty((len(p), 3, 3))
+        slope = np.empty(p.shape)
+        LOOPS.open().potential(p, self.low, self.sides, self.order, weights, gradients, slope, hessian)
+        return gradients, slope, hessian
 
     def variances(self, kernel: Kernel, *, sd: float, length_m: float) -> Array:
         """Prior variances of the weights for a kernel, shape (M,)."""

@@ -235,34 +235,47 @@ class Model:
         """
         return self._three_axes(state) if self.vector else self._magnitude(state)
 
+    def expected(self, state: State) -> Array:
+        """Expected readings [nT], shape (N, m)."""
+        if not self.vector:
+            return self._magnitude(state)[0]
+        f = self.basis.slopes(state.p + state.R @ self.lever, state.g[self.layout.weights])
+        f += state.g[self.layout.uniform]
+        return self._sensed((f[:, None] @ state.R)[:, 0], state)
+
+    def _sensed(self, b: Array, state: State) -> Array:
+        """What the magnetometer makes of the field in the robot's axes, shape (N, 3)."""
+        layout, y = self.layout, b
+        if layout.soft.stop > layout.soft.start:
+            y = y + b @ state.g[layout.soft].reshape(3, 3).T
+        if layout.offset.stop > layout.offset.start:
+            y = y + state.g[layout.offset]
+        return y + state.drift if self.drifts else y
+
     def _three_axes(self, state: State) -> tuple[Array, Array, Array]:
         layout, count = self.layout, len(state.p)
         weights = state.g[layout.weights]
         arm = state.R @ self.lever
         q = state.p + arm
-        gradients = self.basis.gradients(q)
-        hessian = self.basis.hessians(q, weights)
-        f = gradients @ weights + state.g[layout.uniform]
+        gradients, slope, hessian = self.basis.derivatives(q, weights)
+        f = slope + state.g[layout.uniform]
         into = state.R.transpose(0, 2, 1)
         b = (into @ f[..., None])[..., 0]
-        y = b
+        y = self._sensed(b, state)
         has_soft = layout.soft.stop > layout.soft.start
         if has_soft:
-            mix = np.eye(3) + state.g[layout.soft].reshape(3, 3)
-            into, y = mix @ into, b @ mix.T
+            into = (np.eye(3) + state.g[layout.soft].reshape(3, 3)) @ into
         by_state = np.zeros((count, 3, self.size))
         by_state[:, :, :3] = into @ hessian
         by_state[:, :, 3:6] = into @ cross(f) - by_state[:, :, :3] @ cross(arm)
         by_constants = np.zeros((count, 3, layout.count))
         if layout.offset.stop > layout.offset.start:
-            y = y + state.g[layout.offset]
             by_constants[:, :, layout.offset] = np.eye(3)
         if has_soft:
             for row in range(3):
                 start = layout.soft.start + 3 * row
                 by_constants[:, row, start : start + 3] = b
         if self.drifts:
-            y = y + state.drift
             by_state[:, :, 6:] = np.eye(3)
         by_constants[:, :, layout.uniform] = into
         np.matmul(into, gradients, out=by_constants[:, :, layout.weights])

@@ -15,8 +15,9 @@ moments have normal priors, so the field is a Gaussian process with curl- and di
   width of intervals is learnt from positions left out in turn, and between headings that are far apart from
   headings left out in turn, since a platform is more than iron.
 
-The magnitude is not linear in the field. Gauss-Newton steps, halved until the posterior grows, solve it. Each
-needs one factorisation, of a matrix as large as the number of readings or of unknowns, whichever is smaller.
+The magnitude is not linear in the field. Gauss-Newton steps, halved until the posterior grows, solve it. A
+round of learning is one such step and one of the hyperparameters. It needs one factorisation, of a matrix as
+large as the number of readings or of unknowns, whichever is smaller.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,20 +27,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.field.fit.harmonic.layers import ladders, layers_below
+from magtwin.field.fit.harmonic.layers import Layers, ladders, layers_below
 from magtwin.field.fit.harmonic.model import HarmonicModel
-from magtwin.field.fit.harmonic.problem import Platform, Problem
+from magtwin.field.fit.harmonic.problem import Hyperparameters, Platform, Problem
 from magtwin.field.fit.harmonic.solution import Solution
 from magtwin.field.survey.readings import Readings, checked_earth_nt
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], Any]
+Known = tuple[Layers, Hyperparameters, Array]  # An earlier fit: its layers, hyperparameters and unknowns
 
 LEAST_READINGS = 8
 ROUNDS = 30  # Most rounds of learning
 LAYERWISE = 4  # First rounds, in which a layer has one strength
 # Change of the logarithms of hyperparameters in a round (of strengths, in the mean) at which learning ends
 STILL = 0.03
+# Gain of the log evidence in a round below which learning from an earlier fit ends: less is no strong
+# evidence (Kass & Raftery 1995: a Bayes factor of 20)
+GAIN = 3.0
 
 
 def fit_harmonic(
@@ -50,6 +55,8 @@ def fit_harmonic(
     soft_iron: ArrayLike | None = None,
     above: bool | None = None,
     most_dipoles: int | None = None,
+    like: HarmonicModel | None = None,
+    gain: float | None = None,
     progress: Progress | None = None,
 ) -> HarmonicModel:
     """Fit a field without curl or divergence, and the platform, to a survey.
@@ -81,6 +88,9 @@ def fit_harmonic(
         above: Whether a layer of dipoles lies above the sensor. Default: if the evidence is for it.
         most_dipoles: Most dipoles. Default: 500 for the magnitudes of a drive, 1,500 otherwise, or 800 if
             there are many readings.
+        like: A fit to other readings of the same survey. Learning starts from it, which saves most rounds.
+        gain: Gain of the log evidence in a round below which learning ends. Default: it ends when the
+            hyperparameters hardly change, or at `GAIN` from an earlier fit.
         progress: Called as progress(done, total, what), once per round.
 
     Raises:
@@ -97,11 +107,13 @@ def fit_harmonic(
     earth = readings.earth_nt if earth_nt is None else checked_earth_nt(earth_nt)
     platform = _platform(hard_iron_nt, soft_iron)
     tries = [d for d in ladders(good, height) if above is None or above == (min(d) < 0)]
-    fits: list[Solution] = []
+    known = None if like is None else (like.layers, like.figures, like.unknowns)
+    least = GAIN if gain is None and like is not None else gain
+    fits = list[Solution]()
     for k, depths in enumerate(tries):
         problem = Problem.of(good, layers_below(good, depths, height, most_dipoles), height, earth, platform)
         begins = [fits[0].uniform] if fits else problem.begins
-        fits.append(_solve(problem, begins, progress, k, len(tries)))
+        fits.append(_solve(problem, known or begins, least, progress, k, len(tries)))
     return max(fits, key=Solution.evidence).model(good)
 
 
@@ -123,9 +135,18 @@ def _platform(hard_iron_nt: ArrayLike | None, soft_iron: ArrayLike | None) -> Pl
 
 
 def _solve(
-    problem: Problem, begins: list[Array], progress: Progress | None, turn: int, turns: int
+    problem: Problem,
+    begin: list[Array] | Known,
+    gain: float | None,
+    progress: Progress | None,
+    turn: int,
+    turns: int,
 ) -> Solution:
-    """Fit from each uniform field of `begins`, continue from the likeliest, and learn the hyperparameters."""
+    """Fit from each of several uniform fields, continue from the likeliest, and learn the hyperparameters.
+
+    With an earlier fit to begin with, continue from that.
+    """
+    begins, like = (begin, None) if isinstance(begin, list) else ([], begin)
     tried = len(begins) if len(begins) > 1 else 0
     total = tried * (1 + LAYERWISE) + ROUNDS
 
@@ -139,15 +160,24 @@ def _solve(
         solution = Solution.start(problem, problem.first(), uniform)
         for step in range(LAYERWISE if tried else 0):
             report(k * (1 + LAYERWISE) + step + 1)
-            solution = solution.learnt(None).step()
+            solution = solution.learnt(None)
         begun.append(solution)
-    solution = max(begun, key=Solution.evidence) if tried else begun[0]
-    shares = problem.layers.shares()
+    if like is not None:
+        solution = Solution.resumed(problem, *like)
+    else:
+        solution = max(begun, key=Solution.evidence) if tried else begun[0]
+    shares, evidence = problem.layers.shares(), -np.inf
+    layerwise = LAYERWISE if like is None else 0
     for done in range(ROUNDS):
         report(total - ROUNDS + done)
-        before = solution.figures
-        solution = solution.learnt(shares if done >= LAYERWISE else None).step()
-        if done > LAYERWISE and solution.figures.change(before) < STILL:
+        old, before = solution.figures, evidence
+        solution = solution.learnt(shares if done >= layerwise else None)
+        if gain is not None:
+            evidence = solution.evidence()
+            still = evidence - before < gain
+        else:
+            still = solution.figures.change(old) < STILL
+        if done > layerwise and still:
             break
     solution = solution.settle()
     report(total)

@@ -1,6 +1,6 @@
 """Solution of a harmonic fit: Gauss-Newton steps, learning of hyperparameters, and the resulting model."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.field.fit.harmonic.forward import SOFT, Reading
+from magtwin.field.fit.harmonic.layers import Layers
 from magtwin.field.fit.harmonic.model import HarmonicModel, between, surveyed, widened
 from magtwin.field.fit.harmonic.posterior import Posterior
 from magtwin.field.fit.harmonic.problem import Hyperparameters, Problem
@@ -42,13 +43,45 @@ class Solution:
         unknowns = problem.mean.copy()
         count = 3 * len(figures.strength)
         unknowns[count : count + 3] = uniform
-        state = cls(problem, figures, unknowns, problem.at(unknowns))
-        off = problem.read_nt - state.reading.values_nt
-        coarse = np.full(off.shape, max(float(np.mean(off**2)) / 100, figures.noise_nt**2))
-        state = state._moved(state._towards(1 / coarse), 1.0)
+        state = cls(problem, figures, unknowns, problem.at(unknowns))._coarse()
         for _ in range(FIRST_STEPS):
             state = state.step()
         return state
+
+    @classmethod
+    def resumed(
+        cls, problem: Problem, known: Layers, figures: Hyperparameters, unknowns: Array
+    ) -> "Solution":
+        """Start from a fit to other readings of the survey, or with fewer layers.
+
+        Dipoles take the strength per area of the nearest one of their layer. Moments are kept if the layers
+        are the same.
+        """
+        from scipy.spatial import cKDTree
+
+        layers, strength = problem.layers, problem.first().strength.copy()
+        moments, old_moments = np.zeros((len(strength), 3)), unknowns[: 3 * len(known.layer)].reshape(-1, 3)
+        same = True
+        for k in range(min(len(layers.depths), len(known.depths))):
+            own, old = np.flatnonzero(layers.layer == k), np.flatnonzero(known.layer == k)
+            p, q = layers.p_world_dipole[own], known.p_world_dipole[old]
+            nearest = old[cKDTree(q[:, :2]).query(p[:, :2])[1]]
+            strength[own] = figures.strength[nearest] * np.sqrt(layers.area_m2[own] / known.area_m2[nearest])
+            same = same and p.shape == q.shape and np.allclose(p, q)
+            if same:
+                moments[own] = old_moments[old]
+        rest = unknowns[3 * len(known.layer) :]
+        rest = np.where(problem.rest_sd > 0, rest, problem.mean[moments.size :])
+        unknowns = np.append(moments if same else np.zeros_like(moments), rest)
+        figures = replace(figures, strength=strength)
+        state = cls(problem, figures, unknowns, problem.at(unknowns))
+        return state.step() if same else state._coarse().step()
+
+    def _coarse(self) -> "Solution":
+        """A step that weights all readings equally and weakly."""
+        off = self.off
+        coarse = np.full(off.shape, max(float(np.mean(off**2)) / 100, self.figures.noise_nt**2))
+        return self._moved(self._towards(self._posterior(1 / coarse), 1 / coarse), 1.0)
 
     @property
     def uniform(self) -> Array:
@@ -71,7 +104,7 @@ class Solution:
         """Squared scales of the readings [nT^2], (N, C)."""
         return self.figures.variance(self.reading)
 
-    @property
+    @cached_property
     def precision(self) -> Array:
         """Precisions of the readings [1/nT^2], (N, C)."""
         return np.asarray(self.weights(self.variance)[:, None] / self.variance)
@@ -88,19 +121,23 @@ class Solution:
         moved = self._scaled()
         return float((freedom + parts) / 2 * surprise.sum() + moved @ moved / 2)
 
-    def posterior(self, precision: Array) -> Posterior:
-        """Posterior of the unknowns, in units of their priors, for reading precisions (N, C)."""
+    @cached_property
+    def posterior(self) -> Posterior:
+        """Posterior of the unknowns, in units of their priors, linearised here."""
+        return self._posterior(self.precision)
+
+    def _posterior(self, precision: Array) -> Posterior:
         rows = self.reading.jacobian.reshape(-1, self.reading.jacobian.shape[-1]) * self.prior_sd
-        return Posterior.of(rows * np.sqrt(precision).reshape(-1, 1))
+        rows *= np.sqrt(precision).reshape(-1, 1)
+        return Posterior.of(rows)
 
     def _scaled(self) -> Array:
         """Unknowns minus their priors' means, in prior standard deviations; 0 for fixed ones."""
         sd = self.prior_sd
         return np.divide(self.unknowns - self.problem.mean, sd, out=np.zeros_like(sd), where=sd > 0)
 
-    def _towards(self, precision: Array) -> Array:
+    def _towards(self, posterior: Posterior, precision: Array) -> Array:
         """Unknowns that solve the linearised problem."""
-        posterior = self.posterior(precision)
         best = posterior.mean(self._target(posterior, precision))
         return np.asarray(self.problem.mean + self.prior_sd * best)
 
@@ -113,7 +150,7 @@ class Solution:
         return Solution(self.problem, self.figures, unknowns, self.problem.at(unknowns))
 
     def _stepped(self) -> tuple["Solution", float]:
-        towards = self._towards(self.precision)
+        towards = self._towards(self.posterior, self.precision)
         before, part = self.objective(self.variance), 1.0
         while part > 0.05:
             after = self._moved(towards, part)
@@ -137,16 +174,19 @@ class Solution:
         return state
 
     def learnt(self, shares: list[Array] | None) -> "Solution":
-        """The same unknowns with more likely hyperparameters."""
+        """One Gauss-Newton step, and hyperparameters that are more likely after it.
+
+        The step and the learning share one factorisation, that of the problem linearised before the step.
+        """
         from scipy.special import gammaln, psi
 
-        figures, layers, variance = self.figures, self.problem.layers, self.variance
-        weights, precision = self.weights(variance), self.precision
-        posterior = self.posterior(precision)
+        after, posterior = self.step(), self.posterior
+        figures, layers, variance = self.figures, self.problem.layers, after.variance
+        weights = after.weights(variance)
         count = len(figures.strength)
         known = posterior.known()[: 3 * count].reshape(count, 3).mean(axis=1)
         known = np.clip(known, 1e-9, 1)
-        square = np.mean(self.unknowns[: 3 * count].reshape(count, 3) ** 2, axis=1) / layers.area_m2
+        square = np.mean(after.unknowns[: 3 * count].reshape(count, 3) ** 2, axis=1) / layers.area_m2
         density = figures.strength**2 / layers.area_m2
         new = np.empty(count)
         for k in range(len(layers.depths)):
@@ -157,9 +197,9 @@ class Solution:
                 drawn = DRAWN * shares[k].sum(axis=1).mean() * known[own].mean()
                 new[own] = (shares[k] @ square[own] + drawn * whole) / (shares[k] @ known[own] + drawn)
         new = np.clip(new, 0.3 * density, 3 * density)
-        left = posterior.fitted().reshape(variance.shape) / precision
-        size = (self.off**2 + left) * weights[:, None] / variance
-        share = figures.terms(self.reading) / variance[..., None]
+        left = posterior.fitted().reshape(variance.shape) / self.precision
+        size = (after.off**2 + left) * weights[:, None] / variance
+        share = figures.terms(after.reading) / variance[..., None]
         whole_share = np.maximum(np.sum(share, axis=(0, 1)), np.finfo(float).tiny)  # 0 for what is held at 0
         scale = np.sqrt(np.sum(share * size[..., None], axis=(0, 1)) / whole_share)
         parts = variance.shape[1]
@@ -174,7 +214,7 @@ class Solution:
             freedom=freedom,
             strength=np.sqrt(new * layers.area_m2),
         )
-        return Solution(self.problem, learnt, self.unknowns, self.reading)
+        return Solution(self.problem, learnt, after.unknowns, after.reading)
 
     def evidence(self) -> float:
         """Log evidence by Laplace's approximation (Rasmussen & Williams 2006, eq. 3.32)."""
@@ -184,12 +224,12 @@ class Solution:
         freedom, parts = self.figures.freedom, variance.shape[1]
         constant = gammaln((freedom + parts) / 2) - gammaln(freedom / 2) - parts / 2 * np.log(freedom * np.pi)
         fit = len(variance) * constant - np.log(variance).sum() / 2 - self.objective(variance)
-        return float(fit - self.posterior(self.precision).half_log_det())
+        return float(fit - self.posterior.half_log_det())
 
     def model(self, good: Readings) -> HarmonicModel:
         """The fitted model."""
         figures, problem, precision = self.figures, self.problem, self.precision
-        posterior = self.posterior(precision)
+        posterior = self.posterior
         learnt, (louder, width) = posterior.directions(), self._calibrated(posterior, precision)
         headings, turned = self._turned(posterior, precision)
         field = problem.forward.field(self.unknowns)
@@ -211,6 +251,7 @@ class Solution:
             noise_nt2=noise,
             figures=figures,
             forward=problem.forward,
+            layers=problem.layers,
             unknowns=self.unknowns,
             prior_sd=self.prior_sd,
             learnt=learnt,
