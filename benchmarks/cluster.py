@@ -1,8 +1,8 @@
 """How a benchmark scales with jobs on this machine, against one job.
 
 Printed for 1, 2, 4, ... jobs up to the number of processors: elapsed time and processor time of the workers,
-both relative to one job, and the largest memory of a worker. On a machine that has other work, only the processor
-times mean anything. At last the cost of a chunk that does nothing.
+both relative to one job, and the largest memory of a worker. On a machine that has other work, only the
+processor times mean anything. At last the cost of a chunk that does nothing.
 
     python benchmarks/cluster.py [runs per scenario]
 """
