@@ -241,6 +241,4 @@ def _readings(t: Array, p: Array, q: Array, y_nt: Array) -> Run:
 
 def _truth(t: Array, p: Array, q: Array) -> Run:
     R = Rotation.from_quat(q).as_matrix()
-    return Run(
-        {"t": t, "p_world_base": p, "q_world_base_xyzw": q, "yaw": np.arctan2(R[:, 1, 0], R[:, 0, 0])}
-    )
+    return Run({"t": t, "p_world_base": p, "q_world_base_xyzw": q, "yaw": np.arctan2(R[:, 1, 0], R[:, 0, 0])})

@@ -22,6 +22,13 @@ descend from a single one and share its estimate of the constants, whose error t
 WALK_S = 500.0
 """The same where they are sampled, whose values would run out [s]."""
 
+KEEP_S = 5.0
+"""Time between two memories of the constants, for a start after a kidnapping [s]. The last but one is used:
+what was learned after the kidnapping is wrong."""
+
+INFLATE = 4.0
+"""Factor of their covariance then."""
+
 SETTLED_M = 0.5
 """Spread of the particles, sqrt(var x + var y), below which the pose counts as known [m]."""
 
@@ -50,9 +57,10 @@ class RaoBlackwell:
     * Map error: the share `map_correlated` of the map's variance is the FOGM state of length
       `Problem.map_length_m`, the rest is white.
     * Where the map is unknown, a reading has the mean and the variance of the whole map.
-    * Kidnapping: a cumulative sum of surprise, c = max(0, c + ref - log p - 1.5), with p the
-      likelihood of a reading and ref the mean log likelihood of a Gaussian with the variance of the readings
-      that the particles predict. Above 12, the filter starts again over the whole floor.
+    * Kidnapping: a cumulative sum of surprise, c = max(0, c + ref - log p - 1.5), with p the likelihood of a
+      reading and ref the mean log likelihood of a Gaussian with the variance of the readings that the
+      particles predict. Above 12, the filter starts again over the whole floor, half of the particles with
+      the offset and hard iron that were known 5 to 10 s before.
     * A reading that repeats itself to the bit while the robot moves is not used, nor is nan.
 
     `lost` is set while the particles spread over more than 0.5 m.
@@ -146,10 +154,19 @@ class RaoBlackwell:
         self._prior_variances = np.array(variances, float)
         self._rates = 1 / np.array(times), 1 / np.array(lengths)
         self._kinds = np.array(kinds, np.int64)
+        self._constant = np.isin(times, (FORGET_S, WALK_S)) & np.isinf(lengths)
         self._numbers_map_white = 1 - correlated
 
-    def _start(self, mean: tuple[float, float, float], sd: tuple[float, float, float]) -> None:
-        """Draw all particles: Gaussian, and R3 where the standard deviation is infinite."""
+    def _start(
+        self,
+        mean: tuple[float, float, float],
+        sd: tuple[float, float, float],
+        errors: tuple[Array, Array] | None = None,
+    ) -> None:
+        """Draw all particles: Gaussian, and R3 where the standard deviation is infinite.
+
+        Every other particle gets the mean and covariance `errors` of the constants, the rest their prior.
+        """
         x0, x1, y0, y1 = self._problem.extent
         wide = [math.sqrt(2 * math.pi * math.e) * s for s in sd]  # side of the uniform of the same entropy
         area = (x1 - x0) * (y1 - y0) if math.isinf(sd[0]) else wide[0] * wide[1]
@@ -172,11 +189,12 @@ class RaoBlackwell:
                 state[row] = mean[row] + sd[row] * normal[row]
         state[k.SCALE : k.LINEAR] = 0.0
         state[k.LINEAR :] = 0.0
-        for i, variance in enumerate(self._prior_variances):
-            if self.sampled:
-                state[k.LINEAR + i] = math.sqrt(variance) * self._rng.standard_normal(count)
-            else:
-                state[k.LINEAR + size + i * (i + 1) // 2 + i] = variance
+        self._draw_errors(state, slice(None), np.zeros(size), np.diag(self._prior_variances))
+        if errors is not None:
+            known, covariance = np.zeros(size), np.diag(self._prior_variances)
+            known[self._constant] = errors[0]
+            covariance[np.ix_(self._constant, self._constant)] = errors[1]
+            self._draw_errors(state, slice(None, None, 2), known, covariance)
         self._scale_variance = self._problem.odometry.scale_std**2
         self._shift = math.log(count)
         self._scales = np.full(_blocks(count), 1.0 / count)
@@ -185,6 +203,34 @@ class RaoBlackwell:
             (middle[0], middle[1], mean[2]) if math.isinf(sd[0]) else (mean[0], mean[1], mean[2])
         )
         self._surprise, self._settled = 0.0, False
+        self._kept: list[tuple[Array, Array]] = []
+        self._kept_t = -math.inf
+
+    def _draw_errors(self, state: Array, part: slice, mean: Array, covariance: Array) -> None:
+        """Give some particles a mean and a covariance of the linear states, or draws of them."""
+        k, size = self._loops, len(mean)
+        means, triangle = state[k.LINEAR : k.LINEAR + size, part], state[k.LINEAR + size :, part]
+        if self.sampled:
+            root = np.linalg.cholesky(covariance + 1e-12 * np.eye(size))
+            means[:] = mean[:, None] + root @ self._rng.standard_normal(means.shape)
+        else:
+            means[:] = mean[:, None]
+            triangle[:] = covariance[np.tril_indices(size)][:, None]
+
+    def _errors(self) -> tuple[Array, Array]:
+        """Mean and covariance of the constants: offset and hard iron."""
+        k, count, size = self._loops, self._count, len(self._kinds)
+        w = self._state[k.WEIGHT, :count] * np.repeat(self._scales, k.BLOCK)[:count]
+        rows = np.flatnonzero(self._constant)
+        means = self._state[k.LINEAR + rows, :count]
+        mean = means @ w
+        covariance = (w * (means - mean[:, None])) @ (means - mean[:, None]).T
+        for i, high in enumerate(rows.tolist()):
+            for j, low in enumerate(rows[: i + 1].tolist()):
+                inner = float(self._state[k.LINEAR + size + high * (high + 1) // 2 + low, :count] @ w)
+                covariance[i, j] += inner
+                covariance[j, i] = covariance[i, j]
+        return mean, covariance
 
     def step(self, reading: Reading) -> Estimate:
         """Move the particles, weigh them by the reading, and resample if need be."""
@@ -293,8 +339,11 @@ class RaoBlackwell:
         """Resample, shrink, or start again."""
         if self.resets and self._surprise > RESET_ABOVE:
             self.reset_count += 1
-            self._start((0.0, 0.0, 0.0), (math.inf, math.inf, math.inf))
+            errors = None if len(self._kept) < 2 else (self._kept[0][0], INFLATE * self._kept[0][1])
+            self._start((0.0, 0.0, 0.0), (math.inf, math.inf, math.inf), errors)
             return
+        if self._settled and estimate.t >= self._kept_t + KEEP_S:
+            self._kept, self._kept_t = [*self._kept[-1:], self._errors()], estimate.t
         wanted = self._count
         if self.spread < SETTLED_M:
             wanted = max(self.least, int(0.7 * self._count))

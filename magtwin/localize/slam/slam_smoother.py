@@ -34,7 +34,7 @@ class SlamSmoother(Settings):
     soft_iron_sd: float = 0.1
     """Prior standard deviation of each entry of the soft-iron matrix W, for three axes. 0: no W."""
 
-    starts: int = 6
+    starts: int = 2
     """Starts to try: dead reckoning; the incremental filter's trajectory; dead reckoning with a velocity error
     of one prior standard deviation along x, -x, y and -y (these if `velocity_sd_m_s` is above 0)."""
 
