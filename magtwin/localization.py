@@ -21,6 +21,7 @@ from magtwin.frames import wrap_angle, yaw_from_quat
 from magtwin.io.formats import read_run
 from magtwin.io.surveys.maps import open_map
 from magtwin.localize.bounds import Bounds, bounds
+from magtwin.localize.compensators import COMPENSATORS, compensated
 from magtwin.localize.localizers import load_localizer
 from magtwin.localize.odometry import Odometry
 from magtwin.localize.problem import (
@@ -139,6 +140,8 @@ def localize(
     sensor: SensorModel | None = None,
     odometry: OdometryModel | None = None,
     map_length_m: float = 0.3,
+    compensator: str = "none",
+    calibration: Run | Source | None = None,
     rate_hz: float | None = RATE_HZ,
     seed: int = 0,
     progress: Callable[[int, int], Any] | None = None,
@@ -156,6 +159,9 @@ def localize(
             metadata.
         odometry: Noise model of the odometry.
         map_length_m: Correlation length of the map's error [m].
+        compensator: Model of the robot's own field, a name in `magtwin.localize.compensators.COMPENSATORS`,
+            for methods that use its prediction (rbpf-network). It is fitted to `calibration`.
+        calibration: A drive earlier in the session with true poses, or its file.
         rate_hz: Readings per second that the method gets [Hz]. None: all.
         seed: Seed of the method and of the prior's error.
         progress: Called as progress(readings done, all readings).
@@ -176,6 +182,8 @@ def localize(
         sensor=sensor,
         odometry=odometry,
         map_length_m=map_length_m,
+        compensator=compensator,
+        calibration=calibration,
         rate_hz=rate_hz,
         seed=seed,
         progress=progress,
@@ -206,6 +214,8 @@ def _localization(
     sensor: SensorModel | None = None,
     odometry: OdometryModel | None = None,
     map_length_m: float = 0.3,
+    compensator: str = "none",
+    calibration: Run | Source | None = None,
     rate_hz: float | None = RATE_HZ,
     seed: int = 0,
     keep_particles: bool = False,
@@ -224,6 +234,17 @@ def _localization(
         raise InputError(f"`rate_hz` must be above 0 Hz, got {rate_hz!r}", parameter="rate_hz")
     if rate_hz is not None and run.rows > 1 and 1.01 * rate_hz < (run.rows - 1) / run.duration_s:
         run = thinned(run, rate_hz)
+    if calibration is not None:
+        calibration = calibration if isinstance(calibration, Run) else read_run(existing(calibration, "run"))
+        if rate_hz is not None:
+            calibration = thinned(calibration, rate_hz)
+    if compensator != "none":
+        if anomaly_map is None or calibration is None:
+            raise InputError(
+                f"the `compensator` {compensator!r} needs a map and a `calibration` drive",
+                parameter="calibration",
+            )
+        run = compensated(run, COMPENSATORS[compensator]().fit(calibration, anomaly_map))
     lever_arm = lever_arm_of(run) if sensor is None else sensor.lever_arm_m
     if anomaly_map is not None:
         check_on_map(run, anomaly_map, lever_arm)
@@ -234,6 +255,7 @@ def _localization(
         sensor=sensor or replace(ROBOT_NOISE, lever_arm_m=lever_arm),
         odometry=odometry or OdometryModel(),
         map_length_m=map_length_m,
+        calibration=calibration,
         rate_hz=rate_hz or (run.rows - 1) / max(run.duration_s, 1e-9),
         seed=seed,
     )

@@ -155,7 +155,9 @@ class Difference:
         """Which is better, in words."""
         if self.rmse_m.p >= SHOWN:
             return "no difference shown"
-        better, worse = (self.b, self.a) if self.rmse_m.difference > 0 else (self.a, self.b)
+        better, worse = ("B", "A") if self.rmse_m.difference > 0 else ("A", "B")
+        if self.a != self.b:
+            better, worse = {"A": self.a, "B": self.b}[better], {"A": self.a, "B": self.b}[worse]
         return f"{better} is better than {worse}"
 
 

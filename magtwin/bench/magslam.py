@@ -116,7 +116,7 @@ def ship_case(folder: str | os.PathLike[str], loop: int, seed: int) -> Recording
         rate_hz=1 / dt,
         seed=seed,
     )
-    t = dt * np.arange(len(p))
+    t = np.asarray(dt * np.arange(len(p)), float)
     return Recording(
         problem,
         _readings(t, odom_p, odom_q, y_nt),
@@ -151,8 +151,8 @@ def hand_case(folder: str | os.PathLike[str], name: Literal["eight", "square"]) 
     The files have no true pose. The reference is the telephone's own visual-inertial tracking, which corrects
     itself when it sees a place again (`dPos`); odometry is the same without these corrections
     (`dPosSmooth`). Orientations are those of the telephone in both. The magnetometer's axes are turned by
-    90 deg about z from those of the orientation: of the 24 right-handed ways this one makes the field in world
-    axes vary least, in both files.
+    90 deg about z from those of the orientation: of the 24 right-handed ways this one makes the field in
+    world axes vary least, in both files.
 
     Args:
         folder: Folder of the files.
@@ -241,6 +241,4 @@ def _readings(t: Array, p: Array, q: Array, y_nt: Array) -> Run:
 
 def _truth(t: Array, p: Array, q: Array) -> Run:
     R = Rotation.from_quat(q).as_matrix()
-    return Run(
-        {"t": t, "p_world_base": p, "q_world_base_xyzw": q, "yaw": np.arctan2(R[:, 1, 0], R[:, 0, 0])}
-    )
+    return Run({"t": t, "p_world_base": p, "q_world_base_xyzw": q, "yaw": np.arctan2(R[:, 1, 0], R[:, 0, 0])})

@@ -4,7 +4,7 @@ The runs to localize have no part in it.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -55,6 +55,9 @@ class Candidate:
     log_loss: float
     """Mean over starts, runs and readings of -log N(true position; estimate, covariance) [nats]."""
 
+    log_loss_se: float
+    """Standard error of `log_loss`, from its scatter between tracks [nats]."""
+
     rmse_m: float
     """Pooled RMSE of the position from a known start [m]."""
 
@@ -63,7 +66,7 @@ def choose(
     folder: str | os.PathLike[str],
     *,
     training: tuple[int, ...] = TRAINING,
-    seeds: int = 4,
+    seeds: int = 2,
     method: str = "rbpf",
     progress: Progress = lambda done, total, what: None,
 ) -> list[Candidate]:
@@ -80,7 +83,7 @@ def choose(
         progress: Called as progress(done, total, what).
 
     Returns:
-        All candidates, the one of least log loss first.
+        All candidates, the one of least log loss first. `preferred` picks one of them.
     """
     folds = [(tuple(n for n in training if n != left), left) for left in training]
     total = 2 + 2 * len(KAPPAS)
@@ -101,10 +104,26 @@ def choose(
                 if start == "tracking":
                     squares.append(np.mean(np.sum(off**2, axis=1)))
             rmse = float(np.sqrt(np.mean(squares)))
-            candidates.append(Candidate(noise, kappa, float(np.mean(losses)), rmse))
+            error = float(np.std(losses, ddof=1) / np.sqrt(len(losses)))
+            candidates.append(Candidate(noise, kappa, float(np.mean(losses)), error, rmse))
             done += 1
     progress(total, total, "")
     return sorted(candidates, key=lambda candidate: candidate.log_loss)
+
+
+def preferred(candidates: Sequence[Candidate]) -> Candidate:
+    """The least tempering within one standard error of the best.
+
+    That is the one-standard-error rule (Breiman, Friedman, Olshen and Stone 1984, Classification and
+    Regression Trees, section 3.4.3): candidates so close cannot be told apart, and kappa = 1 is the model
+    itself. Between candidates of one kappa the log loss decides.
+
+    Args:
+        candidates: Results of `choose`.
+    """
+    best = min(candidates, key=lambda candidate: candidate.log_loss)
+    close = [c for c in candidates if c.log_loss <= best.log_loss + best.log_loss_se]
+    return min(close, key=lambda candidate: (candidate.kappa, candidate.log_loss))
 
 
 def likeliest_noise(

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from magtwin.bench.leaderboard import SHOWN, Columns, Difference, Standing, compare_rows, standings
+from magtwin.bench.leaderboard import Columns, Difference, Standing, compare_rows, standings
 from magtwin.bench.results import read_results
 from magtwin.bench.statistics import Interval
 from magtwin.bench.suite import Scenario
@@ -102,21 +102,11 @@ def compare_results(
     for d in compare_rows(first.rows, second.rows):
         lines[f"{d.scenario}, {d.a}"] = (
             f"A - B {d.rmse_m.difference:+.4f} m ({d.rmse_m.low:+.4f} to {d.rmse_m.high:+.4f}), "
-            f"p {d.rmse_m.p:.2g}, {d.runs} runs: "
-            + (
-                "no difference shown"
-                if d.rmse_m.p >= SHOWN
-                else "B is better"
-                if d.rmse_m.difference > 0
-                else "A is better"
-            )
+            f"p {d.rmse_m.p:.2g}, {d.runs} runs: {d.verdict}"
         )
-    same = first.about["sha256"] == second.about["sha256"]
-    notes = (
-        {}
-        if same
-        else {"note": "the suites differ; only runs with the same scenario name and seed are compared"}
-    )
+    notes = {}
+    if first.about["sha256"] != second.about["sha256"]:
+        notes["note"] = "the suites differ; runs with the same scenario name and seed are compared"
     return Report(f"RMSE of {a} (A) and {b} (B)", (), {"differences": lines, **notes})
 
 

@@ -25,6 +25,8 @@ def localize(
     sensor: Names = None,
     odometry: Names = None,
     map_length_m: float = 0.3,
+    compensator: str = "none",
+    calibration: Path | None = None,
     seed: Seed = 0,
     force: Force = False,
 ) -> Done:
@@ -64,6 +66,11 @@ def localize(
         yaw_std_s, scale_std. May be repeated.
     map_length_m
         Correlation length of the map's error that the method is told [m].
+    compensator
+        Model of the robot's own field for the method rbpf-network, fitted to --calibration: iron, ridge or
+        tolles-lawson.
+    calibration
+        Run earlier in the same session, with true poses.
     """
     from magtwin.figures.localization import save_localization
     from magtwin.files import check_free
@@ -85,6 +92,8 @@ def localize(
             sensor=replace(ROBOT_NOISE, **{"lever_arm_m": lever_arm_of(whole), **told}),
             odometry=OdometryModel(**_values("odometry", odometry, OdometryModel)),
             map_length_m=map_length_m,
+            compensator=compensator,
+            calibration=calibration,
             rate_hz=rate_hz,
             seed=seed,
             keep_particles=True,

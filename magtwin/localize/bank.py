@@ -1,12 +1,18 @@
 """Bank of extended Kalman filters: many starts at once, until one place is left."""
 
 import math
-from types import ModuleType
 
 import numpy as np
 
+from magtwin.compiled import Loops
 from magtwin.localize.odometry import increment
 from magtwin.localize.problem import Array, Problem, Reading
+
+LOOPS = Loops("magtwin.localize.bank_loops", pays=0.0)
+"""Compiled loops; a bank in plain Python would take minutes."""
+
+STATS = 14
+"""Number of sums that compiled updates return; see `grid_loops.update`."""
 
 CUT = 20.0
 """Filters and nodes whose mass is below exp(-CUT) of the greatest are dropped."""
@@ -93,7 +99,6 @@ class Bank:
     at a node of a grid over the prior. Components whose mass vanishes are dropped.
 
     Args:
-        code: The compiled loops.
         likelihood: Tables and noise.
         mean: Mean of x, y and yaw.
         sd: Their standard deviations; uniform over the extent or all headings where infinite.
@@ -103,7 +108,6 @@ class Bank:
 
     def __init__(
         self,
-        code: ModuleType,
         likelihood: Likelihood,
         mean: tuple[float, float, float],
         sd: tuple[float, float, float],
@@ -111,7 +115,7 @@ class Bank:
         cell_m: float,
         step_rad: float,
     ) -> None:
-        self._code, self.likelihood = code, likelihood
+        self._code, self.likelihood = LOOPS.open(), likelihood
         x0, x1, y0, y1 = likelihood.problem.extent
         ranges = ((x0, x1, cell_m), (y0, y1, cell_m), (mean[2] - math.pi, mean[2] + math.pi, step_rad))
         axes, spreads, masses = [], [], []
@@ -127,7 +131,7 @@ class Bank:
                 wide = math.sqrt(s * s - (OVERLAP * step) ** 2)
                 half = math.ceil(SPAN * wide / step)
                 axis = middle + step * np.arange(-half, half + 1)
-                mass = -0.5 * ((axis - middle) / wide) ** 2
+                mass = np.asarray(-0.5 * ((axis - middle) / wide) ** 2, float)
             axes.append(axis)
             spreads.append((OVERLAP * step) ** 2)
             masses.append(mass)
@@ -138,7 +142,7 @@ class Bank:
         states = np.zeros((logw.size, self.n + self.n**2))
         states[:, 0], states[:, 1], states[:, 2] = x.ravel(), y.ravel(), yaw.ravel()
         states[:, self.n :: self.n + 1] = variances
-        self.logw: Array = (logw - np.log(np.exp(logw).sum())).ravel()
+        self.logw: Array = np.asarray(logw - np.log(np.exp(logw).sum()), float).ravel()
         self._state: Array = states.ravel()
 
     @property
@@ -171,7 +175,7 @@ class Bank:
         pose = [1.0] * 4, [0.0] * 4
         numbers = [*self.likelihood.numbers(reading, reference), *motion]
         numbers += [*problem.odometry.variances(distance, motion[2], dt), *pose[0], *decay, *pose[1], *noise]
-        stats = np.empty(self._code.STATS)
+        stats = np.empty(STATS)
         table, spreads = self.likelihood.table, self.likelihood.spreads
         self._code.update_bank(table, spreads, self.logw, self._state, np.array(numbers, float), stats)
         if stats[1] < 0.8 * len(self.logw):

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError
 from magtwin.localize.problem import Array, FieldBelief, Problem
 
-MOST = 1500
+MOST = 1000
 """Most readings conditioned on together. In a longer run, drift and map error are independent between such
 parts, and the smoothed bound uses no later part."""
 
@@ -85,7 +85,8 @@ def bounds(
     """Bounds of a problem along a true path.
 
     An unknown start counts as Gaussian, with the variance of a uniform one; so do the poses after a
-    kidnapping. The information that a varying variance of the map adds is left out.
+    kidnapping. The information that a varying variance of the map adds is left out: it is 1e-5 of that of the
+    field on the shipped map.
 
     Args:
         problem: Noise models, prior, and correlation length of the map's error.

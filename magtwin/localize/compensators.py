@@ -1,5 +1,6 @@
 """Compensators: models of the robot's own field from on-board signals, fitted to a calibration drive."""
 
+import itertools
 import math
 from typing import Any, ClassVar, Self
 
@@ -36,6 +37,15 @@ DISTURBANCE_COLUMNS = {
 PENALTIES = np.logspace(-8, 1, 19)
 """Ridge penalties of the cross-validation, for columns of unit mean square."""
 
+TIMES_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+"""Correlation times of the errors that are tried [s]."""
+
+SHARES = (0.5, 0.8, 0.9, 0.95, 0.98)
+"""Shares of correlated errors in their variance that are tried."""
+
+MOST_ROWS = 400
+"""Most readings of a fit, evenly from the drive: errors are alike at neighbouring ones."""
+
 FOLDS = 8
 """Stretches of the drive for the cross-validation."""
 
@@ -57,9 +67,10 @@ class Linear:
 
         d = c_0 + sum_i c_i f_i,  fitted to measured minus map on a drive with true poses
 
-    by ridge regression on standardised f_i, with the penalty of the best prediction of each of eight
-    stretches from the others. The standard deviation of d is that of the coefficients, with a covariance that holds for
-    errors correlated in time (Newey and West 1987, Econometrica 55:703), since drift and map errors are.
+    by generalised least squares: the errors are white noise and a first-order Gauss-Markov process, whose
+    variances and correlation time maximise the restricted likelihood (Patterson and Thompson 1971, Biometrika
+    58:545). Coefficients of standardised f_i are shrunk with the penalty of the best prediction of each of
+    eight stretches of the drive from the others. The standard deviation of d is that of the coefficients.
     The errors of the readings themselves are part of the `SensorModel`.
     """
 
@@ -100,7 +111,9 @@ class Linear:
             last = reading
         matrix = np.array(rows, float)
         known = np.isfinite(misfit) & np.isfinite(matrix).all(axis=1)
-        matrix, misfit = matrix[known], misfit[known]
+        rows_used = np.flatnonzero(known)
+        rows_used = rows_used[:: -(-len(rows_used) // MOST_ROWS) or 1]
+        t, matrix, misfit = run["t"][rows_used], matrix[rows_used], misfit[rows_used]
         least = 3 * (matrix.shape[1] + 1)
         if len(misfit) < least:
             raise InputError(
@@ -113,8 +126,12 @@ class Linear:
         )  # a constant gets no coefficient
         design = np.column_stack([np.ones(len(misfit)), (matrix - self.mean) / self.scale])
         penalty = _best_penalty(design, misfit) if self.shrunk else 0.0
-        self.coefficients = _ridge(design, misfit, penalty)
-        self.covariance = _robust_covariance(design, misfit - design @ self.coefficients, penalty)
+        whitening, variance = _whitening(t, design, misfit)
+        design_w, misfit_w = whitening @ design, whitening @ misfit
+        self.coefficients = _ridge(design_w, misfit_w, penalty)
+        gram = design_w.T @ design_w
+        inverse = np.linalg.pinv(gram + _shrinkage(gram, penalty), rcond=1e-12)
+        self.covariance: Array = variance * inverse @ gram @ inverse
         self.spread_nt = float(np.std(design[:, 1:] @ self.coefficients[1:]))
         return self
 
@@ -222,13 +239,17 @@ def _direction(reading: Reading) -> tuple[float, Array]:
     return b, vector / b if b > 0 else np.full(3, np.nan)
 
 
-def _ridge(design: Array, y: Array, penalty: float) -> Array:
-    """Least squares with a penalty on all columns but the first, relative to their mean square."""
-    gram = design.T @ design
-    shrink = np.full(len(gram), penalty * len(y))
+def _shrinkage(gram: Array, penalty: float) -> Array:
+    """Penalty relative to the mean squares of all columns but the first."""
+    shrink = penalty * np.diag(gram).copy()
     shrink[0] = 0.0
-    made: Array = np.linalg.lstsq(gram + np.diag(shrink), design.T @ y, rcond=1e-12)[0]
-    return made
+    return np.diag(shrink)
+
+
+def _ridge(design: Array, y: Array, penalty: float) -> Array:
+    """Least squares with a penalty on all coefficients but the first."""
+    gram = design.T @ design
+    return np.asarray(np.linalg.lstsq(gram + _shrinkage(gram, penalty), design.T @ y, rcond=1e-12)[0], float)
 
 
 def _best_penalty(design: Array, y: Array) -> float:
@@ -243,17 +264,29 @@ def _best_penalty(design: Array, y: Array) -> float:
     return float(PENALTIES[np.argmin(errors)])
 
 
-def _robust_covariance(design: Array, residual: Array, penalty: float) -> Array:
-    """Covariance of the coefficients, for residuals that are correlated in time (Newey and West 1987)."""
-    n = len(residual)
-    lags = min(n // 4, math.ceil(4 * n ** (1 / 3)))
-    scores = design * residual[:, None]
-    middle = scores.T @ scores
-    for lag in range(1, lags + 1):
-        cross = scores[lag:].T @ scores[:-lag]
-        middle += (1 - lag / (lags + 1)) * (cross + cross.T)
-    shrink = np.full(design.shape[1], penalty * n)
-    shrink[0] = 0.0
-    inverse = np.linalg.pinv(design.T @ design + np.diag(shrink), rcond=1e-12)
-    made: Array = inverse @ middle @ inverse * n / max(n - design.shape[1], 1)
-    return made
+def _whitening(t: Array, design: Array, y: Array) -> tuple[Array, float]:
+    """Matrix that whitens the errors of a linear model, and the variance of what it makes of them.
+
+    The correlation of the errors is (1 - r) I + r exp(-|t - t'| / tau); r and tau maximise
+
+        -1/2 (log |V| + log |X' V^-1 X| + (n - p) log s^2),   s^2 = e' V^-1 e / (n - p)
+    """
+    from scipy.linalg import solve_triangular
+
+    n, rank = len(y), int(np.linalg.matrix_rank(design))
+    apart = np.abs(t[:, None] - t)
+    best: tuple[float, Array, float] | None = None
+    for tau, share in ((1.0, 0.0), *itertools.product(TIMES_S, SHARES)):
+        correlation = share * np.exp(-apart / tau) + (1 - share) * np.eye(n)
+        root = np.linalg.cholesky(correlation)
+        white = solve_triangular(root, np.column_stack([design, y]), lower=True)
+        x, z = white[:, :-1], white[:, -1]
+        residual = z - x @ np.linalg.lstsq(x, z, rcond=1e-10)[0]
+        variance = float(residual @ residual) / max(n - rank, 1) + 1e-12
+        strengths = np.linalg.svd(x, compute_uv=False)[:rank]
+        likelihood = -np.log(np.diag(root)).sum() - np.log(strengths).sum()
+        likelihood -= 0.5 * (n - rank) * math.log(variance)
+        if best is None or likelihood > best[0]:
+            best = float(likelihood), np.asarray(root, float), variance
+    assert best is not None
+    return np.asarray(np.linalg.inv(best[1]), float), best[2]

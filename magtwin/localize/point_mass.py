@@ -7,7 +7,7 @@ import numpy as np
 
 from magtwin.compiled import Loops
 from magtwin.errors import InputError
-from magtwin.localize.bank import CUT, SPAN, WHITE_SHARE, Bank, Likelihood, moments
+from magtwin.localize.bank import CUT, SPAN, STATS, WHITE_SHARE, Bank, Likelihood, moments
 from magtwin.localize.belief import table_of
 from magtwin.localize.odometry import increment, repeats
 from magtwin.localize.problem import Array, Estimate, Problem, Reading
@@ -212,7 +212,7 @@ class PointMass:
 
     def _begin(self, mean: tuple[float, float, float], sd: tuple[float, float, float]) -> None:
         cells = {"cell_m": self._cell, "step_rad": self._heading}
-        self.bank = Bank(self._code, self._likelihood, mean, sd, **cells)
+        self.bank = Bank(self._likelihood, mean, sd, **cells)
         self.grid: Grid | None = None
         self._lost, self._surprise = any(math.isinf(s) for s in sd), 0.0
         x0, x1, y0, y1 = self._problem.extent
@@ -232,7 +232,7 @@ class PointMass:
         self._convolve(grid, model.variances(distance, motion[2], dt), distance)
         decay, noise = self._likelihood.dynamics(dt, distance)
         numbers = np.array([*self._likelihood.numbers(reading, self._mean), *decay, *noise], float)
-        stats = np.empty(self._code.STATS)
+        stats = np.empty(STATS)
         table, spreads = self._likelihood.table, self._likelihood.spreads
         self._code.update(
             table, spreads, grid.logw, grid.state, grid.layers, grid.axes, grid.shape, numbers, stats

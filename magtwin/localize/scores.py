@@ -4,7 +4,7 @@ Trajectories are never aligned: the frame of a map is absolute.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from itertools import pairwise
 
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError
 from magtwin.localize.bounds import Bounds
 from magtwin.localize.problem import Array
-from magtwin.localize.track import LocalizerError, Track
+from magtwin.localize.track import Track
 
 Flags = NDArray[np.bool_]
 
@@ -181,21 +181,6 @@ def score(
         step_us=1e6 * track.step_s,
         bound_m={} if bounds is None else {name: bounds.rms(name, counted) for name in BOUNDS},
     )
-
-
-def scored(made: Callable[[], Track], truth_pose: ArrayLike, **options: object) -> Scores:
-    """Scores of a track that is made now, or of a failure.
-
-    Args:
-        made: Runs an algorithm; a `LocalizerError` that it raises becomes the reason of the failure.
-        truth_pose: As for `score`.
-        **options: Keyword arguments of `score`.
-    """
-    try:
-        track = made()
-    except LocalizerError as error:
-        return Scores(failed=str(error))
-    return score(track, truth_pose, **options)  # type: ignore[arg-type]
 
 
 def nees(error: ArrayLike, covariance: ArrayLike, rows: Flags | None = None) -> Array:

@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,6 +38,29 @@ WANDER_M = 0.15
 """Distance over which the field's slope, and the error of a placement between nodes, stays alike [m]."""
 
 
+SAME_M = 0.03
+"""Distance of fits that count as one [m]."""
+
+
+class Fit(NamedTuple):
+    """A refined placement of a sequence."""
+
+    likelihood: float
+    """Logarithm, by Laplace's method, without constants."""
+
+    pose: Array
+    """Last x, y [m] and yaw [rad]."""
+
+    covariance: Array
+    """Of that pose, shape (3, 3)."""
+
+    misfit: float
+    """Sum of squares of the whitened residuals."""
+
+    offset_nt: float
+    """Offset and drift at the last reading [nT]."""
+
+
 class Sequence:
     """Sequence matching with refinement.
 
@@ -50,8 +74,9 @@ class Sequence:
     least squares (`magtwin.localize.smoother.Graph`), which lets the path bend. Their likelihoods by
     Laplace's method give the probability of the best one; its covariance is that of the last pose.
 
-    Between matches the pose moves by odometry. A known pose is refined from its prediction; all placements
-    are searched again after 2 m, or when the misfit is improbable.
+    Between matches the pose moves by odometry. Around a known pose, the prediction and the best placements
+    nearby are refined and merged by moments. All placements are searched again after 2 m, or when the misfit
+    is improbable.
 
     Args:
         length_m: Length of path that is matched [m].
@@ -60,6 +85,7 @@ class Sequence:
         spacing_m: Distance between the readings of a sequence [m].
         cell_m: Distance of places that are tried, at most [m].
         heading_deg: Distance of headings that are tried, at most [deg].
+        temper: Divisor of the log-likelihood, for what the linearised fits lack; covariances grow by it.
     """
 
     def __init__(
@@ -71,12 +97,13 @@ class Sequence:
         spacing_m: float = 0.05,
         cell_m: float = 0.08,
         heading_deg: float = 6.0,
+        temper: float = 1.5,
     ) -> None:
         for name, value in list(locals().items())[1:]:
             if not (isinstance(value, int | float) and 0 < value < math.inf):
                 raise InputError(f"{name} of Sequence must be above 0, got {value}", parameter=name)
         self._length, self._shortest, self._every, self._spacing = length_m, shortest_m, every_m, spacing_m
-        self._cell, self._heading = cell_m, math.radians(heading_deg)
+        self._cell, self._heading, self._temper = cell_m, math.radians(heading_deg), temper
 
     def reset(self, problem: Problem) -> None:
         """Begin at the prior.
@@ -151,38 +178,39 @@ class Sequence:
             return
         self._since_match = 0.0
         graph = self._graph()
-        found: list[tuple[float, Array, Array, float, float]] = []
+        known: list[Fit] = []
         if self._known:
-            found.append(self._refined(graph, np.array(self._odometry.pose)))
-            misfit, count = found[0][3], len(self._window)
+            starts = [np.array(self._odometry.pose), *self._placements(near=True)]
+            known = _distinct([self._refined(graph, pose) for pose in starts])
+            misfit, count = known[0].misfit, len(self._window)
             improbable = misfit > count + 5 * math.sqrt(2 * count)
-            if self._since_check < CHECK_M and not improbable:
-                self._take(found[0])
+            if anchored or length < self._shortest or (self._since_check < CHECK_M and not improbable):
+                self._take(known)
                 return
-        if anchored or (self._known and length < self._shortest):
-            self._take(found[0]) if found else None
-            return
         self._since_check = 0.0
-        known = found[0] if found else None
-        found += [self._refined(graph, pose) for pose in self._placements()]
-        found.sort(key=lambda fit: -fit[0])
-        best = found[0]
-        if known is not None and best[0] < known[0] + BETTER:
+        found = _distinct([self._refined(graph, pose) for pose in self._placements()])
+        if known and found[0].likelihood < known[0].likelihood + BETTER:
             self._take(known)
             return
-        others = [fit for fit in found[1:] if _apart(fit[1], best[1]) > 2 * self._cell]
-        share = 1 / (1 + sum(math.exp(max(fit[0] - best[0], -50.0)) for fit in others))
-        self._known = share > SURE
-        self._take(best)
+        total = sum(math.exp((fit.likelihood - found[0].likelihood) / self._temper) for fit in found)
+        self._known = 1 / total > SURE
+        self._take(found[:1])
 
-    def _take(self, fit: tuple[float, Array, Array, float, float]) -> None:
-        """Continue dead reckoning from a match; another turn of the heading changes nothing."""
-        x, y, yaw = fit[1].tolist()
+    def _take(self, fits: "list[Fit]") -> None:
+        """Continue dead reckoning from a match: mean and covariance of fits, weighted by their likelihood."""
+        w = np.array([math.exp((fit.likelihood - fits[0].likelihood) / self._temper) for fit in fits])
+        w /= w.sum()
+        away = np.array([fit.pose - fits[0].pose for fit in fits])
+        away[:, 2] = (away[:, 2] + math.pi) % (2 * math.pi) - math.pi
+        shift = w @ away
+        covariance = self._temper * np.einsum("k,kij->ij", w, np.array([fit.covariance for fit in fits]))
+        covariance += (away * w[:, None]).T @ away - np.outer(shift, shift)
+        x, y, yaw = (fits[0].pose + shift).tolist()
         self._odometry.pose = (x, y, yaw)
         self._odometry.covariance[:] = 0.0
-        self._odometry.covariance[:3, :3] = fit[2]
+        self._odometry.covariance[:3, :3] = covariance
         self._odometry.covariance[3, 3] = self._problem.odometry.scale_std**2
-        self._bias = fit[4]
+        self._bias = fits[0].offset_nt
 
     def _graph(self) -> Graph:
         """Factor graph of the sequence; it has the prior if it begins at the first reading."""
@@ -200,8 +228,8 @@ class Sequence:
         unknown = Prior(sd=(math.inf, math.inf, math.inf))
         return Graph(self._problem if self._whole else replace(self._problem, prior=unknown), Run(columns))
 
-    def _refined(self, graph: Graph, pose: Array) -> tuple[float, Array, Array, float, float]:
-        """Log-likelihood, last pose, its covariance, misfit and offset of the best fit near a placement."""
+    def _refined(self, graph: Graph, pose: Array) -> "Fit":
+        """The best fit near a placement."""
         poses = [pose]
         for motion in graph.motion[::-1]:
             poses.append(moved_back(poses[-1], motion))
@@ -209,21 +237,24 @@ class Sequence:
         matrix = graph.normal_equations(local, common, *weights)[0]
         covariance, determinant = matrix.last_covariance()
         likelihood = -0.5 * (cost + determinant)
-        return likelihood, local[-1, :3], covariance[:3, :3], cost, float(common[1] + local[-1, 3])
+        offset = float(common[1] + local[-1, 3])
+        return Fit(likelihood, local[-1, :3], covariance[:3, :3], cost, offset)
 
-    def _placements(self) -> list[Array]:
-        """Separate minima of the misfit over all places and headings."""
+    def _placements(self, *, near: bool = False) -> list[Array]:
+        """Separate minima of the misfit over all places and headings, or over those near the known pose."""
         path, z, covariance = self._sequence()
         whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+        cell, turn, kept = self._cell, self._heading, KEPT
         x0, x1, y0, y1 = self._problem.extent
-        xs, ys = (
-            low + (high - low) * (np.arange(n) + 0.5) / n
-            for low, high, n in (
-                (x0, x1, math.ceil((x1 - x0) / self._cell)),
-                (y0, y1, math.ceil((y1 - y0) / self._cell)),
-            )
-        )
         yaws = self._headings()
+        if near:
+            pose, sd = self._odometry.pose, np.sqrt(np.diag(self._odometry.covariance)).tolist()
+            cell, turn, kept = cell / 2, turn / 2, 2
+            reach = [min(max(3 * sd[0], 3 * self._cell), 1.0), min(max(3 * sd[1], 3 * self._cell), 1.0)]
+            x0, x1, y0, y1 = pose[0] - reach[0], pose[0] + reach[0], pose[1] - reach[1], pose[1] + reach[1]
+            yaws = np.asarray(pose[2] + turn * np.arange(-3, 4), float)
+        ranges = ((x0, x1, math.ceil((x1 - x0) / cell)), (y0, y1, math.ceil((y1 - y0) / cell)))
+        xs, ys = (low + (high - low) * (np.arange(n) + 0.5) / n for low, high, n in ranges)
         costs = np.empty(len(yaws) * len(ys) * len(xs))
         flat = np.ascontiguousarray(path).ravel(), z, np.ascontiguousarray(whitening).ravel()
         self._code.match(self._table, *flat, xs, ys, yaws, MARGIN, costs)
@@ -232,11 +263,11 @@ class Sequence:
         h, j, i = np.unravel_index(order, (len(yaws), len(ys), len(xs)))
         poses = np.column_stack([xs[i], ys[j], yaws[h]])
         made: list[Array] = []
-        while len(poses) and len(made) < KEPT:
+        while len(poses) and len(made) < kept:
             made.append(poses[0])
-            turn = np.abs((poses[:, 2] - poses[0, 2] + math.pi) % (2 * math.pi) - math.pi)
-            far = np.hypot(*(poses[:, :2] - poses[0, :2]).T) > 2.5 * self._cell
-            poses = poses[far | (turn > 2.5 * self._heading)]
+            turned = np.abs((poses[:, 2] - poses[0, 2] + math.pi) % (2 * math.pi) - math.pi)
+            far = np.hypot(*(poses[:, :2] - poses[0, :2]).T) > 2.5 * cell
+            poses = poses[far | (turned > 2.5 * turn)]
         return made
 
     def _headings(self) -> Array:
@@ -285,5 +316,10 @@ class Sequence:
         return path, z, k + np.diag(noise)
 
 
-def _apart(a: Array, b: Array) -> float:
-    return math.hypot(a[0] - b[0], a[1] - b[1])
+def _distinct(fits: list[Fit]) -> list[Fit]:
+    """Fits by falling likelihood, without those that are at the place of a better one."""
+    made: list[Fit] = []
+    for fit in sorted(fits, key=lambda fit: -fit.likelihood):
+        if all(math.dist(fit.pose[:2], other.pose[:2]) > SAME_M for other in made):
+            made.append(fit)
+    return made

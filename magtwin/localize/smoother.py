@@ -419,7 +419,7 @@ class MapSmoother:
                 damping *= 10
             else:
                 damping = 1e-4
-            settled = before - cost < 1e-3
+            settled = before - cost < 1e-5
             if settled and looseness == 1.0:
                 break
             if settled or looseness > 1.0:

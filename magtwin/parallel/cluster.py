@@ -1,11 +1,14 @@
 """Workers of a dask cluster."""
 
 import contextlib
+import hashlib
 import pickle
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import islice
+from pathlib import Path
 from typing import Any, Self
 
 from magtwin.errors import InputError
@@ -96,7 +99,7 @@ class Cluster:
                 chunk = pickle.dumps(chunks[index], pickle.HIGHEST_PROTOCOL)
                 limit = limit_s(chunks[index]) if callable(limit_s) else limit_s
                 future = client.submit(
-                    _lend, pickled, chunk, index, limit, self._session, __version__, pure=False
+                    _lend, pickled, chunk, index, limit, self._session, _version(), pure=False
                 )
                 sent[future.key] = index, future
                 futures.append(future)
@@ -148,14 +151,19 @@ def _same(value: bytes) -> bytes:
     return value
 
 
+@lru_cache
 def _version() -> str:
-    """Version of magtwin in a dask worker."""
-    return __version__
+    """Version of magtwin in this process, with a checksum of its code: a version in development changes."""
+    package = Path(__file__).parent.parent
+    code = hashlib.sha256()
+    for file in sorted(package.rglob("*.py")):
+        code.update(f"{file.relative_to(package).as_posix()} ".encode() + file.read_bytes())
+    return f"{__version__} (code {code.hexdigest()[:8]})"
 
 
 def _check_version(version: str, where: str) -> None:
-    if version != __version__:
-        text = f"{where} has magtwin {version}, and this is {__version__}; install the same version"
+    if version != _version():
+        text = f"{where} has magtwin {version}, and this is {_version()}; install the same"
         raise InputError(text, parameter="dask")
 
 

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import pickle
 import signal
+import sys
 import threading
 import time
 from collections import deque
@@ -43,7 +44,7 @@ class _Worker:
         self.process = context.Process(
             target=serve, args=(theirs, idle_s), daemon=True, name="magtwin-worker"
         )
-        with _start_lock, _no_interrupt(), _as_parent(), _environment(ONE_THREAD):
+        with _start_lock, _no_interrupt(), _as_parent(), _known_main(), _environment(ONE_THREAD):
             self.process.start()
         theirs.close()
         self.ready = False
@@ -222,7 +223,7 @@ class Processes:
         if self._failed_starts >= STARTS:
             raise InputError(
                 f"worker processes cannot start: the last one {reason}; a Python script that starts them "
-                'must be a file and begin its work below `if __name__ == "__main__":`'
+                'must begin its work below `if __name__ == "__main__":`'
             )
 
 
@@ -257,6 +258,21 @@ def _as_parent() -> Iterator[None]:
         yield
     finally:
         this.daemon = True
+
+
+@contextlib.contextmanager
+def _known_main() -> Iterator[None]:
+    """Let a new process not look for the program's file if there is none, as for `python - < script`."""
+    main = sys.modules["__main__"]
+    file = getattr(main, "__file__", None)
+    if file is None or os.path.exists(file):  # noqa: PTH110 - as multiprocessing joins it
+        yield
+        return
+    del main.__file__
+    try:
+        yield
+    finally:
+        main.__file__ = file
 
 
 @contextlib.contextmanager

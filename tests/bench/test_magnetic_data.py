@@ -21,7 +21,7 @@ from magtwin.bench.magnetic_data import (
     read_recording,
     scaled,
 )
-from magtwin.bench.recorded_noise import choose, likeliest_noise
+from magtwin.bench.recorded_noise import Candidate, choose, likeliest_noise, preferred
 from magtwin.errors import InputError
 from magtwin.localize.bounds import bounds
 from magtwin.localize.localizers import load_localizer
@@ -222,9 +222,20 @@ def test_the_choice_is_ordered_and_uses_no_run_to_localize(folder, monkeypatch):
     assert made[-1].rmse_m > made[0].rmse_m
 
 
+def test_the_least_tempering_within_a_standard_error_is_preferred():
+    def candidate(kappa, loss, error=0.2):
+        return Candidate(NOISE, kappa, loss, error, 0.1)
+
+    best, near, far = candidate(16.0, -2.0), candidate(8.0, -1.81), candidate(4.0, -1.79, 5.0)
+    assert preferred([far, near, best]) is near
+    twin = candidate(8.0, -1.9)
+    assert preferred([near, twin, best, far]) is twin
+    assert preferred([best]) is best
+
+
 @pytest.mark.slow
 def test_the_choice_on_the_real_runs_is_the_recorded_one(real_data):
-    best = choose(real_data / "magnetic-data")[0]
+    best = preferred(choose(real_data / "magnetic-data"))
     assert best.noise == NOISE
     assert best.kappa == KAPPA
 

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from magtwin.errors import InputError
 from magtwin.frames import quat_from_yaw, yaw_from_quat
 from magtwin.localize import point_mass
-from magtwin.localize.bank import Bank, Likelihood
+from magtwin.localize.bank import STATS, Bank, Likelihood
 from magtwin.localize.belief import table_of
 from magtwin.localize.bounds import bounds
 from magtwin.localize.particles import RaoBlackwell
@@ -65,9 +65,11 @@ def test_the_convolution_is_that_of_a_plain_loop_over_gaussian_mixtures():
             if not 0 <= g < count:
                 continue
             u, v = np.linalg.solve(grid.cell, origins[h] + grid.cell @ (i, j) - origins[g])
-            for jj in (math.floor(v), math.floor(v) + 1):
-                for ii in (math.floor(u), math.floor(u) + 1):
-                    sources.append((g, jj, ii, turn * (1 - abs(u - ii)) * (1 - abs(v - jj))))
+            sources += [
+                (g, jj, ii, turn * (1 - abs(u - ii)) * (1 - abs(v - jj)))
+                for jj in (math.floor(v), math.floor(v) + 1)
+                for ii in (math.floor(u), math.floor(u) + 1)
+            ]
         mass, first, second = 0.0, np.zeros(2), np.zeros((2, 2))
         for g, jj, ii, share in sources:
             if 0 <= jj < count and 0 <= ii < count:
@@ -119,7 +121,7 @@ def test_the_update_is_a_kalman_update_in_each_node():
     reading = Reading(0.2, 41_234.0, (0, 0, 0), disturbance_nt=20.0, disturbance_sd_nt=7.0)
     decay, noise = likelihood.dynamics(0.2, 0.04)
     numbers = np.array([*likelihood.numbers(reading, np.zeros(3)), *decay, *noise], float)
-    stats = np.empty(CODE.STATS)
+    stats = np.empty(STATS)
     layout = grid.layers, grid.axes, grid.shape
     CODE.update(likelihood.table, likelihood.spreads, grid.logw, grid.state, *layout, numbers, stats)
 
@@ -209,7 +211,7 @@ def test_one_start_of_the_bank_is_an_extended_kalman_filter():
     prior = case.problem.prior
     table, spreads = table_of(field, field.extent)
     bank = Bank(
-        CODE, Likelihood(case.problem, table, spreads, 1.0), prior.mean, prior.sd, cell_m=0.08, step_rad=0.13
+        Likelihood(case.problem, table, spreads, 1.0), prior.mean, prior.sd, cell_m=0.08, step_rad=0.13
     )
     means, covariances = synthetic.kalman(case, gradient)
     last = None

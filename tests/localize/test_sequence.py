@@ -93,7 +93,7 @@ def test_a_known_heading_limits_the_search():
 
 def test_tracking_is_consistent():
     errors, nees = [], []
-    for seed in range(8):
+    for seed in range(5):
         _, score = synthetic.scored(Sequence(), synthetic.drive(synthetic.wavy_map(seed), seed))
         errors.append(score.error[25:])
         nees.append(score.nees[25:].mean())

@@ -102,14 +102,14 @@ def test_the_normal_equations_are_those_of_the_residuals(variance):
 
 
 def test_a_short_problem_has_the_minimum_of_scipy():
-    case = short_case()
+    case = short_case(cell=0.01)  # the slope of a coarse map jumps, and both solvers stop at its jumps
     graph = Graph(case.problem, case.readings)
     start = graph.start(case.truth + 0.01)
     local, common, cost, _ = MapSmoother().minimise(graph, *start)
     peer = least_squares(
         lambda v: graph.residuals(*split(graph, v)),
         packed(graph, *start),
-        x_scale="jac",
+        method="lm",
         xtol=1e-12,
         ftol=1e-12,
     )

@@ -1,6 +1,7 @@
 """Workers of a dask cluster: a real scheduler and real workers on this machine."""
 
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -12,8 +13,10 @@ import chunk_work
 import pytest
 from dask_cluster import Cluster
 
+import magtwin
 from magtwin.errors import InputError
 from magtwin.parallel import open_pool
+from magtwin.version import __version__
 
 pytest.importorskip("distributed")
 
@@ -109,15 +112,19 @@ def test_an_interruption_stops_what_the_cluster_does(cluster, tmp_path):
     assert len(list(tmp_path.iterdir())) == 2  # nothing else has begun
 
 
-def test_workers_of_another_version_are_refused(tmp_path):
-    (tmp_path / "sitecustomize.py").write_text(
-        "import magtwin.version\nmagtwin.version.__version__ = '0.0.1'\n"
-    )
+@pytest.mark.parametrize(
+    ("line", "version"), [('__version__ = "0.0.1"', "0.0.1"), ("# a change", __version__)]
+)
+def test_workers_of_another_version_or_with_other_code_are_refused(tmp_path, line, version):
+    package = Path(magtwin.__file__).parent
+    shutil.copytree(package, tmp_path / "magtwin", ignore=shutil.ignore_patterns("__pycache__"))
+    with open(tmp_path / "magtwin" / "version.py", "a") as file:
+        file.write(f"{line}\n")
     other = Cluster(tmp_path)
     try:
         path = other.environment["PYTHONPATH"]
         other.add_worker(PYTHONPATH=os.pathsep.join([str(tmp_path), path]))
-        with pytest.raises(InputError, match=r"has magtwin 0\.0\.1, and this is"):
+        with pytest.raises(InputError, match=rf"has magtwin {version} \(code .*, and this is {__version__} "):
             open_pool(dask=other.address)
     finally:
         other.close()

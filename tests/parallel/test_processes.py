@@ -176,6 +176,12 @@ def test_a_script_without_a_guard_is_told_so(tmp_path):
     assert '`if __name__ == "__main__":`' in done.stderr
 
 
+def test_a_script_on_stdin_can_start_workers():
+    script = "from magtwin.parallel import open_pool\nprint([o.value for o in open_pool(1).run(abs, [-1])])"
+    done = subprocess.run([sys.executable, "-"], input=script, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "[1]\n", "")
+
+
 def test_shards_split_all_chunks():
     for count in (1, 2, 7):
         shards = [[k for k in range(20) if in_shard(k, parse_shard(f"{i}/{count}"))] for i in range(count)]

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 def gram(flat: Array) -> Array:
-    """flat' flat of a contiguous array, by half the products."""
+    """Square, flat' flat, of a contiguous array, by half the products."""
     upper = dsyrk(1.0, flat.T)
     return np.asarray(np.triu(upper) + np.triu(upper, 1).T)
 

@@ -14,7 +14,7 @@ _FLAT = types.Array(types.float64, 2, "C")
 
 @inlined
 def _factor(a: Array, n: int) -> bool:
-    """Cholesky factor in the lower triangle of `a`, in place, with inverted diagonal; False if not definite."""
+    """Cholesky factor in the lower triangle, in place, with inverted diagonal; False if not definite."""
     for i in range(n):
         for j in range(i + 1):
             s = a[i, j]

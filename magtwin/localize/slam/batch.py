@@ -68,7 +68,7 @@ class Batch:
     def __init__(self, model: Model, samples: Samples, noise: float = 1.0) -> None:
         self.model, self.samples = model, samples
         self._steps = model.steps(samples)
-        self._known = np.isfinite(samples.y_nt).all(axis=1)
+        self._known: NDArray[np.bool_] = np.asarray(np.isfinite(samples.y_nt).all(axis=1))
         self._y = np.where(self._known[:, None], samples.y_nt, 0.0)
         self._root_steps = 1 / np.sqrt(self._steps.variance)
         self._root_start = 1 / np.sqrt(model.start_variance)
@@ -226,8 +226,8 @@ class Batch:
         """Linearisation at a state: covariances, and the Laplace approximation of -log p(y).
 
         -log p(y) is near cost + log det(H) / 2 + sum of the logarithms of all standard deviations, where H is
-        the matrix of the normal equations (MacKay 2003, Information Theory, Inference, and Learning Algorithms,
-        eq. 27.6; constant terms are left out).
+        the matrix of the normal equations (MacKay 2003, Information Theory, Inference, and Learning
+        Algorithms, eq. 27.6; constant terms are left out).
         """
         arrow, r = self.linearised(state)
         solution = arrow.solve()

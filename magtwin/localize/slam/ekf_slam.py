@@ -51,7 +51,8 @@ class EkfSlam(Settings):
         self._noise = self._problem.sensor.white_nt**2
 
     def _move(self, sample: Samples) -> None:
-        assert self.model is not None and self._last is not None
+        assert self.model is not None
+        assert self._last is not None
         size, motion = self.model.size, self.model.layout.motion.stop
         steps = self.model.steps(followed_by([self._last, sample]))
         self.state, by_state, by_constants = self.model.move(self.state, steps)

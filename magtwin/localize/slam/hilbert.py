@@ -173,7 +173,8 @@ def basis(low: Sequence[float], high: Sequence[float], count: int) -> Basis:
     An isotropic spectral density that falls with frequency gives these weights the greatest variance.
 
     Args:
-        low, high: Corners of the box [m], shape (d,).
+        low: Lower corner of the box [m], shape (d,).
+        high: Upper corner [m].
         count: Number of functions.
 
     Raises:

@@ -30,7 +30,9 @@ def potential(
 
     Args:
         p: Points, shape (N, 3).
-        low, sides, order: Those of `Basis`.
+        low: Lower corner of the box, shape (3,).
+        sides: Its sides, shape (3,).
+        order: Half waves of each function, shape (M, 3).
         weights: Shape (M,).
         gradients: Takes the gradients, shape (N, 3, M); of shape (0, 3, M) to leave them out.
         slope: Takes the gradient of the sum, shape (N, 3).

@@ -20,6 +20,7 @@ f0 and m alone.
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -157,7 +158,7 @@ class Model:
             variances,
         ]
         ends = np.cumsum([0] + [len(part) for part in parts]).tolist()
-        return Layout(*[slice(a, b) for a, b in zip(ends, ends[1:], strict=False)]), np.concatenate(parts)
+        return Layout(*[slice(a, b) for a, b in pairwise(ends)]), np.concatenate(parts)
 
     def steps(self, samples: Samples) -> Steps:
         """Odometry's increments between samples and their variances."""

@@ -81,6 +81,3 @@ def _refuse(name: str, value: float, least: float, *, above: bool = False) -> No
     if not good:
         word = "above" if above else "at least"
         raise InputError(f"{name} must be a finite number {word} {least:g}, got {value!r}", parameter=name)
-
-
-check_number = _refuse

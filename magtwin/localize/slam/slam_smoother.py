@@ -34,14 +34,16 @@ class SlamSmoother(Settings):
     soft_iron_sd: float = 0.1
     """Prior standard deviation of each entry of the soft-iron matrix W, for three axes. 0: no W."""
 
-    starts: int = 6
-    """Starts to try: dead reckoning; the incremental filter's trajectory; dead reckoning with a velocity error
-    of one prior standard deviation along x, -x, y and -y (these if `velocity_sd_m_s` is above 0)."""
+    starts: int = 2
+    """Starts to try: dead reckoning; the incremental filter's trajectory; dead reckoning with a velocity
+    error of one prior standard deviation along x, -x, y and -y (these if `velocity_sd_m_s` is above 0)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not (isinstance(self.starts, int) and 1 <= self.starts <= 6):
-            raise InputError(f"starts must be a whole number from 1 to 6, got {self.starts}", parameter="starts")
+            raise InputError(
+                f"starts must be a whole number from 1 to 6, got {self.starts}", parameter="starts"
+            )
 
     def run(self, problem: Problem, readings: Run) -> list[Estimate]:
         """Estimates at the times of all readings."""

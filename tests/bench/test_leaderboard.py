@@ -1,0 +1,164 @@
+"""Leaderboard and report: intervals, verdicts, paired differences, and a page that says so."""
+
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from magtwin.bench.leaderboard import compare_rows, standings
+from magtwin.bench.report import describe, page_of_comparison, page_of_results
+from magtwin.bench.suite import Scenario, load_suite
+from magtwin.errors import InputError
+from magtwin.figures.page import to_html, to_json, to_markdown
+
+RUNS = 40
+
+
+def rows_of(localizer, rmse, *, anees=1.0, failed=0, diverged=0, scenario="tracking", seed=0):
+    rng = np.random.default_rng(seed)
+    n = RUNS
+    bad = np.arange(n) < failed
+    return {
+        "scenario": np.full(n, scenario),
+        "localizer": np.full(n, localizer),
+        "run": np.arange(n),
+        "seed": 100 + np.arange(n),
+        "session": np.arange(n) % 10,
+        "status": np.where(bad, "failed", "ok"),
+        "reason": np.where(bad, "step raised ZeroDivisionError", ""),
+        "smoother": np.zeros(n, bool),
+        "global_start": np.full(n, scenario == "global"),
+        "recovered_in_time": np.zeros(n, int),
+        "kidnapped": np.zeros(n, int),
+        "rmse_m": np.where(bad, np.nan, rmse * (1 + 0.1 * rng.standard_normal(n))),
+        "heading_rad": np.where(bad, np.nan, 0.02),
+        "anees": np.where(bad, np.nan, anees),
+        "coverage": np.where(bad, np.nan, 0.9),
+        "diverged": (np.arange(n) >= failed) & (np.arange(n) < failed + diverged),
+        "converged_s": np.where(np.arange(n) < 36, 10.0, np.nan),
+        "lost_share": np.zeros(n),
+        "bound_correlated_m": np.full(n, 0.05),
+        "bound_smoothed_m": np.full(n, 0.03),
+    }
+
+
+def joined(*parts):
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def test_a_standing_pools_its_runs_and_counts_failures_as_diverged():
+    (standing,) = standings(rows_of("f", 0.1, failed=4, diverged=2))
+    assert standing.runs == RUNS
+    assert standing.failed == 4
+    assert_allclose(standing.rmse_m.value, 0.1, rtol=0.1)
+    assert standing.rmse_m.low < standing.rmse_m.value < standing.rmse_m.high
+    assert_allclose(standing.ratio, 2.0, rtol=0.1)
+    assert standing.diverged.value == 6 / RUNS
+    assert standing.converged is None
+    assert "4 of 40 runs failed" in standing.verdict()
+    assert "diverges in 15 % of runs" in standing.verdict()
+
+
+@pytest.mark.parametrize(
+    ("anees", "text"), [(4.0, "too sure of itself: errors are 2.0 times"), (0.25, "too cautious"), (1.0, "")]
+)
+def test_the_verdict_says_whether_the_covariance_is_right(anees, text):
+    (standing,) = standings(rows_of("f", 0.1, anees=anees))
+    assert text in standing.verdict()
+    assert bool(standing.verdict()) == bool(text)
+
+
+def test_an_unknown_start_counts_as_found_within_30_s_and_no_later():
+    (standing,) = standings(rows_of("f", 0.1, scenario="global"))
+    assert standing.converged.value == 0.9
+    assert standing.converged.low < 0.9 < standing.converged.high
+
+
+def test_a_localizer_all_of_whose_runs_failed_has_no_error():
+    (standing,) = standings(rows_of("f", 0.1, failed=RUNS))
+    assert standing.rmse_m is None
+    assert standing.diverged.value == 1.0
+
+
+def test_a_smoother_is_measured_by_its_own_bound():
+    rows = rows_of("f", 0.1)
+    rows["smoother"][:] = True
+    assert standings(rows)[0].bound_m == pytest.approx(0.03)
+
+
+def test_paired_differences_find_a_small_change_that_intervals_hide():
+    before, after = rows_of("f", 0.10, seed=1), rows_of("f", 0.10, seed=1)
+    after["rmse_m"] = after["rmse_m"] - 0.004 + 0.001 * np.random.default_rng(2).standard_normal(RUNS)
+    (difference,) = compare_rows(after, before)
+    assert_allclose(difference.rmse_m.difference, -0.004, atol=0.001)
+    assert difference.rmse_m.p < 0.05
+    assert difference.runs == RUNS
+    one, other = standings(after)[0].rmse_m, standings(before)[0].rmse_m
+    assert one.high > other.low  # the intervals of the two overlap
+
+
+def test_only_runs_that_both_finished_are_compared_and_none_is_an_error():
+    (difference,) = compare_rows(rows_of("f", 0.1, failed=4), rows_of("f", 0.1))
+    assert difference.runs == RUNS - 4
+    assert (difference.failed_a, difference.failed_b) == (4, 0)
+    with pytest.raises(InputError, match="share no scenario, localizer and seed"):
+        compare_rows(rows_of("f", 0.1), rows_of("g", 0.1))
+
+
+def tracks_of(rows):
+    t = np.arange(60, dtype=np.float32) / 2
+    return [
+        {
+            "scenario": s,
+            "localizer": name,
+            "run": k,
+            "t": t,
+            "error_m": 0.1 + 0 * t,
+            "bound_m": 0.05 + 0 * t,
+            "x": 2 * np.sin(t / 5),
+            "y": np.cos(t / 5),
+            "lost": 0 * t,
+        }
+        for s, name, k in zip(rows["scenario"], rows["localizer"], rows["run"], strict=True)
+    ]
+
+
+def test_the_page_has_every_scenario_with_its_tables_and_pictures_and_escapes_names():
+    rows = joined(
+        rows_of("<b>f</b>", 0.1, failed=2),
+        rows_of("odometry", 0.5),
+        rows_of("odometry", 0.5, scenario="global"),
+    )
+    scenarios = {name: Scenario(name=name) for name in ("tracking", "global")}
+    times = {name: rows[name] for name in ("scenario", "localizer", "run")} | {
+        "step_us": np.full(3 * RUNS, 50.0)
+    }
+    page = page_of_results(rows, times, tracks_of(rows), scenarios, title="Benchmark small")
+    html = to_html(page)
+    assert "<b>f</b>" not in html
+    assert [section.title for section in page.sections] == ["Leaderboard", "tracking", "global"]
+    assert [len(section.pictures) for section in page.sections] == [1, 3, 3]
+    titles = [table.title for table in page.sections[1].tables]
+    assert titles == ["Accuracy", "Reliability", "Paired differences", "Failures"]
+    assert "step raised ZeroDivisionError" in to_markdown(page)
+    found = json.loads(to_json(page))["standings"]
+    assert len(found) == 3
+    assert found[0]["rmse_m"]["low"] < found[0]["rmse_m"]["value"]
+    assert found[0]["step_us"] == 50.0
+
+
+def test_a_page_of_two_results_names_them_and_says_which_is_better():
+    page = page_of_comparison(rows_of("f", 0.1), rows_of("f", 0.2), ("new", "old"))
+    text = to_markdown(page)
+    assert "new" in page.lead
+    assert "old" in page.lead
+    assert "f is better than f" not in text
+
+
+@pytest.mark.parametrize("name", ["standard", "aprilab", "magnetic-data", "ship"])
+def test_every_scenario_that_ships_is_described_in_words(name):
+    for scenario in load_suite(name).scenario:
+        text = describe(scenario)
+        assert text.endswith(".")
+        assert f"{scenario.runs} runs" in text

@@ -1,0 +1,150 @@
+"""Suites: keys, selections, seeds and refusals."""
+
+import pytest
+
+from magtwin.bench.suite import HELD_OUT, SUITES, load_suite
+from magtwin.errors import InputError
+from magtwin.localize.localizers import LOCALIZERS
+
+TEXT = """
+name = "small"
+seed = 5
+chunk = 4
+
+[[scenario]]
+name = "near"
+runs = 10
+sessions = 3
+
+[[scenario]]
+name = "far"
+runs = 3
+prior = "global"
+
+[[localizer]]
+method = "odometry"
+
+[[localizer]]
+name = "few"
+method = "rbpf"
+options = { particles = 200 }
+scenarios = ["near"]
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(text=TEXT):
+        file = tmp_path / "small.toml"
+        file.write_text(text, encoding="utf-8")
+        return file
+
+    return write
+
+
+@pytest.mark.parametrize("file", sorted(SUITES.glob("*.toml")), ids=lambda file: file.stem)
+def test_a_suite_that_ships_loads_and_names_known_methods(file):
+    suite = load_suite(file.stem)
+    assert suite.name == file.stem
+    assert {entry.method for entry in suite.localizer} <= set(LOCALIZERS)
+    assert suite.chunks()
+
+
+def test_the_standard_suite_needs_nothing_but_magtwin():
+    load_suite("standard").check()
+
+
+def test_chunks_cover_every_run_of_every_localizer_once(write):
+    suite = load_suite(write())
+    runs = [
+        (chunk.scenario, name, run)
+        for chunk in suite.chunks()
+        for name in chunk.entries
+        for run in range(chunk.first, chunk.first + chunk.runs)
+    ]
+    assert len(runs) == len(set(runs)) == 10 + 10 + 3
+    assert ("far", "few", 0) not in runs
+
+
+def test_a_selection_keeps_the_seeds_of_its_runs(write):
+    suite = load_suite(write())
+    part = suite.limited(scenarios=["near"], localizers=["few", "ekf"], runs=2)
+    assert list(part.scenarios) == ["near"]
+    assert list(part.localizers) == ["few", "ekf"]
+    assert part.first_seed == suite.first_seed == 5
+    assert part.localizers["few"].options == {"particles": 200}
+    assert suite.limited(seeds="held-out").first_seed == 5 + HELD_OUT
+
+
+def test_the_checksum_is_that_of_the_content_and_not_of_the_place(write, tmp_path):
+    file = write()
+    other = tmp_path / "elsewhere" / "small.toml"
+    other.parent.mkdir()
+    other.write_text(TEXT + "\n# a comment\n", encoding="utf-8")
+    assert load_suite(file).sha256 == load_suite(other).sha256
+    assert load_suite(write(TEXT.replace("runs = 10", "runs = 11"))).sha256 != load_suite(other).sha256
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        (
+            "sessions = 3",
+            "sesions = 3",
+            r"small.toml:9: \[scenario\] unknown key 'sesions'; did you mean 'sessions'",
+        ),
+        ('prior = "global"', 'prior = "globe"', r"small.toml:14: \[scenario\] prior must be one of"),
+        ("runs = 3", "runs = 0", "runs must be at least 1, got 0"),
+        ('name = "far"', 'name = "near"', r"two of \[\[scenario\]\] are called 'near'"),
+        ('name = "far"', 'name = "../x"', "lower-case letters, digits and hyphens"),
+        ('scenarios = ["near"]', 'scenarios = ["near", "fra"]', "no scenario 'fra'; did you mean 'far'"),
+        ("chunk = 4", "chunk = 0", "chunk and time_limit_s must be above 0"),
+        (
+            "runs = 3",
+            "runs = 3\nsensor = { white_nt = -1.0 }",
+            "white_nt of SensorModel must be finite and not negative",
+        ),
+        ("runs = 3", "runs = 3\nkidnap_m = [4.0, 0.5]", "kidnap_m must be two ascending distances"),
+        ("runs = 3", "runs = 3\nduration_s = 1e9", "over a million readings"),
+    ],
+)
+def test_a_wrong_suite_is_refused(write, old, new, text):
+    with pytest.raises(InputError, match=text):
+        load_suite(write(TEXT.replace(old, new)))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ('method = "rbpf"', 'method = "rbfp"', "no localizer 'rbfp'; did you mean 'rbpf'"),
+        ("particles = 200", "partikles = 200", "'rbpf' has no option 'partikles'; did you mean 'particles'"),
+        ('method = "rbpf"', 'method = "no_such_module:Filter"', "cannot be imported: ModuleNotFoundError"),
+        ('method = "rbpf"', 'method = "math:tau"', "cannot be made|must have the methods"),
+        ("runs = 3", 'runs = 3\nscene = "lub"', "no scene 'lub'; did you mean 'lab'"),
+        ("runs = 3", 'runs = 3\ndata = "elsewhere"', "scenario 'far' needs the data 'elsewhere'"),
+        ("runs = 3", 'runs = 3\nsource = "ship"', "name them by its key data"),
+        (
+            'method = "odometry"',
+            'method = "odometry"\ncompensator = "irn"',
+            "no compensator 'irn'; did you mean 'iron'",
+        ),
+    ],
+)
+def test_what_a_suite_names_is_looked_for_before_anything_runs(write, old, new, text):
+    suite = load_suite(write(TEXT.replace(old, new)))
+    with pytest.raises(InputError, match=text):
+        suite.check()
+
+
+def test_data_are_relative_to_the_suite_and_can_be_given(write, tmp_path):
+    (tmp_path / "here").mkdir()
+    (tmp_path / "there").mkdir()
+    text = TEXT.replace("chunk = 4", 'chunk = 4\ndata = { loops = "here" }').replace(
+        "runs = 3", 'runs = 3\nsource = "ship"\ndata = "loops"'
+    )
+    suite = load_suite(write(text))
+    assert suite.folder(suite.scenarios["far"]) == tmp_path / "here"
+    given = suite.limited(data={"loops": str(tmp_path / "there")})
+    assert given.folder(given.scenarios["far"]) == tmp_path / "there"
+    with pytest.raises(InputError, match="no such folder of data 'loops'"):
+        suite.limited(data={"loops": "nowhere"}).check()
