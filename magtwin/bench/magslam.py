@@ -39,8 +39,11 @@ SHIP_OFFSET = 0.1
 """Prior standard deviation of the magnetometer's offset: the noise of one reading, in units of the ship."""
 
 SHIP_LIKELY = (0.01, 0.05, 3.0)
-"""White noise and drift of a reading, in units of the ship, and correlation time of the drift [s], of greatest
-marginal likelihood: the errors of the readings and of the field model last for seconds."""
+"""White noise and drift of a reading, in units of the ship, and correlation time of the drift [s].
+
+They have the greatest marginal likelihood of those compared: errors of the readings and of the field model last
+for seconds.
+"""
 
 SHIP_FUNCTIONS = {1: 50, 2: 50, 3: 100, 4: 50}
 """Published number of eigenfunctions of each loop."""
