@@ -1,16 +1,17 @@
 """Particle filters: bootstrap, and Rao-Blackwellised for the errors of the magnetometer."""
 
-import importlib
 import math
 from typing import Any, ClassVar
 
 import numpy as np
 
-from magtwin.compiled import in_threads
+from magtwin.compiled import Loops, in_threads
 from magtwin.errors import InputError
 from magtwin.localize.belief import known_values, mean_variance, table_of, tempering
 from magtwin.localize.odometry import increment
 from magtwin.localize.problem import Array, Estimate, Problem, Reading
+
+LOOPS = Loops("magtwin.localize.particle_loops", pays=0)
 
 SHARE = 32
 """Blocks of 256 particles that a thread takes at a time."""
@@ -35,8 +36,7 @@ SETTLED_M = 0.5
 STILL_M = 1e-3
 """Motion, in metres and in radians / 10, within which a reading may repeat itself to the bit."""
 
-_GOLDEN = 0x9E3779B97F4A7C15
-_WORD = (1 << 64) - 1
+_STRIDE, _WORD = 0x9E3779B97F4A7C15 * 0x2545F4914F6CDD1D, (1 << 64) - 1
 
 # Fractions of the roots of x^4 = x + 1: the low-discrepancy sequence R3 (Roberts 2018)
 _R3 = 1 / 1.2207440846057596 ** np.arange(1, 4)
@@ -76,6 +76,9 @@ class RaoBlackwell:
         resets: Whether to test for kidnapping.
     """
 
+    reset_count = 0
+    """How often the filter has started again."""
+
     sampled: ClassVar[bool] = False
     iron: ClassVar[bool] = False
     network: ClassVar[bool] = False
@@ -94,8 +97,11 @@ class RaoBlackwell:
     ) -> None:
         self.least = self.least if particles is None else particles
         self.start_per_m2 = self.start_per_m2 if per_m2 is None else per_m2
-        if not 2 <= self.least <= most:
-            raise InputError(f"particles must be between 2 and most = {most}, got {self.least}")
+        if not (isinstance(self.least, int) and isinstance(most, int) and 2 <= self.least <= most):
+            raise InputError(
+                f"particles must be a whole number between 2 and most = {most}, got {self.least}",
+                parameter="particles",
+            )
         if not (self.start_per_m2 > 0 and (kappa is None or kappa > 0) and 0 <= map_correlated <= 1):
             raise InputError(
                 "per_m2 and kappa must be above 0 and map_correlated between 0 and 1, got "
@@ -112,7 +118,7 @@ class RaoBlackwell:
         """
         if problem.belief is None:
             raise InputError("particle filters need a map; without one, use ekf-slam or slam-smoother")
-        self._loops: Any = importlib.import_module("magtwin.localize.particle_loops")
+        self._loops: Any = LOOPS.open()
         self._problem = problem
         self._rng = np.random.default_rng(problem.seed)
         self._seed, self._count_steps = int(self._rng.integers(1 << 63)), 0
@@ -129,6 +135,7 @@ class RaoBlackwell:
         self._numbers[self._loops.ELSEWHERE] = self._field_mean
         self._numbers[self._loops.ELSEWHERE_VARIANCE] = self._field_variance
         self._numbers[self._loops.KAPPA] = self._kappa
+        self.reset_count = 0
         self._last: Reading | None = None
         self._repeated_m, self._same_nt = 0.0, math.nan
         self._start(problem.prior.mean, problem.prior.sd)
@@ -155,7 +162,7 @@ class RaoBlackwell:
         self._rates = 1 / np.array(times), 1 / np.array(lengths)
         self._kinds = np.array(kinds, np.int64)
         self._constant = np.isin(times, (FORGET_S, WALK_S)) & np.isinf(lengths)
-        self._numbers_map_white = 1 - correlated
+        self._map_white = 1 - correlated
 
     def _start(
         self,
@@ -197,7 +204,7 @@ class RaoBlackwell:
             self._draw_errors(state, slice(None, None, 2), known, covariance)
         self._scale_variance = self._problem.odometry.scale_std**2
         self._shift = math.log(count)
-        self._scales = np.full(_blocks(count), 1.0 / count)
+        self._scales = np.full(self._blocks(count), 1.0 / count)
         state[k.WEIGHT] = 1.0
         self._reference = (
             (middle[0], middle[1], mean[2]) if math.isinf(sd[0]) else (mean[0], mean[1], mean[2])
@@ -247,7 +254,7 @@ class RaoBlackwell:
         numbers[k.FIELD] = reading.b_nt - (reading.disturbance_nt if self.network else 0.0) if used else 0.0
         extra = reading.disturbance_sd_nt**2 if self.network else 0.0
         numbers[k.WHITE] = self._problem.sensor.white_nt**2 + extra
-        numbers[k.MAP_WHITE] = self._numbers_map_white
+        numbers[k.MAP_WHITE] = self._map_white
         x, y, yaw = self._reference
         yaw += turn
         middle = yaw - turn / 2
@@ -287,8 +294,8 @@ class RaoBlackwell:
         """One step of all blocks, on several threads if there are many."""
         k, count = self._loops, self._count
         self._count_steps += 1
-        key = np.uint64((self._seed + self._count_steps * _GOLDEN * 0x2545F4914F6CDD1D) & _WORD)
-        blocks = _blocks(count)
+        key = np.uint64((self._seed + self._count_steps * _STRIDE) & _WORD)
+        blocks = self._blocks(count)
         sums = self._sums = np.empty((blocks, k.PLAIN_SUM + 1))
 
         def work(part: slice) -> None:
@@ -350,6 +357,9 @@ class RaoBlackwell:
         if wanted < self._count or self._effective < self._count / 2:
             self._resample(wanted)
 
+    def _blocks(self, count: int) -> int:
+        return -(-count // self._loops.BLOCK)
+
     def _resample(self, count: int) -> None:
         k = self._loops
         chosen = np.empty(count, np.int64)
@@ -363,10 +373,7 @@ class RaoBlackwell:
 
         in_threads(work, count, SHARE * k.BLOCK)
         self._state, self._spare, self._count, self._shift = out, state, count, 0.0
-        self._scales = np.full(_blocks(count), 1.0 / count)
-
-    reset_count = 0
-    """How often the filter has started again."""
+        self._scales = np.full(self._blocks(count), 1.0 / count)
 
     def particles(self) -> Array:
         """x, y, yaw and weight of the particles, shape (P, 4)."""
@@ -404,10 +411,6 @@ SLACK = 1.5
 
 RESET_ABOVE = 12.0
 """Sum of surprise at which the filter starts again."""
-
-
-def _blocks(count: int) -> int:
-    return -(-count // 256)
 
 
 def _padded(count: int) -> int:

@@ -52,7 +52,7 @@ class PlainFilter:
         self.log_w = np.full(n, -math.log(n))
         self.sampled, self.kappa, self.least = compiled.sampled, compiled._kappa, compiled.least
         self.variances, self.rates = compiled._prior_variances, compiled._rates
-        self.map_white = compiled._numbers_map_white
+        self.map_white = compiled._map_white
         self.elsewhere = compiled._field_mean, compiled._field_variance
         self.scale_variance = self.problem.odometry.scale_std**2
         self.last = None
