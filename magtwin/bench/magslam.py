@@ -38,6 +38,13 @@ SHIP_NOISE, SHIP_LENGTH_M, SHIP_POTENTIAL_SD, SHIP_UNIFORM_SD = 0.1, 0.8, 1.0, 1
 SHIP_OFFSET = 0.1
 """Prior standard deviation of the magnetometer's offset: the noise of one reading, in units of the ship."""
 
+SHIP_LIKELY = (0.01, 0.05, 3.0)
+"""White noise and drift of a reading, in units of the ship, and correlation time of the drift [s].
+
+They have the greatest marginal likelihood of those compared: errors of the readings and of the field model last
+for seconds.
+"""
+
 SHIP_FUNCTIONS = {1: 50, 2: 50, 3: 100, 4: 50}
 """Published number of eigenfunctions of each loop."""
 
@@ -68,7 +75,13 @@ class Recording:
     """Random walk of odometry's roll and pitch [rad/sqrt(s)], an option of the SLAM methods."""
 
 
-def ship_case(folder: str | os.PathLike[str], loop: int, seed: int) -> Recording:
+def ship_case(
+    folder: str | os.PathLike[str],
+    loop: int,
+    seed: int,
+    *,
+    noise: Literal["published", "likely"] = "published",
+) -> Recording:
     """A loop of the model ship with the published random odometry.
 
     Each increment of the position in world axes is the true one plus the bias `SHIP_BIAS_M` and normal noise;
@@ -80,12 +93,16 @@ def ship_case(folder: str | os.PathLike[str], loop: int, seed: int) -> Recording
         loop: 1 to 4.
         seed: Seed of the odometry's noise. An odd seed has the noise of the one before with the opposite sign
             (antithetic pairs), which makes means over an even number of seeds more precise.
+        noise: What the problem states of the readings: the published white noise, or `SHIP_LIKELY`.
 
     Raises:
         InputError: There is no such loop, or its file is missing or wrong.
     """
     if loop not in SHIP_FUNCTIONS:
         raise InputError(f"loop must be 1, 2, 3 or 4, got {loop}", parameter="loop")
+    if noise not in ("published", "likely"):
+        raise InputError(f"noise must be published or likely, got {noise!r}", parameter="noise")
+    white, drift, drift_s = (SHIP_NOISE, 0.0, 1.0) if noise == "published" else SHIP_LIKELY
     data = _matlab(Path(folder) / f"Aligned_SquareLoop_{loop}.mat", ("p", "q", "p_0", "q_0", "T", "y_mag"))
     p, rotation, dt = data["p"].T, _rotation(data["q"].T), float(data["T"].item())
     y_nt = SHIP_UNIT_NT * data["y_mag"].T
@@ -102,7 +119,10 @@ def ship_case(folder: str | os.PathLike[str], loop: int, seed: int) -> Recording
         extent=(p[:, 0].min(), p[:, 0].max(), p[:, 1].min(), p[:, 1].max()),
         prior=_start(p0, R0),
         sensor=SensorModel(
-            white_nt=SHIP_NOISE * SHIP_UNIT_NT, drift_nt=0.0, offset_nt=SHIP_OFFSET * SHIP_UNIT_NT
+            white_nt=white * SHIP_UNIT_NT,
+            drift_nt=drift * SHIP_UNIT_NT,
+            drift_s=drift_s,
+            offset_nt=SHIP_OFFSET * SHIP_UNIT_NT,
         ),
         odometry=OdometryModel(
             position_std=0.0,
