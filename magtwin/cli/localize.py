@@ -17,7 +17,7 @@ def localize(
     run: Path,
     *,
     map: str,  # noqa: A002 - the option is called --map
-    method: str = "rbpf",
+    method: str = "rbpf-iron",
     option: Names = None,
     out: Path = Path("localized"),
     prior: str = "tracking",
@@ -109,7 +109,7 @@ def localize_live(
     scene: Path,
     *settings: str,
     where: Where = HERE,
-    method: str = "rbpf",
+    method: str = "rbpf-iron",
     option: Names = None,
     map: str | None = None,  # noqa: A002
     sensor: Names = None,

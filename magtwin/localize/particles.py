@@ -4,6 +4,7 @@ import math
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtwin.compiled import Loops, in_threads
 from magtwin.errors import InputError
@@ -67,8 +68,8 @@ class RaoBlackwell:
     * Where the map is unknown, a reading has the mean and the variance of the whole map.
     * Kidnapping: a cumulative sum of surprise, c = max(0, c + ref - log p - 1.5), with p the likelihood of a
       reading and ref the mean log likelihood of a Gaussian with the variance of the readings that the
-      particles predict. Above 12, the filter starts again over the whole floor, half of the particles with
-      the offset and hard iron that were known 5 to 10 s before.
+      particles predict. Above 12, particles over the whole floor join those that there are, half of them with
+      the offset and hard iron that were known 5 to 10 s before. So a false alarm does not lose the pose.
     * A reading that repeats itself to the bit while the robot moves is not used, nor is nan.
 
     `lost` is set while the particles spread over more than 0.5 m.
@@ -177,10 +178,12 @@ class RaoBlackwell:
         mean: tuple[float, float, float],
         sd: tuple[float, float, float],
         errors: tuple[Array, Array] | None = None,
+        kept: Array | None = None,
     ) -> None:
         """Draw all particles: Gaussian, and R3 where the standard deviation is infinite.
 
         Every other particle gets the mean and covariance `errors` of the constants, the rest their prior.
+        Particles `kept`, columns of the state, stay beside them.
         """
         x0, x1, y0, y1 = self._problem.extent
         wide = [math.sqrt(2 * math.pi * math.e) * s for s in sd]  # side of the uniform of the same entropy
@@ -190,10 +193,13 @@ class RaoBlackwell:
         count = int(min(max(wanted, MOST_TIMES * self.least), self.most))
         size = len(self._kinds)
         k = self._loops
-        self._state = np.empty((k.LINEAR + size + size * (size + 1) // 2, _padded(count)))
+        old = 0 if kept is None else kept.shape[1]
+        self._count = old + count
+        self._state = np.empty((k.LINEAR + size + size * (size + 1) // 2, _padded(self._count)))
         self._spare = np.empty_like(self._state)
-        self._count = count
-        state = self._state[:, :count]
+        if kept is not None:
+            self._state[:, :old] = kept
+        state = self._state[:, old : self._count]
         unit = (self._rng.random(3)[:, None] + _R3[:, None] * np.arange(1, count + 1)) % 1.0
         middle, span = ((x0 + x1) / 2, (y0 + y1) / 2, 0.0), (x1 - x0, y1 - y0, 2 * math.pi)
         normal = self._rng.standard_normal((3, count))
@@ -211,12 +217,14 @@ class RaoBlackwell:
             covariance[np.ix_(self._constant, self._constant)] = errors[1]
             self._draw_errors(state, slice(None, None, 2), known, covariance)
         self._scale_variance = self._problem.odometry.scale_std**2
-        self._shift = math.log(count)
-        self._scales = np.full(self._blocks(count), 1.0 / count)
-        state[k.WEIGHT] = 1.0
-        self._reference = (
-            (middle[0], middle[1], mean[2]) if math.isinf(sd[0]) else (mean[0], mean[1], mean[2])
-        )
+        self._state[k.LOG_WEIGHT : k.WEIGHT, : self._count] = 0.0
+        self._state[k.LOG_WEIGHT, :old] = math.log(count / max(old, 1))
+        self._state[k.WEIGHT, : self._count] = np.exp(self._state[k.LOG_WEIGHT, : self._count])
+        total = count * (2.0 if old else 1.0)
+        self._shift = math.log(total)
+        self._scales = np.full(self._blocks(self._count), 1.0 / total)
+        if not old:
+            self._reference = mean if math.isfinite(sd[0]) else (middle[0], middle[1], mean[2])
         self._surprise, self._settled = 0.0, False
         self._kept: list[tuple[Array, Array]] = []
         self._kept_t = -math.inf
@@ -336,8 +344,10 @@ class RaoBlackwell:
         covariance[np.triu_indices(3)] = part[4:10]
         covariance[np.tril_indices(3)] = covariance.T[np.tril_indices(3)]
         covariance -= np.outer(part[1:4], part[1:4])
-        self._reference = pose
         self.spread = math.sqrt(max(0.0, covariance[0, 0] + covariance[1, 1]))
+        if self.spread > SETTLED_M and self.reset_count:
+            pose, covariance = self._held(pose, covariance, (x, y))
+        self._reference = pose
         self._settled = self._settled or self.spread < SETTLED_M
         if used and self._settled:
             top = float(sums[:, k.PLAIN_TOP].max())
@@ -345,17 +355,39 @@ class RaoBlackwell:
             mean = float(before @ sums[:, k.NU])
             variance = float(before @ sums[:, k.NU_NU]) - mean**2 + float(before @ sums[:, k.PRIOR_S])
             expected = -0.5 - 0.5 * math.log(variance)
-            self._surprise = max(0.0, self._surprise + expected - likelihood - SLACK)
+            more = min(expected - likelihood - SLACK, MOST_SURPRISE)
+            self._surprise = max(0.0, self._surprise + more)
         lost = self.spread > SETTLED_M
         bias = float(total[k.OFFSET]) / weight
         return Estimate(t, *pose, covariance, bias, lost)
+
+    def _held(
+        self, pose: tuple[float, float, float], covariance: Array, place: tuple[float, float]
+    ) -> tuple[tuple[float, float, float], Array]:
+        """After an alarm: the particles about the last pose, while they have most of the weight.
+
+        The covariance stays that of all particles.
+        """
+        k, count = self._loops, self._count
+        state = self._state[:, :count]
+        near = np.hypot(state[k.X] - place[0], state[k.Y] - place[1]) < NEAR_M
+        weight = state[k.WEIGHT] * np.repeat(self._scales, k.BLOCK)[:count]
+        weight /= weight.sum()
+        if weight[near].sum() < 0.5:
+            return pose, covariance
+        weight, (x, y, yaw) = weight[near] / weight[near].sum(), state[:3, near]
+        turn = math.atan2(float(weight @ np.sin(yaw)), float(weight @ np.cos(yaw)))
+        held = float(weight @ x), float(weight @ y), turn
+        off = np.array([pose[0] - held[0], pose[1] - held[1], _wrapped(pose[2] - held[2])])
+        return held, covariance + np.outer(off, off)
 
     def _maintain(self, estimate: Estimate) -> None:
         """Resample, shrink, or start again."""
         if self.resets and self._surprise > RESET_ABOVE:
             self.reset_count += 1
             errors = None if len(self._kept) < 2 else (self._kept[0][0], INFLATE * self._kept[0][1])
-            self._start((0.0, 0.0, 0.0), (math.inf, math.inf, math.inf), errors)
+            kept = self._state[:, self._chosen(min(KEPT, self._count))]
+            self._start((0.0, 0.0, 0.0), (math.inf, math.inf, math.inf), errors, kept)
             return
         if self._settled and estimate.t >= self._kept_t + KEEP_S:
             self._kept, self._kept_t = [*self._kept[-1:], self._errors()], estimate.t
@@ -372,10 +404,14 @@ class RaoBlackwell:
     def _blocks(self, count: int) -> int:
         return -(-count // self._loops.BLOCK)
 
-    def _resample(self, count: int) -> None:
-        k = self._loops
+    def _chosen(self, count: int) -> NDArray[np.int64]:
+        """Particles drawn by their weights, systematically."""
         chosen = np.empty(count, np.int64)
-        k.choose(self._count, self._state, self._scales, float(self._rng.random()), chosen)
+        self._loops.choose(self._count, self._state, self._scales, float(self._rng.random()), chosen)
+        return chosen
+
+    def _resample(self, count: int) -> None:
+        k, chosen = self._loops, self._chosen(count)
         if self._spare.shape[1] != _padded(count):
             self._spare = np.empty((len(self._state), _padded(count)))
         state, out = self._state, self._spare
@@ -420,6 +456,15 @@ class RaoBlackwellNetwork(RaoBlackwellIron):
 
 SLACK = 1.5
 """Surprise of a reading that is ignored."""
+
+MOST_SURPRISE = 6.0
+"""Most that one reading adds to the surprise: a step of the robot's own field is no kidnapping [nats]."""
+
+NEAR_M = 1.0
+"""Distance from the last pose within which particles belong to it after an alarm [m]."""
+
+KEPT = 1000
+"""Particles that stay when the filter starts again, with half of the weight."""
 
 RESET_ABOVE = 12.0
 """Sum of surprise at which the filter starts again."""
