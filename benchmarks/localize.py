@@ -4,7 +4,8 @@ Both do the same steps of the same drive on the shipped map: 12 readings, in whi
 as it does. The plain filter is that of the tests, with numpy's random numbers and numpy's own map lookups;
 with the compiled filter's random numbers it gives the same estimates, which is checked first. The ways take
 turns reading by reading, so that a busy machine slows all alike; medians over the readings of all rounds, and
-least times, which a busy machine spoils less.
+least times, which a busy machine spoils less. The last column is the ratio of processor times, of all threads
+together.
 
     python benchmarks/localize.py [rounds]
 """
@@ -66,11 +67,11 @@ def check(method: str, problem: Problem, readings: list[Reading]) -> None:
             sys.exit(f"{method}: the filters differ by {math.hypot(a.x - b.x, a.y - b.y):.1e} m")
 
 
-def measure(method: str, rounds: int) -> dict[str, list[float]]:
-    """Seconds of each step, by way."""
+def measure(method: str, rounds: int) -> dict[str, list[tuple[float, float]]]:
+    """Seconds and processor seconds of each step, by way."""
     problem, readings = case(method)
     check(method, problem, readings)
-    seconds: dict[str, list[float]] = {"numpy": [], **{name: [] for name in WANTED}}
+    seconds: dict[str, list[tuple[float, float]]] = {"numpy": [], **{name: [] for name in WANTED}}
     for _ in range(rounds):
         filters = {}
         for name in seconds:
@@ -81,9 +82,9 @@ def measure(method: str, rounds: int) -> dict[str, list[float]]:
             for name, made in filters.items():
                 compiled.MOST_THREADS = 2 if "two" in name else 1
                 LOOPS.code = None  # numpy's own lookups
-                start = time.perf_counter()
+                start, busy = time.perf_counter(), time.process_time()
                 made.step(reading)
-                seconds[name].append(time.perf_counter() - start)
+                seconds[name].append((time.perf_counter() - start, time.process_time() - busy))
     return seconds
 
 
@@ -92,14 +93,17 @@ def main(rounds: int = 5) -> None:
     print(f"{PARTICLES:,} particles, {READINGS} readings, {rounds} rounds")
     for method in CASES:
         seconds = measure(method, rounds)
-        print(f"\n{method:24}{'median, ns a particle':>22}{'least':>8}{'x numpy':>10}{'least':>8}")
+        print(f"\n{method:24}{'median, ns a particle':>22}{'least':>8}{'x numpy':>10}{'least':>8}{'cpu':>8}")
+        each = 1e9 / PARTICLES
+        peer = [statistics.median(column) for column in zip(*seconds["numpy"], strict=True)]
+        fastest = min(seconds["numpy"])[0]
         for name, took in seconds.items():
-            median, least = statistics.median(took), min(took)
-            ratios = statistics.median(seconds["numpy"]) / median, min(seconds["numpy"]) / least
+            median, busy = (statistics.median(column) for column in zip(*took, strict=True))
+            least = min(took)[0]
             wanted = f"  wanted: {WANTED[name]} times numpy" if name in WANTED else ""
-            each = 1e9 / PARTICLES
             print(
-                f"{name:24}{median * each:22.1f}{least * each:8.1f}{ratios[0]:10.1f}{ratios[1]:8.1f}{wanted}"
+                f"{name:24}{median * each:22.1f}{least * each:8.1f}{peer[0] / median:10.1f}"
+                f"{fastest / least:8.1f}{peer[1] / busy:8.1f}{wanted}"
             )
 
 

@@ -33,6 +33,13 @@ INFLATE = 4.0
 SETTLED_M = 0.5
 """Spread of the particles, sqrt(var x + var y), below which the pose counts as known [m]."""
 
+NARROW_M, MOST_TIMES = 0.06, 5.0
+"""The least number of particles grows with their spread above this [m], up to so many times: a wrong position
+nearby may agree with the first readings better."""
+
+SHRINK = 0.95
+"""Factor of the number of particles at each reading, while there are more than enough."""
+
 STILL_M = 1e-3
 """Motion, in metres and in radians / 10, within which a reading may repeat itself to the bit."""
 
@@ -51,9 +58,10 @@ class RaoBlackwell:
     error of the odometry is marginalised too: the sampled distances are its readings. The proposal is the
     odometry; see `magtwin.localize.particle_loops.step` for the equations.
 
-    * Start: R3 points over the parts of the pose that are unknown, more of them the larger the region.
+    * Start: five times `particles`, or more where the region is large; R3 points over the unknown parts.
     * Resampling: systematic, once the effective number is below half of the particles. While they are within
-      0.5 m, 30 % fewer remain at each reading, down to `particles`.
+      0.5 m, 5 % fewer remain at each reading, down to `particles`, or up to five times as many for a spread
+      above 0.06 m.
     * Map error: the share `map_correlated` of the map's variance is the FOGM state of length
       `Problem.map_length_m`, the rest is white.
     * Where the map is unknown, a reading has the mean and the variance of the whole map.
@@ -179,7 +187,7 @@ class RaoBlackwell:
         area = (x1 - x0) * (y1 - y0) if math.isinf(sd[0]) else wide[0] * wide[1]
         turn = min(1.0, wide[2] / (2 * math.pi))
         wanted = self.start_per_m2 * area * (1 + 3 * turn)
-        count = int(min(max(wanted, self.least), self.most))
+        count = int(min(max(wanted, MOST_TIMES * self.least), self.most))
         size = len(self._kinds)
         k = self._loops
         self._state = np.empty((k.LINEAR + size + size * (size + 1) // 2, _padded(count)))
@@ -353,9 +361,13 @@ class RaoBlackwell:
             self._kept, self._kept_t = [*self._kept[-1:], self._errors()], estimate.t
         wanted = self._count
         if self.spread < SETTLED_M:
-            wanted = max(self.least, int(0.7 * self._count))
+            wanted = min(self._count, max(self._enough(self.spread), int(SHRINK * self._count)))
         if wanted < self._count or self._effective < self._count / 2:
             self._resample(wanted)
+
+    def _enough(self, spread: float) -> int:
+        """Least number of particles for a spread [m]."""
+        return min(self.most, int(self.least * min(max(spread / NARROW_M, 1.0), MOST_TIMES)))
 
     def _blocks(self, count: int) -> int:
         return -(-count // self._loops.BLOCK)

@@ -86,7 +86,8 @@ class PlainFilter:
         estimate = self.estimate(reading.t)
         spread = math.sqrt(estimate.covariance[0, 0] + estimate.covariance[1, 1])
         count = len(self.x)
-        wanted = max(self.least, int(0.7 * count)) if spread < 0.5 else count
+        enough = int(self.least * min(max(spread / 0.06, 1.0), 5.0))
+        wanted = min(count, max(enough, int(0.95 * count))) if spread < 0.5 else count
         if wanted < count or 1 / np.sum(self.w**2) < count / 2:
             self.resample(wanted)
         return estimate
