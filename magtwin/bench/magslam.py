@@ -41,8 +41,8 @@ SHIP_OFFSET = 0.1
 SHIP_LIKELY = (0.01, 0.05, 3.0)
 """White noise and drift of a reading, in units of the ship, and correlation time of the drift [s].
 
-They have the greatest marginal likelihood of those compared: errors of the readings and of the field model last
-for seconds.
+They have the greatest marginal likelihood of those compared: errors of the readings and of the field model
+last for seconds.
 """
 
 SHIP_FUNCTIONS = {1: 50, 2: 50, 3: 100, 4: 50}
