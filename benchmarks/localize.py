@@ -27,8 +27,8 @@ from plain_particles import PlainFilter
 from magtwin import compiled
 from magtwin.field.maps.lookup import LOOPS
 from magtwin.io.surveys.maps import open_map
-from magtwin.localize.localizers import load_localizer
-from magtwin.localize.problem import Problem, Reading, SensorModel
+from magtwin.localization.localizers import load_localizer
+from magtwin.localization.problem import Problem, Reading, SensorModel
 
 PARTICLES = 100_000
 READINGS = 12

@@ -36,11 +36,11 @@ from magtwin.bench.magslam import (
     ship_case,
     ship_options,
 )
-from magtwin.localize.odometry import Odometry
-from magtwin.localize.slam.ekf_slam import EkfSlam
-from magtwin.localize.slam.incremental_slam import IncrementalSlam
-from magtwin.localize.slam.slam_smoother import SlamSmoother
-from magtwin.localize.track import track
+from magtwin.localization.odometry import Odometry
+from magtwin.localization.slam.ekf_slam import EkfSlam
+from magtwin.localization.slam.incremental_slam import IncrementalSlam
+from magtwin.localization.slam.slam_smoother import SlamSmoother
+from magtwin.localization.track import track
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "magslam"
 BIAS_M = 0.005  # prior standard deviation of odometry's error a step

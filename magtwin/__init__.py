@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from magtwin.learning import calibrate as calibrate
     from magtwin.learning import error_budget as error_budget
     from magtwin.learning import evaluate as evaluate
-    from magtwin.localization import localize as localize
+    from magtwin.localizing import localize as localize
     from magtwin.run.run import COLUMNS as COLUMNS
     from magtwin.run.run import Run as Run
     from magtwin.sim.plant_families import draw_plant as draw_plant
@@ -77,7 +77,7 @@ _NAMES = {
     "from_urdf": "author.from_urdf",
     "in_session": "twin",
     "load_map": "usd.maps",
-    "localize": "localization",
+    "localize": "localizing",
     "load_predictor": "learn.models.predictor",
     "load_run": "io.formats:read_run",
     "new_scene": "twin",

@@ -5,8 +5,8 @@ import signal
 import sys
 import time
 
-from magtwin.localize.odometry import Odometry
-from magtwin.localize.problem import Estimate
+from magtwin.localization.odometry import Odometry
+from magtwin.localization.problem import Estimate
 
 
 class _Bad(Odometry):

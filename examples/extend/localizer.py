@@ -3,9 +3,9 @@
 import numpy as np
 
 import magtwin as mt
-from magtwin.localize.localizers import localizer
-from magtwin.localize.odometry import increment
-from magtwin.localize.problem import Estimate
+from magtwin.localization.localizers import localizer
+from magtwin.localization.odometry import increment
+from magtwin.localization.problem import Estimate
 
 
 @localizer("my-filter")

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.localize.problem import FieldBelief, Problem
+from magtwin.localization.problem import FieldBelief, Problem
 from magtwin.run.run import Run
 
 Array = NDArray[np.float64]

@@ -29,7 +29,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.readings import Readings
 from magtwin.files import existing
 from magtwin.frames import quat_from_yaw
-from magtwin.localize.problem import HEADING_WITHIN, OdometryModel, Prior, Problem, SensorModel
+from magtwin.localization.problem import HEADING_WITHIN, OdometryModel, Prior, Problem, SensorModel
 from magtwin.run.run import Run
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from magtwin.errors import InputError
-from magtwin.localize.problem import OdometryModel, Prior, Problem, SensorModel
+from magtwin.localization.problem import OdometryModel, Prior, Problem, SensorModel
 from magtwin.run.run import Run
 
 Array = NDArray[np.float64]

@@ -21,10 +21,10 @@ from magtwin.bench.magnetic_data import (
     read_recording,
     recorded_field,
 )
-from magtwin.localize.bounds import map_correlation
-from magtwin.localize.localizers import load_localizer
-from magtwin.localize.scores import nees
-from magtwin.localize.track import track
+from magtwin.localization.bounds import map_correlation
+from magtwin.localization.localizers import load_localizer
+from magtwin.localization.scores import nees
+from magtwin.localization.track import track
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], Any]

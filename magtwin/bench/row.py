@@ -15,11 +15,11 @@ from magtwin.bench.suite import Chunk, Entry, Scenario, Suite
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import quat_from_yaw, yaw_from_quat
-from magtwin.localize.bounds import Bounds, bounds
-from magtwin.localize.localizers import load_localizer
-from magtwin.localize.problem import Localizer, Problem, SensorModel, Smoother
-from magtwin.localize.scores import Scores, score
-from magtwin.localize.track import LocalizerError, Track, track
+from magtwin.localization.bounds import Bounds, bounds
+from magtwin.localization.localizers import load_localizer
+from magtwin.localization.problem import Localizer, Problem, SensorModel, Smoother
+from magtwin.localization.scores import Scores, score
+from magtwin.localization.track import LocalizerError, Track, track
 from magtwin.parallel import beat
 from magtwin.run.run import Run
 
@@ -150,7 +150,7 @@ def run_localizer(
         with time_limit(limit_s):
             readings = case.readings
             if entry.compensator != "none":
-                from magtwin.localize.compensators import COMPENSATORS, compensated
+                from magtwin.localization.compensators import COMPENSATORS, compensated
 
                 if case.problem.calibration is None or case.problem.belief is None:
                     raise LocalizerError(

@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 from magtwin.errors import InputError, find
 from magtwin.files import from_table, read_toml
-from magtwin.localize.localizers import load_localizer
-from magtwin.localize.problem import OdometryModel, SensorModel
+from magtwin.localization.localizers import load_localizer
+from magtwin.localization.problem import OdometryModel, SensorModel
 from magtwin.twin import scene_file
 
 HELD_OUT = 1_000_000_000
@@ -306,7 +306,7 @@ class Suite:
         for entry in self.localizer:
             load_localizer(entry.method, entry.options)
             if entry.compensator != "none":
-                from magtwin.localize.compensators import COMPENSATORS
+                from magtwin.localization.compensators import COMPENSATORS
 
                 find("compensator", entry.compensator, COMPENSATORS)
         for scenario in self.scenario:

@@ -18,7 +18,7 @@ from magtwin.bench.suite import Scenario
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import quat_from_yaw, wrap_angle, yaw_from_quat
-from magtwin.localize.problem import HEADING_WITHIN, OdometryModel, Prior, Problem, SensorModel
+from magtwin.localization.problem import HEADING_WITHIN, OdometryModel, Prior, Problem, SensorModel
 from magtwin.run.run import Run
 
 if TYPE_CHECKING:

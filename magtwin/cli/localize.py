@@ -75,8 +75,8 @@ def localize(
     from magtwin.figures.localization import save_localization
     from magtwin.files import check_free
     from magtwin.io.formats import read_run
-    from magtwin.localization import ROBOT_NOISE, lever_arm_of, localization
-    from magtwin.localize.problem import OdometryModel, SensorModel
+    from magtwin.localization.problem import OdometryModel, SensorModel
+    from magtwin.localizing import ROBOT_NOISE, lever_arm_of, localization
 
     check_free(out, force=force)
     announce(f"Reading {run}")
@@ -145,9 +145,9 @@ def localize_live(
     map_length_m
         Correlation length of the map's error that the method is told [m].
     """
-    from magtwin.localization import live_problem
-    from magtwin.localize.problem import OdometryModel, SensorModel
-    from magtwin.ros.localize import PARAMETERS, LocalizerNode
+    from magtwin.localization.problem import OdometryModel, SensorModel
+    from magtwin.localizing import live_problem
+    from magtwin.ros.localization.localize import PARAMETERS, LocalizerNode
     from magtwin.ros.parameters import settings as settings_of
     from magtwin.twin import open_twin
 

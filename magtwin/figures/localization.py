@@ -36,8 +36,8 @@ from magtwin.figures.maps import draw_cells, mean_field_ut
 from magtwin.files import output
 from magtwin.frames import wrap_angle
 from magtwin.io.rerun.localization import write_localization
-from magtwin.localization import Localization
-from magtwin.localize.tum import save_tum
+from magtwin.localization.tum import save_tum
+from magtwin.localizing import Localization
 
 ESTIMATE_INK, TRUTH_INK, DEAD_INK, BOUND_INK, LOST_INK = "#e8590c", INK, "#1971c2", "#2b8a3e", "#f3d9fa"
 BAND_INK = "#ffd8a8"
@@ -62,10 +62,10 @@ def draw_localization(result: Localization) -> Figure:
     The ellipses hold 2 standard deviations along each of their axes (86 % of the poses, if the covariance is
     right) and are drawn every 5 s at most. The band of the position error is twice the root of the
     estimate's variances along x and y. The bound is the least standard deviation that any unbiased method
-    can have with this map, see `magtwin.localize.bounds`.
+    can have with this map, see `magtwin.localization.bounds`.
 
     Args:
-        result: Result of `magtwin.localization.localization`. Without a true pose, the errors are left out
+        result: Result of `magtwin.localizing.localization`. Without a true pose, the errors are left out
             and the standard deviations are drawn alone.
 
     Returns:
@@ -253,7 +253,7 @@ def save_localization(result: Localization, out: str | os.PathLike[str], *, forc
     """Write the folder of a localization.
 
     Args:
-        result: Result of `magtwin.localization.localization`.
+        result: Result of `magtwin.localizing.localization`.
         out: Folder to make, with run.parquet, localize.rrd, localize.png, estimate.tum and, if the true pose
             is known, truth.tum.
         force: Whether to replace an existing folder.

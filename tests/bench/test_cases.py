@@ -11,7 +11,7 @@ from magtwin.bench.suite import Scenario
 from magtwin.bench.twin_case import chained, fogm, moves, noisy_odometry, twin_case
 from magtwin.files import shipped
 from magtwin.io.surveys.maps import open_map
-from magtwin.localize.problem import OdometryModel, SensorModel
+from magtwin.localization.problem import OdometryModel, SensorModel
 
 LAB = str(shipped("scenes", "lab", "lab.usda"))
 PLAIN = Scenario(name="plain", duration_s=20.0)

@@ -23,12 +23,12 @@ from magtwin.bench.magnetic_data import (
 )
 from magtwin.bench.recorded_noise import Candidate, choose, likeliest_noise, preferred
 from magtwin.errors import InputError
-from magtwin.localize.bounds import bounds
-from magtwin.localize.localizers import load_localizer
-from magtwin.localize.problem import OdometryModel
-from magtwin.localize.readings import ONBOARD
-from magtwin.localize.scores import score
-from magtwin.localize.track import track
+from magtwin.localization.bounds import bounds
+from magtwin.localization.localizers import load_localizer
+from magtwin.localization.problem import OdometryModel
+from magtwin.localization.readings import ONBOARD
+from magtwin.localization.scores import score
+from magtwin.localization.track import track
 
 IRON_NT, ARM_M = (-2500.0, 700.0), -0.03
 

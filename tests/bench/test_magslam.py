@@ -19,8 +19,8 @@ from magtwin.bench.magslam import (
     ship_options,
 )
 from magtwin.errors import InputError
-from magtwin.localize.localizers import load_localizer
-from magtwin.localize.track import track
+from magtwin.localization.localizers import load_localizer
+from magtwin.localization.track import track
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "magslam"
 SHIP, HAND = DATA / "ship", DATA / "1d"

@@ -4,7 +4,7 @@ import pytest
 
 from magtwin.bench.suite import HELD_OUT, SUITES, load_suite
 from magtwin.errors import InputError
-from magtwin.localize.localizers import LOCALIZERS
+from magtwin.localization.localizers import LOCALIZERS
 
 TEXT = """
 name = "small"

@@ -11,9 +11,9 @@ import pytest
 import magtwin as mt
 from magtwin.cli import main
 from magtwin.errors import InputError, MismatchWarning
-from magtwin.localization import Localization, localization, prior_of, thinned, verdict_of
-from magtwin.localize.problem import Prior
-from magtwin.localize.scores import Scores
+from magtwin.localization.problem import Prior
+from magtwin.localization.scores import Scores
+from magtwin.localizing import Localization, localization, prior_of, thinned, verdict_of
 
 
 @pytest.fixture(scope="module")

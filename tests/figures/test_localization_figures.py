@@ -11,8 +11,8 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.figures.canvas import render
 from magtwin.figures.localization import draw_localization, ellipse
 from magtwin.frames import quat_from_yaw
-from magtwin.localization import Localization, localization
-from magtwin.localize.problem import Prior
+from magtwin.localization.problem import Prior
+from magtwin.localizing import Localization, localization
 from magtwin.run.run import Run
 
 

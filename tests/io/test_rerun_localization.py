@@ -30,7 +30,7 @@ def run() -> Run:
         "est_bias_nt": 100 + t,
         "est_lost": t < 1,
     }
-    from magtwin.localize.track import EST_COLUMNS
+    from magtwin.localization.track import EST_COLUMNS
 
     return Run(columns, {"localizer": "own"}, EST_COLUMNS)
 

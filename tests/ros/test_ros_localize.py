@@ -15,15 +15,14 @@ from magtwin.files import shipped
 from magtwin.frames import quat_from_yaw, rotate, wrap_angle, yaw_from_quat
 from magtwin.io.bags.topics import CLOCK, COMMAND, MAGNITUDE, ODOMETRY, Qos
 from magtwin.io.bags.types import typestore
-from magtwin.localization import live_problem, localization, localize, new_localizer
-from magtwin.localize.problem import Estimate, Prior
-from magtwin.localize.track import LocalizerError
+from magtwin.localization.problem import Estimate, Prior
+from magtwin.localization.track import LocalizerError
+from magtwin.localizing import live_problem, localization, localize, new_localizer
 from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
 from magtwin.ros.diagnostics import KIND
 from magtwin.ros.follow import command_bytes
-from magtwin.ros.localize import PARAMETERS, LocalizerNode
-from magtwin.ros.parameters import settings
-from magtwin.ros.poses import (
+from magtwin.ros.localization.localize import PARAMETERS, LocalizerNode
+from magtwin.ros.localization.poses import (
     CLOUD,
     CLOUD_KIND,
     ESTIMATE,
@@ -36,6 +35,7 @@ from magtwin.ros.poses import (
     prior_from,
     read_pose,
 )
+from magtwin.ros.parameters import settings
 from magtwin.ros.simulate import Simulator
 from magtwin.run.run import Run
 from magtwin.twin import Twin, open_twin, simulate
@@ -336,7 +336,7 @@ def test_a_smoother_and_a_wrong_prior_are_refused(net: Net, twin: Twin) -> None:
 
 
 def test_the_method_ros_is_known_by_name(tmp_path: Path) -> None:
-    from magtwin.localize.localizers import load_localizer
+    from magtwin.localization.localizers import load_localizer
 
     with pytest.raises(InputError, match="timeout_s of the localizer ros must be above 0 s"):
         load_localizer("ros", {"timeout_s": 0.0})

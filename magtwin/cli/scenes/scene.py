@@ -24,7 +24,7 @@ def new(out: Path, *, force: Force = False) -> Done:
     """
     check_output(out, (".toml", ".py"), "a room or a localizer", force=force)
     if out.suffix == ".py":
-        from magtwin.localization import new_localizer
+        from magtwin.localizing import new_localizer
 
         new_localizer(out, force=force)
         try_it = f"magtwin localize localizer_run/run.parquet --map lab --method {out.stem}:MyLocalizer"

@@ -50,7 +50,7 @@ def write_localization(
     The columns of the run are stored as by `magtwin.io.rerun.file.write_rrd`, and can be read back.
 
     Args:
-        run: A run with the columns of `magtwin.localize.track.EST_COLUMNS`.
+        run: A run with the columns of `magtwin.localization.track.EST_COLUMNS`.
         path: The .rrd file to make.
         anomaly_map: The map, drawn below the paths.
         truth: True x, y [m] and yaw [rad], shape (N, 3).

@@ -1,0 +1,214 @@
+"""Bank of extended Kalman filters: many starts at once, until one place is left."""
+
+import math
+
+import numpy as np
+
+from magtwin.compiled import Loops
+from magtwin.localization.odometry import increment
+from magtwin.localization.problem import Array, Problem, Reading
+
+LOOPS = Loops("magtwin.localization.grid.bank_loops", pays=0.0)
+"""Compiled loops; a bank in plain Python would take minutes."""
+
+STATS = 14
+"""Number of sums that compiled updates return; see `grid_loops.update`."""
+
+CUT = 20.0
+"""Filters and nodes whose mass is below exp(-CUT) of the greatest are dropped."""
+
+SPAN = 3.6
+"""Half width of a Gaussian that is kept [standard deviations]."""
+
+OVERLAP = 0.45
+"""Standard deviation of a component by the distance to the next one."""
+
+OUTSIDE = 1.0
+"""Penalty of a pose outside the extent per reading [nats]."""
+
+WHITE_SHARE = 0.16
+"""Share of the map's variance that differs from reading to reading; the rest is correlated along the path."""
+
+
+class Likelihood:
+    """What all compiled updates are told of a problem: tables, noise, and dynamics of the linear states.
+
+    Args:
+        problem: The problem, with a belief.
+        table: Table of the field.
+        spreads: Table of its variance, of length 0 if there is none.
+        temper: Divisor of the log-likelihood.
+    """
+
+    def __init__(self, problem: Problem, table: Array, spreads: Array, temper: float) -> None:
+        from magtwin.field.maps.trilinear import planes
+
+        self.problem, self.table, self.spreads, self.temper = problem, table, spreads, temper
+        self.mapped, self.iron = len(spreads) > 0, problem.sensor.iron_nt > 0
+        begin, end, *_ = planes(table)
+        values = table[begin:end]
+        if len(table) > end:
+            values = values[table[end:] == 0]
+        self.wide = (float(values.mean()), float(values.var()) + 1.0)
+        sensor = problem.sensor
+        sd = [sensor.offset_nt, sensor.drift_nt]
+        self.start = np.array(sd + [1.0] * self.mapped + [sensor.iron_nt] * (2 * self.iron)) ** 2
+        """Prior variances of the linear states: offset, drift, map error, iron cos and sin."""
+
+    def numbers(self, reading: Reading, reference: Array) -> list[float]:
+        """The first entries of `numbers` of the compiled updates."""
+        sensor = self.problem.sensor
+        return [
+            reading.b_nt - reading.disturbance_nt,
+            *sensor.lever_arm_m,
+            sensor.white_nt**2 + reading.disturbance_sd_nt**2,
+            WHITE_SHARE,
+            1 / self.temper,
+            self.mapped,
+            self.iron,
+            *self.wide,
+            *self.problem.extent,
+            OUTSIDE,
+            CUT,
+            *reference.tolist(),
+        ]
+
+    def dynamics(self, dt: float, distance: float) -> tuple[list[float], list[float]]:
+        """Decay and noise variance of the linear states over a step."""
+        sensor = self.problem.sensor
+        time = math.exp(-dt / sensor.drift_s)
+        along = math.exp(-distance / self.problem.map_length_m)
+        decay = [1.0, time] + [along] * self.mapped + [1.0, 1.0] * self.iron
+        noise = [0.0, (1 - time**2) * sensor.drift_nt**2]
+        return decay, noise + [1 - along**2] * self.mapped + [0.0, 0.0] * self.iron
+
+
+def moments(stats: Array) -> tuple[Array, Array]:
+    """Mean, minus the reference, and covariance of x, y and yaw from the sums of a compiled update."""
+    shift = stats[4:7] / stats[3]
+    second = np.empty((3, 3))
+    second[np.triu_indices(3)] = stats[7:13]
+    second.T[np.triu_indices(3)] = stats[7:13]
+    return shift, second / stats[3] - np.outer(shift, shift)
+
+
+class Bank:
+    """Gaussian sum filter (Alspach and Sorenson 1972, IEEE TAC 17:439) on a grid of starts.
+
+    Each component is an extended Kalman filter of x, y, yaw, odometry scale and the linear states, and starts
+    at a node of a grid over the prior. Components whose mass vanishes are dropped.
+
+    Args:
+        likelihood: Tables and noise.
+        mean: Mean of x, y and yaw.
+        sd: Their standard deviations; uniform over the extent or all headings where infinite.
+        cell_m: Greatest distance of starts [m].
+        step_rad: Greatest distance of their headings [rad].
+    """
+
+    def __init__(
+        self,
+        likelihood: Likelihood,
+        mean: tuple[float, float, float],
+        sd: tuple[float, float, float],
+        *,
+        cell_m: float,
+        step_rad: float,
+    ) -> None:
+        self._code, self.likelihood = LOOPS.open(), likelihood
+        x0, x1, y0, y1 = likelihood.problem.extent
+        ranges = ((x0, x1, cell_m), (y0, y1, cell_m), (mean[2] - math.pi, mean[2] + math.pi, step_rad))
+        axes, spreads, masses = [], [], []
+        for (low, high, step), middle, s in zip(ranges, mean, sd, strict=True):
+            if math.isinf(s):
+                count = max(2, math.ceil((high - low) / step))
+                step = (high - low) / count
+                axis = low + step * (np.arange(count) + 0.5)
+                mass = np.zeros(count)
+            elif s <= 0.7 * step:
+                axis, mass, step = np.array([middle]), np.zeros(1), s / OVERLAP
+            else:  # a sum of Gaussians with the variance of the prior
+                wide = math.sqrt(s * s - (OVERLAP * step) ** 2)
+                half = math.ceil(SPAN * wide / step)
+                axis = middle + step * np.arange(-half, half + 1)
+                mass = np.asarray(-0.5 * ((axis - middle) / wide) ** 2, float)
+            axes.append(axis)
+            spreads.append((OVERLAP * step) ** 2)
+            masses.append(mass)
+        yaw, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
+        logw = masses[2][:, None, None] + masses[1][:, None] + masses[0]
+        self.n = 4 + len(likelihood.start)
+        variances = [*spreads, likelihood.problem.odometry.scale_std**2, *likelihood.start]
+        states = np.zeros((logw.size, self.n + self.n**2))
+        states[:, 0], states[:, 1], states[:, 2] = x.ravel(), y.ravel(), yaw.ravel()
+        states[:, self.n :: self.n + 1] = variances
+        self.logw: Array = np.asarray(logw - np.log(np.exp(logw).sum()), float).ravel()
+        self._state: Array = states.ravel()
+
+    @property
+    def means(self) -> Array:
+        """Means of the components, shape (K, n)."""
+        return self._state.reshape(len(self.logw), -1)[:, : self.n]
+
+    @property
+    def covariances(self) -> Array:
+        """Their covariances, shape (K, n, n)."""
+        return self._state.reshape(len(self.logw), -1)[:, self.n :].reshape(-1, self.n, self.n)
+
+    def step(self, last: Reading | None, reading: Reading, reference: Array) -> Array:
+        """Move by the odometry, use a reading, and drop components without mass.
+
+        Args:
+            last: The reading before, or None.
+            reading: The reading.
+            reference: x, y and yaw from which the sums are taken.
+
+        Returns:
+            The sums `stats` of the compiled update.
+        """
+        problem = self.likelihood.problem
+        dt, motion = 0.0, (0.0, 0.0, 0.0)
+        if last is not None:
+            dt, motion = reading.t - last.t, increment(last.odometry, reading.odometry)
+        distance = math.hypot(motion[0], motion[1])
+        decay, noise = self.likelihood.dynamics(dt, distance)
+        pose = [1.0] * 4, [0.0] * 4
+        numbers = [*self.likelihood.numbers(reading, reference), *motion]
+        numbers += [*problem.odometry.variances(distance, motion[2], dt), *pose[0], *decay, *pose[1], *noise]
+        stats = np.empty(STATS)
+        table, spreads = self.likelihood.table, self.likelihood.spreads
+        self._code.update_bank(table, spreads, self.logw, self._state, np.array(numbers, float), stats)
+        if stats[1] < 0.8 * len(self.logw):
+            kept = np.isfinite(self.logw)
+            self._state = np.ascontiguousarray(self._state.reshape(len(kept), -1)[kept]).ravel()
+            self.logw = np.ascontiguousarray(self.logw[kept])
+            stats[2] = np.argmax(self.logw)
+        return stats
+
+    def heaviest(self, stats: Array) -> Array:
+        """x, y and yaw of the component with the most mass."""
+        made: Array = self.means[int(stats[2]), :3].copy()
+        return made
+
+    def smooth(self, covariance: Array) -> bool:
+        """Whether the components overlap so much that nodes at half a standard deviation resolve them."""
+        w = np.exp(self.logw)
+        within = np.einsum("k,kij->ij", w, self.covariances[:, :3, :3])
+        root = np.linalg.cholesky(np.linalg.inv(covariance + 1e-14 * np.eye(3)))
+        return bool(np.linalg.eigvalsh(root.T @ within @ root)[0] > 0.3)
+
+    def splat(self, poses: Array, logw: Array, state: Array) -> None:
+        """Evaluate the mixture at nodes, shape (3 N,): their mass and linear states given the pose."""
+        some = np.argsort(-self.logw)[:60]
+        some = some[self.logw[some] > self.logw[some[0]] - 8]
+        means, covariances = self.means[some], self.covariances[some]
+        pose = covariances[:, :3, :3]
+        inverses = np.linalg.inv(pose)
+        slopes = covariances[:, 4:, :3] @ inverses
+        rest = covariances[:, 4:, 4:] - slopes @ covariances[:, :3, 4:]
+        n = self.n - 4
+        a, b = np.triu_indices(n)
+        linear = np.concatenate([means[:, 4:], slopes.reshape(len(some), -1), rest[:, a, b]], axis=1)
+        weights = self.logw[some] - 0.5 * np.linalg.slogdet(pose)[1]
+        flat = (np.ascontiguousarray(v).ravel() for v in (means[:, :3], inverses, linear))
+        self._code.splat(np.ascontiguousarray(weights), *flat, poses, logw, state)

@@ -1,0 +1,479 @@
+"""Particle filters: bootstrap, and Rao-Blackwellised for the errors of the magnetometer."""
+
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.compiled import Loops, in_threads
+from magtwin.errors import InputError
+from magtwin.localization.belief import known_values, mean_variance, table_of, tempering
+from magtwin.localization.odometry import increment
+from magtwin.localization.problem import Array, Estimate, Problem, Reading
+
+LOOPS = Loops("magtwin.localization.particle_loops", pays=0)
+
+SHARE = 32
+"""Blocks of 256 particles that a thread takes at a time."""
+
+FORGET_S = 1000.0
+"""Correlation time of the offset and of hard iron [s]. They are constant in the model, but the particles soon
+descend from a single one and share its estimate of the constants, whose error they do not spread over."""
+
+WALK_S = 500.0
+"""The same where they are sampled, whose values would run out [s]."""
+
+KEEP_S = 5.0
+"""Time between two memories of the constants, for a start after a kidnapping [s]. The last but one is used:
+what was learned after the kidnapping is wrong."""
+
+INFLATE = 4.0
+"""Factor of their covariance then."""
+
+SETTLED_M = 0.5
+"""Spread of the particles, sqrt(var x + var y), below which the pose counts as known [m]."""
+
+NARROW_M, MOST_TIMES = 0.06, 5.0
+"""The least number of particles grows with their spread above this [m], up to so many times: a wrong position
+nearby may agree with the first readings better."""
+
+SHRINK = 0.95
+"""Factor of the number of particles at each reading, while there are more than enough."""
+
+STILL_M = 1e-3
+"""Motion, in metres and in radians / 10, within which a reading may repeat itself to the bit."""
+
+_STRIDE, _WORD = 0x9E3779B97F4A7C15 * 0x2545F4914F6CDD1D, (1 << 64) - 1
+
+# Fractions of the roots of x^4 = x + 1: the low-discrepancy sequence R3 (Roberts 2018)
+_R3 = 1 / 1.2207440846057596 ** np.arange(1, 4)
+
+
+class RaoBlackwell:
+    """Particle filter whose particles carry a Kalman filter for the errors of the magnetometer.
+
+    A particle is a pose with a Gaussian z | pose history of linear states: the offset of the run, the drift
+    (FOGM over time) and, if the map has a variance, the map's error (FOGM over distance). Marginalising them
+    is Rao-Blackwellisation (Schön, Gustafsson and Nordlund 2005, IEEE Trans. Signal Process. 53). The scale
+    error of the odometry is marginalised too: the sampled distances are its readings. The proposal is the
+    odometry; see `magtwin.localization.particle_loops.step` for the equations.
+
+    * Start: five times `particles`, or more where the region is large; R3 points over the unknown parts.
+    * Resampling: systematic, once the effective number is below half of the particles. While they are within
+      0.5 m, 5 % fewer remain at each reading, down to `particles`, or up to five times as many for a spread
+      above 0.06 m.
+    * Map error: the share `map_correlated` of the map's variance is the FOGM state of length
+      `Problem.map_length_m`, the rest is white.
+    * Where the map is unknown, a reading has the mean and the variance of the whole map.
+    * Kidnapping: a cumulative sum of surprise, c = max(0, c + ref - log p - 1.5), with p the likelihood of a
+      reading and ref the mean log likelihood of a Gaussian with the variance of the readings that the
+      particles predict. Above 12, particles over the whole floor join those that there are, half of them with
+      the offset and hard iron that were known 5 to 10 s before. So a false alarm does not lose the pose.
+    * A reading that repeats itself to the bit while the robot moves is not used, nor is nan.
+
+    `lost` is set while the particles spread over more than 0.5 m.
+
+    Args:
+        particles: Least number of particles. Default: 3,000; 6,000 for the bootstrap filter.
+        per_m2: Particles per square metre of an unknown position with known heading at the start; four times
+            as many if the heading is unknown. Default: 500; 2,000 for the bootstrap filter.
+        most: Greatest number of particles.
+        kappa: Divisor of the log likelihood (tempering): above 1 for a map whose errors depend on each other
+            more than their model, as at a place that is passed again. Default: `tempering`.
+        map_correlated: Share of the map's variance that is correlated.
+        resets: Whether to test for kidnapping.
+    """
+
+    reset_count = 0
+    """How often the filter has started again."""
+
+    sampled: ClassVar[bool] = False
+    iron: ClassVar[bool] = False
+    network: ClassVar[bool] = False
+    least: int = 3000
+    start_per_m2: float = 500.0
+
+    def __init__(
+        self,
+        *,
+        particles: int | None = None,
+        per_m2: float | None = None,
+        most: int = 100_000,
+        kappa: float | None = None,
+        map_correlated: float = 0.8,
+        resets: bool = True,
+    ) -> None:
+        self.least = self.least if particles is None else particles
+        self.start_per_m2 = self.start_per_m2 if per_m2 is None else per_m2
+        if not (isinstance(self.least, int) and isinstance(most, int) and 2 <= self.least <= most):
+            raise InputError(
+                f"particles must be a whole number between 2 and most = {most}, got {self.least}",
+                parameter="particles",
+            )
+        if not (self.start_per_m2 > 0 and (kappa is None or kappa > 0) and 0 <= map_correlated <= 1):
+            raise InputError(
+                "per_m2 and kappa must be above 0 and map_correlated between 0 and 1, got "
+                f"{self.start_per_m2}, {kappa}, {map_correlated}"
+            )
+        self.most = most
+        self.kappa, self.map_correlated, self.resets = kappa, map_correlated, resets
+
+    def reset(self, problem: Problem) -> None:
+        """Draw the particles from the prior.
+
+        Raises:
+            InputError: The problem has no map.
+        """
+        if problem.belief is None:
+            raise InputError("particle filters need a map; without one, use ekf-slam or slam-smoother")
+        self._loops: Any = LOOPS.open()
+        self._problem = problem
+        self._rng = np.random.default_rng(problem.seed)
+        self._seed, self._count_steps = int(self._rng.integers(1 << 63)), 0
+        table = table_of(problem.belief, problem.extent)
+        self._table, self._variance = table.field, mean_variance(table)
+        known = known_values(table)
+        self._field_mean, self._field_variance = float(known.mean()), float(known.var())
+        sensor = problem.sensor
+        self._kappa = self.kappa or tempering(self._variance, sensor.white_nt)
+        self._states(len(self._variance) > 0)
+        self._scale_variance = problem.odometry.scale_std**2
+        self._numbers = np.zeros(20)
+        self._numbers[[self._loops.ARM_X, self._loops.ARM_Y]] = sensor.lever_arm_m
+        self._numbers[self._loops.ELSEWHERE] = self._field_mean
+        self._numbers[self._loops.ELSEWHERE_VARIANCE] = self._field_variance
+        self._numbers[self._loops.KAPPA] = self._kappa
+        self.reset_count = 0
+        self._last: Reading | None = None
+        self._repeated_m, self._same_nt = 0.0, math.nan
+        self._start(problem.prior.mean, problem.prior.sd)
+
+    def _states(self, has_variance: bool) -> None:
+        """Linear states: prior variance, correlation time [s], correlation length [m] and factor of each."""
+        k, sensor, problem = self._loops, self._problem.sensor, self._problem
+        iron = sensor.iron_nt**2
+        states = [(sensor.offset_nt**2, math.inf, math.inf, k.CONSTANT)]
+        drift = sensor.drift_nt**2 + (0.0 if self.iron else iron)
+        if drift > 0:
+            states.append((drift, sensor.drift_s, math.inf, k.CONSTANT))
+        if self.iron and iron > 0:
+            states += [(iron, math.inf, math.inf, k.COSINE), (iron, math.inf, math.inf, k.SINE)]
+        correlated = self.map_correlated if has_variance and problem.map_length_m > 0 else 0.0
+        if correlated > 0:
+            states.append((correlated, math.inf, problem.map_length_m, k.MAP_SD))
+        variances, times, lengths, kinds = zip(*states, strict=True)
+        slow = WALK_S if self.sampled else FORGET_S
+        times = tuple(
+            slow if math.isinf(t) and math.isinf(d) else t for t, d in zip(times, lengths, strict=True)
+        )
+        self._prior_variances = np.array(variances, float)
+        self._rates = 1 / np.array(times), 1 / np.array(lengths)
+        self._kinds = np.array(kinds, np.int64)
+        self._constant = np.isin(times, (FORGET_S, WALK_S)) & np.isinf(lengths)
+        self._map_white = 1 - correlated
+
+    def _start(
+        self,
+        mean: tuple[float, float, float],
+        sd: tuple[float, float, float],
+        errors: tuple[Array, Array] | None = None,
+        kept: Array | None = None,
+    ) -> None:
+        """Draw all particles: Gaussian, and R3 where the standard deviation is infinite.
+
+        Every other particle gets the mean and covariance `errors` of the constants, the rest their prior.
+        Particles `kept`, columns of the state, stay beside them.
+        """
+        x0, x1, y0, y1 = self._problem.extent
+        wide = [math.sqrt(2 * math.pi * math.e) * s for s in sd]  # side of the uniform of the same entropy
+        area = (x1 - x0) * (y1 - y0) if math.isinf(sd[0]) else wide[0] * wide[1]
+        turn = min(1.0, wide[2] / (2 * math.pi))
+        wanted = self.start_per_m2 * area * (1 + 3 * turn)
+        count = int(min(max(wanted, MOST_TIMES * self.least), self.most))
+        size = len(self._kinds)
+        k = self._loops
+        old = 0 if kept is None else kept.shape[1]
+        self._count = old + count
+        self._state = np.empty((k.LINEAR + size + size * (size + 1) // 2, _padded(self._count)))
+        self._spare = np.empty_like(self._state)
+        if kept is not None:
+            self._state[:, :old] = kept
+        state = self._state[:, old : self._count]
+        unit = (self._rng.random(3)[:, None] + _R3[:, None] * np.arange(1, count + 1)) % 1.0
+        middle, span = ((x0 + x1) / 2, (y0 + y1) / 2, 0.0), (x1 - x0, y1 - y0, 2 * math.pi)
+        normal = self._rng.standard_normal((3, count))
+        for row in range(3):
+            if math.isinf(sd[row]):
+                state[row] = middle[row] + (unit[row] - 0.5) * span[row]
+            else:
+                state[row] = mean[row] + sd[row] * normal[row]
+        state[k.SCALE : k.LINEAR] = 0.0
+        state[k.LINEAR :] = 0.0
+        self._draw_errors(state, slice(None), np.zeros(size), np.diag(self._prior_variances))
+        if errors is not None:
+            known, covariance = np.zeros(size), np.diag(self._prior_variances)
+            known[self._constant] = errors[0]
+            covariance[np.ix_(self._constant, self._constant)] = errors[1]
+            self._draw_errors(state, slice(None, None, 2), known, covariance)
+        self._scale_variance = self._problem.odometry.scale_std**2
+        self._state[k.LOG_WEIGHT : k.WEIGHT, : self._count] = 0.0
+        self._state[k.LOG_WEIGHT, :old] = math.log(count / max(old, 1))
+        self._state[k.WEIGHT, : self._count] = np.exp(self._state[k.LOG_WEIGHT, : self._count])
+        total = count * (2.0 if old else 1.0)
+        self._shift = math.log(total)
+        self._scales = np.full(self._blocks(self._count), 1.0 / total)
+        if not old:
+            self._reference = mean if math.isfinite(sd[0]) else (middle[0], middle[1], mean[2])
+        self._surprise, self._settled = 0.0, False
+        self._kept: list[tuple[Array, Array]] = []
+        self._kept_t = -math.inf
+
+    def _draw_errors(self, state: Array, part: slice, mean: Array, covariance: Array) -> None:
+        """Give some particles a mean and a covariance of the linear states, or draws of them."""
+        k, size = self._loops, len(mean)
+        means, triangle = state[k.LINEAR : k.LINEAR + size, part], state[k.LINEAR + size :, part]
+        if self.sampled:
+            root = np.linalg.cholesky(covariance + 1e-12 * np.eye(size))
+            means[:] = mean[:, None] + root @ self._rng.standard_normal(means.shape)
+        else:
+            means[:] = mean[:, None]
+            triangle[:] = covariance[np.tril_indices(size)][:, None]
+
+    def _errors(self) -> tuple[Array, Array]:
+        """Mean and covariance of the constants: offset and hard iron."""
+        k, count, size = self._loops, self._count, len(self._kinds)
+        w = self._state[k.WEIGHT, :count] * np.repeat(self._scales, k.BLOCK)[:count]
+        rows = np.flatnonzero(self._constant)
+        means = self._state[k.LINEAR + rows, :count]
+        mean = means @ w
+        covariance = (w * (means - mean[:, None])) @ (means - mean[:, None]).T
+        for i, high in enumerate(rows.tolist()):
+            for j, low in enumerate(rows[: i + 1].tolist()):
+                inner = float(self._state[k.LINEAR + size + high * (high + 1) // 2 + low, :count] @ w)
+                covariance[i, j] += inner
+                covariance[j, i] = covariance[i, j]
+        return mean, covariance
+
+    def step(self, reading: Reading) -> Estimate:
+        """Move the particles, weigh them by the reading, and resample if need be."""
+        k, numbers = self._loops, self._numbers
+        forward = left = turn = dt = 0.0
+        if self._last is not None:
+            forward, left, turn = increment(self._last.odometry, reading.odometry)
+            dt = reading.t - self._last.t
+        self._last = reading
+        distance = self._set_motion(forward, left, turn, dt)
+        used = self._usable(reading.b_nt, distance + 0.1 * abs(turn))
+        numbers[k.USED] = used
+        numbers[k.SHIFT] = self._shift
+        numbers[k.FIELD] = reading.b_nt - (reading.disturbance_nt if self.network else 0.0) if used else 0.0
+        extra = reading.disturbance_sd_nt**2 if self.network else 0.0
+        numbers[k.WHITE] = self._problem.sensor.white_nt**2 + extra
+        numbers[k.MAP_WHITE] = self._map_white
+        x, y, yaw = self._reference
+        yaw += turn
+        middle = yaw - turn / 2
+        x += forward * math.cos(middle) - left * math.sin(middle)
+        y += forward * math.sin(middle) + left * math.cos(middle)
+        numbers[k.X_REF : k.YAW_REF + 1] = x, y, yaw
+        decay = np.exp(-dt * self._rates[0] - distance * self._rates[1])
+        noise = self._prior_variances * (1 - decay**2)
+        self._run(decay, noise)
+        estimate = self._estimate(reading.t, used)
+        self._maintain(estimate)
+        return estimate
+
+    def _set_motion(self, forward: float, left: float, turn: float, dt: float) -> float:
+        """Numbers of the motion; the sampled distances update the variance of the scale error."""
+        k, numbers, model = self._loops, self._numbers, self._problem.odometry
+        distance = math.hypot(forward, left)
+        along, _, yaw = model.variances(distance, turn, dt).tolist()
+        total = along + distance**2 * self._scale_variance
+        gain = distance * self._scale_variance / total if total > 0 else 0.0
+        least = (0.1 * model.scale_std) ** 2
+        self._scale_variance = max(self._scale_variance * (1 - gain * distance), least)
+        numbers[k.DISTANCE], numbers[k.DIRECTION] = distance, math.atan2(left, forward)
+        numbers[k.TURNED], numbers[k.SCALE_GAIN] = turn, gain
+        numbers[k.ALONG_SD : k.YAW_SD + 1] = math.sqrt(total), math.sqrt(along), math.sqrt(yaw)
+        return distance
+
+    def _usable(self, b_nt: float, moved: float) -> bool:
+        """Whether a reading is a number and has not stood still while the robot moved."""
+        if b_nt == self._same_nt:
+            self._repeated_m += moved
+        else:
+            self._same_nt, self._repeated_m = b_nt, 0.0
+        return math.isfinite(b_nt) and self._repeated_m <= STILL_M
+
+    def _run(self, decay: Array, noise: Array) -> None:
+        """One step of all blocks, on several threads if there are many."""
+        k, count = self._loops, self._count
+        self._count_steps += 1
+        key = np.uint64((self._seed + self._count_steps * _STRIDE) & _WORD)
+        blocks = self._blocks(count)
+        sums = self._sums = np.empty((blocks, k.PLAIN_SUM + 1))
+
+        def work(part: slice) -> None:
+            k.step(
+                part.start, part.stop, count, self._state, sums, self._table, self._variance, self._numbers,
+                decay, noise, self._kinds, key, self.sampled,
+            )  # fmt: skip
+
+        in_threads(work, blocks, SHARE)
+
+    def _estimate(self, t: float, used: bool) -> Estimate:
+        """Weighted mean and covariance; the sum of surprise."""
+        k, sums = self._loops, self._sums
+        top = float(sums[:, k.TOP].max())
+        scales, before = np.exp(sums[:, k.TOP] - top), self._scales
+        total = scales @ sums
+        weight = float(total[k.SUM])
+        self._effective = weight**2 / float(scales**2 @ sums[:, k.SQUARES])
+        self._shift = top + math.log(weight)
+        self._scales = scales / weight
+        x, y, yaw = self._numbers[k.X_REF : k.YAW_REF + 1].tolist()
+        part = total[k.SUM : k.YAW_YAW + 1] / weight
+        mean_yaw = math.atan2(total[k.SIN], total[k.COS])
+        if abs(_wrapped(mean_yaw - yaw - part[3])) > 0.05:  # the heading is spread around the circle
+            out = np.empty(k.YAW_YAW + 1)
+            k.moments(self._count, self._state, self._scales, x, y, mean_yaw, out)
+            part, yaw = out[k.SUM :] / out[k.SUM], mean_yaw
+        pose = x + float(part[1]), y + float(part[2]), mean_yaw
+        covariance = np.empty((3, 3))
+        covariance[np.triu_indices(3)] = part[4:10]
+        covariance[np.tril_indices(3)] = covariance.T[np.tril_indices(3)]
+        covariance -= np.outer(part[1:4], part[1:4])
+        self.spread = math.sqrt(max(0.0, covariance[0, 0] + covariance[1, 1]))
+        if self.spread > SETTLED_M and self.reset_count:
+            pose, covariance = self._held(pose, covariance, (x, y))
+        self._reference = pose
+        self._settled = self._settled or self.spread < SETTLED_M
+        if used and self._settled:
+            top = float(sums[:, k.PLAIN_TOP].max())
+            likelihood = top + math.log(float(np.exp(sums[:, k.PLAIN_TOP] - top) @ sums[:, k.PLAIN_SUM]))
+            mean = float(before @ sums[:, k.NU])
+            variance = float(before @ sums[:, k.NU_NU]) - mean**2 + float(before @ sums[:, k.PRIOR_S])
+            expected = -0.5 - 0.5 * math.log(variance)
+            more = min(expected - likelihood - SLACK, MOST_SURPRISE)
+            self._surprise = max(0.0, self._surprise + more)
+        lost = self.spread > SETTLED_M
+        bias = float(total[k.OFFSET]) / weight
+        return Estimate(t, *pose, covariance, bias, lost)
+
+    def _held(
+        self, pose: tuple[float, float, float], covariance: Array, place: tuple[float, float]
+    ) -> tuple[tuple[float, float, float], Array]:
+        """After an alarm: the particles about the last pose, while they have most of the weight.
+
+        The covariance stays that of all particles.
+        """
+        k, count = self._loops, self._count
+        state = self._state[:, :count]
+        near = np.hypot(state[k.X] - place[0], state[k.Y] - place[1]) < NEAR_M
+        weight = state[k.WEIGHT] * np.repeat(self._scales, k.BLOCK)[:count]
+        weight /= weight.sum()
+        if weight[near].sum() < 0.5:
+            return pose, covariance
+        weight, (x, y, yaw) = weight[near] / weight[near].sum(), state[:3, near]
+        turn = math.atan2(float(weight @ np.sin(yaw)), float(weight @ np.cos(yaw)))
+        held = float(weight @ x), float(weight @ y), turn
+        off = np.array([pose[0] - held[0], pose[1] - held[1], _wrapped(pose[2] - held[2])])
+        return held, covariance + np.outer(off, off)
+
+    def _maintain(self, estimate: Estimate) -> None:
+        """Resample, shrink, or start again."""
+        if self.resets and self._surprise > RESET_ABOVE:
+            self.reset_count += 1
+            errors = None if len(self._kept) < 2 else (self._kept[0][0], INFLATE * self._kept[0][1])
+            kept = self._state[:, self._chosen(min(KEPT, self._count))]
+            self._start((0.0, 0.0, 0.0), (math.inf, math.inf, math.inf), errors, kept)
+            return
+        if self._settled and estimate.t >= self._kept_t + KEEP_S:
+            self._kept, self._kept_t = [*self._kept[-1:], self._errors()], estimate.t
+        wanted = self._count
+        if self.spread < SETTLED_M:
+            wanted = min(self._count, max(self._enough(self.spread), int(SHRINK * self._count)))
+        if wanted < self._count or self._effective < self._count / 2:
+            self._resample(wanted)
+
+    def _enough(self, spread: float) -> int:
+        """Least number of particles for a spread [m]."""
+        return min(self.most, int(self.least * min(max(spread / NARROW_M, 1.0), MOST_TIMES)))
+
+    def _blocks(self, count: int) -> int:
+        return -(-count // self._loops.BLOCK)
+
+    def _chosen(self, count: int) -> NDArray[np.int64]:
+        """Particles drawn by their weights, systematically."""
+        chosen = np.empty(count, np.int64)
+        self._loops.choose(self._count, self._state, self._scales, float(self._rng.random()), chosen)
+        return chosen
+
+    def _resample(self, count: int) -> None:
+        k, chosen = self._loops, self._chosen(count)
+        if self._spare.shape[1] != _padded(count):
+            self._spare = np.empty((len(self._state), _padded(count)))
+        state, out = self._state, self._spare
+
+        def work(part: slice) -> None:
+            k.gather(part.start, part.stop, state, chosen, out)
+
+        in_threads(work, count, SHARE * k.BLOCK)
+        self._state, self._spare, self._count, self._shift = out, state, count, 0.0
+        self._scales = np.full(self._blocks(count), 1.0 / count)
+
+    def particles(self) -> Array:
+        """x, y, yaw and weight of the particles, shape (P, 4)."""
+        k, count = self._loops, self._count
+        weight = self._state[k.WEIGHT, :count] * np.repeat(self._scales, k.BLOCK)[:count]
+        return np.column_stack([*self._state[:3, :count], weight / weight.sum()])
+
+
+class Bootstrap(RaoBlackwell):
+    """Bootstrap particle filter: the errors of the magnetometer are sampled, not marginalised.
+
+    (Gordon, Salmond and Smith 1993, IEE Proc. F 140.) The offset is a FOGM of 500 s, so that resampling does
+    not use up its values. Otherwise as `RaoBlackwell`.
+    """
+
+    sampled = True
+    least = 6000
+    start_per_m2 = 2000.0
+
+
+class RaoBlackwellIron(RaoBlackwell):
+    """`RaoBlackwell` with two more linear states: hard iron c cos(yaw) + s sin(yaw), learned online."""
+
+    iron = True
+
+
+class RaoBlackwellNetwork(RaoBlackwellIron):
+    """`RaoBlackwellIron` on readings less the predicted disturbance; its variance joins the white noise."""
+
+    network = True
+
+
+SLACK = 1.5
+"""Surprise of a reading that is ignored."""
+
+MOST_SURPRISE = 6.0
+"""Most that one reading adds to the surprise: a step of the robot's own field is no kidnapping [nats]."""
+
+NEAR_M = 1.0
+"""Distance from the last pose within which particles belong to it after an alarm [m]."""
+
+KEPT = 1000
+"""Particles that stay when the filter starts again, with half of the weight."""
+
+RESET_ABOVE = 12.0
+"""Sum of surprise at which the filter starts again."""
+
+
+def _padded(count: int) -> int:
+    """Columns of the state: not a multiple of a page, whose rows would compete for the same cache lines."""
+    return -(-count // 8) * 8 + 8 * (1 + count // 8 % 2)
+
+
+def _wrapped(angle: float) -> float:
+    return angle - 2 * math.pi * math.floor(angle / (2 * math.pi) + 0.5)

@@ -1,0 +1,83 @@
+"""Settings: options that all methods of magnetic SLAM share."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from magtwin.errors import InputError
+from magtwin.localization.slam.hilbert import Kernel, smoothness
+
+
+@dataclass(kw_only=True)
+class Settings:
+    """Prior of the field, and what `Problem` does not say of odometry and magnetometer."""
+
+    functions: int = 100
+    """Number of eigenfunctions."""
+
+    length_m: float = 0.8
+    """Length scale of the field [m]."""
+
+    sd_nt: float = 10_000.0
+    """Prior standard deviation of the field's variation, each axis [nT]."""
+
+    uniform_sd_nt: float = 50_000.0
+    """Prior standard deviation of the uniform part of the field, each axis [nT]."""
+
+    kernel: Kernel = "se"
+    """Kernel of the scalar potential, or of the field magnitude: "se", "matern32" or "matern52"."""
+
+    margin_m: float = 1.0
+    """Space between the floor's extent and the border of the eigenfunctions' box [m]."""
+
+    field: Literal["auto", "vector", "scalar"] = "auto"
+    """Readings to use: three axes, the magnitude, or three axes if the first reading has them."""
+
+    odometry_axes: Literal["body", "world"] = "body"
+    """Axes in which odometry's increments are right: those of the robot, or of the world.
+
+    Wheels measure in the robot's axes: an error of the heading turns all later increments. An odometry with
+    an absolute heading of its own measures in world axes.
+    """
+
+    velocity_sd_m_s: float = 0.0
+    """Prior standard deviation of a constant error of odometry's velocity, along each of two axes [m/s]."""
+
+    calibrate: bool = True
+    """Estimate the magnetometer's offset and iron, with the prior of `Problem.sensor`."""
+
+    soft_iron_sd: float = 0.0
+    """Prior standard deviation of each entry of the soft-iron matrix W, for three axes. 0: no W."""
+
+    vertical_std_s: float = 1e-3
+    """Random walk of odometry's height [m/sqrt(s)], for three axes."""
+
+    tilt_std_s: float = 1e-3
+    """Random walk of odometry's roll and pitch [rad/sqrt(s)], for three axes."""
+
+    def __post_init__(self) -> None:
+        for name in ("length_m", "sd_nt", "uniform_sd_nt", "margin_m", "vertical_std_s", "tilt_std_s"):
+            _refuse(name, getattr(self, name), 0.0, above=True)
+        for name in ("velocity_sd_m_s", "soft_iron_sd"):
+            _refuse(name, getattr(self, name), 0.0)
+        if isinstance(self.functions, bool) or self.functions != int(self.functions) or self.functions < 1:
+            raise InputError(
+                f"functions must be a whole number from 1, got {self.functions}", parameter="functions"
+            )
+        smoothness(self.kernel)
+        for name, known in (("field", ("auto", "vector", "scalar")), ("odometry_axes", ("body", "world"))):
+            if getattr(self, name) not in known:
+                raise InputError(
+                    f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}", parameter=name
+                )
+
+
+def _refuse(name: str, value: float, least: float, *, above: bool = False) -> None:
+    """Raise `InputError` unless an option is a finite number from (or above) the least one."""
+    try:
+        good = math.isfinite(value) and (value > least if above else value >= least)
+    except TypeError:
+        good = False
+    if not good:
+        word = "above" if above else "at least"
+        raise InputError(f"{name} must be a finite number {word} {least:g}, got {value!r}", parameter=name)

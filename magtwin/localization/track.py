@@ -1,0 +1,183 @@
+"""Track: run an algorithm over readings, check every estimate, and keep them as columns."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.localization.problem import Array, Estimate, Localizer, Problem, Smoother
+from magtwin.localization.readings import onboard, readings_of
+from magtwin.run.run import Column, Run
+
+EST_COLUMNS = {
+    "est_p_world_base": Column("m", "world", "estimated position of base_link", 3, ("x", "y", "z")),
+    "est_yaw": Column("rad", "world", "estimated heading of base_link", interpolation="angle"),
+    "est_covariance": Column(
+        "",
+        "world",
+        "covariance of the estimate [m^2, m rad, rad^2]; nan if unknown",
+        6,
+        ("xx", "xy", "x_yaw", "yy", "y_yaw", "yaw_yaw"),
+    ),
+    "est_bias_nt": Column("nT", "", "estimated offset of the magnetometer; nan if unknown"),
+    "est_lost": Column("bool", "", "the localizer does not trust its pose", interpolation="hold"),
+}
+"""Columns that localization adds to a run."""
+
+_UPPER = np.triu_indices(3)
+
+
+class LocalizerError(InputError):
+    """An algorithm under test raised, or returned what is not an estimate."""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Estimates at all readings of a run."""
+
+    t: Array
+    """[s], shape (N,)."""
+
+    pose: Array
+    """x, y [m] and yaw [rad], shape (N, 3)."""
+
+    covariance: Array
+    """Shape (N, 3, 3); nan if unknown."""
+
+    bias_nt: Array
+    """Shape (N,); nan if unknown."""
+
+    lost: NDArray[np.bool_]
+    """Shape (N,)."""
+
+    step_s: float = math.nan
+    """Mean processor time of a step [s]."""
+
+    particles: tuple[Array, ...] = ()
+    """Samples at each reading, shapes (P, 4): x, y, yaw, weight; () if they were not kept."""
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """The estimates as the columns `EST_COLUMNS`."""
+        zero = np.zeros(len(self.t))
+        return {
+            "est_p_world_base": np.column_stack([self.pose[:, :2], zero]),
+            "est_yaw": np.arctan2(np.sin(self.pose[:, 2]), np.cos(self.pose[:, 2])),
+            "est_covariance": self.covariance[:, *_UPPER],
+            "est_bias_nt": self.bias_nt,
+            "est_lost": self.lost,
+        }
+
+
+def track(
+    algorithm: Localizer | Smoother,
+    problem: Problem,
+    run: Run,
+    *,
+    keep_particles: bool = False,
+    progress: Callable[[int, int], Any] | None = None,
+) -> Track:
+    """Run an algorithm over the on-board columns of a run.
+
+    Args:
+        algorithm: A new `Localizer` or `Smoother`.
+        problem: What it is told.
+        run: The readings. Other columns than those on board are not passed on.
+        keep_particles: Keep the samples of a localizer that has `particles()`.
+        progress: Called as progress(readings done, all readings).
+
+    Raises:
+        LocalizerError: The algorithm raised; or an estimate is no `Estimate`, is not finite, has another time
+            than its reading or a covariance that is not a symmetric, positive semidefinite (3, 3) array.
+        InputError: The run lacks a column.
+    """
+    run = onboard(run)
+    clouds: list[Array] = []
+    estimates: list[Estimate] = []
+    name = type(algorithm).__name__
+    begin = time.process_time()
+    spent = 0.0
+    if isinstance(algorithm, Smoother) and not isinstance(algorithm, Localizer):
+        estimates = list(_called(name, lambda: algorithm.run(problem, run)))
+        spent = time.process_time() - begin
+        if len(estimates) != run.rows:
+            raise LocalizerError(f"{name}.run returned {len(estimates)} estimates for {run.rows} readings")
+    else:
+        _called(f"{name}.reset", lambda: algorithm.reset(problem))
+        step = algorithm.step
+        for k, reading in enumerate(readings_of(run)):
+            begin = time.process_time()
+            try:
+                estimates.append(step(reading))
+            except Exception as error:  # whatever the algorithm under test does wrong
+                raise LocalizerError(
+                    f"{name}.step raised {type(error).__name__} at t = {reading.t:g} s: {error}"
+                ) from error
+            spent += time.process_time() - begin
+            if keep_particles and hasattr(algorithm, "particles"):
+                clouds.append(np.array(algorithm.particles(), float))
+            if progress is not None:
+                progress(k + 1, run.rows)
+    made = checked_estimates(name, estimates, run["t"])
+    return Track(run["t"], *made, spent / run.rows, tuple(clouds))
+
+
+def _called(what: str, work: Callable[[], Any]) -> Any:
+    try:
+        return work()
+    except Exception as error:
+        raise LocalizerError(f"{what} raised {type(error).__name__}: {error}") from error
+
+
+def checked_estimates(
+    name: str, estimates: list[Any], t: Array
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Pose, covariance, bias and lost of all estimates."""
+    for k, estimate in enumerate(estimates):
+        if not isinstance(estimate, Estimate):
+            raise LocalizerError(
+                f"{name} returned {type(estimate).__name__} at t = {t[k]:g} s, not an Estimate"
+            )
+    count = len(estimates)
+    try:
+        times = np.array([e.t for e in estimates], float)
+        pose = np.array([(e.x, e.y, e.yaw) for e in estimates], float).reshape(count, 3)
+        bias = np.array([math.nan if e.bias_nt is None else e.bias_nt for e in estimates], float)
+        lost = np.array([bool(e.lost) for e in estimates], bool)
+    except (TypeError, ValueError) as error:
+        raise LocalizerError(f"{name} returned an estimate whose values are not numbers: {error}") from error
+    if (wrong := times != t).any():
+        k = int(np.argmax(wrong))
+        when = "from the future" if times[k] > t[k] else "of another reading"
+        raise LocalizerError(f"{name} returned an estimate {when} at t = {t[k]:g} s: its t is {times[k]:g} s")
+    if (wrong := ~np.isfinite(pose).all(axis=1)).any():
+        raise LocalizerError(f"{name} returned a pose that is not finite at t = {t[np.argmax(wrong)]:g} s")
+    covariance = np.full((count, 3, 3), np.nan)
+    for k, e in enumerate(estimates):
+        if e.covariance is None:
+            continue
+        matrix = np.asarray(e.covariance, float)
+        if matrix.shape != (3, 3):
+            raise LocalizerError(
+                f"{name} returned a covariance of shape {matrix.shape} at t = {t[k]:g} s, not (3, 3)"
+            )
+        covariance[k] = matrix
+    known = ~np.isnan(covariance).all(axis=(1, 2))
+    if known.any():
+        some = covariance[known]
+        scale = np.abs(some).max(axis=(1, 2), keepdims=True) + 1e-300
+        bad = ~np.isfinite(some).all(axis=(1, 2)) | (
+            np.abs(some - some.transpose(0, 2, 1)) > 1e-6 * scale
+        ).any(axis=(1, 2))
+        if not bad.any():
+            bad = np.linalg.eigvalsh(some)[:, 0] < -1e-9 * scale[:, 0, 0]
+        if bad.any():
+            when = t[known][np.argmax(bad)]
+            raise LocalizerError(
+                f"{name} returned a covariance that is not positive semidefinite at t = {when:g} s"
+            )
+    return pose, covariance, bias, lost

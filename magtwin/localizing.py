@@ -1,0 +1,581 @@
+"""Localization of runs from files: `magtwin localize` in Python."""
+
+import keyword
+import math
+import os
+import sys
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError, MismatchWarning, find
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.files import existing, output, sha256
+from magtwin.frames import wrap_angle, yaw_from_quat
+from magtwin.io.formats import read_run
+from magtwin.io.surveys.maps import open_map
+from magtwin.localization.bounds import Bounds, bounds
+from magtwin.localization.compensators import COMPENSATORS, compensated
+from magtwin.localization.localizers import load_localizer
+from magtwin.localization.odometry import Odometry
+from magtwin.localization.problem import (
+    HEADING_WITHIN,
+    Array,
+    FieldBelief,
+    Localizer,
+    OdometryModel,
+    Prior,
+    Problem,
+    SensorModel,
+    Smoother,
+)
+from magtwin.localization.scores import AWAY_S, FAR_M, HELD_S, NEAR_M, Scores, score
+from magtwin.localization.track import EST_COLUMNS, Track, track
+from magtwin.report import Figure, Report
+from magtwin.run.run import Run
+from magtwin.twin import Twin, scene_file
+from magtwin.verdict import EVEN
+
+RATE_HZ = 5.0
+"""Default rate of readings that a localizer gets [Hz]."""
+
+START_SD = (0.1, 0.1, math.radians(5))
+"""Standard deviation of a known start: x, y [m] and yaw [rad]."""
+
+ROBOT_NOISE = SensorModel(white_nt=100.0, drift_nt=250.0, drift_s=2.5, offset_nt=500.0, iron_nt=400.0)
+"""Default noise model of a magnetometer on a robot: the own field of the shipped TurtleBot 4 in new sessions.
+In six simulated drives the difference of the readings from the map had a mean of 190 to 520 nT, 290 to 500 nT
+along the heading, and the rest 180 to 280 nT with a correlation of 0.4 to 0.6 after 2 s."""
+
+LEAST_ON_MAP = 0.5
+"""Share of the readings that must be on the map."""
+
+Source = str | os.PathLike[str]
+
+
+@dataclass(frozen=True, eq=False)
+class Localization:
+    """A run with its estimates, and what they were made from."""
+
+    run: Run
+    """The readings, with the columns `EST_COLUMNS`."""
+
+    problem: Problem
+    """What the method was told."""
+
+    track: Track
+    """The estimates."""
+
+    method: str
+    """Name of the method."""
+
+    @cached_property
+    def truth(self) -> Array | None:
+        """True x, y [m] and yaw [rad], shape (N, 3); None if unknown."""
+        return truth_of(self.run)
+
+    @cached_property
+    def dead_reckoning(self) -> Track | None:
+        """The start moved by odometry alone; from the true start if the prior has none. None if unknown."""
+        start = self.problem.prior
+        if any(map(math.isinf, start.sd)):
+            if self.truth is None or not np.isfinite(self.truth[0]).all():
+                return None
+            start = Prior(mean=tuple(self.truth[0].tolist()), sd=START_SD)
+        problem = Problem(
+            belief=None,
+            extent=self.problem.extent,
+            prior=start,
+            odometry=self.problem.odometry,
+            rate_hz=self.problem.rate_hz,
+        )
+        return track(Odometry(), problem, self.run)
+
+    @cached_property
+    def bounds(self) -> Bounds | None:
+        """Least standard deviations of any unbiased method; None without a map, or if the truth has gaps."""
+        if self.problem.belief is None or self.truth is None or not np.isfinite(self.truth).all():
+            return None
+        used = np.isfinite(self.run["b_measured_nt"])
+        return bounds(self.problem, self.truth, self.track.t, used=used)
+
+    @cached_property
+    def scores(self) -> Scores | None:
+        """Scores by the truth; None if it is unknown or has gaps."""
+        if self.truth is None or not np.isfinite(self.truth).all():
+            return None
+        start = self.problem.prior.is_global
+        return score(self.track, self.truth, global_start=start, bounds=self.bounds)
+
+    @property
+    def scored_rows(self) -> NDArray[np.bool_]:
+        """Readings whose errors count: all, or those from convergence on if the start was unknown."""
+        after = 0.0
+        if (
+            self.scores is not None
+            and self.problem.prior.is_global
+            and math.isfinite(self.scores.converged_s)
+        ):
+            after = self.scores.converged_s
+        return self.track.t >= self.track.t[0] + after
+
+    def report(self) -> Report:
+        """Errors beside their bound and dead reckoning, and a verdict in one line."""
+        return report_of(self)
+
+
+def localize(
+    run: Run | Source,
+    anomaly_map: FieldBelief | Source | None,
+    *,
+    method: str | Localizer | Smoother = "rbpf-iron",
+    options: Mapping[str, Any] | None = None,
+    prior: Prior | str | None = None,
+    sensor: SensorModel | None = None,
+    odometry: OdometryModel | None = None,
+    map_length_m: float = 0.3,
+    compensator: str = "none",
+    calibration: Run | Source | None = None,
+    rate_hz: float | None = RATE_HZ,
+    seed: int = 0,
+    progress: Callable[[int, int], Any] | None = None,
+) -> Run:
+    """Estimate the pose of a robot along a run from its magnetometer and odometry.
+
+    Args:
+        run: A run with the columns `b_measured_nt`, `odom_p` and `odom_q_xyzw`, or its file.
+        anomaly_map: The map; its layer, its stage, or the name of a shipped scene ("lab"); or any
+            `FieldBelief`. None: no map (SLAM).
+        method: A name in `magtwin.localization.localizers.LOCALIZERS`, "module:Class", or an object.
+        options: Keyword arguments of the method's class.
+        prior: The pose at the first reading, or a text of `prior_of`. Default: "tracking".
+        sensor: Noise model of the magnetometer. Default: `ROBOT_NOISE`, with the lever arm in the run's
+            metadata.
+        odometry: Noise model of the odometry.
+        map_length_m: Correlation length of the map's error [m].
+        compensator: Model of the robot's own field, a name in
+            `magtwin.localization.compensators.COMPENSATORS`, for methods that use its prediction (rbpf-network). It is fitted to `calibration`.
+        calibration: A drive earlier in the session with true poses, or its file.
+        rate_hz: Readings per second that the method gets [Hz]. None: all.
+        seed: Seed of the method and of the prior's error.
+        progress: Called as progress(readings done, all readings).
+
+    Returns:
+        The run at `rate_hz` with the columns `EST_COLUMNS`.
+
+    Raises:
+        InputError: A file or a column is missing, the run is off the map, there is no prior and no true pose,
+            or the method fails.
+    """
+    return _localization(
+        run,
+        anomaly_map,
+        method=method,
+        options=options,
+        prior=prior,
+        sensor=sensor,
+        odometry=odometry,
+        map_length_m=map_length_m,
+        compensator=compensator,
+        calibration=calibration,
+        rate_hz=rate_hz,
+        seed=seed,
+        progress=progress,
+    ).run
+
+
+def localization(run: Run | Source, anomaly_map: FieldBelief | Source | None, **options: Any) -> Localization:
+    """As `localize`, but also returns what the estimates were made from.
+
+    Args:
+        run: As for `localize`.
+        anomaly_map: As for `localize`.
+        **options: Those of `localize`; and `keep_particles`, whether the samples of the method are kept.
+
+    Raises:
+        InputError: As for `localize`.
+    """
+    return _localization(run, anomaly_map, **options)
+
+
+def _localization(
+    run: Run | Source,
+    anomaly_map: FieldBelief | Source | None,
+    *,
+    method: str | Localizer | Smoother = "rbpf-iron",
+    options: Mapping[str, Any] | None = None,
+    prior: Prior | str | None = None,
+    sensor: SensorModel | None = None,
+    odometry: OdometryModel | None = None,
+    map_length_m: float = 0.3,
+    compensator: str = "none",
+    calibration: Run | Source | None = None,
+    rate_hz: float | None = RATE_HZ,
+    seed: int = 0,
+    keep_particles: bool = False,
+    progress: Callable[[int, int], Any] | None = None,
+) -> Localization:
+    algorithm = load_localizer(method, options) if isinstance(method, str) else method
+    if not isinstance(run, Run):
+        run = read_run(existing(run, "run"))
+    if isinstance(anomaly_map, str | os.PathLike):
+        file = map_file(anomaly_map)
+        anomaly_map = open_map(file)
+        check_map(run, anomaly_map, file)
+    if not run.rows or "t" not in run:
+        raise InputError("the run has no readings")
+    if rate_hz is not None and not rate_hz > 0:
+        raise InputError(f"`rate_hz` must be above 0 Hz, got {rate_hz!r}", parameter="rate_hz")
+    if rate_hz is not None and run.rows > 1 and 1.01 * rate_hz < (run.rows - 1) / run.duration_s:
+        run = thinned(run, rate_hz)
+    if calibration is not None:
+        calibration = calibration if isinstance(calibration, Run) else read_run(existing(calibration, "run"))
+        if rate_hz is not None:
+            calibration = thinned(calibration, rate_hz)
+    if compensator != "none":
+        if anomaly_map is None or calibration is None:
+            raise InputError(
+                f"the `compensator` {compensator!r} needs a map and a `calibration` drive",
+                parameter="calibration",
+            )
+        run = compensated(run, COMPENSATORS[compensator]().fit(calibration, anomaly_map))
+    lever_arm = lever_arm_of(run) if sensor is None else sensor.lever_arm_m
+    if anomaly_map is not None:
+        check_on_map(run, anomaly_map, lever_arm)
+    problem = Problem(
+        belief=anomaly_map,
+        extent=extent_of(run, anomaly_map),
+        prior=prior if isinstance(prior, Prior) else prior_of(run, prior or "tracking", seed=seed),
+        sensor=sensor or replace(ROBOT_NOISE, lever_arm_m=lever_arm),
+        odometry=odometry or OdometryModel(),
+        map_length_m=map_length_m,
+        calibration=calibration,
+        rate_hz=rate_hz or (run.rows - 1) / max(run.duration_s, 1e-9),
+        seed=seed,
+    )
+    x, y, _ = problem.prior.mean
+    x0, x1, y0, y1 = problem.extent
+    if not problem.prior.is_global and not (x0 <= x <= x1 and y0 <= y <= y1):
+        text = f"x {x0:g} to {x1:g} m, y {y0:g} to {y1:g} m"
+        raise InputError(f"the `prior` x, y = {x:g}, {y:g} m is off the floor, {text}", parameter="prior")
+    made = track(algorithm, problem, run, keep_particles=keep_particles, progress=progress)
+    name = method if isinstance(method, str) else type(method).__name__
+    estimated = run.with_columns(**made.columns()).with_specs(**EST_COLUMNS)
+    return Localization(estimated.with_metadata(localizer=name, localizer_seed=seed), problem, made, name)
+
+
+def live_problem(
+    twin: Twin,
+    anomaly_map: FieldBelief | Source | None = None,
+    *,
+    sensor: Mapping[str, Any] | None = None,
+    odometry: OdometryModel | None = None,
+    map_length_m: float = 0.3,
+    seed: int = 0,
+) -> Problem:
+    """What a method is told when it localizes the robot of a twin live; its prior is the default one.
+
+    Args:
+        twin: Gives the map, the floor and the place of the magnetometer.
+        anomaly_map: Map in place of the twin's, as for `localize`; "none": no map (SLAM).
+        sensor: Figures of `SensorModel` that differ from `ROBOT_NOISE` and the robot's lever arm.
+        odometry: As for `localize`.
+        map_length_m: As for `localize`.
+        seed: As for `localize`.
+
+    Raises:
+        InputError: There is no such map.
+    """
+    belief: FieldBelief | None = twin.field
+    if isinstance(anomaly_map, str | os.PathLike):
+        belief = None if str(anomaly_map) == "none" else open_map(map_file(anomaly_map))
+    elif anomaly_map is not None:
+        belief = anomaly_map
+    x, y = (side / 2 for side in twin.scene.lab.floor_m)
+    return Problem(
+        belief=belief,
+        extent=belief.extent if isinstance(belief, AnomalyMap) else (-x, x, -y, y),
+        sensor=replace(
+            ROBOT_NOISE, **{"lever_arm_m": tuple(twin.scene.robot.p_base_magnetometer[:2]), **(sensor or {})}
+        ),
+        odometry=odometry or OdometryModel(),
+        map_length_m=map_length_m,
+        seed=seed,
+    )
+
+
+def new_localizer(out: Source, *, force: bool = False) -> Path:
+    """Write a commented localizer to start from: a particle filter that runs as it is.
+
+    Args:
+        out: Python file to write. Its name becomes the module's.
+        force: Whether to replace a file that exists.
+
+    Raises:
+        InputError: The file exists, or its name cannot name a module.
+    """
+    out = Path(out)
+    if not (out.stem.isidentifier() and not keyword.iskeyword(out.stem)):
+        raise InputError(f"{out}: a module's name has letters, digits and _, such as localizer.py")
+    if out.stem in sys.stdlib_module_names:
+        raise InputError(f"{out}: Python has a module {out.stem!r}; take another name")
+    text = Path(__file__).with_name("localize").joinpath("starter.py.txt").read_text(encoding="utf-8")
+    with output(out, force=force) as aside:
+        aside.write_text(text.replace("localizer:MyLocalizer", f"{out.stem}:MyLocalizer"), encoding="utf-8")
+    return out
+
+
+def report_of(result: Localization) -> Report:
+    """Errors of a localization beside their bound and dead reckoning, and a verdict."""
+    run, scores, dead = result.run, result.scores, result.dead_reckoning
+    belief = result.problem.belief
+    metadata: dict[str, Any] = {
+        "map": "none (SLAM)" if belief is None else getattr(belief, "name", "") or type(belief).__name__,
+        "readings": f"{run.rows:,} in {run.duration_s:.1f} s, {result.problem.rate_hz:g} a second",
+    }
+    title = f"{result.method} on {', '.join(_origin(run)) or 'a recorded run'}"
+    if scores is None or dead is None or result.truth is None:
+        lost = Figure("flagged lost", float(result.track.lost.mean()), note="share of the readings")
+        return Report(title, (lost,), metadata, "No verdict: the run has no true pose to compare with.")
+    ratio = scores.ratio.get("correlated", math.nan)
+    close = f"{ratio:.2f} of the bound" if math.isfinite(ratio) else ""
+    rows = result.scored_rows
+    off = np.hypot(*(dead.pose - result.truth)[rows, :2].T)
+    dead_m = float(np.sqrt(np.mean(off**2)))
+    expected = f"{scores.anees_low:.2f} to {scores.anees_high:.2f} if the covariance is right"
+    figures = [
+        Figure("position error, RMSE", scores.rmse_m, "m", note=close),
+        Figure("position error, median", scores.median_m, "m"),
+        Figure("position error, 95 %", scores.p95_m, "m"),
+        Figure("position error, end", scores.end_m, "m"),
+        Figure("heading error, RMSE", math.degrees(scores.heading_rad), "deg"),
+        Figure("dead reckoning, RMSE", dead_m, "m", note=_dead_start(result)),
+    ]
+    if scores.bound_m:
+        figures += [
+            Figure("bound", scores.bound_m["correlated"], "m", note="map error alike at nearby places"),
+            Figure("bound, exact map", scores.bound_m["exact"], "m"),
+        ]
+    if math.isfinite(scores.anees):
+        figures.append(Figure("ANEES per state", scores.anees, note=expected))
+        figures.append(Figure("in the 90 % ellipse", scores.coverage, note="share of true positions"))
+    if result.problem.prior.is_global and math.isfinite(scores.converged_s):
+        figures.append(Figure("converged after", scores.converged_s, "s", note="errors count from then on"))
+    figures += [
+        Figure("flagged lost", scores.lost_share, note="share of the readings"),
+        Figure("time a step", scores.step_us, "us"),
+    ]
+    return Report(title, tuple(figures), metadata, verdict_of(scores, dead_m, _dead_start(result)))
+
+
+def verdict_of(scores: Scores, dead_m: float, start: str = "") -> str:
+    """Judge in one line whether an estimate is better than dead reckoning, consistent, and lost.
+
+    Args:
+        scores: Scores of the estimate.
+        dead_m: RMSE of dead reckoning over the same readings [m].
+        start: Where dead reckoning started, if not at the prior.
+    """
+    sizes = f"{100 * scores.rmse_m:.1f} cm RMSE against {100 * dead_m:.1f} cm"
+    less = 1 - scores.rmse_m / dead_m if dead_m > 0 else -math.inf
+    name = f"dead reckoning {start}".rstrip()
+    if abs(less) <= EVEN:
+        words = [f"No better than {name}: {sizes}."]
+    elif less > 0:
+        words = [f"Better than {name}: {sizes}, {less:.0%} less."]
+    else:
+        words = [f"WORSE than {name}: {sizes}."]
+    size = f"{scores.anees:.2f}" if scores.anees < 1e3 else f"{scores.anees:.0e}"
+    figure = f"ANEES {size} per state"
+    if not math.isfinite(scores.anees):
+        words.append("Its covariance is unknown." if math.isnan(scores.anees) else "Its covariance is WRONG.")
+    elif scores.anees > scores.anees_high:
+        words.append(f"TOO CONFIDENT: {figure}, at most {scores.anees_high:.2f} expected.")
+    elif scores.anees < scores.anees_low:
+        words.append(f"Too cautious: {figure}, at least {scores.anees_low:.2f} expected.")
+    else:
+        words.append(f"Consistent: {figure}.")
+    if not math.isfinite(scores.converged_s) and not scores.diverged:
+        words.append(f"It never stayed within {NEAR_M:g} m for {HELD_S:g} s.")
+    if scores.diverged:
+        flagged = "" if scores.diverged_unflagged else ", and flagged it"
+        words.append(f"LOST: its error stayed above {FAR_M:g} m for more than {AWAY_S:g} s{flagged}.")
+    elif scores.lost_share > 0:
+        words.append(f"Not lost, but flagged so in {scores.lost_share:.0%} of the readings.")
+    else:
+        words.append("Not lost.")
+    return " ".join(words)
+
+
+def _origin(run: Run) -> list[str]:
+    return [f"{key} {run.metadata[key]}" for key in ("scene", "path", "seed") if key in run.metadata]
+
+
+def _dead_start(result: Localization) -> str:
+    known = all(map(math.isfinite, result.problem.prior.sd))
+    return "" if known else "from the true start"
+
+
+def thinned(run: Run, rate_hz: float) -> Run:
+    """The latest row of a run at each tick of a slower clock, which starts at its first row."""
+    t = run["t"]
+    ticks = t[0] + np.arange(int((t[-1] - t[0]) * rate_hz + 1e-9) + 1) / rate_hz
+    return run.take(np.unique(np.searchsorted(t, ticks + 1e-9, side="right") - 1))
+
+
+def truth_of(run: Run) -> Array | None:
+    """True x, y [m] and yaw [rad], else those of motion capture, shape (N, 3); None if unknown."""
+    if "p_world_base" in run and "yaw" in run and np.isfinite(run["p_world_base"]).any():
+        return np.column_stack([run["p_world_base"][:, :2], run["yaw"]])
+    if "mocap_p" in run and "mocap_q_xyzw" in run and np.isfinite(run["mocap_p"]).any():
+        return np.column_stack([run["mocap_p"][:, :2], yaw_from_quat(run["mocap_q_xyzw"])])
+    return None
+
+
+def prior_of(run: Run, text: str = "tracking", *, seed: int = 0) -> Prior:
+    """What is known of the pose at the first reading of a run.
+
+    | text | position | heading |
+    |---|---|---|
+    | "tracking" | the true one with an error of 0.1 m sd each axis | the true one with an error of 5 deg sd |
+    | "heading" | unknown | the true one with a uniform error within 10 deg |
+    | "global" | unknown | unknown |
+    | "x,y,yaw" | x, y [m], known to 0.1 m | yaw [rad], known to 5 deg |
+
+    Args:
+        run: The run, whose first true pose is used for "tracking" and "heading".
+        text: One of the texts above.
+        seed: Seed of the error.
+
+    Raises:
+        InputError: The text is none of these, or the run has no true pose.
+    """
+    if "," in text:
+        try:
+            x, y, yaw = map(float, text.split(","))
+        except ValueError:
+            x = y = yaw = math.nan
+        if not all(map(math.isfinite, (x, y, yaw))):
+            raise InputError(f"a `prior` is x,y,yaw [m, m, rad], got {text!r}", parameter="prior")
+        return Prior(mean=(x, y, yaw), sd=START_SD)
+    find("prior", text, dict.fromkeys(("tracking", "heading", "global")))
+    if text == "global":
+        return Prior(sd=(math.inf, math.inf, math.inf))
+    truth = truth_of(run)
+    if truth is None or not np.isfinite(truth[0]).all():
+        raise InputError(
+            "the run has no true pose to start from; give a `prior` x,y,yaw or global", parameter="prior"
+        )
+    rng = np.random.default_rng([seed, 1])
+    if text == "heading":
+        yaw = float(wrap_angle(truth[0, 2] + rng.uniform(-1, 1) * math.radians(10)))
+        return Prior(mean=(0.0, 0.0, yaw), sd=(math.inf, math.inf, HEADING_WITHIN))
+    x, y, yaw = (truth[0] + rng.normal(0, START_SD)).tolist()
+    return Prior(mean=(x, y, float(wrap_angle(yaw))), sd=START_SD)
+
+
+def lever_arm_of(run: Run) -> tuple[float, float]:
+    """Place of the magnetometer in base_link from the metadata of a run; (0, 0) if it is not there."""
+    words = str(run.metadata.get("sensor_m", "")).split(",")
+    return (float(words[0]), float(words[1])) if len(words) == 3 else (0.0, 0.0)
+
+
+def extent_of(run: Run, belief: FieldBelief | None) -> tuple[float, float, float, float]:
+    """Extent of a map; else that of the true poses, or of the odometry, with 1 m around it."""
+    if isinstance(belief, AnomalyMap):
+        return belief.extent
+    p = run["p_world_base" if "p_world_base" in run else "odom_p"][:, :2]
+    (x0, y0), (x1, y1) = np.nanmin(p, axis=0) - 1.0, np.nanmax(p, axis=0) + 1.0
+    return float(x0), float(x1), float(y0), float(y1)
+
+
+def map_file(source: Source) -> Path:
+    """The file of a map: a layer, a stage, a folder of CSVs, or the stage of a shipped scene's name.
+
+    Raises:
+        InputError: There is no such file or scene.
+    """
+    path = Path(source)
+    if path.is_dir() and not (path / f"{path.resolve().name}.usda").is_file():
+        return path
+    if path.is_file():
+        return path
+    try:
+        return Path(scene_file(path))
+    except InputError as error:
+        raise InputError(
+            f"{source}: no map layer, stage, folder of CSVs or shipped scene: {error}"
+        ) from error
+
+
+def check_map(run: Run, anomaly_map: AnomalyMap, file: Path) -> None:
+    """Warn if a map is not the one of the run's scene, by the checksum in the run's metadata."""
+    made = str(run.metadata.get("map_sha256", ""))
+    layer = _layer_of(file)
+    if anomaly_map.frame and not anomaly_map.frame.startswith("world"):
+        warnings.warn(
+            f"the map {anomaly_map.name!r} is in the frame {anomaly_map.frame!r}; poses are taken to be in "
+            "that frame",
+            MismatchWarning,
+            stacklevel=3,
+        )
+    if made and layer is not None and sha256(layer) != made:
+        theirs = f"{run.metadata.get('map', '')!r} of scene {run.metadata.get('scene', '')!r}"
+        warnings.warn(
+            f"{file}: map {anomaly_map.name!r} is not the map {theirs} that the run was made with; their "
+            "difference adds to the errors",
+            MismatchWarning,
+            stacklevel=3,
+        )
+
+
+def check_on_map(run: Run, belief: FieldBelief, lever_arm_m: tuple[float, float] = (0.0, 0.0)) -> None:
+    """Refuse a run most of whose readings are off the map; warn if some are.
+
+    Raises:
+        InputError: Less than half of the readings at known poses are on the map.
+    """
+    truth = truth_of(run)
+    if truth is None:
+        return
+    known = np.isfinite(truth).all(axis=1)
+    x, y, yaw = truth[known].T
+    c, s, (along, left) = np.cos(yaw), np.sin(yaw), lever_arm_m
+    p = np.column_stack([x + c * along - s * left, y + s * along + c * left])
+    on_map = np.isfinite(np.asarray(belief.mean(p, yaw), float))
+    share = float(on_map.mean()) if len(on_map) else 1.0
+    if share < LEAST_ON_MAP:
+        name = getattr(belief, "name", "") or "belief"
+        where = f"x {x.min():.2f} to {x.max():.2f} m, y {y.min():.2f} to {y.max():.2f} m"
+        extent = ""
+        if isinstance(belief, AnomalyMap):
+            x0, x1, y0, y1 = belief.extent
+            extent = f", which covers x {x0:.2f} to {x1:.2f} m, y {y0:.2f} to {y1:.2f} m"
+        raise InputError(
+            f"the run is off the map: {share:.0%} of its readings, in {where}, are on map {name!r}{extent}; "
+            "give the map of the run's place and frame"
+        )
+    if share < 1:
+        text = f"{1 - share:.1%} of the run's readings are off the map or on masked nodes"
+        warnings.warn(text, MismatchWarning, stacklevel=3)
+
+
+def _layer_of(file: Path) -> Path | None:
+    """The layer that holds the map of a file; None for a folder of CSVs, or a stage that is no scene."""
+    if file.is_dir():
+        return None
+    from magtwin.usd.maps import is_map_layer
+    from magtwin.usd.scene import read_scene
+
+    if is_map_layer(file):
+        return file
+    try:
+        return Path(read_scene(file, check_network=False).map_layer)
+    except InputError:
+        return None

@@ -1,0 +1,1 @@
+"""Localizers on live topics, and ROS nodes as localizers."""

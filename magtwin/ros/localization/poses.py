@@ -1,0 +1,132 @@
+"""Poses: messages of estimated poses, clouds and starts, and back."""
+
+import math
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.frames import quat_conjugate, quat_from_yaw, quat_multiply, rotate, yaw_from_quat
+from magtwin.localization.problem import Array, Estimate, Prior
+from magtwin.ros.bus import Message, to_bytes
+
+POSE_KIND = "geometry_msgs/msg/PoseWithCovarianceStamped"
+CLOUD_KIND = "geometry_msgs/msg/PoseArray"
+LOST_KIND = "std_msgs/msg/Bool"
+TF_KIND = "tf2_msgs/msg/TFMessage"
+
+ESTIMATE, CLOUD, LOST = "estimate/pose", "estimate/particles", "estimate/lost"
+"""Topics of a localizer, in the robot's namespace."""
+
+INITIAL = "/initialpose"
+"""Topic on which RViz and others set a pose."""
+
+START_SD = (0.1, 0.1, math.radians(5))
+"""Standard deviation of a pose that comes without one: x, y [m] and yaw [rad]."""
+
+PLANAR = (0, 1, 5)
+"""Rows of x, y and yaw in the 6 x 6 covariance of a pose, whose order is x, y, z, roll, pitch, yaw."""
+
+
+def pose_bytes(
+    stamp_ns: int, frame: str, pose: tuple[float, float, float], covariance: NDArray[Any] | None
+) -> bytes:
+    """A PoseWithCovarianceStamped of x, y [m] and yaw [rad]; a covariance of None is sent as zeros."""
+    whole = np.zeros((6, 6))
+    if covariance is not None:
+        whole[np.ix_(PLANAR, PLANAR)] = covariance
+    x, y, yaw = pose
+    fields = {
+        "header.stamp": np.int64(stamp_ns),
+        "header.frame_id": frame,
+        "pose.pose.position": [x, y, 0.0],
+        "pose.pose.orientation": quat_from_yaw(yaw),
+        "pose.covariance": whole.ravel(),
+    }
+    return to_bytes(POSE_KIND, fields)
+
+
+def read_pose(message: Message) -> tuple[int, str, Array, Array | None]:
+    """Stamp [ns], frame, x, y [m], yaw [rad] and covariance (3, 3) of a PoseWithCovarianceStamped.
+
+    The covariance is None if all of it is 0, which means unknown.
+
+    Raises:
+        InputError: A number is not finite, or the quaternion has not the length 1.
+    """
+    p, q, c = "pose.pose.position", "pose.pose.orientation", "pose.covariance"
+    read = message.read(["header.stamp", "header.frame_id", p, q, c])
+    whole = np.asarray(read[c], float).reshape(6, 6)[np.ix_(PLANAR, PLANAR)]
+    numbers = np.concatenate([read[p][:2], read[q], whole.ravel()])
+    if not np.isfinite(numbers).all() or abs(float(np.linalg.norm(read[q])) - 1) > 0.1:
+        raise InputError("a pose whose numbers are not finite, or whose quaternion has not the length 1")
+    pose = np.array([*read[p][:2], float(yaw_from_quat(np.asarray(read[q], float)))])
+    return int(read["header.stamp"]), str(read["header.frame_id"]), pose, whole if whole.any() else None
+
+
+def prior_from(message: Message) -> tuple[str, Prior]:
+    """Frame and prior of a message on /initialpose; without a covariance, 0.1 m and 5 deg.
+
+    Raises:
+        InputError: As for `read_pose`.
+    """
+    _, frame, pose, covariance = read_pose(message)
+    sd = START_SD
+    if covariance is not None and (covariance.diagonal() > 0).all():
+        x, y, yaw = np.sqrt(covariance.diagonal()).tolist()
+        sd = (x, y, yaw)
+    x, y, yaw = pose.tolist()
+    return frame, Prior(mean=(x, y, yaw), sd=sd)
+
+
+def cloud_bytes(stamp_ns: int, frame: str, cloud: Array, most: int) -> bytes:
+    """A PoseArray of at most `most` particles, drawn evenly by weight.
+
+    Args:
+        stamp_ns: Stamp [ns].
+        frame: Frame of the poses.
+        cloud: x, y [m], yaw [rad] and weight of each particle, shape (P, 4).
+        most: Largest number of poses, which have the same weight.
+    """
+    total = np.cumsum(cloud[:, 3])
+    count = min(most, len(cloud))
+    rows = np.searchsorted(total, (np.arange(count) + 0.5) / max(count, 1) * total[-1])
+    kept = cloud[np.minimum(rows, len(cloud) - 1)]
+    table = np.column_stack([kept[:, :2], np.zeros(count), quat_from_yaw(kept[:, 2])])
+    empty = to_bytes(CLOUD_KIND, {"header.stamp": np.int64(stamp_ns), "header.frame_id": frame, "poses": 0})
+    head = empty[: _length_at(frame)] + struct.pack("<I", count)
+    padding = -(len(head) - 4) % 8 if count else 0  # doubles are aligned to 8 bytes after the CDR header
+    return head + b"\0" * padding + table.astype("<f8").tobytes()
+
+
+def _length_at(frame: str) -> int:
+    """Place of the number of poses in a PoseArray: after CDR header, stamp and frame, aligned to 4 bytes."""
+    end = 4 + 8 + 4 + len(frame.encode()) + 1
+    return end + -(end - 4) % 4
+
+
+def odom_bytes(
+    stamp_ns: int, frames: tuple[str, str], estimate: Estimate, p_odom: Array, q_odom: Array
+) -> bytes:
+    """A TFMessage of map to odom, such that base_link is at an estimate.
+
+    Args:
+        stamp_ns: Stamp [ns].
+        frames: Names of map and odom.
+        estimate: The pose in map.
+        p_odom: Position of base_link in odom [m], shape (3,).
+        q_odom: Its orientation, xyzw.
+    """
+    q = quat_multiply(quat_from_yaw(estimate.yaw), quat_conjugate(q_odom))
+    p = np.array([estimate.x, estimate.y, 0.0]) - rotate(q, p_odom)
+    transform = {
+        "header.stamp": np.int64(stamp_ns),
+        "header.frame_id": frames[0],
+        "child_frame_id": frames[1],
+        "transform.translation": p,
+        "transform.rotation": q,
+    }
+    fields = {f"transforms.0.{name}": value for name, value in transform.items()}
+    return to_bytes(TF_KIND, {"transforms": 1, **fields})

@@ -1,0 +1,349 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import synthetic
+from numpy.testing import assert_allclose
+
+from magtwin.errors import InputError
+from magtwin.frames import quat_from_yaw, yaw_from_quat
+from magtwin.localization.belief import table_of
+from magtwin.localization.bounds import bounds
+from magtwin.localization.grid import point_mass
+from magtwin.localization.grid.bank import STATS, Bank, Likelihood
+from magtwin.localization.grid.point_mass import Grid, PointMass
+from magtwin.localization.particles import RaoBlackwell
+from magtwin.localization.problem import OdometryModel, Problem, Reading, SensorModel
+from magtwin.localization.readings import readings_of
+from magtwin.localization.track import track
+
+CODE = point_mass.LOOPS.open()
+N = 2
+
+
+def unpacked(state):
+    """Means (K, 2) and covariances (K, 2, 2) of the linear states of all nodes."""
+    rows = state.reshape(-1, 5)
+    return rows[:, :2], rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+
+
+def random_grid(seed, count=6):
+    rng = np.random.default_rng(seed)
+    grid = Grid(np.array([0.2, -0.1, 0.4]), np.diag([0.02, 0.01, 0.003]) + 0.001, count, N)
+    grid.logw[:] = np.where(rng.random(grid.logw.shape) < 0.8, rng.normal(0, 2, grid.logw.shape), -np.inf)
+    grid.normalise()
+    roots = rng.normal(0, 10, (len(grid.logw), 2, 2))
+    covariances = roots @ roots.transpose(0, 2, 1)
+    rows = grid.state.reshape(-1, 5)
+    rows[:, :2] = rng.normal(0, 100, (len(rows), 2))
+    rows[:, 2:] = covariances[:, [0, 0, 1], [0, 1, 1]]
+    return grid
+
+
+def test_the_convolution_is_that_of_a_plain_loop_over_gaussian_mixtures():
+    grid = random_grid(0)
+    rng = np.random.default_rng(1)
+    count = int(grid.shape[0])
+    taps = rng.uniform(0.01, 0.1, (count, 3, 3))
+    taps[:, 1, 1] = 1 - (taps.sum(axis=(1, 2)) - taps[:, 1, 1])
+    turn = 0.07
+    logw, state = np.empty_like(grid.logw), np.empty_like(grid.state)
+    layout = grid.layers, grid.axes, grid.shape
+    CODE.mix(grid.logw, grid.state, logw, state, *layout, taps.ravel(), turn)
+
+    w = np.exp(grid.logw).reshape(count, count, count)
+    means, covariances = unpacked(grid.state)
+    origins = grid.layers.reshape(-1, 3)[:, 1:]
+    for h, j, i in rng.integers(0, count, (60, 3)):
+        sources = [
+            (h, j + dj, i + di, (1 - 2 * turn) * taps[h, 1 - dj, 1 - di])
+            for dj in (-1, 0, 1)
+            for di in (-1, 0, 1)
+        ]
+        for g in (h - 1, h + 1):
+            if not 0 <= g < count:
+                continue
+            u, v = np.linalg.solve(grid.cell, origins[h] + grid.cell @ (i, j) - origins[g])
+            sources += [
+                (g, jj, ii, turn * (1 - abs(u - ii)) * (1 - abs(v - jj)))
+                for jj in (math.floor(v), math.floor(v) + 1)
+                for ii in (math.floor(u), math.floor(u) + 1)
+            ]
+        mass, first, second = 0.0, np.zeros(2), np.zeros((2, 2))
+        for g, jj, ii, share in sources:
+            if 0 <= jj < count and 0 <= ii < count:
+                k = (g * count + jj) * count + ii
+                part = share * w[g, jj, ii]
+                mass += part
+                first += part * means[k]
+                second += part * (covariances[k] + np.outer(means[k], means[k]))
+        k = (h * count + j) * count + i
+        assert_allclose(np.exp(logw[k]), mass, rtol=1e-10, atol=1e-300)
+        if mass > 0:
+            got_mean, got_covariance = (part[k] for part in unpacked(state))
+            mean = first / mass
+            assert_allclose(got_mean, mean, rtol=1e-9, atol=1e-9)
+            # the plain sum subtracts squares of 1e4 to 1e5 nT^2: rounding of 1e-10 of them
+            assert_allclose(got_covariance, second / mass - np.outer(mean, mean), rtol=1e-6, atol=1e-5)
+
+
+def test_a_kernel_adds_its_variance_and_keeps_the_mean():
+    grid = Grid(np.zeros(3), np.diag([0.01, 0.02, 0.004]), 21, N)
+    poses = grid.poses()
+    grid.logw[:] = -0.5 * np.sum(poses**2 / (0.01, 0.02, 0.004), axis=1)
+    grid.normalise()
+    case = synthetic.drive(synthetic.wavy_map(), 0, seconds=2)
+    algorithm = PointMass(scale_m=1.0)
+    algorithm.reset(case.problem)
+    before = np.cov(poses.T, aweights=np.exp(grid.logw), bias=True)
+    added = np.array([0.002, 0.002, 0.0008])
+    distance = 1.0
+    algorithm._convolve(grid, added, distance)
+    w = np.exp(grid.logw)
+    after = np.cov(poses.T, aweights=w, bias=True)
+    expected = before + np.diag(added)
+    expected[0, 0] += 0.02**2 * np.average(np.cos(poses[:, 2]) ** 2, weights=w)
+    expected[1, 1] += 0.02**2 * np.average(np.sin(poses[:, 2]) ** 2, weights=w)
+    assert_allclose(w @ poses / w.sum(), 0, atol=1e-6)
+    # mass beyond the window, 3.6 sd before and 3.2 sd after, would have 1.5 % of the variance
+    assert_allclose(np.diag(after), np.diag(expected), rtol=0.02)
+
+
+def test_the_update_is_a_kalman_update_in_each_node():
+    field = synthetic.wavy_map(variance=900.0)
+    sensor = SensorModel(lever_arm_m=(0.05, 0.02))
+    problem = Problem(belief=field, extent=field.extent, sensor=sensor)
+    likelihood = Likelihood(problem, *table_of(field, field.extent), 2.0)
+    grid = random_grid(2)
+    grid = _with_states(grid, 3)
+    before = grid.logw.copy(), grid.state.copy()
+    reading = Reading(0.2, 41_234.0, (0, 0, 0), disturbance_nt=20.0, disturbance_sd_nt=7.0)
+    decay, noise = likelihood.dynamics(0.2, 0.04)
+    numbers = np.array([*likelihood.numbers(reading, np.zeros(3)), *decay, *noise], float)
+    stats = np.empty(STATS)
+    layout = grid.layers, grid.axes, grid.shape
+    CODE.update(likelihood.table, likelihood.spreads, grid.logw, grid.state, *layout, numbers, stats)
+
+    a, b = np.triu_indices(3)
+    logs = np.full(len(grid.logw), -np.inf)
+    for k, (x, y, yaw) in enumerate(grid.poses()):
+        if not np.isfinite(before[0][k]):
+            continue
+        row = before[1].reshape(-1, 9)[k]
+        mean, cov = row[:3] * decay, np.zeros((3, 3))
+        cov[a, b] = cov[b, a] = row[3:]
+        cov = cov * np.outer(decay, decay) + np.diag(noise)
+        c, s = math.cos(yaw), math.sin(yaw)
+        p = [x + c * 0.05 - s * 0.02, y + s * 0.05 + c * 0.02]
+        h = np.array([1.0, 1.0, math.sqrt(0.84 * 900)])
+        r = 20.0**2 + 7.0**2 + 0.16 * float(field.variance(p, yaw))
+        h[2] = math.sqrt(0.84 * float(field.variance(p, yaw)))
+        miss = 41_234.0 - 20.0 - float(field.mean(p, yaw)) - h @ mean
+        spread = h @ cov @ h + r
+        logs[k] = before[0][k] - 0.5 * (miss**2 / spread + math.log(spread)) / 2.0
+        gain = cov @ h / spread
+        if np.isfinite(grid.logw[k]):
+            got = grid.state.reshape(-1, 9)[k]
+            assert_allclose(got[:3], mean + gain * miss, rtol=1e-9)
+            assert_allclose(got[3:], (cov - np.outer(gain, h @ cov))[a, b], rtol=1e-7, atol=1e-6)
+    logs -= np.log(np.exp(logs - logs.max()).sum()) + logs.max()
+    kept = np.isfinite(grid.logw)
+    assert_allclose(grid.logw[kept], logs[kept], atol=1e-6)  # dropped nodes hold less than exp(-20)
+    assert logs[~kept].max() < logs.max() - 19
+
+
+def _with_states(grid, n):
+    """A grid with as many nodes and n linear states."""
+    made = Grid(np.array([0.2, -0.1, 0.4]), np.diag([0.02, 0.01, 0.003]) + 0.001, int(grid.shape[0]), n)
+    made.logw[:] = grid.logw
+    rows = made.state.reshape(len(made.logw), -1)
+    rng = np.random.default_rng(9)
+    roots = rng.normal(0, 10, (len(rows), n, n))
+    a, b = np.triu_indices(n)
+    rows[:, :n] = rng.normal(0, 100, (len(rows), n))
+    rows[:, n:] = (roots @ roots.transpose(0, 2, 1))[:, a, b]
+    return made
+
+
+def test_a_new_window_keeps_a_gaussian():
+    covariance = np.array([[0.01, 0.004, 0.002], [0.004, 0.02, -0.001], [0.002, -0.001, 0.003]])
+    mean = np.array([0.3, -0.2, 1.0])
+    old = Grid(mean, covariance, 15, N)
+    inverse = np.linalg.inv(covariance)
+    d = old.poses() - mean
+    old.logw[:] = -0.5 * np.einsum("ni,ij,nj->n", d, inverse, d)
+    old.normalise()
+    old.state[:] = 1.0
+    new = Grid(mean + 0.3 * np.sqrt(np.diag(covariance)), 0.8 * covariance, 15, N)
+    layout = old.layers, old.axes, old.shape
+    CODE.regrid(old.logw, old.state, *layout, new.logw, new.state, new.layers, new.axes, new.shape, -60.0)
+    inside = np.isfinite(new.logw)
+    d = new.poses()[inside] - mean
+    expected = -0.5 * np.einsum("ni,ij,nj->n", d, inverse, d)
+    near = expected > -8
+    assert near.sum() > 1500
+    level = (new.logw[inside] - expected)[near]
+    assert_allclose(level, level[0], atol=1e-6)  # the expansion is exact for a Gaussian
+    assert_allclose(new.state.reshape(-1, 5)[inside][near], 1.0)
+
+
+def test_in_a_linear_field_the_filter_agrees_with_a_kalman_filter():
+    gradient = (3000.0, -1500.0)
+    field = synthetic.linear_map(*gradient)
+    model = OdometryModel(scale_std=0.0, turn_std=0.0, yaw_std=math.radians(0.5))
+    sensor = SensorModel(offset_nt=100.0)
+    case = synthetic.drive(field, 3, seconds=12, sd=(0.05, 0.05, 0.05), odometry=model, sensor=sensor)
+    made = track(PointMass(reset_at=math.inf), case.problem, case.readings)
+    means, covariances = synthetic.kalman(case, gradient)
+    sd = np.sqrt(covariances[:, range(3), range(3)])
+    # the window cuts tails beyond 3.6 sd, 1 % of the variance, again and again; the filter's headings are
+    # not linearised
+    assert np.abs((made.pose - means[:, :3]) / sd).max() < 0.2
+    assert_allclose(made.covariance[:, range(3), range(3)] / sd**2, 1.0, atol=0.12)
+
+
+def test_one_start_of_the_bank_is_an_extended_kalman_filter():
+    gradient = (3000.0, -1500.0)
+    field = synthetic.linear_map(*gradient)
+    model = OdometryModel(scale_std=0.0)
+    case = synthetic.drive(field, 3, seconds=8, sd=(0.02, 0.02, 0.02), odometry=model)  # one start
+    prior = case.problem.prior
+    table, spreads = table_of(field, field.extent)
+    bank = Bank(
+        Likelihood(case.problem, table, spreads, 1.0), prior.mean, prior.sd, cell_m=0.08, step_rad=0.13
+    )
+    means, covariances = synthetic.kalman(case, gradient)
+    last = None
+    for k, reading in enumerate(readings_of(case.readings)):
+        bank.step(last, reading, np.zeros(3))
+        last = reading
+        assert len(bank.logw) == 1
+        kept = [0, 1, 2, 4, 5]
+        assert_allclose(bank.means[0, kept], means[k], rtol=1e-6, atol=1e-6)
+        assert_allclose(bank.covariances[0][np.ix_(kept, kept)], covariances[k], rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("variance", [None, 150.0**2])
+def test_tracking_is_consistent_and_as_good_as_a_particle_filter(variance):
+    errors, others, nees, limits = [], [], [], []
+    for seed in range(8):
+        truth = synthetic.wavy_map(seed)
+        case = synthetic.drive(truth, seed)
+        if variance is not None:
+            error = synthetic.waves(100 + seed, sd=math.sqrt(variance), length=0.3)
+            base = synthetic.waves(seed)
+            belief = synthetic.tabulated(
+                lambda x, y, base=base, error=error: 41_000 + base(x, y) + error(x, y), variance=variance
+            )
+            case.problem = replace(case.problem, belief=belief)
+        _, score = synthetic.scored(PointMass(), case)
+        errors.append(score.error[25:])
+        nees.append(score.nees[25:].mean())
+        others.append(synthetic.scored(RaoBlackwell(), case)[1].error[25:])
+        limit = bounds(case.problem, case.truth, case.readings["t"], truth)
+        limits.append((limit.exact if variance is None else limit.correlated)[25:])
+    rmse, other, limit = (math.sqrt(np.mean(np.square(v))) for v in (errors, others, limits))
+    assert rmse > limit
+    assert rmse < 1.1 * other
+    assert 0.7 < np.mean(nees) < 1.4  # sd of the mean over 8 correlated drives is about 0.15
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_global_start_finds_the_pose(seed):
+    case = synthetic.drive(synthetic.wavy_map(seed), seed, prior=synthetic.UNKNOWN, seconds=30)
+    made, score = synthetic.scored(PointMass(), case)
+    assert made.lost[0]
+    assert not made.lost[-50:].any()
+    assert score.error[-50:].max() < 0.25
+
+
+def test_iron_is_learned():
+    sensor = SensorModel(iron_nt=400.0, lever_arm_m=(0.1, 0.0))
+    case = synthetic.drive(synthetic.wavy_map(1), 1, sensor=sensor)
+    _, score = synthetic.scored(PointMass(), case)
+    assert score.error[50:].max() < 0.25
+    assert score.nees[50:].mean() < 2.5
+
+
+def test_a_kidnapped_robot_is_found_again():
+    first, second = (synthetic.drive(synthetic.wavy_map(2), seed, seconds=30) for seed in (4, 6))
+    assert math.dist(first.truth[-1, :2], second.truth[0, :2]) > 0.5
+    columns = {name: np.concatenate([first.readings[name], v]) for name, v in second.readings.items()}
+    columns["t"] = np.arange(len(columns["t"])) / 5
+    columns["b_measured_nt"][150:] -= np.median(
+        second.readings["b_measured_nt"] - second.problem.belief.mean(second.truth[:, :2], second.truth[:, 2])
+    ) - np.median(
+        first.readings["b_measured_nt"] - first.problem.belief.mean(first.truth[:, :2], first.truth[:, 2])
+    )
+    # odometry does not see the move: it goes on from its last pose
+    yaw = yaw_from_quat(columns["odom_q_xyzw"])
+    turn = yaw[149] - yaw[150]
+    c, s = math.cos(turn), math.sin(turn)
+    columns["odom_p"][150:, :2] = columns["odom_p"][149, :2] + columns["odom_p"][150:, :2] @ np.array(
+        [[c, s], [-s, c]]
+    )
+    columns["odom_q_xyzw"][150:] = quat_from_yaw(yaw[150:] + turn)
+    case = synthetic.Drive(
+        first.problem,
+        type(first.readings)(columns),
+        np.concatenate([first.truth, second.truth]),
+    )
+    made, score = synthetic.scored(PointMass(), case)
+    assert score.error[140:150].max() < 0.25
+    assert made.lost[150:].any()
+    assert score.error[-25:].max() < 0.25
+
+
+def test_readings_without_a_value_widen_the_estimate():
+    case = synthetic.drive(synthetic.wavy_map(3), 3, seconds=30)
+    b = case.readings["b_measured_nt"].copy()
+    b[75:125] = np.nan
+    case.readings = case.readings.with_columns(b_measured_nt=b)
+    made, score = synthetic.scored(PointMass(), case)
+    spread = made.covariance[:, 0, 0] + made.covariance[:, 1, 1]
+    assert spread[124] > 2 * spread[74]
+    assert score.error[-20:].max() < 0.25
+
+
+def test_a_stuck_sensor_is_not_used():
+    case = synthetic.drive(synthetic.wavy_map(3), 3, seconds=30)
+    b = case.readings["b_measured_nt"].copy()
+    b[75:100] = b[74]
+    case.readings = case.readings.with_columns(b_measured_nt=b)
+    _, score = synthetic.scored(PointMass(), case)
+    assert score.error[50:].max() < 0.35
+
+
+def test_a_robot_off_the_map_gets_finite_estimates():
+    field = synthetic.wavy_map(5, extent=(-2.0, 2.0, -1.5, 1.5))
+    case = synthetic.drive(field, 5, seconds=20, margin=-0.6)
+    b = np.where(np.isfinite(case.readings["b_measured_nt"]), case.readings["b_measured_nt"], 41_000.0)
+    case.readings = case.readings.with_columns(b_measured_nt=b)
+    assert (np.abs(case.truth[:, 0]) > 2).any() or (np.abs(case.truth[:, 1]) > 1.5).any()
+    made = track(PointMass(), case.problem, case.readings)  # refuses what is not finite
+    assert len(made.t) == 100
+
+
+def test_the_same_problem_gives_the_same_bytes():
+    case = synthetic.drive(synthetic.wavy_map(6), 6, seconds=8, prior=synthetic.UNKNOWN)
+    first, second = (track(PointMass(), case.problem, case.readings) for _ in range(2))
+    assert first.pose.tobytes() == second.pose.tobytes()
+    assert first.covariance.tobytes() == second.covariance.tobytes()
+
+
+def test_particles_are_the_mass():
+    case = synthetic.drive(synthetic.wavy_map(6), 6, seconds=8)
+    made = track(PointMass(), case.problem, case.readings, keep_particles=True)
+    for cloud, pose in zip(made.particles, made.pose, strict=True):
+        assert_allclose(cloud[:, 3].sum(), 1.0)
+        assert_allclose(cloud[:, 3] @ cloud[:, :2], pose[:2], atol=0.02)
+
+
+def test_wrong_options_and_a_problem_without_map_are_refused():
+    with pytest.raises(InputError, match="nodes of PointMass must be odd"):
+        PointMass(nodes=10)
+    with pytest.raises(InputError, match="temper of PointMass must be above 0"):
+        PointMass(temper=0.0)
+    with pytest.raises(InputError, match="needs a map"):
+        PointMass().reset(Problem(belief=None, extent=synthetic.EXTENT))

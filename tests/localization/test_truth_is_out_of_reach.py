@@ -1,0 +1,116 @@
+"""What a localizer gets leads to no true pose, no true field and no later reading."""
+
+import gc
+import types
+
+import numpy as np
+import pytest
+
+import magtwin as mt
+from magtwin.localization.problem import Estimate, Problem
+from magtwin.localization.readings import NEEDED, ONBOARD, onboard, readings_of
+from magtwin.localization.track import LocalizerError, track
+from magtwin.run.run import COLUMNS
+
+TRUE = (
+    "p_world_base",
+    "q_world_base_xyzw",
+    "yaw",
+    "v_base",
+    "w_base",
+    "b_truth_nt",
+    "b_map_nt",
+    "b_total_nt",
+)
+"""Columns that no localizer may see."""
+
+
+@pytest.fixture(scope="module")
+def run():
+    return mt.simulate("lab", "figure8", seed=2, duration_s=10, rate_hz=5, magnetometer="physical")
+
+
+def reachable(*starts):
+    """All arrays that can be reached from some objects, without modules, classes and functions' globals."""
+    seen, stack, arrays = set(), list(starts), []
+    while stack:
+        item = stack.pop()
+        if id(item) in seen or isinstance(
+            item, types.ModuleType | type | types.FunctionType | types.FrameType
+        ):
+            continue
+        seen.add(id(item))
+        if isinstance(item, np.ndarray):
+            arrays.append(item)
+            stack.append(item.base)
+        stack += gc.get_referents(item)
+    return arrays
+
+
+def holds(arrays, values):
+    """Whether an array has the values of a column, or of its parts, anywhere in it."""
+    for column in values.T.reshape(-1, len(values)):
+        if np.ptp(column) == 0:  # such as the height
+            continue
+        for array in arrays:
+            if array.dtype.kind == "f" and array.size >= len(column):
+                parts = array.reshape(-1, array.shape[-1]).T if array.ndim > 1 else array[None]
+                if any(part.size == column.size and np.array_equal(part, column) for part in parts):
+                    return True
+    return False
+
+
+def test_no_true_column_can_be_reached_from_a_problem_and_a_reading(run):
+    reading = next(iter(readings_of(run)))
+    problem = Problem(belief=None, extent=(-3, 3, -2, 2))
+    arrays = reachable(problem, reading, onboard(run))
+    assert holds(arrays, run["odom_p"][:, :2])  # the search finds what is there
+    for name in TRUE:
+        assert not holds(arrays, run[name]), name
+
+
+def test_on_board_columns_are_none_of_the_true_ones(run):
+    assert not set(ONBOARD) & set(TRUE)
+    assert set(NEEDED) <= set(ONBOARD)
+    assert {name for name in ONBOARD if name in COLUMNS} <= set(run)
+    assert not set(onboard(run).metadata)
+
+
+def test_a_reading_holds_no_later_reading(run):
+    readings = readings_of(run)
+    next(readings)
+    second = next(readings)
+    later = run["b_measured_nt"][2:]
+    for array in reachable(second):
+        assert not np.isin(later, array).any()
+    assert not np.isin(later, [value for value in second.signals.values() if np.isscalar(value)]).any()
+
+
+class Wrong:
+    def __init__(self, estimate):
+        self.estimate = estimate
+
+    def reset(self, problem):
+        pass
+
+    def step(self, reading):
+        return self.estimate(reading)
+
+
+@pytest.mark.parametrize(
+    ("estimate", "text"),
+    [
+        (lambda r: 1 / 0, "raised ZeroDivisionError at t = 0 s"),
+        (lambda r: (0, 0, 0), "returned tuple at t = 0 s, not an Estimate"),
+        (lambda r: Estimate(r.t, np.nan, 0, 0), "a pose that is not finite at t = 0 s"),
+        (lambda r: Estimate(r.t + 1, 0, 0, 0), "an estimate from the future at t = 0 s"),
+        (lambda r: Estimate(r.t - 1, 0, 0, 0), "an estimate of another reading at t = 0 s"),
+        (lambda r: Estimate(r.t, "east", 0, 0), "whose values are not numbers"),
+        (lambda r: Estimate(r.t, 0, 0, 0, np.eye(2)), r"a covariance of shape \(2, 2\)"),
+        (lambda r: Estimate(r.t, 0, 0, 0, -np.eye(3)), "not positive semidefinite"),
+        (lambda r: Estimate(r.t, 0, 0, 0, np.arange(9.0).reshape(3, 3)), "not positive semidefinite"),
+    ],
+)
+def test_a_wrong_estimate_is_refused_with_its_time(run, estimate, text):
+    with pytest.raises(LocalizerError, match=text):
+        track(Wrong(estimate), Problem(belief=None, extent=(-3, 3, -2, 2)), run)
