@@ -160,7 +160,8 @@ def localize(
         odometry: Noise model of the odometry.
         map_length_m: Correlation length of the map's error [m].
         compensator: Model of the robot's own field, a name in
-            `magtwin.localization.compensators.COMPENSATORS`, for methods that use its prediction (rbpf-network). It is fitted to `calibration`.
+            `magtwin.localization.compensators.COMPENSATORS`, for methods that use its prediction
+            (rbpf-network). It is fitted to `calibration`.
         calibration: A drive earlier in the session with true poses, or its file.
         rate_hz: Readings per second that the method gets [Hz]. None: all.
         seed: Seed of the method and of the prior's error.
