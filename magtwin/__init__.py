@@ -16,6 +16,7 @@ from magtwin.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from magtwin.author.from_urdf import from_urdf as from_urdf
+    from magtwin.bench.results import read_results as read_results
     from magtwin.bench.runner import benchmark as benchmark
     from magtwin.errors import InputError as InputError
     from magtwin.errors import MismatchWarning as MismatchWarning
@@ -83,6 +84,7 @@ _NAMES = {
     "new_scene": "twin",
     "open_twin": "twin",
     "plot": "figures.plot",
+    "read_results": "bench.results",
     "read_survey": "io.surveys.survey",
     "reproduce": "io.provenance:repeat_of",
     "save_map": "usd.maps",

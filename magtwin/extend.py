@@ -10,11 +10,12 @@
 | `@map_method("name")` | `magtwin.field.fit.methods.MapMethod` | `fit_map(survey, "name")` |
 | `@predictor("name")` | `magtwin.learn.models.predictor.PredictorKind` | `train(dataset, model="name")` |
 | `@log_format(".suffix")` | `magtwin.io.formats.Format` | `run.save("run.suffix")`, `load_run` |
+| `@localizer("name")` | `magtwin.localization.problem.Localizer` | `localize(run, map, method="name")` |
 | `@rule("magtwin", advice)` | a function that checks a stage | `validate(stage)` |
 
 An installed package can announce them as entry points instead, in the groups `magtwin.sensors`,
 `magtwin.interference`, `magtwin.controllers`, `magtwin.engines`, `magtwin.paths`, `magtwin.map_methods`,
-`magtwin.predictors` and `magtwin.formats`; then they are known on the command line too:
+`magtwin.predictors`, `magtwin.localizers` and `magtwin.formats`; then they are known on the command line too:
 
     [project.entry-points."magtwin.map_methods"]
     kriging = "my_package.kriging:fit_kriging"
@@ -35,6 +36,7 @@ _NAMES = {
     "controller": "sim.extensions:controller",
     "engine": "sim.extensions:engine",
     "interference": "sim.extensions:interference",
+    "localizer": "localization.localizers:localizer",
     "log_format": "io.formats:FORMATS.register",
     "map_method": "field.fit.methods:map_method",
     "path": "path:path",

@@ -31,5 +31,5 @@ def test_the_eight_common_jobs_need_one_import_of_magtwin_and_at_most_25_lines()
 
 
 def test_each_extension_point_has_an_example():
-    names = {"sensor", "interference", "path", "controller", "engine", "map_method", "predictor"}
+    names = {"sensor", "interference", "path", "controller", "engine", "map_method", "predictor", "localizer"}
     assert {script.stem for script in EXTENSIONS} == names

@@ -3,7 +3,7 @@
 import numpy as np
 
 import magtwin as mt
-from magtwin.localization.localizers import localizer
+from magtwin.extend import localizer
 from magtwin.localization.odometry import increment
 from magtwin.localization.problem import Estimate
 
