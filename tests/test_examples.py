@@ -33,3 +33,12 @@ def test_the_eight_common_jobs_need_one_import_of_magtwin_and_at_most_25_lines()
 def test_each_extension_point_has_an_example():
     names = {"sensor", "interference", "path", "controller", "engine", "map_method", "predictor", "localizer"}
     assert {script.stem for script in EXTENSIONS} == names
+
+
+def test_the_tutorial_shows_the_class_of_the_localizer_example():
+    tutorial = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+    example = (ROOT / "examples" / "extend" / "localizer.py").read_text(encoding="utf-8")
+    (shown,) = re.findall(r"^```python\n(.*?)^```$", tutorial, re.MULTILINE | re.DOTALL)
+    of_magtwin = re.findall(r"^from magtwin\.localization\..*\n", example, re.MULTILINE)
+    (written,) = re.findall(r"^class .*?(?=\n\n\n)", example, re.MULTILINE | re.DOTALL)
+    assert shown == "import numpy as np\n\n" + "".join(of_magtwin) + "\n\n" + written + "\n"
