@@ -11,9 +11,7 @@ from magtwin.cli.terminal import Done, announce, progress
 
 Results = Annotated[Path, Parameter(required=True)]
 
-bench_app = App(
-    name="bench", help="Benchmark localizers on simulated and recorded drives, and report the results."
-)
+bench_app = App(name="bench")
 app.command(bench_app)
 
 
@@ -33,10 +31,12 @@ def bench(
     no_tracks: Flag = False,
     force: Force = False,
 ) -> Done:
-    """Benchmark localizers: run those of a suite on its scenarios, and write one row per run.
+    """Benchmark localizers on simulated and recorded drives, and report the results.
 
-    Runs that are in the output folder already are skipped, so that the same command continues an interrupted
-    benchmark, and shards can share a folder. The rows depend on neither jobs nor shards nor the machine.
+    The localizers of a suite run on its scenarios; the folder gets one row per run and localizer. Runs that
+    the folder already has are skipped, so the same command continues an interrupted benchmark, and shards can
+    share a folder. The number of processes, shards and machines does not change the rows. docs/bench.md
+    describes scenarios and scores.
 
     Parameters
     ----------
@@ -44,19 +44,22 @@ def bench(
         TOML file of the suite, or the name of one that ships with magtwin: standard, aprilab, magnetic-data,
         ship.
     out
-        Folder of results.
+        Folder of results to write or continue.
     only
         Scenarios to run. Default: all.
     localizer
-        Localizers to run: names of the suite, of magtwin, or MODULE:CLASS. Default: all of the suite.
+        Localizers to run: names in the suite, methods of `magtwin localize`, or MODULE:CLASS. Default: all of
+        the suite.
     runs
-        Most runs of each scenario. Default: as many as the suite has.
+        Largest number of runs of each scenario. Default: all of the suite.
     seeds
-        held-out: other seeds than the public ones, for a final measurement.
+        public, to choose settings; or held-out, other seeds for a final measurement.
     data
-        Folders of data, as NAME=FOLDER.
+        Folders of the data that the suite needs, as NAME=FOLDER, such as ship=magslam/ship.
+    jobs
+        Number of processes. Default: one for each processor, as far as memory allows.
     no_tracks
-        Keep no errors over time.
+        Do not write the errors over time, which the report draws.
     """
     from magtwin.bench.leaderboard import standings
     from magtwin.bench.runner import benchmark
@@ -84,16 +87,17 @@ def bench(
 
 @bench_app.command
 def report(*folders: Results, out: Path | None = None, force: Force = False) -> Done:
-    """Write a page about results: leaderboard, distributions, errors over time and over the floor.
+    """Write a report on results: leaderboard, distributions of errors, errors over time and over the floor.
 
-    The folder gets bench.html, which needs no other file, bench.md with its pictures, and bench.json.
+    The report is a folder with bench.html, which is self-contained, bench.md with its pictures, and
+    bench.json.
 
     Parameters
     ----------
     folders
-        Folders of results of one suite, as of shards on several machines.
+        Folders of results of one suite, such as those of shards on several machines.
     out
-        Folder to make. Default: report, in the first folder.
+        Folder to make. Default: `report` in the first folder.
     """
     from magtwin.bench.report import report_results
 
@@ -105,16 +109,19 @@ def report(*folders: Results, out: Path | None = None, force: Force = False) -> 
 
 @bench_app.command
 def compare(a: Path, b: Path, *, out: Path | None = None, force: Force = False) -> Done:
-    """Compare two results of one suite, run by run: paired differences with intervals and p-values.
+    """Compare two folders of results run by run: paired differences with intervals and p-values.
+
+    Only localizers whose name is in both folders are compared.
 
     Parameters
     ----------
     a
         Folder of results.
     b
-        Folder of other results with the same scenarios and seeds, as of another version of a localizer.
+        Folder of results to subtract, with the same scenarios and seeds, such as those of another version of
+        a localizer.
     out
-        Page to write: .html, .md or .json. Default: only print.
+        Page to write: .html, .md or .json. Default: none; the result is printed.
     """
     from magtwin.bench.report import compare_results
 

@@ -32,45 +32,45 @@ def localize(
 ) -> Done:
     """Localize a robot along a run by its magnetometer and odometry, and score the estimate.
 
-    The method gets the on-board columns only, one row after another. The output is a folder with run.parquet
-    (the readings with columns est_*), localize.rrd, localize.png, and estimate.tum and truth.tum for evo.
-    docs/localize.md has the methods and how to write one; `magtwin new localizer.py` writes one to start
-    from.
+    The method gets only the on-board columns, one row after another. The output is a folder with run.parquet
+    (the readings with the columns est_*), localize.rrd, localize.png, and estimate.tum and truth.tum for evo.
+    docs/localize.md lists the methods and shows how to write one. `magtwin new localizer.py` writes one to
+    start from.
 
     Parameters
     ----------
     run
         A run in any format that magtwin reads.
     map
-        Map layer, stage, folder of survey CSVs, or the name of a scene that ships with magtwin: lab. none:
-        no map (simultaneous localization and mapping).
+        Map layer, stage, folder of survey CSVs, or the name of a scene that ships with magtwin (lab). none:
+        no map, for the methods of simultaneous localization and mapping, such as ekf-slam.
     method
-        Name of a method, such as rbpf or odometry; or MODULE:CLASS of your own, which is also looked for in
-        the current folder.
+        Name of a method, such as rbpf or odometry; or a class of your own as MODULE:CLASS, in the current
+        folder or an installed package.
     option
-        Option of the method, as NAME=VALUE. May be repeated.
+        Options of the method, as NAME=VALUE.
     out
         Folder to make.
     prior
-        What the method knows of the start: tracking (the true pose with errors of 0.1 m and 5 deg), heading
-        (the heading within 10 deg), global (nothing), or a pose x,y,yaw [m, m, rad]. For a negative x, write
-        --prior=-1,0,0.
+        Start that the method is told: tracking (the true pose with errors of 0.1 m and 5 deg), heading (the
+        heading within 10 deg; no position), global (nothing), or a pose x,y,yaw [m, m, rad]. For a negative
+        x, write --prior=-1,0,0.
     rate_hz
         Readings per second that the method gets [Hz].
     sensor
-        Figure of the magnetometer's noise model that the method is told, as NAME=VALUE: white_nt (100),
-        drift_nt (250), drift_s (2.5), offset_nt (500), iron_nt (400). May be repeated. The defaults are those
-        of the shipped robot's own field.
+        Values of the magnetometer's noise model that the method is told, as NAME=VALUE: white_nt (100),
+        drift_nt (250), drift_s (2.5), offset_nt (500), iron_nt (400), lever_arm_m (that of the run). The
+        defaults fit the shipped robot in a new session.
     odometry
-        Figure of the odometry's noise model, as NAME=VALUE: position_std, yaw_std, turn_std, position_std_s,
-        yaw_std_s, scale_std. May be repeated.
+        Values of the odometry's noise model that the method is told, as NAME=VALUE: position_std,
+        yaw_std, turn_std, position_std_s, yaw_std_s, scale_std. docs/localize.md has their defaults.
     map_length_m
         Correlation length of the map's error that the method is told [m].
     compensator
-        Model of the robot's own field for the method rbpf-network, fitted to --calibration: iron, ridge or
-        tolles-lawson.
+        Model of the robot's own field, fitted to --calibration: none, iron, ridge or tolles-lawson. Its
+        prediction is used by the method rbpf-network.
     calibration
-        Run earlier in the same session, with true poses.
+        Earlier run of the same session, with true poses.
     """
     from magtwin.figures.localization import save_localization
     from magtwin.files import check_free
@@ -118,13 +118,15 @@ def localize_live(
     seed: Seed = 0,
     duration_s: WallS = None,
 ) -> Done:
-    """Localize a robot live by its magnetometer and odometry, with any method of `magtwin localize`.
+    """Localize a robot live by its magnetometer and odometry, with any causal method of `magtwin localize`.
 
-    It reads qtfm/magnitude and odom, and passes IMU, battery, commands and scans on to the method. It
-    publishes estimate/pose (PoseWithCovarianceStamped), estimate/lost (Bool), estimate/particles (PoseArray)
-    and the transform from map to odom, and its state in /diagnostics. A pose on /initialpose makes it begin
-    anew there. Settings have the form of ROS, name:=value: rate_hz (5), use_sim_time, prior (wait, global,
-    or x,y,yaw), max_age_s (0.5), silent_s (0.5), tf_broadcast (true), cloud_hz (1), particles (500).
+    The node needs qtfm/magnitude and odom; it passes IMU, battery, commands and scans on to the method. It
+    publishes estimate/pose (PoseWithCovarianceStamped), estimate/lost (Bool), estimate/particles (PoseArray),
+    the transform from map to odom, and /diagnostics. It starts again at each pose on /initialpose.
+
+    Settings have the form of ROS, name:=value: rate_hz (5), use_sim_time (false), prior (wait, global or
+    x,y,yaw; default wait), max_age_s (0.5), silent_s (0.5), tf_broadcast (true), cloud_hz (1), particles
+    (500). docs/localize.md explains them.
 
     Parameters
     ----------
@@ -135,9 +137,9 @@ def localize_live(
     method
         As for `magtwin localize`.
     option
-        Option of the method, as NAME=VALUE. May be repeated.
+        Options of the method, as NAME=VALUE.
     map
-        Map in place of the scene's; none: no map.
+        Map to use instead of the scene's, as for `magtwin localize`. none: no map.
     sensor
         As for `magtwin localize`.
     odometry

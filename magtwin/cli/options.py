@@ -52,10 +52,7 @@ Json = Annotated[
 Quiet = Annotated[
     bool, Parameter(name="--quiet", negative="", help="Print no report and no progress; errors remain.")
 ]
-Jobs = Annotated[
-    int | None,
-    Parameter(converter=_whole, help="Number of processes. Default: one for each processor."),
-]
+Jobs = Annotated[int | None, Parameter(converter=_whole)]
 Shard = Annotated[
     str | None,
     Parameter(
