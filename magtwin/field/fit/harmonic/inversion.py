@@ -161,7 +161,7 @@ def _solve(
         for step in range(LAYERWISE if tried else 0):
             report(k * (1 + LAYERWISE) + step + 1)
             solution = solution.learnt(None)
-        begun.append(solution)
+        begun.append(solution.step() if tried else solution)
     if like is not None:
         solution = Solution.resumed(problem, *like)
     else:
