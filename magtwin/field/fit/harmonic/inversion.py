@@ -160,8 +160,10 @@ def _solve(
         solution = Solution.start(problem, problem.first(), uniform)
         for step in range(LAYERWISE if tried else 0):
             report(k * (1 + LAYERWISE) + step + 1)
-            solution = solution.learnt(None)
-        begun.append(solution.step() if tried else solution)
+            solution = solution.learnt(
+                None, step=False
+            ).step()  # the starts are compared where they have settled
+        begun.append(solution)
     if like is not None:
         solution = Solution.resumed(problem, *like)
     else:
@@ -171,11 +173,13 @@ def _solve(
     for done in range(ROUNDS):
         report(total - ROUNDS + done)
         old, before = solution.figures, evidence
-        solution = solution.learnt(shares if done >= layerwise else None)
+        by_layer = shares if done >= layerwise else None
         if gain is not None:
+            solution = solution.learnt(by_layer)
             evidence = solution.evidence()
             still = evidence - before < gain
-        else:
+        else:  # in full: a step with what was learned, from a factorisation of its own
+            solution = solution.learnt(by_layer, step=False).step()
             still = solution.figures.change(old) < STILL
         if done > layerwise and still:
             break

@@ -173,14 +173,15 @@ class Solution:
                 break
         return state
 
-    def learnt(self, shares: list[Array] | None) -> "Solution":
+    def learnt(self, shares: list[Array] | None, *, step: bool = True) -> "Solution":
         """One Gauss-Newton step, and hyperparameters that are more likely after it.
 
         The step and the learning share one factorisation, that of the problem linearised before the step.
+        Without `step`, the unknowns stay.
         """
         from scipy.special import gammaln, psi
 
-        after, posterior = self.step(), self.posterior
+        after, posterior = self.step() if step else self, self.posterior
         figures, layers, variance = self.figures, self.problem.layers, after.variance
         weights = after.weights(variance)
         count = len(figures.strength)
