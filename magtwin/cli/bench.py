@@ -41,7 +41,7 @@ def bench(
     Parameters
     ----------
     suite
-        TOML file of the suite, or the name of one that ships with magtwin: standard, aprilab, magnetic-data,
+        TOML file of the suite, or the name of one that ships with magtwin: standard, slam, aprilab, magnetic-data,
         ship.
     out
         Folder of results to write or continue.
