@@ -252,7 +252,9 @@ def _localization(
     problem = Problem(
         belief=anomaly_map,
         extent=extent_of(run, anomaly_map),
-        prior=prior if isinstance(prior, Prior) else prior_of(run, prior or "tracking", seed=seed),
+        prior=prior
+        if isinstance(prior, Prior)
+        else prior_of(run, "tracking" if prior is None else prior, seed=seed),
         sensor=sensor or replace(ROBOT_NOISE, lever_arm_m=lever_arm),
         odometry=odometry or OdometryModel(),
         map_length_m=map_length_m,
@@ -336,9 +338,10 @@ def report_of(result: Localization) -> Report:
     """Errors of a localization beside their bound and dead reckoning, and a verdict."""
     run, scores, dead = result.run, result.scores, result.dead_reckoning
     belief = result.problem.belief
+    rate = (run.rows - 1) / max(run.duration_s, 1e-9)
     metadata: dict[str, Any] = {
         "map": "none (SLAM)" if belief is None else getattr(belief, "name", "") or type(belief).__name__,
-        "readings": f"{run.rows:,} in {run.duration_s:.1f} s, {result.problem.rate_hz:g} a second",
+        "readings": f"{run.rows:,} in {run.duration_s:.1f} s, {rate:.3g} a second",
     }
     title = f"{result.method} on {', '.join(_origin(run)) or 'a recorded run'}"
     if scores is None or dead is None or result.truth is None:
@@ -465,7 +468,7 @@ def prior_of(run: Run, text: str = "tracking", *, seed: int = 0) -> Prior:
         if not all(map(math.isfinite, (x, y, yaw))):
             raise InputError(f"a `prior` is x,y,yaw [m, m, rad], got {text!r}", parameter="prior")
         return Prior(mean=(x, y, yaw), sd=START_SD)
-    find("prior", text, dict.fromkeys(("tracking", "heading", "global")))
+    find("prior", text, dict.fromkeys(("tracking", "heading", "global", "x,y,yaw")))
     if text == "global":
         return Prior(sd=(math.inf, math.inf, math.inf))
     truth = truth_of(run)

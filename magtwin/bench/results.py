@@ -58,6 +58,9 @@ class Results(Summarized):
     times: Columns
     """Processor times of the same runs, in the same order; nan where unknown."""
 
+    new: int = 0
+    """Runs that the call of `magtwin.benchmark` made; the others were in the folder."""
+
     @property
     def missing(self) -> int:
         """Runs of the suite's localizers that the rows lack."""
@@ -112,17 +115,27 @@ class Results(Summarized):
         Args:
             standings: What `magtwin.bench.leaderboard.standings` says of the rows.
         """
-        failed = int(np.count_nonzero(self.rows["status"] != "ok"))
+        bad = self.rows["status"] != "ok"
         lines: dict[str, str] = {}
         for each in standings:
             error = "no run finished" if each.rmse_m is None else f"RMSE {each.rmse_m.value:.3f} m"
             bound = f", bound {each.bound_m:.3f} m" if each.bound_m > 0 else ""
             said = each.verdict()
+            mine = bad & (self.rows["scenario"] == each.scenario) & (self.rows["localizer"] == each.localizer)
+            if mine.any():
+                said += f", first: {self.rows['reason'][np.argmax(mine)]}"
             lines[f"{each.scenario}, {each.localizer}"] = error + bound + (f"; {said}" if said else "")
         figures = (
             Figure("runs", len(self.rows["run"])),
-            Figure("failed", failed),
-            Figure("missing", self.missing, note="runs of the suite that are not in the folder"),
+            Figure(
+                "new",
+                self.new,
+                note="" if self.new else "all were in the folder; a changed localizer needs another",
+            ),
+            Figure("failed", int(np.count_nonzero(bad))),
+            Figure(
+                "not run", self.missing, note="runs of the whole suite that were not asked for or are left"
+            ),
         )
         title = f"Suite {self.suite.name}, version {self.suite.version}, {self.suite.seeds} seeds"
         return Report(title, figures, {"localizers": lines})

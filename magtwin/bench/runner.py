@@ -105,7 +105,7 @@ def benchmark(
         tasks = [Task(part) for chunk in chunks for part in without(chunk, done)]
         if tasks:
             _run(pool, chosen, whole, tasks, out, tracks, progress or (lambda done, total, what: None))
-    return results.results_in(out)
+    return replace(results.results_in(out), new=sum(map(_size, tasks)))
 
 
 def about(whole: Suite, chosen: Suite) -> dict[str, Any]:

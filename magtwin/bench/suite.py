@@ -362,7 +362,10 @@ def suite_file(file: str | os.PathLike[str]) -> Path:
     """The file of a suite: `file`, or that of a suite that ships with magtwin, by name."""
     path = Path(file)
     shipped = SUITES / f"{path.name}.toml"
-    return shipped if not path.exists() and shipped.is_file() and path.name == str(file) else path
+    if path.exists() or path.suffix or path.name != str(file):
+        return path
+    find("suite", path.name, {suite.stem: suite for suite in SUITES.glob("*.toml")})
+    return shipped
 
 
 def _plain(value: Any) -> Any:

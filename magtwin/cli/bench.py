@@ -29,7 +29,12 @@ def bench(
     shard: Shard = None,
     dask: Dask = None,
     no_tracks: Flag = False,
-    force: Force = False,
+    force: Annotated[
+        bool,
+        Parameter(
+            name="--force", negative="", help="Remove all results in the folder first, of all localizers."
+        ),
+    ] = False,
 ) -> Done:
     """Benchmark localizers on simulated and recorded drives, and report the results.
 
@@ -41,8 +46,8 @@ def bench(
     Parameters
     ----------
     suite
-        TOML file of the suite, or the name of one that ships with magtwin: standard, slam, aprilab, magnetic-data,
-        ship.
+        TOML file of the suite, or the name of one that ships with magtwin: standard, slam, aprilab,
+        magnetic-data, ship.
     out
         Folder of results to write or continue.
     only

@@ -168,6 +168,11 @@ class Problem:
     seed: int = 0
     """Seed of the algorithm's random numbers."""
 
+    def __post_init__(self) -> None:
+        for name in ("map_length_m", "rate_hz"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"`{name}` must be above 0, got {getattr(self, name)}", parameter=name)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
