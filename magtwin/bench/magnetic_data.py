@@ -12,15 +12,15 @@ are fitted to the runs of the map. The odometry is the true motion with noise.
 
 import math
 import os
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.bench.case import Case, Truth
+from magtwin.bench.draws import Start, drawn_prior, noisy_odometry
 from magtwin.errors import InputError
 from magtwin.field.fit.covariance import ROOT5
 from magtwin.field.fit.fit import fit
@@ -29,14 +29,10 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.readings import Readings
 from magtwin.files import existing
 from magtwin.frames import quat_from_yaw
-from magtwin.localization.problem import HEADING_WITHIN, OdometryModel, Prior, Problem, SensorModel
+from magtwin.localization.problem import OdometryModel, Problem, SensorModel
 from magtwin.run.run import Run
 
 Array = NDArray[np.float64]
-Start = Literal["tracking", "heading", "global"]
-
-WITHIN = math.radians(10)
-"""Error of the heading of a start with known heading, at most [rad]."""
 
 TRAINING = (1, 3, 5)
 """Runs of the maps."""
@@ -326,9 +322,9 @@ def magnetic_data_case(
     part = read_recording(folder, number)
     rows = np.unique(np.searchsorted(part.t, np.arange(part.t[0], part.t[-1], 1 / rate_hz) - 1e-6))
     t, pose = part.t[rows], np.column_stack([part.p, part.yaw])[rows]
-    model = scaled(odometry or OdometryModel(), odometry_factor)
+    model = (odometry or OdometryModel()).scaled(odometry_factor)
     rng = np.random.default_rng([seed, number])
-    prior = _prior(start, pose[0], rng)
+    prior = drawn_prior(start, pose[0], rng)
     moved = noisy_odometry(pose, t, model, rng)
     zero = np.zeros(len(t))
     readings = Run(
@@ -370,46 +366,3 @@ def magnetic_data_case(
         "map of runs": " ".join(map(str, training)),
     }
     return Case(problem, readings, Truth(t, pose), about)
-
-
-def scaled(model: OdometryModel, factor: float) -> OdometryModel:
-    """A model with all standard deviations multiplied."""
-    return OdometryModel(**{f.name: factor * getattr(model, f.name) for f in fields(OdometryModel)})
-
-
-def noisy_odometry(pose: Array, t: Array, model: OdometryModel, rng: np.random.Generator) -> Array:
-    """Poses in odom of true motion with the noise of a model.
-
-    Args:
-        pose: True x, y [m] and yaw [rad], shape (N, 3).
-        t: Times [s], shape (N,).
-        model: The noise.
-        rng: Its source.
-
-    Returns:
-        x, y [m] and yaw [rad] in odom, which begins at 0, shape (N, 3).
-    """
-    dp, turn = np.diff(pose[:, :2], axis=0), np.diff(pose[:, 2])
-    middle = pose[:-1, 2] + turn / 2
-    c, s = np.cos(middle), np.sin(middle)
-    step = np.column_stack([c * dp[:, 0] + s * dp[:, 1], c * dp[:, 1] - s * dp[:, 0], turn])
-    spread = np.sqrt(model.variances(np.hypot(dp[:, 0], dp[:, 1]), turn, np.diff(t)))
-    step[:, :2] *= 1 + model.scale_std * rng.standard_normal()
-    step += spread * rng.standard_normal(step.shape)
-    yaw = np.concatenate([[0.0], np.cumsum(step[:, 2])])
-    middle = yaw[:-1] + step[:, 2] / 2
-    c, s = np.cos(middle), np.sin(middle)
-    way = np.column_stack([c * step[:, 0] - s * step[:, 1], s * step[:, 0] + c * step[:, 1]])
-    return np.column_stack([np.concatenate([[[0.0, 0.0]], np.cumsum(way, axis=0)]), yaw])
-
-
-def _prior(start: Start, first: Array, rng: np.random.Generator) -> Prior:
-    """A prior whose mean errs as its standard deviation states."""
-    known = Prior()
-    x, y, yaw = (first + known.sd * rng.standard_normal(3)).tolist()
-    within = float(rng.uniform(-WITHIN, WITHIN))
-    if start == "tracking":
-        return Prior(mean=(x, y, yaw))
-    if start == "heading":
-        return Prior(mean=(0.0, 0.0, float(first[2]) + within), sd=(math.inf, math.inf, HEADING_WITHIN))
-    return Prior(sd=(math.inf, math.inf, math.inf))

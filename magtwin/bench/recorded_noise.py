@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.bench.draws import Start
 from magtwin.bench.magnetic_data import (
     OFFSET_NT,
     TRAINING,
     Noise,
-    Start,
     magnetic_data_case,
     read_recording,
     recorded_field,

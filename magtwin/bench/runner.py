@@ -174,9 +174,6 @@ def _run(
     """Run tasks and write their parts."""
     names = set(whole.chunks())
     total, count = sum(map(_size, tasks)), 0
-    progress(0, total, "compiling")
-    for name in dict.fromkeys(name for task in tasks for name in task.chunk.entries):
-        warm_up(suite.localizers[name])
     progress(0, total, tasks[0].chunk.scenario)
     work = partial(run_task, suite, _fields(suite, out))
     while tasks:

@@ -133,10 +133,7 @@ class Scenario:
     @property
     def told_odometry(self) -> OdometryModel:
         """The odometry model with its factor."""
-        scaled = {
-            f.name: getattr(self.odometry_model, f.name) * self.odometry_factor for f in fields(OdometryModel)
-        }
-        return OdometryModel(**scaled)
+        return self.odometry_model.scaled(self.odometry_factor)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from magtwin.bench import world
 from magtwin.bench.case import Case, Truth
+from magtwin.bench.draws import chained, drawn_prior, moves, noisy_odometry
 from magtwin.bench.suite import Scenario
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import quat_from_yaw, wrap_angle, yaw_from_quat
-from magtwin.localization.problem import HEADING_WITHIN, OdometryModel, Prior, Problem, SensorModel
+from magtwin.localization.problem import Problem, SensorModel
 from magtwin.run.run import Run
 
 if TYPE_CHECKING:
@@ -28,12 +29,6 @@ Array = NDArray[np.float64]
 
 STREAMS = ("odometry", "noise", "prior", "map", "kidnap", "moved", "localizer")
 """Who draws, each from its own child generator. Append only: the order is part of the seed."""
-
-SD_M, SD_YAW = 0.1, math.radians(5)
-"""Prior of tracking."""
-
-WITHIN = math.radians(10)
-"""Largest error of a known heading."""
 
 SESSION = 7
 """Second word of the seed of what a session has in common."""
@@ -98,7 +93,7 @@ def twin_case(scenario: Scenario, scene: str, seed: int, session: int, fields: P
     problem = Problem(
         belief=_belief(scenario, scene, fields, rngs["map"]),
         extent=field.extent,
-        prior=_prior(scenario, pose[0], rngs["prior"]),
+        prior=drawn_prior(scenario.prior, pose[0], rngs["prior"]),
         sensor=replace(scenario.sensor, lever_arm_m=_lever(drive)),
         odometry=scenario.told_odometry,
         map_length_m=scenario.map_length_m,
@@ -186,44 +181,6 @@ def _kidnapped(
     return t, pose[rows], cuts, rows
 
 
-def moves(pose: Array) -> Array:
-    """Increments between poses: forward, leftward [m] and turn [rad], in axes halfway through the turn."""
-    turn = np.diff(pose[:, 2])
-    middle = pose[:-1, 2] + turn / 2
-    dx, dy = np.diff(pose[:, 0]), np.diff(pose[:, 1])
-    c, s = np.cos(middle), np.sin(middle)
-    return np.column_stack([dx * c + dy * s, dy * c - dx * s, turn])
-
-
-def chained(steps: Array) -> Array:
-    """Poses from (0, 0, 0) by increments; the inverse of `moves`."""
-    yaw = np.concatenate([[0.0], np.cumsum(steps[:, 2])])
-    middle = yaw[:-1] + steps[:, 2] / 2
-    c, s = np.cos(middle), np.sin(middle)
-    xy = np.column_stack([steps[:, 0] * c - steps[:, 1] * s, steps[:, 0] * s + steps[:, 1] * c])
-    return np.column_stack([np.vstack([[0.0, 0.0], np.cumsum(xy, axis=0)]), yaw])
-
-
-def noisy_odometry(pose: Array, t: Array, model: OdometryModel, rng: np.random.Generator) -> Array:
-    """Odometry of a true trajectory with the errors of a model.
-
-    Args:
-        pose: True x, y [m] and yaw [rad], shape (N, 3).
-        t: Times [s], shape (N,).
-        model: The errors.
-        rng: Source of the errors.
-
-    Returns:
-        Poses in odom, from (0, 0, 0), shape (N, 3).
-    """
-    steps = moves(pose)
-    scale = 1.0 + model.scale_std * rng.standard_normal()
-    sd = np.sqrt(model.variances(np.hypot(steps[:, 0], steps[:, 1]), steps[:, 2], np.diff(t)))
-    noise = sd * rng.standard_normal(steps.shape)
-    steps[:, :2] *= scale
-    return chained(steps + noise)
-
-
 def _odometry(
     scenario: Scenario,
     drive: Run,
@@ -304,17 +261,6 @@ def _certain(scene: str, fields: Path | None) -> AnomalyMap:
 @lru_cache(maxsize=4)
 def _sparse(scene: str, spacing_m: float) -> AnomalyMap:
     return world.trilinear(_field(scene, None), spacing_m)
-
-
-def _prior(scenario: Scenario, first: Array, rng: np.random.Generator) -> Prior:
-    x, y, yaw = first.tolist()
-    dx, dy, turn = rng.standard_normal(3).tolist()
-    within = float(rng.uniform(-WITHIN, WITHIN))
-    if scenario.prior == "tracking":
-        return Prior(mean=(x + SD_M * dx, y + SD_M * dy, yaw + SD_YAW * turn), sd=(SD_M, SD_M, SD_YAW))
-    if scenario.prior == "heading":
-        return Prior(mean=(0.0, 0.0, yaw + within), sd=(math.inf, math.inf, HEADING_WITHIN))
-    return Prior(sd=(math.inf, math.inf, math.inf))
 
 
 def _calibration(scenario: Scenario, scene: str, session: int) -> Run | None:

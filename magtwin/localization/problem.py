@@ -54,6 +54,10 @@ class OdometryModel:
     def __post_init__(self) -> None:
         _not_negative(self)
 
+    def scaled(self, factor: float) -> "OdometryModel":
+        """The model with all standard deviations multiplied."""
+        return OdometryModel(**{name: factor * value for name, value in vars(self).items()})
+
     def variances(self, distance_m: ArrayLike, turn: ArrayLike, dt_s: ArrayLike) -> Array:
         """Variances of the increments x, y [m^2] and yaw [rad^2], without the scale, shape (..., 3)."""
         d, a, dt = np.abs(distance_m), np.abs(turn), np.asarray(dt_s, float)

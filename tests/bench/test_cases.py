@@ -7,8 +7,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.bench import world
+from magtwin.bench.draws import chained, moves, noisy_odometry
 from magtwin.bench.suite import Scenario
-from magtwin.bench.twin_case import chained, fogm, moves, noisy_odometry, twin_case
+from magtwin.bench.twin_case import fogm, twin_case
 from magtwin.files import shipped
 from magtwin.io.surveys.maps import open_map
 from magtwin.localization.problem import OdometryModel, SensorModel

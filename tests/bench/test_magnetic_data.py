@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import magtwin.bench.recorded_noise as recorded_noise
+from magtwin.bench.draws import noisy_odometry
 from magtwin.bench.magnetic_data import (
     HELD_OUT,
     KAPPA,
@@ -17,9 +18,7 @@ from magtwin.bench.magnetic_data import (
     course,
     fit_iron,
     magnetic_data_case,
-    noisy_odometry,
     read_recording,
-    scaled,
 )
 from magtwin.bench.recorded_noise import Candidate, choose, likeliest_noise, preferred
 from magtwin.errors import InputError
@@ -100,7 +99,7 @@ def test_a_recording_begins_and_ends_in_motion(folder):
 def test_odometry_without_noise_is_the_true_motion():
     t, p, yaw = drive(2)
     pose = np.column_stack([p, yaw])[::10]
-    silent = scaled(OdometryModel(), 0.0)
+    silent = OdometryModel().scaled(0.0)
     made = noisy_odometry(pose, t[::10], silent, np.random.default_rng(0))
     c, s = math.cos(pose[0, 2]), math.sin(pose[0, 2])
     back = (pose[:, :2] - pose[0, :2]) @ np.array([[c, -s], [s, c]])
@@ -152,7 +151,7 @@ def test_priors_err_as_they_state(folder):
 
 def test_the_factor_of_odometry_is_in_the_noise_and_in_what_is_told(folder):
     plain, rough = (magnetic_data_case(folder, 4, 1, odometry_factor=f) for f in (1.0, 3.0))
-    assert rough.problem.odometry == scaled(plain.problem.odometry, 3.0)
+    assert rough.problem.odometry == plain.problem.odometry.scaled(3.0)
     true = magnetic_data_case(folder, 4, 1, odometry_factor=1e-9).readings["odom_p"]
     off = [np.linalg.norm((case.readings["odom_p"] - true)[-1]) for case in (plain, rough)]
     assert off[1] > 1.5 * off[0]
