@@ -72,7 +72,8 @@ class RaoBlackwell:
       the offset and hard iron that were known 5 to 10 s before. So a false alarm does not lose the pose.
     * A reading that repeats itself to the bit while the robot moves is not used, nor is nan.
 
-    `lost` is set while the particles spread over more than 0.5 m.
+    `lost` is set while the particles spread over more than 0.5 m, and after such a start until they have been
+    within 0.5 m for 5 s: where the map is stale, they may gather at a wrong place first.
 
     Args:
         particles: Least number of particles. Default: 3,000; 6,000 for the bootstrap filter.
@@ -136,7 +137,7 @@ class RaoBlackwell:
         known = known_values(table)
         self._field_mean, self._field_variance = float(known.mean()), float(known.var())
         sensor = problem.sensor
-        self._kappa = self.kappa or tempering(self._variance, sensor.white_nt)
+        self._kappa = self.kappa or tempering(table, sensor.white_nt)
         self._states(len(self._variance) > 0)
         self._scale_variance = problem.odometry.scale_std**2
         self._numbers = np.zeros(20)
@@ -145,6 +146,7 @@ class RaoBlackwell:
         self._numbers[self._loops.ELSEWHERE_VARIANCE] = self._field_variance
         self._numbers[self._loops.KAPPA] = self._kappa
         self.reset_count = 0
+        self._doubt, self._spread_t = False, -math.inf
         self._last: Reading | None = None
         self._repeated_m, self._same_nt = 0.0, math.nan
         self._start(problem.prior.mean, problem.prior.sd)
@@ -357,9 +359,17 @@ class RaoBlackwell:
             expected = -0.5 - 0.5 * math.log(variance)
             more = min(expected - likelihood - SLACK, MOST_SURPRISE)
             self._surprise = max(0.0, self._surprise + more)
-        lost = self.spread > SETTLED_M
+        lost = self._doubted(t)
         bias = float(total[k.OFFSET]) / weight
         return Estimate(t, *pose, covariance, bias, lost)
+
+    def _doubted(self, t: float) -> bool:
+        """Whether the particles are spread out, or have met only lately after a start again."""
+        if self.spread > SETTLED_M:
+            self._spread_t = t
+            return True
+        self._doubt = self._doubt and t < self._spread_t + DOUBT_S
+        return self._doubt
 
     def _held(
         self, pose: tuple[float, float, float], covariance: Array, place: tuple[float, float]
@@ -385,6 +395,7 @@ class RaoBlackwell:
         """Resample, shrink, or start again."""
         if self.resets and self._surprise > RESET_ABOVE:
             self.reset_count += 1
+            self._doubt, self._spread_t = True, estimate.t
             errors = None if len(self._kept) < 2 else (self._kept[0][0], INFLATE * self._kept[0][1])
             kept = self._state[:, self._chosen(min(KEPT, self._count))]
             self._start((0.0, 0.0, 0.0), (math.inf, math.inf, math.inf), errors, kept)
@@ -468,6 +479,9 @@ KEPT = 1000
 
 RESET_ABOVE = 12.0
 """Sum of surprise at which the filter starts again."""
+
+DOUBT_S = 5.0
+"""Time after a start again for which the particles must stay together until the pose is trusted [s]."""
 
 
 def _padded(count: int) -> int:
