@@ -147,6 +147,7 @@ class RaoBlackwell:
         self._numbers[self._loops.KAPPA] = self._kappa
         self.reset_count = 0
         self._doubt, self._spread_t = False, -math.inf
+        self._old: Array | None = None
         self._last: Reading | None = None
         self._repeated_m, self._same_nt = 0.0, math.nan
         self._start(problem.prior.mean, problem.prior.sd)
@@ -219,17 +220,23 @@ class RaoBlackwell:
             covariance[np.ix_(self._constant, self._constant)] = errors[1]
             self._draw_errors(state, slice(None, None, 2), known, covariance)
         self._scale_variance = self._problem.odometry.scale_std**2
-        self._state[k.LOG_WEIGHT : k.WEIGHT, : self._count] = 0.0
-        self._state[k.LOG_WEIGHT, :old] = math.log(count / max(old, 1))
-        self._state[k.WEIGHT, : self._count] = np.exp(self._state[k.LOG_WEIGHT, : self._count])
-        total = count * (2.0 if old else 1.0)
-        self._shift = math.log(total)
-        self._scales = np.full(self._blocks(self._count), 1.0 / total)
+        self._share(old, count)
         if not old:
             self._reference = mean if math.isfinite(sd[0]) else (middle[0], middle[1], mean[2])
         self._surprise, self._settled = 0.0, False
         self._kept: list[tuple[Array, Array]] = []
         self._kept_t = -math.inf
+
+    def _share(self, old: int, count: int) -> None:
+        """Give the first `old` particles half of the weight, and the `count` others the rest."""
+        k = self._loops
+        state = self._state[:, : old + count]
+        state[k.LOG_WEIGHT], state[k.LIKELIHOOD] = 0.0, 0.0
+        state[k.LOG_WEIGHT, :old] = math.log(count / max(old, 1))
+        state[k.WEIGHT] = np.exp(state[k.LOG_WEIGHT])
+        total = count * (2.0 if old else 1.0)
+        self._shift = math.log(total)
+        self._scales = np.full(self._blocks(old + count), 1.0 / total)
 
     def _draw_errors(self, state: Array, part: slice, mean: Array, covariance: Array) -> None:
         """Give some particles a mean and a covariance of the linear states, or draws of them."""
@@ -309,20 +316,29 @@ class RaoBlackwell:
         return math.isfinite(b_nt) and self._repeated_m <= STILL_M
 
     def _run(self, decay: Array, noise: Array) -> None:
-        """One step of all blocks, on several threads if there are many."""
-        k, count = self._loops, self._count
+        """One step of all blocks, on several threads if there are many; the old particles beside them."""
         self._count_steps += 1
-        key = np.uint64((self._seed + self._count_steps * _STRIDE) & _WORD)
+        self._sums = self._moved(self._state, self._count, decay, noise, self._count_steps)
+        if self._old is not None:
+            used, self._numbers[self._loops.USED] = self._numbers[self._loops.USED], 0.0
+            self._moved(self._old, self._old.shape[1], decay, noise, -self._count_steps)
+            self._numbers[self._loops.USED] = used
+
+    def _moved(self, state: Array, count: int, decay: Array, noise: Array, step: int) -> Array:
+        """Do a step with some particles; returns the sums of their blocks."""
+        k = self._loops
+        key = np.uint64((self._seed + step * _STRIDE) & _WORD)
         blocks = self._blocks(count)
-        sums = self._sums = np.empty((blocks, k.PLAIN_SUM + 1))
+        sums = np.empty((blocks, k.PLAIN_SUM + 1))
 
         def work(part: slice) -> None:
             k.step(
-                part.start, part.stop, count, self._state, sums, self._table, self._variance, self._numbers,
+                part.start, part.stop, count, state, sums, self._table, self._variance, self._numbers,
                 decay, noise, self._kinds, key, self.sampled,
             )  # fmt: skip
 
         in_threads(work, blocks, SHARE)
+        return sums
 
     def _estimate(self, t: float, used: bool) -> Estimate:
         """Weighted mean and covariance; the sum of surprise."""
@@ -368,7 +384,6 @@ class RaoBlackwell:
         if self.spread > SETTLED_M:
             self._spread_t = t
             return True
-        self._doubt = self._doubt and t < self._spread_t + DOUBT_S
         return self._doubt
 
     def _held(
@@ -398,8 +413,19 @@ class RaoBlackwell:
             self._doubt, self._spread_t = True, estimate.t
             errors = None if len(self._kept) < 2 else (self._kept[0][0], INFLATE * self._kept[0][1])
             kept = self._state[:, self._chosen(min(KEPT, self._count))]
+            if self._old is None:
+                self._old = kept.copy()
+            else:
+                kept = np.concatenate([kept, self._old], axis=1)
             self._start((0.0, 0.0, 0.0), (math.inf, math.inf, math.inf), errors, kept)
             return
+        if self._doubt and estimate.t >= self._spread_t + DOUBT_S:
+            old, self._old = self._old, None
+            self._doubt = old is not None and not self._agrees(old, estimate)
+            if self._doubt and old is not None:
+                self._let_compete(old)
+                self._spread_t = estimate.t
+                return
         if self._settled and estimate.t >= self._kept_t + KEEP_S:
             self._kept, self._kept_t = [*self._kept[-1:], self._errors()], estimate.t
         wanted = self._count
@@ -407,6 +433,20 @@ class RaoBlackwell:
             wanted = min(self._count, max(self._enough(self.spread), int(SHRINK * self._count)))
         if wanted < self._count or self._effective < self._count / 2:
             self._resample(wanted)
+
+    def _agrees(self, old: Array, estimate: Estimate) -> bool:
+        """Whether odometry puts the particles that there were before an alarm near an estimate."""
+        return math.hypot(float(old[0].mean()) - estimate.x, float(old[1].mean()) - estimate.y) < NEAR_M
+
+    def _let_compete(self, old: Array) -> None:
+        """Give half of the weight to the particles that there were before an alarm."""
+        self._resample(self._count)
+        before, count, size = self._state, self._count, old.shape[1]
+        self._count = size + count
+        self._state = np.empty((len(before), _padded(self._count)))
+        self._spare = np.empty_like(self._state)
+        self._state[:, :size], self._state[:, size : self._count] = old, before[:, :count]
+        self._share(size, count)
 
     def _enough(self, spread: float) -> int:
         """Least number of particles for a spread [m]."""
