@@ -70,6 +70,9 @@ class RaoBlackwell:
       reading and ref the mean log likelihood of a Gaussian with the variance of the readings that the
       particles predict. Above 12, particles over the whole floor join those that there are, half of them with
       the offset and hard iron that were known 5 to 10 s before. So a false alarm does not lose the pose.
+    * Stale map: an alarm need not be a kidnapping. Odometry alone moves a copy of the old particles on. Once
+      the others have been within 0.5 m for 5 s, more than 1 m away from these, both compete with equal
+      weights. The copy also joins the start of a further alarm before that.
     * A reading that repeats itself to the bit while the robot moves is not used, nor is nan.
 
     `lost` is set while the particles spread over more than 0.5 m, and after such a start until they have been
@@ -147,7 +150,7 @@ class RaoBlackwell:
         self._numbers[self._loops.KAPPA] = self._kappa
         self.reset_count = 0
         self._doubt, self._spread_t = False, -math.inf
-        self._old: Array | None = None
+        self._old: Array | None = None  # moved by odometry alone since an alarm
         self._last: Reading | None = None
         self._repeated_m, self._same_nt = 0.0, math.nan
         self._start(problem.prior.mean, problem.prior.sd)
