@@ -47,7 +47,7 @@ def bench(
     ----------
     suite
         TOML file of the suite, or the name of one that ships with magtwin: standard, slam, aprilab,
-        magnetic-data, ship.
+        magnetic-data, ship, 1d.
     out
         Folder of results to write or continue.
     only
