@@ -232,8 +232,9 @@ def describe(scenario: Scenario) -> str:
 
 def _lead(rows: Columns) -> str:
     failed = int(np.count_nonzero(rows["status"] != "ok"))
-    text = f"{_count(len(rows['run']), 'run')}, {failed:,} of which failed. RMSE of the position [m], pooled over runs. "
-    return text + (
+    runs = _count(len(rows["run"]), "run")
+    return (
+        f"{runs}, {failed:,} of which failed. RMSE of the position [m], pooled over runs. "
         "Trajectories are not aligned. The bound is the posterior Cramer-Rao bound with the map's error as "
         "correlated; that of all readings for smoothers. Intervals: 95 %, by bootstrap over sessions, or "
         "over runs where all are of one session."

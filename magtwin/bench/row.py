@@ -5,6 +5,7 @@ import signal
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +104,7 @@ def make_case(suite: Suite, scenario: Scenario, run: int, fields: Path | None = 
 
         own = fields / scenario.data if scenario.data and fields is not None else None
         session = suite.first_seed + run % scenario.sessions
+        scenario = replace(scenario, paths=tuple(map(suite.path, scenario.paths)))
         return twin_case(scenario, str(suite.scene(scenario)), seed, session, own)
     folder = suite.folder(scenario)
     if scenario.source == "magnetic-data":

@@ -158,7 +158,7 @@ def paired(
 
 
 def _checked(values: ArrayLike, sessions: ArrayLike | None) -> tuple[Array, NDArray[np.intp], int]:
-    """Values, number of the session of each, and number of sessions; runs of one session count as sessions."""
+    """Values, number of the session of each, and number of sessions; one session is split into its runs."""
     v = np.asarray(values, float)
     if v.ndim != 1 or not len(v):
         raise InputError(f"statistics need one figure per run, got shape {v.shape}")

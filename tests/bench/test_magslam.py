@@ -138,5 +138,5 @@ def test_the_suite_of_the_hand_held_loops_runs_each_recording_once():
     for row, name in zip(rows, ("eight", "square"), strict=True):
         case = hand_case(HAND, name)
         assert row["rmse_m"] == pytest.approx(rmse(case.readings["odom_p"], case.truth), rel=1e-9)
-    with pytest.raises(InputError, match="'eight': number must be one of 1 .eight., 2 .square., got 3"):
+    with pytest.raises(InputError, match=r"'eight': number must be one of 1 .eight., 2 .square., got 3"):
         make_case(suite, replace(suite.scenario[0], number=3), 0)
