@@ -53,6 +53,9 @@ ROBOT_NOISE = SensorModel(white_nt=100.0, drift_nt=250.0, drift_s=2.5, offset_nt
 In six simulated drives the difference of the readings from the map had a mean of 190 to 520 nT, 290 to 500 nT
 along the heading, and the rest 180 to 280 nT with a correlation of 0.4 to 0.6 after 2 s."""
 
+GAP_S = 1.0
+"""Longest gap in the true poses over which they are interpolated for the bounds [s]."""
+
 LEAST_ON_MAP = 0.5
 """Share of the readings that must be on the map."""
 
@@ -98,24 +101,46 @@ class Localization:
         return track(Odometry(), problem, self.run)
 
     @cached_property
+    def known(self) -> NDArray[np.bool_]:
+        """Readings whose true pose is known, shape (N,)."""
+        if self.truth is None:
+            return np.zeros(self.run.rows, bool)
+        return np.asarray(np.isfinite(self.truth).all(axis=1))
+
+    @cached_property
     def bounds(self) -> Bounds | None:
-        """Least standard deviations of any unbiased method; None without a map, or if the truth has gaps."""
-        if self.problem.belief is None or self.truth is None or not np.isfinite(self.truth).all():
+        """Least standard deviations of any unbiased method.
+
+        None without a map, and if the true poses have a gap of more than `GAP_S`; shorter ones are filled.
+        """
+        if self.problem.belief is None or self.truth is None or not self.known.any():
             return None
+        t, truth = self.track.t, self.truth
+        if not self.known.all():
+            seen = t[self.known]
+            if np.diff(np.concatenate([t[:1], seen, t[-1:]])).max() > GAP_S:
+                return None
+            parts = (*truth[self.known, :2].T, np.unwrap(truth[self.known, 2]))
+            truth = np.column_stack([np.interp(t, seen, part) for part in parts])
         used = np.isfinite(self.run["b_measured_nt"])
-        return bounds(self.problem, self.truth, self.track.t, used=used)
+        return bounds(self.problem, truth, t, used=used)
 
     @cached_property
     def scores(self) -> Scores | None:
-        """Scores by the truth; None if it is unknown or has gaps."""
-        if self.truth is None or not np.isfinite(self.truth).all():
+        """Scores at the readings whose true pose is known; None if there are less than two."""
+        if self.truth is None or np.count_nonzero(self.known) < 2:
             return None
+        known, limits = self.known, self.bounds
+        names = ("t", "pose", "covariance", "bias_nt", "lost")
+        made = replace(self.track, **{name: getattr(self.track, name)[known] for name in names})
+        if limits is not None:
+            limits = Bounds(**{name: values[known] for name, values in vars(limits).items()})
         start = self.problem.prior.is_global
-        return score(self.track, self.truth, global_start=start, bounds=self.bounds)
+        return score(made, self.truth[known], global_start=start, bounds=limits)
 
     @property
     def scored_rows(self) -> NDArray[np.bool_]:
-        """Readings whose errors count: all, or those from convergence on if the start was unknown."""
+        """Readings whose errors count: those of known pose, from convergence on if the start was unknown."""
         after = 0.0
         if (
             self.scores is not None
@@ -123,7 +148,8 @@ class Localization:
             and math.isfinite(self.scores.converged_s)
         ):
             after = self.scores.converged_s
-        return self.track.t >= self.track.t[0] + after
+        t = self.track.t
+        return self.known & (t >= t[np.argmax(self.known)] + after)
 
     def report(self) -> Report:
         """Errors beside their bound and dead reckoning, and a verdict in one line."""
@@ -343,6 +369,9 @@ def report_of(result: Localization) -> Report:
         "map": "none (SLAM)" if belief is None else getattr(belief, "name", "") or type(belief).__name__,
         "readings": f"{run.rows:,} in {run.duration_s:.1f} s, {rate:.3g} a second",
     }
+    if result.scores is not None:
+        gaps = "" if result.known.all() else f", known at {result.known.sum():,} of them"
+        metadata["errors"] = f"differences from the {truth_name(run)}{gaps}"
     title = f"{result.method} on {', '.join(_origin(run)) or 'a recorded run'}"
     if scores is None or dead is None or result.truth is None:
         lost = Figure("flagged lost", float(result.track.lost.mean()), note="share of the readings")
@@ -397,7 +426,9 @@ def verdict_of(scores: Scores, dead_m: float, start: str = "") -> str:
         words = [f"WORSE than {name}: {sizes}."]
     size = f"{scores.anees:.2f}" if scores.anees < 1e3 else f"{scores.anees:.0e}"
     figure = f"ANEES {size} per state"
-    if not math.isfinite(scores.anees):
+    if scores.lost_share == 1:
+        words.append("It flagged all readings as lost, so its covariance is not judged.")
+    elif not math.isfinite(scores.anees):
         words.append("Its covariance is unknown." if math.isnan(scores.anees) else "Its covariance is WRONG.")
     elif scores.anees > scores.anees_high:
         words.append(f"TOO CONFIDENT: {figure}, at most {scores.anees_high:.2f} expected.")
@@ -434,12 +465,24 @@ def thinned(run: Run, rate_hz: float) -> Run:
 
 
 def truth_of(run: Run) -> Array | None:
-    """True x, y [m] and yaw [rad], else those of motion capture, shape (N, 3); None if unknown."""
+    """True x, y [m] and yaw [rad], else those of motion capture, shape (N, 3); None if unknown.
+
+    A pose is nan where motion capture had lost the robot.
+    """
     if "p_world_base" in run and "yaw" in run and np.isfinite(run["p_world_base"]).any():
         return np.column_stack([run["p_world_base"][:, :2], run["yaw"]])
     if "mocap_p" in run and "mocap_q_xyzw" in run and np.isfinite(run["mocap_p"]).any():
-        return np.column_stack([run["mocap_p"][:, :2], yaw_from_quat(run["mocap_q_xyzw"])])
+        pose = np.column_stack([run["mocap_p"][:, :2], yaw_from_quat(run["mocap_q_xyzw"])])
+        if "flag_pose_lost" in run:
+            pose[run["flag_pose_lost"]] = np.nan
+        return pose
     return None
+
+
+def truth_name(run: Run) -> str:
+    """What `truth_of` gives: "true pose", or "pose of motion capture (mocap_p)"."""
+    simulated = "p_world_base" in run and "yaw" in run and np.isfinite(run["p_world_base"]).any()
+    return "true pose" if simulated else "pose of motion capture (mocap_p)"
 
 
 def prior_of(run: Run, text: str = "tracking", *, seed: int = 0) -> Prior:
@@ -473,8 +516,10 @@ def prior_of(run: Run, text: str = "tracking", *, seed: int = 0) -> Prior:
         return Prior(sd=(math.inf, math.inf, math.inf))
     truth = truth_of(run)
     if truth is None or not np.isfinite(truth[0]).all():
+        where = "" if truth is None else " at its first reading"
         raise InputError(
-            "the run has no true pose to start from; give a `prior` x,y,yaw or global", parameter="prior"
+            f"the run has no true pose{where} to start from; give a `prior` x,y,yaw or global",
+            parameter="prior",
         )
     rng = np.random.default_rng([seed, 1])
     if text == "heading":

@@ -100,6 +100,28 @@ def test_without_a_true_pose_it_estimates_and_gives_no_verdict(here: Path) -> No
     assert result.report().verdict == "No verdict: the run has no true pose to compare with."
 
 
+def test_motion_capture_with_gaps_is_what_errors_count_against(here: Path) -> None:
+    whole = mt.load_run("run.parquet")
+    onboard = whole.select("t", "b_measured_nt", "odom_p", "odom_q_xyzw")
+    lost = (whole["t"] > 10) & (whole["t"] < 10.5)
+    p = np.where(lost[:, None], 99.0, whole["p_world_base"])  # the last pose is held: anything
+    captured = onboard.with_columns(mocap_p=p, mocap_q_xyzw=whole["q_world_base_xyzw"], flag_pose_lost=lost)
+    exact, result = (localization(each, "lab", method="ekf", prior="tracking") for each in (whole, captured))
+    np.testing.assert_allclose(result.track.pose, exact.track.pose)
+    known = ~result.run["flag_pose_lost"]
+    off = np.hypot(*(exact.track.pose - exact.truth)[known, :2].T)
+    assert 0 < np.count_nonzero(~known) < 5
+    assert result.scores.rmse_m == pytest.approx(np.sqrt(np.mean(off**2)))
+    assert result.scores.bound_m["correlated"] == pytest.approx(exact.scores.bound_m["correlated"], rel=0.05)
+    said = result.report().metadata["errors"]
+    assert said == f"differences from the pose of motion capture (mocap_p), known at {known.sum()} of them"
+    assert exact.report().metadata["errors"] == "differences from the true pose"
+    away = captured.with_columns(flag_pose_lost=whole["t"] < 5)
+    assert localization(away, "lab", method="odometry", prior="0,0,0.8").bounds is None
+    with pytest.raises(InputError, match="no true pose at its first reading"):
+        localization(away, "lab", method="odometry")
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [
