@@ -21,7 +21,7 @@ from magtwin.frames import wrap_angle, yaw_from_quat
 from magtwin.io.formats import read_run
 from magtwin.io.surveys.maps import open_map
 from magtwin.localization.bounds import Bounds, bounds
-from magtwin.localization.compensators import COMPENSATORS, compensated
+from magtwin.localization.compensators import COMPENSATORS, DISTURBANCE_COLUMNS, compensated, is_weights
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.odometry import Odometry
 from magtwin.localization.problem import (
@@ -35,12 +35,12 @@ from magtwin.localization.problem import (
     SensorModel,
     Smoother,
 )
-from magtwin.localization.scores import AWAY_S, FAR_M, HELD_S, NEAR_M, Scores, score
+from magtwin.localization.readings import onboard
+from magtwin.localization.scores import Scores, score, verdict_of
 from magtwin.localization.track import EST_COLUMNS, Track, track
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run
 from magtwin.twin import Twin, scene_file
-from magtwin.verdict import EVEN
 
 RATE_HZ = 5.0
 """Default rate of readings that a localizer gets [Hz]."""
@@ -80,7 +80,7 @@ class Localization:
 
     @cached_property
     def truth(self) -> Array | None:
-        """True x, y [m] and yaw [rad], shape (N, 3); None if unknown."""
+        """`truth_of` the run."""
         return truth_of(self.run)
 
     @cached_property
@@ -103,16 +103,12 @@ class Localization:
     @cached_property
     def known(self) -> NDArray[np.bool_]:
         """Readings whose true pose is known, shape (N,)."""
-        if self.truth is None:
-            return np.zeros(self.run.rows, bool)
-        return np.asarray(np.isfinite(self.truth).all(axis=1))
+        known = self.truth is not None and np.isfinite(self.truth).all(axis=1)
+        return np.broadcast_to(known, self.run.rows)
 
     @cached_property
     def bounds(self) -> Bounds | None:
-        """Least standard deviations of any unbiased method.
-
-        None without a map, and if the true poses have a gap of more than `GAP_S`; shorter ones are filled.
-        """
+        """Least standard deviations of any unbiased method; None with no map, or a gap above `GAP_S`."""
         if self.problem.belief is None or self.truth is None or not self.known.any():
             return None
         t, truth = self.track.t, self.truth
@@ -185,9 +181,9 @@ def localize(
             metadata.
         odometry: Noise model of the odometry.
         map_length_m: Correlation length of the map's error [m].
-        compensator: Model of the robot's own field, a name in
-            `magtwin.localization.compensators.COMPENSATORS`, for methods that use its prediction
-            (rbpf-network). It is fitted to `calibration`.
+        compensator: Model of the robot's own field for methods that use its prediction (rbpf-network): a
+            name in `magtwin.localization.compensators.COMPENSATORS`, which is fitted to `calibration`; or
+            the weights of a trained network.
         calibration: A drive earlier in the session with true poses, or its file.
         rate_hz: Readings per second that the method gets [Hz]. None: all.
         seed: Seed of the method and of the prior's error.
@@ -200,7 +196,7 @@ def localize(
         InputError: A file or a column is missing, the run is off the map, there is no prior and no true pose,
             or the method fails.
     """
-    return _localization(
+    return localization(
         run,
         anomaly_map,
         method=method,
@@ -217,21 +213,7 @@ def localize(
     ).run
 
 
-def localization(run: Run | Source, anomaly_map: FieldBelief | Source | None, **options: Any) -> Localization:
-    """As `localize`, but also returns what the estimates were made from.
-
-    Args:
-        run: As for `localize`.
-        anomaly_map: As for `localize`.
-        **options: Those of `localize`; and `keep_particles`, whether the samples of the method are kept.
-
-    Raises:
-        InputError: As for `localize`.
-    """
-    return _localization(run, anomaly_map, **options)
-
-
-def _localization(
+def localization(
     run: Run | Source,
     anomaly_map: FieldBelief | Source | None,
     *,
@@ -248,6 +230,10 @@ def _localization(
     keep_particles: bool = False,
     progress: Callable[[int, int], Any] | None = None,
 ) -> Localization:
+    """As `localize`, but also returns what the estimates were made from.
+
+    `keep_particles` keeps the samples of the method; the other arguments and errors are those of `localize`.
+    """
     algorithm = load_localizer(method, options) if isinstance(method, str) else method
     if not isinstance(run, Run):
         run = read_run(existing(run, "run"))
@@ -265,13 +251,7 @@ def _localization(
         calibration = calibration if isinstance(calibration, Run) else read_run(existing(calibration, "run"))
         if rate_hz is not None:
             calibration = thinned(calibration, rate_hz)
-    if compensator != "none":
-        if anomaly_map is None or calibration is None:
-            raise InputError(
-                f"the `compensator` {compensator!r} needs a map and a `calibration` drive",
-                parameter="calibration",
-            )
-        run = compensated(run, COMPENSATORS[compensator]().fit(calibration, anomaly_map))
+    run = with_disturbance(run, compensator, calibration, anomaly_map)
     lever_arm = lever_arm_of(run) if sensor is None else sensor.lever_arm_m
     if anomaly_map is not None:
         check_on_map(run, anomaly_map, lever_arm)
@@ -288,15 +268,46 @@ def _localization(
         rate_hz=rate_hz or (run.rows - 1) / max(run.duration_s, 1e-9),
         seed=seed,
     )
-    x, y, _ = problem.prior.mean
-    x0, x1, y0, y1 = problem.extent
+    (x, y, _), (x0, x1, y0, y1) = problem.prior.mean, problem.extent
     if not problem.prior.is_global and not (x0 <= x <= x1 and y0 <= y <= y1):
-        text = f"x {x0:g} to {x1:g} m, y {y0:g} to {y1:g} m"
-        raise InputError(f"the `prior` x, y = {x:g}, {y:g} m is off the floor, {text}", parameter="prior")
+        text = f"{x:g}, {y:g} m is off the floor, x {x0:g} to {x1:g} m, y {y0:g} to {y1:g} m"
+        raise InputError(f"the `prior` x, y = {text}", parameter="prior")
     made = track(algorithm, problem, run, keep_particles=keep_particles, progress=progress)
     name = method if isinstance(method, str) else type(method).__name__
     estimated = run.with_columns(**made.columns()).with_specs(**EST_COLUMNS)
     return Localization(estimated.with_metadata(localizer=name, localizer_seed=seed), problem, made, name)
+
+
+def with_disturbance(
+    run: Run, compensator: str, calibration: Run | None = None, belief: FieldBelief | None = None
+) -> Run:
+    """A run with the robot's own field as a model predicts it: `disturbance_nt` and `disturbance_sd_nt`.
+
+    Args:
+        run: The run; the model gets its on-board columns.
+        compensator: "none", which changes nothing; a name in `COMPENSATORS`; or weights of a trained network
+            (.safetensors, .pth).
+        calibration: A drive earlier in the session with true poses, to which a named model is fitted.
+        belief: The map along that drive.
+
+    Raises:
+        InputError: There is no such model, a named one has no calibration or no map, or a column is missing.
+    """
+    if compensator == "none":
+        return run
+    if is_weights(compensator):
+        from magtwin.learn.inference.magnetometer import NeuralMagnetometer
+
+        (made,) = NeuralMagnetometer.load(compensator).read([onboard(run)], outside=False)
+        columns = {"disturbance_nt": made.disturbance_nt, "disturbance_sd_nt": made.sd_nt}
+        return run.with_columns(**columns).with_specs(**DISTURBANCE_COLUMNS)
+    model = COMPENSATORS[compensator]
+    if belief is None or calibration is None:
+        raise InputError(
+            f"the `compensator` {compensator!r} needs a map and a `calibration` drive",
+            parameter="calibration",
+        )
+    return compensated(run, model().fit(calibration, belief))
 
 
 def live_problem(
@@ -327,12 +338,11 @@ def live_problem(
     elif anomaly_map is not None:
         belief = anomaly_map
     x, y = (side / 2 for side in twin.scene.lab.floor_m)
+    arm = tuple(twin.scene.robot.p_base_magnetometer[:2])
     return Problem(
         belief=belief,
         extent=belief.extent if isinstance(belief, AnomalyMap) else (-x, x, -y, y),
-        sensor=replace(
-            ROBOT_NOISE, **{"lever_arm_m": tuple(twin.scene.robot.p_base_magnetometer[:2]), **(sensor or {})}
-        ),
+        sensor=replace(ROBOT_NOISE, **{"lever_arm_m": arm, **(sensor or {})}),
         odometry=odometry or OdometryModel(),
         map_length_m=map_length_m,
         seed=seed,
@@ -378,8 +388,7 @@ def report_of(result: Localization) -> Report:
         return Report(title, (lost,), metadata, "No verdict: the run has no true pose to compare with.")
     ratio = scores.ratio.get("correlated", math.nan)
     close = f"{ratio:.2f} of the bound" if math.isfinite(ratio) else ""
-    rows = result.scored_rows
-    off = np.hypot(*(dead.pose - result.truth)[rows, :2].T)
+    off = np.hypot(*(dead.pose - result.truth)[result.scored_rows, :2].T)
     dead_m = float(np.sqrt(np.mean(off**2)))
     expected = f"{scores.anees_low:.2f} to {scores.anees_high:.2f} if the covariance is right"
     figures = [
@@ -407,47 +416,6 @@ def report_of(result: Localization) -> Report:
     return Report(title, tuple(figures), metadata, verdict_of(scores, dead_m, _dead_start(result)))
 
 
-def verdict_of(scores: Scores, dead_m: float, start: str = "") -> str:
-    """Judge in one line whether an estimate is better than dead reckoning, consistent, and lost.
-
-    Args:
-        scores: Scores of the estimate.
-        dead_m: RMSE of dead reckoning over the same readings [m].
-        start: Where dead reckoning started, if not at the prior.
-    """
-    sizes = f"{100 * scores.rmse_m:.1f} cm RMSE against {100 * dead_m:.1f} cm"
-    less = 1 - scores.rmse_m / dead_m if dead_m > 0 else -math.inf
-    name = f"dead reckoning {start}".rstrip()
-    if abs(less) <= EVEN:
-        words = [f"No better than {name}: {sizes}."]
-    elif less > 0:
-        words = [f"Better than {name}: {sizes}, {less:.0%} less."]
-    else:
-        words = [f"WORSE than {name}: {sizes}."]
-    size = f"{scores.anees:.2f}" if scores.anees < 1e3 else f"{scores.anees:.0e}"
-    figure = f"ANEES {size} per state"
-    if scores.lost_share == 1:
-        words.append("It flagged all readings as lost, so its covariance is not judged.")
-    elif not math.isfinite(scores.anees):
-        words.append("Its covariance is unknown." if math.isnan(scores.anees) else "Its covariance is WRONG.")
-    elif scores.anees > scores.anees_high:
-        words.append(f"TOO CONFIDENT: {figure}, at most {scores.anees_high:.2f} expected.")
-    elif scores.anees < scores.anees_low:
-        words.append(f"Too cautious: {figure}, at least {scores.anees_low:.2f} expected.")
-    else:
-        words.append(f"Consistent: {figure}.")
-    if not math.isfinite(scores.converged_s) and not scores.diverged:
-        words.append(f"It never stayed within {NEAR_M:g} m for {HELD_S:g} s.")
-    if scores.diverged:
-        flagged = "" if scores.diverged_unflagged else ", and flagged it"
-        words.append(f"LOST: its error stayed above {FAR_M:g} m for more than {AWAY_S:g} s{flagged}.")
-    elif scores.lost_share > 0:
-        words.append(f"Not lost, but flagged so in {scores.lost_share:.0%} of the readings.")
-    else:
-        words.append("Not lost.")
-    return " ".join(words)
-
-
 def _origin(run: Run) -> list[str]:
     return [f"{key} {run.metadata[key]}" for key in ("scene", "path", "seed") if key in run.metadata]
 
@@ -469,7 +437,7 @@ def truth_of(run: Run) -> Array | None:
 
     A pose is nan where motion capture had lost the robot.
     """
-    if "p_world_base" in run and "yaw" in run and np.isfinite(run["p_world_base"]).any():
+    if _has_true_pose(run):
         return np.column_stack([run["p_world_base"][:, :2], run["yaw"]])
     if "mocap_p" in run and "mocap_q_xyzw" in run and np.isfinite(run["mocap_p"]).any():
         pose = np.column_stack([run["mocap_p"][:, :2], yaw_from_quat(run["mocap_q_xyzw"])])
@@ -481,8 +449,11 @@ def truth_of(run: Run) -> Array | None:
 
 def truth_name(run: Run) -> str:
     """What `truth_of` gives: "true pose", or "pose of motion capture (mocap_p)"."""
-    simulated = "p_world_base" in run and "yaw" in run and np.isfinite(run["p_world_base"]).any()
-    return "true pose" if simulated else "pose of motion capture (mocap_p)"
+    return "true pose" if _has_true_pose(run) else "pose of motion capture (mocap_p)"
+
+
+def _has_true_pose(run: Run) -> bool:
+    return "p_world_base" in run and "yaw" in run and bool(np.isfinite(run["p_world_base"]).any())
 
 
 def prior_of(run: Run, text: str = "tracking", *, seed: int = 0) -> Prior:
@@ -558,9 +529,8 @@ def map_file(source: Source) -> Path:
     try:
         return Path(scene_file(path))
     except InputError as error:
-        raise InputError(
-            f"{source}: no map layer, stage, folder of CSVs or shipped scene: {error}"
-        ) from error
+        text = f"{source}: no map layer, stage, folder of CSVs or shipped scene: {error}"
+        raise InputError(text) from error
 
 
 def check_map(run: Run, anomaly_map: AnomalyMap, file: Path) -> None:

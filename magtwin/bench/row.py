@@ -20,7 +20,7 @@ from magtwin.localization.bounds import Bounds, bounds
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import Localizer, Problem, SensorModel, Smoother
 from magtwin.localization.scores import Scores, score
-from magtwin.localization.track import LocalizerError, Track, track
+from magtwin.localization.track import Track, track
 from magtwin.parallel import beat
 from magtwin.run.run import Run
 
@@ -69,6 +69,7 @@ def run_chunk(
         limits = bounds_of(case)
         for name in chunk.entries:
             entry = suite.localizers[name]
+            entry = replace(entry, compensator=suite.path(entry.compensator))
             key = {"scenario": scenario.name, "localizer": name, "run": run}
             beat(f"{run} {name}")
             if failures and (run, name) in failures:
@@ -156,17 +157,12 @@ def run_localizer(
     """A track and its scores; None and the reason if the localizer failed."""
     try:
         with time_limit(limit_s):
-            readings = case.readings
+            problem, readings = case.problem, case.readings
             if entry.compensator != "none":
-                from magtwin.localization.compensators import COMPENSATORS, compensated
+                from magtwin.localizing import with_disturbance
 
-                if case.problem.calibration is None or case.problem.belief is None:
-                    raise LocalizerError(
-                        f"compensator {entry.compensator!r} needs a calibration drive and a map"
-                    )
-                fitted = COMPENSATORS[entry.compensator]().fit(case.problem.calibration, case.problem.belief)
-                readings = compensated(readings, fitted)
-            made = track(load_localizer(entry.method, entry.options), case.problem, readings)
+                readings = with_disturbance(readings, entry.compensator, problem.calibration, problem.belief)
+            made = track(load_localizer(entry.method, entry.options), problem, readings)
     except (InputError, MemoryError) as error:
         return None, Scores(failed=str(error))
     except TimeLimitError:

@@ -12,8 +12,8 @@ import magtwin as mt
 from magtwin.cli import main
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.localization.problem import Prior
-from magtwin.localization.scores import Scores
-from magtwin.localizing import Localization, localization, prior_of, thinned, verdict_of
+from magtwin.localization.scores import Scores, verdict_of
+from magtwin.localizing import Localization, localization, prior_of, thinned
 
 
 @pytest.fixture(scope="module")
