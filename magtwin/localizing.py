@@ -21,7 +21,6 @@ from magtwin.frames import wrap_angle, yaw_from_quat
 from magtwin.io.formats import read_run
 from magtwin.io.surveys.maps import open_map
 from magtwin.localization.bounds import Bounds, bounds
-from magtwin.localization.compensators import COMPENSATORS, DISTURBANCE_COLUMNS, compensated, is_weights
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.odometry import Odometry
 from magtwin.localization.problem import (
@@ -35,9 +34,9 @@ from magtwin.localization.problem import (
     SensorModel,
     Smoother,
 )
-from magtwin.localization.readings import onboard
 from magtwin.localization.scores import Scores, score, verdict_of
 from magtwin.localization.track import EST_COLUMNS, Track, track
+from magtwin.own_field import with_own_field
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run
 from magtwin.twin import Twin, scene_file
@@ -251,7 +250,6 @@ def localization(
         calibration = calibration if isinstance(calibration, Run) else read_run(existing(calibration, "run"))
         if rate_hz is not None:
             calibration = thinned(calibration, rate_hz)
-    run = with_disturbance(run, compensator, calibration, anomaly_map)
     lever_arm = lever_arm_of(run) if sensor is None else sensor.lever_arm_m
     if anomaly_map is not None:
         check_on_map(run, anomaly_map, lever_arm)
@@ -272,42 +270,11 @@ def localization(
     if not problem.prior.is_global and not (x0 <= x <= x1 and y0 <= y <= y1):
         text = f"{x:g}, {y:g} m is off the floor, x {x0:g} to {x1:g} m, y {y0:g} to {y1:g} m"
         raise InputError(f"the `prior` x, y = {text}", parameter="prior")
+    run = with_own_field(run, compensator, problem)
     made = track(algorithm, problem, run, keep_particles=keep_particles, progress=progress)
     name = method if isinstance(method, str) else type(method).__name__
     estimated = run.with_columns(**made.columns()).with_specs(**EST_COLUMNS)
     return Localization(estimated.with_metadata(localizer=name, localizer_seed=seed), problem, made, name)
-
-
-def with_disturbance(
-    run: Run, compensator: str, calibration: Run | None = None, belief: FieldBelief | None = None
-) -> Run:
-    """A run with the robot's own field as a model predicts it: `disturbance_nt` and `disturbance_sd_nt`.
-
-    Args:
-        run: The run; the model gets its on-board columns.
-        compensator: "none", which changes nothing; a name in `COMPENSATORS`; or weights of a trained network
-            (.safetensors, .pth).
-        calibration: A drive earlier in the session with true poses, to which a named model is fitted.
-        belief: The map along that drive.
-
-    Raises:
-        InputError: There is no such model, a named one has no calibration or no map, or a column is missing.
-    """
-    if compensator == "none":
-        return run
-    if is_weights(compensator):
-        from magtwin.learn.inference.magnetometer import NeuralMagnetometer
-
-        (made,) = NeuralMagnetometer.load(compensator).read([onboard(run)], outside=False)
-        columns = {"disturbance_nt": made.disturbance_nt, "disturbance_sd_nt": made.sd_nt}
-        return run.with_columns(**columns).with_specs(**DISTURBANCE_COLUMNS)
-    model = COMPENSATORS[compensator]
-    if belief is None or calibration is None:
-        raise InputError(
-            f"the `compensator` {compensator!r} needs a map and a `calibration` drive",
-            parameter="calibration",
-        )
-    return compensated(run, model().fit(calibration, belief))
 
 
 def live_problem(

@@ -157,12 +157,12 @@ def run_localizer(
     """A track and its scores; None and the reason if the localizer failed."""
     try:
         with time_limit(limit_s):
-            problem, readings = case.problem, case.readings
+            readings = case.readings
             if entry.compensator != "none":
-                from magtwin.localizing import with_disturbance
+                from magtwin.own_field import with_own_field
 
-                readings = with_disturbance(readings, entry.compensator, problem.calibration, problem.belief)
-            made = track(load_localizer(entry.method, entry.options), problem, readings)
+                readings = with_own_field(readings, entry.compensator, case.problem)
+            made = track(load_localizer(entry.method, entry.options), case.problem, readings)
     except (InputError, MemoryError) as error:
         return None, Scores(failed=str(error))
     except TimeLimitError:

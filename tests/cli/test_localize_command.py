@@ -11,7 +11,11 @@ import pytest
 import magtwin as mt
 from magtwin.cli import main
 from magtwin.errors import InputError, MismatchWarning
+from magtwin.files import shipped
+from magtwin.learn.data.labels import labelled
+from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.localization.problem import Prior
+from magtwin.localization.readings import onboard
 from magtwin.localization.scores import Scores, verdict_of
 from magtwin.localizing import Localization, localization, prior_of, thinned
 
@@ -120,6 +124,33 @@ def test_motion_capture_with_gaps_is_what_errors_count_against(here: Path) -> No
     assert localization(away, "lab", method="odometry", prior="0,0,0.8").bounds is None
     with pytest.raises(InputError, match="no true pose at its first reading"):
         localization(away, "lab", method="odometry")
+
+
+def test_a_network_predicts_the_own_field_at_the_poses_of_a_first_pass(here: Path) -> None:
+    weights = str(shipped("weights", "turtlebot4_hybrid.safetensors"))
+    run = thinned(mt.load_run("run.parquet"), 5.0)
+    plain, result = (
+        localization(run, "lab", method=method, compensator=how)
+        for method, how in (("rbpf-iron", "none"), ("rbpf-network", weights))
+    )
+    at = onboard(run).with_columns(
+        p_world_base=np.pad(plain.track.pose[:, :2], ((0, 0), (0, 1))), yaw=plain.track.pose[:, 2]
+    )
+    (peer,) = NeuralMagnetometer.load(weights).read([labelled(at, plain.problem.belief)], outside=False)
+    known = np.isfinite(peer.disturbance_nt)
+    assert known.mean() > 0.9
+    np.testing.assert_allclose(
+        result.run["disturbance_nt"][known],
+        peer.disturbance_nt[known],
+        atol=1e-3 * np.ptp(peer.disturbance_nt),
+    )
+    paper = str(shipped("weights", "turtlebot4_paper.safetensors"))
+    with pytest.raises(InputError, match="the network reads battery_fraction, which a localizer is not told"):
+        localization(
+            run.select(*(set(run) - {"battery_fraction"})), "lab", method="rbpf-network", compensator=paper
+        )
+    with pytest.raises(InputError, match="so it needs a map"):
+        localization(run, None, method="rbpf-network", compensator=weights)
 
 
 @pytest.mark.parametrize(
