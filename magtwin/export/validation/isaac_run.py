@@ -35,7 +35,9 @@ FOLDER_RULES = ("CleanFolder", "RobotNaming", "ThumbnailExists")
 """Rules for the folder of an asset."""
 
 NO_ROBOT = "the stage has no robot in a separate asset"
-ONE_LAYER = "the robot is not in the layers of Isaac Sim's asset structure; `magtwin export --target isaac` makes them"
+ONE_LAYER = (
+    "the robot is not in the layers of Isaac Sim's asset structure; `magtwin export --target isaac` makes them"
+)
 PACKED = "a package has no folder"
 
 

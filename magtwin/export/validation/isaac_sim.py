@@ -101,9 +101,7 @@ def isaac(file: Path, robots: Mapping[str, Path | None], *, packed: bool = False
             return Check("isaac", (Finding("unfinished", f"Isaac Sim's rules {ended}"),))
         result = json.loads(answer.read_text(encoding="utf-8"))
     findings = [Finding(**finding) for finding in result["findings"]]
-    findings = [
-        replace(finding, advice=finding.advice or ADVICE.get(finding.rule, "")) for finding in findings
-    ]
+    findings = [replace(finding, advice=finding.advice or ADVICE.get(finding.rule, "")) for finding in findings]
     findings += [Finding(rule, f"not run: {why}", severity="note") for rule, why in result["skipped"].items()]
     findings.sort(key=lambda finding: (finding.rule, finding.where, finding.text))
     run, whole = result["rules"] - len(result["skipped"]), result["rules"]
