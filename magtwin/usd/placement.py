@@ -88,6 +88,8 @@ def lab_on(stage: Usd.Stage, name: str = "") -> Lab:
     where = f"{stage.GetRootLayer().realPath or stage.GetRootLayer().identifier}"
     known = ", ".join(lab.path for lab in labs)
     if not name:
+        if len(labs) > 1 and len({lab.path for lab in labs}) == 1:
+            only_prim_with(stage.GetPseudoRoot(), "lab")  # refuses
         if len(labs) > 1:
             raise InputError(f"{where}: has {len(labs)} labs, {known}; name one with `lab`", parameter="lab")
         return labs[0]
@@ -293,9 +295,8 @@ def _refused(lab: Lab, metres: float) -> InputError:
         units = UNITS.format(metres, UsdGeom.GetStageUpAxis(stage))
         turn = "" if _up(stage)[2] == 1 else " and rotateX -90"
         return InputError(
-            f"{place(lab.root)}: the stage has {units}, and USD converts neither; magtwin reads metres "
-            f"with Z up: reference the lab with scale {1 / metres:g}{turn}, or make the stage in metres with "
-            "Z up"
+            f"{place(lab.root)}: the stage has {units}; magtwin reads metres with Z up, and USD converts "
+            f"neither: reference the lab with scale {1 / metres:g}{turn}, or make the stage in metres with Z up"
         )
     for path in lab.root.GetPath().GetPrefixes():
         prim = stage.GetPrimAtPath(path)

@@ -22,8 +22,8 @@ from magtwin.usd.earth import AGREES_NT, read_earth
 from magtwin.usd.furniture import read_magnets
 from magtwin.usd.geometry import Link, Shape, read_links, read_shapes
 from magtwin.usd.lab import read_lab
-from magtwin.usd.layers import open_stage, stage_sha256
-from magtwin.usd.maps import read_map
+from magtwin.usd.layers import open_stage, relative_asset, save_layer, stage_sha256
+from magtwin.usd.maps import MADE_FROM, read_map
 from magtwin.usd.obstacles import read_obstacles
 from magtwin.usd.placement import (
     AT_ORIGIN,
@@ -132,16 +132,16 @@ def open_scene(path: str | os.PathLike[str], *, lab: str = "", check_network: bo
             "--out DIR` and give the layer in DIR"
         )
     stage = open_stage(path)
-    check_units(stage)
     where = lab_on(stage, lab)
     several, pose = len(labs_on(stage)) > 1, pose_of(where)
-    earth, notes = _earth(stage, where)
+    check_units(stage)
+    earth, notes = earth_in(stage, where)
     take_to_origin(stage, where)
     world = stage.GetPseudoRoot()
     prims = _robot_prims(stage)
     robots = [_read_placed(prim, check_network, notes) for prim in prims]
     magnetometers = [only_prim_with(prim, "magnetometer") for prim in prims]
-    maps = [_map_of(magnetometer, notes) for magnetometer in magnetometers]
+    maps = [map_of(magnetometer) for magnetometer in magnetometers]
     checksums = [plain_value(m.GetAttribute(MAP_CHECKSUM)) for m in magnetometers]
     anomaly_map = read_map(maps[0])
     for magnetometer, own_map, checksum in zip(magnetometers, maps, checksums, strict=True):
@@ -219,7 +219,7 @@ def _placed(stage: Usd.Stage, lab: str) -> Usd.Stage:
     return stage
 
 
-def _earth(stage: Usd.Stage, lab: Lab) -> tuple[EarthFieldSpec | None, list[str]]:
+def earth_in(stage: Usd.Stage, lab: Lab) -> tuple[EarthFieldSpec | None, list[str]]:
     """The Earth's field in the lab's axes, and a text for each other field on the stage that contradicts it.
 
     The lab's own field turns with the lab: the map was measured with it. Without one, the field of the stage
@@ -262,14 +262,18 @@ def _all_with(stage: Usd.Stage, noun: str) -> list[Usd.Prim]:
     return [p for p in stage.Traverse(Usd.TraverseInstanceProxies()) if p.HasAPI(NOUNS[noun])]
 
 
-def _map_of(magnetometer: Usd.Prim, notes: list[str]) -> Usd.Prim:
-    """The map that a magnetometer reads: the one that it names, else the only one of its lab."""
-    named = magnetometer.GetRelationship(MAP_RELATIONSHIP)
-    maps = prims_with(magnetometer.GetStage().GetPseudoRoot(), "anomalyMap")
-    if len(maps) == 1 and not (named and named.GetForwardedTargets()):
-        notes.append(f"{place(magnetometer)}: names no map in {MAP_RELATIONSHIP}; reads {maps[0].GetPath()}")
-        return maps[0]
-    return require_api(target(magnetometer, MAP_RELATIONSHIP), "anomalyMap")
+def map_of(magnetometer: Usd.Prim) -> Usd.Prim:
+    """The map that a magnetometer reads.
+
+    Raises:
+        InputError: It names none, another kind of prim, or several; the text names the maps of the stage.
+    """
+    try:
+        return require_api(target(magnetometer, MAP_RELATIONSHIP), "anomalyMap")
+    except InputError as error:
+        maps = prims_with(magnetometer.GetStage().GetPseudoRoot(), "anomalyMap")
+        known = ", ".join(str(prim.GetPath()) for prim in maps) or "none"
+        raise InputError(f"{error}; maps of the lab: {known}") from error
 
 
 def _alone(stage: Usd.Stage, robot: str) -> Usd.Stage:
@@ -299,6 +303,53 @@ def check_map(scene: Scene, where: str = "") -> None:
         )
 
 
+def use_map(opened: OpenedScene, map_layer: str | os.PathLike[str], *, dry: bool = False) -> None:
+    """Let the stage of a scene read another map, in place of the old one among its sublayers.
+
+    Args:
+        opened: The scene.
+        map_layer: Layer of the new map, whose prim has the path of the old one.
+        dry: Whether to check only; the new layer need not exist then.
+
+    Raises:
+        InputError: The old map is no sublayer of this stage: it comes from another stage by reference, or is
+            part of the root layer.
+    """
+    stage, map_layer = opened.stage, Path(map_layer)
+    old = opened.scene.map_layer
+    held = [
+        (layer, name)
+        for layer in stage.GetLayerStack(includeSessionLayers=False)
+        for name in layer.subLayerPaths
+        if Path(layer.ComputeAbsolutePath(name)).resolve() == old
+    ]
+    if not held:
+        raise InputError(
+            f"{opened.file}: the map {old} is no sublayer of this stage, so it cannot be replaced here; "
+            "survey the stage that has it as a sublayer",
+            parameter="adopt",
+        )
+    if dry:
+        return
+    changed = {stage.GetRootLayer()}
+    for layer, name in held:
+        new = relative_asset(layer, map_layer)
+        layer.subLayerPaths = [new if n == name else n for n in layer.subLayerPaths]
+        changed.add(layer)
+    checksum = sha256(map_layer)
+    with Usd.EditContext(stage, stage.GetRootLayer()):
+        for prim in prims_with(stage.GetPseudoRoot(), "magnetometer"):
+            prim.GetAttribute(MAP_CHECKSUM).Set(checksum)
+    for prim in prims_with(stage.GetPseudoRoot(), "anomalyMap"):
+        for layer in stage.GetLayerStack(includeSessionLayers=False):
+            over = layer.GetPrimAtPath(prim.GetPath())
+            if layer.realPath != str(map_layer.resolve()) and over and MADE_FROM in over.attributes:
+                over.RemoveProperty(over.attributes[MADE_FROM])
+                changed.add(layer)
+    for layer in changed:
+        save_layer(layer)
+
+
 def _robot_prims(stage: Usd.Stage) -> list[Usd.Prim]:
     """Prims of a stage's robots, at least one."""
     root = stage.GetPseudoRoot()
@@ -309,7 +360,7 @@ def _read_placed(prim: Usd.Prim, check_network: bool, notes: list[str]) -> Place
     """The robot at a prim, its start in the lab and its default path."""
     world = UsdGeom.XformCache().GetLocalToWorldTransform(prim)
     rows = np.array(world)[:3, :3]
-    if np.abs(rows @ rows.T - np.eye(3)).max() > SAME or np.linalg.det(rows) < 0:
+    if np.abs(rows @ rows.T - np.eye(3)).max() > SAME or rows[0] @ np.cross(rows[1], rows[2]) < 0:
         raise InputError(
             f"{place(prim)}: the robot is scaled or mirrored; clear its scale and those above it"
         )

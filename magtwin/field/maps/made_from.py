@@ -12,7 +12,8 @@ import numpy as np
 from magtwin.errors import InputError
 from magtwin.frames import canonical
 from magtwin.spec.base import Vec3
-from magtwin.spec.furniture import steel_of
+from magtwin.spec.furniture import FurnitureSpec, steel_of
+from magtwin.spec.magnetics import SourceSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 
@@ -116,8 +117,10 @@ class MadeFrom:
         Returns:
             What has changed since, one text each. Empty if nothing has.
         """
-        texts = self._bodies_changed(_bodies(scene))
-        texts += self._earth_changed(None if scene.earth is None else scene.earth.b_world_nt)
+        texts, now = list[str](), _bodies(scene)
+        if scene.earth is not None or now:  # else the map alone is the field
+            texts += self._bodies_changed(now)
+            texts += self._earth_changed(None if scene.earth is None else scene.earth.b_world_nt)
         for placed in scene.robots:
             texts += self._robot_changed(placed.robot)
         return texts
@@ -170,9 +173,10 @@ def made_from(scene: Scene, *, height_m: float | None = None) -> MadeFrom:
 
 def _bodies(scene: Scene) -> dict[str, str]:
     """Checksum of each source and each piece of furniture with steel, by name."""
-    pieces = (piece for piece in scene.furniture if steel_of(piece))
+    things: list[SourceSpec | FurnitureSpec] = list(scene.sources)
+    things += [piece for piece in scene.furniture if steel_of(piece)]
     found: dict[str, str] = {}
-    for thing in (*scene.sources, *pieces):
+    for thing in things:
         name = thing.name if thing.name not in found else f"{thing.name} "  # a piece named like a source
         found[name] = _checksum(
             getattr(thing, f.name) if not f.name.startswith("q_") else canonical(getattr(thing, f.name))
