@@ -296,7 +296,7 @@ def _refused(lab: Lab, metres: float) -> InputError:
         turn = "" if _up(stage)[2] == 1 else " and rotateX -90"
         return InputError(
             f"{place(lab.root)}: the stage has {units}; magtwin reads metres with Z up, and USD converts "
-            f"neither: reference the lab with scale {1 / metres:g}{turn}, or make the stage in metres with Z up"
+            f"neither: reference the lab with scale {1 / metres:g}{turn}, or make the stage in metres, Z up"
         )
     for path in lab.root.GetPath().GetPrefixes():
         prim = stage.GetPrimAtPath(path)
