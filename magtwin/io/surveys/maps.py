@@ -281,7 +281,7 @@ def survey_scene(
         "source": "; ".join(f"{file.name} sha256:{sha256(file)}" for file in files),
         "licence": licence,
         "created": day if created is None else created,
-        "progress": progress,
+        "progress": progress or (lambda done, total, what: None),
         "blocked": blocked_by(twin, opened.obstacles),
     }
     if out.suffix == ".parquet":
