@@ -148,22 +148,23 @@ network was trained on the old map, a run warns how far the two maps differ.
 
 | edit in usdview, Kit or Blender | result |
 |---|---|
-| a desk is moved, added, removed or magnetised otherwise, also in a stronger layer | the field is that of the new state; warning that the map is stale, with names and the difference in nT |
+| a desk is moved, added, removed, magnetised | the new field; warning: map stale, what changed, by how many nT |
+| the same in a stronger layer | the same |
 | something that is not magnetic is moved | read as it is; no warning |
 | the magnetometer is mounted elsewhere | read at the new place; warning that the map is stale |
-| a second robot is added by reference | refused until its `magtwin:magnetometer:map` names the map; then both drive |
+| a second robot is added by reference | refused until its `magtwin:magnetometer:map` names the map |
 | a robot is scaled | refused, with the prim |
 | a robot floats or leans | starts on the floor, with a warning |
 | furniture is made instanceable, or a payload | read as before |
-| a payload is unloaded in a viewer | read whole, since the file does not store this; a missing file is refused |
+| a payload is unloaded in a viewer | read whole: the file does not store it; a missing file is refused |
 | variants are switched off | the same bytes |
-| edits in usdview's session layer | not part of the file; if saved as a layer, that layer is read as a stronger one |
+| edits in usdview's session layer | not part of the file; saved as a layer, that is a stronger layer |
 | changes in the same process that are not saved | refused: save them first |
 | the whole lab is moved, or turned about the vertical | the same bytes |
 | the whole lab is tilted, scaled or mirrored | refused, with the prim |
 | only the room or only the map is moved | refused, with the prim to move instead |
 | the lab is referenced twice | the same bytes in each; `--lab` names one |
-| a stage in centimetres or with Y up references the lab | the same bytes if it scales and turns the lab, else refused |
+| a stage in centimetres or with Y up references the lab | the same bytes if scaled and turned, else refused |
 | a layer in other units is brought in without a scale | refused, with prim, scale and turn |
 """
 
