@@ -148,7 +148,7 @@ network was trained on the old map, a run warns how far the two maps differ.
 
 | edit in usdview, Kit or Blender | result |
 |---|---|
-| a desk is moved, added, removed, magnetised | the new field; warning: map stale, what changed, by how many nT |
+| a desk is moved, added, removed, magnetised | the new field; warning: map stale, why and by how much |
 | the same in a stronger layer | the same |
 | something that is not magnetic is moved | read as it is; no warning |
 | the magnetometer is mounted elsewhere | read at the new place; warning that the map is stale |
