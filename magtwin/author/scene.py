@@ -153,7 +153,7 @@ def _with_copies(scene: Scene, folder: Path) -> Scene:
         if magnetometer.network is not None:
             weights = once(magnetometer.network, "weights", robot.name, _copied)
             magnetometer = replace(magnetometer, network=weights)
-        asset = once(robot.asset, "robot", robot.name, _copied_asset)
+        asset = once(robot.asset, "robots", robot.name, _copied_robot)
         if isinstance(path, Path):
             path = once(path, "paths", robot.name, _copied)
         robot = replace(robot, asset=asset, magnetometer=magnetometer)
@@ -170,6 +170,11 @@ def _with_copies(scene: Scene, folder: Path) -> Scene:
 def _copied(file: Path, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     return Path(shutil.copyfile(file, folder / file.name))
+
+
+def _copied_robot(asset: Path, folder: Path) -> Path:
+    """A robot's asset copied to a folder with its own name, as Isaac Sim wants it, below `folder`."""
+    return _copied_asset(asset, folder / asset.stem)
 
 
 def _copied_asset(asset: Path, folder: Path) -> Path:

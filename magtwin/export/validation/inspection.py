@@ -114,7 +114,7 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
     from magtwin.export.validation.fix import mend
 
     importlib.import_module("magtwin.export.validation.isaac_rules")  # fills RULES
-    from magtwin.export.validation.rule import RULES, Subject
+    from magtwin.export.validation.rule import RULES, TITLES, Subject
     from magtwin.export.validation.rules import robot_assets
 
     file, root = Path(job["file"]), Path(job["root"])
@@ -142,7 +142,7 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
             if name in job["against"]:
                 found = [finding for rule in rules.values() for finding in rule.findings(subject)]
                 found += lost if name == "magtwin" else []
-                checks.append(Check(name, tuple(found), scope=f"{len(rules)} rules"))
+                checks.append(Check(TITLES[name], tuple(found), scope=f"{len(rules)} rules"))
         assets = robot_assets(subject)
         bodies = sum(prim.HasAPI(UsdPhysics.RigidBodyAPI) for prim in subject.prims)
     except (Tf.ErrorException, UnicodeError, MemoryError) as error:

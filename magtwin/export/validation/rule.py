@@ -135,6 +135,9 @@ class Rule:
         return [Finding(self.name, w.text, w.where, w.advice or self.advice, w.severity) for w in wrongs]
 
 
+TITLES = {"isaac": "isaac extra", "magtwin": "magtwin"}
+"""Name of the check of each group of rules. The check `isaac` is that of Isaac Sim's own rules."""
+
 RULES: dict[str, dict[str, Rule]] = {"isaac": {}, "magtwin": {}}
 """Every rule by validator and name. Importing `isaac_rules` and `rules` fills it."""
 
