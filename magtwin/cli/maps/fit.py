@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.maps.map import LAYERS, Earth, Kernel, Sources, headings_rad, map_app
-from magtwin.cli.options import Flag, Force, Licence, Seed
+from magtwin.cli.options import Flag, Force, Jobs, Licence, Seed
 from magtwin.cli.terminal import Done, check_output, progress, step
 from magtwin.io.surveys.about import About
 from magtwin.io.surveys.columns import Columns
@@ -175,6 +175,7 @@ def map_survey(
     name: str | None = None,
     licence: Licence = "",
     created: str | None = None,
+    jobs: Jobs = None,
     force: Force = False,
 ) -> Done:
     """Survey a scene as its robot would, node by node, with sensor noise and pose errors.
@@ -186,7 +187,7 @@ def map_survey(
     Parameters
     ----------
     scene
-        USD stage with a known Earth field.
+        USD stage with a known Earth field, or the name of a scene that ships with magtwin: lab.
     out
         Map layer (.usdc) or readings (.parquet) to write.
     spacing_m
@@ -206,9 +207,13 @@ def map_survey(
         Name of the map. Default: the name of the output.
     created
         Date of the survey, YYYY-MM-DD. Default: that of the Earth's field.
+    jobs
+        Number of processes that share the headings. Default: one, with several threads.
     """
     from magtwin.io.surveys.maps import survey_scene
+    from magtwin.twin import scene_file
 
+    scene = scene_file(scene)
     check_output(out, (*LAYERS, ".parquet"), "a map layer, or a file of readings,", force=force)
     angles = headings_rad(headings_deg)
     with progress(f"Surveying {scene.name}", "headings") as advance:
@@ -225,6 +230,7 @@ def map_survey(
             name=name,
             licence=licence,
             created=created,
+            jobs=jobs,
             progress=advance,
             force=force,
         )

@@ -17,7 +17,7 @@ from magtwin.cli.options import (
     Shard,
     Whole,
 )
-from magtwin.cli.terminal import Done, announce, progress
+from magtwin.cli.terminal import Done, announce, continued_by_a_repeat, progress
 from magtwin.errors import InputError
 
 RUNS_A_SESSION = 5
@@ -117,6 +117,7 @@ def sweep(
         **options,
     )
     part = None if shard is None else parse_shard(shard)
-    with progress("Driving", "runs") as advance:
+    kept = jobs is not None or part is not None or dask is not None
+    with continued_by_a_repeat(when=kept), progress("Driving", "runs") as advance:
         made = runs.save(out, force=force, jobs=jobs, shard=part, dask=dask, progress=advance)
     return Done(made, out if out.exists() else Path(f"{out}.parts"))

@@ -226,6 +226,7 @@ def survey_scene(
     name: str | None = None,
     licence: str = "",
     created: str | None = None,
+    jobs: int | None = None,
     progress: Progress | None = None,
     force: bool = False,
 ) -> Report:
@@ -244,6 +245,8 @@ def survey_scene(
         name: Name of the map. None: that of `out`.
         licence: Licence of the map, an SPDX identifier.
         created: Date of the survey, YYYY-MM-DD. None: that of the Earth's field.
+        jobs: Processes that share the headings; they do not change the output. None: this process, with
+            several threads.
         progress: Called with the number of headings done and their total.
         force: Whether an existing output is replaced.
 
@@ -275,6 +278,7 @@ def survey_scene(
         "created": day if created is None else created,
         "progress": progress,
         "blocked": blocked_by(twin, read_obstacles(scene_file)),
+        "jobs": jobs,
     }
     if out.suffix == ".parquet":
         surveyed = replace(survey_readings(twin, **options), name=name or out.stem)
@@ -314,7 +318,8 @@ def _doubts(readings: Readings, source: Source) -> list[str]:
     if np.abs(mean) >= ONE_HEADING:
         doubts.append(
             f"one heading only, {np.degrees(np.angle(mean)):.0f} deg: the robot's own field cannot be "
-            "separated from the room's, and a simulated robot adds its own again; survey in several headings"
+            "separated from the room's, and a simulated robot adds its own again; survey in several headings, "
+            "or carry the sensor by hand"
         )
     return doubts
 
