@@ -230,7 +230,7 @@ def test_a_scenes_folder_can_be_moved_and_needs_nothing_outside_of_it(own_parts,
         map_layer=tmp_path / "moved" / "map" / "map.usdc",
         robot=replace(
             scene.robot,
-            asset=tmp_path / "moved" / "robot" / "bot.usda",
+            asset=tmp_path / "moved" / "robots" / "bot" / "bot.usda",
             magnetometer=replace(
                 scene.robot.magnetometer, network=tmp_path / "moved" / "weights" / "net.pth"
             ),
@@ -274,7 +274,7 @@ def test_the_root_layer_is_short_text_with_units_axes_and_relative_paths(parts, 
     assert UsdGeom.GetStageUpAxis(stage) == "Z"
     assert stage.GetDefaultPrim().GetPath() == "/World"
     assert list(stage.GetRootLayer().subLayerPaths) == ["./room.usda", "./magnetics.usda", "./map/map.usdc"]
-    assert "@./robot/bot.usda@" in text
+    assert "@./robots/bot/bot.usda@" in text
     assert "@./weights/net.pth@" in text
     assert stage.GetRootLayer().documentation
     assert stage.GetRootLayer().customLayerData["creator"] == "magtwin"
@@ -700,7 +700,7 @@ def broken(parts: Path, folder: Path, edit) -> Path:
     ("edit", "said"),
     [
         (
-            lambda t: t.replace("./robot/bot.usda", "./robot/gone.usda"),
+            lambda t: t.replace("./robots/bot/bot.usda", "./robots/bot/gone.usda"),
             r"gone\.usda@ for reference.*</World/bot>",
         ),
         (lambda t: t.replace("./map/map.usdc", "./map/gone.usdc"), r"Could not load sublayer.*gone\.usdc"),
