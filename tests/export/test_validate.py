@@ -136,6 +136,26 @@ BROKEN = {
         "is moved",
         "error",
     ),
+    "map-stale": (
+        over("Furniture/desk_0", "double3 xformOp:translate = (-1.8, 2.3, 0)"),
+        "since the map was made: desk_0 is moved",
+        "warning",
+    ),
+    "earth-fields": (
+        HEAD
+        + """def Xform "Town" (prepend apiSchemas = ["MagtwinEarthFieldAPI"])
+{
+    double3 magtwin:earth:bWorldNt = (0, 20000, -40000)
+    double magtwin:earth:latitudeDeg = 29.65
+    double magtwin:earth:longitudeDeg = -82.35
+    double magtwin:earth:heightM = 50
+    string magtwin:earth:date = "2026-11-21"
+    bool magtwin:earth:measured = true
+}
+""",
+        "Earth's field differs by",
+        "warning",
+    ),
     "robot-inside": (
         over("turtlebot4", "double3 xformOp:translate = (9, 0, 0)"),
         "it is off the floor",
