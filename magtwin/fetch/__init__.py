@@ -1,6 +1,7 @@
 """Fetch original data from their publishers; each file is checked against its SHA-256.
 
-magtwin ships none of them. Each source is a table: name, checksum, and path in a repository at a pinned commit.
+magtwin ships none of them. Each source is a table: name, checksum, and path in a repository at a pinned
+commit.
 """
 
 from collections.abc import Callable

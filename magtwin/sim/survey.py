@@ -13,6 +13,7 @@ from magtwin.errors import InputError
 from magtwin.field.grid import Grid
 from magtwin.field.maps.curvature import interpolation_error_nt2
 from magtwin.field.maps.holes import filled
+from magtwin.field.maps.made_from import made_from
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.magnets import body_of
 from magtwin.field.survey.readings import Readings
@@ -279,6 +280,7 @@ def survey(
         frame=read.frame,
         datum=read.datum,
         height_m=read.height_m,
+        made_from=made_from(scene, height_m=read.height_m),
         parameters={
             "readings": readings,
             "noise_std_nt": sensor.noise_std_nt,

@@ -101,8 +101,8 @@ def define_no_contact(body: Usd.Prim, surface: Surface, meshes: MeshLayer) -> Us
     sphere.CreateExtentAttr([Gf.Vec3f(-NO_CONTACT_RADIUS_M), Gf.Vec3f(NO_CONTACT_RADIUS_M)])
     sphere.CreatePurposeAttr(UsdGeom.Tokens.guide)
     prim = sphere.GetPrim()
-    centre = UsdPhysics.MassAPI(body).GetCenterOfMassAttr().Get() if body.HasAPI(UsdPhysics.MassAPI) else None
-    write_pose(prim, tuple(map(float, centre or (0, 0, 0))))
+    x, y, z = UsdPhysics.MassAPI(body).GetCenterOfMassAttr().Get() or (0.0, 0.0, 0.0)
+    write_pose(prim, (x, y, z))
     UsdPhysics.CollisionAPI.Apply(prim).CreateCollisionEnabledAttr(False)
     wear(prim, body.GetParent(), None, meshes, define_grip(body.GetParent(), surface))
     return prim

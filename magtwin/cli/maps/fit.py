@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.maps.map import LAYERS, Earth, Kernel, Sources, headings_rad, map_app
-from magtwin.cli.options import Flag, Force, Jobs, Licence, Seed
+from magtwin.cli.options import Flag, Force, Jobs, Lab, Licence, Seed
 from magtwin.cli.terminal import Done, check_output, progress, step
 from magtwin.io.surveys.about import About
 from magtwin.io.surveys.columns import Columns
@@ -165,6 +165,8 @@ def map_survey(
     scene: Path,
     *,
     out: Path,
+    adopt: Flag = False,
+    lab: Lab = "",
     spacing_m: float = 0.25,
     headings_deg: str = "0,90,180,270",
     readings: int = 135,
@@ -181,8 +183,8 @@ def map_survey(
     """Survey a scene as its robot would, node by node, with sensor noise and pose errors.
 
     The field is that of the stage as it is now: move a desk in it, survey again, and `magtwin map diff` finds
-    the change. The map's variance includes noise and pose errors. Nodes where the sensor loses lock or the
-    robot cannot stand are masked.
+    the change. With --adopt, the stage reads the new map from then on. The map's variance includes noise and
+    pose errors. Nodes where the sensor loses lock or the robot cannot stand are masked.
 
     Parameters
     ----------
@@ -190,6 +192,9 @@ def map_survey(
         USD stage with a known Earth field, or the name of a scene that ships with magtwin: lab.
     out
         Map layer (.usdc) or readings (.parquet) to write.
+    adopt
+        Put the new map in place of the stage's old one: in the sublayers, and in the checksum of each
+        magnetometer. The old map's file stays.
     spacing_m
         Spacing of the nodes [m].
     headings_deg
@@ -220,6 +225,8 @@ def map_survey(
         report = survey_scene(
             scene,
             out,
+            adopt=adopt,
+            lab=lab,
             spacing_m=spacing_m,
             headings_rad=angles,
             readings=readings,

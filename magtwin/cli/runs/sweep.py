@@ -10,6 +10,7 @@ from magtwin.cli.options import (
     Flag,
     Force,
     Jobs,
+    Lab,
     Names,
     Plant,
     Seed,
@@ -32,6 +33,7 @@ def sweep(
     count: Whole = 100,
     path: Names = None,
     fit: Flag = False,
+    lab: Lab = "",
     seed: Seed = 0,
     sessions: Whole | None = None,
     session: Literal["survey"] | None = None,
@@ -102,7 +104,7 @@ def sweep(
     opening = {
         name: options.pop(name) for name in ("network", "magnetometer", "model_error", "tracking_error")
     }
-    twin = open_twin(scene, **opening)
+    twin = open_twin(scene, lab=lab, **opening)
     announce(f"Driving {count} runs")
     runs = drive_many(
         twin,

@@ -86,10 +86,10 @@ def inspect(
             raise RuntimeError(f"the inspection of {file} ended with {done.returncode}: {last}")
         result = json.loads(answer.read_text(encoding="utf-8"))
     if result.get("refused"):
-        raise InputError(_as_named(result["refused"], home, file))
+        raise InputError(as_named(result["refused"], home, file))
     for check in result["checks"]:
         for finding in check["findings"]:
-            finding |= {name: _as_named(finding[name], home, file) for name in ("text", "where")}
+            finding |= {name: as_named(finding[name], home, file) for name in ("text", "where")}
     return Inspection(
         tuple(check_from(check) for check in result["checks"]),
         {prim: None if asset is None else Path(asset) for prim, asset in result["robots"].items()},
@@ -98,7 +98,7 @@ def inspect(
     )
 
 
-def _as_named(text: str, home: Path | None, file: Path) -> str:
+def as_named(text: str, home: Path | None, file: Path) -> str:
     """A text with the folder of an unpacked package replaced by the package."""
     for folder in () if home is None else (home.resolve(), home):
         text = text.replace(folder.as_posix(), file.as_posix())

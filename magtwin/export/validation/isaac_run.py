@@ -17,7 +17,7 @@ from pxr import Sdf, Usd, UsdUtils
 
 from magtwin.export.validation import kit_stand_ins
 from magtwin.export.validation.findings import Finding
-from magtwin.export.validation.kit_stand_ins import BaseRuleChecker, NeedsKit
+from magtwin.export.validation.kit_stand_ins import BaseRuleChecker, NeedsKitError
 
 PACKAGE = "isaacsim.asset.validation"
 
@@ -36,7 +36,7 @@ FOLDER_RULES = ("CleanFolder", "RobotNaming", "ThumbnailExists")
 
 NO_ROBOT = "the stage has no robot in a separate asset"
 ONE_LAYER = (
-    "the robot is not in the layers of Isaac Sim's asset structure; `magtwin export --target isaac` makes them"
+    "the robot is not in the layers of Isaac Sim's asset structure, see `magtwin export --target isaac`"
 )
 PACKED = "a package has no folder"
 
@@ -66,8 +66,8 @@ def main(job_file: str) -> None:
                 continue
             try:
                 found = _findings(rule(), file, robots.get(file, ""))
-            except NeedsKit as error:
-                skipped[name] = f"needs {error} of Isaac Sim"
+            except NeedsKitError as error:
+                skipped[name] = f"needs Isaac Sim itself ({error})"
                 break
             new = {key: group for key, group in found.items() if key not in findings}
             findings |= new  # a robot's prim is in its asset and, by reference, on the stage
@@ -99,7 +99,7 @@ def _findings(rule: BaseRuleChecker, file: Path, robot: str) -> dict[tuple[str, 
         robot: Prim of the robot on the stage, if the file is its asset. Its variants are checked too.
 
     Raises:
-        NeedsKit: The rule needs what has no stand-in.
+        NeedsKitError: The rule needs what has no stand-in.
     """
     stage, name = Usd.Stage.Open(str(file)), type(rule).__name__
     try:
@@ -109,7 +109,7 @@ def _findings(rule: BaseRuleChecker, file: Path, robot: str) -> dict[tuple[str, 
             for view in _variants(stage) if robot else (stage,):
                 for prim in Usd.PrimRange.Stage(view, Usd.TraverseInstanceProxies()):
                     rule.CheckPrim(prim)
-    except NeedsKit:
+    except NeedsKitError:
         raise
     except Exception as error:  # code of another project may fail in any way
         text = f"the rule failed: {type(error).__name__}: {' '.join(str(error).split())[:200]}"
@@ -128,10 +128,9 @@ def _variants(stage: Usd.Stage) -> Iterable[Usd.Stage]:
     """The stage as it is, then in each variant of its default prim."""
     yield stage
     robot = stage.GetDefaultPrim()
-    sets = robot.GetVariantSets() if robot else None
-    for name in sets.GetNames() if sets else ():
-        chosen = sets.GetVariantSelection(name)
-        for other in sets.GetVariantSet(name).GetVariantNames():
+    for name in robot.GetVariantSets().GetNames() if robot else ():
+        chosen = robot.GetVariantSet(name).GetVariantSelection()
+        for other in robot.GetVariantSet(name).GetVariantNames():
             if other != chosen:
                 session = Usd.Stage.Open(stage.GetRootLayer())
                 with Usd.EditContext(session, session.GetSessionLayer()):

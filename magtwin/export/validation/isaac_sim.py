@@ -1,9 +1,9 @@
 """Isaac Sim's own rules for assets, the extension `isaacsim.asset.validation`, run on usd-core.
 
-magtwin does not ship them. They come from an Isaac Sim installation that the user names, or from the copy that
-`magtwin fetch isaac-rules` makes. They are code of another project, so they run in a separate process with a
-time limit, from a temporary folder that holds only the files needed; those of the copy are first compared with
-their SHA-256.
+magtwin does not ship them. They come from an Isaac Sim installation that the user names, or from the copy
+that `magtwin fetch isaac-rules` makes. They are code of another project, so they run in a separate process
+with a time limit, from a temporary folder that holds only the files needed. Those of the copy are compared
+with their SHA-256 first.
 """
 
 import hashlib
@@ -20,9 +20,10 @@ from typing import Any
 
 from magtwin.errors import InputError
 from magtwin.export.validation.findings import Check, Finding
+from magtwin.export.validation.inspection import as_named
 
 INSTALLATION = "MAGTWIN_ISAACSIM"
-"""Environment variable with the path of an Isaac Sim installation, of a checkout of it, or of fetched rules."""
+"""Environment variable with the path of an Isaac Sim installation, of a checkout, or of fetched rules."""
 
 FILES = Path(__file__).with_name("isaac_files.txt")
 """The files that `magtwin fetch isaac-rules` fetches: name, SHA-256, and path in Isaac Sim's repository."""
@@ -46,8 +47,8 @@ NEEDED = (
 RULES, ROBOT_SCHEMA = "isaacsim/asset/validation/__init__.py", "usd/schema/isaac/robot_schema/__init__.py"
 
 GET_RULES = (
-    f"the rule files of Isaac Sim are not here; `magtwin fetch isaac-rules` fetches them, or {INSTALLATION} names "
-    "an installation"
+    "the rule files of Isaac Sim are not here; `magtwin fetch isaac-rules` fetches them, or "
+    f"{INSTALLATION} names an installation"
 )
 
 PATIENCE_S = 120.0
@@ -61,13 +62,16 @@ def copy_folder() -> Path:
     return Path(pooch.os_cache("magtwin")) / "isaac-rules"
 
 
-def isaac(file: Path, robots: Mapping[str, Path | None], *, packed: bool = False) -> Check:
+def isaac(
+    file: Path, robots: Mapping[str, Path | None], *, home: Path | None = None, package: Path | None = None
+) -> Check:
     """Check a stage, and the assets of its robots, with Isaac Sim's rules.
 
     Args:
         file: The stage.
         robots: Asset of each robot by its prim; None if the robot has no separate asset.
-        packed: Whether the stage was unpacked from a package, whose folder has no name of its own.
+        home: Folder of an unpacked package. Rules about the folder of an asset are not run there.
+        package: The package, which the findings name instead.
     """
     try:
         files = rule_files()
@@ -83,7 +87,7 @@ def isaac(file: Path, robots: Mapping[str, Path | None], *, packed: bool = False
             "rules": str(rules),
             "stage": str(file),
             "robots": [[str(asset), prim] for asset, prim in assets.items()],
-            "packed": packed,
+            "packed": home is not None,
             "answer": str(answer),
         }
         job_file = Path(folder, "job.json")
@@ -100,10 +104,14 @@ def isaac(file: Path, robots: Mapping[str, Path | None], *, packed: bool = False
         if not answer.is_file():
             return Check("isaac", (Finding("unfinished", f"Isaac Sim's rules {ended}"),))
         result = json.loads(answer.read_text(encoding="utf-8"))
-    findings = [Finding(**finding) for finding in result["findings"]]
-    findings = [replace(finding, advice=finding.advice or ADVICE.get(finding.rule, "")) for finding in findings]
-    findings += [Finding(rule, f"not run: {why}", severity="note") for rule, why in result["skipped"].items()]
+    findings = []
+    for finding in (Finding(**each) for each in result["findings"]):
+        text = as_named(finding.text, home, package or file)
+        findings.append(replace(finding, text=text, advice=finding.advice or ADVICE.get(finding.rule, "")))
     findings.sort(key=lambda finding: (finding.rule, finding.where, finding.text))
+    for why in dict.fromkeys(result["skipped"].values()):
+        names = sorted(rule for rule, reason in result["skipped"].items() if reason == why)
+        findings.append(Finding("not-run", f"{', '.join(names)}: {why}", severity="note"))
     run, whole = result["rules"] - len(result["skipped"]), result["rules"]
     return Check("isaac", tuple(findings), scope=f"{run} of {whole} rules of {_version(files)}")
 
@@ -112,7 +120,7 @@ ADVICE = {
     "CleanFolder": "Isaac Sim's asset structure puts further files below payloads/",
     "RigidBodyHasCollider": "give it a collider, disabled if it shall touch nothing",
     "RobotNaming": "put the robot into a folder of its own, with the name of its file",
-    "ThumbnailExists": "draw it with magtwin robot",
+    "ThumbnailExists": "draw it with magtwin robot --thumbnail",
 }
 """What to do about a rule that does not suggest it."""
 

@@ -1,6 +1,7 @@
 """Stand-ins for the Kit modules that Isaac Sim's rule files import, so that the rules run on usd-core.
 
-A rule that calls anything else of Kit, such as a step of PhysX, raises `NeedsKit` and is listed as not run.
+A rule that calls anything else of Kit, such as a step of PhysX, raises `NeedsKitError` and is listed as not
+run.
 Used only in the process of `isaac_run`, since it replaces methods of `Usd.Prim`.
 """
 
@@ -8,7 +9,6 @@ import importlib.abc
 import importlib.machinery
 import sys
 import types
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from pxr import Usd
 from magtwin.export.validation.findings import Severity
 
 KIT = ("omni", "carb", "usdrt")
-"""Packages of Kit. Any module in them can be imported; a call of what it holds raises `NeedsKit`."""
+"""Packages of Kit. Any module in them can be imported; a call of what it holds raises `NeedsKitError`."""
 
 APPLIED_AS = {"JointStateAPI": "PhysicsJointStateAPI"}
 """Name with which a class of PhysxSchema is applied, where it differs from the name of the class."""
@@ -33,7 +33,7 @@ FALLBACKS: dict[str, tuple[str, float]] = {
 """Attributes of PhysxSchema's classes that rules read: name on the prim, and value if it is not authored."""
 
 
-class NeedsKit(Exception):
+class NeedsKitError(Exception):
     """A rule called a part of Kit that has no stand-in."""
 
 
@@ -113,13 +113,15 @@ class _Absent:
         return ()
 
     def __call__(self, *_: Any, **__: Any) -> Any:
-        raise NeedsKit(self._name)
+        raise NeedsKitError(self._name)
 
 
 class _Module(types.ModuleType):
     """A module whose names are all there: those that it is given, else `_Absent`."""
 
-    __path__: Sequence[str] = ()
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.__path__ = []
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):

@@ -22,6 +22,7 @@ from pxr import Sdf, Tf, Usd
 
 from magtwin.errors import InputError
 from magtwin.export.validation.findings import Finding, Severity
+from magtwin.usd.placement import lab_on, labs_on, take_to_origin
 from magtwin.usd.schema import prims_with
 
 MOST_CHARACTERS = 120
@@ -77,6 +78,22 @@ class Subject:
     def layers(self) -> list[Sdf.Layer]:
         """Every layer that was read from a file."""
         return [layer for layer in self.stage.GetUsedLayers() if layer.realPath]
+
+    @cached_property
+    def labs(self) -> list[Usd.Stage]:
+        """The stage once for each lab, in that lab's axes and without other labs; see `usd.placement`.
+
+        A lab that is tilted or scaled is left out, as the rule `frames` reports it.
+        """
+        stages = []
+        for path in dict.fromkeys(lab.path for lab in labs_on(self.stage)):
+            stage = Usd.Stage.Open(self.stage.GetRootLayer())
+            try:
+                take_to_origin(stage, lab_on(stage, path))
+            except InputError:
+                continue
+            stages.append(stage)
+        return stages
 
     def owns(self, layer: Sdf.Layer) -> bool:
         """Whether a layer is in the stage's folder."""

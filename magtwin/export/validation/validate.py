@@ -76,7 +76,7 @@ def validate(
         for name, look in (
             ("nvidia", lambda: [nvidia(file)]),
             ("simready", lambda: simready(seen.robots, packed=root is not None)),
-            ("isaac", lambda: [isaac(root or file, seen.robots, packed=root is not None), *checks["isaac"]]),
+            ("isaac", lambda: [isaac(root or file, seen.robots, home=home, package=file), *checks["isaac"]]),
             ("newton", lambda: [newton(root or file, seen.bodies)]),
         ):
             if name in wanted:
