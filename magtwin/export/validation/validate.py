@@ -1,8 +1,8 @@
 """Validate a file with every validator.
 
 `core` are OpenUSD's own validators, `nvidia` is usd-validation-nvidia, `simready` are SimReady's profiles,
-`isaac` and `magtwin` are the rules of `isaac_rules` and `rules`, `newton` loads the file in Newton. `rule`
-explains how to add a rule.
+`isaac` and `magtwin` are the rules of `isaac_rules` and `rules`, `newton` loads the file in Newton, and `physx` drives
+its robots in PhysX. `rule` explains how to add a rule.
 """
 
 import os
@@ -15,10 +15,11 @@ from magtwin.errors import InputError, find, hint
 from magtwin.export.usdz import unpack
 from magtwin.export.validation.findings import Findings
 from magtwin.export.validation.inspection import Inspection, inspect
+from magtwin.export.validation.physx_drive import physx
 from magtwin.export.validation.validators import newton, nvidia, simready
 from magtwin.files import existing
 
-AGAINST = ("core", "nvidia", "simready", "isaac", "newton", "magtwin")
+AGAINST = ("core", "nvidia", "simready", "isaac", "newton", "physx", "magtwin")
 """Validators, in the order of the results."""
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
@@ -74,6 +75,7 @@ def validate(
             ("nvidia", lambda: [nvidia(file)]),
             ("simready", lambda: simready(seen.robots, packed=root is not None)),
             ("newton", lambda: [newton(root or file, seen.bodies)]),
+            ("physx", lambda: [physx(root or file, seen.driven)]),
         ):
             if name in wanted:
                 say(name)
