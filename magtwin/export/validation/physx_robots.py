@@ -7,13 +7,17 @@ from typing import Any
 import numpy as np
 from pxr import Usd, UsdGeom, UsdPhysics
 
-from magtwin.author.shape import wheels_of
+from magtwin.author.shape import drive_of, footprint_of, wheels_of
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.usd.attributes import target
 from magtwin.usd.geometry import BASE_LINK
 from magtwin.usd.obstacles import read_obstacles
-from magtwin.usd.schema import attribute_name, prims_with
-from magtwin.usd.sensors import JOINT_FIELDS, read_drive, read_footprint
+from magtwin.usd.schema import NOUNS, attribute_name
+from magtwin.usd.sensors import JOINT_FIELDS, read_drive
+
+ROBOT_API = "IsaacRobotAPI"
+"""Isaac Sim's applied schema of a robot."""
 
 AHEAD_M = 1.0
 """Distance that a robot drives straight [m]."""
@@ -52,19 +56,25 @@ class DrivenRobot:
 
 
 def read_driven(stage: Usd.Stage) -> list[DrivenRobot]:
-    """The robots of a stage that have a drive, in order of their prims.
+    """The robots of a stage with two driven wheels, in order of their prims.
+
+    The wheels of a robot without a drive of magtwin's schema are the only two that mirror each other.
 
     Raises:
         InputError: A drive is incomplete.
     """
     found = []
-    prims = prims_with(stage.GetPseudoRoot(), "drive")
-    obstacles = read_obstacles(stage) if prims else Obstacles()
-    bases = {prim: _base(prim) for prim in prims}
+    drives = {
+        prim: drive
+        for prim in stage.Traverse()
+        if ROBOT_API in prim.GetPrimTypeInfo().GetAppliedAPISchemas() or prim.HasAPI(NOUNS["drive"])
+        if (drive := _drive(prim)) is not None
+    }
+    obstacles = read_obstacles(stage) if drives else Obstacles()
+    bases = {prim: _base(prim) for prim in drives}
     places = {prim: _pose(base) for prim, base in bases.items()}
     for prim, base in bases.items():
-        drive = read_drive(prim)
-        left, right = (str(target(prim, attribute_name("drive", name)).GetPath()) for name in JOINT_FIELDS)
+        drive, joints = drives[prim]
         others = np.array([pose[:2] for other, pose in places.items() if other != prim]).reshape(-1, 2)
         height = _height(base)
         wheels = [wheel.lowest_m for wheel in wheels_of(prim)]
@@ -72,8 +82,8 @@ def read_driven(stage: Usd.Stage) -> list[DrivenRobot]:
             DrivenRobot(
                 prim=str(prim.GetPath()),
                 base=str(base.GetPath()),
-                joints=(left, right),
-                start=find_room(obstacles, places[prim], read_footprint(prim), others),
+                joints=joints,
+                start=find_room(obstacles, places[prim], footprint_of(prim) or 0.0, others),
                 height_m=height,
                 lowest_m=_height(prim) + min(wheels, default=0.0),
                 wheel_radius_m=drive.wheel_radius_m,
@@ -135,6 +145,19 @@ def driven_table(stage: Usd.Stage) -> dict[str, Any]:
         "ground": has_ground(stage),
         "scene": any(prim.IsA(UsdPhysics.Scene) for prim in stage.Traverse()),
     }
+
+
+def _drive(robot: Usd.Prim) -> tuple[DriveSpec, tuple[str, str]] | None:
+    """The drive of a robot and the paths of its wheels' joints; None if it does not have two wheels."""
+    if robot.HasAPI(NOUNS["drive"]):
+        left, right = (str(target(robot, attribute_name("drive", name)).GetPath()) for name in JOINT_FIELDS)
+        return read_drive(robot), (left, right)
+    drive, _ = drive_of(robot, DriveSpec())
+    paths = {p.GetDisplayName() or p.GetName(): str(p.GetPath()) for p in Usd.PrimRange(robot)}
+    names = drive.left_wheel_joint, drive.right_wheel_joint
+    if not set(names) <= {wheel.joint for wheel in wheels_of(robot)}:
+        return None
+    return drive, (paths[names[0]], paths[names[1]])
 
 
 def _base(robot: Usd.Prim) -> Usd.Prim:
