@@ -22,7 +22,7 @@ from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import RobotSpec
 
 STEP_S = 0.001
-"""Approximate length of a physics step [s]; a control step has a whole number of them."""
+"""Default length of a physics step [s]."""
 
 TOUCH_M = 0.003
 """Distance at which the footprint counts as touching an obstacle [m], since shapes are not circles."""
@@ -50,6 +50,9 @@ class Newton:
     progress: Callable[[int, int, str], Any] | None = None
     """Called ten times a simulated second with steps done, steps at most, and the time as text."""
 
+    step_s: float = STEP_S
+    """Approximate length of a physics step [s]; a control step has a whole number of them."""
+
     name = "newton"
 
     def drive(
@@ -66,7 +69,7 @@ class Newton:
         closed_loop.check(obstacles)
         drive, dt = closed_loop.drive, closed_loop.dt
         guide: Controller = replace(closed_loop.guide) if controller is None else controller
-        limit, parts = limiter(drive, dt), max(1, round(dt / STEP_S))
+        limit, parts = limiter(drive, dt), max(1, round(dt / self.step_s))
         step = dt / parts
         left = math.exp(-step / drive.motor_lag_s) if drive.motor_lag_s else 0.0
         in_mean = drive.motor_lag_s / step * (1.0 - left)
