@@ -28,8 +28,8 @@ LAMP_HEIGHT_M = 2.8
 def define_lab(stage: Usd.Stage, spec: LabSpec) -> Usd.Prim:
     """Author the room at /World/Lab and the physics scene at /World/PhysicsScene.
 
-    The top of the floor is at z = 0, its centre at the world's origin. The walls stand outside the floor. What
-    collides is an infinite plane, because PhysX lets wheels sink into a large thin box.
+    The top of the floor is at z = 0, its centre at the world's origin. The walls stand outside the floor.
+    What carries robots is an infinite plane, because PhysX lets wheels sink into a large thin box.
 
     Args:
         stage: Written to in its edit target; metres, Z up.

@@ -1,6 +1,7 @@
 """PhysX: the scenes that ship, every export and a robot of others stand and drive in it (`make physx`)."""
 
 import math
+import subprocess
 import sys
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -254,8 +255,10 @@ def test_a_stage_that_has_no_articulation_is_refused_in_a_line(tmp_path, lab_sce
     UsdGeom.Xform.Define(stage, "/World")
     stage.Save()
     with (
-        pytest.raises(InputError, match="PhysX cannot run it: .*no articulation with /World/base"),
-        open_world(PYTHON, tmp_path / "empty.usda", {"base": "/World/base", "joints": ["/a", "/b"], "start": None}) as world,
+        pytest.raises(InputError, match=r"PhysX cannot run it: .*no articulation with /World/base"),
+        open_world(
+            PYTHON, tmp_path / "empty.usda", {"base": "/World/base", "joints": ["/a", "/b"], "start": None}
+        ) as world,
     ):
         world.seen()
 
@@ -263,16 +266,15 @@ def test_a_stage_that_has_no_articulation_is_refused_in_a_line(tmp_path, lab_sce
 @physx
 def test_every_attribute_of_physx_is_in_its_schemas(exports):
     """Those of `physx-usd-schemas`; PhysxJointAPI was in them until 2025 and Isaac Sim 6 reads it."""
-    import subprocess
-
-    code = "from importlib.metadata import distribution as d; print(d('physx-usd-schemas').locate_file('physx_usd_schemas/PhysxSchema/resources/generatedSchema.usda'))"
+    path = "physx_usd_schemas/PhysxSchema/resources/generatedSchema.usda"
+    code = f"from importlib.metadata import distribution as d; print(d('physx-usd-schemas').locate_file('{path}'))"
     file = subprocess.check_output([PYTHON, "-c", code], text=True).strip()
+    layer = Sdf.Layer.FindOrOpen(file)  # held in a name: a spec does not keep its layer alive
     known = {
         name.replace("__INSTANCE_NAME__:", ""): spec.typeName
-        for schema in (layer := Sdf.Layer.FindOrOpen(file)).rootPrims
+        for schema in layer.rootPrims
         for name, spec in schema.attributes.items()
     }
-    assert layer
     stage = Usd.Stage.Open(str(exports["isaac"]))
     for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
         for attribute in prim.GetAuthoredAttributes():

@@ -97,7 +97,7 @@ def test_a_prismatic_joint_keeps_its_limits_in_metres(tmp_path):
 def test_both_frames_of_a_joint_meet_and_its_axis_is_the_urdfs(tmp_path_factory, axis, xyz, rpy):
     tmp_path = tmp_path_factory.mktemp("joint")
     words = [" ".join(f"{v:.9f}" for v in vector) for vector in (axis, xyz, rpy)]
-    stage, robot = convert(
+    stage, _ = convert(
         arm(tmp_path, f'continuous|<axis xyz="{words[0]}"/><origin xyz="{words[1]}" rpy="{words[2]}"/>')
     )
     links = read_links(stage)

@@ -104,7 +104,9 @@ def test_friction_that_differs_across_is_a_loss(tmp_path):
 def test_one_link_that_collides_with_its_robot_switches_all_on(tmp_path):
     _stage, robot, _ = cart(tmp_path, on("base_link", "<selfCollide>true</selfCollide>"))
     assert robot.GetPrimAtPath("base_link").GetAttribute("newton:selfCollisionEnabled").Get() is True
-    assert robot.GetPrimAtPath("base_link").GetAttribute("physxArticulation:enabledSelfCollisions").Get() is True
+    assert (
+        robot.GetPrimAtPath("base_link").GetAttribute("physxArticulation:enabledSelfCollisions").Get() is True
+    )
 
 
 def test_a_link_without_gravity_floats_in_physx(tmp_path):

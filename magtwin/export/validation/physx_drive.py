@@ -1,7 +1,7 @@
 """Drive the robots of a stage in NVIDIA's PhysX: whether they stand, drive a metre and turn.
 
-PhysX runs in another process, and may be installed for another Python: `make physx` makes an environment for it,
-and `MAGTWIN_PHYSX` is the path of its Python.
+PhysX runs in another process, and may be installed for another Python: `make physx` makes an environment
+for it, and `MAGTWIN_PHYSX` is the path of its Python.
 """
 
 import math
@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,8 @@ PHYSX = "MAGTWIN_PHYSX"
 """Environment variable with the path of a Python that has ovphysx."""
 
 GET_PHYSX = (
-    f"ovphysx is not installed; pip install 'magtwin[physx]', or set {PHYSX} to the path of a Python that has it; "
-    "`make physx` installs one in build/physx"
+    "ovphysx is not installed; pip install 'magtwin[physx]', or set "
+    f"{PHYSX} to the path of a Python that has it; `make physx` installs one in build/physx"
 )
 
 LIMIT_S = 300.0
@@ -95,7 +95,9 @@ def physx(file: Path, driven: Mapping[str, Any]) -> Check:
                 with open_world(python, stage, job) as world:
                     findings += [f(world, robot) for f in (_stands, _drives, _turns)]
             except InputError as error:
-                findings.append(Finding("unfinished", str(error).replace(str(stage), str(file)), robot["prim"]))
+                findings.append(
+                    Finding("unfinished", str(error).replace(str(stage), str(file)), robot["prim"])
+                )
     count = f"{len(robots)} robot{'s' * (len(robots) > 1)}"
     return Check("physx", tuple(findings), scope=f"ovphysx {version}: {count} at {1 / STEP_S:g} steps/s")
 
@@ -145,7 +147,10 @@ def _stands(world: WorldProcess, robot: Mapping[str, Any]) -> Finding:
     moved, sunk = math.dist(before[:2], after[:2]), after[7] - robot["height_m"]
     good = moved < MOST_MOVED_M and abs(sunk) < MOST_SUNK_M and after[8] > LEAST_UPRIGHT
     tilt = math.degrees(math.acos(min(1.0, after[8])))
-    text = f"at rest for {REST_S:g} s it moved {1e3 * moved:.2f} mm and its height changed by {1e3 * sunk:.2f} mm; tilt {tilt:.1f} deg"
+    text = (
+        f"at rest for {REST_S:g} s it moved {1e3 * moved:.2f} mm and its height changed by "
+        f"{1e3 * sunk:.2f} mm; tilt {tilt:.1f} deg"
+    )
     return _finding("stands", text, robot, good)
 
 

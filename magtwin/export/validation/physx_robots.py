@@ -64,17 +64,17 @@ def read_driven(stage: Usd.Stage) -> list[DrivenRobot]:
         InputError: A drive is incomplete.
     """
     found = []
-    drives = {
-        prim: drive
-        for prim in stage.Traverse()
-        if ROBOT_API in prim.GetPrimTypeInfo().GetAppliedAPISchemas() or prim.HasAPI(NOUNS["drive"])
-        if (drive := _drive(prim)) is not None
-    }
+    drives = {}
+    for prim in stage.Traverse():
+        if ROBOT_API in prim.GetPrimTypeInfo().GetAppliedAPISchemas() or prim.HasAPI(NOUNS["drive"]):
+            drive = _drive(prim)
+            if drive is not None:
+                drives[prim] = drive
     obstacles = read_obstacles(stage) if drives else Obstacles()
     bases = {prim: _base(prim) for prim in drives}
     places = {prim: _pose(base) for prim, base in bases.items()}
     for prim, base in bases.items():
-        drive, joints = drives[prim]
+        spec, joints = drives[prim]
         others = np.array([pose[:2] for other, pose in places.items() if other != prim]).reshape(-1, 2)
         height = _height(base)
         wheels = [wheel.lowest_m for wheel in wheels_of(prim)]
@@ -86,10 +86,10 @@ def read_driven(stage: Usd.Stage) -> list[DrivenRobot]:
                 start=find_room(obstacles, places[prim], footprint_of(prim) or 0.0, others),
                 height_m=height,
                 lowest_m=_height(prim) + min(wheels, default=0.0),
-                wheel_radius_m=drive.wheel_radius_m,
-                wheel_separation_m=drive.wheel_separation_m,
-                v_max=drive.v_max,
-                w_max=drive.w_max,
+                wheel_radius_m=spec.wheel_radius_m,
+                wheel_separation_m=spec.wheel_separation_m,
+                v_max=spec.v_max,
+                w_max=spec.w_max,
             )
         )
     return found
@@ -121,9 +121,9 @@ def find_room(
         free = clear > radius_m + MARGIN_M
         for other in others:
             free &= np.hypot(*(points - other).T) > 2 * radius_m + MARGIN_M
-        for yaw, whole in zip(yaws, free.reshape(HEADINGS, -1).all(axis=1), strict=True):
-            if whole:
-                return float(place[0]), float(place[1]), float(yaw)
+        whole = np.flatnonzero(free.reshape(HEADINGS, -1).all(axis=1))
+        if len(whole):
+            return float(place[0]), float(place[1]), float(yaws[whole[0]])
     return at
 
 
@@ -172,6 +172,6 @@ def _height(prim: Usd.Prim) -> float:
 
 
 def _pose(prim: Usd.Prim) -> tuple[float, float, float]:
-    """x [m], y [m] and yaw [rad] of a prim in world."""
+    """Place of a prim in world: x [m], y [m] and yaw [rad]."""
     T = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim))
     return float(T[3, 0]), float(T[3, 1]), math.atan2(T[0, 1], T[0, 0])

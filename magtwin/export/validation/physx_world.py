@@ -2,10 +2,10 @@
 
     python physx_world.py
 
-In: a line of JSON, `{"stage", "base", "joints": [left, right], "start": [x, y, yaw] or null, "step_s"}` with the
-paths of prims; then a line per answer: a list with the rates of both wheels [rad/s], a pair per physics step, or
-`[x, y, yaw]` to place the robot there at rest. Out: a line after the robot has settled and one after each line
-in: x, y, yaw, v, w, both wheels' angles, height of the base [m], and the z component of its up axis.
+In: a line of JSON, `{"stage", "base", "joints": [left, right], "start": [x, y, yaw] or null, "step_s"}` with
+the paths of prims; then a line per answer: a list with the rates of both wheels [rad/s], a pair per physics
+step, or `[x, y, yaw]` to place the robot there at rest. Out: a line after the robot has settled and one after
+each line in: x, y, yaw, v, w, both wheels' angles, height of the base [m], and the z component of its up axis.
 
 PhysX reads attributes only of schemas that are registered first: those of the packages physx-usd-schemas and
 newton-usd-schemas.
@@ -29,7 +29,11 @@ SETTLE_S = 0.5
 SCHEMAS = ("PhysxSchema", "OmniUsdPhysicsDeformableSchema")
 """Folders of physx-usd-schemas; PhysX refuses to start without both."""
 
-LINK, JOINT, ROBOT = SimObjectType.ARTICULATION_LINK, SimObjectType.ARTICULATION_JOINT, SimObjectType.ARTICULATION
+LINK, JOINT, ROBOT = (
+    SimObjectType.ARTICULATION_LINK,
+    SimObjectType.ARTICULATION_JOINT,
+    SimObjectType.ARTICULATION,
+)
 
 BASE = ("position", "orientation", "linearVelocity", "angularVelocity")
 
@@ -66,7 +70,12 @@ class World:
         away = p[0] - at_x, p[1] - at_y  # the root need not be the base
         p = [x + c * away[0] - s * away[1], y + s * away[0] + c * away[1], p[2]]
         half_c, half_s, (i, j, k, w) = math.cos(turn / 2), math.sin(turn / 2), q
-        q = [half_c * i - half_s * j, half_c * j + half_s * i, half_c * k + half_s * w, half_c * w - half_s * k]
+        q = [
+            half_c * i - half_s * j,
+            half_c * j + half_s * i,
+            half_c * k + half_s * w,
+            half_c * w - half_s * k,
+        ]
         self._write(ROBOT, self._base, "rootPosition", p)
         self._write(ROBOT, self._base, "rootOrientation", q)
         for name in ("rootLinearVelocity", "rootAngularVelocity"):

@@ -1,8 +1,8 @@
 """Validate a file with every validator.
 
 `core` are OpenUSD's own validators, `nvidia` is usd-validation-nvidia, `simready` are SimReady's profiles,
-`isaac` and `magtwin` are the rules of `isaac_rules` and `rules`, `newton` loads the file in Newton, and `physx` drives
-its robots in PhysX. `rule` explains how to add a rule.
+`isaac` and `magtwin` are the rules of `isaac_rules` and `rules`, `newton` loads the file in Newton, and
+`physx` drives its robots in PhysX. `rule` explains how to add a rule.
 """
 
 import os

@@ -133,7 +133,6 @@ class Newton:
             duration_s=(len(seen) - 1) * dt,
         )
 
-
     def world(self, closed_loop: ClosedLoop, step_s: float) -> WorldProcess:
         """The process that steps the stage."""
         drive, root = closed_loop.drive, str(FilePath(__file__).resolve().parents[3])

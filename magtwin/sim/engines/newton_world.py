@@ -44,7 +44,9 @@ class World:
         for name in job["joints"]:
             joint = _only(list(model.joint_label), job["robot"], name)
             if not model.joint_armature.numpy()[model.joint_qd_start.numpy()[joint]] > 0:
-                raise ValueError(f"{name} has no newton:armature, so that its drive throws the robot; set it to 0.002")
+                raise ValueError(
+                    f"{name} has no newton:armature, so that its drive throws the robot; set it to 0.002"
+                )
         # Kept, since it owns the model and the data.
         self._solver = newton.solvers.SolverMuJoCo(model, use_mujoco_cpu=True, cone="elliptic")
         self._model, self._data = self._solver.mj_model, self._solver.mj_data

@@ -12,8 +12,11 @@ from magtwin.usd.geometry import read_triangles
 NEWTON_API, PHYSX_API = "NewtonArticulationRootAPI", "PhysxArticulationAPI"
 """Applied schemas of Newton and PhysX; their plugins are not installed here."""
 
-SELF_COLLISION = ((NEWTON_API, "newton:selfCollisionEnabled"), (PHYSX_API, "physxArticulation:enabledSelfCollisions"))
-"""Attributes that enable collisions between links, with their schemas. Without its schema, PhysX ignores one."""
+SELF_COLLISION = (
+    (NEWTON_API, "newton:selfCollisionEnabled"),
+    (PHYSX_API, "physxArticulation:enabledSelfCollisions"),
+)
+"""Attributes that enable collisions between links, with their schemas, without which PhysX ignores them."""
 
 OVERLAP_M = 0.001
 """Colliders whose convex hulls overlap by less can touch, such as the closed fingers of a gripper [m]."""
@@ -73,7 +76,7 @@ def _ends(joint: Usd.Prim) -> list[Sdf.Path]:
 def _hulls(
     bodies: Mapping[str, Usd.Prim], colliders: Mapping[str, Sequence[Usd.Prim]]
 ) -> dict[str, list[NDArray[np.float64]]]:
-    """Corners of the convex hull of each collider of each body, shrunk by half of `OVERLAP_M`, shape (N, 3)."""
+    """Corners of the hull of each collider of each body, shrunk by half of `OVERLAP_M`, shape (N, 3)."""
     hulls: dict[str, list[NDArray[np.float64]]] = {name: [] for name in bodies}
     if not bodies:
         return hulls

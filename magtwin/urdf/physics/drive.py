@@ -24,8 +24,9 @@ RESPONSE = 0.007
 """Response time of a wheel's velocity drive [s]."""
 
 ROTOR_KG_M2 = 0.002
-"""Default inertia of a wheel's motor through its gears; assumed. With less, a wheel answers a stiff drive within
-one step: MuJoCo's implicit integrator then corrects the wheel but not the contact, and throws a robot of 5 kg."""
+"""Default inertia of a wheel's motor through its gears; assumed. With less, a wheel answers a stiff drive
+within one step: MuJoCo's implicit integrator then corrects the wheel but not the contact, and throws a robot
+of 5 kg."""
 
 POSITION_STIFFNESS = 100.0
 """Default gain of a limited joint's position drive [N m/rad, N/m]; the damping is a tenth of it."""
