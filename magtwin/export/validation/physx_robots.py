@@ -123,7 +123,7 @@ def find_room(
             free &= np.hypot(*(points - other).T) > 2 * radius_m + MARGIN_M
         whole = np.flatnonzero(free.reshape(HEADINGS, -1).all(axis=1))
         if len(whole):
-            return float(place[0]), float(place[1]), float(yaws[whole[0]])
+            return float(place[0]), float(place[1]), math.remainder(float(yaws[whole[0]]), math.tau)
     return at
 
 

@@ -5,7 +5,7 @@
 In: a line of JSON, `{"stage", "base", "joints": [left, right], "start": [x, y, yaw] or null, "step_s"}` with
 the paths of prims; then a line per answer: a list with the rates of both wheels [rad/s], a pair per physics
 step, or `[x, y, yaw]` to place the robot there at rest. Out: a line after the robot has settled and one after
-each line in: x, y, yaw, v, w, both wheels' angles, height of the base [m], and the z component of its up axis.
+each line in: x, y, yaw, v, w, both wheels' angles, height of the base [m], and z of its up axis.
 
 PhysX reads attributes only of schemas that are registered first: those of the packages physx-usd-schemas and
 newton-usd-schemas.
