@@ -10,6 +10,7 @@ from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
 
 from magtwin.author.room import check_name
 from magtwin.errors import InputError
+from magtwin.field.maps.made_from import made_from
 from magtwin.field.sources.magnets import body_of
 from magtwin.files import existing, output
 from magtwin.frames import quat_from_yaw
@@ -21,7 +22,7 @@ from magtwin.usd.earth import define_earth
 from magtwin.usd.furniture import FURNITURE, define_furniture
 from magtwin.usd.lab import LAB, PHYSICS_SCENE, define_lab
 from magtwin.usd.layers import WORLD, describe_stage, new_stage, relative_asset
-from magtwin.usd.maps import MAP, load_map
+from magtwin.usd.maps import MAP, load_map, read_made_from, write_made_from
 from magtwin.usd.robot import load_robot, urdf_of
 from magtwin.usd.scene import check_map
 from magtwin.usd.schema import only_prim_with
@@ -90,6 +91,9 @@ def author_scene(
         root.subLayerPaths = [relative_asset(root, layer) for layer in sublayers]
         for robot in placed.robots:
             _define_robot(stage, robot, scene.map_sha256)
+        map_prim = only_prim_with(stage.GetPrimAtPath(WORLD), "anomalyMap")
+        if read_made_from(map_prim) is None:  # from now on, changes of the stage are seen
+            write_made_from(map_prim, made_from(scene))
         del stage  # _settle makes paths right for the final folder
         _settle(root, aside, Path(folder).resolve())
         root.Save()
@@ -149,7 +153,7 @@ def _with_copies(scene: Scene, folder: Path) -> Scene:
         if magnetometer.network is not None:
             weights = once(magnetometer.network, "weights", robot.name, _copied)
             magnetometer = replace(magnetometer, network=weights)
-        asset = once(robot.asset, "robot", robot.name, _copied_asset)
+        asset = once(robot.asset, "robots", robot.name, _copied_robot)
         if isinstance(path, Path):
             path = once(path, "paths", robot.name, _copied)
         robot = replace(robot, asset=asset, magnetometer=magnetometer)
@@ -166,6 +170,11 @@ def _with_copies(scene: Scene, folder: Path) -> Scene:
 def _copied(file: Path, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     return Path(shutil.copyfile(file, folder / file.name))
+
+
+def _copied_robot(asset: Path, folder: Path) -> Path:
+    """A robot's asset copied to a folder with its own name, as Isaac Sim wants it, below `folder`."""
+    return _copied_asset(asset, folder / asset.stem)
 
 
 def _copied_asset(asset: Path, folder: Path) -> Path:

@@ -49,6 +49,7 @@ def drive(
     *,
     commands: str | Path | None = None,
     replay: str | Path | None = None,
+    lab: str = "",
     network: str | Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
     model_error: bool = True,
@@ -69,6 +70,7 @@ def drive(
         path: Path, as for `magtwin.simulate`.
         commands: CSV of commands to drive by, in place of the path.
         replay: Run to drive again, in place of the path.
+        lab: As for `magtwin.open_twin`.
         network: As for `magtwin.open_twin`.
         magnetometer: As for `magtwin.open_twin`.
         model_error: As for `magtwin.open_twin`.
@@ -95,6 +97,7 @@ def drive(
         drive_input(path)  # refuses a wrong name before the scene is opened
     twin = open_twin(
         scene_file,
+        lab=lab,
         network=network,
         magnetometer=magnetometer,
         model_error=model_error,

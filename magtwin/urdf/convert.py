@@ -39,7 +39,7 @@ from magtwin.urdf.physics.merge import WORLD, Place, carried, place_links, rider
 from magtwin.urdf.physics.wheel import find_wheels, fit_wheels, grip, not_on
 from magtwin.urdf.report import ConversionReport, Ledger, make_report
 from magtwin.urdf.sensor import define_sensors
-from magtwin.urdf.shape import COLLISIONS, VISUALS, define_collider, define_visual, pose_of
+from magtwin.urdf.shape import COLLISIONS, VISUALS, define_collider, define_no_contact, define_visual, pose_of
 from magtwin.urdf.simready import check_metadata, metadata
 from magtwin.urdf.source.source import read_source
 from magtwin.usd.layers import describe_stage, open_stage
@@ -249,6 +249,8 @@ class _Author:
                 parts.append(rider)
             define_body(body, parts, description, options.density)
             colliders[name] = [collider for part in parts for collider in part.colliders]
+            if not colliders[name]:
+                define_no_contact(body, surfaces.get(name, Surface()), self.meshes)
         paths = {WORLD: robot.GetPath(), **{name: body.GetPath() for name, body in bodies.items()}}
         for name, (above, pose) in places.items():
             if above != name:
@@ -265,8 +267,10 @@ class _Author:
         define_articulation(robot if held else base, self_collision=self_collides(tags))
         filter_overlaps(bodies, colliders, jointed)
         links = [body.GetPath() for body in bodies.values()]
-        robot.CreateRelationship("isaac:physics:robotLinks", custom=False).SetTargets(links)
-        robot.CreateRelationship("isaac:physics:robotJoints", custom=False).SetTargets(joints)
+        for name, paths_listed in (("robotLinks", links), ("robotJoints", joints)):
+            relationship = robot.CreateRelationship(f"isaac:physics:{name}", custom=False)
+            for path in paths_listed:  # each is prepended, so that a stronger layer can add to the list
+                relationship.AddTarget(path)
         self._equip(robot, tags, options, drive)
         return robot
 

@@ -310,7 +310,7 @@ class _Writer:
             if not prim.IsA(UsdGeom.Gprim) or not parts:
                 continue
             shown = UsdGeom.Imageable(prim).ComputePurpose() in SHOWN
-            roles = {"visual": shown, "collision": prim.HasAPI(UsdPhysics.CollisionAPI)}
+            roles = {"visual": shown, "collision": _collides(prim)}
             primitive = self._primitive(prim, link)
             parent = prim.GetParent()  # has the name of the shape if it refers to a mesh
             named = parent if prim.IsInstanceProxy() and parent.IsInstance() else prim
@@ -364,6 +364,13 @@ class _Writer:
     def _note(self, text: str) -> None:
         if text not in self.notes:
             self.notes.append(text)
+
+
+def _collides(prim: Usd.Prim) -> bool:
+    """Whether a prim is an enabled collider."""
+    return prim.HasAPI(UsdPhysics.CollisionAPI) and bool(
+        UsdPhysics.CollisionAPI(prim).GetCollisionEnabledAttr().Get()
+    )
 
 
 def _name(prim: Usd.Prim) -> str:
