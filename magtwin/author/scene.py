@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +14,8 @@ from magtwin.field.maps.made_from import made_from
 from magtwin.field.sources.magnets import body_of
 from magtwin.files import existing, output
 from magtwin.frames import quat_from_yaw
+from magtwin.spec.furniture import FurnitureSpec
+from magtwin.spec.magnetics import SourceSpec
 from magtwin.spec.robot import PlacedRobot
 from magtwin.spec.scene import Scene
 from magtwin.urdf.convert import THUMBNAILS
@@ -123,15 +125,24 @@ def check_things(scene: Scene) -> None:
     Raises:
         InputError: Two have the same name, or a susceptibility needs the Earth's field.
     """
-    for what, things in (("sources", scene.sources), ("pieces of furniture", scene.furniture)):
-        names = [thing.name for thing in things]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise InputError(f"two {what} are called {twice[0]!r}; give each its own name")
+    check_names(scene.sources, scene.furniture)
     if any(source.name == LOOKS for source in scene.sources):
         raise InputError(f"source {LOOKS!r} has the name of the scope of materials; rename it")
     for source in scene.magnets:
         if source.susceptibility and scene.earth is None:
             body_of(source)  # raises
+
+
+def check_names(sources: Sequence[SourceSpec], furniture: Sequence[FurnitureSpec]) -> None:
+    """Refuse sources and furniture with equal names.
+
+    Raises:
+        InputError: Two have the same name.
+    """
+    for what, things in (("sources", sources), ("pieces of furniture", furniture)):
+        names = [thing.name for thing in things]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise InputError(f"two {what} are called {twice[0]!r}; give each its own name")
 
 
 def _with_copies(scene: Scene, folder: Path) -> Scene:

@@ -241,8 +241,9 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
         )
     grid = _covered_grid(prim)
     if checksum != _checksum(values, valid, variance, harmonic, grid):
-        what = "values" if grid is None else "values and grid"
-        raise InputError(f"{place(prim)}: the map's {what} do not match its checksum; make the map anew")
+        also = "" if grid is None else ", which covers its grid too"
+        text = f"the map's values do not match its checksum{also}; make the map anew"
+        raise InputError(f"{place(prim)}: {text}")
     spreads = variance.reshape(-1, *shape).astype(float)  # of the nodes, and between them
     recorded = _read_recorded(prim, RECORDED[0], sample, shape)
     if recorded is not None and not np.array_equal(recorded.ravel().astype("f4"), values, equal_nan=True):

@@ -551,7 +551,7 @@ def test_the_checksum_covers_the_grid(tmp_path, attribute, value):
     prim = layer.GetPrimAtPath(MAP)
     prim.attributes[f"magtwin:anomalyMap:{attribute}"].default = value
     layer.Save()
-    with pytest.raises(InputError, match="values and grid do not match its checksum"):
+    with pytest.raises(InputError, match="do not match its checksum, which covers its grid too"):
         load_map(tmp_path / "m.usdc")
     with_old_checksum(prim)  # which does not see it
     layer.Save()

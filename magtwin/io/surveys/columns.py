@@ -43,7 +43,8 @@ class Columns:
     """Column of world y [m]."""
 
     heading: str = ""
-    """Column of the robot's heading, or "none" for a sensor carried by hand. Default: heading, yaw or theta."""
+    """Column of the robot's heading, or "none" for a sensor carried by hand. Default: heading, yaw or
+    theta."""
 
     quaternion: str = ""
     """Columns of the robot's orientation in world, qx,qy,qz,qw, instead of a heading."""

@@ -328,8 +328,8 @@ def _doubts(readings: Readings, source: Source) -> list[str]:
     if np.abs(mean) >= ONE_HEADING:
         doubts.append(
             f"one heading only, {np.degrees(np.angle(mean)):.0f} deg: the robot's own field cannot be "
-            "separated from the room's, and a simulated robot adds its own again; survey in several headings, "
-            "or carry the sensor by hand"
+            "separated from the room's, and a simulated robot adds its own again; survey in several "
+            "headings, or carry the sensor by hand"
         )
     return doubts
 
