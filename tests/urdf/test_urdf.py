@@ -13,7 +13,6 @@ from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.urdf import convert_urdf, read_notes
 from magtwin.urdf.description.description import read_description
-from magtwin.urdf.meshes.mesh import corner_normals
 from magtwin.urdf.physics.inertia import principal_axes, quaternion
 from magtwin.usd.geometry import read_links, read_shapes
 
