@@ -61,8 +61,8 @@ def author_scene(
     """Write a scene as a folder of layers.
 
     `<name>.usda` places each robot, with what differs from its asset. Its sublayers are `room.usda`,
-    `furniture.usda`, `magnetics.usda` (the Earth's field and sources) and the map. Their shown meshes reference
-    the unit shapes of `shapes.usdc`.
+    `furniture.usda`, `magnetics.usda` (the Earth's field and sources) and the map. Meshes that are
+    shown reference the unit shapes of `shapes.usdc`.
 
     Args:
         scene: What to author.

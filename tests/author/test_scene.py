@@ -371,7 +371,12 @@ def test_the_lab_has_gravity_and_light():
 def test_a_lab_without_walls_and_posts_has_none():
     spec = LabSpec(wall_height_m=0.0, post_height_m=0.0)
     stage = lab_stage(spec)
-    assert {p.GetName() for p in stage.GetPrimAtPath(LAB).GetChildren()} == {"Looks", "Floor", "Lights"}
+    assert {p.GetName() for p in stage.GetPrimAtPath(LAB).GetChildren()} == {
+        "Looks",
+        "Floor",
+        "Visuals",
+        "Lights",
+    }
     assert read_lab(stage.GetPrimAtPath(LAB)) == spec
 
 

@@ -15,6 +15,7 @@ from magtwin.urdf import convert_urdf, read_notes
 from magtwin.urdf.description.description import read_description
 from magtwin.urdf.physics.inertia import principal_axes, quaternion
 from magtwin.usd.geometry import read_links, read_shapes
+from magtwin.usd.solids import corner_normals
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
 BALL = '<geometry><sphere radius="0.1"/></geometry>'
