@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from looking import assert_looks_alike
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics
 from validators import assert_valid
@@ -385,6 +386,10 @@ def primitive_box(geometry):
     else:
         half = np.full(3, geometry.radius)
     return np.stack([-half, half])
+
+
+def test_the_real_robot_shows_meshes_with_materials_and_hides_its_colliders(real_robot):
+    assert_looks_alike(real_robot[1])
 
 
 def test_the_mass_of_the_real_robot_is_its_urdfs_and_nothing_is_silent(real_robot):
