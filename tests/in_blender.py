@@ -13,7 +13,7 @@ import sys
 import bpy
 from mathutils import Vector
 
-SIZE = (720, 450)
+SIZE = (640, 400)
 SAMPLES = 32
 
 
@@ -60,11 +60,12 @@ def render(out, engine, eye, target, angle_deg):
     camera.data.sensor_fit, camera.data.angle = "VERTICAL", math.radians(float(angle_deg))
     if engine == "HYDRA_STORM":
         bpy.ops.preferences.addon_enable(module="hydra_storm")
+        scene.render.film_transparent = True
     scene.render.engine = engine
     scene.render.resolution_x, scene.render.resolution_y = SIZE
     scene.view_settings.view_transform = "Standard"
     scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.seed = SAMPLES, True, 0
-    scene.render.image_settings.color_mode = "RGB"
+    scene.render.image_settings.color_mode = "RGBA"
     scene.render.filepath = out
     bpy.ops.render.render(write_still=True)
 

@@ -41,7 +41,8 @@ def in_blender(stage: Path) -> dict:
 
 def assert_arrives(root: Path) -> dict:
     """Blender has as many meshes as are shown, each with its material, within the same box."""
-    seen, shown = in_blender(root), shown_gprims(Usd.Stage.Open(str(root)))
+    seen, stage = in_blender(root), Usd.Stage.Open(str(root))
+    shown = shown_gprims(stage)
     assert seen["without_material"] == []
     assert seen["meshes"] == len(shown)
     low, high = bounds(shown)
