@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/export.md: one export of the lab in Blender, in Hydra Storm, on the web, by magtwin.
+"""Draw the pictures of docs/export.md: one export in Blender, in Hydra Storm, on the web, and by magtwin.
 
     python docs/looks.py
 
