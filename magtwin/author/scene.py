@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +10,12 @@ from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
 
 from magtwin.author.room import check_name
 from magtwin.errors import InputError
+from magtwin.field.maps.made_from import made_from
 from magtwin.field.sources.magnets import body_of
 from magtwin.files import existing, output
 from magtwin.frames import quat_from_yaw
+from magtwin.spec.furniture import FurnitureSpec
+from magtwin.spec.magnetics import SourceSpec
 from magtwin.spec.robot import PlacedRobot
 from magtwin.spec.scene import Scene
 from magtwin.urdf.convert import THUMBNAILS
@@ -22,7 +25,7 @@ from magtwin.usd.furniture import FURNITURE, define_furniture
 from magtwin.usd.lab import LAB, PHYSICS_SCENE, define_lab, expose_for_kit
 from magtwin.usd.layers import WORLD, describe_stage, new_stage, relative_asset
 from magtwin.usd.looks import SHAPES, SHAPES_FILE, VISUALS, define_shapes
-from magtwin.usd.maps import MAP, load_map
+from magtwin.usd.maps import MAP, load_map, read_made_from, write_made_from
 from magtwin.usd.robot import load_robot, urdf_of
 from magtwin.usd.scene import check_map
 from magtwin.usd.schema import only_prim_with
@@ -93,6 +96,9 @@ def author_scene(
         root.subLayerPaths = [relative_asset(root, layer) for layer in sublayers]
         for robot in placed.robots:
             _define_robot(stage, robot, scene.map_sha256)
+        map_prim = only_prim_with(stage.GetPrimAtPath(WORLD), "anomalyMap")
+        if read_made_from(map_prim) is None:  # from now on, changes of the stage are seen
+            write_made_from(map_prim, made_from(scene))
         del stage  # _settle makes paths right for the final folder
         _settle(root, aside, Path(folder).resolve())
         root.Save()
@@ -122,16 +128,25 @@ def check_things(scene: Scene) -> None:
     Raises:
         InputError: Two have the same name, or a susceptibility needs the Earth's field.
     """
-    for what, things in (("sources", scene.sources), ("pieces of furniture", scene.furniture)):
-        names = [thing.name for thing in things]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise InputError(f"two {what} are called {twice[0]!r}; give each its own name")
+    check_names(scene.sources, scene.furniture)
     for name, what in ((LOOKS, "materials"), (VISUALS, "shown meshes")):
         if any(source.name == name for source in scene.sources):
             raise InputError(f"source {name!r} has the name of the scope of {what}; rename it")
     for source in scene.magnets:
         if source.susceptibility and scene.earth is None:
             body_of(source)  # raises
+
+
+def check_names(sources: Sequence[SourceSpec], furniture: Sequence[FurnitureSpec]) -> None:
+    """Refuse sources and furniture with equal names.
+
+    Raises:
+        InputError: Two have the same name.
+    """
+    for what, things in (("sources", sources), ("pieces of furniture", furniture)):
+        names = [thing.name for thing in things]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise InputError(f"two {what} are called {twice[0]!r}; give each its own name")
 
 
 def _with_copies(scene: Scene, folder: Path) -> Scene:
@@ -153,7 +168,7 @@ def _with_copies(scene: Scene, folder: Path) -> Scene:
         if magnetometer.network is not None:
             weights = once(magnetometer.network, "weights", robot.name, _copied)
             magnetometer = replace(magnetometer, network=weights)
-        asset = once(robot.asset, "robot", robot.name, _copied_asset)
+        asset = once(robot.asset, "robots", robot.name, _copied_robot)
         if isinstance(path, Path):
             path = once(path, "paths", robot.name, _copied)
         robot = replace(robot, asset=asset, magnetometer=magnetometer)
@@ -170,6 +185,11 @@ def _with_copies(scene: Scene, folder: Path) -> Scene:
 def _copied(file: Path, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     return Path(shutil.copyfile(file, folder / file.name))
+
+
+def _copied_robot(asset: Path, folder: Path) -> Path:
+    """A robot's asset copied to a folder with its own name, as Isaac Sim wants it, below `folder`."""
+    return _copied_asset(asset, folder / asset.stem)
 
 
 def _copied_asset(asset: Path, folder: Path) -> Path:

@@ -5,6 +5,7 @@ import signal
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +104,7 @@ def make_case(suite: Suite, scenario: Scenario, run: int, fields: Path | None = 
 
         own = fields / scenario.data if scenario.data and fields is not None else None
         session = suite.first_seed + run % scenario.sessions
+        scenario = replace(scenario, paths=tuple(map(suite.path, scenario.paths)))
         return twin_case(scenario, str(suite.scene(scenario)), seed, session, own)
     folder = suite.folder(scenario)
     if scenario.source == "magnetic-data":
@@ -117,9 +119,15 @@ def make_case(suite: Suite, scenario: Scenario, run: int, fields: Path | None = 
             odometry_factor=scenario.odometry_factor,
             rate_hz=scenario.rate_hz,
         )
-    from magtwin.bench.magslam import ship_case
+    from magtwin.bench.magslam import HAND_LOOPS, hand_case, ship_case
 
-    loop = ship_case(folder, scenario.number, seed)
+    if scenario.source == "ship":
+        loop = ship_case(folder, scenario.number, seed)
+    elif 1 <= scenario.number <= len(HAND_LOOPS):
+        loop = hand_case(folder, HAND_LOOPS[scenario.number - 1])
+    else:
+        known = ", ".join(f"{k} ({name})" for k, name in enumerate(HAND_LOOPS, 1))
+        raise InputError(f"scenario {scenario.name!r}: number must be one of {known}, got {scenario.number}")
     pose = np.column_stack(
         [loop.truth["p_world_base"][:, :2], np.unwrap(yaw_from_quat(loop.truth["q_world_base_xyzw"]))]
     )

@@ -156,7 +156,7 @@ class RaoBlackwell:
         states = [(sensor.offset_nt**2, math.inf, math.inf, k.CONSTANT)]
         drift = sensor.drift_nt**2 + (0.0 if self.iron else iron)
         if drift > 0:
-            states.append((drift, sensor.drift_s, math.inf, k.CONSTANT))
+            states.append((drift, sensor.drift_s, math.inf, k.DRIFT))
         if self.iron and iron > 0:
             states += [(iron, math.inf, math.inf, k.COSINE), (iron, math.inf, math.inf, k.SINE)]
         correlated = self.map_correlated if has_variance and problem.map_length_m > 0 else 0.0
@@ -195,8 +195,10 @@ class RaoBlackwell:
         k = self._loops
         old = 0 if kept is None else kept.shape[1]
         self._count = old + count
-        self._state = np.empty((k.LINEAR + size + size * (size + 1) // 2, _padded(self._count)))
-        self._spare = np.empty_like(self._state)
+        rows = k.LINEAR + size + size * (size + 1) // 2
+        self._memory = np.empty((2, rows * _padded(self._count)))
+        self._resampled = np.empty(0, np.int64)
+        self._state = self._next_state(rows)
         if kept is not None:
             self._state[:, :old] = kept
         state = self._state[:, old : self._count]
@@ -314,13 +316,18 @@ class RaoBlackwell:
         blocks = self._blocks(count)
         sums = self._sums = np.empty((blocks, k.PLAIN_SUM + 1))
 
+        before = self._state
+        if len(self._resampled):
+            self._state = self._next_state(len(before))
+
         def work(part: slice) -> None:
             k.step(
-                part.start, part.stop, count, self._state, sums, self._table, self._variance, self._numbers,
-                decay, noise, self._kinds, key, self.sampled,
+                part.start, part.stop, count, before, self._resampled, self._state, sums, self._table,
+                self._variance, self._numbers, decay, noise, self._kinds, key, self.sampled,
             )  # fmt: skip
 
         in_threads(work, blocks, SHARE)
+        self._resampled = self._resampled[:0]
 
     def _estimate(self, t: float, used: bool) -> Estimate:
         """Weighted mean and covariance; the sum of surprise."""
@@ -397,6 +404,11 @@ class RaoBlackwell:
         if wanted < self._count or self._effective < self._count / 2:
             self._resample(wanted)
 
+    def _next_state(self, rows: int) -> Array:
+        """Memory of a state, beside that of the present one."""
+        self._memory, columns = self._memory[::-1], _padded(self._count)
+        return self._memory[0, : rows * columns].reshape(rows, columns)
+
     def _enough(self, spread: float) -> int:
         """Least number of particles for a spread [m]."""
         return min(self.most, int(self.least * min(max(spread / NARROW_M, 1.0), MOST_TIMES)))
@@ -406,26 +418,27 @@ class RaoBlackwell:
 
     def _chosen(self, count: int) -> NDArray[np.int64]:
         """Particles drawn by their weights, systematically."""
-        chosen = np.empty(count, np.int64)
-        self._loops.choose(self._count, self._state, self._scales, float(self._rng.random()), chosen)
+        k = self._loops
+        below = np.concatenate([[0.0], np.cumsum(self._scales * self._sums[:, k.SUM])])
+        chosen, start = np.empty(count, np.int64), float(self._rng.random())
+
+        def work(part: slice) -> None:
+            k.choose(part.start, part.stop, self._count, self._state, self._scales, below, start, chosen)
+
+        in_threads(work, len(below) - 1, SHARE)
         return chosen
 
     def _resample(self, count: int) -> None:
-        k, chosen = self._loops, self._chosen(count)
-        if self._spare.shape[1] != _padded(count):
-            self._spare = np.empty((len(self._state), _padded(count)))
-        state, out = self._state, self._spare
-
-        def work(part: slice) -> None:
-            k.gather(part.start, part.stop, state, chosen, out)
-
-        in_threads(work, count, SHARE * k.BLOCK)
-        self._state, self._spare, self._count, self._shift = out, state, count, 0.0
+        """Choose the particles that the next step starts from, which copies them."""
+        self._resampled = self._chosen(count)
+        self._count, self._shift = count, 0.0
         self._scales = np.full(self._blocks(count), 1.0 / count)
 
     def particles(self) -> Array:
         """x, y, yaw and weight of the particles, shape (P, 4)."""
         k, count = self._loops, self._count
+        if len(self._resampled):
+            return np.column_stack([*self._state[:3, self._resampled], np.full(count, 1 / count)])
         weight = self._state[k.WEIGHT, :count] * np.repeat(self._scales, k.BLOCK)[:count]
         return np.column_stack([*self._state[:3, :count], weight / weight.sum()])
 

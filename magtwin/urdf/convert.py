@@ -38,7 +38,7 @@ from magtwin.urdf.physics.merge import WORLD, Place, carried, place_links, rider
 from magtwin.urdf.physics.wheel import find_wheels, fit_wheels, grip, not_on
 from magtwin.urdf.report import ConversionReport, Ledger, make_report
 from magtwin.urdf.sensor import define_sensors
-from magtwin.urdf.shape import COLLISIONS, VISUALS, define_collider, define_visual, pose_of
+from magtwin.urdf.shape import COLLISIONS, VISUALS, define_collider, define_no_contact, define_visual, pose_of
 from magtwin.urdf.simready import check_metadata, metadata
 from magtwin.urdf.source.source import read_source
 from magtwin.usd.layers import describe_stage, open_stage
@@ -247,6 +247,8 @@ class _Author:
                     rider.colliders.extend(made)
                 parts.append(rider)
             define_body(body, parts, description, options.density)
+            if not any(part.colliders for part in parts):
+                define_no_contact(body, surfaces.get(name, Surface()), self.meshes)
         paths = {WORLD: robot.GetPath(), **{name: body.GetPath() for name, body in bodies.items()}}
         for name, (above, pose) in places.items():
             if above != name:
@@ -263,8 +265,10 @@ class _Author:
         for name in ("newton:selfCollisionEnabled", "physxArticulation:enabledSelfCollisions"):
             robot.CreateAttribute(name, Sdf.ValueTypeNames.Bool, custom=False).Set(collides)
         links = [body.GetPath() for body in bodies.values()]
-        robot.CreateRelationship("isaac:physics:robotLinks", custom=False).SetTargets(links)
-        robot.CreateRelationship("isaac:physics:robotJoints", custom=False).SetTargets(joints)
+        for name, paths_listed in (("robotLinks", links), ("robotJoints", joints)):
+            relationship = robot.CreateRelationship(f"isaac:physics:{name}", custom=False)
+            for path in paths_listed:  # each is prepended, so that a stronger layer can add to the list
+                relationship.AddTarget(path)
         self._equip(robot, tags, options, drive)
         return robot
 

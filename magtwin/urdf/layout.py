@@ -71,6 +71,7 @@ NAMESPACES = (
     ("physics:", "physics"),
     ("drive:", "physics"),
     ("limit:", "physics"),
+    ("state:", "physics"),
     ("newton:", "physics"),
     ("material:binding:physics", "physics"),
     ("isaac:", "robot"),

@@ -26,6 +26,9 @@ VISUALS, COLLISIONS = "visuals", "collisions"
 APPROXIMATIONS = {"hull": "convexHull", "decomposition": "convexHull", "mesh": "none"}
 """Approximation of a mesh collider by `Options.collision`."""
 
+NO_CONTACT, NO_CONTACT_RADIUS_M = "no_contact", 0.005
+"""Name and radius of the disabled collider of a body that touches nothing."""
+
 NEWTON_MESH_API = "NewtonMeshCollisionAPI"
 """Newton's applied schema; its plugin is not installed here."""
 
@@ -88,6 +91,24 @@ def define_collider(
             prim.AddAppliedSchema(NEWTON_MESH_API)
         wear(prim, robot, None, meshes, define_grip(robot, surface))
     return made
+
+
+def define_no_contact(body: Usd.Prim, surface: Surface, meshes: MeshLayer) -> Usd.Prim:
+    """Author a disabled collider on a body without colliders: a small sphere at its centre of mass.
+
+    Isaac Sim's rules require a collider on every rigid body. A URDF link without `<collision>` touches
+    nothing, so this one is disabled. Arguments as for `define_collider`.
+    """
+    sphere = UsdGeom.Sphere.Define(body.GetStage(), _path(body, COLLISIONS, NO_CONTACT))
+    sphere.CreateRadiusAttr(NO_CONTACT_RADIUS_M)
+    sphere.CreateExtentAttr([Gf.Vec3f(-NO_CONTACT_RADIUS_M), Gf.Vec3f(NO_CONTACT_RADIUS_M)])
+    sphere.CreatePurposeAttr(UsdGeom.Tokens.guide)
+    prim = sphere.GetPrim()
+    x, y, z = UsdPhysics.MassAPI(body).GetCenterOfMassAttr().Get() or (0.0, 0.0, 0.0)
+    write_pose(prim, (x, y, z))
+    UsdPhysics.CollisionAPI.Apply(prim).CreateCollisionEnabledAttr(False)
+    wear(prim, body.GetParent(), None, meshes, define_grip(body.GetParent(), surface))
+    return prim
 
 
 def _define_mesh(

@@ -27,7 +27,6 @@ from magtwin.urdf.meshes.mesh_layer import MESH, free_name, primitive_of
 from magtwin.urdf.physics.joint import AXIS
 from magtwin.urdf.physics.link import SITE_API
 from magtwin.urdf.physics.mechanism import displacement
-from magtwin.urdf.shape import VISUALS
 from magtwin.usd.geometry import SHOWN, Shape, read_shapes, srgb_from_linear
 from magtwin.usd.layers import open_stage
 from magtwin.usd.schema import place
@@ -311,10 +310,10 @@ class _Writer:
             if not prim.IsA(UsdGeom.Gprim) or not parts:
                 continue
             shown = UsdGeom.Imageable(prim).ComputePurpose() in SHOWN
-            roles = {"visual": shown, "collision": prim.HasAPI(UsdPhysics.CollisionAPI)}
+            roles = {"visual": shown, "collision": _collides(prim)}
             primitive = self._primitive(prim, link)
             parent = prim.GetParent()  # has the name of the shape if it refers to a mesh
-            named = parent if prim.GetName() == MESH and parent.GetParent().GetName() == VISUALS else prim
+            named = parent if prim.GetName() == MESH and parent != link.prim else prim
             for role in (role for role, wanted in roles.items() if wanted):
                 for shape in parts[:1] if primitive is not None else parts:
                     own = Sub(element, role, name=named.GetName())
@@ -369,6 +368,13 @@ class _Writer:
     def _note(self, text: str) -> None:
         if text not in self.notes:
             self.notes.append(text)
+
+
+def _collides(prim: Usd.Prim) -> bool:
+    """Whether a prim is an enabled collider."""
+    return prim.HasAPI(UsdPhysics.CollisionAPI) and bool(
+        UsdPhysics.CollisionAPI(prim).GetCollisionEnabledAttr().Get()
+    )
 
 
 def _name(prim: Usd.Prim) -> str:

@@ -13,6 +13,7 @@ from magtwin.spec.magnetics import SourceSpec
 from magtwin.usd.attributes import check_prim_name, plain_value, write_pose
 from magtwin.usd.layers import WORLD
 from magtwin.usd.looks import define_box, define_looks, define_visual, hide, visual_path, wear
+from magtwin.usd.placement import labs_on
 from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, prims_with
 from magtwin.usd.solids import define_triangles
 from magtwin.usd.sources import (
@@ -102,6 +103,8 @@ def read_magnets(stage: Usd.Stage) -> tuple[tuple[SourceSpec, ...], tuple[Furnit
             taken |= {prim.GetPath() for prim in prims if prim.GetPath().HasPrefix(root.GetPath())}
     sources: list[SourceSpec] = []
     names: set[str] = set()
+    labs = {lab.root.GetPath() for lab in labs_on(stage)} - {Sdf.Path.absoluteRootPath}
+    root_path = labs.pop() if len(labs) == 1 else WORLD
     for prim in prims:
         if robot := next((r for r in robots if prim.GetPath().HasPrefix(r)), None):
             raise InputError(
@@ -109,7 +112,7 @@ def read_magnets(stage: Usd.Stage) -> tuple[tuple[SourceSpec, ...], tuple[Furnit
                 "robot's platform field"
             )
         if prim.GetPath() not in taken:
-            sources.append(read_source(prim, name=_name(prim, names)))
+            sources.append(read_source(prim, name=_name(prim, root_path, names)))
             names.add(sources[-1].name)
     return tuple(sources), tuple(pieces)
 
@@ -167,10 +170,10 @@ def _named(source: SourceSpec, name: str) -> SourceSpec:
     return SourceSpec(**{**vars(source), "name": name})
 
 
-def _name(prim: Usd.Prim, taken: set[str]) -> str:
-    """Unique name of a source: its prim's below /World/Sources, else the path of prims down to it."""
-    path = prim.GetPath()
-    anchor = SOURCES if path.GetParentPath() == SOURCES else WORLD if path.HasPrefix(WORLD) else Sdf.Path("/")
+def _name(prim: Usd.Prim, root: Sdf.Path, taken: set[str]) -> str:
+    """Unique name of a source: its prim's below the lab's Sources, else the path of prims down to it."""
+    path, sources = prim.GetPath(), root.AppendChild(SOURCES.name)
+    anchor = sources if path.GetParentPath() == sources else root if path.HasPrefix(root) else Sdf.Path("/")
     name = path.MakeRelativePath(anchor).pathString.replace("/", "_")
     number, free = 2, name
     while free in taken:

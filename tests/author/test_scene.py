@@ -230,7 +230,7 @@ def test_a_scenes_folder_can_be_moved_and_needs_nothing_outside_of_it(own_parts,
         map_layer=tmp_path / "moved" / "map" / "map.usdc",
         robot=replace(
             scene.robot,
-            asset=tmp_path / "moved" / "robot" / "bot.usda",
+            asset=tmp_path / "moved" / "robots" / "bot" / "bot.usda",
             magnetometer=replace(
                 scene.robot.magnetometer, network=tmp_path / "moved" / "weights" / "net.pth"
             ),
@@ -251,8 +251,8 @@ def test_a_robot_of_several_files_is_copied_whole(own_parts, tmp_path):
         root.GetPayloads().AddPayload("./base/body.usda")
     scene = scene_from_toml(own_parts / "scene.toml")
     read = read_scene(author_scene(scene, tmp_path / "s"))
-    assert (tmp_path / "s" / "robot" / "base" / "body.usda").exists()
-    assert read.robot.asset == tmp_path / "s" / "robot" / "bot.usda"
+    assert (tmp_path / "s" / "robots" / "bot" / "base" / "body.usda").exists()
+    assert read.robot.asset == tmp_path / "s" / "robots" / "bot" / "bot.usda"
 
 
 def test_one_scene_gives_the_same_bytes_every_time(parts, tmp_path):
@@ -274,7 +274,7 @@ def test_the_root_layer_is_short_text_with_units_axes_and_relative_paths(parts, 
     assert UsdGeom.GetStageUpAxis(stage) == "Z"
     assert stage.GetDefaultPrim().GetPath() == "/World"
     assert list(stage.GetRootLayer().subLayerPaths) == ["./room.usda", "./magnetics.usda", "./map/map.usdc"]
-    assert "@./robot/bot.usda@" in text
+    assert "@./robots/bot/bot.usda@" in text
     assert "@./weights/net.pth@" in text
     assert stage.GetRootLayer().documentation
     assert stage.GetRootLayer().customLayerData["creator"] == "magtwin"
@@ -560,7 +560,7 @@ def test_several_robots_survive_their_layers_each_a_prim_of_its_own(own_parts, t
         shutil.rmtree(own_parts)
         read = read_scene(tmp_path / "moved" / "two.usda")
         files = [p.robot.asset.relative_to(tmp_path / "moved") for p in read.robots]
-        assert list(map(str, files)) == ["robot/bot.usda", "robot/bot.usda", "robot/cleo/bot.usda"]
+        assert list(map(str, files)) == [*["robots/bot/bot.usda"] * 2, "robots/cleo/bot/bot.usda"]
         assert read.robots[1].path == tmp_path / "moved" / "paths" / "there.csv"
         for copy, original in ((read.robots[i], scene.robots[i]) for i in (0, 2)):
             assert replace(copy.robot, asset=original.robot.asset) == original.robot
@@ -706,7 +706,7 @@ def broken(parts: Path, folder: Path, edit) -> Path:
     ("edit", "said"),
     [
         (
-            lambda t: t.replace("./robot/bot.usda", "./robot/gone.usda"),
+            lambda t: t.replace("./robots/bot/bot.usda", "./robots/bot/gone.usda"),
             r"gone\.usda@ for reference.*</World/bot>",
         ),
         (lambda t: t.replace("./map/map.usdc", "./map/gone.usdc"), r"Could not load sublayer.*gone\.usdc"),

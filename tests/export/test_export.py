@@ -26,6 +26,7 @@ from magtwin.export.attached import BYTES, SCOPE
 from magtwin.export.glb import corner_normals
 from magtwin.export.package import PLUGIN, README, export_scene, licence_of
 from magtwin.export.usdz import ALIGNMENT, ALLOWED
+from magtwin.export.validation.validate import validate
 from magtwin.field.survey.folder import read_survey
 from magtwin.files import sha256, shipped
 from magtwin.run.run import Run
@@ -256,6 +257,16 @@ def test_an_export_shows_meshes_with_materials_lit_within_the_room(what, request
     assert_lit(stage)
     if what != "package":  # its run has other times than the default one, at which boxes are taken
         assert_within_room(stage, read_lab(stage.GetPrimAtPath(LAB_PRIM)), top_m=3.0)
+
+
+@pytest.mark.parametrize("what", ["folder", "package", "isaac"])
+def test_exports_break_no_rule_of_isaac_sim(what, request, isaac_rules):
+    out = request.getfixturevalue(what)
+    check, extra = validate(out if out.is_file() else out / "lab.usda", ["isaac"]).checks
+    assert (check.validator, extra.validator) == ("isaac", "isaac extra")
+    assert [f for f in (*check.findings, *extra.findings) if f.severity == "error"] == []
+    run = {"folder": 20, "package": 17, "isaac": 23}  # see the rules that are not run
+    assert check.scope.startswith(f"{run[what]} of 24 rules of isaacsim.asset.validation 1.3.6")
 
 
 @pytest.mark.slow

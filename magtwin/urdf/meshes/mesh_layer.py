@@ -267,9 +267,8 @@ def primitive_of(prim: Usd.Prim) -> Geometry | None:
     values = prim.GetCustomDataByKey(PRIMITIVE)
     if not values:
         return None
-    measures = {name: float(values[name]) for name in ("radius", "length") if name in values}
-    size = np.array(values.get("size", (1.0, 1.0, 1.0)), float)
-    return Geometry(values["kind"], size, **measures)
+    radius, length = (float(values.get(name, 0.0)) for name in ("radius", "length"))
+    return Geometry(values["kind"], np.array(values.get("size", (1.0, 1.0, 1.0)), float), radius, length)
 
 
 def free_name(name: str, taken: set[str]) -> str:

@@ -20,6 +20,7 @@ from magtwin.urdf.physics.mechanism import Mechanism
 
 JOINT_API, NEWTON_API, NEWTON_MIMIC_API = "IsaacJointAPI", "NewtonJointAPI", "NewtonMimicAPI"
 PHYSX_API, PHYSX_AXIS_API, PHYSX_MIMIC_API = "PhysxJointAPI", "PhysxJointAxisAPI", "PhysxMimicJointAPI"
+STATE_API = "PhysicsJointStateAPI"
 """Applied schemas of Isaac Sim, Newton and PhysX; their plugins are not installed here."""
 
 AXIS = "magtwin:axis"
@@ -85,6 +86,8 @@ def define_joint(
     axes = _free_axes(made, joint, token, description)
     define_drive(prim, axes, joint, mechanism, options, wheels)
     _tune(prim, joint, axes, joint.name in wheels, description)
+    if joint.type != "planar":
+        _define_state(prim, axes[0])
     prim.AddAppliedSchema(JOINT_API)
     return prim
 
@@ -202,6 +205,13 @@ def _axis(axis: ArrayLike) -> tuple[str, NDArray[np.float64]]:
 
 def _quatf(R: NDArray) -> Gf.Quatf:
     return Gf.Quatf(*(round(float(v), 9) + 0.0 for v in wxyz_from_xyzw(quaternion(R))))
+
+
+def _define_state(prim: Usd.Prim, axis: str) -> None:
+    """Author where a joint stands, at 0 and at rest: Isaac Sim writes its state there while it runs."""
+    prim.AddAppliedSchema(f"{STATE_API}:{axis}")
+    for name in ("position", "velocity"):
+        _write(prim, f"state:{axis}:physics:{name}", 0.0)
 
 
 def _unit(joint: Joint) -> float:
