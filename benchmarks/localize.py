@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "localize"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "localization"))
 
 from drives import drive
 from plain_particles import PlainFilter

@@ -105,6 +105,67 @@ with 5 cm of clearance if there is space. `magtwin run` prints the scale. The ru
 
 **A CSV file** is driven unchanged. If it does not fit, the error message proposes a change. `--fit` moves
 the path and, if necessary, shrinks it.
+
+## A lab in another place
+
+The lab, its map, sources, robots and floor are relative to the lab's root, the prim `/World` of the stage
+that magtwin writes. Move and turn this prim, or reference the stage into another one, as often as you like:
+
+```
+def Xform "Building"
+{
+    def Xform "LabA" (references = @lab/lab.usda@) {}
+    def Xform "LabB" (references = @lab/lab.usda@)
+    {
+        double3 xformOp:translate = (12, 0, 0)
+        uniform token[] xformOpOrder = ["xformOp:translate"]
+    }
+}
+```
+
+```
+magtwin run building.usda --lab /Building/LabB
+```
+
+* **Readings** of a moved and turned lab equal those of the lab at the origin, to the byte. Poses and fields
+  are in the lab's axes. The run's metadata keep the lab's path (`lab`, on a stage of several labs) and its
+  x, y, z [m] and yaw [rad] on the stage (`lab_pose`).
+* **Commands.** `run`, `sweep` and `map survey` take `--lab`; in Python, `open_twin(stage, lab=...)`. Newton
+  and, for several labs, `magtwin export` take the lab's own stage.
+* **Earth's field.** The lab's own field turns with the lab, because its map was measured with it. If another
+  field on the stage differs by more than 1 nT in the lab's axes, a run warns: the stage then has two norths.
+  A lab without a field of its own takes that of the stage, turned into its axes.
+* **Steel** outside every lab counts in each of them. That of another lab does not.
+* **Units.** A stage in centimetres or with Y up must reference the lab with scale 100 and rotateX -90.
+  Otherwise it is refused.
+
+## Editing a stage
+
+A map records what it was made from: the Earth's field, each magnetised thing, the place of the magnetometer
+and the robot's hard and soft iron. `run`, `info` and `validate` warn if the stage no longer agrees. Survey
+again with `magtwin map survey lab.usda --out new.usdc --adopt`; the stage then reads the new map. If a
+network was trained on the old map, a run warns how far the two maps differ.
+
+| edit in usdview, Kit or Blender | result |
+|---|---|
+| a desk is moved, added, removed, magnetised | the new field; warning: map stale, why and by how much |
+| the same in a stronger layer | the same |
+| something that is not magnetic is moved | read as it is; no warning |
+| the magnetometer is mounted elsewhere | read at the new place; warning that the map is stale |
+| a second robot is added by reference | refused until its `magtwin:magnetometer:map` names the map |
+| a robot is scaled | refused, with the prim |
+| a robot floats or leans | starts on the floor, with a warning |
+| furniture is made instanceable, or a payload | read as before |
+| a payload is unloaded in a viewer | read whole: the file does not store it; a missing file is refused |
+| variants are switched off | the same bytes |
+| edits in usdview's session layer | not part of the file; saved as a layer, that is a stronger layer |
+| changes in the same process that are not saved | refused: save them first |
+| the whole lab is moved, or turned about the vertical | the same bytes |
+| the whole lab is tilted, scaled or mirrored | refused, with the prim |
+| only the room or only the map is moved | refused, with the prim to move instead |
+| the lab is referenced twice | the same bytes in each; `--lab` names one |
+| a stage in centimetres or with Y up references the lab | the same bytes if scaled and turned, else refused |
+| a layer in other units is brought in without a scale | refused, with prim, scale and turn |
 """
 
 

@@ -47,7 +47,7 @@ class InputError(ValueError):
 
 
 class MismatchWarning(UserWarning):
-    """A network is used with a map, at a place or on a robot that it was not trained on."""
+    """A network is used where it was not trained, or a map where the lab is no longer as it was."""
 
 
 class CalibrationWarning(UserWarning):

@@ -11,7 +11,7 @@ import tempfile
 import tomllib
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -172,7 +172,11 @@ def from_table(
         InputError: A key is unknown or missing, or a value has the wrong type or range; the text has file and
             line.
     """
-    where = _Where(Path(path), section, number)
+    return _from_table(cls, table, _Where(Path(path), section, number))
+
+
+def _from_table(cls: type[T], table: dict[str, Any], where: "_Where") -> T:
+    """As `from_table`."""
     hints = typing.get_type_hints(cls)
     known = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     for key in table:
@@ -214,30 +218,69 @@ class _Where:
     path: Path
     section: str
     number: int = 0
+    """Index among tables of that name in `parent`."""
+
+    parent: "_Where | None" = None
+    """The table that this one is in."""
+
+    def inside(self, key: str, number: int = 0) -> "_Where":
+        """The table, or one of the array of tables, that is the value of a key."""
+        return _Where(self.path, f"{self.section}.{key}" if self.section else key, number, self)
 
     def refused(self, key: str, text: str) -> InputError:
+        line = self._line(key)
         table = f"[{self.section}] " if self.section else ""
-        return InputError(f"{self.path}{self._line(key)}: {table}{text}")
+        where = f"{self.path}:{line}" if line else str(self.path)
+        return InputError(f"{where}: {table}{text}")
 
-    def _line(self, key: str) -> str:
-        inside, seen = not self.section, -1
+    def _line(self, key: str) -> int | None:
+        """Line of a key, or of the table if it has none; None if the file cannot be read."""
         try:
             lines = self.path.read_text(encoding="utf-8").splitlines()
         except OSError:
-            return ""
+            return None
+        here, counts, header = self._place(), dict[str, int](), 0
+        place: tuple[tuple[str, int], ...] = ()
         for number, line in enumerate(lines, 1):
             text = line.strip()
             if text.startswith("["):
-                header = text.split("#")[0].strip("[] ")
-                seen += header == self.section
-                inside = header == self.section and seen == self.number
-                if inside and not key:
-                    return f":{number}"
-                if self.section and text.strip("[] ") == f"{self.section}.{key}":
-                    return f":{number}"
-            elif inside and key and text.split("=")[0].strip().strip('"') == key:
-                return f":{number}"
-        return ""
+                name = text.split("#")[0].strip("[] ")
+                place = _counted(counts, name, text.startswith("[["))
+                if _matches(place, here):
+                    header = number
+                elif key and place[-1][0] == key and _matches(place[:-1], here):
+                    return number
+            elif _matches(place, here) and key and text.split("=")[0].strip().strip('"') == key:
+                return number
+        if not header and self.parent is not None:  # an inline table
+            return self.parent._line(self.section.rpartition(".")[2])
+        return header or None
+
+    def _place(self) -> tuple[tuple[str, int | None], ...]:
+        """Names and indices of the tables from the top to this one; an index of None matches any."""
+        above: tuple[tuple[str, int | None], ...] = ()
+        if self.parent is not None:
+            above = self.parent._place()
+        elif self.section:
+            above = tuple((name, None) for name in self.section.split(".")[:-1])
+        return (*above, (self.section.rpartition(".")[2], self.number)) if self.section else ()
+
+
+def _counted(counts: dict[str, int], name: str, array: bool) -> tuple[tuple[str, int], ...]:
+    """Names and indices of the tables that a header begins; `counts` has those of the headers before."""
+    if array:
+        counts[name] = counts.get(name, -1) + 1
+        for below in [other for other in counts if other.startswith(f"{name}.")]:
+            del counts[below]
+    words = name.split(".")
+    return tuple((word, counts.get(".".join(words[: k + 1]), 0)) for k, word in enumerate(words))
+
+
+def _matches(place: Sequence[tuple[str, int]], wanted: Sequence[tuple[str, int | None]]) -> bool:
+    return len(place) == len(wanted) and all(
+        name == word and index in (None, number)
+        for (name, number), (word, index) in zip(place, wanted, strict=True)
+    )
 
 
 def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
@@ -246,11 +289,10 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         return _value(next(a for a in args if a is not type(None)), value, where, key)
-    section = f"{where.section}.{key}" if where.section else key
     if dataclasses.is_dataclass(kind):
         if not isinstance(value, dict):
             raise wrong
-        return from_table(kind, value, where.path, section)  # type: ignore[arg-type]
+        return _from_table(kind, value, where.inside(key))  # type: ignore[arg-type]
     if origin is tuple:
         if not isinstance(value, list):
             raise wrong
@@ -262,7 +304,7 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
             if not all(isinstance(v, dict) for v in value):
                 raise wrong
             return tuple(
-                from_table(a, v, where.path, section, k)
+                _from_table(a, v, where.inside(key, k))
                 for k, (a, v) in enumerate(zip(args, value, strict=True))
             )
         return tuple(_value(a, v, where, key) for a, v in zip(args, value, strict=True))
@@ -273,7 +315,7 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
     if origin in (dict, Mapping):
         if not isinstance(value, dict):
             raise wrong
-        return {name: _value(args[1], entry, where, name) for name, entry in value.items()}
+        return {name: _value(args[1], entry, where.inside(key), name) for name, entry in value.items()}
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         if not abs(value) < 1e300:  # nan, inf, and too large integers
             raise wrong

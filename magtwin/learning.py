@@ -59,6 +59,7 @@ def build_dataset(
     session_by: By = "metadata",
     path_by: By = "metadata",
     rate_hz: float | None = None,
+    jobs: int | None = None,
     force: bool = False,
     progress: Progress | None = None,
     **reading: Any,
@@ -76,6 +77,8 @@ def build_dataset(
             (the file name) or "folder" (the folder name).
         path_by: What gives the driven path; takes the same values.
         rate_hz: Highest rate of readings to keep [Hz]. Default: all.
+        jobs: Processes that share the recordings; they do not change the data set. Default: this process,
+            with several threads.
         force: Replace an existing folder.
         progress: Called as progress(done, total, name of the next recording).
         **reading: Options of `magtwin.io.formats.read_run`: topics, unit, columns.
@@ -99,6 +102,7 @@ def build_dataset(
         alignment=alignment,
         map_sha256=checksum,
         rate_hz=rate_hz,
+        jobs=jobs,
         force=force,
         progress=progress,
     )

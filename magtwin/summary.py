@@ -143,11 +143,12 @@ def _cell(text: object) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[tuple[str, ...]]) -> str:
-    left = ' style="text-align:left;padding-right:1em"'
+    left = ' style="text-align:left;vertical-align:top;padding-right:1em"'
+    text_cell = f'{left[:-1]};overflow-wrap:anywhere"'  # checksums and paths are longer than a narrow page
     lines = ["<table>"]
     if heads:
         lines.append(f"<tr>{''.join(f'<th{left}>{_cell(head)}</th>' for head in heads)}</tr>")
     for label, *rest in rows:
-        cells = "".join(f"<td{left}>{_cell(text)}</td>" for text in rest)
+        cells = "".join(f"<td{text_cell}>{_cell(text)}</td>" for text in rest)
         lines.append(f"<tr><th{left}>{_cell(label)}</th>{cells}</tr>")
     return "".join([*lines, "</table>"])

@@ -20,6 +20,16 @@ def real_data() -> Path:
     return REAL
 
 
+@pytest.fixture
+def isaac_rules(real_data: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Isaac Sim's published rules, named as an installation for the test."""
+    folder = real_data / "isaacsim-6.0.1"
+    if not folder.is_dir():
+        pytest.skip(f"Isaac Sim's rules are not at {folder}; `magtwin fetch isaac-rules` gets them")
+    monkeypatch.setenv("MAGTWIN_ISAACSIM", str(folder))
+    return folder
+
+
 @pytest.fixture(scope="session")
 def lab_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Root layer of the default lab, authored once into a folder of its own; not to be changed."""

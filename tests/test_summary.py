@@ -35,7 +35,7 @@ from magtwin.spec.magnetics import SourceSpec
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import PlacedRobot
 from magtwin.spec.scene import Scene
-from magtwin.summary import LINES, WIDTH, Summarized
+from magtwin.summary import LINES, WIDTH, Summarized, Summary
 from magtwin.twin import open_twin, scan, simulate, sweep
 
 HOSTILE = '<script>alert("1")</script>&amp;\x1b[31m\n\u2028name'
@@ -211,6 +211,11 @@ def test_the_whole_repr_of_a_long_run_takes_no_longer_than_a_look(run):
     )
     assert "2,000,000 rows" in repr(long)
     assert len(long._repr_html_()) < 5_000
+
+
+def test_long_words_of_a_notebooks_table_break_in_a_narrow_window():
+    html = Summary("Map", (("source", f"a.csv sha256:{'0' * 64}"),)).html()
+    assert re.search(r'<td style="[^"]*overflow-wrap:anywhere[^"]*">a\.csv sha256:0{64}</td>', html)
 
 
 def test_to_pandas_tells_units_and_frames(run):

@@ -193,10 +193,13 @@ def placed_furniture(
         seed: Seed of the scene.
 
     Raises:
-        InputError: A piece does not stand on the slab; the text has its line.
+        InputError: Two pieces have one name, or one does not stand on the slab; the text has the line.
     """
-    pieces = []
+    pieces = list[FurnitureSpec]()
     for number, table in enumerate(tables):
+        if any(piece.name == table.name for piece in pieces):
+            text = f"two pieces of furniture are called {table.name!r}; give each its own name"
+            raise refused_at(path, "name", text, section="furniture", number=number)
         pieces.append(table.spec(seed))
         try:
             if lab is not None:

@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,18 +10,22 @@ from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
 
 from magtwin.author.room import check_name
 from magtwin.errors import InputError
+from magtwin.field.maps.made_from import made_from
 from magtwin.field.sources.magnets import body_of
 from magtwin.files import existing, output
 from magtwin.frames import quat_from_yaw
+from magtwin.spec.furniture import FurnitureSpec
+from magtwin.spec.magnetics import SourceSpec
 from magtwin.spec.robot import PlacedRobot
 from magtwin.spec.scene import Scene
 from magtwin.urdf.convert import THUMBNAILS
 from magtwin.usd.attributes import check_prim_name, write_pose
 from magtwin.usd.earth import define_earth
 from magtwin.usd.furniture import FURNITURE, define_furniture
-from magtwin.usd.lab import LAB, PHYSICS_SCENE, define_lab
+from magtwin.usd.lab import LAB, PHYSICS_SCENE, define_lab, expose_for_kit
 from magtwin.usd.layers import WORLD, describe_stage, new_stage, relative_asset
-from magtwin.usd.maps import MAP, load_map
+from magtwin.usd.looks import SHAPES, SHAPES_FILE, VISUALS, define_shapes
+from magtwin.usd.maps import MAP, load_map, read_made_from, write_made_from
 from magtwin.usd.robot import load_robot, urdf_of
 from magtwin.usd.scene import check_map
 from magtwin.usd.schema import only_prim_with
@@ -42,7 +46,7 @@ from magtwin.usd.sensors import (
 from magtwin.usd.sources import LOOKS, SOURCES, define_sources
 
 EARTH = WORLD.AppendChild("Earth")
-TAKEN = (LAB.name, PHYSICS_SCENE.name, MAP.name, EARTH.name, SOURCES.name, FURNITURE.name)
+TAKEN = (LAB.name, PHYSICS_SCENE.name, MAP.name, EARTH.name, SOURCES.name, FURNITURE.name, SHAPES.name)
 """Children of /World that cannot be names of robots."""
 
 PARTS: dict[str, Callable[..., Usd.Prim]] = {
@@ -60,7 +64,8 @@ def author_scene(
     """Write a scene as a folder of layers.
 
     `<name>.usda` places each robot, with what differs from its asset. Its sublayers are `room.usda`,
-    `furniture.usda`, `magnetics.usda` (the Earth's field and sources) and the map.
+    `furniture.usda`, `magnetics.usda` (the Earth's field and sources) and the map. Meshes that are
+    shown reference the unit shapes of `shapes.usdc`.
 
     Args:
         scene: What to author.
@@ -85,11 +90,15 @@ def author_scene(
         stage = Usd.Stage.Open(root)
         names = ", ".join(placed.robot.name for placed in scene.robots)
         describe_stage(stage, f"{scene.name}: a lab, its magnetic map and {names}, by magtwin")
+        expose_for_kit(root)
         stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, WORLD).GetPrim())
         Usd.ModelAPI(stage.GetDefaultPrim()).SetKind(Kind.Tokens.assembly)
         root.subLayerPaths = [relative_asset(root, layer) for layer in sublayers]
         for robot in placed.robots:
             _define_robot(stage, robot, scene.map_sha256)
+        map_prim = only_prim_with(stage.GetPrimAtPath(WORLD), "anomalyMap")
+        if read_made_from(map_prim) is None:  # from now on, changes of the stage are seen
+            write_made_from(map_prim, made_from(scene))
         del stage  # _settle makes paths right for the final folder
         _settle(root, aside, Path(folder).resolve())
         root.Save()
@@ -119,15 +128,25 @@ def check_things(scene: Scene) -> None:
     Raises:
         InputError: Two have the same name, or a susceptibility needs the Earth's field.
     """
-    for what, things in (("sources", scene.sources), ("pieces of furniture", scene.furniture)):
-        names = [thing.name for thing in things]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise InputError(f"two {what} are called {twice[0]!r}; give each its own name")
-    if any(source.name == LOOKS for source in scene.sources):
-        raise InputError(f"source {LOOKS!r} has the name of the scope of materials; rename it")
+    check_names(scene.sources, scene.furniture)
+    for name, what in ((LOOKS, "materials"), (VISUALS, "shown meshes")):
+        if any(source.name == name for source in scene.sources):
+            raise InputError(f"source {name!r} has the name of the scope of {what}; rename it")
     for source in scene.magnets:
         if source.susceptibility and scene.earth is None:
             body_of(source)  # raises
+
+
+def check_names(sources: Sequence[SourceSpec], furniture: Sequence[FurnitureSpec]) -> None:
+    """Refuse sources and furniture with equal names.
+
+    Raises:
+        InputError: Two have the same name.
+    """
+    for what, things in (("sources", sources), ("pieces of furniture", furniture)):
+        names = [thing.name for thing in things]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise InputError(f"two {what} are called {twice[0]!r}; give each its own name")
 
 
 def _with_copies(scene: Scene, folder: Path) -> Scene:
@@ -149,7 +168,7 @@ def _with_copies(scene: Scene, folder: Path) -> Scene:
         if magnetometer.network is not None:
             weights = once(magnetometer.network, "weights", robot.name, _copied)
             magnetometer = replace(magnetometer, network=weights)
-        asset = once(robot.asset, "robot", robot.name, _copied_asset)
+        asset = once(robot.asset, "robots", robot.name, _copied_robot)
         if isinstance(path, Path):
             path = once(path, "paths", robot.name, _copied)
         robot = replace(robot, asset=asset, magnetometer=magnetometer)
@@ -166,6 +185,11 @@ def _with_copies(scene: Scene, folder: Path) -> Scene:
 def _copied(file: Path, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     return Path(shutil.copyfile(file, folder / file.name))
+
+
+def _copied_robot(asset: Path, folder: Path) -> Path:
+    """A robot's asset copied to a folder with its own name, as Isaac Sim wants it, below `folder`."""
+    return _copied_asset(asset, folder / asset.stem)
 
 
 def _copied_asset(asset: Path, folder: Path) -> Path:
@@ -219,13 +243,20 @@ def _write_parts(scene: Scene, folder: Path) -> list[Path]:
             field,
         ),
     ]
+    shapes = folder / SHAPES_FILE
+    with new_stage(shapes, "Unit shapes of what is shown, by magtwin") as stage:
+        define_shapes(stage)
     paths = []
     for name, content, about, define in parts:
         if content:  # the root layer may have the name
             taken = scene.name.casefold() == name
             paths.append(folder / (f"{name}_layer.usda" if taken else f"{name}.usda"))
             with new_stage(paths[-1], about) as stage:
+                stage.GetRootLayer().subLayerPaths = [str(shapes.resolve())]  # this layer is not in its place
                 define(stage)
+            layer = Sdf.Layer.FindOrOpen(str(paths[-1]))
+            layer.subLayerPaths = [f"./{shapes.name}"]
+            layer.Save()
     return paths
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from magtwin.author.furniture import FurnitureTable, placed_furniture
 from magtwin.author.robot import RobotSettings, build_robot
 from magtwin.author.room import asset_named, check_name, check_start, lab_of, obstacles_in
-from magtwin.author.scene import check_things
+from magtwin.author.scene import check_names, check_things
 from magtwin.errors import InputError
 from magtwin.files import existing, from_table, read_toml, refused_at, sha256
 from magtwin.path import resolve_path
@@ -159,6 +159,10 @@ def scene_from_toml(
             f'{path}: names no map; add map = "FILE.usdc" to it, or give `map_layer=FILE.usdc`, or add an '
             f"[earth] table (latitude_deg, longitude_deg, height_m, date){more}, from which it is surveyed"
         )
+    try:
+        check_names(sources, pieces)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
     standing = obstacles_in(lab, pieces)
     robots: list[PlacedRobot] = []
     for number, (robot_table, keys) in enumerate(zip(given.robot, table["robot"], strict=True)):

@@ -48,6 +48,9 @@ last for seconds.
 SHIP_FUNCTIONS = {1: 50, 2: 50, 3: 100, 4: 50}
 """Published number of eigenfunctions of each loop."""
 
+HAND_LOOPS: tuple[Literal["eight", "square"], ...] = ("eight", "square")
+"""Names of the hand-held loops, by which a suite numbers them from 1."""
+
 HAND_NOISE_NT = 2_000.0
 """Noise assumed for the hand-held loops [nT]."""
 
@@ -181,7 +184,7 @@ def hand_case(folder: str | os.PathLike[str], name: Literal["eight", "square"]) 
     Raises:
         InputError: There is no such loop, or its file is missing or wrong.
     """
-    if name not in ("eight", "square"):
+    if name not in HAND_LOOPS:
         raise InputError(f"name must be eight or square, got {name!r}", parameter="name")
     names = ("dPos", "dPosSmooth", "initPos", "m", "quat", "t")
     data = _matlab(Path(folder) / f"{name}.mat", names)

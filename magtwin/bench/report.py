@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from magtwin.bench.leaderboard import Columns, Difference, Standing, compare_rows, standings
 from magtwin.bench.results import read_results
-from magtwin.bench.statistics import Interval
+from magtwin.bench.statistics import Interval, Paired
 from magtwin.bench.suite import Scenario
 from magtwin.figures.canvas import (
     WIDTH_IN,
@@ -101,8 +101,7 @@ def compare_results(
     lines = {}
     for d in compare_rows(first.rows, second.rows):
         lines[f"{d.scenario}, {d.a}"] = (
-            f"A - B {d.rmse_m.difference:+.4f} m ({d.rmse_m.low:+.4f} to {d.rmse_m.high:+.4f}), "
-            f"p {d.rmse_m.p:.2g}, {d.runs} runs: {d.verdict}"
+            f"A - B [m] {_difference(d.rmse_m)}, p {d.rmse_m.p:.2g}, {_count(d.runs, 'run')}: {d.verdict}"
         )
     notes = {}
     if first.about["sha256"] != second.about["sha256"]:
@@ -186,16 +185,23 @@ def describe(scenario: Scenario) -> str:
         "heading": "The start is unknown, its heading is known within 10 deg.",
         "global": "Position and heading at the start are unknown.",
     }
-    parts = [
-        f"{scenario.runs} runs of {scenario.duration_s:g} s in {min(scenario.runs, scenario.sessions)} "
-        f"sessions, {scenario.rate_hz:g} readings per second.",
-        starts[scenario.prior],
-    ]
+    runs = _count(scenario.runs, "run")
     if scenario.source != "twin":
-        parts.append(f"Recorded data: {scenario.source}, recording {scenario.number}.")
+        parts = [f"{runs} on recorded data: {scenario.source}, recording {scenario.number}."]
+        if scenario.source == "magnetic-data":
+            parts += [f"{scenario.rate_hz:g} readings per second.", starts[scenario.prior]]
         if scenario.odometry_factor != 1:
             parts.append(f"The noise of the odometry is {scenario.odometry_factor:g} times as large.")
+        if scenario.source == "1d":
+            parts.append("No true pose: errors are differences from the telephone's own visual tracking.")
+        elif scenario.runs > 1:
+            parts.append("Runs differ in the errors of odometry and start only; so do the intervals.")
         return " ".join(parts)
+    sessions = _count(min(scenario.runs, scenario.sessions), "session")
+    parts = [
+        f"{runs} of {scenario.duration_s:g} s in {sessions}, {scenario.rate_hz:g} readings per second.",
+        starts[scenario.prior],
+    ]
     if scenario.truth == "map":
         sensor = scenario.sensor
         parts.append(
@@ -226,12 +232,12 @@ def describe(scenario: Scenario) -> str:
 
 def _lead(rows: Columns) -> str:
     failed = int(np.count_nonzero(rows["status"] != "ok"))
-    text = (
-        f"{len(rows['run']):,} runs, {failed:,} of which failed. RMSE of the position [m], pooled over runs. "
-    )
-    return text + (
+    runs = _count(len(rows["run"]), "run")
+    return (
+        f"{runs}, {failed:,} of which failed. RMSE of the position [m], pooled over runs. "
         "Trajectories are not aligned. The bound is the posterior Cramer-Rao bound with the map's error as "
-        "correlated; that of all readings for smoothers. Intervals: 95 %, by bootstrap over sessions."
+        "correlated; that of all readings for smoothers. Intervals: 95 %, by bootstrap over sessions, or "
+        "over runs where all are of one session."
     )
 
 
@@ -315,7 +321,7 @@ def _differences(found: Sequence[Difference]) -> Table:
             d.a,
             d.b,
             d.runs,
-            f"{d.rmse_m.difference:+.4f} ({d.rmse_m.low:+.4f} to {d.rmse_m.high:+.4f})",
+            _difference(d.rmse_m),
             f"{d.rmse_m.p:.3g}",
             d.verdict,
         )
@@ -508,7 +514,19 @@ def _error_axis(axis: Any) -> None:
 
 
 def _interval(value: Interval | None) -> str:
-    return "" if value is None else f"{value.value:.3f} ({value.low:.3f} to {value.high:.3f})"
+    if value is None or not math.isfinite(value.low):
+        return "" if value is None else f"{value.value:.3f}"
+    return f"{value.value:.3f} ({value.low:.3f} to {value.high:.3f})"
+
+
+def _difference(value: Paired) -> str:
+    if not math.isfinite(value.low):
+        return f"{value.difference:+.4f}"
+    return f"{value.difference:+.4f} ({value.low:+.4f} to {value.high:+.4f})"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number:,} {noun}{'s' * (number != 1)}"
 
 
 def _rate(value: Interval | None) -> str:

@@ -5,6 +5,7 @@ import signal
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from magtwin.localization.bounds import Bounds, bounds
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import Localizer, Problem, SensorModel, Smoother
 from magtwin.localization.scores import Scores, score
-from magtwin.localization.track import LocalizerError, Track, track
+from magtwin.localization.track import Track, track
 from magtwin.parallel import beat
 from magtwin.run.run import Run
 
@@ -68,6 +69,7 @@ def run_chunk(
         limits = bounds_of(case)
         for name in chunk.entries:
             entry = suite.localizers[name]
+            entry = replace(entry, compensator=suite.path(entry.compensator))
             key = {"scenario": scenario.name, "localizer": name, "run": run}
             beat(f"{run} {name}")
             if failures and (run, name) in failures:
@@ -103,6 +105,7 @@ def make_case(suite: Suite, scenario: Scenario, run: int, fields: Path | None = 
 
         own = fields / scenario.data if scenario.data and fields is not None else None
         session = suite.first_seed + run % scenario.sessions
+        scenario = replace(scenario, paths=tuple(map(suite.path, scenario.paths)))
         return twin_case(scenario, str(suite.scene(scenario)), seed, session, own)
     folder = suite.folder(scenario)
     if scenario.source == "magnetic-data":
@@ -117,9 +120,15 @@ def make_case(suite: Suite, scenario: Scenario, run: int, fields: Path | None = 
             odometry_factor=scenario.odometry_factor,
             rate_hz=scenario.rate_hz,
         )
-    from magtwin.bench.magslam import ship_case
+    from magtwin.bench.magslam import HAND_LOOPS, hand_case, ship_case
 
-    loop = ship_case(folder, scenario.number, seed)
+    if scenario.source == "ship":
+        loop = ship_case(folder, scenario.number, seed)
+    elif 1 <= scenario.number <= len(HAND_LOOPS):
+        loop = hand_case(folder, HAND_LOOPS[scenario.number - 1])
+    else:
+        known = ", ".join(f"{k} ({name})" for k, name in enumerate(HAND_LOOPS, 1))
+        raise InputError(f"scenario {scenario.name!r}: number must be one of {known}, got {scenario.number}")
     pose = np.column_stack(
         [loop.truth["p_world_base"][:, :2], np.unwrap(yaw_from_quat(loop.truth["q_world_base_xyzw"]))]
     )
@@ -150,14 +159,9 @@ def run_localizer(
         with time_limit(limit_s):
             readings = case.readings
             if entry.compensator != "none":
-                from magtwin.localization.compensators import COMPENSATORS, compensated
+                from magtwin.own_field import with_own_field
 
-                if case.problem.calibration is None or case.problem.belief is None:
-                    raise LocalizerError(
-                        f"compensator {entry.compensator!r} needs a calibration drive and a map"
-                    )
-                fitted = COMPENSATORS[entry.compensator]().fit(case.problem.calibration, case.problem.belief)
-                readings = compensated(readings, fitted)
+                readings = with_own_field(readings, entry.compensator, case.problem)
             made = track(load_localizer(entry.method, entry.options), case.problem, readings)
     except (InputError, MemoryError) as error:
         return None, Scores(failed=str(error))

@@ -89,7 +89,7 @@ def benchmark(
     file, out = suite_file(suite), Path(out)
     whole = load_suite(file)
     chosen = whole.limited(scenarios=scenarios, localizers=localizers, runs=runs, seeds=seeds, data=data)
-    chosen.check()
+    chosen.check(file)
     if shard is not None:
         checked_shard(shard)
         if force:

@@ -1,5 +1,6 @@
 """Statistics of benchmarks: intervals over sessions, intervals of rates, and paired differences."""
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -58,7 +59,8 @@ def bootstrap(
     """Percentile interval of a statistic by the bootstrap over sessions.
 
     Runs of a session share its errors, so whole sessions are drawn with replacement (Davison and Hinkley
-    1997, Bootstrap Methods and their Application, section 3.8).
+    1997, Bootstrap Methods and their Application, section 3.8). If all runs are of one session, as those of
+    one recording are, single runs are drawn: the interval is then that of the session. One run has none.
 
     Args:
         values: One figure per run, shape (N,). Failed runs have none: leave them out and report their rate.
@@ -72,6 +74,8 @@ def bootstrap(
         InputError: There are no values, one is nan, or the sessions do not match.
     """
     v, index, count = _checked(values, sessions)
+    if count == 1:
+        return Interval(float(statistic(v)), math.nan, math.nan)
     rng = np.random.default_rng(seed)
     members = np.split(np.argsort(index, kind="stable"), np.cumsum(np.bincount(index))[:-1])
     drawn = np.empty(resamples)
@@ -154,7 +158,7 @@ def paired(
 
 
 def _checked(values: ArrayLike, sessions: ArrayLike | None) -> tuple[Array, NDArray[np.intp], int]:
-    """Values, number of the session of each, and number of sessions."""
+    """Values, number of the session of each, and number of sessions; one session is split into its runs."""
     v = np.asarray(values, float)
     if v.ndim != 1 or not len(v):
         raise InputError(f"statistics need one figure per run, got shape {v.shape}")
@@ -167,6 +171,8 @@ def _checked(values: ArrayLike, sessions: ArrayLike | None) -> tuple[Array, NDAr
     if given.shape != v.shape:
         raise InputError(f"sessions must have shape {v.shape}, got {given.shape}")
     names, index = np.unique(given, return_inverse=True)
+    if len(names) == 1:
+        return v, np.arange(len(v)), len(v)
     return v, index, len(names)
 
 

@@ -4,15 +4,17 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from magtwin.errors import InputError, find
-from magtwin.files import from_table, read_toml
+from magtwin.files import existing, from_table, read_toml, refused_at
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import OdometryModel, SensorModel
+from magtwin.sim.motion.drive_input import drive_input
 from magtwin.twin import scene_file
 
 HELD_OUT = 1_000_000_000
@@ -57,7 +59,7 @@ class Scenario:
     """Scene in which the robot drives: the name of a shipped one, or a stage."""
 
     paths: tuple[str, ...] = ("sine", "lawnmower", "figure8", "continuous_cycle", "random")
-    """Paths driven in turn."""
+    """Paths driven in turn: names, or CSV files relative to the suite's file."""
 
     truth: Literal["map", "scene"] = "map"
     """Readings: drawn from the true field with the noise of `sensor`; or those of the scene's physical
@@ -147,7 +149,8 @@ class Entry:
     """Name in results. Default: the method."""
 
     compensator: str = "none"
-    """Model of the robot's own field that predicts it from on-board signals."""
+    """Model of the robot's own field that predicts it from on-board signals: a name, or the weights of a
+    trained network, relative to the suite's file."""
 
     options: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the localizer."""
@@ -206,8 +209,8 @@ class Suite:
     def __post_init__(self) -> None:
         for kind, items in (("scenario", self.scenario), ("localizer", self.localizer)):
             names = [item.name for item in items]
-            if not names:
-                raise InputError(f"a suite needs at least one [[{kind}]]")
+            if not names and kind == "scenario":
+                raise InputError("a suite needs at least one [[scenario]]")
             if twice := [name for name in names if names.count(name) > 1]:
                 raise InputError(f"two of [[{kind}]] are called {twice[0]!r}; give one another name")
         if self.seed < 0 or self.chunk < 1 or not self.time_limit_s > 0:
@@ -271,7 +274,7 @@ class Suite:
             data: Folders by name, which replace those of the file.
 
         Raises:
-            InputError: A name is unknown.
+            InputError: A scenario is unknown.
         """
         kept = [find("scenario", name, self.scenarios) for name in scenarios] or list(self.scenario)
         if runs is not None:
@@ -294,21 +297,36 @@ class Suite:
             data={**self.data, **(data or {})},
         )
 
-    def check(self) -> None:
-        """Make every localizer and compensator once, and look for the data.
+    def check(self, file: str | os.PathLike[str] = "") -> None:
+        """Make every localizer and compensator once, and look for scenes, paths and data.
+
+        Args:
+            file: The suite's file, for error messages. Default: not named.
 
         Raises:
-            InputError: One is unknown or refuses its options, or data are missing.
+            InputError: There is no localizer; one is unknown or refuses its options; or a scene, a path or
+                data are missing.
         """
+        if not self.localizer:
+            raise InputError(
+                "no localizer to run: the suite has no [[localizer]]; give `localizers`",
+                parameter="localizers",
+            )
         for entry in self.localizer:
-            load_localizer(entry.method, entry.options)
-            if entry.compensator != "none":
-                from magtwin.localization.compensators import COMPENSATORS
+            with _named_in(file, "localizer", entry.name, ("options", "compensator", "method")):
+                from magtwin.localization.compensators import COMPENSATORS, is_weights
 
-                find("compensator", entry.compensator, COMPENSATORS)
+                load_localizer(entry.method, entry.options)
+                if is_weights(entry.compensator):
+                    existing(self.path(entry.compensator), "weights file")
+                elif entry.compensator != "none":
+                    find("compensator", entry.compensator, COMPENSATORS)
         for scenario in self.scenario:
-            if scenario.source == "twin":
-                self.scene(scenario)
+            with _named_in(file, "scenario", scenario.name, ("scene", "paths")):
+                if scenario.source == "twin":
+                    self.scene(scenario)
+                    for path in scenario.paths:
+                        drive_input(self.path(path))
             if scenario.data or scenario.source != "twin":
                 self.folder(scenario)
 
@@ -320,6 +338,11 @@ class Suite:
         """
         beside = Path(self.base) / scenario.scene
         return scene_file(beside if beside.exists() else scenario.scene)
+
+    def path(self, name: str) -> str:
+        """A name as it is, or the file of that name beside the suite's file."""
+        beside = Path(self.base) / name
+        return str(beside) if beside.is_file() else name
 
     def folder(self, scenario: Scenario) -> Path:
         """Folder of a scenario's data.
@@ -363,6 +386,21 @@ def suite_file(file: str | os.PathLike[str]) -> Path:
         return path
     find("suite", path.name, {suite.stem: suite for suite in SUITES.glob("*.toml")})
     return shipped
+
+
+@contextmanager
+def _named_in(file: str | os.PathLike[str], kind: str, name: str, keys: Sequence[str]) -> Iterator[None]:
+    """Refusals with the line in a suite's file: the key in their text, else the last, of a table by name."""
+    try:
+        yield
+    except InputError as error:
+        tables = read_toml(file).get(kind, []) if file else []
+        names = [table.get("name", table.get("method")) for table in tables]
+        if name not in names:  # given by `localizers`
+            raise
+        number = names.index(name)
+        key = next((key for key in keys if key in tables[number] and key.rstrip("s") in str(error)), keys[-1])
+        raise refused_at(file, key, str(error), section=kind, number=number) from error
 
 
 def _plain(value: Any) -> Any:

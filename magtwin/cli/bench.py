@@ -7,7 +7,7 @@ from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Dask, Flag, Force, Jobs, Names, Shard, Whole, pairs
-from magtwin.cli.terminal import Done, announce, progress
+from magtwin.cli.terminal import Done, announce, continued_by_a_repeat, progress
 
 Results = Annotated[Path, Parameter(required=True)]
 
@@ -47,7 +47,7 @@ def bench(
     ----------
     suite
         TOML file of the suite, or the name of one that ships with magtwin: standard, slam, aprilab,
-        magnetic-data, ship.
+        magnetic-data, ship, 1d.
     out
         Folder of results to write or continue.
     only
@@ -71,7 +71,7 @@ def bench(
     from magtwin.parallel import parse_shard
 
     announce(f"Benchmarking {suite}")
-    with progress("Running", "runs") as advance:
+    with continued_by_a_repeat(), progress("Running", "runs") as advance:
         made = benchmark(
             suite,
             out,

@@ -85,6 +85,14 @@ Plant = Annotated[
         "(none). NAME:SEED draws the constants of an effect from another seed. Default: the scene's.",
     ),
 ]
+Lab = Annotated[
+    str,
+    Parameter(
+        name="--lab",
+        help="Lab to use on a stage of several: path of its root prim, such as /Building/LabB. Default: the "
+        "only lab.",
+    ),
+]
 Network = Annotated[
     Path | None,
     Parameter(

@@ -99,6 +99,17 @@ def print_error(text: str, style: str = "") -> None:
     print(f"\033[{style}m{text}\033[0m" if coloured else text, file=sys.stderr)  # noqa: T201
 
 
+@contextmanager
+def continued_by_a_repeat(*, when: bool = True) -> Iterator[None]:
+    """At Ctrl-C, print that the same command continues the work of the block, if `when`."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if when:
+            print_error("interrupted; finished work is kept, and the same command continues")
+        raise
+
+
 class _Trimmed(io.TextIOBase):
     """Stdout without the spaces that rich fills up lines with."""
 

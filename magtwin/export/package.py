@@ -30,9 +30,11 @@ from magtwin.urdf.simready import UNKNOWN
 from magtwin.usd.animation import write_animation
 from magtwin.usd.layers import open_stage, stage_sha256
 from magtwin.usd.maps import read_map
+from magtwin.usd.placement import labs_on
 from magtwin.usd.scene import read_scene
 from magtwin.usd.schema import FOLDER as SCHEMA
 from magtwin.usd.schema import attribute_name, place, prims_with
+from magtwin.usd.units import check_units
 from magtwin.version import __version__
 
 Profile = Literal["omniverse", "isaac", "newton", "viewer"]
@@ -223,6 +225,11 @@ class _Work:
             detach(self.root)  # of a single layer, which holds its network
             self.checksum = stage_sha256(self.source)
         stage = open_stage(self.root)
+        check_units(stage)
+        if len(labs := dict.fromkeys(lab.path for lab in labs_on(stage))) > 1:
+            raise InputError(
+                f"{self.source}: has the labs {', '.join(labs)}; export the stage of each by itself"
+            )
         metres, up = UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)
         if UsdGeom.LinearUnitsAre(metres, UsdGeom.LinearUnits.meters) and up == UsdGeom.Tokens.z:
             return
@@ -320,7 +327,9 @@ class _Work:
         self.run, self.plays = self.root.with_name(f"{self.root.stem}_run.usdc"), True
         write_animation(run, self.run, self.root)
         layer, below = Sdf.Layer.FindOrOpen(str(self.run)), Sdf.Layer.FindOrOpen(str(self.root))
-        layer.customLayerData = {**dict(layer.customLayerData), "magtwin": below.customLayerData["magtwin"]}
+        theirs = dict(below.customLayerData)
+        kept = {name: theirs[name] for name in ("magtwin", "renderSettings") if name in theirs}
+        layer.customLayerData = {**dict(layer.customLayerData), **kept}  # a root layer has its own
         layer.Save()
 
     def flat(self) -> None:

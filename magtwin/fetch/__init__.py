@@ -1,7 +1,7 @@
 """Fetch original data from their publishers; each file is checked against its SHA-256.
 
-magtwin ships none of them. Each source is a table beside this file: name, checksum, and path in a repository
-at a pinned commit.
+magtwin ships none of them. Each source is a table: name, checksum, and path in a repository at a pinned
+commit.
 """
 
 from collections.abc import Callable
@@ -10,6 +10,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from magtwin.errors import InputError, find
+from magtwin.export.validation.isaac_sim import FILES, copy_folder
 from magtwin.files import output
 
 UNSTATED = "NOASSERTION"
@@ -23,7 +24,7 @@ class Source:
     """A table of published files."""
 
     table: str
-    """File beside this module; each line has name, SHA-256, and path below `base_url`."""
+    """File beside this module, or a path; each line has name, SHA-256, and path below `base_url`."""
 
     base_url: str
     """Address to which the paths are appended."""
@@ -44,6 +45,13 @@ SOURCES = {
             "aprilab.txt",
             f"{_GITHUB}/aprilab-uf/nn_magnetometer/f81ff6c533745b62d97cf9f4775848d86f9e73b5",
             "MIT",
+        ),
+    ),
+    "isaac-rules": (
+        Source(
+            str(FILES),
+            f"{_GITHUB}/isaac-sim/IsaacSim/045ca8b59622b99a408092124377c66346e8d9c2",
+            "Apache-2.0",
         ),
     ),
     "turtlebot4": (
@@ -78,8 +86,14 @@ SOURCES = {
         ),
     ),
 }
-"""Sources by name: the APRILab survey, network and paths; the TurtleBot 4's description; drives of a robot
-with a magnetometer and true positions; recordings with published results of magnetic SLAM."""
+"""Sources by name: the APRILab survey, network and paths; Isaac Sim's rules for assets; the TurtleBot 4's
+description; drives of a robot with a magnetometer and true positions; recordings with published results of
+magnetic SLAM."""
+
+
+def default_folder(name: str) -> Path:
+    """Folder of a source if none is given: its name, or for Isaac Sim's rules where `validate` finds them."""
+    return copy_folder() if name == "isaac-rules" else Path(name)
 
 
 def fetch(

@@ -38,8 +38,7 @@ from magtwin.run.compare import FIELDS, HEADINGS, POSITIONS
 from magtwin.run.run import Run
 from magtwin.spec.base import Vec3
 from magtwin.usd.geometry import ColourScale, Link, Shape, read_colour_scale, read_links, read_shapes
-from magtwin.usd.layers import open_stage
-from magtwin.usd.scene import read_scene
+from magtwin.usd.scene import open_scene
 
 Array = NDArray[np.float64]
 
@@ -168,7 +167,8 @@ class Scenery:
         self._times, self._speed, self._view, self._size = np.asarray(times, float), speed, view, size
         self._position = _position(run)
         self._pose(run)
-        stage, scene = open_stage(scene_file), read_scene(scene_file, check_network=False)
+        opened = open_scene(scene_file, lab=str(run.metadata.get("lab", "")), check_network=False)
+        stage, scene = opened.stage, opened.scene
         shapes, links = read_shapes(stage), read_links(stage)
         moving = _links_of(links, [placed.robot.name for placed in scene.robots], run)
         drive = scene.led_by(str(run.metadata["robot"])).robot.drive if scene.others else scene.robot.drive

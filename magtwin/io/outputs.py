@@ -14,7 +14,9 @@ from magtwin.files import check_free, output
 from magtwin.io.bags.stream import scans_at
 from magtwin.io.formats import format_of, read_run, write_run
 from magtwin.io.recorder import Recorder, Sink, in_step, partial_of
+from magtwin.path import CASES, PATHS
 from magtwin.path import Path as Planned
+from magtwin.path.room import FLOOR_M
 from magtwin.run.run import Run
 from magtwin.sim.motion.commands import Commands, read_commands
 from magtwin.sim.motion.drive_input import drive_input
@@ -49,6 +51,7 @@ def drive(
     *,
     commands: str | Path | None = None,
     replay: str | Path | None = None,
+    lab: str = "",
     network: str | Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
     model_error: bool = True,
@@ -69,6 +72,7 @@ def drive(
         path: Path, as for `magtwin.simulate`.
         commands: CSV of commands to drive by, in place of the path.
         replay: Run to drive again, in place of the path.
+        lab: As for `magtwin.open_twin`.
         network: As for `magtwin.open_twin`.
         magnetometer: As for `magtwin.open_twin`.
         model_error: As for `magtwin.open_twin`.
@@ -95,6 +99,7 @@ def drive(
         drive_input(path)  # refuses a wrong name before the scene is opened
     twin = open_twin(
         scene_file,
+        lab=lab,
         network=network,
         magnetometer=magnetometer,
         model_error=model_error,
@@ -105,9 +110,8 @@ def drive(
     if what is path and path != "random":
         what = planned = drive_input(path, room_of(twin), fit=fit)
         if isinstance(planned, Planned) and planned.placing:
-            report(
-                f"Path {planned.name} is {_placing(planned.placing)} to fit this floor and what stands on it"
-            )
+            how = _placing(planned.placing, named=str(path) in (*PATHS, *CASES))
+            report(f"Path {planned.name} is {how} to fit this floor and what stands on it")
     if isinstance(what, Commands) and (text := what.beyond(twin.scene.robot.drive)):
         report(text)
     report(f"Driving {getattr(planned, 'name', None) or path}")
@@ -117,11 +121,12 @@ def drive(
     return Driven(run, twin, planned, scan(twin, run, seed=seed) if scans else None)  # type: ignore[arg-type]
 
 
-def _placing(placing: tuple[float, ...]) -> str:
-    """How a path was brought onto the floor, in words."""
+def _placing(placing: tuple[float, ...], *, named: bool) -> str:
+    """How a path was brought onto the floor, in words; a named path is made for a floor of its own."""
     scale_x, scale_y, x, y = placing
     scale = f"{scale_x:.2g}" if scale_x == scale_y else f"{scale_x:.2g} in x and {scale_y:.2g} in y"
-    parts = [f"scaled by {scale} from its 6 x 3.5 m floor"] if (scale_x, scale_y) != (1, 1) else []
+    made_for = f" from its {FLOOR_M[0]:g} x {FLOOR_M[1]:g} m floor" if named else ""
+    parts = [f"scaled by {scale}{made_for}"] if (scale_x, scale_y) != (1, 1) else []
     parts += [f"moved by ({x:.2f}, {y:.2f}) m"] if max(abs(x), abs(y)) >= 0.005 else []
     return " and ".join(parts)
 

@@ -2,7 +2,7 @@
 
 Importing this module opens numba (see `magtwin.compiled`). Random numbers are a function of a key, the number
 of the particle and the number of the draw, and sums are taken block by block, so that any number of threads
-gives the same bytes. Logarithms, exponentials, sines and cosines are polynomials here, which the compiler
+gives the same bytes. Sums within a block are taken in 32 lanes. Logarithms, exponentials, sines and cosines are polynomials here, which the compiler
 turns into vector code; their errors are below 1e-13.
 """
 
@@ -22,13 +22,22 @@ Words = NDArray[np.uint64]
 BLOCK = 256
 """Particles worked on at a time: their states and factors stay in the cache."""
 
-X, Y, YAW, SCALE, LOG_WEIGHT, LIKELIHOOD, WEIGHT, LINEAR = range(8)
-"""Rows of the state: pose, mean of the odometry's scale error, log weight, log likelihood of the last
-reading, weight relative to its block; then the means of the linear states, and their covariance by rows of
-its lower triangle."""
+LANES = 32
+"""Partial sums of a block."""
 
-CONSTANT, COSINE, SINE, MAP_SD = range(4)
-"""Factors by which a linear state enters the reading: 1, cos(yaw), sin(yaw), the map's standard deviation."""
+X, Y, YAW, SCALE, LOG_WEIGHT, WEIGHT, LINEAR = range(7)
+"""Rows of the state: pose, mean of the odometry's scale error, log weight, weight relative to its block; then
+the means of the linear states, and their covariance by rows of its lower triangle."""
+
+CONSTANT, DRIFT, COSINE, SINE, MAP_SD = range(5)
+"""Linear states, which enter the reading by the factors 1, 1, cos(yaw), sin(yaw) and the map's standard
+deviation."""
+
+STATES, _TRIANGLE = 5, 15
+_MEAN = LINEAR  # rows of the memory of a block: those of the state with all linear states, then free ones
+_COVARIANCE = _MEAN + STATES
+_FREE = _COVARIANCE + _TRIANGLE
+WORK = _FREE + 21
 
 (
     DISTANCE,
@@ -112,110 +121,168 @@ def sine_of_turns(u: float) -> float:
 
 
 @inlined
-def logarithms(x: Array, bits: Words, exponent: Words, mantissa: Words, e: Array, m: Array) -> None:
-    """Replace x by log(x), for x > 0 and not subnormal.
-
-    `bits` are those of x; `e` and `m` share memory with `exponent` and `mantissa`.
-    """
-    for n in range(x.shape[0]):
-        exponent[n] = (bits[n] >> _S52) | _WHOLE_BITS
-        mantissa[n] = (bits[n] & _MANTISSA) | _ONE_BITS
-    for n in range(x.shape[0]):
-        big = m[n] > _SQRT2
-        v = 0.5 * m[n] if big else m[n]
-        k = e[n] - (_WHOLE + 1022 if big else _WHOLE + 1023)
-        t = (v - 1) / (v + 1)
-        z = t * t
-        p = 1 / 9 + z * (1 / 11 + z * (1 / 13 + z * (1 / 15 + z / 17)))
-        x[n] = k * _LN2 + 2 * t * (1 + z * (1 / 3 + z * (1 / 5 + z * (1 / 7 + z * p))))
+def logarithm(x: float) -> float:
+    """log(x) for x > 0 and not subnormal."""
+    bits = np.float64(x).view(np.uint64)
+    m = np.uint64((bits & _MANTISSA) | _ONE_BITS).view(np.float64)
+    e = np.uint64((bits >> _S52) | _WHOLE_BITS).view(np.float64)
+    big = m > _SQRT2
+    v = 0.5 * m if big else m
+    k = e - (_WHOLE + 1022 if big else _WHOLE + 1023)
+    t = (v - 1) / (v + 1)
+    z = t * t
+    p = 1 / 9 + z * (1 / 11 + z * (1 / 13 + z * (1 / 15 + z / 17)))
+    return k * _LN2 + 2 * t * (1 + z * (1 / 3 + z * (1 / 5 + z * (1 / 7 + z * p))))
 
 
 @inlined
-def exponentials(x: Array, whole: Array, bits: Words, out: Array) -> None:
-    """exp(x) for x <= 0, 0 below -700, in `out`; `bits` shares memory with `whole`."""
+def exponential(x: float) -> float:
+    """exp(x) for x <= 0; 0 below -700."""
     (c0, c1, c2, c3, c4, c5, c6, c7, c8, c9, c10, c11, c12) = _EXP
-    for n in range(x.shape[0]):
-        v = max(x[n], -700.0)
-        k = np.floor(v / _LN2 + 0.5)
-        r = v - k * _LN2
-        p = c6 + r * (c7 + r * (c8 + r * (c9 + r * (c10 + r * (c11 + r * c12)))))
-        p = c0 + r * (c1 + r * (c2 + r * (c3 + r * (c4 + r * (c5 + r * p)))))
-        out[n] = p if x[n] > -700 else 0.0
-        whole[n] = k + (_WHOLE + 1023)
-    for n in range(x.shape[0]):
-        bits[n] <<= _S52
-    for n in range(x.shape[0]):
-        out[n] *= whole[n]
+    v = max(x, -700.0)
+    k = np.floor(v / _LN2 + 0.5)
+    r = v - k * _LN2
+    p = c6 + r * (c7 + r * (c8 + r * (c9 + r * (c10 + r * (c11 + r * c12)))))
+    p = c0 + r * (c1 + r * (c2 + r * (c3 + r * (c4 + r * (c5 + r * p)))))
+    power = np.uint64(np.float64(k + (_WHOLE + 1023)).view(np.uint64) << _S52).view(np.float64)
+    return p * power if x > -700 else 0.0
 
 
 @inlined
-def normals(
-    key: np.uint64, first: int, draw: int, a: Array, b: Array, w: Words, v: Words, e: Words,
-    wf: Array, vf: Array, ef: Array, bits: Words,
-) -> None:  # fmt: skip
-    """Two standard normal numbers per particle in `a` and `b` (Box and Muller 1958).
-
-    The first particle has the number `first`; `draw` counts the pairs of a particle. `bits` shares memory
-    with `a`; the others are memory to work in, as integers and as floats.
-    """
-    start = key + mix(np.uint64(draw) * GOLDEN)
-    for n in range(a.shape[0]):
-        z = mix(start + (np.uint64(first) + np.uint64(n)) * GOLDEN)
-        w[n] = ((z >> _S32) << _S20) | _ONE_BITS
-        v[n] = ((z & _LOW) << _S20) | _ONE_BITS
-    for n in range(a.shape[0]):
-        a[n] = 2 - wf[n]
-        b[n] = vf[n] - 1.5
-    logarithms(a, bits, w, e, wf, ef)
-    for n in range(a.shape[0]):
-        radius, turn = math.sqrt(-2 * a[n]), b[n]
-        far = abs(turn) > 0.25
-        other = (0.5 if turn > 0 else -0.5) - turn
-        a[n] = radius * sine_of_turns(0.25 - abs(turn))
-        b[n] = radius * sine_of_turns(other if far else turn)
+def cosine_sine(turns: float) -> tuple[float, float]:
+    """cos(2 pi u) and sin(2 pi u) for u in [-1/2, 1/2]."""
+    far, half = abs(turns) > 0.25, 0.5 if turns > 0 else -0.5
+    return sine_of_turns(0.25 - abs(turns)), sine_of_turns(half - turns if far else turns)
 
 
 @inlined
-def cosines_sines(yaw: Array, c: Array, s: Array) -> None:
-    """cos(yaw) and sin(yaw)."""
-    for n in range(yaw.shape[0]):
-        u = yaw[n] / _TURN
-        u -= np.floor(u + 0.5)
-        other = (0.5 if u > 0 else -0.5) - u
-        c[n] = sine_of_turns(0.25 - abs(u))
-        s[n] = sine_of_turns(other if abs(u) > 0.25 else u)
+def centred(angle: float) -> float:
+    """An angle [rad] in turns, in [-1/2, 1/2]."""
+    turns = angle / _TURN
+    return turns - np.floor(turns + 0.5)
+
+
+@inlined
+def stream(key: np.uint64, draw: int) -> np.uint64:
+    """Start of the random numbers of one draw of all particles."""
+    return key + mix(np.uint64(draw) * GOLDEN)
+
+
+@inlined
+def normals(start: np.uint64, number: np.uint64) -> tuple[float, float]:
+    """Two standard normal numbers of the particle of a number (Box and Muller 1958)."""
+    z = mix(start + number * GOLDEN)
+    high = np.uint64(((z >> _S32) << _S20) | _ONE_BITS).view(np.float64)
+    low = np.uint64(((z & _LOW) << _S20) | _ONE_BITS).view(np.float64)
+    radius = math.sqrt(-2 * logarithm(2 - high))
+    c, s = cosine_sine(low - 1.5)
+    return radius * c, radius * s
 
 
 @inlined
 def add_moments(
-    weight: Array, x: Array, y: Array, yaw: Array, x_ref: float, y_ref: float, yaw_ref: float, out: Array
+    weight: Array, x: Array, y: Array, yaw: Array, x_ref: float, y_ref: float, yaw_ref: float, lanes: Array
 ) -> None:
-    """Sums of the weights, and of weight times the offsets from a pose and their products."""
-    total = sx = sy = sa = xx = xy = xa = yy = ya = aa = 0.0
-    for n in range(weight.shape[0]):
-        w, dx, dy, turns = weight[n], x[n] - x_ref, y[n] - y_ref, (yaw[n] - yaw_ref) / _TURN
-        a = (turns - np.floor(turns + 0.5)) * _TURN
-        wx, wy, wa = w * dx, w * dy, w * a
-        total += w
-        sx += wx
-        sy += wy
-        sa += wa
-        xx += wx * dx
-        xy += wx * dy
-        xa += wx * a
-        yy += wy * dy
-        ya += wy * a
-        aa += wa * a
-    out[SUM] += total
-    out[SUM_X] += sx
-    out[SUM_Y] += sy
-    out[SUM_YAW] += sa
-    out[XX] += xx
-    out[XY] += xy
-    out[X_YAW] += xa
-    out[YY] += yy
-    out[Y_YAW] += ya
-    out[YAW_YAW] += aa
+    """Sums of the weights, and of weight times the offsets from a pose and their products, by lane."""
+    total, sx, sy, sa = lanes[SUM], lanes[SUM_X], lanes[SUM_Y], lanes[SUM_YAW]
+    xx, xy, xa, yy, ya, aa = lanes[XX], lanes[XY], lanes[X_YAW], lanes[YY], lanes[Y_YAW], lanes[YAW_YAW]
+    for start in range(0, BLOCK, LANES):
+        for k in range(LANES):
+            n = start + k
+            w, dx, dy, a = weight[n], x[n] - x_ref, y[n] - y_ref, centred(yaw[n] - yaw_ref) * _TURN
+            wx, wy, wa = w * dx, w * dy, w * a
+            total[k] += w
+            sx[k] += wx
+            sy[k] += wy
+            sa[k] += wa
+            xx[k] += wx * dx
+            xy[k] += wx * dy
+            xa[k] += wx * a
+            yy[k] += wy * dy
+            ya[k] += wy * a
+            aa[k] += wa * a
+
+
+@inlined
+def greatest(row: Array, lanes: Array) -> float:
+    """Greatest entry of a row."""
+    lanes[:] = -np.inf
+    for start in range(0, BLOCK, LANES):
+        for k in range(LANES):
+            lanes[k] = max(lanes[k], row[start + k])
+    top = -np.inf
+    for k in range(LANES):
+        top = max(top, lanes[k])
+    return top
+
+
+@inlined
+def add_up(lanes: Array, out: Array) -> None:
+    """Sum of each row of lanes."""
+    for row in range(lanes.shape[0]):
+        for k in range(16):
+            lanes[row, k] += lanes[row, k + 16]
+        for k in range(8):
+            lanes[row, k] += lanes[row, k + 8]
+        for k in range(4):
+            lanes[row, k] += lanes[row, k + 4]
+        out[row] = lanes[row, 0] + lanes[row, 1] + lanes[row, 2] + lanes[row, 3]
+
+
+@inlined
+def predict_two(p: Array, g: Array, both: Array, noise: Array) -> None:
+    """P of two constants after a step, and g = P h."""
+    for n in range(BLOCK):
+        p00 = p[0, n] * both[0] + noise[0]
+        p10 = p[1, n] * both[1]
+        p11 = p[2, n] * both[2] + noise[1]
+        p[0, n], p[1, n], p[2, n] = p00, p10, p11
+        g[0, n], g[1, n] = p00 + p10, p10 + p11
+
+
+@inlined
+def predict_five(p: Array, g: Array, both: Array, noise: Array, c: Array, s: Array, r: Array) -> None:
+    """P of all linear states after a step, and g = P h with h = (1, 1, c, s, r)."""
+    for n in range(BLOCK):
+        h2, h3 = c[n], s[n]
+        p00 = p[0, n] * both[0] + noise[0]
+        p10 = p[1, n] * both[1]
+        p11 = p[2, n] * both[2] + noise[1]
+        p20, p21 = p[3, n] * both[3], p[4, n] * both[4]
+        p22 = p[5, n] * both[5] + noise[2]
+        p30, p31, p32 = p[6, n] * both[6], p[7, n] * both[7], p[8, n] * both[8]
+        p33 = p[9, n] * both[9] + noise[3]
+        p[0, n], p[1, n], p[2, n], p[3, n], p[4, n], p[5, n] = p00, p10, p11, p20, p21, p22
+        p[6, n], p[7, n], p[8, n], p[9, n] = p30, p31, p32, p33
+        g[0, n] = p00 + p10 + p20 * h2 + p30 * h3
+        g[1, n] = p10 + p11 + p21 * h2 + p31 * h3
+        g[2, n] = p20 + p21 + p22 * h2 + p32 * h3
+        g[3, n] = p30 + p31 + p32 * h2 + p33 * h3
+    for n in range(BLOCK):
+        h4 = r[n]
+        p40, p41, p42, p43 = (
+            p[10, n] * both[10], p[11, n] * both[11], p[12, n] * both[12], p[13, n] * both[13]
+        )  # fmt: skip
+        p44 = p[14, n] * both[14] + noise[4]
+        p[10, n], p[11, n], p[12, n], p[13, n], p[14, n] = p40, p41, p42, p43, p44
+        g[4, n] = p40 + p41 + p42 * c[n] + p43 * s[n] + p44 * h4
+        g[0, n] += p40 * h4
+        g[1, n] += p41 * h4
+        g[2, n] += p42 * h4
+        g[3, n] += p43 * h4
+
+
+@inlined
+def update(states: int, p: Array, mean: Array, g: Array, nu: Array, inverse: Array) -> None:
+    """z' = z + g nu / S, P' = P - g g' / S of the first linear states."""
+    for k in range(states):
+        mean_k, g_k, row = mean[k], g[k], k * (k + 1) // 2
+        for n in range(BLOCK):
+            mean_k[n] += g_k[n] * nu[n] * inverse[n]
+        for i in range(k + 1):
+            p_i, g_i = p[row + i], g[i]
+            for n in range(BLOCK):
+                p_i[n] -= g_k[n] * g_i[n] * inverse[n]
 
 
 _IN, _OUT = types.Array(types.float64, 1, "C", readonly=True), types.Array(types.float64, 1, "C")
@@ -224,12 +291,13 @@ _KINDS = types.Array(types.int64, 1, "C", readonly=True)
 
 
 @compiled(
-    types.int64, types.int64, types.int64, _TABLE, _TABLE, _IN, _IN, _IN, _IN, _IN, _KINDS, types.uint64,
-    types.boolean,
+    types.int64, types.int64, types.int64, _TABLE, _KINDS, _TABLE, _TABLE, _IN, _IN, _IN, _IN, _IN, _KINDS,
+    types.uint64, types.boolean,
 )  # fmt: skip
 def step(
-    first: int, last: int, count: int, state: Array, sums: Array, table: Array, variance: Array,
-    numbers: Array, decay: Array, noise: Array, kinds: NDArray[np.int64], key: np.uint64, sampled: bool,
+    first: int, last: int, count: int, before: Array, chosen: NDArray[np.int64], state: Array, sums: Array,
+    table: Array, variance: Array, numbers: Array, decay: Array, noise: Array, kinds: NDArray[np.int64],
+    key: np.uint64, sampled: bool,
 ) -> None:  # fmt: skip
     """Move the particles of some blocks, weigh them by a reading, and sum over each block.
 
@@ -248,7 +316,10 @@ def step(
         first: First block.
         last: Block after the last.
         count: Number of particles.
-        state: Particles, one per column, with the rows X, Y, ... and at least `count` columns.
+        before: Particles before the step, one per column, with the rows X, Y, ...
+        chosen: After resampling, the column in `before` of each particle, which all weigh the same; else of
+            length 0.
+        state: Takes the particles, at least `count` columns. Without `chosen` it may be `before`.
         sums: Takes the sums of each block, shape (blocks, 20).
         table: Table of the map's field; see `magtwin.field.maps.trilinear`.
         variance: Variance of the nodes, laid out as the values of the table; of length 0 if it has none.
@@ -256,23 +327,41 @@ def step(
             from the log weights, so that the weights before this step add up to 1.
         decay: Factor of each linear state, shape (n,).
         noise: Variance added to each, shape (n,).
-        kinds: CONSTANT, COSINE, SINE or MAP_SD for each, shape (n,).
+        kinds: CONSTANT, ... for each in ascending order, shape (n,).
         key: Key of this step's random numbers.
         sampled: The linear states are not filtered but sampled: their noise is drawn, and P stays 0.
     """
-    size = decay.shape[0]
-    arrays = np.empty((18, BLOCK))
-    words = np.empty((4, BLOCK), np.uint64)
-    factor, gain = np.ones((max(size, 1), BLOCK)), np.empty((max(size, 1), BLOCK))
-    q, nodes_at = np.empty(2 * BLOCK), np.empty(BLOCK, np.int64)
-    slopes = np.empty(BLOCK)
-    floats = words.view(np.float64)
-    bit_rows = arrays.view(np.uint64)
+    size, inner = decay.shape[0], 0
+    work, lanes = np.zeros((WORK, BLOCK)), np.zeros((PLAIN_SUM + 1, LANES))
+    places = np.zeros(STATES + _TRIANGLE, np.int64)  # rows of the linear states in `work`
+    decays, added, both = np.ones(STATES), np.zeros(STATES), np.ones(_TRIANGLE)
+    for k in range(size):
+        places[k] = k_mean = _MEAN + kinds[k]
+        decays[k_mean - _MEAN], added[k_mean - _MEAN] = decay[k], noise[k]
+        for i in range(k + 1):
+            places[size + inner] = _COVARIANCE + kinds[k] * (kinds[k] + 1) // 2 + kinds[i]
+            inner += 1
+    for k in range(STATES):
+        for i in range(k + 1):
+            both[k * (k + 1) // 2 + i] = decays[k] * decays[i]
+    few = size == 0 or kinds[size - 1] < 2
+    filtered = 2 if few else STATES
+    x, y, yaw, scale, log_w, weight = work[X], work[Y], work[YAW], work[SCALE], work[LOG_WEIGHT], work[WEIGHT]
+    mean, p = work[_MEAN:_COVARIANCE], work[_COVARIANCE:_FREE]
+    g, c, s = work[_FREE : _FREE + STATES], work[_FREE + 5], work[_FREE + 6]
+    e1, e2, e3, b, v = (
+        work[_FREE + 7], work[_FREE + 8], work[_FREE + 9], work[_FREE + 10], work[_FREE + 11]
+    )  # fmt: skip
+    hole, big_s, nu, like, r = (
+        work[_FREE + 12], work[_FREE + 13], work[_FREE + 14], work[_FREE + 15], work[_FREE + 16]
+    )  # fmt: skip
+    wx, wy, wh, slope = work[_FREE + 17], work[_FREE + 18], work[_FREE + 19], work[_FREE + 20]
+    q, node = np.empty(2 * BLOCK), np.empty(BLOCK, np.int64)
     begin, end, in_row, in_layer = planes(table)
     values, masks = table[begin:end], table[end:]
     row, up, edge = np.uint64(in_row), np.uint64(in_layer), table[5]
     used, kappa = numbers[USED] > 0, numbers[KAPPA]
-    triangle = LINEAR + size
+    tempered = used and kappa != 1
     distance, turned, shift = numbers[DISTANCE], numbers[TURNED], numbers[SHIFT]
     half = turned / 2 + numbers[DIRECTION]
     along_sd, across_sd, yaw_sd = numbers[ALONG_SD], numbers[ACROSS_SD], numbers[YAW_SD]
@@ -280,179 +369,135 @@ def step(
     field, white, map_white = numbers[FIELD], numbers[WHITE], numbers[MAP_WHITE]
     elsewhere, elsewhere_variance = numbers[ELSEWHERE], numbers[ELSEWHERE_VARIANCE]
     x_ref, y_ref, yaw_ref = numbers[X_REF], numbers[Y_REF], numbers[YAW_REF]
+    equal = -math.log(count)
     for block in range(first, last):
         start = block * BLOCK
-        stop = min(start + BLOCK, count)
-        m = stop - start
-        w0, w1, w2 = words[0, :m], words[1, :m], words[2, :m]
-        f0, f1, f2 = floats[0, :m], floats[1, :m], floats[2, :m]
-        e1, e2, e3, e4 = arrays[0, :m], arrays[1, :m], arrays[2, :m], arrays[3, :m]
-        c, s, b, v, hole = arrays[4, :m], arrays[5, :m], arrays[6, :m], arrays[7, :m], arrays[8, :m]
-        big_s, nu, log_s = arrays[9, :m], arrays[10, :m], arrays[11, :m]
-        wx, wy, wh, slope, node = arrays[12, :m], arrays[13, :m], arrays[14, :m], slopes[:m], nodes_at[:m]
-        x, y, yaw, scale = (
-            state[X, start:stop],
-            state[Y, start:stop],
-            state[YAW, start:stop],
-            state[SCALE, start:stop],
-        )
-        log_w, like, weight = (
-            state[LOG_WEIGHT, start:stop],
-            state[LIKELIHOOD, start:stop],
-            state[WEIGHT, start:stop],
-        )
-
-        normals(key, start, 0, e1, e2, w0, w1, w2, f0, f1, f2, bit_rows[0, :m])
-        normals(key, start, 1, e3, e4, w0, w1, w2, f0, f1, f2, bit_rows[2, :m])
-        for n in range(m):
-            e4[n] = yaw[n] + half
-        cosines_sines(e4, c, s)
-        for n in range(m):
-            e1[n] *= along_sd
-            e2[n] *= across_sd
-            e4[n] = distance * (1 + scale[n]) + e1[n]
-        for n in range(m):
-            x[n] += e4[n] * c[n] - e2[n] * s[n]
-        for n in range(m):
-            y[n] += e4[n] * s[n] + e2[n] * c[n]
-        for n in range(m):
-            yaw[n] += turned + yaw_sd * e3[n]
-            scale[n] += scale_gain * e1[n]
-        for n in range(m):
-            log_w[n] -= shift
-        cosines_sines(yaw, c, s)
-        for k in range(size):
-            mean, a = state[LINEAR + k, start:stop], decay[k]
-            for n in range(m):
-                mean[n] *= a
-            if sampled and noise[k] > 0:
-                normals(key, start, 2 + k, e1, e2, w0, w1, w2, f0, f1, f2, bit_rows[0, :m])
-                sd = math.sqrt(noise[k])
+        m = min(start + BLOCK, count) - start
+        for k in range(LINEAR + size + inner):
+            to, source = work[k if k < LINEAR else places[k - LINEAR]], before[k]
+            if chosen.shape[0] == 0:
                 for n in range(m):
-                    mean[n] += sd * e1[n]
+                    to[n] = source[start + n]
+            elif k != LOG_WEIGHT and k != WEIGHT:
+                for n in range(m):
+                    to[n] = source[chosen[start + n]]
+            for n in range(m, BLOCK):
+                to[n] = to[0]
+        if chosen.shape[0] > 0:
+            log_w[:] = equal
+            weight[:] = 1.0
+        log_w[m:] = -np.inf
+        weight[m:] = 0.0
+        lanes[:] = 0.0
+
+        first_draw, second_draw = stream(key, 0), stream(key, 1)
+        for n in range(BLOCK):
+            e1[n], e2[n] = normals(first_draw, np.uint64(start) + np.uint64(n))
+        for n in range(BLOCK):
+            e3[n], _ = normals(second_draw, np.uint64(start) + np.uint64(n))
+        for n in range(BLOCK):
+            cos, sin = cosine_sine(centred(yaw[n] + half))
+            along, across = along_sd * e1[n], across_sd * e2[n]
+            far = distance * (1 + scale[n]) + along
+            x[n] += far * cos - across * sin
+            y[n] += far * sin + across * cos
+            scale[n] += scale_gain * along
+        for n in range(BLOCK):
+            yaw[n] += turned + yaw_sd * e3[n]
+            c[n], s[n] = cosine_sine(centred(yaw[n]))
+            log_w[n] -= shift
+        for k in range(filtered):
+            mean_k, a = mean[k], decays[k]
+            for n in range(BLOCK):
+                mean_k[n] *= a
+        if sampled:
+            for k in range(size):
+                if noise[k] > 0:
+                    drawn, sd, to = stream(key, 2 + k), math.sqrt(noise[k]), mean[kinds[k]]
+                    for n in range(BLOCK):
+                        to[n] += sd * normals(drawn, np.uint64(start) + np.uint64(n))[0]
 
         if used:
-            for n in range(m):
+            for n in range(BLOCK):
                 q[2 * n] = x[n] + arm_x * c[n] - arm_y * s[n]
                 q[2 * n + 1] = y[n] + arm_x * s[n] + arm_y * c[n]
-            place(table, q[: 2 * m], yaw, False, wx, wy, wh, node)
+            place(table, q, yaw, False, wx, wy, wh, node)
             climb(table, in_layer, wh, slope, node)
             blends(values, row, up, node, wx, wy, wh, b)
             if masks.shape[0] > 0:
                 blends(masks, row, up, node, wx, wy, wh, hole)
-                for n in range(m):
+                for n in range(BLOCK):
                     b[n] = np.nan if hole[n] > edge else b[n]
             if variance.shape[0] > 0:
                 blends(variance, row, up, node, wx, wy, wh, v)
-            else:
-                for n in range(m):
-                    v[n] = 0.0
-            for n in range(m):
+            for n in range(BLOCK):
                 known = b[n] == b[n]
                 big_s[n] = white + (map_white * v[n] if known else elsewhere_variance)
-                nu[n] = field - (b[n] if known else elsewhere)
-            for n in range(m):
-                v[n] = v[n] if b[n] == b[n] else 0.0
-            for k in range(size):
-                h, mean = factor[k, :m], state[LINEAR + k, start:stop]
-                if kinds[k] == COSINE:
-                    for n in range(m):
-                        h[n] = c[n]
-                elif kinds[k] == SINE:
-                    for n in range(m):
-                        h[n] = s[n]
-                elif kinds[k] == MAP_SD:
-                    for n in range(m):
-                        h[n] = math.sqrt(v[n])
-                for n in range(m):
-                    nu[n] -= h[n] * mean[n]
+                r[n] = math.sqrt(v[n]) if known else 0.0
+                nu[n] = field - (b[n] if known else elsewhere) - (mean[0, n] + mean[1, n])
+            if not few:
+                for n in range(BLOCK):
+                    nu[n] -= c[n] * mean[2, n] + s[n] * mean[3, n] + r[n] * mean[4, n]
         if not sampled:
-            for k in range(size):
-                g, h = gain[k, :m], factor[k, :m]
-                for n in range(m):
-                    g[n] = 0.0
-                for i in range(k + 1):
-                    p, both = state[triangle + k * (k + 1) // 2 + i, start:stop], decay[k] * decay[i]
-                    gi, hi = gain[i, :m], factor[i, :m]
-                    added = noise[k] if i == k else 0.0
-                    if both != 1 or added != 0:
-                        for n in range(m):
-                            p[n] = p[n] * both + added
-                    for n in range(m):
-                        g[n] += p[n] * hi[n]
-                    if i < k:
-                        for n in range(m):
-                            gi[n] += p[n] * h[n]
-        prior_nu = prior_nu_nu = prior_s = 0.0
+            if few:
+                predict_two(p, g, both, added)
+            else:
+                predict_five(p, g, both, added, c, s, r)
+        top = greatest(log_w, lanes[TOP])
         if used:
             if not sampled:
-                for k in range(size):
-                    g, h = gain[k, :m], factor[k, :m]
-                    for n in range(m):
-                        big_s[n] += g[n] * h[n]
-            for n in range(m):
-                prior_nu += weight[n] * nu[n]
-                prior_nu_nu += weight[n] * nu[n] * nu[n]
-                prior_s += weight[n] * big_s[n]
-            for n in range(m):
-                log_s[n] = big_s[n]
-            for n in range(m):
+                for n in range(BLOCK):
+                    big_s[n] += g[0, n] + g[1, n]
+                if not few:
+                    for n in range(BLOCK):
+                        big_s[n] += g[2, n] * c[n] + g[3, n] * s[n] + g[4, n] * r[n]
+            sum_nu, sum_nu_nu, sum_s = lanes[NU], lanes[NU_NU], lanes[PRIOR_S]
+            for at in range(0, BLOCK, LANES):
+                for k in range(LANES):
+                    n = at + k
+                    w_nu = weight[n] * nu[n]
+                    sum_nu[k] += w_nu
+                    sum_nu_nu[k] += w_nu * nu[n]
+                    sum_s[k] += weight[n] * big_s[n]
+            for n in range(BLOCK):
+                log_s = logarithm(big_s[n])
                 big_s[n] = 1 / big_s[n]
-            logarithms(log_s, bit_rows[11, :m], w0, w1, f0, f1)
-            for n in range(m):
-                like[n] = -0.5 * (nu[n] * nu[n] * big_s[n] + log_s[n])
-            for n in range(m):
-                nu[n] *= big_s[n]
+                like[n] = -0.5 * (nu[n] * nu[n] * big_s[n] + log_s)
             if not sampled:
-                for k in range(size):
-                    g, mean = gain[k, :m], state[LINEAR + k, start:stop]
-                    for n in range(m):
-                        mean[n] += g[n] * nu[n]
-                    for i in range(k + 1):
-                        p, gi = state[triangle + k * (k + 1) // 2 + i, start:stop], gain[i, :m]
-                        for n in range(m):
-                            p[n] -= g[n] * gi[n] * big_s[n]
-        else:
-            for n in range(m):
-                like[n] = 0.0
-
-        out = sums[block]
-        out[:] = 0.0
-        out[NU], out[NU_NU], out[PRIOR_S] = prior_nu, prior_nu_nu, prior_s
-        top = -np.inf
-        for n in range(m):
-            top = max(top, log_w[n] + like[n])
-        if used and kappa != 1:
-            out[PLAIN_TOP] = top
-            for n in range(m):
-                e1[n] = log_w[n] + like[n] - top
-            exponentials(e1, f0, w0, e2)
-            for n in range(m):
-                out[PLAIN_SUM] += e2[n]
-            top = -np.inf
-            for n in range(m):
+                update(filtered, p, mean, g, nu, big_s)
+            if tempered:
+                for n in range(BLOCK):
+                    e1[n] = log_w[n] + like[n]
+                plain_top = greatest(e1, lanes[TOP])
+                sum_plain = lanes[PLAIN_SUM]
+                for at in range(0, BLOCK, LANES):
+                    for k in range(LANES):
+                        sum_plain[k] += exponential(e1[at + k] - plain_top)
+            for n in range(BLOCK):
                 log_w[n] += like[n] / kappa
-                top = max(top, log_w[n])
+            top = greatest(log_w, lanes[TOP])
+        for n in range(BLOCK):
+            weight[n] = exponential(log_w[n] - top)
+        add_moments(weight, x, y, yaw, x_ref, y_ref, yaw_ref, lanes)
+        squares, cosines, sines, offsets = lanes[SQUARES], lanes[COS], lanes[SIN], lanes[OFFSET]
+        for at in range(0, BLOCK, LANES):
+            for k in range(LANES):
+                n = at + k
+                w = weight[n]
+                squares[k] += w * w
+                cosines[k] += w * c[n]
+                sines[k] += w * s[n]
+                offsets[k] += w * mean[0, n]
+        add_up(lanes, sums[block])
+        sums[block, TOP] = top
+        if tempered:
+            sums[block, PLAIN_TOP] = plain_top
         else:
+            sums[block, PLAIN_TOP], sums[block, PLAIN_SUM] = top, sums[block, SUM]
+        for k in range(LINEAR + size + inner):
+            to, source = state[k], work[k if k < LINEAR else places[k - LINEAR]]
             for n in range(m):
-                log_w[n] += like[n]
-        out[TOP] = top
-        for n in range(m):
-            e1[n] = log_w[n] - top
-        exponentials(e1, f0, w0, weight)
-        add_moments(weight, x, y, yaw, x_ref, y_ref, yaw_ref, out)
-        squares = cos = sin = offset = 0.0
-        for n in range(m):
-            squares += weight[n] * weight[n]
-            cos += weight[n] * c[n]
-            sin += weight[n] * s[n]
-        if size > 0:
-            first_mean = state[LINEAR, start:stop]
-            for n in range(m):
-                offset += weight[n] * first_mean[n]
-        out[SQUARES], out[COS], out[SIN], out[OFFSET] = squares, cos, sin, offset
-        if kappa == 1 or not used:
-            out[PLAIN_TOP], out[PLAIN_SUM] = out[TOP], out[SUM]
+                to[start + n] = source[n]
 
 
 @compiled(types.int64, _TABLE, _IN, types.float64, types.float64, types.float64, _OUT)
@@ -461,14 +506,17 @@ def moments(
 ) -> None:
     """Sums SUM to YAW_YAW over all particles about another pose; `scales` are factors of blocks' weights."""
     out[:] = 0.0
-    part = np.empty_like(out)
+    work, lanes, part = np.zeros((4, BLOCK)), np.zeros((PLAIN_SUM + 1, LANES)), np.empty(PLAIN_SUM + 1)
     for block in range(scales.shape[0]):
-        start, stop = block * BLOCK, min((block + 1) * BLOCK, count)
-        part[:] = 0.0
-        add_moments(
-            state[WEIGHT, start:stop], state[X, start:stop], state[Y, start:stop], state[YAW, start:stop],
-            x_ref, y_ref, yaw_ref, part,
-        )  # fmt: skip
+        start = block * BLOCK
+        m = min(start + BLOCK, count) - start
+        for n in range(m):
+            work[0, n], work[1, n] = state[WEIGHT, start + n], state[X, start + n]
+            work[2, n], work[3, n] = state[Y, start + n], state[YAW, start + n]
+        work[0, m:] = 0.0
+        lanes[:] = 0.0
+        add_moments(work[0], work[1], work[2], work[3], x_ref, y_ref, yaw_ref, lanes)
+        add_up(lanes, part)
         for k in range(out.shape[0]):
             out[k] += scales[block] * part[k]
 
@@ -476,42 +524,48 @@ def moments(
 _PLACES = types.Array(types.int64, 1, "C")
 
 
-@compiled(types.int64, _TABLE, _IN, types.float64, _PLACES)
-def choose(count: int, state: Array, scales: Array, start: float, chosen: NDArray[np.int64]) -> None:
+@inlined
+def _first_of(limit: float, least: int, most: int) -> int:
+    """Least whole number not below a limit, between two others."""
+    return int(min(max(np.ceil(limit), float(least)), float(most)))
+
+
+@compiled(types.int64, types.int64, types.int64, _TABLE, _IN, _IN, types.float64, _PLACES)
+def choose(
+    first: int, last: int, count: int, state: Array, scales: Array, below: Array, start: float,
+    chosen: NDArray[np.int64],
+) -> None:  # fmt: skip
     """Systematic resampling (Kitagawa 1996): the particles at weights (start + k) / K of their sum.
 
     Args:
+        first: First block.
+        last: Block after the last.
         count: Number of particles.
         state: Particles, whose row WEIGHT is used.
-        scales: Factor of the weights of each block, such that their sum is about 1.
+        scales: Factor of the weights of each block.
+        below: Sum of the weights of all blocks before each block, and of all at the end, shape (blocks + 1,).
         start: A number in [0, 1).
-        chosen: Takes the numbers of the K chosen particles.
+        chosen: Takes the numbers of the K chosen particles, those in the blocks.
     """
-    total = 0.0
-    for n in range(count):
-        total += state[WEIGHT, n] * scales[n // BLOCK]
-    most = chosen.shape[0]
-    done, below = 0, 0.0
-    for n in range(count):
-        below += state[WEIGHT, n] * scales[n // BLOCK]
-        limit = below / total * most - start
-        while done < most and done < limit:
-            chosen[done] = n
-            done += 1
-    while done < most:
-        chosen[done] = count - 1
-        done += 1
-
-
-@compiled(types.int64, types.int64, _TABLE, types.Array(types.int64, 1, "C", readonly=True), _TABLE)
-def gather(first: int, last: int, state: Array, chosen: NDArray[np.int64], out: Array) -> None:
-    """Copy the particles chosen[first:last] of `state` to their places in `out`, with equal weights."""
-    weight = -math.log(chosen.shape[0])
-    for row in range(state.shape[0]):
-        if row == LOG_WEIGHT:
-            out[row, first:last] = weight
-        elif row == WEIGHT:
-            out[row, first:last] = 1.0
-        elif row != LIKELIHOOD:
-            for n in range(first, last):
-                out[row, n] = state[row, chosen[n]]
+    most, blocks = chosen.shape[0], scales.shape[0]
+    each = most / below[blocks]
+    done = _first_of(below[first] * each - start, 0, most)
+    for block in range(first, last):
+        begin, end = block * BLOCK, min((block + 1) * BLOCK, count)
+        stop = most if block == blocks - 1 else _first_of(below[block + 1] * each - start, done, most)
+        if stop == done:
+            continue
+        for k in range(done, stop):
+            chosen[k] = begin
+        place, total, factor = done, below[block] * each - start, scales[block] * each
+        for n in range(begin, end):  # the last particle that is written to a place is the one chosen there
+            chosen[place] = n
+            total += state[WEIGHT, n] * factor
+            place = _first_of(total, place, stop)
+            if place == stop:
+                break
+        latest = begin
+        for k in range(done, stop):
+            latest = max(latest, chosen[k])
+            chosen[k] = latest
+        done = stop

@@ -92,6 +92,10 @@ class RaoBlackwell:
     reset_count = 0
     """How often the filter has started again."""
 
+    _memory: Array
+    _resampled: NDArray[np.int64]
+    _state: Array
+
     sampled: ClassVar[bool] = False
     iron: ClassVar[bool] = False
     network: ClassVar[bool] = False
@@ -162,7 +166,7 @@ class RaoBlackwell:
         states = [(sensor.offset_nt**2, math.inf, math.inf, k.CONSTANT)]
         drift = sensor.drift_nt**2 + (0.0 if self.iron else iron)
         if drift > 0:
-            states.append((drift, sensor.drift_s, math.inf, k.CONSTANT))
+            states.append((drift, sensor.drift_s, math.inf, k.DRIFT))
         if self.iron and iron > 0:
             states += [(iron, math.inf, math.inf, k.COSINE), (iron, math.inf, math.inf, k.SINE)]
         correlated = self.map_correlated if has_variance and problem.map_length_m > 0 else 0.0
@@ -200,9 +204,7 @@ class RaoBlackwell:
         size = len(self._kinds)
         k = self._loops
         old = 0 if kept is None else kept.shape[1]
-        self._count = old + count
-        self._state = np.empty((k.LINEAR + size + size * (size + 1) // 2, _padded(self._count)))
-        self._spare = np.empty_like(self._state)
+        self._open(k.LINEAR + size + size * (size + 1) // 2, old + count)
         if kept is not None:
             self._state[:, :old] = kept
         state = self._state[:, old : self._count]
@@ -234,7 +236,7 @@ class RaoBlackwell:
         """Give the first `old` particles half of the weight, and the `count` others the rest."""
         k = self._loops
         state = self._state[:, : old + count]
-        state[k.LOG_WEIGHT], state[k.LIKELIHOOD] = 0.0, 0.0
+        state[k.LOG_WEIGHT : k.WEIGHT] = 0.0
         state[k.LOG_WEIGHT, :old] = math.log(count / max(old, 1))
         state[k.WEIGHT] = np.exp(state[k.LOG_WEIGHT])
         total = count * (2.0 if old else 1.0)
@@ -321,23 +323,37 @@ class RaoBlackwell:
     def _run(self, decay: Array, noise: Array) -> None:
         """One step of all blocks, on several threads if there are many; the old particles beside them."""
         self._count_steps += 1
-        self._sums = self._moved(self._state, self._count, decay, noise, self._count_steps)
+        before = self._state
+        if len(self._resampled):
+            self._state = self._next_state(len(before))
+        self._sums = self._moved(before, self._resampled, self._state, self._count, decay, noise)
+        self._resampled = self._resampled[:0]
         if self._old is not None:
-            used, self._numbers[self._loops.USED] = self._numbers[self._loops.USED], 0.0
-            self._moved(self._old, self._old.shape[1], decay, noise, -self._count_steps)
-            self._numbers[self._loops.USED] = used
+            old, numbers, used = self._old, self._numbers, self._numbers[self._loops.USED]
+            numbers[self._loops.USED] = 0.0
+            self._moved(old, self._resampled, old, old.shape[1], decay, noise, sign=-1)
+            numbers[self._loops.USED] = used
 
-    def _moved(self, state: Array, count: int, decay: Array, noise: Array, step: int) -> Array:
-        """Do a step with some particles; returns the sums of their blocks."""
+    def _moved(
+        self,
+        before: Array,
+        chosen: NDArray[np.int64],
+        state: Array,
+        count: int,
+        decay: Array,
+        noise: Array,
+        sign: int = 1,
+    ) -> Array:
+        """Do a step with some particles; returns the sums of their blocks. `sign` selects their draws."""
         k = self._loops
-        key = np.uint64((self._seed + step * _STRIDE) & _WORD)
+        key = np.uint64((self._seed + sign * self._count_steps * _STRIDE) & _WORD)
         blocks = self._blocks(count)
         sums = np.empty((blocks, k.PLAIN_SUM + 1))
 
         def work(part: slice) -> None:
             k.step(
-                part.start, part.stop, count, state, sums, self._table, self._variance, self._numbers,
-                decay, noise, self._kinds, key, self.sampled,
+                part.start, part.stop, count, before, chosen, state, sums, self._table, self._variance,
+                self._numbers, decay, noise, self._kinds, key, self.sampled,
             )  # fmt: skip
 
         in_threads(work, blocks, SHARE)
@@ -443,13 +459,23 @@ class RaoBlackwell:
 
     def _let_compete(self, old: Array) -> None:
         """Give half of the weight to the particles that there were before an alarm."""
-        self._resample(self._count)
-        before, count, size = self._state, self._count, old.shape[1]
-        self._count = size + count
-        self._state = np.empty((len(before), _padded(self._count)))
-        self._spare = np.empty_like(self._state)
-        self._state[:, :size], self._state[:, size : self._count] = old, before[:, :count]
+        others = self._state[:, self._chosen(self._count)]
+        size, count = old.shape[1], self._count
+        self._open(len(others), size + count)
+        self._state[:, :size], self._state[:, size : self._count] = old, others
         self._share(size, count)
+
+    def _open(self, rows: int, count: int) -> None:
+        """Memory for a number of particles, of a start or of a competition."""
+        self._count = count
+        self._memory = np.empty((2, rows * _padded(count)))
+        self._resampled = np.empty(0, np.int64)
+        self._state = self._next_state(rows)
+
+    def _next_state(self, rows: int) -> Array:
+        """Memory of a state, beside that of the present one."""
+        self._memory, columns = self._memory[::-1], _padded(self._count)
+        return self._memory[0, : rows * columns].reshape(rows, columns)
 
     def _enough(self, spread: float) -> int:
         """Least number of particles for a spread [m]."""
@@ -460,26 +486,27 @@ class RaoBlackwell:
 
     def _chosen(self, count: int) -> NDArray[np.int64]:
         """Particles drawn by their weights, systematically."""
-        chosen = np.empty(count, np.int64)
-        self._loops.choose(self._count, self._state, self._scales, float(self._rng.random()), chosen)
+        k = self._loops
+        below = np.concatenate([[0.0], np.cumsum(self._scales * self._sums[:, k.SUM])])
+        chosen, start = np.empty(count, np.int64), float(self._rng.random())
+
+        def work(part: slice) -> None:
+            k.choose(part.start, part.stop, self._count, self._state, self._scales, below, start, chosen)
+
+        in_threads(work, len(below) - 1, SHARE)
         return chosen
 
     def _resample(self, count: int) -> None:
-        k, chosen = self._loops, self._chosen(count)
-        if self._spare.shape[1] != _padded(count):
-            self._spare = np.empty((len(self._state), _padded(count)))
-        state, out = self._state, self._spare
-
-        def work(part: slice) -> None:
-            k.gather(part.start, part.stop, state, chosen, out)
-
-        in_threads(work, count, SHARE * k.BLOCK)
-        self._state, self._spare, self._count, self._shift = out, state, count, 0.0
+        """Choose the particles that the next step starts from, which copies them."""
+        self._resampled = self._chosen(count)
+        self._count, self._shift = count, 0.0
         self._scales = np.full(self._blocks(count), 1.0 / count)
 
     def particles(self) -> Array:
         """x, y, yaw and weight of the particles, shape (P, 4)."""
         k, count = self._loops, self._count
+        if len(self._resampled):
+            return np.column_stack([*self._state[:3, self._resampled], np.full(count, 1 / count)])
         weight = self._state[k.WEIGHT, :count] * np.repeat(self._scales, k.BLOCK)[:count]
         return np.column_stack([*self._state[:3, :count], weight / weight.sum()])
 

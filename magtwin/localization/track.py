@@ -1,8 +1,9 @@
 """Track: run an algorithm over readings, check every estimate, and keep them as columns."""
 
+import contextlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -102,7 +103,10 @@ def track(
     begin = time.process_time()
     spent = 0.0
     if isinstance(algorithm, Smoother) and not isinstance(algorithm, Localizer):
-        estimates = list(_called(name, lambda: algorithm.run(problem, run)))
+        made = _called(f"{name}.run", lambda: algorithm.run(problem, run))
+        if not isinstance(made, Iterable):
+            raise LocalizerError(f"{name}.run returned {type(made).__name__}, not a list of Estimates")
+        estimates = _called(f"{name}.run", lambda: list(made))
         spent = time.process_time() - begin
         if len(estimates) != run.rows:
             raise LocalizerError(f"{name}.run returned {len(estimates)} estimates for {run.rows} readings")
@@ -122,8 +126,8 @@ def track(
                 clouds.append(np.array(algorithm.particles(), float))
             if progress is not None:
                 progress(k + 1, run.rows)
-    made = checked_estimates(name, estimates, run["t"])
-    return Track(run["t"], *made, spent / run.rows, tuple(clouds))
+    checked = checked_estimates(name, estimates, run["t"])
+    return Track(run["t"], *checked, spent / run.rows, tuple(clouds))
 
 
 def _called(what: str, work: Callable[[], Any]) -> Any:
@@ -143,13 +147,17 @@ def checked_estimates(
                 f"{name} returned {type(estimate).__name__} at t = {t[k]:g} s, not an Estimate"
             )
     count = len(estimates)
-    try:
-        times = np.array([e.t for e in estimates], float)
-        pose = np.array([(e.x, e.y, e.yaw) for e in estimates], float).reshape(count, 3)
-        bias = np.array([math.nan if e.bias_nt is None else e.bias_nt for e in estimates], float)
-        lost = np.array([bool(e.lost) for e in estimates], bool)
-    except (TypeError, ValueError) as error:
-        raise LocalizerError(f"{name} returned an estimate whose values are not numbers: {error}") from error
+    times = np.array([_number(name, "t", e.t, when) for e, when in zip(estimates, t, strict=True)])
+    pose = np.empty((count, 3))
+    bias, lost = np.full(count, math.nan), np.zeros(count, bool)
+    for k, (e, when) in enumerate(zip(estimates, t.tolist(), strict=True)):
+        pose[k] = [_number(name, part, getattr(e, part), when) for part in ("x", "y", "yaw")]
+        if e.bias_nt is not None:
+            bias[k] = _number(name, "bias_nt", e.bias_nt, when)
+        try:
+            lost[k] = bool(e.lost)
+        except ValueError:
+            raise LocalizerError(_not(name, "lost", "true or false", e.lost, when)) from None
     if (wrong := times != t).any():
         k = int(np.argmax(wrong))
         when = "from the future" if times[k] > t[k] else "of another reading"
@@ -160,7 +168,11 @@ def checked_estimates(
     for k, e in enumerate(estimates):
         if e.covariance is None:
             continue
-        matrix = np.asarray(e.covariance, float)
+        try:
+            matrix = np.asarray(e.covariance, float)
+        except (TypeError, ValueError):
+            text = _not(name, "covariance", "an array of numbers", e.covariance, t[k])
+            raise LocalizerError(text) from None
         if matrix.shape != (3, 3):
             raise LocalizerError(
                 f"{name} returned a covariance of shape {matrix.shape} at t = {t[k]:g} s, not (3, 3)"
@@ -181,3 +193,20 @@ def checked_estimates(
                 f"{name} returned a covariance that is not positive semidefinite at t = {when:g} s"
             )
     return pose, covariance, bias, lost
+
+
+def _number(name: str, part: str, value: Any, t: float) -> float:
+    """A part of an estimate as a number."""
+    if not isinstance(value, str) and np.shape(value) == ():
+        with contextlib.suppress(TypeError, ValueError):
+            return float(value)
+    raise LocalizerError(_not(name, part, "a number", value, t))
+
+
+def _not(name: str, part: str, wanted: str, value: Any, t: float) -> str:
+    """What is said of a part of an estimate that is not what it should be."""
+    if isinstance(value, np.ndarray):
+        seen = f"an array of shape {value.shape}"
+    else:
+        seen = f"{type(value).__name__} {value!r:.40}"
+    return f"{name} returned {part} that is not {wanted} at t = {t:g} s: {seen}"

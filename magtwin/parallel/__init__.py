@@ -24,9 +24,12 @@ they are ready:
 The process that opened the pool writes the results, so workers need no folder in common with it.
 """
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 from magtwin.errors import InputError
 from magtwin.parallel.machine import free_memory, processors
-from magtwin.parallel.pool import RETRIES, Failure, Outcome, Pool, WorkerError
+from magtwin.parallel.pool import RETRIES, C, Failure, Outcome, Pool, R, WorkerError
 from magtwin.parallel.shard import checked_shard, in_shard, parse_shard
 from magtwin.parallel.worker import beat
 
@@ -43,6 +46,7 @@ __all__ = [
     "open_pool",
     "parse_shard",
     "processors",
+    "run_all",
 ]
 
 
@@ -68,3 +72,34 @@ def open_pool(jobs: int | None = None, *, dask: str | None = None) -> Pool:
     from magtwin.parallel.cluster import Cluster
 
     return Cluster(dask)
+
+
+def run_all(
+    work: Callable[[C], R],
+    chunks: Sequence[C],
+    *,
+    jobs: int | None = None,
+    progress: Callable[[int, int], Any] = lambda done, total: None,
+) -> list[R]:
+    """Call a function for every chunk; gives the results in the order of the chunks.
+
+    Args:
+        work: A pure function. With `jobs` it and its chunks must be of the kind that can be pickled.
+        chunks: What it is called with, one at a time.
+        jobs: Processes on this machine. Default: this process, whose compiled loops use several threads.
+        progress: Called with the chunks done and all chunks.
+
+    Raises:
+        InputError: `jobs` is wrong, or the function refused a chunk.
+        WorkerError: A worker failed in another way.
+    """
+    if jobs is None:
+        results = []
+        for k, chunk in enumerate(chunks):
+            progress(k, len(chunks))
+            results.append(work(chunk))
+        progress(len(chunks), len(chunks))
+        return results
+    with open_pool(jobs) as pool:
+        outcomes = {each.index: each.result() for each in pool.run(work, chunks, progress=progress)}
+    return [outcomes[k] for k in range(len(chunks))]

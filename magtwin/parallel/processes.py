@@ -21,6 +21,9 @@ from magtwin.parallel.worker import serve
 STARTS = 3
 """Workers that may end, one after the other, before any of them was ready."""
 
+UNGUARDED = 97
+"""Status of a worker that ended itself, because the script that it imports would start workers again."""
+
 ONE_THREAD = {
     "BLIS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
@@ -93,6 +96,8 @@ class Processes:
     """
 
     def __init__(self, jobs: int, *, idle_s: float | None = None) -> None:
+        if getattr(multiprocessing.current_process(), "_inheriting", False):  # as multiprocessing checks it
+            sys.exit(UNGUARDED)
         self.jobs, self._idle_s = jobs, idle_s
         self._workers: list[_Worker] = []
         self._failed_starts = 0
@@ -220,11 +225,15 @@ class Processes:
     def _count_start(self, reason: str) -> None:
         """Count workers that ended before they were ready, and give up after `STARTS`."""
         self._failed_starts += 1
+        guard = '`if __name__ == "__main__":`'
+        if reason == _reason(UNGUARDED):
+            text = "worker processes import the script that starts them: let it begin its work below"
+            raise InputError(f"{text} {guard}") from None
         if self._failed_starts >= STARTS:
             raise InputError(
                 f"worker processes cannot start: the last one {reason}; a Python script that starts them "
-                'must begin its work below `if __name__ == "__main__":`'
-            )
+                f"must begin its work below {guard}"
+            ) from None
 
 
 def _outcome(index: int, message: tuple[Any, ...], at: str) -> Outcome[Any]:

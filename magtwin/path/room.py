@@ -130,8 +130,8 @@ def _what_fits(path: Path, floor_m: tuple[float, float], footprint_radius_m: flo
         scale = float(np.min(room / (high - low)))
     if scale >= 1:
         x, y = np.clip(0.0, high - room / 2, low + room / 2) * -1.0 + 0.0
-        return f"moved by ({x:.2f}, {y:.2f}) m it fits: give `fit=True`, or move its points"
-    return f"scaled by {math.floor(scale * 100) / 100:g} it fits: give `fit=True`, or enlarge the floor"
+        return f"moved by ({x:.2f}, {y:.2f}) m it fits the floor: give `fit=True`, or move its points"
+    return f"scaled by {math.floor(scale * 100) / 100:g} it fits the floor: give `fit=True`, or enlarge it"
 
 
 def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> None:

@@ -170,6 +170,9 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
                 )
         object.__setattr__(self, "specs", MappingProxyType(custom))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (dict(self.columns), dict(self.metadata), dict(self.specs))
+
     def __getitem__(self, name: str) -> NDArray[Any]:
         return find("column", name, self.columns)
 

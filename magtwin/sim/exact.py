@@ -2,7 +2,8 @@
 
 If a scene has the Earth's field and magnetised things, they make the field. If it has only a survey, the
 fitted map is the field. A map is a magnitude, so the direction of the field comes from the harmonic fit, or
-else from the scene's [earth], or else it is assumed: `DIP` below the horizon, towards world +y.
+else from the scene's [earth], or else it is assumed: `DIP` below the horizon, towards world +y. Magnitudes
+alone hardly determine the direction of a fit, so one that is more than `BENT` off [earth] is not used.
 
 A map that depends on the heading was surveyed by a robot that turned. It contains the permanent and induced
 field of that robot in the session of the survey, and the robot of the scene is taken to be that robot. It
@@ -41,6 +42,10 @@ Array = NDArray[np.float64]
 DIP = np.radians(60.0)
 """Assumed dip of a field of unknown direction [rad]: that of magnetic latitude 41 deg north."""
 
+BENT = np.radians(10.0)
+"""Largest angle between [earth] and the uniform part of a harmonic fit that a building explains [rad]:
+the 3,000 nT of the default lab turn the field by 4 deg."""
+
 OFF_HEIGHT_M = 0.03
 """Difference of the sensor's height from the map's that is noted in a run [m]: the field of iron 0.5 m below
 changes by a sixth over it."""
@@ -76,6 +81,21 @@ class ExactField:
         values = np.where(self.anomaly_map.valid, self.anomaly_map.values_nt, np.nan)
         return bool(np.any(np.abs(values - values[:1]) > CONSTANT_NT))
 
+    @cached_property
+    def direction(self) -> Literal["fit", "earth", "assumed"]:
+        """The origin of the field's direction where the map is the field; see the module."""
+        if self.anomaly_map.harmonic is not None and self._bend <= BENT:
+            return "fit"
+        return "assumed" if self.scene.earth is None else "earth"
+
+    @cached_property
+    def _bend(self) -> float:
+        """Angle between the uniform part of the harmonic fit and [earth] [rad]; 0 if either is absent."""
+        if self.anomaly_map.harmonic is None or self.scene.earth is None:
+            return 0.0
+        a, b = self.anomaly_map.harmonic.b_uniform_nt, np.asarray(self.scene.earth.b_world_nt, float)
+        return float(np.arctan2(np.linalg.norm(np.cross(a, b)), np.dot(a, b)))
+
     @property
     def metadata(self) -> Mapping[str, str]:
         """Metadata of a run on its true field; empty if Earth and sources make it."""
@@ -87,10 +107,16 @@ class ExactField:
             )
         else:
             added = "the whole platform field from the robot's spec, as a map without headings holds none"
-        if self.anomaly_map.harmonic is not None:
+        if self.direction == "fit":
             direction = "from the harmonic fit"
-        elif self.scene.earth is not None:
+            if self.scene.earth is None:
+                direction += ", unchecked, as there is no [earth]"
+        elif self.direction == "earth":
             direction = "that of [earth]"
+            if self.anomaly_map.harmonic is not None:
+                direction += (
+                    f", as that of the harmonic fit is {np.degrees(self._bend):.0f} deg off (fit --earth)"
+                )
         else:
             direction = f"assumed {np.degrees(DIP):.0f} deg down towards +y, as there is no [earth]"
         text = f"the fitted map; {added}; direction of the field {direction}"
@@ -179,7 +205,7 @@ class ExactField:
             size = at_rest_nt
         ambient = self._ambient(scene, true, cos, sin)
         unit = into_base_axes(ambient, cos, sin)
-        if self.holds_robot and field.harmonic is not None:
+        if self.holds_robot and field.harmonic is not None and self.direction == "fit":
             unit = unit + unit @ field.harmonic.soft_iron.T + field.harmonic.hard_iron_nt
         unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
         b_base = size[:, None] * unit
@@ -197,7 +223,7 @@ class ExactField:
     def _ambient(self, scene: Scene, true: Moment, cos: Array, sin: Array) -> Array:
         """Direction of the field without the robot, of any length, in world axes, shape (N, 3)."""
         harmonic = self.anomaly_map.harmonic
-        if harmonic is None:
+        if harmonic is None or self.direction != "fit":
             uniform = self.scene.earth.b_world_nt if self.scene.earth else (0.0, np.cos(DIP), -np.sin(DIP))
             return np.broadcast_to(np.asarray(uniform, float), (len(cos), 3))
         from magtwin.field.sources.compiled_dipoles import dipole_field_nt  # compiled, as simulations are

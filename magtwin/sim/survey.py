@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,12 @@ from magtwin.errors import InputError
 from magtwin.field.grid import Grid
 from magtwin.field.maps.curvature import interpolation_error_nt2
 from magtwin.field.maps.holes import filled
+from magtwin.field.maps.made_from import made_from
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.magnets import body_of
 from magtwin.field.survey.readings import Readings
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
+from magtwin.parallel import run_all
 from magtwin.sim.interference import ambient_field_nt, ambient_gradient_nt_m, platform_field_nt
 from magtwin.sim.sensors.magnetometer import lost_in, rounded, stuck_nt
 from magtwin.spec.lab import SurveySpec
@@ -88,6 +91,7 @@ def survey_readings(
     created: str = "",
     progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
     blocked: Callable[[Array], NDArray[np.bool_]] | None = None,
+    jobs: int | None = None,
 ) -> Readings:
     """Readings of the robot at each node of a grid, in each heading.
 
@@ -111,6 +115,8 @@ def survey_readings(
         created: Day of the survey, YYYY-MM-DD.
         progress: Called with headings done, headings in all, and what is being done.
         blocked: From nodes of shape (Y, X, 2) to whether the robot cannot stand there. Default: none.
+        jobs: Processes that share the headings; they do not change the readings. Default: this process, with
+            several threads.
 
     Returns:
         A row for each node, in the order of `Grid.poses`, with magnitudes; `good` where the robot can stand.
@@ -118,7 +124,8 @@ def survey_readings(
     Raises:
         InputError: The Earth's field is unknown, the grid has no cell, or a figure is out of range.
     """
-    about: dict[str, Any] = {"source": source, "licence": licence, "created": created, "blocked": blocked}
+    about: dict[str, Any] = {"source": source, "licence": licence, "created": created}
+    about |= {"blocked": blocked, "jobs": jobs}
     about |= {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}
     return _visit(scene, rng, spacing_m, headings_rad, readings, height_m, progress, **about)[0]
 
@@ -138,6 +145,7 @@ def _visit(
     licence: str = "",
     created: str = "",
     blocked: Callable[[Array], NDArray[np.bool_]] | None = None,
+    jobs: int | None = None,
 ) -> tuple[Readings, NDArray[np.bool_]]:
     """The readings, and the nodes without one, shape (H, Y, X): lock was lost, or the node is blocked."""
     if readings < 1:
@@ -164,19 +172,19 @@ def _visit(
     if heading_error_rad:
         yaw = nominal + heading_error_rad * rng.standard_normal(nominal.shape)
     sensor, stuck = scene.robot.magnetometer, rng.spawn(1)[0]
-    exact, lost, stood = np.zeros(grid.shape), np.zeros(grid.shape, bool), np.ones(grid.shape, bool)
-    for k in range(len(grid.headings_rad)):
-        progress(k, len(grid.headings_rad), "")
-        closed = np.zeros(grid.shape[1:], bool) if blocked is None else blocked(node[k])
-        here = (slice(None), slice(None)) if not closed.any() else np.nonzero(~closed)
-        lost[k], stood[k] = closed, ~closed
-        exact[k][here] = field_at_rest_nt(scene, stands[k][here], yaw[k][here], height_m=height_m)
-        if sensor.gradient_max_nt_m:
-            gradient = ambient_gradient_nt_m(
-                scene, _sensor_places(scene, stands[k][here], yaw[k][here], height)
-            )
-            lost[k][here] = lost_in(sensor, gradient.ravel()).reshape(gradient.shape)
-    progress(len(grid.headings_rad), len(grid.headings_rad), "")
+    closed = np.zeros(grid.shape, bool)
+    if blocked is not None:
+        closed = np.stack([blocked(nodes) for nodes in node])
+    exact, lost = np.zeros(grid.shape), closed.copy()
+    here = [... if not shut.any() else np.nonzero(~shut) for shut in closed]
+    visited = run_all(
+        partial(_at_nodes, scene, height_m, height),
+        [(stands[k][at], yaw[k][at]) for k, at in enumerate(here)],
+        jobs=jobs,
+        progress=lambda done, every: progress(done, every, ""),
+    )
+    for k, (at, (exact_here, lost_here)) in enumerate(zip(here, visited, strict=True)):
+        exact[k][at], lost[k][at] = exact_here, lost_here
     total = np.zeros_like(exact)
     for _ in range(readings):
         noise = sensor.noise_std_nt * rng.standard_normal(exact.shape)
@@ -185,7 +193,7 @@ def _visit(
         value = rounded(stuck_nt(sensor, lost.ravel(), stuck), sensor.resolution_nt).reshape(grid.shape)
         total[lost] = value[lost] * readings
     read = Readings(
-        good=stood.ravel(),
+        good=~closed.ravel(),
         p_xy=node.reshape(-1, 2),
         yaw=yaw.ravel(),
         b_nt=(total / readings).ravel(),
@@ -201,6 +209,19 @@ def _visit(
         earth_nt=None if scene.earth is None else scene.earth.b_world_nt,
     )
     return read, lost
+
+
+def _at_nodes(
+    scene: Scene, height_m: float | None, height: float, poses: tuple[Array, Array]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Exact field [nT] at places (..., 2) and headings (...), and whether the sensor loses lock there."""
+    stands, yaw = poses
+    sensor = scene.robot.magnetometer
+    exact = field_at_rest_nt(scene, stands, yaw, height_m=height_m)
+    if not sensor.gradient_max_nt_m:
+        return exact, np.zeros(exact.shape, bool)
+    gradient = ambient_gradient_nt_m(scene, _sensor_places(scene, stands, yaw, height))
+    return exact, lost_in(sensor, gradient.ravel()).reshape(gradient.shape)
 
 
 def survey(
@@ -259,6 +280,7 @@ def survey(
         frame=read.frame,
         datum=read.datum,
         height_m=read.height_m,
+        made_from=made_from(scene, height_m=read.height_m),
         parameters={
             "readings": readings,
             "noise_std_nt": sensor.noise_std_nt,

@@ -7,6 +7,7 @@ import tempfile
 import warnings
 import weakref
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,7 @@ from magtwin.twin.twin import (
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.magnetometer import NeuralMagnetometer
+    from magtwin.usd.scene import OpenedScene
 
 _CHECKSUMS = {"map_sha256": "its map", "network_sha256": "its network", "scene_sha256": "the scene"}
 
@@ -33,6 +35,7 @@ _CHECKSUMS = {"map_sha256": "its map", "network_sha256": "its network", "scene_s
 def open_twin(
     scene: Scene | str | FilePath,
     *,
+    lab: str = "",
     network: str | FilePath | None = None,
     magnetometer: Kind | None = None,
     model_error: bool = True,
@@ -40,14 +43,17 @@ def open_twin(
 ) -> Twin:
     """Open a scene with the map and the network that it names.
 
+    The lab can stand anywhere on its stage, turned about the vertical; poses and fields are in its axes.
+
     A network that was trained on another map, another robot or another sensor position causes a
     `magtwin.MismatchWarning` with the expected error. Its text is stored in the metadata of runs as
-    `network_mismatch`.
+    `network_mismatch`. So does a map that was made before the stage was changed, as `map_mismatch`.
 
     Args:
         scene: Root layer or folder of a scene, the name of one that ships ("lab"), or a `Scene`, which is
             written to a temporary folder first. Colliders added to a stage by hand are not part of a
             `Scene`.
+        lab: Path of the lab's root prim on a stage of several labs. Default: the only lab.
         network: Weights (.safetensors or .pth) that replace those of the scene; or "none" for a physical
             magnetometer.
         magnetometer: Kind that replaces the scene's: "physical", "neural" or "map-only".
@@ -64,11 +70,12 @@ def open_twin(
     options: Any = {"network": network, "magnetometer": magnetometer, "model_error": model_error}
     options["tracking_error"] = tracking_error
     if isinstance(scene, Scene):
-        return _open_in_memory(scene, **options)
+        return _open_in_memory(scene, **options)  # has one lab
     from magtwin.usd.scene import open_scene
 
     file = scene_file(scene)
-    stage = open_scene(file, check_network=network is None and magnetometer in (None, "neural"))
+    neural = network is None and magnetometer in (None, "neural")
+    stage = open_scene(file, lab=lab, check_network=neural)
     read = stage.scene
     read = dataclasses.replace(
         read,
@@ -83,6 +90,14 @@ def open_twin(
     if revision := git_revision(file.parent):
         metadata["git_revision"] = revision
     metadata |= {"map": field.name, "map_sha256": sha256(read.map_layer)}
+    if stage.lab:
+        metadata["lab"] = stage.lab
+    if stage.pose is not None:
+        metadata["lab_pose"] = " ".join(map(repr, (*stage.pose.p, stage.pose.yaw)))
+    if stage.changes:
+        metadata["map_mismatch"] = _stale(stage)
+    for text in (*stage.notes, *([str(metadata["map_mismatch"])] if stage.changes else [])):
+        warnings.warn(text, MismatchWarning, stacklevel=2)
     platforms = {placed.robot.name: _platform_sha256(placed.robot) for placed in read.robots}
     metadata["platform_sha256"] = platforms[read.robot.name]
     twin = Twin(read, file, field, predictor, stage.obstacles, metadata, platforms, model_error, opened=stage)
@@ -91,6 +106,23 @@ def open_twin(
         named = {**twin.metadata, "network_file": FilePath(network).as_posix()}
         return dataclasses.replace(twin, metadata=named)
     return twin
+
+
+def _stale(stage: "OpenedScene") -> str:
+    """What has changed since the map was made, by how much the map is off, and what to do."""
+    from magtwin.sim.contradiction import contradiction_nt
+
+    scene, effect = stage.scene, ""
+    advice = f"survey again: magtwin map survey {stage.file} --out MAP.usdc --adopt"
+    if scene.earth is None:
+        advice = "make a map with this robot in this room"
+    else:
+        with suppress(InputError):  # no node to compare
+            effect = f"the map differs from the field of the stage by {contradiction_nt(scene, stage.map)}; "
+    return (
+        f"{stage.file}: has changed since its map {stage.map.name!r} was made: {'; '.join(stage.changes)}; "
+        f"{effect}{advice}"
+    )
 
 
 def scene_file(scene: str | FilePath) -> FilePath:
@@ -279,6 +311,7 @@ def twin_of(
     network = str(metadata["network_file"]) if "network_file" in metadata else None
     twin = open_twin(
         scene,
+        lab=str(metadata.get("lab", "")),
         network=network if network is None else locate(network, near) or network,
         magnetometer=kind if network is None else None,
         model_error=bool(metadata.get("model_error", False)),

@@ -265,6 +265,11 @@ def engine_named(
     if name != "newton":
         return ENGINES[name]
     check_installed()
+    if {"lab", "lab_pose"} & twin.metadata.keys():
+        raise InputError(
+            f"{twin.scene_file}: Newton drives a lab at the origin of its own stage, and this one is placed "
+            "in another; open the lab's own stage"
+        )
     return Newton(twin.scene_file, twin.scene.robot, progress)
 
 

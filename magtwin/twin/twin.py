@@ -89,7 +89,7 @@ class Twin(Summarized):
         if self.opened is not None:
             opened = self.opened.alone(name)
             return opened.shapes, opened.links
-        stage = open_alone(self.scene_file, name)
+        stage = open_alone(self.scene_file, name, lab=str(self.metadata.get("lab", "")))
         return list(read_shapes(stage)), read_links(stage)
 
     def __getstate__(self) -> dict[str, object]:

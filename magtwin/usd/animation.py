@@ -30,6 +30,7 @@ from magtwin.spec.base import Quat, Vec3
 from magtwin.usd.attributes import read_pose, target
 from magtwin.usd.geometry import BASE_LINK, read_links
 from magtwin.usd.layers import SUFFIXES, WORLD, describe_stage, open_stage
+from magtwin.usd.placement import lab_on, labs_on, take_to_origin
 from magtwin.usd.schema import attribute_name, only_prim_with, place, prims_with
 from magtwin.usd.sensors import JOINT_FIELDS
 
@@ -149,9 +150,12 @@ def write_animation(
     stand = _Stand()
     if scene_file is not None:
         stage = open_stage(scene_file)
+        world = stage.GetDefaultPrim()
+        if labs_on(stage):
+            take_to_origin(stage, lab_on(stage, str(run.metadata.get("lab", ""))))
         if path.resolve() in (Path(layer.realPath).resolve() for layer in stage.GetUsedLayers()):
             raise InputError(f"{path}: is a part of the scene; give another name")
-        stand = _stand(stage, str(run.metadata.get("robot", "")))
+        stand = _stand(stage, world, str(run.metadata.get("robot", "")))
     with output(path, force=force) as aside:
         layer = Sdf.Layer.CreateNew(str(aside))
         if layer is None:
@@ -278,23 +282,25 @@ def _pose_columns(run: Run) -> tuple[str, str]:
     raise InputError(f"the run has no pose of the robot; it needs {known}")
 
 
-def _stand(stage: Usd.Stage, name: str) -> _Stand:
-    """The prims of a scene's robot; the first robot if `name` is ""."""
+def _stand(stage: Usd.Stage, default: Usd.Prim, name: str) -> _Stand:
+    """The prims of a lab's robot, on a stage in the lab's axes; the first robot if `name` is ""."""
     root = stage.GetPseudoRoot()
     robots = {prim.GetName(): prim for prim in prims_with(root, "robot")}
     prim = find("robot", name, robots) if name else next(iter(robots.values()), None)
     if prim is None:
         prim = only_prim_with(root, "robot")  # refuses
-    default = stage.GetDefaultPrim()
-    if not default or prim.GetParent() != default:
-        raise InputError(f"{place(prim)}: the robot must stand directly under the default prim of its scene")
+    if not default:
+        raise InputError(f"{place(prim)}: the stage has no default prim, which holds the run; set one")
     if prim.IsInstance() or prim.IsInstanceProxy():
         raise InputError(
             f"{place(prim)}: the robot is an instance, whose wheels cannot turn; make it not instanceable"
         )
     cache = UsdGeom.XformCache()
-    if cache.GetLocalToWorldTransform(default) != Gf.Matrix4d(1):
-        raise InputError(f"{place(default)}: is moved or scaled; place it at the origin")
+    if cache.GetParentToWorldTransform(prim) != Gf.Matrix4d(1):
+        raise InputError(
+            f"{place(prim)}: a prim above the robot, below the lab's root, is moved; the robot must stand in "
+            "the lab's own axes"
+        )
     base = next((body for body in Usd.PrimRange(prim) if body.GetName() == BASE_LINK), prim)
     to_root = cache.ComputeRelativeTransform(base, prim)[0].RemoveScaleShear()
     turn, offset = to_root.ExtractRotationQuat(), to_root.ExtractTranslation()

@@ -5,8 +5,11 @@ from pathlib import Path
 
 from pxr import Usd, UsdGeom, UsdPhysics
 
+from magtwin.errors import InputError
 from magtwin.report import Figure, Report
 from magtwin.usd.layers import open_stage
+from magtwin.usd.placement import AT_ORIGIN, labs_on, pose_of
+from magtwin.usd.scene import open_scene
 
 _PREFIX = "Magtwin"
 _MANY = ("MagtwinMagneticSourceAPI", "MagtwinFurnitureAPI")
@@ -47,4 +50,30 @@ def info_of_stage(path: Path) -> Report:
     for many in _MANY:
         if count := sum(schema == many for schema, _ in applied):
             figures.append(Figure(many, count, "prims"))
+    figures += _labs(path, stage)
     return Report(str(path), tuple(figures))
+
+
+def _labs(path: Path, stage: Usd.Stage) -> list[Figure]:
+    """Where each lab stands, if not at the origin, and what has changed since its map was made."""
+    figures = []
+    for lab in {lab.path: lab for lab in labs_on(stage)}.values():
+        try:
+            pose = pose_of(lab)
+        except InputError as error:
+            figures.append(Figure(f"lab {lab.path}", "cannot be used", note=str(error)))
+            continue
+        if pose != AT_ORIGIN:
+            figures.append(Figure(f"lab {lab.path}", str(pose)))
+        try:
+            opened = open_scene(path, lab=lab.path, check_network=False)
+        except InputError as error:
+            figures.append(Figure("cannot be run", str(error)))
+            continue
+        if opened.map.made_from is not None:
+            figures.append(Figure("map made from", str(opened.map.made_from)))
+        if opened.changes:
+            note = f"magtwin map survey {path} --out MAP.usdc --adopt surveys again"
+            figures.append(Figure("changed since", "; ".join(opened.changes), note=note))
+        figures += [Figure("note", text) for text in opened.notes]
+    return figures

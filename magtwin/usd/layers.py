@@ -58,7 +58,7 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
 
     Raises:
         InputError: The file is missing or not USD, or a sublayer or reference is missing; the text has USD's
-            own message.
+            own message. Or a layer has changes in this process that are not saved, which would be lost.
     """
     path = existing(path, "USD file")
     if path.is_dir():
@@ -66,6 +66,12 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
     try:
         stage = Usd.Stage.Open(str(path))
+        unsaved = [layer.identifier for layer in stage.GetUsedLayers() if layer.dirty and layer.realPath]
+        if unsaved:
+            raise InputError(
+                f"{path}: {unsaved[0]} has changes in this process that are not saved; save them "
+                "(`stage.Save()`), or drop them (`layer.Reload()`)"
+            )
         stage.Reload()  # a layer that is still held elsewhere would be stale
         errors = stage.GetCompositionErrors()
     except Tf.ErrorException as error:
@@ -75,6 +81,16 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
     if errors:
         raise InputError(f"{path}: {_one_line(_text(errors[0]))}")
     return stage
+
+
+def save_layer(layer: Sdf.Layer) -> None:
+    """Write a changed layer to its file, aside and then renamed, as text or crate as before."""
+    path = Path(layer.realPath)
+    with path.open("rb") as old:
+        kind = "usdc" if old.read(8) == b"PXR-USDC" else "usda"
+    with output(path, force=True) as aside:
+        layer.Export(str(aside), args={"format": kind} if path.suffix == ".usd" else {})
+    layer.Reload(force=True)
 
 
 def layer_files(path: str | os.PathLike[str]) -> list[Path]:

@@ -18,6 +18,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 from magtwin.errors import InputError
 from magtwin.field.days import ORIGIN, day_number
 from magtwin.field.maps.epochs import at_date, day_of, in_order
+from magtwin.field.maps.made_from import MadeFrom
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
 from magtwin.field.sources.harmonic import SHAPES as HARMONIC
@@ -45,8 +46,15 @@ MOST_CHARACTERS = 60
 UNIT = "nT"
 TEXTS = ("name", "method", "source", "licence", "created")
 PLACES = ("frame", "datum")
+MADE_FROM = attribute_name("anomalyMap", "made_from")
 RECORDED = ("recorded_nt", "recorded_yaw")
 """What only a survey has: its exact readings, and their headings."""
+
+GRID = ("shape", "origin", "cellSize", "headings")
+"""Attributes of the grid, which the checksum covers from version 2 on."""
+
+CHECKSUM_VERSION = 2
+"""Version of the checksum of a new map. Version 1, that of an older map, is of the arrays alone."""
 
 DAYS_PER_SECOND = 24.0
 """Time codes (days) that a viewer plays per second; USD's own default."""
@@ -163,12 +171,25 @@ def checksums(prim: Usd.Prim) -> list[tuple[str, str]]:
     Raises:
         InputError: An array is missing or of another type; names the prim.
     """
-    pairs = []
+    pairs, grid = [], _covered_grid(prim)
     for sample in (None, *_samples(prim)):
         values, valid, variance = (np.array(_get(prim, n, sample)) for n in ("values", "valid", "variance"))
-        taken = _checksum(values, valid, variance, _read_harmonic(prim, sample))
+        taken = _checksum(values, valid, variance, _read_harmonic(prim, sample), grid)
         pairs.append((_get(prim, "checksum", sample), taken))
     return pairs
+
+
+def _covered_grid(prim: Usd.Prim) -> NDArray[np.float64] | None:
+    """The numbers of the grid in the order of `GRID`; None if the map's checksum does not cover them."""
+    version = _get(prim, "checksumVersion")
+    if version == 1:
+        return None
+    if version != CHECKSUM_VERSION:
+        raise InputError(
+            f"{place(prim)}: its checksum is of version {version}, this magtwin knows 1 to "
+            f"{CHECKSUM_VERSION}; read it with a later magtwin, or make the map anew"
+        )
+    return np.concatenate([np.ravel(np.array(_get(prim, name), float)) for name in GRID])
 
 
 @dataclass(frozen=True)
@@ -205,8 +226,6 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
         )
     values, valid, variance = (np.array(_get(prim, name, sample)) for name in ("values", "valid", "variance"))
     harmonic = _read_harmonic(prim, sample)
-    if checksum != _checksum(values, valid, variance, harmonic):
-        raise InputError(f"{place(prim)}: the map's values do not match its checksum; make the map anew")
     shape = tuple(_get(prim, "shape"))
     if len(shape) != 3 or min(shape) < 1 or not values.size == valid.size == math.prod(shape):
         raise InputError(
@@ -220,6 +239,11 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
             f"{place(prim)}: {attribute_name('anomalyMap', 'headings')} must ascend in [0, 360) deg, got "
             f"{str(headings.tolist())[:MOST_CHARACTERS]}; make the map anew"
         )
+    grid = _covered_grid(prim)
+    if checksum != _checksum(values, valid, variance, harmonic, grid):
+        also = "" if grid is None else ", which covers its grid too"
+        text = f"the map's values do not match its checksum{also}; make the map anew"
+        raise InputError(f"{place(prim)}: {text}")
     spreads = variance.reshape(-1, *shape).astype(float)  # of the nodes, and between them
     recorded = _read_recorded(prim, RECORDED[0], sample, shape)
     if recorded is not None and not np.array_equal(recorded.ravel().astype("f4"), values, equal_nan=True):
@@ -240,6 +264,7 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
             height_m=_read_height(prim),
             parameters=_read_parameters(_get(prim, "parameters", sample)),
             harmonic=None if harmonic is None else HarmonicField(**harmonic),
+            made_from=read_made_from(prim, sample),
             **{name: _get(prim, name) for name in PLACES},
             **{name: _get(prim, name, sample) for name in TEXTS},
         )
@@ -291,6 +316,30 @@ def _read_parameters(text: str) -> dict[str, Any]:
     return figures
 
 
+def read_made_from(prim: Usd.Prim, sample: _Sample | None = None) -> MadeFrom | None:
+    """What a prim's map was made from, or what was authored over it; None if that is not recorded.
+
+    Raises:
+        InputError: The attribute holds something else; names the prim.
+    """
+    text = _get(prim, "madeFrom", sample)
+    if not text:
+        return None
+    try:
+        return MadeFrom.from_table(json.loads(text))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{place(prim)}: {MADE_FROM}: {error}; make the map anew") from error
+
+
+def write_made_from(prim: Usd.Prim, made_from: MadeFrom) -> None:
+    """Author what a map was made from on its prim, in the stage's edit target."""
+    prim.GetAttribute(MADE_FROM).Set(_spelled(made_from))
+
+
+def _spelled(made_from: MadeFrom | None) -> str:
+    return "" if made_from is None else json.dumps(made_from.table(), ensure_ascii=False)
+
+
 def _read_harmonic(prim: Usd.Prim, sample: _Sample | None) -> dict[str, NDArray] | None:
     """The arrays of the harmonic field in the schema's order; None if there is none at that time."""
     if not prim.HasAPI(NOUNS["harmonic"]):
@@ -332,6 +381,7 @@ def _save(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], force: bool)
             "cellSize": Gf.Vec2d(*latest.cell_m),
             "headings": Vt.DoubleArray(np.rad2deg(latest.headings_rad).tolist()),
             "unit": UNIT,
+            "checksumVersion": CHECKSUM_VERSION,
             "height_m": latest.height_m,
             **{name: getattr(latest, name) for name in PLACES},
         }
@@ -377,8 +427,9 @@ def _epoch_values(field: AnomalyMap) -> dict[str, Any]:
         "valid": Vt.BoolArray.FromNumpy(valid),
         "variance": Vt.FloatArray.FromNumpy(variance),
         **dict(zip(RECORDED, recorded, strict=True)),
-        "checksum": _checksum(values, valid, variance, harmonic),
+        "checksum": _checksum(values, valid, variance, harmonic, _grid_of(field)),
         "parameters": text,
+        "made_from": _spelled(field.made_from),
         **{name: getattr(field, name) for name in TEXTS},
     }
     return {
@@ -410,14 +461,24 @@ def _check_type(attribute: Usd.Attribute, value: Any) -> Any:
     return value
 
 
+def _grid_of(field: AnomalyMap) -> NDArray[np.float64]:
+    """The numbers of a map's grid in the order of `GRID`, as its layer has them."""
+    degrees = np.rad2deg(field.headings_rad)
+    return np.concatenate([field.values_nt.shape, field.origin_m, field.cell_m, degrees])
+
+
 def _checksum(
-    values: NDArray, valid: NDArray, variance: NDArray, harmonic: Mapping[str, NDArray] | None
+    values: NDArray,
+    valid: NDArray,
+    variance: NDArray,
+    harmonic: Mapping[str, NDArray] | None,
+    grid: NDArray | None,
 ) -> str:
     """SHA-256 over the bytes of the arrays: float32, one byte a flag, float64; little-endian."""
     digest = hashlib.sha256(values.astype("<f4").tobytes())
     digest.update(valid.astype(np.uint8).tobytes())
     digest.update(variance.astype("<f4").tobytes())
-    for array in (harmonic or {}).values():
+    for array in (*(harmonic or {}).values(), *([] if grid is None else [grid])):
         digest.update(array.astype("<f8").tobytes())
     return digest.hexdigest()
 

@@ -1,30 +1,51 @@
 """A scene read from its stage, which is opened once."""
 
+import math
 import os
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from pxr import Usd, UsdGeom
+import numpy as np
+from pxr import Gf, Usd, UsdGeom
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files import sha256
 from magtwin.frames import yaw_from_quat
+from magtwin.spec.magnetics import EarthFieldSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import PlacedRobot
 from magtwin.spec.scene import Scene
 from magtwin.usd.attributes import plain_value, read_pose, target
-from magtwin.usd.earth import read_earth
+from magtwin.usd.earth import AGREES_NT, read_earth
 from magtwin.usd.furniture import read_magnets
 from magtwin.usd.geometry import Link, Shape, read_links, read_shapes
 from magtwin.usd.lab import read_lab
-from magtwin.usd.layers import open_stage, stage_sha256
-from magtwin.usd.maps import read_map
+from magtwin.usd.layers import open_stage, relative_asset, save_layer, stage_sha256
+from magtwin.usd.maps import MADE_FROM, read_map
 from magtwin.usd.obstacles import read_obstacles
+from magtwin.usd.placement import (
+    AT_ORIGIN,
+    SAME,
+    UPRIGHT,
+    Lab,
+    Pose,
+    into_lab,
+    lab_on,
+    labs_on,
+    nearest_lab,
+    pose_of,
+    take_to_origin,
+)
 from magtwin.usd.robot import read_robot
-from magtwin.usd.schema import only_prim_with, place, prims_with, require_api
+from magtwin.usd.schema import NOUNS, only_prim_with, place, prims_with, require_api
 from magtwin.usd.sensors import MAP_CHECKSUM, MAP_RELATIONSHIP, read_path
+from magtwin.usd.sources import read_transform
+from magtwin.usd.units import check_units
+
+LEVEL_M = 1e-3
+"""Height of a robot above the floor that counts as none [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +56,22 @@ class OpenedScene:
     """Root layer, as it was named."""
 
     stage: Usd.Stage
+    """The stage, with the lab's axes as the world's and without other labs."""
+
     scene: Scene
     map: AnomalyMap
+
+    lab: str = ""
+    """Path of the lab's root; "" if the lab is the only one."""
+
+    pose: Pose | None = None
+    """Pose of the lab in its stage; None if it is at the origin."""
+
+    changes: tuple[str, ...] = ()
+    """What has changed on the stage since the map was made."""
+
+    notes: tuple[str, ...] = ()
+    """What was guessed or left out, one text each."""
 
     @cached_property
     def obstacles(self) -> Obstacles:
@@ -70,21 +105,25 @@ class OpenedScene:
         scene = replace(self.scene.led_by(robot), others=())
         if not self.scene.others:
             return self
-        stage = _alone(Usd.Stage.Open(self.stage.GetRootLayer()), robot)
-        return OpenedScene(self.file, stage, scene, self.map)
+        stage = _alone(_placed(Usd.Stage.Open(self.stage.GetRootLayer()), self.lab), robot)
+        return replace(self, stage=stage, scene=scene)
 
 
-def open_scene(path: str | os.PathLike[str], *, check_network: bool = True) -> OpenedScene:
+def open_scene(path: str | os.PathLike[str], *, lab: str = "", check_network: bool = True) -> OpenedScene:
     """Open the stage of a scene once: its Scene and map, and its obstacles and geometry when asked for.
+
+    All places are in the axes of the lab, wherever it stands on the stage (`magtwin.usd.placement`).
 
     Args:
         path: Root layer, as `author_scene` wrote it or as others edited it. A start's yaw is computed from a
             quaternion, so its last bits can differ from what was authored.
+        lab: Path of the lab's root on a stage of several labs. Default: the only lab.
         check_network: Whether the weights that the magnetometer names must exist.
 
     Raises:
-        InputError: The file or one that it names is missing; the stage has no lab, robot or map; a value is
-            out of range; or the map is not the one that the scene was made with. The text names the prim.
+        InputError: The file or one that it names is missing; the stage has no lab, robot or map, or a lab
+            that is tilted or scaled; a value is out of range; or the map is not the one that the scene was
+            made with. The text names the prim.
     """
     path = Path(path)
     if path.suffix == ".usdz":
@@ -93,29 +132,24 @@ def open_scene(path: str | os.PathLike[str], *, check_network: bool = True) -> O
             "--out DIR` and give the layer in DIR"
         )
     stage = open_stage(path)
-    metres, up = UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)
-    if not (UsdGeom.LinearUnitsAre(metres, UsdGeom.LinearUnits.meters) and up == UsdGeom.Tokens.z):
-        raise InputError(
-            f"{path}: the stage has {metres:g} m a unit and {up} up; magtwin reads metres with Z up"
-        )
+    where = lab_on(stage, lab)
+    several, pose = len(labs_on(stage)) > 1, pose_of(where)
+    check_units(stage)
+    earth, notes = earth_in(stage, where)
+    take_to_origin(stage, where)
     world = stage.GetPseudoRoot()
-    lab = read_lab(only_prim_with(world, "lab"))
     prims = _robot_prims(stage)
-    robots = [_read_placed(prim, check_network) for prim in prims]
+    robots = [_read_placed(prim, check_network, notes) for prim in prims]
     magnetometers = [only_prim_with(prim, "magnetometer") for prim in prims]
-    maps = [require_api(target(m, MAP_RELATIONSHIP), "anomalyMap") for m in magnetometers]
+    maps = [map_of(magnetometer) for magnetometer in magnetometers]
     checksums = [plain_value(m.GetAttribute(MAP_CHECKSUM)) for m in magnetometers]
     anomaly_map = read_map(maps[0])
     for magnetometer, own_map, checksum in zip(magnetometers, maps, checksums, strict=True):
-        if own_map != maps[0] or checksum != checksums[0]:
+        if own_map != maps[0] or checksum not in ("", checksums[0]):
             raise InputError(
                 f"{place(magnetometer)}: reads another map than {magnetometers[0].GetPath()}; the robots of "
                 "a scene share one"
             )
-    earths = prims_with(world, "earth")
-    if len(earths) > 1:
-        raise InputError(f"{place(earths[1])}: a second Earth's field; the first is {earths[0].GetPath()}")
-    earth = read_earth(earths[0]) if earths else None
     sources, furniture = read_magnets(stage)
     values = maps[0].GetAttribute("magtwin:anomalyMap:values").GetPropertyStack()
     try:
@@ -124,7 +158,7 @@ def open_scene(path: str | os.PathLike[str], *, check_network: bool = True) -> O
             map_layer=Path(values[0].layer.realPath).resolve(),
             map_sha256=checksums[0],
             robot=robots[0].robot,
-            lab=lab,
+            lab=read_lab(only_prim_with(world, "lab")),
             earth=earth,
             sources=sources,
             furniture=furniture,
@@ -136,35 +170,110 @@ def open_scene(path: str | os.PathLike[str], *, check_network: bool = True) -> O
         raise InputError(f"{place(prims[0])}: {error}") from error
     if scene.map_layer != path.resolve():  # a flattened stage is its own map, and has no checksum
         check_map(scene, f"{place(magnetometers[0])}: ")
-    return OpenedScene(path, stage, scene, anomaly_map)
+    made = anomaly_map.made_from
+    return OpenedScene(
+        path,
+        stage,
+        scene,
+        anomaly_map,
+        lab=where.path if several else "",
+        pose=None if pose == AT_ORIGIN else pose,
+        changes=() if made is None else tuple(made.changes(scene)),
+        notes=tuple(notes),
+    )
 
 
-def read_scene(path: str | os.PathLike[str], *, check_network: bool = True) -> Scene:
+def read_scene(path: str | os.PathLike[str], *, lab: str = "", check_network: bool = True) -> Scene:
     """The scene of a stage; arguments and errors as for `open_scene`."""
-    return open_scene(path, check_network=check_network).scene
+    return open_scene(path, lab=lab, check_network=check_network).scene
 
 
-def robots_in(path: str | os.PathLike[str]) -> dict[str, str | Path]:
-    """Default path of each robot of a stage, by the robot's name, in the stage's order.
+def robots_in(path: str | os.PathLike[str], *, lab: str = "") -> dict[str, str | Path]:
+    """Default path of each robot of a lab, by the robot's name, in the stage's order.
 
     Raises:
-        InputError: The file is missing or not USD, or has no robot.
+        InputError: The file is missing or not USD, or has no robot; or as for `open_scene`, for `lab`.
     """
-    stage = open_stage(path)  # held in a name: a prim does not keep its stage alive
+    stage = _placed(open_stage(path), lab)  # held in a name: a prim does not keep its stage alive
     return {prim.GetName(): read_path(prim) for prim in _robot_prims(stage)}
 
 
-def open_alone(path: str | os.PathLike[str], robot: str) -> Usd.Stage:
-    """A stage on which all robots but one are inactive.
+def open_alone(path: str | os.PathLike[str], robot: str, *, lab: str = "") -> Usd.Stage:
+    """A stage in the axes of a lab, on which other labs and all robots but one are inactive.
 
     Args:
         path: Root layer of a scene.
         robot: Name of the robot that stays. If there is no such robot, all stay.
+        lab: As for `open_scene`. A stage without a lab stays where it is.
 
     Raises:
-        InputError: The file is missing or not USD.
+        InputError: The file is missing or not USD, or as for `open_scene`, for `lab`.
     """
-    return _alone(open_stage(path), robot)
+    return _alone(_placed(open_stage(path), lab), robot)
+
+
+def _placed(stage: Usd.Stage, lab: str) -> Usd.Stage:
+    """The stage in the axes of a lab, if it has one."""
+    if labs_on(stage):
+        take_to_origin(stage, lab_on(stage, lab))
+    return stage
+
+
+def earth_in(stage: Usd.Stage, lab: Lab) -> tuple[EarthFieldSpec | None, list[str]]:
+    """The Earth's field in the lab's axes, and a text for each other field on the stage that contradicts it.
+
+    The lab's own field turns with the lab: the map was measured with it. Without one, the field of the stage
+    is turned into the lab's axes.
+    """
+    found = [(prim, _turned(read_earth(prim), into_lab(lab, prim))) for prim in _all_with(stage, "earth")]
+    own = [(p, e) for p, e in found if nearest_lab(p, labs_on(stage)) == lab]
+    free = [(p, e) for p, e in found if nearest_lab(p, labs_on(stage)) is None]
+    for those in (own, [] if own else free):
+        if len(those) > 1:
+            raise InputError(
+                f"{place(those[1][0])}: a second Earth's field; the first is {those[0][0].GetPath()}"
+            )
+    if not (own or free):
+        return None, []
+    chosen, earth = (own or free)[0]
+    notes = []
+    for prim, other in found:
+        off = math.dist(other.b_world_nt, earth.b_world_nt)
+        if prim != chosen and off > AGREES_NT:
+            notes.append(
+                f"{place(prim)}: its Earth's field differs by {off:,.0f} nT from that of {chosen.GetPath()}, "
+                f"in the axes of {lab.path}; the lab is turned against it, or surveyed elsewhere"
+            )
+    return earth, notes
+
+
+def _turned(earth: EarthFieldSpec, matrix: Gf.Matrix4d) -> EarthFieldSpec:
+    """An Earth's field in the axes that a transform leads to, such as those of a lab turned about z."""
+    if matrix == Gf.Matrix4d(1):
+        return earth
+    turn = matrix.RemoveScaleShear()
+    x, y, z = turn.TransformDir(Gf.Vec3d(*earth.b_world_nt))
+    north = turn.TransformDir(Gf.Vec3d(0, 1, 0))
+    yaw = math.degrees(math.atan2(-north[0], north[1]))
+    return replace(earth, b_world_nt=(x, y, z), north_deg=math.remainder(earth.north_deg + yaw, 360))
+
+
+def _all_with(stage: Usd.Stage, noun: str) -> list[Usd.Prim]:
+    return [p for p in stage.Traverse(Usd.TraverseInstanceProxies()) if p.HasAPI(NOUNS[noun])]
+
+
+def map_of(magnetometer: Usd.Prim) -> Usd.Prim:
+    """The map that a magnetometer reads.
+
+    Raises:
+        InputError: It names none, another kind of prim, or several; the text names the maps of the stage.
+    """
+    try:
+        return require_api(target(magnetometer, MAP_RELATIONSHIP), "anomalyMap")
+    except InputError as error:
+        maps = prims_with(magnetometer.GetStage().GetPseudoRoot(), "anomalyMap")
+        known = ", ".join(str(prim.GetPath()) for prim in maps) or "none"
+        raise InputError(f"{error}; maps of the lab: {known}") from error
 
 
 def _alone(stage: Usd.Stage, robot: str) -> Usd.Stage:
@@ -194,14 +303,67 @@ def check_map(scene: Scene, where: str = "") -> None:
         )
 
 
+def use_map(opened: OpenedScene, map_layer: str | os.PathLike[str], *, dry: bool = False) -> None:
+    """Let the stage of a scene read another map, in place of the old one among its sublayers.
+
+    Args:
+        opened: The scene.
+        map_layer: Layer of the new map, whose prim has the path of the old one.
+        dry: Whether to check only; the new layer need not exist then.
+
+    Raises:
+        InputError: The old map is no sublayer of this stage: it comes from another stage by reference, or is
+            part of the root layer.
+    """
+    stage, map_layer = opened.stage, Path(map_layer)
+    old = opened.scene.map_layer
+    held = [
+        (layer, name)
+        for layer in stage.GetLayerStack(includeSessionLayers=False)
+        for name in layer.subLayerPaths
+        if Path(layer.ComputeAbsolutePath(name)).resolve() == old
+    ]
+    if not held:
+        raise InputError(
+            f"{opened.file}: the map {old} is no sublayer of this stage, so it cannot be replaced here; "
+            "survey the stage that has it as a sublayer",
+            parameter="adopt",
+        )
+    if dry:
+        return
+    changed = {stage.GetRootLayer()}
+    for layer, name in held:
+        new = relative_asset(layer, map_layer)
+        layer.subLayerPaths = [new if n == name else n for n in layer.subLayerPaths]
+        changed.add(layer)
+    checksum = sha256(map_layer)
+    with Usd.EditContext(stage, stage.GetRootLayer()):
+        for prim in prims_with(stage.GetPseudoRoot(), "magnetometer"):
+            prim.GetAttribute(MAP_CHECKSUM).Set(checksum)
+    for prim in prims_with(stage.GetPseudoRoot(), "anomalyMap"):
+        for layer in stage.GetLayerStack(includeSessionLayers=False):
+            over = layer.GetPrimAtPath(prim.GetPath())
+            if layer.realPath != str(map_layer.resolve()) and over and MADE_FROM in over.attributes:
+                over.RemoveProperty(over.attributes[MADE_FROM])
+                changed.add(layer)
+    for layer in changed:
+        save_layer(layer)
+
+
 def _robot_prims(stage: Usd.Stage) -> list[Usd.Prim]:
     """Prims of a stage's robots, at least one."""
     root = stage.GetPseudoRoot()
     return prims_with(root, "robot") or [only_prim_with(root, "robot")]  # raises if there is none
 
 
-def _read_placed(prim: Usd.Prim, check_network: bool) -> PlacedRobot:
-    """The robot at a prim, its start and its default path."""
+def _read_placed(prim: Usd.Prim, check_network: bool, notes: list[str]) -> PlacedRobot:
+    """The robot at a prim, its start in the lab and its default path."""
+    world = UsdGeom.XformCache().GetLocalToWorldTransform(prim)
+    rows = np.array(world)[:3, :3]
+    if np.abs(rows @ rows.T - np.eye(3)).max() > SAME or rows[0] @ np.cross(rows[1], rows[2]) < 0:
+        raise InputError(
+            f"{place(prim)}: the robot is scaled or mirrored; clear its scale and those above it"
+        )
     robot = read_robot(prim)
     network = robot.magnetometer.network
     neural = robot.magnetometer.kind == "neural"
@@ -211,6 +373,12 @@ def _read_placed(prim: Usd.Prim, check_network: bool) -> PlacedRobot:
             "which is not there"
         )
     p, q = read_pose(prim)
+    if UsdGeom.XformCache().GetParentToWorldTransform(prim) != Gf.Matrix4d(1):
+        p, q, _ = read_transform(prim)
+    if rows[2, 2] < UPRIGHT or abs(p[2]) > LEVEL_M:
+        notes.append(
+            f"{place(prim)}: stands {p[2]:g} m above the floor or tilted; a run starts it on the floor"
+        )
     try:
         return PlacedRobot(robot=robot, start=(p[0], p[1], float(yaw_from_quat(q))), path=read_path(prim))
     except InputError as error:

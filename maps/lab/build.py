@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.field.fit.fit import fit, raster
+from magtwin.field.maps.made_from import made_from
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.readings import Readings
 from magtwin.files import output, shipped
@@ -247,6 +248,7 @@ def lab_map(scene: Scene) -> AnomalyMap:
         values_nt=field.values_nt.astype(np.float32),
         variance_nt2=stepped(field.variance_nt2),
         between_nt2=stepped(field.between_nt2),
+        made_from=made_from(scene),
     )
 
 

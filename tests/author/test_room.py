@@ -334,7 +334,7 @@ def test_any_scene_name_works(toml, tmp_path, name):
         ('kind = "shelf"', 'kind = "shelf"\nyaw = 90', r"den\.toml:23: .*radians.* 90 deg are 1\.5708 rad"),
         ('kind = "shelf"', 'kind = "shelf"\nsize_m = [1, 1, 1]', "size_m is for box, cylinder, mesh"),
         ('kind = "shelf"', 'kind = "mesh"\nmaterial = "wood"', 'kind "mesh" needs file = "FILE'),
-        ('"crate"', '"shelf"', r"den\.toml: two pieces of furniture are called 'shelf'"),
+        ('"crate"', '"shelf"', r"den\.toml:26: .*two pieces of furniture are called 'shelf'"),
         ('"crate"', '"my crate"', r"den\.toml:26: .*'my crate' cannot name a prim"),
         ("[4.0, 3.0]", "[4000, 3000]", r"den\.toml:9: \[lab\] floor_m must be in metres"),
         ("spacing_m = 0.5", "spacing_m = 50", r"den\.toml: cannot be surveyed: spacing_m 50 leaves no cell"),
@@ -357,6 +357,15 @@ def test_a_room_that_does_not_fit_is_refused_by_line_with_nothing_written(toml, 
         author_scene(toml, tmp_path / "s")
     assert "\n" not in str(refused.value)
     assert not (tmp_path / "s").exists()
+
+
+def test_a_piece_of_another_file_with_a_name_that_is_taken_is_refused(toml, tmp_path):
+    crate = ROOM[ROOM.index("[[furniture]]", ROOM.index("shelf")) :].split("\n\n")[0]
+    assert "crate" in crate
+    (tmp_path / "more.toml").write_text(crate)
+    toml.write_text(ROOM + f"\n[sources]\nfile = '{tmp_path / 'more.toml'}'\n")
+    with pytest.raises(InputError, match=r"den\.toml: two pieces of furniture are called 'crate'"):
+        scene_from_toml(toml)
 
 
 def test_the_free_place_that_a_refusal_names_is_free(toml):

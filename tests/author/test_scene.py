@@ -230,7 +230,7 @@ def test_a_scenes_folder_can_be_moved_and_needs_nothing_outside_of_it(own_parts,
         map_layer=tmp_path / "moved" / "map" / "map.usdc",
         robot=replace(
             scene.robot,
-            asset=tmp_path / "moved" / "robot" / "bot.usda",
+            asset=tmp_path / "moved" / "robots" / "bot" / "bot.usda",
             magnetometer=replace(
                 scene.robot.magnetometer, network=tmp_path / "moved" / "weights" / "net.pth"
             ),
@@ -251,15 +251,15 @@ def test_a_robot_of_several_files_is_copied_whole(own_parts, tmp_path):
         root.GetPayloads().AddPayload("./base/body.usda")
     scene = scene_from_toml(own_parts / "scene.toml")
     read = read_scene(author_scene(scene, tmp_path / "s"))
-    assert (tmp_path / "s" / "robot" / "base" / "body.usda").exists()
-    assert read.robot.asset == tmp_path / "s" / "robot" / "bot.usda"
+    assert (tmp_path / "s" / "robots" / "bot" / "base" / "body.usda").exists()
+    assert read.robot.asset == tmp_path / "s" / "robots" / "bot" / "bot.usda"
 
 
 def test_one_scene_gives_the_same_bytes_every_time(parts, tmp_path):
     for name in "ab":
         author_scene(full_scene(parts), tmp_path / name)
     files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*") if p.is_file())
-    assert len(files) == 6
+    assert len(files) == 7
     for file in files:
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
 
@@ -274,7 +274,7 @@ def test_the_root_layer_is_short_text_with_units_axes_and_relative_paths(parts, 
     assert UsdGeom.GetStageUpAxis(stage) == "Z"
     assert stage.GetDefaultPrim().GetPath() == "/World"
     assert list(stage.GetRootLayer().subLayerPaths) == ["./room.usda", "./magnetics.usda", "./map/map.usdc"]
-    assert "@./robot/bot.usda@" in text
+    assert "@./robots/bot/bot.usda@" in text
     assert "@./weights/net.pth@" in text
     assert stage.GetRootLayer().documentation
     assert stage.GetRootLayer().customLayerData["creator"] == "magtwin"
@@ -309,9 +309,9 @@ def lab_stage(spec: LabSpec) -> Usd.Stage:
 
 
 def box_of(stage: Usd.Stage, path: Sdf.Path) -> Gf.Range3d:
-    return (
-        UsdGeom.BBoxCache(0, ["default"]).ComputeWorldBound(stage.GetPrimAtPath(path)).ComputeAlignedRange()
-    )
+    """The box around a prim, shown or a collider."""
+    cache = UsdGeom.BBoxCache(0, ["default", "guide"])
+    return cache.ComputeWorldBound(stage.GetPrimAtPath(path)).ComputeAlignedRange()
 
 
 def test_the_floor_ends_at_zero_and_the_walls_stand_just_outside_of_it():
@@ -352,11 +352,21 @@ def test_everything_in_the_lab_wears_a_material_and_floor_walls_and_posts_collid
     for prim in gprims:
         assert UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0], prim
     solid = {p.GetName() for p in gprims if p.HasAPI(UsdPhysics.CollisionAPI)}
-    assert {"Floor", "North", "South", "East", "West", "Post_0"} <= solid
-    material, _ = UsdShade.MaterialBindingAPI(
-        stage.GetPrimAtPath(LAB.AppendChild("Floor"))
-    ).ComputeBoundMaterial("physics")
-    assert UsdPhysics.MaterialAPI(material.GetPrim()).GetStaticFrictionAttr().Get() == pytest.approx(0.05)
+    assert {"Ground", "North", "South", "East", "West", "Post_0"} <= solid
+    ground = stage.GetPrimAtPath(LAB.AppendChild("Ground"))
+    material, _ = UsdShade.MaterialBindingAPI(ground).ComputeBoundMaterial("physics")
+    assert UsdPhysics.MaterialAPI(material.GetPrim()).GetStaticFrictionAttr().Get() == pytest.approx(0.8)
+
+
+def test_what_carries_the_robots_is_a_plane_at_the_top_of_the_floor_and_adds_nothing_to_the_bounds():
+    stage = lab_stage(LabSpec())  # PhysX lets wheels sink into a large thin box
+    ground = UsdGeom.Plane(stage.GetPrimAtPath(LAB.AppendChild("Ground")))
+    assert ground.GetAxisAttr().Get() == "Z"
+    assert ground.ComputeLocalToWorldTransform(0) == Gf.Matrix4d(1)
+    assert ground.ComputePurpose() == "guide"
+    floor = box_of(stage, LAB.AppendChild("Floor"))
+    assert (ground.GetWidthAttr().Get(), ground.GetLengthAttr().Get()) == pytest.approx(floor.GetSize()[:2])
+    assert not stage.GetPrimAtPath(LAB.AppendChild("Floor")).HasAPI(UsdPhysics.CollisionAPI)
 
 
 def test_the_lab_has_gravity_and_light():
@@ -371,7 +381,13 @@ def test_the_lab_has_gravity_and_light():
 def test_a_lab_without_walls_and_posts_has_none():
     spec = LabSpec(wall_height_m=0.0, post_height_m=0.0)
     stage = lab_stage(spec)
-    assert {p.GetName() for p in stage.GetPrimAtPath(LAB).GetChildren()} == {"Looks", "Floor", "Lights"}
+    assert {p.GetName() for p in stage.GetPrimAtPath(LAB).GetChildren()} == {
+        "Looks",
+        "Floor",
+        "Ground",
+        "Visuals",
+        "Lights",
+    }
     assert read_lab(stage.GetPrimAtPath(LAB)) == spec
 
 
@@ -555,7 +571,7 @@ def test_several_robots_survive_their_layers_each_a_prim_of_its_own(own_parts, t
         shutil.rmtree(own_parts)
         read = read_scene(tmp_path / "moved" / "two.usda")
         files = [p.robot.asset.relative_to(tmp_path / "moved") for p in read.robots]
-        assert list(map(str, files)) == ["robot/bot.usda", "robot/bot.usda", "robot/cleo/bot.usda"]
+        assert list(map(str, files)) == [*["robots/bot/bot.usda"] * 2, "robots/cleo/bot/bot.usda"]
         assert read.robots[1].path == tmp_path / "moved" / "paths" / "there.csv"
         for copy, original in ((read.robots[i], scene.robots[i]) for i in (0, 2)):
             assert replace(copy.robot, asset=original.robot.asset) == original.robot
@@ -612,7 +628,8 @@ def build_lab(folder: Path) -> Path:
 
 def without_ways(layer: Path) -> str:
     """A layer's text, each relative path without the way up to where the project's folders part."""
-    return re.sub(r"@(\.\./)[^@]*?((maps|robots|weights)/[^@]*)@", r"@\2@", layer.read_text())
+    text = Sdf.Layer.OpenAsAnonymous(str(layer)).ExportToString()
+    return re.sub(r"@(\.\./)[^@]*?((maps|robots|weights)/[^@]*)@", r"@\2@", text)
 
 
 def test_the_labs_stage_is_what_a_fresh_build_gives(tmp_path):
@@ -700,7 +717,7 @@ def broken(parts: Path, folder: Path, edit) -> Path:
     ("edit", "said"),
     [
         (
-            lambda t: t.replace("./robot/bot.usda", "./robot/gone.usda"),
+            lambda t: t.replace("./robots/bot/bot.usda", "./robots/bot/gone.usda"),
             r"gone\.usda@ for reference.*</World/bot>",
         ),
         (lambda t: t.replace("./map/map.usdc", "./map/gone.usdc"), r"Could not load sublayer.*gone\.usdc"),

@@ -156,9 +156,9 @@ def test_a_page_of_two_results_names_them_and_says_which_is_better():
     assert "f is better than f" not in text
 
 
-@pytest.mark.parametrize("name", ["standard", "aprilab", "magnetic-data", "ship"])
+@pytest.mark.parametrize("name", ["standard", "aprilab", "magnetic-data", "ship", "1d"])
 def test_every_scenario_that_ships_is_described_in_words(name):
     for scenario in load_suite(name).scenario:
         text = describe(scenario)
         assert text.endswith(".")
-        assert f"{scenario.runs} runs" in text
+        assert f"{scenario.runs} run{'s' * (scenario.runs > 1)} " in text

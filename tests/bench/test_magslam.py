@@ -1,5 +1,6 @@
 """Recorded loops for SLAM: the published protocol, and the published figures of a few runs."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,8 @@ from magtwin.bench.magslam import (
     ship_case,
     ship_options,
 )
+from magtwin.bench.row import make_case, run_chunk
+from magtwin.bench.suite import load_suite
 from magtwin.errors import InputError
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.track import track
@@ -121,3 +124,19 @@ def test_the_hand_held_field_varies_least_with_the_axes_used():
         for turn in Rotation.create_group("O"):
             assert rotation.apply(turn.apply(b)).var(axis=0).sum() >= spread * (1 - 1e-9)
         assert_allclose(case.truth["p_world_base"][0], data["initPos"][0])
+
+
+@needs_hand
+def test_the_suite_of_the_hand_held_loops_runs_each_recording_once():
+    suite = load_suite("1d").limited(localizers=["odometry"], data={"1d": str(HAND)})
+    suite.check()
+    rows = [row for chunk in suite.chunks() for row in run_chunk(suite, chunk)[0]]
+    assert [(row["scenario"], row["run"], row["status"]) for row in rows] == [
+        ("eight", 0, "ok"),
+        ("square", 0, "ok"),
+    ]
+    for row, name in zip(rows, ("eight", "square"), strict=True):
+        case = hand_case(HAND, name)
+        assert row["rmse_m"] == pytest.approx(rmse(case.readings["odom_p"], case.truth), rel=1e-9)
+    with pytest.raises(InputError, match=r"'eight': number must be one of 1 .eight., 2 .square., got 3"):
+        make_case(suite, replace(suite.scenario[0], number=3), 0)

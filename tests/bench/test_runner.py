@@ -224,7 +224,11 @@ def test_an_interruption_leaves_whole_files_and_a_repeat_goes_on(suite, whole, t
             assert time.monotonic() < patience
             time.sleep(0.005)
         program.send_signal(end)
-        program.communicate(timeout=20)
+        said = program.communicate(timeout=20)[1].decode()
+        if end == signal.SIGINT:
+            assert program.returncode == 130
+            assert "magtwin: interrupted; finished work is kept, and the same command continues" in said
+            assert "Traceback" not in said
         done = files_in(out, "times")
         expected = files_in(whole, "times")
         assert all(expected[name] == content for name, content in done.items() if "/." not in name)

@@ -48,6 +48,17 @@ def test_the_mean_over_sessions_has_the_standard_error_of_their_means():
     assert (alone.high - alone.low) < 0.5 * (made.high - made.low)
 
 
+def test_runs_of_one_session_have_its_interval_and_one_run_has_none():
+    values = np.random.default_rng(3).gamma(2, size=20)
+    alone, one = bootstrap(values), bootstrap(values, np.zeros(20))
+    assert one == alone
+    assert one.low < one.value < one.high
+    assert paired(values, values + 0.1, np.zeros(20)).p < 1e-2
+    single = bootstrap(values[:1], [0])
+    assert (single.value, np.isnan(single.low), np.isnan(single.high)) == (values[0], True, True)
+    assert paired(values[:1], values[:1] + 0.1, [0]).p == 1
+
+
 def test_intervals_cover_the_truth_as_often_as_they_claim():
     rng = np.random.default_rng(2)
     covered = 0

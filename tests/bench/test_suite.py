@@ -102,7 +102,12 @@ def test_the_checksum_is_that_of_the_content_and_not_of_the_place(write, tmp_pat
         (
             "runs = 3",
             "runs = 3\nsensor = { white_nt = -1.0 }",
-            "white_nt of SensorModel must be finite and not negative",
+            r"small.toml:14: .*white_nt of SensorModel must be finite and not negative",
+        ),
+        (
+            "runs = 3",
+            "runs = 3\n[scenario.odometry_model]\nyaw_sd = 1.0",
+            r"small.toml:15: \[scenario.odometry_model\] unknown key 'yaw_sd'; did you mean 'yaw_std'",
         ),
         ("runs = 3", "runs = 3\nkidnap_m = [4.0, 0.5]", "kidnap_m must be two ascending distances"),
         ("runs = 3", "runs = 3\nduration_s = 1e9", "over a million readings"),
@@ -116,8 +121,21 @@ def test_a_wrong_suite_is_refused(write, old, new, text):
 @pytest.mark.parametrize(
     ("old", "new", "text"),
     [
-        ('method = "rbpf"', 'method = "rbfp"', "no localizer 'rbfp'; did you mean 'rbpf'"),
-        ("particles = 200", "partikles = 200", "'rbpf' has no option 'partikles'; did you mean 'particles'"),
+        (
+            'method = "rbpf"',
+            'method = "rbfp"',
+            r"small.toml:21: \[localizer\] no localizer 'rbfp'; did you mean 'rbpf'",
+        ),
+        (
+            "runs = 3",
+            'runs = 3\npaths = ["sine", "figur8"]',
+            r"small.toml:14: .*'figur8'; did you mean 'figure8'",
+        ),
+        (
+            "particles = 200",
+            "partikles = 200",
+            r"small.toml:22: .*'rbpf' has no option 'partikles'; did you mean 'particles'",
+        ),
         ('method = "rbpf"', 'method = "no_such_module:Filter"', "cannot be imported: ModuleNotFoundError"),
         ('method = "rbpf"', 'method = "math:tau"', "cannot be made|must have the methods"),
         ("runs = 3", 'runs = 3\nscene = "lub"', "no scene 'lub'; did you mean 'lab'"),
@@ -131,9 +149,30 @@ def test_a_wrong_suite_is_refused(write, old, new, text):
     ],
 )
 def test_what_a_suite_names_is_looked_for_before_anything_runs(write, old, new, text):
-    suite = load_suite(write(TEXT.replace(old, new)))
+    file = write(TEXT.replace(old, new))
     with pytest.raises(InputError, match=text):
+        load_suite(file).check(file)
+
+
+def test_a_suite_without_localizers_needs_them_given(write, tmp_path):
+    file = write(TEXT.partition("[[localizer]]")[0])
+    with pytest.raises(InputError, match=r"the suite has no .*give `localizers`"):
+        load_suite(file).check(file)
+    given = load_suite(file).limited(localizers=["odometry"])
+    given.check(file)
+    assert [chunk.entries for chunk in given.chunks()] == [("odometry",)] * 4
+    with pytest.raises(InputError, match=r"^no localizer 'odometer'; did you mean 'odometry'"):
+        load_suite(file).limited(localizers=["odometer"]).check(file)
+
+
+def test_a_path_of_a_file_is_relative_to_the_suite(write, tmp_path):
+    suite = load_suite(write(TEXT.replace("runs = 3", 'runs = 3\npaths = ["loop.csv"]')))
+    with pytest.raises(InputError, match=r"loop.csv"):
         suite.check()
+    (tmp_path / "loop.csv").write_text("x,y\n0,0\n1,0\n1,1\n")
+    suite.check()
+    assert suite.path("loop.csv") == str(tmp_path / "loop.csv")
+    assert suite.path("sine") == "sine"
 
 
 def test_data_are_relative_to_the_suite_and_can_be_given(write, tmp_path):

@@ -117,16 +117,22 @@ def test_columns_that_a_table_lacks_or_that_are_named_twice_are_refused(tmp_path
     assert not (tmp_path / "set").exists()
 
 
-def test_a_folder_of_runs_stands_for_its_runs_and_their_sessions(recorded, tmp_path):
+def test_a_folder_of_runs_stands_for_its_runs_and_their_sessions(recorded, tmp_path, capsys):
     (tmp_path / "runs").mkdir()
     run = read_run(recorded / "c.parquet")
     for k in range(3):
         dealt = run.with_metadata(session=k % 2, session_seed=5)
         write_run(dealt, tmp_path / "runs" / f"run_0000{k}.parquet")
     (tmp_path / "runs" / "runs.csv").write_text("file\n")
-    main(["dataset", "build", str(tmp_path / "runs"), "--map", str(MAP), "--out", str(tmp_path / "set")])
+    command = ["dataset", "build", str(tmp_path / "runs"), "--map", str(MAP), "--out"]
+    main([*command, str(tmp_path / "set"), "--jobs", "2"])
     found = open_dataset(tmp_path / "set")
     assert [one.session for one in found.recordings] == ["5-0", "5-1", "5-0"]
+    (tmp_path / "runs" / "run_00001.parquet").write_bytes(b"no table")
+    with pytest.raises(SystemExit):
+        main([*command, str(tmp_path / "other"), "--jobs", "2"])
+    assert "run_00001.parquet: " in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
 
 
 def test_info_tells_of_every_recording_and_reads_every_shard(made, capsys):

@@ -44,11 +44,11 @@ def test_a_survey_of_the_shipped_scene_finds_the_shipped_map_but_for_its_error(l
     assert 5 < np.sqrt(np.mean(off**2)) < 80
 
 
-def test_one_seed_gives_one_file_and_another_another(lab_scene, tmp_path):
-    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+def test_one_seed_gives_one_file_with_any_jobs_and_another_another(lab_scene, tmp_path):
+    for name, *more in (("a", "--seed", 0), ("b", "--seed", 0, "--jobs", 2), ("c", "--seed", 1)):
         folder = tmp_path / name
         folder.mkdir()
-        run(lab_scene, "--out", folder / "m.usdc", "--spacing-m", 1, "--readings", 1, "--seed", seed)
+        run(lab_scene, "--out", folder / "m.usdc", "--spacing-m", 1, "--readings", 1, *more)
     a, b, c = ((tmp_path / name / "m.usdc").read_bytes() for name in "abc")
     assert a == b
     assert a != c

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from looking import assert_lit, assert_looks_alike, assert_within_room
 from numpy.testing import assert_allclose
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils, UsdValidation
 from validators import assert_valid
@@ -25,11 +26,14 @@ from magtwin.export.attached import BYTES, SCOPE
 from magtwin.export.glb import corner_normals
 from magtwin.export.package import PLUGIN, README, export_scene, licence_of
 from magtwin.export.usdz import ALIGNMENT, ALLOWED
+from magtwin.export.validation.validate import validate
 from magtwin.field.survey.folder import read_survey
 from magtwin.files import sha256, shipped
 from magtwin.run.run import Run
 from magtwin.usd.animation import read_animation
 from magtwin.usd.geometry import read_shapes
+from magtwin.usd.lab import LAB as LAB_PRIM
+from magtwin.usd.lab import read_lab
 from magtwin.usd.maps import load_map, save_map
 from magtwin.usd.scene import read_scene
 
@@ -244,6 +248,25 @@ def test_exports_pass_the_validators_of_openusd(what, request):
     stage = Usd.Stage.Open(str(out if out.is_file() else out / "lab.usda"))
     findings = UsdValidation.ValidationContext(validators).Validate(stage)
     assert not findings, "\n".join(f"{e.GetName()}: {e.GetMessage()}" for e in findings)
+
+
+@pytest.mark.parametrize("what", ["folder", "package", "isaac"])
+def test_an_export_shows_meshes_with_materials_lit_within_the_room(what, request):
+    out = request.getfixturevalue(what)
+    stage = assert_looks_alike(out if out.is_file() else out / "lab.usda")
+    assert_lit(stage)
+    if what != "package":  # its run has other times than the default one, at which boxes are taken
+        assert_within_room(stage, read_lab(stage.GetPrimAtPath(LAB_PRIM)), top_m=3.0)
+
+
+@pytest.mark.parametrize("what", ["folder", "package", "isaac"])
+def test_exports_break_no_rule_of_isaac_sim(what, request, isaac_rules):
+    out = request.getfixturevalue(what)
+    check, extra = validate(out if out.is_file() else out / "lab.usda", ["isaac"]).checks
+    assert (check.validator, extra.validator) == ("isaac", "isaac extra")
+    assert [f for f in (*check.findings, *extra.findings) if f.severity == "error"] == []
+    run = {"folder": 20, "package": 17, "isaac": 23}  # see the rules that are not run
+    assert check.scope.startswith(f"{run[what]} of 24 rules of isaacsim.asset.validation 1.3.6")
 
 
 @pytest.mark.slow
@@ -556,3 +579,4 @@ def test_the_aprilab_lab_exports_for_every_profile_with_the_licence_of_its_map(
         prim = stage.GetPrimAtPath("/World/AnomalyMap")
         assert prim.GetAttribute("magtwin:anomalyMap:licence").Get() == "MIT"
         assert stage.GetPrimAtPath(MAGNETOMETER)
+        assert_lit(assert_looks_alike(made.root))

@@ -136,6 +136,26 @@ BROKEN = {
         "is moved",
         "error",
     ),
+    "map-stale": (
+        over("Furniture/desk_0", "double3 xformOp:translate = (-1.8, 2.3, 0)"),
+        "since the map was made: desk_0 is moved",
+        "warning",
+    ),
+    "earth-fields": (
+        HEAD
+        + """def Xform "Town" (prepend apiSchemas = ["MagtwinEarthFieldAPI"])
+{
+    double3 magtwin:earth:bWorldNt = (0, 20000, -40000)
+    double magtwin:earth:latitudeDeg = 29.65
+    double magtwin:earth:longitudeDeg = -82.35
+    double magtwin:earth:heightM = 50
+    string magtwin:earth:date = "2026-11-21"
+    bool magtwin:earth:measured = true
+}
+""",
+        "Earth's field differs by",
+        "warning",
+    ),
     "robot-inside": (
         over("turtlebot4", "double3 xformOp:translate = (9, 0, 0)"),
         "it is off the floor",
@@ -149,8 +169,8 @@ BROKEN = {
     "figures": (over("turtlebot4", "double magtwin:drive:wheelRadiusM = -1"), "wheel_radius_m", "error"),
     "sensor-types": (over(IMU, "float sensorPeriod = 1"), "has a period of 1.0 s", "error"),
     "robot-schema": (
-        'def Xform "Extra" (prepend apiSchemas = ["PhysicsArticulationRootAPI"]) {}\n',
-        "without IsaacRobotAPI",
+        over("turtlebot4/bumper", head='(prepend apiSchemas = ["PhysicsArticulationRootAPI"])'),
+        "has 2 articulation roots",
         "error",
     ),
     "robot-lists": (
@@ -176,6 +196,11 @@ BROKEN = {
     "sensor-mounts": (
         over(LIDAR, "float[] omni:sensor:Core:emitterState:s001:azimuthDeg = [0, 1]"),
         "1 emitters and 2",
+        "error",
+    ),
+    "shown-meshes": (
+        over("Furniture/desk_0/Visuals/top", "double3 xformOp:translate = (0, 0.5, 0.726)"),
+        "is shown 0.5 m from /World/Furniture/desk_0/top",
         "error",
     ),
     "physics-scene": ('def PhysicsScene "Second" {}\n', "has 2 physics scenes", "error"),
@@ -290,12 +315,12 @@ def test_what_was_not_run_is_never_passed():
     assert tuple(check_from(check) for check in table["checks"]) == found.checks
 
 
-def test_the_command_says_clean_by_its_exit_status_and_in_json(lab, tmp_path, capfd):
+def test_the_command_says_clean_by_its_exit_status_and_in_json(lab, tmp_path, capfd, isaac_rules):
     out = tmp_path / "r.json"
     main(["validate", str(lab), "--against", "core", "isaac", "magtwin", "--json", "--out", str(out)])
     printed = json.loads(capfd.readouterr().out)
     assert printed == json.loads(out.read_text())
-    assert [c["validator"] for c in printed[0]["checks"]] == ["core", "isaac", "magtwin"]
+    assert [c["validator"] for c in printed[0]["checks"]] == ["core", "isaac", "isaac extra", "magtwin"]
     assert printed[0]["clean"]
     assert all(c["result"] == "passed" for c in printed[0]["checks"])
 
@@ -399,7 +424,7 @@ def test_newton_loads_every_body_of_the_lab(lab):
 def test_the_labs_robot_is_simready_and_one_without_emitters_is_told(lab, tmp_path):
     assert all(check.result == "passed" for check in validate(lab, ["simready"]).checks)
     shutil.copytree(lab.parent, tmp_path / "lab")
-    asset = tmp_path / "lab" / "robot" / "turtlebot4.usda"
+    asset = tmp_path / "lab" / "robots" / "turtlebot4" / "turtlebot4.usda"
     asset.write_text(asset.read_text().replace("numberOfEmitters", "numberOfNothing"))
     (*others_, lidar) = validate(tmp_path / "lab" / lab.name, ["simready"]).checks
     assert [check.result for check in others_] == ["passed", "passed"]
@@ -451,7 +476,7 @@ def test_a_package_with_an_entry_that_climbs_out_is_refused_with_nothing_written
 def test_a_package_is_looked_at_whole(lab, tmp_path):
     package = tmp_path / "a.usdz"
     folder = tmp_path / "in"
-    shutil.copytree(lab.parent / "robot", folder, ignore=shutil.ignore_patterns("*.urdf"))
+    shutil.copytree(lab.parent / "robots" / "turtlebot4", folder, ignore=shutil.ignore_patterns("*.urdf"))
     root = folder / "turtlebot4.usda"
     pack(root, package)
     found = validate(package, ["core", "isaac", "magtwin"])

@@ -157,6 +157,14 @@ def test_a_vector_in_world_axes_needs_no_heading_and_turns_with_one(tmp_path):
     assert_allclose(read_readings(turned, columns=columns).b_body_nt, [[20_000, -12_000, -38_000]])
 
 
+def test_magnitudes_of_a_sensor_carried_by_hand_need_no_heading(tmp_path):
+    readings = read_readings(file(tmp_path, "x,y,field\n0,0,41\n1,0,42\n"), columns=Columns(heading="none"))
+    assert_array_equal(readings.yaw, [0, 0])
+    assert_array_equal(readings.b_nt, [41_000, 42_000])
+    named = file(tmp_path, "x,y,field,none\n0,0,41,1.5\n", "b.csv")  # a column of that name is read
+    assert_array_equal(read_readings(named, columns=Columns(heading="none")).yaw, [1.5])
+
+
 def test_rows_without_a_value_are_left_out_and_the_source_tells_how_many(tmp_path):
     path = file(tmp_path, ROWS + "2,2,,41000\n3,nan,0,41000\n4,4,0,\n")
     readings = read_readings(path)
@@ -346,8 +354,9 @@ REFUSALS = {
     "no heading": (
         "x,y,field\n0,0,41000\n",
         {},
-        r"a\.csv: no heading: no column is called heading, yaw, theta",
+        r"a\.csv: no heading: no column is called heading, yaw, theta.* carried by hand, give --heading none",
     ),
+    "no heading, axes of no vector": ("x,y,field\n0,0,41000\n", {"axes": "world"}, r"a\.csv: no heading"),
     "no field": (
         "x,y,yaw,strength\n0,0,0,41000\n",
         {},
@@ -355,8 +364,8 @@ REFUSALS = {
     ),
     "body vector without heading": (
         "x,y,bx,by,bz\n0,0,12000,20000,1\n",
-        {"vector": "bx,by,bz"},
-        r"a\.csv: no heading",
+        {"vector": "bx,by,bz", "heading": "none"},
+        r"a\.csv: no heading.* vectors in world axes need none",
     ),
     "nought": ("x,y,yaw,field\n0,0,0,41000\n0,0,0,0\n", {}, r"a\.csv:3: a magnitude is above 0, got 0 nT"),
     "negative": ("x,y,yaw,field\n0,0,0,-41000\n", {}, r"a\.csv:2: a magnitude is above 0, got -41000 nT"),

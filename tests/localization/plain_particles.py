@@ -125,7 +125,7 @@ class PlainFilter:
         white = sensor.white_nt**2 + np.where(known, self.map_white * v, self.elsewhere[1])
         h = np.ones_like(self.mean)
         for i, kind in enumerate(self.kinds):
-            if kind != k.CONSTANT:
+            if kind not in (k.CONSTANT, k.DRIFT):
                 h[i] = {k.COSINE: c, k.SINE: s, k.MAP_SD: np.sqrt(v)}[kind]
         nu = b_nt - np.where(known, field, self.elsewhere[0]) - np.sum(h * self.mean, axis=0)
         gain = np.einsum("ijn,jn->in", self.p, h)

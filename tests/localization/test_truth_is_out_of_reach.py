@@ -105,7 +105,17 @@ class Wrong:
         (lambda r: Estimate(r.t, np.nan, 0, 0), "a pose that is not finite at t = 0 s"),
         (lambda r: Estimate(r.t + 1, 0, 0, 0), "an estimate from the future at t = 0 s"),
         (lambda r: Estimate(r.t - 1, 0, 0, 0), "an estimate of another reading at t = 0 s"),
-        (lambda r: Estimate(r.t, "east", 0, 0), "whose values are not numbers"),
+        (lambda r: Estimate(r.t, "east", 0, 0), "returned x that is not a number at t = 0 s: str 'east'"),
+        (
+            lambda r: Estimate(r.t, 0, np.zeros(3), 0),
+            r"y that is not a number at t = 0 s: an array of shape \(3,\)",
+        ),
+        (lambda r: Estimate(r.t, 0, 0, 0, None, "1"), "bias_nt that is not a number at t = 0 s: str '1'"),
+        (
+            lambda r: Estimate(r.t, 0, 0, 0, "wide"),
+            "covariance that is not an array of numbers .*: str 'wide'",
+        ),
+        (lambda r: Estimate(r.t, 0, 0, 0, lost=np.ones(2)), "lost that is not true or false"),
         (lambda r: Estimate(r.t, 0, 0, 0, np.eye(2)), r"a covariance of shape \(2, 2\)"),
         (lambda r: Estimate(r.t, 0, 0, 0, -np.eye(3)), "not positive semidefinite"),
         (lambda r: Estimate(r.t, 0, 0, 0, np.arange(9.0).reshape(3, 3)), "not positive semidefinite"),

@@ -1,5 +1,7 @@
 """Paths on floors of any size: they fit and pass what stands there; on the default floor nothing changes."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -88,11 +90,11 @@ def test_a_fit_keeps_the_shape_and_only_moves_what_is_small_enough():
     [
         (
             [[-3, 0], [3, 0]],
-            r"needs 6\.34 x 0\.34 m, the floor is 4 x 3 m; scaled by 0\.6 it fits: give `fit=True`",
+            r"needs 6\.34 x 0\.34 m, the floor is 4 x 3 m; scaled by 0\.6 it fits the floor: give `fit=True`",
         ),
         (
             [[0, 0], [3, 0]],
-            r"needs 3\.34 x 0\.34 m, .* moved by \(-1\.17, 0\.00\) m it fits: give `fit=True`",
+            r"needs 3\.34 x 0\.34 m, .* moved by \(-1\.17, 0\.00\) m it fits the floor: give `fit=True`",
         ),
     ],
 )
@@ -124,12 +126,12 @@ def test_a_placing_that_is_none_is_refused(placing):
 
 
 def test_a_fitted_run_is_repeated_to_the_bit(lab_scene, tmp_path, capsys):
-    (tmp_path / "far.csv").write_text("0,0\n4,0\n4,1\n")
+    (tmp_path / "far.csv").write_text("0,0\n8,0\n8,1\n")
     run = ["run", str(lab_scene), "--path", str(tmp_path / "far.csv"), "--rate-hz", "5", "--network", "none"]
     with pytest.raises(InputError, match=r"far\.csv leaves the floor .*give `fit=True`"):
         main([*run, "--out", str(tmp_path / "run.parquet"), "--debug"])
     main([*run, "--out", str(tmp_path / "run.parquet"), "--fit"])
-    assert "Path far.csv is moved by (" in capsys.readouterr().err
+    assert re.search(r"Path far\.csv is scaled by 0\.\d+ and moved by \(", capsys.readouterr().err)
     main(["reproduce", str(tmp_path / "run.parquet")])
     assert "yes, to the bit" in capsys.readouterr().out
     with pytest.raises(InputError, match="--fit is for a path"):

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import pickle
 import runpy
 import sys
 
@@ -312,3 +313,14 @@ def test_the_documented_columns_are_those_of_the_code():
     assert written == page, "python docs/columns.py writes it anew"
     for name, column in COLUMNS.items():
         assert f"| `{name}` | {', '.join(column.parts)} | {column.unit} | {column.frame} |" in written
+
+
+def test_a_run_is_the_same_in_another_process():
+    run = Run(
+        {"t": [0.0, 1.0], "own": [[1.0, 2.0], [3.0, 4.0]]},
+        {"seed": 3},
+        {"own": Column("nT", "body", "mine", 2, ("x", "y"))},
+    )
+    again = pickle.loads(pickle.dumps(run))
+    assert_allclose(again["own"], run["own"], rtol=0)
+    assert (dict(again.metadata), again.spec("own")) == ({"seed": 3}, run.spec("own"))

@@ -136,6 +136,21 @@ def test_what_has_changed_since_the_survey_is_added_along_the_earths_direction()
     assert_allclose(run["b_disturbance_nt"], unit @ change, atol=np.dot(change, change) / 2 / 38_000)
 
 
+def test_a_fit_that_is_far_off_the_earths_direction_is_not_believed(harmonic_map):
+    change = PlatformFieldSpec(hard_iron_change_nt=(-150.0, 220.0, 400.0))
+    scene = replace(SURVEYED, robot=replace(ROBOT, platform=change))
+    turned = replace(harmonic_map.harmonic, b_uniform_nt=np.array(EARTH.b_world_nt)[[1, 0, 2]])
+    wrong = replace(harmonic_map, harmonic=turned)
+    known, none = replace(scene, earth=EARTH), replace(harmonic_map, harmonic=None)
+    run = drive(known, wrong)
+    assert_array_equal(run["b_truth_nt"], drive(known, none)["b_truth_nt"])
+    assert "that of [earth], as that of the harmonic fit is" in str(run.metadata["truth"])
+    near = drive(known, harmonic_map)
+    assert_array_equal(near["b_truth_nt"], drive(scene, harmonic_map)["b_truth_nt"])
+    assert str(near.metadata["truth"]).endswith("direction of the field from the harmonic fit")
+    assert "unchecked, as there is no [earth]" in str(drive(scene, wrong).metadata["truth"])
+
+
 def test_without_earth_and_fit_the_field_dips_by_60_deg_towards_y():
     change = (0.0, 0.0, 500.0)
     scene = replace(SURVEYED, robot=replace(ROBOT, platform=PlatformFieldSpec(hard_iron_change_nt=change)))

@@ -83,4 +83,4 @@ def test_a_scene_in_a_folder_of_its_own_keeps_its_robots_description(tmp_path: P
     author_scene(scene_from_toml(shipped("scenes", "lab.toml")), tmp_path / "lab")
     shown = read_description(shipped("robots", "turtlebot4", "turtlebot4.usda"))
     assert "<robot" in shown
-    assert read_description(tmp_path / "lab" / "robot" / "turtlebot4.usda") == shown
+    assert read_description(tmp_path / "lab" / "robots" / "turtlebot4" / "turtlebot4.usda") == shown

@@ -1,6 +1,7 @@
 """A map through its layer and back, and the coloured floor that goes with it."""
 
 import datetime
+import hashlib
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 from validators import assert_valid
 
 from magtwin.errors import InputError
+from magtwin.field.maps.made_from import MadeFrom
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import colour_limits
 from magtwin.field.sources.harmonic import HarmonicField
@@ -31,6 +33,8 @@ from magtwin.usd.schema import attribute_name
 VALUES = "magtwin:anomalyMap:values"
 HEIGHT = "magtwin:anomalyMap:heightM"
 PARAMETERS = "magtwin:anomalyMap:parameters"
+GRID = [f"magtwin:anomalyMap:{name}" for name in ("shape", "origin", "cellSize", "headings")]
+HARMONIC = ("pWorldDipole", "mWorld", "bUniformNt", "hardIronNt", "softIron", "pBaseSensor")
 
 
 def a_map(shape=(4, 3, 5), **changes) -> AnomalyMap:
@@ -526,9 +530,83 @@ def test_a_tampered_map_is_refused_by_file_and_prim(tmp_path, attribute, kind, v
         prim.RemoveProperty(prim.attributes[attribute])
         Sdf.AttributeSpec(prim, attribute, kind)
     prim.attributes[attribute].default = value
+    if attribute in GRID and value:  # an old map; the checksum of a new one has its grid
+        with_old_checksum(prim)
     layer.Save()
     with pytest.raises(InputError, match=rf"m\.usdc </World/AnomalyMap>: .*{said}"):
         load_map(tmp_path / "m.usdc")
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value"),
+    [
+        ("origin", Gf.Vec2d(-3, -1)),
+        ("cellSize", Gf.Vec2d(0.25, 0.25)),
+        ("headings", [0.0, 90.0, 180.0, 271.0]),
+    ],
+)
+def test_the_checksum_covers_the_grid(tmp_path, attribute, value):
+    save_map(a_map(harmonic=a_field()), tmp_path / "m.usdc")
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
+    prim = layer.GetPrimAtPath(MAP)
+    prim.attributes[f"magtwin:anomalyMap:{attribute}"].default = value
+    layer.Save()
+    with pytest.raises(InputError, match="do not match its checksum, which covers its grid too"):
+        load_map(tmp_path / "m.usdc")
+    with_old_checksum(prim)  # which does not see it
+    layer.Save()
+    load_map(tmp_path / "m.usdc")
+
+
+def test_a_map_with_the_old_checksum_opens(tmp_path):
+    field = a_map(variance_nt2=np.ones((4, 3, 5)), harmonic=a_field())
+    save_map(field, tmp_path / "m.usdc")
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
+    with_old_checksum(layer.GetPrimAtPath(MAP))
+    layer.Save()
+    assert load_map(tmp_path / "m.usdc") == field
+
+
+def test_a_checksum_of_a_later_version_is_refused(tmp_path):
+    save_map(a_map(), tmp_path / "m.usdc")
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
+    layer.GetPrimAtPath(MAP).attributes["magtwin:anomalyMap:checksumVersion"].default = 3
+    layer.Save()
+    with pytest.raises(InputError, match="checksum is of version 3, this magtwin knows 1 to 2"):
+        load_map(tmp_path / "m.usdc")
+
+
+def test_a_map_keeps_what_it_was_made_from(tmp_path):
+    origin = MadeFrom(
+        earth_nt=(1.0, 2.5, -3.0),
+        sensor_m=(0.1, 0.0, 0.4),
+        platform="ab",
+        bodies={"désk": "12", "pipe": "34"},
+    )
+    save_map(a_map(made_from=origin), tmp_path / "m.usdc")
+    assert load_map(tmp_path / "m.usdc").made_from == origin
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"earth_nt": null}', '{"a": 1}'])
+def test_a_damaged_record_of_what_a_map_was_made_from_is_refused(tmp_path, text):
+    save_map(a_map(), tmp_path / "m.usdc")
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
+    layer.GetPrimAtPath(MAP).attributes["magtwin:anomalyMap:madeFrom"].default = text
+    layer.Save()
+    with pytest.raises(InputError, match=r"m\.usdc </World/AnomalyMap>: magtwin:anomalyMap:madeFrom: "):
+        load_map(tmp_path / "m.usdc")
+
+
+def with_old_checksum(prim: Sdf.PrimSpec) -> None:
+    """Give a map's prim the checksum of version 1, as docs/schema.md defines it."""
+    digest = hashlib.sha256()
+    kinds = {"anomalyMap:values": "<f4", "anomalyMap:valid": "u1", "anomalyMap:variance": "<f4"}
+    kinds |= {f"harmonic:{name}": "<f8" for name in HARMONIC}
+    for name, kind in kinds.items():
+        if attribute := prim.attributes.get(f"magtwin:{name}"):
+            digest.update(np.array(attribute.default).astype(kind).tobytes())
+    prim.attributes["magtwin:anomalyMap:checksum"].default = digest.hexdigest()
+    prim.RemoveProperty(prim.attributes["magtwin:anomalyMap:checksumVersion"])
 
 
 def test_a_harmonic_field_that_lost_a_part_is_refused(tmp_path):

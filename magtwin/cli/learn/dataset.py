@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import OURS_THEIRS, Force, Remap, Unit, pairs
+from magtwin.cli.options import OURS_THEIRS, Force, Jobs, Remap, Unit, pairs
 from magtwin.cli.terminal import Done, progress, step
 from magtwin.errors import InputError
 
@@ -31,6 +31,7 @@ def build(
     remap: Remap = None,
     unit: Unit = None,
     column: Annotated[list[str] | None, Parameter(negative="")] = None,
+    jobs: Jobs = None,
     force: Force = False,
 ) -> Done:
     """Label recordings on a map and write them as a data set: measured total field minus the map.
@@ -59,6 +60,8 @@ def build(
     column
         Name of a column in a CSV or Parquet of another program, as NAME=THEIRS, of a vector by its parts:
         b_measured_nt=field, p_world_base_x=east. Repeatable. A p_world_base without z is on the floor.
+    jobs
+        Number of processes that share the recordings. Default: one, with several threads.
     """
     from magtwin.files import check_free
     from magtwin.learn.data.alignment import Alignment
@@ -83,6 +86,7 @@ def build(
             session_by=session_by,
             path_by=path_by,
             rate_hz=rate_hz,
+            jobs=jobs,
             force=force,
             progress=advance,
             **{name: value for name, value in reading.items() if value},

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.maps.map import LAYERS, Earth, Kernel, Sources, headings_rad, map_app
-from magtwin.cli.options import Flag, Force, Licence, Seed
+from magtwin.cli.options import Flag, Force, Jobs, Lab, Licence, Seed
 from magtwin.cli.terminal import Done, check_output, progress, step
 from magtwin.io.surveys.about import About
 from magtwin.io.surveys.columns import Columns
@@ -165,6 +165,8 @@ def map_survey(
     scene: Path,
     *,
     out: Path,
+    adopt: Flag = False,
+    lab: Lab = "",
     spacing_m: float = 0.25,
     headings_deg: str = "0,90,180,270",
     readings: int = 135,
@@ -175,20 +177,24 @@ def map_survey(
     name: str | None = None,
     licence: Licence = "",
     created: str | None = None,
+    jobs: Jobs = None,
     force: Force = False,
 ) -> Done:
     """Survey a scene as its robot would, node by node, with sensor noise and pose errors.
 
     The field is that of the stage as it is now: move a desk in it, survey again, and `magtwin map diff` finds
-    the change. The map's variance includes noise and pose errors. Nodes where the sensor loses lock or the
-    robot cannot stand are masked.
+    the change. With --adopt, the stage reads the new map from then on. The map's variance includes noise and
+    pose errors. Nodes where the sensor loses lock or the robot cannot stand are masked.
 
     Parameters
     ----------
     scene
-        USD stage with a known Earth field.
+        USD stage with a known Earth field, or the name of a scene that ships with magtwin: lab.
     out
         Map layer (.usdc) or readings (.parquet) to write.
+    adopt
+        Put the new map in place of the stage's old one: in the sublayers, and in the checksum of each
+        magnetometer. The old map's file stays.
     spacing_m
         Spacing of the nodes [m].
     headings_deg
@@ -206,15 +212,21 @@ def map_survey(
         Name of the map. Default: the name of the output.
     created
         Date of the survey, YYYY-MM-DD. Default: that of the Earth's field.
+    jobs
+        Number of processes that share the headings. Default: one, with several threads.
     """
     from magtwin.io.surveys.maps import survey_scene
+    from magtwin.twin import scene_file
 
+    scene = scene_file(scene)
     check_output(out, (*LAYERS, ".parquet"), "a map layer, or a file of readings,", force=force)
     angles = headings_rad(headings_deg)
     with progress(f"Surveying {scene.name}", "headings") as advance:
         report = survey_scene(
             scene,
             out,
+            adopt=adopt,
+            lab=lab,
             spacing_m=spacing_m,
             headings_rad=angles,
             readings=readings,
@@ -225,6 +237,7 @@ def map_survey(
             name=name,
             licence=licence,
             created=created,
+            jobs=jobs,
             progress=advance,
             force=force,
         )

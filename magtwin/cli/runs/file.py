@@ -98,7 +98,7 @@ def convert(
 
 @app.command
 def fetch(
-    assets: Literal["aprilab", "turtlebot4", "magnetic-data", "magslam"],
+    assets: Literal["aprilab", "isaac-rules", "turtlebot4", "magnetic-data", "magslam"],
     *,
     out: Path | None = None,
     base_url: str | None = None,
@@ -109,17 +109,19 @@ def fetch(
     Parameters
     ----------
     assets
-        aprilab: survey, released network and paths (MIT). turtlebot4: description packages (Apache-2.0,
+        aprilab: survey, released network and paths (MIT). isaac-rules: Isaac Sim's rules for assets, which
+        `magtwin validate --against isaac` runs (Apache-2.0). turtlebot4: description packages (Apache-2.0,
         BSD-3-Clause). magnetic-data: five drives of a robot in a room, with true positions (no licence
         stated). magslam: loops of a model ship (no licence stated) and hand-held loops (MIT).
     out
-        Folder to make. Default: the name of the assets.
+        Folder to make. Default: the name of the assets; for isaac-rules, the user's cache.
     base_url
         Address of a mirror with the same paths.
     """
+    from magtwin.fetch import default_folder
     from magtwin.fetch import fetch as fetch_files
 
-    folder = out or Path(assets)
+    folder = out or default_folder(assets)
     with progress(f"Fetching {assets}", "files") as advance:
         files = fetch_files(assets, folder, base_url=base_url, force=force, progress=advance)
     return Done(wrote=folder, text=f"Wrote {len(files)} files to {folder}")

@@ -14,6 +14,7 @@ from magtwin.cli.options import (
     SENSING,
     Flag,
     Force,
+    Lab,
     ModelError,
     OutUnit,
     Plant,
@@ -82,6 +83,7 @@ def run(
     path: str | None = None,
     fit: Flag = False,
     commands: Path | None = None,
+    lab: Lab = "",
     robot: str | None = None,
     meet: Literal["refuse", "flag"] | None = None,
     engine: Literal["kinematic", "newton"] = "kinematic",
@@ -193,7 +195,7 @@ def run(
     options: dict[str, Any] = {"commands": commands, "replay": replay, "seed": seed, "session": session}
     options |= {"plant": plant, "speed": speed, "duration_s": duration_s, "controller": controller}
     options |= vars(sensing)
-    robots = robots_in(scene)
+    robots = robots_in(scene, lab=lab)
     if robot is not None:
         find("robot", robot, robots)
     if len(robots) > 1:
@@ -204,7 +206,9 @@ def run(
             raise InputError(f"--engine newton drives one robot by itself, and {scene} has {names}; drop it")
         if robot is None and (path or free or fit):
             raise InputError(f"which of {names} is to drive {what}? name it with --robot NAME")
-        return _run_robots(scene, outputs, robot=robot, path=path, fit=fit, meet=meet, scans=scans, **options)
+        return _run_robots(
+            scene, outputs, lab=lab, robot=robot, path=path, fit=fit, meet=meet, scans=scans, **options
+        )
     if meet is not None:
         raise InputError(f"--meet is for several robots, and {scene} has one; drop it")
     if not (path or free):
@@ -219,7 +223,15 @@ def run(
         newton = progress("Driving in Newton", "steps") if engine == "newton" else nullcontext()
         with newton as advance:
             driven = drive(
-                scene, what, fit=fit, scans=scans, engine=engine, progress=advance, report=announce, **options
+                scene,
+                what,
+                lab=lab,
+                fit=fit,
+                scans=scans,
+                engine=engine,
+                progress=advance,
+                report=announce,
+                **options,
             )
         if live or viewer:
             driven = _show(driven, outputs, viewer, pace or 1.0)
@@ -241,6 +253,7 @@ def _run_robots(
     scene: Path,
     outputs: "Outputs",
     *,
+    lab: str,
     robot: str | None,
     path: str | None,
     fit: bool,
@@ -261,7 +274,7 @@ def _run_robots(
     opening = {
         name: options.pop(name) for name in ("network", "magnetometer", "model_error", "tracking_error")
     }
-    twin = open_twin(scene, **opening)
+    twin = open_twin(scene, lab=lab, **opening)
     ways: dict[str, Any] = {spec.robot.name: spec.path or "figure8" for spec in twin.scene.robots}
     if robot is not None and (commands or replay or path):
         ways[robot] = read_commands(commands) if commands else read_run(replay) if replay else path

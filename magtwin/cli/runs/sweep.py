@@ -10,6 +10,7 @@ from magtwin.cli.options import (
     Flag,
     Force,
     Jobs,
+    Lab,
     Names,
     Plant,
     Seed,
@@ -17,7 +18,7 @@ from magtwin.cli.options import (
     Shard,
     Whole,
 )
-from magtwin.cli.terminal import Done, announce, progress
+from magtwin.cli.terminal import Done, announce, continued_by_a_repeat, progress
 from magtwin.errors import InputError
 
 RUNS_A_SESSION = 5
@@ -32,6 +33,7 @@ def sweep(
     count: Whole = 100,
     path: Names = None,
     fit: Flag = False,
+    lab: Lab = "",
     seed: Seed = 0,
     sessions: Whole | None = None,
     session: Literal["survey"] | None = None,
@@ -102,7 +104,7 @@ def sweep(
     opening = {
         name: options.pop(name) for name in ("network", "magnetometer", "model_error", "tracking_error")
     }
-    twin = open_twin(scene, **opening)
+    twin = open_twin(scene, lab=lab, **opening)
     announce(f"Driving {count} runs")
     runs = drive_many(
         twin,
@@ -117,6 +119,7 @@ def sweep(
         **options,
     )
     part = None if shard is None else parse_shard(shard)
-    with progress("Driving", "runs") as advance:
+    kept = jobs is not None or part is not None or dask is not None
+    with continued_by_a_repeat(when=kept), progress("Driving", "runs") as advance:
         made = runs.save(out, force=force, jobs=jobs, shard=part, dask=dask, progress=advance)
     return Done(made, out if out.exists() else Path(f"{out}.parts"))

@@ -11,7 +11,7 @@ from magtwin.errors import find
 from magtwin.export.contents import named_files
 from magtwin.export.validation.rule import Subject
 from magtwin.export.validation.rules import is_absolute
-from magtwin.files import output
+from magtwin.usd.layers import save_layer
 from magtwin.usd.schema import NOUNS
 
 
@@ -35,12 +35,7 @@ def mend(file: Path, names: Collection[str]) -> list[str]:
         done += fix(subject)
         for layer in subject.layers:  # before the next fix
             if layer.dirty:
-                path = Path(layer.realPath)
-                with path.open("rb") as old:
-                    kind = "usdc" if old.read(8) == b"PXR-USDC" else "usda"
-                with output(path, force=True) as aside:
-                    layer.Export(str(aside), args={"format": kind} if path.suffix == ".usd" else {})
-                layer.Reload(force=True)
+                save_layer(layer)
     return done
 
 

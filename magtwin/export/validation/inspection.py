@@ -34,6 +34,9 @@ class Inspection:
     bodies: int = 0
     """Number of rigid bodies."""
 
+    driven: dict[str, Any] = field(default_factory=dict)
+    """What `physx_robots.driven_table` found; empty if "physx" was not asked for."""
+
     mended: tuple[str, ...] = ()
 
 
@@ -50,7 +53,7 @@ def inspect(
 
     Args:
         file: The file that the user named.
-        against: Some of "core", "isaac" and "magtwin".
+        against: Some of "core", "isaac", "magtwin" and "physx".
         root: Root layer of an unpacked .usdz. Default: the file itself.
         home: Folder of the unpacked .usdz.
         inputs: Names of the inputs that a network may have.
@@ -86,19 +89,20 @@ def inspect(
             raise RuntimeError(f"the inspection of {file} ended with {done.returncode}: {last}")
         result = json.loads(answer.read_text(encoding="utf-8"))
     if result.get("refused"):
-        raise InputError(_as_named(result["refused"], home, file))
+        raise InputError(as_named(result["refused"], home, file))
     for check in result["checks"]:
         for finding in check["findings"]:
-            finding |= {name: _as_named(finding[name], home, file) for name in ("text", "where")}
+            finding |= {name: as_named(finding[name], home, file) for name in ("text", "where")}
     return Inspection(
         tuple(check_from(check) for check in result["checks"]),
         {prim: None if asset is None else Path(asset) for prim, asset in result["robots"].items()},
         result["bodies"],
+        result["driven"],
         tuple(result["mended"]),
     )
 
 
-def _as_named(text: str, home: Path | None, file: Path) -> str:
+def as_named(text: str, home: Path | None, file: Path) -> str:
     """A text with the folder of an unpacked package replaced by the package."""
     for folder in () if home is None else (home.resolve(), home):
         text = text.replace(folder.as_posix(), file.as_posix())
@@ -114,7 +118,8 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
     from magtwin.export.validation.fix import mend
 
     importlib.import_module("magtwin.export.validation.isaac_rules")  # fills RULES
-    from magtwin.export.validation.rule import RULES, Subject
+    from magtwin.export.validation.physx_robots import driven_table
+    from magtwin.export.validation.rule import RULES, TITLES, Subject
     from magtwin.export.validation.rules import robot_assets
 
     file, root = Path(job["file"]), Path(job["root"])
@@ -142,8 +147,9 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
             if name in job["against"]:
                 found = [finding for rule in rules.values() for finding in rule.findings(subject)]
                 found += lost if name == "magtwin" else []
-                checks.append(Check(name, tuple(found), scope=f"{len(rules)} rules"))
+                checks.append(Check(TITLES[name], tuple(found), scope=f"{len(rules)} rules"))
         assets = robot_assets(subject)
+        driven = driven_table(stage) if "physx" in job["against"] else {}
         bodies = sum(prim.HasAPI(UsdPhysics.RigidBodyAPI) for prim in subject.prims)
     except (Tf.ErrorException, UnicodeError, MemoryError) as error:
         raise InputError(f"{file}: cannot be opened as USD; it is damaged, cut short, or not USD") from error
@@ -153,6 +159,7 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
         "checks": [asdict(check) for check in checks],
         "robots": {prim: None if asset is None else str(asset) for prim, asset in assets.items()},
         "bodies": bodies,
+        "driven": driven,
         "mended": mended,
     }
 

@@ -22,6 +22,7 @@ from pxr import Sdf, Tf, Usd
 
 from magtwin.errors import InputError
 from magtwin.export.validation.findings import Finding, Severity
+from magtwin.usd.placement import lab_on, labs_on, take_to_origin
 from magtwin.usd.schema import prims_with
 
 MOST_CHARACTERS = 120
@@ -78,6 +79,22 @@ class Subject:
         """Every layer that was read from a file."""
         return [layer for layer in self.stage.GetUsedLayers() if layer.realPath]
 
+    @cached_property
+    def labs(self) -> list[Usd.Stage]:
+        """The stage once for each lab, in that lab's axes and without other labs; see `usd.placement`.
+
+        A lab that is tilted or scaled is left out, as the rule `frames` reports it.
+        """
+        stages = []
+        for path in dict.fromkeys(lab.path for lab in labs_on(self.stage)):
+            stage = Usd.Stage.Open(self.stage.GetRootLayer())
+            try:
+                take_to_origin(stage, lab_on(stage, path))
+            except InputError:
+                continue
+            stages.append(stage)
+        return stages
+
     def owns(self, layer: Sdf.Layer) -> bool:
         """Whether a layer is in the stage's folder."""
         return Path(layer.realPath).resolve().is_relative_to(self.folder)
@@ -117,6 +134,9 @@ class Rule:
             wrongs.append(Wrong(text, advice="author it anew; docs/schema.md lists the type of each value"))
         return [Finding(self.name, w.text, w.where, w.advice or self.advice, w.severity) for w in wrongs]
 
+
+TITLES = {"isaac": "isaac extra", "magtwin": "magtwin"}
+"""Name of the check of each group of rules. The check `isaac` is that of Isaac Sim's own rules."""
 
 RULES: dict[str, dict[str, Rule]] = {"isaac": {}, "magtwin": {}}
 """Every rule by validator and name. Importing `isaac_rules` and `rules` fills it."""

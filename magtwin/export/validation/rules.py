@@ -5,6 +5,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,10 +23,13 @@ from magtwin.usd.attributes import plain_value, target
 from magtwin.usd.earth import read_earth
 from magtwin.usd.furniture import read_magnets
 from magtwin.usd.lab import read_lab
+from magtwin.usd.looks import VISUALS
 from magtwin.usd.maps import HEAT_MAP, checksums, heading_variants, read_map
 from magtwin.usd.obstacles import read_obstacles
+from magtwin.usd.placement import UPRIGHT, labs_on, pose_of
 from magtwin.usd.robot import read_robot
-from magtwin.usd.schema import NOUNS, attribute_name
+from magtwin.usd.scene import earth_in, open_scene
+from magtwin.usd.schema import NOUNS, attribute_name, prims_with
 from magtwin.usd.sensors import (
     IMU_TYPE,
     LIDAR_TYPE,
@@ -36,6 +40,7 @@ from magtwin.usd.sensors import (
     read_lidar,
     read_magnetometer,
 )
+from magtwin.usd.units import mixed_units
 
 NETWORK = attribute_name("magnetometer", "network")
 
@@ -45,8 +50,8 @@ NEEDED = ("values", "valid", "shape", "origin", "cell_size", "headings", "unit",
 SAME_M = 1e-6
 """Single precision at 10 m [m]: what two places that ought to be one may be apart."""
 
-UPRIGHT = 1 - 1e-9
-"""Cosine of the tilt of a robot that stands."""
+OFF_M = 1e-3
+"""Largest distance between a mesh and what it shows [m]."""
 
 
 @rule("magtwin", "make the path relative to the layer; --fix does this if the file exists")
@@ -73,19 +78,23 @@ def climbing_paths(subject: Subject) -> Iterator[Wrong]:
 
 @rule("magtwin", "convert it to metres with Z up in the program that made it")
 def units(subject: Subject) -> Iterator[Wrong]:
-    """The stage is authored in metres and kilograms with Z up, and no layer below differs."""
+    """The stage is authored in metres and kilograms with Z up, and what it brings in is scaled to that."""
     root, advice = subject.stage.GetRootLayer(), "--fix says so where magtwin made the stage"
     for name, default in (("metersPerUnit", "centimetres"), ("upAxis", "Y up")):
         if not subject.stage.HasAuthoredMetadata(name):
             yield Wrong(f"does not say {name}, and counts as {default}", advice=advice)
-    defaults: dict[str, Any] = {"metersPerUnit": 1.0, "upAxis": "Z", "kilogramsPerUnit": 1.0}
+    metres, up = UsdGeom.GetStageMetersPerUnit(subject.stage), UsdGeom.GetStageUpAxis(subject.stage)
+    severity: Severity = "warning" if subject.labs else "error"  # a lab is scaled and turned to fit
+    if not UsdGeom.LinearUnitsAre(metres, UsdGeom.LinearUnits.meters):
+        yield Wrong(f"is in units of {metres:g} m; USD does not convert them", severity=severity)
+    if up != UsdGeom.Tokens.z:
+        yield Wrong(f"has {up} up; USD does not turn it", severity=severity)
+    for text in mixed_units(subject.stage):
+        yield wrong_of(InputError(text))
     for layer in subject.layers:
-        said, name = layer.pseudoRoot, "" if layer == root else f"{subject.name_of(layer)} "
-        metres, up, kilograms = (said.GetInfo(k) if said.HasInfo(k) else d for k, d in defaults.items())
-        if not UsdGeom.LinearUnitsAre(metres, UsdGeom.LinearUnits.meters):
-            yield Wrong(f"{name}is in units of {metres:g} m; USD does not convert them")
-        if up != UsdGeom.Tokens.z:
-            yield Wrong(f"{name}has {up} up; USD does not turn it")
+        name = "" if layer == root else f"{subject.name_of(layer)} "
+        said = layer.pseudoRoot
+        kilograms = said.GetInfo("kilogramsPerUnit") if said.HasInfo("kilogramsPerUnit") else 1.0
         if not math.isclose(kilograms, UsdPhysics.MassUnits.kilograms, rel_tol=1e-6):
             yield Wrong(f"{name}is in units of {kilograms:g} kg; USD does not convert them")
 
@@ -142,7 +151,7 @@ def map_checksum(subject: Subject) -> Iterator[Wrong]:
                 yield Wrong(text, str(prim.GetPath()))
 
 
-@rule("magtwin", "the checksum does not cover the grid: make the map again with magtwin map")
+@rule("magtwin", "make the map again with magtwin map")
 def map_grid(subject: Subject) -> Iterator[Wrong]:
     """The coloured floor of every map covers its grid and has a variant for each heading."""
     for prim in subject.having("anomalyMap"):
@@ -189,15 +198,29 @@ def map_file(subject: Subject) -> Iterator[Wrong]:
 
 @rule("magtwin", "point magtwin:magnetometer:map to the map's prim")
 def magnetometer_map(subject: Subject) -> Iterator[Wrong]:
-    """Every magnetometer in a lab reads a map on the stage, and all read the same one."""
-    first = None
-    for prim in subject.having("magnetometer") if subject.having("lab") else ():
-        end = target(prim, MAP_RELATIONSHIP)
-        if not end.HasAPI(NOUNS["anomalyMap"]):
-            yield Wrong(f"reads <{end.GetPath()}>, which is no map", str(prim.GetPath()))
-        first = first or end
-        if end != first:
-            yield Wrong(f"reads <{end.GetPath()}>, another than <{first.GetPath()}>", str(prim.GetPath()))
+    """Every magnetometer in a lab reads a map on the stage, and all of a lab read the same one."""
+    for stage in subject.labs:
+        first = None
+        for prim in prims_with(stage.GetPseudoRoot(), "magnetometer"):
+            end = target(prim, MAP_RELATIONSHIP)
+            if not end.HasAPI(NOUNS["anomalyMap"]):
+                yield Wrong(f"reads <{end.GetPath()}>, which is no map", str(prim.GetPath()))
+            first = first or end
+            if end != first:
+                text = f"reads <{end.GetPath()}>, another than <{first.GetPath()}>"
+                yield Wrong(text, str(prim.GetPath()))
+
+
+@rule("magtwin", "survey it again: magtwin map survey STAGE --out MAP.usdc --adopt")
+def map_stale(subject: Subject) -> Iterator[Wrong]:
+    """The lab is as it was when its map was made."""
+    for lab in {lab.path: lab for lab in labs_on(subject.stage)}.values():
+        try:
+            opened = open_scene(subject.file, lab=lab.path, check_network=False)
+        except InputError:
+            continue  # other rules tell
+        for text in opened.changes:
+            yield Wrong(f"since the map was made: {text}", lab.path, severity="warning")
 
 
 @rule("magtwin", "restore the weights, or make the scene again with these")
@@ -246,52 +269,68 @@ def network_inputs(subject: Subject) -> Iterator[Wrong]:
             yield Wrong("names other inputs than its file of weights, or in another order", where)
 
 
-@rule("magtwin", "move the lab or the map to the origin of the world, without rotation or scale")
+@rule("magtwin", "a lab can be moved and turned about the vertical, as one and not otherwise")
 def frames(subject: Subject) -> Iterator[Wrong]:
-    """Lab and map are in world axes without a transform, and the map is within the floor."""
-    cache, labs = UsdGeom.XformCache(), subject.having("lab")
-    for prim in (*labs, *subject.having("anomalyMap")):
-        if cache.GetLocalToWorldTransform(prim) != Gf.Matrix4d(1):
-            yield Wrong("is moved, turned or scaled, and its figures are in world", str(prim.GetPath()))
-    if len(labs) != 1:
-        return
-    half = np.array(read_lab(labs[0]).floor_m) / 2
-    for prim in subject.having("anomalyMap"):
-        x0, x1, y0, y1 = (field := read_map(prim)).extent
-        beyond = max(float(np.max(np.abs([[x0, y0], [x1, y1]]) - half)), 0.0)
-        if beyond > max(field.cell_m) / 2 + SAME_M:
-            text = f"reaches {beyond:.3g} m beyond the floor of {2 * half[0]:g} x {2 * half[1]:g} m"
-            yield Wrong(text, str(prim.GetPath()), "say the lab's size and the map's origin in one frame")
+    """Every lab stands level in its own size, its lab and map in the same axes, the map within the floor."""
+    for lab in labs_on(subject.stage):
+        try:
+            pose_of(lab)
+        except InputError as error:
+            yield wrong_of(error)
+    for stage in subject.labs:
+        labs = prims_with(stage.GetPseudoRoot(), "lab")
+        if len(labs) != 1:
+            continue
+        half = np.array(read_lab(labs[0]).floor_m) / 2
+        for prim in prims_with(stage.GetPseudoRoot(), "anomalyMap"):
+            x0, x1, y0, y1 = (field := read_map(prim)).extent
+            beyond = max(float(np.max(np.abs([[x0, y0], [x1, y1]]) - half)), 0.0)
+            if beyond > max(field.cell_m) / 2 + SAME_M:
+                text = f"reaches {beyond:.3g} m beyond the floor of {2 * half[0]:g} x {2 * half[1]:g} m"
+                yield Wrong(text, str(prim.GetPath()), "say the lab's size and the map's origin in one frame")
+
+
+@rule("magtwin", "set one field for the stage, or turn and survey the lab as the others")
+def earth_fields(subject: Subject) -> Iterator[Wrong]:
+    """Every Earth's field on the stage is the same, in the axes of each lab."""
+    for lab in {lab.path: lab for lab in labs_on(subject.stage)}.values():
+        for note in earth_in(subject.stage, lab)[1]:
+            yield replace(wrong_of(InputError(note)), severity="warning")
 
 
 @rule("magtwin", "start it upright on the floor, clear of the walls")
 def robot_inside(subject: Subject) -> Iterator[Wrong]:
     """Every robot stands upright on the floor, with its footprint inside it."""
-    labs = subject.having("lab")
-    if len(labs) != 1:
-        return
-    half = np.array(read_lab(labs[0]).floor_m) / 2
-    cache = UsdGeom.XformCache()
-    for prim in subject.having("robot"):
-        at = cache.GetLocalToWorldTransform(prim)
-        x, y, z = at.ExtractTranslation()
-        where, radius = str(prim.GetPath()), read_footprint(prim)
-        if np.any(np.abs([x, y]) + radius > half + SAME_M):
-            text = f"stands at ({x:g}, {y:g}) m and needs {radius:g} m about it: it is off the floor"
-            yield Wrong(text, where)
-        if abs(z) > SAME_M:
-            yield Wrong(f"stands {z:g} m above the floor", where)
-        if at.TransformDir(Gf.Vec3d(0, 0, 1)).GetNormalized()[2] < UPRIGHT:
-            yield Wrong("does not stand upright", where)
+    for stage in subject.labs:
+        world = stage.GetPseudoRoot()
+        labs = prims_with(world, "lab")
+        if len(labs) != 1:
+            continue
+        half = np.array(read_lab(labs[0]).floor_m) / 2
+        cache = UsdGeom.XformCache()
+        for prim in prims_with(world, "robot"):
+            at = cache.GetLocalToWorldTransform(prim)
+            x, y, z = at.ExtractTranslation()
+            where, radius = str(prim.GetPath()), read_footprint(prim)
+            if np.any(np.abs([x, y]) + radius > half + SAME_M):
+                text = f"stands at ({x:g}, {y:g}) m and needs {radius:g} m about it: it is off the floor"
+                yield Wrong(text, where)
+            if abs(z) > SAME_M:
+                yield Wrong(f"stands {z:g} m above the floor", where)
+            if at.TransformDir(Gf.Vec3d(0, 0, 1)).GetNormalized()[2] < UPRIGHT:
+                yield Wrong("does not stand upright", where)
 
 
 @rule("magtwin", "start it elsewhere; a run that begins in a collision is refused")
 def robot_clear(subject: Subject) -> Iterator[Wrong]:
     """Every robot is clear of obstacles and of the other robots."""
-    robots = subject.having("robot")
-    if not (robots and subject.having("lab")):
-        return
-    obstacles, cache = read_obstacles(subject.stage), UsdGeom.XformCache()
+    for stage in subject.labs:
+        yield from _collisions(stage, prims_with(stage.GetPseudoRoot(), "robot"))
+
+
+def _collisions(stage: Usd.Stage, robots: list[Usd.Prim]) -> Iterator[Wrong]:
+    """Robots that start in an obstacle or in another robot, in the axes of a lab."""
+    obstacles, cache = read_obstacles(stage), UsdGeom.XformCache()
     places = [np.array(cache.GetLocalToWorldTransform(prim).ExtractTranslation())[:2] for prim in robots]
     radii = [read_footprint(prim) for prim in robots]
     for i, prim in enumerate(robots):
@@ -311,17 +350,18 @@ def figures(subject: Subject) -> Iterator[Wrong]:
     looks: list[tuple[Callable[[], object], Usd.Prim]] = []
     for noun, read in (("lab", read_lab), ("earth", read_earth), ("robot", read_robot)):
         looks += [(partial(read, prim), prim) for prim in subject.having(noun)]
-    if subject.having("source"):
-        looks.append((partial(read_magnets, subject.stage), subject.stage.GetPseudoRoot()))
+    for stage in (subject.labs or [subject.stage]) if subject.having("source") else []:
+        looks.append((partial(read_magnets, stage), stage.GetPseudoRoot()))
     for look, prim in looks:
         try:
             look()
         except InputError as error:
             wrong = wrong_of(error)
             yield wrong if wrong.where else Wrong(wrong.text, str(prim.GetPath()))
-    for noun in ("lab", "earth"):
-        for prim in subject.having(noun)[1:]:
-            yield Wrong(f"is a second {NOUNS[noun]}", str(prim.GetPath()), "keep one of them")
+    for stage in subject.labs or [subject.stage]:
+        for noun in ("lab", "earth"):
+            for prim in prims_with(stage.GetPseudoRoot(), noun)[1:]:
+                yield Wrong(f"is a second {NOUNS[noun]}", str(prim.GetPath()), "keep one of them")
 
 
 @rule("magtwin", "author the sensor again with magtwin robot or magtwin scene")
@@ -345,6 +385,25 @@ def sensor_types(subject: Subject) -> Iterator[Wrong]:
             if wrong:
                 text = f"ranges to {wanted:g} m, its {LIDAR_TYPE} has {name} {seen}"
                 yield Wrong(text, str(prim.GetPath()))
+
+
+@rule("magtwin", "move the piece of furniture or the room as a whole, or both prims alike")
+def shown_meshes(subject: Subject) -> Iterator[Wrong]:
+    """A mesh below `Visuals` stands where the collider or source that it shows is."""
+    boxes = UsdGeom.BBoxCache(Usd.TimeCode.Default(), [UsdGeom.Tokens.default_, UsdGeom.Tokens.guide])
+    for prim in subject.prims:
+        if prim.GetParent().GetName() != VISUALS:
+            continue
+        body = prim.GetParent().GetParent().GetChild(prim.GetName())
+        if not body:
+            continue
+        here, there = (boxes.ComputeWorldBound(p).ComputeAlignedRange() for p in (prim, body))
+        off = max(
+            (a - b).GetLength() for a, b in ((here.GetMin(), there.GetMin()), (here.GetMax(), there.GetMax()))
+        )
+        if off > OFF_M:
+            text = f"is shown {off:.3g} m from {body.GetPath()}, which readings and collisions follow"
+            yield Wrong(text, str(prim.GetPath()))
 
 
 def robot_assets(subject: Subject) -> dict[str, Path | None]:

@@ -97,6 +97,7 @@ def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
         method=f"{field.method}; {text}" if field.method else text,
         parameters=parameters,
         harmonic=harmonic,
+        made_from=None if field.made_from is None else field.made_from.at_height(height_m),
     )
 
 

@@ -14,6 +14,7 @@ from magtwin.errors import InputError
 from magtwin.field.days import check_texts
 from magtwin.field.grid import Grid, check_axes
 from magtwin.field.maps.lookup import EDGE, NONE, Lookup
+from magtwin.field.maps.made_from import MadeFrom
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.report import Figure, Report
 from magtwin.summary import Summarized, Summary, listed, rectangle, span
@@ -62,6 +63,8 @@ class AnomalyMap(Summarized):
     parameters: Mapping[str, Any] = field(default_factory=dict)
     # The vector field from which the values were computed; None if there is none
     harmonic: HarmonicField | None = None
+    # The room and the robot that the map was made from; None if that is not known
+    made_from: MadeFrom | None = None
 
     def __post_init__(self) -> None:
         values = _frozen(self.values_nt, float)
@@ -376,6 +379,7 @@ class AnomalyMap(Summarized):
                 ("nodes", f"{columns} x {rows}, {cell} apart, {rectangle(x0, x1, y0, y1)}"),
                 ("headings", f"{headings}: {degrees} deg" + (f"; {masked:,} nodes masked" if masked else "")),
                 ("known", ", ".join(about)),
+                *((("made from", str(self.made_from)),) if self.made_from else ()),
                 ("method", self.method or "unknown"),
                 ("source", self.source),
                 ("frame", self.frame),

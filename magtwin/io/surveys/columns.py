@@ -12,6 +12,9 @@ HeadingUnit = Literal["rad", "deg"]
 HEADINGS = ("heading", "yaw", "theta")
 """Default names of a heading."""
 
+NO_HEADING = "none"
+"""Given instead of a heading's column: a sensor carried by hand reads the same at all headings."""
+
 FIELDS = (
     *("field", "b_nt", "scalar_mag", "magnitude", "b_total", "b_total_nt", "b_ut", "b_total_ut", "b"),
     *("b_tot", "btotal", "bt", "|b|", "b_mag", "mag", "total", "total_field", "f"),
@@ -40,7 +43,8 @@ class Columns:
     """Column of world y [m]."""
 
     heading: str = ""
-    """Column of the robot's heading. Default: heading, yaw or theta."""
+    """Column of the robot's heading, or "none" for a sensor carried by hand. Default: heading, yaw or
+    theta."""
 
     quaternion: str = ""
     """Columns of the robot's orientation in world, qx,qy,qz,qw, instead of a heading."""

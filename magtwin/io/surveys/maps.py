@@ -216,6 +216,8 @@ def survey_scene(
     scene_file: Source,
     out: Source,
     *,
+    lab: str = "",
+    adopt: bool = False,
     spacing_m: float = 0.25,
     headings_rad: Sequence[float],
     readings: int = 135,
@@ -226,6 +228,7 @@ def survey_scene(
     name: str | None = None,
     licence: str = "",
     created: str | None = None,
+    jobs: int | None = None,
     progress: Progress | None = None,
     force: bool = False,
 ) -> Report:
@@ -233,6 +236,8 @@ def survey_scene(
 
     Args:
         scene_file: USD stage with a known Earth field.
+        lab: As for `magtwin.open_twin`.
+        adopt: Whether the stage reads this map from now on, in place of its old one.
         out: Map layer (.usdc) or readings (.parquet) to write.
         spacing_m: Spacing of the nodes [m].
         headings_rad: Headings at each node [rad], ascending.
@@ -244,6 +249,8 @@ def survey_scene(
         name: Name of the map. None: that of `out`.
         licence: Licence of the map, an SPDX identifier.
         created: Date of the survey, YYYY-MM-DD. None: that of the Earth's field.
+        jobs: Processes that share the headings; they do not change the output. None: this process, with
+            several threads.
         progress: Called with the number of headings done and their total.
         force: Whether an existing output is replaced.
 
@@ -253,13 +260,17 @@ def survey_scene(
     from magtwin.sim.survey import blocked_by, survey, survey_readings
     from magtwin.usd.layers import layer_files
     from magtwin.usd.maps import save_map
-    from magtwin.usd.obstacles import read_obstacles
-    from magtwin.usd.scene import read_scene
+    from magtwin.usd.scene import open_scene, use_map
 
     out = check_free(out, force=force)
     if seed < 0:
         raise InputError(f"`seed` must be a whole number from 0 up, got {seed}", parameter="seed")
-    twin = read_scene(scene_file, check_network=False)
+    if adopt and out.suffix == ".parquet":
+        raise InputError(f"{out}: a scene reads a map layer (.usdc), not readings", parameter="adopt")
+    opened = open_scene(scene_file, lab=lab, check_network=False)
+    if adopt:
+        use_map(opened, out, dry=True)  # refuses before the survey
+    twin = opened.scene
     day = twin.earth.date if twin.earth is not None else ""
     files = [file for file in layer_files(scene_file) if file.resolve() != twin.map_layer.resolve()]
     options: dict[str, Any] = {
@@ -273,8 +284,9 @@ def survey_scene(
         "source": "; ".join(f"{file.name} sha256:{sha256(file)}" for file in files),
         "licence": licence,
         "created": day if created is None else created,
-        "progress": progress,
-        "blocked": blocked_by(twin, read_obstacles(scene_file)),
+        "progress": progress or (lambda done, total, what: None),
+        "blocked": blocked_by(twin, opened.obstacles),
+        "jobs": jobs,
     }
     if out.suffix == ".parquet":
         surveyed = replace(survey_readings(twin, **options), name=name or out.stem)
@@ -283,6 +295,8 @@ def survey_scene(
     field = survey(twin, **options, name=name or out.stem)
     field = replace(field, parameters={**field.parameters, "seed": seed})
     save_map(field, out, force=force)
+    if adopt:
+        use_map(opened, out)
     return field.report()
 
 
@@ -314,7 +328,8 @@ def _doubts(readings: Readings, source: Source) -> list[str]:
     if np.abs(mean) >= ONE_HEADING:
         doubts.append(
             f"one heading only, {np.degrees(np.angle(mean)):.0f} deg: the robot's own field cannot be "
-            "separated from the room's, and a simulated robot adds its own again; survey in several headings"
+            "separated from the room's, and a simulated robot adds its own again; survey in several "
+            "headings, or carry the sensor by hand"
         )
     return doubts
 

@@ -20,7 +20,7 @@ from magtwin.field.survey.readings import FARTHEST_M, SHAPES, TAKEN, Readings
 from magtwin.field.units import check_unit, nt_per, unit_by_size
 from magtwin.files import existing, output, sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
-from magtwin.io.surveys.columns import FIELDS, HEADINGS, TIMES, VECTORS, Columns
+from magtwin.io.surveys.columns import FIELDS, HEADINGS, NO_HEADING, TIMES, VECTORS, Columns
 from magtwin.io.surveys.table import Table, read_csv, read_parquet_table
 from magtwin.io.tables import load_parquet, read_parquet
 from magtwin.run.arrow import FACTS
@@ -311,10 +311,13 @@ def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
             raise InputError(f"{where}: a quaternion's length is 1, got {length[off[0]]:.4g}")
         turn = turn / length[:, None]
     elif turn is None:
-        if vector is None or columns.axes != "world":
+        if columns.heading != NO_HEADING if vector is None else columns.axes != "world":
+            none = "vectors in world axes need none (--axes world)"
+            if vector is None:
+                none = "if the sensor was carried by hand, give --heading none"
             raise InputError(
                 f"{table.path}: no heading: no column is called {', '.join(HEADINGS)}; name it with "
-                "--heading or --quaternion; only vectors in world axes need none"
+                f"--heading or --quaternion; {none}"
             )
         turn = np.zeros(len(p))
     yaw = turn if turn.ndim == 1 else yaw_from_quat(turn)
@@ -421,7 +424,7 @@ def _turn(table: Table, columns: Columns) -> Array | None:
     """Headings [rad], shape (N,), or quaternions xyzw, shape (N, 4); None if there is no such column."""
     if columns.quaternion:
         return np.column_stack([table.numbers(name) for name in columns.several("quaternion")])
-    if not columns.heading:
+    if not columns.heading or (columns.heading == NO_HEADING and NO_HEADING not in table.names):
         return None
     name, heading = columns.heading, table.numbers(columns.heading)
     if columns.heading_unit == "deg":

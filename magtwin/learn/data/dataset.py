@@ -11,6 +11,7 @@ import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -30,6 +31,7 @@ from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.origin import map_metadata, shared_metadata
 from magtwin.learn.data.recording import Recording, Rows, Source, plant_name, read, sources_of, thinned
 from magtwin.learn.data.split import Part, Split
+from magtwin.parallel import run_all
 from magtwin.report import Figure, Report
 from magtwin.run.arrow import run_of, table_of
 from magtwin.run.run import Metadata, Run
@@ -326,6 +328,7 @@ def build_dataset(
     alignment: Literal["fit"] | Alignment | None = None,
     map_sha256: str = "",
     rate_hz: float | None = None,
+    jobs: int | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Dataset:
@@ -339,6 +342,8 @@ def build_dataset(
             they are.
         map_sha256: Checksum of the map's file. Default: that of its values.
         rate_hz: Highest rate of readings to keep [Hz]. Default: all.
+        jobs: Processes that share the recordings; they do not change the data set. Default: this process,
+            with several threads.
         force: Replace an existing folder.
         progress: Called with the recordings done, their number, and the name of the next.
 
@@ -352,12 +357,13 @@ def build_dataset(
         raise InputError(f"rate_hz must be above 0 Hz and finite, got {rate_hz!r}")
     how = "given" if isinstance(alignment, Alignment) else "none"
     total = len(sources) * (2 if alignment == "fit" else 1)
+
+    def each(first: int, what: str = "") -> Callable[[int, int], None]:
+        return lambda k, n: report(first + k, total, f"{sources[k].name}{what}") if k < n else None
+
     if alignment == "fit":
-        how, runs = "fitted", []
-        for i, source in enumerate(sources):
-            report(i, total, f"{source.name}: aligning")
-            run = read(source)
-            runs.append(thinned(run.select(*(column for column in ALIGNED if column in run)), ALIGNED_AT_HZ))
+        how = "fitted"
+        runs = run_all(_to_align, sources, jobs=jobs, progress=each(0, ": aligning"))
         alignment = fit_alignment(
             runs,
             field,
@@ -368,22 +374,15 @@ def build_dataset(
         del runs
     elif alignment is not None and not isinstance(alignment, Alignment):
         raise InputError(f'alignment must be "fit", an Alignment or None, got {alignment!r}')
-    written: list[Recording] = []
-    columns: list[set[str]] = []
-    of_runs: list[Metadata] = []
     with output(folder, force=force) as aside:
         (aside / RUNS).mkdir(parents=True)
-        for i, source in enumerate(sources):
-            report(total - len(sources) + i, total, source.name)
-            run = thinned(read(source), rate_hz)
-            try:
-                run = labelled(run, field, alignment)
-            except InputError as error:
-                raise InputError(f"{source.name}: {error}") from error
-            run = run.select(*(column for column in KEPT if column in run))
-            written.append(_write(run, source, aside / RUNS / f"{source.name}.parquet"))
-            columns.append(set(run))
-            of_runs.append(run.metadata)
+        shards = run_all(
+            partial(_shard, field, alignment, rate_hz, aside / RUNS),
+            sources,
+            jobs=jobs,
+            progress=each(total - len(sources)),
+        )
+        written, columns, of_runs = zip(*shards, strict=True)
         means = [recording.label_mean_nt for recording in written]
         if max(recording.label_sd_nt for recording in written) < 1e-9 and max(means) - min(means) < 1e-9:
             raise InputError(
@@ -452,6 +451,25 @@ def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
     if not dataset.recordings or len(set(dataset.names)) < len(dataset.names):
         raise InputError(f"{path}: has no recording, or two of one name; build it anew")
     return dataset
+
+
+def _to_align(source: Source) -> Run:
+    """What the fit of an alignment reads of a recording."""
+    run = read(source)
+    return thinned(run.select(*(column for column in ALIGNED if column in run)), ALIGNED_AT_HZ)
+
+
+def _shard(
+    field: AnomalyMap, alignment: Alignment | None, rate_hz: float | None, folder: Path, source: Source
+) -> tuple[Recording, set[str], Metadata]:
+    """Label a recording and write its shard; gives its entry, its columns and the metadata of its run."""
+    run = thinned(read(source), rate_hz)
+    try:
+        run = labelled(run, field, alignment)
+    except InputError as error:
+        raise InputError(f"{source.name}: {error}") from error
+    run = run.select(*(column for column in KEPT if column in run))
+    return _write(run, source, folder / f"{source.name}.parquet"), set(run), dict(run.metadata)
 
 
 def _write(run: Run, source: Source, path: Path) -> Recording:

@@ -4,6 +4,7 @@ import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,7 +155,7 @@ def sources_of(recordings: Mapping[str, Run] | Sequence[Source]) -> list[Source]
         InputError: There is none, a name is not valid, or two have one name.
     """
     if isinstance(recordings, Mapping):
-        sources = [Source(name, lambda run=run: run) for name, run in recordings.items()]  # type: ignore[misc]
+        sources = [Source(name, partial(_same, run)) for name, run in recordings.items()]
     else:
         sources = list(recordings)
     if not sources:
@@ -169,6 +170,10 @@ def sources_of(recordings: Mapping[str, Run] | Sequence[Source]) -> list[Source]
             raise InputError(f"two recordings are called {source.name!r}; rename one")
         seen.add(source.name.casefold())
     return sources
+
+
+def _same(run: Run) -> Run:
+    return run
 
 
 def read(source: Source) -> Run:

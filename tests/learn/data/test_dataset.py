@@ -146,6 +146,9 @@ def test_an_alignment_is_fitted_to_all_runs_together_and_kept(tmp_path):
     found = build_dataset(late, FIELD, tmp_path / "d", alignment="fit")
     assert found.alignment.latency_s == pytest.approx(0.3, abs=0.05)
     assert open_dataset(found.folder).alignment == found.alignment
+    shared = build_dataset(late, FIELD, tmp_path / "j", alignment="fit", jobs=2)
+    for name in ("dataset.json", "runs/a.parquet", "runs/c.parquet"):
+        assert (shared.folder / name).read_bytes() == (found.folder / name).read_bytes()
     given = build_dataset(late, FIELD, tmp_path / "e", alignment=Alignment(latency_s=0.3))
     assert given.metadata["alignment"] == "given"
     sds = [d.recordings[0].label_sd_nt for d in (given, build_dataset(late, FIELD, tmp_path / "f"))]

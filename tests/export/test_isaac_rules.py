@@ -1,0 +1,304 @@
+"""Isaac Sim's rules: what they find is reported, what cannot run is named, and only known files are run."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+import magtwin.export.validation.isaac_sim as isaac_sim
+from magtwin.cli import main
+from magtwin.export.validation.isaac_sim import INSTALLATION, RULES, isaac, rule_files
+from magtwin.fetch import SOURCES, default_folder
+from magtwin.urdf.convert import convert_urdf
+
+EXTENSION, INNER = "isaacsim.asset.validation", "isaacsim/asset/validation"
+
+ROBOT = """#usda 1.0
+(
+    defaultPrim = "bot"
+    kilogramsPerUnit = 1
+    metersPerUnit = 1
+    upAxis = "Z"
+)
+def Xform "bot" (prepend apiSchemas = ["IsaacRobotAPI", "PhysicsArticulationRootAPI"])
+{
+    rel isaac:physics:robotLinks = [</bot/a>, </bot/b>]
+    def Xform "a" (prepend apiSchemas = ["PhysicsRigidBodyAPI"])
+    {
+        def Sphere "hidden" (prepend apiSchemas = ["PhysicsCollisionAPI"])
+        {
+            token visibility = "invisible"
+        }
+    }
+    def Xform "b" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI"])
+    {
+        float physics:mass = 1
+        float3 physics:diagonalInertia = (1, 1, 3)
+    }
+    def PhysicsRevoluteJoint "bare"
+    {
+        rel physics:body0 = </bot/a>
+        rel physics:body1 = </bot/b>
+    }
+    def PhysicsRevoluteJoint "turned" (
+        prepend apiSchemas = ["PhysicsDriveAPI:angular", "PhysicsJointStateAPI:angular", "PhysxJointAPI"]
+    )
+    {
+        rel physics:body0 = </bot/a>
+        rel physics:body1 = </bot/b>
+        float state:angular:physics:position = 30
+        float physxJoint:maxJointVelocity = 0
+        float drive:angular:physics:stiffness = 2e6
+    }
+    def PhysicsRevoluteJoint "follower" (
+        prepend apiSchemas = ["PhysxMimicJointAPI:rotZ", "PhysicsJointStateAPI:angular", "PhysxJointAPI"]
+    )
+    {
+        rel physics:body0 = </bot/a>
+        rel physics:body1 = </bot/b>
+        rel physxMimicJoint:rotZ:referenceJoint = </bot/turned>
+        float physxMimicJoint:rotZ:gearing = 0
+    }
+    def Scope "Looks"
+    {
+        def Material "paint"
+        {
+            def Material "inner" {}
+        }
+    }
+    def Material "stray" {}
+}
+"""
+
+FOUND = {
+    "CheckRobotRelationships": "/bot",
+    "DriveJointValueReasonable": "/bot/turned",
+    "JointHasCorrectTransformAndState": "/bot/turned",
+    "JointHasJointStateAPI": "/bot/bare",
+    "MaterialsOnTopLevelOnly": "/bot/stray",
+    "MimicAPICheck": "/bot/follower",
+    "PhysicsJointHasDriveOrMimicAPI": "/bot/bare",
+    "PhysicsJointMaxVelocity": "/bot/turned",
+    "RigidBodyHasCollider": "/bot/b",
+    "RigidBodyHasMassAPI": "/bot/a",
+    "RobotNaming": "/bot",
+    "RobotSchema": "/bot",
+}
+"""A prim of `ROBOT` at which each rule finds an error."""
+
+OWN_RULES = """
+import carb
+import omni.nothing.known
+import omni.client
+from omni.asset_validator.core import BaseRuleChecker, registerRule
+from pxr import PhysxSchema
+
+@registerRule("Ours")
+class Names(BaseRuleChecker):
+    def CheckPrim(self, prim):
+        if prim.HasAPI(PhysxSchema.PhysxArticulationAPI):
+            self._AddWarning(message="an articulation", at=prim)
+
+@registerRule("Ours")
+class Breaks(BaseRuleChecker):
+    def CheckStage(self, stage):
+        stage.GetSessionLayer().Clear()
+        raise KeyError("broken")
+
+@registerRule("IsaacSim.RobotRules")
+class Steps(BaseRuleChecker):
+    def CheckStage(self, stage):
+        omni.nothing.known.simulate(carb.settings)
+
+@registerRule("IsaacSim.RobotRules")
+class Lists(BaseRuleChecker):
+    def CheckStage(self, stage):
+        result, entries = omni.client.list(stage.GetRootLayer().realPath + "/..")
+        if result != omni.client.Result.OK:
+            self._AddInfo(message="no folder")
+"""
+
+
+@pytest.fixture
+def robot(tmp_path):
+    file = tmp_path / "stage" / "bot.usda"
+    file.parent.mkdir()
+    file.write_text(ROBOT)
+    return file
+
+
+@pytest.fixture
+def own_rules(tmp_path, monkeypatch):
+    """Rules of the tests in the place of NVIDIA's; called with their text."""
+
+    def write(text):
+        folder = tmp_path / "sim" / "exts"
+        rules, schema = folder / EXTENSION / INNER, folder / "isaacsim.robot.schema" / "robot_schema"
+        for place, content in ((rules, text), (schema, "")):
+            place.mkdir(parents=True)
+            (place / "__init__.py").write_text(content)
+        monkeypatch.setenv(INSTALLATION, str(tmp_path / "sim"))
+
+    return write
+
+
+def errors(check):
+    return [(f.rule, f.where, f.text) for f in check.findings if f.severity == "error"]
+
+
+def test_isaac_sims_rules_find_each_fault_of_a_robot_with_many(isaac_rules, robot):
+    check = isaac(robot, {"/bot": robot})
+    found = {(rule, where) for rule, where, _ in errors(check)}
+    assert {rule for rule, _ in found} == set(FOUND)
+    assert found >= set(FOUND.items())
+    assert not [text for _, _, text in errors(check) if "the rule failed" in text]
+    warned = {f.rule for f in check.findings if f.severity == "warning"}
+    assert warned == {
+        *("InvisibleCollisionMeshHasPurposeGuide", "JointsExist", "LinksExist", "NoNestedMaterials"),
+        "ThumbnailExists",
+    }
+
+
+def test_a_robots_findings_name_its_prim_on_the_stage_and_come_once(isaac_rules, robot):
+    stage = robot.with_name("stage.usda")
+    stage.write_text('#usda 1.0\n(defaultPrim = "World")\ndef "World" {\n'
+                     'def "ann" (references = @./bot.usda@) {}\n}\n')  # fmt: skip
+    check = isaac(stage, {"/World/ann": robot})
+    rules = [(rule, where) for rule, where, _ in errors(check)]
+    assert rules.count(("RigidBodyHasCollider", "/World/ann/b")) == 1
+    assert ("RobotNaming", "/World/ann") in rules
+    assert {where.startswith("/World/ann") for _, where in rules} == {True}
+
+
+def test_rules_that_cannot_run_are_named_with_the_reason_and_are_not_counted(isaac_rules, lab_scene):
+    asset = lab_scene.parent / "robots" / "turtlebot4" / "turtlebot4.usda"
+    check = isaac(lab_scene, {"/World/turtlebot4": asset})
+    assert errors(check) == []
+    not_run = {f.text.split(": ")[0]: f.text for f in check.findings if f.rule == "not-run"}
+    assert "needs Isaac Sim itself (usdrt" in not_run["NonAdjacentCollisionMeshesDoNotClash"]
+    layers = "NoOverrides, VerifyRobotPhysicsAttributesSourceLayer, VerifyRobotPhysicsSchemaSourceLayer"
+    assert "asset structure" in not_run[layers]
+    assert check.scope == "20 of 24 rules of isaacsim.asset.validation 1.3.6"
+    (note,) = [f for f in isaac(lab_scene, {}).findings if f.rule == "not-run" and "RobotSchema" in f.text]
+    assert note.text.endswith("the stage has no robot in a separate asset")
+
+
+def test_the_makers_description_of_the_turtlebot_4_converts_without_an_error(
+    isaac_rules, real_data, tmp_path
+):
+    asset = convert_urdf(
+        real_data / "turtlebot4" / "turtlebot4.urdf", tmp_path / "turtlebot4" / "turtlebot4.usda"
+    )
+    check = isaac(asset, {"/turtlebot4": asset})
+    assert errors(check) == []
+    assert check.scope.startswith("23 of 24 rules")
+
+
+def test_a_rule_sees_schemas_without_plugins_and_one_that_fails_or_needs_kit_ends_nothing(own_rules, robot):
+    own_rules(OWN_RULES)
+    robot.write_text(ROBOT.replace('"IsaacRobotAPI",', '"IsaacRobotAPI", "PhysxArticulationAPI",'))
+    check = isaac(robot, {"/bot": robot})
+    assert [(f.rule, f.where, f.severity) for f in check.findings] == [
+        ("Breaks", "/bot", "error"),
+        ("Lists", "/bot", "note"),
+        ("Names", "/bot", "warning"),
+        ("not-run", "", "note"),
+    ]
+    assert check.findings[0].text == "the rule failed: KeyError: 'broken'"
+    assert check.findings[-1].text == "Steps: needs Isaac Sim itself (omni.nothing.known.simulate)"
+    assert check.scope == "3 of 4 rules of isaacsim.asset.validation"
+
+
+@pytest.mark.parametrize(
+    ("text", "said", "patience_s"),
+    [("while True: pass", "took longer than 1 s", 1.0), ("import nothing_known", "nothing_known", 60.0)],
+)
+def test_rules_that_hang_or_do_not_load_are_an_error_and_never_passed(
+    own_rules, robot, monkeypatch, text, said, patience_s
+):
+    own_rules(text)
+    monkeypatch.setattr(isaac_sim, "PATIENCE_S", patience_s)
+    check = isaac(robot, {"/bot": robot})
+    assert (check.result, check.findings[0].rule) == ("failed", "unfinished")
+    assert said in check.findings[0].text
+
+
+# --- where the rules come from --------------------------------------------------------------------
+
+
+@pytest.fixture
+def copy(isaac_rules, tmp_path, monkeypatch):
+    """The files of `magtwin fetch isaac-rules` in the user's cache."""
+    monkeypatch.delenv(INSTALLATION)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder = default_folder("isaac-rules")
+    assert folder.is_relative_to(tmp_path)
+    for source in SOURCES["isaac-rules"]:
+        for name, _, _ in source.files():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(isaac_rules / name, folder / name)
+    return folder
+
+
+def test_the_fetched_copy_has_the_files_that_run_and_no_other(copy, isaac_rules, monkeypatch):
+    files = rule_files()
+    monkeypatch.setenv(INSTALLATION, str(isaac_rules))
+    assert files == rule_files()
+    assert len(files) == len(SOURCES["isaac-rules"][0].files())
+
+
+@pytest.mark.parametrize("change", ["altered", "added", "removed"])
+def test_a_copy_that_is_not_as_it_was_published_is_not_run(copy, robot, change):
+    rules = copy / EXTENSION / INNER
+    if change == "altered":
+        (rules / "util.py").write_text("raise SystemExit")
+    elif change == "added":
+        (rules / "more_rules.py").write_text("raise SystemExit")
+    else:
+        (rules / "util.py").unlink()
+    check = isaac(robot, {})
+    assert check.result == "not run"
+    assert "is not as it was published; `magtwin fetch isaac-rules --force`" in check.not_run
+
+
+@pytest.mark.parametrize(
+    ("base", "extension", "schema"),
+    [
+        ("exts", EXTENSION, "usd/schema/isaac/robot_schema"),
+        ("extscache", f"{EXTENSION}-1.3.6+110.0", "usd/schema/isaac/robot_schema"),
+        ("source/extensions", EXTENSION, "robot_schema"),
+    ],
+)
+def test_rules_are_found_in_an_installation_a_registry_and_a_checkout(
+    isaac_rules, tmp_path, monkeypatch, base, extension, schema
+):
+    there = rule_files()
+    shutil.copytree(isaac_rules / EXTENSION, tmp_path / base / extension)
+    (tmp_path / base / f"{EXTENSION}.ui" / INNER).mkdir(parents=True)
+    (tmp_path / base / f"{EXTENSION}.ui" / INNER / "other.py").write_text("raise SystemExit")
+    shutil.copytree(
+        isaac_rules / "isaacsim.robot.schema" / "robot_schema",
+        tmp_path / base / "isaacsim.robot.schema" / schema,
+    )
+    monkeypatch.setenv(INSTALLATION, str(tmp_path))
+    assert rule_files() == there
+    assert RULES in there
+
+
+def test_without_rules_one_line_says_how_to_get_them(robot, tmp_path, monkeypatch, capfd):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv(INSTALLATION, raising=False)
+    with pytest.raises(SystemExit) as e:
+        main(["validate", str(robot), "--against", "isaac"])
+    assert e.value.code == 1
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("magtwin:")]
+    assert "asked for and not run: isaac: the rule files of Isaac Sim are not here" in line
+    assert "`magtwin fetch isaac-rules`" in line
+    monkeypatch.setenv(INSTALLATION, str(tmp_path))
+    assert isaac(robot, {}).not_run == f"{INSTALLATION} names {tmp_path}, which has no {EXTENSION}"
+
+
+def test_the_fetch_command_names_the_folder_in_which_validate_looks(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert default_folder("isaac-rules") == isaac_sim.copy_folder()
+    assert default_folder("magslam") == Path("magslam")

@@ -1,0 +1,456 @@
+"""Edits that a user of usdview, Kit or Blender makes with bare usd-core: each is read right, told or refused.
+
+docs/scenes.md has the table of these edits.
+"""
+
+import gc
+import shutil
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from pxr import Gf, Sdf, Usd, UsdGeom
+
+import magtwin
+from magtwin.errors import InputError, MismatchWarning
+from magtwin.io.surveys.maps import survey_scene
+from magtwin.sim.survey import field_at_rest_nt
+from magtwin.spec.base import ZERO3
+from magtwin.twin import simulate_robots
+from magtwin.usd.layers import open_stage
+from magtwin.usd.scene import open_scene, read_scene
+
+ROBOT = "/World/turtlebot4"
+MAGNETOMETER = f"{ROBOT}/magnetometer_link"
+DESK = "/World/Furniture/desk"
+AT = [[0.3, 0.2], [-0.8, 0.6]]
+TOML = """
+name = "room"
+[robot]
+asset = "turtlebot4"
+[lab]
+floor_m = [4.0, 3.0]
+post_height_m = 0.0
+[earth]
+latitude_deg = 29.65
+longitude_deg = -82.35
+height_m = 50.0
+date = "2026-11-21"
+[survey]
+spacing_m = 0.5
+readings = 1
+[[furniture]]
+name = "desk"
+kind = "desk"
+p_world = [-0.2, 1.0, 0.0]
+[[furniture]]
+name = "table"
+kind = "box"
+material = "wood"
+size_m = [0.4, 0.4, 0.7]
+p_world = [1.6, -1.2, 0.0]
+[[source]]
+name = "pipe"
+shape = "cylinder"
+p_world = [0.5, -0.3, -0.4]
+size_m = [0.1, 0.1, 0.8]
+magnetization = [4000.0, 0.0, 2000.0]
+"""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made")
+    (folder / "room.toml").write_text(TOML)
+    return magtwin.author_scene(folder / "room.toml", folder / "room")
+
+
+@pytest.fixture
+def room(made, tmp_path) -> Path:
+    """A copy of the room, to edit."""
+    return shutil.copytree(made.parent, tmp_path / "room") / made.name
+
+
+def edited(file: Path) -> tuple[Usd.Stage, Usd.Prim]:
+    stage = Usd.Stage.Open(str(file))
+    return stage, stage.GetPrimAtPath(DESK)
+
+
+def readings(file, **options) -> np.ndarray:
+    """A short run of the physical magnetometer."""
+    twin = magtwin.open_twin(file, network="none", **options)
+    return magtwin.simulate(twin, "sine", seed=3, session="survey", duration_s=2.0)["b_measured_nt"]
+
+
+def field(file) -> np.ndarray:
+    """Exact field at two places."""
+    return field_at_rest_nt(read_scene(file), AT, 0.4)
+
+
+def told(file, **options) -> str:
+    """What opening warns of."""
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always", MismatchWarning)
+        magtwin.open_twin(file, network="none", **options)
+    return "\n".join(str(w.message) for w in heard)
+
+
+def building(folder: Path, room: Path, *, metres=1.0, up="Z", **labs) -> Path:
+    """A stage that references the room, once for each keyword: its transform ops by name."""
+    stage = Usd.Stage.CreateNew(str(folder / "building.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, metres)
+    UsdGeom.SetStageUpAxis(stage, up)
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/Building").GetPrim())
+    for name, ops in labs.items():
+        xform = UsdGeom.Xform.Define(stage, f"/Building/{name}")
+        xform.GetPrim().GetReferences().AddReference(str(room))
+        for op, value in ops.items():
+            getattr(xform, f"Add{op}Op")().Set(value)
+    stage.Save()
+    return folder / "building.usda"
+
+
+TURNED = {"Translate": Gf.Vec3d(12.5, -7.25, 3.0), "RotateZ": 37.0}
+BLENDER = {"Translate": Gf.Vec3d(900, 250, -40), "RotateX": -90.0, "RotateZ": 20.0, "Scale": Gf.Vec3f(100)}
+
+
+# What is not edited, and what does not matter
+
+
+def test_an_unedited_room_warns_of_nothing(room):
+    assert told(room) == ""
+
+
+def test_a_wooden_table_may_move(room):
+    stage, _ = edited(room)
+    stage.GetPrimAtPath("/World/Furniture/table").GetAttribute("xformOp:translate").Set(Gf.Vec3d(1.5, -1, 0))
+    stage.Save()
+    assert told(room) == ""
+
+
+# A desk
+
+
+def test_a_moved_desk_is_read_at_its_new_place_and_the_map_is_told_stale(room):
+    before, scene = field(room), read_scene(room)
+    stage, desk = edited(room)
+    desk.GetAttribute("xformOp:translate").Set(Gf.Vec3d(-0.5, 0.9, 0.0))
+    stage.Save()
+    moved = replace(
+        scene, furniture=(replace(scene.furniture[0], p_world=(-0.5, 0.9, 0.0)), scene.furniture[1])
+    )
+    assert_allclose(field(room), field_at_rest_nt(moved, AT, 0.4), rtol=1e-12)
+    assert np.abs(field(room) - before).max() > 10
+    text = told(room)
+    assert "room.usda: has changed since its map 'room' was made: desk is moved" in text
+    assert "nT rms over" in text
+    assert f"magtwin map survey {room} --out MAP.usdc --adopt" in text
+    twin = magtwin.open_twin(room, network="none")
+    run = magtwin.simulate(twin, "sine", seed=1, duration_s=1.0)
+    assert "desk is moved" in run.metadata["map_mismatch"]
+
+
+def test_the_named_command_makes_the_map_fit_again(room):
+    stage, desk = edited(room)
+    desk.GetAttribute("xformOp:translate").Set(Gf.Vec3d(-0.5, 0.9, 0.0))
+    stage.Save()
+    del stage, desk
+    options = {"spacing_m": 0.5, "headings_rad": [0.0, np.pi / 2, np.pi, 3 * np.pi / 2], "readings": 1}
+    survey_scene(room, room.parent / "new.usdc", adopt=True, **options)
+    assert told(room) == ""
+    assert read_scene(room).map_layer == (room.parent / "new.usdc").resolve()
+    assert open_scene(room).map.name == "new"
+
+
+def test_a_map_that_comes_by_reference_is_not_adopted(room, tmp_path):
+    file = building(tmp_path, room, LabA=TURNED)
+    with pytest.raises(InputError, match="no sublayer of this stage, so it cannot be replaced here"):
+        survey_scene(file, tmp_path / "new.usdc", adopt=True, headings_rad=[0.0])
+    assert not (tmp_path / "new.usdc").exists()
+
+
+def test_a_stronger_magnetization_in_a_stronger_layer_counts(room, tmp_path):
+    strong = tmp_path / "strong.usda"
+    layer = Sdf.Layer.CreateNew(str(strong))
+    layer.subLayerPaths = [str(room)]
+    layer.Save()
+    stage = Usd.Stage.Open(layer)
+    UsdGeom.SetStageMetersPerUnit(stage, 1)
+    UsdGeom.SetStageUpAxis(stage, "Z")
+    stage.GetPrimAtPath("/World/Sources/pipe").GetAttribute("magtwin:source:magnetization").Set(
+        Gf.Vec3d(8000, 0, 4000)
+    )
+    stage.Save()
+    scene = read_scene(room)
+    twice = replace(scene, sources=(replace(scene.sources[0], magnetization=(8000.0, 0.0, 4000.0)),))
+    assert_allclose(field(strong), field_at_rest_nt(twice, AT, 0.4), rtol=1e-12)
+    assert "pipe is moved, or has another magnetization" in told(strong)
+
+
+def test_a_deleted_and_a_new_source_are_told_by_name(room):
+    stage, desk = edited(room)
+    desk.SetActive(False)
+    copy = stage.OverridePrim("/World/Sources/pipe2")
+    copy.GetReferences().AddInternalReference("/World/Sources/pipe")
+    copy.GetAttribute("xformOp:translate").Set(Gf.Vec3d(1, 1, -0.5))
+    stage.Save()
+    assert "desk is gone; pipe2 is new" in told(room)
+
+
+def test_a_desk_in_an_instance_is_read_as_before(room):
+    before = field(room)
+    stage, desk = edited(room)
+    desk.SetInstanceable(True)
+    stage.Save()
+    assert_allclose(field(room), before, rtol=1e-12)
+    assert told(room) == ""
+
+
+def test_a_desk_from_a_payload_is_read_whole(room, tmp_path):
+    before = field(room)
+    stage, _ = edited(room)
+    stage.Flatten().Export(str(room.parent / "flat.usdc"))
+    piece = Usd.Stage.CreateNew(str(room.parent / "desk.usda"))
+    UsdGeom.SetStageMetersPerUnit(piece, 1)
+    UsdGeom.SetStageUpAxis(piece, "Z")
+    Sdf.CopySpec(Sdf.Layer.FindOrOpen(str(room.parent / "flat.usdc")), DESK, piece.GetRootLayer(), "/desk")
+    piece.Save()
+    layer = Sdf.Layer.FindOrOpen(str(room.parent / "furniture.usda"))
+    del layer.GetPrimAtPath("/World/Furniture").nameChildren["desk"]
+    spec = Sdf.CreatePrimInLayer(layer, DESK)
+    spec.specifier = Sdf.SpecifierDef
+    spec.payloadList.prependedItems = [Sdf.Payload("./desk.usda", "/desk")]
+    layer.Save()
+    assert_allclose(field(room), before, rtol=1e-12)
+    stage = Usd.Stage.Open(str(room), Usd.Stage.LoadNone)  # as a viewer that unloads it: not part of the file
+    stage.Save()
+    assert_allclose(field(room), before, rtol=1e-12)
+    del stage, piece, layer  # they hold the layers
+    gc.collect()
+    (room.parent / "desk.usda").unlink()
+    with pytest.raises(InputError, match=r"room\.usda: .*desk\.usda"):
+        read_scene(room)
+
+
+# The robot
+
+
+def test_a_magnetometer_mounted_elsewhere_reads_there_and_the_map_is_told_stale(room):
+    stage, _ = edited(room)
+    link = stage.GetPrimAtPath(MAGNETOMETER)
+    old = link.GetAttribute("xformOp:translate").Get()
+    link.GetAttribute("xformOp:translate").Set(old + Gf.Vec3d(0.1, 0.0, 0.05))
+    stage.Save()
+    scene = read_scene(room)
+    assert_allclose(scene.robot.p_base_magnetometer[0], old[0] + 0.1, atol=1e-9)
+    bare = replace(scene, robot=replace(scene.robot, platform=type(scene.robot.platform)()))
+    there = [[0.0, 0.0, 0.0]]
+    place = np.array(scene.robot.p_base_magnetometer) + there
+    without = replace(bare, robot=replace(bare.robot, p_base_magnetometer=ZERO3))
+    assert_allclose(field_at_rest_nt(bare, there, 0.0), field_at_rest_nt(without, place, 0.0), rtol=1e-12)
+    assert "the magnetometer of turtlebot4 is at (" in told(room)
+
+
+def test_a_second_robot_by_reference_needs_its_map(room):
+    stage, _ = edited(room)
+    second = stage.DefinePrim("/World/second", "Xform")
+    (asset,) = Usd.PrimCompositionQuery.GetDirectReferences(stage.GetPrimAtPath(ROBOT)).GetCompositionArcs()
+    second.GetReferences().AddReference(asset.GetTargetLayer().realPath)
+    UsdGeom.XformCommonAPI(second).SetTranslate((-1.2, -0.9, 0))
+    stage.Save()
+    del stage, second
+    with pytest.raises(InputError, match=r"</World/second/.*map must point to one prim.*/World/AnomalyMap"):
+        read_scene(room)
+    stage, _ = edited(room)
+    sensor = stage.GetPrimAtPath("/World/second/magnetometer_link/magnetometer")
+    sensor.GetRelationship("magtwin:magnetometer:map").SetTargets(["/World/AnomalyMap"])
+    stage.Save()
+    twin = magtwin.open_twin(room, network="none")
+    assert [placed.robot.name for placed in twin.scene.robots] == ["turtlebot4", "second"]
+    runs = simulate_robots(twin, {"second": "random"}, seed=1, duration_s=1.0)
+    assert_allclose(runs["second"]["p_world_base"][0, :2], [-1.2, -0.9], atol=0.05)
+
+
+def test_a_scaled_robot_is_refused_and_a_floating_one_told(room):
+    stage, _ = edited(room)
+    UsdGeom.Xformable(stage.GetPrimAtPath(ROBOT)).AddScaleOp().Set(Gf.Vec3f(2))
+    stage.Save()
+    with pytest.raises(InputError, match=f"<{ROBOT}>: the robot is scaled"):
+        read_scene(room)
+    UsdGeom.Xformable(stage.GetPrimAtPath(ROBOT)).GetOrderedXformOps()[-1].Set(Gf.Vec3f(1))
+    stage.GetPrimAtPath(ROBOT).GetAttribute("xformOp:translate").Set(Gf.Vec3d(0, 0, 0.5))
+    stage.Save()
+    assert f"<{ROBOT}>: stands 0.5 m above the floor" in told(room)
+
+
+def test_variants_that_are_off_change_no_reading(room):
+    before = readings(room)
+    stage, _ = edited(room)
+    changed = 0
+    for prim in stage.Traverse():
+        for name in prim.GetVariantSets().GetNames():
+            prim.GetVariantSets().SetSelection(name, "")
+            changed += 1
+    stage.Save()
+    assert changed
+    assert np.array_equal(readings(room), before)
+    assert told(room) == ""
+
+
+# Layers
+
+
+def test_the_session_layer_is_not_part_of_the_file(room):
+    before = field(room)
+    stage, desk = edited(room)
+    with Usd.EditContext(stage, stage.GetSessionLayer()):
+        desk.GetAttribute("xformOp:translate").Set(Gf.Vec3d(-0.5, 0.9, 0.0))
+    assert_allclose(field(room), before, rtol=0)
+    stage.GetSessionLayer().subLayerPaths = [str(room)]
+    saved = room.with_name("session.usda")
+    stage.GetSessionLayer().Export(str(saved))  # as usdview saves its overrides
+    layer = Sdf.Layer.FindOrOpen(str(saved))
+    layer.pseudoRoot.SetInfo("metersPerUnit", 1.0)
+    layer.pseudoRoot.SetInfo("upAxis", "Z")
+    layer.Save()
+    assert "desk is moved" in told(saved)
+
+
+def test_unsaved_changes_are_neither_lost_nor_overlooked(room):
+    stage, desk = edited(room)
+    desk.GetAttribute("xformOp:translate").Set(Gf.Vec3d(-0.5, 0.9, 0.0))
+    with pytest.raises(InputError, match="has changes in this process that are not saved"):
+        open_stage(room)
+    assert desk.GetAttribute("xformOp:translate").Get() == Gf.Vec3d(-0.5, 0.9, 0.0)
+    stage.Save()
+    assert "desk is moved" in told(room)
+
+
+# The lab in another place
+
+
+@pytest.mark.parametrize(
+    "ops", [TURNED, {"Translate": Gf.Vec3d(0, 0, 100)}, {"RotateXYZ": Gf.Vec3f(0, 0, -90)}]
+)
+def test_a_moved_and_turned_lab_reads_the_same_bytes(room, tmp_path, ops):
+    stage, _ = edited(room)
+    here = readings(room)
+    xform = UsdGeom.Xformable(stage.GetPrimAtPath("/World"))
+    for op, value in ops.items():
+        getattr(xform, f"Add{op}Op")().Set(value)
+    stage.Save()
+    assert np.array_equal(readings(room), here)
+    assert told(room) == ""
+
+
+def test_a_lab_in_a_building_reads_the_same_bytes_wherever_it_stands(room, tmp_path):
+    here = readings(room)
+    file = building(tmp_path, room, LabA=TURNED, LabB={"Translate": Gf.Vec3d(-20, 0, 0), "RotateZ": 37.0})
+    with pytest.raises(InputError, match="has 2 labs, /Building/LabA, /Building/LabB; name one with `lab`"):
+        readings(file)
+    with pytest.raises(InputError, match="no lab is at '/Building/LabC'; known: /Building/LabA"):
+        readings(file, lab="/Building/LabC")
+    for lab in ("/Building/LabA", "/Building/LabB", "LabB"):
+        assert np.array_equal(readings(file, lab=lab), here)
+        assert told(file, lab=lab) == ""
+    run = magtwin.simulate(magtwin.open_twin(file, lab="LabA", network="none"), "sine", duration_s=0.5)
+    assert run.metadata["lab"] == "/Building/LabA"
+    p = [float(x) for x in run.metadata["lab_pose"].split()]
+    assert_allclose(p, [12.5, -7.25, 3.0, np.radians(37.0)], atol=1e-9)
+
+
+def test_labs_turned_against_each_other_contradict_in_the_earths_field(room, tmp_path):
+    file = building(tmp_path, room, LabA={}, LabB={"Translate": Gf.Vec3d(9, 0, 0), "RotateZ": 90.0})
+    scene = read_scene(file, lab="LabB")
+    assert scene.earth == read_scene(room).earth, "its own field turns with the lab"
+    horizontal = np.hypot(*scene.earth.b_world_nt[:2])
+    assert f"differs by {np.sqrt(2) * horizontal:,.0f} nT" in told(file, lab="LabB")
+
+
+def test_a_lab_without_an_earth_takes_that_of_the_building_into_its_axes(room, tmp_path):
+    file = building(tmp_path, room, LabA={"RotateZ": 90.0})
+    stage = Usd.Stage.Open(str(file))
+    own = stage.GetPrimAtPath("/Building/LabA/Earth")
+    stage.DefinePrim("/Building/Earth", "Xform").GetReferences().AddReference(str(room), "/World/Earth")
+    own.SetActive(False)
+    stage.Save()
+    x, y, z = read_scene(room).earth.b_world_nt
+    assert_allclose(read_scene(file).earth.b_world_nt, (y, -x, z), atol=1e-9)
+    assert "the Earth's field differs by" in told(file)
+
+
+def test_steel_of_the_building_counts_in_the_labs_axes(room, tmp_path):
+    file = building(tmp_path, room, LabA=TURNED)
+    stage = Usd.Stage.Open(str(file))
+    world = UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath("/Building/LabA"))
+    beam = stage.OverridePrim("/Building/Beam")
+    beam.GetReferences().AddReference(str(room), "/World/Sources/pipe")
+    local = Gf.Matrix4d().SetTranslate(Gf.Vec3d(0.5, 1.0, -0.6))
+    UsdGeom.Xformable(beam).MakeMatrixXform().Set(local * world)
+    stage.Save()
+    scene = read_scene(room)
+    both = replace(
+        scene, sources=(*scene.sources, replace(scene.sources[0], name="b", p_world=(0.5, 1.0, -0.6)))
+    )
+    assert_allclose(field(file), field_at_rest_nt(both, AT, 0.4), rtol=1e-9)
+    assert "was made: Building_Beam is new" in told(file)
+
+
+@pytest.mark.parametrize(
+    ("ops", "said"),
+    [
+        ({"RotateX": 2.0}, "</Building/LabA>: is tilted by 2 deg, and its lab with it"),
+        ({"Scale": Gf.Vec3f(1.1)}, "</Building/LabA>: is scaled by 1.1, 1.1, 1.1"),
+        ({"Scale": Gf.Vec3f(-1, 1, 1)}, "</Building/LabA>: is mirrored"),
+    ],
+)
+def test_a_lab_that_does_not_stand_level_in_its_size_is_refused_by_prim(room, tmp_path, ops, said):
+    file = building(tmp_path, room, LabA=ops)
+    with pytest.raises(InputError, match=said) as refused:
+        readings(file)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_room_moved_without_its_map_is_refused(room):
+    stage, _ = edited(room)
+    UsdGeom.XformCommonAPI(stage.GetPrimAtPath("/World/Lab")).SetTranslate((1, 0, 0))
+    stage.Save()
+    with pytest.raises(InputError, match=r"</World/Lab>: is moved.*; move /World instead"):
+        readings(room)
+
+
+# A stage in centimetres with Y up
+
+
+def test_a_stage_in_centimetres_with_y_up_that_scales_and_turns_the_lab_reads_the_same_bytes(room, tmp_path):
+    file = building(tmp_path, room, metres=0.01, up="Y", LabA=BLENDER)
+    assert np.array_equal(readings(file), readings(room))
+    pose = open_scene(file).pose
+    assert_allclose((*pose.p, pose.yaw), (9, 0.4, 2.5, np.radians(20)), atol=1e-9)
+
+
+def test_one_that_does_not_is_refused(room, tmp_path):
+    file = building(tmp_path, room, metres=0.01, up="Y", LabA={})
+    with pytest.raises(InputError, match="reference the lab with scale 100 and rotateX -90"):
+        readings(file)
+
+
+def test_a_thing_in_centimetres_in_our_stage_is_refused_until_it_is_scaled(room, tmp_path):
+    thing = Usd.Stage.CreateNew(str(tmp_path / "thing.usda"))
+    UsdGeom.SetStageMetersPerUnit(thing, 0.01)
+    UsdGeom.SetStageUpAxis(thing, "Y")
+    thing.SetDefaultPrim(UsdGeom.Cube.Define(thing, "/Thing").GetPrim())
+    thing.Save()
+    stage, _ = edited(room)
+    xform = UsdGeom.Xform.Define(stage, "/World/Thing")
+    xform.GetPrim().GetReferences().AddReference(str(tmp_path / "thing.usda"))
+    stage.Save()
+    with pytest.raises(InputError, match=r"</World/Thing>: brings in .*give it scale 0.01 and rotateX 90"):
+        read_scene(room)
+    xform.AddRotateXOp().Set(90.0)
+    xform.AddScaleOp().Set(Gf.Vec3f(0.01))
+    stage.Save()
+    read_scene(room)
