@@ -15,7 +15,7 @@ MOST_MB := 2700
 # Two processes whose linear algebra has threads of its own wait for each other more than they work.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 
-.PHONY: demo test test-slow readme simready blender ros physics lint paper bench wheel-test schema assets pictures clean help
+.PHONY: demo test test-slow readme simready blender ros physics physx lint paper bench wheel-test schema assets pictures clean help
 
 help:  ## Say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -63,6 +63,11 @@ lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies
 physics: $(VENV)/.dev  ## Drive converted robots in Newton (extra physics, 600 MB)
 	$(PIP) -e '.[dev,physics]'
 	$(BIN)/python -m pytest -m physics tests/sim/engines/test_newton.py tests/sim/engines/test_engine.py tests/export/test_engine_scripts.py tests/export/test_validate.py
+
+physx: $(VENV)/.dev  ## Drive the labs in NVIDIA's PhysX on the CPU (1 GB, in an environment of its own)
+	test -x build/physx/bin/python || $(PYTHON) -m venv build/physx
+	build/physx/bin/python -m pip --disable-pip-version-check -q install 'ovphysx>=0.7' 'physx-usd-schemas>=25.11' 'newton-usd-schemas>=0.6'
+	MAGTWIN_PHYSX=$(CURDIR)/build/physx/bin/python $(ONE_THREAD) $(BIN)/python -m pytest -n 2 tests/export/test_physx.py
 
 paper: $(VENV)/.dev  ## Measure the tables of docs/results.md and README again (up to an hour)
 	$(BIN)/python docs/results.py $(if $(wildcard $(SURVEYS)),--surveys $(SURVEYS)) $(if $(wildcard $(RELEASED)),--released $(RELEASED))

@@ -41,7 +41,8 @@ VARIANTS = {
 """Layer of each physics variant, below PAYLOADS."""
 
 DEFAULT_VARIANT = "physx"
-"""Default of Isaac Sim 6.0.1; Newton and MuJoCo read the neutral attributes below it."""
+"""Default of Isaac Sim 6.0.1; Newton and MuJoCo read the neutral attributes below it. mjc:priority is one of
+these, because Newton has no other attribute for it."""
 
 LAYERS = {
     "base": ("base.usda", "links, frames and sensors"),
@@ -58,6 +59,7 @@ FILES = {name: file for name, (file, _) in LAYERS.items()}
 
 SCHEMAS = (
     ("Physx", "physx"),
+    ("MjcCollision", "physics"),
     ("Mjc", "mujoco"),
     ("Physics", "physics"),
     ("Newton", "physics"),
@@ -67,6 +69,7 @@ SCHEMAS = (
 
 NAMESPACES = (
     ("physx", "physx"),
+    ("mjc:priority", "physics"),
     ("mjc:", "mujoco"),
     ("physics:", "physics"),
     ("drive:", "physics"),

@@ -10,7 +10,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Shape
-from magtwin.urdf.material import define_grip, define_look, wear
+from magtwin.urdf.material import define_grip, define_look, define_priority, wear
 from magtwin.urdf.meshes.mesh_layer import MESH, Entry, MeshLayer, free_child
 from magtwin.urdf.meshes.piece import PLAIN, Paint
 from magtwin.urdf.meshes.reading import Reading
@@ -90,6 +90,7 @@ def define_collider(
             )
             prim.AddAppliedSchema(NEWTON_MESH_API)
         wear(prim, robot, None, meshes, define_grip(robot, surface))
+        define_priority(prim, surface)
     return made
 
 

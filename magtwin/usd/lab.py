@@ -1,13 +1,13 @@
 """The room in USD: floor, low walls, motion-capture frame, lights and physics scene."""
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, Vt
 
 from magtwin.frames import quat_from_rpy
 from magtwin.spec.lab import LabSpec
 from magtwin.usd.attributes import read_spec, write_pose, write_spec
 from magtwin.usd.layers import WORLD
-from magtwin.usd.looks import define_box, define_looks, define_visual
+from magtwin.usd.looks import define_box, define_looks, define_visual, hide
 from magtwin.usd.schema import apply_api
 
 LAB = WORLD.AppendChild("Lab")
@@ -41,6 +41,7 @@ def define_lab(stage: Usd.Stage, spec: LabSpec) -> Usd.Prim:
     """Author the room at /World/Lab and the physics scene at /World/PhysicsScene.
 
     The top of the floor is at z = 0, its centre at the world's origin. The walls stand outside the floor.
+    What carries robots is an infinite plane, because PhysX lets wheels sink into a large thin box.
 
     Args:
         stage: Written to in its edit target; metres, Z up.
@@ -57,7 +58,8 @@ def define_lab(stage: Usd.Stage, spec: LabSpec) -> Usd.Prim:
     x, y = spec.floor_m
     edge = 2 * (spec.wall_thickness_m + spec.apron_m)  # walls and posts stand on the slab too
     size = (x + edge, y + edge, FLOOR_THICKNESS_M)
-    define_box(stage, LAB.AppendChild("Floor"), (0, 0, -FLOOR_THICKNESS_M / 2), size, FLOOR, collides=True)
+    define_box(stage, LAB.AppendChild("Floor"), (0, 0, -FLOOR_THICKNESS_M / 2), size, FLOOR)
+    _define_ground(stage, size[:2])
     _define_walls(stage, spec)
     _define_frame(stage, spec)
     _define_lights(stage, spec)
@@ -81,6 +83,18 @@ def read_lab(prim: Usd.Prim) -> LabSpec:
         InputError: The prim is no lab, or a value is out of range.
     """
     return read_spec(LabSpec, prim, "lab")
+
+
+def _define_ground(stage: Usd.Stage, size: tuple[float, float]) -> None:
+    """The collider of the floor, with the floor's size in viewers that show it [m]."""
+    plane = UsdGeom.Plane.Define(stage, LAB.AppendChild("Ground"))
+    plane.CreateAxisAttr(UsdGeom.Tokens.z)
+    plane.CreateWidthAttr(size[0])
+    plane.CreateLengthAttr(size[1])
+    half = Gf.Vec3f(size[0] / 2, size[1] / 2, 0)
+    plane.CreateExtentAttr(Vt.Vec3fArray([-half, half]))
+    UsdPhysics.CollisionAPI.Apply(plane.GetPrim())
+    hide(plane, FLOOR)
 
 
 def _define_walls(stage: Usd.Stage, spec: LabSpec) -> None:

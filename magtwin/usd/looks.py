@@ -43,13 +43,12 @@ class Look:
     metallic: float = 0.0
 
     friction: float | None = None
-    """Coulomb friction, static and dynamic. MuJoCo and Newton use the larger of a pair and PhysX the mean: on
-    a slippery floor, wheels hold and casters slide in all of them."""
+    """Coulomb friction, static and dynamic."""
 
 
 LOOKS: Mapping[str, Look] = MappingProxyType(
     {
-        "Floor": Look((0.33, 0.34, 0.36), 0.7, friction=0.05),  # dark vinyl
+        "Floor": Look((0.33, 0.34, 0.36), 0.7, friction=0.8),  # dark vinyl
         "Wall": Look((0.62, 0.53, 0.40), 0.6, friction=0.4),  # plywood
         "Post": Look((0.70, 0.71, 0.73), 0.35, 1.0, friction=0.4),  # anodised aluminium
         "Camera": Look((0.03, 0.03, 0.035), 0.5),

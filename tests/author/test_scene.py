@@ -352,11 +352,21 @@ def test_everything_in_the_lab_wears_a_material_and_floor_walls_and_posts_collid
     for prim in gprims:
         assert UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0], prim
     solid = {p.GetName() for p in gprims if p.HasAPI(UsdPhysics.CollisionAPI)}
-    assert {"Floor", "North", "South", "East", "West", "Post_0"} <= solid
-    material, _ = UsdShade.MaterialBindingAPI(
-        stage.GetPrimAtPath(LAB.AppendChild("Floor"))
-    ).ComputeBoundMaterial("physics")
-    assert UsdPhysics.MaterialAPI(material.GetPrim()).GetStaticFrictionAttr().Get() == pytest.approx(0.05)
+    assert {"Ground", "North", "South", "East", "West", "Post_0"} <= solid
+    ground = stage.GetPrimAtPath(LAB.AppendChild("Ground"))
+    material, _ = UsdShade.MaterialBindingAPI(ground).ComputeBoundMaterial("physics")
+    assert UsdPhysics.MaterialAPI(material.GetPrim()).GetStaticFrictionAttr().Get() == pytest.approx(0.8)
+
+
+def test_what_carries_the_robots_is_a_plane_at_the_top_of_the_floor_and_adds_nothing_to_the_bounds():
+    stage = lab_stage(LabSpec())  # PhysX lets wheels sink into a large thin box
+    ground = UsdGeom.Plane(stage.GetPrimAtPath(LAB.AppendChild("Ground")))
+    assert ground.GetAxisAttr().Get() == "Z"
+    assert ground.ComputeLocalToWorldTransform(0) == Gf.Matrix4d(1)
+    assert ground.ComputePurpose() == "guide"
+    floor = box_of(stage, LAB.AppendChild("Floor"))
+    assert (ground.GetWidthAttr().Get(), ground.GetLengthAttr().Get()) == pytest.approx(floor.GetSize()[:2])
+    assert not stage.GetPrimAtPath(LAB.AppendChild("Floor")).HasAPI(UsdPhysics.CollisionAPI)
 
 
 def test_the_lab_has_gravity_and_light():
@@ -374,6 +384,7 @@ def test_a_lab_without_walls_and_posts_has_none():
     assert {p.GetName() for p in stage.GetPrimAtPath(LAB).GetChildren()} == {
         "Looks",
         "Floor",
+        "Ground",
         "Visuals",
         "Lights",
     }

@@ -98,7 +98,7 @@ def test_a_prismatic_joint_keeps_its_limits_in_metres(tmp_path):
 def test_both_frames_of_a_joint_meet_and_its_axis_is_the_urdfs(tmp_path_factory, axis, xyz, rpy):
     tmp_path = tmp_path_factory.mktemp("joint")
     words = [" ".join(f"{v:.9f}" for v in vector) for vector in (axis, xyz, rpy)]
-    stage, robot = convert(
+    stage, _ = convert(
         arm(tmp_path, f'continuous|<axis xyz="{words[0]}"/><origin xyz="{words[1]}" rpy="{words[2]}"/>')
     )
     links = read_links(stage)
@@ -112,7 +112,7 @@ def test_both_frames_of_a_joint_meet_and_its_axis_is_the_urdfs(tmp_path_factory,
         [*joint.GetLocalRot1Attr().Get().imaginary, joint.GetLocalRot1Attr().Get().real]
     )
     assert_allclose(first, turned @ second, atol=1e-6)  # single precision quaternions
-    assert robot.HasAPI(UsdPhysics.ArticulationRootAPI)
+    assert stage.GetPrimAtPath(joint.GetBody0Rel().GetTargets()[0]).HasAPI(UsdPhysics.ArticulationRootAPI)
 
 
 def test_the_base_floats_and_nothing_is_bolted_to_the_world(tmp_path):
@@ -121,9 +121,10 @@ def test_the_base_floats_and_nothing_is_bolted_to_the_world(tmp_path):
         if prim.IsA(UsdPhysics.Joint):
             joint = UsdPhysics.Joint(prim)
             assert len(joint.GetBody0Rel().GetTargets()) == len(joint.GetBody1Rel().GetTargets()) == 1
-    roots = [p for p in stage.Traverse() if p.HasAPI(UsdPhysics.ArticulationRootAPI)]
-    assert roots == [robot]
-    assert robot.GetAttribute("newton:selfCollisionEnabled").Get() is False
+    (root,) = [p for p in stage.Traverse() if p.HasAPI(UsdPhysics.ArticulationRootAPI)]
+    assert root.HasAPI(UsdPhysics.RigidBodyAPI)
+    assert root == robot.GetChildren()[0]
+    assert root.GetAttribute("newton:selfCollisionEnabled").Get() is False
 
 
 def test_links_that_only_name_a_place_become_sites_on_the_body_they_ride_on(tmp_path):
