@@ -102,9 +102,7 @@ def main(rounds: int = 5) -> None:
             wall, busy = np.median(ratio.reshape(-1, 2), axis=0).tolist()
             best = np.median(ratio[:, :, 0], axis=1).max()
             wanted = f"  wanted: {WANTED[name]} times numpy" if name in WANTED else ""
-            print(
-                f"{name:24}{seconds_each:14.1f}{busy_each:9.1f}{wall:10.1f}{best:8.1f}{busy:8.1f}{wanted}"
-            )
+            print(f"{name:24}{seconds_each:14.1f}{busy_each:9.1f}{wall:10.1f}{best:8.1f}{busy:8.1f}{wanted}")
     print(f"load at the end {os.getloadavg()[0]:.1f}")
 
 

@@ -1,24 +1,34 @@
 """Compiled loops of the particle filters: one step of a range of blocks of particles, and resampling.
 
-Importing this module opens numba (see `magtwin.compiled`). Random numbers are a function of a key, the number
-of the particle and the number of the draw, and sums are taken block by block, so that any number of threads
-gives the same bytes. Sums within a block are taken in 64 lanes. Logarithms, exponentials, sines and cosines are polynomials here, which the compiler
-turns into vector code; their errors are below 1e-13.
+Importing this module opens numba (see `magtwin.compiled`). Random numbers belong to a particle and a step,
+and sums are taken block by block, in lanes of a fixed order, so that any number of threads gives the same
+bytes. Particles are copied to memory of fixed shape, a block at a time, which the compiler needs to know that
+rows do not overlap.
 """
 
 import math
-from functools import partial
 
 import numpy as np
+from llvmlite import ir
 from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from magtwin.compiled import compiled, inlined
+from magtwin.compiled import compiled
 from magtwin.field.maps.loops import blends, climb, place
 from magtwin.field.maps.trilinear import planes
+from magtwin.localization.elementary import (
+    centred,
+    cosine_sine,
+    exponential,
+    logarithm,
+    normals,
+    stream,
+    whole,
+)
 
 Array = NDArray[np.float64]
-Words = NDArray[np.uint64]
 
 BLOCK = 128
 """Particles worked on at a time: their states and factors stay in the cache."""
@@ -37,10 +47,14 @@ CONSTANT, DRIFT, COSINE, SINE, MAP_SD = range(5)
 deviation."""
 
 STATES, _TRIANGLE = 5, 15
-_MEAN = LINEAR  # rows of the memory of a block: those of the state with all linear states, then free ones
+
+_MEAN = (
+    LINEAR  # rows of the memory of a block: those of the state with all linear states, then those in between
+)
 _COVARIANCE = _MEAN + STATES
-_FREE = _COVARIANCE + _TRIANGLE
-WORK = _FREE + 21
+_GAIN = _COVARIANCE + _TRIANGLE
+_FREE = _GAIN + STATES
+_ROWS = _FREE + 16
 
 (
     DISTANCE,
@@ -93,99 +107,32 @@ weight times offsets from the reference pose, their products; sum of squared wei
 cos(yaw), sin(yaw), mean of the first linear state; sum of the weights before the step times nu, nu^2 and S;
 greatest log weight and sum of the weights without KAPPA."""
 
-GOLDEN, MIX_1, MIX_2 = (np.uint64(k) for k in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
-_S20, _S27, _S30, _S31, _S32, _S52 = (np.uint64(k) for k in (20, 27, 30, 31, 32, 52))
-_LOW = np.uint64(0xFFFFFFFF)
-_MANTISSA, _ONE_BITS, _WHOLE_BITS = (
-    np.uint64(k) for k in (0x000FFFFFFFFFFFFF, 0x3FF0000000000000, 0x4330000000000000)
-)
-_WHOLE = 2.0**52  # The float of _WHOLE_BITS: an integer in its lowest bits is the float plus that integer
-_LN2, _SQRT2, _TURN = math.log(2), math.sqrt(2), 2 * math.pi
 
-_SIN = tuple((-1) ** k * _TURN ** (2 * k + 1) / math.factorial(2 * k + 1) for k in range(10))
-_EXP = tuple(1 / math.factorial(k) for k in range(13))
+@intrinsic
+def prefetch(_, row, at):  # type: ignore[no-untyped-def]
+    """Ask for the memory of one entry of a row, to be written soon."""
 
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        word = ir.IntType(32)
+        code = ir.FunctionType(ir.VoidType(), [data.type, word, word, word])
+        call = cgutils.get_or_insert_function(builder.module, code, "llvm.prefetch.p0")
+        builder.call(call, [builder.gep(data, [arguments[1]]), word(1), word(2), word(1)])
+        return context.get_dummy_value()
 
-_inlined = partial(inlined, forceinline=True)  # vector code needs the whole loop in one function
-
-
-@_inlined
-def mix(z: np.uint64) -> np.uint64:
-    """A hash of 64 bits (the finalizer of splitmix64: Steele, Lea and Flood 2014)."""
-    z = (z ^ (z >> _S30)) * MIX_1
-    z = (z ^ (z >> _S27)) * MIX_2
-    return z ^ (z >> _S31)
+    return types.void(row, at), generate
 
 
-@_inlined
-def sine_of_turns(u: float) -> float:
-    """sin(2 pi u) for u in [-1/4, 1/4]."""
-    z = u * u
-    (c0, c1, c2, c3, c4, c5, c6, c7, c8, c9) = _SIN
-    p = c5 + z * (c6 + z * (c7 + z * (c8 + z * c9)))
-    return u * (c0 + z * (c1 + z * (c2 + z * (c3 + z * (c4 + z * p)))))
+@whole
+def fetch(state: Array, part: int, parts: int, start: int, stop: int) -> None:
+    """Ask for a part of the rows of some particles, so that they are in the cache when their turn comes."""
+    rows = state.shape[0]
+    for row in range(rows * part // parts, rows * (part + 1) // parts):
+        for line in range(start, stop, 8):
+            prefetch(state[row], line)
 
 
-@_inlined
-def logarithm(x: float) -> float:
-    """log(x) for x > 0 and not subnormal."""
-    bits = np.float64(x).view(np.uint64)
-    m = np.uint64((bits & _MANTISSA) | _ONE_BITS).view(np.float64)
-    e = np.uint64((bits >> _S52) | _WHOLE_BITS).view(np.float64)
-    big = m > _SQRT2
-    v = 0.5 * m if big else m
-    k = e - (_WHOLE + 1022 if big else _WHOLE + 1023)
-    t = (v - 1) / (v + 1)
-    z = t * t
-    p = 1 / 9 + z * (1 / 11 + z * (1 / 13 + z * (1 / 15 + z / 17)))
-    return k * _LN2 + 2 * t * (1 + z * (1 / 3 + z * (1 / 5 + z * (1 / 7 + z * p))))
-
-
-@_inlined
-def exponential(x: float) -> float:
-    """exp(x) for x <= 0; 0 below -700."""
-    (c0, c1, c2, c3, c4, c5, c6, c7, c8, c9, c10, c11, c12) = _EXP
-    v = max(x, -700.0)
-    k = np.floor(v / _LN2 + 0.5)
-    r = v - k * _LN2
-    p = c6 + r * (c7 + r * (c8 + r * (c9 + r * (c10 + r * (c11 + r * c12)))))
-    p = c0 + r * (c1 + r * (c2 + r * (c3 + r * (c4 + r * (c5 + r * p)))))
-    power = np.uint64(np.float64(k + (_WHOLE + 1023)).view(np.uint64) << _S52).view(np.float64)
-    return p * power if x > -700 else 0.0
-
-
-@_inlined
-def cosine_sine(turns: float) -> tuple[float, float]:
-    """cos(2 pi u) and sin(2 pi u) for u in [-1/2, 1/2]."""
-    far, half = abs(turns) > 0.25, 0.5 if turns > 0 else -0.5
-    return sine_of_turns(0.25 - abs(turns)), sine_of_turns(half - turns if far else turns)
-
-
-@_inlined
-def centred(angle: float) -> float:
-    """An angle [rad] in turns, in [-1/2, 1/2]."""
-    turns = angle / _TURN
-    return turns - np.floor(turns + 0.5)
-
-
-@_inlined
-def stream(key: np.uint64, draw: int) -> np.uint64:
-    """Start of the random numbers of one draw of all particles."""
-    return key + mix(np.uint64(draw) * GOLDEN)
-
-
-@_inlined
-def normals(start: np.uint64, number: np.uint64) -> tuple[float, float]:
-    """Two standard normal numbers of the particle of a number (Box and Muller 1958)."""
-    z = mix(start + number * GOLDEN)
-    high = np.uint64(((z >> _S32) << _S20) | _ONE_BITS).view(np.float64)
-    low = np.uint64(((z & _LOW) << _S20) | _ONE_BITS).view(np.float64)
-    radius = math.sqrt(-2 * logarithm(2 - high))
-    c, s = cosine_sine(low - 1.5)
-    return radius * c, radius * s
-
-
-@_inlined
+@whole
 def add_moments(
     weight: Array, x: Array, y: Array, yaw: Array, x_ref: float, y_ref: float, yaw_ref: float, lanes: Array
 ) -> None:
@@ -194,7 +141,7 @@ def add_moments(
         total = sx = sy = sa = xx = xy = xa = yy = ya = aa = 0.0
         for part in range(PARTS):
             n = part * LANES + k
-            w, dx, dy, a = weight[n], x[n] - x_ref, y[n] - y_ref, centred(yaw[n] - yaw_ref) * _TURN
+            w, dx, dy, a = weight[n], x[n] - x_ref, y[n] - y_ref, centred(yaw[n] - yaw_ref) * (2 * math.pi)
             wx, wy, wa = w * dx, w * dy, w * a
             total += w
             sx += wx
@@ -211,7 +158,7 @@ def add_moments(
         lanes[YY, k], lanes[Y_YAW, k], lanes[YAW_YAW, k] = yy, ya, aa
 
 
-@_inlined
+@whole
 def greatest(row: Array, lane: Array) -> float:
     """Greatest entry of a row."""
     for k in range(LANES):
@@ -227,7 +174,7 @@ def greatest(row: Array, lane: Array) -> float:
     return top
 
 
-@_inlined
+@whole
 def add_up(lanes: Array, out: Array) -> None:
     """Sum of each row of lanes."""
     for row in range(lanes.shape[0]):
@@ -240,7 +187,7 @@ def add_up(lanes: Array, out: Array) -> None:
         out[row] = total
 
 
-@_inlined
+@whole
 def predict_two(p: Array, g: Array, both: Array, noise: Array) -> None:
     """P of two constants after a step, and g = P h."""
     for n in range(BLOCK):
@@ -251,7 +198,7 @@ def predict_two(p: Array, g: Array, both: Array, noise: Array) -> None:
         g[0, n], g[1, n] = p00 + p10, p10 + p11
 
 
-@_inlined
+@whole
 def predict_five(p: Array, g: Array, both: Array, noise: Array, c: Array, s: Array, r: Array) -> None:
     """P of all linear states after a step, and g = P h with h = (1, 1, c, s, r)."""
     for n in range(BLOCK):
@@ -283,9 +230,9 @@ def predict_five(p: Array, g: Array, both: Array, noise: Array, c: Array, s: Arr
         g[3, n] += p43 * h4
 
 
-@_inlined
+@whole
 def update_two(p: Array, mean: Array, g: Array, nu: Array, inverse: Array) -> None:
-    """z' = z + g nu / S and P' = P - g g' / S of two constants."""
+    """Add g nu / S to z and subtract g g' / S from P of two constants."""
     for n in range(BLOCK):
         g0, g1 = g[0, n], g[1, n]
         u0, u1 = g0 * inverse[n], g1 * inverse[n]
@@ -296,9 +243,9 @@ def update_two(p: Array, mean: Array, g: Array, nu: Array, inverse: Array) -> No
         p[2, n] -= u1 * g1
 
 
-@_inlined
+@whole
 def update_five(p: Array, mean: Array, g: Array, nu: Array, inverse: Array) -> None:
-    """z' = z + g nu / S and P' = P - g g' / S of all linear states."""
+    """Add g nu / S to z and subtract g g' / S from P of all linear states."""
     for n in range(BLOCK):
         g0, g1, g2, g3 = g[0, n], g[1, n], g[2, n], g[3, n]
         u0, u1, u2, u3 = g0 * inverse[n], g1 * inverse[n], g2 * inverse[n], g3 * inverse[n]
@@ -374,8 +321,9 @@ def step(
         sampled: The linear states are not filtered but sampled: their noise is drawn, and P stays 0.
     """
     size, inner = decay.shape[0], 0
-    work, lanes = np.empty((WORK, BLOCK + 8)), np.empty((PLAIN_SUM + 1, LANES + 8))
-    work[_MEAN:_FREE] = 0.0
+    # Rows are wider than a block: rows a power of two apart would compete for the same cache lines
+    work, lanes = np.empty((_ROWS, BLOCK + 8)), np.empty((PLAIN_SUM + 1, LANES + 8))
+    work[_MEAN:_GAIN] = 0.0
     places = np.zeros(STATES + _TRIANGLE, np.int64)  # rows of the linear states in `work`
     decays, added, both = np.ones(STATES), np.zeros(STATES), np.ones(_TRIANGLE)
     for k in range(size):
@@ -391,15 +339,12 @@ def step(
     filtered = 2 if few else STATES
     x, y, yaw, scale = work[X, :BLOCK], work[Y, :BLOCK], work[YAW, :BLOCK], work[SCALE, :BLOCK]
     log_w, weight = work[LOG_WEIGHT, :BLOCK], work[WEIGHT, :BLOCK]
-    mean, p = work[_MEAN:_COVARIANCE], work[_COVARIANCE:_FREE]
-    g, c, s = work[_FREE : _FREE + STATES], work[_FREE + 5, :BLOCK], work[_FREE + 6, :BLOCK]
-    e1, e2, e3, b, v = (
-        work[_FREE + 7, :BLOCK], work[_FREE + 8, :BLOCK], work[_FREE + 9, :BLOCK], work[_FREE + 10, :BLOCK], work[_FREE + 11, :BLOCK]
-    )  # fmt: skip
-    hole, big_s, nu, like, r = (
-        work[_FREE + 12, :BLOCK], work[_FREE + 13, :BLOCK], work[_FREE + 14, :BLOCK], work[_FREE + 15, :BLOCK], work[_FREE + 16, :BLOCK]
-    )  # fmt: skip
-    wx, wy, wh, slope = work[_FREE + 17, :BLOCK], work[_FREE + 18, :BLOCK], work[_FREE + 19, :BLOCK], work[_FREE + 20, :BLOCK]
+    mean, p, g = work[_MEAN:_COVARIANCE], work[_COVARIANCE:_GAIN], work[_GAIN:_FREE]
+    free = work[_FREE:]
+    c, s, e1, e2 = free[0, :BLOCK], free[1, :BLOCK], free[2, :BLOCK], free[3, :BLOCK]
+    e3, b, v, hole = free[4, :BLOCK], free[5, :BLOCK], free[6, :BLOCK], free[7, :BLOCK]
+    big_s, nu, like, r = free[8, :BLOCK], free[9, :BLOCK], free[10, :BLOCK], free[11, :BLOCK]
+    wx, wy, wh, slope = free[12, :BLOCK], free[13, :BLOCK], free[14, :BLOCK], free[15, :BLOCK]
     q, node = np.empty(2 * BLOCK), np.empty(BLOCK, np.int64)
     begin, end, in_row, in_layer = planes(table)
     values, masks = table[begin:end], table[end:]
@@ -417,6 +362,8 @@ def step(
     for block in range(first, last):
         start = block * BLOCK
         m = min(start + BLOCK, count) - start
+        ahead = count if chosen.shape[0] > 0 else min(start + BLOCK, count)
+        behind = min(ahead + BLOCK, count)
         for k in range(LINEAR + size + inner):
             to = work[k if k < LINEAR else places[k - LINEAR]]
             if chosen.shape[0] == 0:
@@ -439,8 +386,10 @@ def step(
         first_draw, second_draw = stream(key, 0), stream(key, 1)
         for n in range(BLOCK):
             e1[n], e2[n] = normals(first_draw, np.uint64(start) + np.uint64(n))
+        fetch(before, 0, 6, ahead, behind)
         for n in range(BLOCK):
             e3[n], _ = normals(second_draw, np.uint64(start) + np.uint64(n))
+        fetch(before, 1, 6, ahead, behind)
         for n in range(BLOCK):
             cos, sin = cosine_sine(centred(yaw[n] + half))
             along, across = along_sd * e1[n], across_sd * e2[n]
@@ -448,6 +397,7 @@ def step(
             x[n] += far * cos - across * sin
             y[n] += far * sin + across * cos
             scale[n] += scale_gain * along
+        fetch(before, 2, 6, ahead, behind)
         for n in range(BLOCK):
             yaw[n] += turned + yaw_sd * e3[n]
             c[n], s[n] = cosine_sine(centred(yaw[n]))
@@ -486,6 +436,7 @@ def step(
             if not few:
                 for n in range(BLOCK):
                     nu[n] -= c[n] * mean[2, n] + s[n] * mean[3, n] + r[n] * mean[4, n]
+        fetch(before, 3, 6, ahead, behind)
         if not sampled:
             if few:
                 predict_two(p, g, both, added)
@@ -531,6 +482,7 @@ def step(
             for n in range(BLOCK):
                 log_w[n] += like[n] / kappa
             top = greatest(log_w, lanes[TOP])
+        fetch(before, 4, 6, ahead, behind)
         for n in range(BLOCK):
             weight[n] = exponential(log_w[n] - top)
         add_moments(weight, x, y, yaw, x_ref, y_ref, yaw_ref, lanes)
@@ -545,6 +497,7 @@ def step(
                 offsets += w * mean[0, n]
             lanes[SQUARES, k], lanes[COS, k], lanes[SIN, k] = squares, cosines, sines
             lanes[OFFSET, k] = offsets
+        fetch(before, 5, 6, ahead, behind)
         add_up(lanes, sums[block])
         sums[block, TOP] = top
         if tempered:
@@ -581,7 +534,7 @@ def moments(
 _PLACES = types.Array(types.int64, 1, "C")
 
 
-@_inlined
+@whole
 def _first_of(limit: float, least: int, most: int) -> int:
     """Least whole number not below a limit, between two others."""
     return int(min(max(np.ceil(limit), float(least)), float(most)))

@@ -16,7 +16,7 @@ from scipy import stats
 
 from magtwin import compiled
 from magtwin.errors import InputError
-from magtwin.localization import particle_loops as loops
+from magtwin.localization import elementary
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.particles import Bootstrap, RaoBlackwell, RaoBlackwellIron, RaoBlackwellNetwork
 from magtwin.localization.problem import OdometryModel, Prior, Problem, Reading, SensorModel
@@ -29,9 +29,9 @@ UNKNOWN = (math.inf, math.inf, math.inf)
 def test_draws_are_standard_normal_and_independent():
     @njit
     def draws(count):
-        start, out = loops.stream(np.uint64(7), 0), np.empty((2, count))
+        start, out = elementary.stream(np.uint64(7), 0), np.empty((2, count))
         for n in range(count):
-            out[0, n], out[1, n] = loops.normals(start, np.uint64(n))
+            out[0, n], out[1, n] = elementary.normals(start, np.uint64(n))
         return out
 
     a, b = draws(1 << 17)
@@ -44,15 +44,15 @@ def test_draws_are_standard_normal_and_independent():
 def test_vector_functions_agree_with_numpy():
     @njit
     def cosine_sine(angle):
-        return loops.cosine_sine(loops.centred(angle))
+        return elementary.cosine_sine(elementary.centred(angle))
 
     x = np.concatenate([np.linspace(-60, 60, 20_001), [0.0, math.pi, -math.pi / 2]])
     pairs = np.array([cosine_sine(a) for a in x.tolist()])
     assert_allclose(pairs.T, [np.cos(x), np.sin(x)], atol=2e-14)
     u = np.concatenate([np.geomspace(1e-300, 1e300, 10_001), np.linspace(0.4, 3, 10_001)])
-    assert_allclose(vectorize(loops.logarithm)(u), np.log(u), rtol=1e-13, atol=1e-14)
+    assert_allclose(vectorize(elementary.logarithm)(u), np.log(u), rtol=1e-13, atol=1e-14)
     v = np.concatenate([np.linspace(-690, 0, 10_001), [-800.0, -np.inf]])
-    assert_allclose(vectorize(loops.exponential)(v), np.exp(np.where(v < -700, -np.inf, v)), rtol=1e-13)
+    assert_allclose(vectorize(elementary.exponential)(v), np.exp(np.where(v < -700, -np.inf, v)), rtol=1e-13)
 
 
 @pytest.mark.parametrize(
