@@ -9,10 +9,7 @@ rows do not overlap.
 import math
 
 import numpy as np
-from llvmlite import ir
 from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from magtwin.compiled import compiled
@@ -106,30 +103,6 @@ _ROWS = _FREE + 16
 weight times offsets from the reference pose, their products; sum of squared weights; of weight times
 cos(yaw), sin(yaw), mean of the first linear state; sum of the weights before the step times nu, nu^2 and S;
 greatest log weight and sum of the weights without KAPPA."""
-
-
-@intrinsic
-def prefetch(_, row, at):  # type: ignore[no-untyped-def]
-    """Ask for the memory of one entry of a row, to be written soon."""
-
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
-        word = ir.IntType(32)
-        code = ir.FunctionType(ir.VoidType(), [data.type, word, word, word])
-        call = cgutils.get_or_insert_function(builder.module, code, "llvm.prefetch.p0")
-        builder.call(call, [builder.gep(data, [arguments[1]]), word(1), word(2), word(1)])
-        return context.get_dummy_value()
-
-    return types.void(row, at), generate
-
-
-@whole
-def fetch(state: Array, part: int, parts: int, start: int, stop: int) -> None:
-    """Ask for a part of the rows of some particles, so that they are in the cache when their turn comes."""
-    rows = state.shape[0]
-    for row in range(rows * part // parts, rows * (part + 1) // parts):
-        for line in range(start, stop, 8):
-            prefetch(state[row], line)
 
 
 @whole
@@ -362,8 +335,6 @@ def step(
     for block in range(first, last):
         start = block * BLOCK
         m = min(start + BLOCK, count) - start
-        ahead = count if chosen.shape[0] > 0 else min(start + BLOCK, count)
-        behind = min(ahead + BLOCK, count)
         for k in range(LINEAR + size + inner):
             to = work[k if k < LINEAR else places[k - LINEAR]]
             if chosen.shape[0] == 0:
@@ -386,10 +357,8 @@ def step(
         first_draw, second_draw = stream(key, 0), stream(key, 1)
         for n in range(BLOCK):
             e1[n], e2[n] = normals(first_draw, np.uint64(start) + np.uint64(n))
-        fetch(before, 0, 6, ahead, behind)
         for n in range(BLOCK):
             e3[n], _ = normals(second_draw, np.uint64(start) + np.uint64(n))
-        fetch(before, 1, 6, ahead, behind)
         for n in range(BLOCK):
             cos, sin = cosine_sine(centred(yaw[n] + half))
             along, across = along_sd * e1[n], across_sd * e2[n]
@@ -397,7 +366,6 @@ def step(
             x[n] += far * cos - across * sin
             y[n] += far * sin + across * cos
             scale[n] += scale_gain * along
-        fetch(before, 2, 6, ahead, behind)
         for n in range(BLOCK):
             yaw[n] += turned + yaw_sd * e3[n]
             c[n], s[n] = cosine_sine(centred(yaw[n]))
@@ -436,7 +404,6 @@ def step(
             if not few:
                 for n in range(BLOCK):
                     nu[n] -= c[n] * mean[2, n] + s[n] * mean[3, n] + r[n] * mean[4, n]
-        fetch(before, 3, 6, ahead, behind)
         if not sampled:
             if few:
                 predict_two(p, g, both, added)
@@ -482,7 +449,6 @@ def step(
             for n in range(BLOCK):
                 log_w[n] += like[n] / kappa
             top = greatest(log_w, lanes[TOP])
-        fetch(before, 4, 6, ahead, behind)
         for n in range(BLOCK):
             weight[n] = exponential(log_w[n] - top)
         add_moments(weight, x, y, yaw, x_ref, y_ref, yaw_ref, lanes)
@@ -497,7 +463,6 @@ def step(
                 offsets += w * mean[0, n]
             lanes[SQUARES, k], lanes[COS, k], lanes[SIN, k] = squares, cosines, sines
             lanes[OFFSET, k] = offsets
-        fetch(before, 5, 6, ahead, behind)
         add_up(lanes, sums[block])
         sums[block, TOP] = top
         if tempered:
