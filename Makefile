@@ -15,7 +15,7 @@ MOST_MB := 2700
 # Two processes whose linear algebra has threads of its own wait for each other more than they work.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 
-.PHONY: demo test test-slow readme simready ros physics physx lint paper bench wheel-test schema assets pictures clean help
+.PHONY: demo test test-slow readme simready blender ros physics physx lint paper bench wheel-test schema assets pictures clean help
 
 help:  ## Say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -39,6 +39,14 @@ simready: $(VENV)/.dev  ## Hold robots against NVIDIA's SimReady profiles, in an
 
 ros: $(VENV)/.dev build/ros-jazzy/.installed build/ros-kilted/.installed  ## Cross our nodes with rclpy of ROS 2 Jazzy and Kilted, in environments of their own
 	$(ONE_THREAD) $(BIN)/python -m pytest tests/ros/test_ros_bus.py tests/ros/test_ros_rclpy.py
+
+blender: $(VENV)/.dev build/blender/.installed  ## Import exports in Blender (bpy, 1 GB, Python 3.11), in an environment of its own
+	$(ONE_THREAD) MAGTWIN_BLENDER=$(CURDIR)/build/blender/bin/python $(BIN)/python -m pytest tests/export/test_blender.py
+
+build/blender/.installed:
+	$(PYTHON) -m venv build/blender
+	build/blender/bin/python -m pip --disable-pip-version-check -q install 'bpy==5.0.1'
+	@touch $@
 
 build/ros-%/.installed:
 	$(PYTHON) -m venv build/ros-$*
@@ -85,13 +93,14 @@ assets: $(VENV)/.dev  ## Build robots/, maps/, weights/ and scenes/ anew
 	rm -rf build/paper/lab && $(BIN)/python weights/protocol.py --out build/paper/lab --ship
 	$(BIN)/python scenes/build.py
 
-pictures: $(VENV)/.installed  ## Draw the README's pictures again
+pictures: $(VENV)/.installed build/blender/.installed  ## Draw the pictures of README and docs again (needs npm and chromium)
 	$(BIN)/magtwin picture scenes/lab/lab.usda --out docs/lab.png --force
 	$(BIN)/magtwin picture robots/turtlebot4/turtlebot4.usda --size 1100x900 --out docs/robot.png --force
 	$(BIN)/magtwin map plot maps/lab/lab.usdc --out docs/map.png --force
 	$(BIN)/magtwin run scenes/lab/lab.usda --seed 1 --out build/pictures --force
 	$(BIN)/magtwin picture build/pictures/run.rrd --time-s 35 --size 1600x900 --out docs/recording.png --force
 	$(BIN)/magtwin film build/pictures/run.parquet --camera 0.4,-1.6,6.1:0.4,-0.2,0 --size 560x350 --pace 10 --fps 8 --out docs/run.gif --force
+	MAGTWIN_BLENDER=$(CURDIR)/build/blender/bin/python $(BIN)/python docs/looks.py
 
 clean:  ## Remove the environment and what was built
 	rm -rf $(VENV) build demo

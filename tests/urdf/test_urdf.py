@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from looking import assert_looks_alike
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics
 from validators import assert_valid
@@ -13,9 +14,9 @@ from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.urdf import convert_urdf, read_notes
 from magtwin.urdf.description.description import read_description
-from magtwin.urdf.meshes.mesh import corner_normals
 from magtwin.urdf.physics.inertia import principal_axes, quaternion
 from magtwin.usd.geometry import read_links, read_shapes
+from magtwin.usd.solids import corner_normals
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
 BALL = '<geometry><sphere radius="0.1"/></geometry>'
@@ -386,6 +387,10 @@ def primitive_box(geometry):
     else:
         half = np.full(3, geometry.radius)
     return np.stack([-half, half])
+
+
+def test_the_real_robot_shows_meshes_with_materials_and_hides_its_colliders(real_robot):
+    assert_looks_alike(real_robot[1])
 
 
 def test_the_mass_of_the_real_robot_is_its_urdfs_and_nothing_is_silent(real_robot):

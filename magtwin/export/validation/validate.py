@@ -1,8 +1,8 @@
 """Validate a file with every validator.
 
 `core` are OpenUSD's own validators, `nvidia` is usd-validation-nvidia, `simready` are SimReady's profiles,
-`isaac` are Isaac Sim's rules and those of `isaac_rules`, `newton` loads the file in Newton, `physx` drives its
-robots in PhysX, `magtwin` are the rules of `rules`. `rule` explains how to add a rule.
+`isaac` are Isaac Sim's rules and those of `isaac_rules`, `newton` loads the file in Newton, `physx` drives
+its robots in PhysX, `magtwin` are the rules of `rules`. `rule` explains how to add a rule.
 """
 
 import os
