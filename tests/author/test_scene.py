@@ -385,7 +385,6 @@ def test_a_lab_without_walls_and_posts_has_none():
         "Looks",
         "Floor",
         "Ground",
-        "Visuals",
         "Lights",
     }
     assert read_lab(stage.GetPrimAtPath(LAB)) == spec
