@@ -15,7 +15,7 @@ from magtwin.localization.problem import Array, Estimate, Problem, Reading
 LOOPS = Loops("magtwin.localization.particle_loops", pays=0)
 
 SHARE = 32
-"""Blocks of 256 particles that a thread takes at a time."""
+"""Blocks of 128 particles that a thread takes at a time."""
 
 FORGET_S = 1000.0
 """Correlation time of the offset and of hard iron [s]. They are constant in the model, but the particles soon
@@ -45,6 +45,8 @@ STILL_M = 1e-3
 """Motion, in metres and in radians / 10, within which a reading may repeat itself to the bit."""
 
 _STRIDE, _WORD = 0x9E3779B97F4A7C15 * 0x2545F4914F6CDD1D, (1 << 64) - 1
+
+_PRODUCTS = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])  # of x, y and yaw, among the sums of a block
 
 # Fractions of the roots of x^4 = x + 1: the low-discrepancy sequence R3 (Roberts 2018)
 _R3 = 1 / 1.2207440846057596 ** np.arange(1, 4)
@@ -377,10 +379,7 @@ class RaoBlackwell:
             k.moments(self._count, self._state, self._scales, x, y, mean_yaw, out)
             part, yaw = out[k.SUM :] / out[k.SUM], mean_yaw
         pose = x + float(part[1]), y + float(part[2]), mean_yaw
-        covariance = np.empty((3, 3))
-        covariance[np.triu_indices(3)] = part[4:10]
-        covariance[np.tril_indices(3)] = covariance.T[np.tril_indices(3)]
-        covariance -= np.outer(part[1:4], part[1:4])
+        covariance = part[_PRODUCTS] - np.outer(part[1:4], part[1:4])
         self.spread = math.sqrt(max(0.0, covariance[0, 0] + covariance[1, 1]))
         if self.spread > SETTLED_M and self.reset_count:
             pose, covariance = self._held(pose, covariance, (x, y))
@@ -469,7 +468,8 @@ class RaoBlackwell:
         """Memory for a number of particles, of a start or of a competition."""
         self._count = count
         self._memory = np.empty((2, rows * _padded(count)))
-        self._resampled = np.empty(0, np.int64)
+        self._columns = np.empty(count, np.int64)
+        self._resampled = self._columns[:0]
         self._state = self._next_state(rows)
 
     def _next_state(self, rows: int) -> Array:
@@ -488,7 +488,7 @@ class RaoBlackwell:
         """Particles drawn by their weights, systematically."""
         k = self._loops
         below = np.concatenate([[0.0], np.cumsum(self._scales * self._sums[:, k.SUM])])
-        chosen, start = np.empty(count, np.int64), float(self._rng.random())
+        chosen, start = self._columns[:count], float(self._rng.random())
 
         def work(part: slice) -> None:
             k.choose(part.start, part.stop, self._count, self._state, self._scales, below, start, chosen)

@@ -41,8 +41,8 @@ VARIANTS = {
 """Layer of each physics variant, below PAYLOADS."""
 
 DEFAULT_VARIANT = "physx"
-"""Default of Isaac Sim 6.0.1; Newton and MuJoCo read the neutral attributes below it. mjc:priority is one of
-these, because Newton has no other attribute for it."""
+"""Default of Isaac Sim 6.0.1; Newton and MuJoCo read the attributes below it. Those of mjc: are among them,
+because Newton has no other attribute for the priority of a contact; the layer of MuJoCo is the user's."""
 
 LAYERS = {
     "base": ("base.usda", "links, frames and sensors"),
@@ -59,8 +59,7 @@ FILES = {name: file for name, (file, _) in LAYERS.items()}
 
 SCHEMAS = (
     ("Physx", "physx"),
-    ("MjcCollision", "physics"),
-    ("Mjc", "mujoco"),
+    ("Mjc", "physics"),
     ("Physics", "physics"),
     ("Newton", "physics"),
     ("Isaac", "robot"),
@@ -69,8 +68,7 @@ SCHEMAS = (
 
 NAMESPACES = (
     ("physx", "physx"),
-    ("mjc:priority", "physics"),
-    ("mjc:", "mujoco"),
+    ("mjc:", "physics"),
     ("physics:", "physics"),
     ("drive:", "physics"),
     ("limit:", "physics"),

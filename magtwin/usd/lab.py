@@ -7,7 +7,7 @@ from magtwin.frames import quat_from_rpy
 from magtwin.spec.lab import LabSpec
 from magtwin.usd.attributes import read_spec, write_pose, write_spec
 from magtwin.usd.layers import WORLD
-from magtwin.usd.looks import define_box, define_looks, define_visual
+from magtwin.usd.looks import define_box, define_looks, define_visual, hide
 from magtwin.usd.schema import apply_api
 
 LAB = WORLD.AppendChild("Lab")
@@ -93,8 +93,8 @@ def _define_ground(stage: Usd.Stage, size: tuple[float, float]) -> None:
     plane.CreateLengthAttr(size[1])
     half = Gf.Vec3f(size[0] / 2, size[1] / 2, 0)
     plane.CreateExtentAttr(Vt.Vec3fArray([-half, half]))
-    plane.CreatePurposeAttr(UsdGeom.Tokens.guide)
     UsdPhysics.CollisionAPI.Apply(plane.GetPrim())
+    hide(plane, FLOOR)
 
 
 def _define_walls(stage: Usd.Stage, spec: LabSpec) -> None:
