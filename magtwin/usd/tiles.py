@@ -113,7 +113,7 @@ def write_tiles(
 
 def _define(layer: Sdf.Layer, path: Sdf.Path) -> Sdf.PrimSpec:
     prim = Sdf.CreatePrimInLayer(layer, path)
-    prim.specifier, prim.typeName = Sdf.SpecifierDef, "Scope"
+    prim.specifier, prim.typeName = Sdf.SpecifierDef, "Xform"
     return prim
 
 

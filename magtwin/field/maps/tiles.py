@@ -67,10 +67,10 @@ class Tile:
 
     def check(self) -> None:
         """Refuse values that no map may have; errors as for `AnomalyMap`."""
-        if not np.isfinite(self.values_nt[self.valid]).all():
+        if not np.all(np.isfinite(self.values_nt) | ~self.valid):
             raise InputError("its values must be finite at valid nodes; mask the others in `valid`")
         for part in (self.variance_nt2, self.between_nt2):
-            if part is not None and not np.all(part[..., self.valid] >= 0):
+            if part is not None and not np.all((part >= 0) | ~self.valid):
                 raise InputError("its variances must not be below 0, nor nan, at valid nodes")
 
 
