@@ -249,7 +249,7 @@ def write_tiled(
         named = {attribute_name("anomalyMap", name): value for name, value in tree.items()}
         shared = shared_values(field, grid, TILED_CHECKSUM_VERSION)
         set_values(prim, {**shared, **named, **texts_of(field), **harmonic_values(harmonic)})
-        floor = Floor(grid, every, j, i, [(shown, flags)], colour_limits(shown[flags]))
+        floor = Floor(grid, every, j, i, [(shown, flags)], colour_limits(shown[flags].astype(float)))
         define_heat_map(stage, floor, ())
         stage.Save()
         del stage, prim
