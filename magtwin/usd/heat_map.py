@@ -44,7 +44,7 @@ class Floor:
     def of(cls, maps: Sequence[AnomalyMap]) -> "Floor":
         """The floor of maps in memory of one grid, the latest last."""
         every, j, i = nodes_shown(maps[-1].grid)
-        here = np.ix_(range(len(maps[-1].headings_rad)), j, i)
+        here = np.ix_(np.arange(len(maps[-1].headings_rad)), j, i)
         limits = colour_limits(np.concatenate([m.values_nt[m.valid] for m in maps]))
         return cls(maps[-1].grid, every, j, i, [(m.values_nt[here], m.valid[here]) for m in maps], limits)
 

@@ -64,7 +64,7 @@ def save_tiled_map(
         InputError: As for `save_map`; or an array has another shape, or a value that no map may have.
     """
     tiling = Tiling(grid, tile_cells) if tile_cells else Tiling.of(grid)
-    few = {"origin_m": grid.origin_m, "cell_m": grid.cell_m, "headings_rad": [0.0]}
+    few: dict[str, Any] = {"origin_m": grid.origin_m, "cell_m": grid.cell_m, "headings_rad": [0.0]}
     known = AnomalyMap(values_nt=np.zeros((1, 2, 2)), **few, **about)  # checks what is told
     write_tiled(tiling, lambda tile: field_of(*tiling.nodes(tile)), known, path, force)
 
@@ -229,7 +229,7 @@ def write_tiled(
                 slice(*np.searchsorted(k, (at.start, at.stop)).tolist())
                 for k, at in ((j, rows), (i, columns))
             ]
-            at = np.ix_(range(len(shown)), j[to[0]] - rows.start, i[to[1]] - columns.start)
+            at = np.ix_(np.arange(len(shown)), j[to[0]] - rows.start, i[to[1]] - columns.start)
             shown[:, to[0], to[1]], flags[:, to[0], to[1]] = arrays.values_nt[at], arrays.valid[at]
         stage = Usd.Stage.Open(str(aside))
         prim = apply_api(stage.GetPrimAtPath(MAP), "anomalyMap")

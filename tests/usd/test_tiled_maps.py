@@ -1,6 +1,7 @@
-"""Maps in tiles: the bytes of a map in memory, tiles read only where they are touched, damage that is seen."""
+"""Maps in tiles: bytes of a map in memory, tiles read only where they are touched, damage that is seen."""
 
 import pickle
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -14,10 +15,12 @@ from magtwin.field.maps import tiles as tiles_module
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import map_metadata, statistics
 from magtwin.field.maps.tiles import Tile, TiledMap, Tiling
+from magtwin.twin import open_twin, simulate
 from magtwin.usd import layers
 from magtwin.usd.heat_map import HEAT_MAP, MAP
 from magtwin.usd.layers import layer_sha256
 from magtwin.usd.maps import checksums, load_epochs, load_map, save_map
+from magtwin.usd.scene import open_scene, use_map
 from magtwin.usd.tiled_maps import check_tiles, save_tiled_map, tile_faults
 
 SHAPE = (5, 41, 57)
@@ -224,7 +227,7 @@ def test_a_file_is_written_from_a_function_and_never_holds_two_kinds_of_tile(bot
         lambda r, c: replace(field_of(r, c), between_nt2=None) if r.start else field_of(r, c),
         lambda r, c: replace(field_of(r, c), valid=np.ones((1, 1, 1), bool)),
     ):
-        with pytest.raises(InputError, match="tile .* of map 'hall': arrays must be of shape"):
+        with pytest.raises(InputError, match=r"tile .* of map 'hall': arrays must be of shape"):
             save_tiled_map(tmp_path / "no.usdc", grid, wrong, tile_cells=CELLS, **about)
     with pytest.raises(InputError, match="variances must not be below 0"):
         save_tiled_map(
@@ -284,3 +287,16 @@ def test_tiles_cover_every_node_once():
         own = tiling.own(tile)
         seen[rows, columns][own] += 1
     assert (seen == 1).all()
+
+
+def test_a_run_on_a_tiled_map_has_the_bytes_of_one_on_the_map_in_memory(lab_scene, tmp_path):
+    scene, flat = tmp_path / lab_scene.name, open_twin(lab_scene, magnetometer="physical")
+    save_map(flat.field, tmp_path / "tiled.usdc", tile_cells=CELLS)
+    shutil.copytree(lab_scene.parent, tmp_path, dirs_exist_ok=True)
+    use_map(open_scene(scene, check_network=False), tmp_path / "tiled.usdc")
+    tiled = open_twin(scene, magnetometer="physical")
+    assert tiled.field.opened == set()
+    ours, its = (simulate(t, "figure8", duration_s=3, seed=1) for t in (tiled, flat))
+    for name, values in its.items():
+        assert np.asarray(values).tobytes() == np.asarray(ours[name]).tobytes(), name
+    assert 0 < len(tiled.field.opened) < len(tiled.field.tiling) / 4

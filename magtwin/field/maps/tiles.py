@@ -272,8 +272,8 @@ class TiledMap(AnomalyMap):
             gigabytes = (9 + 8 * self.planes) * headings * rows * columns / 1e9
             raise InputError(
                 f"map {self.name!r} has {rows} x {columns} nodes in {headings} headings, "
-                f"{gigabytes:.1f} GB at once, and this needs all of them; only maps up to {MOST_NODES:,} nodes "
-                "are read whole: take a part of it (`map.part`)"
+                f"{gigabytes:.1f} GB at once, and this needs all of them; only maps up to {MOST_NODES:,} "
+                "nodes are read whole: in Python, take a part of it (`map.part`)"
             )
         return self._joined(slice(0, rows), slice(0, columns))
 
@@ -329,7 +329,7 @@ class TiledMap(AnomalyMap):
             if any(each.start == each.stop for each in to):
                 continue
             arrays = self.tile(tile)
-            at = np.ix_(range(shape[0]), j[to[0]] - down.start, i[to[1]] - along.start)
+            at = np.ix_(np.arange(shape[0]), j[to[0]] - down.start, i[to[1]] - along.start)
             here = (slice(None), *to)
             values[here], valid[here] = arrays.values_nt[at], arrays.valid[at]
             for plane, part in zip(spreads, _planes(arrays), strict=True):
@@ -341,6 +341,8 @@ class TiledMap(AnomalyMap):
             self.origin_m[1] + rows.start * dy,
         )
         about["cell_m"] = (every * dx, every * dy)
+        if every > 1:
+            about["name"] = f"{self.name}, every {every}th node"
         return AnomalyMap(
             **about,
             values_nt=values,
