@@ -15,7 +15,7 @@ MOST_MB := 2700
 # Two processes whose linear algebra has threads of its own wait for each other more than they work.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 
-.PHONY: demo test test-slow readme simready ros physics lint paper bench wheel-test schema assets pictures clean help
+.PHONY: demo test test-slow readme simready blender ros physics physx lint paper bench wheel-test schema assets pictures clean help
 
 help:  ## Say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -40,6 +40,14 @@ simready: $(VENV)/.dev  ## Hold robots against NVIDIA's SimReady profiles, in an
 ros: $(VENV)/.dev build/ros-jazzy/.installed build/ros-kilted/.installed  ## Cross our nodes with rclpy of ROS 2 Jazzy and Kilted, in environments of their own
 	$(ONE_THREAD) $(BIN)/python -m pytest tests/ros/test_ros_bus.py tests/ros/test_ros_rclpy.py
 
+blender: $(VENV)/.dev build/blender/.installed  ## Import exports in Blender (bpy, 1 GB, Python 3.11), in an environment of its own
+	$(ONE_THREAD) MAGTWIN_BLENDER=$(CURDIR)/build/blender/bin/python $(BIN)/python -m pytest tests/export/test_blender.py
+
+build/blender/.installed:
+	$(PYTHON) -m venv build/blender
+	build/blender/bin/python -m pip --disable-pip-version-check -q install 'bpy==5.0.1'
+	@touch $@
+
 build/ros-%/.installed:
 	$(PYTHON) -m venv build/ros-$*
 	build/ros-$*/bin/python -m pip --disable-pip-version-check -q install numpy 'ros-$*-rclpy[fastrtps]' ros-$*-sensor-msgs ros-$*-geometry-msgs ros-$*-nav-msgs ros-$*-rosgraph-msgs ros-$*-diagnostic-msgs ros-$*-std-srvs
@@ -55,6 +63,11 @@ lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies
 physics: $(VENV)/.dev  ## Drive converted robots in Newton (extra physics, 600 MB)
 	$(PIP) -e '.[dev,physics]'
 	$(BIN)/python -m pytest -m physics tests/sim/engines/test_newton.py tests/sim/engines/test_engine.py tests/export/test_engine_scripts.py tests/export/test_validate.py
+
+physx: $(VENV)/.dev  ## Drive the labs in NVIDIA's PhysX on the CPU (1 GB, in an environment of its own)
+	test -x build/physx/bin/python || $(PYTHON) -m venv build/physx
+	build/physx/bin/python -m pip --disable-pip-version-check -q install 'ovphysx>=0.7' 'physx-usd-schemas>=25.11' 'newton-usd-schemas>=0.6'
+	MAGTWIN_PHYSX=$(CURDIR)/build/physx/bin/python $(ONE_THREAD) $(BIN)/python -m pytest -n 2 tests/export/test_physx.py
 
 paper: $(VENV)/.dev  ## Measure the tables of docs/results.md and README again (up to an hour)
 	$(BIN)/python docs/results.py $(if $(wildcard $(SURVEYS)),--surveys $(SURVEYS)) $(if $(wildcard $(RELEASED)),--released $(RELEASED))
@@ -80,13 +93,14 @@ assets: $(VENV)/.dev  ## Build robots/, maps/, weights/ and scenes/ anew
 	rm -rf build/paper/lab && $(BIN)/python weights/protocol.py --out build/paper/lab --ship
 	$(BIN)/python scenes/build.py
 
-pictures: $(VENV)/.installed  ## Draw the README's pictures again
+pictures: $(VENV)/.installed build/blender/.installed  ## Draw the pictures of README and docs again (needs npm and chromium)
 	$(BIN)/magtwin picture scenes/lab/lab.usda --out docs/lab.png --force
 	$(BIN)/magtwin picture robots/turtlebot4/turtlebot4.usda --size 1100x900 --out docs/robot.png --force
 	$(BIN)/magtwin map plot maps/lab/lab.usdc --out docs/map.png --force
 	$(BIN)/magtwin run scenes/lab/lab.usda --seed 1 --out build/pictures --force
 	$(BIN)/magtwin picture build/pictures/run.rrd --time-s 35 --size 1600x900 --out docs/recording.png --force
 	$(BIN)/magtwin film build/pictures/run.parquet --camera 0.4,-1.6,6.1:0.4,-0.2,0 --size 560x350 --pace 10 --fps 8 --out docs/run.gif --force
+	MAGTWIN_BLENDER=$(CURDIR)/build/blender/bin/python $(BIN)/python docs/looks.py
 
 clean:  ## Remove the environment and what was built
 	rm -rf $(VENV) build demo

@@ -3,16 +3,17 @@
 Both do the same steps of the same drive on the shipped map: 12 readings, in which resampling happens as often
 as it does. The plain filter is that of the tests, with numpy's random numbers and numpy's own map lookups;
 with the compiled filter's random numbers it gives the same estimates, which is checked first. The ways take
-turns reading by reading, so that a busy machine slows all alike; medians over the readings of all rounds, and
-least times, which a busy machine spoils less. The last column is the ratio of processor times, of all threads
-together.
+turns reading by reading, so that a busy machine slows all alike. The columns are the median time of a step;
+the median over all steps of how many times faster it is than the same step in numpy; the same over the steps
+of the best round, which a busy machine spoils least; and the median ratio of processor times, of all threads
+together. On a busy machine, read the last for one thread.
 
     python benchmarks/localize.py [rounds]
 """
 
 import copy
 import math
-import statistics
+import os
 import sys
 import time
 from pathlib import Path
@@ -90,21 +91,19 @@ def measure(method: str, rounds: int) -> dict[str, list[tuple[float, float]]]:
 
 def main(rounds: int = 5) -> None:
     LOOPS.pays = float("inf")
-    print(f"{PARTICLES:,} particles, {READINGS} readings, {rounds} rounds")
+    print(f"{PARTICLES:,} particles, {READINGS} readings, {rounds} rounds, load {os.getloadavg()[0]:.1f}")
     for method in CASES:
         seconds = measure(method, rounds)
-        print(f"\n{method:24}{'median, ns a particle':>22}{'least':>8}{'x numpy':>10}{'least':>8}{'cpu':>8}")
-        each = 1e9 / PARTICLES
-        peer = [statistics.median(column) for column in zip(*seconds["numpy"], strict=True)]
-        fastest = min(seconds["numpy"])[0]
-        for name, took in seconds.items():
-            median, busy = (statistics.median(column) for column in zip(*took, strict=True))
-            least = min(took)[0]
+        print(f"\n{method:24}{'ns a particle':>14}{'cpu, ns':>9}{'x numpy':>10}{'best':>8}{'cpu':>8}")
+        steps = {name: np.array(took).reshape(rounds, READINGS, 2) for name, took in seconds.items()}
+        for name, took in steps.items():
+            ratio = steps["numpy"] / took
+            seconds_each, busy_each = (np.median(took.reshape(-1, 2), axis=0) * 1e9 / PARTICLES).tolist()
+            wall, busy = np.median(ratio.reshape(-1, 2), axis=0).tolist()
+            best = np.median(ratio[:, :, 0], axis=1).max()
             wanted = f"  wanted: {WANTED[name]} times numpy" if name in WANTED else ""
-            print(
-                f"{name:24}{median * each:22.1f}{least * each:8.1f}{peer[0] / median:10.1f}"
-                f"{fastest / least:8.1f}{peer[1] / busy:8.1f}{wanted}"
-            )
+            print(f"{name:24}{seconds_each:14.1f}{busy_each:9.1f}{wall:10.1f}{best:8.1f}{busy:8.1f}{wanted}")
+    print(f"load at the end {os.getloadavg()[0]:.1f}")
 
 
 if __name__ == "__main__":

@@ -23,13 +23,14 @@ Where numba does not work, `after` returns None for good, and `open` raises Impo
 """
 
 import contextlib
+import functools
 import importlib
 import math
 import os
 import sys
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from types import ModuleType
 from typing import Any
 
@@ -151,8 +152,21 @@ def in_threads(work: Callable[[slice], Any], rows: int, share: int) -> None:
         for start in starts:
             work(slice(start, min(start + share, rows)))
 
-    with ThreadPoolExecutor(workers - 1) as pool:
-        others = [pool.submit(take) for _ in range(workers - 1)]
+    others = [_pool().submit(take) for _ in range(workers - 1)]
+    try:
         take()
-        for other in others:
-            other.result()
+    finally:
+        started = [other for other in others if not other.cancel()]  # all work is taken: do not wait for more
+        wait(started)
+    for other in started:
+        other.result()
+
+
+@functools.cache
+def _pool() -> ThreadPoolExecutor:
+    """Threads that stay for the next work: starting them takes as long as 4,000 particles."""
+    return ThreadPoolExecutor(MOST_THREADS - 1, "magtwin")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # a fork has none of the threads

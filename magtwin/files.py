@@ -230,7 +230,8 @@ class _Where:
     def refused(self, key: str, text: str) -> InputError:
         line = self._line(key)
         table = f"[{self.section}] " if self.section else ""
-        return InputError(f"{self.path}{line and f':{line}'}: {table}{text}")
+        where = f"{self.path}:{line}" if line else str(self.path)
+        return InputError(f"{where}: {table}{text}")
 
     def _line(self, key: str) -> int | None:
         """Line of a key, or of the table if it has none; None if the file cannot be read."""

@@ -21,7 +21,6 @@ from magtwin.frames import wrap_angle, yaw_from_quat
 from magtwin.io.formats import read_run
 from magtwin.io.surveys.maps import open_map
 from magtwin.localization.bounds import Bounds, bounds
-from magtwin.localization.compensators import COMPENSATORS, compensated
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.odometry import Odometry
 from magtwin.localization.problem import (
@@ -35,12 +34,12 @@ from magtwin.localization.problem import (
     SensorModel,
     Smoother,
 )
-from magtwin.localization.scores import AWAY_S, FAR_M, HELD_S, NEAR_M, Scores, score
+from magtwin.localization.scores import Scores, score, verdict_of
 from magtwin.localization.track import EST_COLUMNS, Track, track
+from magtwin.own_field import with_own_field
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run
 from magtwin.twin import Twin, scene_file
-from magtwin.verdict import EVEN
 
 RATE_HZ = 5.0
 """Default rate of readings that a localizer gets [Hz]."""
@@ -52,6 +51,9 @@ ROBOT_NOISE = SensorModel(white_nt=100.0, drift_nt=250.0, drift_s=2.5, offset_nt
 """Default noise model of a magnetometer on a robot: the own field of the shipped TurtleBot 4 in new sessions.
 In six simulated drives the difference of the readings from the map had a mean of 190 to 520 nT, 290 to 500 nT
 along the heading, and the rest 180 to 280 nT with a correlation of 0.4 to 0.6 after 2 s."""
+
+GAP_S = 1.0
+"""Longest gap in the true poses over which they are interpolated for the bounds [s]."""
 
 LEAST_ON_MAP = 0.5
 """Share of the readings that must be on the map."""
@@ -77,7 +79,7 @@ class Localization:
 
     @cached_property
     def truth(self) -> Array | None:
-        """True x, y [m] and yaw [rad], shape (N, 3); None if unknown."""
+        """`truth_of` the run."""
         return truth_of(self.run)
 
     @cached_property
@@ -98,24 +100,42 @@ class Localization:
         return track(Odometry(), problem, self.run)
 
     @cached_property
+    def known(self) -> NDArray[np.bool_]:
+        """Readings whose true pose is known, shape (N,)."""
+        known = self.truth is not None and np.isfinite(self.truth).all(axis=1)
+        return np.broadcast_to(known, self.run.rows)
+
+    @cached_property
     def bounds(self) -> Bounds | None:
-        """Least standard deviations of any unbiased method; None without a map, or if the truth has gaps."""
-        if self.problem.belief is None or self.truth is None or not np.isfinite(self.truth).all():
+        """Least standard deviations of any unbiased method; None with no map, or a gap above `GAP_S`."""
+        if self.problem.belief is None or self.truth is None or not self.known.any():
             return None
+        t, truth = self.track.t, self.truth
+        if not self.known.all():
+            seen = t[self.known]
+            if np.diff(np.concatenate([t[:1], seen, t[-1:]])).max() > GAP_S:
+                return None
+            parts = (*truth[self.known, :2].T, np.unwrap(truth[self.known, 2]))
+            truth = np.column_stack([np.interp(t, seen, part) for part in parts])
         used = np.isfinite(self.run["b_measured_nt"])
-        return bounds(self.problem, self.truth, self.track.t, used=used)
+        return bounds(self.problem, truth, t, used=used)
 
     @cached_property
     def scores(self) -> Scores | None:
-        """Scores by the truth; None if it is unknown or has gaps."""
-        if self.truth is None or not np.isfinite(self.truth).all():
+        """Scores at the readings whose true pose is known; None if there are less than two."""
+        if self.truth is None or np.count_nonzero(self.known) < 2:
             return None
+        known, limits = self.known, self.bounds
+        names = ("t", "pose", "covariance", "bias_nt", "lost")
+        made = replace(self.track, **{name: getattr(self.track, name)[known] for name in names})
+        if limits is not None:
+            limits = Bounds(**{name: values[known] for name, values in vars(limits).items()})
         start = self.problem.prior.is_global
-        return score(self.track, self.truth, global_start=start, bounds=self.bounds)
+        return score(made, self.truth[known], global_start=start, bounds=limits)
 
     @property
     def scored_rows(self) -> NDArray[np.bool_]:
-        """Readings whose errors count: all, or those from convergence on if the start was unknown."""
+        """Readings whose errors count: those of known pose, from convergence on if the start was unknown."""
         after = 0.0
         if (
             self.scores is not None
@@ -123,7 +143,8 @@ class Localization:
             and math.isfinite(self.scores.converged_s)
         ):
             after = self.scores.converged_s
-        return self.track.t >= self.track.t[0] + after
+        t = self.track.t
+        return self.known & (t >= t[np.argmax(self.known)] + after)
 
     def report(self) -> Report:
         """Errors beside their bound and dead reckoning, and a verdict in one line."""
@@ -159,9 +180,9 @@ def localize(
             metadata.
         odometry: Noise model of the odometry.
         map_length_m: Correlation length of the map's error [m].
-        compensator: Model of the robot's own field, a name in
-            `magtwin.localization.compensators.COMPENSATORS`, for methods that use its prediction
-            (rbpf-network). It is fitted to `calibration`.
+        compensator: Model of the robot's own field for methods that use its prediction (rbpf-network): a
+            name in `magtwin.localization.compensators.COMPENSATORS`, which is fitted to `calibration`; or
+            the weights of a trained network.
         calibration: A drive earlier in the session with true poses, or its file.
         rate_hz: Readings per second that the method gets [Hz]. None: all.
         seed: Seed of the method and of the prior's error.
@@ -174,7 +195,7 @@ def localize(
         InputError: A file or a column is missing, the run is off the map, there is no prior and no true pose,
             or the method fails.
     """
-    return _localization(
+    return localization(
         run,
         anomaly_map,
         method=method,
@@ -191,21 +212,7 @@ def localize(
     ).run
 
 
-def localization(run: Run | Source, anomaly_map: FieldBelief | Source | None, **options: Any) -> Localization:
-    """As `localize`, but also returns what the estimates were made from.
-
-    Args:
-        run: As for `localize`.
-        anomaly_map: As for `localize`.
-        **options: Those of `localize`; and `keep_particles`, whether the samples of the method are kept.
-
-    Raises:
-        InputError: As for `localize`.
-    """
-    return _localization(run, anomaly_map, **options)
-
-
-def _localization(
+def localization(
     run: Run | Source,
     anomaly_map: FieldBelief | Source | None,
     *,
@@ -222,6 +229,10 @@ def _localization(
     keep_particles: bool = False,
     progress: Callable[[int, int], Any] | None = None,
 ) -> Localization:
+    """As `localize`, but also returns what the estimates were made from.
+
+    `keep_particles` keeps the samples of the method; the other arguments and errors are those of `localize`.
+    """
     algorithm = load_localizer(method, options) if isinstance(method, str) else method
     if not isinstance(run, Run):
         run = read_run(existing(run, "run"))
@@ -239,13 +250,6 @@ def _localization(
         calibration = calibration if isinstance(calibration, Run) else read_run(existing(calibration, "run"))
         if rate_hz is not None:
             calibration = thinned(calibration, rate_hz)
-    if compensator != "none":
-        if anomaly_map is None or calibration is None:
-            raise InputError(
-                f"the `compensator` {compensator!r} needs a map and a `calibration` drive",
-                parameter="calibration",
-            )
-        run = compensated(run, COMPENSATORS[compensator]().fit(calibration, anomaly_map))
     lever_arm = lever_arm_of(run) if sensor is None else sensor.lever_arm_m
     if anomaly_map is not None:
         check_on_map(run, anomaly_map, lever_arm)
@@ -262,11 +266,11 @@ def _localization(
         rate_hz=rate_hz or (run.rows - 1) / max(run.duration_s, 1e-9),
         seed=seed,
     )
-    x, y, _ = problem.prior.mean
-    x0, x1, y0, y1 = problem.extent
+    (x, y, _), (x0, x1, y0, y1) = problem.prior.mean, problem.extent
     if not problem.prior.is_global and not (x0 <= x <= x1 and y0 <= y <= y1):
-        text = f"x {x0:g} to {x1:g} m, y {y0:g} to {y1:g} m"
-        raise InputError(f"the `prior` x, y = {x:g}, {y:g} m is off the floor, {text}", parameter="prior")
+        text = f"{x:g}, {y:g} m is off the floor, x {x0:g} to {x1:g} m, y {y0:g} to {y1:g} m"
+        raise InputError(f"the `prior` x, y = {text}", parameter="prior")
+    run = with_own_field(run, compensator, problem)
     made = track(algorithm, problem, run, keep_particles=keep_particles, progress=progress)
     name = method if isinstance(method, str) else type(method).__name__
     estimated = run.with_columns(**made.columns()).with_specs(**EST_COLUMNS)
@@ -301,12 +305,11 @@ def live_problem(
     elif anomaly_map is not None:
         belief = anomaly_map
     x, y = (side / 2 for side in twin.scene.lab.floor_m)
+    arm = tuple(twin.scene.robot.p_base_magnetometer[:2])
     return Problem(
         belief=belief,
         extent=belief.extent if isinstance(belief, AnomalyMap) else (-x, x, -y, y),
-        sensor=replace(
-            ROBOT_NOISE, **{"lever_arm_m": tuple(twin.scene.robot.p_base_magnetometer[:2]), **(sensor or {})}
-        ),
+        sensor=replace(ROBOT_NOISE, **{"lever_arm_m": arm, **(sensor or {})}),
         odometry=odometry or OdometryModel(),
         map_length_m=map_length_m,
         seed=seed,
@@ -343,14 +346,16 @@ def report_of(result: Localization) -> Report:
         "map": "none (SLAM)" if belief is None else getattr(belief, "name", "") or type(belief).__name__,
         "readings": f"{run.rows:,} in {run.duration_s:.1f} s, {rate:.3g} a second",
     }
+    if result.scores is not None:
+        gaps = "" if result.known.all() else f", known at {result.known.sum():,} of them"
+        metadata["errors"] = f"differences from the {truth_name(run)}{gaps}"
     title = f"{result.method} on {', '.join(_origin(run)) or 'a recorded run'}"
     if scores is None or dead is None or result.truth is None:
         lost = Figure("flagged lost", float(result.track.lost.mean()), note="share of the readings")
         return Report(title, (lost,), metadata, "No verdict: the run has no true pose to compare with.")
     ratio = scores.ratio.get("correlated", math.nan)
     close = f"{ratio:.2f} of the bound" if math.isfinite(ratio) else ""
-    rows = result.scored_rows
-    off = np.hypot(*(dead.pose - result.truth)[rows, :2].T)
+    off = np.hypot(*(dead.pose - result.truth)[result.scored_rows, :2].T)
     dead_m = float(np.sqrt(np.mean(off**2)))
     expected = f"{scores.anees_low:.2f} to {scores.anees_high:.2f} if the covariance is right"
     figures = [
@@ -378,45 +383,6 @@ def report_of(result: Localization) -> Report:
     return Report(title, tuple(figures), metadata, verdict_of(scores, dead_m, _dead_start(result)))
 
 
-def verdict_of(scores: Scores, dead_m: float, start: str = "") -> str:
-    """Judge in one line whether an estimate is better than dead reckoning, consistent, and lost.
-
-    Args:
-        scores: Scores of the estimate.
-        dead_m: RMSE of dead reckoning over the same readings [m].
-        start: Where dead reckoning started, if not at the prior.
-    """
-    sizes = f"{100 * scores.rmse_m:.1f} cm RMSE against {100 * dead_m:.1f} cm"
-    less = 1 - scores.rmse_m / dead_m if dead_m > 0 else -math.inf
-    name = f"dead reckoning {start}".rstrip()
-    if abs(less) <= EVEN:
-        words = [f"No better than {name}: {sizes}."]
-    elif less > 0:
-        words = [f"Better than {name}: {sizes}, {less:.0%} less."]
-    else:
-        words = [f"WORSE than {name}: {sizes}."]
-    size = f"{scores.anees:.2f}" if scores.anees < 1e3 else f"{scores.anees:.0e}"
-    figure = f"ANEES {size} per state"
-    if not math.isfinite(scores.anees):
-        words.append("Its covariance is unknown." if math.isnan(scores.anees) else "Its covariance is WRONG.")
-    elif scores.anees > scores.anees_high:
-        words.append(f"TOO CONFIDENT: {figure}, at most {scores.anees_high:.2f} expected.")
-    elif scores.anees < scores.anees_low:
-        words.append(f"Too cautious: {figure}, at least {scores.anees_low:.2f} expected.")
-    else:
-        words.append(f"Consistent: {figure}.")
-    if not math.isfinite(scores.converged_s) and not scores.diverged:
-        words.append(f"It never stayed within {NEAR_M:g} m for {HELD_S:g} s.")
-    if scores.diverged:
-        flagged = "" if scores.diverged_unflagged else ", and flagged it"
-        words.append(f"LOST: its error stayed above {FAR_M:g} m for more than {AWAY_S:g} s{flagged}.")
-    elif scores.lost_share > 0:
-        words.append(f"Not lost, but flagged so in {scores.lost_share:.0%} of the readings.")
-    else:
-        words.append("Not lost.")
-    return " ".join(words)
-
-
 def _origin(run: Run) -> list[str]:
     return [f"{key} {run.metadata[key]}" for key in ("scene", "path", "seed") if key in run.metadata]
 
@@ -434,12 +400,27 @@ def thinned(run: Run, rate_hz: float) -> Run:
 
 
 def truth_of(run: Run) -> Array | None:
-    """True x, y [m] and yaw [rad], else those of motion capture, shape (N, 3); None if unknown."""
-    if "p_world_base" in run and "yaw" in run and np.isfinite(run["p_world_base"]).any():
+    """True x, y [m] and yaw [rad], else those of motion capture, shape (N, 3); None if unknown.
+
+    A pose is nan where motion capture had lost the robot.
+    """
+    if _has_true_pose(run):
         return np.column_stack([run["p_world_base"][:, :2], run["yaw"]])
     if "mocap_p" in run and "mocap_q_xyzw" in run and np.isfinite(run["mocap_p"]).any():
-        return np.column_stack([run["mocap_p"][:, :2], yaw_from_quat(run["mocap_q_xyzw"])])
+        pose = np.column_stack([run["mocap_p"][:, :2], yaw_from_quat(run["mocap_q_xyzw"])])
+        if "flag_pose_lost" in run:
+            pose[run["flag_pose_lost"]] = np.nan
+        return pose
     return None
+
+
+def truth_name(run: Run) -> str:
+    """What `truth_of` gives: "true pose", or "pose of motion capture (mocap_p)"."""
+    return "true pose" if _has_true_pose(run) else "pose of motion capture (mocap_p)"
+
+
+def _has_true_pose(run: Run) -> bool:
+    return "p_world_base" in run and "yaw" in run and bool(np.isfinite(run["p_world_base"]).any())
 
 
 def prior_of(run: Run, text: str = "tracking", *, seed: int = 0) -> Prior:
@@ -473,8 +454,10 @@ def prior_of(run: Run, text: str = "tracking", *, seed: int = 0) -> Prior:
         return Prior(sd=(math.inf, math.inf, math.inf))
     truth = truth_of(run)
     if truth is None or not np.isfinite(truth[0]).all():
+        where = "" if truth is None else " at its first reading"
         raise InputError(
-            "the run has no true pose to start from; give a `prior` x,y,yaw or global", parameter="prior"
+            f"the run has no true pose{where} to start from; give a `prior` x,y,yaw or global",
+            parameter="prior",
         )
     rng = np.random.default_rng([seed, 1])
     if text == "heading":
@@ -513,9 +496,8 @@ def map_file(source: Source) -> Path:
     try:
         return Path(scene_file(path))
     except InputError as error:
-        raise InputError(
-            f"{source}: no map layer, stage, folder of CSVs or shipped scene: {error}"
-        ) from error
+        text = f"{source}: no map layer, stage, folder of CSVs or shipped scene: {error}"
+        raise InputError(text) from error
 
 
 def check_map(run: Run, anomaly_map: AnomalyMap, file: Path) -> None:

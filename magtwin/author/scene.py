@@ -23,8 +23,9 @@ from magtwin.usd.attributes import check_prim_name, write_pose
 from magtwin.usd.earth import define_earth
 from magtwin.usd.furniture import FURNITURE, define_furniture
 from magtwin.usd.heat_map import MAP
-from magtwin.usd.lab import LAB, PHYSICS_SCENE, define_lab
+from magtwin.usd.lab import LAB, PHYSICS_SCENE, define_lab, expose_for_kit
 from magtwin.usd.layers import WORLD, describe_stage, new_stage, relative_asset
+from magtwin.usd.looks import SHAPES, SHAPES_FILE, VISUALS, define_shapes
 from magtwin.usd.map_attributes import read_made_from, write_made_from
 from magtwin.usd.maps import load_map
 from magtwin.usd.robot import load_robot, urdf_of
@@ -47,7 +48,7 @@ from magtwin.usd.sensors import (
 from magtwin.usd.sources import LOOKS, SOURCES, define_sources
 
 EARTH = WORLD.AppendChild("Earth")
-TAKEN = (LAB.name, PHYSICS_SCENE.name, MAP.name, EARTH.name, SOURCES.name, FURNITURE.name)
+TAKEN = (LAB.name, PHYSICS_SCENE.name, MAP.name, EARTH.name, SOURCES.name, FURNITURE.name, SHAPES.name)
 """Children of /World that cannot be names of robots."""
 
 PARTS: dict[str, Callable[..., Usd.Prim]] = {
@@ -65,7 +66,8 @@ def author_scene(
     """Write a scene as a folder of layers.
 
     `<name>.usda` places each robot, with what differs from its asset. Its sublayers are `room.usda`,
-    `furniture.usda`, `magnetics.usda` (the Earth's field and sources) and the map.
+    `furniture.usda`, `magnetics.usda` (the Earth's field and sources) and the map. Meshes that are
+    shown reference the unit shapes of `shapes.usdc`.
 
     Args:
         scene: What to author.
@@ -90,6 +92,7 @@ def author_scene(
         stage = Usd.Stage.Open(root)
         names = ", ".join(placed.robot.name for placed in scene.robots)
         describe_stage(stage, f"{scene.name}: a lab, its magnetic map and {names}, by magtwin")
+        expose_for_kit(root)
         stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, WORLD).GetPrim())
         Usd.ModelAPI(stage.GetDefaultPrim()).SetKind(Kind.Tokens.assembly)
         root.subLayerPaths = [relative_asset(root, layer) for layer in sublayers]
@@ -128,8 +131,9 @@ def check_things(scene: Scene) -> None:
         InputError: Two have the same name, or a susceptibility needs the Earth's field.
     """
     check_names(scene.sources, scene.furniture)
-    if any(source.name == LOOKS for source in scene.sources):
-        raise InputError(f"source {LOOKS!r} has the name of the scope of materials; rename it")
+    for name, what in ((LOOKS, "materials"), (VISUALS, "shown meshes")):
+        if any(source.name == name for source in scene.sources):
+            raise InputError(f"source {name!r} has the name of the scope of {what}; rename it")
     for source in scene.magnets:
         if source.susceptibility and scene.earth is None:
             body_of(source)  # raises
@@ -241,13 +245,20 @@ def _write_parts(scene: Scene, folder: Path) -> list[Path]:
             field,
         ),
     ]
+    shapes = folder / SHAPES_FILE
+    with new_stage(shapes, "Unit shapes of what is shown, by magtwin") as stage:
+        define_shapes(stage)
     paths = []
     for name, content, about, define in parts:
         if content:  # the root layer may have the name
             taken = scene.name.casefold() == name
             paths.append(folder / (f"{name}_layer.usda" if taken else f"{name}.usda"))
             with new_stage(paths[-1], about) as stage:
+                stage.GetRootLayer().subLayerPaths = [str(shapes.resolve())]  # this layer is not in its place
                 define(stage)
+            layer = Sdf.Layer.FindOrOpen(str(paths[-1]))
+            layer.subLayerPaths = [f"./{shapes.name}"]
+            layer.Save()
     return paths
 
 

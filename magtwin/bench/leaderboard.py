@@ -77,7 +77,7 @@ class Standing:
         parts = []
         if self.failed:
             parts.append(f"{self.failed} of {self.runs} runs failed")
-        if self.diverged.value > 0.01:
+        if self.diverged.value > 0.01 and self.failed < self.runs:
             parts.append(f"diverges in {100 * self.diverged.value:.0f} % of runs")
         low, high = CONSISTENT
         if self.anees > high:

@@ -230,7 +230,7 @@ def check_about(folder: Path, about: Mapping[str, Any]) -> None:
             raise InputError(f"{folder}: results with another {what}{values}; {remedy}", parameter="force")
     for name, checksum in found["data"].items():
         if about["data"].get(name, checksum) != checksum:
-            raise InputError(f"{folder}: results on other data {name!r}; {remedy}", parameter="force")
+            raise InputError(f"{folder}: results on another content of {name!r}; {remedy}", parameter="force")
 
 
 def begin_results(folder: Path, suite_text: bytes, about: Mapping[str, Any]) -> None:

@@ -20,7 +20,7 @@ from magtwin.localization.bounds import Bounds, bounds
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import Localizer, Problem, SensorModel, Smoother
 from magtwin.localization.scores import Scores, score
-from magtwin.localization.track import LocalizerError, Track, track
+from magtwin.localization.track import Track, track
 from magtwin.parallel import beat
 from magtwin.run.run import Run
 
@@ -69,6 +69,7 @@ def run_chunk(
         limits = bounds_of(case)
         for name in chunk.entries:
             entry = suite.localizers[name]
+            entry = replace(entry, compensator=suite.path(entry.compensator))
             key = {"scenario": scenario.name, "localizer": name, "run": run}
             beat(f"{run} {name}")
             if failures and (run, name) in failures:
@@ -158,14 +159,9 @@ def run_localizer(
         with time_limit(limit_s):
             readings = case.readings
             if entry.compensator != "none":
-                from magtwin.localization.compensators import COMPENSATORS, compensated
+                from magtwin.own_field import with_own_field
 
-                if case.problem.calibration is None or case.problem.belief is None:
-                    raise LocalizerError(
-                        f"compensator {entry.compensator!r} needs a calibration drive and a map"
-                    )
-                fitted = COMPENSATORS[entry.compensator]().fit(case.problem.calibration, case.problem.belief)
-                readings = compensated(readings, fitted)
+                readings = with_own_field(readings, entry.compensator, case.problem)
             made = track(load_localizer(entry.method, entry.options), case.problem, readings)
     except (InputError, MemoryError) as error:
         return None, Scores(failed=str(error))

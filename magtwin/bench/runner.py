@@ -14,7 +14,8 @@ from magtwin.bench.results import Results, Run, runs_of
 from magtwin.bench.row import SETUP, Row, run_chunk, warm_up
 from magtwin.bench.suite import Chunk, Seeds, Suite, load_suite, suite_file
 from magtwin.errors import InputError
-from magtwin.files import output
+from magtwin.files import output, sha256, shipped
+from magtwin.localization.compensators import is_weights
 from magtwin.parallel import Failure, Pool, beat, checked_shard, free_memory, in_shard, open_pool, processors
 from magtwin.version import __version__
 
@@ -116,14 +117,14 @@ def about(whole: Suite, chosen: Suite) -> dict[str, Any]:
         "sha256": whole.sha256,
         "seeds": whole.seeds,
         "magtwin": __version__,
-        "data": {name: folder_sha256(folder) for name, folder in _data(chosen).items()},
+        "data": {name: folder_sha256(folder) for name, folder in _data(chosen).items()} | _inputs(chosen),
     }
 
 
-def folder_sha256(folder: Path) -> str:
-    """SHA-256 of all files of a folder and their names; hidden files do not count."""
+def folder_sha256(folder: Path, pattern: str = "*") -> str:
+    """SHA-256 of the files of a folder that match `pattern`, and their names; hidden files do not count."""
     sum_ = hashlib.sha256()
-    for file in sorted(folder.rglob("*")):
+    for file in sorted(folder.rglob(pattern)):
         inside = file.relative_to(folder)
         if file.is_file() and not any(part.startswith(".") for part in inside.parts):
             with open(file, "rb") as content:
@@ -137,6 +138,25 @@ def _data(suite: Suite) -> dict[str, Path]:
     """Folders of the data that a suite's scenarios need, by name."""
     needed = [each for each in suite.scenario if each.data or each.source != "twin"]
     return {each.data: suite.folder(each) for each in needed}
+
+
+def _inputs(suite: Suite) -> dict[str, str]:
+    """Checksums of a suite's own files: layers beside its scenes, CSV files of paths, weights.
+
+    What ships with magtwin is left out: its version identifies that.
+    """
+    sums = {}
+    ours = shipped("scenes").resolve()
+    for scenario in suite.scenario:
+        if scenario.source != "twin":
+            continue
+        scene = suite.scene(scenario).resolve()
+        if not scene.is_relative_to(ours):
+            sums[f"scene {scenario.scene}"] = folder_sha256(scene.parent, "*.usd*")
+        files = {f"path {name}": Path(suite.path(name)) for name in scenario.paths}
+        sums |= {name: sha256(file) for name, file in files.items() if file.is_file()}
+    models = {each.compensator for each in suite.localizer if is_weights(each.compensator)}
+    return sums | {f"weights {name}": sha256(suite.path(name)) for name in sorted(models)}
 
 
 def checked_jobs(jobs: int | None) -> int:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from magtwin.errors import InputError, find
-from magtwin.files import from_table, read_toml, refused_at
+from magtwin.files import existing, from_table, read_toml, refused_at
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import OdometryModel, SensorModel
 from magtwin.sim.motion.drive_input import drive_input
@@ -149,7 +149,8 @@ class Entry:
     """Name in results. Default: the method."""
 
     compensator: str = "none"
-    """Model of the robot's own field that predicts it from on-board signals."""
+    """Model of the robot's own field that predicts it from on-board signals: a name, or the weights of a
+    trained network, relative to the suite's file."""
 
     options: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the localizer."""
@@ -313,10 +314,12 @@ class Suite:
             )
         for entry in self.localizer:
             with _named_in(file, "localizer", entry.name, ("options", "compensator", "method")):
-                load_localizer(entry.method, entry.options)
-                if entry.compensator != "none":
-                    from magtwin.localization.compensators import COMPENSATORS
+                from magtwin.localization.compensators import COMPENSATORS, is_weights
 
+                load_localizer(entry.method, entry.options)
+                if is_weights(entry.compensator):
+                    existing(self.path(entry.compensator), "weights file")
+                elif entry.compensator != "none":
                     find("compensator", entry.compensator, COMPENSATORS)
         for scenario in self.scenario:
             with _named_in(file, "scenario", scenario.name, ("scene", "paths")):
@@ -337,7 +340,7 @@ class Suite:
         return scene_file(beside if beside.exists() else scenario.scene)
 
     def path(self, name: str) -> str:
-        """A path of a scenario: the name of one, or its file, beside the suite's file or in this folder."""
+        """A name as it is, or the file of that name beside the suite's file."""
         beside = Path(self.base) / name
         return str(beside) if beside.is_file() else name
 

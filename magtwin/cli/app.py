@@ -37,6 +37,7 @@ ALIASES = {
     "anomaly_map": "map",
     "duration": "duration_s",
     "map_layer": "map",
+    "localizers": "localizer",
     "net": "network",
     "offsets_s": "offset_s",
     "profile": "target",

@@ -50,7 +50,7 @@ DEFAULT_QOS, SENSOR_QOS, CLOCK_QOS = "qos", "sensor_qos", "clock_qos"
 class _Parts(NamedTuple):
     """Prims of a robot for its graph."""
 
-    root: Sdf.Path
+    articulation: Sdf.Path
     base: Sdf.Path
     imu: Sdf.Path
     lidar: Sdf.Path
@@ -189,7 +189,7 @@ def _message(graph: Graph, node: str, kind: str, qos: str, after: str = "tick.ti
 
 
 def _joints(graph: Graph, parts: _Parts, topic: str) -> None:
-    graph.node("joints", f"{SENSORS}IsaacReadJointState", prim=parts.root)
+    graph.node("joints", f"{SENSORS}IsaacReadJointState", prim=parts.articulation)
     graph.node("publish_joints", f"{BRIDGE}ROS2PublishJointState", topicName=topic)
     graph.connect("tick.tick", "joints.execIn")
     _published(graph, "publish_joints", DEFAULT_QOS, "joints.execOut")
@@ -232,7 +232,7 @@ def _drive(graph: Graph, robot: RobotSpec, parts: _Parts, topic: str) -> None:
     graph.node(
         "wheels",
         f"{CORE}IsaacArticulationController",
-        targetPrim=parts.root,
+        targetPrim=parts.articulation,
         jointNames=[drive.left_wheel_joint, drive.right_wheel_joint],
     )
     _published(graph, "command", DEFAULT_QOS, stamp=False)
@@ -266,8 +266,11 @@ def _parts(root: Usd.Prim) -> _Parts:
     base = root.GetStage().GetPrimAtPath(links[0])
     if not base or not base.HasAPI(UsdPhysics.RigidBodyAPI):
         raise InputError(f"{place(root)}: {LINKS} begins with {links[0]}, which is no rigid body")
+    roots = [prim for prim in Usd.PrimRange(root) if prim.HasAPI(UsdPhysics.ArticulationRootAPI)]
+    if len(roots) != 1:
+        raise InputError(f"{place(root)}: has {len(roots)} articulation roots; it needs one")
     return _Parts(
-        root=root.GetPath(),
+        articulation=roots[0].GetPath(),
         base=links[0],
         imu=_child(only_prim_with(root, "imu"), IMU_TYPE).GetPath(),
         lidar=_child(only_prim_with(root, "lidar"), LIDAR_TYPE).GetPath(),

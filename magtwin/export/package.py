@@ -329,7 +329,9 @@ class _Work:
         self.run, self.plays = self.root.with_name(f"{self.root.stem}_run.usdc"), True
         write_animation(run, self.run, self.root)
         layer, below = Sdf.Layer.FindOrOpen(str(self.run)), Sdf.Layer.FindOrOpen(str(self.root))
-        layer.customLayerData = {**dict(layer.customLayerData), "magtwin": below.customLayerData["magtwin"]}
+        theirs = dict(below.customLayerData)
+        kept = {name: theirs[name] for name in ("magtwin", "renderSettings") if name in theirs}
+        layer.customLayerData = {**dict(layer.customLayerData), **kept}  # a root layer has its own
         layer.Save()
 
     def flat(self) -> None:

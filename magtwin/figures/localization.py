@@ -37,7 +37,7 @@ from magtwin.files import output
 from magtwin.frames import wrap_angle
 from magtwin.io.rerun.localization import write_localization
 from magtwin.localization.tum import save_tum
-from magtwin.localizing import Localization
+from magtwin.localizing import Localization, truth_name
 
 ESTIMATE_INK, TRUTH_INK, DEAD_INK, BOUND_INK, LOST_INK = "#e8590c", INK, "#1971c2", "#2b8a3e", "#f3d9fa"
 BAND_INK = "#ffd8a8"
@@ -126,7 +126,7 @@ def _draw_floor(figure: Figure, ax: Axes, result: Localization, field: AnomalyMa
     if result.dead_reckoning is not None:
         path(result.dead_reckoning.pose, _dead_name(result), DEAD_INK, lw=1.2, ls=(0, (4, 2)), zorder=3)
     if result.truth is not None:
-        path(result.truth, "true path", TRUTH_INK, lw=2.0, zorder=4)
+        path(result.truth, _true_name(result), TRUTH_INK, lw=2.0, zorder=4)
     trusted = np.where(result.track.lost[:, None], np.nan, pose)
     path(trusted, "estimate", ESTIMATE_INK, lw=1.4, zorder=5)
     rows = _ellipse_rows(t, result.track.lost)
@@ -225,6 +225,10 @@ def _shade_lost(ax: Axes, result: Localization) -> None:
         end = t[min(last, len(t) - 1)]
         ax.axvspan(t[first], end, color=LOST_INK, lw=0, zorder=-1, label=name)
         name = "_"
+
+
+def _true_name(result: Localization) -> str:
+    return "true path" if truth_name(result.run) == "true pose" else "motion capture"
 
 
 def _dead_name(result: Localization) -> str:

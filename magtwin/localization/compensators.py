@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -27,6 +28,9 @@ COMPENSATORS: Registry[Any] = Registry(
 
 compensator = COMPENSATORS.register
 """Decorator that gives a class a name."""
+
+WEIGHTS = (".safetensors", ".pth")
+"""Suffixes of a trained network's weights, which can take the place of a compensator's name."""
 
 DISTURBANCE_COLUMNS = {
     "disturbance_nt": Column("nT", "", "the robot's own field as predicted by a compensator"),
@@ -203,6 +207,11 @@ class TollesLawson(Linear):
             rate = (u - _direction(last)[1]) / (reading.t - last.t)
         induced = b * np.array([u[0] * u[0], u[0] * u[1], u[0] * u[2], u[1] * u[1], u[1] * u[2]])
         return [*u.tolist(), *induced.tolist(), *(b * np.outer(u, rate).ravel()[:8]).tolist()]
+
+
+def is_weights(compensator: str) -> bool:
+    """Whether a compensator is given by a file of weights, not by name."""
+    return Path(compensator).suffix in WEIGHTS
 
 
 def compensated(run: Run, fitted: Compensator) -> Run:

@@ -1,9 +1,9 @@
 """Compiled loops of the particle filters: one step of a range of blocks of particles, and resampling.
 
-Importing this module opens numba (see `magtwin.compiled`). Random numbers are a function of a key, the number
-of the particle and the number of the draw, and sums are taken block by block, so that any number of threads
-gives the same bytes. Sums within a block are taken in 32 lanes. Logarithms, exponentials, sines and cosines are polynomials here, which the compiler
-turns into vector code; their errors are below 1e-13.
+Importing this module opens numba (see `magtwin.compiled`). Random numbers belong to a particle and a step,
+and sums are taken block by block, in lanes of a fixed order, so that any number of threads gives the same
+bytes. Particles are copied to memory of fixed shape, a block at a time, which the compiler needs to know that
+rows do not overlap.
 """
 
 import math
@@ -12,18 +12,28 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from magtwin.compiled import compiled, inlined
+from magtwin.compiled import compiled
 from magtwin.field.maps.loops import blends, climb, place
 from magtwin.field.maps.trilinear import planes
+from magtwin.localization.elementary import (
+    centred,
+    cosine_sine,
+    exponential,
+    logarithm,
+    normals,
+    stream,
+    whole,
+)
 
 Array = NDArray[np.float64]
-Words = NDArray[np.uint64]
 
-BLOCK = 256
+BLOCK = 128
 """Particles worked on at a time: their states and factors stay in the cache."""
 
-LANES = 32
-"""Partial sums of a block."""
+LANES, PARTS = 32, BLOCK // 32
+"""Partial sums of a block, and particles in each."""
+
+_QUARTER = LANES // 4
 
 X, Y, YAW, SCALE, LOG_WEIGHT, WEIGHT, LINEAR = range(7)
 """Rows of the state: pose, mean of the odometry's scale error, log weight, weight relative to its block; then
@@ -34,10 +44,14 @@ CONSTANT, DRIFT, COSINE, SINE, MAP_SD = range(5)
 deviation."""
 
 STATES, _TRIANGLE = 5, 15
-_MEAN = LINEAR  # rows of the memory of a block: those of the state with all linear states, then free ones
+
+_MEAN = (
+    LINEAR  # rows of the memory of a block: those of the state with all linear states, then those in between
+)
 _COVARIANCE = _MEAN + STATES
-_FREE = _COVARIANCE + _TRIANGLE
-WORK = _FREE + 21
+_GAIN = _COVARIANCE + _TRIANGLE
+_FREE = _GAIN + STATES
+_ROWS = _FREE + 16
 
 (
     DISTANCE,
@@ -90,146 +104,63 @@ weight times offsets from the reference pose, their products; sum of squared wei
 cos(yaw), sin(yaw), mean of the first linear state; sum of the weights before the step times nu, nu^2 and S;
 greatest log weight and sum of the weights without KAPPA."""
 
-GOLDEN, MIX_1, MIX_2 = (np.uint64(k) for k in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
-_S20, _S27, _S30, _S31, _S32, _S52 = (np.uint64(k) for k in (20, 27, 30, 31, 32, 52))
-_LOW = np.uint64(0xFFFFFFFF)
-_MANTISSA, _ONE_BITS, _WHOLE_BITS = (
-    np.uint64(k) for k in (0x000FFFFFFFFFFFFF, 0x3FF0000000000000, 0x4330000000000000)
-)
-_WHOLE = 2.0**52  # The float of _WHOLE_BITS: an integer in its lowest bits is the float plus that integer
-_LN2, _SQRT2, _TURN = math.log(2), math.sqrt(2), 2 * math.pi
 
-_SIN = tuple((-1) ** k * _TURN ** (2 * k + 1) / math.factorial(2 * k + 1) for k in range(10))
-_EXP = tuple(1 / math.factorial(k) for k in range(13))
-
-
-@inlined
-def mix(z: np.uint64) -> np.uint64:
-    """A hash of 64 bits (the finalizer of splitmix64: Steele, Lea and Flood 2014)."""
-    z = (z ^ (z >> _S30)) * MIX_1
-    z = (z ^ (z >> _S27)) * MIX_2
-    return z ^ (z >> _S31)
-
-
-@inlined
-def sine_of_turns(u: float) -> float:
-    """sin(2 pi u) for u in [-1/4, 1/4]."""
-    z = u * u
-    (c0, c1, c2, c3, c4, c5, c6, c7, c8, c9) = _SIN
-    p = c5 + z * (c6 + z * (c7 + z * (c8 + z * c9)))
-    return u * (c0 + z * (c1 + z * (c2 + z * (c3 + z * (c4 + z * p)))))
-
-
-@inlined
-def logarithm(x: float) -> float:
-    """log(x) for x > 0 and not subnormal."""
-    bits = np.float64(x).view(np.uint64)
-    m = np.uint64((bits & _MANTISSA) | _ONE_BITS).view(np.float64)
-    e = np.uint64((bits >> _S52) | _WHOLE_BITS).view(np.float64)
-    big = m > _SQRT2
-    v = 0.5 * m if big else m
-    k = e - (_WHOLE + 1022 if big else _WHOLE + 1023)
-    t = (v - 1) / (v + 1)
-    z = t * t
-    p = 1 / 9 + z * (1 / 11 + z * (1 / 13 + z * (1 / 15 + z / 17)))
-    return k * _LN2 + 2 * t * (1 + z * (1 / 3 + z * (1 / 5 + z * (1 / 7 + z * p))))
-
-
-@inlined
-def exponential(x: float) -> float:
-    """exp(x) for x <= 0; 0 below -700."""
-    (c0, c1, c2, c3, c4, c5, c6, c7, c8, c9, c10, c11, c12) = _EXP
-    v = max(x, -700.0)
-    k = np.floor(v / _LN2 + 0.5)
-    r = v - k * _LN2
-    p = c6 + r * (c7 + r * (c8 + r * (c9 + r * (c10 + r * (c11 + r * c12)))))
-    p = c0 + r * (c1 + r * (c2 + r * (c3 + r * (c4 + r * (c5 + r * p)))))
-    power = np.uint64(np.float64(k + (_WHOLE + 1023)).view(np.uint64) << _S52).view(np.float64)
-    return p * power if x > -700 else 0.0
-
-
-@inlined
-def cosine_sine(turns: float) -> tuple[float, float]:
-    """cos(2 pi u) and sin(2 pi u) for u in [-1/2, 1/2]."""
-    far, half = abs(turns) > 0.25, 0.5 if turns > 0 else -0.5
-    return sine_of_turns(0.25 - abs(turns)), sine_of_turns(half - turns if far else turns)
-
-
-@inlined
-def centred(angle: float) -> float:
-    """An angle [rad] in turns, in [-1/2, 1/2]."""
-    turns = angle / _TURN
-    return turns - np.floor(turns + 0.5)
-
-
-@inlined
-def stream(key: np.uint64, draw: int) -> np.uint64:
-    """Start of the random numbers of one draw of all particles."""
-    return key + mix(np.uint64(draw) * GOLDEN)
-
-
-@inlined
-def normals(start: np.uint64, number: np.uint64) -> tuple[float, float]:
-    """Two standard normal numbers of the particle of a number (Box and Muller 1958)."""
-    z = mix(start + number * GOLDEN)
-    high = np.uint64(((z >> _S32) << _S20) | _ONE_BITS).view(np.float64)
-    low = np.uint64(((z & _LOW) << _S20) | _ONE_BITS).view(np.float64)
-    radius = math.sqrt(-2 * logarithm(2 - high))
-    c, s = cosine_sine(low - 1.5)
-    return radius * c, radius * s
-
-
-@inlined
+@whole
 def add_moments(
     weight: Array, x: Array, y: Array, yaw: Array, x_ref: float, y_ref: float, yaw_ref: float, lanes: Array
 ) -> None:
     """Sums of the weights, and of weight times the offsets from a pose and their products, by lane."""
-    total, sx, sy, sa = lanes[SUM], lanes[SUM_X], lanes[SUM_Y], lanes[SUM_YAW]
-    xx, xy, xa, yy, ya, aa = lanes[XX], lanes[XY], lanes[X_YAW], lanes[YY], lanes[Y_YAW], lanes[YAW_YAW]
-    for start in range(0, BLOCK, LANES):
-        for k in range(LANES):
-            n = start + k
-            w, dx, dy, a = weight[n], x[n] - x_ref, y[n] - y_ref, centred(yaw[n] - yaw_ref) * _TURN
-            wx, wy, wa = w * dx, w * dy, w * a
-            total[k] += w
-            sx[k] += wx
-            sy[k] += wy
-            sa[k] += wa
-            xx[k] += wx * dx
-            xy[k] += wx * dy
-            xa[k] += wx * a
-            yy[k] += wy * dy
-            ya[k] += wy * a
-            aa[k] += wa * a
-
-
-@inlined
-def greatest(row: Array, lanes: Array) -> float:
-    """Greatest entry of a row."""
-    lanes[:] = -np.inf
-    for start in range(0, BLOCK, LANES):
-        for k in range(LANES):
-            lanes[k] = max(lanes[k], row[start + k])
-    top = -np.inf
     for k in range(LANES):
-        top = max(top, lanes[k])
+        total = sx = sy = sa = xx = xy = xa = yy = ya = aa = 0.0
+        for part in range(PARTS):
+            n = part * LANES + k
+            w, dx, dy, a = weight[n], x[n] - x_ref, y[n] - y_ref, centred(yaw[n] - yaw_ref) * (2 * math.pi)
+            wx, wy, wa = w * dx, w * dy, w * a
+            total += w
+            sx += wx
+            sy += wy
+            sa += wa
+            xx += wx * dx
+            xy += wx * dy
+            xa += wx * a
+            yy += wy * dy
+            ya += wy * a
+            aa += wa * a
+        lanes[SUM, k], lanes[SUM_X, k], lanes[SUM_Y, k], lanes[SUM_YAW, k] = total, sx, sy, sa
+        lanes[XX, k], lanes[XY, k], lanes[X_YAW, k] = xx, xy, xa
+        lanes[YY, k], lanes[Y_YAW, k], lanes[YAW_YAW, k] = yy, ya, aa
+
+
+@whole
+def greatest(row: Array, lane: Array) -> float:
+    """Greatest entry of a row."""
+    for k in range(LANES):
+        top = row[k]
+        for part in range(1, PARTS):
+            top = max(top, row[part * LANES + k])
+        lane[k] = top
+    for k in range(_QUARTER):
+        lane[k] = max(max(lane[k], lane[k + _QUARTER]), max(lane[k + 2 * _QUARTER], lane[k + 3 * _QUARTER]))
+    top = lane[0]
+    for k in range(1, _QUARTER):
+        top = max(top, lane[k])
     return top
 
 
-@inlined
+@whole
 def add_up(lanes: Array, out: Array) -> None:
     """Sum of each row of lanes."""
     for row in range(lanes.shape[0]):
-        for k in range(16):
-            lanes[row, k] += lanes[row, k + 16]
-        for k in range(8):
-            lanes[row, k] += lanes[row, k + 8]
-        for k in range(4):
-            lanes[row, k] += lanes[row, k + 4]
-        out[row] = lanes[row, 0] + lanes[row, 1] + lanes[row, 2] + lanes[row, 3]
+        lane = lanes[row]
+        for k in range(_QUARTER):
+            lane[k] = (lane[k] + lane[k + _QUARTER]) + (lane[k + 2 * _QUARTER] + lane[k + 3 * _QUARTER])
+        total = 0.0
+        for k in range(_QUARTER):
+            total += lane[k]
+        out[row] = total
 
 
-@inlined
+@whole
 def predict_two(p: Array, g: Array, both: Array, noise: Array) -> None:
     """P of two constants after a step, and g = P h."""
     for n in range(BLOCK):
@@ -240,7 +171,7 @@ def predict_two(p: Array, g: Array, both: Array, noise: Array) -> None:
         g[0, n], g[1, n] = p00 + p10, p10 + p11
 
 
-@inlined
+@whole
 def predict_five(p: Array, g: Array, both: Array, noise: Array, c: Array, s: Array, r: Array) -> None:
     """P of all linear states after a step, and g = P h with h = (1, 1, c, s, r)."""
     for n in range(BLOCK):
@@ -272,17 +203,48 @@ def predict_five(p: Array, g: Array, both: Array, noise: Array, c: Array, s: Arr
         g[3, n] += p43 * h4
 
 
-@inlined
-def update(states: int, p: Array, mean: Array, g: Array, nu: Array, inverse: Array) -> None:
-    """z' = z + g nu / S, P' = P - g g' / S of the first linear states."""
-    for k in range(states):
-        mean_k, g_k, row = mean[k], g[k], k * (k + 1) // 2
-        for n in range(BLOCK):
-            mean_k[n] += g_k[n] * nu[n] * inverse[n]
-        for i in range(k + 1):
-            p_i, g_i = p[row + i], g[i]
-            for n in range(BLOCK):
-                p_i[n] -= g_k[n] * g_i[n] * inverse[n]
+@whole
+def update_two(p: Array, mean: Array, g: Array, nu: Array, inverse: Array) -> None:
+    """Add g nu / S to z and subtract g g' / S from P of two constants."""
+    for n in range(BLOCK):
+        g0, g1 = g[0, n], g[1, n]
+        u0, u1 = g0 * inverse[n], g1 * inverse[n]
+        mean[0, n] += u0 * nu[n]
+        mean[1, n] += u1 * nu[n]
+        p[0, n] -= u0 * g0
+        p[1, n] -= u1 * g0
+        p[2, n] -= u1 * g1
+
+
+@whole
+def update_five(p: Array, mean: Array, g: Array, nu: Array, inverse: Array) -> None:
+    """Add g nu / S to z and subtract g g' / S from P of all linear states."""
+    for n in range(BLOCK):
+        g0, g1, g2, g3 = g[0, n], g[1, n], g[2, n], g[3, n]
+        u0, u1, u2, u3 = g0 * inverse[n], g1 * inverse[n], g2 * inverse[n], g3 * inverse[n]
+        mean[0, n] += u0 * nu[n]
+        mean[1, n] += u1 * nu[n]
+        mean[2, n] += u2 * nu[n]
+        mean[3, n] += u3 * nu[n]
+        p[0, n] -= u0 * g0
+        p[1, n] -= u1 * g0
+        p[2, n] -= u1 * g1
+        p[3, n] -= u2 * g0
+        p[4, n] -= u2 * g1
+        p[5, n] -= u2 * g2
+        p[6, n] -= u3 * g0
+        p[7, n] -= u3 * g1
+        p[8, n] -= u3 * g2
+        p[9, n] -= u3 * g3
+    for n in range(BLOCK):
+        g4 = g[4, n]
+        u4 = g4 * inverse[n]
+        mean[4, n] += u4 * nu[n]
+        p[10, n] -= u4 * g[0, n]
+        p[11, n] -= u4 * g[1, n]
+        p[12, n] -= u4 * g[2, n]
+        p[13, n] -= u4 * g[3, n]
+        p[14, n] -= u4 * g4
 
 
 _IN, _OUT = types.Array(types.float64, 1, "C", readonly=True), types.Array(types.float64, 1, "C")
@@ -332,7 +294,9 @@ def step(
         sampled: The linear states are not filtered but sampled: their noise is drawn, and P stays 0.
     """
     size, inner = decay.shape[0], 0
-    work, lanes = np.zeros((WORK, BLOCK)), np.zeros((PLAIN_SUM + 1, LANES))
+    # Rows are wider than a block: rows a power of two apart would compete for the same cache lines
+    work, lanes = np.empty((_ROWS, BLOCK + 8)), np.empty((PLAIN_SUM + 1, LANES + 8))
+    work[_MEAN:_GAIN] = 0.0
     places = np.zeros(STATES + _TRIANGLE, np.int64)  # rows of the linear states in `work`
     decays, added, both = np.ones(STATES), np.zeros(STATES), np.ones(_TRIANGLE)
     for k in range(size):
@@ -346,16 +310,14 @@ def step(
             both[k * (k + 1) // 2 + i] = decays[k] * decays[i]
     few = size == 0 or kinds[size - 1] < 2
     filtered = 2 if few else STATES
-    x, y, yaw, scale, log_w, weight = work[X], work[Y], work[YAW], work[SCALE], work[LOG_WEIGHT], work[WEIGHT]
-    mean, p = work[_MEAN:_COVARIANCE], work[_COVARIANCE:_FREE]
-    g, c, s = work[_FREE : _FREE + STATES], work[_FREE + 5], work[_FREE + 6]
-    e1, e2, e3, b, v = (
-        work[_FREE + 7], work[_FREE + 8], work[_FREE + 9], work[_FREE + 10], work[_FREE + 11]
-    )  # fmt: skip
-    hole, big_s, nu, like, r = (
-        work[_FREE + 12], work[_FREE + 13], work[_FREE + 14], work[_FREE + 15], work[_FREE + 16]
-    )  # fmt: skip
-    wx, wy, wh, slope = work[_FREE + 17], work[_FREE + 18], work[_FREE + 19], work[_FREE + 20]
+    x, y, yaw, scale = work[X, :BLOCK], work[Y, :BLOCK], work[YAW, :BLOCK], work[SCALE, :BLOCK]
+    log_w, weight = work[LOG_WEIGHT, :BLOCK], work[WEIGHT, :BLOCK]
+    mean, p, g = work[_MEAN:_COVARIANCE], work[_COVARIANCE:_GAIN], work[_GAIN:_FREE]
+    free = work[_FREE:]
+    c, s, e1, e2 = free[0, :BLOCK], free[1, :BLOCK], free[2, :BLOCK], free[3, :BLOCK]
+    e3, b, v, hole = free[4, :BLOCK], free[5, :BLOCK], free[6, :BLOCK], free[7, :BLOCK]
+    big_s, nu, like, r = free[8, :BLOCK], free[9, :BLOCK], free[10, :BLOCK], free[11, :BLOCK]
+    wx, wy, wh, slope = free[12, :BLOCK], free[13, :BLOCK], free[14, :BLOCK], free[15, :BLOCK]
     q, node = np.empty(2 * BLOCK), np.empty(BLOCK, np.int64)
     begin, end, in_row, in_layer = planes(table)
     values, masks = table[begin:end], table[end:]
@@ -374,13 +336,15 @@ def step(
         start = block * BLOCK
         m = min(start + BLOCK, count) - start
         for k in range(LINEAR + size + inner):
-            to, source = work[k if k < LINEAR else places[k - LINEAR]], before[k]
+            to = work[k if k < LINEAR else places[k - LINEAR]]
             if chosen.shape[0] == 0:
+                source = before[k, start : start + m]  # no negative index, which would not vectorise
                 for n in range(m):
-                    to[n] = source[start + n]
+                    to[n] = source[n]
             elif k != LOG_WEIGHT and k != WEIGHT:
+                row_before, place_before = before[k], chosen[start : start + m]
                 for n in range(m):
-                    to[n] = source[chosen[start + n]]
+                    to[n] = row_before[np.uint64(place_before[n])]
             for n in range(m, BLOCK):
                 to[n] = to[0]
         if chosen.shape[0] > 0:
@@ -430,6 +394,8 @@ def step(
                     b[n] = np.nan if hole[n] > edge else b[n]
             if variance.shape[0] > 0:
                 blends(variance, row, up, node, wx, wy, wh, v)
+            else:
+                v[:] = 0.0
             for n in range(BLOCK):
                 known = b[n] == b[n]
                 big_s[n] = white + (map_white * v[n] if known else elsewhere_variance)
@@ -451,43 +417,52 @@ def step(
                 if not few:
                     for n in range(BLOCK):
                         big_s[n] += g[2, n] * c[n] + g[3, n] * s[n] + g[4, n] * r[n]
-            sum_nu, sum_nu_nu, sum_s = lanes[NU], lanes[NU_NU], lanes[PRIOR_S]
-            for at in range(0, BLOCK, LANES):
-                for k in range(LANES):
-                    n = at + k
+            for k in range(LANES):
+                sum_nu = sum_nu_nu = sum_s = 0.0
+                for part in range(PARTS):
+                    n = part * LANES + k
                     w_nu = weight[n] * nu[n]
-                    sum_nu[k] += w_nu
-                    sum_nu_nu[k] += w_nu * nu[n]
-                    sum_s[k] += weight[n] * big_s[n]
+                    sum_nu += w_nu
+                    sum_nu_nu += w_nu * nu[n]
+                    sum_s += weight[n] * big_s[n]
+                lanes[NU, k], lanes[NU_NU, k], lanes[PRIOR_S, k] = sum_nu, sum_nu_nu, sum_s
             for n in range(BLOCK):
                 log_s = logarithm(big_s[n])
                 big_s[n] = 1 / big_s[n]
                 like[n] = -0.5 * (nu[n] * nu[n] * big_s[n] + log_s)
             if not sampled:
-                update(filtered, p, mean, g, nu, big_s)
+                if few:
+                    update_two(p, mean, g, nu, big_s)
+                else:
+                    update_five(p, mean, g, nu, big_s)
             if tempered:
                 for n in range(BLOCK):
                     e1[n] = log_w[n] + like[n]
                 plain_top = greatest(e1, lanes[TOP])
-                sum_plain = lanes[PLAIN_SUM]
-                for at in range(0, BLOCK, LANES):
-                    for k in range(LANES):
-                        sum_plain[k] += exponential(e1[at + k] - plain_top)
+                for n in range(BLOCK):
+                    e1[n] = exponential(e1[n] - plain_top)
+                for k in range(LANES):
+                    plain = 0.0
+                    for part in range(PARTS):
+                        plain += e1[part * LANES + k]
+                    lanes[PLAIN_SUM, k] = plain
             for n in range(BLOCK):
                 log_w[n] += like[n] / kappa
             top = greatest(log_w, lanes[TOP])
         for n in range(BLOCK):
             weight[n] = exponential(log_w[n] - top)
         add_moments(weight, x, y, yaw, x_ref, y_ref, yaw_ref, lanes)
-        squares, cosines, sines, offsets = lanes[SQUARES], lanes[COS], lanes[SIN], lanes[OFFSET]
-        for at in range(0, BLOCK, LANES):
-            for k in range(LANES):
-                n = at + k
+        for k in range(LANES):
+            squares = cosines = sines = offsets = 0.0
+            for part in range(PARTS):
+                n = part * LANES + k
                 w = weight[n]
-                squares[k] += w * w
-                cosines[k] += w * c[n]
-                sines[k] += w * s[n]
-                offsets[k] += w * mean[0, n]
+                squares += w * w
+                cosines += w * c[n]
+                sines += w * s[n]
+                offsets += w * mean[0, n]
+            lanes[SQUARES, k], lanes[COS, k], lanes[SIN, k] = squares, cosines, sines
+            lanes[OFFSET, k] = offsets
         add_up(lanes, sums[block])
         sums[block, TOP] = top
         if tempered:
@@ -495,9 +470,9 @@ def step(
         else:
             sums[block, PLAIN_TOP], sums[block, PLAIN_SUM] = top, sums[block, SUM]
         for k in range(LINEAR + size + inner):
-            to, source = state[k], work[k if k < LINEAR else places[k - LINEAR]]
+            to, source = state[k, start : start + m], work[k if k < LINEAR else places[k - LINEAR]]
             for n in range(m):
-                to[start + n] = source[n]
+                to[n] = source[n]
 
 
 @compiled(types.int64, _TABLE, _IN, types.float64, types.float64, types.float64, _OUT)
@@ -524,7 +499,7 @@ def moments(
 _PLACES = types.Array(types.int64, 1, "C")
 
 
-@inlined
+@whole
 def _first_of(limit: float, least: int, most: int) -> int:
     """Least whole number not below a limit, between two others."""
     return int(min(max(np.ceil(limit), float(least)), float(most)))
@@ -561,7 +536,7 @@ def choose(
         for n in range(begin, end):  # the last particle that is written to a place is the one chosen there
             chosen[place] = n
             total += state[WEIGHT, n] * factor
-            place = _first_of(total, place, stop)
+            place = _first_of(total, done, stop)
             if place == stop:
                 break
         latest = begin

@@ -15,6 +15,7 @@ from magtwin.errors import InputError
 from magtwin.localization.bounds import Bounds
 from magtwin.localization.problem import Array
 from magtwin.localization.track import Track
+from magtwin.verdict import EVEN
 
 Flags = NDArray[np.bool_]
 
@@ -181,6 +182,47 @@ def score(
         step_us=1e6 * track.step_s,
         bound_m={} if bounds is None else {name: bounds.rms(name, counted) for name in BOUNDS},
     )
+
+
+def verdict_of(scores: Scores, dead_m: float, start: str = "") -> str:
+    """Judge in one line whether an estimate is better than dead reckoning, consistent, and lost.
+
+    Args:
+        scores: Scores of the estimate.
+        dead_m: RMSE of dead reckoning over the same readings [m].
+        start: Where dead reckoning started, if not at the prior.
+    """
+    sizes = f"{100 * scores.rmse_m:.1f} cm RMSE against {100 * dead_m:.1f} cm"
+    less = 1 - scores.rmse_m / dead_m if dead_m > 0 else -math.inf
+    name = f"dead reckoning {start}".rstrip()
+    if abs(less) <= EVEN:
+        words = [f"No better than {name}: {sizes}."]
+    elif less > 0:
+        words = [f"Better than {name}: {sizes}, {less:.0%} less."]
+    else:
+        words = [f"WORSE than {name}: {sizes}."]
+    size = f"{scores.anees:.2f}" if scores.anees < 1e3 else f"{scores.anees:.0e}"
+    figure = f"ANEES {size} per state"
+    if scores.lost_share == 1:
+        words.append("It flagged all readings as lost, so its covariance is not judged.")
+    elif not math.isfinite(scores.anees):
+        words.append("Its covariance is unknown." if math.isnan(scores.anees) else "Its covariance is WRONG.")
+    elif scores.anees > scores.anees_high:
+        words.append(f"TOO CONFIDENT: {figure}, at most {scores.anees_high:.2f} expected.")
+    elif scores.anees < scores.anees_low:
+        words.append(f"Too cautious: {figure}, at least {scores.anees_low:.2f} expected.")
+    else:
+        words.append(f"Consistent: {figure}.")
+    if not math.isfinite(scores.converged_s) and not scores.diverged:
+        words.append(f"It never stayed within {NEAR_M:g} m for {HELD_S:g} s.")
+    if scores.diverged:
+        flagged = "" if scores.diverged_unflagged else ", and flagged it"
+        words.append(f"LOST: its error stayed above {FAR_M:g} m for more than {AWAY_S:g} s{flagged}.")
+    elif scores.lost_share > 0:
+        words.append(f"Not lost, but flagged so in {scores.lost_share:.0%} of the readings.")
+    else:
+        words.append("Not lost.")
+    return " ".join(words)
 
 
 def nees(error: ArrayLike, covariance: ArrayLike, rows: Flags | None = None) -> Array:

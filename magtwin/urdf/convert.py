@@ -22,6 +22,7 @@ from magtwin.urdf.material import LOOKS
 from magtwin.urdf.meshes.mesh_layer import MeshLayer, free_name, gather
 from magtwin.urdf.meshes.texture import TEXTURES
 from magtwin.urdf.options import DEFAULTS, Options
+from magtwin.urdf.physics.articulation import define_articulation, filter_overlaps
 from magtwin.urdf.physics.control import define_differential, read_commands, read_drive
 from magtwin.urdf.physics.drive import NO_WHEELS, Wheels, check_rules
 from magtwin.urdf.physics.gazebo import (
@@ -50,8 +51,8 @@ JOINTS = "joints"
 THUMBNAILS = Path(".thumbs", "256x256")
 """Folder of an asset's thumbnail, relative to the asset's folder."""
 
-ROBOT_API, ARTICULATION_API = "IsaacRobotAPI", "NewtonArticulationRootAPI"
-"""Applied schemas of Isaac Sim and Newton; their plugins are not installed here."""
+ROBOT_API = "IsaacRobotAPI"
+"""Isaac Sim's applied schema; its plugin is not installed here."""
 
 Finish = Callable[[Usd.Prim], Iterable[str]]
 
@@ -226,7 +227,7 @@ class _Author:
         robot = _define(stage, Sdf.Path.absoluteRootPath.AppendChild(names[""]), description.name)
         stage.SetDefaultPrim(robot)
         Usd.ModelAPI(robot).SetKind("component")
-        bodies: dict[str, Usd.Prim] = {}
+        bodies, colliders = dict[str, Usd.Prim](), dict[str, list[Usd.Prim]]()
         for name in description.links:
             if places[name][0] != name:
                 continue
@@ -247,7 +248,8 @@ class _Author:
                     rider.colliders.extend(made)
                 parts.append(rider)
             define_body(body, parts, description, options.density)
-            if not any(part.colliders for part in parts):
+            colliders[name] = [collider for part in parts for collider in part.colliders]
+            if not colliders[name]:
                 define_no_contact(body, surfaces.get(name, Surface()), self.meshes)
         paths = {WORLD: robot.GetPath(), **{name: body.GetPath() for name, body in bodies.items()}}
         for name, (above, pose) in places.items():
@@ -258,12 +260,12 @@ class _Author:
                 ledger.bodies[name] = became, frame.GetPath()
         wheels = fit_wheels(mechanism, driven, bodies) if driven else NO_WHEELS
         joints = self._joints(stage, mechanism, options, wheels, places, paths)
-        UsdPhysics.ArticulationRootAPI.Apply(robot)
         robot.AddAppliedSchema(ROBOT_API)
-        robot.AddAppliedSchema(ARTICULATION_API)
-        collides = self_collides(tags)
-        for name in ("newton:selfCollisionEnabled", "physxArticulation:enabledSelfCollisions"):
-            robot.CreateAttribute(name, Sdf.ValueTypeNames.Bool, custom=False).Set(collides)
+        jointed = [stage.GetPrimAtPath(joint) for joint in joints]
+        held = any(robot.GetPath() in UsdPhysics.Joint(joint).GetBody0Rel().GetTargets() for joint in jointed)
+        base = bodies.get(_base(places), robot)
+        define_articulation(robot if held else base, self_collision=self_collides(tags))
+        filter_overlaps(bodies, colliders, jointed)
         links = [body.GetPath() for body in bodies.values()]
         for name, paths_listed in (("robotLinks", links), ("robotJoints", joints)):
             relationship = robot.CreateRelationship(f"isaac:physics:{name}", custom=False)
@@ -287,7 +289,7 @@ class _Author:
         joints = {joint.name: joint for joint in description.joints.values()}
         names = _free_names(joints, set(), "joint ", description)
         names[""] = free_name("root_joint", {*joints, *names.values()})
-        base = next((name for name, (above, _) in places.items() if above == name), WORLD)
+        base = _base(places)
         if options.fix_base and places[description.root][0] != WORLD and base != WORLD:
             pose, ends = mechanism.poses()[base], (paths[WORLD], paths[base])
             made[""] = define_fixed_joint(stage, scope.AppendChild(names[""]), ends, pose)
@@ -334,6 +336,11 @@ class _Author:
         if count:
             most = ", ".join(sorted(ledger.unknown_tags, key=lambda tag: -ledger.unknown_tags[tag])[:4])
             tags.description.note(f"{count} tags without a meaning here are kept as text, such as {most}")
+
+
+def _base(places: dict[str, Place]) -> str:
+    """Name of the first body, the base of its robot."""
+    return next((name for name, (above, _) in places.items() if above == name), WORLD)
 
 
 def _define(stage: Usd.Stage, path: Sdf.Path, name: str, pose: NDArray | None = None) -> Usd.Prim:

@@ -41,7 +41,8 @@ VARIANTS = {
 """Layer of each physics variant, below PAYLOADS."""
 
 DEFAULT_VARIANT = "physx"
-"""Default of Isaac Sim 6.0.1; Newton and MuJoCo read the neutral attributes below it."""
+"""Default of Isaac Sim 6.0.1; Newton and MuJoCo read the attributes below it. Those of mjc: are among them,
+because Newton has no other attribute for the priority of a contact; the layer of MuJoCo is the user's."""
 
 LAYERS = {
     "base": ("base.usda", "links, frames and sensors"),
@@ -58,7 +59,7 @@ FILES = {name: file for name, (file, _) in LAYERS.items()}
 
 SCHEMAS = (
     ("Physx", "physx"),
-    ("Mjc", "mujoco"),
+    ("Mjc", "physics"),
     ("Physics", "physics"),
     ("Newton", "physics"),
     ("Isaac", "robot"),
@@ -67,7 +68,7 @@ SCHEMAS = (
 
 NAMESPACES = (
     ("physx", "physx"),
-    ("mjc:", "mujoco"),
+    ("mjc:", "physics"),
     ("physics:", "physics"),
     ("drive:", "physics"),
     ("limit:", "physics"),

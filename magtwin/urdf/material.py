@@ -7,8 +7,11 @@ from magtwin.urdf.meshes.piece import PLAIN, Paint
 from magtwin.urdf.physics.gazebo import Surface
 from magtwin.usd.geometry import linear_from_srgb
 
-PHYSX_API = "PhysxMaterialAPI"
-"""PhysX's applied schema; its plugin is not installed here."""
+PHYSX_API, MUJOCO_API = "PhysxMaterialAPI", "MjcCollisionAPI"
+"""Applied schemas of PhysX and MuJoCo; their plugins are not installed here."""
+
+SLIPPERY = 0.2
+"""Friction below which a surface slides on any floor."""
 
 LOOKS = "Looks"
 """Scope of all materials below the robot's prim."""
@@ -94,7 +97,8 @@ def define_grip(robot: Usd.Prim, surface: Surface) -> UsdShade.Material:
 
     Args:
         robot: Root prim; physics materials are in the scope of its looks.
-        surface: The surface; its stiffness and damping become PhysX's compliant contact.
+        surface: The surface; its stiffness and damping become PhysX's compliant contact. If its friction is
+            below `SLIPPERY`, PhysX uses that of the less rough of a pair, instead of the mean.
     """
     stage = robot.GetStage()
     scope = UsdGeom.Scope.Define(stage, robot.GetPath().AppendChild(LOOKS)).GetPath()
@@ -113,13 +117,23 @@ def define_grip(robot: Usd.Prim, surface: Surface) -> UsdShade.Material:
     api.CreateStaticFrictionAttr(surface.friction)
     api.CreateDynamicFrictionAttr(surface.friction)
     api.CreateRestitutionAttr(surface.restitution)
+    prim, kinds = material.GetPrim(), Sdf.ValueTypeNames
+    if surface.friction < SLIPPERY or surface.stiffness is not None or surface.damping is not None:
+        prim.AddAppliedSchema(PHYSX_API)
+    if surface.friction < SLIPPERY:
+        prim.CreateAttribute("physxMaterial:frictionCombineMode", kinds.Token, custom=False).Set("min")
     for what, value in (("Stiffness", surface.stiffness), ("Damping", surface.damping)):
         if value is not None:
-            if PHYSX_API not in material.GetPrim().GetPrimTypeInfo().GetAppliedAPISchemas():
-                material.GetPrim().AddAppliedSchema(PHYSX_API)
-            attribute = f"physxMaterial:compliantContact{what}"
-            material.GetPrim().CreateAttribute(attribute, Sdf.ValueTypeNames.Float, custom=False).Set(value)
+            name = f"physxMaterial:compliantContact{what}"
+            prim.CreateAttribute(name, kinds.Float, custom=False).Set(value)
     return material
+
+
+def define_priority(collider: Usd.Prim, surface: Surface) -> None:
+    """Author that MuJoCo and Newton use the friction of a slippery collider, not the larger of a pair."""
+    if surface.friction < SLIPPERY:
+        collider.AddAppliedSchema(MUJOCO_API)
+        collider.CreateAttribute("mjc:priority", Sdf.ValueTypeNames.Int, custom=False).Set(1)
 
 
 def wear(

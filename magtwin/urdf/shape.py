@@ -10,7 +10,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Shape
-from magtwin.urdf.material import define_grip, define_look, wear
+from magtwin.urdf.material import define_grip, define_look, define_priority, wear
 from magtwin.urdf.meshes.mesh_layer import MESH, Entry, MeshLayer, free_child
 from magtwin.urdf.meshes.piece import PLAIN, Paint
 from magtwin.urdf.meshes.reading import Reading
@@ -36,7 +36,7 @@ NEWTON_MESH_API = "NewtonMeshCollisionAPI"
 def define_visual(
     body: Usd.Prim, visual: Shape, description: Description, meshes: MeshLayer, layer: str
 ) -> list[Usd.Prim]:
-    """Author a URDF `<visual>`: a gprim with its look, or an Xform over a shared mesh.
+    """Author a URDF `<visual>`: a mesh with its look, or an Xform over one.
 
     Args:
         body: Prim of the link, a child of the robot's prim.
@@ -50,7 +50,10 @@ def define_visual(
     """
     paint = _paint_of(visual, description)
     if visual.geometry.kind != "mesh":
-        prim = _define_primitive(body, VISUALS, visual)
+        path = _path(body, VISUALS, visual.name or visual.geometry.kind)
+        prim = body.GetStage().DefinePrim(path, "Mesh")
+        prim.GetReferences().AddReference(layer, meshes.primitive(visual.geometry))
+        _place(prim, origin_of(visual))
         wear(prim, body.GetParent(), _plain(paint, "a primitive", description), meshes)
         return [prim]
     entry = meshes.try_add(visual.geometry, meshes.visual)
@@ -69,7 +72,7 @@ def define_collider(
     The prims have purpose guide, so that viewers hide them by default. Arguments as for `define_visual`.
     """
     if collision.geometry.kind != "mesh":
-        made = [_define_primitive(body, COLLISIONS, collision)]
+        made = [_define_primitive(body, collision)]
     else:
         made = []
         for path in meshes.try_add(collision.geometry, meshes.collider) or ():
@@ -87,6 +90,7 @@ def define_collider(
             )
             prim.AddAppliedSchema(NEWTON_MESH_API)
         wear(prim, robot, None, meshes, define_grip(robot, surface))
+        define_priority(prim, surface)
     return made
 
 
@@ -111,10 +115,10 @@ def define_no_contact(body: Usd.Prim, surface: Surface, meshes: MeshLayer) -> Us
 def _define_mesh(
     body: Usd.Prim, visual: Shape, entry: Entry, given: Paint | None, meshes: MeshLayer, layer: str
 ) -> Usd.Prim:
-    """An Xform that references a mesh, as an instance if it has one look.
+    """An Xform that references a mesh, whose arrays all references share.
 
-    Looks are in the robot's scope, to which prims below an instance cannot refer: a single look is bound
-    above the instance, and a mesh with several looks is not an instance. Arrays are shared in both cases.
+    It is no instance: looks are in the robot's scope, to which prims below an instance cannot refer, and
+    Blender drops a look that is bound above one.
     """
     stage, robot = body.GetStage(), body.GetParent()
     prim = UsdGeom.Xform.Define(stage, _path(body, VISUALS, visual.name or entry.path.name)).GetPrim()
@@ -123,7 +127,6 @@ def _define_mesh(
     looks = [paint or given or PLAIN for paint in entry.paints]
     if not entry.subsets:
         wear(prim, robot, looks[0], meshes)
-        prim.SetInstanceable(True)
         return prim
     mesh = prim.GetPrimAtPath(MESH)
     for name, look in zip(entry.subsets, looks, strict=True):
@@ -183,10 +186,10 @@ def _plain(paint: Paint | None, what: str, description: Description) -> Paint | 
     return Paint(f"{paint.name}_mean", (*paint.image.mean, paint.rgba[3]))
 
 
-def _define_primitive(body: Usd.Prim, scope: str, shape: Shape) -> Usd.Prim:
-    """Author a box, capsule, cylinder or sphere."""
+def _define_primitive(body: Usd.Prim, shape: Shape) -> Usd.Prim:
+    """Author a box, capsule, cylinder or sphere as a collider."""
     stage, form, kind, scale = body.GetStage(), shape.geometry, shape.geometry.kind, None
-    path = _path(body, scope, shape.name or kind)
+    path = _path(body, COLLISIONS, shape.name or kind)
     if kind == "box":
         prim = UsdGeom.Cube.Define(stage, path).GetPrim()
         UsdGeom.Cube(prim).CreateSizeAttr(1.0)

@@ -23,7 +23,7 @@ from magtwin.errors import InputError
 from magtwin.files import check_free, output
 from magtwin.frames import matrix_from_quat
 from magtwin.report import Figure, Report
-from magtwin.urdf.meshes.mesh_layer import free_name
+from magtwin.urdf.meshes.mesh_layer import MESH, free_name, primitive_of
 from magtwin.urdf.physics.joint import AXIS
 from magtwin.urdf.physics.link import SITE_API
 from magtwin.urdf.physics.mechanism import displacement
@@ -313,7 +313,7 @@ class _Writer:
             roles = {"visual": shown, "collision": _collides(prim)}
             primitive = self._primitive(prim, link)
             parent = prim.GetParent()  # has the name of the shape if it refers to a mesh
-            named = parent if prim.IsInstanceProxy() and parent.IsInstance() else prim
+            named = parent if prim.GetName() == MESH and parent != link.prim else prim
             for role in (role for role, wanted in roles.items() if wanted):
                 for shape in parts[:1] if primitive is not None else parts:
                     own = Sub(element, role, name=named.GetName())
@@ -344,11 +344,15 @@ class _Writer:
         T[:3, :3] /= scale
         if not np.allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), rtol=0, atol=1e-9):
             return None
-        if prim.IsA(UsdGeom.Cube):
-            size = scale * float(UsdGeom.Cube(prim).GetSizeAttr().Get())
+        form = primitive_of(prim)
+        if prim.IsA(UsdGeom.Cube) or (form is not None and form.kind == "box"):
+            size = scale * (float(UsdGeom.Cube(prim).GetSizeAttr().Get()) if form is None else form.size)
             return T, "box", {"size": _text(_shortest(v) for v in size)}
         if not np.allclose(scale, scale[0], rtol=1e-9):
             return None
+        if form is not None:
+            names = ("radius",) if form.kind == "sphere" else ("radius", "length")
+            return T, form.kind, {name: _text([getattr(form, name) * scale[0]]) for name in names}
         if prim.IsA(UsdGeom.Sphere):
             return T, "sphere", {"radius": _text([UsdGeom.Sphere(prim).GetRadiusAttr().Get() * scale[0]])}
         for schema, tag in ((UsdGeom.Cylinder, "cylinder"), (UsdGeom.Capsule, "capsule")):

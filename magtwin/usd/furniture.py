@@ -12,14 +12,14 @@ from magtwin.spec.furniture import BODY, GENERIC, FurnitureSpec, Part, parts_of
 from magtwin.spec.magnetics import SourceSpec
 from magtwin.usd.attributes import check_prim_name, plain_value, write_pose
 from magtwin.usd.layers import WORLD
-from magtwin.usd.looks import define_box, define_looks, wear
+from magtwin.usd.looks import define_box, define_looks, define_visual, hide, visual_path, wear
 from magtwin.usd.placement import labs_on
 from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, prims_with
+from magtwin.usd.solids import define_triangles
 from magtwin.usd.sources import (
     LOOKS,
     SOURCES,
     define_source,
-    define_triangles,
     read_source,
     read_transform,
     source_prims,
@@ -61,12 +61,12 @@ def define_furniture(stage: Usd.Stage, furniture: tuple[FurnitureSpec, ...]) -> 
 
 
 def _define_part(stage: Usd.Stage, piece: Sdf.Path, part: Part, source: SourceSpec | None) -> Usd.Prim:
-    """One part; a steel part is a source."""
+    """The collider of a part, and a mesh that shows it; a steel part is a source."""
     path, look = piece.AppendChild(part.name), piece.AppendChild(LOOKS).AppendChild(part.look)
     if source is not None:
         return define_source(stage, piece, _named(source, part.name), look=part.look)
     if part.shape == "cuboid":
-        return define_box(stage, path, part.p, part.size_m, look)
+        return define_box(stage, path, part.p, part.size_m, look, collides=True)
     if part.shape == "mesh":
         mesh = UsdGeom.Mesh.Define(stage, path)
         define_triangles(mesh, part.vertices_m, part.faces)
@@ -80,7 +80,8 @@ def _define_part(stage: Usd.Stage, piece: Sdf.Path, part: Part, source: SourceSp
     cylinder.CreateAxisAttr(UsdGeom.Tokens.z)
     cylinder.CreateExtentAttr(Vt.Vec3fArray([(-radius, -radius, -half), (radius, radius, half)]))
     write_pose(cylinder.GetPrim(), part.p)
-    wear(cylinder, look)
+    hide(cylinder, look)
+    define_visual(stage, visual_path(path), part.shape, part.p, part.size_m, look)
     return cylinder.GetPrim()
 
 

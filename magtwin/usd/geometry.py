@@ -12,9 +12,7 @@ from magtwin.errors import InputError
 from magtwin.frames import IDENTITY_XYZW, canonical
 from magtwin.spec.base import ZERO3, Quat, Vec3
 from magtwin.usd.layers import open_stage
-
-SEGMENTS = 32
-"""Sides of the polygon that approximates a circle."""
+from magtwin.usd.solids import Solid, solid_of
 
 GREY = (0.5, 0.5, 0.5, 1.0)
 """Colour of a shape without one."""
@@ -212,7 +210,7 @@ def _shown(
     stage: Usd.Stage,
     purposes: Sequence[str],
     wanted: Callable[[Usd.Prim, bool], bool] = lambda prim, carried: True,
-) -> Iterator[tuple[UsdGeom.Gprim, "Solid", NDArray, str]]:
+) -> Iterator[tuple[UsdGeom.Gprim, Solid, NDArray, str]]:
     """Visible gprims with a surface, their transform to the frame of their body (4, 4), and its name."""
     cache, bodies = UsdGeom.XformCache(), _bodies(stage)
     for prim in _prims(stage):
@@ -227,7 +225,7 @@ def _shown(
         body = body or None
         if not wanted(prim, body is not None):
             continue
-        solid = _solid(gprim)
+        solid = solid_of(gprim)
         if solid is None:
             continue
         to_frame = cache.GetLocalToWorldTransform(prim)
@@ -289,122 +287,6 @@ def _pose(matrix: Gf.Matrix4d) -> tuple[Vec3, Quat]:
     q, (px, py, pz) = matrix.ExtractRotationQuat(), matrix.ExtractTranslation()
     x, y, z, w = (float(v) for v in canonical([*q.GetImaginary(), q.GetReal()]))
     return (float(px), float(py), float(pz)), (x, y, z, w)
-
-
-@dataclass(frozen=True)
-class Solid:
-    """Points of a gprim, and the triangles between them, each with the face that it was cut from."""
-
-    points: NDArray[np.float64]
-    triangles: NDArray[np.int64]
-    """Corners of the triangles as indices into the face-vertex list, shape (F, 3)."""
-    corners: NDArray[np.int64]
-    """Index of the point at each entry of the face-vertex list."""
-    origin: NDArray[np.int64]
-    """Index of the face that each triangle is a part of, shape (F,)."""
-
-
-def _solid(gprim: UsdGeom.Gprim) -> Solid | None:
-    """A gprim in its own space; None for kinds without a surface (points, curves)."""
-    prim = gprim.GetPrim()
-    if prim.IsA(UsdGeom.Mesh):
-        try:
-            return mesh_solid(UsdGeom.Mesh(prim))
-        except InputError as error:
-            raise InputError(f"{prim.GetPath()}: {error}") from error
-    get = {name: prim.GetAttribute(name).Get() for name in ("radius", "height", "size", "width", "length")}
-    axis = prim.GetAttribute("axis").Get()
-    kind = prim.GetTypeName()
-    if kind == "Cube":
-        return _faces(*_box(get["size"]))
-    if kind == "Plane":
-        return _faces(*_plane(get["width"], get["length"], axis))
-    if kind == "Sphere":
-        return _faces(*_revolved(_arc(get["radius"], -90, 90), "Z"))
-    if kind in ("Cylinder", "Cone"):
-        r, h = get["radius"], get["height"] / 2
-        rim = [[r, -h], [r, h]] if kind == "Cylinder" else [[r, -h]]
-        return _faces(*_revolved(np.array([[0, -h], *rim, [0, h]]), axis))
-    if kind == "Capsule":
-        lift = np.array([0, get["height"] / 2])
-        halves = [_arc(get["radius"], -90, 0) - lift, _arc(get["radius"], 0, 90) + lift]
-        return _faces(*_revolved(np.vstack(halves), axis))
-    return None
-
-
-def mesh_solid(mesh: UsdGeom.Mesh) -> Solid:
-    """A mesh's polygons as fans of triangles, without holes.
-
-    Raises:
-        InputError: Its indices, counts and points do not fit together.
-    """
-    points = np.array(mesh.GetPointsAttr().Get() or np.empty((0, 3)), float)
-    counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [], int)
-    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [], int)
-    outside = len(corners) and not 0 <= corners.min() <= corners.max() < len(points)
-    if counts.sum() != len(corners) or outside:
-        raise InputError(
-            f"its {counts.sum()} corners, {len(corners)} indices and {len(points)} points do not fit together"
-            "; export the mesh again"
-        )
-    cuts = np.maximum(counts - 2, 0)
-    origin = np.repeat(np.arange(len(counts)), cuts)
-    first = np.repeat(np.cumsum(counts) - counts, cuts)
-    step = np.arange(len(origin)) - np.repeat(np.cumsum(cuts) - cuts, cuts)
-    triangles = np.column_stack([first, first + step + 1, first + step + 2])
-    if mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded:
-        triangles = triangles[:, ::-1]
-    kept = ~np.isin(origin, np.array(mesh.GetHoleIndicesAttr().Get() or [], int))
-    return Solid(points, triangles[kept], corners, origin[kept])
-
-
-def _faces(points: NDArray, triangles: NDArray) -> Solid:
-    """A solid made of triangles."""
-    index = np.arange(triangles.size).reshape(-1, 3)
-    return Solid(points, index, np.asarray(triangles, int).ravel(), np.arange(len(index)))
-
-
-def _box(size: float) -> tuple[NDArray, NDArray]:
-    corners = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3, indexing="ij"), -1).reshape(8, 3) * size
-    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-    return corners, np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-
-
-def _plane(width: float, length: float, axis: str) -> tuple[NDArray, NDArray]:
-    """A rectangle with the normal `axis`; width and length as in UsdGeomPlane."""
-    w, h = width / 2, length / 2
-    across = {"X": ([0, 0, w], [0, h, 0]), "Y": ([w, 0, 0], [0, 0, h]), "Z": ([w, 0, 0], [0, h, 0])}[axis]
-    u, v = np.array(across, float)
-    points = np.array([-u - v, u - v, u + v, v - u])
-    triangles = np.array([[0, 1, 2], [0, 2, 3]])
-    return points, triangles if np.cross(u, v)["XYZ".index(axis)] > 0 else triangles[:, ::-1]
-
-
-def _arc(radius: float, start_deg: float, end_deg: float) -> NDArray:
-    """Distance from the axis and height along it, of points on a circle, from below upwards."""
-    steps = round((end_deg - start_deg) / 180 * SEGMENTS / 2)
-    angle = np.radians(np.linspace(start_deg, end_deg, steps + 1))
-    return radius * np.column_stack([np.cos(angle), np.sin(angle)])
-
-
-def _revolved(profile: NDArray, axis: str) -> tuple[NDArray, NDArray]:
-    """The surface of revolution of a profile of (distance, height) that begins and ends on the axis."""
-    angle = 2 * np.pi * np.arange(SEGMENTS) / SEGMENTS
-    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(SEGMENTS)])
-    rings = [r * ring + [0, 0, z] for r, z in profile[1:-1]]
-    points = np.vstack([[[0, 0, profile[0][1]]], *rings, [[0, 0, profile[-1][1]]]])
-    here = np.arange(SEGMENTS)
-    there = (here + 1) % SEGMENTS
-    last = len(points) - 1
-    triangles = [np.column_stack([np.zeros_like(here), 1 + there, 1 + here])]
-    for k in range(len(rings) - 1):
-        a, b = 1 + k * SEGMENTS, 1 + (k + 1) * SEGMENTS
-        triangles += [np.column_stack([a + here, a + there, b + there])]
-        triangles += [np.column_stack([a + here, b + there, b + here])]
-    top = 1 + (len(rings) - 1) * SEGMENTS
-    triangles += [np.column_stack([top + here, top + there, np.full_like(here, last)])]
-    order = {"X": [2, 0, 1], "Y": [1, 2, 0], "Z": [0, 1, 2]}[axis]  # even permutations keep the winding
-    return points[:, order], np.vstack(triangles)
 
 
 def _shapes(gprim: UsdGeom.Gprim, solid: Solid, to_frame: NDArray, link: str) -> list[Shape]:

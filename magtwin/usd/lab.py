@@ -7,7 +7,7 @@ from magtwin.frames import quat_from_rpy
 from magtwin.spec.lab import LabSpec
 from magtwin.usd.attributes import read_spec, write_pose, write_spec
 from magtwin.usd.layers import WORLD
-from magtwin.usd.looks import define_box, define_looks, wear
+from magtwin.usd.looks import define_box, define_looks, define_visual, hide
 from magtwin.usd.schema import apply_api
 
 LAB = WORLD.AppendChild("Lab")
@@ -21,14 +21,27 @@ POST_WIDTH_M = 0.04
 """Width of the aluminium profile of the motion-capture frame."""
 
 CAMERA_SIZE_M = (0.07, 0.09, 0.09)
+LENS_SIZE_M = (0.064, 0.064, 0.02)
 LAMP_SIZE_M = (1.2, 0.3)
 LAMP_HEIGHT_M = 2.8
+
+SKY = 0.5
+"""Radiance of the sky. A white surface below it has this radiance, where 1 is the white of a picture without
+tone mapping."""
+
+LAMP = 8.0
+"""Intensity of a lamp: radiance times area [m2], `inputs:normalize`. Blender has pi times this, in watts."""
+
+KIT_EXPOSURE = 400.0
+"""Factor of Kit's camera (`rtx:post:tonemap:cm2Factor`). Its radiances are in cd/m2: with its default
+aperture, shutter and film, a white surface shows white at some 400 cd/m2."""
 
 
 def define_lab(stage: Usd.Stage, spec: LabSpec) -> Usd.Prim:
     """Author the room at /World/Lab and the physics scene at /World/PhysicsScene.
 
     The top of the floor is at z = 0, its centre at the world's origin. The walls stand outside the floor.
+    What carries robots is an infinite plane, because PhysX lets wheels sink into a large thin box.
 
     Args:
         stage: Written to in its edit target; metres, Z up.
@@ -45,11 +58,22 @@ def define_lab(stage: Usd.Stage, spec: LabSpec) -> Usd.Prim:
     x, y = spec.floor_m
     edge = 2 * (spec.wall_thickness_m + spec.apron_m)  # walls and posts stand on the slab too
     size = (x + edge, y + edge, FLOOR_THICKNESS_M)
-    define_box(stage, LAB.AppendChild("Floor"), (0, 0, -FLOOR_THICKNESS_M / 2), size, FLOOR, collides=True)
+    define_box(stage, LAB.AppendChild("Floor"), (0, 0, -FLOOR_THICKNESS_M / 2), size, FLOOR)
+    _define_ground(stage, size[:2])
     _define_walls(stage, spec)
     _define_frame(stage, spec)
     _define_lights(stage, spec)
     return lab
+
+
+def expose_for_kit(layer: Sdf.Layer) -> None:
+    """Adapt the exposure of programs on Omniverse Kit to the lights of a lab.
+
+    Kit reads these settings from the root layer only. Blender, usdview and others have no exposure in
+    cd/m2: there the lights suit as they are.
+    """
+    settings = {"rtx:post:tonemap:cm2Factor": KIT_EXPOSURE}
+    layer.customLayerData = {**layer.customLayerData, "renderSettings": settings}
 
 
 def read_lab(prim: Usd.Prim) -> LabSpec:
@@ -59,6 +83,18 @@ def read_lab(prim: Usd.Prim) -> LabSpec:
         InputError: The prim is no lab, or a value is out of range.
     """
     return read_spec(LabSpec, prim, "lab")
+
+
+def _define_ground(stage: Usd.Stage, size: tuple[float, float]) -> None:
+    """The collider of the floor, with the floor's size in viewers that show it [m]."""
+    plane = UsdGeom.Plane.Define(stage, LAB.AppendChild("Ground"))
+    plane.CreateAxisAttr(UsdGeom.Tokens.z)
+    plane.CreateWidthAttr(size[0])
+    plane.CreateLengthAttr(size[1])
+    half = Gf.Vec3f(size[0] / 2, size[1] / 2, 0)
+    plane.CreateExtentAttr(Vt.Vec3fArray([-half, half]))
+    UsdPhysics.CollisionAPI.Apply(plane.GetPrim())
+    hide(plane, FLOOR)
 
 
 def _define_walls(stage: Usd.Stage, spec: LabSpec) -> None:
@@ -105,27 +141,31 @@ def _camera(stage: Usd.Stage, path: Sdf.Path, post_top: np.ndarray) -> None:
     prim = UsdGeom.Xform.Define(stage, path).GetPrim()
     write_pose(prim, tuple(at), tuple(quat_from_rpy((0.0, pitch, yaw))))  # type: ignore[arg-type]
     define_box(stage, path.AppendChild("Body"), (0, 0, 0), CAMERA_SIZE_M, CAMERA)
-    lens = UsdGeom.Cylinder.Define(stage, path.AppendChild("Lens"))
-    radius, height = 0.032, 0.02
-    lens.CreateAxisAttr(UsdGeom.Tokens.x)
-    lens.CreateRadiusAttr(radius)
-    lens.CreateHeightAttr(height)
-    lens.CreateExtentAttr(Vt.Vec3fArray([(-height / 2, -radius, -radius), (height / 2, radius, radius)]))
-    lens.AddTranslateOp().Set(Gf.Vec3d((CAMERA_SIZE_M[0] + height) / 2, 0, 0))
-    wear(lens, LENS)
+    at_lens = ((CAMERA_SIZE_M[0] + LENS_SIZE_M[2]) / 2, 0.0, 0.0)
+    quarter = quat_from_rpy((0.0, np.pi / 2, 0.0))
+    define_visual(
+        stage,
+        path.AppendChild("Lens"),
+        "cylinder",
+        at_lens,
+        LENS_SIZE_M,
+        LENS,
+        q_xyzw=tuple(quarter.tolist()),
+    )
 
 
 def _define_lights(stage: Usd.Stage, spec: LabSpec) -> None:
     """An even sky, and four lamps in two rows above the floor."""
     root = UsdGeom.Xform.Define(stage, LAB.AppendChild("Lights")).GetPath()
     sky = UsdLux.DomeLight.Define(stage, root.AppendChild("Sky"))
-    sky.CreateIntensityAttr(350.0)
+    sky.CreateIntensityAttr(SKY)
     sky.CreateColorAttr(Gf.Vec3f(0.92, 0.96, 1.0))
     quarter = np.array(spec.floor_m) / 4
     for i, (sx, sy) in enumerate([(-1, -1), (-1, 1), (1, -1), (1, 1)]):
         lamp = UsdLux.RectLight.Define(stage, root.AppendChild(f"Lamp_{i}"))  # shines along -z
         lamp.CreateWidthAttr(LAMP_SIZE_M[0])
         lamp.CreateHeightAttr(LAMP_SIZE_M[1])
-        lamp.CreateIntensityAttr(4000.0)
+        lamp.CreateIntensityAttr(LAMP)
+        lamp.CreateNormalizeAttr(True)
         lamp.CreateColorAttr(Gf.Vec3f(1.0, 0.97, 0.92))
         lamp.AddTranslateOp().Set(Gf.Vec3d(sx * quarter[0], sy * quarter[1], LAMP_HEIGHT_M))

@@ -12,10 +12,10 @@ from magtwin.frames import IDENTITY_XYZW, canonical, quat_conjugate, quat_multip
 from magtwin.spec.base import ZERO3, Quat, Vec3
 from magtwin.spec.magnetics import SourceSpec
 from magtwin.usd.attributes import check_prim_name, plain_value, write_pose
-from magtwin.usd.geometry import mesh_solid
 from magtwin.usd.layers import WORLD
-from magtwin.usd.looks import define_looks, wear
+from magtwin.usd.looks import define_looks, define_visual, hide, visual_path, wear
 from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, require_api
+from magtwin.usd.solids import define_triangles, mesh_solid
 
 SOURCES = WORLD.AppendChild("Sources")
 LOOK = "Steel"
@@ -42,15 +42,18 @@ Transform = tuple[Vec3, Quat, Vec3]
 
 
 def define_source(
-    stage: Usd.Stage, parent: str | Sdf.Path, spec: SourceSpec, *, look: str = LOOK
+    stage: Usd.Stage, parent: str | Sdf.Path, spec: SourceSpec, *, look: str = LOOK, shown: bool = True
 ) -> Usd.Prim:
     """Author a magnetised thing as the child `spec.name` of a prim; its pose is in that prim's axes.
+
+    Its cube, cylinder or sphere is a guide with the exact shape; a mesh below `Visuals` shows it.
 
     Args:
         stage: Written to in its edit target.
         parent: A prim with materials under `Looks`.
         spec: What to author: an Xform for a point, otherwise a prim of the shape.
         look: Name of its material.
+        shown: Whether viewers show it.
 
     Raises:
         InputError: Its name cannot name a prim.
@@ -63,7 +66,16 @@ def define_source(
         figures = {"moment": spec.m_world}
     else:
         _define_shape(prim, spec)
-        wear(UsdGeom.Gprim(prim), path.GetParentPath().AppendChild(LOOKS).AppendChild(look))
+        material = path.GetParentPath().AppendChild(LOOKS).AppendChild(look)
+        if spec.shape == "mesh" and shown:
+            wear(UsdGeom.Gprim(prim), material)
+        else:
+            hide(UsdGeom.Gprim(prim), material)
+        if spec.shape != "mesh" and shown:
+            turn = _turn(spec)
+            define_visual(
+                stage, visual_path(path), spec.shape, spec.p_world, spec.size_m, material, q_xyzw=turn
+            )
     apply_api(prim, "source")
     for name, value in figures.items():
         prim.GetAttribute(attribute_name("source", name)).Set(value)
@@ -71,17 +83,28 @@ def define_source(
 
 
 def define_sources(stage: Usd.Stage, sources: tuple[SourceSpec, ...]) -> None:
-    """Author magnetised things under /World/Sources, which is at the origin."""
+    """Author magnetised things under /World/Sources, which is at the origin.
+
+    Those below the floor, z = 0, are guides: no one sees them, and they would enlarge the bounding box.
+    """
     UsdGeom.Xform.Define(stage, SOURCES)
     if any(source.shape != "point" for source in sources):
         define_looks(stage, SOURCES.AppendChild(LOOKS), [LOOK])
     for source in sources:
-        define_source(stage, SOURCES, source)
+        define_source(stage, SOURCES, source, shown=top_of(source) > 0)
+
+
+def top_of(spec: SourceSpec) -> float:
+    """Height of the top of a source, or of the box around it [m]."""
+    corners = np.array(spec.vertices_m or [spec.size_m]) * (1 if spec.vertices_m else 0.5)
+    up = rotate(quat_conjugate(spec.q_world_xyzw), (0.0, 0.0, 1.0))
+    heights = corners @ up if spec.vertices_m else np.abs(corners) @ np.abs(up)
+    return float(spec.p_world[2] + heights.max())
 
 
 def _define_shape(prim: Usd.Prim, spec: SourceSpec) -> None:
     """A body's geometry; a box is a scaled cube."""
-    write_pose(prim, spec.p_world, None if spec.q_world_xyzw == IDENTITY_XYZW else spec.q_world_xyzw)
+    write_pose(prim, spec.p_world, _turn(spec))
     x, y, z = spec.size_m
     half = Gf.Vec3f(x / 2, y / 2, z / 2)
     extent = [-half, half]
@@ -101,15 +124,9 @@ def _define_shape(prim: Usd.Prim, spec: SourceSpec) -> None:
     UsdGeom.Gprim(prim).CreateExtentAttr(Vt.Vec3fArray(extent))
 
 
-def define_triangles(mesh: UsdGeom.Mesh, vertices_m: Any, faces: Any) -> None:
-    """A mesh's geometry: vertices [m], shape (V, 3), in single precision, and triangles, shape (F, 3)."""
-    points = np.array(vertices_m, np.float32)
-    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray([3] * len(faces)))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.array(faces, np.int32).ravel()))
-    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    extent = [Gf.Vec3f(*map(float, corner)) for corner in (points.min(axis=0), points.max(axis=0))]
-    mesh.CreateExtentAttr(Vt.Vec3fArray(extent))
+def _turn(spec: SourceSpec) -> Quat | None:
+    """Orientation of a source; None if it is not turned."""
+    return None if spec.q_world_xyzw == IDENTITY_XYZW else spec.q_world_xyzw
 
 
 def source_prims(stage: Usd.Stage) -> list[Usd.Prim]:

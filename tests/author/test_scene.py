@@ -260,7 +260,7 @@ def test_one_scene_gives_the_same_bytes_every_time(parts, tmp_path):
     for name in "ab":
         author_scene(full_scene(parts), tmp_path / name)
     files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*") if p.is_file())
-    assert len(files) == 6
+    assert len(files) == 7
     for file in files:
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
 
@@ -268,7 +268,7 @@ def test_one_scene_gives_the_same_bytes_every_time(parts, tmp_path):
 def test_the_root_layer_is_short_text_with_units_axes_and_relative_paths(parts, tmp_path):
     root = author_scene(full_scene(parts), tmp_path / "s")
     text = root.read_text()
-    assert len(text.splitlines()) < 60
+    assert len(text.splitlines()) < 65
     stage = Usd.Stage.Open(str(root))
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1
     assert UsdPhysics.GetStageKilogramsPerUnit(stage) == 1
@@ -310,9 +310,9 @@ def lab_stage(spec: LabSpec) -> Usd.Stage:
 
 
 def box_of(stage: Usd.Stage, path: Sdf.Path) -> Gf.Range3d:
-    return (
-        UsdGeom.BBoxCache(0, ["default"]).ComputeWorldBound(stage.GetPrimAtPath(path)).ComputeAlignedRange()
-    )
+    """The box around a prim, shown or a collider."""
+    cache = UsdGeom.BBoxCache(0, ["default", "guide"])
+    return cache.ComputeWorldBound(stage.GetPrimAtPath(path)).ComputeAlignedRange()
 
 
 def test_the_floor_ends_at_zero_and_the_walls_stand_just_outside_of_it():
@@ -353,11 +353,21 @@ def test_everything_in_the_lab_wears_a_material_and_floor_walls_and_posts_collid
     for prim in gprims:
         assert UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0], prim
     solid = {p.GetName() for p in gprims if p.HasAPI(UsdPhysics.CollisionAPI)}
-    assert {"Floor", "North", "South", "East", "West", "Post_0"} <= solid
-    material, _ = UsdShade.MaterialBindingAPI(
-        stage.GetPrimAtPath(LAB.AppendChild("Floor"))
-    ).ComputeBoundMaterial("physics")
-    assert UsdPhysics.MaterialAPI(material.GetPrim()).GetStaticFrictionAttr().Get() == pytest.approx(0.05)
+    assert {"Ground", "North", "South", "East", "West", "Post_0"} <= solid
+    ground = stage.GetPrimAtPath(LAB.AppendChild("Ground"))
+    material, _ = UsdShade.MaterialBindingAPI(ground).ComputeBoundMaterial("physics")
+    assert UsdPhysics.MaterialAPI(material.GetPrim()).GetStaticFrictionAttr().Get() == pytest.approx(0.8)
+
+
+def test_what_carries_the_robots_is_a_plane_at_the_top_of_the_floor_and_adds_nothing_to_the_bounds():
+    stage = lab_stage(LabSpec())  # PhysX lets wheels sink into a large thin box
+    ground = UsdGeom.Plane(stage.GetPrimAtPath(LAB.AppendChild("Ground")))
+    assert ground.GetAxisAttr().Get() == "Z"
+    assert ground.ComputeLocalToWorldTransform(0) == Gf.Matrix4d(1)
+    assert ground.ComputePurpose() == "guide"
+    floor = box_of(stage, LAB.AppendChild("Floor"))
+    assert (ground.GetWidthAttr().Get(), ground.GetLengthAttr().Get()) == pytest.approx(floor.GetSize()[:2])
+    assert not stage.GetPrimAtPath(LAB.AppendChild("Floor")).HasAPI(UsdPhysics.CollisionAPI)
 
 
 def test_the_lab_has_gravity_and_light():
@@ -372,7 +382,12 @@ def test_the_lab_has_gravity_and_light():
 def test_a_lab_without_walls_and_posts_has_none():
     spec = LabSpec(wall_height_m=0.0, post_height_m=0.0)
     stage = lab_stage(spec)
-    assert {p.GetName() for p in stage.GetPrimAtPath(LAB).GetChildren()} == {"Looks", "Floor", "Lights"}
+    assert {p.GetName() for p in stage.GetPrimAtPath(LAB).GetChildren()} == {
+        "Looks",
+        "Floor",
+        "Ground",
+        "Lights",
+    }
     assert read_lab(stage.GetPrimAtPath(LAB)) == spec
 
 
@@ -613,7 +628,8 @@ def build_lab(folder: Path) -> Path:
 
 def without_ways(layer: Path) -> str:
     """A layer's text, each relative path without the way up to where the project's folders part."""
-    return re.sub(r"@(\.\./)[^@]*?((maps|robots|weights)/[^@]*)@", r"@\2@", layer.read_text())
+    text = Sdf.Layer.OpenAsAnonymous(str(layer)).ExportToString()
+    return re.sub(r"@(\.\./)[^@]*?((maps|robots|weights)/[^@]*)@", r"@\2@", text)
 
 
 def test_the_labs_stage_is_what_a_fresh_build_gives(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,11 +14,12 @@ import numpy as np
 import pytest
 
 from magtwin.bench import runner
-from magtwin.bench.results import read_results
-from magtwin.bench.runner import benchmark
+from magtwin.bench.results import begin_results, check_about, read_results
+from magtwin.bench.runner import about, benchmark
 from magtwin.bench.suite import load_suite
 from magtwin.cli import main
 from magtwin.errors import InputError
+from magtwin.files import shipped
 from magtwin.parallel import open_pool
 
 SUITE = """
@@ -302,6 +304,31 @@ def test_results_of_another_version_of_magtwin_are_refused(suite, whole, tmp_pat
     monkeypatch.setattr(runner, "__version__", "9.9")
     with pytest.raises(InputError, match=r"another version of magtwin \(.*, not 9\.9\)"):
         benchmark(suite, whole)
+
+
+def test_results_on_other_inputs_are_refused(suite, tmp_path):
+    shutil.copytree(shipped("scenes", "lab"), tmp_path / "room")
+    points = tmp_path / "way.csv"
+    points.write_text("x,y\n0,0\n1,0\n1,1\n")
+    file = tmp_path / "own.toml"
+    text = suite.read_text().replace(
+        'name = "exact"', 'name = "exact"\nscene = "room/lab.usda"\npaths = ["way.csv"]'
+    )
+    file.write_text(text)
+    inputs = about(load_suite(file), load_suite(file))["data"]
+    assert inputs.keys() == {"scene room/lab.usda", "path way.csv"}
+    assert about(load_suite(suite), load_suite(suite))["data"] == {}
+    results_folder = tmp_path / "results"
+    begin_results(results_folder, file.read_bytes(), about(load_suite(file), load_suite(file)))
+    for changed, named in (
+        (points, "path way.csv"),
+        (tmp_path / "room" / "room.usda", "scene room/lab.usda"),
+    ):
+        before = changed.read_bytes()
+        changed.write_bytes(before + b"\n")
+        with pytest.raises(InputError, match=f"another content of '{named}'"):
+            check_about(results_folder, about(load_suite(file), load_suite(file)))
+        changed.write_bytes(before)
 
 
 def test_force_replaces_results(warm, suite, tmp_path):

@@ -11,9 +11,13 @@ import pytest
 import magtwin as mt
 from magtwin.cli import main
 from magtwin.errors import InputError, MismatchWarning
+from magtwin.files import shipped
+from magtwin.learn.data.labels import labelled
+from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.localization.problem import Prior
-from magtwin.localization.scores import Scores
-from magtwin.localizing import Localization, localization, prior_of, thinned, verdict_of
+from magtwin.localization.readings import onboard
+from magtwin.localization.scores import Scores, verdict_of
+from magtwin.localizing import Localization, localization, prior_of, thinned
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +102,55 @@ def test_without_a_true_pose_it_estimates_and_gives_no_verdict(here: Path) -> No
     assert not (here / "bare" / "truth.tum").exists()
     result = localization("bare.parquet", "lab", method="odometry", prior="0,0,0.8")
     assert result.report().verdict == "No verdict: the run has no true pose to compare with."
+
+
+def test_motion_capture_with_gaps_is_what_errors_count_against(here: Path) -> None:
+    whole = mt.load_run("run.parquet")
+    onboard = whole.select("t", "b_measured_nt", "odom_p", "odom_q_xyzw")
+    lost = (whole["t"] > 10) & (whole["t"] < 10.5)
+    p = np.where(lost[:, None], 99.0, whole["p_world_base"])  # the last pose is held: anything
+    captured = onboard.with_columns(mocap_p=p, mocap_q_xyzw=whole["q_world_base_xyzw"], flag_pose_lost=lost)
+    exact, result = (localization(each, "lab", method="ekf", prior="tracking") for each in (whole, captured))
+    np.testing.assert_allclose(result.track.pose, exact.track.pose)
+    known = ~result.run["flag_pose_lost"]
+    off = np.hypot(*(exact.track.pose - exact.truth)[known, :2].T)
+    assert 0 < np.count_nonzero(~known) < 5
+    assert result.scores.rmse_m == pytest.approx(np.sqrt(np.mean(off**2)))
+    assert result.scores.bound_m["correlated"] == pytest.approx(exact.scores.bound_m["correlated"], rel=0.05)
+    said = result.report().metadata["errors"]
+    assert said == f"differences from the pose of motion capture (mocap_p), known at {known.sum()} of them"
+    assert exact.report().metadata["errors"] == "differences from the true pose"
+    away = captured.with_columns(flag_pose_lost=whole["t"] < 5)
+    assert localization(away, "lab", method="odometry", prior="0,0,0.8").bounds is None
+    with pytest.raises(InputError, match="no true pose at its first reading"):
+        localization(away, "lab", method="odometry")
+
+
+def test_a_network_predicts_the_own_field_at_the_poses_of_a_first_pass(here: Path) -> None:
+    weights = str(shipped("weights", "turtlebot4_hybrid.safetensors"))
+    run = thinned(mt.load_run("run.parquet"), 5.0)
+    plain, result = (
+        localization(run, "lab", method=method, compensator=how)
+        for method, how in (("rbpf-iron", "none"), ("rbpf-network", weights))
+    )
+    at = onboard(run).with_columns(
+        p_world_base=np.pad(plain.track.pose[:, :2], ((0, 0), (0, 1))), yaw=plain.track.pose[:, 2]
+    )
+    (peer,) = NeuralMagnetometer.load(weights).read([labelled(at, plain.problem.belief)], outside=False)
+    known = np.isfinite(peer.disturbance_nt)
+    assert known.mean() > 0.9
+    np.testing.assert_allclose(
+        result.run["disturbance_nt"][known],
+        peer.disturbance_nt[known],
+        atol=1e-3 * np.ptp(peer.disturbance_nt),
+    )
+    paper = str(shipped("weights", "turtlebot4_paper.safetensors"))
+    with pytest.raises(InputError, match="the network reads battery_fraction, which a localizer is not told"):
+        localization(
+            run.select(*(set(run) - {"battery_fraction"})), "lab", method="rbpf-network", compensator=paper
+        )
+    with pytest.raises(InputError, match="so it needs a map"):
+        localization(run, None, method="rbpf-network", compensator=weights)
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from looking import assert_lit, assert_looks_alike, assert_within_room
 from numpy.testing import assert_allclose
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils, UsdValidation
 from validators import assert_valid
@@ -31,6 +32,8 @@ from magtwin.files import sha256, shipped
 from magtwin.run.run import Run
 from magtwin.usd.animation import read_animation
 from magtwin.usd.geometry import read_shapes
+from magtwin.usd.lab import LAB as LAB_PRIM
+from magtwin.usd.lab import read_lab
 from magtwin.usd.maps import load_map, save_map
 from magtwin.usd.scene import read_scene
 
@@ -245,6 +248,15 @@ def test_exports_pass_the_validators_of_openusd(what, request):
     stage = Usd.Stage.Open(str(out if out.is_file() else out / "lab.usda"))
     findings = UsdValidation.ValidationContext(validators).Validate(stage)
     assert not findings, "\n".join(f"{e.GetName()}: {e.GetMessage()}" for e in findings)
+
+
+@pytest.mark.parametrize("what", ["folder", "package", "isaac"])
+def test_an_export_shows_meshes_with_materials_lit_within_the_room(what, request):
+    out = request.getfixturevalue(what)
+    stage = assert_looks_alike(out if out.is_file() else out / "lab.usda")
+    assert_lit(stage)
+    if what != "package":  # its run has other times than the default one, at which boxes are taken
+        assert_within_room(stage, read_lab(stage.GetPrimAtPath(LAB_PRIM)), top_m=3.0)
 
 
 @pytest.mark.parametrize("what", ["folder", "package", "isaac"])
@@ -567,3 +579,4 @@ def test_the_aprilab_lab_exports_for_every_profile_with_the_licence_of_its_map(
         prim = stage.GetPrimAtPath("/World/AnomalyMap")
         assert prim.GetAttribute("magtwin:anomalyMap:licence").Get() == "MIT"
         assert stage.GetPrimAtPath(MAGNETOMETER)
+        assert_lit(assert_looks_alike(made.root))

@@ -228,7 +228,8 @@ def test_prims_that_nodes_name_are_what_isaac_looks_for(authored):
     assert imu.GetTypeName() == "IsaacImuSensor"
     assert imu.GetParent().GetParent().HasAPI(UsdPhysics.RigidBodyAPI)
     assert lidar.GetTypeName() == "OmniLidar"
-    names = [joint.GetName() for joint in target("wheels", "targetPrim").GetChild("joints").GetChildren()]
+    robot = target("wheels", "targetPrim").GetParent()
+    names = [joint.GetName() for joint in robot.GetChild("joints").GetChildren()]
     assert set(graph.GetChild("wheels").GetAttribute("inputs:jointNames").Get()) <= set(names)
 
 

@@ -198,6 +198,11 @@ BROKEN = {
         "1 emitters and 2",
         "error",
     ),
+    "shown-meshes": (
+        over("Furniture/desk_0/Visuals/top", "double3 xformOp:translate = (0, 0.5, 0.726)"),
+        "is shown 0.5 m from /World/Furniture/desk_0/top",
+        "error",
+    ),
     "physics-scene": ('def PhysicsScene "Second" {}\n', "has 2 physics scenes", "error"),
     "materials": ('def Sphere "Bare" {}\n', "wears no material", "warning"),
     "action-graph": (

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from magtwin.bench.draws import chained, moves
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.localization.problem import OdometryModel, Prior, Problem, Reading, SensorModel
 
@@ -42,24 +43,6 @@ def circle(count, *, speed=0.25, dt=0.2, radius=1.2, start=0.0):
     x, y = 1.5 * radius * np.cos(u), radius * np.sin(u)
     yaw = np.unwrap(np.arctan2(radius * np.cos(u), -1.5 * radius * np.sin(u)))
     return np.column_stack([x, y, yaw])
-
-
-def moves(pose):
-    turn = np.diff(pose[:, 2])
-    middle = pose[:-1, 2] + turn / 2
-    dx, dy = np.diff(pose[:, 0]), np.diff(pose[:, 1])
-    c, s = np.cos(middle), np.sin(middle)
-    return np.column_stack([dx * c + dy * s, dy * c - dx * s, turn])
-
-
-def chained(steps, first=(0.0, 0.0, 0.0)):
-    out = [np.array(first, float)]
-    for forward, left, turn in steps:
-        x, y, yaw = out[-1]
-        middle = yaw + turn / 2
-        c, s = math.cos(middle), math.sin(middle)
-        out.append(np.array([x + forward * c - left * s, y + forward * s + left * c, yaw + turn]))
-    return np.array(out)
 
 
 def drive(field, pose, seed=0, *, sensor=None, odometry=None, prior_sd=(0.1, 0.1, 0.05), belief=None, dt=0.2):

@@ -9,14 +9,14 @@ import pytest
 from drives import EXTENT, circle, drive, estimates, flat_map, poses, rough_map, squared_errors
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numba import njit
+from numba import njit, vectorize
 from numpy.testing import assert_allclose, assert_array_equal
 from plain_particles import PlainFilter
 from scipy import stats
 
 from magtwin import compiled
 from magtwin.errors import InputError
-from magtwin.localization import particle_loops as loops
+from magtwin.localization import elementary
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.particles import Bootstrap, RaoBlackwell, RaoBlackwellIron, RaoBlackwellNetwork
 from magtwin.localization.problem import OdometryModel, Prior, Problem, Reading, SensorModel
@@ -27,14 +27,14 @@ UNKNOWN = (math.inf, math.inf, math.inf)
 
 
 def test_draws_are_standard_normal_and_independent():
-    draw, n = njit(loops.normals), 512 * loops.BLOCK
-    a, b = np.empty(n), np.empty(n)
-    w = np.empty((3, loops.BLOCK), np.uint64)
-    floats = w.view(float)
-    for start in range(0, n, loops.BLOCK):
-        part = slice(start, start + loops.BLOCK)
-        bits = a[part].view(np.uint64)
-        draw(np.uint64(7), start, 0, a[part], b[part], *w, *floats, bits)
+    @njit
+    def draws(count):
+        start, out = elementary.stream(np.uint64(7), 0), np.empty((2, count))
+        for n in range(count):
+            out[0, n], out[1, n] = elementary.normals(start, np.uint64(n))
+        return out
+
+    a, b = draws(1 << 17)
     both = np.concatenate([a, b])
     assert stats.kstest(both, "norm").pvalue > 0.01
     for x, y in ((a, b), (a[1:], a[:-1]), (a**2, b**2)):
@@ -42,18 +42,17 @@ def test_draws_are_standard_normal_and_independent():
 
 
 def test_vector_functions_agree_with_numpy():
+    @njit
+    def cosine_sine(angle):
+        return elementary.cosine_sine(elementary.centred(angle))
+
     x = np.concatenate([np.linspace(-60, 60, 20_001), [0.0, math.pi, -math.pi / 2]])
-    c, s = np.empty_like(x), np.empty_like(x)
-    njit(loops.cosines_sines)(x, c, s)
-    assert_allclose([c, s], [np.cos(x), np.sin(x)], atol=2e-14)
+    pairs = np.array([cosine_sine(a) for a in x.tolist()])
+    assert_allclose(pairs.T, [np.cos(x), np.sin(x)], atol=2e-14)
     u = np.concatenate([np.geomspace(1e-300, 1e300, 10_001), np.linspace(0.4, 3, 10_001)])
-    out, w = u.copy(), np.empty((2, len(u)), np.uint64)
-    njit(loops.logarithms)(out, out.view(np.uint64), *w, *w.view(float))
-    assert_allclose(out, np.log(u), rtol=1e-13, atol=1e-14)
+    assert_allclose(vectorize(elementary.logarithm)(u), np.log(u), rtol=1e-13, atol=1e-14)
     v = np.concatenate([np.linspace(-690, 0, 10_001), [-800.0, -np.inf]])
-    whole = np.empty_like(v)
-    njit(loops.exponentials)(v, whole, whole.view(np.uint64), out := np.empty_like(v))
-    assert_allclose(out, np.exp(np.where(v < -700, -np.inf, v)), rtol=1e-13)
+    assert_allclose(vectorize(elementary.exponential)(v), np.exp(np.where(v < -700, -np.inf, v)), rtol=1e-13)
 
 
 @pytest.mark.parametrize(
@@ -233,6 +232,22 @@ def test_a_kidnapped_robot_is_found_and_others_are_not_looked_for():
     stubborn = RaoBlackwellIron(resets=False)
     estimates(stubborn, problem, readings[:100] + [joined(r) for r in others[100:]])
     assert stubborn.reset_count == 0
+
+
+@pytest.mark.parametrize("start", [1.0, 2.5, 4.0, 5.0])
+def test_after_readings_of_another_place_odometry_leads_back_to_the_pose(start):
+    pose, away = circle(240), range(100, 135)  # the map is wrong there: the robot goes on
+    problem, readings = drive(FIELD, pose, 12)
+    _, others = drive(FIELD, circle(240, start=start), 12)
+    mixed = [replace(r, b_nt=others[k].b_nt) if k in away else r for k, r in enumerate(readings)]
+    fast = RaoBlackwellIron()
+    made = estimates(fast, problem, mixed)
+    error = np.hypot(*(poses(made)[:, :2] - pose[:, :2]).T)
+    lost = np.array([e.lost for e in made])
+    assert fast.reset_count >= 1
+    assert error[-25:].max() < 0.25
+    assert np.count_nonzero(~lost & (error > 0.5)) < 25  # 5 s
+    assert lost[np.argmax(lost) :][:25].all()  # for 5 s at least
 
 
 @settings(max_examples=8)

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from looking import assert_looks_alike
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics
 from validators import assert_valid
@@ -13,9 +14,9 @@ from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.urdf import convert_urdf, read_notes
 from magtwin.urdf.description.description import read_description
-from magtwin.urdf.meshes.mesh import corner_normals
 from magtwin.urdf.physics.inertia import principal_axes, quaternion
 from magtwin.usd.geometry import read_links, read_shapes
+from magtwin.usd.solids import corner_normals
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
 BALL = '<geometry><sphere radius="0.1"/></geometry>'
@@ -97,7 +98,7 @@ def test_a_prismatic_joint_keeps_its_limits_in_metres(tmp_path):
 def test_both_frames_of_a_joint_meet_and_its_axis_is_the_urdfs(tmp_path_factory, axis, xyz, rpy):
     tmp_path = tmp_path_factory.mktemp("joint")
     words = [" ".join(f"{v:.9f}" for v in vector) for vector in (axis, xyz, rpy)]
-    stage, robot = convert(
+    stage, _ = convert(
         arm(tmp_path, f'continuous|<axis xyz="{words[0]}"/><origin xyz="{words[1]}" rpy="{words[2]}"/>')
     )
     links = read_links(stage)
@@ -111,7 +112,7 @@ def test_both_frames_of_a_joint_meet_and_its_axis_is_the_urdfs(tmp_path_factory,
         [*joint.GetLocalRot1Attr().Get().imaginary, joint.GetLocalRot1Attr().Get().real]
     )
     assert_allclose(first, turned @ second, atol=1e-6)  # single precision quaternions
-    assert robot.HasAPI(UsdPhysics.ArticulationRootAPI)
+    assert stage.GetPrimAtPath(joint.GetBody0Rel().GetTargets()[0]).HasAPI(UsdPhysics.ArticulationRootAPI)
 
 
 def test_the_base_floats_and_nothing_is_bolted_to_the_world(tmp_path):
@@ -120,9 +121,10 @@ def test_the_base_floats_and_nothing_is_bolted_to_the_world(tmp_path):
         if prim.IsA(UsdPhysics.Joint):
             joint = UsdPhysics.Joint(prim)
             assert len(joint.GetBody0Rel().GetTargets()) == len(joint.GetBody1Rel().GetTargets()) == 1
-    roots = [p for p in stage.Traverse() if p.HasAPI(UsdPhysics.ArticulationRootAPI)]
-    assert roots == [robot]
-    assert robot.GetAttribute("newton:selfCollisionEnabled").Get() is False
+    (root,) = [p for p in stage.Traverse() if p.HasAPI(UsdPhysics.ArticulationRootAPI)]
+    assert root.HasAPI(UsdPhysics.RigidBodyAPI)
+    assert root == robot.GetChildren()[0]
+    assert root.GetAttribute("newton:selfCollisionEnabled").Get() is False
 
 
 def test_links_that_only_name_a_place_become_sites_on_the_body_they_ride_on(tmp_path):
@@ -385,6 +387,10 @@ def primitive_box(geometry):
     else:
         half = np.full(3, geometry.radius)
     return np.stack([-half, half])
+
+
+def test_the_real_robot_shows_meshes_with_materials_and_hides_its_colliders(real_robot):
+    assert_looks_alike(real_robot[1])
 
 
 def test_the_mass_of_the_real_robot_is_its_urdfs_and_nothing_is_silent(real_robot):

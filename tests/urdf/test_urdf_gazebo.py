@@ -84,7 +84,7 @@ def test_a_number_may_be_in_the_attribute_value(tmp_path):
     collider = robot.GetPrimAtPath("left_wheel/collisions").GetChildren()[0]
     grip = UsdShade.MaterialBindingAPI(collider).ComputeBoundMaterial("physics")[0].GetPrim()
     assert_allclose(grip.GetAttribute("physics:staticFriction").Get(), 0.7, rtol=1e-6)
-    assert robot.GetAttribute("newton:selfCollisionEnabled").Get() is True
+    assert robot.GetPrimAtPath("base_link").GetAttribute("newton:selfCollisionEnabled").Get() is True
     assert not report.unknown_tags
 
 
@@ -103,8 +103,10 @@ def test_friction_that_differs_across_is_a_loss(tmp_path):
 
 def test_one_link_that_collides_with_its_robot_switches_all_on(tmp_path):
     _stage, robot, _ = cart(tmp_path, on("base_link", "<selfCollide>true</selfCollide>"))
-    assert robot.GetAttribute("newton:selfCollisionEnabled").Get() is True
-    assert robot.GetAttribute("physxArticulation:enabledSelfCollisions").Get() is True
+    assert robot.GetPrimAtPath("base_link").GetAttribute("newton:selfCollisionEnabled").Get() is True
+    assert (
+        robot.GetPrimAtPath("base_link").GetAttribute("physxArticulation:enabledSelfCollisions").Get() is True
+    )
 
 
 def test_a_link_without_gravity_floats_in_physx(tmp_path):

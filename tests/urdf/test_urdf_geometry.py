@@ -655,14 +655,16 @@ def test_smooth_normals_of_a_file_survive_although_its_faces_would_be_flat(tmp_p
     assert_allclose(normals, corners / np.linalg.norm(corners, axis=-1, keepdims=True), atol=1e-4)
 
 
-def test_visuals_of_one_mesh_are_instances_of_one_prototype(tmp_path):
+def test_visuals_of_one_mesh_share_its_arrays_and_none_is_an_instance(tmp_path):
     trimesh.creation.icosphere().export(tmp_path / "ball.stl")
     look = '<material name="{}"><color rgba="{} 0 0 1"/></material>'
     body = visual("ball.stl", look.format("a", 1)) + visual("ball.stl", look.format("b", 0.5))
     stage = robot(tmp_path, body + visual("ball.stl", scale="2 2 2"))
-    instances = [p for p in stage.Traverse() if p.IsInstance()]
-    assert len(instances) == 3
-    assert instances[0].GetPrototype() == instances[1].GetPrototype() != instances[2].GetPrototype()
+    meshes = meshes_of(stage)
+    sources = [m.GetPointsAttr().GetPropertyStack()[-1].path for m in meshes]
+    assert len(sources) == 3
+    assert sources[0] == sources[1] != sources[2]
+    assert not any(m.GetPrim().IsInstanceProxy() for m in meshes)  # Blender drops looks bound above
     assert_allclose([s.colour[0] for s in read_shapes(stage)], [1, 0.21404, 0.21404], atol=1e-4)
     layer = Usd.Stage.Open(str(tmp_path / "out/payloads/geometries.usdc"))
     assert len([p for p in layer.Traverse() if p.IsA(UsdGeom.Mesh)]) == 2
@@ -763,9 +765,8 @@ def test_a_urdf_texture_lies_on_a_mesh_with_coordinates_and_gives_others_its_mea
     (tmp_path / "bare.obj").write_text(SQUARES.replace("mtllib paint.mtl\n", "").replace("usemtl", "#"))
     box = f'<visual><geometry><box size="1 1 1"/></geometry>{SKIN.format("t.png")}</visual>'
     stage = robot(tmp_path, visual("bare.obj", SKIN.format("t.png")) + box)
-    (mesh,) = meshes_of(stage)
+    mesh, cube = meshes_of(stage)
     assert surface_of(mesh).GetInput("diffuseColor").HasConnectedSource()
-    cube = next(p for p in stage.Traverse() if p.IsA(UsdGeom.Cube))
     assert_allclose(
         surface_of(cube).GetInput("diffuseColor").Get(), linear_from_srgb([0.5, 0, 0.5]), atol=0.01
     )

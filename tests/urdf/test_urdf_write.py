@@ -225,7 +225,7 @@ def _off(stage):
 
 
 def _no_robot(stage):
-    stage.GetPrimAtPath("/two").RemoveAPI(UsdPhysics.ArticulationRootAPI)
+    stage.GetPrimAtPath("/two/base_link").RemoveAPI(UsdPhysics.ArticulationRootAPI)
 
 
 @pytest.mark.parametrize(

@@ -21,8 +21,6 @@ builder = newton.ModelBuilder()
 newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
 builder.add_usd(stage, load_visual_shapes=False, load_static_visual_shapes=False)
 wheels = [builder.joint_qd_start[builder.joint_label.index(str(path))] for path in lap.joints]
-for dof in wheels:  # inertia of the motors; without it stiff drives answer in one step and throw the robot
-    builder.joint_armature[dof] = max(builder.joint_armature[dof], 0.002)
 base = builder.body_label.index(str(lap.base))
 free = builder.joint_q_start[builder.joint_child.index(base)]  # of its joint: x, y, z, and a quaternion
 model = builder.finalize(device="cpu")

@@ -34,6 +34,9 @@ class Inspection:
     bodies: int = 0
     """Number of rigid bodies."""
 
+    driven: dict[str, Any] = field(default_factory=dict)
+    """What `physx_robots.driven_table` found; empty if "physx" was not asked for."""
+
     mended: tuple[str, ...] = ()
 
 
@@ -50,7 +53,7 @@ def inspect(
 
     Args:
         file: The file that the user named.
-        against: Some of "core", "isaac" and "magtwin".
+        against: Some of "core", "isaac", "magtwin" and "physx".
         root: Root layer of an unpacked .usdz. Default: the file itself.
         home: Folder of the unpacked .usdz.
         inputs: Names of the inputs that a network may have.
@@ -94,6 +97,7 @@ def inspect(
         tuple(check_from(check) for check in result["checks"]),
         {prim: None if asset is None else Path(asset) for prim, asset in result["robots"].items()},
         result["bodies"],
+        result["driven"],
         tuple(result["mended"]),
     )
 
@@ -114,6 +118,7 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
     from magtwin.export.validation.fix import mend
 
     importlib.import_module("magtwin.export.validation.isaac_rules")  # fills RULES
+    from magtwin.export.validation.physx_robots import driven_table
     from magtwin.export.validation.rule import RULES, TITLES, Subject
     from magtwin.export.validation.rules import robot_assets
 
@@ -144,6 +149,7 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
                 found += lost if name == "magtwin" else []
                 checks.append(Check(TITLES[name], tuple(found), scope=f"{len(rules)} rules"))
         assets = robot_assets(subject)
+        driven = driven_table(stage) if "physx" in job["against"] else {}
         bodies = sum(prim.HasAPI(UsdPhysics.RigidBodyAPI) for prim in subject.prims)
     except (Tf.ErrorException, UnicodeError, MemoryError) as error:
         raise InputError(f"{file}: cannot be opened as USD; it is damaged, cut short, or not USD") from error
@@ -153,6 +159,7 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
         "checks": [asdict(check) for check in checks],
         "robots": {prim: None if asset is None else str(asset) for prim, asset in assets.items()},
         "bodies": bodies,
+        "driven": driven,
         "mended": mended,
     }
 

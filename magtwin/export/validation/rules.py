@@ -25,6 +25,7 @@ from magtwin.usd.furniture import read_magnets
 from magtwin.usd.heat_map import HEAT_MAP, heading_variants
 from magtwin.usd.lab import read_lab
 from magtwin.usd.layers import layer_sha256
+from magtwin.usd.looks import VISUALS
 from magtwin.usd.maps import checksums, read_map
 from magtwin.usd.obstacles import read_obstacles
 from magtwin.usd.placement import UPRIGHT, labs_on, pose_of
@@ -51,6 +52,9 @@ NEEDED = ("values", "valid", "shape", "origin", "cell_size", "headings", "unit",
 
 SAME_M = 1e-6
 """Single precision at 10 m [m]: what two places that ought to be one may be apart."""
+
+OFF_M = 1e-3
+"""Largest distance between a mesh and what it shows [m]."""
 
 
 @rule("magtwin", "make the path relative to the layer; --fix does this if the file exists")
@@ -388,6 +392,25 @@ def sensor_types(subject: Subject) -> Iterator[Wrong]:
             if wrong:
                 text = f"ranges to {wanted:g} m, its {LIDAR_TYPE} has {name} {seen}"
                 yield Wrong(text, str(prim.GetPath()))
+
+
+@rule("magtwin", "move the piece of furniture or the room as a whole, or both prims alike")
+def shown_meshes(subject: Subject) -> Iterator[Wrong]:
+    """A mesh below `Visuals` stands where the collider or source that it shows is."""
+    boxes = UsdGeom.BBoxCache(Usd.TimeCode.Default(), [UsdGeom.Tokens.default_, UsdGeom.Tokens.guide])
+    for prim in subject.prims:
+        if prim.GetParent().GetName() != VISUALS:
+            continue
+        body = prim.GetParent().GetParent().GetChild(prim.GetName())
+        if not body:
+            continue
+        here, there = (boxes.ComputeWorldBound(p).ComputeAlignedRange() for p in (prim, body))
+        off = max(
+            (a - b).GetLength() for a, b in ((here.GetMin(), there.GetMin()), (here.GetMax(), there.GetMax()))
+        )
+        if off > OFF_M:
+            text = f"is shown {off:.3g} m from {body.GetPath()}, which readings and collisions follow"
+            yield Wrong(text, str(prim.GetPath()))
 
 
 def robot_assets(subject: Subject) -> dict[str, Path | None]:

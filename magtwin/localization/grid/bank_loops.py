@@ -31,8 +31,8 @@ def update_bank(
     A filter has the mean and the full covariance of x, y, yaw, scale, offset, drift, then the map state and
     the iron states if there are any; `state` has them one after the other, shape (N (n + n n),).
 
-    `numbers`: as for `grid_loops.update`, but before decay and noise come forward, left and turn of the
-    motion and its variances of x, y and yaw. `stats` has the sums of `grid_loops.update`, over the filters.
+    `numbers`: as for `loops.update`, but before decay and noise come forward, left and turn of the
+    motion and its variances of x, y and yaw. `stats` has the sums of `loops.update`, over the filters.
     """
     z, lx, ly, white, share, power = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5]
     mapped, iron = numbers[6] > 0, numbers[7] > 0

@@ -1,14 +1,10 @@
 """Newton: physics in the stage itself, with its bodies, contacts and drives (extra `physics`)."""
 
 import importlib.util
-import json
 import math
 import os
-import subprocess
 import sys
-import tempfile
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any
@@ -17,6 +13,7 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.sim.engines.sampled import SampledMotion
+from magtwin.sim.engines.world_process import WorldProcess
 from magtwin.sim.motion.closed_loop import ClosedLoop
 from magtwin.sim.motion.controllers import Controller
 from magtwin.sim.motion.drive import limiter, wheel_rates
@@ -25,7 +22,7 @@ from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import RobotSpec
 
 STEP_S = 0.001
-"""Approximate length of a physics step [s]; a control step has a whole number of them."""
+"""Default length of a physics step [s]."""
 
 TOUCH_M = 0.003
 """Distance at which the footprint counts as touching an obstacle [m], since shapes are not circles."""
@@ -53,6 +50,9 @@ class Newton:
     progress: Callable[[int, int, str], Any] | None = None
     """Called ten times a simulated second with steps done, steps at most, and the time as text."""
 
+    step_s: float = STEP_S
+    """Approximate length of a physics step [s]; a control step has a whole number of them."""
+
     name = "newton"
 
     def drive(
@@ -69,7 +69,7 @@ class Newton:
         closed_loop.check(obstacles)
         drive, dt = closed_loop.drive, closed_loop.dt
         guide: Controller = replace(closed_loop.guide) if controller is None else controller
-        limit, parts = limiter(drive, dt), max(1, round(dt / STEP_S))
+        limit, parts = limiter(drive, dt), max(1, round(dt / self.step_s))
         step = dt / parts
         left = math.exp(-step / drive.motor_lag_s) if drive.motor_lag_s else 0.0
         in_mean = drive.motor_lag_s / step * (1.0 - left)
@@ -77,7 +77,7 @@ class Newton:
         radius, separation = (1.0 + error for error in closed_loop.wheel_errors)
         rest_w = REST_M_S * 2 / drive.wheel_separation_m
         commanded: list[tuple[float, float]] = []
-        with _Process(self, closed_loop, step) as world:
+        with self.world(closed_loop, step) as world:
             rows = [world.seen()]
             yaw = rows[0][2]
             for k in range(closed_loop.steps):
@@ -107,7 +107,7 @@ class Newton:
                     rates.append(wheel_rates(*rolls, drive).tolist())
                 if target == (0.0, 0.0) and abs(wheels[0]) < REST_M_S and abs(wheels[1]) < rest_w:
                     wheels = 0.0, 0.0
-                rows.append(world.step(rates))
+                rows.append(world.ask(rates))
                 commanded.append(last)
                 yaw += wrapped(rows[-1][2] - yaw)
                 if rows[-1][8] < UPRIGHT or not math.isfinite(rows[-1][7]):
@@ -133,6 +133,22 @@ class Newton:
             duration_s=(len(seen) - 1) * dt,
         )
 
+    def world(self, closed_loop: ClosedLoop, step_s: float) -> WorldProcess:
+        """The process that steps the stage."""
+        drive, root = closed_loop.drive, str(FilePath(__file__).resolve().parents[3])
+        job = {
+            "stage": str(FilePath(self.stage).resolve()),
+            "robot": self.robot.name,
+            "base": "base_link",
+            "joints": [drive.left_wheel_joint, drive.right_wheel_joint],
+            "start": list(closed_loop.pose0),
+            "step_s": step_s,
+            "scrub": drive.yaw_slip > 0,
+        }
+        path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+        command = [sys.executable, "-m", "magtwin.sim.engines.newton_world"]
+        return WorldProcess(command, job, "Newton", environment={**os.environ, "PYTHONPATH": path})
+
 
 def check_installed() -> None:
     """Refuse to run without Newton; the text says how to install it."""
@@ -142,76 +158,3 @@ def check_installed() -> None:
             f"the engine newton needs {', '.join(lacking)}, which is not installed; get it (600 MB) with: "
             "pip install 'magtwin[physics]'"
         )
-
-
-class _Process:
-    """`newton_world` in another process, which ends with the block."""
-
-    def __init__(self, engine: Newton, closed_loop: ClosedLoop, step_s: float) -> None:
-        self._engine = engine
-        drive = closed_loop.drive
-        self._job = {
-            "stage": str(FilePath(engine.stage).resolve()),
-            "robot": engine.robot.name,
-            "base": "base_link",
-            "joints": [drive.left_wheel_joint, drive.right_wheel_joint],
-            "start": list(closed_loop.pose0),
-            "step_s": step_s,
-            "scrub": drive.yaw_slip > 0,
-        }
-
-    def __enter__(self) -> "_Process":
-        self._folder = tempfile.TemporaryDirectory()  # MuJoCo writes its log there
-        self._log = open(FilePath(self._folder.name, "log"), "w+", encoding="utf-8")
-        root = str(FilePath(__file__).resolve().parents[3])
-        path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "magtwin.sim.engines.newton_world"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._log,
-            text=True,
-            bufsize=1,
-            cwd=self._folder.name,
-            env={**os.environ, "PYTHONPATH": path},
-        )
-        self._send(self._job)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        with suppress(OSError):
-            self._process.stdin.close()
-        try:
-            self._process.wait(5)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._process.stdout.close()
-        self._log.close()
-        self._folder.cleanup()
-
-    def seen(self) -> list[float]:
-        """The next answer."""
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            self._log.seek(0)
-            lines = [text for text in self._log.read().splitlines() if text.strip()]
-            raise InputError(
-                f"{self._engine.stage}: Newton cannot run it: {lines[-1] if lines else 'it gave no reason'}"
-            )
-        row: list[float] = json.loads(line)
-        return row
-
-    def step(self, rates: list[list[float]]) -> list[float]:
-        """Drive for one control step, with a pair of wheel rates [rad/s] for each physics step."""
-        self._send(rates)
-        return self.seen()
-
-    def _send(self, message: object) -> None:
-        assert self._process.stdin is not None
-        with suppress(OSError):  # it has ended; `seen` reports why
-            self._process.stdin.write(json.dumps(message) + "\n")
-            self._process.stdin.flush()

@@ -24,10 +24,6 @@ import newton_usd_schemas  # noqa: F401 - registers them
 SETTLE_S = 0.5
 """Time for which the robot settles before it is driven [s]."""
 
-ROTOR_KG_M2 = 0.002
-"""Inertia of a wheel's motor through its gears; assumed. With less, a wheel answers its stiff drive within
-one step: MuJoCo's implicit integrator then corrects the wheel but not the contact, and throws the robot."""
-
 STIFF_STEPS = 4.0
 """Time constant of a contact in steps (MuJoCo's solref); assumed. With MuJoCo's default of 0.02 s a robot of
 4 kg sinks by 0.34 mm into a hard floor, and its wheels roll as if they were 0.5 % smaller."""
@@ -45,12 +41,12 @@ class World:
         newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
         builder.add_usd(job["stage"], load_visual_shapes=False, load_static_visual_shapes=False)
         model = builder.finalize(device="cpu")
-        starts, armature = model.joint_qd_start.numpy(), model.joint_armature.numpy()
-        labels = list(model.joint_label)
-        wheels = [_only(labels, job["robot"], joint) for joint in job["joints"]]
-        for joint in wheels:
-            armature[starts[joint]] = max(float(armature[starts[joint]]), ROTOR_KG_M2)
-        model.joint_armature.assign(armature)
+        for name in job["joints"]:
+            joint = _only(list(model.joint_label), job["robot"], name)
+            if not model.joint_armature.numpy()[model.joint_qd_start.numpy()[joint]] > 0:
+                raise ValueError(
+                    f"{name} has no newton:armature, so that its drive throws the robot; set it to 0.002"
+                )
         # Kept, since it owns the model and the data.
         self._solver = newton.solvers.SolverMuJoCo(model, use_mujoco_cpu=True, cone="elliptic")
         self._model, self._data = self._solver.mj_model, self._solver.mj_data

@@ -10,15 +10,10 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.urdf.meshes.piece import Paint, Piece
 from magtwin.urdf.meshes.reading import Note, Reading
+from magtwin.usd.solids import corner_normals
 
 SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
 """Formats that can be read."""
-
-CREASE = np.radians(35)
-"""Faces that meet at a smaller angle than this are shaded as one smooth surface [rad]."""
-
-FAN = 64
-"""Where more faces than this meet, as at tips and in the middle of discs, each keeps its own normal."""
 
 
 @dataclass(frozen=True)
@@ -221,39 +216,3 @@ def face_normals(points: NDArray, faces: NDArray) -> NDArray[np.float64]:
     a, b, c = (points[faces[:, i]].astype(float) for i in range(3))
     area = np.cross(b - a, c - a)
     return area / np.linalg.norm(area, axis=1, keepdims=True)
-
-
-def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float32]:
-    """Unit normals of each triangle's corners: smooth across shallow edges, sharp across creases.
-
-    A corner's normal is the area-weighted mean of the faces around its point whose angle to its own face is
-    below CREASE; where more than FAN faces meet, it is that of its own face.
-
-    Args:
-        points: Vertices [m], shape (V, 3).
-        faces: Corners of the triangles, counter-clockwise from outside, shape (F, 3).
-
-    Returns:
-        Normals, shape (F, 3, 3).
-    """
-    a, b, c = (points[faces[:, i]].astype(float) for i in range(3))
-    area = np.cross(b - a, c - a)
-    size = np.linalg.norm(area, axis=1, keepdims=True)
-    area = (area / size.mean()).astype(np.float32)
-    unit = area / np.linalg.norm(area, axis=1, keepdims=True)
-    flat = faces.ravel().astype(np.int32)
-    by_point = np.argsort(flat, kind="stable")  # corners of one point stand together
-    count = np.bincount(flat, minlength=len(points))
-    first = np.cumsum(count) - count
-    corner = by_point[count[flat[by_point]] <= FAN]
-    around = count[flat[corner]]  # each corner is paired with each corner of its point
-    mine = np.repeat(np.arange(len(corner)), around)
-    start = np.repeat(first[flat[corner]] - np.cumsum(around) + around, around)
-    theirs = (by_point // 3)[start + np.arange(len(mine))]
-    near = np.einsum("ij,ij->i", np.repeat(unit[corner // 3], around, axis=0), unit[theirs]) >= np.cos(CREASE)
-    mine, theirs = mine[near], theirs[near]
-    normals = np.repeat(unit, 3, axis=0)
-    for axis in range(3):
-        normals[corner, axis] = np.bincount(mine, area[theirs, axis], len(corner))
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return (normals / length).reshape(-1, 3, 3)

@@ -1,4 +1,4 @@
-"""Mesh layer: the arrays of a robot's mesh files, each file once, in a separate layer (.usdc).
+"""Mesh layer: the arrays of mesh files and of shown primitives, each once, in a separate layer (.usdc).
 
 The readable root layer references it, since large arrays do not belong in text.
 """
@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 
 from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description
@@ -21,6 +21,7 @@ from magtwin.urdf.meshes.piece import PLAIN, Paint
 from magtwin.urdf.meshes.texture import Textures
 from magtwin.urdf.options import DEFAULTS, Collision, Options
 from magtwin.urdf.source.source import MissingFileError
+from magtwin.usd import solids
 from magtwin.usd.layers import describe_stage
 
 T = TypeVar("T")
@@ -32,6 +33,9 @@ FORMS: dict[Collision, str] = {"hull": "hull", "decomposition": "part", "mesh": 
 
 MESH = "mesh"
 """Name of the mesh below a visual's prim."""
+
+PRIMITIVE = "magtwin:primitive"
+"""Custom data of a mesh that shows a primitive: its kind and measures [m]."""
 
 
 @dataclass(frozen=True)
@@ -74,11 +78,12 @@ class MeshLayer:
         self._found: dict[str, Path] = {}
         self._files: dict[Path, Mesh] = {}
         self._visuals: dict[tuple[Path, tuple[float, ...]], Entry] = {}
+        self._primitives: dict[tuple[Any, ...], Sdf.Path] = {}
         self._colliders: dict[tuple[Path, tuple[float, ...]], tuple[Sdf.Path, ...]] = {}
         self._solids: dict[Path, tuple[Solid, ...]] = {}
 
     def __len__(self) -> int:
-        return len(self._visuals) + len(self._colliders)
+        return len(self._visuals) + len(self._colliders) + len(self._primitives)
 
     def visual(self, mesh: Geometry) -> Entry:
         """The prim of a URDF `<mesh>` as a visual.
@@ -92,6 +97,31 @@ class MeshLayer:
         if key not in self._visuals:
             self._visuals[key] = self._define_visual(self._read(path), np.array(scale))
         return self._visuals[key]
+
+    def primitive(self, form: Geometry) -> Sdf.Path:
+        """The mesh that shows a box, capsule, cylinder or sphere, which `primitive_of` tells from others.
+
+        Blender drops the materials of USD's own primitives.
+        """
+        values: dict[str, Any] = {"kind": form.kind}
+        if form.kind == "box":
+            values["size"] = Gf.Vec3d(*form.size.tolist())
+            points, faces = solids.box(1.0)
+            points = points * form.size
+        elif form.kind == "sphere":
+            values["radius"] = form.radius
+            points, faces = solids.sphere(form.radius)
+        else:
+            values |= {"radius": form.radius, "length": form.length}
+            make = solids.capsule if form.kind == "capsule" else solids.cylinder
+            points, faces = make(form.radius, form.length)
+        key = tuple(values.values())
+        if key not in self._primitives:
+            mesh = UsdGeom.Mesh.Define(self._stage, self._free(form.kind))
+            solids.define_triangles(mesh, points, faces, shaded=True)
+            mesh.GetPrim().SetCustomDataByKey(PRIMITIVE, values)
+            self._primitives[key] = mesh.GetPath()
+        return self._primitives[key]
 
     def collider(self, mesh: Geometry) -> tuple[Sdf.Path, ...]:
         """The prims of a URDF `<mesh>` as a collider, several for a convex decomposition.
@@ -216,6 +246,8 @@ def gather(description: Description, options: Options, textures: str) -> MeshLay
     meshes = MeshLayer(description, options, textures)
     colliding = False
     for name, link in description.links.items():
+        for form in (visual.geometry for visual in link.visuals if visual.geometry.kind != "mesh"):
+            meshes.primitive(form)
         for role, shapes, add in (
             ("visual", link.visuals, meshes.visual),
             ("collision", link.collisions, meshes.collider),
@@ -228,6 +260,15 @@ def gather(description: Description, options: Options, textures: str) -> MeshLay
             "meshes collide as they are; PhysX does this for static bodies only, others become convex hulls"
         )
     return meshes
+
+
+def primitive_of(prim: Usd.Prim) -> Geometry | None:
+    """The primitive that a mesh shows; None for other meshes."""
+    values = prim.GetCustomDataByKey(PRIMITIVE)
+    if not values:
+        return None
+    radius, length = (float(values.get(name, 0.0)) for name in ("radius", "length"))
+    return Geometry(values["kind"], np.array(values.get("size", (1.0, 1.0, 1.0)), float), radius, length)
 
 
 def free_name(name: str, taken: set[str]) -> str:

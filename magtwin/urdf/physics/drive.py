@@ -20,6 +20,14 @@ WHEEL_DAMPING = 5.0
 """Default gain of a continuous joint's velocity drive [N m s/rad]. With it, Newton 1.8 is stable for a 5 kg
 robot from 500 steps a second; the profile diff-drive fits the gain to the robot."""
 
+RESPONSE = 0.007
+"""Response time of a wheel's velocity drive [s]."""
+
+ROTOR_KG_M2 = 0.002
+"""Default inertia of a wheel's motor through its gears; assumed. With less, a wheel answers a stiff drive
+within one step: MuJoCo's implicit integrator then corrects the wheel but not the contact, and throws a robot
+of 5 kg."""
+
 POSITION_STIFFNESS = 100.0
 """Default gain of a limited joint's position drive [N m/rad, N/m]; the damping is a tenth of it."""
 
@@ -102,6 +110,18 @@ def define_drive(
             made.CreateTargetPositionAttr(_target(joint) / unit)
         else:
             made.CreateTargetVelocityAttr(0.0)
+
+
+def rotor_inertia(prim: Usd.Prim, joint: Joint) -> float:
+    """Inertia of the motor of a continuous joint that holds a velocity [kg m2]; 0 for other joints.
+
+    At most gain times `RESPONSE`, so that the rotor of a small robot does not slow its drive.
+    """
+    drive = UsdPhysics.DriveAPI(prim, "angular")
+    if joint.type != "continuous" or not prim.HasAPI(UsdPhysics.DriveAPI, "angular"):
+        return 0.0
+    damping, stiffness = drive.GetDampingAttr().Get() * 180 / np.pi, drive.GetStiffnessAttr().Get()
+    return 0.0 if stiffness else float(f"{min(ROTOR_KG_M2, damping * RESPONSE):.3g}")
 
 
 def _effort(joint: Joint, default: float, description: Description) -> float:

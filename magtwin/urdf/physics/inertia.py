@@ -11,6 +11,7 @@ from pxr import Usd, UsdGeom
 from magtwin.errors import InputError
 from magtwin.frames import canonical
 from magtwin.urdf.meshes.collider import hull_faces
+from magtwin.urdf.meshes.mesh_layer import primitive_of
 
 NEAR_MISS = 0.02
 """Relative excess of the largest moment over the sum of the others that is still repaired."""
@@ -166,10 +167,18 @@ def read_solid(prims: Iterable[Usd.Prim], frame: Usd.Prim) -> MassProperties | N
 
 def _read_gprim(prim: Usd.Prim, T: NDArray) -> MassProperties | None:
     """The solid of a gprim with pose T, shape (4, 4); boxes and meshes may be scaled."""
-    if prim.IsA(UsdGeom.Mesh):
+    form = primitive_of(prim)
+    if form is None and prim.IsA(UsdGeom.Mesh):
         return _read_mesh(UsdGeom.Mesh(prim), T)
     scale = np.linalg.norm(T[:3, :3], axis=0)
     T = T @ np.diag([*1 / scale, 1])
+    if form is not None:
+        match form.kind:
+            case "box":
+                return box(scale * form.size).moved(T)
+            case "sphere":
+                return sphere(form.radius).moved(T)
+        return (cylinder if form.kind == "cylinder" else capsule)(form.radius, form.length).moved(T)
     if prim.IsA(UsdGeom.Cube):
         return box(scale * UsdGeom.Cube(prim).GetSizeAttr().Get()).moved(T)
     if prim.IsA(UsdGeom.Sphere):

@@ -14,14 +14,15 @@ from magtwin.frames import wxyz_from_xyzw
 from magtwin.urdf.description.description import Description
 from magtwin.urdf.description.model import Joint
 from magtwin.urdf.options import DEFAULTS, Options
-from magtwin.urdf.physics.drive import NO_WHEELS, Wheels, define_drive
+from magtwin.urdf.physics.drive import NO_WHEELS, Wheels, define_drive, rotor_inertia
 from magtwin.urdf.physics.inertia import quaternion
 from magtwin.urdf.physics.mechanism import Mechanism
 
 JOINT_API, NEWTON_API, NEWTON_MIMIC_API = "IsaacJointAPI", "NewtonJointAPI", "NewtonMimicAPI"
+MUJOCO_API = "MjcJointAPI"
 PHYSX_API, PHYSX_AXIS_API, PHYSX_MIMIC_API = "PhysxJointAPI", "PhysxJointAxisAPI", "PhysxMimicJointAPI"
 STATE_API = "PhysicsJointStateAPI"
-"""Applied schemas of Isaac Sim, Newton and PhysX; their plugins are not installed here."""
+"""Applied schemas of Isaac Sim, Newton, MuJoCo and PhysX; their plugins are not installed here."""
 
 AXIS = "magtwin:axis"
 """Key of a joint's customData: an oblique axis in the child's body in double precision."""
@@ -225,7 +226,10 @@ def _write(prim: Usd.Prim, name: str, value: float) -> None:
 
 
 def _tune(prim: Usd.Prim, joint: Joint, axes: list[str], wheel: bool, description: Description) -> None:
-    """Maximum speed, damping and friction of a joint, for Newton and PhysX."""
+    """Maximum speed, rotor inertia, damping and friction of a joint, for Newton, PhysX and MuJoCo.
+
+    PhysX from 2026 on reads the Newton attributes of the whole joint, older ones PhysxJointAPI.
+    """
     unit = _unit(joint)
     speed = None if joint.limit is None or joint.type == "planar" else joint.limit.velocity
     speed = speed if speed and np.isfinite(speed) else None
@@ -237,6 +241,14 @@ def _tune(prim: Usd.Prim, joint: Joint, axes: list[str], wheel: bool, descriptio
         _write(prim, "newton:velocityLimit", speed * unit)
         prim.AddAppliedSchema(PHYSX_API)
         _write(prim, "physxJoint:maxJointVelocity", speed * unit)
+    rotor = rotor_inertia(prim, joint)
+    if rotor:
+        _write(prim, "newton:armature", rotor)
+        if speed is None:
+            prim.AddAppliedSchema(PHYSX_API)
+        _write(prim, "physxJoint:armature", rotor)
+        prim.AddAppliedSchema(MUJOCO_API)
+        _write(prim, "mjc:armature", rotor)
     if joint.dynamics is None:
         return
     damping, friction = float(joint.dynamics.damping or 0.0), float(joint.dynamics.friction or 0.0)

@@ -12,15 +12,12 @@ from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Joint, Link
 from magtwin.urdf.options import DriveRule
-from magtwin.urdf.physics.drive import DEFAULT_EFFORT, WHEEL_DAMPING, Wheels
+from magtwin.urdf.physics.drive import DEFAULT_EFFORT, RESPONSE, WHEEL_DAMPING, Wheels
 from magtwin.urdf.physics.gazebo import Surface
 from magtwin.urdf.physics.mechanism import Mechanism
 
 WHEEL_FRICTION, CASTER_FRICTION = 1.0, 0.05
 """Default friction of driven wheels (rubber) and of sliding parts (a polished ball)."""
-
-RESPONSE = 0.007
-"""Response time of a wheel's velocity drive [s]."""
 
 GRAVITY = 9.81
 """[m/s2]."""

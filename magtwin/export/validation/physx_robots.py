@@ -1,0 +1,177 @@
+"""The robots of a stage that PhysX drives: their prims, and where each has room for it."""
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from pxr import Usd, UsdGeom, UsdPhysics
+
+from magtwin.author.shape import drive_of, footprint_of, wheels_of
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.obstacles import Obstacles
+from magtwin.usd.attributes import target
+from magtwin.usd.geometry import BASE_LINK
+from magtwin.usd.obstacles import read_obstacles
+from magtwin.usd.schema import NOUNS, attribute_name
+from magtwin.usd.sensors import JOINT_FIELDS, read_drive
+
+ROBOT_API = "IsaacRobotAPI"
+"""Isaac Sim's applied schema of a robot."""
+
+AHEAD_M = 1.0
+"""Distance that a robot drives straight [m]."""
+
+MARGIN_M = 0.05
+"""Free space around the footprint [m]."""
+
+FAR_M, SPACING_M, HEADINGS = 10.0, 0.25, 12
+"""Places to look for room: up to this distance from the robot, on a grid, in this number of directions."""
+
+
+@dataclass(frozen=True)
+class DrivenRobot:
+    """A robot with a differential drive on a stage."""
+
+    prim: str
+    base: str
+    """Path of its base, a rigid body."""
+
+    joints: tuple[str, str]
+    """Paths of the joints of the left and the right wheel."""
+
+    start: tuple[float, float, float]
+    """x [m], y [m] and yaw [rad] of its base: at the robot if there is room for `AHEAD_M`, or near it."""
+
+    height_m: float
+    """Height of its base [m]."""
+
+    lowest_m: float
+    """Height of the lowest point of its wheels [m]."""
+
+    wheel_radius_m: float
+    wheel_separation_m: float
+    v_max: float
+    w_max: float
+
+
+def read_driven(stage: Usd.Stage) -> list[DrivenRobot]:
+    """The robots of a stage with two driven wheels, in order of their prims.
+
+    The wheels of a robot without a drive of magtwin's schema are the only two that mirror each other.
+
+    Raises:
+        InputError: A drive is incomplete.
+    """
+    found = []
+    drives = {}
+    for prim in stage.Traverse():
+        if ROBOT_API in prim.GetPrimTypeInfo().GetAppliedAPISchemas() or prim.HasAPI(NOUNS["drive"]):
+            drive = _drive(prim)
+            if drive is not None:
+                drives[prim] = drive
+    obstacles = read_obstacles(stage) if drives else Obstacles()
+    bases = {prim: _base(prim) for prim in drives}
+    places = {prim: _pose(base) for prim, base in bases.items()}
+    for prim, base in bases.items():
+        spec, joints = drives[prim]
+        others = np.array([pose[:2] for other, pose in places.items() if other != prim]).reshape(-1, 2)
+        height = _height(base)
+        wheels = [wheel.lowest_m for wheel in wheels_of(prim)]
+        found.append(
+            DrivenRobot(
+                prim=str(prim.GetPath()),
+                base=str(base.GetPath()),
+                joints=joints,
+                start=find_room(obstacles, places[prim], footprint_of(prim) or 0.0, others),
+                height_m=height,
+                lowest_m=_height(prim) + min(wheels, default=0.0),
+                wheel_radius_m=spec.wheel_radius_m,
+                wheel_separation_m=spec.wheel_separation_m,
+                v_max=spec.v_max,
+                w_max=spec.w_max,
+            )
+        )
+    return found
+
+
+def find_room(
+    obstacles: Obstacles, at: tuple[float, float, float], radius_m: float, others: np.ndarray
+) -> tuple[float, float, float]:
+    """The nearest pose from which a robot can drive `AHEAD_M` straight.
+
+    Args:
+        obstacles: What stands in the way.
+        at: x [m], y [m] and yaw [rad] from where to look; the result if no pose has room.
+        radius_m: Radius of the robot's footprint [m].
+        others: Places of other robots of its size [m], shape (N, 2).
+    """
+    steps = np.arange(-FAR_M, FAR_M + SPACING_M, SPACING_M)
+    offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    offsets = offsets[np.argsort(np.hypot(*offsets.T), kind="stable")]
+    yaws = at[2] + math.tau / HEADINGS * np.arange(HEADINGS)
+    along = np.linspace(0, AHEAD_M, 21)
+    ways = np.stack([np.cos(yaws), np.sin(yaws)], axis=-1)[:, None] * along[:, None]
+    for offset in offsets:
+        place = np.array(at[:2]) + offset
+        if obstacles.clearance(place[None], reach_m=radius_m + MARGIN_M)[0][0] < radius_m + MARGIN_M:
+            continue
+        points = (place + ways).reshape(-1, 2)
+        clear, _ = obstacles.clearance(points, reach_m=radius_m + MARGIN_M)
+        free = clear > radius_m + MARGIN_M
+        for other in others:
+            free &= np.hypot(*(points - other).T) > 2 * radius_m + MARGIN_M
+        whole = np.flatnonzero(free.reshape(HEADINGS, -1).all(axis=1))
+        if len(whole):
+            return float(place[0]), float(place[1]), math.remainder(float(yaws[whole[0]]), math.tau)
+    return at
+
+
+def has_ground(stage: Usd.Stage) -> bool:
+    """Whether a stage has a collider that no rigid body carries, on which a robot can stand."""
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        if prim.HasAPI(UsdPhysics.CollisionAPI) and not any(
+            stage.GetPrimAtPath(path).HasAPI(UsdPhysics.RigidBodyAPI)
+            for path in prim.GetPath().GetAncestorsRange()
+        ):
+            return True
+    return False
+
+
+def driven_table(stage: Usd.Stage) -> dict[str, Any]:
+    """The robots and the ground of a stage as plain data, for another process."""
+    return {
+        "robots": [asdict(robot) for robot in read_driven(stage)],
+        "ground": has_ground(stage),
+        "scene": any(prim.IsA(UsdPhysics.Scene) for prim in stage.Traverse()),
+    }
+
+
+def _drive(robot: Usd.Prim) -> tuple[DriveSpec, tuple[str, str]] | None:
+    """The drive of a robot and the paths of its wheels' joints; None if it does not have two wheels."""
+    if robot.HasAPI(NOUNS["drive"]):
+        left, right = (str(target(robot, attribute_name("drive", name)).GetPath()) for name in JOINT_FIELDS)
+        return read_drive(robot), (left, right)
+    drive, _ = drive_of(robot, DriveSpec())
+    paths = {p.GetDisplayName() or p.GetName(): str(p.GetPath()) for p in Usd.PrimRange(robot)}
+    names = drive.left_wheel_joint, drive.right_wheel_joint
+    if not set(names) <= {wheel.joint for wheel in wheels_of(robot)}:
+        return None
+    return drive, (paths[names[0]], paths[names[1]])
+
+
+def _base(robot: Usd.Prim) -> Usd.Prim:
+    """The body of a robot called base_link, or else its first body, or else its prim."""
+    bodies = [prim for prim in Usd.PrimRange(robot) if prim.HasAPI(UsdPhysics.RigidBodyAPI)]
+    return next((p for p in bodies if p.GetName() == BASE_LINK), bodies[0] if bodies else robot)
+
+
+def _height(prim: Usd.Prim) -> float:
+    """Height of a prim's origin in world [m]."""
+    return float(UsdGeom.XformCache().GetLocalToWorldTransform(prim).ExtractTranslation()[2])
+
+
+def _pose(prim: Usd.Prim) -> tuple[float, float, float]:
+    """Place of a prim in world: x [m], y [m] and yaw [rad]."""
+    T = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim))
+    return float(T[3, 0]), float(T[3, 1]), math.atan2(T[0, 1], T[0, 0])

@@ -1,0 +1,121 @@
+"""Articulation: which prim is its root, and which of its bodies do not collide with each other."""
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Sdf, Usd, UsdGeom, UsdPhysics
+
+from magtwin.usd.geometry import read_triangles
+
+NEWTON_API, PHYSX_API = "NewtonArticulationRootAPI", "PhysxArticulationAPI"
+"""Applied schemas of Newton and PhysX; their plugins are not installed here."""
+
+SELF_COLLISION = (
+    (NEWTON_API, "newton:selfCollisionEnabled"),
+    (PHYSX_API, "physxArticulation:enabledSelfCollisions"),
+)
+"""Attributes that enable collisions between links, with their schemas, without which PhysX ignores them."""
+
+OVERLAP_M = 0.001
+"""Colliders whose convex hulls overlap by less can touch, such as the closed fingers of a gripper [m]."""
+
+
+def define_articulation(root: Usd.Prim, *, self_collision: bool) -> None:
+    """Make a prim the root of an articulation.
+
+    The root of a floating robot is its base. If an ancestor of the base is the root, PhysX chooses the link
+    in the middle of the tree, and root poses are poses of that link. The root of a fixed robot is the
+    robot's prim; its base is the body on a joint to the world.
+
+    Args:
+        root: The base of a floating robot, or the prim of a fixed one.
+        self_collision: Whether links that no joint connects collide with each other.
+    """
+    UsdPhysics.ArticulationRootAPI.Apply(root)
+    for schema, attribute in SELF_COLLISION:
+        root.AddAppliedSchema(schema)
+        root.CreateAttribute(attribute, Sdf.ValueTypeNames.Bool, custom=False).Set(self_collision)
+
+
+def filter_overlaps(
+    bodies: Mapping[str, Usd.Prim], colliders: Mapping[str, Sequence[Usd.Prim]], joints: Sequence[Usd.Prim]
+) -> list[tuple[str, str]]:
+    """Author that bodies whose colliders overlap do not collide, since engines push such bodies apart.
+
+    The hull of a bumper around a base, for example, contains the wheels. Colliders count as their convex
+    hulls. Engines ignore the bodies of one joint already.
+
+    Args:
+        bodies: Prims by link name, at rest.
+        colliders: Colliders of each body, in the same stage.
+        joints: Prims of the joints.
+
+    Returns:
+        The pairs of link names.
+    """
+    jointed = {frozenset(_ends(joint)) for joint in joints}
+    hulls = _hulls(bodies, colliders)
+    pairs = []
+    for first, second in combinations([name for name in bodies if hulls[name]], 2):
+        ends = bodies[first].GetPath(), bodies[second].GetPath()
+        if frozenset(ends) in jointed or not any(_overlap(a, b) for a in hulls[first] for b in hulls[second]):
+            continue
+        UsdPhysics.FilteredPairsAPI.Apply(bodies[first]).CreateFilteredPairsRel().AddTarget(ends[1])
+        pairs.append((first, second))
+    return pairs
+
+
+def _ends(joint: Usd.Prim) -> list[Sdf.Path]:
+    """Paths of the bodies of a joint."""
+    made = UsdPhysics.Joint(joint)
+    return [*made.GetBody0Rel().GetTargets(), *made.GetBody1Rel().GetTargets()]
+
+
+def _hulls(
+    bodies: Mapping[str, Usd.Prim], colliders: Mapping[str, Sequence[Usd.Prim]]
+) -> dict[str, list[NDArray[np.float64]]]:
+    """Corners of the hull of each collider of each body, shrunk by half of `OVERLAP_M`, shape (N, 3)."""
+    hulls: dict[str, list[NDArray[np.float64]]] = {name: [] for name in bodies}
+    if not bodies:
+        return hulls
+    owner = {prim.GetPath(): name for name, prims in colliders.items() for prim in prims}
+    stage = next(iter(bodies.values())).GetStage()
+    triangles = read_triangles(
+        stage, purposes=(UsdGeom.Tokens.guide,), wanted=lambda prim, _: prim.GetPath() in owner
+    )
+    places = UsdGeom.XformCache()
+    for path, corners in triangles.items():
+        T = np.array(places.GetLocalToWorldTransform(bodies[owner[path]]))
+        points = np.unique(corners.reshape(-1, 3), axis=0) @ T[:3, :3] + T[3, :3]
+        away = points - points.mean(axis=0)
+        far = np.linalg.norm(away, axis=1, keepdims=True)
+        shrunk = points - away * np.minimum(1.0, OVERLAP_M / 2 / np.maximum(far, 1e-12))
+        hulls[owner[path]].append(_outermost(shrunk))
+    return hulls
+
+
+def _outermost(points: NDArray) -> NDArray[np.float64]:
+    """The points (N, 3) that are corners of their convex hull; all of them if they are in one plane."""
+    from scipy.spatial import ConvexHull, QhullError  # takes 0.1 s
+
+    try:
+        return np.asarray(points[ConvexHull(points).vertices], float)
+    except QhullError:
+        return points
+
+
+def _overlap(a: NDArray, b: NDArray) -> bool:
+    """Whether the convex hulls of points (N, 3) and (M, 3) have a point in common.
+
+    Weights u, v >= 0 with sum 1 each and a^T u = b^T v exist if and only if they do (a linear program).
+    """
+    if np.any(a.min(axis=0) > b.max(axis=0)) or np.any(b.min(axis=0) > a.max(axis=0)):
+        return False
+    from scipy.optimize import linprog
+
+    ones = np.concatenate([np.ones(len(a)), np.zeros(len(b))])
+    equal = np.vstack([np.hstack([a.T, -b.T]), ones, 1 - ones])
+    found = linprog(np.zeros(len(ones)), A_eq=equal, b_eq=[0, 0, 0, 1, 1], bounds=(0, None), method="highs")
+    return bool(found.status == 0)

@@ -1,0 +1,223 @@
+"""Solids: primitives and meshes of USD as triangles."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pxr import Gf, Sdf, UsdGeom, Vt
+
+from magtwin.errors import InputError
+
+SEGMENTS = 32
+"""Sides of the polygon that approximates a circle."""
+
+CREASE = np.radians(35)
+"""Faces that meet at a smaller angle than this are shaded as one smooth surface [rad]."""
+
+FAN = 64
+"""Where more faces than this meet, as at tips and in the middle of discs, each keeps its own normal."""
+
+Triangles = tuple[NDArray, NDArray]
+"""Points [m], shape (V, 3), and the corners of triangles, counter-clockwise from outside, shape (F, 3)."""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """Points of a gprim, and the triangles between them, each with the face that it was cut from."""
+
+    points: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+    """Corners of the triangles as indices into the face-vertex list, shape (F, 3)."""
+    corners: NDArray[np.int64]
+    """Index of the point at each entry of the face-vertex list."""
+    origin: NDArray[np.int64]
+    """Index of the face that each triangle is a part of, shape (F,)."""
+
+
+def solid_of(gprim: UsdGeom.Gprim) -> Solid | None:
+    """A gprim in its own space; None for kinds without a surface (points, curves).
+
+    Raises:
+        InputError: It is an inconsistent mesh; the text names the prim.
+    """
+    prim = gprim.GetPrim()
+    if prim.IsA(UsdGeom.Mesh):
+        try:
+            return mesh_solid(UsdGeom.Mesh(prim))
+        except InputError as error:
+            raise InputError(f"{prim.GetPath()}: {error}") from error
+    get = {name: prim.GetAttribute(name).Get() for name in ("radius", "height", "size", "width", "length")}
+    axis = prim.GetAttribute("axis").Get()
+    kind = prim.GetTypeName()
+    if kind == "Cube":
+        return _faces(*box(get["size"]))
+    if kind == "Plane":
+        return _faces(*_plane(get["width"], get["length"], axis))
+    if kind == "Sphere":
+        return _faces(*sphere(get["radius"]))
+    if kind == "Cone":
+        r, h = get["radius"], get["height"] / 2
+        return _faces(*_revolved(np.array([[0, -h], [r, -h], [0, h]]), axis))
+    if kind == "Cylinder":
+        return _faces(*cylinder(get["radius"], get["height"], axis))
+    if kind == "Capsule":
+        return _faces(*capsule(get["radius"], get["height"], axis))
+    return None
+
+
+def mesh_solid(mesh: UsdGeom.Mesh) -> Solid:
+    """A mesh's polygons as fans of triangles, without holes.
+
+    Raises:
+        InputError: Its indices, counts and points do not fit together.
+    """
+    points = np.array(mesh.GetPointsAttr().Get() or np.empty((0, 3)), float)
+    counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [], int)
+    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [], int)
+    outside = len(corners) and not 0 <= corners.min() <= corners.max() < len(points)
+    if counts.sum() != len(corners) or outside:
+        raise InputError(
+            f"its {counts.sum()} corners, {len(corners)} indices and {len(points)} points do not fit together"
+            "; export the mesh again"
+        )
+    cuts = np.maximum(counts - 2, 0)
+    origin = np.repeat(np.arange(len(counts)), cuts)
+    first = np.repeat(np.cumsum(counts) - counts, cuts)
+    step = np.arange(len(origin)) - np.repeat(np.cumsum(cuts) - cuts, cuts)
+    triangles = np.column_stack([first, first + step + 1, first + step + 2])
+    if mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded:
+        triangles = triangles[:, ::-1]
+    kept = ~np.isin(origin, np.array(mesh.GetHoleIndicesAttr().Get() or [], int))
+    return Solid(points, triangles[kept], corners, origin[kept])
+
+
+def _faces(points: NDArray, triangles: NDArray) -> Solid:
+    """A solid made of triangles."""
+    index = np.arange(triangles.size).reshape(-1, 3)
+    return Solid(points, index, np.asarray(triangles, int).ravel(), np.arange(len(index)))
+
+
+def box(size: float) -> Triangles:
+    """A cube about the origin with edges of `size` [m]; points (V, 3) and triangles (F, 3), as all below."""
+    corners = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3, indexing="ij"), -1).reshape(8, 3) * size
+    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    return corners, np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+
+
+def sphere(radius: float) -> Triangles:
+    """A sphere about the origin."""
+    return _revolved(_arc(radius, -90, 90), "Z")
+
+
+def cylinder(radius: float, height: float, axis: str = "Z") -> Triangles:
+    """A cylinder about the origin, along an axis."""
+    r, h = radius, height / 2
+    return _revolved(np.array([[0, -h], [r, -h], [r, h], [0, h]]), axis)
+
+
+def capsule(radius: float, height: float, axis: str = "Z") -> Triangles:
+    """A capsule about the origin; its height is without the round ends."""
+    lift = np.array([0, height / 2])
+    halves = [_arc(radius, -90, 0) - lift, _arc(radius, 0, 90) + lift]
+    return _revolved(np.vstack(halves), axis)
+
+
+def _plane(width: float, length: float, axis: str) -> Triangles:
+    """A rectangle with the normal `axis`; width and length as in UsdGeomPlane."""
+    w, h = width / 2, length / 2
+    across = {"X": ([0, 0, w], [0, h, 0]), "Y": ([w, 0, 0], [0, 0, h]), "Z": ([w, 0, 0], [0, h, 0])}[axis]
+    u, v = np.array(across, float)
+    points = np.array([-u - v, u - v, u + v, v - u])
+    triangles = np.array([[0, 1, 2], [0, 2, 3]])
+    return points, triangles if np.cross(u, v)["XYZ".index(axis)] > 0 else triangles[:, ::-1]
+
+
+def _arc(radius: float, start_deg: float, end_deg: float) -> NDArray:
+    """Distance from the axis and height along it, of points on a circle, from below upwards."""
+    steps = round((end_deg - start_deg) / 180 * SEGMENTS / 2)
+    angle = np.radians(np.linspace(start_deg, end_deg, steps + 1))
+    return radius * np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def _revolved(profile: NDArray, axis: str) -> Triangles:
+    """The surface of revolution of a profile of (distance, height) that begins and ends on the axis."""
+    angle = 2 * np.pi * np.arange(SEGMENTS) / SEGMENTS
+    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(SEGMENTS)])
+    rings = [r * ring + [0, 0, z] for r, z in profile[1:-1]]
+    points = np.vstack([[[0, 0, profile[0][1]]], *rings, [[0, 0, profile[-1][1]]]])
+    here = np.arange(SEGMENTS)
+    there = (here + 1) % SEGMENTS
+    last = len(points) - 1
+    triangles = [np.column_stack([np.zeros_like(here), 1 + there, 1 + here])]
+    for k in range(len(rings) - 1):
+        a, b = 1 + k * SEGMENTS, 1 + (k + 1) * SEGMENTS
+        triangles += [np.column_stack([a + here, a + there, b + there])]
+        triangles += [np.column_stack([a + here, b + there, b + here])]
+    top = 1 + (len(rings) - 1) * SEGMENTS
+    triangles += [np.column_stack([top + here, top + there, np.full_like(here, last)])]
+    order = {"X": [2, 0, 1], "Y": [1, 2, 0], "Z": [0, 1, 2]}[axis]  # even permutations keep the winding
+    return points[:, order], np.vstack(triangles)
+
+
+def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float32]:
+    """Unit normals of each triangle's corners: smooth across shallow edges, sharp across creases.
+
+    A corner's normal is the area-weighted mean of the faces around its point whose angle to its own face is
+    below CREASE; where more than FAN faces meet, it is that of its own face.
+
+    Args:
+        points: Vertices [m], shape (V, 3).
+        faces: Corners of the triangles, counter-clockwise from outside, shape (F, 3).
+
+    Returns:
+        Normals, shape (F, 3, 3).
+    """
+    a, b, c = (points[faces[:, i]].astype(float) for i in range(3))
+    area = np.cross(b - a, c - a)
+    size = np.linalg.norm(area, axis=1, keepdims=True)
+    area = (area / size.mean()).astype(np.float32)
+    unit = area / np.linalg.norm(area, axis=1, keepdims=True)
+    flat = faces.ravel().astype(np.int32)
+    by_point = np.argsort(flat, kind="stable")  # corners of one point stand together
+    count = np.bincount(flat, minlength=len(points))
+    first = np.cumsum(count) - count
+    corner = by_point[count[flat[by_point]] <= FAN]
+    around = count[flat[corner]]  # each corner is paired with each corner of its point
+    mine = np.repeat(np.arange(len(corner)), around)
+    start = np.repeat(first[flat[corner]] - np.cumsum(around) + around, around)
+    theirs = (by_point // 3)[start + np.arange(len(mine))]
+    near = np.einsum("ij,ij->i", np.repeat(unit[corner // 3], around, axis=0), unit[theirs]) >= np.cos(CREASE)
+    mine, theirs = mine[near], theirs[near]
+    normals = np.repeat(unit, 3, axis=0)
+    for axis in range(3):
+        normals[corner, axis] = np.bincount(mine, area[theirs, axis], len(corner))
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return (normals / length).reshape(-1, 3, 3)
+
+
+def define_triangles(
+    mesh: UsdGeom.Mesh, points: ArrayLike, faces: ArrayLike, *, shaded: bool = False
+) -> None:
+    """Author a mesh's geometry.
+
+    Args:
+        mesh: Written to in its stage's edit target.
+        points: Vertices [m], in single precision, shape (V, 3).
+        faces: Corners of the triangles, counter-clockwise from outside, shape (F, 3).
+        shaded: Whether to author normals, see `corner_normals`.
+    """
+    points, faces = np.array(points, np.float32), np.array(faces, np.int32)
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray([3] * len(faces)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.ravel()))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    extent = [Gf.Vec3f(*map(float, corner)) for corner in (points.min(axis=0), points.max(axis=0))]
+    mesh.CreateExtentAttr(Vt.Vec3fArray(extent))
+    if shaded:
+        normals = np.round(corner_normals(points, faces), 4).reshape(-1, 3) + np.float32(0)
+        primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
+            "normals", Sdf.ValueTypeNames.Normal3fArray, UsdGeom.Tokens.faceVarying
+        )
+        rows, index = np.unique(normals, axis=0, return_inverse=True)
+        primvar.Set(Vt.Vec3fArray.FromNumpy(rows))
+        primvar.SetIndices(Vt.IntArray.FromNumpy(index.ravel().astype(np.int32)))

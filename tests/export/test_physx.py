@@ -1,0 +1,291 @@
+"""PhysX: the scenes that ship, every export and a robot of others stand and drive in it (`make physx`)."""
+
+import math
+import subprocess
+import sys
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Sdf, Usd, UsdGeom, UsdPhysics
+
+import magtwin.export.validation.physx_drive as physx_drive
+from magtwin.author.scene import author_scene
+from magtwin.cli import main
+from magtwin.errors import InputError
+from magtwin.export.package import export_scene
+from magtwin.export.usdz import unpack
+from magtwin.export.validation.physx_drive import STEP_S, find_python, open_world
+from magtwin.export.validation.physx_robots import driven_table, find_room, read_driven
+from magtwin.export.validation.validate import validate
+from magtwin.files import shipped
+from magtwin.path import figure8
+from magtwin.sim.engines.newton import Newton
+from magtwin.sim.motion.follow import follow
+from magtwin.spec.obstacles import Obstacles
+from magtwin.twin import open_twin, scene_from_toml
+from magtwin.urdf import convert_urdf
+from magtwin.urdf.options import Options
+from magtwin.usd.obstacles import read_obstacles
+
+PYTHON, VERSION = find_python()
+
+physx = pytest.mark.skipif(not PYTHON, reason=physx_drive.GET_PHYSX)
+
+RATE = 5.594
+"""Wheels of a TurtleBot 4 at 0.2 m/s [rad/s]."""
+
+
+@pytest.fixture(scope="module")
+def exports(lab_scene, tmp_path_factory):
+    """The default lab as it ships, and in every form that magtwin exports."""
+    folder = tmp_path_factory.mktemp("physx")
+    made = {"lab": lab_scene}
+    for profile in ("omniverse", "isaac", "newton"):
+        export_scene(lab_scene, folder / profile, profile=profile, trusted=True)
+        made[profile] = folder / profile / lab_scene.name
+    for name in ("viewer.usdc", "lab.usdz"):
+        made[name] = folder / name
+        export_scene(lab_scene, made[name], trusted=True)
+    return made
+
+
+FORMS = ["lab", "omniverse", "isaac", "newton", "viewer.usdc", "lab.usdz"]
+
+
+# Without PhysX
+
+
+def test_a_validator_that_is_missing_is_named_with_how_to_get_it(lab_scene, monkeypatch, capsys):
+    monkeypatch.setenv(physx_drive.PHYSX, "/no/such/python")
+    with pytest.raises(SystemExit) as left:
+        main(["validate", str(lab_scene), "--against", "physx"])
+    assert left.value.code == 1
+    assert "not run: physx: ovphysx is not installed; pip install 'magtwin[physx]'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [("import time; time.sleep(60)", "took longer than 0.5 s"), ("raise ValueError('no floor')", "no floor")],
+)
+def test_an_engine_that_hangs_or_fails_is_a_finding(lab_scene, monkeypatch, code, said):
+    monkeypatch.setattr(physx_drive, "LIMIT_S", 0.5)
+    monkeypatch.setattr(physx_drive, "find_python", lambda: (sys.executable, "0"))
+    real = physx_drive.WorldProcess
+    monkeypatch.setattr(
+        physx_drive, "WorldProcess", lambda command, *a, **k: real([command[0], "-c", code], *a, **k)
+    )
+    if "time" not in code:
+        monkeypatch.setattr(physx_drive, "LIMIT_S", 60)
+    (check,) = validate(lab_scene, ["physx"]).checks
+    (finding,) = check.findings
+    assert finding.rule == "unfinished"
+    assert said in finding.text
+    assert check.result == "failed"
+
+
+def test_a_robot_drives_where_it_has_room():
+    box = np.array([[0.5, -0.5], [1.5, -0.5], [1.5, 0.5], [0.5, 0.5]])
+    others = np.empty((0, 2))
+    assert find_room(Obstacles(), (0, 0, 0), 0.2, others) == (0, 0, 0)
+    x, y, yaw = find_room(Obstacles(("box",), (box,)), (0, 0, 0), 0.2, others)
+    assert (x, y) == (0, 0)
+    assert yaw == pytest.approx(math.pi / 2)  # at 60 degrees, the corner is 0.18 m from the way
+    _, _, yaw = find_room(Obstacles(), (0, 0, 0), 0.2, np.array([[1.0, 0.0]]))
+    assert abs(yaw) > math.radians(20)
+    inside = find_room(Obstacles(("box",), (box,)), (1.0, 0.0, 0.0), 0.2, others)
+    assert Obstacles(("box",), (box,)).clearance([inside[:2]])[0][0] > 0.2
+
+
+def test_the_robot_of_the_lab_is_found_with_its_wheels_and_its_ground(lab_scene):
+    stage = Usd.Stage.Open(str(lab_scene))
+    table = driven_table(stage)
+    (robot,) = table["robots"]
+    assert robot["base"] == "/World/turtlebot4/base_link"
+    assert robot["joints"] == tuple(f"/World/turtlebot4/joints/{s}_wheel_joint" for s in ("left", "right"))
+    assert robot["lowest_m"] == pytest.approx(0, abs=1e-6)
+    assert table["ground"]
+    assert not driven_table(Usd.Stage.CreateInMemory())["ground"]
+
+
+def test_attributes_of_physx_are_on_prims_that_have_their_schema(exports):
+    """PhysX ignores an attribute whose schema is not applied."""
+    stage = Usd.Stage.Open(str(exports["isaac"]))
+    seen = set()
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        apis = prim.GetPrimTypeInfo().GetAppliedAPISchemas()
+        for prop in prim.GetAuthoredPropertyNames():
+            if prop.startswith("physx"):
+                family = prop.partition(":")[0]
+                schema = f"P{family[1:]}API"
+                assert any(api.partition(":")[0] == schema for api in apis), (prim.GetPath(), prop)
+                seen.add(prop)
+    assert {
+        "physxArticulation:enabledSelfCollisions",
+        "physxJoint:armature",
+        "physxMaterial:frictionCombineMode",
+    } <= seen
+
+
+# In PhysX
+
+
+@physx
+def test_the_lab_passes_and_the_command_says_so_in_a_line_each(lab_scene, capsys):
+    main(["validate", str(lab_scene), "--against", "physx"])
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines() if "note physx" in line]
+    assert [line.split()[2] for line in lines] == ["stands", "drives", "turns"]
+
+
+@physx
+@pytest.mark.parametrize("form", FORMS)
+def test_the_robot_of_the_lab_and_of_each_export_rests_drives_and_turns(exports, form, tmp_path):
+    file = exports[form] if exports[form].suffix != ".usdz" else unpack(exports[form], tmp_path)
+    stage = Usd.Stage.Open(str(file))
+    (robot,) = read_driven(stage)
+    obstacles, none = read_obstacles(stage), np.empty((0, 2))
+    spots = [(0, 0, 0.0), (2, 1, 1.0), (-2, 1, 2.5), (2, -1, -1.0), (-2, -1, -2.5)]
+    starts = [find_room(obstacles, spot, 0.2, none) for spot in spots]
+    assert len(set(starts)) == 5
+    job = {"base": robot.base, "joints": robot.joints, "start": starts[0]}
+    moved = []
+    with open_world(PYTHON, file, job) as world:
+        before = world.seen()
+        after = world.ask([[0.0, 0.0]] * round(5 / STEP_S))
+        assert math.dist(before[:2], after[:2]) < 0.002
+        assert abs(after[7] - robot.height_m) < 0.002
+        for start in starts:
+            before = world.ask(start)
+            assert before[:3] == pytest.approx(start, abs=1e-3)
+            after = world.ask([[RATE, RATE]] * round(2 / STEP_S))
+            moved.append(math.dist(before[:2], after[:2]))
+        before = world.ask(starts[0])
+        rate = robot.wheel_separation_m / 2 / robot.wheel_radius_m
+        after = world.ask([[-rate, rate]] * round(2 / STEP_S))
+    assert min(moved) > 0.37
+    assert max(moved) < 0.42
+    assert math.remainder(after[2] - before[2], math.tau) == pytest.approx(2, rel=0.08)
+
+
+@physx
+def test_the_robot_of_an_aprilab_scene_passes(tmp_path):
+    scene = scene_from_toml(shipped("scenes", "aprilab.toml"), map_layer=shipped("maps", "lab", "lab.usdc"))
+    (check,) = validate(author_scene(scene, tmp_path / "aprilab"), ["physx"]).checks
+    assert check.result == "passed", check.findings
+
+
+@physx
+@pytest.mark.parametrize("merge", [False, True])
+def test_the_real_robot_passes(real_data, tmp_path, merge):
+    asset = convert_urdf(
+        real_data / "turtlebot4" / "turtlebot4.urdf",
+        tmp_path / "turtlebot4.usda",
+        options=Options(profile="diff-drive", merge_fixed=merge),
+    )
+    (check,) = validate(asset, ["physx"]).checks
+    assert [finding.rule for finding in check.findings] == ["stands", "drives", "turns"]
+    assert check.result == "passed", check.findings
+
+
+@physx
+def test_a_robot_with_hindered_wheels_fails(exports, tmp_path):
+    stage = Usd.Stage.Open(str(exports["viewer.usdc"]))
+    stage.GetRootLayer().Export(str(tmp_path / "stuck.usda"))
+    stage = Usd.Stage.Open(str(tmp_path / "stuck.usda"))
+    drive = UsdPhysics.DriveAPI(stage.GetPrimAtPath("/World/turtlebot4/joints/left_wheel_joint"), "angular")
+    drive.GetMaxForceAttr().Set(1e-6)
+    stage.Save()
+    (check,) = validate(tmp_path / "stuck.usda", ["physx"]).checks
+    found = {finding.rule: finding.severity for finding in check.findings}
+    assert found == {"stands": "note", "drives": "error", "turns": "error"}
+
+
+@physx
+def test_a_robot_above_a_hole_falls_and_fails(exports, tmp_path):
+    stage = Usd.Stage.Open(str(exports["viewer.usdc"]))
+    stage.GetRootLayer().Export(str(tmp_path / "hole.usda"))
+    stage = Usd.Stage.Open(str(tmp_path / "hole.usda"))
+    stage.RemovePrim("/World/Lab/Ground")  # walls and furniture still collide
+    stage.Save()
+    (check,) = validate(tmp_path / "hole.usda", ["physx"]).checks
+    assert check.findings[0].rule in ("stands", "unfinished")
+    assert check.result == "failed"
+
+
+@dataclass(frozen=True)
+class Physx(Newton):
+    """A robot in PhysX, behind the engine's interface."""
+
+    step_s: float = 0.01
+    name = "physx"
+
+    def world(self, closed_loop, step_s):
+        root, drive = f"/World/{self.robot.name}", closed_loop.drive
+        wheels = (drive.left_wheel_joint, drive.right_wheel_joint)
+        return open_world(
+            PYTHON,
+            Path(self.stage),
+            {
+                "base": f"{root}/base_link",
+                "joints": [f"{root}/joints/{wheel}" for wheel in wheels],
+                "start": list(closed_loop.pose0),
+                "step_s": step_s,
+            },
+        )
+
+
+@physx
+def test_kinematic_newton_and_physx_follow_the_figure_of_eight_alike(lab_scene, monkeypatch):
+    monkeypatch.setattr("magtwin.sim.engines.newton.check_installed", lambda: None)
+    twin = open_twin(lab_scene, network="none")
+    engines = {"kinematic": None, "physx": Physx(twin.scene_file, twin.scene.robot)}
+    if find_spec("newton") is not None:
+        engines["newton"] = Newton(twin.scene_file, twin.scene.robot)
+    drive = twin.scene.robot.drive
+    motions = {
+        name: follow(figure8(), drive, speed=0.2, **({} if engine is None else {"engine": engine}))
+        for name, engine in engines.items()
+    }
+    t = np.arange(0, min(motion.duration_s for motion in motions.values()), 0.05)
+    assert t[-1] > 70
+    seen = {name: motion.at(t).pose[:, :2] for name, motion in motions.items()}
+    for first in seen:
+        for second in seen:
+            assert np.sqrt(np.mean(np.sum((seen[first] - seen[second]) ** 2, axis=1))) < 0.05, (first, second)
+
+
+@physx
+def test_a_stage_that_has_no_articulation_is_refused_in_a_line(tmp_path, lab_scene):
+    stage = Usd.Stage.CreateNew(str(tmp_path / "empty.usda"))
+    UsdGeom.Xform.Define(stage, "/World")
+    stage.Save()
+    with (
+        pytest.raises(InputError, match=r"PhysX cannot run it: .*no articulation with /World/base"),
+        open_world(
+            PYTHON, tmp_path / "empty.usda", {"base": "/World/base", "joints": ["/a", "/b"], "start": None}
+        ) as world,
+    ):
+        world.seen()
+
+
+@physx
+def test_every_attribute_of_physx_is_in_its_schemas(exports):
+    """Those of `physx-usd-schemas`; PhysxJointAPI was in them until 2025 and Isaac Sim 6 reads it."""
+    path = "physx_usd_schemas/PhysxSchema/resources/generatedSchema.usda"
+    found = f"distribution('physx-usd-schemas').locate_file('{path}')"
+    code = f"from importlib.metadata import distribution; print({found})"
+    file = subprocess.check_output([PYTHON, "-c", code], text=True).strip()
+    layer = Sdf.Layer.FindOrOpen(file)  # held in a name: a spec does not keep its layer alive
+    known = {
+        name.replace("__INSTANCE_NAME__:", ""): spec.typeName
+        for schema in layer.rootPrims
+        for name, spec in schema.attributes.items()
+    }
+    stage = Usd.Stage.Open(str(exports["isaac"]))
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        for attribute in prim.GetAuthoredAttributes():
+            name = attribute.GetName()
+            if name.startswith("physx") and not name.startswith("physxJoint:"):
+                assert known.get(name) == attribute.GetTypeName(), name
