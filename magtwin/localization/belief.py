@@ -84,30 +84,42 @@ def mean_variance(table: Table) -> Array:
     Returns:
         Laid out as the values of the table; of length 0 if the map has no variance, or 0 everywhere.
     """
-    begin, end, _, _ = planes(table.field)
-    plane, spreads = end - begin, table.variance
-    total = spreads[:plane].copy()
-    if len(spreads) > plane:
-        total += BETWEEN_CELLS * spreads[plane : 2 * plane] + BETWEEN_TURNS * spreads[2 * plane : 3 * plane]
-    total = np.where(np.isfinite(total), total, 0.0)
+    nodes, between = _variances(table)
+    total = nodes + between
     return total if total.any() else total[:0]
 
 
-def tempering(variance: Array, white_nt: float) -> float:
+def tempering(table: Table, white_nt: float) -> float:
     """Divisor of a log likelihood whose errors of the map depend on each other more than their model.
 
     Readings at a place that is passed again have the same error, which no filter over time knows. The larger
-    the map's error against the noise, the more this counts:
+    the map's error against the noise, the more this counts, and most for errors of interpolation, which are
+    far from Gaussian: small near the nodes, large in a few cells.
 
-        kappa = min(4, 1 + rms / (10 white)),
+        kappa = max(min(4, 1 + rms / (10 white)), min(3, 1 + rms_between / (5 white))),
 
-    chosen so that the covariances fit the errors on maps with a random error of 150 nT over 0.3 m, and on
-    trilinear maps of nodes 0.5 m apart.
+    with rms of the whole error and rms_between of interpolation alone. It was chosen so that the covariances
+    fit the errors on maps with a random error of 150 nT over 0.3 m, and on trilinear maps of nodes 0.25 and
+    0.5 m apart.
 
     Args:
-        variance: Result of `mean_variance`.
+        table: A map and its variance.
         white_nt: Standard deviation of the sensor's white noise [nT].
     """
-    if not len(variance):
+    nodes, between = _variances(table)
+    if not len(nodes):
         return 1.0
-    return min(4.0, 1.0 + float(np.sqrt(variance.mean())) / (10 * white_nt))
+    rms, rms_between = (float(np.sqrt(v.mean())) for v in (nodes + between, between))
+    return max(min(4.0, 1 + rms / (10 * white_nt)), min(3.0, 1 + rms_between / (5 * white_nt)))
+
+
+def _variances(table: Table) -> tuple[Array, Array]:
+    """Variance at the nodes, and that of interpolation around them, 0 where unknown [nT^2]."""
+    begin, end, _, _ = planes(table.field)
+    plane, spreads = end - begin, table.variance
+    nodes = spreads[:plane]
+    between = np.zeros_like(nodes)
+    if len(spreads) > plane:
+        between = BETWEEN_CELLS * spreads[plane : 2 * plane] + BETWEEN_TURNS * spreads[2 * plane : 3 * plane]
+    known = np.isfinite(nodes + between)
+    return np.where(known, nodes, 0.0), np.where(known, between, 0.0)

@@ -89,8 +89,9 @@ class Ekf:
             self._iron = len(variances)
             variances += [sensor.iron_nt**2] * 2
             self._rates += [(0.0, 0.0)] * 2
-        variance = mean_variance(Table(table, spreads))
-        self._kappa = self.kappa or tempering(variance, sensor.white_nt)
+        tables = Table(table, spreads)
+        variance = mean_variance(tables)
+        self._kappa = self.kappa or tempering(tables, sensor.white_nt)
         if len(variance) and self.map_correlated > 0 and problem.map_length_m > 0:
             self._error = len(variances)
             variances.append(self.map_correlated)

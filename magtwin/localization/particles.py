@@ -72,9 +72,13 @@ class RaoBlackwell:
       reading and ref the mean log likelihood of a Gaussian with the variance of the readings that the
       particles predict. Above 12, particles over the whole floor join those that there are, half of them with
       the offset and hard iron that were known 5 to 10 s before. So a false alarm does not lose the pose.
+    * Stale map: an alarm need not be a kidnapping. Odometry alone moves a copy of the old particles on. Once
+      the others have been within 0.5 m for 5 s, more than 1 m away from these, both compete with equal
+      weights. The copy also joins the start of a further alarm before that.
     * A reading that repeats itself to the bit while the robot moves is not used, nor is nan.
 
-    `lost` is set while the particles spread over more than 0.5 m.
+    `lost` is set while the particles spread over more than 0.5 m, and after such a start until they have been
+    within 0.5 m for 5 s: where the map is stale, they may gather at a wrong place first.
 
     Args:
         particles: Least number of particles. Default: 3,000; 6,000 for the bootstrap filter.
@@ -89,6 +93,10 @@ class RaoBlackwell:
 
     reset_count = 0
     """How often the filter has started again."""
+
+    _memory: Array
+    _resampled: NDArray[np.int64]
+    _state: Array
 
     sampled: ClassVar[bool] = False
     iron: ClassVar[bool] = False
@@ -138,7 +146,7 @@ class RaoBlackwell:
         known = known_values(table)
         self._field_mean, self._field_variance = float(known.mean()), float(known.var())
         sensor = problem.sensor
-        self._kappa = self.kappa or tempering(self._variance, sensor.white_nt)
+        self._kappa = self.kappa or tempering(table, sensor.white_nt)
         self._states(len(self._variance) > 0)
         self._scale_variance = problem.odometry.scale_std**2
         self._numbers = np.zeros(20)
@@ -147,6 +155,8 @@ class RaoBlackwell:
         self._numbers[self._loops.ELSEWHERE_VARIANCE] = self._field_variance
         self._numbers[self._loops.KAPPA] = self._kappa
         self.reset_count = 0
+        self._doubt, self._spread_t = False, -math.inf
+        self._old: Array | None = None  # moved by odometry alone since an alarm
         self._last: Reading | None = None
         self._repeated_m, self._same_nt = 0.0, math.nan
         self._start(problem.prior.mean, problem.prior.sd)
@@ -196,12 +206,7 @@ class RaoBlackwell:
         size = len(self._kinds)
         k = self._loops
         old = 0 if kept is None else kept.shape[1]
-        self._count = old + count
-        rows = k.LINEAR + size + size * (size + 1) // 2
-        self._memory = np.empty((2, rows * _padded(self._count)))
-        self._columns = np.empty(self._count, np.int64)
-        self._resampled = self._columns[:0]
-        self._state = self._next_state(rows)
+        self._open(k.LINEAR + size + size * (size + 1) // 2, old + count)
         if kept is not None:
             self._state[:, :old] = kept
         state = self._state[:, old : self._count]
@@ -222,17 +227,23 @@ class RaoBlackwell:
             covariance[np.ix_(self._constant, self._constant)] = errors[1]
             self._draw_errors(state, slice(None, None, 2), known, covariance)
         self._scale_variance = self._problem.odometry.scale_std**2
-        self._state[k.LOG_WEIGHT : k.WEIGHT, : self._count] = 0.0
-        self._state[k.LOG_WEIGHT, :old] = math.log(count / max(old, 1))
-        self._state[k.WEIGHT, : self._count] = np.exp(self._state[k.LOG_WEIGHT, : self._count])
-        total = count * (2.0 if old else 1.0)
-        self._shift = math.log(total)
-        self._scales = np.full(self._blocks(self._count), 1.0 / total)
+        self._share(old, count)
         if not old:
             self._reference = mean if math.isfinite(sd[0]) else (middle[0], middle[1], mean[2])
         self._surprise, self._settled = 0.0, False
         self._kept: list[tuple[Array, Array]] = []
         self._kept_t = -math.inf
+
+    def _share(self, old: int, count: int) -> None:
+        """Give the first `old` particles half of the weight, and the `count` others the rest."""
+        k = self._loops
+        state = self._state[:, : old + count]
+        state[k.LOG_WEIGHT : k.WEIGHT] = 0.0
+        state[k.LOG_WEIGHT, :old] = math.log(count / max(old, 1))
+        state[k.WEIGHT] = np.exp(state[k.LOG_WEIGHT])
+        total = count * (2.0 if old else 1.0)
+        self._shift = math.log(total)
+        self._scales = np.full(self._blocks(old + count), 1.0 / total)
 
     def _draw_errors(self, state: Array, part: slice, mean: Array, covariance: Array) -> None:
         """Give some particles a mean and a covariance of the linear states, or draws of them."""
@@ -312,25 +323,43 @@ class RaoBlackwell:
         return math.isfinite(b_nt) and self._repeated_m <= STILL_M
 
     def _run(self, decay: Array, noise: Array) -> None:
-        """One step of all blocks, on several threads if there are many."""
-        k, count = self._loops, self._count
+        """One step of all blocks, on several threads if there are many; the old particles beside them."""
         self._count_steps += 1
-        key = np.uint64((self._seed + self._count_steps * _STRIDE) & _WORD)
-        blocks = self._blocks(count)
-        sums = self._sums = np.empty((blocks, k.PLAIN_SUM + 1))
-
         before = self._state
         if len(self._resampled):
             self._state = self._next_state(len(before))
+        self._sums = self._moved(before, self._resampled, self._state, self._count, decay, noise)
+        self._resampled = self._resampled[:0]
+        if self._old is not None:
+            old, numbers, used = self._old, self._numbers, self._numbers[self._loops.USED]
+            numbers[self._loops.USED] = 0.0
+            self._moved(old, self._resampled, old, old.shape[1], decay, noise, sign=-1)
+            numbers[self._loops.USED] = used
+
+    def _moved(
+        self,
+        before: Array,
+        chosen: NDArray[np.int64],
+        state: Array,
+        count: int,
+        decay: Array,
+        noise: Array,
+        sign: int = 1,
+    ) -> Array:
+        """Do a step with some particles; returns the sums of their blocks. `sign` selects their draws."""
+        k = self._loops
+        key = np.uint64((self._seed + sign * self._count_steps * _STRIDE) & _WORD)
+        blocks = self._blocks(count)
+        sums = np.empty((blocks, k.PLAIN_SUM + 1))
 
         def work(part: slice) -> None:
             k.step(
-                part.start, part.stop, count, before, self._resampled, self._state, sums, self._table,
-                self._variance, self._numbers, decay, noise, self._kinds, key, self.sampled,
+                part.start, part.stop, count, before, chosen, state, sums, self._table, self._variance,
+                self._numbers, decay, noise, self._kinds, key, self.sampled,
             )  # fmt: skip
 
         in_threads(work, blocks, SHARE)
-        self._resampled = self._resampled[:0]
+        return sums
 
     def _estimate(self, t: float, used: bool) -> Estimate:
         """Weighted mean and covariance; the sum of surprise."""
@@ -364,9 +393,16 @@ class RaoBlackwell:
             expected = -0.5 - 0.5 * math.log(variance)
             more = min(expected - likelihood - SLACK, MOST_SURPRISE)
             self._surprise = max(0.0, self._surprise + more)
-        lost = self.spread > SETTLED_M
+        lost = self._doubted(t)
         bias = float(total[k.OFFSET]) / weight
         return Estimate(t, *pose, covariance, bias, lost)
+
+    def _doubted(self, t: float) -> bool:
+        """Whether the particles are spread out, or have met only lately after a start again."""
+        if self.spread > SETTLED_M:
+            self._spread_t = t
+            return True
+        return self._doubt
 
     def _held(
         self, pose: tuple[float, float, float], covariance: Array, place: tuple[float, float]
@@ -392,10 +428,22 @@ class RaoBlackwell:
         """Resample, shrink, or start again."""
         if self.resets and self._surprise > RESET_ABOVE:
             self.reset_count += 1
+            self._doubt, self._spread_t = True, estimate.t
             errors = None if len(self._kept) < 2 else (self._kept[0][0], INFLATE * self._kept[0][1])
             kept = self._state[:, self._chosen(min(KEPT, self._count))]
+            if self._old is None:
+                self._old = kept.copy()
+            else:
+                kept = np.concatenate([kept, self._old], axis=1)
             self._start((0.0, 0.0, 0.0), (math.inf, math.inf, math.inf), errors, kept)
             return
+        if self._doubt and estimate.t >= self._spread_t + DOUBT_S:
+            old, self._old = self._old, None
+            self._doubt = old is not None and not self._agrees(old, estimate)
+            if self._doubt and old is not None:
+                self._let_compete(old)
+                self._spread_t = estimate.t
+                return
         if self._settled and estimate.t >= self._kept_t + KEEP_S:
             self._kept, self._kept_t = [*self._kept[-1:], self._errors()], estimate.t
         wanted = self._count
@@ -403,6 +451,26 @@ class RaoBlackwell:
             wanted = min(self._count, max(self._enough(self.spread), int(SHRINK * self._count)))
         if wanted < self._count or self._effective < self._count / 2:
             self._resample(wanted)
+
+    def _agrees(self, old: Array, estimate: Estimate) -> bool:
+        """Whether odometry puts the particles that there were before an alarm near an estimate."""
+        return math.hypot(float(old[0].mean()) - estimate.x, float(old[1].mean()) - estimate.y) < NEAR_M
+
+    def _let_compete(self, old: Array) -> None:
+        """Give half of the weight to the particles that there were before an alarm."""
+        others = self._state[:, self._chosen(self._count)]
+        size, count = old.shape[1], self._count
+        self._open(len(others), size + count)
+        self._state[:, :size], self._state[:, size : self._count] = old, others
+        self._share(size, count)
+
+    def _open(self, rows: int, count: int) -> None:
+        """Memory for a number of particles, of a start or of a competition."""
+        self._count = count
+        self._memory = np.empty((2, rows * _padded(count)))
+        self._columns = np.empty(count, np.int64)
+        self._resampled = self._columns[:0]
+        self._state = self._next_state(rows)
 
     def _next_state(self, rows: int) -> Array:
         """Memory of a state, beside that of the present one."""
@@ -481,6 +549,9 @@ KEPT = 1000
 
 RESET_ABOVE = 12.0
 """Sum of surprise at which the filter starts again."""
+
+DOUBT_S = 5.0
+"""Time after a start again for which the particles must stay together until the pose is trusted [s]."""
 
 
 def _padded(count: int) -> int:

@@ -234,6 +234,22 @@ def test_a_kidnapped_robot_is_found_and_others_are_not_looked_for():
     assert stubborn.reset_count == 0
 
 
+@pytest.mark.parametrize("start", [1.0, 2.5, 4.0, 5.0])
+def test_after_readings_of_another_place_odometry_leads_back_to_the_pose(start):
+    pose, away = circle(240), range(100, 135)  # the map is wrong there: the robot goes on
+    problem, readings = drive(FIELD, pose, 12)
+    _, others = drive(FIELD, circle(240, start=start), 12)
+    mixed = [replace(r, b_nt=others[k].b_nt) if k in away else r for k, r in enumerate(readings)]
+    fast = RaoBlackwellIron()
+    made = estimates(fast, problem, mixed)
+    error = np.hypot(*(poses(made)[:, :2] - pose[:, :2]).T)
+    lost = np.array([e.lost for e in made])
+    assert fast.reset_count >= 1
+    assert error[-25:].max() < 0.25
+    assert np.count_nonzero(~lost & (error > 0.5)) < 25  # 5 s
+    assert lost[np.argmax(lost) :][:25].all()  # for 5 s at least
+
+
 @settings(max_examples=8)
 @given(
     x=st.floats(-5, 5),
