@@ -93,8 +93,10 @@ def build_dataset(
         sources = sources_of_files(runs, session_by=session_by, path_by=path_by, **reading)
     checksum = ""
     if not isinstance(anomaly_map, AnomalyMap):
+        from magtwin.usd.layers import layer_sha256
+
         path = Path(anomaly_map)
-        anomaly_map, checksum = open_map(path), sha256(path) if path.is_file() else ""
+        anomaly_map, checksum = open_map(path), layer_sha256(path) if path.is_file() else ""
     return build(
         sources,
         anomaly_map,
@@ -369,6 +371,8 @@ def _dataset(dataset: Dataset | File) -> Dataset:
 
 
 def _named_maps(maps: Sequence[AnomalyMap | File]) -> list[NamedMap]:
+    from magtwin.usd.layers import layer_sha256
+
     files = iter(short_names([Path(each) for each in maps if not isinstance(each, AnomalyMap)]))
     named = []
     for each in maps:
@@ -376,7 +380,7 @@ def _named_maps(maps: Sequence[AnomalyMap | File]) -> list[NamedMap]:
             named.append(named_map(each.name, each))
         else:
             path = existing(each, "map")
-            checksum = [sha256(path)] if path.is_file() else []
+            checksum = [layer_sha256(path)] if path.is_file() else []
             named.append(named_map(next(files), open_map(path), *checksum))
     if not named:
         raise InputError(

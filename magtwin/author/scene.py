@@ -22,10 +22,12 @@ from magtwin.urdf.convert import THUMBNAILS
 from magtwin.usd.attributes import check_prim_name, write_pose
 from magtwin.usd.earth import define_earth
 from magtwin.usd.furniture import FURNITURE, define_furniture
+from magtwin.usd.heat_map import MAP
 from magtwin.usd.lab import LAB, PHYSICS_SCENE, define_lab, expose_for_kit
 from magtwin.usd.layers import WORLD, describe_stage, new_stage, relative_asset
 from magtwin.usd.looks import SHAPES, SHAPES_FILE, VISUALS, define_shapes
-from magtwin.usd.maps import MAP, load_map, read_made_from, write_made_from
+from magtwin.usd.map_attributes import read_made_from, write_made_from
+from magtwin.usd.maps import load_map
 from magtwin.usd.robot import load_robot, urdf_of
 from magtwin.usd.scene import check_map
 from magtwin.usd.schema import only_prim_with

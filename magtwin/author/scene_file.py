@@ -22,6 +22,7 @@ from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import PlacedRobot, RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.usd.earth import checked
+from magtwin.usd.layers import layer_sha256
 from magtwin.usd.robot import load_robot
 
 
@@ -190,7 +191,7 @@ def scene_from_toml(
     scene = Scene(
         name=given.name,
         map_layer=Path("surveyed") if layer is None else existing(layer, "map layer"),
-        map_sha256="" if layer is None else sha256(layer),
+        map_sha256="" if layer is None else layer_sha256(layer),
         robot=robots[0].robot,
         lab=lab,
         earth=earth,
@@ -209,7 +210,7 @@ def scene_from_toml(
             surveyed = survey_of(scene, given.survey or SurveySpec(), given.seed, standing)
         except InputError as error:
             raise InputError(f"{path}: cannot be surveyed: {error}") from error
-        scene = replace(scene, map_layer=surveyed, map_sha256=sha256(surveyed))
+        scene = replace(scene, map_layer=surveyed, map_sha256=layer_sha256(surveyed))
     return scene
 
 

@@ -34,6 +34,7 @@ from magtwin.usd.placement import labs_on
 from magtwin.usd.scene import read_scene
 from magtwin.usd.schema import FOLDER as SCHEMA
 from magtwin.usd.schema import attribute_name, place, prims_with
+from magtwin.usd.tiled_maps import check_tiles
 from magtwin.usd.units import check_units
 from magtwin.version import __version__
 
@@ -247,6 +248,7 @@ class _Work:
         self.map = ""
         for prim in prims_with(world, "anomalyMap"):
             read_map(prim)
+            check_tiles(prim)
             self.map = self.map or str(prim.GetPath())
             licence = prim.GetAttribute(attribute_name("anomalyMap", "licence")).Get()
             values = prim.GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack()[0].layer

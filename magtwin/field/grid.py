@@ -33,14 +33,9 @@ class Grid(Summarized):
     def __post_init__(self) -> None:
         headings = np.asarray(self.headings_rad, float)
         check_axes(self)
-        object.__setattr__(self, "headings_rad", tuple(headings.tolist()))
         if self.rows < 2 or self.columns < 2:
             raise InputError(f"a Grid needs 2 x 2 nodes at least, got {self.rows} x {self.columns}")
-        if np.prod(self.shape, dtype=float) > MOST_NODES:
-            raise InputError(
-                f"a grid of {self.rows} x {self.columns} nodes in {len(headings)} headings is beyond "
-                f"{MOST_NODES:,} nodes; widen the spacing"
-            )
+        object.__setattr__(self, "headings_rad", tuple(headings.tolist()))
 
     @classmethod
     def over(cls, extent: ArrayLike, spacing_m: float, headings_rad: ArrayLike) -> "Grid":
@@ -69,7 +64,7 @@ class Grid(Summarized):
             headings_rad=tuple(np.asarray(headings_rad, float).ravel().tolist()),
             rows=rows,
             columns=columns,
-        )
+        ).in_memory()
 
     @classmethod
     def filling(cls, extent: ArrayLike, widest_m: float, headings_rad: ArrayLike) -> "Grid":
@@ -88,7 +83,21 @@ class Grid(Summarized):
             headings_rad=tuple(np.asarray(headings_rad, float).ravel().tolist()),
             rows=along + 1,
             columns=across + 1,
-        )
+        ).in_memory()
+
+    def in_memory(self) -> "Grid":
+        """The grid, if arrays over all its nodes fit in memory.
+
+        Raises:
+            InputError: It has more than `MOST_NODES`.
+        """
+        headings, rows, columns = self.shape
+        if headings * rows * columns > MOST_NODES:
+            raise InputError(
+                f"a grid of {rows} x {columns} nodes in {headings} headings is beyond {MOST_NODES:,} nodes; "
+                "widen the spacing"
+            )
+        return self
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -113,6 +122,7 @@ class Grid(Summarized):
 
     def poses(self) -> tuple[Array, Array]:
         """World x and y of every node [m], shape (H, Y, X, 2), and its heading [rad], shape (H, Y, X)."""
+        self.in_memory()
         yaw, y, x = np.meshgrid(np.asarray(self.headings_rad), self.y_m, self.x_m, indexing="ij")
         return np.stack([x, y], axis=-1), yaw
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import sha256
 from magtwin.io.formats import read_run, write_run
 from magtwin.path import CASES, PATHS, Path, path_named, read_path_csv
 from magtwin.report import Figure, Report
@@ -177,11 +176,12 @@ def map_of(
     Raises:
         InputError: The scene is missing, or its map changed.
     """
+    from magtwin.usd.layers import layer_sha256
     from magtwin.usd.maps import load_map
     from magtwin.usd.scene import read_scene
 
     layer = read_scene(scene_of(run, scene, near=near), check_network=False).map_layer
-    if "map_sha256" in run.metadata and run.metadata["map_sha256"] != sha256(layer):
+    if "map_sha256" in run.metadata and run.metadata["map_sha256"] != layer_sha256(layer):
         raise InputError(f"{layer}: is not the map of the run")
     return load_map(layer)
 

@@ -27,10 +27,10 @@ from magtwin.localization.elementary import (
 
 Array = NDArray[np.float64]
 
-BLOCK = 128
+BLOCK = 256
 """Particles worked on at a time: their states and factors stay in the cache."""
 
-LANES, PARTS = 32, BLOCK // 32
+LANES, PARTS = 64, BLOCK // 64
 """Partial sums of a block, and particles in each."""
 
 _QUARTER = LANES // 4

@@ -14,8 +14,8 @@ from magtwin.localization.problem import Array, Estimate, Problem, Reading
 
 LOOPS = Loops("magtwin.localization.particle_loops", pays=0)
 
-SHARE = 32
-"""Blocks of 128 particles that a thread takes at a time."""
+SHARE = 16
+"""Blocks of 256 particles that a thread takes at a time."""
 
 FORGET_S = 1000.0
 """Correlation time of the offset and of hard iron [s]. They are constant in the model, but the particles soon

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.field.maps.map import CONSTANT_NT, AnomalyMap, Outside
+from magtwin.field.maps.map import AnomalyMap, Outside
 from magtwin.run.run import Run
 from magtwin.sim.interference import (
     ambient_at_sensor_nt,
@@ -78,8 +78,7 @@ class ExactField:
     @cached_property
     def holds_robot(self) -> bool:
         """Whether the map contains the surveying robot: its values depend on the heading."""
-        values = np.where(self.anomaly_map.valid, self.anomaly_map.values_nt, np.nan)
-        return bool(np.any(np.abs(values - values[:1]) > CONSTANT_NT))
+        return self.anomaly_map.turns
 
     @cached_property
     def direction(self) -> Literal["fit", "earth", "assumed"]:
@@ -261,8 +260,8 @@ def check_field(scene: Scene, anomaly_map: AnomalyMap) -> None:
     made = scene.magnets or scene.others  # other robots have iron too
     if not anomaly_map.is_constant or (scene.earth is not None and made):
         return
-    values = anomaly_map.values_nt[anomaly_map.valid]
-    what = f"{values.mean():,.0f} nT at every node" if values.size else "without a valid node"
+    known = anomaly_map.known
+    what = f"{known.mean_nt:,.0f} nT at every node" if known.nodes else "without a valid node"
     raise InputError(
         f"scene {scene.name!r} has a constant field: its map {anomaly_map.name!r} is {what}, and nothing "
         "in it is magnetised; name a map that was fitted to a survey, or add [earth] with [[source]] or "

@@ -12,7 +12,7 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any
 
 from magtwin.errors import InputError, MismatchWarning, find
-from magtwin.files import existing, git_revision, sha256, shipped
+from magtwin.files import existing, git_revision, shipped
 from magtwin.run.run import Run
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
@@ -71,6 +71,7 @@ def open_twin(
     options["tracking_error"] = tracking_error
     if isinstance(scene, Scene):
         return _open_in_memory(scene, **options)  # has one lab
+    from magtwin.usd.layers import layer_sha256
     from magtwin.usd.scene import open_scene
 
     file = scene_file(scene)
@@ -89,7 +90,7 @@ def open_twin(
     metadata: Metadata = {"scene_file": file.as_posix(), "scene_sha256": stage.sha256}
     if revision := git_revision(file.parent):
         metadata["git_revision"] = revision
-    metadata |= {"map": field.name, "map_sha256": sha256(read.map_layer)}
+    metadata |= {"map": field.name, "map_sha256": layer_sha256(read.map_layer)}
     if stage.lab:
         metadata["lab"] = stage.lab
     if stage.pose is not None:

@@ -1,6 +1,7 @@
 """Layers: create them with units and default prim, open them, and name files relative to them."""
 
 import hashlib
+import json
 import os
 import re
 from collections.abc import Iterator
@@ -14,6 +15,12 @@ from magtwin.files import existing, output, sha256
 
 WORLD = Sdf.Path("/World")
 """Default prim of maps and scenes."""
+
+TILED_MAP, MAP_PREFIX = WORLD.AppendChild("AnomalyMap"), "magtwin:anomalyMap:"
+"""Path of the map in a map's layer, and how its attributes begin."""
+
+TILED_BYTES = 1_000_000
+"""Bytes from which on a layer can be one whose map is read by tiles."""
 
 SUFFIXES = (".usd", ".usda", ".usdc")
 
@@ -104,6 +111,23 @@ def layer_files(path: str | os.PathLike[str]) -> list[Path]:
     return [Path(layer.realPath) for layer in layers if layer.realPath]
 
 
+def layer_sha256(path: str | os.PathLike[str]) -> str:
+    """Checksum of a layer: of its bytes, but of a map in tiles of what its map's prim says.
+
+    That holds the map's own checksum, which covers every tile, so no tile is read.
+    """
+    path = Path(path)
+    with path.open("rb") as file:
+        crate = file.read(8) == b"PXR-USDC"
+    if crate and path.stat().st_size > TILED_BYTES:
+        layer = Sdf.Layer.OpenAsAnonymous(str(path))
+        prim = layer.GetPrimAtPath(TILED_MAP)
+        if prim and f"{MAP_PREFIX}tileCells" in prim.attributes:
+            said = {a.name: str(a.default) for a in prim.attributes if not a.name.endswith("tileFigures")}
+            return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+    return sha256(path)
+
+
 def stage_sha256(path: str | os.PathLike[str]) -> str:
     """Checksum of a stage: of its root layer and, recursively, of every file that it names.
 
@@ -124,7 +148,7 @@ def _content_sha256(file: Path, above: tuple[Path, ...]) -> str:
         return sha256(file)
     try:
         if not any(UsdUtils.ExtractExternalReferences(str(file))):
-            return sha256(file)
+            return layer_sha256(file)
         layer = Sdf.Layer.OpenAsAnonymous(str(file))
     except Tf.ErrorException as error:
         raise InputError(f"{file}: cannot be opened as USD: {_reason(error)}") from error

@@ -11,7 +11,6 @@ from pxr import Gf, Usd, UsdGeom
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import sha256
 from magtwin.frames import yaw_from_quat
 from magtwin.spec.magnetics import EarthFieldSpec
 from magtwin.spec.obstacles import Obstacles
@@ -22,8 +21,9 @@ from magtwin.usd.earth import AGREES_NT, read_earth
 from magtwin.usd.furniture import read_magnets
 from magtwin.usd.geometry import Link, Shape, read_links, read_shapes
 from magtwin.usd.lab import read_lab
-from magtwin.usd.layers import open_stage, relative_asset, save_layer, stage_sha256
-from magtwin.usd.maps import MADE_FROM, read_map
+from magtwin.usd.layers import layer_sha256, open_stage, relative_asset, save_layer, stage_sha256
+from magtwin.usd.map_attributes import MADE_FROM
+from magtwin.usd.maps import read_map
 from magtwin.usd.obstacles import read_obstacles
 from magtwin.usd.placement import (
     AT_ORIGIN,
@@ -296,7 +296,7 @@ def check_map(scene: Scene, where: str = "") -> None:
     Raises:
         InputError: The checksum differs.
     """
-    if scene.map_sha256 and (actual := sha256(scene.map_layer)) != scene.map_sha256.lower():
+    if scene.map_sha256 and (actual := layer_sha256(scene.map_layer)) != scene.map_sha256.lower():
         raise InputError(
             f"{where}{scene.map_layer}: has SHA-256 {actual}, but scene {scene.name!r} was made with a map "
             f"of {scene.map_sha256}; put that map back, or make the scene anew with this one"
@@ -336,7 +336,7 @@ def use_map(opened: OpenedScene, map_layer: str | os.PathLike[str], *, dry: bool
         new = relative_asset(layer, map_layer)
         layer.subLayerPaths = [new if n == name else n for n in layer.subLayerPaths]
         changed.add(layer)
-    checksum = sha256(map_layer)
+    checksum = layer_sha256(map_layer)
     with Usd.EditContext(stage, stage.GetRootLayer()):
         for prim in prims_with(stage.GetPseudoRoot(), "magnetometer"):
             prim.GetAttribute(MAP_CHECKSUM).Set(checksum)

@@ -17,17 +17,8 @@ from magtwin.field.maps.made_from import MadeFrom
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import colour_limits
 from magtwin.field.sources.harmonic import HarmonicField
-from magtwin.usd.maps import (
-    HEAT_MAP,
-    MAP,
-    colour_index,
-    heading_variants,
-    load_epochs,
-    load_map,
-    save_map,
-    save_map_series,
-    viridis,
-)
+from magtwin.usd.heat_map import HEAT_MAP, MAP, colour_index, heading_variants, viridis
+from magtwin.usd.maps import load_epochs, load_map, save_map, save_map_series
 from magtwin.usd.schema import attribute_name
 
 VALUES = "magtwin:anomalyMap:values"

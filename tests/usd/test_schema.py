@@ -96,6 +96,7 @@ def other_value(attribute: Usd.Attribute):
         "float[]": Vt.FloatArray([1.5]),
         "double[]": Vt.DoubleArray([1.5]),
         "double3[]": Vt.Vec3dArray([Gf.Vec3d(1, 2, 3)]),
+        "double4[]": Vt.Vec4dArray([Gf.Vec4d(1, 2, 3, 4)]),
         "int": 7,
         "double": 1.5,  # one without a fallback: unknown unless authored
     }[str(attribute.GetTypeName())]

@@ -24,7 +24,12 @@ class Lap:
         self.inputs = json.loads(self.network.get_modelmeta().custom_metadata_map["features"])
         self.robot, self.drive = self.figures("drive")
         self.grid, self.battery, self.lidar = (self.figures(n)[1] for n in ("anomalyMap", "battery", "lidar"))
-        values = np.where(self.grid["valid"], self.grid["values"], np.nan).reshape(self.grid["shape"])
+        values = (
+            self.nodes()
+            if self.grid.get("tileCells")
+            else np.where(self.grid["valid"], self.grid["values"], np.nan)
+        )
+        values = values.reshape(self.grid["shape"])
         self.values = np.append(values, values[:1], axis=0)  # once round: the last heading is the first
         self.headings = np.radians([*self.grid["headings"], self.grid["headings"][0] + 360])
         names = [f"magtwin:drive:{side}WheelJoint" for side in ("left", "right")]
@@ -46,6 +51,20 @@ class Lap:
         key = f"magtwin:{noun}:"
         prim = next(p for p in self.stage.Traverse() if any(n.startswith(key) for n in p.GetPropertyNames()))
         return prim, {a.GetName().removeprefix(key): a.Get() for a in prim.GetAttributes()}
+
+    def nodes(self):
+        """The values of a map in tiles [nT], in single precision: all of them, in memory."""
+        values, cells = np.empty(tuple(self.grid["shape"]), np.float32), self.grid["tileCells"]
+        for tile in (
+            next(p for p in self.stage.Traverse() if p.GetName() == "tile_0_0").GetParent().GetChildren()
+        ):
+            row, column = (int(n) * cells for n in tile.GetName().split("_")[1:])
+            part = values[:, row : row + cells + 1, column : column + cells + 1]
+            known, valid = (
+                np.array(tile.GetAttribute(f"magtwin:mapTile:{n}").Get()) for n in ("values", "valid")
+            )
+            part[:] = np.where(valid, known, np.float32(np.nan)).reshape(part.shape)
+        return values
 
     def field_map(self, x, y, yaw):
         """The map at a pose [nT]: linear in x, in y, and between two headings on the circle."""

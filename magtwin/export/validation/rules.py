@@ -22,9 +22,11 @@ from magtwin.files import sha256
 from magtwin.usd.attributes import plain_value, target
 from magtwin.usd.earth import read_earth
 from magtwin.usd.furniture import read_magnets
+from magtwin.usd.heat_map import HEAT_MAP, heading_variants
 from magtwin.usd.lab import read_lab
+from magtwin.usd.layers import layer_sha256
 from magtwin.usd.looks import VISUALS
-from magtwin.usd.maps import HEAT_MAP, checksums, heading_variants, read_map
+from magtwin.usd.maps import checksums, read_map
 from magtwin.usd.obstacles import read_obstacles
 from magtwin.usd.placement import UPRIGHT, labs_on, pose_of
 from magtwin.usd.robot import read_robot
@@ -40,6 +42,7 @@ from magtwin.usd.sensors import (
     read_lidar,
     read_magnetometer,
 )
+from magtwin.usd.tiled_maps import tile_faults
 from magtwin.usd.units import mixed_units
 
 NETWORK = attribute_name("magnetometer", "network")
@@ -149,6 +152,10 @@ def map_checksum(subject: Subject) -> Iterator[Wrong]:
                     f"its arrays have SHA-256 {taken[:12]}..., its checksum says {said[:12] or 'nothing'}..."
                 )
                 yield Wrong(text, str(prim.GetPath()))
+                break
+        else:
+            for path, text in tile_faults(prim):
+                yield Wrong(text, str(path))
 
 
 @rule("magtwin", "make the map again with magtwin map")
@@ -191,7 +198,7 @@ def map_file(subject: Subject) -> Iterator[Wrong]:
         if layer == subject.stage.GetRootLayer() or not layer.realPath:
             continue  # a flattened stage is its own map
         file = Path(layer.realPath)
-        if (seen := sha256(file)) != said:
+        if (seen := layer_sha256(file)) != said:
             text = f"{file.name} has SHA-256 {seen[:12]}..., it names {said[:12]}..."
             yield Wrong(text, str(prim.GetPath()))
 

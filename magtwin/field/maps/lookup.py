@@ -5,6 +5,8 @@ All three do the same operations in the same order, so a pose gives the same byt
 among others.
 """
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,6 +34,37 @@ def warm_up() -> None:
     LOOPS.open()
 
 
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A rectangle of a map's nodes laid out for lookup: all of them, or those of a tile.
+
+    Each array is flat, by heading, row and column, with the first heading repeated at the end.
+    """
+
+    values: NDArray  # Field [nT], 0 at masked nodes; single or double precision
+    holes: NDArray | None  # 1 at masked nodes, 0 at others; None if there are none
+    spreads: tuple[NDArray, ...]  # Variances [nT^2]: of the nodes, and any errors of interpolation
+    row: int  # Row of its first node in the map
+    column: int  # Column of its first node in the map
+    rows: int
+    columns: int
+
+    def node(self, h: NDArray[np.intp], j: NDArray[np.intp], i: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Index of the nodes at heading h, row j and column i of the map."""
+        return (h * self.rows + (j - self.row)) * self.columns + (i - self.column)
+
+    def corners(self, plane: NDArray, node: NDArray[np.intp]) -> list[Array]:
+        """Entries of the cells whose lowest nodes are `node`, in double precision."""
+        along_y = self.columns
+        ways = [up + way for up in (0, self.rows * along_y) for way in (0, 1, along_y, along_y + 1)]
+        return [plane.take(node + way).astype(float, copy=False) for way in ways]
+
+
+def closed(plane: NDArray) -> NDArray:
+    """Nodes (H, Y, X) as a plane of a `Block`."""
+    return np.concatenate([plane.ravel(), plane[0].ravel()])
+
+
 class Lookup:
     """A gridded field laid out for lookup, in the order heading, row, column of `AnomalyMap`.
 
@@ -49,28 +82,40 @@ class Lookup:
         headings_rad: Array,
     ) -> None:
         layers, rows, columns = values_nt.shape
+        self._lay_axes(layers, rows, columns, origin_m, cell_m, headings_rad)
+        x0, y0, dx, dy, first, per_rad, *_ = self.figures
+        grids = [np.where(valid, values_nt, 0.0)]
+        if not valid.all():
+            grids.append((~valid).astype(float))
+        header = [x0, y0, dx, dy, first, EDGE, layers, rows, columns, per_rad]
+        self.table: Array = np.concatenate([header, self.knots, self.gaps, *map(closed, grids)])
+        """The map in one array, see `trilinear`."""
+
+        begin, end, *_ = trilinear.planes(self.table)
+        holes = self.table[end:] if len(grids) > 1 else None
+        self._block = Block(self.table[begin:end], holes, (), 0, 0, rows, columns)
+        self._plain = memoryview(self.table.data)  # its entries are plain floats, which Python adds up faster
+
+    def _lay_axes(
+        self,
+        layers: int,
+        rows: int,
+        columns: int,
+        origin_m: tuple[float, float],
+        cell_m: tuple[float, float],
+        headings_rad: Array,
+    ) -> None:
+        """Lay out the axes of a map of so many headings, rows and columns."""
         first = float(headings_rad[0])
         self.knots: Array = headings_rad - first
         self.gaps: Array = np.diff(np.append(headings_rad, first + TURN))
         even = np.abs(self.gaps - TURN / layers).max() < 1e-12
         per_rad = 0.0 if layers == 1 else layers / TURN if even else -1.0
-        grids = [np.where(valid, values_nt, 0.0)]
-        if not valid.all():
-            grids.append((~valid).astype(float))
-        header = [*origin_m, *cell_m, first, EDGE, layers, rows, columns, per_rad]
-        closed = [part.ravel() for grid in grids for part in (grid, grid[:1])]
-        self.table: Array = np.concatenate([header, self.knots, self.gaps, *closed])
-        """The map in one array, see `trilinear`."""
-
-        begin, end, *_ = trilinear.planes(self.table)
-        self.values: Array = self.table[begin:end]
-        self.holes: Array | None = self.table[end:] if len(grids) > 1 else None
         self.figures = (*origin_m, *cell_m, first, per_rad, layers, rows, columns)
-        self._plain = memoryview(self.table.data)  # its entries are plain floats, which Python adds up faster
 
     def spreads(self, *layers: Array) -> Array:
         """Variances (H, Y, X) laid out for `lookup`: the nodes' own, and any errors of interpolation."""
-        return np.concatenate([part.ravel() for layer in layers for part in (layer, layer[:1])])
+        return np.concatenate([closed(layer) for layer in layers])
 
     def lookup(
         self, p: Array, yaw: Array, *, clamp: bool, gradient: bool, spreads: Array = NONE
@@ -102,9 +147,11 @@ class Lookup:
 
             in_threads(work, len(yaw), SHARE)
         else:
+            planes = tuple(spreads.reshape(-1, self._block.values.size)) if len(spreads) else ()
+            block = replace(self._block, spreads=planes)
             for start in range(0, len(p), BLOCK):
                 part = slice(start, start + BLOCK)
-                self._by_numpy(p[part], yaw[part], clamp, out[part], slopes[part], spreads, sds[part])
+                self._by_numpy(block, p[part], yaw[part], clamp, out[part], slopes[part], sds[part])
         sds[np.isnan(out[: len(sds)])] = np.nan
         return out, slopes, sds
 
@@ -124,21 +171,34 @@ class Lookup:
             return trilinear.at_with_gradient(self._plain, x, y, yaw, clamp)
         return code.at_with_gradient(self.table, x, y, yaw, clamp)  # type: ignore[no-any-return]
 
-    def _by_numpy(
-        self, p: Array, yaw: Array, clamp: bool, out: Array, slopes: Array, spreads: Array, sds: Array
-    ) -> None:
-        """Look up a block of poses in numpy; `slopes` and `sds` are empty if they are not wanted."""
-        x0, y0, dx, dy, first, per_rad, layers, rows, columns = self.figures
-        unknown = ~np.isfinite(yaw)
-        place, inside = [], []
+    def _cells(
+        self, p: Array, clamp: bool
+    ) -> tuple[tuple[NDArray[np.intp], ...], tuple[Array, ...], tuple[NDArray[np.bool_], ...], NDArray]:
+        """Cells of points (N, 2) on the floor.
+
+        Returns:
+            Their columns and rows; the weights of the higher nodes along x and y; whether the points are
+            inside along x and y; whether the field is unknown there.
+        """
+        x0, y0, dx, dy, _, _, _, rows, columns = self.figures
+        unknown = np.zeros(len(p), bool)
+        cells, weights, inside = [], [], []
         for axis, (origin, spacing, last) in enumerate(((x0, dx, columns - 1), (y0, dy, rows - 1))):
             u = (p[:, axis] - origin) / spacing
             inside.append((u >= -EDGE) & (u <= last + EDGE))
             unknown |= np.isnan(u) if clamp else ~inside[axis]
             u = np.clip(np.where(np.isnan(u), 0.0, u), 0, last)
-            cell = np.minimum(u.astype(np.intp), last - 1)
-            place.append((cell, u - cell))
-        (i, wx), (j, wy) = place
+            cells.append(np.minimum(u.astype(np.intp), last - 1))
+            weights.append(u - cells[axis])
+        return tuple(cells), tuple(weights), tuple(inside), unknown
+
+    def _by_numpy(
+        self, block: Block, p: Array, yaw: Array, clamp: bool, out: Array, slopes: Array, sds: Array
+    ) -> None:
+        """Look up poses of a block in numpy; `slopes` and `sds` are empty if they are not wanted."""
+        _, _, dx, dy, first, per_rad, layers, _, _ = self.figures
+        (i, j), (wx, wy), inside, unknown = self._cells(p, clamp)
+        unknown |= ~np.isfinite(yaw)
         a = np.where(unknown, 0.0, yaw) - first
         a -= TURN * np.floor(a / TURN)
         a = np.clip(a, 0, TURN)
@@ -149,18 +209,16 @@ class Lookup:
             u = a * per_rad
             h = np.minimum(u.astype(np.intp), layers - 1)
             wh, rate = u - h, np.full(len(a), per_rad)
-        node = (h * rows + j) * columns + i
-        ways = [up + along for up in (0, rows * columns) for along in (0, 1, columns, columns + 1)]
-        values = [self.values.take(node + way) for way in ways]
+        node = block.node(h, j, i)
+        values = block.corners(block.values, node)
         out[:] = blend(values, wx, wy, wh)
         holes = None
-        if self.holes is not None:
-            holes = [self.holes.take(node + way) for way in ways]
+        if block.holes is not None:
+            holes = block.corners(block.holes, node)
             unknown |= blend(holes, wx, wy, wh) > EDGE
         out[unknown] = np.nan
         if len(sds):
-            layers_of = spreads.reshape(-1, self.values.size)
-            parts = [blend([one.take(node + way) for way in ways], wx, wy, wh) for one in layers_of]
+            parts = [blend(block.corners(one, node), wx, wy, wh) for one in block.spreads]
             whole = parts[0] if len(parts) == 1 else spread(parts[0], parts[1], parts[2], wx, wy, wh)
             sds[:] = np.sqrt(whole)
         if not len(slopes):

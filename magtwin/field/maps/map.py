@@ -30,6 +30,16 @@ CONSTANT_NT = 1e-3  # Range of values up to which a map is constant [nT]
 Outside = Literal["nan", "clamp", "raise"]
 
 
+@dataclass(frozen=True)
+class Known:
+    """The values of a map's valid nodes in short; nan if there is none."""
+
+    nodes: int  # Number of valid nodes, over all headings
+    least_nt: float
+    greatest_nt: float
+    mean_nt: float
+
+
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class AnomalyMap(Summarized):
     """Total field on a grid over x, y and heading, as read by a robot at rest at each node.
@@ -143,7 +153,7 @@ class AnomalyMap(Summarized):
             Flags, shape (...); false for nan.
         """
         u = (np.asarray(p_xy, float) - self.origin_m) / self.cell_m
-        _, rows, columns = self.values_nt.shape
+        _, rows, columns = self.grid.shape
         return np.all((u >= -EDGE) & (u <= np.array([columns - 1, rows - 1]) + EDGE), axis=-1)
 
     def lookup(self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan") -> Array:
@@ -198,7 +208,7 @@ class AnomalyMap(Summarized):
         Raises:
             InputError: The map has no variance; or an error of `lookup`.
         """
-        value, _, sd = self._look(p_xy, yaw, outside, gradient=False, spreads=self._spreads)
+        value, _, sd = self._look(p_xy, yaw, outside, gradient=False, sd=True)
         return value, sd
 
     def lookup_all(
@@ -210,7 +220,7 @@ class AnomalyMap(Summarized):
             Field magnitude [nT], its standard deviation [nT], shapes (...), and dB/dx, dB/dy [nT/m] and
             dB/dyaw [nT/rad], shape (..., 3).
         """
-        value, slopes, sd = self._look(p_xy, yaw, outside, gradient=True, spreads=self._spreads)
+        value, slopes, sd = self._look(p_xy, yaw, outside, gradient=True, sd=True)
         return value, sd, slopes
 
     def mean(self, p_xy: ArrayLike, yaw: ArrayLike) -> Array:
@@ -219,7 +229,7 @@ class AnomalyMap(Summarized):
 
     def variance(self, p_xy: ArrayLike, yaw: ArrayLike) -> Array:
         """Square of the standard deviation of `lookup_with_sd` [nT^2]; 0 for a map without variance."""
-        if self.variance_nt2 is None:
+        if not self.has_variance:
             return self.lookup(p_xy, yaw) * 0.0
         return self.lookup_with_sd(p_xy, yaw)[1] ** 2
 
@@ -292,17 +302,45 @@ class AnomalyMap(Summarized):
             figures += [Figure(f"{k} gradient", round(float(v), 3), "uT/m") for k, v in sizes.items()]
         everywhere = self.valid.all(axis=0)
         if len(self.headings_rad) >= 3 and everywhere.any():
-            means, h = self.values_nt[:, everywhere].mean(axis=1), self.headings_rad
-            waves = np.column_stack([np.ones_like(h), np.cos(h), np.sin(h)])
-            _, c, s = np.linalg.lstsq(waves, means, rcond=None)[0]
-            figures.append(Figure("heading amplitude", round(float(np.hypot(c, s)), 1), "nT"))
+            figures.append(amplitude(self.values_nt[:, everywhere].mean(axis=1), self.headings_rad))
         return Report(f"map {self.name}", tuple(figures), {"method": self.method, "licence": self.licence})
+
+    @property
+    def has_variance(self) -> bool:
+        """Whether the variance of the values is known."""
+        return self.variance_nt2 is not None
+
+    @cached_property
+    def known(self) -> Known:
+        """The values of the valid nodes in short."""
+        values = self.values_nt[self.valid]
+        if not values.size:
+            return Known(0, np.nan, np.nan, np.nan)
+        return Known(values.size, float(values.min()), float(values.max()), float(values.mean()))
+
+    @cached_property
+    def mean_nt(self) -> float:
+        """Mean of the values, which stands for the field beside masked nodes [nT]."""
+        return float(np.nanmean(self.values_nt))
 
     @cached_property
     def is_constant(self) -> bool:
         """Whether all valid nodes have the same value within 1 pT, or no node is valid."""
-        values = self.values_nt[self.valid]
-        return not values.size or float(np.ptp(values)) <= CONSTANT_NT
+        return not self.known.nodes or self.known.greatest_nt - self.known.least_nt <= CONSTANT_NT
+
+    @cached_property
+    def turns(self) -> bool:
+        """Whether the values depend on the heading by more than 1 pT at any node."""
+        values = np.where(self.valid, self.values_nt, np.nan)
+        return bool(np.any(np.abs(values - values[:1]) > CONSTANT_NT))
+
+    def whole(self) -> "AnomalyMap":
+        """The map with all its arrays in memory; a map in tiles is read whole, if it is not too large."""
+        return self
+
+    def overview(self) -> "AnomalyMap":
+        """The map for pictures; of a map in tiles, every few nodes."""
+        return self
 
     @cached_property
     def _lookup(self) -> Lookup:
@@ -327,8 +365,9 @@ class AnomalyMap(Summarized):
         outside: Outside,
         *,
         gradient: bool,
-        spreads: Array = NONE,
+        sd: bool = False,
     ) -> tuple[Array, Array, Array]:
+        spreads = self._spreads if sd else NONE
         p, yaw = np.asarray(p_xy, float), np.asarray(yaw, float)
         if p.ndim == 0 or p.shape[-1] != 2:
             raise InputError(f"p_xy must have shape (..., 2), got {p.shape}")
@@ -340,9 +379,9 @@ class AnomalyMap(Summarized):
         if outside != "nan":
             self._check_outside(p, outside)
         clamp = outside == "clamp"
-        b, slopes, sd = self._lookup.lookup(p, yaw, clamp=clamp, gradient=gradient, spreads=spreads)
+        b, slopes, sds = self._lookup.lookup(p, yaw, clamp=clamp, gradient=gradient, spreads=spreads)
         slopes = slopes.reshape(*shape, 3) if gradient else slopes
-        return b.reshape(shape), slopes, sd.reshape(shape) if len(spreads) else sd
+        return b.reshape(shape), slopes, sds.reshape(shape) if sd else sds
 
     def _check_outside(self, p: Array, outside: Outside) -> None:
         if outside not in ("nan", "clamp", "raise"):
@@ -359,19 +398,23 @@ class AnomalyMap(Summarized):
                 'keep inside, or ask for outside="clamp" or "nan"'
             )
 
+    def _error_in_short(self) -> list[str]:
+        if self.variance_nt2 is None or not self.known.nodes:
+            return []
+        return [f"sd {np.sqrt(np.median(self.variance_nt2[self.valid])):.3g} nT (median)"]
+
     def _summary(self) -> Summary:
-        known, (x0, x1, y0, y1) = self.values_nt[self.valid], self.extent
+        known, (x0, x1, y0, y1) = self.known, self.extent
         title = "no valid node"
-        if known.size:
-            title = f"{span(known.min(), known.max(), 'nT')}, mean {known.mean():,.0f} nT"
+        if known.nodes:
+            title = f"{span(known.least_nt, known.greatest_nt, 'nT')}, mean {known.mean_nt:,.0f} nT"
         cell = f"{self.cell_m[0]:.3g} x {self.cell_m[1]:.3g} m"
-        headings, rows, columns = self.values_nt.shape
-        masked = int(np.count_nonzero(~self.valid))
+        headings, rows, columns = self.grid.shape
+        masked = headings * rows * columns - known.nodes
         degrees = listed([f"{d:.4g}" for d in np.degrees(self.headings_rad)], 40)
         about = [self.created or "day unknown"]
         about.append("height unknown" if self.height_m is None else f"sensor at {self.height_m:.3g} m")
-        if self.variance_nt2 is not None and known.size:
-            about.append(f"sd {np.sqrt(np.median(self.variance_nt2[self.valid])):.3g} nT (median)")
+        about += self._error_in_short()
         about += [self.licence] if self.licence else []
         return Summary(
             f"AnomalyMap {self.name or 'without a name'}: {title}",
@@ -379,13 +422,20 @@ class AnomalyMap(Summarized):
                 ("nodes", f"{columns} x {rows}, {cell} apart, {rectangle(x0, x1, y0, y1)}"),
                 ("headings", f"{headings}: {degrees} deg" + (f"; {masked:,} nodes masked" if masked else "")),
                 ("known", ", ".join(about)),
-                *((("made from", str(self.made_from)),) if self.made_from else ()),
                 ("method", self.method or "unknown"),
+                *((("made from", str(self.made_from)),) if self.made_from else ()),
                 ("source", self.source),
                 ("frame", self.frame),
                 ("datum", self.datum),
             ),
         )
+
+
+def amplitude(means_nt: Array, headings_rad: Array) -> Figure:
+    """The figure of a + c cos(heading) + s sin(heading), least squares, through the headings' means."""
+    waves = np.column_stack([np.ones_like(headings_rad), np.cos(headings_rad), np.sin(headings_rad)])
+    _, c, s = np.linalg.lstsq(waves, means_nt, rcond=None)[0]
+    return Figure("heading amplitude", round(float(np.hypot(c, s)), 1), "nT")
 
 
 def _frozen(values: ArrayLike, kind: type) -> NDArray[Any]:

@@ -1,7 +1,8 @@
 """What is known about a map: statistics per heading, metadata, colour limits."""
 
+import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.maps.epochs import drift
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.tiles import TiledMap
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.report import Figure, Report
 from magtwin.summary import span
@@ -64,18 +66,20 @@ def map_metadata(field: AnomalyMap, epochs: Sequence[AnomalyMap] = ()) -> Report
         datum, day, licence, and source files with checksums. Unknown entries are "unknown".
     """
     figures = [*field.report().figures]
-    share = 100 * float(field.valid.mean())
+    share = 100 * field.known.nodes / math.prod(field.grid.shape)
     figures.append(Figure("valid share", round(share, 2), "%", note="of the nodes, over all headings"))
     x0, x1, y0, y1 = field.extent
     dx, dy = field.cell_m
     extent = f"x {x0:g}..{x1:g}, y {y0:g}..{y1:g}"
     figures.append(Figure("extent", extent, "m", note=f"cells {dx:g} x {dy:g} m"))
-    known = None if field.variance_nt2 is None else field.variance_nt2[field.valid]
-    if known is None or not known.size:
+    known = _variances(field)
+    if not known.size:
         figures.append(Figure("standard deviation", "unknown"))
     else:
         low, middle, high = np.sqrt(np.percentile(known, (0, 50, 100)))
         note = f"median; from {low:.3g} to {high:.3g} nT"
+        if isinstance(field, TiledMap) and field.sums.every > 1:
+            note += f" at every {field.sums.every}th node along x and y"
         figures.append(Figure("standard deviation", float(middle), "nT", note=note))
     if field.height_m is None:
         figures.append(Figure("height", "unknown"))
@@ -117,10 +121,37 @@ def source_files(source: str) -> dict[str, str]:
     return files
 
 
+def _variances(field: AnomalyMap) -> Array:
+    """Variances of the valid nodes, of a map in tiles at every few nodes; empty if unknown."""
+    if isinstance(field, TiledMap):
+        return field.sums.variances_nt2
+    return np.empty(0) if field.variance_nt2 is None else field.variance_nt2[field.valid]
+
+
+def _rows(field: AnomalyMap) -> Iterable[Mapping[str, float]]:
+    """`statistics` of each heading; of a map in tiles without gradients and errors."""
+    if not isinstance(field, TiledMap):
+        return (statistics(field, h) for h in range(len(field.headings_rad)))
+    sums = field.sums
+    with np.errstate(invalid="ignore"):
+        rows: dict[str, Any] = {
+            "heading_deg": np.degrees(field.headings_rad),
+            "nodes": np.full(len(sums.count), sums.nodes),
+            "masked": sums.nodes - sums.count,
+            "mean_nt": sums.mean,
+            "sd_nt": np.sqrt(sums.square / sums.count),
+            "least_nt": sums.least,
+            "greatest_nt": sums.greatest,
+        }
+    return [
+        dict(zip(rows, row, strict=True)) for row in zip(*map(np.ndarray.tolist, rows.values()), strict=True)
+    ]
+
+
 def _headings(field: AnomalyMap) -> list[Figure]:
     """Mean and standard deviation of each heading, with its range and masked share."""
     figures = []
-    for row in (statistics(field, h) for h in range(len(field.headings_rad))):
+    for row in _rows(field):
         name = f"heading {row['heading_deg']:.6g}"
         if row["masked"] == row["nodes"]:
             figures.append(Figure(name, "no valid node"))

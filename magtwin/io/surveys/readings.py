@@ -190,8 +190,9 @@ def load_readings(path: Source) -> Readings:
         raise InputError(f"{path}: no Readings: metadata {_SURVEY.decode()!r} is missing")
     try:
         about = json.loads(metadata[_SURVEY])
-        grid = about["grid"] and Grid(
-            **{**about["grid"], "headings_rad": tuple(about["grid"]["headings_rad"])}
+        grid = (
+            about["grid"]
+            and Grid(**{**about["grid"], "headings_rad": tuple(about["grid"]["headings_rad"])}).in_memory()
         )
         given = {key: about[key] for key in (*_TEXTS, "height_m")} | {"runs": tuple(about["runs"])}
         given |= {key: about.get(key, "") for key in _PLACES} | {"earth_nt": about.get("earth_nt")}

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.tiles import TiledMap
 from magtwin.files import existing, output, sha256
 from magtwin.learn.data.alignment import Alignment, fit_alignment
 from magtwin.learn.data.features import FEATURES, SETS, columns_of, feature_names
@@ -502,7 +503,10 @@ def _write(run: Run, source: Source, path: Path) -> Recording:
 
 def values_sha256(field: AnomalyMap) -> str:
     """Checksum of a map's nodes, for maps without a file."""
-    digest = hashlib.sha256(json.dumps([field.origin_m, field.cell_m, field.values_nt.shape]).encode())
+    digest = hashlib.sha256(json.dumps([field.origin_m, field.cell_m, field.grid.shape]).encode())
+    if isinstance(field, TiledMap):
+        digest.update("".join(field.checksums).encode())
+        return digest.hexdigest()
     for array in (field.values_nt, field.valid, field.headings_rad):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

@@ -293,7 +293,8 @@ class SteppedRobots:
             b_map, slopes = self._map.lookup_with_gradient(*where, outside="clamp")
         else:
             b_map = self._map.lookup(*where, outside="clamp")
-        b_map = np.where(np.isnan(b_map), np.nanmean(self._map.values_nt), b_map)  # beside masked nodes
+        if np.isnan(b_map).any():  # beside masked nodes
+            b_map = np.where(np.isnan(b_map), self._map.mean_nt, b_map)
         error = np.zeros(len(which))
         if self._disturbance_nt is not None:
             sloped = into_base(np.nan_to_num(slopes[:, :2]), table["yaw"])

@@ -15,6 +15,7 @@ FOLDER = Path(__file__).resolve().parent
 
 NOUNS = {
     "anomalyMap": "MagtwinAnomalyMapAPI",
+    "mapTile": "MagtwinMapTileAPI",
     "harmonic": "MagtwinHarmonicFieldAPI",
     "magnetometer": "MagtwinMagnetometerAPI",
     "imu": "MagtwinImuAPI",

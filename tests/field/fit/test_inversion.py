@@ -340,7 +340,7 @@ def test_the_real_survey_is_told_to_190_nt_at_nodes_left_out_at_all_headings(rea
 
 
 @pytest.mark.slow
-def test_real_runs_are_told_by_three_others_to_1850_nt(real_data):
+def test_real_runs_are_told_by_three_others_to_1660_nt(real_data):
     from scipy.spatial import cKDTree
 
     folder = real_data / "magnetic-data"
@@ -366,6 +366,6 @@ def test_real_runs_are_told_by_three_others_to_1850_nt(real_data):
     near = cKDTree(shown.p_xy).query(rest.p_xy)[0] < 0.1
     value, variance = model.predict(rest.p_xy[near], rest.yaw[near])
     off = rest.b_nt[near] - value
-    assert rms(off) < 1_850
+    assert rms(off) < 1_660
     # 95.9 % when this was written: a little wide
     assert 0.85 < covered(off, variance + model.noise_nt2) < 0.97

@@ -1,0 +1,206 @@
+"""Attributes of a map's prim: what maps in memory and maps in tiles have in common."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Gf, Sdf, Usd, Vt
+
+from magtwin.errors import InputError
+from magtwin.field.grid import Grid
+from magtwin.field.maps.made_from import MadeFrom
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.sources.harmonic import SHAPES as HARMONIC
+from magtwin.usd.heat_map import UNIT
+from magtwin.usd.schema import NOUNS, attribute_name, place
+
+MOST_CHARACTERS = 60
+"""Characters of an attribute that an error quotes."""
+
+TEXTS = ("name", "method", "source", "licence", "created")
+
+PLACES = ("frame", "datum")
+
+MADE_FROM = attribute_name("anomalyMap", "made_from")
+
+GRID = ("shape", "origin", "cellSize", "headings")
+"""Attributes of the grid, which the checksum covers from version 2 on."""
+
+CHECKSUM_VERSION = 2
+"""Version of the checksum of a new map. Version 1, that of an older map, is of the arrays alone."""
+
+TILED_CHECKSUM_VERSION = 3
+"""Version of the checksum of a map in tiles: over the checksums of its tiles."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A time sample in the layer of a map's epochs, read there so that no layer offset rounds its time."""
+
+    layer: Sdf.Layer
+    prim: Sdf.Path
+    time: float
+
+    def get(self, attribute: str) -> Any:
+        """An attribute's value at exactly this time, or None."""
+        value = self.layer.QueryTimeSample(self.prim.AppendProperty(attribute), self.time)
+        return None if isinstance(value, Sdf.ValueBlock) else value
+
+
+def get(prim: Usd.Prim, name: str, sample: Sample | None = None) -> Any:
+    """Value of one of the map's attributes, of the schema's type."""
+    attribute = prim.GetAttribute(attribute_name("anomalyMap", name))
+    return check_type(attribute, sample.get(attribute.GetName()) if sample else attribute.Get())
+
+
+def check_type(attribute: Usd.Attribute, value: Any) -> Any:
+    """`value`, if it is of the attribute's type.
+
+    Raises:
+        InputError: It is not; names the prim.
+    """
+    kind = attribute.GetTypeName()
+    if not isinstance(value, type(kind.defaultValue)):
+        raise InputError(f"{place(attribute.GetPrim())}: {attribute.GetName()} must be a {kind}")
+    return value
+
+
+def read_height(prim: Usd.Prim) -> float | None:
+    """Height of the sensor above the floor [m]; None if unknown."""
+    attribute = prim.GetAttribute(attribute_name("anomalyMap", "height_m"))
+    height = attribute.Get()
+    if height is None:
+        return None
+    if not isinstance(height, float) or not math.isfinite(height):
+        raise InputError(
+            f"{attribute.GetName()} must be a length [m], got {height!r}; clear it where unknown"
+        )
+    return height
+
+
+def read_parameters(text: str) -> dict[str, Any]:
+    """Parameters from their JSON; empty if there is none."""
+    name, got = (
+        attribute_name("anomalyMap", "parameters"),
+        f"got {text[:MOST_CHARACTERS]!r}; make the map anew",
+    )
+    try:
+        figures = json.loads(text or "{}")
+        json.dumps(figures, allow_nan=False)  # refuses NaN, and 1e999, which is infinite
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{name} is not JSON ({error}), {got}") from error
+    if not isinstance(figures, dict):
+        raise InputError(f"{name} must be a JSON object, {got}")
+    return figures
+
+
+def read_made_from(prim: Usd.Prim, sample: Sample | None = None) -> MadeFrom | None:
+    """What a prim's map was made from, or what was authored over it; None if that is not recorded.
+
+    Raises:
+        InputError: The attribute holds something else; names the prim.
+    """
+    text = get(prim, "madeFrom", sample)
+    if not text:
+        return None
+    try:
+        return MadeFrom.from_table(json.loads(text))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{place(prim)}: {MADE_FROM}: {error}; make the map anew") from error
+
+
+def write_made_from(prim: Usd.Prim, made_from: MadeFrom) -> None:
+    """Author what a map was made from on its prim, in the stage's edit target."""
+    prim.GetAttribute(MADE_FROM).Set(_spelled(made_from))
+
+
+def _spelled(made_from: MadeFrom | None) -> str:
+    return "" if made_from is None else json.dumps(made_from.table(), ensure_ascii=False)
+
+
+def read_harmonic(prim: Usd.Prim, sample: Sample | None) -> dict[str, NDArray] | None:
+    """The arrays of the harmonic field in the schema's order; None if there is none at that time."""
+    if not prim.HasAPI(NOUNS["harmonic"]):
+        return None
+    arrays = {}
+    for name, shape in HARMONIC.items():
+        attribute = prim.GetAttribute(attribute_name("harmonic", name))
+        source = attribute.GetResolveInfo(Usd.TimeCode.Default()).GetSource()
+        authored = source == Usd.ResolveInfoSourceDefault
+        value = sample.get(attribute.GetName()) if sample else attribute.Get() if authored else None
+        if value is None:
+            continue
+        check_type(attribute, value)
+        arrays[name] = np.array(value, float).reshape([-1 if n < 0 else n for n in shape])
+    if arrays and len(arrays) < len(HARMONIC):
+        lost = ", ".join(attribute_name("harmonic", name) for name in HARMONIC.keys() - arrays.keys())
+        raise InputError(f"{place(prim)}: its harmonic field has no {lost}; make the map anew")
+    return arrays or None
+
+
+def set_values(prim: Usd.Prim, values: Mapping[str, Any]) -> None:
+    """Author attributes by name, but those without a value."""
+    for name, value in values.items():
+        if value is not None:
+            prim.GetAttribute(name).Set(value)
+
+
+def shared_values(field: AnomalyMap, grid: Grid, version: int) -> dict[str, Any]:
+    """Values of the attributes that all epochs share, by name; None if there is no value."""
+    shared = {
+        "shape": Vt.IntArray(grid.shape),
+        "origin": Gf.Vec2d(*grid.origin_m),
+        "cellSize": Gf.Vec2d(*grid.cell_m),
+        "headings": Vt.DoubleArray(np.rad2deg(grid.headings_rad).tolist()),
+        "unit": UNIT,
+        "checksumVersion": version,
+        "height_m": field.height_m,
+        **{name: getattr(field, name) for name in PLACES},
+    }
+    return {attribute_name("anomalyMap", name): value for name, value in shared.items()}
+
+
+def texts_of(field: AnomalyMap) -> dict[str, Any]:
+    """Values of the attributes that are texts and differ between epochs, by name."""
+    parameters = dict(field.parameters or {})
+    try:
+        text = json.dumps(parameters, allow_nan=False, ensure_ascii=False) if parameters else ""
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"parameters of map {field.name!r} must be finite numbers, texts and lists of them ({error})"
+        ) from error
+    given = {
+        "parameters": text,
+        "made_from": _spelled(field.made_from),
+        **{name: getattr(field, name) for name in TEXTS},
+    }
+    return {attribute_name("anomalyMap", name): value for name, value in given.items()}
+
+
+def harmonic_arrays(field: AnomalyMap) -> dict[str, NDArray] | None:
+    """Arrays of a map's harmonic field by name; None if there is none."""
+    return None if field.harmonic is None else {n: getattr(field.harmonic, n) for n in HARMONIC}
+
+
+def harmonic_values(harmonic: Mapping[str, NDArray] | None) -> dict[str, Any]:
+    """Values of the attributes of a harmonic field, by name; None if there is none."""
+    return {
+        attribute_name("harmonic", name): _usd_array(harmonic[name], shape) if harmonic else None
+        for name, shape in HARMONIC.items()
+    }
+
+
+def _usd_array(array: NDArray, shape: tuple[int, ...]) -> Any:
+    """An array of a harmonic field as the type of its attribute; -1 in `shape` is any number of rows."""
+    if shape in ((3, 3), (3,)):
+        return (Gf.Matrix3d if len(shape) == 2 else Gf.Vec3d)(*array.ravel().tolist())
+    return Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(array))
+
+
+def grid_numbers(grid: Grid) -> NDArray[np.float64]:
+    """The numbers of a map's grid in the order of `GRID`, as its layer has them."""
+    return np.concatenate([grid.shape, grid.origin_m, grid.cell_m, np.rad2deg(grid.headings_rad)])
