@@ -95,9 +95,10 @@ def open_twin(
         metadata["lab"] = stage.lab
     if stage.pose is not None:
         metadata["lab_pose"] = " ".join(map(repr, (*stage.pose.p, stage.pose.yaw)))
-    if stage.changes:
-        metadata["map_mismatch"] = _stale(stage)
-    for text in (*stage.notes, *([str(metadata["map_mismatch"])] if stage.changes else [])):
+    stale = [_stale(stage)] if stage.changes else []
+    for text in stale:  # a run has the same bytes wherever its stage lies
+        metadata["map_mismatch"] = text.replace(str(stage.file), stage.file.name)
+    for text in (*stage.notes, *stale):
         warnings.warn(text, MismatchWarning, stacklevel=2)
     platforms = {placed.robot.name: _platform_sha256(placed.robot) for placed in read.robots}
     metadata["platform_sha256"] = platforms[read.robot.name]

@@ -144,7 +144,7 @@ def test_what_is_listed_survives_its_file(runs):
 
 def test_an_interrupted_command_is_continued(lab_scene, tmp_path):
     out, parts = tmp_path / "runs", tmp_path / "runs.parts"
-    options = ["--count", "8", "--duration-s", "2", "--magnetometer", "physical", "--quiet"]
+    options = ["--count", "30", "--duration-s", "2", "--magnetometer", "physical", "--quiet"]
     command = ["sweep", str(lab_scene), "--out", str(out), *options]
     program = subprocess.Popen(
         [sys.executable, "-m", "magtwin", *command, "--jobs", "1"],

@@ -159,7 +159,7 @@ def test_no_worker_outlives_the_program(tmp_path, how):
     workers = [int(mark.name.partition("-")[2]) for mark in marks.iterdir()]
     assert len(workers) == 2
     program.send_signal(how)
-    err = program.communicate(timeout=10)[1]
+    err = program.communicate(timeout=60)[1]
     assert program.returncode == -how
     assert gone(workers)
     assert err.count("Traceback") == (how == signal.SIGINT)  # that of the program itself
