@@ -55,6 +55,13 @@ class Node:
     backend: Literal["auto", "rclpy", "cyclonedds"] = "auto"
     """ROS client library. auto: rclpy if it can be imported, else cyclonedds."""
 
+    discovery: Literal["localhost", "subnet"] | None = None
+    """Which machines find the node: this one, or all of the network. Default:
+    ROS_AUTOMATIC_DISCOVERY_RANGE, else localhost."""
+
+    qos: Literal["reliable", "sensor-data"] = "reliable"
+    """QoS of published sensor data: reliable, for every subscriber; or sensor-data, best effort with depth 5."""
+
     @contextmanager
     def bus(self, name: str, *, sim_time: bool = False, duration_s: float | None = None) -> "Iterator[Bus]":
         """The node, until the end of the block or Ctrl-C."""
@@ -68,7 +75,10 @@ class Node:
             sim_time=sim_time,
             backend=self.backend,
             domain=self.domain,
+            discovery=self.discovery,
+            offers=self.qos,
         )
+        _announce_reach(bus)
         signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a script ignore it
         try:
             with suppress(KeyboardInterrupt):
@@ -410,6 +420,17 @@ def spin(bus: "Bus", duration_s: float | None) -> None:
             bus.spin_once(0.1)
             if duration_s is not None:
                 advance(gone, duration_s)
+
+
+def _announce_reach(bus: "Bus") -> None:
+    """Which machines reach the node."""
+    from magtwin.ros.bus.names import interfaces
+
+    if bus.reach == "subnet":
+        names = ", ".join(interfaces()) or "none"
+        _warn(f"every host on the network can find this node and send to it (interfaces: {names})")
+    else:
+        announce("only this machine can find this node; --discovery subnet opens it to the network")
 
 
 def _drive_of(asset: Path | None) -> "DriveSpec":

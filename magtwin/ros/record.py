@@ -90,8 +90,7 @@ class Recorder:
             if len(kinds) > 1:
                 self._say(f"{name} is published as {' and as '.join(kinds)}; recording {kind}")
             latched = topic is not None and topic.qos.latched
-            reliable = latched or (topic is not None and topic.qos.reliable)
-            qos = Qos(depth=DEPTH, reliable=reliable, latched=latched)
+            qos = Qos(depth=DEPTH, reliable=latched or self._bus.reliable(name), latched=latched)
             self._writer.add(name, kind, qos)
             self._bus.subscribe(name, kind, partial(self._heard, name), qos)
 

@@ -14,7 +14,7 @@ from places import ROOT
 from magtwin.errors import InputError
 from magtwin.io.bags.topics import LATCHED, ODOMETRY, SENSOR_DATA, TOPICS, Qos
 from magtwin.ros.bus import Bus, Message, names_of, open_bus, to_bytes
-from magtwin.ros.clock import Clock
+from magtwin.ros.bus.clock import Clock
 
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 
@@ -74,7 +74,7 @@ def test_every_type_of_the_table_crosses_unchanged(pair: tuple[Bus, Bus]) -> Non
 def test_our_bytes_are_those_that_cyclonedds_itself_writes() -> None:
     from cyclonedds.idl import IdlStruct
 
-    from magtwin.ros.types import _struct
+    from magtwin.ros.bus.types import _struct
 
     struct = _struct(FIELD)
     header, field = (struct.__annotations__[name] for name in ("header", "magnetic_field"))

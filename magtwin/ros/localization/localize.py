@@ -133,8 +133,8 @@ class LocalizerNode:
         self._tf = None
         if settings["tf_broadcast"] and bus.knows(TF_KIND):
             self._tf = bus.publisher(TF.name, TF_KIND, TF.qos)
-            bus.subscribe(TF.name, TF_KIND, self._hear_tf, TF.qos)
-        bus.subscribe(INITIAL, POSE_KIND, self._start_at, Qos())
+            bus.subscribe(TF.name, TF_KIND, self._hear_tf, TF.qos.heard)
+        bus.subscribe(INITIAL, POSE_KIND, self._start_at, Qos().heard)
         self._reporter = Reporter(bus)
         self._algorithm: Localizer | None = None
         self._tick0, self._done = 0.0, 0
