@@ -92,7 +92,9 @@ class RclpyBus(Bus):
     def publisher(self, topic: str, kind: str, qos: Qos) -> Publisher:
         """As for `Bus`."""
         whole = self._names.resolve(topic)
-        sender = self._node.create_publisher(class_of(kind), whole, qos_of(offered(qos, self._offers_as)))  # takes CDR bytes
+        sender = self._node.create_publisher(
+            class_of(kind), whole, qos_of(offered(qos, self._offers_as))
+        )  # takes CDR bytes
         return Publisher(whole, kind, sender.publish, sender.get_subscription_count)
 
     def subscribe(self, topic: str, kind: str, handler: Handler, qos: Qos) -> Subscription:

@@ -20,9 +20,15 @@ FIRST = {
 }
 """Executables, and the parameter of each that is the positional argument of its command."""
 
+NETWORK = ("discovery", "qos", "backend", "domain")
+"""Parameters of every node that are options."""
+
 OPTIONS = {
-    "magnetometer": ("network", "online", "measured", "duration_s"),
-    "localize": ("method", "option", "map", "sensor", "odometry", "map_length_m", "seed", "duration_s"),
+    "magnetometer": ("network", "online", "measured", "duration_s", "frame_prefix", *NETWORK),
+    "localize": (
+        *("method", "option", "map", "sensor", "odometry", "map_length_m", "seed", "duration_s"),
+        *("frame_prefix", *NETWORK),
+    ),
 }
 """Parameters of these nodes that are options; their other parameters are settings, name:=value."""
 
