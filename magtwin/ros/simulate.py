@@ -143,8 +143,8 @@ class Simulator:
             links = tuple(link for robot in self.robots for link in robot.sender.links)
             for robot in self.robots:
                 robot.sender = replace(robot.sender, links=links if robot is self.robots[0] else ())
-        self._restart()
         for robot in self.robots:
+            robot.restart()
             for topic in robot.topics():
                 self._advertise(topic)
         self._restart()

@@ -1,7 +1,7 @@
 """Bus: the interface of a node to ROS 2, and its two backends.
 
-`bus` has the interface and `open_bus`, `names` the names and the reach of a node; `dds` and `rclpy_bus` are the
-backends.
+`bus` has the interface and `open_bus`; `names` has the names and the reach of a node; `dds` and `rclpy_bus`
+are the backends.
 """
 
 from magtwin.ros.bus.bus import (

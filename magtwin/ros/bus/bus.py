@@ -24,8 +24,8 @@ from magtwin.ros.parameters import Parameter
 Backend = Literal["auto", "rclpy", "cyclonedds"]
 
 Offers = Literal["reliable", "sensor-data"]
-"""QoS in which streams of sensor data are offered: reliable, which every subscriber matches, or best effort with
-depth 5, the sensor-data profile of ROS."""
+"""QoS in which streams of sensor data are offered: reliable, which every subscriber matches, or best effort
+with depth 5, the sensor-data profile of ROS."""
 
 BACKENDS: Mapping[str, tuple[str, str]] = {
     "rclpy": ("magtwin.ros.bus.rclpy_bus", "RclpyBus"),

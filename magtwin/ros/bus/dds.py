@@ -48,10 +48,13 @@ _COMMON = (
     "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"  # differs in Kilted
     "<Tracing><Verbosity>none</Verbosity></Tracing>"
 )
+# A node that announces itself by multicast alone, as ROS does by default, is found by our announcements to
+# each port of this machine; they go on, as such a node may start at any time.
 _HERE = (
     '<General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'
     "<AllowMulticast>false</AllowMulticast></General>"
     "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
+    "<SPDPInterval>1s</SPDPInterval><InitialLocatorPruneDelay>inf</InitialLocatorPruneDelay>"
     '<Peers><Peer address="127.0.0.1"/></Peers></Discovery>'
 )
 _ANYWHERE = "<Discovery><ParticipantIndex>auto</ParticipantIndex></Discovery>"
