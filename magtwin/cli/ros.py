@@ -61,7 +61,7 @@ class Node:
     ROS_AUTOMATIC_DISCOVERY_RANGE, else localhost."""
 
     qos: Literal["reliable", "sensor-data"] = "reliable"
-    """QoS of published sensor data: reliable, for every subscriber; or sensor-data, best effort with depth 5."""
+    """QoS of published sensor data. reliable: every subscriber gets it. sensor-data: best effort, depth 5."""
 
     @contextmanager
     def bus(

@@ -44,7 +44,7 @@ DISCHARGING = 2
 """POWER_SUPPLY_STATUS_DISCHARGING of sensor_msgs/BatteryState."""
 
 QOS, HEARD_QOS = "qos", "heard_qos"
-"""Nodes with the QoS of published topics, and of the subscription: best effort, which matches every publisher."""
+"""Nodes with the QoS of published topics, and of commands: best effort, which matches every publisher."""
 
 
 class _Parts(NamedTuple):

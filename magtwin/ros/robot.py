@@ -1,7 +1,7 @@
 """A simulated robot on its topics: commands in, readings out."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -130,7 +130,7 @@ class SimulatedRobot:
         self._command = (v, w)
         self._commands += 1
 
-    def state(self) -> tuple[list[tuple[Any, str]], Mapping[str, str]]:
+    def state(self) -> tuple[list[tuple[Any, str]], dict[str, str]]:
         """Problems since the last call, and values, for diagnostics."""
         senders, command = self._input.publishers(), self._name(COMMAND)
         others = [kind for kind in self._bus.types(command) if kind != self._kind]

@@ -64,7 +64,7 @@ class Simulator:
     """The robots of a twin in real time; the same commands in the same steps give the same messages.
 
     One robot has the topics of the bus's namespace. Of several, each has a namespace of its own below it, by
-    its name, and its name as prefix of its frames. They share /clock, /tf, /tf_static, /diagnostics and reset.
+    its name, and its name as prefix of its frames. They share /clock, /tf, /tf_static, /diagnostics, reset.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""APRILab's released nodes, unmodified, beside the simulated robot: they get their inputs, and read what we read."""
+"""APRILab's released nodes, unmodified, beside the simulated robot: they read what our magnetometer reads."""
 
 import math
 import os
@@ -46,7 +46,7 @@ path_follower.main()
 @pytest.fixture(scope="module")
 def scene(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The real lab with the released network, by the commands of the README."""
-    if not PYTHON.exists():
+    if not (PYTHON.exists() and OLD_NUMPY.exists()):
         pytest.skip("no rclpy of jazzy: `make ros` installs it into build/ros-jazzy")
     real, out = real_data / "aprilab", tmp_path_factory.mktemp("aprilab")
     network = real / "models" / "nn_magnetometer_model_v0.0.1.pth"
