@@ -56,7 +56,7 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 "discovery",
                 default_value=PythonExpression(["'' if '", value["sim"], "' == 'true' else 'subnet'"]),
-                description="which machines find the nodes: localhost or subnet; empty: as the environment says",
+                description="which machines find the nodes: localhost, subnet; empty: by the environment",
             ),
             DeclareLaunchArgument("path", default_value="", description="path to follow; empty: no follower"),
             DeclareLaunchArgument("speed", default_value="0.2", description="forward speed [m/s]"),
