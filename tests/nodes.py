@@ -17,8 +17,8 @@ SLOWEST_S = 15.0
 MOST_DOMAINS = 100
 """Domains up to here have ports below those that systems hand out."""
 
-EACH = 12
-"""Domains that one process uses in turn."""
+EACH = 48
+"""Domains that one process uses in turn; a domain may remember nodes of an earlier test for some seconds."""
 
 LOCKS = Path(tempfile.gettempdir()) / "magtwin-domains"
 
