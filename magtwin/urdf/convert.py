@@ -92,8 +92,8 @@ def convert_with_report(
         Every link, joint and geometry before and after, and all notes.
 
     Raises:
-        InputError: The URDF or a mesh cannot be converted, `options.strict` is set and something was lost,
-            or a file exists; nothing is written.
+        InputError: The URDF cannot be converted, `options.strict` is set and something was repaired or
+            lost, or a file exists; nothing is written.
     """
     out = Path(out)
     if out.suffix != ".usda":
@@ -192,12 +192,8 @@ class _Author:
             poses=read_mechanism(description, options).poses(),
             lint=lint(description, mass=options.mass, vertices=self.meshes.vertices),
         )
-        if options.strict and report.losses:
-            others = f" (and {len(report.losses) - 1} more)" if len(report.losses) > 1 else ""
-            raise InputError(
-                f"{report.source}: {report.losses[0]}{others}; convert without --strict to accept that"
-            )
-        notes = Vt.StringArray(description.notes)
+        description.repairs.check(report.source, strict=options.strict)
+        notes = Vt.StringArray(description.repairs.notes)
         stage.GetRootLayer().customLayerData = {
             **stage.GetRootLayer().customLayerData,
             **metadata(stage, description, report, options.metadata),

@@ -45,6 +45,13 @@ class Source:
         file, line = self.places[element]
         return f"{file}:{line}"
 
+    def place(self, element: ElementTree.Element | None) -> tuple[str, int]:
+        """File, relative to the folder of the description, and line of an element; ("", 0) if unknown."""
+        if element is None or element not in self.places:
+            return "", 0
+        file, line = self.places[element]
+        return Path(os.path.relpath(file, self.path.parent)).as_posix(), line
+
     def find_file(self, filename: str, what: str, element: ElementTree.Element | None = None) -> Path:
         """The file that a `filename=` refers to.
 
