@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from xml.etree import ElementTree
 
 from magtwin.errors import InputError, hint
+from magtwin.urdf.repairs import NOTE
 
 Element = ElementTree.Element
 
@@ -265,7 +266,7 @@ class _Checker:
             inertial.remove(tensor)
             mass = inertial.find("mass")
             if mass is None or float(mass.get("value", 0.0)) != 0:
-                self.repair("inertia-missing", "an <inertia> of zeros counts as none", given)
+                self.repair(NOTE, "an <inertia> of zeros counts as none", given)
 
     def _check_mass(self, link: Element, inertial: Element, source: Element) -> None:
         """Leave out an inertial without a mass above 0."""
