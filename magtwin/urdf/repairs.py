@@ -56,6 +56,7 @@ FAULTS: Mapping[str, tuple[str, str]] = {
     "mesh-unreadable": ("mesh that cannot be read", "a box of the link's size as a placeholder"),
     "mesh-flat": ("flat collision mesh", "thickened to a thin plate"),
     "file-name": ("malformed package path", "read as if it had the usual slashes"),
+    "package-missing": ("missing package of $(find)", "files in it count as missing"),
     "include-skipped": ("missing include of a xacro", "skipped; none of its macros is called"),
 }
 """Faults by kind: the fault, and its repair."""

@@ -13,8 +13,8 @@ from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.description.description import read_description
 from magtwin.urdf.source import xacro as our_xacro
 from magtwin.urdf.source.expression import GLOBALS, Budget, ExpressionError, evaluate
-from magtwin.urdf.source.package import Packages
-from magtwin.urdf.source.source import MissingFileError, read_source
+from magtwin.urdf.source.package import MissingFileError, Packages
+from magtwin.urdf.source.source import read_source
 
 URDF = DATA / "urdf"
 XACRO = '<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">\n{}\n</robot>\n'
@@ -218,7 +218,7 @@ def test_a_mistake_in_a_xacro_is_refused_with_its_line(tmp_path, slip):
 def test_messages_and_hidden_problems_of_a_xacro_are_noted(tmp_path):
     body = '<l x="${xacro.warning(\'careful\')}"/><xacro:property name="e" value="2"/>'
     body += '<xacro:include filename="none*.xacro"/>'
-    assert read_source(write_xacro(tmp_path, body)).notes == (
+    assert read_source(write_xacro(tmp_path, body)).repairs.notes == (
         "arm.xacro:2: careful",
         "arm.xacro:2: redefining global symbol: e",
         "arm.xacro:2: include 'none*.xacro' matches no file",
@@ -230,12 +230,12 @@ def test_a_xacro_does_not_read_the_environment(tmp_path, monkeypatch):
     path = write_xacro(tmp_path, '<link name="$(optenv ARM_MODE quiet)"/>')
     source = read_source(path)
     assert source.xml.find("link").get("name") == "quiet"
-    assert source.notes == (
+    assert source.repairs.notes == (
         "arm.xacro:2: environment variable ARM_MODE is not read, 'quiet' is taken; give --arg ARM_MODE=VALUE",
     )
     given = read_source(path, arguments={"ARM_MODE": "loud"})
     assert given.xml.find("link").get("name") == "loud"
-    assert given.notes == ()
+    assert given.repairs.notes == ()
 
 
 def test_symbolic_links_do_not_leave_the_folder(tmp_path):

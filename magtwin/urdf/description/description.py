@@ -5,6 +5,7 @@ the XML.
 """
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -31,6 +32,8 @@ from magtwin.urdf.repairs import LOSS, NOTE, Repairs
 from magtwin.urdf.source.source import Source, read_source
 
 Element = ElementTree.Element
+
+_SCHEME = re.compile(r"^(package|model):/*")
 
 JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "planar", "floating")
 """Types of joints that can be converted."""
@@ -84,15 +87,20 @@ class Description:
     def find_file(self, filename: str, what: str) -> Path:
         """The file that a `filename=` refers to, see `Source.find_file`.
 
-        Raises:
-            MissingFileError: The file does not exist.
-            InputError: The file may not be read, or its package was not found.
+        Backslashes, and too many or too few slashes after a scheme, are repaired.
         """
-        named = (e for e in self.xml.iter() if e.get("filename") == filename)
+        element = next((e for e in self.xml.iter() if e.get("filename") == filename), None)
+        usual = _SCHEME.sub(r"\1://", filename.replace("\\", "/"))
+        if usual != filename:
+            self.repair("file-name", f"{what} {filename!r} is read as {usual!r}", element)
         try:
-            return self.source.find_file(filename, what, next(named, None))
+            return self.source.find_file(usual, what, element)
         finally:
             self._take_notes()
+
+    def mesh_element(self, filename: str) -> Element | None:
+        """The first `<mesh>` of a file."""
+        return next((e for e in self.xml.iter("mesh") if e.get("filename") == filename), None)
 
     def note(self, text: str, *, lost: bool = False) -> None:
         """Add a note for the user, once.
@@ -123,8 +131,8 @@ class Description:
         return next((e for e in self.xml.findall(kind) if e.get("name") == name), None)
 
     def _take_notes(self) -> None:
-        """Take over the notes of the source, which grow as files are searched."""
-        for note in (*self.source.notes, *self.source.packages.notes):
+        """Take over the notes on packages, which grow as files are searched."""
+        for note in self.source.packages.notes:
             self.note(note)
 
     def poses(self) -> dict[str, NDArray[np.float64]]:
@@ -152,9 +160,10 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
     """
     if not isinstance(source, Source):
         source = read_source(source)
-    description = Description(source=source, name=source.xml.get("name", ""), root="", links={}, joints={})
+    description = Description(source, "", "", links={}, joints={}, repairs=source.repairs)
     description._take_notes()
     check_names(source, description.repair)
+    description = replace(description, name=source.xml.attrib["name"])
     clean = [
         check_grammar(part, description.where, description.repair)
         for part in source.xml

@@ -283,9 +283,8 @@ class _Checker:
         """Complete limits; see `repairs.FAULTS`."""
         limit, given, kind = clean.find("limit"), joint.find("limit"), clean.get("type")
         about = joint if given is None else given
-        ends = {
-            e: float(limit.attrib[e]) for e in ("lower", "upper") if limit is not None and e in limit.attrib
-        }
+        given_ends = {} if limit is None else limit.attrib
+        ends: dict[str, float] = {e: float(given_ends[e]) for e in ("lower", "upper") if e in given_ends}
         for name in ("effort", "velocity"):
             if limit is not None and float(limit.get(name, 0.0)) < 0:
                 value = limit.attrib.pop(name)

@@ -33,10 +33,9 @@ def check_names(source: Source, repair: Callable[[str, str, Element], None]) -> 
             name = element.get("name")
             if not name:
                 raise InputError(f"{where(element)}: a <{kind}> has no name")
-            if name in seen:
-                element = _renamed(source, kind, element, seen[name], repair)
-            if element is not None:
-                seen[element.attrib["name"]] = element
+            kept = element if name not in seen else _renamed(source, kind, element, seen[name], repair)
+            if kept is not None:
+                seen[kept.attrib["name"]] = kept
     if not xml.findall("link"):
         raise InputError(f"{where(xml)}: the robot has no <link>")
     for joint in xml.findall("joint"):
