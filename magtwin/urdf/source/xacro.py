@@ -120,9 +120,14 @@ class _Expansion:
             document = self._expanded()
         except UnsafeError:
             raise
-        except InputError:
+        except InputError as error:
             self._check_absent()  # what is missing may be the cause
-            raise
+            if not self._skipped:
+                raise
+            supplied = " ".join(self._repairs.supplies) or "the files in their place"
+            raise InputError(
+                f"{error}; this may come from a skipped include: {', '.join(self._skipped)}; give {supplied}"
+            ) from error
         self._check_absent()
         for include, place in self._skipped.items():
             file, _, line = place.rpartition(":")
