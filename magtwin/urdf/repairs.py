@@ -56,7 +56,7 @@ FAULTS: Mapping[str, tuple[str, str]] = {
     "mesh-missing": ("missing mesh", "a box of the link's size as a placeholder"),
     "mesh-unreadable": ("mesh that cannot be read", "a box of the link's size as a placeholder"),
     "mesh-flat": ("flat collision mesh", "thickened to a thin plate"),
-    "file-name": ("malformed package path", "read as if it had the usual slashes"),
+    "file-name": ("package path with odd slashes, or path relative to the package", "read as meant"),
     "package-missing": ("missing package of $(find)", "files in it count as missing"),
     "macro-unknown": ("call of an unknown macro in a .urdf", "left out, as readers of URDF do"),
     "include-skipped": ("missing include of a xacro", "skipped; none of its macros is called"),

@@ -232,7 +232,12 @@ FAULTY = {
         (look('<geometry><mesh filename="flat.stl"/></geometry>', "collision"), 2, "as a plate 0.0071 m")
     ],
     "file-name": [
-        (look('<geometry><mesh filename="package:///arms/flat.stl"/></geometry>'), 2, "'package://arms/")
+        (
+            look('<geometry><mesh filename="parts/box.stl"/></geometry>'),
+            2,
+            "is found in the package, not beside",
+        ),
+        (look('<geometry><mesh filename="package:///arms/flat.stl"/></geometry>'), 2, "'package://arms/"),
     ],
     "package-missing": [
         (
@@ -258,11 +263,14 @@ def write(tmp_path, kind, number):
     folder = tmp_path / "arms"
     folder.mkdir()
     (folder / "package.xml").write_text("<package><name>arms</name></package>")
+    (folder / "parts").mkdir()
+    trimesh.creation.box().export(folder / "parts" / "box.stl")
     (folder / "broken.stl").write_bytes(b"no triangles")
     (folder / "a.step").write_bytes(b"")
     flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
     flat.export(folder / "flat.stl")
-    path = folder / ("arm.urdf.xacro" if xacro else "arm.urdf")
+    path = folder / ("urdf/arm.urdf" if "parts/" in text else "arm.urdf.xacro" if xacro else "arm.urdf")
+    path.parent.mkdir(exist_ok=True)
     path.write_text(f"{head}\n{text}\n</robot>\n")
     return path, line, told
 

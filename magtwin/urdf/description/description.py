@@ -87,16 +87,22 @@ class Description:
     def find_file(self, filename: str, what: str) -> Path:
         """The file that a `filename=` refers to, see `Source.find_file`.
 
-        Backslashes, and too many or too few slashes after a scheme, are repaired.
+        Backslashes, too many or too few slashes after a scheme, and names relative to the package are
+        repaired.
         """
         element = next((e for e in self.xml.iter() if e.get("filename") == filename), None)
         usual = _SCHEME.sub(r"\1://", filename.replace("\\", "/"))
         if usual != filename:
             self.repair("file-name", f"{what} {filename!r} is read as {usual!r}", element)
         try:
-            return self.source.find_file(usual, what, element)
+            path = self.source.find_file(usual, what, element)
         finally:
             self._take_notes()
+        if ":" not in usual and not (self.path.parent / usual).is_file():
+            self.repair(
+                "file-name", f"{what} {filename!r} is found in the package, not beside the file", element
+            )
+        return path
 
     def mesh_element(self, filename: str) -> Element | None:
         """The first `<mesh>` of a file."""

@@ -14,8 +14,8 @@ DEPTH, FOLDERS = 3, 5_000
 """Depth of the search for packages below a folder, and most folders searched."""
 
 MARKS = (
-    *(MANIFEST, "CMakeLists.txt", "launch", "mesh", "meshes", "model.config", "models", "robots", "urdf"),
-    "xacro",
+    *(MANIFEST, "CMakeLists.txt", "launch", "mesh", "meshes", "model", "model.config", "models", "robots"),
+    *("urdf", "xacro"),
 )
 """Contents, any of which marks a folder without a manifest as a package."""
 

@@ -52,7 +52,7 @@ class Source:
         """The file that a `filename=` refers to.
 
         `package://NAME/rest` and `model://NAME/rest` lie in that package. Any other name is relative to the
-        folder of the description, and may lie in its package or in other packages.
+        folder of the description, or else to its package, and may lie in its package or in other packages.
 
         Args:
             filename: Name in the description.
@@ -90,6 +90,9 @@ class Source:
         else:
             path = Path(os.path.normpath(self.path.resolve().parent / (rest if separator else filename)))
             folder, inside = self.packages.home, self.packages.holds(path)
+            other = self.packages.home / filename
+            if inside and not path.is_file() and self.packages.holds(other) and other.is_file():
+                path = Path(os.path.normpath(other))
         if not inside:
             raise UnsafeError(
                 f"{start} lies outside {folder}; files are read from there only: move it in, "
