@@ -1,5 +1,6 @@
 """Markup: XML with the line of each element, without external references or entities."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,10 @@ from magtwin.errors import InputError
 
 MAX_DEPTH = 200
 """Most levels of nested elements; deeper nesting would exhaust the stack."""
+
+
+class UnsafeError(InputError):
+    """A file that could read other files or fill the memory; never repaired."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +54,7 @@ def parse_markup(text: bytes, path: Path) -> Markup:
         nonlocal depth
         depth += 1
         if depth > MAX_DEPTH:
-            raise InputError(f"{path}:{parser.CurrentLineNumber}: nests deeper than {MAX_DEPTH} elements")
+            raise UnsafeError(f"{path}:{parser.CurrentLineNumber}: nests deeper than {MAX_DEPTH} elements")
         lines[builder.start(tag, attributes)] = parser.CurrentLineNumber
 
     def end(tag: str) -> None:
@@ -58,7 +63,7 @@ def parse_markup(text: bytes, path: Path) -> Markup:
         builder.end(tag)
 
     def doctype(*_: Any) -> None:
-        raise InputError(
+        raise UnsafeError(
             f"{path}:{parser.CurrentLineNumber}: has a DOCTYPE, whose entities are not followed; "
             "remove it and write the values in full"
         )
@@ -80,6 +85,14 @@ def parse_markup(text: bytes, path: Path) -> Markup:
             raise
         raise InputError(f"{path}:1: not XML: {error}; save the file as UTF-8") from error
     return Markup(builder.close(), lines)
+
+
+def plain_text(element: ElementTree.Element) -> str:
+    """An element as text on one line, with sorted attributes."""
+    text = ElementTree.tostring(element, encoding="unicode").strip()
+    with suppress(ElementTree.ParseError):  # a prefix without a namespace
+        text = ElementTree.canonicalize(text, strip_text=True)
+    return " ".join(text.split())
 
 
 def _undecodable(text: bytes, line: int) -> str:
