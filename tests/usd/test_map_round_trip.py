@@ -170,7 +170,7 @@ def test_a_map_that_is_no_survey_is_written_at_its_own_headings(tmp_path):
     assert (tmp_path / "csv" / "90_map.csv").read_text().splitlines()[
         -15
     ] == f"-1.0,0.25,{np.pi / 2!r},45000.0"
-    attributes = ("magtwin:anomalyMap:recordedYaw", "magtwin:anomalyMap:recordedNt")
+    attributes = ("magtwin:anomalyMap:recordedYawRad", "magtwin:anomalyMap:recordedNt")
     prim = Usd.Stage.Open(str(tmp_path / "a.usdc")).GetPrimAtPath
     assert not any(prim("/World/AnomalyMap").GetAttribute(name).HasAuthoredValue() for name in attributes)
 

@@ -189,7 +189,7 @@ def test_one_attribute_stands_for_each_field_of_the_spec(noun):
     wanted = {schema.attribute_name(noun, f.name) for f in fields(SPECS[noun]) if f.name not in ELSEWHERE}
     if noun == "source":
         wanted -= {schema.attribute_name(noun, field) for field in SHAPED}
-        wanted = {name.replace("mWorld", "moment") for name in wanted}  # which turns with the prim
+        wanted = {name.replace("mWorld", "momentAm2") for name in wanted}  # which turns with the prim
     beside_the_spec = {sensors.MAP_RELATIONSHIP, sensors.MAP_CHECKSUM, DERIVED_FROM}
     assert set(definition.GetPropertyNames()) - beside_the_spec == wanted
 
@@ -253,7 +253,7 @@ import sys
 from pxr import Usd
 stage = Usd.Stage.Open(sys.argv[1])  # held in a name: a prim does not keep its stage alive
 prim = stage.GetPrimAtPath("/turtlebot4")
-names = ("drive:vMax", "drive:wheelSeparationM", "drive:wheelRadiusM", "robot:footprintRadiusM")
+names = ("drive:vMaxMPerS", "drive:wheelSeparationM", "drive:wheelRadiusM", "robot:footprintRadiusM")
 print([prim.GetAttribute(f"magtwin:{name}").Get() for name in names])
 """
     done = subprocess.run([sys.executable, "-c", reader, asset], capture_output=True, text=True, check=True)

@@ -250,7 +250,7 @@ def test_a_layer_over_a_sensor_holds_only_what_it_changes():
     assert session.empty
     sensors.define_magnetometer(stage, f"{LINK}/mag", replace(spec, noise_density_nt=2.0))
     attributes = session.GetPrimAtPath(f"{LINK}/mag").attributes
-    assert [a.name for a in attributes] == ["magtwin:magnetometer:noiseDensityNt"]
+    assert [a.name for a in attributes] == ["magtwin:magnetometer:noiseDensityNtPerRootHz"]
 
 
 def test_a_network_is_named_relative_to_the_edited_layer_and_moves_with_it(tmp_path):

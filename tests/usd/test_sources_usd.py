@@ -240,7 +240,7 @@ def test_a_cylinders_axis_and_scale_are_its_shape_and_leave_its_magnetization(ax
     scale = [0.1, 0.1, 0.1]
     scale["XYZ".index(axis)] = 3.0
     cylinder.AddScaleOp().Set(Gf.Vec3f(*scale))
-    apply_api(cylinder.GetPrim(), "source").GetAttribute("magtwin:source:magnetization").Set((1.0, 2.0, 3.0))
+    apply_api(cylinder.GetPrim(), "source").GetAttribute("magtwin:source:magnetizationAPerM").Set((1.0, 2.0, 3.0))
     read = read_source(cylinder.GetPrim())
     assert_allclose(read.size_m, (0.1, 0.1, 6.0), rtol=1e-6)
     assert_allclose(rotate(read.q_world_xyzw, (0, 0, 1)), np.eye(3)["XYZ".index(axis)], atol=1e-12)
@@ -249,7 +249,7 @@ def test_a_cylinders_axis_and_scale_are_its_shape_and_leave_its_magnetization(ax
 
 def test_a_bodys_moment_is_its_magnetization_times_its_volume():
     stage = stage_of(replace(BAR, magnetization=(0.0, 0.0, 0.0)))
-    the_source(stage).GetAttribute("magtwin:source:moment").Set((0, 0, 3.0))
+    the_source(stage).GetAttribute("magtwin:source:momentAm2").Set((0, 0, 3.0))
     body = body_of(read_magnets(stage)[0][0])
     assert body.volume_m3 == pytest.approx(np.pi * 0.01**2 * 0.8)
     assert_allclose(body.volume_m3 * body.magnetization, (0, 0, 3), rtol=1e-12)
@@ -263,7 +263,7 @@ def test_a_mesh_with_doubled_vertices_polygons_and_faces_turned_inwards_is_the_s
     mesh.CreatePointsAttr([Gf.Vec3f(*map(float, corners[k])) for quad in quads for k in quad[::-1]])
     mesh.CreateFaceVertexCountsAttr([4] * 6)
     mesh.CreateFaceVertexIndicesAttr(list(range(24)))
-    apply_api(mesh.GetPrim(), "source").GetAttribute("magtwin:source:magnetization").Set((0, 0, 1e3))
+    apply_api(mesh.GetPrim(), "source").GetAttribute("magtwin:source:magnetizationAPerM").Set((0, 0, 1e3))
     body = body_of(read_source(mesh.GetPrim()))
     assert body.vertices.shape == (8, 3)
     assert body.volume_m3 == pytest.approx(1.0)

@@ -47,7 +47,7 @@ from magtwin.usd.units import mixed_units
 
 NETWORK = attribute_name("magnetometer", "network")
 
-NEEDED = ("values", "valid", "shape", "origin", "cell_size", "headings", "unit", "checksum")
+NEEDED = ("values", "valid", "shape", "origin", "cell_size", "headings", "checksum")
 """Attributes that a map's layer must author: a fallback would be a grid that is not its own."""
 
 SAME_M = 1e-6

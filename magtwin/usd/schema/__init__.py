@@ -10,8 +10,22 @@ from pathlib import Path
 from pxr import Plug, Usd
 
 from magtwin.errors import InputError, find
+from magtwin.usd.schema.names import VERSION, attribute_name
+
+__all__ = [
+    "FOLDER",
+    "NOUNS",
+    "apply_api",
+    "attribute_name",
+    "only_prim_with",
+    "place",
+    "prims_with",
+    "register",
+    "require_api",
+]
 
 FOLDER = Path(__file__).resolve().parent
+"""Folder of the schema library, for PXR_PLUGINPATH_NAME."""
 
 NOUNS = {
     "anomalyMap": "MagtwinAnomalyMapAPI",
@@ -38,9 +52,17 @@ def register() -> None:
     """Register the schemas with USD; a second call does nothing.
 
     Raises:
-        InputError: USD's schema registry was used before, so it cannot add schemas.
+        InputError: USD's schema registry was used before, so it cannot add schemas; or it has another version
+            of the library.
     """
     Plug.Registry().RegisterPlugins(str(FOLDER))
+    plugin = Plug.Registry().GetPluginWithName("magtwin")
+    version, wanted = plugin.metadata.get("schemaVersion", "0.x"), ".".join(map(str, VERSION))
+    if version != wanted:
+        raise InputError(
+            f"USD loads version {version} of magtwin's schemas from {plugin.resourcePath}, this magtwin needs "
+            f"{wanted}; let PXR_PLUGINPATH_NAME name {FOLDER} instead"
+        )
     registry = Usd.SchemaRegistry()
     unknown = [api for api in NOUNS.values() if not registry.FindAppliedAPIPrimDefinition(api)]
     if unknown:
@@ -49,12 +71,6 @@ def register() -> None:
             "use of a stage; import magtwin.usd before opening one, or add "
             f"{FOLDER} to PXR_PLUGINPATH_NAME"
         )
-
-
-def attribute_name(noun: str, field: str) -> str:
-    """The attribute of a spec's field: ("drive", "wheel_radius_m") is `magtwin:drive:wheelRadiusM`."""
-    first, *rest = field.split("_")
-    return f"magtwin:{noun}:{first}{''.join(word.capitalize() for word in rest)}"
 
 
 def place(prim: Usd.Prim) -> str:

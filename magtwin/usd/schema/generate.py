@@ -9,8 +9,9 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from importlib.util import find_spec
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
@@ -38,17 +39,39 @@ one that equals the fallback; only empty values are left out.
 """
 
 
+def _names() -> ModuleType:
+    """The module names.py, without its package, which needs the generated files."""
+    spec = spec_from_file_location("names", HERE / "names.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+NAMES = _names()
+VERSION = ".".join(map(str, NAMES.VERSION))
+
+
 def generate(folder: Path) -> None:
     """Write the generated files of the schema library to `folder`, with USD's own generator.
 
-    USD leaves placeholders for paths in plugInfo.json; here the library is beside that file.
+    USD leaves placeholders for paths in plugInfo.json; here the library is beside that file. Of a text USD
+    keeps the first sentence; here all of it. The version is in plugInfo.json.
     """
+    from pxr import Sdf
+
     spec = find_spec("pxr.Usd")
     assert spec is not None
     assert spec.origin is not None
     generator = Path(spec.origin).with_name("usdGenSchema.py")
     with tempfile.TemporaryDirectory() as scratch:
         shutil.copy(HERE / "schema.usda", scratch)
+        layer = Sdf.Layer.FindOrOpen(str(Path(scratch) / "schema.usda"))
+        for item in (item for schema in layer.rootPrims for item in (schema, *schema.properties)):
+            if item.documentation:
+                item.customData["userDocBrief"] = " ".join(item.documentation.split())
+        layer.Save()
         subprocess.run(
             [sys.executable, str(generator), "schema.usda", "."], cwd=scratch, check=True, capture_output=True
         )
@@ -56,6 +79,7 @@ def generate(folder: Path) -> None:
         plug_info = json.loads("\n".join(line for line in written.splitlines() if not line.startswith("#")))
         for plugin in plug_info["Plugins"]:
             plugin |= {"LibraryPath": "", "ResourcePath": ".", "Root": "."}
+            plugin["Info"]["schemaVersion"] = VERSION
         (folder / "plugInfo.json").write_text(json.dumps(plug_info, indent=4) + "\n", encoding="utf-8")
         shutil.copyfile(Path(scratch) / "generatedSchema.usda", folder / "generatedSchema.usda")
 
