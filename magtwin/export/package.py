@@ -34,8 +34,10 @@ from magtwin.usd.placement import labs_on
 from magtwin.usd.scene import read_scene
 from magtwin.usd.schema import FOLDER as SCHEMA
 from magtwin.usd.schema import attribute_name, place, prims_with
+from magtwin.usd.schema.versions import TEXT
 from magtwin.usd.tiled_maps import check_tiles
 from magtwin.usd.units import check_units
+from magtwin.usd.upgrade import upgrade
 from magtwin.version import __version__
 
 Profile = Literal["omniverse", "isaac", "newton", "viewer"]
@@ -225,6 +227,10 @@ class _Work:
             self.root = bring_together(self.source, self.folder)
             detach(self.root)  # of a single layer, which holds its network
             self.checksum = stage_sha256(self.source)
+        if older := upgrade(self.root):
+            self.notes.append(
+                f"{len(older)} layers were of an older schema, or named one, and are of schema {TEXT} here"
+            )
         stage = open_stage(self.root)
         check_units(stage)
         if len(labs := dict.fromkeys(lab.path for lab in labs_on(stage))) > 1:

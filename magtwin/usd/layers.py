@@ -103,11 +103,16 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
 def save_layer(layer: Sdf.Layer) -> None:
     """Write a changed layer to its file, aside and then renamed, as text or crate as before."""
     path = Path(layer.realPath)
+    with output(path, force=True) as aside:
+        export_like(layer, path, aside)
+    layer.Reload(force=True)
+
+
+def export_like(layer: Sdf.Layer, path: Path, out: Path) -> None:
+    """Write a layer to another file, as text or crate as the file `path` is."""
     with path.open("rb") as old:
         kind = "usdc" if old.read(8) == b"PXR-USDC" else "usda"
-    with output(path, force=True) as aside:
-        layer.Export(str(aside), args={"format": kind} if path.suffix == ".usd" else {})
-    layer.Reload(force=True)
+    layer.Export(str(out), args={"format": kind} if path.suffix == ".usd" else {})
 
 
 def layer_files(path: str | os.PathLike[str]) -> list[Path]:

@@ -5,11 +5,14 @@ The library is codeless: `schema.usda` is its source, `generate.py` makes `gener
 silent about those that come later; `register` therefore asks the registry whether it knows each one.
 """
 
+import os
+import shutil
 from pathlib import Path
 
 from pxr import Plug, Usd
 
 from magtwin.errors import InputError, find
+from magtwin.files import output
 from magtwin.usd.schema.names import VERSION, attribute_name
 
 __all__ = [
@@ -20,12 +23,16 @@ __all__ = [
     "only_prim_with",
     "place",
     "prims_with",
+    "publish",
     "register",
     "require_api",
 ]
 
 FOLDER = Path(__file__).resolve().parent
 """Folder of the schema library, for PXR_PLUGINPATH_NAME."""
+
+FILES = ("plugInfo.json", "generatedSchema.usda", "schema.usda")
+"""Files of the library; USD reads the first two, the third is their source."""
 
 NOUNS = {
     "anomalyMap": "MagtwinAnomalyMapAPI",
@@ -71,6 +78,22 @@ def register() -> None:
             "use of a stage; import magtwin.usd before opening one, or add "
             f"{FOLDER} to PXR_PLUGINPATH_NAME"
         )
+
+
+def publish(folder: str | os.PathLike[str], *, force: bool = False) -> None:
+    """Copy the library to a folder, for PXR_PLUGINPATH_NAME of programs that cannot read this package.
+
+    Args:
+        folder: Folder to make.
+        force: Whether to replace an existing folder.
+
+    Raises:
+        InputError: The folder exists and `force` is False, or cannot be written.
+    """
+    with output(folder, force=force) as aside:
+        aside.mkdir()
+        for name in FILES:
+            shutil.copyfile(FOLDER / name, aside / name)
 
 
 def place(prim: Usd.Prim) -> str:
