@@ -46,7 +46,7 @@ def upgrade(path: str | os.PathLike[str]) -> list[Path]:
         raise InputError(f"{path}: cannot be opened as USD")
     files = {Path(layer.realPath): layer_sha256(layer.realPath) for layer in layers}
     copies = {file: Sdf.Layer.OpenAsAnonymous(str(file)) for file in files}
-    older = [file for file, copy in copies.items() if upgrade_layer(copy)]
+    older = [file for file, copy in copies.items() if _is_changed(copy, file)]
     with ExitStack() as renamed:  # all files at the end
 
         def write(file: Path) -> Path:
@@ -66,6 +66,14 @@ def upgrade(path: str | os.PathLike[str]) -> list[Path]:
     for layer in layers:
         layer.Reload(force=True)  # an open stage has it too
     return done
+
+
+def _is_changed(copy: Sdf.Layer, file: Path) -> bool:
+    """Upgrade the copy of a file's layer; whether it had older names. Errors name the file."""
+    try:
+        return upgrade_layer(copy) > 0
+    except InputError as error:
+        raise InputError(str(error).replace(copy.identifier, str(file))) from error
 
 
 def _checksums_in(layer: Sdf.Layer) -> list[Sdf.AttributeSpec]:

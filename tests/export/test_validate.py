@@ -100,7 +100,11 @@ BROKEN = {
     "units": (HEAD.replace("metersPerUnit = 1", "metersPerUnit = 0.01"), "in units of 0.01 m", "error"),
     "schema-names": (over("turtlebot4", "double magtwin:drive:vMx = 1"), "magtwin:drive:vMx, which", "error"),
     "targets": (over("turtlebot4", "rel magtwin:drive:leftWheelJoint = </World/x>"), "</World/x>", "error"),
-    "map-complete": (over("AnomalyMap", "double[] magtwin:anomalyMap:headingsDeg = None"), "headings", "error"),
+    "map-complete": (
+        over("AnomalyMap", "double[] magtwin:anomalyMap:headingsDeg = None"),
+        "headings",
+        "error",
+    ),
     "map-checksum": (
         over("AnomalyMap", f'string magtwin:anomalyMap:checksum = "{"0" * 64}"'),
         "its checksum says 000000000000",

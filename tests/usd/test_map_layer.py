@@ -494,7 +494,12 @@ def test_a_stage_without_a_map_is_refused(tmp_path):
             [0.0, 90.0],
             r"headings_rad of AnomalyMap must have shape \(4,\), got \(2,\)",
         ),
-        ("magtwin:anomalyMap:headingsDeg", Sdf.ValueTypeNames.DoubleArray, [], "must ascend in .* got \\[\\]"),
+        (
+            "magtwin:anomalyMap:headingsDeg",
+            Sdf.ValueTypeNames.DoubleArray,
+            [],
+            "must ascend in .* got \\[\\]",
+        ),
         (VALUES, Sdf.ValueTypeNames.String, "many", r"values must be a float\[\]"),
         (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": 1', "parameters is not JSON"),
         (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": NaN}', r"not JSON \(Out of range float"),
@@ -510,7 +515,12 @@ def test_a_stage_without_a_map_is_refused(tmp_path):
             Gf.Vec3d(0, 0, 1),
             "do not match its checksum",
         ),
-        ("magtwin:harmonic:mWorldAm2", Sdf.ValueTypeNames.Float3Array, [Gf.Vec3f(1)], r"must be a double3\[\]"),
+        (
+            "magtwin:harmonic:mWorldAm2",
+            Sdf.ValueTypeNames.Float3Array,
+            [Gf.Vec3f(1)],
+            r"must be a double3\[\]",
+        ),
     ],
 )
 def test_a_tampered_map_is_refused_by_file_and_prim(tmp_path, attribute, kind, value, said):

@@ -240,7 +240,9 @@ def test_a_cylinders_axis_and_scale_are_its_shape_and_leave_its_magnetization(ax
     scale = [0.1, 0.1, 0.1]
     scale["XYZ".index(axis)] = 3.0
     cylinder.AddScaleOp().Set(Gf.Vec3f(*scale))
-    apply_api(cylinder.GetPrim(), "source").GetAttribute("magtwin:source:magnetizationAPerM").Set((1.0, 2.0, 3.0))
+    apply_api(cylinder.GetPrim(), "source").GetAttribute("magtwin:source:magnetizationAPerM").Set(
+        (1.0, 2.0, 3.0)
+    )
     read = read_source(cylinder.GetPrim())
     assert_allclose(read.size_m, (0.1, 0.1, 6.0), rtol=1e-6)
     assert_allclose(rotate(read.q_world_xyzw, (0, 0, 1)), np.eye(3)["XYZ".index(axis)], atol=1e-12)

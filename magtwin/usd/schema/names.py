@@ -1,8 +1,8 @@
 """Names of the schema's attributes, and its version. Imports nothing, so that generate.py can load it alone.
 
 The rule: `magtwin:<noun>:<field>`, in camel case, and last the unit of the value. Units that multiply follow
-each other, `Per` comes before each that divides: nT/m is NtPerM, nT s/m is NtSPerM, nT/(N m) is NtPerNm. A
-ratio, a number, a text and a file have none.
+each other, `Per` comes before each that divides, and N m and A m2 count as one: nT/m is NtPerM, nT s/m is
+NtSPerM, nT/(N m) is NtPerNm. A ratio, a count, a text and a file have none.
 """
 
 VERSION = (1, 0)
