@@ -25,7 +25,7 @@ VALUES = "magtwin:anomalyMap:valuesNt"
 HEIGHT = "magtwin:anomalyMap:heightM"
 PARAMETERS = "magtwin:anomalyMap:parameters"
 GRID = [f"magtwin:anomalyMap:{name}" for name in ("shape", "originM", "cellSizeM", "headingsDeg")]
-HARMONIC = ("pWorldDipole", "mWorld", "bUniformNt", "hardIronNt", "softIron", "pBaseSensor")
+HARMONIC = ("pWorldDipoleM", "mWorldAm2", "bUniformNt", "hardIronNt", "softIron", "pBaseSensorM")
 
 
 def a_map(shape=(4, 3, 5), **changes) -> AnomalyMap:
@@ -469,7 +469,6 @@ def test_a_stage_without_a_map_is_refused(tmp_path):
             Gf.Vec2d(0, 1),
             "cell_m of AnomalyMap must",
         ),
-        ("magtwin:anomalyMap:unit", Sdf.ValueTypeNames.Token, "uT", "the map is in 'uT', magtwin reads nT"),
         (
             "magtwin:anomalyMap:created",
             Sdf.ValueTypeNames.String,
@@ -486,7 +485,7 @@ def test_a_stage_without_a_map_is_refused(tmp_path):
             "magtwin:anomalyMap:headingsDeg",
             Sdf.ValueTypeNames.DoubleArray,
             [0.0, 180.0, 90.0, 270.0],
-            r"headings must ascend in \[0, 360\) deg, got \[0.0, 180.0",
+            r"headingsDeg must ascend in \[0, 360\) deg, got \[0.0, 180.0",
         ),
         (
             "magtwin:anomalyMap:headingsDeg",
@@ -500,7 +499,7 @@ def test_a_stage_without_a_map_is_refused(tmp_path):
             [],
             "must ascend in .* got \\[\\]",
         ),
-        (VALUES, Sdf.ValueTypeNames.String, "many", r"values must be a float\[\]"),
+        (VALUES, Sdf.ValueTypeNames.String, "many", r"valuesNt must be a float\[\]"),
         (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": 1', "parameters is not JSON"),
         (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": NaN}', r"not JSON \(Out of range float"),
         (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": 1e999}', "parameters is not JSON"),
@@ -601,7 +600,7 @@ def test_a_damaged_record_of_what_a_map_was_made_from_is_refused(tmp_path, text)
 def with_old_checksum(prim: Sdf.PrimSpec) -> None:
     """Give a map's prim the checksum of version 1, as docs/schema.md defines it."""
     digest = hashlib.sha256()
-    kinds = {"anomalyMap:values": "<f4", "anomalyMap:valid": "u1", "anomalyMap:variance": "<f4"}
+    kinds = {"anomalyMap:valuesNt": "<f4", "anomalyMap:valid": "u1", "anomalyMap:varianceNt2": "<f4"}
     kinds |= {f"harmonic:{name}": "<f8" for name in HARMONIC}
     for name, kind in kinds.items():
         if attribute := prim.attributes.get(f"magtwin:{name}"):

@@ -190,7 +190,7 @@ def test_each_day_of_a_map_keeps_its_own_readings_and_a_day_between_has_none(tmp
     [
         ("recordedNt", [45_000.0] * 60, "not those that were recorded"),
         ("recordedNt", [45_000.0] * 3, "recordedNt has 3 numbers for 60 values"),
-        ("recordedYaw", [0.0] * 3, "recordedYaw has 3 numbers for 60 values"),
+        ("recordedYawRad", [0.0] * 3, "recordedYawRad has 3 numbers for 60 values"),
     ],
 )
 def test_readings_that_do_not_fit_the_map_are_refused_by_prim(tmp_path, name, value, said):

@@ -118,8 +118,8 @@ def test_an_old_map_is_read_as_it_was_with_one_warning(tmp_path):
     bytes_before = file.read_bytes()
     field, said = heard(load_map, file)
     assert said == [
-        f"{file}: old.usda is of schema 0.x, read with the names of {TEXT}; `magtwin upgrade {file}` rewrites "
-        "the files"
+        f"{file}: old.usda has attributes of schema 0.x, read as those of {TEXT}; `magtwin upgrade {file}` "
+        "rewrites the files"
     ]
     np.testing.assert_array_equal(field.values_nt.ravel()[:7], np.arange(1.0, 8))
     assert not field.valid.ravel()[7]
@@ -159,7 +159,7 @@ def test_an_edit_with_an_older_name_counts_and_is_told(copied, tmp_path):
     twin, said = heard(lambda: magtwin.open_twin(edit, network="none"))
     assert twin.scene.robot.drive.v_max == 0.123
     assert len(said) == 1
-    assert "edit.usda is of schema 0.x" in said[0]
+    assert "edit.usda has attributes of schema 0.x" in said[0]
 
 
 def test_a_stage_that_another_one_holds_is_opened_again_and_other_edits_are_refused(tmp_path):

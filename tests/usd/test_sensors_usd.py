@@ -22,6 +22,7 @@ from magtwin.spec.sensors import (
 )
 from magtwin.usd import sensors
 from magtwin.usd.attributes import read_pose
+from magtwin.usd.schema import attribute_name
 
 LINK = "/robot/some_link"
 
@@ -319,7 +320,7 @@ def test_a_figure_that_makes_no_sense_is_refused_by_prim(noun, attribute, value,
         "imu": lambda: sensors.define_imu(stage, f"{LINK}/imu", ImuSpec(link="some_link")),
         "lidar": lambda: sensors.define_lidar(stage, f"{LINK}/lidar", LidarSpec(link="some_link")),
     }[noun]()
-    prim.GetAttribute(f"magtwin:{noun}:{attribute}").Set(value)
+    prim.GetAttribute(attribute_name(noun, attribute)).Set(value)
     with pytest.raises(InputError, match=said):
         getattr(sensors, f"read_{noun}")(prim)
 

@@ -18,7 +18,7 @@ from magtwin.spec.furniture import KINDS, FurnitureSpec, parts_of
 from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
 from magtwin.usd.earth import DERIVED_FROM, checked, define_earth, read_earth
 from magtwin.usd.furniture import FURNITURE, define_furniture, read_magnets
-from magtwin.usd.schema import apply_api
+from magtwin.usd.schema import apply_api, attribute_name
 from magtwin.usd.sources import SOURCES, define_source, define_sources, read_source
 
 unhurried = settings(deadline=None, max_examples=50)
@@ -279,7 +279,7 @@ def ops(prim: Usd.Prim) -> UsdGeom.Xformable:
 
 
 def put(prim: Usd.Prim, attribute: str, value) -> None:
-    prim.GetAttribute(f"magtwin:source:{attribute}").Set(value)
+    prim.GetAttribute(attribute_name("source", attribute)).Set(value)
 
 
 @pytest.mark.parametrize(

@@ -109,7 +109,9 @@ def schema_version(subject: Subject) -> Iterator[Wrong]:
     """Every layer is of this version of the schema. An older one is checked with the names of today."""
     for layer in subject.layers:
         if is_upgraded(layer):
-            yield Wrong(f"{subject.name_of(layer)} is of schema {OLDER}, not {TEXT}", severity="warning")
+            yield Wrong(
+                f"{subject.name_of(layer)} has attributes of schema {OLDER}, not {TEXT}", severity="warning"
+            )
 
 
 @rule("magtwin", "use a name that is in docs/schema.md")

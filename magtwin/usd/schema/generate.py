@@ -88,8 +88,9 @@ that magtwin writes has it in its `customLayerData`, as `magtwin:schemaVersion`.
 | layer | what magtwin does |
 |---|---|
 | of this version | reads it |
-| of no version, without older names: an edit of another program | reads it |
-| of no version, with older names: magtwin 0.2 and earlier | reads it with the names of today, in memory, and warns once per stage |
+| of no version, without older names: an edit in another program | reads it |
+| with older names: magtwin 0.2 and earlier, or typed by hand | reads it with the names of today, in memory, and warns once per stage |
+| with an attribute under its older and its later name | refuses it |
 | of a later second number | reads it, ignores attributes that it does not know, and warns |
 | of a later first number | refuses it |
 

@@ -1,7 +1,7 @@
 """Version of the schema that a layer was written with; names of an older version are replaced in memory.
 
-A layer that magtwin writes has its version in customLayerData, as `magtwin:schemaVersion`. A layer without one,
-such as an edit made in another program, is older if it has a name that only an older version had.
+A layer that magtwin writes has its version in customLayerData, as `magtwin:schemaVersion`. Any layer, also an
+edit made by hand, is older if it has a name that only an older version had.
 """
 
 import warnings
@@ -60,10 +60,7 @@ def version_of(layer: Sdf.Layer) -> tuple[int, int] | None:
 
 
 def older_properties(layer: Sdf.Layer) -> list[Sdf.Path]:
-    """Properties with a name that only an older version has. A layer of this version is not searched."""
-    version = version_of(layer)
-    if version is not None and version[0] == VERSION[0]:
-        return []
+    """Properties with a name that only an older version has."""
     found: list[Sdf.Path] = []
 
     def look(path: Sdf.Path) -> None:
@@ -84,6 +81,7 @@ def upgrade_layer(layer: Sdf.Layer) -> int:
         InputError: A prim has an attribute under both names, or a value that this version cannot express; or
             as for `version_of`. The layer is not changed.
     """
+    version_of(layer)
     older = older_properties(layer)
     for path in older:
         spec, name = layer.GetPropertyAtPath(path), RENAMED.get(path.name)
@@ -150,14 +148,14 @@ def upgrade_stage(stage: Usd.Stage, name: str) -> None:
             later.append(layer)
     if fresh := _not_named(changed):
         warnings.warn(
-            f"{name}: {_counted(fresh)} of schema {OLDER}, read with the names of {TEXT}; `magtwin upgrade "
-            f"{name}` rewrites the files",
+            f"{name}: {_counted(fresh, 'has', 'have')} attributes of schema {OLDER}, read as those of {TEXT}; "
+            f"`magtwin upgrade {name}` rewrites the files",
             MismatchWarning,
             stacklevel=3,
         )
     if fresh := _not_named(later):
         warnings.warn(
-            f"{name}: {_counted(fresh)} of a schema later than {TEXT}; attributes that this magtwin does not "
+            f"{name}: {_counted(fresh, 'is', 'are')} of a schema later than {TEXT}; attributes that this magtwin does not "
             "know are ignored",
             MismatchWarning,
             stacklevel=3,
@@ -172,9 +170,9 @@ def _not_named(layers: list[Sdf.Layer]) -> list[Sdf.Layer]:
     return fresh
 
 
-def _counted(layers: list[Sdf.Layer]) -> str:
+def _counted(layers: list[Sdf.Layer], one: str, several: str) -> str:
     first = Path(layers[0].realPath).name
-    return f"{first} is" if len(layers) == 1 else f"{first} and {len(layers) - 1} more of its layers are"
+    return f"{first} {one}" if len(layers) == 1 else f"{first} and {len(layers) - 1} more layers {several}"
 
 
 def _changed(layer: Sdf.Layer) -> int:
