@@ -67,8 +67,8 @@ def register() -> None:
     version, wanted = plugin.metadata.get("schemaVersion", "0.x"), ".".join(map(str, VERSION))
     if version != wanted:
         raise InputError(
-            f"USD loads version {version} of magtwin's schemas from {plugin.resourcePath}, this magtwin needs "
-            f"{wanted}; let PXR_PLUGINPATH_NAME name {FOLDER} instead"
+            f"USD loads version {version} of magtwin's schemas from {plugin.resourcePath}, this magtwin "
+            f"needs {wanted}; let PXR_PLUGINPATH_NAME name {FOLDER} instead"
         )
     registry = Usd.SchemaRegistry()
     unknown = [api for api in NOUNS.values() if not registry.FindAppliedAPIPrimDefinition(api)]

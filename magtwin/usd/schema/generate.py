@@ -29,13 +29,13 @@ one that equals the fallback; only empty values are left out. An attribute that 
 fallback, in magtwin as in any program that has the schemas. The tables leave out a fallback that is an empty
 text, list or file; `none` is no value.
 
-* **Names** are `magtwin:<noun>:<field>` in camel case and end in the unit of the value: `rateHz`, `hardIronNt`,
-  `yawZeroRad`. Units that multiply follow each other, `Per` comes before each that divides, and N m and A m2
-  count as one: nT/m is `NtPerM`, nT s/m is `NtSPerM`, nT/(N m) is `NtPerNm`. A ratio, a count, a text and a
-  file have no unit.
+* **Names** are `magtwin:<noun>:<field>` in camel case and end in the unit of the value: `rateHz`,
+  `hardIronNt`, `yawZeroRad`. Units that multiply follow each other, `Per` comes before each that divides, and
+  N m and A m2 count as one: nT/m is `NtPerM`, nT s/m is `NtSPerM`, nT/(N m) is `NtPerNm`. A ratio, a count, a
+  text and a file have no unit.
 * **Every attribute is uniform.** What a run changes is not part of the schemas: poses are time samples of
   transforms, and readings are attributes of the run's own layer ([logs.md](logs.md)).
-* **Every attribute has a display name with its unit, a display group and a text**, which usdview and Kit show.
+* **Every attribute has a display name with its unit, a display group and a text**, for usdview and Kit.
 
 `make schema` generates this page from [schema.usda](../magtwin/usd/schema/schema.usda).
 
@@ -82,14 +82,14 @@ This prints `0.03575 Wheel radius [m]`. On Windows, set the variable with `set` 
 ## Versions
 
 The schemas have a version of two numbers, apart from magtwin's. The first number changes with names and
-meanings, the second with new attributes. `schemaVersion` in `plugInfo.json` is that of the library. Each layer
-that magtwin writes has it in its `customLayerData`, as `magtwin:schemaVersion`.
+meanings, the second with new attributes. `schemaVersion` in `plugInfo.json` is that of the library. Each
+layer that magtwin writes has it in its `customLayerData`, as `magtwin:schemaVersion`.
 
 | layer | what magtwin does |
 |---|---|
 | of this version | reads it |
 | of no version, without older names: an edit in another program | reads it |
-| with older names: magtwin 0.2 and earlier, or typed by hand | reads it with the names of today, in memory, and warns once per stage |
+| with older names: of magtwin 0.2, or typed by hand | uses the names of today in memory, and warns once |
 | with an attribute under its older and its later name | refuses it |
 | of a later second number | reads it, ignores attributes that it does not know, and warns |
 | of a later first number | refuses it |

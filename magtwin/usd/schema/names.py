@@ -6,7 +6,7 @@ NtSPerM, nT/(N m) is NtPerNm. A ratio, a count, a text and a file have none.
 """
 
 VERSION = (1, 0)
-"""Version of the schema. Another first number means other names or meanings, another second new attributes."""
+"""Version of the schema: the first number changes with names and meanings, the second with new attributes."""
 
 OLDER = "0.x"
 """How messages call a version before 1.0, which layers do not name."""

@@ -21,11 +21,11 @@ _upgraded: dict[str, int] = {}
 """Layers whose names were replaced in memory, by identifier: when their file was last changed [ns]."""
 
 _warned: set[tuple[str, int]] = set()
-"""Files that a warning has named, with the time of their last change [ns]: a stage is opened several times."""
+"""Files that a warning has named, with the time of their last change [ns]: a stage is opened often."""
 
 
 def creator() -> dict[str, Any]:
-    """customLayerData of a layer that magtwin writes."""
+    """What a layer that magtwin writes has as customLayerData."""
     return {"creator": "magtwin", "magtwin": {KEY: TEXT}}
 
 
@@ -148,8 +148,8 @@ def upgrade_stage(stage: Usd.Stage, name: str) -> None:
             later.append(layer)
     if fresh := _not_named(changed):
         warnings.warn(
-            f"{name}: {_counted(fresh, 'has', 'have')} attributes of schema {OLDER}, read as those of {TEXT}; "
-            f"`magtwin upgrade {name}` rewrites the files",
+            f"{name}: {_counted(fresh, 'has', 'have')} attributes of schema {OLDER}, read as those of {TEXT};"
+            f" `magtwin upgrade {name}` rewrites the files",
             MismatchWarning,
             stacklevel=3,
         )
