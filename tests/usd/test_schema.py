@@ -271,8 +271,8 @@ UNAUTHORED = {
 """Fallbacks beside the specs' fields, and what the reader assumes."""
 
 EMPTY = {
-    "anomalyMap": "valuesNt valid varianceNt2 recordedNt recordedYawRad shape headingsDeg checksum parameters "
-    "madeFrom heightM tileCells tileChecksums tileFigures originM cellSizeM",
+    "anomalyMap": "valuesNt valid varianceNt2 recordedNt recordedYawRad shape headingsDeg checksum "
+    "parameters madeFrom heightM tileCells tileChecksums tileFigures originM cellSizeM",
     "mapTile": "valuesNt valid varianceNt2",
 }
 """Attributes of maps: unknown if empty, or refused, as test_schema_versions.py shows."""

@@ -14,6 +14,7 @@ import pytest
 from pxr import Sdf, Usd
 
 import magtwin
+from magtwin.cli import main
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files import shipped
@@ -351,3 +352,31 @@ def test_no_name_is_used_twice_and_every_new_one_is_in_the_schema():
     assert set(RENAMED.values()) <= known
     assert not (RENAMED.keys() | REMOVED.keys()) & known
     assert len(set(RENAMED.values())) == len(RENAMED)
+
+
+def test_the_commands_copy_the_library_and_rewrite_a_map(tmp_path, capsys):
+    main(["schema"])
+    assert capsys.readouterr().out.strip() == str(FOLDER)
+    main(["schema", "--out", str(tmp_path / "library")])
+    assert sorted(p.name for p in (tmp_path / "library").iterdir()) == sorted(FILES)
+    capsys.readouterr()
+    file = old_map(tmp_path)
+    main(["map", "info", str(file)])
+    assert capsys.readouterr().err.count("magtwin upgrade") == 1
+    main(["upgrade", str(file), "--json"])
+    assert json.loads(capsys.readouterr().out) == {"wrote": [str(file)]}
+    main(["map", "info", str(file)])
+    assert "upgrade" not in capsys.readouterr().err
+    main(["upgrade", str(file)])
+    assert "Nothing to do" in capsys.readouterr().out
+
+
+def test_an_export_of_an_old_map_is_of_this_version(tmp_path):
+    file = old_map(tmp_path)
+    done, _ = heard(magtwin.export_scene, file, tmp_path / "out")
+    assert any("were of schema 0.x" in note for note in done.notes)
+    layer = Sdf.Layer.OpenAsAnonymous(str(done.root))
+    assert older_properties(layer) == []
+    assert version_of(layer) == (1, 0)
+    assert older_properties(Sdf.Layer.OpenAsAnonymous(str(file)))
+    assert heard(load_map, done.root) == (load_map(file), [])

@@ -155,8 +155,8 @@ def upgrade_stage(stage: Usd.Stage, name: str) -> None:
         )
     if fresh := _not_named(later):
         warnings.warn(
-            f"{name}: {_counted(fresh, 'is', 'are')} of a schema later than {TEXT}; attributes that this magtwin does not "
-            "know are ignored",
+            f"{name}: {_counted(fresh, 'is', 'are')} of a schema later than {TEXT}; attributes that "
+            "this magtwin does not know are ignored",
             MismatchWarning,
             stacklevel=3,
         )
