@@ -33,7 +33,7 @@ from magtwin.usd.robot import read_robot
 from magtwin.usd.scene import earth_in, open_scene
 from magtwin.usd.schema import NOUNS, attribute_name, prims_with
 from magtwin.usd.schema.names import OLDER
-from magtwin.usd.schema.versions import TEXT, is_upgraded
+from magtwin.usd.schema.versions import TEXT, is_upgraded, older_properties
 from magtwin.usd.sensors import (
     IMU_TYPE,
     LIDAR_TYPE,
@@ -108,7 +108,7 @@ def units(subject: Subject) -> Iterator[Wrong]:
 def schema_version(subject: Subject) -> Iterator[Wrong]:
     """Every layer is of this version of the schema. An older one is checked with the names of today."""
     for layer in subject.layers:
-        if is_upgraded(layer):
+        if is_upgraded(layer) or older_properties(layer):
             yield Wrong(
                 f"{subject.name_of(layer)} has attributes of schema {OLDER}, not {TEXT}", severity="warning"
             )
