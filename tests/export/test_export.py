@@ -406,12 +406,12 @@ def test_the_plugin_beside_an_export_tells_usd_core_the_schemas(folder):
     code = (
         "from pxr import Usd;"
         "known = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition('MagtwinAnomalyMapAPI');"
-        "print(known.GetAttributeFallbackValue('magtwin:anomalyMap:unit'))"
+        "print(known.GetAttributeFallbackValue('magtwin:anomalyMap:cellSizeM'))"
     )
     plugin = {**os.environ, "PXR_PLUGINPATH_NAME": str(folder / PLUGIN)}
     command = [sys.executable, "-s", "-c", code]
     done = subprocess.run(command, capture_output=True, check=True, text=True, env=plugin)
-    assert done.stdout.strip() == "nT"
+    assert done.stdout.strip() == "(0.25, 0.25)"
 
 
 def test_robots_of_the_scene_that_newton_loads_have_what_newton_needs(tmp_path):
