@@ -63,6 +63,7 @@ In a Kit extension instead, on startup and before a stage is opened:
 
 ```python
 from pxr import Plug
+
 Plug.Registry().RegisterPlugins("/path/to/the/folder")
 ```
 
