@@ -18,6 +18,7 @@ from magtwin.export.contents import kind_of, named_files
 from magtwin.files import sha256
 from magtwin.usd.layers import open_stage, relative_asset
 from magtwin.usd.schema import place as prim_place
+from magtwin.usd.schema.versions import creator
 
 SCOPE = "Files"
 """Name of the scope, below the default prim."""
@@ -62,7 +63,7 @@ def attach(root: Path, *more: Path) -> None:
     place = next(path for path in map(root.with_name, names) if not path.exists())
     files = Sdf.Layer.CreateNew(str(place))
     files.documentation = "Files as bytes, which a package may not hold otherwise"
-    files.customLayerData = {"creator": "magtwin"}
+    files.customLayerData = creator()
     for key in ("metersPerUnit", "upAxis", "kilogramsPerUnit"):
         if meta.pseudoRoot.HasInfo(key):
             files.pseudoRoot.SetInfo(key, meta.pseudoRoot.GetInfo(key))

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from typing import Literal
 from jinja2 import Template
 from pxr import Sdf, UsdGeom
 
-from magtwin.errors import InputError, find
+from magtwin.errors import InputError, MismatchWarning, find
 from magtwin.export.attached import attach, detach
 from magtwin.export.contents import THUMBNAIL, bring_together, copied, weights_metadata
 from magtwin.export.flatten import flatten
@@ -34,8 +35,11 @@ from magtwin.usd.placement import labs_on
 from magtwin.usd.scene import read_scene
 from magtwin.usd.schema import FOLDER as SCHEMA
 from magtwin.usd.schema import attribute_name, place, prims_with
+from magtwin.usd.schema.names import OLDER
+from magtwin.usd.schema.versions import TEXT
 from magtwin.usd.tiled_maps import check_tiles
 from magtwin.usd.units import check_units
+from magtwin.usd.upgrade import upgrade
 from magtwin.version import __version__
 
 Profile = Literal["omniverse", "isaac", "newton", "viewer"]
@@ -214,9 +218,11 @@ class _Work:
             root = unpack(self.source, package)
             if not trusted:
                 inspect(root, ())
-            unnamed = detach(root)
             self.checksum = sha256(self.source)
-            self.root = bring_together(root, self.folder, within=package)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", MismatchWarning)  # it would name the working copy
+                unnamed = detach(root)
+                self.root = bring_together(root, self.folder, within=package)
             for file in unnamed:
                 copied(file, self.folder / file.relative_to(root.parent))
         else:
@@ -225,6 +231,10 @@ class _Work:
             self.root = bring_together(self.source, self.folder)
             detach(self.root)  # of a single layer, which holds its network
             self.checksum = stage_sha256(self.source)
+        if older := upgrade(self.root):
+            self.notes.append(
+                f"{len(older)} layers were of schema {OLDER}, or named such a map, and are of {TEXT} here"
+            )
         stage = open_stage(self.root)
         check_units(stage)
         if len(labs := dict.fromkeys(lab.path for lab in labs_on(stage))) > 1:

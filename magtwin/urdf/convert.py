@@ -44,6 +44,7 @@ from magtwin.urdf.shape import COLLISIONS, VISUALS, define_collider, define_no_c
 from magtwin.urdf.simready import check_metadata, metadata
 from magtwin.urdf.source.source import read_source
 from magtwin.usd.layers import describe_stage, open_stage
+from magtwin.usd.schema.versions import creator
 from magtwin.usd.sensors import write_pose
 
 JOINTS = "joints"
@@ -204,7 +205,11 @@ class _Author:
         stage.GetRootLayer().customLayerData = {
             **stage.GetRootLayer().customLayerData,
             **metadata(stage, description, report, options.metadata),
-            "magtwin": {"source": description.path.name, "sourceSha256": checksum, "notes": notes},
+            "magtwin": {
+                "source": description.path.name,
+                "sourceSha256": checksum,
+                "notes": notes,
+            },
         }
         return stage, report
 

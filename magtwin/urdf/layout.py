@@ -24,6 +24,7 @@ from magtwin.errors import InputError
 from magtwin.files import check_free
 from magtwin.urdf.material import LOOKS
 from magtwin.urdf.shape import COLLISIONS, VISUALS
+from magtwin.usd.schema.versions import creator
 
 PAYLOADS = "payloads"
 """Folder of the layers beside the interface."""
@@ -250,8 +251,9 @@ def _describe(layer: Sdf.Layer, flat: Sdf.Layer, name: str, robot: str) -> None:
         if name in ("instances", "materials"):
             root.specifier, root.typeName = Sdf.SpecifierDef, "Scope"
     layer.documentation = f"{robot}: {LAYERS[name][1]}."
-    metadata = {"interface": Path(flat.realPath).name} if name == "base" else {}
-    layer.customLayerData = {"creator": "magtwin", **({"magtwin": metadata} if metadata else {})}
+    layer.customLayerData = creator()
+    if name == "base":
+        layer.customLayerData = {**creator(), "magtwin": {"interface": Path(flat.realPath).name}}
 
 
 def _compose(parts: dict[str, Sdf.Layer], robot: Sdf.PrimSpec) -> None:

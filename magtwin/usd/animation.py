@@ -32,6 +32,7 @@ from magtwin.usd.geometry import BASE_LINK, read_links
 from magtwin.usd.layers import SUFFIXES, WORLD, describe_stage, open_stage
 from magtwin.usd.placement import lab_on, labs_on, take_to_origin
 from magtwin.usd.schema import attribute_name, only_prim_with, place, prims_with
+from magtwin.usd.schema.versions import creator
 from magtwin.usd.sensors import JOINT_FIELDS
 
 FPS = 30.0
@@ -163,7 +164,7 @@ def write_animation(
         about = "A run of magtwin: poses of the robot and readings of its sensors over time"
         describe_stage(Usd.Stage.Open(layer), about)
         metadata = json.dumps(dict(run.metadata), ensure_ascii=False)
-        layer.customLayerData = {"creator": "magtwin", _FACTS: metadata}
+        layer.customLayerData = {**creator(), _FACTS: metadata}
         layer.defaultPrim = stand.world.name
         layer.startTimeCode, layer.endTimeCode = 0.0, float((t[-1] - t[0]) * rate)
         layer.timeCodesPerSecond = layer.framesPerSecond = float(rate)

@@ -12,6 +12,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
 from magtwin.errors import InputError
 from magtwin.files import existing, output, sha256
+from magtwin.usd.schema.versions import creator, is_upgraded, upgrade_stage
 
 WORLD = Sdf.Path("/World")
 """Default prim of maps and scenes."""
@@ -57,15 +58,18 @@ def describe_stage(stage: Usd.Stage, documentation: str) -> None:
     UsdPhysics.SetStageKilogramsPerUnit(stage, UsdPhysics.MassUnits.kilograms)
     layer = stage.GetRootLayer()
     layer.documentation = documentation
-    layer.customLayerData = {"creator": "magtwin"}
+    layer.customLayerData = creator()
 
 
 def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
     """Open the stage of a USD file, reloaded from disk.
 
+    Layers of an older version of the schema get its names of today in memory, with a warning.
+
     Raises:
         InputError: The file is missing or not USD, or a sublayer or reference is missing; the text has USD's
-            own message. Or a layer has changes in this process that are not saved, which would be lost.
+            own message. Or a layer has changes in this process that are not saved, which would be lost; or is
+            of a later version of the schema.
     """
     path = existing(path, "USD file")
     if path.is_dir():
@@ -73,13 +77,18 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
     try:
         stage = Usd.Stage.Open(str(path))
-        unsaved = [layer.identifier for layer in stage.GetUsedLayers() if layer.dirty and layer.realPath]
+        layers = [layer for layer in stage.GetUsedLayers() if layer.realPath]
+        held = [layer for layer in layers if is_upgraded(layer)]  # by another stage; a reload would undo it
+        unsaved = [layer.identifier for layer in layers if layer.dirty and layer not in held]
         if unsaved:
             raise InputError(
                 f"{path}: {unsaved[0]} has changes in this process that are not saved; save them "
                 "(`stage.Save()`), or drop them (`layer.Reload()`)"
             )
-        stage.Reload()  # a layer that is still held elsewhere would be stale
+        if held:
+            Sdf.Layer.ReloadLayers([layer for layer in layers if layer not in held])
+        else:
+            stage.Reload()  # a layer that is still held elsewhere would be stale
         errors = stage.GetCompositionErrors()
     except Tf.ErrorException as error:
         raise InputError(f"{path}: cannot be opened as USD: {_reason(error)}") from error
@@ -87,17 +96,23 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
         diagnostics.TakeUncoalescedDiagnostics()
     if errors:
         raise InputError(f"{path}: {_one_line(_text(errors[0]))}")
+    upgrade_stage(stage, str(path))
     return stage
 
 
 def save_layer(layer: Sdf.Layer) -> None:
     """Write a changed layer to its file, aside and then renamed, as text or crate as before."""
     path = Path(layer.realPath)
+    with output(path, force=True) as aside:
+        export_like(layer, path, aside)
+    layer.Reload(force=True)
+
+
+def export_like(layer: Sdf.Layer, path: Path, out: Path) -> None:
+    """Write a layer to another file, as text or crate as the file `path` is."""
     with path.open("rb") as old:
         kind = "usdc" if old.read(8) == b"PXR-USDC" else "usda"
-    with output(path, force=True) as aside:
-        layer.Export(str(aside), args={"format": kind} if path.suffix == ".usd" else {})
-    layer.Reload(force=True)
+    layer.Export(str(out), args={"format": kind} if path.suffix == ".usd" else {})
 
 
 def layer_files(path: str | os.PathLike[str]) -> list[Path]:

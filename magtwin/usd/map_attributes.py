@@ -15,7 +15,6 @@ from magtwin.field.grid import Grid
 from magtwin.field.maps.made_from import MadeFrom
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.harmonic import SHAPES as HARMONIC
-from magtwin.usd.heat_map import UNIT
 from magtwin.usd.schema import NOUNS, attribute_name, place
 
 MOST_CHARACTERS = 60
@@ -156,7 +155,6 @@ def shared_values(field: AnomalyMap, grid: Grid, version: int) -> dict[str, Any]
         "origin": Gf.Vec2d(*grid.origin_m),
         "cellSize": Gf.Vec2d(*grid.cell_m),
         "headings": Vt.DoubleArray(np.rad2deg(grid.headings_rad).tolist()),
-        "unit": UNIT,
         "checksumVersion": version,
         "height_m": field.height_m,
         **{name: getattr(field, name) for name in PLACES},

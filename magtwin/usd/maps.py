@@ -19,7 +19,7 @@ from magtwin.field.maps.epochs import at_date, day_of, in_order
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.tiles import TILED_FROM, Tile, TiledMap, Tiling
 from magtwin.field.sources.harmonic import HarmonicField
-from magtwin.usd.heat_map import MAP, UNIT, Floor, define_heat_map
+from magtwin.usd.heat_map import MAP, Floor, define_heat_map
 from magtwin.usd.layers import new_stage, open_stage
 from magtwin.usd.map_attributes import (
     CHECKSUM_VERSION,
@@ -220,8 +220,6 @@ def _samples(prim: Usd.Prim) -> list[Sample]:
 
 def _read(prim: Usd.Prim, sample: Sample | None) -> AnomalyMap:
     """The map of a prim at a time, or its default."""
-    if (unit := get(prim, "unit")) != UNIT:
-        raise InputError(f"{place(prim)}: the map is in {unit!r}, magtwin reads {UNIT}; make the map anew")
     checksum = get(prim, "checksum", sample)
     if is_tiled(prim) and sample is None:
         return read_tiled(prim)

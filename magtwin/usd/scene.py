@@ -39,7 +39,7 @@ from magtwin.usd.placement import (
     take_to_origin,
 )
 from magtwin.usd.robot import read_robot
-from magtwin.usd.schema import NOUNS, only_prim_with, place, prims_with, require_api
+from magtwin.usd.schema import NOUNS, attribute_name, only_prim_with, place, prims_with, require_api
 from magtwin.usd.sensors import MAP_CHECKSUM, MAP_RELATIONSHIP, read_path
 from magtwin.usd.sources import read_transform
 from magtwin.usd.units import check_units
@@ -151,7 +151,7 @@ def open_scene(path: str | os.PathLike[str], *, lab: str = "", check_network: bo
                 "a scene share one"
             )
     sources, furniture = read_magnets(stage)
-    values = maps[0].GetAttribute("magtwin:anomalyMap:values").GetPropertyStack()
+    values = maps[0].GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack()
     try:
         scene = Scene(
             name=path.stem,

@@ -887,7 +887,7 @@ def test_a_truncated_crate_is_refused_in_words_without_where_usd_keeps_its_sourc
 def test_a_map_that_was_changed_is_refused(parts, tmp_path):
     root = author_scene(full_scene(parts), tmp_path / "s")
     layer = Sdf.Layer.FindOrOpen(str(tmp_path / "s" / "map" / "map.usdc"))
-    layer.GetPrimAtPath(MAP).attributes["magtwin:anomalyMap:values"].default = [4e4] * 48
+    layer.GetPrimAtPath(MAP).attributes["magtwin:anomalyMap:valuesNt"].default = [4e4] * 48
     layer.Save()
     with pytest.raises(InputError, match=r"</World/AnomalyMap>: .*do not match its checksum"):
         read_scene(root)

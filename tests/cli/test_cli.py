@@ -190,7 +190,7 @@ def test_a_scene_whose_map_was_changed_is_refused(tmp_path, capsys, lab_scene):
         p for p in folder.rglob("*.usdc") if "AnomalyMap" in (Sdf.Layer.FindOrOpen(str(p)).ExportToString())
     )
     opened = Sdf.Layer.FindOrOpen(str(layer))
-    values = opened.GetAttributeAtPath("/World/AnomalyMap.magtwin:anomalyMap:values")
+    values = opened.GetAttributeAtPath("/World/AnomalyMap.magtwin:anomalyMap:valuesNt")
     changed = np.array(values.default)
     changed[0] += 1
     values.default = type(values.default).FromNumpy(changed)

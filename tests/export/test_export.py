@@ -62,7 +62,7 @@ print(json.dumps({
     "wheel": place("ROBOT/left_wheel"), "magnetometer": place("MAGNETOMETER"),
     "heat_map": points(stage.GetPrimAtPath("HEAT_MAP")),
     "robot": sum(points(m) for m in meshes if str(m.GetPath()).startswith("ROBOT/")),
-    "values": len(stage.GetPrimAtPath("/World/AnomalyMap").GetAttribute("magtwin:anomalyMap:values").Get()),
+    "values": len(stage.GetPrimAtPath("/World/AnomalyMap").GetAttribute("magtwin:anomalyMap:valuesNt").Get()),
     "layers": [l.realPath for l in stage.GetUsedLayers() if not l.anonymous],
 }))
 """.replace("ROBOT", ROBOT)
@@ -330,7 +330,7 @@ def test_a_stage_for_viewers_is_one_layer_without_instances_or_variants_that_sho
     for a, b in zip(before, after, strict=True):
         assert_allclose(b.vertices, a.vertices, atol=1e-6)
         assert_allclose(b.colour, a.colour, atol=1e-6)
-    assert here.GetPrimAtPath("/World/AnomalyMap").GetAttribute("magtwin:anomalyMap:values").Get()
+    assert here.GetPrimAtPath("/World/AnomalyMap").GetAttribute("magtwin:anomalyMap:valuesNt").Get()
     base = UsdGeom.Xformable(here.GetPrimAtPath(f"{ROBOT}/base_link"))
     end = base.ComputeLocalToWorldTransform(here.GetEndTimeCode()).ExtractTranslation()
     assert_allclose(end, played["p_world_base"][-1], atol=1e-9)
@@ -406,12 +406,12 @@ def test_the_plugin_beside_an_export_tells_usd_core_the_schemas(folder):
     code = (
         "from pxr import Usd;"
         "known = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition('MagtwinAnomalyMapAPI');"
-        "print(known.GetAttributeFallbackValue('magtwin:anomalyMap:unit'))"
+        "print(known.GetAttributeFallbackValue('magtwin:anomalyMap:cellSizeM'))"
     )
     plugin = {**os.environ, "PXR_PLUGINPATH_NAME": str(folder / PLUGIN)}
     command = [sys.executable, "-s", "-c", code]
     done = subprocess.run(command, capture_output=True, check=True, text=True, env=plugin)
-    assert done.stdout.strip() == "nT"
+    assert done.stdout.strip() == "(0.25, 0.25)"
 
 
 def test_robots_of_the_scene_that_newton_loads_have_what_newton_needs(tmp_path):
@@ -507,8 +507,8 @@ def test_a_glb_tells_of_map_and_magnetometer(web):
     extras = {node["name"]: node["extras"] for node in said["nodes"] if "extras" in node}
     assert extras["magnetometer"]["magtwin:magnetometer:kind"] == "neural"
     told, field = extras["AnomalyMap"], load_map(LAB)
-    assert_allclose(told["magtwin:anomalyMap:headings"], np.degrees(field.headings_rad), atol=1e-9)
-    values = array_of(said, data, told["magtwin:anomalyMap:values"]["accessor"])
+    assert_allclose(told["magtwin:anomalyMap:headingsDeg"], np.degrees(field.headings_rad), atol=1e-9)
+    values = array_of(said, data, told["magtwin:anomalyMap:valuesNt"]["accessor"])
     assert_allclose(values, field.values_nt.astype(np.float32).ravel(), atol=0)
     assert told["colours"]["unit"] == "nT"
     assert said["asset"]["extras"]["profile"] == "viewer"

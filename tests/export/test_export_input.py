@@ -104,7 +104,7 @@ def test_a_network_that_is_not_the_one_of_its_checksum_is_refused(lab, tmp_path)
 def test_a_map_that_is_not_the_one_of_its_checksum_is_refused(lab, tmp_path):
     own = shutil.copytree(lab, tmp_path / "lab")
     layer = Sdf.Layer.FindOrOpen(str(own / "lab" / "lab.usdc"))
-    values = layer.GetAttributeAtPath("/World/AnomalyMap.magtwin:anomalyMap:values")
+    values = layer.GetAttributeAtPath("/World/AnomalyMap.magtwin:anomalyMap:valuesNt")
     values.default = type(values.default)([v + 1 for v in values.default])
     layer.Save()
     refuse("<.*AnomalyMap>: the map's values do not match its checksum", own / "lab.usda", tmp_path)

@@ -98,16 +98,25 @@ BROKEN = {
     "absolute-paths": (over("", "asset a = @/somewhere/else.png@"), "names /somewhere/else.png", "error"),
     "climbing-paths": (over("", "asset a = @../else.png@"), "names ../else.png, outside", "warning"),
     "units": (HEAD.replace("metersPerUnit = 1", "metersPerUnit = 0.01"), "in units of 0.01 m", "error"),
+    "schema-version": (
+        over("turtlebot4", "double magtwin:drive:vMax = 1"),
+        "has attributes of schema 0.x, not 1.0",
+        "warning",
+    ),
     "schema-names": (over("turtlebot4", "double magtwin:drive:vMx = 1"), "magtwin:drive:vMx, which", "error"),
     "targets": (over("turtlebot4", "rel magtwin:drive:leftWheelJoint = </World/x>"), "</World/x>", "error"),
-    "map-complete": (over("AnomalyMap", "double[] magtwin:anomalyMap:headings = None"), "headings", "error"),
+    "map-complete": (
+        over("AnomalyMap", "double[] magtwin:anomalyMap:headingsDeg = None"),
+        "headings",
+        "error",
+    ),
     "map-checksum": (
         over("AnomalyMap", f'string magtwin:anomalyMap:checksum = "{"0" * 64}"'),
         "its checksum says 000000000000",
         "error",
     ),
     "map-grid": (
-        over("AnomalyMap", "double2 magtwin:anomalyMap:origin = (-2.9, -1.7)"),
+        over("AnomalyMap", "double2 magtwin:anomalyMap:originM = (-2.9, -1.7)"),
         "its grid spans x -2.9",
         "error",
     ),

@@ -180,7 +180,7 @@ def test_a_stronger_magnetization_in_a_stronger_layer_counts(room, tmp_path):
     stage = Usd.Stage.Open(layer)
     UsdGeom.SetStageMetersPerUnit(stage, 1)
     UsdGeom.SetStageUpAxis(stage, "Z")
-    stage.GetPrimAtPath("/World/Sources/pipe").GetAttribute("magtwin:source:magnetization").Set(
+    stage.GetPrimAtPath("/World/Sources/pipe").GetAttribute("magtwin:source:magnetizationAPerM").Set(
         Gf.Vec3d(8000, 0, 4000)
     )
     stage.Save()

@@ -21,11 +21,11 @@ from magtwin.usd.heat_map import HEAT_MAP, MAP, colour_index, heading_variants, 
 from magtwin.usd.maps import load_epochs, load_map, save_map, save_map_series
 from magtwin.usd.schema import attribute_name
 
-VALUES = "magtwin:anomalyMap:values"
+VALUES = "magtwin:anomalyMap:valuesNt"
 HEIGHT = "magtwin:anomalyMap:heightM"
 PARAMETERS = "magtwin:anomalyMap:parameters"
-GRID = [f"magtwin:anomalyMap:{name}" for name in ("shape", "origin", "cellSize", "headings")]
-HARMONIC = ("pWorldDipole", "mWorld", "bUniformNt", "hardIronNt", "softIron", "pBaseSensor")
+GRID = [f"magtwin:anomalyMap:{name}" for name in ("shape", "originM", "cellSizeM", "headingsDeg")]
+HARMONIC = ("pWorldDipoleM", "mWorldAm2", "bUniformNt", "hardIronNt", "softIron", "pBaseSensorM")
 
 
 def a_map(shape=(4, 3, 5), **changes) -> AnomalyMap:
@@ -464,12 +464,11 @@ def test_a_stage_without_a_map_is_refused(tmp_path):
         ("magtwin:anomalyMap:shape", Sdf.ValueTypeNames.IntArray, [4, 3, 6], "does not fit 60 values"),
         ("magtwin:anomalyMap:shape", Sdf.ValueTypeNames.IntArray, [-1, -1, 60], "does not fit 60 values"),
         (
-            "magtwin:anomalyMap:cellSize",
+            "magtwin:anomalyMap:cellSizeM",
             Sdf.ValueTypeNames.Double2,
             Gf.Vec2d(0, 1),
             "cell_m of AnomalyMap must",
         ),
-        ("magtwin:anomalyMap:unit", Sdf.ValueTypeNames.Token, "uT", "the map is in 'uT', magtwin reads nT"),
         (
             "magtwin:anomalyMap:created",
             Sdf.ValueTypeNames.String,
@@ -483,19 +482,24 @@ def test_a_stage_without_a_map_is_refused(tmp_path):
             "must be a SHA-256, 64 digits 0-9a-f, got 'none'",
         ),
         (
-            "magtwin:anomalyMap:headings",
+            "magtwin:anomalyMap:headingsDeg",
             Sdf.ValueTypeNames.DoubleArray,
             [0.0, 180.0, 90.0, 270.0],
-            r"headings must ascend in \[0, 360\) deg, got \[0.0, 180.0",
+            r"headingsDeg must ascend in \[0, 360\) deg, got \[0.0, 180.0",
         ),
         (
-            "magtwin:anomalyMap:headings",
+            "magtwin:anomalyMap:headingsDeg",
             Sdf.ValueTypeNames.DoubleArray,
             [0.0, 90.0],
             r"headings_rad of AnomalyMap must have shape \(4,\), got \(2,\)",
         ),
-        ("magtwin:anomalyMap:headings", Sdf.ValueTypeNames.DoubleArray, [], "must ascend in .* got \\[\\]"),
-        (VALUES, Sdf.ValueTypeNames.String, "many", r"values must be a float\[\]"),
+        (
+            "magtwin:anomalyMap:headingsDeg",
+            Sdf.ValueTypeNames.DoubleArray,
+            [],
+            "must ascend in .* got \\[\\]",
+        ),
+        (VALUES, Sdf.ValueTypeNames.String, "many", r"valuesNt must be a float\[\]"),
         (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": 1', "parameters is not JSON"),
         (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": NaN}', r"not JSON \(Out of range float"),
         (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": 1e999}', "parameters is not JSON"),
@@ -510,7 +514,12 @@ def test_a_stage_without_a_map_is_refused(tmp_path):
             Gf.Vec3d(0, 0, 1),
             "do not match its checksum",
         ),
-        ("magtwin:harmonic:mWorld", Sdf.ValueTypeNames.Float3Array, [Gf.Vec3f(1)], r"must be a double3\[\]"),
+        (
+            "magtwin:harmonic:mWorldAm2",
+            Sdf.ValueTypeNames.Float3Array,
+            [Gf.Vec3f(1)],
+            r"must be a double3\[\]",
+        ),
     ],
 )
 def test_a_tampered_map_is_refused_by_file_and_prim(tmp_path, attribute, kind, value, said):
@@ -531,9 +540,9 @@ def test_a_tampered_map_is_refused_by_file_and_prim(tmp_path, attribute, kind, v
 @pytest.mark.parametrize(
     ("attribute", "value"),
     [
-        ("origin", Gf.Vec2d(-3, -1)),
-        ("cellSize", Gf.Vec2d(0.25, 0.25)),
-        ("headings", [0.0, 90.0, 180.0, 271.0]),
+        ("originM", Gf.Vec2d(-3, -1)),
+        ("cellSizeM", Gf.Vec2d(0.25, 0.25)),
+        ("headingsDeg", [0.0, 90.0, 180.0, 271.0]),
     ],
 )
 def test_the_checksum_covers_the_grid(tmp_path, attribute, value):
@@ -591,7 +600,7 @@ def test_a_damaged_record_of_what_a_map_was_made_from_is_refused(tmp_path, text)
 def with_old_checksum(prim: Sdf.PrimSpec) -> None:
     """Give a map's prim the checksum of version 1, as docs/schema.md defines it."""
     digest = hashlib.sha256()
-    kinds = {"anomalyMap:values": "<f4", "anomalyMap:valid": "u1", "anomalyMap:variance": "<f4"}
+    kinds = {"anomalyMap:valuesNt": "<f4", "anomalyMap:valid": "u1", "anomalyMap:varianceNt2": "<f4"}
     kinds |= {f"harmonic:{name}": "<f8" for name in HARMONIC}
     for name, kind in kinds.items():
         if attribute := prim.attributes.get(f"magtwin:{name}"):

@@ -170,7 +170,7 @@ def test_a_map_that_is_no_survey_is_written_at_its_own_headings(tmp_path):
     assert (tmp_path / "csv" / "90_map.csv").read_text().splitlines()[
         -15
     ] == f"-1.0,0.25,{np.pi / 2!r},45000.0"
-    attributes = ("magtwin:anomalyMap:recordedYaw", "magtwin:anomalyMap:recordedNt")
+    attributes = ("magtwin:anomalyMap:recordedYawRad", "magtwin:anomalyMap:recordedNt")
     prim = Usd.Stage.Open(str(tmp_path / "a.usdc")).GetPrimAtPath
     assert not any(prim("/World/AnomalyMap").GetAttribute(name).HasAuthoredValue() for name in attributes)
 
@@ -190,7 +190,7 @@ def test_each_day_of_a_map_keeps_its_own_readings_and_a_day_between_has_none(tmp
     [
         ("recordedNt", [45_000.0] * 60, "not those that were recorded"),
         ("recordedNt", [45_000.0] * 3, "recordedNt has 3 numbers for 60 values"),
-        ("recordedYaw", [0.0] * 3, "recordedYaw has 3 numbers for 60 values"),
+        ("recordedYawRad", [0.0] * 3, "recordedYawRad has 3 numbers for 60 values"),
     ],
 )
 def test_readings_that_do_not_fit_the_map_are_refused_by_prim(tmp_path, name, value, said):

@@ -6,22 +6,27 @@ import subprocess
 import sys
 from dataclasses import MISSING, fields
 
+import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils, Vt
 
 from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.files import shipped
+from magtwin.spec.base import ZERO3
 from magtwin.spec.drive import DriveSpec
+from magtwin.spec.furniture import FurnitureSpec
 from magtwin.spec.lab import LabSpec
 from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
 from magtwin.spec.plant import PlantSpec
-from magtwin.spec.robot import RobotSpec
+from magtwin.spec.robot import PlacedRobot, RobotSpec
+from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec
 from magtwin.usd import schema, sensors
 from magtwin.usd.attributes import plain_value, write_pose
 from magtwin.usd.earth import DERIVED_FROM
-from magtwin.usd.schema import generate
+from magtwin.usd.schema import attribute_name, generate
 
 SPECS = {
     "magnetometer": MagnetometerSpec,
@@ -183,13 +188,50 @@ def test_every_number_has_its_unit_in_words(noun):
             assert re.search(r"\[[^\]]+\]", definition.GetPropertyDocumentation(name)), name
 
 
+def suffix_of(unit: str) -> str:
+    """The end of a name by the rule of names.py: nT/(N m)^2 is NtPerNm2."""
+    spelled = unit.replace("(N m)", "Nm").replace("A m2", "Am2").replace("^", "")
+    spelled = re.sub(r"sqrt\((\w+)\)", r"root \1", spelled)
+    factors = [[word for word in part.split() if word != "1"] for part in spelled.split("/")]
+    return "Per".join("".join(word[0].upper() + word[1:].lower() for word in part) for part in factors)
+
+
+def test_units_are_spelled_by_the_rule():
+    told = {"nT/sqrt(Hz)": "NtPerRootHz", "nT s/m": "NtSPerM", "1/s": "PerS", "nT/(N m)^2": "NtPerNm2"}
+    assert {unit: suffix_of(unit) for unit in told} == told
+
+
+@every_noun
+def test_every_name_ends_in_the_unit_that_usdview_shows(noun):
+    definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(schema.NOUNS[noun])
+    for name in definition.GetPropertyNames():
+        shown = definition.GetPropertyMetadata(name, "displayName")
+        unit = re.search(r" \[(.+)\]$", shown)
+        text = definition.GetPropertyDocumentation(name)
+        assert definition.GetPropertyMetadata(name, "displayGroup"), name
+        if unit:
+            assert name.endswith(suffix_of(unit[1])), name
+            assert f"[{unit[1]}]" in text, name
+        elif named := re.search(r"\[([^\]\d=]+)\]", text):  # a ratio, or several units
+            assert named[1] == "nT per nT" or name.endswith(("madeFrom", "pathFile")), name
+        assert "[" not in shown.removesuffix(unit[0] if unit else "")
+
+
+@every_noun
+def test_every_attribute_is_uniform(noun):
+    definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(schema.NOUNS[noun])
+    assert attributes(noun) or noun == "none"
+    for name in attributes(noun):
+        assert definition.GetAttributeDefinition(name).GetVariability() == Sdf.VariabilityUniform, name
+
+
 @pytest.mark.parametrize("noun", SPECS)
 def test_one_attribute_stands_for_each_field_of_the_spec(noun):
     definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(schema.NOUNS[noun])
     wanted = {schema.attribute_name(noun, f.name) for f in fields(SPECS[noun]) if f.name not in ELSEWHERE}
     if noun == "source":
         wanted -= {schema.attribute_name(noun, field) for field in SHAPED}
-        wanted = {name.replace("mWorld", "moment") for name in wanted}  # which turns with the prim
+        wanted = {name.replace("mWorld", "momentAm2") for name in wanted}  # which turns with the prim
     beside_the_spec = {sensors.MAP_RELATIONSHIP, sensors.MAP_CHECKSUM, DERIVED_FROM}
     assert set(definition.GetPropertyNames()) - beside_the_spec == wanted
 
@@ -206,6 +248,51 @@ def test_the_footprints_fallback_is_the_default_of_the_robot():
     _, prim = stage_with("robot")
     default = next(f.default for f in fields(RobotSpec) if f.name == "footprint_radius_m")
     assert sensors.read_footprint(prim) == default
+
+
+UNAUTHORED = {
+    "magtwin:anomalyMap:checksumVersion": (1, 1),  # the first maps have no such attribute
+    "magtwin:earth:derivedFrom": ("", ""),  # computed anew
+    "magtwin:furniture:kind": ("desk", "desk"),
+    "magtwin:magnetometer:mapSha256": ("", Scene.__dataclass_fields__["map_sha256"].default),
+    "magtwin:robot:footprintRadiusM": (0.171, RobotSpec.__dataclass_fields__["footprint_radius_m"].default),
+    "magtwin:robot:path": ("", PlacedRobot.__dataclass_fields__["path"].default),
+    "magtwin:robot:pathFile": (None, None),
+    "magtwin:source:momentAm2": (ZERO3, SourceSpec.__dataclass_fields__["m_world"].default),
+    **{
+        attribute_name("furniture", name): (default, FurnitureSpec.__dataclass_fields__[name].default)
+        for name, default in (("material", ""), ("size_m", ZERO3))
+    },
+    **{
+        attribute_name("anomalyMap", name): ("", AnomalyMap.__dataclass_fields__[name].default)
+        for name in ("name", "method", "source", "licence", "created", "frame", "datum")
+    },
+}
+"""Fallbacks beside the specs' fields, and what the reader assumes."""
+
+EMPTY = {
+    "anomalyMap": "valuesNt valid varianceNt2 recordedNt recordedYawRad shape headingsDeg checksum "
+    "parameters madeFrom heightM tileCells tileChecksums tileFigures originM cellSizeM",
+    "mapTile": "valuesNt valid varianceNt2",
+}
+"""Attributes of maps: unknown if empty, or refused, as test_schema_versions.py shows."""
+
+
+def test_every_fallback_is_what_the_reader_assumes():
+    checked = {f"magtwin:{noun}:{name}" for noun, names in EMPTY.items() for name in names.split()}
+    for noun in schema.NOUNS:
+        _, prim = stage_with(noun)
+        spec = {f.name: f.default for f in fields(SPECS[noun])} if noun in SPECS else {}
+        known = {attribute_name(noun, field): default for field, default in spec.items()}
+        for name in attributes(noun):
+            got = plain_value(prim.GetAttribute(name)) if name not in checked else None
+            if name in UNAUTHORED:
+                assert (got, got) == UNAUTHORED[name]
+            elif name not in checked:
+                default = known[name]
+                assert got == default or (default is MISSING and not np.any(got)), name
+            checked.add(name)
+    assert not UNAUTHORED.keys() - checked
 
 
 @every_noun
@@ -253,7 +340,7 @@ import sys
 from pxr import Usd
 stage = Usd.Stage.Open(sys.argv[1])  # held in a name: a prim does not keep its stage alive
 prim = stage.GetPrimAtPath("/turtlebot4")
-names = ("drive:vMax", "drive:wheelSeparationM", "drive:wheelRadiusM", "robot:footprintRadiusM")
+names = ("drive:vMaxMPerS", "drive:wheelSeparationM", "drive:wheelRadiusM", "robot:footprintRadiusM")
 print([prim.GetAttribute(f"magtwin:{name}").Get() for name in names])
 """
     done = subprocess.run([sys.executable, "-c", reader, asset], capture_output=True, text=True, check=True)

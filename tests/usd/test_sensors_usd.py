@@ -22,6 +22,7 @@ from magtwin.spec.sensors import (
 )
 from magtwin.usd import sensors
 from magtwin.usd.attributes import read_pose
+from magtwin.usd.schema import attribute_name
 
 LINK = "/robot/some_link"
 
@@ -250,7 +251,7 @@ def test_a_layer_over_a_sensor_holds_only_what_it_changes():
     assert session.empty
     sensors.define_magnetometer(stage, f"{LINK}/mag", replace(spec, noise_density_nt=2.0))
     attributes = session.GetPrimAtPath(f"{LINK}/mag").attributes
-    assert [a.name for a in attributes] == ["magtwin:magnetometer:noiseDensityNt"]
+    assert [a.name for a in attributes] == ["magtwin:magnetometer:noiseDensityNtPerRootHz"]
 
 
 def test_a_network_is_named_relative_to_the_edited_layer_and_moves_with_it(tmp_path):
@@ -319,7 +320,7 @@ def test_a_figure_that_makes_no_sense_is_refused_by_prim(noun, attribute, value,
         "imu": lambda: sensors.define_imu(stage, f"{LINK}/imu", ImuSpec(link="some_link")),
         "lidar": lambda: sensors.define_lidar(stage, f"{LINK}/lidar", LidarSpec(link="some_link")),
     }[noun]()
-    prim.GetAttribute(f"magtwin:{noun}:{attribute}").Set(value)
+    prim.GetAttribute(attribute_name(noun, attribute)).Set(value)
     with pytest.raises(InputError, match=said):
         getattr(sensors, f"read_{noun}")(prim)
 

@@ -18,7 +18,7 @@ from magtwin.spec.furniture import KINDS, FurnitureSpec, parts_of
 from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
 from magtwin.usd.earth import DERIVED_FROM, checked, define_earth, read_earth
 from magtwin.usd.furniture import FURNITURE, define_furniture, read_magnets
-from magtwin.usd.schema import apply_api
+from magtwin.usd.schema import apply_api, attribute_name
 from magtwin.usd.sources import SOURCES, define_source, define_sources, read_source
 
 unhurried = settings(deadline=None, max_examples=50)
@@ -240,7 +240,9 @@ def test_a_cylinders_axis_and_scale_are_its_shape_and_leave_its_magnetization(ax
     scale = [0.1, 0.1, 0.1]
     scale["XYZ".index(axis)] = 3.0
     cylinder.AddScaleOp().Set(Gf.Vec3f(*scale))
-    apply_api(cylinder.GetPrim(), "source").GetAttribute("magtwin:source:magnetization").Set((1.0, 2.0, 3.0))
+    apply_api(cylinder.GetPrim(), "source").GetAttribute("magtwin:source:magnetizationAPerM").Set(
+        (1.0, 2.0, 3.0)
+    )
     read = read_source(cylinder.GetPrim())
     assert_allclose(read.size_m, (0.1, 0.1, 6.0), rtol=1e-6)
     assert_allclose(rotate(read.q_world_xyzw, (0, 0, 1)), np.eye(3)["XYZ".index(axis)], atol=1e-12)
@@ -249,7 +251,7 @@ def test_a_cylinders_axis_and_scale_are_its_shape_and_leave_its_magnetization(ax
 
 def test_a_bodys_moment_is_its_magnetization_times_its_volume():
     stage = stage_of(replace(BAR, magnetization=(0.0, 0.0, 0.0)))
-    the_source(stage).GetAttribute("magtwin:source:moment").Set((0, 0, 3.0))
+    the_source(stage).GetAttribute("magtwin:source:momentAm2").Set((0, 0, 3.0))
     body = body_of(read_magnets(stage)[0][0])
     assert body.volume_m3 == pytest.approx(np.pi * 0.01**2 * 0.8)
     assert_allclose(body.volume_m3 * body.magnetization, (0, 0, 3), rtol=1e-12)
@@ -263,7 +265,7 @@ def test_a_mesh_with_doubled_vertices_polygons_and_faces_turned_inwards_is_the_s
     mesh.CreatePointsAttr([Gf.Vec3f(*map(float, corners[k])) for quad in quads for k in quad[::-1]])
     mesh.CreateFaceVertexCountsAttr([4] * 6)
     mesh.CreateFaceVertexIndicesAttr(list(range(24)))
-    apply_api(mesh.GetPrim(), "source").GetAttribute("magtwin:source:magnetization").Set((0, 0, 1e3))
+    apply_api(mesh.GetPrim(), "source").GetAttribute("magtwin:source:magnetizationAPerM").Set((0, 0, 1e3))
     body = body_of(read_source(mesh.GetPrim()))
     assert body.vertices.shape == (8, 3)
     assert body.volume_m3 == pytest.approx(1.0)
@@ -277,7 +279,7 @@ def ops(prim: Usd.Prim) -> UsdGeom.Xformable:
 
 
 def put(prim: Usd.Prim, attribute: str, value) -> None:
-    prim.GetAttribute(f"magtwin:source:{attribute}").Set(value)
+    prim.GetAttribute(attribute_name("source", attribute)).Set(value)
 
 
 @pytest.mark.parametrize(

@@ -170,7 +170,7 @@ def test_the_coloured_floor_is_that_of_the_map(both):
 def test_a_damaged_tile_is_refused_where_it_is_read_and_found_by_a_check(both, tmp_path):
     file = tmp_path / "damaged.usdc"
     layer = Sdf.Layer.OpenAsAnonymous(str(both[1]))
-    attribute = layer.GetAttributeAtPath(f"{MAP}/Tiles/tile_2_3.magtwin:mapTile:values")
+    attribute = layer.GetAttributeAtPath(f"{MAP}/Tiles/tile_2_3.magtwin:mapTile:valuesNt")
     values = np.array(attribute.default)
     values[7] += 0.01
     attribute.default = Vt.FloatArray.FromNumpy(values)
@@ -192,7 +192,7 @@ def test_a_damaged_tile_is_refused_where_it_is_read_and_found_by_a_check(both, t
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("origin", (9.0, 9.0)), ("tileCells", 4), ("shape", [5, 57, 41]), ("tileChecksums", ["0" * 64] * 35)],
+    [("originM", (9.0, 9.0)), ("tileCells", 4), ("shape", [5, 57, 41]), ("tileChecksums", ["0" * 64] * 35)],
 )
 def test_a_changed_grid_or_checksum_is_refused_when_the_map_is_opened(both, name, value):
     stage = Usd.Stage.Open(str(both[1]))

@@ -27,11 +27,11 @@ class Lap:
         values = (
             self.nodes()
             if self.grid.get("tileCells")
-            else np.where(self.grid["valid"], self.grid["values"], np.nan)
+            else np.where(self.grid["valid"], self.grid["valuesNt"], np.nan)
         )
         values = values.reshape(self.grid["shape"])
         self.values = np.append(values, values[:1], axis=0)  # once round: the last heading is the first
-        self.headings = np.radians([*self.grid["headings"], self.grid["headings"][0] + 360])
+        self.headings = np.radians([*self.grid["headingsDeg"], self.grid["headingsDeg"][0] + 360])
         names = [f"magtwin:drive:{side}WheelJoint" for side in ("left", "right")]
         self.joints = [self.robot.GetRelationship(name).GetTargets()[0] for name in names]
         self.base = self.robot.GetRelationship("isaac:physics:robotLinks").GetTargets()[0]  # it comes first
@@ -61,7 +61,7 @@ class Lap:
             row, column = (int(n) * cells for n in tile.GetName().split("_")[1:])
             part = values[:, row : row + cells + 1, column : column + cells + 1]
             known, valid = (
-                np.array(tile.GetAttribute(f"magtwin:mapTile:{n}").Get()) for n in ("values", "valid")
+                np.array(tile.GetAttribute(f"magtwin:mapTile:{n}").Get()) for n in ("valuesNt", "valid")
             )
             part[:] = np.where(valid, known, np.float32(np.nan)).reshape(part.shape)
         return values
@@ -72,7 +72,7 @@ class Lap:
         yaw = (yaw - headings[0]) % (2 * math.pi) + headings[0]
         k = min(np.searchsorted(headings, yaw, "right"), len(headings) - 1) - 1
         h = (yaw - headings[k]) / (headings[k + 1] - headings[k])
-        column, row = (np.array([x, y]) - self.grid["origin"]) / self.grid["cellSize"]
+        column, row = (np.array([x, y]) - self.grid["originM"]) / self.grid["cellSizeM"]
         if not (0 <= column <= values.shape[2] - 1 and 0 <= row <= values.shape[1] - 1):
             return math.nan
         i, j = min(int(column), values.shape[2] - 2), min(int(row), values.shape[1] - 2)

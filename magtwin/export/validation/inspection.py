@@ -10,12 +10,13 @@ import json
 import subprocess
 import sys
 import tempfile
+import warnings
 from collections.abc import Collection
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, MismatchWarning
 from magtwin.export.validation.findings import Check, Finding, check_from
 
 PATIENCE_S = 120.0
@@ -121,6 +122,7 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
     from magtwin.export.validation.physx_robots import driven_table
     from magtwin.export.validation.rule import RULES, TITLES, Subject
     from magtwin.export.validation.rules import robot_assets
+    from magtwin.usd.schema.versions import upgrade_stage
 
     file, root = Path(job["file"]), Path(job["root"])
     packed = None if job["home"] is None else Path(job["home"])
@@ -139,6 +141,9 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
             raise InputError(f"{file}: cannot be opened as USD; it is damaged, cut short, or not USD")
         for layer in stage.GetUsedLayers():
             _read_all(layer)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MismatchWarning)  # the rule `schema-version` reports it
+            upgrade_stage(stage, str(file))
         if "core" in job["against"]:
             checks.append(_core(stage if packed is None else Usd.Stage.Open(str(file))))
         inputs = None if job["inputs"] is None else frozenset(job["inputs"])

@@ -32,6 +32,8 @@ from magtwin.usd.placement import UPRIGHT, labs_on, pose_of
 from magtwin.usd.robot import read_robot
 from magtwin.usd.scene import earth_in, open_scene
 from magtwin.usd.schema import NOUNS, attribute_name, prims_with
+from magtwin.usd.schema.names import OLDER
+from magtwin.usd.schema.versions import TEXT, is_upgraded, older_properties
 from magtwin.usd.sensors import (
     IMU_TYPE,
     LIDAR_TYPE,
@@ -47,7 +49,7 @@ from magtwin.usd.units import mixed_units
 
 NETWORK = attribute_name("magnetometer", "network")
 
-NEEDED = ("values", "valid", "shape", "origin", "cell_size", "headings", "unit", "checksum")
+NEEDED = ("values", "valid", "shape", "origin", "cell_size", "headings", "checksum")
 """Attributes that a map's layer must author: a fallback would be a grid that is not its own."""
 
 SAME_M = 1e-6
@@ -102,6 +104,16 @@ def units(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"{name}is in units of {kilograms:g} kg; USD does not convert them")
 
 
+@rule("magtwin", "rewrite the files: magtwin upgrade STAGE")
+def schema_version(subject: Subject) -> Iterator[Wrong]:
+    """Every layer is of this version of the schema. An older one is checked with the names of today."""
+    for layer in subject.layers:
+        if is_upgraded(layer) or older_properties(layer):
+            yield Wrong(
+                f"{subject.name_of(layer)} has attributes of schema {OLDER}, not {TEXT}", severity="warning"
+            )
+
+
 @rule("magtwin", "use a name that is in docs/schema.md")
 def schema_names(subject: Subject) -> Iterator[Wrong]:
     """Every schema and attribute with magtwin's prefix is defined, and its prim has the schema."""
@@ -132,7 +144,7 @@ def targets(subject: Subject) -> Iterator[Wrong]:
 
 @rule("magtwin", "make the map again with magtwin map")
 def map_complete(subject: Subject) -> Iterator[Wrong]:
-    """Every map authors its arrays, grid and unit, and they match each other."""
+    """Every map authors its arrays and grid, and they match each other."""
     for prim in subject.having("anomalyMap"):
         names = [attribute_name("anomalyMap", field) for field in NEEDED]
         lost = [name for name in names if not prim.GetAttribute(name).HasAuthoredValue()]

@@ -5,13 +5,34 @@ The library is codeless: `schema.usda` is its source, `generate.py` makes `gener
 silent about those that come later; `register` therefore asks the registry whether it knows each one.
 """
 
+import os
+import shutil
 from pathlib import Path
 
 from pxr import Plug, Usd
 
 from magtwin.errors import InputError, find
+from magtwin.files import output
+from magtwin.usd.schema.names import VERSION, attribute_name
+
+__all__ = [
+    "FOLDER",
+    "NOUNS",
+    "apply_api",
+    "attribute_name",
+    "only_prim_with",
+    "place",
+    "prims_with",
+    "publish",
+    "register",
+    "require_api",
+]
 
 FOLDER = Path(__file__).resolve().parent
+"""Folder of the schema library, for PXR_PLUGINPATH_NAME."""
+
+FILES = ("plugInfo.json", "generatedSchema.usda", "schema.usda")
+"""Files of the library; USD reads the first two, the third is their source."""
 
 NOUNS = {
     "anomalyMap": "MagtwinAnomalyMapAPI",
@@ -38,9 +59,17 @@ def register() -> None:
     """Register the schemas with USD; a second call does nothing.
 
     Raises:
-        InputError: USD's schema registry was used before, so it cannot add schemas.
+        InputError: USD's schema registry was used before, so it cannot add schemas; or it has another version
+            of the library.
     """
     Plug.Registry().RegisterPlugins(str(FOLDER))
+    plugin = Plug.Registry().GetPluginWithName("magtwin")
+    version, wanted = plugin.metadata.get("schemaVersion", "0.x"), ".".join(map(str, VERSION))
+    if version != wanted:
+        raise InputError(
+            f"USD loads version {version} of magtwin's schemas from {plugin.resourcePath}, this magtwin "
+            f"needs {wanted}; let PXR_PLUGINPATH_NAME name {FOLDER} instead"
+        )
     registry = Usd.SchemaRegistry()
     unknown = [api for api in NOUNS.values() if not registry.FindAppliedAPIPrimDefinition(api)]
     if unknown:
@@ -51,10 +80,20 @@ def register() -> None:
         )
 
 
-def attribute_name(noun: str, field: str) -> str:
-    """The attribute of a spec's field: ("drive", "wheel_radius_m") is `magtwin:drive:wheelRadiusM`."""
-    first, *rest = field.split("_")
-    return f"magtwin:{noun}:{first}{''.join(word.capitalize() for word in rest)}"
+def publish(folder: str | os.PathLike[str], *, force: bool = False) -> None:
+    """Copy the library to a folder, for PXR_PLUGINPATH_NAME of programs that cannot read this package.
+
+    Args:
+        folder: Folder to make.
+        force: Whether to replace an existing folder.
+
+    Raises:
+        InputError: The folder exists and `force` is False, or cannot be written.
+    """
+    with output(folder, force=force) as aside:
+        aside.mkdir()
+        for name in FILES:
+            shutil.copyfile(FOLDER / name, aside / name)
 
 
 def place(prim: Usd.Prim) -> str:

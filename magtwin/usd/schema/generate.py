@@ -9,8 +9,9 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from importlib.util import find_spec
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
@@ -20,35 +21,128 @@ INTRODUCTION = """\
 # magtwin's USD schemas
 
 This page lists every attribute that magtwin adds to a stage. Use it to read a magtwin scene in another
-program, or to author one without magtwin. Lengths are in metres, angles in radians and fields in nT, unless
-a name or a text gives another unit.
-
-`import magtwin.usd` registers the schemas with USD. For other programs, set `PXR_PLUGINPATH_NAME` to the
-absolute path of the folder `magtwin/usd/schema`:
-
-```
-PXR_PLUGINPATH_NAME=$PWD/magtwin/usd/schema usdview scenes/lab/lab.usda
-```
+program, or to author one without magtwin. It describes version {version} of the schemas.
 
 The schemas are codeless applied API schemas on plain `Xform` prims. A program that does not have them still
 places every prim, and reads and keeps every value. This works because magtwin authors every attribute, even
-one that equals the fallback; only empty values are left out.
+one that equals the fallback; only empty values are left out. An attribute that a layer leaves out has its
+fallback, in magtwin as in any program that has the schemas. The tables leave out a fallback that is an empty
+text, list or file; `none` is no value.
+
+* **Names** are `magtwin:<noun>:<field>` in camel case and end in the unit of the value: `rateHz`,
+  `hardIronNt`, `yawZeroRad`. Units that multiply follow each other, `Per` comes before each that divides, and
+  N m and A m2 count as one: nT/m is `NtPerM`, nT s/m is `NtSPerM`, nT/(N m) is `NtPerNm`. A ratio, a count, a
+  text and a file have no unit.
+* **Every attribute is uniform.** What a run changes is not part of the schemas: poses are time samples of
+  transforms, and readings are attributes of the run's own layer ([logs.md](logs.md)).
+* **Every attribute has a display name with its unit, a display group and a text**, for usdview and Kit.
 
 `make schema` generates this page from [schema.usda](../magtwin/usd/schema/schema.usda).
+
+## The schemas in other programs
+
+`import magtwin.usd` registers the schemas with USD. Other programs find them by `PXR_PLUGINPATH_NAME`, which
+USD reads when a program starts. It names a folder with `plugInfo.json` and `generatedSchema.usda`:
+`magtwin schema` prints the one of this installation, and `magtwin schema --out DIR` makes a copy for another
+machine. `magtwin export` puts a copy in the folder `plugin/magtwin` of each export.
+
+OpenUSD's usdview:
+
+```
+PXR_PLUGINPATH_NAME=$(magtwin schema) usdview scenes/lab/lab.usda
+```
+
+Kit and Isaac Sim on Linux, in the program's own folder (these two lines were not run in Kit):
+
+```
+PXR_PLUGINPATH_NAME=$(magtwin schema) ./kit/kit apps/omni.app.editor.kit   # your app's .kit file
+PXR_PLUGINPATH_NAME=$(magtwin schema) ./isaac-sim.sh
+```
+
+In a Kit extension instead, on startup and before a stage is opened:
+
+```python
+from pxr import Plug
+
+Plug.Registry().RegisterPlugins("/path/to/the/folder")
+```
+
+Python with usd-core and without magtwin (`pip install usd-core`):
+
+```
+export PXR_PLUGINPATH_NAME=/path/to/the/folder
+python -c "
+from pxr import Usd
+drive = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition('MagtwinDifferentialDriveAPI')
+name = 'magtwin:drive:wheelRadiusM'
+print(drive.GetAttributeFallbackValue(name), drive.GetPropertyMetadata(name, 'displayName'))"
+```
+
+This prints `0.03575 Wheel radius [m]`. On Windows, set the variable with `set` or `$env:` first.
+
+## Versions
+
+The schemas have a version of two numbers, apart from magtwin's. The first number changes with names and
+meanings, the second with new attributes. `schemaVersion` in `plugInfo.json` is that of the library. Each
+layer that magtwin writes has it in its `customLayerData`, as `magtwinSchemaVersion`.
+
+| layer | what magtwin does |
+|---|---|
+| of this version | reads it |
+| of no version, without older names: an edit in another program | reads it |
+| with older names: of magtwin 0.2, or typed by hand | uses the names of today in memory, and warns once |
+| with an attribute under its older and its later name | refuses it |
+| of a later second number | reads it, ignores attributes that it does not know, and warns |
+| of a later first number | refuses it |
+
+`magtwin upgrade FILE` rewrites a stage, robot or map, with every layer that it names, to this version. Values
+stay as they are, so a run gives the same readings. A rewritten map is another file: the checksum in the
+scene's magnetometers follows, but a network or run made before names the file of before and reports another
+map or scene. `magtwin export` upgrades what it exports, and `magtwin validate` has the rule `schema-version`.
+
+### From 0.x to 1.0
+
+Attributes with another name:
+
+{table}
+These are removed: {removed}. All attributes are uniform
+since 1.0, and layers have a version.
 """
+
+
+def _names() -> ModuleType:
+    """The module names.py, without its package, which needs the generated files."""
+    spec = spec_from_file_location("names", HERE / "names.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+NAMES = _names()
+VERSION = ".".join(map(str, NAMES.VERSION))
 
 
 def generate(folder: Path) -> None:
     """Write the generated files of the schema library to `folder`, with USD's own generator.
 
-    USD leaves placeholders for paths in plugInfo.json; here the library is beside that file.
+    USD leaves placeholders for paths in plugInfo.json; here the library is beside that file. Of a text USD
+    keeps the first sentence; here all of it. The version is in plugInfo.json.
     """
+    from pxr import Sdf
+
     spec = find_spec("pxr.Usd")
     assert spec is not None
     assert spec.origin is not None
     generator = Path(spec.origin).with_name("usdGenSchema.py")
     with tempfile.TemporaryDirectory() as scratch:
         shutil.copy(HERE / "schema.usda", scratch)
+        layer = Sdf.Layer.FindOrOpen(str(Path(scratch) / "schema.usda"))
+        for item in (item for schema in layer.rootPrims for item in (schema, *schema.properties)):
+            if item.documentation:
+                item.customData["userDocBrief"] = " ".join(item.documentation.split())
+        layer.Save()
         subprocess.run(
             [sys.executable, str(generator), "schema.usda", "."], cwd=scratch, check=True, capture_output=True
         )
@@ -56,6 +150,7 @@ def generate(folder: Path) -> None:
         plug_info = json.loads("\n".join(line for line in written.splitlines() if not line.startswith("#")))
         for plugin in plug_info["Plugins"]:
             plugin |= {"LibraryPath": "", "ResourcePath": ".", "Root": "."}
+            plugin["Info"]["schemaVersion"] = VERSION
         (folder / "plugInfo.json").write_text(json.dumps(plug_info, indent=4) + "\n", encoding="utf-8")
         shutil.copyfile(Path(scratch) / "generatedSchema.usda", folder / "generatedSchema.usda")
 
@@ -65,7 +160,7 @@ def reference() -> str:
     from pxr import Sdf
 
     layer = Sdf.Layer.FindOrOpen(str(HERE / "schema.usda"))
-    parts = [INTRODUCTION]
+    parts = [_introduction()]
     for schema in layer.rootPrims:
         if schema.specifier != Sdf.SpecifierClass:
             continue
@@ -80,9 +175,19 @@ def reference() -> str:
     return "".join(parts)
 
 
+def _introduction() -> str:
+    """What stands above the tables, with the version and the names of version 0.x."""
+    rows = [f"| `{older}` | `{name}` |\n" for older, name in NAMES.RENAMED.items()]
+    removed = (f"`{name}`, which was always {value!r}" for name, value in NAMES.REMOVED.items())
+    table = "| 0.x | 1.0 |\n|---|---|\n" + "".join(rows)
+    return INTRODUCTION.format(version=VERSION, table=table, removed=", ".join(removed))
+
+
 def _fallback(attribute: Any) -> str:
     """An attribute's fallback as text; "" if it is empty."""
     value = attribute.default
+    if value is None:
+        return "none"
     if isinstance(value, float):
         return f"{value:g}"
     text = str(value)
