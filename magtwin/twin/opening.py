@@ -159,14 +159,17 @@ def opened(
     magnetometer: Kind | None,
     model_error: bool,
     function: str,
+    **where: Any,
 ) -> Twin:
-    """The twin, opened if it is a scene; `function` is named in the refusal of options that come too late."""
+    """The twin, opened if it is a scene; `function` is named in the refusal of options that come too late.
+
+    `where` are the options `lab` and `epoch`.
+    """
     if not isinstance(twin, Twin):
-        return open_twin(twin, network=network, magnetometer=magnetometer, model_error=model_error)
-    if network is not None or magnetometer is not None:
-        raise InputError(
-            f"give `network` and `magnetometer` to open_twin, not to {function}, which got a Twin"
-        )
+        return open_twin(twin, network=network, magnetometer=magnetometer, model_error=model_error, **where)
+    if network is not None or magnetometer is not None or any(where.values()):
+        names = ", ".join(f"`{name}`" for name in ("network", *where))
+        raise InputError(f"give {names} and `magnetometer` to open_twin, not to {function}, which got a Twin")
     return twin if model_error else without_model_error(twin)
 
 

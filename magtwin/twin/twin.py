@@ -5,7 +5,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -118,7 +118,7 @@ class Twin(Summarized):
         )
 
 
-def lab_and_epoch(metadata: Mapping[str, object]) -> dict[str, str]:
+def lab_and_epoch(metadata: Mapping[str, object]) -> dict[str, Any]:
     """The options `lab` and `epoch` of `open_twin` with which a run was made, from its metadata."""
     return {"lab": str(metadata.get("lab", "")), "epoch": str(metadata.get("map_epoch", ""))}
 

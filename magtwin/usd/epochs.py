@@ -1,8 +1,9 @@
 """Epochs of a map: the variant set `epoch` of its prim, with one variant for each date."""
 
 import datetime
+import itertools
 import warnings
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager
 
 from pxr import Sdf, Usd
@@ -73,12 +74,11 @@ def each_epoch(prim: Usd.Prim, dates: Collection[str] = ()) -> Iterator[tuple[st
     Yields:
         Date and prim. The prim is valid until the next step.
     """
-    names = epochs_of(prim)
-    for date in names:
+    root, mask = prim.GetStage().GetRootLayer(), Usd.StagePopulationMask([prim.GetPath()])
+    for date, session in itertools.chain(_variants(prim), _time_samples(prim)):
         if not dates or date in dates:
-            yield from _overlaid(prim, date, lambda over, d=date: over.variantSelections.update({EPOCH: d}))
-    if not names:
-        yield from _time_samples(prim)
+            stage = Usd.Stage.OpenMasked(root, session, mask)  # held in a name: a prim does not keep it
+            yield date, stage.GetPrimAtPath(prim.GetPath())
 
 
 def warn_of_time_codes(prim: Usd.Prim) -> bool:
@@ -93,17 +93,19 @@ def warn_of_time_codes(prim: Usd.Prim) -> bool:
     return old
 
 
-def _overlaid(
-    prim: Usd.Prim, date: str, edit: Callable[[Sdf.PrimSpec], object]
-) -> Iterator[tuple[str, Usd.Prim]]:
-    """The prim on a stage of its own, with an edit in the session layer."""
-    stage = prim.GetStage()
+def _session_of(prim: Usd.Prim) -> tuple[Sdf.Layer, Sdf.PrimSpec]:
+    """A copy of the session layer of a prim's stage, and its opinion on the prim."""
     session = Sdf.Layer.CreateAnonymous()
-    session.TransferContent(stage.GetSessionLayer())
-    edit(Sdf.CreatePrimInLayer(session, prim.GetPath()))
-    mask = Usd.StagePopulationMask([prim.GetPath()])
-    own = Usd.Stage.OpenMasked(stage.GetRootLayer(), session, mask)
-    yield date, own.GetPrimAtPath(prim.GetPath())
+    session.TransferContent(prim.GetStage().GetSessionLayer())
+    return session, Sdf.CreatePrimInLayer(session, prim.GetPath())
+
+
+def _variants(prim: Usd.Prim) -> Iterator[tuple[str, Sdf.Layer]]:
+    """Date of each epoch, and the session layer that selects it."""
+    for date in epochs_of(prim):
+        session, over = _session_of(prim)
+        over.variantSelections[EPOCH] = date
+        yield date, session
 
 
 def _samples(prim: Usd.Prim) -> tuple[Sdf.Layer, Sdf.Path, list[float]] | None:
@@ -114,19 +116,16 @@ def _samples(prim: Usd.Prim) -> tuple[Sdf.Layer, Sdf.Path, list[float]] | None:
     return None
 
 
-def _time_samples(prim: Usd.Prim) -> Iterator[tuple[str, Usd.Prim]]:
-    """The prim at each time code of an older map, which are days since 2000-01-01."""
-    if not (found := _samples(prim)):
+def _time_samples(prim: Usd.Prim) -> Iterator[tuple[str, Sdf.Layer]]:
+    """Date of each time code of an older map, in days since 2000-01-01, and a session layer of its values."""
+    if epochs_of(prim) or not (found := _samples(prim)):
         return
     layer, path, times = found
-
-    def edit(over: Sdf.PrimSpec, time: float) -> None:
+    for time in times:
+        session, over = _session_of(prim)
         for name, spec in layer.GetPrimAtPath(path).attributes.items():
             if layer.GetNumTimeSamplesForPath(spec.path):
                 value = layer.QueryTimeSample(spec.path, time)
                 own = Sdf.AttributeSpec(over, name, spec.typeName, spec.variability)
                 own.default = Sdf.ValueBlock() if value is None else value
-
-    for time in times:
-        date = (ORIGIN + datetime.timedelta(days=time)).isoformat()
-        yield from _overlaid(prim, date, lambda over, t=time: edit(over, t))
+        yield (ORIGIN + datetime.timedelta(days=time)).isoformat(), session
