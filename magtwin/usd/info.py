@@ -12,7 +12,7 @@ from magtwin.usd.placement import AT_ORIGIN, labs_on, pose_of
 from magtwin.usd.scene import open_scene
 
 _PREFIX = "Magtwin"
-_MANY = ("MagtwinMagneticSourceAPI", "MagtwinFurnitureAPI")
+_MANY = ("MagtwinMagneticSourceAPI", "MagtwinFurnitureAPI", "MagtwinMapTileAPI")
 """Schemas that are on many prims, so that only their number is shown."""
 
 

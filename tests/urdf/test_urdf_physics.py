@@ -310,6 +310,8 @@ def test_a_fixed_base_is_bolted_to_the_robots_prim_where_it_stands(tmp_path):
       <origin xyz="0 0 0.1" rpy="0 0 1"/></joint>"""
     path = urdf(tmp_path, body, "post")
     stage, robot, _ = convert(path, fix_base=True)
+    assert robot.GetAttribute("isaac:robotType").Get() == "Manipulator"
+    assert convert(path)[1].GetAttribute("isaac:robotType").Get() == "Default"
     joint = UsdPhysics.Joint(prim(robot, "root_joint"))
     assert joint.GetBody0Rel().GetTargets() == [robot.GetPath()]
     assert joint.GetBody1Rel().GetTargets() == [robot.GetPath().AppendChild("base")]
