@@ -175,7 +175,7 @@ class _Scene:
         for attribute in prim.GetAuthoredAttributes():
             if attribute.GetNamespace().startswith("magtwin:"):
                 value = _json_value(attribute.Get())
-                if value is not None:
+                if value not in (None, []):
                     extras[attribute.GetName()] = value
         if prim.HasAPI(NOUNS["anomalyMap"]) and not is_tiled(prim):
             values = np.array(prim.GetAttribute(attribute_name("anomalyMap", "values")).Get(), "<f4")
