@@ -19,6 +19,7 @@ from magtwin.errors import InputError
 from magtwin.usd.geometry import Shape, read_shapes
 from magtwin.usd.layers import open_stage
 from magtwin.usd.schema import NOUNS, attribute_name, prims_with
+from magtwin.usd.tiled_maps import is_tiled
 from magtwin.version import __version__
 
 CREASE = np.deg2rad(40.0)
@@ -174,19 +175,19 @@ class _Scene:
         for attribute in prim.GetAuthoredAttributes():
             if attribute.GetNamespace().startswith("magtwin:"):
                 value = _json_value(attribute.Get())
-                if value is not None:
+                if value not in (None, []):
                     extras[attribute.GetName()] = value
-        if prim.HasAPI(NOUNS["anomalyMap"]):
+        if prim.HasAPI(NOUNS["anomalyMap"]) and not is_tiled(prim):
             values = np.array(prim.GetAttribute(attribute_name("anomalyMap", "values")).Get(), "<f4")
             valid = np.array(prim.GetAttribute(attribute_name("anomalyMap", "valid")).Get(), "u1")
             valid &= np.isfinite(values)
             numbers = {"values": np.where(valid, values, 0).astype("<f4"), "valid": valid}
             for name, array in numbers.items():
                 extras[attribute_name("anomalyMap", name)] = {"accessor": self._accessor(array)}
-            for child in prim.GetChildren():
-                scale = child.GetCustomDataByKey("magtwin") or {}
-                if "colourMap" in scale:
-                    extras["colours"] = {key: _json_value(value) for key, value in scale.items()}
+        for child in prim.GetChildren() if prim.HasAPI(NOUNS["anomalyMap"]) else ():
+            scale = child.GetCustomDataByKey("magtwin") or {}
+            if "colourMap" in scale:
+                extras["colours"] = {key: _json_value(value) for key, value in scale.items()}
 
     def animate(self) -> None:
         """Animate the nodes of prims with time samples."""

@@ -37,6 +37,7 @@ from magtwin.frames import matrix_from_quat, quat_from_yaw
 from magtwin.run.compare import FIELDS, HEADINGS, POSITIONS
 from magtwin.run.run import Run
 from magtwin.spec.base import Vec3
+from magtwin.twin import lab_and_epoch
 from magtwin.usd.geometry import ColourScale, Link, Shape, read_colour_scale, read_links, read_shapes
 from magtwin.usd.scene import open_scene
 
@@ -167,7 +168,7 @@ class Scenery:
         self._times, self._speed, self._view, self._size = np.asarray(times, float), speed, view, size
         self._position = _position(run)
         self._pose(run)
-        opened = open_scene(scene_file, lab=str(run.metadata.get("lab", "")), check_network=False)
+        opened = open_scene(scene_file, check_network=False, **lab_and_epoch(run.metadata))
         stage, scene = opened.stage, opened.scene
         shapes, links = read_shapes(stage), read_links(stage)
         moving = _links_of(links, [placed.robot.name for placed in scene.robots], run)

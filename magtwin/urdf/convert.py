@@ -279,7 +279,7 @@ class _Author:
             relationship = robot.CreateRelationship(f"isaac:physics:{name}", custom=False)
             for path in paths_listed:  # each is prepended, so that a stronger layer can add to the list
                 relationship.AddTarget(path)
-        self._equip(robot, tags, options, drive)
+        self._equip(robot, tags, options, drive, held)
         return robot
 
     def _joints(
@@ -320,7 +320,9 @@ class _Author:
             define_mimic(made[name], made[mimic.joint], joints[name], joints[mimic.joint], mechanism)
         return [prim.GetPath() for prim in made.values()]
 
-    def _equip(self, robot: Usd.Prim, tags: Tags, options: Options, drive: DriveSpec | None) -> None:
+    def _equip(
+        self, robot: Usd.Prim, tags: Tags, options: Options, drive: DriveSpec | None, held: bool
+    ) -> None:
         """Author the contents of tags outside URDF's grammar; the rest is kept as text."""
         stage, ledger = robot.GetStage(), self.ledger
 
@@ -332,8 +334,9 @@ class _Author:
 
         define_springs(tags, joint_of, options)
         define_weightless(tags, link_of)
-        if not options.fix_base and (drive is not None or options.profile == "diff-drive"):
-            robot.CreateAttribute("isaac:robotType", Sdf.ValueTypeNames.Token, custom=False).Set("Wheeled")
+        wheeled = not options.fix_base and (drive is not None or options.profile == "diff-drive")
+        kind = "Wheeled" if wheeled else "Manipulator" if held else "Default"  # of Isaac Sim's list
+        robot.CreateAttribute("isaac:robotType", Sdf.ValueTypeNames.Token, custom=False).Set(kind)
         if drive is not None:
             define_differential(robot, drive, {name: path.name for name, path in ledger.joints.items()})
         define_sensors(tags, robot, link_of)

@@ -28,6 +28,7 @@ from magtwin.run.resample import grid
 from magtwin.run.run import COLUMNS, Column, Run, check_clock
 from magtwin.spec.base import Quat, Vec3
 from magtwin.usd.attributes import read_pose, target
+from magtwin.usd.epochs import EPOCH
 from magtwin.usd.geometry import BASE_LINK, read_links
 from magtwin.usd.layers import SUFFIXES, WORLD, describe_stage, open_stage
 from magtwin.usd.placement import lab_on, labs_on, take_to_origin
@@ -148,7 +149,7 @@ def write_animation(
         rules: Any = {p_name: "linear", q_name: "quaternion"}  # it moves between recorded poses
         frames = run.select(*wanted).resample(grid(t[0], t[-1], fps), interpolation=rules)
         codes = np.arange(frames.rows, dtype=float)
-    stand = _Stand()
+    stand, maps = _Stand(), list[Sdf.Path]()
     if scene_file is not None:
         stage = open_stage(scene_file)
         world = stage.GetDefaultPrim()
@@ -157,6 +158,7 @@ def write_animation(
         if path.resolve() in (Path(layer.realPath).resolve() for layer in stage.GetUsedLayers()):
             raise InputError(f"{path}: is a part of the scene; give another name")
         stand = _stand(stage, world, str(run.metadata.get("robot", "")))
+        maps = [prim.GetPath() for prim in prims_with(stage.GetPseudoRoot(), "anomalyMap")]
     with output(path, force=force) as aside:
         layer = Sdf.Layer.CreateNew(str(aside))
         if layer is None:
@@ -177,6 +179,9 @@ def write_animation(
             for bare in (stand.world, stand.robot, stand.sensors["magnetometer"]):
                 spec = Sdf.CreatePrimInLayer(layer, bare)
                 spec.specifier, spec.typeName = Sdf.SpecifierDef, "Xform"
+        if epoch := str(run.metadata.get("map_epoch", "")):
+            for prim in maps:
+                Sdf.CreatePrimInLayer(layer, prim).variantSelections[EPOCH] = epoch
         _animate(layer, stand, frames, codes.tolist())
         _sample_readings(layer, stand, run, frames, codes.tolist(), rate)
         _store(layer, stand.world.AppendChild(RUN), run)

@@ -287,6 +287,14 @@ def test_merging_the_real_robot_leaves_three_bodies_of_the_same_mass_and_balance
 # --- bases and joints -----------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("fix_base", "kind"), [(True, "Manipulator"), (False, "Default")])
+def test_a_robot_without_a_drive_has_one_of_isaacs_types(tmp_path, fix_base, kind):
+    _stage, robot, _ = convert(
+        urdf(tmp_path, """<link name="base">{BODY}</link>""", "arm"), fix_base=fix_base
+    )
+    assert robot.GetAttribute("isaac:robotType").Get() == kind
+
+
 def test_a_fixed_base_is_bolted_to_the_robots_prim_where_it_stands(tmp_path):
     body = """<link name="base_footprint"/><link name="base">{BODY}</link>
     <joint name="up" type="fixed"><parent link="base_footprint"/><child link="base"/>

@@ -36,7 +36,8 @@ FOLDER_RULES = ("CleanFolder", "RobotNaming", "ThumbnailExists")
 
 NO_ROBOT = "the stage has no robot in a separate asset"
 ONE_LAYER = (
-    "the robot is not in the layers of Isaac Sim's asset structure, see `magtwin export --target isaac`"
+    "the robot is in one layer; `magtwin robot` without --single-file, or `magtwin export --target isaac`, "
+    "makes the layers of Isaac Sim's asset structure, which these rules check"
 )
 PACKED = "a package has no folder"
 
