@@ -133,6 +133,7 @@ def sim(
     stamps: Literal["sim", "wall"] = "sim",
     stamped_commands: Stamped = False,
     frame_prefix: FramePrefix = None,
+    tf: Literal["all", "odom", "none"] = "odom",
 ) -> Done:
     """Simulate a scene's robots in real time: the topics of real robots, and /clock.
 
@@ -153,6 +154,10 @@ def sim(
         its topics to `magtwin ros magnetometer`. Default: the scene's.
     stamps
         Time of the messages: sim, from 0, or wall.
+    tf
+        Transforms of the drive on /tf. odom: odom to base_link, for a localizer that publishes map to odom.
+        all: also map to odom, by the true pose. none: neither, for a filter that publishes both. The true pose
+        is on ground_truth, and unless all, it is the frame ground_truth in the map.
     """
     from magtwin.ros.simulate import Simulator
     from magtwin.twin import open_twin, with_plant
@@ -175,6 +180,7 @@ def sim(
             stamped_commands=stamped_commands,
             magnetometer=magnetometer != "none",
             frame_prefix=frame_prefix,
+            tf=tf,
             say=announce,
         )
         announce(f"simulating by {bus.backend} at {pace:g} x real time; Ctrl-C ends")

@@ -16,7 +16,8 @@ from magtwin.io.bags.stream import Sent, Stream
 from magtwin.io.bags.topics import COMMAND, IMU, MAGNITUDE, SCAN, TOTAL_FIELD, VECTOR, Topic
 from magtwin.ros.bus import Bus, Message
 from magtwin.ros.bus.names import within
-from magtwin.ros.topics import READ, SAMPLED, TICKS
+from magtwin.ros.topics import PATH, READ, READINGS, SAMPLED, TICKS
+from magtwin.ros.views import Truth
 from magtwin.run.run import Run
 from magtwin.sim.exact import check_field
 from magtwin.sim.runs.live import LiveRobot
@@ -87,11 +88,13 @@ class SimulatedRobot:
             lidar=self._lidar,
         )
         self._stream, self._moved = None, None
+        self._truth = Truth(self.sender, self._twin.scene.robot.p_base_magnetometer)
 
     def topics(self) -> list[Topic]:
         """The topics that it publishes; it drives for some steps to find out, and must `restart`."""
         rows = [self.live.step() for _ in range(WARM)]
-        topics = (*self._streamed(rows[0]).topics, *SAMPLED.values(), SCAN)
+        shown = (PATH, *[READINGS] * self._reads)
+        topics = (*self._streamed(rows[0]).topics, *SAMPLED.values(), SCAN, *shown)
         return [self._renamed(topic) for topic in topics]
 
     def drive(self) -> None:
@@ -106,6 +109,8 @@ class SimulatedRobot:
             self._stream = self._streamed(rows)
         for topic, times, fields in self._stream.messages(rows):
             yield self._renamed(topic), times, fields
+        for topic, times, fields in self._truth.add(rows):
+            yield self._renamed(topic), times, fields
         if rows.rows:
             self._moved = rows["odom_v"][-1:]
         for name, parts in self.live.samples().items():
@@ -115,6 +120,10 @@ class SimulatedRobot:
         if len(scans.t):
             moments, came = (np.rint(t * NS).astype(np.int64) for t in (scans.t, scans.arrival))
             yield self._renamed(SCAN), came, SCAN.write({"ranges_m": scans.ranges_m}, moments, self.sender)
+
+    def path(self, stamp_ns: int) -> tuple[str, bytes]:
+        """Topic and message of its true path so far."""
+        return self._name(PATH), self._truth.path(stamp_ns)
 
     def commanded(self, message: Message) -> None:
         """Take a command."""

@@ -9,7 +9,7 @@ from typing import Literal
 
 from magtwin.errors import InputError
 from magtwin.io.bags.cdr import NS, encode
-from magtwin.io.bags.sender import Unit, prefixed, sender_for
+from magtwin.io.bags.sender import Transforms, Unit, prefixed, sender_for
 from magtwin.io.bags.stream import Sent
 from magtwin.io.bags.topics import Qos, Topic
 from magtwin.io.bags.types import layout
@@ -17,7 +17,8 @@ from magtwin.ros.bus import Bus, Publisher
 from magtwin.ros.bus.names import checked_prefix
 from magtwin.ros.diagnostics import Reporter, status_of
 from magtwin.ros.robot import SimulatedRobot
-from magtwin.ros.topics import TICKS
+from magtwin.ros.topics import OCCUPANCY, TICKS
+from magtwin.ros.views import publish_lab
 from magtwin.sim.runs.live import LiveRobot
 from magtwin.twin import Session, Twin, in_session, led_by
 
@@ -82,6 +83,7 @@ class Simulator:
         stamped_commands: bool = False,
         magnetometer: bool = True,
         frame_prefix: str | None = None,
+        tf: Transforms = "odom",
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
         """Advertise its topics; `run` starts it.
@@ -100,6 +102,8 @@ class Simulator:
             magnetometer: Publish the magnetometer's readings; else another node does.
             frame_prefix: Prefix of the names of frames, such as "tb4/". Default: none; for several robots the
                 name of each, "ann/", which a given prefix precedes.
+            tf: Transforms of the drive on /tf: "odom", odom to base_link, for a localizer that publishes map to
+                odom; "all", also map to odom, by the true pose; or "none", for a filter that publishes both.
             say: Called with messages for the user.
 
         Raises:
@@ -129,7 +133,7 @@ class Simulator:
             robot = SimulatedRobot(
                 own,
                 bus,
-                prefixed(sender, f"{prefix}{name}/" if several else prefix),
+                replace(prefixed(sender, f"{prefix}{name}/" if several else prefix), transforms=tf),
                 within=name if several else "",
                 which=k,
                 seed=seed,
@@ -148,6 +152,7 @@ class Simulator:
             for topic in robot.topics():
                 self._advertise(topic)
         self._restart()
+        self._lab = publish_lab(twin, bus, self.robots[0].sender.map_frame)
         if units == "nT":
             say("fields are published in nT, as APRILab's robot does; ROS means tesla")
 
@@ -248,17 +253,22 @@ class Simulator:
                 return
 
     def _report(self, factor: float) -> None:
-        clock = self._bus.publishers(TICKS.name)
+        stamp = self._begin_ns + round(self.online.t * NS)
+        for robot in self.robots:
+            name, path = robot.path(stamp)
+            if name in self._publishers:
+                self._publishers[name].publish(path)
+        clock, maps = (self._bus.publishers(topic.name) for topic in (TICKS, OCCUPANCY))
         problems = [
             (self._slips, f"slower than {self._speed:g} x real time"),
             (clock > 1, f"{clock} publishers on {self._bus.resolve(TICKS.name)}"),
+            (maps > 1, f"{maps} publishers on {self._bus.resolve(OCCUPANCY.name)}: remap that of one"),
         ]
         values = {
             "sim time [s]": f"{self.online.t:.2f}",
             "real-time factor": f"{factor:.3f}",
             "resets": str(self._resets),
         }
-        stamp = self._begin_ns + round(self.online.t * NS)
         if len(self.robots) == 1:
             more, own = self.robots[0].state()
             statuses = [status_of("simulator", [*problems, *more], fine="running", values=values | own)]

@@ -10,6 +10,7 @@ from magtwin.io.bags.topics import (
     DESCRIPTION,
     IMU,
     JOINTS,
+    LATCHED,
     MAGNITUDE,
     NAMES,
     ODOMETRY,
@@ -19,7 +20,9 @@ from magtwin.io.bags.topics import (
     TF,
     TF_STATIC,
     TOTAL_FIELD,
+    TRUTH,
     VECTOR,
+    Qos,
     Topic,
 )
 
@@ -29,10 +32,19 @@ TICKS = replace(CLOCK, sent="each")
 SAMPLED: Mapping[str, Topic] = {"odometry": ODOMETRY, "imu": IMU, "mocap": POSE, "battery": BATTERY}
 """Topics that are sent sample by sample on arrival, stamped with the sampling time; by sensor name."""
 
-READ = (TICKS, JOINTS, TF, MAGNITUDE, VECTOR, TOTAL_FIELD)
+READ = (TICKS, JOINTS, TF, TRUTH, MAGNITUDE, VECTOR, TOTAL_FIELD)
 """Topics that are sent at readings of the magnetometer."""
 
-LIVE = (*READ, *SAMPLED.values(), SCAN, TF_STATIC, DESCRIPTION, NAMES, READING)
+OCCUPANCY = Topic(name="/map", kind="nav_msgs/msg/OccupancyGrid", qos=LATCHED, sent="once")
+FIELD = Topic(name="/anomaly_map", kind="sensor_msgs/msg/PointCloud2", qos=LATCHED, sent="once")
+FIELD_GRID = Topic(name="/anomaly_map/grid", kind="nav_msgs/msg/OccupancyGrid", qos=LATCHED, sent="once")
+READINGS = Topic(name="/robot/ground_truth/readings", kind="sensor_msgs/msg/PointCloud2")
+PATH = Topic(name="/robot/ground_truth/path", kind="nav_msgs/msg/Path", qos=Qos(depth=1))
+
+VIEWS = (OCCUPANCY, FIELD, FIELD_GRID, READINGS, PATH)
+"""Topics for viewers, see `magtwin.ros.views`; robots share those of the lab."""
+
+LIVE = (*READ, *SAMPLED.values(), SCAN, TF_STATIC, DESCRIPTION, NAMES, READING, *VIEWS)
 """Topics of a simulated robot."""
 
 RECORDED = (*LIVE, COMMAND)

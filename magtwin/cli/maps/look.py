@@ -1,4 +1,4 @@
-"""`magtwin map info`, `plot`, `diff`, `upward`, `export` and `epochs`: commands on maps that exist."""
+"""`magtwin map plot`, `diff`, `upward`, `export`, `epochs` and `occupancy`: commands on what exists."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -154,3 +154,31 @@ def map_epochs(*files: Sources, out: Path, force: Force = False) -> Done:
     maps = in_order([epoch for file in files for epoch in load_epochs(file)])
     save_map_series(maps, out, force=force)
     return Done(drift(maps), out)
+
+
+@map_app.command(name="occupancy")
+def map_occupancy(scene: Path, *, out: Path, resolution_m: float = 0.05, force: Force = False) -> Done:
+    """Write walls, furniture and floor of a scene as an occupancy grid, for nav2's map_server.
+
+    Occupied is where a simulated robot stops. The floor is free, and what is beyond it is unknown.
+
+    Parameters
+    ----------
+    scene
+        Scene (.usd, .usda, .usdc), or the name of a shipped one: lab.
+    out
+        File to write (.yaml). The picture (.pgm) is written beside it.
+    resolution_m
+        Side of a cell [m].
+    """
+    from magtwin.path.occupancy import occupancy_of
+    from magtwin.twin import open_twin, room_of
+
+    check_output(out, (".yaml",), "a map of map_server", force=force)
+    step("Opening the scene")
+    grid = occupancy_of(room_of(open_twin(scene, magnetometer="map-only")), resolution_m=resolution_m)
+    wrote = grid.save(out, force=force)
+    rows, columns = grid.cells.shape
+    data = {"columns": columns, "rows": rows, "resolution_m": resolution_m, "origin_m": list(grid.origin_m)}
+    lines = (str(grid), f"Wrote {wrote[0]} and {wrote[1]}")
+    return Done(text="\n".join(lines), data=data, wrote=wrote)

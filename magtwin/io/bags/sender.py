@@ -1,12 +1,13 @@
 """Sender: what the messages of a robot hold beside its readings: frames, covariances, links, units."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from magtwin.errors import InputError
-from magtwin.frames import IDENTITY_XYZW
+from magtwin.frames import IDENTITY_XYZW, quat_from_rpy
 from magtwin.spec.base import ZERO3, Quat, Vec3
 from magtwin.spec.robot import RobotSpec
 
@@ -14,6 +15,12 @@ if TYPE_CHECKING:
     from magtwin.twin import Twin
 
 Unit = Literal["T", "nT"]
+
+Transforms = Literal["all", "odom", "none"]
+"""Which part of the chain from map to base_link is on /tf: all of it, odom to base_link, or nothing."""
+
+FOOTPRINT = "base_footprint"
+"""Name of the frame below base_link on the floor, as in REP 120."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +42,16 @@ class Sender:
     map_frame: str = "map"
     odom_frame: str = "odom"
     base_frame: str = "base_link"
+    truth_frame: str = "ground_truth"
+    """Frame at the true pose of base_link, in the map; on /tf if the map is not the parent of odom."""
+
     imu_frame: str = "imu_link"
     magnetometer_frame: str = "magnetometer_link"
     lidar_frame: str = "rplidar_link"
     wheel_joints: tuple[str, str] = ("left_wheel_joint", "right_wheel_joint")
+
+    transforms: Transforms = "all"
+    """Transforms of the drive on /tf. With "all", map to odom puts base_link at its true pose."""
 
     unit: Unit = "T"
     """Unit of magnetic fields in messages."""
@@ -122,7 +135,7 @@ def prefixed(sender: Sender, prefix: str) -> Sender:
     def moved(frame: FixedFrame) -> FixedFrame:
         return replace(frame, parent=prefix + frame.parent, name=prefix + frame.name)
 
-    names = ("odom_frame", "base_frame", "imu_frame", "magnetometer_frame", "lidar_frame")
+    names = ("odom_frame", "base_frame", "truth_frame", "imu_frame", "magnetometer_frame", "lidar_frame")
     wheels = None if sender.wheels is None else (moved(sender.wheels[0]), moved(sender.wheels[1]))
     frames: dict[str, Any] = {name: prefix + getattr(sender, name) for name in names}
     return replace(sender, links=tuple(map(moved, sender.links)), wheels=wheels, **frames)
@@ -150,11 +163,30 @@ def sender_for(twin: "Twin | None", unit: Unit, rate_hz: Any = None) -> Sender:
             frame = FixedFrame(BASE_LINK, link.name, link.p_base_link, link.q_base_link_xyzw, axis)
             frames[link.joint if link.joint in joints else f"/{link.name}"] = frame
     wheels = tuple(frames.pop(joint) for joint in joints if joint in frames)
+    description = read_description(robot.asset)
+    below = _footprint(description) if f"/{FOOTPRINT}" not in frames else ()
     return sender_of(
         robot,
         unit=unit,
         rate_hz=float(rate_hz) if isinstance(rate_hz, int | float) and rate_hz > 0 else None,
-        links=tuple(frames.values()),
+        links=(*frames.values(), *below),
         wheels=wheels if len(wheels) == 2 else None,
-        description=read_description(robot.asset),
+        description=description,
     )
+
+
+def _footprint(description: str) -> tuple[FixedFrame, ...]:
+    """The frame base_footprint of a URDF whose root is base_link; it has no body, so the stage has no link."""
+    if not description:
+        return ()
+    from magtwin.urdf.source.markup import parse_markup
+
+    for joint in parse_markup(description.encode(), Path("robot_description")).root.findall("joint"):
+        ends = [element.get("link") for element in (*joint.findall("parent"), *joint.findall("child"))]
+        if joint.get("type") == "fixed" and ends == ["base_link", FOOTPRINT]:
+            origin = joint.find("origin")
+            text = {} if origin is None else origin.attrib
+            xyz, rpy = (np.array(text.get(name, "0 0 0").split(), float) for name in ("xyz", "rpy"))
+            q = quat_from_rpy(rpy).tolist()
+            return (FixedFrame("base_link", FOOTPRINT, tuple(xyz.tolist()), tuple(q)),)
+    return ()

@@ -193,13 +193,21 @@ def _transform_fields(stamp: NDArray[np.int64], transforms: list[tuple[str, str,
 
 
 def _transforms(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
-    """Map to odom, such that base_link is at its true pose; odom to base_link; base_link to each wheel."""
+    """Of the drive, what `sender.transforms` asks for; then base_link to each wheel.
+
+    Map to odom is such that base_link is at its true pose. Where another node publishes map to odom, the true
+    pose is a frame of its own in the map.
+    """
     p_odom, q_odom = c["odom_p"], c["odom_q_xyzw"]
-    q = quat_multiply(c["q_world_base_xyzw"], quat_conjugate(q_odom))
-    chain = [
-        (sender.map_frame, sender.odom_frame, c["p_world_base"] - rotate(q, p_odom), q),
-        (sender.odom_frame, sender.base_frame, p_odom, q_odom),
-    ]
+    p_base, q_base = c["p_world_base"], c["q_world_base_xyzw"]
+    chain: list[tuple[str, str, Any, Any]] = []
+    if sender.transforms == "all":
+        q = quat_multiply(q_base, quat_conjugate(q_odom))
+        chain.append((sender.map_frame, sender.odom_frame, p_base - rotate(q, p_odom), q))
+    else:
+        chain.append((sender.map_frame, sender.truth_frame, p_base, q_base))
+    if sender.transforms != "none":
+        chain.append((sender.odom_frame, sender.base_frame, p_odom, q_odom))
     if sender.wheels is not None and "wheel_angle" in c:
         for wheel, angle in zip(sender.wheels, c["wheel_angle"].T, strict=True):
             half = angle[:, None] / 2
@@ -207,6 +215,16 @@ def _transforms(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
             p = np.broadcast_to(np.array(wheel.p), (len(stamp), 3))
             chain.append((wheel.parent, wheel.name, p, quat_multiply(wheel.q_xyzw, turn)))
     return _transform_fields(stamp, chain)
+
+
+def _truth(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
+    return {
+        "child_frame_id": sender.truth_frame,
+        "pose.pose.position": c["p_world_base"],
+        "pose.pose.orientation": c["q_world_base_xyzw"],
+        "twist.twist.linear": c["v_base"],
+        "twist.twist.angular": c["w_base"],
+    }
 
 
 def _static(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
@@ -385,3 +403,14 @@ TOPICS: Mapping[str, Topic] = MappingProxyType(
 )
 """Topics by name. /magtwin/reading holds the columns that no ROS message carries, in the order that
 /magtwin/columns gives."""
+
+TRUTH = Topic(
+    name="/robot/ground_truth",
+    kind="nav_msgs/msg/Odometry",
+    needs=("p_world_base", "q_world_base_xyzw", "v_base", "w_base"),
+    sent="ticks",
+    every_s=1 / 62,
+    frame="map_frame",
+    more=_truth,
+)
+"""The true pose of base_link in the map, with its velocities in base_link; live robots only."""

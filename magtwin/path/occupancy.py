@@ -1,0 +1,123 @@
+"""OccupancyGrid: a lab for navigation programs, in cells that are free, occupied or unknown."""
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.files import check_free, output
+from magtwin.path.room import Room
+from magtwin.summary import Summarized, Summary
+
+FREE, OCCUPIED, UNKNOWN = 0, 100, -1
+"""Values of cells, those of nav_msgs/OccupancyGrid."""
+
+MOST_CELLS = 16_000_000
+"""Largest number of cells."""
+
+PIXELS = {FREE: 254, OCCUPIED: 0, UNKNOWN: 205}
+"""Grey of each value in the picture of nav2's map_server, with the thresholds that `save` writes."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class OccupancyGrid(Summarized):
+    """Cells of a lab. The lower left corner of `cells[j, i]` is at origin + (i, j) * resolution."""
+
+    cells: NDArray[np.int8]
+    """Values of the cells, shape (Y, X); rows ascend in y."""
+
+    resolution_m: float
+    """Side of a cell [m]."""
+
+    origin_m: tuple[float, float]
+    """World x and y of the lower left corner of `cells[0, 0]` [m]."""
+
+    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> tuple[FilePath, FilePath]:
+        """Write it for nav2's map_server: a YAML file, and the picture that it names (.pgm) beside it.
+
+        Args:
+            path: The YAML file.
+            force: Whether to replace existing files.
+
+        Returns:
+            The YAML file and the picture.
+
+        Raises:
+            InputError: The suffix is not .yaml, or a file exists and `force` is False.
+        """
+        file = FilePath(path)
+        if file.suffix != ".yaml":
+            raise InputError(f"{file}: the map of map_server is a .yaml file", parameter="out")
+        picture = file.with_suffix(".pgm")
+        for each in (file, picture):
+            check_free(each, force=force)
+        grey = np.full(self.cells.shape, PIXELS[UNKNOWN], np.uint8)
+        for value in (FREE, OCCUPIED):
+            grey[self.cells == value] = PIXELS[value]
+        rows, columns = grey.shape
+        x, y = self.origin_m
+        text = (
+            f"image: {picture.name}\nmode: trinary\nresolution: {self.resolution_m:.9g}\n"
+            f"origin: [{x:.9g}, {y:.9g}, 0.0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+        )
+        with output(picture, force=force) as aside:
+            aside.write_bytes(f"P5\n{columns} {rows}\n255\n".encode() + grey[::-1].tobytes())
+        with output(file, force=force) as aside:
+            aside.write_text(text, encoding="utf-8")
+        return file, picture
+
+    def _summary(self) -> Summary:
+        rows, columns = self.cells.shape
+        share = [(self.cells == value).mean() for value in (FREE, OCCUPIED, UNKNOWN)]
+        x, y = self.origin_m
+        return Summary(
+            f"OccupancyGrid: {columns} x {rows} cells of {self.resolution_m:g} m",
+            (
+                ("cells", "{:.1%} free, {:.1%} occupied, {:.1%} unknown".format(*share)),
+                ("origin", f"x {x:g}, y {y:g} m"),
+            ),
+        )
+
+
+def occupancy_of(room: Room, *, resolution_m: float = 0.05) -> OccupancyGrid:
+    """The occupancy grid of a room, over its floor and all obstacles.
+
+    A cell is occupied if its centre is less than half a cell from the outline of an obstacle, or if a corner
+    of an outline is in it. The outlines are those at which simulated robots stop. Other cells are free on the
+    floor, and unknown beyond it.
+
+    Args:
+        room: Floor and obstacles.
+        resolution_m: Side of a cell [m].
+
+    Raises:
+        InputError: The resolution is not above 0, or gives more than `MOST_CELLS` cells.
+    """
+    if not (math.isfinite(resolution_m) and resolution_m > 0):
+        raise InputError(f"resolution_m must be above 0 m, got {resolution_m!r}", parameter="resolution_m")
+    half = np.asarray(room.floor_m) / 2
+    corners = np.concatenate([[-half, half], *room.obstacles.outlines])
+    low = np.floor(corners.min(axis=0) / resolution_m - 1e-9) - 1  # one cell more on each side
+    count = np.ceil(corners.max(axis=0) / resolution_m + 1e-9) + 1 - low
+    if count.prod() > MOST_CELLS:
+        raise InputError(
+            f"{count[0]:.0f} x {count[1]:.0f} cells of {resolution_m:g} m are too many; at most "
+            f"{MOST_CELLS:,} are possible",
+            parameter="resolution_m",
+        )
+    columns, rows = count.astype(int).tolist()
+    x, y = ((low[k] + np.arange(n) + 0.5) * resolution_m for k, n in enumerate((columns, rows)))
+    on_floor = (np.abs(y) <= half[1])[:, None] & (np.abs(x) <= half[0])[None, :]
+    cells = np.where(on_floor, FREE, UNKNOWN).astype(np.int8)
+    at = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    distance, _ = room.obstacles.clearance(at, reach_m=resolution_m)
+    cells[(distance < resolution_m / 2 * (1 - 1e-6)).reshape(rows, columns)] = OCCUPIED
+    for outline in room.obstacles.outlines:  # corners move inwards a little, off the borders of cells
+        at = outline + 1e-6 * (outline.mean(axis=0) - outline)
+        column, row = np.floor(at / resolution_m - low).astype(int).T
+        cells[row, column] = OCCUPIED
+    return OccupancyGrid(cells, resolution_m, (low[0] * resolution_m, low[1] * resolution_m))
