@@ -17,6 +17,12 @@ CREASE = np.radians(35)
 FAN = 64
 """Where more faces than this meet, as at tips and in the middle of discs, each keeps its own normal."""
 
+SMOOTH = np.cos(CREASE / 2) + 1e-5
+"""Cosine of the angle to their common normal below which all faces of a point are within CREASE."""
+
+PAIRS = 2**19
+"""Most pairs of corners that are compared at once."""
+
 Triangles = tuple[NDArray, NDArray]
 """Points [m], shape (V, 3), and the corners of triangles, counter-clockwise from outside, shape (F, 3)."""
 
@@ -172,27 +178,54 @@ def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float32]:
     Returns:
         Normals, shape (F, 3, 3).
     """
-    a, b, c = (points[faces[:, i]].astype(float) for i in range(3))
-    area = np.cross(b - a, c - a)
+    area = _cross(points.astype(float), faces)
     size = np.linalg.norm(area, axis=1, keepdims=True)
     area = (area / size.mean()).astype(np.float32)
     unit = area / np.linalg.norm(area, axis=1, keepdims=True)
-    flat = faces.ravel().astype(np.int32)
-    by_point = np.argsort(flat, kind="stable")  # corners of one point stand together
+    flat, own = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
     count = np.bincount(flat, minlength=len(points))
-    first = np.cumsum(count) - count
-    corner = by_point[count[flat[by_point]] <= FAN]
-    around = count[flat[corner]]  # each corner is paired with each corner of its point
-    mine = np.repeat(np.arange(len(corner)), around)
-    start = np.repeat(first[flat[corner]] - np.cumsum(around) + around, around)
-    theirs = (by_point // 3)[start + np.arange(len(mine))]
-    near = np.einsum("ij,ij->i", np.repeat(unit[corner // 3], around, axis=0), unit[theirs]) >= np.cos(CREASE)
+    together = np.column_stack([np.bincount(flat, area[own, i], len(points)) for i in range(3)])
+    length = np.maximum(np.linalg.norm(together, axis=1, keepdims=True), 1e-30)
+    off = np.einsum("ij,ij->i", unit[own], (together / length).astype(np.float32)[flat]) < SMOOTH
+    creased = np.bincount(flat[off], minlength=len(points)) > 0  # elsewhere, all faces are within CREASE
+    normals = unit[own]
+    shared = ~creased[flat] & (count[flat] <= FAN)
+    normals[shared] = together.astype(np.float32)[flat[shared]]
+    corner = np.flatnonzero(creased[flat] & (count[flat] <= FAN))
+    corner = corner[np.argsort(flat[corner], kind="stable")]  # corners of one point stand together
+    starts = np.flatnonzero(np.diff(flat[corner], prepend=-1))
+    sizes = count[flat[corner[starts]]]
+    block = (np.cumsum(sizes**2) - sizes**2) // PAIRS  # whole points, so that memory stays bounded
+    for some in np.split(np.arange(len(starts)), np.flatnonzero(np.diff(block)) + 1):
+        if len(some):
+            at = corner[starts[some[0]] : starts[some[-1]] + sizes[some[-1]]]
+            normals[at] = _creased(own[at], sizes[some], unit, area)
+    return (normals / np.linalg.norm(normals, axis=1, keepdims=True)).reshape(-1, 3, 3)
+
+
+def _creased(own: NDArray, sizes: NDArray, unit: NDArray, area: NDArray) -> NDArray[np.float64]:
+    """Normals, not of unit length, at the corners of points with creases, shape (C, 3).
+
+    Args:
+        own: Face of each corner; corners of one point stand together, shape (C,).
+        sizes: Number of corners of each point, shape (P,).
+        unit: Unit normal of each face, shape (F, 3).
+        area: Normal of each face times its area, shape (F, 3).
+    """
+    first, around = np.repeat(np.cumsum(sizes) - sizes, sizes), np.repeat(sizes, sizes)
+    mine = np.repeat(np.arange(len(own)), around)  # each corner is paired with each corner of its point
+    theirs = own[np.repeat(first - np.cumsum(around) + around, around) + np.arange(len(mine))]
+    near = np.einsum("ij,ij->i", unit[own[mine]], unit[theirs]) >= np.cos(CREASE)
     mine, theirs = mine[near], theirs[near]
-    normals = np.repeat(unit, 3, axis=0)
-    for axis in range(3):
-        normals[corner, axis] = np.bincount(mine, area[theirs, axis], len(corner))
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return (normals / length).reshape(-1, 3, 3)
+    return np.column_stack([np.bincount(mine, area[theirs, i], len(own)) for i in range(3)])
+
+
+def _cross(points: NDArray, faces: NDArray) -> NDArray[np.float64]:
+    """Twice the area of each triangle times its normal, shape (F, 3); column by column, which is faster."""
+    x, y, z = np.ascontiguousarray(points.T)
+    a, b, c = np.ascontiguousarray(faces.T)
+    (ux, vx), (uy, vy), (uz, vz) = ((p[b] - p[a], p[c] - p[a]) for p in (x, y, z))
+    return np.column_stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx])
 
 
 def define_triangles(
