@@ -193,31 +193,15 @@ def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float32]:
     normals[shared] = together.astype(np.float32)[flat[shared]]
     corner = np.flatnonzero(creased[flat] & (count[flat] <= FAN))
     corner = corner[np.argsort(flat[corner], kind="stable")]  # corners of one point stand together
-    starts = np.flatnonzero(np.diff(flat[corner], prepend=-1))
-    sizes = count[flat[corner[starts]]]
-    block = (np.cumsum(sizes**2) - sizes**2) // PAIRS  # whole points, so that memory stays bounded
-    for some in np.split(np.arange(len(starts)), np.flatnonzero(np.diff(block)) + 1):
-        if len(some):
-            at = corner[starts[some[0]] : starts[some[-1]] + sizes[some[-1]]]
-            normals[at] = _creased(own[at], sizes[some], unit, area)
+    around = count[flat[corner]]
+    for number in np.unique(around):
+        points_of = corner[around == number].reshape(-1, number)
+        step = max(PAIRS // number**2, 1)  # so that memory stays bounded
+        for some in (points_of[i : i + step] for i in range(0, len(points_of), step)):
+            directions, areas = unit[own[some]], area[own[some]].astype(float)
+            near = directions @ directions.transpose(0, 2, 1) >= np.float32(np.cos(CREASE))
+            normals[some] = near.astype(float) @ areas
     return (normals / np.linalg.norm(normals, axis=1, keepdims=True)).reshape(-1, 3, 3)
-
-
-def _creased(own: NDArray, sizes: NDArray, unit: NDArray, area: NDArray) -> NDArray[np.float64]:
-    """Normals, not of unit length, at the corners of points with creases, shape (C, 3).
-
-    Args:
-        own: Face of each corner; corners of one point stand together, shape (C,).
-        sizes: Number of corners of each point, shape (P,).
-        unit: Unit normal of each face, shape (F, 3).
-        area: Normal of each face times its area, shape (F, 3).
-    """
-    first, around = np.repeat(np.cumsum(sizes) - sizes, sizes), np.repeat(sizes, sizes)
-    mine = np.repeat(np.arange(len(own)), around)  # each corner is paired with each corner of its point
-    theirs = own[np.repeat(first - np.cumsum(around) + around, around) + np.arange(len(mine))]
-    near = np.einsum("ij,ij->i", unit[own[mine]], unit[theirs]) >= np.cos(CREASE)
-    mine, theirs = mine[near], theirs[near]
-    return np.column_stack([np.bincount(mine, area[theirs, i], len(own)) for i in range(3)])
 
 
 def _cross(points: NDArray, faces: NDArray) -> NDArray[np.float64]:
