@@ -194,7 +194,7 @@ def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float32]:
     corner = np.flatnonzero(creased[flat] & (count[flat] <= FAN))
     corner = corner[np.argsort(flat[corner], kind="stable")]  # corners of one point stand together
     around = count[flat[corner]]
-    for number in np.unique(around):
+    for number in np.flatnonzero(np.bincount(around)):
         points_of = corner[around == number].reshape(-1, number)
         step = max(PAIRS // number**2, 1)  # so that memory stays bounded
         for some in (points_of[i : i + step] for i in range(0, len(points_of), step)):
@@ -235,6 +235,9 @@ def define_triangles(
         primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
             "normals", Sdf.ValueTypeNames.Normal3fArray, UsdGeom.Tokens.faceVarying
         )
-        rows, index = np.unique(normals, axis=0, return_inverse=True)
-        primvar.Set(Vt.Vec3fArray.FromNumpy(rows))
-        primvar.SetIndices(Vt.IntArray.FromNumpy(index.ravel().astype(np.int32)))
+        order = np.lexsort(normals.T[::-1])  # as np.unique, which imports numpy.ma
+        starts = np.append(True, (normals[order[1:]] != normals[order[:-1]]).any(axis=1))
+        index = np.empty(len(order), np.int32)
+        index[order] = np.cumsum(starts) - 1
+        primvar.Set(Vt.Vec3fArray.FromNumpy(normals[order[starts]]))
+        primvar.SetIndices(Vt.IntArray.FromNumpy(index))

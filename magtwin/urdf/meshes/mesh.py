@@ -134,7 +134,7 @@ def _join(reading: Reading, pieces: Sequence[Piece]) -> Mesh:
     faces, paint = faces[solid], paint[solid]
     used = np.zeros(len(points), bool)
     used[faces] = True
-    shown = np.unique(paint)
+    shown = np.flatnonzero(np.bincount(paint))
     return Mesh(
         path=path,
         points=points[used],

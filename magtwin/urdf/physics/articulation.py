@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
-from magtwin.usd.geometry import read_triangles
+from magtwin.usd.geometry import read_vertices
 
 NEWTON_API, PHYSX_API = "NewtonArticulationRootAPI", "PhysxArticulationAPI"
 """Applied schemas of Newton and PhysX; their plugins are not installed here."""
@@ -88,13 +88,12 @@ def _hulls(
         return hulls
     owner = {prim.GetPath(): name for name, prims in colliders.items() for prim in prims}
     stage = next(iter(bodies.values())).GetStage()
-    triangles = read_triangles(
-        stage, purposes=(UsdGeom.Tokens.guide,), wanted=lambda prim, _: prim.GetPath() in owner
-    )
     places = UsdGeom.XformCache()
-    for path, corners in triangles.items():
+    for path, (_, corners) in read_vertices(stage, purposes=(UsdGeom.Tokens.guide,)).items():
+        if path not in owner:
+            continue
         T = np.array(places.GetLocalToWorldTransform(bodies[owner[path]]))
-        points = np.unique(corners.reshape(-1, 3), axis=0) @ T[:3, :3] + T[3, :3]
+        points = corners.astype(float) @ T[:3, :3] + T[3, :3]
         away = points - points.mean(axis=0)
         far = np.linalg.norm(away, axis=1, keepdims=True)
         shrunk = points - away * np.minimum(1.0, OVERLAP_M / 2 / np.maximum(far, 1e-12))
