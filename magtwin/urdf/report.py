@@ -244,7 +244,7 @@ def _geometries(
     ledger: Ledger,
     poses: Mapping[str, NDArray],
 ) -> tuple[GeometryLine, ...]:
-    boxes, lines = _boxes(stage), []
+    boxes, lines = _boxes(stage, {prim for prims in ledger.shapes.values() for prim in prims}), []
     for name, link in description.links.items():
         for role, shapes in (("visual", link.visuals), ("collision", link.collisions)):
             for index, shape in enumerate(shapes):
@@ -269,14 +269,18 @@ def _box_of(shape: Shape, T: NDArray[np.float64], meshes: MeshLayer) -> Box | No
     return _corners(*bounds(points @ T[:3, :3].T + T[:3, 3]))
 
 
-def _boxes(stage: Usd.Stage) -> dict[Sdf.Path, Box]:
-    """The box around each gprim of a stage, including colliders, in the frame of its default prim."""
+def _boxes(stage: Usd.Stage, prims: set[Sdf.Path]) -> dict[Sdf.Path, Box]:
+    """The box around each gprim at or below `prims`, including colliders, in the frame of the default prim."""
     to_robot = UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetDefaultPrim()).GetInverse()
     bodies = {str(p.GetPath()): p for p in stage.Traverse() if p.HasAPI(UsdPhysics.RigidBodyAPI)}
     by_name = {p.GetName(): p for p in bodies.values()} | bodies
     cache, boxes = UsdGeom.XformCache(), {}
     tokens = UsdGeom.Tokens
-    shown = read_vertices(stage, purposes=(tokens.default_, tokens.render, tokens.guide))
+    shown = read_vertices(
+        stage,
+        purposes=(tokens.default_, tokens.render, tokens.guide),
+        wanted=lambda prim, _: not prims.isdisjoint(prim.GetPath().GetPrefixes()),
+    )
     for path, (link, vertices) in shown.items():
         points = vertices.astype(float)
         if link:

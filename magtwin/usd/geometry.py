@@ -117,16 +117,24 @@ def read_shapes(stage: Usd.Stage | str | os.PathLike[str], *, purposes: Sequence
 
 
 def read_vertices(
-    stage: Usd.Stage, *, purposes: Sequence[str] = SHOWN
+    stage: Usd.Stage,
+    *,
+    purposes: Sequence[str] = SHOWN,
+    wanted: Callable[[Usd.Prim, bool], bool] = lambda prim, carried: True,
 ) -> dict[Sdf.Path, tuple[str, NDArray[np.float32]]]:
     """The vertices of the shapes that `read_shapes` reads, which is faster.
+
+    Args:
+        stage: A stage.
+        purposes: USD purposes to read.
+        wanted: Function of a prim, and of whether a rigid body carries it: whether to read it.
 
     Returns:
         By path of the gprim: the name of its body ("" for none), and the vertices of its faces in the body's
         frame or else in world [m], shape (V, 3).
     """
     found = {}
-    for gprim, solid, to_frame, name in _shown(stage, purposes):
+    for gprim, solid, to_frame, name in _shown(stage, purposes, wanted):
         used = np.zeros(len(solid.points), bool)
         used[solid.corners] = True
         if used.any():

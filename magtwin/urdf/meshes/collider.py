@@ -63,6 +63,8 @@ def hull_faces(points: NDArray) -> NDArray[np.int64] | None:
     if hull.volume() <= FLAT * float(np.ptp(points, axis=0).max(initial=0.0)) ** 3:
         return None
     mesh = hull.to_mesh64()
-    index = {point.tobytes(): i for i, point in enumerate(points)}
     corners = np.ascontiguousarray(mesh.vert_properties[:, :3], float) + 0.0
+    x = np.sort(corners[:, 0])
+    alike = np.flatnonzero(x[np.searchsorted(x, points[:, 0]) % len(x)] == points[:, 0])
+    index = {points[i].tobytes(): i for i in alike}
     return np.array([index[corner.tobytes()] for corner in corners])[mesh.tri_verts]

@@ -89,9 +89,10 @@ def _hulls(
     owner = {prim.GetPath(): name for name, prims in colliders.items() for prim in prims}
     stage = next(iter(bodies.values())).GetStage()
     places = UsdGeom.XformCache()
-    for path, (_, corners) in read_vertices(stage, purposes=(UsdGeom.Tokens.guide,)).items():
-        if path not in owner:
-            continue
+    vertices = read_vertices(
+        stage, purposes=(UsdGeom.Tokens.guide,), wanted=lambda prim, _: prim.GetPath() in owner
+    )
+    for path, (_, corners) in vertices.items():
         T = np.array(places.GetLocalToWorldTransform(bodies[owner[path]]))
         points = corners.astype(float) @ T[:3, :3] + T[3, :3]
         away = points - points.mean(axis=0)
