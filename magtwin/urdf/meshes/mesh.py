@@ -120,7 +120,7 @@ def _join(reading: Reading, pieces: Sequence[Piece]) -> Mesh:
     faces = np.vstack([piece.faces + n for piece, n in zip(pieces, first, strict=False)]).astype(np.int64)
     if not np.isfinite(points[faces]).all():
         raise InputError(f"{path}: has vertices that are not finite numbers; export it again")
-    pieces = [_coloured(piece, reading) for piece in pieces]
+    pieces = [_textured(_coloured(piece, reading), reading) for piece in pieces]
     paints = tuple(dict.fromkeys(piece.paint for piece in pieces))
     paint = np.repeat([paints.index(p.paint) for p in pieces], [len(p.faces) for p in pieces])
     kept, index = distinct(points)
@@ -156,6 +156,15 @@ def _coloured(piece: Piece, reading: Reading) -> Piece:
         return replace(piece, paint=Paint("vertex_colours", by_vertex=True))
     reading.lose("colours of vertices are left out where a material covers them")
     return replace(piece, colours=None)
+
+
+def _textured(piece: Piece, reading: Reading) -> Piece:
+    """A piece with a textured paint only if it has texture coordinates."""
+    paint = piece.paint
+    if paint is None or not paint.textured or piece.uvs is not None:
+        return piece
+    reading.lose(f"material {paint.name!r}: its textures are left out where there are no texture coordinates")
+    return replace(piece, paint=paint.without_textures)
 
 
 def _at_corners(
