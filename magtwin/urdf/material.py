@@ -62,7 +62,12 @@ def define_look(robot: Usd.Prim, look: Paint, meshes: MeshLayer) -> UsdShade.Mat
         if look.see_through:
             maps.insert(1, ("opacity", replace(own, channel="a")))
     files = [meshes.textures.add(each.image) for _, each in maps]
-    shown = (tuple(inputs), tuple(files), tuple((n, replace(m, image=NO_IMAGE)) for n, m in maps), look.by_vertex)
+    shown = (
+        tuple(inputs),
+        tuple(files),
+        tuple((n, replace(m, image=NO_IMAGE)) for n, m in maps),
+        look.by_vertex,
+    )
     hexed = "".join(f"{round(c * 255):02x}" for c in look.rgba)
     stem, number = Tf.MakeValidIdentifier(look.name) if look.name else f"colour_{hexed}", 1
     path = scope.AppendChild(stem)

@@ -374,9 +374,7 @@ def _material_colour(prim: Usd.Prim) -> tuple[float, float, float, float] | None
     return (float(r), float(g), float(b), 1.0 if a is None else float(a))
 
 
-def _texture(
-    prim: Usd.Prim, gprim: UsdGeom.Gprim, triangles: NDArray, mirrored: bool
-) -> Texture | None:
+def _texture(prim: Usd.Prim, gprim: UsdGeom.Gprim, triangles: NDArray, mirrored: bool) -> Texture | None:
     """The texture of the bound material's colour, on triangles of face-vertex indices, shape (F, 3)."""
     triangles = triangles[:, ::-1] if mirrored else triangles
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()

@@ -202,7 +202,9 @@ def _paint(name: str, table: dict[str, list[str]], folder: Path, reading: Readin
     image = library.image("map_kd")
     if image is not None and ("kd" not in table or (r, g, b) == (0, 0, 0)):
         r, g, b = 1.0, 1.0, 1.0  # black is what exporters write beside a texture that they mean to show
-    return Paint(name, (r, g, b, opacity), image, **library.surface(), maps=library.maps(opacity))
+    surface = library.surface()
+    maps = library.maps(opacity, surface.get("emissive", (0.0, 0.0, 0.0)))
+    return Paint(name, (r, g, b, opacity), image, **surface, maps=maps)
 
 
 @dataclass
@@ -252,7 +254,7 @@ class _Material:
             made["ior"] = ni
         return made
 
-    def maps(self, opacity: float) -> tuple[tuple[str, Map], ...]:
+    def maps(self, opacity: float, emissive: tuple[float, float, float]) -> tuple[tuple[str, Map], ...]:
         """Maps of emission, roughness, metallic, opacity and normals; others are counted as lost."""
         maps: list[tuple[str, Map]] = []
         for key, name in (("map_pr", "roughness"), ("map_pm", "metallic")):
@@ -261,7 +263,9 @@ class _Material:
                 maps.append((name, Map(image, "r")))
         image = self.image("map_ke")
         if image is not None:
-            maps.append(("emissiveColor", Map(image, colour=True)))
+            black = max(emissive) == 0  # as exporters write beside a texture that they mean to show
+            scale = (1.0, 1.0, 1.0, 1.0) if black else (*emissive, 1.0)
+            maps.append(("emissiveColor", Map(image, scale=scale, colour=True)))
         image = self.image("map_d")
         if image is not None:
             scale = (opacity, opacity, opacity, opacity)
