@@ -101,13 +101,13 @@ def _connect_map(
 ) -> None:
     """Connect a texture, mapped by the mesh's `st`, to an input of a surface.
 
-    Inputs that read channels of the same texels share a shader.
+    The colour and an opacity from the same file share a shader.
     """
     kinds = Sdf.ValueTypeNames
     prim = path.AppendChild("texture" if name == "diffuseColor" else f"{name}_texture")
-    if name == "opacity" and (shared := stage.GetPrimAtPath(path.AppendChild("texture"))):
-        if shared.GetAttribute("inputs:file").Get().path == file:
-            prim = shared.GetPath()
+    shared = stage.GetPrimAtPath(path.AppendChild("texture")) if name == "opacity" else None
+    if shared and shared.GetAttribute("inputs:file").Get().path == file:
+        prim = shared.GetPath()
     texture = UsdShade.Shader(stage.GetPrimAtPath(prim))
     if not texture:
         texture = UsdShade.Shader.Define(stage, prim)

@@ -270,7 +270,7 @@ def _box_of(shape: Shape, T: NDArray[np.float64], meshes: MeshLayer) -> Box | No
 
 
 def _boxes(stage: Usd.Stage, prims: set[Sdf.Path]) -> dict[Sdf.Path, Box]:
-    """The box around each gprim at or below `prims`, including colliders, in the frame of the default prim."""
+    """The box around each gprim at or below `prims`, in the frame of the default prim."""
     to_robot = UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetDefaultPrim()).GetInverse()
     bodies = {str(p.GetPath()): p for p in stage.Traverse() if p.HasAPI(UsdPhysics.RigidBodyAPI)}
     by_name = {p.GetName(): p for p in bodies.values()} | bodies

@@ -337,7 +337,8 @@ def _shapes(gprim: UsdGeom.Gprim, solid: Solid, to_frame: NDArray, link: str) ->
         colours = None if material is not None else _display_colours(gprim, solid, mask)
         texture = None if material is not None else _texture(part, gprim, solid.triangles[mask], mirrored)
         if texture is not None and colours is not None:
-            material, colours = (*map(float, colours.mean(axis=0)), 1.0), None
+            r, g, b = map(float, colours.mean(axis=0))
+            material, colours = (r, g, b, 1.0), None
         if colours is not None and len(colours) != len(points):  # each corner has its own
             vertices, corners = points[corners.ravel()], np.arange(corners.size).reshape(-1, 3)
         used, faces = np.unique(corners[:, ::-1] if mirrored else corners, return_inverse=True)
@@ -381,11 +382,11 @@ def _texture(prim: Usd.Prim, gprim: UsdGeom.Gprim, triangles: NDArray, mirrored:
     surface = material.ComputeSurfaceSource()[0] if material else None
     shader, channel = _source(surface, "diffuseColor")
     reader, _ = _source(shader, "st")
-    if channel != "rgb" or not reader or shader.GetIdAttr().Get() != "UsdUVTexture":
+    if channel != "rgb" or shader is None or reader is None or shader.GetIdAttr().Get() != "UsdUVTexture":
         return None
     asset, name = shader.GetInput("file"), reader.GetInput("varname")
     path = asset.Get().resolvedPath if asset and asset.Get() else ""
-    if not name or not os.path.isfile(path):  # missing, or within a .usdz
+    if not name or not Path(path).is_file():  # missing, or within a .usdz
         return None
     primvar = UsdGeom.PrimvarsAPI(gprim).FindPrimvarWithInheritance(str(name.Get()))
     values = primvar.ComputeFlattened() if primvar else None

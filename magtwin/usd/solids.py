@@ -196,7 +196,7 @@ def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float32]:
     around = count[flat[corner]]
     for number in np.flatnonzero(np.bincount(around)):
         points_of = corner[around == number].reshape(-1, number)
-        step = max(PAIRS // number**2, 1)  # so that memory stays bounded
+        step = max(PAIRS // int(number) ** 2, 1)  # so that memory stays bounded
         for some in (points_of[i : i + step] for i in range(0, len(points_of), step)):
             directions, areas = unit[own[some]], area[own[some]].astype(float)
             near = directions @ directions.transpose(0, 2, 1) >= np.float32(np.cos(CREASE))

@@ -204,7 +204,7 @@ def test_a_machine_without_opengl_is_told_the_packages(lacks, stage, tmp_path, m
 
 
 def test_a_texture_is_drawn_upright_and_times_its_factor(stage, tmp_path):
-    """Seen from x, y is on the right: the picture's left half is red, its upper right white, all halved in blue."""
+    """Seen from x, y is on the right. Without blue, white becomes yellow."""
     from PIL import Image
 
     image = Image.new("RGB", (64, 64), (255, 0, 0))

@@ -1,4 +1,4 @@
-"""Looks of mesh files as UsdPreviewSurface: emission, highlights, metal, opacity, normals, and what is lost."""
+"""Looks of mesh files as UsdPreviewSurface, and what is lost of them."""
 
 import numpy as np
 import pytest
@@ -82,7 +82,7 @@ def test_a_wavefront_material_arrives_with_all_of_its_pbr_statements(tmp_path):
 @pytest.mark.parametrize("exponent", [0, 10, 250])
 def test_a_phong_highlight_keeps_its_width_and_its_height(tmp_path, exponent):
     """GGX of width a = roughness^2 peaks at F / 4 a^2, and is as wide as an exponent of 2 / a^2 - 2."""
-    stage, surface = blue(tmp_path, f"Kd 0.5 0.5 0.5\nKs 0.2 0.1 0\nNs {exponent}\nNi 1.5")
+    _, surface = blue(tmp_path, f"Kd 0.5 0.5 0.5\nKs 0.2 0.1 0\nNs {exponent}\nNi 1.5")
     seen = values(surface)
     assert seen["useSpecularWorkflow"] == 1
     squared = seen["roughness"] ** 4
@@ -112,7 +112,7 @@ def test_what_a_material_loses_is_reported_and_strict_refuses_it(tmp_path, line)
     picture(tmp_path / "h.png", [(90, 90, 90)])
     stage, _ = blue(tmp_path, f"Kd 1 1 1\n{line}")
     assert LOST[line] in notes_of(stage)
-    with pytest.raises(InputError, match="squares.obj: material 'blue'"):
+    with pytest.raises(InputError, match=r"squares\.obj: material 'blue'"):
         blue(tmp_path, f"Kd 1 1 1\n{line}", options=Options(strict=True))
 
 
@@ -165,8 +165,8 @@ def test_collada_normal_maps_cut_outs_and_glowing_textures_arrive(tmp_path):
     image = '<image id="{0}"><init_from>{0}.png</init_from></image>'
     stage, surface = shaded(
         tmp_path,
-        '<lambert><emission><texture texture="leaf" texcoord="U"/></emission><diffuse><texture texture="leaf" '
-        'texcoord="U"/></diffuse><transparent><texture texture="leaf" texcoord="U"/></transparent></lambert>',
+        '<lambert><emission><texture texture="leaf" texcoord="U"/></emission><diffuse><texture '
+        'texture="leaf" texcoord="U"/></diffuse><transparent><texture texture="leaf" texcoord="U"/></transparent></lambert>',
         extra='<extra><technique profile="FCOLLADA"><bump bumptype="NORMALMAP"><texture texture="n" texcoord='
         '"U"/></bump></technique></extra>',
         images=image.format("leaf") + image.format("n"),

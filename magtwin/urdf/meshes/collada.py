@@ -364,7 +364,7 @@ class _Collada:
     def _maps(
         self, effect: Element, shader: Element, profile: Element, name: str
     ) -> tuple[tuple[str, Map], ...]:
-        """Maps of emission and of normals (`<bump>`, an extension of exporters); others are counted as lost."""
+        """Maps of emission and of normals (`<bump>`, an extension); others are counted as lost."""
         maps = []
         emission = shader.find("emission/texture")
         image = None if emission is None else self._image(emission, profile)

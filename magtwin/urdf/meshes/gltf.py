@@ -30,7 +30,9 @@ Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
-WRAPS = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
+REPEAT = 10497
+WRAPS = {33071: "clamp", 33648: "mirror", REPEAT: "repeat"}
+"""Wrapping of UsdUVTexture by that of a sampler."""
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
 """Modes of primitives with faces."""
@@ -172,11 +174,11 @@ class _Gltf:
         if image is not None:
             for name, channel, factor in (("roughness", "g", roughness), ("metallic", "b", metallic)):
                 maps.append((name, Map(image, channel, (factor,) * 4, wrap=wrap)))
-        given = material.get("normalTexture")
+        given = material.get("normalTexture", {})
         image, wrap = self._texture(given, index)
         if image is not None:
             maps.append(("normal", normal_map(image, float(given.get("scale", 1.0)), wrap)))
-        given = material.get("occlusionTexture")
+        given = material.get("occlusionTexture", {})
         image, wrap = self._texture(given, index)
         if image is not None:  # 1 + strength (texel - 1)
             s = float(given.get("strength", 1.0))
@@ -192,15 +194,15 @@ class _Gltf:
 
     def _texture(self, given: dict[str, Any] | None, index: int) -> tuple[Image | None, tuple[str, str]]:
         """Image and wrapping of a texture of a material."""
-        if given is None:
+        if not given:
             return None, ("repeat", "repeat")
         moved = "KHR_texture_transform" in given.get("extensions", {})
         if given.get("texCoord", 0) != 0 or moved:
             self._reading.lose(f"material {index}'s texture uses other coordinates than the first set")
         texture = self._json["textures"][given["index"]]
         sampler = self._json["samplers"][texture["sampler"]] if "sampler" in texture else {}
-        wrap = tuple(WRAPS.get(sampler.get(f"wrap{side}"), "repeat") for side in "ST")
-        return self._image(texture), wrap
+        s, t = (WRAPS[sampler.get(f"wrap{side}", REPEAT)] for side in "ST")
+        return self._image(texture), (s, t)
 
     def _image(self, texture: dict[str, Any]) -> Image | None:
         """The image of a texture: in a file, inline, or in a buffer."""

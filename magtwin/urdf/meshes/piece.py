@@ -103,9 +103,9 @@ class Paint:
 def smoothness(exponent: float, highlight: tuple[float, float, float]) -> tuple[float, tuple]:
     """Roughness and reflectance of a Phong highlight.
 
-    A microfacet lobe of width a has the shape of a highlight with the exponent n if a^2 = 2 / (n + 2) (Walter et
-    al. 2007, doi:10.2312/EGWR/EGSR07/195-206), and `UsdPreviewSurface` takes the root of a. Its peak, F / 4 a^2,
-    is as high as that of the highlight, k, if the reflectance F is 4 a^2 k.
+    A microfacet lobe of width a has the shape of a highlight with the exponent n if a^2 = 2 / (n + 2)
+    (Walter et al. 2007, doi:10.2312/EGWR/EGSR07/195-206), and `UsdPreviewSurface` takes the root of a. Its
+    peak, F / 4 a^2, is as high as that of the highlight, k, if the reflectance F is 4 a^2 k.
 
     Args:
         exponent: Exponent n of the highlight, 0 or more.

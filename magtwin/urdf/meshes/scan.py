@@ -1,7 +1,7 @@
 """Scan: STL and PLY, triangles without materials.
 
-trimesh reads PLY and STL in text. Binary STL is an array; it is read here, since importing trimesh takes longer
-than most conversions.
+trimesh reads PLY and STL in text. Binary STL is an array; it is read here, since importing trimesh takes
+longer than most conversions.
 """
 
 import io

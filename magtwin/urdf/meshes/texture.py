@@ -35,7 +35,7 @@ class Image:
 
     @property
     def shows_normals(self) -> bool:
-        """Whether it is a map of normals, by its mean: (0.5, 0.5, 1) is straight up; maps of height are grey."""
+        """Whether it is a map of normals, by its mean: (0.5, 0.5, 1) is up; maps of height are grey."""
         r, g, b = self.mean
         return b > 0.7 and abs(r - 0.5) < 0.2 and abs(g - 0.5) < 0.2
 

@@ -106,7 +106,7 @@ def _overlap(a: NDArray, b: NDArray) -> bool:
     """Whether the convex hulls of points (N, 3) and (M, 3) have a point in common.
 
     They do if and only if the hull of all differences p - q contains the origin. Its point nearest to the
-    origin is found with Wolfe's algorithm (1976, doi:10.1007/BF01580381), which needs no differences but those
+    origin is found with Wolfe's algorithm (1976, doi:10.1007/BF01580381), which needs only the differences
     that are farthest along a direction.
     """
     if np.any(a.min(axis=0) > b.max(axis=0)) or np.any(b.min(axis=0) > a.max(axis=0)):
