@@ -166,7 +166,8 @@ def test_collada_normal_maps_cut_outs_and_glowing_textures_arrive(tmp_path):
     stage, surface = shaded(
         tmp_path,
         '<lambert><emission><texture texture="leaf" texcoord="U"/></emission><diffuse><texture '
-        'texture="leaf" texcoord="U"/></diffuse><transparent><texture texture="leaf" texcoord="U"/></transparent></lambert>',
+        'texture="leaf" texcoord="U"/></diffuse>'
+        '<transparent><texture texture="leaf" texcoord="U"/></transparent></lambert>',
         extra='<extra><technique profile="FCOLLADA"><bump bumptype="NORMALMAP"><texture texture="n" texcoord='
         '"U"/></bump></technique></extra>',
         images=image.format("leaf") + image.format("n"),
