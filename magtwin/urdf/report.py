@@ -244,13 +244,18 @@ def _geometries(
     ledger: Ledger,
     poses: Mapping[str, NDArray],
 ) -> tuple[GeometryLine, ...]:
-    boxes, lines = _boxes(stage, {prim for prims in ledger.shapes.values() for prim in prims}), []
+    below: dict[Sdf.Path, list[Box]] = {prim: [] for prims in ledger.shapes.values() for prim in prims}
+    for path, box in _boxes(stage, set(below)).items():
+        for prim in path.GetPrefixes():
+            if prim in below:
+                below[prim].append(box)
+    lines = []
     for name, link in description.links.items():
         for role, shapes in (("visual", link.visuals), ("collision", link.collisions)):
             for index, shape in enumerate(shapes):
                 prims, form = ledger.shapes.get((name, role, index), []), shape.geometry
                 box_in = _box_of(shape, poses[name] @ origin_of(shape), meshes)
-                box_out = [box for prim in prims for path, box in boxes.items() if path.HasPrefix(prim)]
+                box_out = [box for prim in prims for box in below[prim]]
                 kind = form.filename.rpartition("/")[2] if form.kind == "mesh" else form.kind
                 paths = tuple(map(str, prims))
                 lines.append(GeometryLine(name, role, index, kind, paths, box_in, _union(box_out)))
