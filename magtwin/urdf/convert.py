@@ -44,7 +44,6 @@ from magtwin.urdf.shape import COLLISIONS, VISUALS, define_collider, define_no_c
 from magtwin.urdf.simready import check_metadata, metadata
 from magtwin.urdf.source.source import read_source
 from magtwin.usd.layers import describe_stage, open_stage
-from magtwin.usd.schema.versions import creator
 from magtwin.usd.sensors import write_pose
 
 JOINTS = "joints"

@@ -290,13 +290,18 @@ def _geometries(
     ledger: Ledger,
     poses: Mapping[str, NDArray],
 ) -> tuple[GeometryLine, ...]:
-    boxes, lines = _boxes(stage), []
+    below: dict[Sdf.Path, list[Box]] = {prim: [] for prims in ledger.shapes.values() for prim in prims}
+    for path, box in _boxes(stage, set(below)).items():
+        for prim in path.GetPrefixes():
+            if prim in below:
+                below[prim].append(box)
+    lines = []
     for name, link in description.links.items():
         for role, shapes in (("visual", link.visuals), ("collision", link.collisions)):
             for index, shape in enumerate(shapes):
                 prims, form = ledger.shapes.get((name, role, index), []), shape.geometry
                 box_in = _box_of(shape, poses[name] @ origin_of(shape), meshes)
-                box_out = [box for prim in prims for path, box in boxes.items() if path.HasPrefix(prim)]
+                box_out = [box for prim in prims for box in below[prim]]
                 kind = form.filename.rpartition("/")[2] if form.kind == "mesh" else form.kind
                 paths = tuple(map(str, prims))
                 lines.append(GeometryLine(name, role, index, kind, paths, box_in, _union(box_out)))
@@ -315,14 +320,18 @@ def _box_of(shape: Shape, T: NDArray[np.float64], meshes: MeshLayer) -> Box | No
     return _corners(*bounds(points @ T[:3, :3].T + T[:3, 3]))
 
 
-def _boxes(stage: Usd.Stage) -> dict[Sdf.Path, Box]:
-    """The box around each gprim of a stage, including colliders, in the frame of its default prim."""
+def _boxes(stage: Usd.Stage, prims: set[Sdf.Path]) -> dict[Sdf.Path, Box]:
+    """The box around each gprim at or below `prims`, in the frame of the default prim."""
     to_robot = UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetDefaultPrim()).GetInverse()
     bodies = {str(p.GetPath()): p for p in stage.Traverse() if p.HasAPI(UsdPhysics.RigidBodyAPI)}
     by_name = {p.GetName(): p for p in bodies.values()} | bodies
     cache, boxes = UsdGeom.XformCache(), {}
     tokens = UsdGeom.Tokens
-    shown = read_vertices(stage, purposes=(tokens.default_, tokens.render, tokens.guide))
+    shown = read_vertices(
+        stage,
+        purposes=(tokens.default_, tokens.render, tokens.guide),
+        wanted=lambda prim, _: not prims.isdisjoint(prim.GetPath().GetPrefixes()),
+    )
     for path, (link, vertices) in shown.items():
         points = vertices.astype(float)
         if link:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.urdf.meshes.piece import GREY, Paint, Piece, Rgba
+from magtwin.urdf.meshes.piece import GREY, Map, Paint, Piece, Rgba, linear, normal_map, smoothness
 from magtwin.urdf.meshes.polygon import cut_polygons, strips
 from magtwin.urdf.meshes.reading import Reading, numbers
 from magtwin.urdf.meshes.texture import Image, read_image
@@ -182,7 +182,7 @@ class _Collada:
             triangles = cut_polygons(points, corners, counts)
         binding = bound.get(primitive.get("material"))
         paint, uvs, colours = self._paint(primitive, binding), None, None
-        if paint is None or paint.image is not None:
+        if paint is None or paint.textured:
             binds = [] if binding is None else binding.findall("bind_vertex_input")
             of_uvs = (b.get("input_set", 0) for b in binds if b.get("input_semantic") == "TEXCOORD")
             uvs = self._picked(inputs, "TEXCOORD", 2, index, triangles, int(next(of_uvs, -1)))
@@ -304,9 +304,83 @@ class _Collada:
         texture = diffuse.find("texture")
         image = None if texture is None else self._image(texture, profile)
         if image is not None:
-            return Paint(name, (1.0, 1.0, 1.0, opacity), image, double_sided=double_sided)
-        r, g, b, _ = GREY if texture is not None else self._colour(diffuse, profile)
-        return Paint(name, (r, g, b, opacity), double_sided=double_sided)
+            r, g, b = 1.0, 1.0, 1.0
+        else:
+            r, g, b, _ = GREY if texture is not None else self._colour(diffuse, profile)
+        emissive, emission = (0.0, 0.0, 0.0), shader.find("emission")
+        if emission is not None and diffuse is not emission and self._has_colour(emission):
+            emissive = linear(self._colour(emission, profile))
+        cut_out = self._cut_out(shader, profile, name)
+        maps = self._maps(effect, shader, profile, name)
+        if cut_out is not None and cut_out != image:
+            maps = (*maps, ("opacity", Map(cut_out, "a", (opacity,) * 4)))
+        return Paint(
+            name,
+            (r, g, b, opacity),
+            image,
+            emissive=emissive,
+            **self._highlight(shader, profile, name),
+            maps=maps,
+            see_through=cut_out is not None and cut_out == image,
+            double_sided=double_sided,
+        )
+
+    def _cut_out(self, shader: Element, profile: Element, name: str) -> Image | None:
+        """The image whose alpha is the opacity; None if the shader has none."""
+        transparent = shader.find("transparent")
+        texture = None if transparent is None else transparent.find("texture")
+        image = None if texture is None else self._image(texture, profile)
+        if transparent is None or image is None:
+            return None
+        if transparent.get("opaque", "A_ONE") == "A_ONE" and image.has_alpha:
+            return image
+        self._reading.lose(f"material {name!r}: its map of transparency without alpha is left out")
+        return None
+
+    @staticmethod
+    def _has_colour(element: Element) -> bool:
+        return element.find("color") is not None or element.find("param") is not None
+
+    def _highlight(self, shader: Element, profile: Element, name: str) -> dict[str, Any]:
+        """Roughness and reflectance of a phong or blinn shader, see `smoothness`, as arguments of a paint.
+
+        Exporters write the exponent of phong and blinn from 0 to 1 or to 1000; below 1 it is a share of 128.
+        """
+        specular, shininess = shader.find("specular"), shader.find("shininess")
+        if specular is None or shininess is None:
+            return {}
+        if specular.find("texture") is not None:
+            self._reading.lose(f"material {name!r}: its map of highlights is left out")
+        number = numbers(shininess.findtext("float", ""), float)
+        if not self._has_colour(specular) or len(number) != 1 or not np.isfinite(number).all():
+            return {}
+        exponent = float(number[0]) * (128 if number[0] < 1 else 1)
+        highlight = linear(self._colour(specular, profile))
+        if max(highlight) == 0:
+            return {"roughness": 1.0}
+        roughness, reflectance = smoothness(exponent, highlight)
+        return {"roughness": roughness, "specular": reflectance}
+
+    def _maps(
+        self, effect: Element, shader: Element, profile: Element, name: str
+    ) -> tuple[tuple[str, Map], ...]:
+        """Maps of emission and of normals (`<bump>`, an extension); others are counted as lost."""
+        maps = []
+        emission = shader.find("emission/texture")
+        image = None if emission is None else self._image(emission, profile)
+        if image is not None:
+            maps.append(("emissiveColor", Map(image, colour=True)))
+        for bump in effect.iter("bump"):
+            texture = bump.find("texture")
+            image = None if texture is None else self._image(texture, profile)
+            if image is not None and (bump.get("bumptype") == "NORMALMAP" or image.shows_normals):
+                maps.append(("normal", normal_map(image)))
+                break
+            if image is not None:
+                self._reading.lose(f"material {name!r}: its map of heights {image.name!r} is left out")
+        if shader.find("reflective/texture") is not None:
+            self._reading.lose(f"material {name!r}: its map of reflections is left out")
+        return tuple(maps)
 
     def _image(self, texture: Element, profile: Element) -> Image | None:
         """The image of a `<texture>`: through sampler and surface, through a sampler (1.5), or directly."""

@@ -31,6 +31,14 @@ class Image:
     mean: tuple[float, float, float]
     """Mean colour (sRGB), 0 to 1, for viewers without textures."""
 
+    has_alpha: bool = False
+
+    @property
+    def shows_normals(self) -> bool:
+        """Whether it is a map of normals, by its mean: (0.5, 0.5, 1) is up; maps of height are grey."""
+        r, g, b = self.mean
+        return b > 0.7 and abs(r - 0.5) < 0.2 and abs(g - 0.5) < 0.2
+
 
 def read_image(name: str, reading: Reading, folder: Path | None = None) -> Image | None:
     """The image that a mesh file references; None with a note if it cannot be read.
@@ -72,6 +80,7 @@ def image_of(data: bytes, name: str, reading: Reading) -> Image | None:
             kind, (width, height) = picture.format or "", picture.size
             if width * height > MAX_PIXELS:
                 raise InputError(f"{width} x {height} pixels are too many")
+            alpha = "A" in picture.getbands() or "transparency" in picture.info
             rgba = picture.convert("RGBA")
     except (OSError, InputError, SyntaxError, ValueError, Pillow.DecompressionBombError) as error:
         reason = str(error).partition(" <")[0]  # without the object's address
@@ -83,7 +92,7 @@ def image_of(data: bytes, name: str, reading: Reading) -> Image | None:
         buffer = io.BytesIO()
         rgba.save(buffer, "PNG")
         data, kind = buffer.getvalue(), "PNG"
-    return Image(stem + KEPT[kind], data, (r, g, b))
+    return Image(stem + KEPT[kind], data, (r, g, b), alpha)
 
 
 class Textures:
