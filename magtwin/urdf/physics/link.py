@@ -11,7 +11,14 @@ from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, wxyz_from_xyzw
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Link
-from magtwin.urdf.physics.inertia import MassProperties, combined, principal_axes, read_solid
+from magtwin.urdf.physics.inertia import MassProperties, combined, principal_axes, read_solid, sphere
+
+MASSLESS_KG = 0.001
+"""Mass of a body whose links have none [kg]. Without an explicit mass, engines fill the colliders with
+1000 kg/m3, and give a body without colliders 1 kg."""
+
+MASSLESS_RADIUS_M = 0.01
+"""Radius of gyration of such a body without a shape [m]."""
 
 LINK_API, SITE_API = "IsaacLinkAPI", "IsaacSiteAPI"
 """Isaac Sim's applied schemas; their plugins are not installed here."""
@@ -47,7 +54,8 @@ def define_body(
         prim: The Xform, with its shapes below it.
         parts: The body's own link, and links merged into it.
         description: Receives notes of repairs and guesses.
-        density: Density of links without mass [kg/m3]; None leaves them without.
+        density: Density of links without mass [kg/m3]. None leaves them without; a body of such links gets
+            `MASSLESS_KG`.
 
     Raises:
         InputError: A mass is not above 0, or an inertia is impossible; the message gives the line.
@@ -58,7 +66,7 @@ def define_body(
     properties = [_mass_properties(part, prim, description, density, len(parts) == 1) for part in parts]
     known = [each for each in properties if each is not None]
     if not known:
-        return prim
+        known = [_massless(parts[0], prim, description)]
     whole = known[0] if len(known) == 1 else combined(known)
     mass = UsdPhysics.MassAPI.Apply(prim)
     mass.CreateMassAttr(whole.mass)
@@ -82,17 +90,21 @@ def _mass_properties(
     """
     link, inertial = part.link, part.link.inertial
     if inertial is None:
-        return _from_shapes(part, body, description, density, alone)
+        return _from_shapes(part, body, description, density)
     if inertial.mass is None or not (np.isfinite(inertial.mass) and inertial.mass > 0):
         raise description.refused("link", link.name, f"has a mass of {inertial.mass!r} kg; give one above 0")
     mass, centre = float(inertial.mass), (part.pose @ origin_of(inertial))[:3, 3]
     if inertial.inertia is not None:
         tensor = _checked(link, np.asarray(inertial.inertia, float), origin_of(inertial), description)
         return MassProperties(mass, centre, part.pose[:3, :3] @ tensor @ part.pose[:3, :3].T)
-    if alone:
+    if alone and part.colliders:
         description.note(f"link {link.name!r} has no <inertia>: engines take it from its colliders")
         return MassProperties(mass, centre, np.full((3, 3), np.nan))
     solid = read_solid(part.colliders or part.visuals, body)
+    if solid is None and alone:
+        ball = sphere((mass / (1000 * sphere(1.0).mass)) ** (1 / 3))
+        description.note(f"link {link.name!r} has no <inertia> and no shape: that of a ball of water is used")
+        return MassProperties(mass, centre, mass / ball.mass * ball.inertia)
     if solid is None:
         description.note(f"link {link.name!r} has no <inertia> and no shape: its mass counts as a point")
         return MassProperties(mass, centre, np.zeros((3, 3)))
@@ -100,16 +112,22 @@ def _mass_properties(
     return MassProperties(mass, centre, mass / solid.mass * solid.inertia)
 
 
+def _massless(part: Rider, body: Usd.Prim, description: Description) -> MassProperties:
+    """Mass properties of a body whose links have no mass: `MASSLESS_KG`, spread over its shapes."""
+    kg = MASSLESS_KG
+    description.note(f"link {part.link.name!r} has no <inertial>: {kg:g} kg, so that engines add none")
+    solid = read_solid(part.colliders or part.visuals, body)
+    if solid is None:
+        return MassProperties(kg, np.zeros(3), kg * MASSLESS_RADIUS_M**2 * np.eye(3))
+    return MassProperties(kg, solid.centre, kg / solid.mass * solid.inertia)
+
+
 def _from_shapes(
-    part: Rider, body: Usd.Prim, description: Description, density: float | None, alone: bool
+    part: Rider, body: Usd.Prim, description: Description, density: float | None
 ) -> MassProperties | None:
     """Mass properties of a link without `<inertial>`: its shapes at a density, if one is given."""
     name = part.link.name
     if density is None:
-        lacks = "engines take its mass from its colliders" if alone else "it adds none to its body's"
-        if alone and not part.colliders:
-            lacks = "without a collider, engines cannot find its mass; give a density"
-        description.note(f"link {name!r} has no <inertial>: {lacks}")
         return None
     used, solid = "colliders", read_solid(part.colliders, body)
     if solid is None:
