@@ -29,6 +29,7 @@ def scene_with_robot(
     controllers: str | FilePath | None = None,
     packages: Mapping[str, FilePath] | None = None,
     arguments: Mapping[str, str] | None = None,
+    skip_missing_includes: bool = False,
     workshop: str | FilePath | None = None,
     **choices: Any,
 ) -> Scene:
@@ -44,6 +45,7 @@ def scene_with_robot(
         controllers: YAML of the robot's controllers, see `Options.controllers`.
         packages: Folders of packages by name.
         arguments: Arguments of a xacro.
+        skip_missing_includes: See `Options`.
         workshop: Folder for the robot and the map. Default: as for `scene_from_toml`.
         **choices: Further arguments of `scene_from_toml`.
 
@@ -68,6 +70,7 @@ def scene_with_robot(
             controllers=None if controllers is None else existing(FilePath(controllers), "controllers"),
             packages=dict(packages or {}),
             arguments=dict(arguments or {}),
+            skip_missing_includes=skip_missing_includes,
         )
         settings = RobotSettings(magnetometer=_mounted(magnetometer), conversion=options)
         asset = FilePath(workshop) / "robot" / f"{stem}.usda"

@@ -52,6 +52,7 @@ def scene(
     controllers: Path | None = None,
     package: list[str] | None = None,
     arg: list[str] | None = None,
+    skip_missing_includes: bool | None = None,
     map: Path | None = None,  # noqa: A002 - the option is called --map
     network: Network = None,
     force: Force = False,
@@ -79,6 +80,8 @@ def scene(
         NAME=DIR: folder of a package that the URDF names. May be repeated.
     arg
         NAME=VALUE: argument of the xacro. May be repeated.
+    skip_missing_includes
+        Skip files and packages that the xacro includes but that are missing, if none of their macros is called.
     map
         Map layer that replaces the one of the TOML. Earth, sources and furniture stay. A map that contradicts
         them is refused, and the difference is given in nT.
@@ -110,6 +113,7 @@ def scene(
                     controllers=controllers,
                     packages={name: Path(folder) for name, folder in pairs("package", package).items()},
                     arguments=pairs("arg", arg, empty=True),
+                    skip_missing_includes=bool(skip_missing_includes),
                     **choices,
                 )
             elif spec is None:

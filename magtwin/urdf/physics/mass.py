@@ -33,7 +33,7 @@ def _mass(body: Usd.Prim) -> float:
         told.centerOfMass, told.localPos, told.localRot = Gf.Vec3f(0), Gf.Vec3f(0), Gf.Quatf(1)
         solid = None if given else read_solid([collider], body)  # a given mass does not depend on volumes
         if solid is not None:
-            moments, q, _ = principal_axes(solid.inertia)
+            moments, q = principal_axes(solid.inertia)
             told.volume, told.inertia = solid.mass, Gf.Matrix3f(Gf.Vec3f(*map(float, moments)))
             told.localPos = Gf.Vec3f(*map(float, solid.centre))
             told.localRot = Gf.Quatf(*map(float, wxyz_from_xyzw(q)))
