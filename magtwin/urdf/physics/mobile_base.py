@@ -73,6 +73,9 @@ class MobileBase:
     figures: Mapping[str, float] = field(default_factory=dict)
     """Fields of the DriveSpec that are given."""
 
+    separation_multiplier: float = 1.0
+    """Effective over measured wheel separation, if the separation is not given."""
+
     wheelbase_m: float | None = None
     """Distance between the axles [m]; None: that of the joints."""
 
@@ -110,7 +113,9 @@ def drive_spec(base: MobileBase, mechanism: Mechanism, radius_of: Callable[[str]
             gap + max(along) - min(along),
             "not given: the sum of both distances between wheel joints",
         )
-    guess("wheel_separation_m", gap, "not given: the distance between the wheel joints")
+    times = base.separation_multiplier
+    scaled = "" if times == 1 else f", times the multiplier {times:g}"
+    guess("wheel_separation_m", times * gap, f"not given: the distance between the wheel joints{scaled}")
     radii = [radius for name in (left[0], right[0]) if (radius := radius_of(name)) > 0]
     guess("wheel_radius_m", sum(radii) / len(radii) if radii else None, "not given: from the wheels' shape")
     limit = joints[left[0]].limit
