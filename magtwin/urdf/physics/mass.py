@@ -1,6 +1,5 @@
 """Mass: what a USD physics engine computes as the mass of each body."""
 
-import numpy as np
 from pxr import Gf, Sdf, Usd, UsdPhysics
 
 from magtwin.frames import wxyz_from_xyzw
@@ -24,22 +23,21 @@ def engine_masses(stage: Usd.Stage) -> dict[Sdf.Path, float]:
 
 
 def _mass(body: Usd.Prim) -> float:
-    """Mass of a body by USD's own implementation [kg]."""
-    given = body.HasAPI(UsdPhysics.MassAPI) and (UsdPhysics.MassAPI(body).GetMassAttr().Get() or 0) > 0
+    """Mass of a body [kg]: its own, or else what USD's own implementation computes from its colliders."""
+    own = UsdPhysics.MassAPI(body).GetMassAttr().Get() if body.HasAPI(UsdPhysics.MassAPI) else None
+    if own:
+        return float(own)
 
     def information(collider: Usd.Prim) -> UsdPhysics.RigidBodyAPI.MassInformation:
-        told = UsdPhysics.RigidBodyAPI.MassInformation()
-        told.volume, told.inertia = 1.0, Gf.Matrix3f(1.0)
+        told, solid = UsdPhysics.RigidBodyAPI.MassInformation(), read_solid([collider], body)
+        told.volume, told.inertia = 0.0, Gf.Matrix3f(1.0)
         told.centerOfMass, told.localPos, told.localRot = Gf.Vec3f(0), Gf.Vec3f(0), Gf.Quatf(1)
-        solid = None if given else read_solid([collider], body)  # a given mass does not depend on volumes
         if solid is not None:
             moments, q = principal_axes(solid.inertia)
             told.volume, told.inertia = solid.mass, Gf.Matrix3f(Gf.Vec3f(*map(float, moments)))
             told.localPos = Gf.Vec3f(*map(float, solid.centre))
             told.localRot = Gf.Quatf(*map(float, wxyz_from_xyzw(q)))
-        elif not given:
-            told.volume = 0.0
         return told
 
     mass = UsdPhysics.RigidBodyAPI(body).ComputeMassProperties(information)[0]
-    return float(mass) if np.isfinite(mass) else float("inf")
+    return float(mass)
