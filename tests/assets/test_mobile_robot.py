@@ -11,6 +11,7 @@ from magtwin.author.robot import RobotSettings, build_robot
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.spec.drive import DriveSpec
+from magtwin.spec.sensors import MagnetometerSpec
 from magtwin.twin import scene_with_robot
 from magtwin.usd.robot import load_robot
 from magtwin.usd.scene import read_scene
@@ -59,7 +60,9 @@ def test_keys_of_the_drive_override_those_of_the_plugin_which_fill_in_the_rest(t
     )
     urdf = tmp_path / "cart.urdf"
     urdf.write_text(text.replace("</robot>", plugin))
-    settings = RobotSettings(drive=DriveSpec(wheel_radius_m=0.1, v_max=0.7))
+    settings = RobotSettings(
+        drive=DriveSpec(wheel_radius_m=0.1, v_max=0.7), magnetometer=MagnetometerSpec(link="mast")
+    )
     report = build_robot(urdf, settings, tmp_path / "cart.usda")
     drive = load_robot(tmp_path / "cart.usda").drive
     assert (drive.wheel_radius_m, drive.v_max) == (0.1, 0.7)
@@ -67,4 +70,4 @@ def test_keys_of_the_drive_override_those_of_the_plugin_which_fill_in_the_rest(t
     assert drive.sides == {"left": 0, "right": 1}
     filled = next(note for note in report.notes if note.startswith("[drive] filled in from the description"))
     assert "wheel_separation_m" in filled
-    assert math.isclose(load_robot(tmp_path / "cart.usda").drive.w_max, DriveSpec.w_max)
+    assert math.isclose(drive.w_max, 2 * 10 * 0.09 / 0.5)  # the wheels' joints turn at 10 rad/s

@@ -212,11 +212,11 @@ def test_a_plugin_that_moves_a_base_of_unknown_wheels_is_kept_and_strict_refuses
     path = tmp_path / "puck.urdf"
     tags = plugin("libgazebo_ros_planar_move.so", "<odometryRate>25</odometryRate>")
     path.write_text(f'<robot name="puck"><link name="base">{MASS.format(2)}</link>{tags}</robot>')
-    report = convert_with_report(path, tmp_path / "puck.usda")
+    report = convert_with_report(path, tmp_path / "puck.usda", options=Options(single_file=True))
     assert any("no wheels are known: kept as text" in loss for loss in report.losses)
     assert report.unknown_tags == {"gazebo/plugin": 1}
     with pytest.raises(InputError, match="no wheels are known"):
-        convert_with_report(path, tmp_path / "other.usda", options=Options(strict=True))
+        convert_with_report(path, tmp_path / "other.usda", options=Options(strict=True, single_file=True))
 
 
 def test_a_plugin_with_wheels_on_one_side_only_is_refused_with_its_line(tmp_path):

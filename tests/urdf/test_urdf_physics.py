@@ -185,8 +185,8 @@ def test_a_massless_base_takes_the_mass_of_the_inertial_link_welded_to_it(tmp_pa
 def test_a_link_without_inertial_adds_no_mass_in_an_engine(tmp_path, shape):
     shapes = f"<{shape}>{BALL}</{shape}>"
     stage, robot, notes = convert(arm(tmp_path, "fixed|", shapes))
-    assert "link 'hand' has no <inertial>: it is part of the body of 'base'" in notes
-    assert not robot.GetPrimAtPath("base/hand").HasAPI(UsdPhysics.RigidBodyAPI)
+    assert "link 'hand' has no <inertial>: it is part of the body of 'base_link'" in notes
+    assert not robot.GetPrimAtPath("base_link/hand").HasAPI(UsdPhysics.RigidBodyAPI)
     fixed = sum(engine_masses(stage).values())
     stage, robot, notes = convert(arm(tmp_path, "continuous|", shapes))
     assert "link 'hand' has no <inertial>: 0.001 kg, so that engines add none" in notes
