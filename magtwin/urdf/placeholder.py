@@ -61,8 +61,10 @@ def _kept(description: Description, meshes: MeshLayer, link: Link, role: str) ->
         if shape.geometry.kind != "mesh" or file not in meshes.failed:
             yield shape
             continue
-        missing = isinstance(meshes.failed[file], MissingFileError)
-        what = f"mesh {file!r} is missing" if missing else f"mesh {file!r} cannot be read"
+        error = meshes.failed[file]
+        what = f"mesh {file!r} cannot be read"
+        if isinstance(error, MissingFileError):
+            what = f"mesh {file!r} is missing{error.near}"
         about, start = description.mesh_element(file), f"link {link.name!r}: {role}"
         if meshes.options.missing_meshes == "note":
             description.note(f"{start} is left out: its {what}", lost=True)
@@ -74,7 +76,8 @@ def _kept(description: Description, meshes: MeshLayer, link: Link, role: str) ->
             meshes.primitive(box)
         edges = " x ".join(f"{edge:.3g}" for edge in size)
         text = f"{start} {what}: a box of {edges} m stands for it"
-        description.repair("mesh-missing" if missing else "mesh-unreadable", text, about)
+        kind = "mesh-missing" if isinstance(error, MissingFileError) else "mesh-unreadable"
+        description.repair(kind, text, about)
         yield replace(shape, geometry=box, origin=T)
 
 

@@ -58,6 +58,7 @@ FAULTS: Mapping[str, tuple[str, str]] = {
     "mesh-flat": ("flat collision mesh", "thickened to a thin plate"),
     "file-name": ("malformed package path", "read as if it had the usual slashes"),
     "package-missing": ("missing package of $(find)", "files in it count as missing"),
+    "macro-unknown": ("call of an unknown macro in a .urdf", "left out, as readers of URDF do"),
     "include-skipped": ("missing include of a xacro", "skipped; none of its macros is called"),
 }
 """Faults by kind: the fault, and its repair."""

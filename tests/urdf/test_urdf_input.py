@@ -30,7 +30,7 @@ REFUSED = {
     "zero_axis.urdf": r":4: joint 'j' moves about an axis of length 0",
     "child_not_there.urdf": r":4: joint 'j' names no link 'hnad'; did you mean 'hand'\?",
     "joint_without_child.urdf": r":3: joint 'j' has no <child link=>",
-    "mesh_missing.urdf": r":4: mesh 'input_meshes/tetrahedro\.stl' is missing; .*; did you mean 'tetra",
+    "mesh_missing.urdf": r":4: mesh 'input_meshes/tetrahedro\.stl' is missing \(did you mean 'tetra",
     "mesh_climbs.urdf": r":4: mesh '\.\./\.\./\.\./secret\.stl' lies outside .*urdf; files are",
     "mesh_absolute.urdf": r":4: mesh 'file:///etc/passwd\.stl' lies outside .*urdf; files are",
     "mesh_climbs_out_of_package.urdf": r":4: mesh 'package:.*' lies outside .*/arm_description;",

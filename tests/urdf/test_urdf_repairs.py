@@ -241,6 +241,7 @@ FAULTY = {
             "$(find absent): no such package",
         )
     ],
+    "macro-unknown": [(f'{GOOD}\n<xacro:lidar name="l"/>', 3, "<xacro:lidar> is no macro: left out")],
     "include-skipped": [
         (f'{GOOD}\n<xacro:include filename="$(find absent)/eye.xacro"/>', 3, "eye.xacro' is missing: skipped")
     ],
@@ -262,7 +263,7 @@ def write(tmp_path, kind, number):
     flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
     flat.export(folder / "flat.stl")
     path = folder / ("arm.urdf.xacro" if xacro else "arm.urdf")
-    path.write_text(f"{head if xacro else head.replace(' xmlns:xacro=', ' xmlns:x=')}\n{text}\n</robot>\n")
+    path.write_text(f"{head}\n{text}\n</robot>\n")
     return path, line, told
 
 
@@ -358,6 +359,20 @@ def test_packages_of_ros_are_found_by_the_name_in_the_description_and_only_so(tm
     path.write_text(
         f"{HEAD}\n{look(f'<geometry><mesh filename={chr(34)}{outside}{chr(34)}/></geometry>')}\n</robot>"
     )
+    with pytest.raises(InputError, match="lies outside"):
+        convert_with_report(path, tmp_path / "b.usda")
+
+
+def test_a_folder_of_meshes_beside_a_folder_urdf_is_read_and_nothing_else_there(tmp_path):
+    for folder in ("urdf", "meshes", "secret"):
+        (tmp_path / folder).mkdir()
+        trimesh.creation.box().export(tmp_path / folder / "a.stl")
+    path = tmp_path / "urdf" / "arm.urdf"
+    path.write_text(
+        f"{HEAD}\n{look('<geometry><mesh filename=' + repr('../meshes/a.stl') + '/></geometry>')}</robot>"
+    )
+    assert not convert_with_report(path, tmp_path / "a.usda").repairs
+    path.write_text(path.read_text().replace("../meshes", "../secret"))
     with pytest.raises(InputError, match="lies outside"):
         convert_with_report(path, tmp_path / "b.usda")
 

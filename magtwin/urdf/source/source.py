@@ -1,6 +1,5 @@
 """Source: a robot description as plain URDF, with the files and packages around it."""
 
-import difflib
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -8,7 +7,7 @@ from pathlib import Path
 from types import MappingProxyType
 from xml.etree import ElementTree
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, near
 from magtwin.files import existing
 from magtwin.urdf.repairs import Repairs
 from magtwin.urdf.source.markup import UnsafeError, read_markup
@@ -84,7 +83,7 @@ class Source:
                 folder = self.packages.find(name)
             except MissingFileError as error:
                 missing = MissingFileError(f"{start} is in a package: {error}")
-                missing.supply = error.supply
+                missing.supply, missing.near = error.supply, error.near
                 raise missing from error
             path = Path(os.path.normpath(folder / rest))
             inside = path.resolve().is_relative_to(folder.resolve())
@@ -98,9 +97,10 @@ class Source:
             )
         if not path.is_file():
             siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-            near = difflib.get_close_matches(path.name, siblings, n=1)
-            advice = f"; did you mean {near[0]!r}?" if near else ""
-            raise MissingFileError(f"{start} is missing; looked for {path}{advice}")
+            advice = near(path.name, siblings)
+            absent = MissingFileError(f"{start} is missing{advice}; looked for {path}")
+            absent.near = advice
+            raise absent
         return path
 
 

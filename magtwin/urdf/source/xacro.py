@@ -185,6 +185,11 @@ class _Expansion:
         if supply:
             self._repairs.supplies[supply] = None
 
+    def _repair(self, kind: str, text: str, place: str | None = None) -> None:
+        """Add a repair at a place. Default: the current node's."""
+        file, _, line = (place or self._place()).rpartition(":")
+        self._repairs.add(kind, text, (file, int(line)))
+
     def _place(self) -> str:
         """File, relative to the folder of the xacro, and line of the current node."""
         file, line = self._at
@@ -197,10 +202,13 @@ class _Expansion:
             try:
                 return handle(node, *arguments)
             except self._library.XacroException as error:
-                unknown = f"unknown macro name: {node.tagName}"
-                if not (self._skipped and unknown in str(error.args[0] or "")):
+                unknown = f"unknown macro name: {node.tagName}" in str(error.args[0] or "")
+                if not unknown or (not self._skipped and self._path.suffix == ".xacro"):
                     raise
-                self._miss(f"macro {node.tagName!r}")
+                if self._skipped:
+                    self._miss(f"macro {node.tagName!r}")
+                else:
+                    self._repair("macro-unknown", f"<{node.tagName}> is no macro: left out")
                 self._library.replace_node(node, by=None)
                 return True
 
@@ -276,9 +284,9 @@ class _Expansion:
             self._repairs.supplies[error.supply] = None
             self._near[f"package://{name}"] = error.near
             if not self._including:
-                file, _, line = self._place().rpartition(":")
-                text = f"$(find {name}): no such package: files in it count as missing"
-                self._repairs.add("package-missing", text, (file, int(line)))
+                self._repair(
+                    "package-missing", f"$(find {name}): no such package: files in it count as missing"
+                )
             return f"package://{name}"
 
     def _argument(self, name: str) -> Any:
