@@ -1,16 +1,16 @@
 """Let one converted robot settle in Newton, then drive it or move its first joint.
 
-    python newton_trial.py JOB.json
+    python newton_trial.py < JOBS
 
-Newton's USD schemas must be registered before USD is first used, so this is a process of its own. The job has
-`stage`, `answer`, and `poses`: positions of joints by prim [rad, m] and the places of bodies that belong to
+A server of jobs, see `serving.py`. Newton's USD schemas must be registered before USD is first used, so this
+is a process of its own. A job has `stage`,
+`answer`, and `poses`: positions of joints by prim [rad, m] and the places of bodies that belong to
 them [m], both for forward kinematics. A floating robot starts with its lowest collider on a plane. The
 MuJoCo solver on the CPU steps the model, with the settings of magtwin's own engine.
 """
 
 import json
 import math
-import sys
 from pathlib import Path
 
 import mujoco
@@ -18,6 +18,7 @@ import newton
 import newton_usd_schemas  # noqa: F401 - registers them
 import numpy as np
 import warp as wp
+from serving import serve
 
 STEP_S = 0.002
 SETTLE_S, WATCH_S, MOVE_S = 3.0, 1.0, 1.0
@@ -30,6 +31,9 @@ SPEED_M_S, TURN_RAD, SLIDE_M = 0.1, 0.2, 0.02
 """Speed of wheels, and steps of a rotary and of a sliding joint."""
 
 FAR_M = 100.0
+
+LIMIT_GB = 8
+"""Most memory of a trial [GB]."""
 
 
 class Trial:
@@ -208,7 +212,6 @@ class Trial:
 
 
 def main(job_file: str) -> None:
-    wp.config.quiet = True
     job = json.loads(Path(job_file).read_text())
     trial = Trial(job["stage"])
     seen: dict = {
@@ -244,4 +247,6 @@ def main(job_file: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    wp.config.quiet = True
+    wp.init()
+    serve(main, LIMIT_GB)

@@ -1,21 +1,20 @@
-"""One robot of the zoo: convert, validate, compare with yourdfpy, try in an engine; writes a row as JSON.
+"""One robot of the zoo: convert, validate, compare with yourdfpy; writes its row and the jobs of engines.
 
-    python robot.py JOB.json
+    python robot.py < JOBS
 
-`zoo.py` starts it with limits on time and memory, and describes the job.
+A server of jobs, see `serving.py`. `zoo.py` writes them.
 """
 
 import json
-import os
-import subprocess
-import sys
 import time
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+from serving import serve
 
-HERE = Path(__file__).parent
+LIMIT_GB = 8
+"""Most memory of a robot [GB]."""
 
 SEED = 0
 """Of the joint values for forward kinematics."""
@@ -28,7 +27,7 @@ def convert(job: dict, row: dict):
     from magtwin.author.from_urdf import from_urdf
 
     packages = {name: Path(folder) for name, folder in job["packages"].items()}
-    start = time.perf_counter()
+    start = time.process_time()
     made = from_urdf(
         job["urdf"],
         job["out"],
@@ -41,11 +40,12 @@ def convert(job: dict, row: dict):
     report = made.report
     absent = {g.shape for g in report.geometries if g.shape not in PRIMITIVES and g.box_in is None}
     row |= {
-        "convert_s": round(time.perf_counter() - start, 2),
+        "convert_cpu_s": round(time.process_time() - start, 2),
         "links": len(report.links),
         "joints": len(report.joints),
         "notes": list(report.notes),
         "losses": list(report.losses),
+        "repairs": len(getattr(report, "repairs", report.notes)),
         "lint": len(report.lint),
         "meshes_absent": len(absent),
         "mass_kg": report.mass_out_kg,
@@ -100,12 +100,12 @@ class Peer:
         names = self.model.actuated_joint_names
         self.model.update_cfg([values.get(name, self.rest.get(name, 0.0)) for name in names])
 
-    def drawn(self, rng: np.random.Generator) -> dict:
-        """Random values of the actuated joints."""
+    def drawn(self, rng: np.random.Generator, moving: set[str]) -> dict:
+        """Random values of the joints that move on the stage too."""
         values = {}
         for name in self.model.actuated_joint_names:
             joint = self.joints[name]
-            if name in self.rest or joint.type not in ("continuous", "revolute", "prismatic"):
+            if name not in moving or joint.type not in ("continuous", "revolute", "prismatic"):
                 continue
             low, high = -1.0, 1.0
             if joint.type != "continuous" and joint.limit and joint.limit.upper is not None:
@@ -155,7 +155,8 @@ def fk_job(report, peer: Peer | None) -> dict:
     """Joint values by prim, and where bodies must be, for the engine's own forward kinematics."""
     if peer is None:
         return {}
-    values = peer.drawn(np.random.default_rng(SEED))
+    moving = {line.name for line in report.joints if line.type_out not in ("", "PhysicsFixedJoint")}
+    values = peer.drawn(np.random.default_rng(SEED), moving)
     peer.update(values)
     joints = {line.name: line.prim for line in report.joints if line.prim}
     bodies = {line.name: line.prim for line in report.links if line.became == "body"}
@@ -171,21 +172,41 @@ def fk_job(report, peer: Peer | None) -> dict:
     }
 
 
-def engine(name: str, python: str, asset: Path, poses: dict, work: Path, limit_s: float) -> dict:
-    """The result of a trial in an engine, in another process."""
-    answer, job_file = work / f"{name}.json", work / f"{name}_job.json"
-    answer.unlink(missing_ok=True)
-    job_file.write_text(json.dumps({"stage": str(asset), "poses": poses, "answer": str(answer)}))
-    command = [python, str(HERE / f"{name}_trial.py"), str(job_file)]
-    clean = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=limit_s, env=clean)
-    except subprocess.TimeoutExpired:
-        return {"failed": f"took longer than {limit_s:.0f} s"}
-    if not answer.is_file():
-        last = (done.stderr.strip().splitlines() or ["no output"])[-1]
-        return {"failed": f"ended with status {done.returncode}: {last[:300]}"}
-    return json.loads(answer.read_text())
+def drives_job(asset: Path, report) -> dict:
+    """Bodies, lowest collider and driven joints of a stage, for an engine that reads none of them itself."""
+    from pxr import Usd, UsdGeom, UsdPhysics
+
+    from magtwin.usd.geometry import read_triangles
+
+    stage = Usd.Stage.Open(str(asset))
+    guides = read_triangles(stage, purposes=(UsdGeom.Tokens.guide,))
+    enabled = [
+        corners
+        for path, corners in guides.items()
+        if UsdPhysics.CollisionAPI(stage.GetPrimAtPath(path)).GetCollisionEnabledAttr().Get() is not False
+    ]
+    drives = []
+    for line in report.joints:
+        prim = stage.GetPrimAtPath(line.prim) if line.prim else None
+        for axis, schema in (("angular", UsdPhysics.RevoluteJoint), ("linear", UsdPhysics.PrismaticJoint)):
+            if not prim or not prim.IsA(schema) or not prim.HasAPI(UsdPhysics.DriveAPI, axis):
+                continue
+            drive, joint = UsdPhysics.DriveAPI(prim, axis), schema(prim)
+            stiffness, damping = drive.GetStiffnessAttr().Get(), drive.GetDampingAttr().Get()
+            if stiffness or damping:
+                drives.append(
+                    {
+                        "path": line.prim,
+                        "slides": axis == "linear",
+                        "stiffness": stiffness,
+                        "target": drive.GetTargetPositionAttr().Get() or 0.0,
+                        "lower": joint.GetLowerLimitAttr().Get(),
+                        "upper": joint.GetUpperLimitAttr().Get(),
+                    }
+                )
+    bodies = [line.prim for line in report.links if line.became == "body"]
+    lowest = min((float(c.reshape(-1, 3)[:, 2].min()) for c in enabled), default=0.0)
+    return {"bodies": bodies, "base": bodies[0], "lowest_m": lowest, "drives": drives}
 
 
 def main(job_file: str) -> None:
@@ -197,7 +218,7 @@ def main(job_file: str) -> None:
     def step(name: str, call):
         try:
             return call()
-        except Exception as error:  # noqa: BLE001 - of a foreign library on a foreign file
+        except Exception as error:  # of a foreign library, on a foreign file
             row["steps_failed"][name] = f"{type(error).__name__}: {error}".splitlines()[0][:400]
             return None
 
@@ -208,10 +229,17 @@ def main(job_file: str) -> None:
             step("compare", lambda: compare(made.asset, made.report, peer, row))
         step("validate", lambda: check(made.asset, row))
         poses = step("poses", lambda: fk_job(made.report, peer)) or {}
-        for name, python in job["engines"].items():
-            row[name] = engine(name, python, made.asset, poses, work, job["limit_s"])
+        seen = step("drives", lambda: drives_job(made.asset, made.report)) or {}
+        trial = {"stage": str(made.asset), "poses": poses, "floats": not job["fix_base"], **seen}
+        for name in job["engines"]:
+            text = json.dumps({**trial, "answer": str(work / f"{name}.json")})
+            (work / f"{name}_job.json").write_text(text)
     Path(job["answer"]).write_text(json.dumps(row, indent=1))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    import yourdfpy  # noqa: F401 - here, so that no job imports it again
+
+    import magtwin.author.from_urdf  # noqa: F401
+
+    serve(main, LIMIT_GB)

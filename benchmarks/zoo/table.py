@@ -1,5 +1,7 @@
 """The zoo's table: what is wrong with a row, the summary, and Markdown."""
 
+import re
+
 MOST_CREEP_M = 0.005
 """A robot is at rest if no link moves by more in a second [m]."""
 
@@ -15,6 +17,9 @@ MOTION = 0.5, 1.5
 BEGIN, END = "<!-- zoo: begin -->", "<!-- zoo: end -->"
 
 ENGINES = ("newton", "physx")
+
+TIPPED_DEG = 30.0
+"""A robot that ends with a larger tilt has tipped over [deg]."""
 
 
 def faults(row: dict) -> list[str]:
@@ -57,7 +62,7 @@ def trial_faults(seen: dict, row: dict) -> list[str]:
 
 def summary(rows: list[dict]) -> str:
     """One line."""
-    converted = [r for r in rows if "convert_s" in r]
+    converted = [r for r in rows if "convert_cpu_s" in r]
     good = [r for r in rows if not faults(r)]
     return f"{len(rows)} robots: {len(converted)} converted, {len(good)} without a fault"
 
@@ -70,4 +75,44 @@ def replaced(text: str, rows: list[dict]) -> str:
 
 
 def markdown(rows: list[dict]) -> str:
-    return ""
+    """The summary, the table, and the list of faults."""
+    lines = [
+        f"{summary(rows)}.",
+        "",
+        "| robot | kind | description | links | mass, kg | rules | at rest: creep, mm | motion | remarks |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    lines += [_line(row) for row in rows]
+    lines += ["", "## What is wrong", ""]
+    bad = [(row["name"], text) for row in rows for text in faults(row)]
+    lines += [f"- {name}: {_plain(text)}" for name, text in bad] or ["Nothing."]
+    return "\n".join(lines)
+
+
+def _line(row: dict) -> str:
+    where = f"`{row['source']}` {row['commit'][:10]}, `{row['path']}`"
+    if "convert_cpu_s" not in row:
+        return f"| {row['name']} | {row['kind']} | {where} | | | | | | not converted |"
+    count = sum(map(len, row.get("errors", {}).values()))
+    rules = "not run" if "errors" not in row else "passed" if not count else f"{count} errors"
+    seen = next((row[engine] for engine in ENGINES if engine in row), {})
+    creep = f"{1e3 * seen['creep_m']:.2f}" if "creep_m" in seen else "failed" if seen else ""
+    motion = seen.get("motion")
+    share = f"{motion['what']}: {100 * motion['share']:.0f} %" if motion else ""
+    mass = f"{seen['mass_kg']:.4g}" if "mass_kg" in seen else f"{row['mass_kg']:.4g}"
+    remarks = []
+    if row["meshes_absent"]:
+        remarks.append(f"meshes absent: {row['meshes_absent']}")
+    if row["repairs"]:
+        remarks.append(f"repairs: {row['repairs']}")
+    if "yourdfpy" in row.get("steps_failed", {}):
+        remarks.append("yourdfpy refuses it")
+    if seen.get("floats") and seen.get("tilt_deg", 0.0) > TIPPED_DEG:
+        remarks.append("tips over")
+    cells = [row["name"], row["kind"], where, row["links"], mass, rules, creep, share, "; ".join(remarks)]
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def _plain(text: str) -> str:
+    """A text without the folders of this machine."""
+    return re.sub(r"/\S*/(?=[^/\s]+\+[^/\s]+/)", "", text)

@@ -6,23 +6,24 @@
 as OWNER+NAME. A robot is a process with limits on time and memory. Its row is kept in build/zoo/rows, and a
 repeat does only what is missing or has changed. `--docs` writes the table into docs/zoo.md.
 
-NVIDIA's rules come with the extra dev; Isaac Sim's with `magtwin fetch isaac-rules` or MAGTWIN_ISAACSIM; Newton
-with the extra physics; PhysX where MAGTWIN_PHYSX is the path of a Python with ovphysx (`make physx`).
+NVIDIA's rules come with the extra dev; Isaac Sim's with `magtwin fetch isaac-rules` or MAGTWIN_ISAACSIM;
+Newton with the extra physics; PhysX where MAGTWIN_PHYSX is the path of a Python with ovphysx (`make physx`).
 """
 
 import argparse
 import hashlib
 import json
 import os
-import resource
 import shutil
 import subprocess
 import sys
 import tomllib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from queue import Queue
 
 import table
+from serving import Server
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
@@ -32,11 +33,8 @@ DOCS = ROOT / "docs" / "zoo.md"
 FORGE = "https://github.com"
 """Host of the repositories."""
 
-LIMIT_S, ENGINE_LIMIT_S = 900.0, 300.0
+LIMIT_S, ENGINE_LIMIT_S = 900.0, 600.0
 """Time limits of a robot, and of its trial in an engine [s]."""
-
-LIMIT_GB = 8
-"""Limit on the memory of a robot's processes, each [GB]."""
 
 FIXED = ("arm", "hand")
 """Kinds that are fixed to the world."""
@@ -53,13 +51,17 @@ def checkout(source: str, commit: str, folder: Path | None) -> Path:
         raise ValueError(f"{place} is {f'at {at}' if at else 'absent'}; wanted commit {commit}")
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir(parents=True)
-    for words in (["init"], ["fetch", "--depth", "1", f"{FORGE}/{source}.git", commit], ["checkout", "FETCH_HEAD"]):
+    for words in (
+        ["init"],
+        ["fetch", "--depth", "1", f"{FORGE}/{source}.git", commit],
+        ["checkout", "FETCH_HEAD"],
+    ):
         subprocess.run(["git", "-C", place, "-c", "advice.detachedHead=false", *words, "-q"], check=True)
     mark.write_text(commit + "\n")
     return place
 
 
-def job_of(robot: dict, commits: dict, folder: Path | None, engines: dict) -> dict:
+def job_of(robot: dict, commits: dict, folder: Path | None, engines: list) -> dict:
     """The job of a robot for `robot.py`."""
 
     def inside(place: str) -> str:
@@ -76,13 +78,13 @@ def job_of(robot: dict, commits: dict, folder: Path | None, engines: dict) -> di
         "fix_base": robot["kind"] in FIXED,
         "out": str(work / stem),
         "engines": engines,
-        "limit_s": ENGINE_LIMIT_S,
         "answer": str(work / "answer.json"),
     }
 
 
-def run(robot: dict, commits: dict, folder: Path | None, engines: dict, fresh: bool) -> dict:
+def run(robot: dict, commits: dict, folder: Path | None, servers: dict, fresh: bool) -> dict:
     """The row of a robot, kept or made."""
+    engines = [name for name in servers if name != "robot"]
     kept = BUILD / "rows" / f"{robot['name']}.json"
     key = hashlib.sha256(json.dumps([robot, commits[robot["source"]], sorted(engines)]).encode()).hexdigest()
     if kept.is_file() and not fresh:
@@ -96,29 +98,21 @@ def run(robot: dict, commits: dict, folder: Path | None, engines: dict, fresh: b
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir(parents=True)
         (work / "job.json").write_text(json.dumps(job))
-        command = [sys.executable, str(HERE / "robot.py"), str(work / "job.json")]
-        limit = LIMIT_GB * 2**30
-        done = subprocess.run(
-            command,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=LIMIT_S,
-            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_DATA, (limit, limit)),  # noqa: PLW1509
-        )
+        ended = servers["robot"].do(work / "job.json", LIMIT_S)
         if Path(job["answer"]).is_file():
             row |= json.loads(Path(job["answer"]).read_text())
         else:
-            last = (done.stderr.strip().splitlines() or ["no output"])[-1]
-            row["steps_failed"] = {"process": f"ended with status {done.returncode}: {last[:300]}"}
-    except subprocess.TimeoutExpired:
-        row["steps_failed"] = {"process": f"took longer than {LIMIT_S:.0f} s"}
+            row["steps_failed"] = {"process": ended}
+        for name in engines if "convert_cpu_s" in row else ():
+            ended = servers[name].do(work / f"{name}_job.json", ENGINE_LIMIT_S)
+            answer = work / f"{name}.json"
+            row[name] = json.loads(answer.read_text()) if answer.is_file() else {"failed": ended}
     except (ValueError, OSError, subprocess.CalledProcessError) as error:
         row["steps_failed"] = {"source": str(error)}
     kept.parent.mkdir(parents=True, exist_ok=True)
     aside = kept.with_suffix(".part")
     aside.write_text(json.dumps(row, indent=1))
-    os.replace(aside, kept)
+    aside.replace(kept)
     return row
 
 
@@ -138,13 +132,29 @@ def main() -> int:
     if unknown:
         parser.error(f"no robot called {', '.join(sorted(unknown))} in {LIST.name}")
     pythons = {"newton": sys.executable, "physx": os.environ.get("MAGTWIN_PHYSX", sys.executable)}
-    engines = {name: pythons[name] for name in given.engine}
+    idle: Queue = Queue()
+    for _ in range(given.jobs):
+        servers = {"robot": Server(sys.executable, HERE / "robot.py")}
+        idle.put(servers | {n: Server(pythons[n], HERE / f"{n}_trial.py") for n in given.engine})
+
+    def row_of(robot: dict) -> dict:
+        servers = idle.get()
+        try:
+            return run(robot, listed["commits"], given.folder, servers, given.fresh)
+        finally:
+            idle.put(servers)
+
     rows = []
     with ThreadPoolExecutor(given.jobs) as pool:
-        made = pool.map(lambda r: run(r, listed["commits"], given.folder, engines, given.fresh), robots)
-        for count, row in enumerate(made, 1):
+        for count, row in enumerate(pool.map(row_of, robots), 1):
             rows.append(row)
-            print(f"{count:3d}/{len(robots)} {row['name']:18} {'; '.join(table.faults(row)) or 'good'}", flush=True)
+            print(
+                f"{count:3d}/{len(robots)} {row['name']:18} {'; '.join(table.faults(row)) or 'good'}",
+                flush=True,
+            )
+    while not idle.empty():
+        for server in idle.get().values():
+            server.close()
     (BUILD / "zoo.json").write_text(json.dumps(rows, indent=1))
     print(table.summary(rows))
     if given.docs:

@@ -70,10 +70,11 @@ def define_drive(
     options: Options,
     wheels: Wheels = NO_WHEELS,
 ) -> None:
-    """Author the drive of a joint that moves, unless it follows another or has several axes and no rule.
+    """Author the drive of a joint that moves.
 
     The first rule that matches wins. By default, wheels and continuous joints hold a velocity and limited
-    joints a position; with the profile diff-drive, continuous joints that are not wheels are left free.
+    joints a position; with the profile diff-drive, continuous joints that are not wheels are left free. The
+    gains of a joint that follows another, or has several axes and no rule, are 0: it moves freely.
 
     Args:
         prim: Prim of the joint.
@@ -88,6 +89,8 @@ def define_drive(
     """
     rule = next((r for r in options.drives if fnmatchcase(joint.name, r.joints)), None)
     if joint.name in mechanism.mimics or (joint.type not in SINGLE and rule is None):
+        for axis in axes:  # Isaac Sim's rules want a drive on every joint that moves
+            _define_gains(prim, axis, None, 0.0, 0.0)
         return
     damping, force = wheels.get(joint.name, (WHEEL_DAMPING, DEFAULT_EFFORT))
     if rule is None and joint.type != "continuous":
@@ -101,15 +104,24 @@ def define_drive(
     force = _effort(joint, force, mechanism.description) if rule.max_force is None else rule.max_force
     for axis in axes:
         unit = np.pi / 180 if axis == "angular" or axis.startswith("rot") else 1.0
-        made = UsdPhysics.DriveAPI.Apply(prim, axis)
-        made.CreateTypeAttr(UsdPhysics.Tokens.force)
-        made.CreateMaxForceAttr(force)
-        made.CreateStiffnessAttr(round(rule.stiffness * unit, 9))
-        made.CreateDampingAttr(round(rule.damping * unit, 9))
+        made = _define_gains(prim, axis, force, rule.stiffness * unit, rule.damping * unit)
         if rule.type == "position":
             made.CreateTargetPositionAttr(_target(joint) / unit)
         else:
             made.CreateTargetVelocityAttr(0.0)
+
+
+def _define_gains(
+    prim: Usd.Prim, axis: str, force: float | None, stiffness: float, damping: float
+) -> UsdPhysics.DriveAPI:
+    """A drive of a joint's axis with gains in the units of UsdPhysics; with gains of 0 it exerts nothing."""
+    made = UsdPhysics.DriveAPI.Apply(prim, axis)
+    made.CreateTypeAttr(UsdPhysics.Tokens.force)
+    if force is not None:
+        made.CreateMaxForceAttr(force)
+    made.CreateStiffnessAttr(round(stiffness, 9))
+    made.CreateDampingAttr(round(damping, 9))
+    return made
 
 
 def rotor_inertia(prim: Usd.Prim, joint: Joint) -> float:

@@ -88,7 +88,7 @@ def define_joint(
     define_drive(prim, axes, joint, mechanism, options, wheels)
     _tune(prim, joint, axes, joint.name in wheels, description)
     if joint.type != "planar":
-        _define_state(prim, axes[0])
+        _define_state(prim, axes[0], mechanism.rests.get(joint.name, 0.0) * _unit(joint))
     prim.AddAppliedSchema(JOINT_API)
     return prim
 
@@ -114,8 +114,8 @@ def define_mimic(prim: Usd.Prim, leader: Usd.Prim, joint: Joint, lead: Joint, me
 
     Newton: q = coef0 + coef1 q_leader, with coef0 in degrees if the follower rotates. PhysX, until it reads
     Newton's attributes: q + gearing q_leader + offset = 0, in degrees or metres, with limits on a joint
-    that rotates. The follower has no drive, so that the coupling alone moves it; a runtime that supports
-    neither lets it move freely.
+    that rotates. The follower's drive has no gains, so that the coupling alone moves it; a runtime that
+    supports neither lets it move freely.
 
     Args:
         prim: Prim of the follower.
@@ -208,11 +208,11 @@ def _quatf(R: NDArray) -> Gf.Quatf:
     return Gf.Quatf(*(round(float(v), 9) + 0.0 for v in wxyz_from_xyzw(quaternion(R))))
 
 
-def _define_state(prim: Usd.Prim, axis: str) -> None:
-    """Author where a joint stands, at 0 and at rest: Isaac Sim writes its state there while it runs."""
+def _define_state(prim: Usd.Prim, axis: str, position: float) -> None:
+    """Author where a joint stands, without motion: Isaac Sim writes its state there while it runs."""
     prim.AddAppliedSchema(f"{STATE_API}:{axis}")
-    for name in ("position", "velocity"):
-        _write(prim, f"state:{axis}:physics:{name}", 0.0)
+    _write(prim, f"state:{axis}:physics:position", position)
+    _write(prim, f"state:{axis}:physics:velocity", 0.0)
 
 
 def _unit(joint: Joint) -> float:
