@@ -400,6 +400,18 @@ def test_a_mimic_is_authored_for_newton_and_for_physx_and_its_own_drive_has_no_g
     assert_allclose(hand.ExtractRotation().GetAngle(), np.degrees(0.1), atol=1e-6)  # where it rests
 
 
+def test_the_limits_of_a_follower_overlap_those_of_its_leader_times_the_gearing(tmp_path):
+    """Isaac Sim's MimicAPICheck, which the fingers of Panda and HSR failed: they close at 0."""
+    closed = '<limit lower="0" upper="0.7" effort="3" velocity="2"/>'
+    path = follower(tmp_path, '<mimic joint="lead"/>', lead=closed)
+    path.write_text(path.read_text().replace(LIMIT, closed))
+    _stage, robot, _ = convert(path)
+    joint = prim(robot, "f")
+    low, high = (joint.GetAttribute(f"physics:{end}Limit").Get() for end in ("lower", "upper"))
+    assert -0.001 < low < 0
+    assert_allclose(high, np.degrees(0.7), rtol=1e-6)
+
+
 def test_a_slide_that_follows_a_turn_gears_in_metres_per_degree(tmp_path):
     path = follower(tmp_path, '<mimic joint="lead" multiplier="0.05"/>', kind="prismatic")
     _stage, robot, _ = convert(path)
