@@ -23,7 +23,7 @@ from magtwin.urdf.meshes.mesh_layer import MeshLayer, free_name, gather
 from magtwin.urdf.meshes.texture import TEXTURES
 from magtwin.urdf.options import DEFAULTS, Options
 from magtwin.urdf.physics.articulation import define_articulation, filter_overlaps
-from magtwin.urdf.physics.control import define_differential, read_commands, read_drive
+from magtwin.urdf.physics.control import define_differential, read_base, read_commands
 from magtwin.urdf.physics.drive import NO_WHEELS, Wheels, check_rules
 from magtwin.urdf.physics.gazebo import (
     Surface,
@@ -36,7 +36,9 @@ from magtwin.urdf.physics.joint import define_fixed_joint, define_joint, define_
 from magtwin.urdf.physics.link import SITE_API, Rider, define_body, is_marker
 from magtwin.urdf.physics.mechanism import Mechanism, read_mechanism
 from magtwin.urdf.physics.merge import WORLD, Place, carried, place_links, riders
-from magtwin.urdf.physics.wheel import find_wheels, fit_wheels, grip, not_on
+from magtwin.urdf.physics.mobile_base import MobileBase, drive_spec
+from magtwin.urdf.physics.wheel import find_base, fit_wheels, grip, not_on, wheel_radius
+from magtwin.urdf.placeholder import replace_failed
 from magtwin.urdf.report import ConversionReport, Ledger, make_report
 from magtwin.urdf.sensor import define_sensors
 from magtwin.urdf.shape import COLLISIONS, VISUALS, define_collider, define_no_contact, define_visual, pose_of
@@ -92,17 +94,23 @@ def convert_with_report(
         Every link, joint and geometry before and after, and all notes.
 
     Raises:
-        InputError: The URDF or a mesh cannot be converted, `options.strict` is set and something was lost,
-            or a file exists; nothing is written.
+        InputError: The URDF cannot be converted, `options.strict` is set and something was repaired or
+            lost, or a file exists; nothing is written.
     """
     out = Path(out)
     if out.suffix != ".usda":
         raise InputError(f"{out}: the robot's root layer is text; give it the suffix .usda")
     check_metadata(options.metadata)
-    source = read_source(urdf, packages=options.packages, arguments=options.arguments)
+    source = read_source(
+        urdf,
+        packages=options.packages,
+        arguments=options.arguments,
+        skip_missing_includes=options.skip_missing_includes,
+    )
     description = read_description(source)
     textures = f"{out.stem}_textures" if options.single_file else f"{PAYLOADS}/{TEXTURES}"
     meshes = gather(description, options, f"./{textures}")
+    description = replace_failed(description, meshes)
     check_free(out, force=force)
     write = _write_single if options.single_file else _write_payloads
     report = write(_Author(description, options, meshes, out, finish), out, force)
@@ -192,12 +200,8 @@ class _Author:
             poses=read_mechanism(description, options).poses(),
             lint=lint(description, mass=options.mass, vertices=self.meshes.vertices),
         )
-        if options.strict and report.losses:
-            others = f" (and {len(report.losses) - 1} more)" if len(report.losses) > 1 else ""
-            raise InputError(
-                f"{report.source}: {report.losses[0]}{others}; convert without --strict to accept that"
-            )
-        notes = Vt.StringArray(description.notes)
+        description.repairs.check(report.source, strict=options.strict)
+        notes = Vt.StringArray(description.repairs.notes)
         stage.GetRootLayer().customLayerData = {
             **stage.GetRootLayer().customLayerData,
             **metadata(stage, description, report, options.metadata),
@@ -215,15 +219,17 @@ class _Author:
         names |= _free_names(description.links, {JOINTS, LOOKS, VISUALS, COLLISIONS}, "", description)
         mechanism, tags = read_mechanism(description, self.options), Tags(description)
         check_rules(mechanism, self.options)
-        (drive, named), commands = read_drive(tags, mechanism), read_commands(tags, mechanism)
+        base, commands = read_base(tags, self.options.controllers), read_commands(tags, mechanism)
         surfaces = read_surfaces(tags)
         driven: tuple[str, ...] = ()
         if self.options.profile == "diff-drive":
-            driven = find_wheels(mechanism, named)
+            base = find_base(mechanism, base)
+            driven = base.wheels
             surfaces = grip(mechanism, driven, surfaces)
             commands = not_on(driven, commands)
         options = replace(self.options, drives=(*self.options.drives, *commands))
-        places, poses = place_links(mechanism, merge=options.merge_fixed), mechanism.poses()
+        places = place_links(mechanism, merge=options.merge_fixed, filled=options.density is not None)
+        poses = mechanism.poses()
         robot = _define(stage, Sdf.Path.absoluteRootPath.AppendChild(names[""]), description.name)
         stage.SetDefaultPrim(robot)
         Usd.ModelAPI(robot).SetKind("component")
@@ -263,16 +269,40 @@ class _Author:
         robot.AddAppliedSchema(ROBOT_API)
         jointed = [stage.GetPrimAtPath(joint) for joint in joints]
         held = any(robot.GetPath() in UsdPhysics.Joint(joint).GetBody0Rel().GetTargets() for joint in jointed)
-        base = bodies.get(_base(places), robot)
-        define_articulation(robot if held else base, self_collision=self_collides(tags))
+        first = bodies.get(_base(places), robot)
+        define_articulation(robot if held else first, self_collision=self_collides(tags))
         filter_overlaps(bodies, colliders, jointed)
         links = [body.GetPath() for body in bodies.values()]
         for name, paths_listed in (("robotLinks", links), ("robotJoints", joints)):
             relationship = robot.CreateRelationship(f"isaac:physics:{name}", custom=False)
             for path in paths_listed:  # each is prepended, so that a stronger layer can add to the list
                 relationship.AddTarget(path)
-        self._equip(robot, tags, options, drive)
+        self._equip(robot, tags, options, self._drive(base, mechanism, bodies))
         return robot
+
+    def _drive(
+        self, base: MobileBase | None, mechanism: Mechanism, bodies: dict[str, Usd.Prim]
+    ) -> DriveSpec | None:
+        """The drive of the robot's base; None if it has none, or one whose wheels are not known."""
+        if base is None:
+            return None
+        joints = {joint.name: joint for joint in self.description.joints.values()}
+        if len(base.wheels) < 2:
+            try:
+                base = find_base(mechanism, base)
+            except InputError:
+                text = f"{base.source} moves the base, but no wheels are known: kept as text"
+                self.description.note(text, lost=True)
+                return None
+
+        def radius_of(name: str) -> float:
+            link = self.description.links[joints[name].child]
+            forms = [part.geometry for part in (*link.collisions, *link.visuals)]
+            round_ones = [form.radius for form in forms if form.kind in ("cylinder", "sphere")]
+            body = bodies.get(link.name)
+            return round_ones[0] if round_ones else wheel_radius(body, joints[name].axis) if body else 0.0
+
+        return drive_spec(base, mechanism, radius_of)
 
     def _joints(
         self,

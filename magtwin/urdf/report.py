@@ -15,6 +15,8 @@ from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Shape
 from magtwin.urdf.meshes.mesh import bounds
 from magtwin.urdf.meshes.mesh_layer import MeshLayer
+from magtwin.urdf.physics.mass import engine_masses
+from magtwin.urdf.repairs import FAULTS, Repair
 from magtwin.usd.geometry import read_vertices
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -28,6 +30,13 @@ ROUND_TOLERANCE = 0.01
 1 - cos(pi / 32) is 0.5 % of its radius."""
 
 
+PLACES, LINES = 3, 8
+"""Most places of one kind of fault, and most guesses and doubts, that the terminal shows."""
+
+ADDED = 1e-3
+"""Share of the URDF's mass above which a note gives the mass that links without mass add."""
+
+
 @dataclass(frozen=True)
 class LinkLine:
     """A link before and after."""
@@ -39,6 +48,7 @@ class LinkLine:
     """Path of its prim, or ""."""
     mass_in_kg: float | None
     mass_out_kg: float | None
+    """Mass of its body as physics engines compute it, with all merged links; None if it is not a body."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +97,27 @@ class GeometryLine:
 
 
 @dataclass(frozen=True)
+class RepairLine:
+    """All faults of one kind."""
+
+    kind: str
+    """A key of `repairs.FAULTS`, or "loss"."""
+    fault: str
+    done: str
+    """What was done about each."""
+    count: int
+    entries: tuple[Repair, ...]
+    """Each fault, with file and line."""
+
+    @property
+    def places(self) -> str:
+        """The first places, or the first text if no place is known."""
+        places = list(dict.fromkeys(entry.place for entry in self.entries if entry.place))
+        more = f" and {len(places) - PLACES} more" if len(places) > PLACES else ""
+        return ", ".join(places[:PLACES]) + more if places else self.entries[0].text
+
+
+@dataclass(frozen=True)
 class ConversionReport:
     """What a conversion read, wrote and changed."""
 
@@ -101,10 +132,15 @@ class ConversionReport:
     geometries: tuple[GeometryLine, ...]
     mass_in_kg: float
     mass_out_kg: float
+    """Mass as physics engines compute it, see `engine_masses`."""
     box_in: Box | None
     """Box of all visuals in the description."""
     box_out: Box | None
     """Box of all visuals on the stage."""
+    repairs: tuple[RepairLine, ...]
+    """Faults of the description by kind; `Options.strict` refuses each."""
+    supply: str
+    """Options of the command line that would supply what is missing."""
     notes: tuple[str, ...]
     """Repairs, guesses and omissions, one line each."""
     losses: tuple[str, ...]
@@ -113,6 +149,11 @@ class ConversionReport:
     """Doubtful values in the description, one line each."""
     unknown_tags: Mapping[str, int] = field(default_factory=dict)
     """Number of occurrences of each tag that is kept as text."""
+
+    @property
+    def _faults(self) -> frozenset[str]:
+        """Texts of all repairs and losses."""
+        return frozenset(entry.text for line in self.repairs for entry in line.entries)
 
     def to_json(self) -> str:
         """The report as one JSON object."""
@@ -127,23 +168,33 @@ class ConversionReport:
             Figure("links", len(self.links), note=f"{bodies} bodies, the rest frames on them"),
             Figure("joints", len(self.joints), note=f"{len(moving)} move"),
             Figure("shapes", len(self.geometries), note=f"{kept} with their true bounding box"),
-            Figure("mass", round(self.mass_out_kg, 6), "kg", note=f"{self.mass_in_kg:.6g} kg in the URDF"),
+            Figure(
+                "mass",
+                round(self.mass_out_kg, 6),
+                "kg",
+                note=f"in engines; {self.mass_in_kg:.6g} kg in the URDF",
+            ),
         ]
         if self.box_out is not None:
             size = np.subtract(self.box_out[1], self.box_out[0])
             figures.append(Figure("size", " x ".join(f"{v:.3f}" for v in size), "m"))
         figures += [
+            Figure(line.fault, line.count, note=f"{line.done}: {line.places}".lstrip(": "))
+            for line in self.repairs
+        ]
+        guesses = [note for note in self.notes if note not in self._faults]
+        figures += [
             Figure("unknown tags", sum(self.unknown_tags.values()), note="kept as text"),
-            Figure("notes", len(self.notes)),
-            Figure("losses", len(self.losses)),
+            Figure("guesses", len(guesses)),
             Figure("doubts about the description", len(self.lint)),
         ]
         metadata = {
             "source": self.source,
             "sha256": self.source_sha256,
+            "to supply what is missing": self.supply,
             "losses": list(self.losses),
-            "notes": list(self.notes),
-            "lint": list(self.lint),
+            "guesses": _first(guesses),
+            "doubts": _first(self.lint),
         }
         return Report(f"{self.robot}: {self.source} -> {self.stage}", tuple(figures), metadata)
 
@@ -192,11 +243,10 @@ def make_report(
         lint: Lines of `lint.lint`.
     """
     lines = _geometries(description, meshes, stage, ledger, poses or description.poses())
-    links, joints = [], []
+    links, joints, masses = [], [], engine_masses(stage)
     for link in description.links.values():
         became, path = ledger.bodies.get(link.name, ("nothing", Sdf.Path.emptyPath))
-        mass = UsdPhysics.MassAPI(stage.GetPrimAtPath(path)).GetMassAttr() if became == "body" else None
-        mass_out = round(float(mass.Get()), 9) if mass and mass.HasAuthoredValue() else None
+        mass_out = round(masses[path], 9) if path in masses and became == "body" else None
         mass_in = None if link.inertial is None else link.inertial.mass
         links.append(LinkLine(link.name, became, str(path), mass_in, mass_out))
     for joint in description.joints.values():
@@ -205,19 +255,21 @@ def make_report(
         joints.append(JointLine(joint.name, joint.type, kind, str(path)))
     visuals = [line for line in lines if line.role == "visual"]
     given = sum(line.mass_in_kg or 0.0 for line in links)
-    total = sum(
-        float(UsdPhysics.MassAPI(prim).GetMassAttr().Get() or 0.0)
-        for prim in stage.Traverse()
-        if prim.HasAPI(UsdPhysics.MassAPI)
-    )
-    losses = list(description.dropped)
-    losses += [f"link {line.name!r} has no prim" for line in links if line.became == "nothing"]
+    total = sum(masses.values())
+    losses = [f"link {line.name!r} has no prim" for line in links if line.became == "nothing"]
     for line in lines:
         if line.box_in is not None and not line.kept:
             what = "did not arrive" if line.box_out is None else f"changed its box by {line.error_m:.3g} m"
             losses.append(f"{line.role} {line.index} of link {line.link!r} ({line.shape}) {what}")
     if given - total > 1e-6 * max(given, 1e-9):
         losses.append(f"mass {given:.6g} kg became {total:.6g} kg")
+    for loss in losses:
+        description.note(loss, lost=True)
+    if total > (1 + ADDED) * given > 0:
+        description.note(
+            f"physics engines compute {total:.6g} kg, {total / given - 1:.2%} above the URDF's mass"
+        )
+    repairs = description.repairs
     return ConversionReport(
         robot=description.name,
         source=description.path.name,
@@ -230,8 +282,13 @@ def make_report(
         mass_out_kg=round(total, 9),
         box_in=_union([line.box_in for line in visuals]),
         box_out=_union([line.box_out for line in visuals]),
-        notes=tuple(description.notes),
-        losses=tuple(dict.fromkeys(losses)),
+        repairs=tuple(
+            RepairLine(kind, *FAULTS.get(kind, ("left out", "")), len(entries), tuple(entries))
+            for kind, entries in repairs.by_kind().items()
+        ),
+        supply=" ".join(repairs.supplies),
+        notes=repairs.notes,
+        losses=repairs.losses,
         lint=tuple(lint),
         unknown_tags=dict(sorted(ledger.unknown_tags.items())),
     )
@@ -284,6 +341,14 @@ def _boxes(stage: Usd.Stage) -> dict[Sdf.Path, Box]:
             points = points @ T[:3, :3] + T[3, :3]
         boxes[path] = _corners(*bounds(points))
     return boxes
+
+
+def _first(lines: Sequence[str]) -> list[str]:
+    """The first lines, and how many are left."""
+    left = len(lines) - LINES
+    return (
+        list(lines) if left <= 1 else [*lines[:LINES], f"and {left} more; the report of --report lists all"]
+    )
 
 
 def _union(boxes: Sequence[Box | None]) -> Box | None:

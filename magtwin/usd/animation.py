@@ -27,12 +27,12 @@ from magtwin.frames import quat_conjugate, quat_multiply, rotate
 from magtwin.run.resample import grid
 from magtwin.run.run import COLUMNS, Column, Run, check_clock
 from magtwin.spec.base import Quat, Vec3
-from magtwin.usd.attributes import read_pose, target
+from magtwin.usd.attributes import read_pose, target, targets
 from magtwin.usd.geometry import BASE_LINK, read_links
 from magtwin.usd.layers import SUFFIXES, WORLD, describe_stage, open_stage
 from magtwin.usd.placement import lab_on, labs_on, take_to_origin
 from magtwin.usd.schema import attribute_name, only_prim_with, place, prims_with
-from magtwin.usd.sensors import JOINT_FIELDS
+from magtwin.usd.sensors import JOINT_FIELDS, WHEELS_FIELDS
 
 FPS = 30.0
 """Default frame rate [Hz]."""
@@ -95,8 +95,9 @@ class _Stand:
     p_root_base: Vec3 = (0.0, 0.0, 0.0)
     """Origin of the base link in the robot's root [m]."""
     q_root_base_xyzw: Quat = (0.0, 0.0, 0.0, 1.0)
-    wheels: tuple[tuple[Sdf.Path, Vec3, Quat, Vec3], ...] = ()
-    """Left and right wheel: prim, position [m] and orientation in its parent, and axis in its own frame."""
+    wheels: tuple[tuple[int, Sdf.Path, Vec3, Quat, Vec3], ...] = ()
+    """Driven wheels: side (0 for left, 1 for right), prim, position [m] and orientation in its parent, and
+    axis in its own frame."""
     sensors: Mapping[str, Sdf.Path] = field(
         default_factory=lambda: {"magnetometer": _BARE.AppendChild("magnetometer"), "robot": _BARE}
     )
@@ -311,19 +312,23 @@ def _stand(stage: Usd.Stage, default: Usd.Prim, name: str) -> _Stand:
         robot=prim.GetPath(),
         p_root_base=(x, y, z),
         q_root_base_xyzw=(*map(float, turn.GetImaginary()), float(turn.GetReal())),  # type: ignore[arg-type]
-        wheels=tuple(_wheel(prim, field_, stage) for field_ in JOINT_FIELDS),
+        wheels=tuple(
+            _wheel(side, joint, stage)
+            for fields_ in (JOINT_FIELDS, WHEELS_FIELDS)
+            for side, field_ in enumerate(fields_)
+            for joint in targets(prim, attribute_name("drive", field_))
+        ),
         sensors=sensors,
     )
 
 
-def _wheel(robot: Usd.Prim, joint_field: str, stage: Usd.Stage) -> tuple[Sdf.Path, Vec3, Quat, Vec3]:
-    joint = target(robot, attribute_name("drive", joint_field))
+def _wheel(side: int, joint: Usd.Prim, stage: Usd.Stage) -> tuple[int, Sdf.Path, Vec3, Quat, Vec3]:
     body = target(joint, "physics:body1")
     links = read_links(stage).values()
     axis = next((link.axis_link for link in links if link.joint == joint.GetName()), None)
     if axis is None:
         raise InputError(f"{place(joint)}: is no revolute joint between two bodies, as a wheel needs")
-    return body.GetPath(), *read_pose(body), axis
+    return side, body.GetPath(), *read_pose(body), axis
 
 
 def _animate(layer: Sdf.Layer, stand: _Stand, frames: Run, codes: list[float]) -> None:
@@ -337,8 +342,8 @@ def _animate(layer: Sdf.Layer, stand: _Stand, frames: Run, codes: list[float]) -
     _move(layer, stand.robot, at, Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(p)), q)
     if "wheel_angle" not in frames or not stand.wheels:
         return
-    for (path, p_rest, q_rest, axis), angle in zip(stand.wheels, frames["wheel_angle"].T, strict=True):
-        half = angle[:, None] / 2
+    for side, path, p_rest, q_rest, axis in stand.wheels:
+        half = frames["wheel_angle"][:, side, None] / 2
         turn = np.hstack([np.sin(half) * axis, np.cos(half)])
         _move(layer, path, codes, Gf.Vec3d(p_rest), quat_multiply(q_rest, turn))
 

@@ -14,6 +14,8 @@ from magtwin.urdf import convert_urdf, read_notes
 from magtwin.urdf.options import DriveRule, Options
 from magtwin.urdf.physics import inertia as solids
 from magtwin.urdf.physics.inertia import MassProperties, combined
+from magtwin.urdf.physics.mass import engine_masses
+from magtwin.usd.sensors import read_drive
 
 LIMIT = '<limit effort="3" velocity="2" lower="-1" upper="0.5"/>'
 
@@ -145,12 +147,51 @@ def test_a_mesh_weighs_what_it_encloses_and_an_open_one_what_its_hull_does(tmp_p
         assert_allclose(mass_of(robot.GetPrimAtPath("hand"))[0], 2000 * mesh.volume, rtol=1e-4)
 
 
-def test_without_a_density_a_link_without_inertial_is_left_to_the_engine_and_noted(tmp_path):
-    _stage, robot, notes = convert(arm(tmp_path, "fixed|", f"<collision>{BALL}</collision>"))
-    assert not robot.GetPrimAtPath("hand").HasAPI(UsdPhysics.MassAPI)
-    assert "link 'hand' has no <inertial>: engines take its mass from its colliders" in notes
-    _stage, robot, notes = convert(arm(tmp_path, "fixed|", f"<visual>{BALL}</visual>"))
-    assert any("without a collider, engines cannot find its mass" in note for note in notes)
+def test_engines_fill_a_body_without_mass_as_usdphysics_tells():
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageMetersPerUnit(stage, 1)
+    for name, density in (("plain", None), ("light", 10.0)):
+        body = UsdGeom.Xform.Define(stage, f"/{name}").GetPrim()
+        UsdPhysics.RigidBodyAPI.Apply(body)
+        box = UsdGeom.Cube.Define(stage, f"/{name}/box")
+        box.CreateSizeAttr(0.5)
+        UsdPhysics.CollisionAPI.Apply(box.GetPrim())
+        if density:
+            UsdPhysics.MassAPI.Apply(body).CreateDensityAttr(density)
+    assert_allclose(list(engine_masses(stage).values()), [1000 / 8, 10 / 8], rtol=1e-6)
+
+
+def test_a_massless_base_takes_the_mass_of_the_inertial_link_welded_to_it(tmp_path):
+    parts = (
+        f'<link name="base"><collision>{BALL}</collision></link>'
+        '<link name="mass"><inertial><origin xyz="0 0 0.1"/><mass value="46"/>'
+        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        f'<link name="lid"><collision>{BALL}</collision>{INERTIAL}</link>'
+    )
+    for name, z in (("mass", 0.2), ("lid", 0.5)):
+        parts += (
+            f'<joint name="{name}_joint" type="fixed"><parent link="base"/><child link="{name}"/>'
+            f'<origin xyz="0 0 {z}"/></joint>'
+        )
+    stage, robot, notes = convert(urdf(tmp_path, parts))
+    mass, centre, _ = mass_of(robot.GetPrimAtPath("base"))
+    assert_allclose([mass, *centre], [46, 0, 0, 0.3], rtol=1e-6, atol=1e-7)
+    assert [path.name for path in engine_masses(stage)] == ["base", "lid"]  # the lid stays a body
+    assert_allclose(sum(engine_masses(stage).values()), 47, rtol=1e-6)
+    assert "link 'base' has no <inertial>: it takes that of 'mass'" in notes
+
+
+@pytest.mark.parametrize("shape", ["collision", "visual"])
+def test_a_link_without_inertial_adds_no_mass_in_an_engine(tmp_path, shape):
+    shapes = f"<{shape}>{BALL}</{shape}>"
+    stage, robot, notes = convert(arm(tmp_path, "fixed|", shapes))
+    assert "link 'hand' has no <inertial>: it is part of the body of 'base'" in notes
+    assert not robot.GetPrimAtPath("base/hand").HasAPI(UsdPhysics.RigidBodyAPI)
+    fixed = sum(engine_masses(stage).values())
+    stage, robot, notes = convert(arm(tmp_path, "continuous|", shapes))
+    assert "link 'hand' has no <inertial>: 0.001 kg, so that engines add none" in notes
+    assert_allclose(sum(engine_masses(stage).values()), fixed + 0.001, rtol=1e-6)
+    assert_allclose(mass_of(robot.GetPrimAtPath("hand"))[0], 0.001, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -599,7 +640,8 @@ def test_all_wheels_that_a_plugin_names_are_driven_not_the_first_of_each_side(tm
     assert len(joints) == 4
     assert all(UsdPhysics.DriveAPI(joint, "angular").GetDampingAttr().Get() > 0 for joint in joints)
     assert not any("caster" in note or "freely" in note for note in notes)
-    assert "drive plugin: the first of 2 <left_joint> is used" in notes
+    spec = read_drive(stage.GetDefaultPrim())
+    assert spec.sides == {"j0": 0, "j1": 1, "j2": 0, "j3": 1}
 
 
 def test_the_urdfs_values_of_wheels_override_the_profile(tmp_path):

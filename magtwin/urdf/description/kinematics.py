@@ -47,7 +47,7 @@ def link_poses(
         if part.tag == "link":
             ElementTree.SubElement(bare, "link", name=part.attrib["name"])
         elif part.tag == "joint":
-            bare.append(check_grammar(part, description.where, description.note))
+            bare.append(check_grammar(part, description.where, description.repair))
             for mimic in bare[-1].findall("mimic"):  # yourdfpy does not support a mimic of a mimic
                 bare[-1].remove(mimic)
     model = yourdfpy.URDF.load(io.BytesIO(ElementTree.tostring(bare)), load_meshes=False)

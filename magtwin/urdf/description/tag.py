@@ -8,7 +8,6 @@ from xml.etree import ElementTree
 import numpy as np
 from pxr import Usd, Vt
 
-from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description
 from magtwin.urdf.description.grammar import CHILDREN
 
@@ -72,25 +71,27 @@ class Tags:
         least: float = -np.inf,
         above: float = -np.inf,
     ) -> float | None:
-        """A finite number at one of the paths; None if there is none.
+        """A finite number at one of the paths; None if there is none, or if it is invalid.
 
-        Raises:
-            InputError: It is not a number, below `least` or not above `above`; the message gives the line.
+        A number below `least` is raised to it. One that is not above `above`, and a text that is no number,
+        count as not given.
         """
         match = self.find(element, *paths)
         if match is None:
             return None
-        try:
-            value = float(_text_of(match))
-        except ValueError:
-            value = np.nan
-        if not np.isfinite(value) or value < least or not (value > above or above == -np.inf):
-            want = f" above {above:g}" if above > -np.inf else f" not below {least:g}"
-            want = want if max(least, above) > -np.inf else ""
-            raise InputError(
-                f"{self.description.where(match)}: {match.tag} must be a finite number{want}, "
-                f"got {_text_of(match)!r}"
-            )
+        text, value = _text_of(match), np.nan
+        with contextlib.suppress(ValueError):
+            value = float(text)
+        repair = self.description.repair
+        if not np.isfinite(value):
+            repair("number-unreadable", f"{match.tag} must be a finite number, not {text!r}: not used", match)
+            return None
+        if value < least:
+            repair("number-range", f"{match.tag} {text} is below {least:g}: raised to it", match)
+            return least
+        if not (value > above or above == -np.inf):
+            repair("number-range", f"{match.tag} {text} is not above {above:g}: not used", match)
+            return None
         return value
 
     def nothing(self, element: Element | None, *paths: str) -> None:
@@ -102,18 +103,15 @@ class Tags:
                     self.find(element, path)
 
     def flag(self, element: Element | None, *paths: str) -> bool | None:
-        """A boolean at one of the paths; None if there is none.
-
-        Raises:
-            InputError: It is not a boolean; the message gives the line.
-        """
+        """A boolean at one of the paths; None if there is none, or if it is no boolean."""
         match = self.find(element, *paths)
         if match is None:
             return None
         word = _text_of(match).lower()
         if word not in ("true", "false", "1", "0"):
-            where = self.description.where(match)
-            raise InputError(f"{where}: {match.tag} must be true or false, got {word!r}")
+            text = f"{match.tag} must be true or false, not {word!r}: not used"
+            self.description.repair("number-unreadable", text, match)
+            return None
         return word in ("true", "1")
 
     def keep(self, prim_of: Callable[[str], Usd.Prim]) -> dict[str, int]:

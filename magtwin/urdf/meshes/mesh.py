@@ -10,10 +10,15 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.urdf.meshes.piece import Paint, Piece
 from magtwin.urdf.meshes.reading import Note, Reading
+from magtwin.urdf.source.markup import UnsafeError
 from magtwin.usd.solids import corner_normals
 
 SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
 """Formats that can be read."""
+
+
+class UnreadableMeshError(InputError):
+    """A mesh file is damaged, empty or of an unknown format."""
 
 
 @dataclass(frozen=True)
@@ -71,19 +76,22 @@ def read_mesh(path: Path, may_read: Callable[[Path], bool] | None = None) -> Mes
             in the folder of the mesh and below.
 
     Raises:
-        InputError: The file cannot be read, has no triangle, or has vertices that are not finite.
+        UnreadableMeshError: The file cannot be read, has no triangle, or has vertices that are not finite.
+        UnsafeError: It refers to files that it may not read, or has entities.
     """
     folder = path.resolve().parent
     allowed = may_read or (lambda other: other.resolve().is_relative_to(folder))
     reading = Reading(path, allowed)
     try:
-        pieces = _reader(path)(reading)
-    except InputError:
+        return _join(reading, _reader(path)(reading))
+    except UnsafeError:
         raise
+    except InputError as error:
+        raise UnreadableMeshError(str(error)) from error
     except Exception as error:  # readers raise many types on a damaged file
         reason = str(error).strip().splitlines() or [type(error).__name__]
-        raise InputError(f"{path}: cannot be read as a mesh: {reason[0]}; export it again") from error
-    return _join(reading, pieces)
+        text = f"{path}: cannot be read as a mesh: {reason[0]}; export it again"
+        raise UnreadableMeshError(text) from error
 
 
 def _reader(path: Path) -> Reader:

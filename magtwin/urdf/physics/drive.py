@@ -93,7 +93,7 @@ def define_drive(
             _define_gains(prim, axis, None, 0.0, 0.0)
         return
     damping, force = wheels.get(joint.name, (WHEEL_DAMPING, DEFAULT_EFFORT))
-    if rule is None and joint.type != "continuous":
+    if rule is None and joint.type != "continuous" and joint.name not in wheels:
         gain = POSITION_STIFFNESS
         rule = DriveRule(joints=joint.name, type="position", stiffness=gain, damping=gain / 10)
     elif rule is None and options.profile == "diff-drive" and joint.name not in wheels:
@@ -125,12 +125,12 @@ def _define_gains(
 
 
 def rotor_inertia(prim: Usd.Prim, joint: Joint) -> float:
-    """Inertia of the motor of a continuous joint that holds a velocity [kg m2]; 0 for other joints.
+    """Inertia of the motor of a rotary joint that holds a velocity [kg m2]; 0 for other joints.
 
     At most gain times `RESPONSE`, so that the rotor of a small robot does not slow its drive.
     """
     drive = UsdPhysics.DriveAPI(prim, "angular")
-    if joint.type != "continuous" or not prim.HasAPI(UsdPhysics.DriveAPI, "angular"):
+    if joint.type not in ("continuous", "revolute") or not prim.HasAPI(UsdPhysics.DriveAPI, "angular"):
         return 0.0
     damping, stiffness = drive.GetDampingAttr().Get() * 180 / np.pi, drive.GetStiffnessAttr().Get()
     return 0.0 if stiffness else float(f"{min(ROTOR_KG_M2, damping * RESPONSE):.3g}")

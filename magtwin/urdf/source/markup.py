@@ -12,6 +12,10 @@ MAX_DEPTH = 200
 """Most levels of nested elements; deeper nesting would exhaust the stack."""
 
 
+class UnsafeError(InputError):
+    """A file that could read other files or fill the memory; never repaired."""
+
+
 @dataclass(frozen=True)
 class Markup:
     """Elements of an XML file without comments, and the line on which each starts."""
@@ -49,7 +53,7 @@ def parse_markup(text: bytes, path: Path) -> Markup:
         nonlocal depth
         depth += 1
         if depth > MAX_DEPTH:
-            raise InputError(f"{path}:{parser.CurrentLineNumber}: nests deeper than {MAX_DEPTH} elements")
+            raise UnsafeError(f"{path}:{parser.CurrentLineNumber}: nests deeper than {MAX_DEPTH} elements")
         lines[builder.start(tag, attributes)] = parser.CurrentLineNumber
 
     def end(tag: str) -> None:
@@ -58,7 +62,7 @@ def parse_markup(text: bytes, path: Path) -> Markup:
         builder.end(tag)
 
     def doctype(*_: Any) -> None:
-        raise InputError(
+        raise UnsafeError(
             f"{path}:{parser.CurrentLineNumber}: has a DOCTYPE, whose entities are not followed; "
             "remove it and write the values in full"
         )

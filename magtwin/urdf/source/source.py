@@ -3,20 +3,17 @@
 import difflib
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from xml.etree import ElementTree
 
 from magtwin.errors import InputError
 from magtwin.files import existing
-from magtwin.urdf.source.markup import read_markup
-from magtwin.urdf.source.package import Packages
+from magtwin.urdf.repairs import Repairs
+from magtwin.urdf.source.markup import UnsafeError, read_markup
+from magtwin.urdf.source.package import MissingFileError, Packages
 from magtwin.urdf.source.xacro import expand
-
-
-class MissingFileError(InputError):
-    """A file named in a description is missing; the caller may be able to continue without it."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +32,8 @@ class Source:
     packages: Packages
     """Finds the folders of `package://`."""
 
-    notes: tuple[str, ...] = ()
-    """Notes on the expansion, one line each."""
+    repairs: Repairs = field(default_factory=Repairs)
+    """Receives every repair and note of the conversion; those of the expansion so far."""
 
     def where(self, element: ElementTree.Element | None) -> str:
         """File and line of an element, as `file:line`; the file alone if it has none."""
@@ -44,6 +41,13 @@ class Source:
             return str(self.path)
         file, line = self.places[element]
         return f"{file}:{line}"
+
+    def place(self, element: ElementTree.Element | None) -> tuple[str, int]:
+        """File, relative to the folder of the description, and line of an element; ("", 0) if unknown."""
+        if element is None or element not in self.places:
+            return "", 0
+        file, line = self.places[element]
+        return Path(os.path.relpath(file, self.path.parent)).as_posix(), line
 
     def find_file(self, filename: str, what: str, element: ElementTree.Element | None = None) -> Path:
         """The file that a `filename=` refers to.
@@ -57,8 +61,9 @@ class Source:
             element: Element with the name, for error messages.
 
         Raises:
-            MissingFileError: The file does not exist; the message suggests a near name.
-            InputError: Its package was not found, or the description may not read the file.
+            MissingFileError: The file or its package does not exist; the message suggests a near name.
+            UnsafeError: The description may not read the file.
+            InputError: Its scheme is unknown, or it cannot be looked for.
         """
         start = f"{self.where(element)}: {what} {filename!r}"
         try:
@@ -76,15 +81,17 @@ class Source:
             name, _, rest = rest.partition("/")
             try:
                 folder = self.packages.find(name)
-            except InputError as error:
-                raise InputError(f"{start} is in a package: {error}") from error
+            except MissingFileError as error:
+                missing = MissingFileError(f"{start} is in a package: {error}")
+                missing.supply = error.supply
+                raise missing from error
             path = Path(os.path.normpath(folder / rest))
             inside = path.resolve().is_relative_to(folder.resolve())
         else:
             path = Path(os.path.normpath(self.path.resolve().parent / (rest if separator else filename)))
             folder, inside = self.packages.home, self.packages.holds(path)
         if not inside:
-            raise InputError(
+            raise UnsafeError(
                 f"{start} lies outside {folder}; files are read from there only: move it in, "
                 "or name its folder by --package NAME=FOLDER"
             )
@@ -92,8 +99,6 @@ class Source:
             siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
             near = difflib.get_close_matches(path.name, siblings, n=1)
             advice = f"; did you mean {near[0]!r}?" if near else ""
-            if what == "mesh":
-                advice += "; --missing-meshes note leaves it out"
             raise MissingFileError(f"{start} is missing; looked for {path}{advice}")
         return path
 
@@ -103,6 +108,7 @@ def read_source(
     *,
     packages: Mapping[str, Path] = MappingProxyType({}),
     arguments: Mapping[str, str] = MappingProxyType({}),
+    skip_missing_includes: bool = False,
 ) -> Source:
     """Read a URDF, or a xacro with its macros expanded.
 
@@ -110,6 +116,7 @@ def read_source(
         path: The file; it is a xacro if its suffix is .xacro or it has elements `xacro:`.
         packages: Folders of packages by name; they override packages that are found.
         arguments: Values of a xacro's `<xacro:arg>`.
+        skip_missing_includes: Whether to skip missing includes of a xacro of which no macro is called.
 
     Raises:
         InputError: The file is missing, is not XML, has a DOCTYPE, is not a `<robot>`, or has macros that
@@ -122,8 +129,9 @@ def read_source(
         raise InputError(f"{path}:{line}: a URDF begins with <robot>, this file with <{markup.root.tag}>")
     around = Packages(packages, path)
     if path.suffix == ".xacro" or any(element.tag.startswith("xacro:") for element in markup.lines):
-        xml, places, notes = expand(path, around, arguments)
-        return Source(path, xml, MappingProxyType(places), around, notes)
+        repairs = Repairs()
+        xml, places = expand(path, around, arguments, repairs, skip_missing_includes=skip_missing_includes)
+        return Source(path, xml, MappingProxyType(places), around, repairs)
     if arguments:
         raise InputError(f"{path}: is not a xacro and takes no arguments; leave out {', '.join(arguments)}")
     return Source(
