@@ -19,8 +19,6 @@ LIMIT_GB = 8
 SEED = 0
 """Of the joint values for forward kinematics."""
 
-PRIMITIVES = ("box", "sphere", "cylinder", "capsule")
-
 
 def convert(job: dict, row: dict):
     """Convert with the defaults of `magtwin robot`; an arm's base is fixed."""
@@ -35,19 +33,18 @@ def convert(job: dict, row: dict):
         arguments=job["arguments"],
         fix_base=job["fix_base"],
         force=True,
-        **{"missing_meshes": "note", **job["options"]},
+        **job["options"],
     )
     report = made.report
-    absent = {g.shape for g in report.geometries if g.shape not in PRIMITIVES and g.box_in is None}
     row |= {
         "convert_cpu_s": round(time.process_time() - start, 2),
         "links": len(report.links),
         "joints": len(report.joints),
         "notes": list(report.notes),
         "losses": list(report.losses),
-        "repairs": len(getattr(report, "repairs", report.notes)),
+        "repairs": {line.kind: line.count for line in report.repairs},
         "lint": len(report.lint),
-        "meshes_absent": len(absent),
+        "meshes_absent": sum(line.count for line in report.repairs if line.kind == "mesh-missing"),
         "mass_kg": report.mass_out_kg,
     }
     return made
@@ -75,7 +72,12 @@ class Peer:
         from magtwin.urdf.source.source import read_source
 
         packages = {name: Path(folder) for name, folder in job["packages"].items()}
-        self.source = read_source(job["urdf"], packages=packages, arguments=job["arguments"])
+        self.source = read_source(
+            job["urdf"],
+            packages=packages,
+            arguments=job["arguments"],
+            skip_missing_includes=job["options"].get("skip_missing_includes", False),
+        )
         text = work / "peer.urdf"
         ElementTree.ElementTree(self.source.xml).write(text)
         self.absent = 0

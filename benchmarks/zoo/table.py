@@ -104,7 +104,7 @@ def _line(row: dict) -> str:
     if row["meshes_absent"]:
         remarks.append(f"meshes absent: {row['meshes_absent']}")
     if row["repairs"]:
-        remarks.append(f"repairs: {row['repairs']}")
+        remarks.append("repaired: " + ", ".join(f"{kind} {count}" for kind, count in row["repairs"].items()))
     if "yourdfpy" in row.get("steps_failed", {}):
         remarks.append("yourdfpy refuses it")
     if seen.get("floats") and seen.get("tilt_deg", 0.0) > TIPPED_DEG:

@@ -515,6 +515,40 @@ def test_the_first_rule_that_fits_a_joint_drives_it(tmp_path):
     assert drive_of(robot, "f")[1:] == (0, 0)
 
 
+CRANE = """<link name="a">{{BODY}}</link>
+<link name="b"><inertial><origin xyz="0.5 0 0"/><mass value="{mass}"/>
+  <inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="c"><inertial><origin xyz="0 0 0.1"/><mass value="3"/>
+  <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="lift" type="prismatic"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+  <limit lower="0" upper="1" effort="0" velocity="1"/></joint>
+<joint name="elbow" type="revolute"><parent link="b"/><child link="c"/><origin xyz="1 0 0" rpy="0 0 1"/>
+  <axis xyz="0 2 0"/><limit lower="-1" upper="1" effort="40" velocity="1"/></joint>{extra}"""
+
+
+@pytest.mark.parametrize("mass", [2, 200])
+def test_a_joint_with_limits_holds_what_it_carries_at_10_hz(tmp_path, mass):
+    """Torsos sank and arms fell: 100 N/m held the lift of HSR, 100 N m/rad the shoulder of Baxter and UR5e."""
+    path = urdf(tmp_path, CRANE.format(mass=mass, extra=""), "crane")
+    _stage, robot, _ = convert(path)
+    square = (2 * np.pi * 10) ** 2
+    drive, stiffness, damping = drive_of(robot, "lift", "linear")
+    assert_allclose([stiffness, damping], [square * (mass + 3), square * (mass + 3) / 10], rtol=5e-3)
+    assert_allclose(drive.GetMaxForceAttr().Get(), 2 * 9.80665 * (mass + 3), rtol=5e-3)  # the URDF gives 0
+    drive, stiffness, _ = drive_of(robot, "elbow")
+    assert_allclose(stiffness, square * (0.1 + 3 * 0.1**2), rtol=5e-3)
+    assert drive.GetMaxForceAttr().Get() == 40
+
+
+def test_a_joint_with_limits_is_held_although_it_is_commanded_by_effort(tmp_path):
+    """The arms of Panda and PR2 fell: their transmissions are for effort, with controllers above them."""
+    tags = """<transmission name="t"><joint name="elbow"><hardwareInterface>
+    hardware_interface/EffortJointInterface</hardwareInterface></joint></transmission>"""
+    path = urdf(tmp_path, CRANE.format(mass=2, extra=tags), "crane")
+    _stage, robot, _ = convert(path)
+    assert drive_of(robot, "elbow")[1] > 100
+
+
 def test_a_rule_drives_each_free_axis_of_a_planar_joint(tmp_path):
     path = arm(tmp_path, 'planar|<axis xyz="0 0 1"/>')
     _stage, robot, _ = convert(path)

@@ -29,10 +29,17 @@ within one step: MuJoCo's implicit integrator then corrects the wheel but not th
 of 5 kg."""
 
 POSITION_STIFFNESS = 100.0
-"""Default gain of a limited joint's position drive [N m/rad, N/m]; the damping is a tenth of it."""
+"""Least default gain of a limited joint's position drive [N m/rad, N/m]; the damping is a tenth of it."""
+
+POSITION_HZ = 10.0
+"""Natural frequency of the drive with what it carries, above that gain: an arm of length L then sags by about
+g / (2 pi f)^2 = 2.5 mm, whatever its mass."""
 
 DEFAULT_EFFORT = 10.0
-"""Default maximum effort of a drive [N m, N]."""
+"""Least default for the maximum effort of a drive [N m, N]."""
+
+RESERVE = 2.0
+"""Default maximum effort of a position drive, relative to the weight that it carries."""
 
 
 Wheels = Mapping[str, tuple[float, float]]
@@ -94,7 +101,9 @@ def define_drive(
         return
     damping, force = wheels.get(joint.name, (WHEEL_DAMPING, DEFAULT_EFFORT))
     if rule is None and joint.type != "continuous" and joint.name not in wheels:
-        gain = POSITION_STIFFNESS
+        load = mechanism.loads[joint.name]
+        gain = max(POSITION_STIFFNESS, float(f"{(2 * np.pi * POSITION_HZ) ** 2 * load.inertia:.3g}"))
+        force = max(DEFAULT_EFFORT, float(f"{RESERVE * load.weight:.3g}"))
         rule = DriveRule(joints=joint.name, type="position", stiffness=gain, damping=gain / 10)
     elif rule is None and options.profile == "diff-drive" and joint.name not in wheels:
         rule = DriveRule(joints=joint.name, type="none")
