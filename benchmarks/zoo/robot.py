@@ -181,7 +181,7 @@ def drives_job(asset: Path, report) -> dict:
     from magtwin.usd.geometry import read_triangles
 
     stage = Usd.Stage.Open(str(asset))
-    guides = read_triangles(stage, purposes=(UsdGeom.Tokens.guide,))
+    guides = read_triangles(stage, purposes=(UsdGeom.Tokens.guide,), wanted=lambda *_: True)
     enabled = [
         corners
         for path, corners in guides.items()

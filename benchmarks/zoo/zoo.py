@@ -1,6 +1,6 @@
 """The robot zoo: convert public robot descriptions, validate them, compare them, and try them in an engine.
 
-    python benchmarks/zoo/zoo.py [--from DIR] [--only NAME ...] [--jobs N] [--engine newton physx] [--fresh]
+    python benchmarks/zoo/zoo.py [--from DIR] [--only NAME ...] [--jobs N] [--engine newton physx] [--docs]
 
 `robots.toml` lists the descriptions. Each repository is fetched at its commit into build/zoo, or lies in DIR
 as OWNER+NAME. A robot is a process with limits on time and memory. Its row is kept in build/zoo/rows, and a
@@ -28,10 +28,11 @@ from serving import Server
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 LIST = HERE / "robots.toml"
-BUILD = ROOT / "build" / "zoo"
 DOCS = ROOT / "docs" / "zoo.md"
 FORGE = "https://github.com"
 """Host of the repositories."""
+
+BUILD = ROOT / "build" / "zoo"
 
 LIMIT_S, ENGINE_LIMIT_S = 900.0, 600.0
 """Time limits of a robot, and of its trial in an engine [s]."""
@@ -40,9 +41,9 @@ FIXED = ("arm", "hand")
 """Kinds that are fixed to the world."""
 
 
-def checkout(source: str, commit: str, folder: Path | None) -> Path:
+def checkout(source: str, commit: str, folder: Path | None, build: Path) -> Path:
     """Folder of a repository at a commit; fetched if no folder of checkouts is given."""
-    place = (folder or BUILD / "checkouts") / source.replace("/", "+")
+    place = (folder or build / "checkouts") / source.replace("/", "+")
     mark = place / ".commit"
     at = mark.read_text().strip() if mark.is_file() else ""
     if at == commit:
@@ -61,14 +62,14 @@ def checkout(source: str, commit: str, folder: Path | None) -> Path:
     return place
 
 
-def job_of(robot: dict, commits: dict, folder: Path | None, engines: list) -> dict:
+def job_of(robot: dict, commits: dict, folder: Path | None, engines: list, build: Path) -> dict:
     """The job of a robot for `robot.py`."""
 
     def inside(place: str) -> str:
         source, _, path = place.partition(":")
-        return str(checkout(source, commits[source], folder) / path)
+        return str(checkout(source, commits[source], folder, build) / path)
 
-    work = BUILD / "robots" / robot["name"]
+    work = build / "robots" / robot["name"]
     stem = Path(robot["path"]).name.split(".")[0]
     return {
         "urdf": inside(f"{robot['source']}:{robot['path']}"),
@@ -82,10 +83,10 @@ def job_of(robot: dict, commits: dict, folder: Path | None, engines: list) -> di
     }
 
 
-def run(robot: dict, commits: dict, folder: Path | None, servers: dict, fresh: bool) -> dict:
+def run(robot: dict, commits: dict, folder: Path | None, servers: dict, fresh: bool, build: Path) -> dict:
     """The row of a robot, kept or made."""
     engines = [name for name in servers if name != "robot"]
-    kept = BUILD / "rows" / f"{robot['name']}.json"
+    kept = build / "rows" / f"{robot['name']}.json"
     key = hashlib.sha256(json.dumps([robot, commits[robot["source"]], sorted(engines)]).encode()).hexdigest()
     if kept.is_file() and not fresh:
         row = json.loads(kept.read_text())
@@ -93,7 +94,7 @@ def run(robot: dict, commits: dict, folder: Path | None, servers: dict, fresh: b
             return row
     row = {"key": key, **robot, "commit": commits[robot["source"]]}
     try:
-        job = job_of(robot, commits, folder, engines)
+        job = job_of(robot, commits, folder, engines, build)
         work = Path(job["answer"]).parent
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir(parents=True)
@@ -123,14 +124,17 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", default=[], help="names of robots")
     parser.add_argument("--jobs", type=int, default=1, help="robots at a time")
     parser.add_argument("--engine", nargs="*", choices=("newton", "physx"), default=["newton"])
+    parser.add_argument("--list", type=Path, default=LIST, help="descriptions (.toml)")
+    parser.add_argument("--build", type=Path, default=BUILD, help="folder of checkouts, assets and rows")
     parser.add_argument("--fresh", action="store_true", help="do rows again that are kept")
     parser.add_argument("--docs", action="store_true", help="write the table into docs/zoo.md")
     given = parser.parse_args()
-    listed = tomllib.loads(LIST.read_text())
+    build = given.build.resolve()
+    listed = tomllib.loads(given.list.read_text())
     robots = [r for r in listed["robot"] if not given.only or r["name"] in given.only]
     unknown = set(given.only) - {r["name"] for r in robots}
     if unknown:
-        parser.error(f"no robot called {', '.join(sorted(unknown))} in {LIST.name}")
+        parser.error(f"no robot called {', '.join(sorted(unknown))} in {given.list.name}")
     pythons = {"newton": sys.executable, "physx": os.environ.get("MAGTWIN_PHYSX", sys.executable)}
     idle: Queue = Queue()
     for _ in range(given.jobs):
@@ -140,7 +144,7 @@ def main() -> int:
     def row_of(robot: dict) -> dict:
         servers = idle.get()
         try:
-            return run(robot, listed["commits"], given.folder, servers, given.fresh)
+            return run(robot, listed["commits"], given.folder, servers, given.fresh, build)
         finally:
             idle.put(servers)
 
@@ -155,7 +159,7 @@ def main() -> int:
     while not idle.empty():
         for server in idle.get().values():
             server.close()
-    (BUILD / "zoo.json").write_text(json.dumps(rows, indent=1))
+    (build / "zoo.json").write_text(json.dumps(rows, indent=1))
     print(table.summary(rows))
     if given.docs:
         text = DOCS.read_text()

@@ -46,7 +46,7 @@ def read_commands(tags: Tags, mechanism: Mechanism) -> tuple[DriveRule, ...]:
 
     A velocity or position interface becomes a drive with the default gains; effort leaves a continuous joint
     free. A joint with limits keeps its default drive, which holds a position, unless it is commanded by
-    velocity: an arm that nothing holds would fall. Joints that cannot move or that follow another get no rule.
+    velocity: an arm that nothing holds would fall. Joints that cannot move or follow another get no rule.
 
     Raises:
         InputError: A joint is unknown; the message gives the line.

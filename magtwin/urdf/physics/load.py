@@ -21,7 +21,7 @@ class Load:
     """Moment of inertia about the axis [kg m2]; of a joint that slides, the mass [kg]."""
 
     weight: float
-    """Largest torque of gravity about the axis, in any attitude [N m]; of a joint that slides, the force [N]."""
+    """Largest torque of gravity about the axis, in any attitude [N m]; if the joint slides, the force [N]."""
 
 
 def read_loads(description: Description, poses: Mapping[str, NDArray]) -> dict[str, Load]:
