@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
 
@@ -44,8 +45,8 @@ from magtwin.urdf.sensor import define_sensors
 from magtwin.urdf.shape import COLLISIONS, VISUALS, define_collider, define_no_contact, define_visual, pose_of
 from magtwin.urdf.simready import check_metadata, metadata
 from magtwin.urdf.source.source import read_source
+from magtwin.usd.attributes import read_pose, write_pose
 from magtwin.usd.layers import describe_stage, open_stage
-from magtwin.usd.sensors import write_pose
 
 JOINTS = "joints"
 """Scope of the joints below the robot's prim."""
@@ -197,7 +198,7 @@ class _Author:
             self.ledger,
             name=self.out.name,
             sha256=checksum,
-            poses=read_mechanism(description, options).poses(),
+            poses=self._poses(stage),
             lint=lint(description, mass=options.mass, vertices=self.meshes.vertices),
         )
         description.repairs.check(report.source, strict=options.strict)
@@ -208,6 +209,17 @@ class _Author:
             "magtwin": {"source": description.path.name, "sourceSha256": checksum, "notes": notes},
         }
         return stage, report
+
+    def _poses(self, stage: Usd.Stage) -> dict[str, NDArray]:
+        """T_root_link of each link as authored, (4, 4); `finish` may have raised the whole robot."""
+        poses = read_mechanism(self.description, self.options).poses()
+        first = next((n for n, (became, _) in self.ledger.bodies.items() if became == "body"), None)
+        if first is not None:
+            place, _ = read_pose(stage.GetPrimAtPath(self.ledger.bodies[first][1]))
+            shift = np.eye(4)
+            shift[:3, 3] = place - poses[first][:3, 3]
+            poses = {name: shift @ pose for name, pose in poses.items()}
+        return poses
 
     def _robot(self, stage: Usd.Stage, layer: str) -> Usd.Prim:
         """The robot's prim with everything below it."""

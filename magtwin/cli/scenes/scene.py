@@ -81,7 +81,8 @@ def scene(
     arg
         NAME=VALUE: argument of the xacro. May be repeated.
     skip_missing_includes
-        Skip files and packages that the xacro includes but that are missing, if none of their macros is called.
+        Skip files and packages that a xacro includes but that are missing, if none of their macros is
+        called.
     map
         Map layer that replaces the one of the TOML. Earth, sources and furniture stay. A map that contradicts
         them is refused, and the difference is given in nT.

@@ -139,6 +139,7 @@ class _Settings:
             wheels=tuple(wheels),
             steered=tuple(steered),
             figures={name: figure for name, figure in figures.items() if figure is not None},
+            separation_multiplier=self._multiplier() if kind in ("differential", "skid-steer") else 1.0,
             wheelbase_m=None if wheelbase is None else wheelbase * self._multiplier("_h"),
         )
 

@@ -73,6 +73,9 @@ class MobileBase:
     figures: Mapping[str, float] = field(default_factory=dict)
     """Fields of the DriveSpec that are given."""
 
+    separation_multiplier: float = 1.0
+    """Effective over measured wheel separation, if the separation is not given."""
+
     wheelbase_m: float | None = None
     """Distance between the axles [m]; None: that of the joints."""
 
@@ -100,7 +103,7 @@ def drive_spec(base: MobileBase, mechanism: Mechanism, radius_of: Callable[[str]
     def guess(name: str, value: float | None, how: str) -> None:
         if name not in given and value is not None and 0 < value < np.inf:
             given[name] = float(value)
-            description.note(f"drive: no {NAMES[name]} given: {value:.5g} {UNITS[name]}, {how}")
+            description.note(f"drive: {NAMES[name]} {value:.5g} {UNITS[name]}, {how}")
 
     gap = abs(places[left[0]][1] - places[right[0]][1])
     if base.kind == "mecanum" and "wheel_separation_m" not in given:
@@ -108,11 +111,13 @@ def drive_spec(base: MobileBase, mechanism: Mechanism, radius_of: Callable[[str]
         guess(
             "wheel_separation_m",
             gap + max(along) - min(along),
-            "the sum of both distances between wheel joints",
+            "not given: the sum of both distances between wheel joints",
         )
-    guess("wheel_separation_m", gap, "the distance between the wheel joints")
+    times = base.separation_multiplier
+    scaled = "" if times == 1 else f", times the multiplier {times:g}"
+    guess("wheel_separation_m", times * gap, f"not given: the distance between the wheel joints{scaled}")
     radii = [radius for name in (left[0], right[0]) if (radius := radius_of(name)) > 0]
-    guess("wheel_radius_m", sum(radii) / len(radii) if radii else None, "from the wheels' shape")
+    guess("wheel_radius_m", sum(radii) / len(radii) if radii else None, "not given: from the wheels' shape")
     limit = joints[left[0]].limit
     rate = None if limit is None or not limit.velocity else float(limit.velocity)
     radius = given.get("wheel_radius_m", DriveSpec.wheel_radius_m)
