@@ -51,6 +51,7 @@ FAULTS: Mapping[str, tuple[str, str]] = {
     "shape-empty": ("shape of size 0", "left out"),
     "material-twice": ("material defined twice", "the first definition is used"),
     "name-twice": ("link or joint name used twice", "the second is renamed, or left out if it is equal"),
+    "name-unknown": ("tag about a joint that is missing", "left out"),
     "name-missing": ("robot without a name", "the name of its file"),
     "mesh-missing": ("missing mesh", "a box of the link's size as a placeholder"),
     "mesh-unreadable": ("mesh that cannot be read", "a box of the link's size as a placeholder"),

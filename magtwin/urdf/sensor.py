@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdRender, Vt
 
-from magtwin.errors import InputError, hint
+from magtwin.errors import InputError, near
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.spec.base import ZERO3
 from magtwin.spec.sensors import ImuSpec, LidarSpec, MagnetometerSpec
@@ -106,7 +106,8 @@ def define_sensors(tags: Tags, robot: Usd.Prim, prim_of: Callable[[str], Usd.Pri
             name, kind = sensor.get("name") or "sensor", (sensor.get("type") or "").lower()
             start = f"sensor {name!r} of link {link!r}"
             if link not in description.links:
-                description.note(f"{start}: {hint(link, description.links)}; kept as text", lost=True)
+                text = f"{start}, which is no link{near(link, description.links)}: kept as text"
+                description.repair("name-unknown", text, sensor)
                 continue
             if kind not in KINDS:
                 description.note(f"{start} is of type {kind!r}, which has no counterpart: kept as text")

@@ -175,7 +175,7 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
             for kind in (shape.geometry.kind for shape in shapes if shape.geometry.empty):
                 text = f"link {link.name!r}: a {role} {kind} of size 0 is left out"
                 description.repair("shape-empty", text, ("link", link.name))
-    joints = [read_joint(e) for e in clean if e.tag == "joint"]
+    joints = _leading(description, links, [read_joint(e) for e in clean if e.tag == "joint"])
     materials = _materials(description, [e for e in clean if e.tag == "material"])
     held = {joint.child: joint for joint in joints}
     description = replace(
@@ -232,6 +232,18 @@ def _materials(description: Description, elements: Sequence[Element]) -> dict[st
 def _look(material: Material) -> tuple[object, ...]:
     """What a material looks like."""
     return material.texture, None if material.rgba is None else tuple(material.rgba)
+
+
+def _leading(description: Description, links: Sequence[Link], joints: Sequence[Joint]) -> list[Joint]:
+    """The joints without those that lead to no link, if all links are connected without them."""
+    names, children = {link.name for link in links}, {joint.child for joint in joints}
+    if len(names - children) != 1:
+        return list(joints)  # a misspelt child leaves a link behind: see `_check_joints`
+    for joint in joints:
+        if joint.child not in names:
+            text = f"joint {joint.name!r} leads to no link {joint.child!r}: left out"
+            description.repair("name-unknown", text, ("joint", joint.name))
+    return [joint for joint in joints if joint.child in names]
 
 
 def _check_joints(description: Description, joints: Sequence[Joint]) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from xml.etree import ElementTree
 
-from magtwin.errors import InputError, hint
+from magtwin.errors import InputError, hint, near
 from magtwin.urdf.repairs import NOTE
 
 Element = ElementTree.Element
@@ -193,9 +193,7 @@ class _Checker:
                 return False  # misplaced, see `_rehouse`
             if parent.tag == "geometry":
                 raise _ShapeError(f"a geometry {child.tag!r} ({hint(child.tag, SHAPES)})")
-            near = hint(child.tag, known) if known else ""
-            advice = f"; {near}" if near.startswith("did") else ""
-            text = f"<{child.tag}> is unknown in <{parent.tag}> and left out{advice}"
+            text = f"<{child.tag}> is unknown in <{parent.tag}>{near(child.tag, known)} and left out"
             self.repair("tag-unknown", text, child)
             return False
         first = clean.find(child.tag)

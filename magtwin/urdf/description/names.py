@@ -4,6 +4,7 @@ from collections.abc import Callable
 from xml.etree import ElementTree
 
 from magtwin.errors import InputError
+from magtwin.urdf.source.markup import plain_text
 from magtwin.urdf.source.source import Source
 
 Element = ElementTree.Element
@@ -53,7 +54,7 @@ def _renamed(
     file, line = source.places[first]
     at = f"line {line}" if file == source.places[element][0] else f"{file.name}:{line}"
     start = f"{kind} {name!r} exists twice, first on {at}"
-    if _plain(element) == _plain(first):
+    if plain_text(element) == plain_text(first):
         xml.remove(element)
         repair("name-twice", f"{start}: the second is equal and left out", element)
         return None
@@ -67,9 +68,3 @@ def _renamed(
     element.set("name", free)
     repair("name-twice", f"{start}: the second is called {free!r}", element)
     return element
-
-
-def _plain(element: Element) -> str:
-    """An element as text without the blanks between its tags."""
-    text = ElementTree.tostring(element, encoding="unicode").strip()
-    return ElementTree.canonicalize(text, strip_text=True)

@@ -10,6 +10,7 @@ from pxr import Usd, Vt
 
 from magtwin.urdf.description.description import Description
 from magtwin.urdf.description.grammar import CHILDREN
+from magtwin.urdf.source.markup import plain_text
 
 Element = ElementTree.Element
 
@@ -129,7 +130,9 @@ class Tags:
             for way, left in self._unread(element):
                 counts["/".join((*(e.tag for e in way), left.tag))] += 1
                 inside = "/".join(_label(e) for e in way)
-                texts.setdefault(name, []).append(f"{inside}: {_plain(left)}" if inside else _plain(left))
+                texts.setdefault(name, []).append(
+                    f"{inside}: {plain_text(left)}" if inside else plain_text(left)
+                )
         for name, kept in texts.items():
             prim = prim_of(name)
             there = prim.GetCustomDataByKey(KEPT) or ()
@@ -165,9 +168,3 @@ def _label(element: Element) -> str:
     """Tag of an element, with its name if it has one."""
     name = element.get("name")
     return f"{element.tag}({name})" if name else element.tag
-
-
-def _plain(element: Element) -> str:
-    """An element as text on one line, with sorted attributes."""
-    text = ElementTree.canonicalize(ElementTree.tostring(element, encoding="unicode"), strip_text=True)
-    return " ".join(text.split())

@@ -46,10 +46,8 @@ def read_commands(tags: Tags, mechanism: Mechanism) -> tuple[DriveRule, ...]:
 
     A velocity or position interface becomes a drive with the default gains; effort leaves a continuous joint
     free. A joint with limits keeps its default drive, which holds a position, unless it is commanded by
-    velocity: an arm that nothing holds would fall. Joints that cannot move or follow another get no rule.
-
-    Raises:
-        InputError: A joint is unknown; the message gives the line.
+    velocity: an arm that nothing holds would fall. Joints that cannot move or follow another get no rule. Interfaces of
+    unknown joints are left out.
     """
     rules: dict[str, DriveRule] = {}
     joints = mechanism.description.joints.values()
@@ -95,7 +93,11 @@ def _commands(tags: Tags) -> Iterator[tuple[str, str]]:
                     text = [
                         kind for kind in COMMANDS if kind in tags.text(joint, "hardwareInterface").lower()
                     ]
-                name = known_joint(tags, joint.get("name", ""), joint)
+                name = joint.get("name", "")
+                if all(name != known.name for known in tags.description.joints.values()):
+                    fault = f"<{tag}> names no joint {name!r}: its interfaces are left out"
+                    tags.description.repair("name-unknown", fault, joint)
+                    continue
                 kind = next((kind for kind in COMMANDS if kind in text), None)
                 if kind is not None:
                     yield name, COMMANDS[kind]

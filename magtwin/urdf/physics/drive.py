@@ -96,8 +96,10 @@ def define_drive(
     """
     rule = next((r for r in options.drives if fnmatchcase(joint.name, r.joints)), None)
     if joint.name in mechanism.mimics or (joint.type not in SINGLE and rule is None):
+        effort = None if joint.limit is None else joint.limit.effort
+        force = float(effort) if effort and 0 < effort < np.inf else DEFAULT_EFFORT
         for axis in axes:  # Isaac Sim's rules want a drive on every joint that moves
-            _define_gains(prim, axis, None, 0.0, 0.0)
+            _define_gains(prim, axis, force, 0.0, 0.0)
         return
     damping, force = wheels.get(joint.name, (WHEEL_DAMPING, DEFAULT_EFFORT))
     if rule is None and joint.type != "continuous" and joint.name not in wheels:
@@ -121,13 +123,12 @@ def define_drive(
 
 
 def _define_gains(
-    prim: Usd.Prim, axis: str, force: float | None, stiffness: float, damping: float
+    prim: Usd.Prim, axis: str, force: float, stiffness: float, damping: float
 ) -> UsdPhysics.DriveAPI:
     """A drive of a joint's axis with gains in the units of UsdPhysics; with gains of 0 it exerts nothing."""
     made = UsdPhysics.DriveAPI.Apply(prim, axis)
     made.CreateTypeAttr(UsdPhysics.Tokens.force)
-    if force is not None:
-        made.CreateMaxForceAttr(force)
+    made.CreateMaxForceAttr(force)
     made.CreateStiffnessAttr(round(stiffness, 9))
     made.CreateDampingAttr(round(damping, 9))
     return made

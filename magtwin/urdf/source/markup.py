@@ -1,5 +1,6 @@
 """Markup: XML with the line of each element, without external references or entities."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -84,6 +85,14 @@ def parse_markup(text: bytes, path: Path) -> Markup:
             raise
         raise InputError(f"{path}:1: not XML: {error}; save the file as UTF-8") from error
     return Markup(builder.close(), lines)
+
+
+def plain_text(element: ElementTree.Element) -> str:
+    """An element as text on one line, with sorted attributes."""
+    text = ElementTree.tostring(element, encoding="unicode").strip()
+    with suppress(ElementTree.ParseError):  # a prefix without a namespace
+        text = ElementTree.canonicalize(text, strip_text=True)
+    return " ".join(text.split())
 
 
 def _undecodable(text: bytes, line: int) -> str:

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from magtwin.errors import InputError, hint
+from magtwin.errors import InputError, hint, near
 from magtwin.urdf.source.markup import read_markup
 
 MANIFEST = "package.xml"
@@ -20,11 +20,21 @@ MARKS = (
 """Contents, any of which marks a folder without a manifest as a package."""
 
 
+SUBFOLDERS = ("robot", "robots", "urdf", "xacro")
+"""Usual names of a folder with descriptions, inside the folder of a robot."""
+
+BESIDE = ("materials", "mesh", "meshes", "textures", *SUBFOLDERS)
+"""Folders beside such a folder that a description without a package may read."""
+
+
 class MissingFileError(InputError):
     """A file or package named in a description is missing; the caller may be able to continue without it."""
 
     supply = ""
     """Option of the command line that would supply it, such as `--package arm=FOLDER`."""
+
+    near = ""
+    """The nearest known name, as an addition to a text."""
 
 
 class Packages:
@@ -47,6 +57,8 @@ class Packages:
         self._given = {name: Path(folder).resolve() for name, folder in given.items()}
         self._folder = file.resolve().parent
         self._above = [p for p in (self._folder, *self._folder.parents) if (p / MANIFEST).is_file()]
+        beside = self._folder.parent if not self._above and self._folder.name in SUBFOLDERS else None
+        self._beside = [beside / name for name in BESIDE] if beside else []
         self._found: dict[str, list[Path]] | None = None
         self._installed: dict[str, Path] = {}
         self._complete = True
@@ -90,14 +102,17 @@ class Packages:
         error = MissingFileError(
             f"no package {name!r} around it{stopped}; give --package {name}=FOLDER{advice}"
         )
-        error.supply = f"--package {name}=FOLDER"
+        error.supply, error.near = f"--package {name}=FOLDER", near(name, known)
         raise error
 
     def holds(self, path: Path) -> bool:
-        """Whether a file lies in the home folder, in a given package or in a package that was found."""
-        path = path.resolve()
-        installed = (folder.resolve() for folder in self._installed.values())
-        if any(path.is_relative_to(folder) for folder in (self.home, *self._given.values(), *installed)):
+        """Whether a file lies in the home folder, beside it (see BESIDE), or in a package.
+
+        Packages are those given, those around the file, and those of ROS that `find` found.
+        """
+        path, installed = path.resolve(), self._installed.values()
+        allowed = (self.home, *self._given.values(), *self._beside, *installed)
+        if any(path.is_relative_to(folder) for folder in allowed):
             return True
         return any(path.is_relative_to(p) for folders in self._search().values() for p in folders)
 

@@ -61,9 +61,10 @@ class Source:
             element: Element with the name, for error messages.
 
         Raises:
-            MissingFileError: The file or its package does not exist; the message suggests a near name.
+            MissingFileError: The file or its package does not exist; the message suggests a near name. Or
+                its scheme is unknown, such as https: nothing is downloaded.
             UnsafeError: The description may not read the file.
-            InputError: Its scheme is unknown, or it cannot be looked for.
+            InputError: It cannot be looked for.
         """
         start = f"{self.where(element)}: {what} {filename!r}"
         try:
@@ -76,7 +77,7 @@ class Source:
         """The file of `find_file`; `start` begins its error messages."""
         scheme, separator, rest = filename.partition("://")
         if separator and scheme not in ("package", "model", "file"):
-            raise InputError(f"{start} has scheme {scheme!r}; known: file, model, package")
+            raise MissingFileError(f"{start} has scheme {scheme!r}; known: file, model, package")
         if separator and scheme != "file":
             name, _, rest = rest.partition("/")
             try:

@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import Any
 from xml.dom import minidom
 from xml.etree import ElementTree
+from xml.parsers.expat import ExpatError
 
 from magtwin.errors import InputError, hint
 from magtwin.urdf.repairs import NOTE, Repairs
@@ -87,6 +88,7 @@ class _Expansion:
         self._repairs, self._skip = repairs, skip
         self._absent: dict[str, str] = {}  # what the expansion cannot do without, and where
         self._skipped: dict[str, str] = {}  # includes, and where
+        self._near: dict[str, str] = {}  # near names of missing packages
         self._optional = self._including = False
         self._asked: set[str] = set()
         self._budget = Budget(UNITS)
@@ -118,9 +120,14 @@ class _Expansion:
             document = self._expanded()
         except UnsafeError:
             raise
-        except InputError:
+        except InputError as error:
             self._check_absent()  # what is missing may be the cause
-            raise
+            if not self._skipped:
+                raise
+            supplied = " ".join(self._repairs.supplies) or "the files in their place"
+            raise InputError(
+                f"{error}; this may come from a skipped include: {', '.join(self._skipped)}; give {supplied}"
+            ) from error
         self._check_absent()
         for include, place in self._skipped.items():
             file, _, line = place.rpartition(":")
@@ -160,7 +167,9 @@ class _Expansion:
         """
         absent = dict(self._absent)
         if absent or not self._skip:
-            absent = {f"include {name!r}": place for name, place in self._skipped.items()} | absent
+            near = {name: self._near.get("/".join(name.split("/")[:3]), "") for name in self._skipped}
+            includes = {f"include {name!r}{near[name]}": place for name, place in self._skipped.items()}
+            absent = includes | absent
         if not absent:
             return
         faults = ", ".join(f"{what} ({place})" for what, place in absent.items())
@@ -265,6 +274,7 @@ class _Expansion:
             return str(self._packages.find(name))
         except MissingFileError as error:
             self._repairs.supplies[error.supply] = None
+            self._near[f"package://{name}"] = error.near
             if not self._including:
                 file, _, line = self._place().rpartition(":")
                 text = f"$(find {name}): no such package: files in it count as missing"
@@ -334,7 +344,13 @@ class _Expansion:
                 f"include {str(path)!r} cannot be read: {error.strerror}", exc=error
             ) from error
         markup = parse_markup(content, path)
-        document = minidom.parseString(content)
+        try:
+            document = minidom.parseString(content)
+        except ExpatError as error:
+            reason = f"{error}".partition(":")[0]
+            raise InputError(
+                f"{path}:{error.lineno}: not XML: {reason}; declare xmlns:xacro in <robot>"
+            ) from error
         elements = document.getElementsByTagName("*")
         for element, line in zip(elements, markup.lines.values(), strict=True):
             element.setUserData(PLACE, (path, line), _KEEP)
