@@ -15,7 +15,7 @@ from magtwin.urdf.physics.controller import base_of_plugin_settings, base_of_set
 from magtwin.urdf.physics.drive import POSITION_STIFFNESS, WHEEL_DAMPING
 from magtwin.urdf.physics.mechanism import Mechanism
 from magtwin.urdf.physics.mobile_base import MobileBase
-from magtwin.urdf.physics.plugin import base_of_plugin, known_joint
+from magtwin.urdf.physics.plugin import base_of_plugin
 from magtwin.usd.sensors import JOINT_FIELDS, WHEELS_FIELDS, define_drive
 
 COMMANDS = {"velocity": "velocity", "position": "position", "effort": "none"}
@@ -46,8 +46,8 @@ def read_commands(tags: Tags, mechanism: Mechanism) -> tuple[DriveRule, ...]:
 
     A velocity or position interface becomes a drive with the default gains; effort leaves a continuous joint
     free. A joint with limits keeps its default drive, which holds a position, unless it is commanded by
-    velocity: an arm that nothing holds would fall. Joints that cannot move or follow another get no rule. Interfaces of
-    unknown joints are left out.
+    velocity: an arm that nothing holds would fall. Joints that cannot move or follow another get no rule.
+    Interfaces of unknown joints are left out.
     """
     rules: dict[str, DriveRule] = {}
     joints = mechanism.description.joints.values()
