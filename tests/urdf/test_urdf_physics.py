@@ -499,7 +499,7 @@ CRANE = """<link name="a">{{BODY}}</link>
 
 @pytest.mark.parametrize("mass", [2, 200])
 def test_a_joint_with_limits_holds_what_it_carries_at_10_hz(tmp_path, mass):
-    """Torsos sank and arms fell: 100 N/m held the lift of HSR, 100 N m/rad the shoulder of Baxter and UR5e."""
+    """Torsos sank and arms fell: 100 N/m held the lift of HSR, 100 N m/rad the shoulder of Baxter."""
     path = urdf(tmp_path, CRANE.format(mass=mass, extra=""), "crane")
     _stage, robot, _ = convert(path)
     square = (2 * np.pi * 10) ** 2
