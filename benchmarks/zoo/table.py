@@ -55,7 +55,7 @@ def trial_faults(seen: dict, row: dict) -> list[str]:
     if seen["creep_m"] > MOST_CREEP_M:
         texts.append(f"creeps {1e3 * seen['creep_m']:.0f} mm/s ({seen['creeps'].rpartition('/')[2]})")
     motion = seen.get("motion")
-    if motion and not MOTION[0] <= motion["share"] <= MOTION[1]:
+    if motion and not row.get("meshes_absent") and not MOTION[0] <= motion["share"] <= MOTION[1]:
         texts.append(f"{motion['what']}: {100 * motion['share']:.0f} % of the commanded motion")
     return texts
 
