@@ -13,8 +13,8 @@ from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import MagnetometerSpec
 from magtwin.twin.authoring import scene_from_toml
 
-ROOM_RADIUS_M, ROOM_TURN_M = 0.3, 1.1
-"""Footprint radius, and radius of the circle in which a robot can turn, for which the room has space [m]."""
+ROOM_RADIUS_M, ROOM_TURN_M = 0.3, 0.28
+"""Footprint radius and turning radius of robots for which the room has space [m]."""
 
 PATHS = ("figure8", "continuous_cycle", "narrow_figure8", "loops", "lawnmower")
 """Paths that such a scene may have as its default; the first that the robot can drive is taken."""
@@ -84,8 +84,8 @@ def scene_with_robot(
     scale = 1.0
     if spec is None:
         made = load_robot(asset)
-        turn = made.footprint_radius_m + made.drive.turning_radius_m
-        scale = max(1.0, made.footprint_radius_m / ROOM_RADIUS_M, turn / ROOM_TURN_M)
+        sizes = made.footprint_radius_m / ROOM_RADIUS_M, made.drive.turning_radius_m / ROOM_TURN_M
+        scale = max(1.0, *sizes)
         spec, name = shipped("scenes", "starter.toml"), name or stem
     return _with_path(
         scene_from_toml(spec, robot=asset, name=name, scale=scale, workshop=workshop, **choices)

@@ -289,11 +289,11 @@ class _Author:
             relationship = robot.CreateRelationship(f"isaac:physics:{name}", custom=False)
             for path in paths_listed:  # each is prepended, so that a stronger layer can add to the list
                 relationship.AddTarget(path)
-        self._equip(robot, tags, options, self._drive(base, mechanism, bodies))
+        self._equip(robot, tags, options, self._drive(base, mechanism, bodies, tags))
         return robot
 
     def _drive(
-        self, base: MobileBase | None, mechanism: Mechanism, bodies: dict[str, Usd.Prim]
+        self, base: MobileBase | None, mechanism: Mechanism, bodies: dict[str, Usd.Prim], tags: Tags
     ) -> DriveSpec | None:
         """The drive of the robot's base; None if it has none, or one whose wheels are not known."""
         if base is None:
@@ -305,6 +305,8 @@ class _Author:
             except InputError:
                 text = f"{base.source} moves the base, but no wheels are known: kept as text"
                 self.description.note(text, lost=True)
+                if base.element is not None:
+                    tags.forget(base.element)
                 return None
 
         def radius_of(name: str) -> float:

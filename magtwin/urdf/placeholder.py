@@ -66,6 +66,7 @@ def _kept(description: Description, meshes: MeshLayer, link: Link, role: str) ->
         about, start = description.mesh_element(file), f"link {link.name!r}: {role}"
         if meshes.options.missing_meshes == "note":
             description.note(f"{start} is left out: its {what}", lost=True)
+            yield shape  # the report lists it; no prim is made of it
             continue
         size, T = _box_of(link, meshes)
         box = Geometry("box", size)

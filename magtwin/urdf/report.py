@@ -188,14 +188,13 @@ class ConversionReport:
             Figure("guesses", len(guesses)),
             Figure("doubts about the description", len(self.lint)),
         ]
-        metadata = {
+        metadata: dict[str, str | list[str]] = {
             "source": self.source,
             "sha256": self.source_sha256,
             "to supply what is missing": self.supply,
-            "losses": list(self.losses),
-            "guesses": _first(guesses),
-            "doubts": _first(self.lint),
         }
+        lists = {"losses": _first(self.losses), "guesses": _first(guesses), "doubts": _first(self.lint)}
+        metadata |= {name: lines for name, lines in lists.items() if lines}
         return Report(f"{self.robot}: {self.source} -> {self.stage}", tuple(figures), metadata)
 
 

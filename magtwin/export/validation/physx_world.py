@@ -5,8 +5,8 @@
 In: a line of JSON, `{"stage", "base", "joints": [left, right, ...], "sides": [0, 1, ...], "start":
 [x, y, yaw] or null, "step_s"}`, where paths name prims and a side is 0 (left) or 1 (right); default: 0 and 1.
 Then a line per answer: a list with the rates of both sides [rad/s], a pair per physics step, or `[x, y, yaw]`
-to place the robot there at rest. Out: a line after the robot has settled and one after each line in: x, y, yaw,
-v, w, the angles of the first two wheels, height of the base [m], and z of its up axis.
+to place the robot there at rest. Out: a line after the robot has settled and one after each line in: x, y,
+yaw, v, w, the angles of the first two wheels, height of the base [m], and z of its up axis.
 
 PhysX reads attributes only of schemas that are registered first: those of the packages physx-usd-schemas and
 newton-usd-schemas.

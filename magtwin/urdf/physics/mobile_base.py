@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.spec.drive import DriveSpec
+from magtwin.urdf.description.tag import Element
 from magtwin.urdf.physics.mechanism import Mechanism
 
 Kind = Literal["differential", "skid-steer", "mecanum", "holonomic", "car"]
@@ -63,6 +64,9 @@ class MobileBase:
 
     source: str
     """What tells it, for notes."""
+
+    element: Element | None = field(default=None, compare=False, repr=False)
+    """Tag of the plugin, if it is one."""
 
     wheels: tuple[str, ...] = ()
     """Joints of the driven wheels; those of the fixed axle if it is a car. Empty: to be found."""

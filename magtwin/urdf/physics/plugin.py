@@ -125,6 +125,7 @@ def _base(tags: Tags, plugin: Element, kind: _Plugin) -> MobileBase:
     return MobileBase(
         kind="skid-steer" if kind.kind == "differential" and len(set(wheels)) > 2 else kind.kind,
         source=f"the plugin at {where.rpartition('/')[2]}",
+        element=plugin,
         wheels=tuple(dict.fromkeys(wheels)),
         steered=tuple(known_joint(tags, (e.text or "").strip(), e) for e in steered),
         figures={name: figure for name, figure in figures.items() if figure is not None},

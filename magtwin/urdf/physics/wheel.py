@@ -29,6 +29,9 @@ FULL_TURN = 6.3
 CASTER_NAMES = ("caster", "castor")
 """Words in the names of links that slide."""
 
+WHEEL_HEIGHT_M = 0.4
+"""Largest height of a wheel's axle above the lowest link of the robot [m]; fingers are higher."""
+
 FLOOR = 0.002
 """Height above the lowest point of the wheels within which other parts touch the floor [m]."""
 
@@ -36,9 +39,10 @@ FLOOR = 0.002
 def find_base(mechanism: Mechanism, told: MobileBase | None = None) -> MobileBase:
     """The mobile base of a description, by its joints where no plugin or controller tells it.
 
-    Wheels are the joints without limits about a horizontal axis, except casters: joints with such a name, or
-    below a joint that swivels. If several have "wheel" in their name or their link's, the others are none.
-    Wheels below a joint with limits about a vertical axis are steered; with others that are not, it is a car.
+    Wheels are the joints without limits about a horizontal axis, no higher than `WHEEL_HEIGHT_M` above the
+    lowest link, except casters: joints with such a name, or below a joint that swivels. If several have
+    "wheel" in their name or their link's, the others are none. Wheels below a joint with limits about a
+    vertical axis are steered; with others that are not, it is a car.
 
     Args:
         mechanism: Joints of the description.
@@ -54,10 +58,12 @@ def find_base(mechanism: Mechanism, told: MobileBase | None = None) -> MobileBas
         return replace(told, wheels=told_wheels)
     poses = mechanism.poses()
     up = {name: abs(_axis(joint, poses)[2]) for name, joint in joints.items() if joint.type in SINGLE}
+    lowest = min(float(T[2, 3]) for T in poses.values())
     wheels = [
         name
         for name, slope in up.items()
-        if _turns(joints[name])
+        if poses[joints[name].child][2, 3] < lowest + WHEEL_HEIGHT_M
+        and _turns(joints[name])
         and slope < 0.5  # within 30 degrees of the horizontal
         and not any(word in _words(joints[name]) for word in CASTER_NAMES)
         and not any(
@@ -79,7 +85,8 @@ def find_base(mechanism: Mechanism, told: MobileBase | None = None) -> MobileBas
     if len(wheels) < 2:
         raise InputError(
             f"{description.path}: profile diff-drive needs two wheels, continuous joints about a horizontal "
-            f"axis; found {', '.join(wheels) or 'none'}; convert with the profile general"
+            f"axis near the floor; found {', '.join(wheels) or 'none'}. A robot without them can be "
+            "converted with the profile general, but not driven"
         )
     if told is not None:
         return replace(told, wheels=tuple(wheels), steered=told.steered or steered)
