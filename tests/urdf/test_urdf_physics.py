@@ -486,6 +486,21 @@ def test_the_first_rule_that_fits_a_joint_drives_it(tmp_path):
     assert drive_of(robot, "f")[1:] == (0, 0)
 
 
+def test_moments_in_single_precision_are_those_of_a_body_too(tmp_path):
+    """Isaac Sim's RigidBodyHasMassAPI: I1 + I2 = I3, but not after rounding, as in a finger of Allegro."""
+    rng = np.random.default_rng(0)
+    for small, large in rng.uniform(1e-6, 1e-4, (20, 2)):
+        tensor = f'<inertia ixx="{small}" iyy="{large}" izz="{small + large}" ixy="0" ixz="0" iyz="0"/>'
+        path = tmp_path / "plate.urdf"
+        path.write_text(
+            f'<robot name="plate"><link name="a"><inertial><mass value="1"/>{tensor}</inertial></link></robot>'
+        )
+        _stage, robot, _ = convert(path)
+        moments = np.array(UsdPhysics.MassAPI(prim(robot, "a")).GetDiagonalInertiaAttr().Get(), np.float32)
+        assert moments[0] + moments[1] >= moments[2]
+        assert_allclose(moments, [small, large, small + large], rtol=1e-6)
+
+
 CRANE = """<link name="a">{{BODY}}</link>
 <link name="b"><inertial><origin xyz="0.5 0 0"/><mass value="{mass}"/>
   <inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
