@@ -141,8 +141,8 @@ def test_the_files_are_those_of_isaac_sims_structure(tmp_path):
 
 def test_long_arrays_of_a_sensor_are_in_a_binary_layer(tmp_path):
     """usd-validation-nvidia refuses them in text, as of the LiDARs of Neobotix' robots."""
-    fan = """<gazebo reference="hand"><sensor name="fan" type="ray"><ray><scan><horizontal><samples>90</samples>
-    <min_angle>-1</min_angle><max_angle>1</max_angle></horizontal></scan>
+    fan = """<gazebo reference="hand"><sensor name="fan" type="ray"><ray><scan><horizontal>
+    <samples>90</samples><min_angle>-1</min_angle><max_angle>1</max_angle></horizontal></scan>
     <range><min>0.1</min><max>9</max></range></ray></sensor></gazebo>"""
     one, two = both(arm(tmp_path, extra=fan), tmp_path)
     assert_equal(one, two)

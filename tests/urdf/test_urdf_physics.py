@@ -496,7 +496,7 @@ def test_moments_in_single_precision_are_those_of_a_body_too(tmp_path):
             f'<robot name="plate"><link name="a"><inertial><mass value="1"/>{tensor}</inertial></link></robot>'
         )
         _stage, robot, _ = convert(path)
-        moments = np.array(UsdPhysics.MassAPI(prim(robot, "a")).GetDiagonalInertiaAttr().Get(), np.float32)
+        moments = np.array(UsdPhysics.MassAPI(prim(robot, "a")).GetDiagonalInertiaAttr().Get(), float)
         assert moments[0] + moments[1] >= moments[2]
         assert_allclose(moments, [small, large, small + large], rtol=1e-6)
 

@@ -84,8 +84,8 @@ def _single(moments: NDArray) -> Gf.Vec3f:
     """Principal moments in single precision, where none may exceed the sum of the others either."""
     rounded = np.asarray(moments, np.float32)
     largest = int(np.argmax(rounded))
-    first, second = (rounded[i] for i in range(3) if i != largest)
-    while rounded[largest] > first + second:
+    others = sum(float(rounded[i]) for i in range(3) if i != largest)
+    while float(rounded[largest]) > others:
         rounded[largest] = np.nextafter(rounded[largest], np.float32(0))
     return Gf.Vec3f(*map(float, rounded))
 
