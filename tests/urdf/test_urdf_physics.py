@@ -492,9 +492,8 @@ def test_moments_in_single_precision_are_those_of_a_body_too(tmp_path):
     for small, large in rng.uniform(1e-6, 1e-4, (20, 2)):
         tensor = f'<inertia ixx="{small}" iyy="{large}" izz="{small + large}" ixy="0" ixz="0" iyz="0"/>'
         path = tmp_path / "plate.urdf"
-        path.write_text(
-            f'<robot name="plate"><link name="a"><inertial><mass value="1"/>{tensor}</inertial></link></robot>'
-        )
+        link = f'<link name="a"><inertial><mass value="1"/>{tensor}</inertial></link>'
+        path.write_text(f'<robot name="plate">{link}</robot>')
         _stage, robot, _ = convert(path)
         moments = np.array(UsdPhysics.MassAPI(prim(robot, "a")).GetDiagonalInertiaAttr().Get(), float)
         assert moments[0] + moments[1] >= moments[2]
