@@ -19,7 +19,7 @@ from magtwin.urdf.physics.plugin import base_of_plugin
 from magtwin.usd.sensors import JOINT_FIELDS, WHEELS_FIELDS, define_drive
 
 COMMANDS = {"velocity": "velocity", "position": "position", "effort": "none"}
-"""Type of drive by command interface; effort needs no drive, because the torque comes from outside."""
+"""Type of drive by command interface; effort on a continuous joint needs none: the torque is from outside."""
 
 
 def read_base(tags: Tags, controllers: Path | None = None) -> MobileBase | None:
@@ -44,12 +44,18 @@ def read_base(tags: Tags, controllers: Path | None = None) -> MobileBase | None:
 def read_commands(tags: Tags, mechanism: Mechanism) -> tuple[DriveRule, ...]:
     """Drive rules from `<ros2_control>` and `<transmission>`; the user's rules come before them.
 
-    A velocity or position interface becomes a drive with the default gains; effort leaves the joint free.
-    Joints that cannot move or that follow another get no rule. Interfaces of unknown joints are left out.
+    A velocity or position interface becomes a drive with the default gains; effort leaves a continuous joint
+    free. A joint with limits keeps its default drive, which holds a position, unless it is commanded by
+    velocity: an arm that nothing holds would fall. Joints that cannot move or follow another get no rule.
+    Interfaces of unknown joints are left out.
     """
     rules: dict[str, DriveRule] = {}
+    joints = mechanism.description.joints.values()
+    limited = {joint.name: joint.type in ("revolute", "prismatic") for joint in joints}
     for name, kind in _commands(tags):
         if name in rules or name in mechanism.welded or name in mechanism.mimics:
+            continue
+        if kind != "velocity" and limited.get(name, False):
             continue
         gains: dict[str, float] = {}
         if kind == "velocity":

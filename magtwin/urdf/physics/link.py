@@ -75,9 +75,19 @@ def define_body(
     tensor = whole.inertia.copy()
     tensor[np.abs(tensor) < 1e-9 * np.abs(tensor).max()] = 0.0
     moments, q = principal_axes(tensor)
-    mass.CreateDiagonalInertiaAttr(Gf.Vec3f(*map(float, moments)))
+    mass.CreateDiagonalInertiaAttr(_single(moments))
     mass.CreatePrincipalAxesAttr(Gf.Quatf(*(round(float(v), 7) + 0.0 for v in wxyz_from_xyzw(q))))
     return prim
+
+
+def _single(moments: NDArray) -> Gf.Vec3f:
+    """Principal moments in single precision, where none may exceed the sum of the others either."""
+    rounded = np.asarray(moments, np.float32)
+    largest = int(np.argmax(rounded))
+    others = sum(float(rounded[i]) for i in range(3) if i != largest)
+    while float(rounded[largest]) > others:
+        rounded[largest] = np.nextafter(rounded[largest], np.float32(0))
+    return Gf.Vec3f(*map(float, rounded))
 
 
 def _mass_properties(
