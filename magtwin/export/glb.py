@@ -17,7 +17,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 
 from magtwin.errors import InputError
 from magtwin.usd.geometry import Shape, read_shapes
-from magtwin.usd.layers import open_stage
+from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.schema import NOUNS, attribute_name, prims_with
 from magtwin.version import __version__
 
@@ -41,6 +41,7 @@ _COMPONENTS = {"f4": 5126, "u4": 5125, "u1": 5121}
 _VERTICES, _INDICES = 34962, 34963
 
 
+@translates
 def write_glb(stage_file: Path, out: Path) -> None:
     """Write the visible shapes of a stage.
 

@@ -42,7 +42,7 @@ from magtwin.urdf.sensor import define_sensors
 from magtwin.urdf.shape import COLLISIONS, VISUALS, define_collider, define_no_contact, define_visual, pose_of
 from magtwin.urdf.simready import check_metadata, metadata
 from magtwin.urdf.source.source import read_source
-from magtwin.usd.layers import describe_stage, open_stage
+from magtwin.usd.layers import describe_stage, open_stage, translates
 from magtwin.usd.sensors import write_pose
 
 JOINTS = "joints"
@@ -112,6 +112,7 @@ def convert_with_report(
     return report
 
 
+@translates
 def read_notes(asset: str | os.PathLike[str]) -> tuple[str, ...]:
     """Notes of a conversion on repairs, guesses and omissions, one line each.
 

@@ -20,7 +20,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.tiles import TILED_FROM, Tile, TiledMap, Tiling
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.usd.heat_map import MAP, UNIT, Floor, define_heat_map
-from magtwin.usd.layers import new_stage, open_stage
+from magtwin.usd.layers import new_stage, open_stage, translates
 from magtwin.usd.map_attributes import (
     CHECKSUM_VERSION,
     GRID,
@@ -119,6 +119,7 @@ def _refuse_tables(path: str | os.PathLike[str]) -> None:
         )
 
 
+@translates
 def load_map(path: str | os.PathLike[str], date: str | datetime.date | None = None) -> AnomalyMap:
     """The map of a layer, or of a stage that holds one.
 
@@ -138,6 +139,7 @@ def load_map(path: str | os.PathLike[str], date: str | datetime.date | None = No
     return read_map(only_prim_with(stage.GetPseudoRoot(), "anomalyMap"))
 
 
+@translates
 def load_epochs(path: str | os.PathLike[str]) -> tuple[AnomalyMap, ...]:
     """Every epoch of a layer's or stage's map, the earliest first.
 
@@ -162,6 +164,7 @@ def load_epochs(path: str | os.PathLike[str]) -> tuple[AnomalyMap, ...]:
     return epochs
 
 
+@translates
 def is_map_layer(path: str | os.PathLike[str]) -> bool:
     """Whether a USD file is a map: it holds an anomaly map and no robot.
 
@@ -174,6 +177,7 @@ def is_map_layer(path: str | os.PathLike[str]) -> bool:
     return len(prims_with(root, "anomalyMap")) == 1 and not prims_with(root, "robot")
 
 
+@translates
 def read_map(prim: Usd.Prim) -> AnomalyMap:
     """The map of a prim, its latest epoch; errors as for `load_map`."""
     return _read(prim, None)

@@ -21,7 +21,7 @@ from magtwin.usd.earth import AGREES_NT, read_earth
 from magtwin.usd.furniture import read_magnets
 from magtwin.usd.geometry import Link, Shape, read_links, read_shapes
 from magtwin.usd.lab import read_lab
-from magtwin.usd.layers import layer_sha256, open_stage, relative_asset, save_layer, stage_sha256
+from magtwin.usd.layers import layer_sha256, open_stage, relative_asset, save_layer, stage_sha256, translates
 from magtwin.usd.map_attributes import MADE_FROM
 from magtwin.usd.maps import read_map
 from magtwin.usd.obstacles import read_obstacles
@@ -109,6 +109,7 @@ class OpenedScene:
         return replace(self, stage=stage, scene=scene)
 
 
+@translates
 def open_scene(path: str | os.PathLike[str], *, lab: str = "", check_network: bool = True) -> OpenedScene:
     """Open the stage of a scene once: its Scene and map, and its obstacles and geometry when asked for.
 
@@ -188,6 +189,7 @@ def read_scene(path: str | os.PathLike[str], *, lab: str = "", check_network: bo
     return open_scene(path, lab=lab, check_network=check_network).scene
 
 
+@translates
 def robots_in(path: str | os.PathLike[str], *, lab: str = "") -> dict[str, str | Path]:
     """Default path of each robot of a lab, by the robot's name, in the stage's order.
 
@@ -198,6 +200,7 @@ def robots_in(path: str | os.PathLike[str], *, lab: str = "") -> dict[str, str |
     return {prim.GetName(): read_path(prim) for prim in _robot_prims(stage)}
 
 
+@translates
 def open_alone(path: str | os.PathLike[str], robot: str, *, lab: str = "") -> Usd.Stage:
     """A stage in the axes of a lab, on which other labs and all robots but one are inactive.
 

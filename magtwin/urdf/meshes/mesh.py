@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
+from magtwin.files import existing_file
 from magtwin.urdf.meshes.piece import Paint, Piece
 from magtwin.urdf.meshes.reading import Note, Reading
 from magtwin.usd.solids import corner_normals
@@ -75,7 +76,7 @@ def read_mesh(path: Path, may_read: Callable[[Path], bool] | None = None) -> Mes
     """
     folder = path.resolve().parent
     allowed = may_read or (lambda other: other.resolve().is_relative_to(folder))
-    reading = Reading(path, allowed)
+    reading = Reading(existing_file(path, "mesh file", "mesh"), allowed)
     try:
         pieces = _reader(path)(reading)
     except InputError:

@@ -1,6 +1,6 @@
 """Scan: STL and PLY, triangles without materials, read by trimesh."""
 
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +9,9 @@ from magtwin.errors import InputError
 from magtwin.urdf.meshes.piece import Piece
 from magtwin.urdf.meshes.reading import Reading
 from magtwin.usd.geometry import linear_from_srgb
+
+LONGEST_LINE = 4096
+"""Most characters of a line of a PLY's header."""
 
 
 def read_scan(reading: Reading) -> list[Piece]:
@@ -25,12 +28,31 @@ def read_scan(reading: Reading) -> list[Piece]:
         else:
             from trimesh.exchange.ply import load_ply
 
+            _check_counts(stream, reading)
             read = load_ply(stream)
     parts = read["geometry"].values() if "geometry" in read else [read]  # an ASCII STL may have several
     pieces = [_piece(part) for part in parts if part.get("faces") is not None and len(part["faces"])]
     if not pieces and reading.path.suffix.lower() == ".stl":
         raise InputError(f"{reading.path}: holds no triangle, or is cut short; export it again")
     return pieces
+
+
+def _check_counts(stream: BinaryIO, reading: Reading) -> None:
+    """Refuse a PLY whose header claims more elements than the file has bytes, before they are read."""
+    size = reading.path.stat().st_size
+    for line in iter(lambda: stream.readline(LONGEST_LINE), b""):
+        words = line.split()
+        if words[:1] == [b"element"]:
+            count = int(words[2])
+            if len(words) != 3 or not 0 <= count <= size:
+                raise InputError(
+                    f"{reading.path}: claims {count} of {words[1].decode()[:40]} in {size} bytes"
+                )
+        if words[:1] == [b"end_header"]:
+            break
+    else:
+        raise ValueError("its header has no end")
+    stream.seek(0)
 
 
 def _piece(part: dict[str, Any]) -> Piece:

@@ -18,6 +18,7 @@ from xml.dom import minidom
 from xml.etree import ElementTree
 
 from magtwin.errors import InputError, hint
+from magtwin.files import read_bytes
 from magtwin.urdf.source.expression import GLOBALS, LARGEST, Budget, ExpressionError, check_size, evaluate
 from magtwin.urdf.source.markup import parse_markup
 from magtwin.urdf.source.package import Packages
@@ -229,18 +230,20 @@ class _Expansion:
         """The DOM of a file; each element carries its file and line."""
         path = Path(os.path.normpath(filename))
         try:
-            content = path.read_bytes()
-        except OSError as error:
+            path.stat()
+            content = read_bytes(path, "xacro file", "XML")
+        except (OSError, InputError) as error:
             self._library.filestack.pop()
+            reason = getattr(error, "strerror", None) or error
             raise self._library.XacroException(
-                f"include {str(path)!r} cannot be read: {error.strerror}", exc=error
+                f"include {str(path)!r} cannot be read: {reason}", exc=error
             ) from error
         markup = parse_markup(content, path)
+        self._budget.spend(ELEMENT * len(markup.lines))
         document = minidom.parseString(content)
         elements = document.getElementsByTagName("*")
         for element, line in zip(elements, markup.lines.values(), strict=True):
             element.setUserData(PLACE, (path, line), _KEEP)
-        self._budget.spend(ELEMENT * len(elements))
         return document
 
     def _yaml(self, filename: str) -> Any:
@@ -262,7 +265,7 @@ class _Expansion:
         for tag, factor in UNIT_TAGS.items():
             UnitLoader.add_constructor(tag, number(factor))
         try:
-            content = path.read_bytes()
+            content = read_bytes(path, "YAML file", "YAML")
             self._budget.spend(len(content))
             return check_size(yaml.load(content, UnitLoader), self._budget)
         except OSError as error:
