@@ -443,7 +443,15 @@ def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
         if str(path) in str(error):
             raise
         raise InputError(f"{path}: {error}") from error
-    except (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
+    except (
+        ValueError,
+        OverflowError,
+        KeyError,
+        TypeError,
+        IndexError,
+        AttributeError,
+        RecursionError,
+    ) as error:
         raise InputError(
             f"{path}: not the manifest of a data set ({type(error).__name__}: {error}); build it anew"
         ) from error

@@ -155,7 +155,7 @@ class _Gltf:
             red, green, blue = (float(c) for c in srgb_from_linear((r, g, b)))
             alpha = material.get("alphaMode", "OPAQUE")
             self._paints[index] = Paint(
-                name=material.get("name", f"material_{index}"),
+                name=str(material.get("name", f"material_{index}")),
                 rgba=(red, green, blue, 1.0 if alpha == "OPAQUE" else float(a)),
                 image=image,
                 roughness=float(surface.get("roughnessFactor", 1.0)),

@@ -78,13 +78,12 @@ def read_mesh(path: Path, may_read: Callable[[Path], bool] | None = None) -> Mes
     allowed = may_read or (lambda other: other.resolve().is_relative_to(folder))
     reading = Reading(existing_file(path, "mesh file", "mesh"), allowed)
     try:
-        pieces = _reader(path)(reading)
+        return _join(reading, _reader(path)(reading))
     except InputError:
         raise
     except Exception as error:  # readers raise many types on a damaged file
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise InputError(f"{path}: cannot be read as a mesh: {reason[0]}; export it again") from error
-    return _join(reading, pieces)
 
 
 def _reader(path: Path) -> Reader:
@@ -105,7 +104,7 @@ def _reader(path: Path) -> Reader:
 
 def _join(reading: Reading, pieces: Sequence[Piece]) -> Mesh:
     """All pieces as one mesh, with equal points merged and triangles without an area removed."""
-    path, pieces = reading.path, [piece for piece in pieces if len(piece.faces)]
+    path, pieces = reading.path, [piece for piece in pieces if piece.faces.size]
     if not pieces:
         raise InputError(f"{path}: holds no triangle; export it again, or use a primitive")
     for piece in pieces:

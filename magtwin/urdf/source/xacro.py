@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import Any
 from xml.dom import minidom
 from xml.etree import ElementTree
+from xml.parsers.expat import ErrorString, ExpatError
 
 from magtwin.errors import InputError, hint
 from magtwin.files import read_bytes
@@ -240,7 +241,10 @@ class _Expansion:
             ) from error
         markup = parse_markup(content, path)
         self._budget.spend(ELEMENT * len(markup.lines))
-        document = minidom.parseString(content)
+        try:
+            document = minidom.parseString(content)  # with namespaces
+        except ExpatError as error:
+            raise InputError(f"{path}:{error.lineno}: not XML: {ErrorString(error.code)}") from error
         elements = document.getElementsByTagName("*")
         for element, line in zip(elements, markup.lines.values(), strict=True):
             element.setUserData(PLACE, (path, line), _KEEP)
