@@ -38,7 +38,7 @@ simready: $(VENV)/.dev  ## Hold robots against NVIDIA's SimReady profiles, in an
 	MAGTWIN_SIMREADY=$(CURDIR)/build/simready/bin/simready-validate $(BIN)/python -m pytest tests/urdf/test_urdf_layout.py tests/export/test_validate.py -k "simready or layout"
 
 ros: $(VENV)/.dev build/ros-jazzy/.installed build/ros-kilted/.installed  ## Cross our nodes with rclpy of ROS 2 Jazzy and Kilted, in environments of their own
-	$(ONE_THREAD) $(BIN)/python -m pytest tests/ros/test_ros_bus.py tests/ros/test_ros_rclpy.py
+	$(ONE_THREAD) $(BIN)/python -m pytest tests/ros/test_ros_bus.py tests/ros/test_ros_rclpy.py tests/ros/test_ros_released.py
 
 blender: $(VENV)/.dev build/blender/.installed  ## Import exports in Blender (bpy, 1 GB, Python 3.11), in an environment of its own
 	$(ONE_THREAD) MAGTWIN_BLENDER=$(CURDIR)/build/blender/bin/python $(BIN)/python -m pytest tests/export/test_blender.py
@@ -51,6 +51,7 @@ build/blender/.installed:
 build/ros-%/.installed:
 	$(PYTHON) -m venv build/ros-$*
 	build/ros-$*/bin/python -m pip --disable-pip-version-check -q install numpy 'ros-$*-rclpy[fastrtps]' ros-$*-sensor-msgs ros-$*-geometry-msgs ros-$*-nav-msgs ros-$*-rosgraph-msgs ros-$*-diagnostic-msgs ros-$*-std-srvs
+	build/ros-$*/bin/python -m pip --disable-pip-version-check -q install --target build/ros-$*/numpy1 'numpy<2'
 	@touch $@
 
 lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies

@@ -67,6 +67,12 @@ def hint(name: str, known: Iterable[str]) -> str:
     return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
 
 
+def near(name: str, known: Iterable[str]) -> str:
+    """An addition to a text with the nearest known name: " (did you mean 'left'?)", or ""."""
+    match = difflib.get_close_matches(name, sorted(known), n=1)
+    return f" (did you mean {match[0]!r}?)" if match else ""
+
+
 def find(kind: str, name: str, table: Mapping[str, T]) -> T:
     """The entry called `name`.
 

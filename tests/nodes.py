@@ -1,21 +1,56 @@
 """What tests of nodes share: domains of their own on loopback, and spinning until something holds."""
 
+import fcntl
 import itertools
 import os
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO
 
 from magtwin.ros.bus import Bus, Message
 from magtwin.ros.diagnostics import LEVELS, Status
 
 SLOWEST_S = 15.0
 
-_EACH = 50
-_WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")) % 2
-_FIRST = os.getpid() % _EACH
+MOST_DOMAINS = 100
+"""Domains up to here have ports below those that systems hand out."""
 
-DOMAINS = (1 + _EACH * _WORKER + k % _EACH for k in itertools.count(_FIRST))
-"""Domains up to 100, whose ports lie below those that systems hand out; those of two workers are apart."""
+EACH = 48
+"""Domains that one process uses in turn; a domain may remember nodes of an earlier test for some seconds."""
+
+LOCKS = Path(tempfile.gettempdir()) / "magtwin-domains"
+
+
+def _domains() -> Iterator[int]:
+    """Domains that no other process of tests uses, also one of another checkout: each is a locked file."""
+    LOCKS.mkdir(exist_ok=True)
+    held: dict[int, IO[str]] = {}  # the locks last as long as the process
+    order = itertools.cycle(range(1, MOST_DOMAINS + 1))
+    for _ in range(os.getpid() % MOST_DOMAINS):
+        next(order)
+    last = time.monotonic() + 10 * SLOWEST_S
+    while len(held) < EACH:
+        for domain in itertools.islice(order, MOST_DOMAINS):
+            lock = (LOCKS / str(domain)).open("w")
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                lock.close()
+                continue
+            held[domain] = lock
+            yield domain
+            break
+        else:
+            if held:
+                break
+            assert time.monotonic() < last, f"all {MOST_DOMAINS} domains are in use: {LOCKS}"
+            time.sleep(0.5)
+    yield from itertools.cycle(held)
+
+
+DOMAINS = _domains()
 
 
 def spin(until: Callable[[], object], *nodes: Bus) -> None:

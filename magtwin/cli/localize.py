@@ -7,7 +7,7 @@ from typing import Any
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force, Names, Seed, pairs
-from magtwin.cli.ros import HERE, WallS, Where, ros_app, spin
+from magtwin.cli.ros import HERE, FramePrefix, WallS, Where, ros_app, spin
 from magtwin.cli.terminal import Done, announce, progress
 from magtwin.errors import InputError, hint
 
@@ -116,6 +116,7 @@ def localize_live(
     odometry: Names = None,
     map_length_m: float = 0.3,
     seed: Seed = 0,
+    frame_prefix: FramePrefix = None,
     duration_s: WallS = None,
 ) -> Done:
     """Localize a robot live by its magnetometer and odometry, with any causal method of `magtwin localize`.
@@ -166,7 +167,16 @@ def localize_live(
     )
     options = _values("option", option)
     with where.bus("magtwin_localize", sim_time=values["use_sim_time"], duration_s=duration_s) as bus:
-        LocalizerNode(twin, bus, values, method=method, options=options, problem=problem, say=announce)
+        LocalizerNode(
+            twin,
+            bus,
+            values,
+            method=method,
+            options=options,
+            problem=problem,
+            frame_prefix=frame_prefix or "",
+            say=announce,
+        )
         announce(f"localizing by {bus.backend}; Ctrl-C ends")
         spin(bus, duration_s)
     return Done()

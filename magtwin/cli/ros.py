@@ -40,8 +40,9 @@ app.command(ros_app)
 class Node:
     """A node's place in the ROS network."""
 
-    namespace: str = "robot"
-    """Namespace of the topics; "" is the root."""
+    namespace: str | None = None
+    """Namespace of the topics; "" is the root. Default: robot. Several robots have one each, by their names,
+    below it or the root."""
 
     node_name: str | None = None
     """Name of the node. Default: magtwin_sim and so on. Two nodes need different names."""
@@ -55,20 +56,39 @@ class Node:
     backend: Literal["auto", "rclpy", "cyclonedds"] = "auto"
     """ROS client library. auto: rclpy if it can be imported, else cyclonedds."""
 
+    discovery: Literal["localhost", "subnet"] | None = None
+    """Which machines find the node: this one, or all of the network. Default:
+    ROS_AUTOMATIC_DISCOVERY_RANGE, else localhost."""
+
+    qos: Literal["reliable", "sensor-data"] = "reliable"
+    """QoS of published sensor data. reliable: every subscriber gets it. sensor-data: best effort, depth 5."""
+
     @contextmanager
-    def bus(self, name: str, *, sim_time: bool = False, duration_s: float | None = None) -> "Iterator[Bus]":
-        """The node, until the end of the block or Ctrl-C."""
+    def bus(
+        self,
+        name: str,
+        *,
+        sim_time: bool = False,
+        duration_s: float | None = None,
+        several: bool = False,
+    ) -> "Iterator[Bus]":
+        """The node of one robot or several, until the end of the block or Ctrl-C."""
         if duration_s is not None and not duration_s > 0:
             raise InputError(f"--duration-s must be above 0 s, got {duration_s!r}")
         from magtwin.ros.bus import names_of, open_bus
 
         bus = open_bus(
             self.node_name or name,
-            names=names_of(self.namespace, self.remap),
+            names=names_of(
+                ("" if several else "robot") if self.namespace is None else self.namespace, self.remap
+            ),
             sim_time=sim_time,
             backend=self.backend,
             domain=self.domain,
+            discovery=self.discovery,
+            offers=self.qos,
         )
+        _announce_reach(bus)
         signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a script ignore it
         try:
             with suppress(KeyboardInterrupt):
@@ -82,6 +102,9 @@ HERE = Node()
 WallS = Annotated[float | None, Parameter(help="Duration in real time [s]. Default: until Ctrl-C.")]
 SimTime = Annotated[bool, Parameter(negative="", help="Use the time of /clock, for a simulated robot.")]
 Stamped = Annotated[bool, Parameter(negative="", help="cmd_vel is a TwistStamped in place of a Twist.")]
+FramePrefix = Annotated[
+    str | None, Parameter(help="Prefix of the names of the robot's frames, such as tb4/. Default: none.")
+]
 Asset = Annotated[
     Path | None, Parameter(help="USD asset of the robot, whose limits are kept. Default: the TurtleBot 4.")
 ]
@@ -105,11 +128,13 @@ def sim(
     lidar: Lidar = "schedule",
     stamps: Literal["sim", "wall"] = "sim",
     stamped_commands: Stamped = False,
+    frame_prefix: FramePrefix = None,
 ) -> Done:
-    """Simulate a scene's robot in real time: the topics of the real robot, and /clock.
+    """Simulate a scene's robots in real time: the topics of real robots, and /clock.
 
-    cmd_vel drives it; it stops after half a second without one. A message on reset (std_msgs/Empty) puts it
-    back to its start. Ctrl-C ends it.
+    cmd_vel drives a robot; it stops after half a second without one. A message on reset (std_msgs/Empty) puts
+    the robots back to their start. Of several robots, each has its name as namespace and before its frames:
+    /ann/odom, ann/base_link. Ctrl-C ends it.
 
     Parameters
     ----------
@@ -132,7 +157,7 @@ def sim(
     kind = None if magnetometer == "none" else magnetometer
     twin = open_twin(scene, network=network, magnetometer=kind, model_error=model_error)
     twin = with_plant(twin, plant)
-    with where.bus("magtwin_sim", duration_s=duration_s) as bus:
+    with where.bus("magtwin_sim", duration_s=duration_s, several=bool(twin.scene.others)) as bus:
         node = Simulator(
             twin,
             bus,
@@ -145,6 +170,7 @@ def sim(
             stamps=stamps,
             stamped_commands=stamped_commands,
             magnetometer=magnetometer != "none",
+            frame_prefix=frame_prefix,
             say=announce,
         )
         announce(f"simulating by {bus.backend} at {pace:g} x real time; Ctrl-C ends")
@@ -167,6 +193,7 @@ def magnetometer(
     network: Network = None,
     online: str | None = None,
     measured: str | None = None,
+    frame_prefix: FramePrefix = None,
     duration_s: WallS = None,
 ) -> Done:
     """Run the magnetometer alone: read a robot's sensors through map and network, and publish the field.
@@ -199,7 +226,9 @@ def magnetometer(
     announce(f"opening {scene}")
     twin = open_twin(scene, network=network, model_error=False)  # it predicts for a robot that reads
     with where.bus("magtwin_magnetometer", sim_time=values["use_sim_time"], duration_s=duration_s) as bus:
-        Magnetometer(twin, bus, values, online=online, measured=measured, say=announce)
+        Magnetometer(
+            twin, bus, values, online=online, measured=measured, frame_prefix=frame_prefix or "", say=announce
+        )
         announce(f"reading by {bus.backend}; Ctrl-C ends")
         spin(bus, duration_s)
     return Done()
@@ -371,6 +400,7 @@ def replay(
     where: Where = HERE,
     pace: float = 1.0,
     out_unit: OutUnit = None,
+    frame_prefix: FramePrefix = None,
 ) -> Done:
     """Publish a recorded run on its robot's ROS topics, in real time.
 
@@ -394,7 +424,9 @@ def replay(
     whole = read_run(run)
     twin = None if scene is None else open_twin(scene, model_error=False)
     with where.bus("magtwin_replay") as bus:
-        player = Player(whole, bus, twin, units=out_unit or "T", topics=topic)
+        player = Player(
+            whole, bus, twin, units=out_unit or "T", topics=topic, frame_prefix=frame_prefix or ""
+        )
         announce(f"replaying {whole['t'][-1] - whole['t'][0]:.0f} s by {bus.backend}; Ctrl-C ends")
         step("Replaying")
         count = player.run(speed=pace)
@@ -409,6 +441,17 @@ def spin(bus: "Bus", duration_s: float | None) -> None:
             bus.spin_once(0.1)
             if duration_s is not None:
                 advance(gone, duration_s)
+
+
+def _announce_reach(bus: "Bus") -> None:
+    """Which machines reach the node."""
+    from magtwin.ros.bus.names import interfaces
+
+    if bus.reach == "subnet":
+        names = ", ".join(interfaces()) or "none"
+        _warn(f"every host on the network can find this node and send to it (interfaces: {names})")
+    else:
+        announce("only this machine can find this node; --discovery subnet opens it to the network")
 
 
 def _drive_of(asset: Path | None) -> "DriveSpec":

@@ -43,8 +43,8 @@ FRAMES_HZ = 60.0
 DISCHARGING = 2
 """POWER_SUPPLY_STATUS_DISCHARGING of sensor_msgs/BatteryState."""
 
-DEFAULT_QOS, SENSOR_QOS, CLOCK_QOS = "qos", "sensor_qos", "clock_qos"
-"""Nodes with the QoS of topics."""
+QOS, HEARD_QOS = "qos", "heard_qos"
+"""Nodes with the QoS of published topics, and of commands: best effort, which matches every publisher."""
 
 
 class _Parts(NamedTuple):
@@ -101,12 +101,11 @@ def _clocks(graph: Graph, *, publish: bool) -> None:
     graph.node("context", f"{BRIDGE}ROS2Context", useDomainIDEnvVar=True)
     kind = f"{BRIDGE}ROS2QoSProfile"
     reliable, best = {"reliability": "reliable"}, {"reliability": "bestEffort"}
-    graph.node(DEFAULT_QOS, kind, createProfile="Default for publishers/subscribers", depth=10, **reliable)
-    graph.node(SENSOR_QOS, kind, createProfile="Sensor Data", depth=5, **best)
-    graph.node(CLOCK_QOS, kind, createProfile="Custom", depth=1, **best)
+    graph.node(QOS, kind, createProfile="Default for publishers/subscribers", depth=10, **reliable)
+    graph.node(HEARD_QOS, kind, createProfile="Custom", depth=10, **best)
     if publish:
         graph.node("clock", f"{BRIDGE}ROS2PublishClock", topicName="/clock")
-        _published(graph, "clock", CLOCK_QOS)
+        _published(graph, "clock", QOS)
 
 
 def _published(graph: Graph, node: str, qos: str, after: str = "tick.tick", *, stamp: bool = True) -> None:
@@ -130,7 +129,7 @@ def _odometry(graph: Graph, parts: _Parts, topic: str) -> None:
         publishRawVelocities=True,  # they are in the robot's axes already
     )
     graph.connect("tick.tick", "odometry.execIn")
-    _published(graph, "publish_odometry", SENSOR_QOS, "odometry.execOut")
+    _published(graph, "publish_odometry", QOS, "odometry.execOut")
     for name in ("position", "orientation", "linearVelocity", "angularVelocity"):
         graph.connect(f"odometry.{name}", f"publish_odometry.{name}")
 
@@ -139,7 +138,7 @@ def _imu(graph: Graph, parts: _Parts, topic: str, frame: str) -> None:
     graph.node("imu", f"{SENSORS}IsaacReadIMU", imuPrim=parts.imu, readGravity=False)  # as imu_a is
     graph.node("publish_imu", f"{BRIDGE}ROS2PublishImu", topicName=topic, frameId=frame)
     graph.connect("tick.tick", "imu.execIn")
-    _published(graph, "publish_imu", SENSOR_QOS, "imu.execOut")
+    _published(graph, "publish_imu", QOS, "imu.execOut")
     graph.connect("imu.orientation", "publish_imu.orientation")
     graph.connect("imu.angVel", "publish_imu.angularVelocity")
     graph.connect("imu.linAcc", "publish_imu.linearAcceleration")
@@ -151,7 +150,7 @@ def _pose(graph: Graph, parts: _Parts, topic: str) -> None:
     graph.node("place", f"{BREAK}3")
     graph.node("turn", f"{BREAK}4")
     values = {"topicName": topic, "header:frame_id": "map"}
-    _message(graph, "publish_pose", "geometry_msgs/msg/PoseStamped", DEFAULT_QOS, **values)
+    _message(graph, "publish_pose", "geometry_msgs/msg/PoseStamped", QOS, **values)
     graph.connect("pose.translation", "place.tuple")
     graph.connect("pose.orientation", "turn.tuple")
     for axis in "xyz":
@@ -177,7 +176,7 @@ def _battery(graph: Graph, spec: BatterySpec, topic: str) -> None:
         "present": True,
     }
     kind = "sensor_msgs/msg/BatteryState"
-    _message(graph, "publish_battery", kind, SENSOR_QOS, after="seldom.execOut", **values)
+    _message(graph, "publish_battery", kind, QOS, after="seldom.execOut", **values)
 
 
 def _message(graph: Graph, node: str, kind: str, qos: str, after: str = "tick.tick", **values: Any) -> None:
@@ -192,7 +191,7 @@ def _joints(graph: Graph, parts: _Parts, topic: str) -> None:
     graph.node("joints", f"{SENSORS}IsaacReadJointState", prim=parts.articulation)
     graph.node("publish_joints", f"{BRIDGE}ROS2PublishJointState", topicName=topic)
     graph.connect("tick.tick", "joints.execIn")
-    _published(graph, "publish_joints", DEFAULT_QOS, "joints.execOut")
+    _published(graph, "publish_joints", QOS, "joints.execOut")
     for name in ("Names", "Positions", "Velocities", "Efforts", "DofTypes"):
         graph.connect(f"joints.joint{name}", f"publish_joints.joint{name}")
     graph.connect("joints.stageMetersPerUnit", "publish_joints.stageMetersPerUnit")
@@ -207,7 +206,7 @@ def _scan(graph: Graph, parts: _Parts, topic: str, frame: str) -> None:
     )
     graph.connect("tick.tick", "once.execIn")
     graph.connect("once.step", "beams.execIn")
-    _published(graph, "publish_scan", SENSOR_QOS, "beams.execOut", stamp=False)
+    _published(graph, "publish_scan", QOS, "beams.execOut", stamp=False)
     graph.connect("beams.renderProductPath", "publish_scan.renderProductPath")
 
 
@@ -235,7 +234,7 @@ def _drive(graph: Graph, robot: RobotSpec, parts: _Parts, topic: str) -> None:
         targetPrim=parts.articulation,
         jointNames=[drive.left_wheel_joint, drive.right_wheel_joint],
     )
-    _published(graph, "command", DEFAULT_QOS, stamp=False)
+    _published(graph, "command", HEARD_QOS, stamp=False)
     graph.connect("tick.tick", "controller.execIn")  # each frame, as its limits of acceleration go by time
     graph.connect("tick.deltaSeconds", "controller.dt")
     graph.connect("tick.tick", "wheels.execIn")

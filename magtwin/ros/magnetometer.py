@@ -19,7 +19,7 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap, Outside
 from magtwin.frames import yaw_from_quat
 from magtwin.io.bags.cdr import NS
-from magtwin.io.bags.sender import sender_of
+from magtwin.io.bags.sender import prefixed, sender_of
 from magtwin.io.bags.topics import (
     BATTERY,
     COMMAND,
@@ -32,6 +32,7 @@ from magtwin.io.bags.topics import (
     Topic,
 )
 from magtwin.ros.bus import Bus, Timer, to_bytes
+from magtwin.ros.bus.names import checked_prefix
 from magtwin.ros.diagnostics import Level, Reporter, status_of
 from magtwin.ros.inputs import Columns, Input, Scanning
 from magtwin.ros.online import Measured, Online
@@ -93,6 +94,7 @@ class Magnetometer:
         *,
         online: str | None = None,
         measured: str | None = None,
+        frame_prefix: str = "",
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
         """Advertise its topics, and search for its inputs.
@@ -104,6 +106,7 @@ class Magnetometer:
             online: Topic of late poses by which a mixed model follows its session. Readings are then
                 published on predicted/magnitude and predicted/total_field_nt.
             measured: Topic of the field that a real sensor measures. Default: qtfm/magnitude.
+            frame_prefix: Prefix of the names of frames, such as "tb4/".
             say: Called with messages for the user.
 
         Raises:
@@ -118,6 +121,7 @@ class Magnetometer:
                 "this node needs a network: name weights, or a scene with a neural magnetometer"
             )
         self._twin, self._bus, self._settings, self._say = twin, bus, dict(settings), say
+        self._prefix = checked_prefix(frame_prefix)
         needed = (twin.magnetometer.columns if twin.magnetometer else frozenset()) - MADE
         known = {column for topic in INPUTS for column in topic.needs}
         if beyond := sorted(needed - known):
@@ -205,7 +209,8 @@ class Magnetometer:
             kept += [self._scans] if self._scans is not None else []
             for buffer in kept:
                 buffer.history_s = settings["buffer_s"]
-        self._sender = sender_of(robot, unit=settings["units"], rate_hz=settings["rate_hz"])
+        sender = sender_of(robot, unit=settings["units"], rate_hz=settings["rate_hz"])
+        self._sender = prefixed(sender, self._prefix)
         if settings["rate_hz"] != self._rate:
             if self._timer is not None:
                 self._timer.cancel()

@@ -9,11 +9,12 @@ import numpy as np
 from magtwin.errors import InputError
 from magtwin.io.bags import RawBagWriter
 from magtwin.io.bags.cdr import NS, encode
-from magtwin.io.bags.sender import Unit, sender_for
+from magtwin.io.bags.sender import Unit, prefixed, sender_for
 from magtwin.io.bags.stream import Stream
 from magtwin.io.bags.topics import Qos
 from magtwin.io.bags.types import layout
 from magtwin.ros.bus import Bus, Message, Publisher
+from magtwin.ros.bus.names import checked_prefix
 from magtwin.ros.topics import READ, RECORDED, SAMPLED
 from magtwin.run.run import Run
 from magtwin.twin import Twin
@@ -90,8 +91,7 @@ class Recorder:
             if len(kinds) > 1:
                 self._say(f"{name} is published as {' and as '.join(kinds)}; recording {kind}")
             latched = topic is not None and topic.qos.latched
-            reliable = latched or (topic is not None and topic.qos.reliable)
-            qos = Qos(depth=DEPTH, reliable=reliable, latched=latched)
+            qos = Qos(depth=DEPTH, reliable=latched or self._bus.reliable(name), latched=latched)
             self._writer.add(name, kind, qos)
             self._bus.subscribe(name, kind, partial(self._heard, name), qos)
 
@@ -117,6 +117,7 @@ class Player:
         *,
         units: Unit = "T",
         topics: Sequence[str] = (),
+        frame_prefix: str = "",
     ) -> None:
         """Advertise its topics.
 
@@ -126,12 +127,14 @@ class Player:
             twin: The twin of the run: gives frames, covariances, /tf_static and the robot's description.
             units: Unit of magnetic fields.
             topics: Names of topics to publish. Default: all.
+            frame_prefix: Prefix of the names of frames, such as "tb4/".
 
         Raises:
             InputError: The run has no column of these topics.
         """
         self._run = run
         sender = sender_for(twin, units, run.metadata.get("rate_hz"))
+        sender = prefixed(sender, checked_prefix(frame_prefix))
         self._stream = Stream(run, sender, None, topics=(*SAMPLED.values(), *READ), whole=True)
         chosen = [t for t in self._stream.topics if bus.knows(t.kind) and (not topics or t.name in topics)]
         if not chosen:

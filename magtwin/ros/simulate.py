@@ -1,36 +1,28 @@
-"""The simulator as a node: a twin's robot in real time, with the topics of the real one."""
+"""The simulator as a node: the robots of a twin in real time, with the topics of real ones."""
 
 import heapq
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
-
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import dataclass, replace
+from typing import Literal
 
 from magtwin.errors import InputError
 from magtwin.io.bags.cdr import NS, encode
-from magtwin.io.bags.sender import Unit, sender_for
-from magtwin.io.bags.stream import Sent, Stream
-from magtwin.io.bags.topics import COMMAND, IMU, MAGNITUDE, SCAN, TOTAL_FIELD, VECTOR, Qos, Topic
+from magtwin.io.bags.sender import Unit, prefixed, sender_for
+from magtwin.io.bags.stream import Sent
+from magtwin.io.bags.topics import Qos, Topic
 from magtwin.io.bags.types import layout
-from magtwin.ros.bus import Bus, Message, Publisher
+from magtwin.ros.bus import Bus, Publisher
+from magtwin.ros.bus.names import checked_prefix
 from magtwin.ros.diagnostics import Reporter, status_of
-from magtwin.ros.topics import READ, SAMPLED, TICKS
-from magtwin.run.run import Run
-from magtwin.sim.exact import check_field
+from magtwin.ros.robot import SimulatedRobot
+from magtwin.ros.topics import TICKS
 from magtwin.sim.runs.live import LiveRobot
-from magtwin.sim.sensors.clock import Samples
-from magtwin.twin import Session, Twin, in_session, model_error_of
-
-if TYPE_CHECKING:
-    from magtwin.learn.inference.magnetometer import NeuralMagnetometer
+from magtwin.twin import Session, Twin, in_session, led_by
 
 RESET = "/robot/reset"
-"""Topic (std_msgs/Empty), and with rclpy service (std_srvs/Empty), that resets robot and time."""
+"""Topic (std_msgs/Empty), and with rclpy service (std_srvs/Empty), that resets robots and time."""
 
 LEAD_S = 0.006
 """Time by which a control step is computed ahead, so that its first message is not late [s]."""
@@ -40,9 +32,6 @@ SLIP_S = 0.1
 
 MOST_HZ = 1000.0
 """Highest rate of readings [Hz], that of the magnetometer node."""
-
-WARM = 5
-"""Steps of a second robot at the start. They load libraries and determine the topics."""
 
 REPORT_S = 1.0
 """Wall time between diagnostics [s]."""
@@ -72,7 +61,11 @@ class Pace:
 
 
 class Simulator:
-    """A robot simulated in real time; the same commands in the same steps give the same messages."""
+    """The robots of a twin in real time; the same commands in the same steps give the same messages.
+
+    One robot has the topics of the bus's namespace. Of several, each has a namespace of its own below it, by
+    its name, and its name as prefix of its frames. They share /clock, /tf, /tf_static, /diagnostics, reset.
+    """
 
     def __init__(
         self,
@@ -88,6 +81,7 @@ class Simulator:
         stamps: Literal["sim", "wall"] = "sim",
         stamped_commands: bool = False,
         magnetometer: bool = True,
+        frame_prefix: str | None = None,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
         """Advertise its topics; `run` starts it.
@@ -104,48 +98,66 @@ class Simulator:
             stamps: Stamp messages with simulated time, from 0 on, or with wall time.
             stamped_commands: cmd_vel is a TwistStamped, not a Twist.
             magnetometer: Publish the magnetometer's readings; else another node does.
+            frame_prefix: Prefix of the names of frames, such as "tb4/". Default: none; for several robots the
+                name of each, "ann/", which a given prefix precedes.
             say: Called with messages for the user.
 
         Raises:
-            InputError: The robot starts in an obstacle, or an option is out of range.
+            InputError: A robot starts in an obstacle, or an option is out of range.
         """
         if not 0 < speed <= 100:
             raise InputError(f"speed must be above 0 and at most 100 times real time, got {speed!r}")
         if rate_hz is not None and rate_hz > MOST_HZ:
             raise InputError(f"rate_hz must be at most {MOST_HZ:g} Hz live, got {rate_hz!r}")
+        prefix = checked_prefix(frame_prefix or "")
         twin = in_session(twin, session, seed=seed)
-        self._twin, self._bus, self._seed, self._rate, self._lidar = twin, bus, seed, rate_hz, lidar
-        self._speed, self._wall, self._say = speed, stamps == "wall", say
-        self._reads = magnetometer
-        self._units: Unit = units
-        self.online = self._online()
-        self._sender = sender_for(twin, units, self.online.rate_hz)
+        names = [placed.robot.name for placed in twin.scene.robots]
+        several = len(names) > 1
+        self._bus, self._speed, self._wall, self._say = bus, speed, stamps == "wall", say
         self._publishers: dict[str, Publisher] = {}
         self._events: list[tuple[int, int, Publisher, bytes]] = []
-        self._count = 0
-        self._command: tuple[float, float] | None = None
-        self._commands, self._refused, self._resets, self._slips = 0, 0, 0, 0
-        self._kind = "geometry_msgs/msg/TwistStamped" if stamped_commands else COMMAND.kind
-        self._input = bus.subscribe(COMMAND.name, self._kind, self._commanded, COMMAND.qos)
-        bus.subscribe(RESET, "std_msgs/msg/Empty", lambda message: self.reset(), Qos())
+        self._count, self._resets, self._slips, self._begin_ns = 0, 0, 0, 0
+        self._reset = False
+        bus.subscribe(RESET, "std_msgs/msg/Empty", lambda message: self.reset(), Qos().heard)
         bus.service(RESET, self.reset)
         self._reporter = Reporter(bus)
-        self._stream: Stream | None = None
-        self._moved: NDArray[np.float64] | None = None
-        warm = self._online()
-        rows = [warm.step() for _ in range(WARM)]
-        for topic in (*self._streamed(rows[0]).topics, *SAMPLED.values(), SCAN):
-            if bus.knows(topic.kind):
-                self._publishers[topic.name] = bus.publisher(topic.name, topic.kind, topic.qos)
-            else:
-                say(f"{topic.name} is left out: {topic.kind} is not installed")
-        self._begin_ns = 0
-        self._reset = False
+        self.robots: list[SimulatedRobot] = []
+        """The robots, in the order of the scene."""
+        for k, name in enumerate(names):
+            own = led_by(twin, name)
+            sender = sender_for(own, units, rate_hz or own.scene.robot.magnetometer.rate_hz)
+            robot = SimulatedRobot(
+                own,
+                bus,
+                prefixed(sender, f"{prefix}{name}/" if several else prefix),
+                within=name if several else "",
+                which=k,
+                seed=seed,
+                rate_hz=rate_hz,
+                lidar=lidar,
+                stamped_commands=stamped_commands,
+                magnetometer=magnetometer,
+            )
+            self.robots.append(robot)
+        if several:  # one latched message has the links of all robots
+            links = tuple(link for robot in self.robots for link in robot.sender.links)
+            for robot in self.robots:
+                robot.sender = replace(robot.sender, links=links if robot is self.robots[0] else ())
+        for robot in self.robots:
+            robot.restart()
+            for topic in robot.topics():
+                self._advertise(topic)
+        self._restart()
         if units == "nT":
             say("fields are published in nT, as APRILab's robot does; ROS means tesla")
 
+    @property
+    def online(self) -> LiveRobot:
+        """The first robot."""
+        return self.robots[0].live
+
     def reset(self) -> None:
-        """Put the robot back to its start, and time to 0, before the next step."""
+        """Put the robots back to their start, and time to 0, before the next step."""
         self._reset = True
 
     def run(self, until: Callable[[], bool] = lambda: False, *, duration_s: float | None = None) -> None:
@@ -153,22 +165,28 @@ class Simulator:
 
         Args:
             until: Ends the run when true; called at each step.
-            duration_s: Simulated duration [s]. Default: no end.
+            duration_s: Simulated time at which the run ends [s]. Default: no end.
         """
         pace = self._begun()
-        reported, factor_from = time.monotonic(), (time.monotonic(), 0.0)
+        reported, factor_from = time.monotonic(), (time.monotonic(), self.online.t)
         while not until() and (duration_s is None or self.online.t < duration_s - 1e-9):
             if self._reset:
                 self._reset, self._resets = False, self._resets + 1
-                self.online = self._online()
-                pace, self._stream = self._begun(), None
+                self._restart()
+                pace = self._begun()
                 factor_from = (time.monotonic(), 0.0)
-                self._say("reset: the robot is at its start, time is 0")
+                which = (
+                    "the robot is at its start" if len(self.robots) == 1 else "the robots are at their start"
+                )
+                self._say(f"reset: {which}, time is 0")
             self._publish_until(pace, pace.due_s(self.online.t) - LEAD_S)
             if pace.slip(self.online.t, time.monotonic()):
                 self._slips += 1
-            command, self._command = self._command, None
-            self._tell(self.online.step(command))
+            for robot in self.robots:
+                robot.drive()
+            for robot in self.robots:
+                for sent in robot.messages():
+                    self._queue(sent)
             now = time.monotonic()
             if now - reported > REPORT_S:
                 factor = (self.online.t - factor_from[1]) / max(now - factor_from[0], 1e-9)
@@ -176,57 +194,28 @@ class Simulator:
                 self._report(factor)
         self._publish_until(pace, pace.due_s(self.online.t))
 
-    def _online(self) -> LiveRobot:
-        twin = self._twin
-        check_field(twin.scene, twin.field)
-        return LiveRobot(
-            twin.scene,
-            anomaly_map=twin.field,
-            rng=np.random.default_rng(self._seed),
-            obstacles=twin.obstacles,
-            rate_hz=self._rate,
-            network=partial(_read_rows, twin.magnetometer) if twin.magnetometer else None,
-            model_error=model_error_of(twin, self._seed),
-            lidar=self._lidar,
-        )
+    def _restart(self) -> None:
+        """Put the robots to their start."""
+        for robot in self.robots:
+            robot.restart()
+        for robot in self.robots:
+            robot.live.beside(other.live for other in self.robots if other is not robot)
 
     def _begun(self) -> Pace:
-        self._events.clear()
-        self._begin_ns = time.time_ns() if self._wall else 0
-        return Pace(self._speed, time.monotonic() + LEAD_S)
+        """The pace of a run that begins or goes on now."""
+        now, t = time.monotonic() + LEAD_S, self.online.t
+        if not t:
+            self._events.clear()
+        self._begin_ns = time.time_ns() - round(t * NS) if self._wall else 0
+        return Pace(self._speed, now - t / self._speed)
 
-    def _tell(self, rows: Run) -> None:
-        """Queue the messages of a step."""
-        if self._stream is None:
-            self._stream = self._streamed(rows)
-        for sent in self._stream.messages(rows):
-            self._queue(sent)
-        if rows.rows:
-            self._moved = rows["odom_v"][-1:]
-        for name, parts in self.online.samples().items():
-            for part in parts:
-                self._sampled(SAMPLED[name], part)
-        scans = self.online.scans()
-        if len(scans.t):
-            moments, came = (np.rint(t * NS).astype(np.int64) for t in (scans.t, scans.arrival))
-            fields = SCAN.write({"ranges_m": scans.ranges_m}, moments, self._sender)
-            self._queue((SCAN, came, fields))
-
-    def _streamed(self, rows: Run) -> Stream:
-        silent = () if self._reads else (MAGNITUDE, VECTOR, TOTAL_FIELD)
-        topics = [topic for topic in READ if topic not in silent]
-        return Stream(rows, self._sender, None, topics=topics, whole=True)
-
-    def _sampled(self, topic: Topic, samples: Samples) -> None:
-        """Queue samples at their arrival; those before the start are dropped."""
-        taken = samples.t >= 0
-        if topic.lost:
-            taken &= ~samples.columns[topic.lost]
-        columns = {name: values[taken] for name, values in samples.columns.items()}
-        if topic is IMU and self._moved is not None:  # its covariances depend on the speed
-            columns["odom_v"] = np.repeat(self._moved, taken.sum(), axis=0)
-        stamps, arrivals = (np.rint(t[taken] * NS).astype(np.int64) for t in (samples.t, samples.arrival))
-        self._queue((topic, arrivals, topic.write(columns, stamps, self._sender)))
+    def _advertise(self, topic: Topic) -> None:
+        if topic.name in self._publishers:  # robots share /tf
+            return
+        if self._bus.knows(topic.kind):
+            self._publishers[topic.name] = self._bus.publisher(topic.name, topic.kind, topic.qos)
+        else:
+            self._say(f"{topic.name} is left out: {topic.kind} is not installed")
 
     def _queue(self, sent: Sent) -> None:
         topic, times, fields = sent
@@ -258,49 +247,25 @@ class Simulator:
                 self._bus.spin_once(0.0)
                 return
 
-    def _commanded(self, message: Message) -> None:
-        linear, angular = COMMAND.leaves(self._kind)
-        try:
-            read = message.read([linear, angular])
-            v, w = float(read[linear][0]), float(read[angular][2])
-        except InputError:
-            v = w = math.nan
-        if not (math.isfinite(v) and math.isfinite(w)):
-            self._refused += 1
-            return
-        self._command = (v, w)
-        self._commands += 1
-
     def _report(self, factor: float) -> None:
-        senders = self._input.publishers()
-        others = [kind for kind in self._bus.types(COMMAND.name) if kind != self._kind]
-        topics = (TICKS, MAGNITUDE) if self._reads else (TICKS,)
-        counts = {self._bus.resolve(topic.name): self._bus.publishers(topic.name) for topic in topics}
+        clock = self._bus.publishers(TICKS.name)
         problems = [
             (self._slips, f"slower than {self._speed:g} x real time"),
-            (senders > 1, f"{senders} publishers on {self._input.topic}: the last command wins"),
-            (self._refused, f"{self._refused} commands were not finite"),
-            (others, f"commands of type {', '.join(others)} are ignored; {self._kind} is expected"),
-            *((count > 1, f"{count} publishers on {name}") for name, count in counts.items()),
+            (clock > 1, f"{clock} publishers on {self._bus.resolve(TICKS.name)}"),
         ]
         values = {
             "sim time [s]": f"{self.online.t:.2f}",
             "real-time factor": f"{factor:.3f}",
-            "commands": str(self._commands),
-            "commands refused": str(self._refused),
-            "publishers of commands": str(senders),
             "resets": str(self._resets),
         }
         stamp = self._begin_ns + round(self.online.t * NS)
-        self._reporter.report([status_of("simulator", problems, fine="running", values=values)], stamp)
-        self._slips = self._refused = 0
-
-
-def _read_rows(
-    magnetometer: "NeuralMagnetometer", run: Run
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_] | None]:
-    """Disturbances, their standard deviations [nT], and whether the rows are outside the training range."""
-    if not run.rows:
-        return np.zeros(0), np.zeros(0), np.zeros(0, bool)
-    (read,) = magnetometer.read([run.select("t", *sorted(magnetometer.columns - {"t"}))])
-    return read.disturbance_nt, read.sd_nt, read.outside
+        if len(self.robots) == 1:
+            more, own = self.robots[0].state()
+            statuses = [status_of("simulator", [*problems, *more], fine="running", values=values | own)]
+        else:
+            statuses = [status_of("simulator", problems, fine="running", values=values)]
+            for robot in self.robots:
+                more, own = robot.state()
+                statuses.append(status_of(robot.within, more, fine="running", values=own))
+        self._reporter.report(statuses, stamp)
+        self._slips = 0

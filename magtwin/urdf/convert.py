@@ -37,6 +37,7 @@ from magtwin.urdf.physics.link import SITE_API, Rider, define_body, is_marker
 from magtwin.urdf.physics.mechanism import Mechanism, read_mechanism
 from magtwin.urdf.physics.merge import WORLD, Place, carried, place_links, riders
 from magtwin.urdf.physics.wheel import find_wheels, fit_wheels, grip, not_on
+from magtwin.urdf.placeholder import replace_failed
 from magtwin.urdf.report import ConversionReport, Ledger, make_report
 from magtwin.urdf.sensor import define_sensors
 from magtwin.urdf.shape import COLLISIONS, VISUALS, define_collider, define_no_contact, define_visual, pose_of
@@ -92,17 +93,23 @@ def convert_with_report(
         Every link, joint and geometry before and after, and all notes.
 
     Raises:
-        InputError: The URDF or a mesh cannot be converted, `options.strict` is set and something was lost,
-            or a file exists; nothing is written.
+        InputError: The URDF cannot be converted, `options.strict` is set and something was repaired or
+            lost, or a file exists; nothing is written.
     """
     out = Path(out)
     if out.suffix != ".usda":
         raise InputError(f"{out}: the robot's root layer is text; give it the suffix .usda")
     check_metadata(options.metadata)
-    source = read_source(urdf, packages=options.packages, arguments=options.arguments)
+    source = read_source(
+        urdf,
+        packages=options.packages,
+        arguments=options.arguments,
+        skip_missing_includes=options.skip_missing_includes,
+    )
     description = read_description(source)
     textures = f"{out.stem}_textures" if options.single_file else f"{PAYLOADS}/{TEXTURES}"
     meshes = gather(description, options, f"./{textures}")
+    description = replace_failed(description, meshes)
     check_free(out, force=force)
     write = _write_single if options.single_file else _write_payloads
     report = write(_Author(description, options, meshes, out, finish), out, force)
@@ -193,12 +200,8 @@ class _Author:
             poses=read_mechanism(description, options).poses(),
             lint=lint(description, mass=options.mass, vertices=self.meshes.vertices),
         )
-        if options.strict and report.losses:
-            others = f" (and {len(report.losses) - 1} more)" if len(report.losses) > 1 else ""
-            raise InputError(
-                f"{report.source}: {report.losses[0]}{others}; convert without --strict to accept that"
-            )
-        notes = Vt.StringArray(description.notes)
+        description.repairs.check(report.source, strict=options.strict)
+        notes = Vt.StringArray(description.repairs.notes)
         stage.GetRootLayer().customLayerData = {
             **stage.GetRootLayer().customLayerData,
             **metadata(stage, description, report, options.metadata),

@@ -78,8 +78,9 @@ class Options:
     arguments: Mapping[str, str] = field(default_factory=dict)
     """Arguments of a xacro."""
 
-    missing_meshes: Literal["refuse", "note"] = "refuse"
-    """Treatment of a missing mesh; "note" leaves out its visual or collider with a note."""
+    missing_meshes: Literal["box", "note", "refuse"] = "box"
+    """Treatment of a mesh that is missing or unreadable: a box of the link's size in its place; "note" leaves
+    out its visual or collider; "refuse" lists all of them and writes nothing."""
 
     collision: Collision = "hull"
     """Mesh colliders: the convex hull, a convex decomposition (extra `decomposition`), or the mesh itself."""
@@ -103,7 +104,11 @@ class Options:
     """Whether to write one root layer and the meshes, instead of Isaac Sim's layers."""
 
     strict: bool = False
-    """Whether to refuse a conversion that loses anything."""
+    """Whether to refuse a description with faults, which are repaired otherwise."""
+
+    skip_missing_includes: bool = False
+    """Whether to skip files and packages that a xacro includes, if they are missing and none of their macros
+    is called."""
 
     mass: float | None = None
     """Mass on the data sheet, to check the robot's [kg]."""

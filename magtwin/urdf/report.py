@@ -15,6 +15,7 @@ from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Shape
 from magtwin.urdf.meshes.mesh import bounds
 from magtwin.urdf.meshes.mesh_layer import MeshLayer
+from magtwin.urdf.repairs import FAULTS, Repair
 from magtwin.usd.geometry import read_vertices
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -26,6 +27,10 @@ BOX_TOLERANCE = 1e-5
 ROUND_TOLERANCE = 0.01
 """The same for a sphere, cylinder or capsule, which the stage shows as a polygon of 32 sides:
 1 - cos(pi / 32) is 0.5 % of its radius."""
+
+
+PLACES, LINES = 3, 8
+"""Most places of one kind of fault, and most guesses and doubts, that the terminal shows."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +92,27 @@ class GeometryLine:
 
 
 @dataclass(frozen=True)
+class RepairLine:
+    """All faults of one kind."""
+
+    kind: str
+    """A key of `repairs.FAULTS`, or "loss"."""
+    fault: str
+    done: str
+    """What was done about each."""
+    count: int
+    entries: tuple[Repair, ...]
+    """Each fault, with file and line."""
+
+    @property
+    def places(self) -> str:
+        """The first places, or the first text if no place is known."""
+        places = list(dict.fromkeys(entry.place for entry in self.entries if entry.place))
+        more = f" and {len(places) - PLACES} more" if len(places) > PLACES else ""
+        return ", ".join(places[:PLACES]) + more if places else self.entries[0].text
+
+
+@dataclass(frozen=True)
 class ConversionReport:
     """What a conversion read, wrote and changed."""
 
@@ -105,6 +131,10 @@ class ConversionReport:
     """Box of all visuals in the description."""
     box_out: Box | None
     """Box of all visuals on the stage."""
+    repairs: tuple[RepairLine, ...]
+    """Faults of the description by kind; `Options.strict` refuses each."""
+    supply: str
+    """Options of the command line that would supply what is missing."""
     notes: tuple[str, ...]
     """Repairs, guesses and omissions, one line each."""
     losses: tuple[str, ...]
@@ -113,6 +143,11 @@ class ConversionReport:
     """Doubtful values in the description, one line each."""
     unknown_tags: Mapping[str, int] = field(default_factory=dict)
     """Number of occurrences of each tag that is kept as text."""
+
+    @property
+    def _faults(self) -> frozenset[str]:
+        """Texts of all repairs and losses."""
+        return frozenset(entry.text for line in self.repairs for entry in line.entries)
 
     def to_json(self) -> str:
         """The report as one JSON object."""
@@ -133,18 +168,22 @@ class ConversionReport:
             size = np.subtract(self.box_out[1], self.box_out[0])
             figures.append(Figure("size", " x ".join(f"{v:.3f}" for v in size), "m"))
         figures += [
+            Figure(line.fault, line.count, note=f"{line.done}: {line.places}".lstrip(": "))
+            for line in self.repairs
+        ]
+        guesses = [note for note in self.notes if note not in self._faults]
+        figures += [
             Figure("unknown tags", sum(self.unknown_tags.values()), note="kept as text"),
-            Figure("notes", len(self.notes)),
-            Figure("losses", len(self.losses)),
+            Figure("guesses", len(guesses)),
             Figure("doubts about the description", len(self.lint)),
         ]
-        metadata = {
+        metadata: dict[str, str | list[str]] = {
             "source": self.source,
             "sha256": self.source_sha256,
-            "losses": list(self.losses),
-            "notes": list(self.notes),
-            "lint": list(self.lint),
+            "to supply what is missing": self.supply,
         }
+        lists = {"losses": _first(self.losses), "guesses": _first(guesses), "doubts": _first(self.lint)}
+        metadata |= {name: lines for name, lines in lists.items() if lines}
         return Report(f"{self.robot}: {self.source} -> {self.stage}", tuple(figures), metadata)
 
 
@@ -210,14 +249,16 @@ def make_report(
         for prim in stage.Traverse()
         if prim.HasAPI(UsdPhysics.MassAPI)
     )
-    losses = list(description.dropped)
-    losses += [f"link {line.name!r} has no prim" for line in links if line.became == "nothing"]
+    losses = [f"link {line.name!r} has no prim" for line in links if line.became == "nothing"]
     for line in lines:
         if line.box_in is not None and not line.kept:
             what = "did not arrive" if line.box_out is None else f"changed its box by {line.error_m:.3g} m"
             losses.append(f"{line.role} {line.index} of link {line.link!r} ({line.shape}) {what}")
     if given - total > 1e-6 * max(given, 1e-9):
         losses.append(f"mass {given:.6g} kg became {total:.6g} kg")
+    for loss in losses:
+        description.note(loss, lost=True)
+    repairs = description.repairs
     return ConversionReport(
         robot=description.name,
         source=description.path.name,
@@ -230,8 +271,13 @@ def make_report(
         mass_out_kg=round(total, 9),
         box_in=_union([line.box_in for line in visuals]),
         box_out=_union([line.box_out for line in visuals]),
-        notes=tuple(description.notes),
-        losses=tuple(dict.fromkeys(losses)),
+        repairs=tuple(
+            RepairLine(kind, *FAULTS.get(kind, ("left out", "")), len(entries), tuple(entries))
+            for kind, entries in repairs.by_kind().items()
+        ),
+        supply=" ".join(repairs.supplies),
+        notes=repairs.notes,
+        losses=repairs.losses,
         lint=tuple(lint),
         unknown_tags=dict(sorted(ledger.unknown_tags.items())),
     )
@@ -284,6 +330,14 @@ def _boxes(stage: Usd.Stage) -> dict[Sdf.Path, Box]:
             points = points @ T[:3, :3] + T[3, :3]
         boxes[path] = _corners(*bounds(points))
     return boxes
+
+
+def _first(lines: Sequence[str]) -> list[str]:
+    """The first lines, and how many are left."""
+    left = len(lines) - LINES
+    return (
+        list(lines) if left <= 1 else [*lines[:LINES], f"and {left} more; the report of --report lists all"]
+    )
 
 
 def _union(boxes: Sequence[Box | None]) -> Box | None:

@@ -4,6 +4,7 @@ Follows SDFormat's specification of `<sensor>` (sdformat.org/spec). Gazebo's sen
 USD's cameras along -z with y up.
 """
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdRender, Vt
 
-from magtwin.errors import InputError, hint
+from magtwin.errors import InputError, near
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.spec.base import ZERO3
 from magtwin.spec.sensors import ImuSpec, LidarSpec, MagnetometerSpec
@@ -42,6 +43,9 @@ SCANNER = np.pi
 
 APERTURE_MM = 20.955
 """Width of a camera's aperture, UsdGeom's default [mm]; only the field of view matters."""
+
+WIDEST = np.radians(170.0)
+"""Largest field of view of a camera without distortion [rad]."""
 
 RAYS, PIXELS = 2_000_000, 65_536
 """Most rays of a LiDAR, and most pixels along one side of an image."""
@@ -93,8 +97,7 @@ def define_sensors(tags: Tags, robot: Usd.Prim, prim_of: Callable[[str], Usd.Pri
         robot: The robot's prim.
         prim_of: Returns the prim of a link by its name.
 
-    Raises:
-        InputError: A value is not a number, or out of range; the message gives the line.
+    A sensor without the figures that its type needs becomes a frame with metadata.
     """
     made, description = list[Usd.Prim](), tags.description
     for block in tags.blocks("gazebo"):
@@ -103,7 +106,8 @@ def define_sensors(tags: Tags, robot: Usd.Prim, prim_of: Callable[[str], Usd.Pri
             name, kind = sensor.get("name") or "sensor", (sensor.get("type") or "").lower()
             start = f"sensor {name!r} of link {link!r}"
             if link not in description.links:
-                description.note(f"{start}: {hint(link, description.links)}; kept as text", lost=True)
+                text = f"{start}, which is no link{near(link, description.links)}: kept as text"
+                description.repair("name-unknown", text, sensor)
                 continue
             if kind not in KINDS:
                 description.note(f"{start} is of type {kind!r}, which has no counterpart: kept as text")
@@ -114,9 +118,10 @@ def define_sensors(tags: Tags, robot: Usd.Prim, prim_of: Callable[[str], Usd.Pri
             try:
                 made.append(KINDS[kind](tags, sensor, site, robot))
             except InputError as error:
-                if str(error).startswith(str(description.path)):
-                    raise
-                raise InputError(f"{description.where(sensor)}: {start}: {error}") from error
+                text = f"{start}: {error}: kept as a frame with its type and rate"
+                description.repair("sensor-missing", text, sensor)
+                prim, rate = site.define(), tags.number(sensor, "update_rate", least=0.0)
+                made.append(_metadata(prim, type=kind, **({} if rate is None else {"rateHz": rate})))
     return made
 
 
@@ -166,8 +171,7 @@ def _define_lidar(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> U
     (least, most, count), (lowest, highest, rows) = across, up
     near = tags.number(scan, "range/min", least=0.0) or 0.0
     far = tags.number(scan, "range/max", above=0.0)
-    if far is None or not far > near:
-        raise InputError(f"its farthest range {far} m is not above its nearest {near:g} m; give both")
+    near, far = _ordered(tags, scan, "range", near, far)
     if count * rows > RAYS:
         raise InputError(f"it has {count} x {rows} rays, over {RAYS}")
     rate = _rate(tags, sensor, LidarSpec.scan_rate_hz)
@@ -241,18 +245,20 @@ def _define_camera(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> 
         site = Site(site.stage, site.path, site.pose @ _pose(tags, lens))
     fov = tags.number(lens, "horizontal_fov", above=0.0)
     fov = 1.047 if fov is None else fov  # SDFormat's own default
-    if not fov < np.pi:
-        raise InputError(f"its horizontal_fov of {fov:g} rad is too large; give one below pi")
+    if fov > WIDEST:
+        text = f"{_say(sensor)}: its horizontal_fov of {fov:g} rad is reduced to {WIDEST:.3g}"
+        tags.description.repair("sensor-range", text, lens)
+        fov = WIDEST
     size = [tags.number(lens, f"image/{side}", above=0.0) for side in ("width", "height")]
-    width, height = (int(n or default) for n, default in zip(size, (320, 240), strict=True))
-    if not 1 <= min(width, height) <= max(width, height) <= PIXELS:
-        raise InputError(
-            f"its image of {width:g} x {height:g} pixels is invalid; give sides from 1 to {PIXELS}"
-        )
+    wanted = [n or default for n, default in zip(size, (320, 240), strict=True)]
+    width, height = (int(min(max(n, 1), PIXELS)) for n in wanted)
+    if [width, height] != [int(n) for n in wanted]:
+        was = " x ".join(f"{n:g}" for n in wanted)
+        text = f"{_say(sensor)}: its image of {was} pixels becomes {width} x {height}"
+        tags.description.repair("sensor-range", text, lens)
     near = tags.number(lens, "clip/near", "depth_camera/clip/near", above=0.0) or 0.1
     far = tags.number(lens, "clip/far", "depth_camera/clip/far", above=0.0) or 100.0
-    if not far > near:
-        raise InputError(f"its clip has far {far:g} m not beyond near {near:g} m")
+    near, far = _ordered(tags, lens, "clip", near, far)
     prim = site.define()
     camera = UsdGeom.Camera.Define(site.stage, site.path.AppendChild("camera"))
     turn = np.eye(4)
@@ -351,11 +357,27 @@ def _fan(tags: Tags, element: Element | None) -> Fan:
     count = max(1, round((samples or 1) * (1.0 if density is None else density)))
     least = tags.number(element, "min_angle") or 0.0
     most = tags.number(element, "max_angle") or 0.0
-    if most < least or most - least > 2 * np.pi + 1e-6:
-        raise InputError(
-            f"its angles go from {least:g} to {most:g} rad; give them in order, at most one turn apart"
-        )
+    given = least, most
+    least, most = min(given), max(given)
+    most = min(most, least + 2 * np.pi)
+    if element is not None and not np.allclose((least, most), given, rtol=0, atol=1e-6):
+        text = f"its angles from {given[0]:.7g} to {given[1]:.7g} rad become {least:.7g} to {most:.7g}"
+        tags.description.repair("sensor-range", text, element)
     return least, most, count
+
+
+def _ordered(tags: Tags, element: Element, what: str, near: float, far: float | None) -> tuple[float, float]:
+    """Nearest and farthest distance of a sensor [m], in this order.
+
+    Raises:
+        InputError: They are equal, or the farthest is missing.
+    """
+    if far is None or far == near:
+        raise InputError(f"its {what} from {near:g} to {far} m is empty")
+    if far < near:
+        text = f"its {what} from {near:g} to {far:g} m is read in the other order"
+        tags.description.repair("sensor-range", text, element)
+    return min(near, far), max(near, far)
 
 
 def _angles(fan: Fan) -> NDArray[np.float64]:
@@ -367,24 +389,21 @@ def _angles(fan: Fan) -> NDArray[np.float64]:
 def _pose(tags: Tags, element: Element) -> NDArray[np.float64]:
     """A `<pose>` x y z roll pitch yaw, shape (4, 4).
 
-    Raises:
-        InputError: It is not six finite numbers, or is relative to another frame.
+    One that is not six finite numbers, or is relative to another frame, is left out.
     """
     tag, T = tags.find(element, "pose"), np.eye(4)
     if tag is None or not (tag.text or "").strip():
         return T
-    where = tags.description.where(tag)
-    frame = tag.get("relative_to") or tag.get("frame")
-    if frame:
-        raise InputError(
-            f"{where}: a pose relative to {frame!r} is not supported; give it in the link's frame"
-        )
-    try:
-        values = [float(word) for word in (tag.text or "").split()]
-    except ValueError:
-        values = []
-    if len(values) != 6 or not np.isfinite(values).all():
-        raise InputError(f"{where}: a pose is x y z roll pitch yaw, got {(tag.text or '').strip()!r}")
+    frame, text = tag.get("relative_to") or tag.get("frame"), (tag.text or "").strip()
+    values: list[float] = []
+    with contextlib.suppress(ValueError):
+        values = [float(word) for word in text.split()]
+    valid = len(values) == 6 and bool(np.isfinite(values).all())
+    if frame or not valid:
+        reason = f"is relative to {frame!r}" if frame else f"is not x y z roll pitch yaw, but {text!r}"
+        fault = f"{_say(element)}: its pose {reason}: it is at the origin of its link"
+        tags.description.repair("sensor-range", fault, tag)
+        return T
     angles = np.radians(values[3:]) if tag.get("degrees", "").lower() in ("true", "1") else values[3:]
     T[:3, :3], T[:3, 3] = matrix_from_quat(quat_from_rpy(angles)), values[:3]
     return T

@@ -17,7 +17,7 @@ from magtwin.urdf.meshes.reading import Reading
 from magtwin.urdf.meshes.texture import Image, read_image
 from magtwin.urdf.physics.gazebo import Surface
 from magtwin.urdf.physics.inertia import quaternion
-from magtwin.urdf.source.source import MissingFileError
+from magtwin.urdf.source.package import MissingFileError
 from magtwin.usd.sensors import write_pose
 
 VISUALS, COLLISIONS = "visuals", "collisions"

@@ -12,9 +12,10 @@ from nodes import DOMAINS, spin
 from places import ROOT
 
 from magtwin.errors import InputError
-from magtwin.io.bags.topics import LATCHED, ODOMETRY, SENSOR_DATA, TOPICS, Qos
+from magtwin.io.bags.topics import LATCHED, ODOMETRY, POSE, SENSOR_DATA, TOPICS, Qos
 from magtwin.ros.bus import Bus, Message, names_of, open_bus, to_bytes
-from magtwin.ros.clock import Clock
+from magtwin.ros.bus.clock import Clock
+from magtwin.ros.bus.names import range_of
 
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 
@@ -74,7 +75,7 @@ def test_every_type_of_the_table_crosses_unchanged(pair: tuple[Bus, Bus]) -> Non
 def test_our_bytes_are_those_that_cyclonedds_itself_writes() -> None:
     from cyclonedds.idl import IdlStruct
 
-    from magtwin.ros.types import _struct
+    from magtwin.ros.bus.types import _struct
 
     struct = _struct(FIELD)
     header, field = (struct.__annotations__[name] for name in ("header", "magnetic_field"))
@@ -109,6 +110,69 @@ def test_who_comes_late_gets_what_is_latched_and_nothing_else(pair: tuple[Bus, B
     for _ in range(10):
         other.spin_once(0.01)
     assert heard == ["latched"]
+
+
+def test_streams_are_offered_reliably_unless_sensor_data_are_asked_for(domain: int) -> None:
+    opened = {"reliable": True, "sensor-data": False}
+    for offers, reliable in opened.items():
+        one, other = (
+            open_bus(n, backend="cyclonedds", domain=domain, offers=offers) for n in ("one", "other")
+        )
+        for topic in (ODOMETRY, POSE):
+            one.publisher(topic.name, topic.kind, topic.qos)
+        spin(lambda: other.publishers(ODOMETRY.name) and other.publishers(POSE.name), other)  # noqa: B023
+        assert other.reliable(ODOMETRY.name) == reliable
+        assert other.reliable(POSE.name)  # no stream of sensor data
+        one.close()
+        other.close()
+
+
+@pytest.mark.parametrize("offered", [Qos(), SENSOR_DATA])
+def test_a_best_effort_subscription_hears_every_publisher_and_a_reliable_one_reliable_ones(
+    pair: tuple[Bus, Bus], offered: Qos
+) -> None:
+    one, other = pair
+    heard: list[str] = []
+    talk = one.publisher("odom", "std_msgs/msg/String", offered)
+    for name, qos in (("any", Qos().heard), ("strict", Qos())):
+        other.subscribe("odom", "std_msgs/msg/String", lambda m, name=name: heard.append(name), qos)
+    wanted = {"any", "strict"} if offered.reliable else {"any"}
+    spin(lambda: talk.subscribers() == len(wanted), one, other)
+    talk.publish(to_bytes("std_msgs/msg/String", {"data": "x"}))
+    spin(lambda: set(heard) == wanted, one, other)
+
+
+@pytest.mark.parametrize(
+    ("environment", "wanted"),
+    [
+        ({}, "localhost"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, "subnet"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "localhost"}, "localhost"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"}, "subnet"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "ROS_LOCALHOST_ONLY": "1"}, "localhost"),
+        ({"ROS_LOCALHOST_ONLY": "0"}, "subnet"),
+    ],
+)
+def test_a_node_is_found_on_this_machine_alone_unless_the_environment_or_an_option_opens_it(
+    environment: dict[str, str], wanted: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOCALHOST_ONLY"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert range_of() == wanted
+    assert range_of("subnet") == "subnet"
+    assert range_of("localhost") == "localhost"
+
+
+@pytest.mark.parametrize("value", ["OFF", "world"])
+def test_a_discovery_range_that_finds_nobody_or_is_unknown_is_refused(
+    value: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("ROS_LOCALHOST_ONLY", raising=False)
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", value)
+    with pytest.raises(InputError, match="LOCALHOST, SUBNET or SYSTEM_DEFAULT"):
+        range_of()
 
 
 def test_a_node_sees_how_many_send_on_a_topic_and_in_which_types(pair: tuple[Bus, Bus]) -> None:

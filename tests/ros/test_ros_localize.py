@@ -98,8 +98,8 @@ def test_a_simulated_drive_is_localized_live_as_offline(net: Net, twin: Twin, me
     bus, ear, robot = net.bus("localizer", sim_time=True), net.bus("ear"), net.bus("robot")
     rows: list[Run] = []
     sim = Simulator(twin, robot, seed=3, speed=3.0)
-    tell = sim._tell
-    sim._tell = lambda run: (rows.append(run), tell(run))[1]  # type: ignore[method-assign, assignment]
+    read = sim.online.read
+    sim.online.read = lambda: (rows.append(read()), rows[-1])[1]  # type: ignore[method-assign]
     spin(lambda: bus.types(MAGNITUDE.name) and bus.types(ODOMETRY.name), bus)
     values = settings(PARAMETERS, told)
     problem = live_problem(twin, seed=4)

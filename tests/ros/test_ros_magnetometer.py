@@ -203,7 +203,7 @@ def test_what_is_set_while_it_runs_counts_from_the_next_reading_on(
         return True
 
     setters: list[Callable[[str, object], None]] = []
-    monkeypatch.setattr("magtwin.ros.dds.DdsBus.settable", settable)
+    monkeypatch.setattr("magtwin.ros.bus.dds.DdsBus.settable", settable)
     bus = world.start()
     world.tick(bus, 10)
     assert (before := world.heard(bus)) >= 9

@@ -57,6 +57,11 @@ def arguments(monkeypatch: pytest.MonkeyPatch):
             "lab --ros-args -p method:=ekf -p prior:=global -p use_sim_time:=true -r __ns:=/tb4",
             "ros localize lab --method=ekf prior:=global use_sim_time:=true --namespace=tb4",
         ),
+        (
+            "follow",
+            "figure8 --ros-args -p discovery:=subnet -p domain:= -p laps:=2",
+            "ros follow figure8 --discovery=subnet --laps=2",
+        ),
         ("replay", "a.mcap --ros-args -p use_sim_time:=true -r x:__ns:=/", "ros replay a.mcap --namespace="),
     ],
 )
@@ -202,7 +207,14 @@ def launched(monkeypatch: pytest.MonkeyPatch) -> list:
 def test_the_launch_file_starts_commands_that_magtwin_takes(arguments, launched, tmp_path) -> None:
     from magtwin.cli.ros import ros_app
 
-    values = {"path": "figure8", "speed": "0.2", "scene": "lab.usda", "units": "T", "use_sim_time": "true"}
+    values = {
+        "path": "figure8",
+        "speed": "0.2",
+        "scene": "lab.usda",
+        "units": "T",
+        "use_sim_time": "true",
+        "discovery": "",
+    }
     declared = {one.args[0] for one in launched if one.made == "DeclareLaunchArgument"}
     nodes = [one for one in launched if one.made == "Node"]
     assert [node.executable for node in nodes] == ["sim", "magnetometer", "follow"]

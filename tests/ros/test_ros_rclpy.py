@@ -29,8 +29,10 @@ from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry
+from diagnostic_msgs.msg import DiagnosticArray
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, Imu, JointState, LaserScan, MagneticField
-from std_msgs.msg import Float64, String
+from std_msgs.msg import Float64, Float64MultiArray, String
 from rclpy.qos import QoSProfile, DurabilityPolicy
 
 rclpy.init()
@@ -40,16 +42,17 @@ heard, due = {}, []
 def keep(name):
     return lambda m: heard.setdefault(name, []).append(m)
 
-sensor = qos_profile_sensor_data
 latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 for name, kind, qos in (
     ("qtfm/magnitude", MagneticField, 10), ("qtfm/field", MagneticField, 10),
-    ("qtfm/total_field_nt", Float64, 10), ("odom", Odometry, sensor), ("imu", Imu, sensor),
-    ("enu/pose", PoseStamped, 10), ("scan", LaserScan, sensor), ("joint_states", JointState, 10),
-    ("battery_state", BatteryState, sensor), ("robot_description", String, latched),
+    ("qtfm/total_field_nt", Float64, 10), ("odom", Odometry, 10), ("imu", Imu, 10),
+    ("enu/pose", PoseStamped, 10), ("scan", LaserScan, 10), ("joint_states", JointState, 10),
+    ("battery_state", BatteryState, 10), ("robot_description", String, latched), ("/clock", Clock, 10),
+    ("magtwin/reading", Float64MultiArray, 10), ("magtwin/columns", String, latched),
+    ("/diagnostics", DiagnosticArray, 10),
 ):
-    node.create_subscription(kind, "/robot/" + name, keep(name), qos)
-drive = node.create_publisher(Twist, "/robot/cmd_vel", 10)
+    node.create_subscription(kind, name if name[0] == "/" else "/robot/" + name, keep(name), qos)
+drive = node.create_publisher(Twist, "/robot/cmd_vel", qos_profile_sensor_data)  # best effort
 
 def tick():
     now = node.get_clock().now().nanoseconds
@@ -61,7 +64,7 @@ def tick():
 
 node.create_timer(0.1, tick)
 begin = time.monotonic()
-while len(due) < 20 and time.monotonic() < begin + 25:
+while (len(due) < 20 or len(heard) < 14) and time.monotonic() < begin + 25:
     rclpy.spin_once(node, timeout_sec=0.1)
 field, odom = heard["qtfm/magnitude"][-1], heard["odom"][-1]
 print(json.dumps({
@@ -74,7 +77,7 @@ print(json.dumps({
     "stamp": field.header.stamp.sec + 1e-9 * field.header.stamp.nanosec,
     "speed": max(o.twist.twist.linear.x for o in heard["odom"]),
     "wheels": list(heard["joint_states"][-1].name),
-    "volts": heard["battery_state"][-1].voltage if "battery_state" in heard else None,
+    "volts": heard["battery_state"][-1].voltage,
     "rays": len(heard["scan"][-1].ranges),
     "urdf": heard["robot_description"][-1].data[:200],
     "sim": due,
@@ -87,22 +90,26 @@ def twin() -> Twin:
     return open_twin(shipped("scenes", "lab", "lab.usda"), magnetometer="map-only")
 
 
-@pytest.mark.parametrize(("distribution", "speed"), [("jazzy", 1.0), ("jazzy", 4.0), ("kilted", 4.0)])
+@pytest.mark.parametrize(
+    ("distribution", "speed", "reach"),
+    [("jazzy", 1.0, "LOCALHOST"), ("jazzy", 4.0, "SUBNET"), ("kilted", 4.0, "SUBNET")],
+)
 def test_a_stranger_in_rclpy_sees_the_robot_obeys_its_clock_and_drives_it(
-    twin: Twin, monkeypatch: pytest.MonkeyPatch, distribution: str, speed: float
+    twin: Twin, monkeypatch: pytest.MonkeyPatch, distribution: str, speed: float, reach: str
 ) -> None:
     python = BUILD / f"ros-{distribution}" / "bin" / "python"
     if not python.exists():
         pytest.skip(f"no rclpy of {distribution}: `make ros` installs it into build/ros-{distribution}")
     domain = next(DOMAINS)
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
+    for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOCALHOST_ONLY", "CYCLONEDDS_URI"):
+        monkeypatch.delenv(name, raising=False)
     bus = open_bus("sim", backend="cyclonedds", domain=domain)
+    assert bus.reach == "localhost"  # whatever the stranger's reach
     simulator, over = Simulator(twin, bus, speed=speed, lidar="on"), threading.Event()
     simulated = threading.Thread(target=simulator.run, args=(over.is_set,))
     simulated.start()
     try:
-        env = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+        env = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": reach}
         ended = subprocess.run([python, "-c", STRANGER], env=env, capture_output=True, text=True, timeout=60)
     finally:
         over.set()
@@ -110,19 +117,22 @@ def test_a_stranger_in_rclpy_sees_the_robot_obeys_its_clock_and_drives_it(
         bus.close()
     assert ended.returncode == 0, ended.stderr
     seen = json.loads(ended.stdout.splitlines()[-1])
-    assert {"qtfm/magnitude", "odom", "imu", "enu/pose", "scan", "joint_states"} <= set(seen["heard"])
+    field = {"qtfm/magnitude", "qtfm/field", "qtfm/total_field_nt", "magtwin/reading", "magtwin/columns"}
+    sensors = {"odom", "imu", "enu/pose", "battery_state", "scan", "joint_states", "robot_description"}
+    assert set(seen["heard"]) == field | sensors | {"/clock", "/diagnostics"}  # the wheels have no tf2_msgs
     assert 2e-5 < seen["tesla"] < 7e-5
     assert seen["nt"] == pytest.approx(1e9 * seen["tesla"], rel=0.05)  # perhaps of the reading beside it
     assert seen["frames"] == ["magnetometer_link", "odom", "base_link", "map", "imu_link"]
     assert seen["wheels"] == ["left_wheel_joint", "right_wheel_joint"]
     assert seen["rays"] == 720
+    assert 12 < seen["volts"] < 17
     assert "<robot" in seen["urdf"]
     assert seen["speed"] > 0.2
     sim = seen["sim"]
     assert abs(seen["stamp"] - sim[-1]) < 0.5
     assert sorted(set(sim)) == sim
     # 19 steps of 0.1 s of /clock; by the wall they would be 7.6 s of it at four times real time.
-    assert 1.7 < sim[-1] - sim[0] < 4.0
+    assert 1.7 < sim[19] - sim[0] < 4.0
 
 
 OURS = """

@@ -269,7 +269,7 @@ def test_commands_that_it_cannot_hear_and_others_on_its_topics_are_said(
     for topic in (CLOCK, MAGNITUDE):
         hand.publisher(topic.name, topic.kind, topic.qos)
     spin(lambda: hand.types("/diagnostics"), hand)
-    simulator._commanded(Message(COMMAND.kind, command(0.3, 0.0)[:20], 0, 0))
+    simulator.robots[0].commanded(Message(COMMAND.kind, command(0.3, 0.0)[:20], 0, 0))
     last, others = time.monotonic() + SLOWEST_S, "2 publishers on /robot/qtfm/magnitude"
 
     def settled() -> bool:  # the domain may still know a node of an earlier test

@@ -14,7 +14,7 @@ from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.urdf import convert_urdf, read_notes
 from magtwin.urdf.description.description import read_description
-from magtwin.urdf.physics.inertia import principal_axes, quaternion
+from magtwin.urdf.physics.inertia import nearest_possible, principal_axes, quaternion
 from magtwin.usd.geometry import read_links, read_shapes
 from magtwin.usd.solids import corner_normals
 
@@ -225,26 +225,16 @@ def test_principal_axes_give_back_the_tensor_of_a_turned_box(sizes, rpy):
     a, b, c = np.square(sizes)
     R = matrix_from_quat(quat_from_rpy(rpy))
     tensor = R @ np.diag([b + c, a + c, a + b]) @ R.T / 12
-    moments, q, repaired = principal_axes(tensor)
+    moments, q = principal_axes(tensor)
     axes = matrix_from_quat(q)
     assert_allclose(axes @ np.diag(moments) @ axes.T, tensor, atol=1e-9)
-    assert not repaired
+    assert nearest_possible(tensor) is tensor
 
 
 def test_a_diagonal_tensor_keeps_its_axes():
-    moments, q, _ = principal_axes(np.diag([3.0, 2.0, 2.5]))
+    moments, q = principal_axes(np.diag([3.0, 2.0, 2.5]))
     assert_allclose(moments, [3, 2, 2.5])
     assert_allclose(q, [0, 0, 0, 1])
-
-
-def test_a_near_miss_of_the_triangle_inequality_is_repaired_and_a_far_one_refused():
-    moments, _, repaired = principal_axes(np.diag([1.0, 1.0, 2.01]))
-    assert repaired
-    assert_allclose(moments, [1, 1, 2])
-    with pytest.raises(InputError, match="none may exceed the sum of the others"):
-        principal_axes(np.diag([1.0, 1.0, 3.0]))
-    with pytest.raises(InputError, match="all must be above 0"):
-        principal_axes(np.diag([1.0, -1.0, 1.0]))
 
 
 @given(st.lists(st.floats(-3.1, 3.1), min_size=3, max_size=3))
@@ -271,14 +261,8 @@ def mesh_link(filename):
     return f'<link name="b"><visual><geometry><mesh filename="{filename}"/></geometry></visual></link>'
 
 
-FLAT = INERTIAL.replace('izz="1"', 'izz="9"')
-NO_MASS = '<link name="b"><inertial><origin xyz="0 0 1"/></inertial></link>'
-
-
 REFUSED = {
     "mesh scale": (mesh_link('t.stl" scale="1 0 1'), r"mesh 't\.stl' has scale \[1\.0, 0\.0, 1\.0\]; give"),
-    "no mass": (NO_MASS, r":3: link 'b' has a mass of None"),
-    "inertia": (f'<link name="b">{FLAT}</link>', r":3: link 'b' has an impossible inertia: no body has"),
     "too large": (
         '<link name="b"><visual><geometry><sphere radius="1e200"/></geometry></visual></link>',
         r":3: link 'b': radius of <sphere> must be a finite number, got '1e200'",
@@ -329,30 +313,6 @@ def test_any_name_is_accepted_and_invalid_usd_names_become_display_names(tmp_pat
     height = UsdGeom.BBoxCache(0, ["default"]).ComputeWorldBound(robot).ComputeAlignedRange().GetMax()[2]
     assert_allclose(height, 0.1, rtol=1e-6)  # no frame moves the shapes beside it
     assert_valid(tmp_path / "my robot.usda", tmp_path)
-
-
-JOINTS = {
-    "no limit": ("revolute|", "joint 'j' is revolute and needs <limit lower= upper=>"),
-    "effort": (
-        'continuous|<limit effort="-1" velocity="1"/>',
-        "joint 'j' has an effort of -1; give one above 0",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", JOINTS)
-def test_a_bad_joint_is_refused_with_its_line(tmp_path, case):
-    inner, message = JOINTS[case]
-    with pytest.raises(InputError, match=r"arm\.urdf:5: " + message):
-        convert_urdf(arm(tmp_path, inner), tmp_path / "arm.usda")
-
-
-def test_a_flat_mesh_has_no_hull_and_is_refused(tmp_path):
-    mesh = '<geometry><mesh filename="m.stl"/></geometry>'
-    path = urdf(tmp_path, f'<link name="b">{{INERTIAL}}<collision>{mesh}</collision></link>')
-    trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).export(tmp_path / "m.stl")
-    with pytest.raises(InputError, match=r"m\.stl: is flat and has no convex hull to collide with"):
-        convert_urdf(path, tmp_path / "arm.usda")
 
 
 def test_an_output_that_exists_is_kept_unless_forced(tmp_path):

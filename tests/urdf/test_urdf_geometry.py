@@ -34,6 +34,9 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 """A tetrahedron of volume 1, facing outwards."""
 
 
+REFUSE = Options(missing_meshes="refuse")
+
+
 def robot(tmp_path, body, head="", options=Options(), name="arm"):  # noqa: B008
     """The stage of a robot of one link whose visuals and colliders are given as XML."""
     path = tmp_path / f"{name}.urdf"
@@ -411,7 +414,7 @@ def test_a_malformed_collada_file_is_refused_with_its_line(tmp_path, case):
 def test_a_geometry_that_no_node_shows_is_noted(tmp_path):
     dae(tmp_path / "n.dae", "<node/>")
     with pytest.raises(InputError, match=r"n\.dae: holds no triangle"):
-        robot(tmp_path, visual("n.dae"))
+        robot(tmp_path, visual("n.dae"), options=REFUSE)
 
 
 # --- polygons -------------------------------------------------------------------------------------
@@ -845,7 +848,7 @@ def test_a_decomposition_without_coacd_is_refused_with_the_line_that_installs_it
 def test_a_missing_mesh_is_refused_or_left_out_with_a_note_that_names_link_and_file(tmp_path):
     body = visual("no.stl") + collision("no.stl")
     with pytest.raises(InputError, match=r"mesh 'no\.stl' is missing"):
-        robot(tmp_path, body)
+        robot(tmp_path, body, options=REFUSE)
     stage = robot(tmp_path, body, options=Options(missing_meshes="note"))
     assert "link 'base_link': visual is left out: its mesh 'no.stl' is missing" in notes_of(stage)
     assert "link 'base_link': collision is left out: its mesh 'no.stl' is missing" in notes_of(stage)
@@ -954,7 +957,7 @@ def test_a_damaged_mesh_is_refused_in_one_line(tmp_path, name):
     write, message = DAMAGED[name]
     write(tmp_path / name)
     with pytest.raises(InputError, match=message) as refusal:
-        robot(tmp_path, visual(name))
+        robot(tmp_path, visual(name), options=REFUSE)
     assert "\n" not in str(refusal.value)
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
 

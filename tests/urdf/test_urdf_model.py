@@ -39,7 +39,7 @@ def yourdfpys(description):
     clean = ElementTree.Element("robot", name=description.name)
     for part in description.xml:
         if part.tag in ("link", "joint", "material"):
-            clean.append(check_grammar(part, description.where, lambda text, lost=False: None))
+            clean.append(check_grammar(part, description.where, lambda kind, text, element: None))
     for capsule in clean.iter("capsule"):
         capsule.tag = "cylinder"
     text = io.BytesIO(ElementTree.tostring(clean))

@@ -168,12 +168,12 @@ MISSING = """<link name="base_link">{BODY}<visual><geometry><mesh filename="{0}.
 <visual><geometry><mesh filename="{1}.stl"/></geometry></visual></link>"""
 
 
-def test_strict_names_the_first_loss_and_counts_the_others(tmp_path):
+def test_strict_names_every_fault(tmp_path):
     path = urdf(tmp_path, MISSING.replace("{0}", "one").replace("{1}", "two"))
     report = convert(path, missing_meshes="note")
     assert len(report.losses) == 2
     path.with_suffix(".usda").unlink()
-    with pytest.raises(InputError, match=r"arm\.urdf: .*one\.stl.*\(and 1 more\); convert without --strict"):
+    with pytest.raises(InputError, match=r"arm\.urdf: 2 faults: .*one\.stl.*two\.stl.*; convert without"):
         convert_with_report(
             path,
             tmp_path / "strict" / "arm.usda",

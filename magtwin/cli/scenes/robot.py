@@ -17,7 +17,8 @@ def robot(
     settings: Path | None = None,
     package: list[str] | None = None,
     arg: list[str] | None = None,
-    missing_meshes: Literal["refuse", "note"] | None = None,
+    missing_meshes: Literal["box", "note", "refuse"] | None = None,
+    skip_missing_includes: bool | None = None,
     collision: Literal["hull", "decomposition", "mesh"] | None = None,
     profile: Literal["general", "diff-drive"] | None = None,
     drive: list[str] | None = None,
@@ -48,7 +49,10 @@ def robot(
     arg
         NAME=VALUE: argument of the xacro. May be repeated.
     missing_meshes
-        What to do about a missing mesh: refuse, or leave it out and note it. Default: refuse.
+        What to do about a missing or unreadable mesh: a box of the link's size as a placeholder; leave it
+        out and note it; or refuse. Default: box.
+    skip_missing_includes
+        Skip files and packages that a xacro includes but that are missing, if none of their macros is called.
     collision
         Collision shape of a mesh: convex hull, convex decomposition (extra "decomposition"), or the mesh.
     profile
@@ -67,7 +71,7 @@ def robot(
     single_file
         Write one root layer and its meshes, in place of Isaac Sim's layers.
     strict
-        Refuse a conversion that loses anything.
+        Refuse a description with faults, naming all of them, in place of repairing it.
     thumbnail
         Draw a picture of the robot beside it, which NVIDIA's SimReady profiles require.
     report
@@ -85,7 +89,8 @@ def robot(
             raise InputError(f"{urdf}: is no stage; a URDF is written from .usd, .usda, .usdc or .usdz")
         return Done(write_urdf(urdf, out, force=force), out)
     check_output(report, (".json",), "a report", force=force)
-    same = ("missing_meshes", "collision", "profile", "fix_base", "merge_fixed", "single_file", "strict")
+    same = ["missing_meshes", "skip_missing_includes", "collision", "profile", "fix_base", "merge_fixed"]
+    same += ["single_file", "strict"]
     choices = {name: given[name] for name in same} | {
         "packages": {name: Path(folder) for name, folder in pairs("package", package).items()} or None,
         "arguments": pairs("arg", arg, empty=True) or None,

@@ -1,6 +1,6 @@
 """Sender: what the messages of a robot hold beside its readings: frames, covariances, links, units."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -111,6 +111,21 @@ def sender_of(robot: RobotSpec, *, unit: Unit = "T", rate_hz: float | None = Non
         range_m=(robot.lidar.range_min_m, robot.lidar.range_max_m),
         **{**rest, "links": (*rest.get("links", ()), *tilted)},
     )
+
+
+def prefixed(sender: Sender, prefix: str) -> Sender:
+    """The sender with a prefix before the names of its frames, as `frame_prefix` of robot_state_publisher.
+
+    The frame of the map is shared by robots and keeps its name. Joints keep theirs.
+    """
+
+    def moved(frame: FixedFrame) -> FixedFrame:
+        return replace(frame, parent=prefix + frame.parent, name=prefix + frame.name)
+
+    names = ("odom_frame", "base_frame", "imu_frame", "magnetometer_frame", "lidar_frame")
+    wheels = None if sender.wheels is None else (moved(sender.wheels[0]), moved(sender.wheels[1]))
+    frames: dict[str, Any] = {name: prefix + getattr(sender, name) for name in names}
+    return replace(sender, links=tuple(map(moved, sender.links)), wheels=wheels, **frames)
 
 
 def sender_for(twin: "Twin | None", unit: Unit, rate_hz: Any = None) -> Sender:

@@ -9,7 +9,7 @@ reading that has its value.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -35,6 +35,17 @@ class Qos:
     latched: bool = False
     """Whether late subscribers get the last message (transient local)."""
 
+    sensor: bool = False
+    """Whether it is a stream of sensor data, which `--qos sensor-data` offers as `SENSOR_DATA`."""
+
+    @property
+    def heard(self) -> "Qos":
+        """QoS of a subscription: best effort, which matches every publisher; reliable only if latched."""
+        return replace(self, reliable=self.latched)
+
+
+STREAM = Qos(sensor=True)
+"""A reliable offer serves reliable and best-effort subscribers, a best-effort offer only the latter."""
 
 SENSOR_DATA = Qos(depth=5, reliable=False)
 LATCHED = Qos(depth=1, latched=True)
@@ -223,7 +234,7 @@ def _pose_at(prefix: str, p: str = "position", q: str = "orientation") -> dict[s
 
 def _carrier(kind: str, leaves: dict[str, str], **rest: Any) -> Topic:
     """A topic whose message type holds each of its columns in a leaf."""
-    return Topic(kind=kind, needs=tuple(leaves), carried=True, reads={kind: leaves}, qos=SENSOR_DATA, **rest)
+    return Topic(kind=kind, needs=tuple(leaves), carried=True, reads={kind: leaves}, qos=STREAM, **rest)
 
 
 _FIELD = "sensor_msgs/msg/MagneticField"
@@ -324,7 +335,7 @@ TF = Topic(
 CLOCK = Topic(
     name="/clock",
     kind="rosgraph_msgs/msg/Clock",
-    qos=Qos(depth=1, reliable=False),
+    qos=STREAM,
     needs=("t",),
     sent="ticks",
     every_s=0.025,
@@ -341,7 +352,7 @@ DESCRIPTION = Topic(
 SCAN = Topic(
     name="/robot/scan",
     kind="sensor_msgs/msg/LaserScan",
-    qos=SENSOR_DATA,
+    qos=STREAM,
     frame="lidar_frame",
     more=_scan,
     reads={"sensor_msgs/msg/LaserScan": {"stamp": "header.stamp"}},

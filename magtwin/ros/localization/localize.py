@@ -19,7 +19,7 @@ from magtwin.field.units import NT_PER
 from magtwin.frames import yaw_from_quat
 from magtwin.io.bags.bag import unit_of
 from magtwin.io.bags.cdr import NS
-from magtwin.io.bags.sender import sender_of
+from magtwin.io.bags.sender import prefixed, sender_of
 from magtwin.io.bags.topics import (
     BATTERY,
     COMMAND,
@@ -36,6 +36,7 @@ from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import Array, Localizer, Prior, Problem, Reading
 from magtwin.localization.track import LocalizerError, checked_estimates
 from magtwin.ros.bus import Bus, Message, Subscription, to_bytes
+from magtwin.ros.bus.names import checked_prefix
 from magtwin.ros.diagnostics import Level, Reporter, status_of
 from magtwin.ros.inputs import JUMP_S, Input, Scanning
 from magtwin.ros.localization.poses import (
@@ -97,6 +98,7 @@ class LocalizerNode:
         method: str,
         options: Mapping[str, Any] | None = None,
         problem: Problem,
+        frame_prefix: str = "",
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
         """Advertise its topics, and search for its inputs.
@@ -108,6 +110,7 @@ class LocalizerNode:
             method: As for `magtwin.localize`.
             options: Keyword arguments of the method's class.
             problem: Map and noise models; its prior and rate are replaced by the settings.
+            frame_prefix: Prefix of the names of frames, such as "tb4/".
             say: Called with messages for the user.
 
         Raises:
@@ -117,7 +120,8 @@ class LocalizerNode:
         self._method, self._options, self._problem = method, dict(options or {}), problem
         self._prior = prior_of(str(settings["prior"]))
         self._make()
-        self._sender = sender_of(twin.scene.robot, unit="T", rate_hz=settings["rate_hz"])
+        sender = sender_of(twin.scene.robot, unit="T", rate_hz=settings["rate_hz"])
+        self._sender = prefixed(sender, checked_prefix(frame_prefix))
         age = settings["max_age_s"]
         self.inputs = {ODOMETRY.name: Input(bus, ODOMETRY, max_age_s=age)}
         self.inputs |= {topic.name: Input(bus, topic, max_age_s=HELD_S) for topic in OTHERS}
@@ -133,8 +137,8 @@ class LocalizerNode:
         self._tf = None
         if settings["tf_broadcast"] and bus.knows(TF_KIND):
             self._tf = bus.publisher(TF.name, TF_KIND, TF.qos)
-            bus.subscribe(TF.name, TF_KIND, self._hear_tf, TF.qos)
-        bus.subscribe(INITIAL, POSE_KIND, self._start_at, Qos())
+            bus.subscribe(TF.name, TF_KIND, self._hear_tf, TF.qos.heard)
+        bus.subscribe(INITIAL, POSE_KIND, self._start_at, Qos().heard)
         self._reporter = Reporter(bus)
         self._algorithm: Localizer | None = None
         self._tick0, self._done = 0.0, 0

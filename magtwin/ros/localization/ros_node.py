@@ -98,8 +98,8 @@ class RosNode:
         initial = bus.publisher(INITIAL, POSE_KIND, Qos())
         self._estimates: dict[int, Estimate] = {}
         self._lost = False
-        bus.subscribe(LOST, LOST_KIND, self._hear_lost, MANY)
-        self._source = bus.subscribe(self._topic, POSE_KIND, self._hear, MANY)
+        bus.subscribe(LOST, LOST_KIND, self._hear_lost, MANY.heard)
+        self._source = bus.subscribe(self._topic, POSE_KIND, self._hear, MANY.heard)
         known = not any(map(np.isinf, problem.prior.sd))
         needed = [self._publishers[topic.name] for topic in (ODOMETRY, MAGNITUDE)] + [initial] * known
         last = time.monotonic() + self._connect_s

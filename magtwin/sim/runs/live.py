@@ -3,7 +3,7 @@
 If `simulate` drives the same commands from the same seed, it gives the same columns.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Literal
 
 import numpy as np
@@ -16,6 +16,7 @@ from magtwin.sim.motion.commands import Commands
 from magtwin.sim.motion.drive import Moment, draw_wheel_errors, moment_in_steps, wheel_rates
 from magtwin.sim.motion.follow import CONTROL_RATE_HZ
 from magtwin.sim.motion.manual import at_start
+from magtwin.sim.runs.neighbours import Neighbour
 from magtwin.sim.runs.sensing import Conditions, LidarMode, Sensing, streams
 from magtwin.sim.runs.simulate import check_run, run_metadata
 from magtwin.sim.sensors.clock import Samples
@@ -55,6 +56,8 @@ class Track:
     def end_s(self) -> float:
         """Time at the end of the last step [s]."""
         return self.steps * self._dt
+
+    duration_s = end_s
 
     def add(self, record: Array) -> None:
         """Add a step; see `magtwin.sim.motion.loop.RECORD`."""
@@ -124,7 +127,8 @@ class LiveRobot:
         self._chassis: Chassis = at_start(robot.drive, scene.start, obstacles, radius, errors, self.step_s)
         self._track = Track(robot.drive, self.step_s, scene.start)
         self._network, self._model_error, self._height_m = network, model_error, robot.base_height_m
-        self._sensing = Sensing(scene, draws, conditions)
+        self._robot, self._neighbours = robot, list[Neighbour]()
+        self._sensing = Sensing(scene, draws, conditions, neighbours=self._neighbours)
         self.rate_hz = self._sensing.rate_hz
         self._scanner = Scanner(robot, obstacles, draws["lidar"])
         self._noise_sd_nt = robot.magnetometer.noise_density_nt * np.sqrt(self.rate_hz / 2)
@@ -148,8 +152,15 @@ class LiveRobot:
         end = (self._track.steps * self.step_s, 0.0, 0.0)
         return Commands("live", np.array([(0.0, 0.0, 0.0), *self._rows, end]))
 
+    def beside(self, others: "Iterable[LiveRobot]") -> None:
+        """Put other robots into the lab, which this one senses as in `magtwin.sim.runs.multi_robot`.
+
+        Robots beside each other must `drive` all before any of them is `read`.
+        """
+        self._neighbours += [Neighbour(other._robot, other._track) for other in others]
+
     def step(self, command: tuple[float, float] | None = None) -> Run:
-        """Drive on for a control step, and read the sensors in its time.
+        """Drive on for a control step, and read the sensors in its time: `drive`, then `read`.
 
         Args:
             command: Forward speed [m/s] and yaw rate [rad/s]. None keeps the last command until the drive's
@@ -161,6 +172,11 @@ class LiveRobot:
         Raises:
             InputError: The command is not finite.
         """
+        self.drive(command)
+        return self.read()
+
+    def drive(self, command: tuple[float, float] | None = None) -> None:
+        """Drive on for a control step; the command is as for `step`."""
         begin = self._track.end_s
         if begin == 0:
             command = (0.0, 0.0)
@@ -168,7 +184,6 @@ class LiveRobot:
         if command is not None and begin > 0:
             self._rows.append((begin, *command))
         self._track.add(self._chassis.last)
-        return self._read()
 
     def scans(self) -> Scans:
         """The LiDAR's scans whose time lay in the last step, with the times at which they will arrive."""
@@ -183,7 +198,8 @@ class LiveRobot:
         """The samples of odometry, imu, mocap and battery since the last call, by these names."""
         return {name: sensor.clock.take_fresh() for name, sensor in self._sensing.sampled.items()}
 
-    def _read(self) -> Run:
+    def read(self) -> Run:
+        """The readings in the time of the last step; see `step`."""
         until = self._track.end_s
         count = int(np.ceil(until * self.rate_hz - 1e-9))
         t = np.arange(self._readings, count) / self.rate_hz

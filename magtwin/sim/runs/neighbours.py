@@ -97,7 +97,12 @@ def iron_moments(robot: RobotSpec, b_base_nt: ArrayLike) -> Array:
 
 
 def neighbours_field_nt(
-    scene: Scene, neighbours: Sequence[Neighbour], motion: Moving, t: ArrayLike, true: Moment
+    scene: Scene,
+    neighbours: Sequence[Neighbour],
+    motion: Moving,
+    t: ArrayLike,
+    true: Moment,
+    until_s: float = math.inf,
 ) -> Array:
     """Field of other robots at a robot's magnetometer.
 
@@ -110,15 +115,17 @@ def neighbours_field_nt(
         motion: What the first robot did.
         t: Times of the readings, ascending [s], shape (N,).
         true: Its motion at these times.
+        until_s: Time up to which the motions are known [s].
 
     Returns:
         Field in base_link axes [nT], shape (N, 3).
     """
     t = np.asarray(t, float)
-    later, sooner = (_at_sensor(scene, neighbours, motion, t + dt) for dt in (RATE_STEP_S, -RATE_STEP_S))
+    ahead = np.minimum(RATE_STEP_S, until_s - t)
+    later, sooner = (_at_sensor(scene, neighbours, motion, at) for at in (t + ahead, t - RATE_STEP_S))
     yaw = true.pose[:, 2]
     b = _turned(_at_sensor(scene, neighbours, motion, t), -yaw)
-    rate = _turned((later - sooner) / (2 * RATE_STEP_S), -yaw)
+    rate = _turned((later - sooner) / (ahead + RATE_STEP_S)[:, None], -yaw)
     rate[:, 0] += true.w * b[:, 1]
     rate[:, 1] -= true.w * b[:, 0]
     soft, eddy = (

@@ -4,6 +4,7 @@
 step. Each sensor draws from its own generator, so its bytes do not depend on which others are read.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -200,7 +201,7 @@ class Sensing:
         columns["lidar_on"] = self.lidar_on(t)
         columns |= self._mapped(now.pose[:, :2], columns["yaw"])
         if self._vector:
-            columns |= self._true_field(motion, t, now, columns)
+            columns |= self._true_field(motion, t, now, columns, until_s)
         if self._reads or self._reads_axes:
             steep = self._steepness(motion, t)
             vector = columns.get("b_vector_nt", np.full((len(t), 3), np.nan))
@@ -277,7 +278,9 @@ class Sensing:
             unknown = unknown | ~self._map.contains(xy)
         return {"b_map_nt": b, **columns, "flag_outside_map": unknown}
 
-    def _true_field(self, motion: Moving, t: Array, now: Moment, columns: Columns) -> Columns:
+    def _true_field(
+        self, motion: Moving, t: Array, now: Moment, columns: Columns, until_s: float | None
+    ) -> Columns:
         """Field at the magnetometer, vector in its axes and magnitude; nan if unknown."""
         unknown = {"b_vector_nt": np.full((len(t), 3), np.nan), "b_truth_nt": np.full(len(t), np.nan)}
         if not self._known or not len(t):
@@ -312,7 +315,8 @@ class Sensing:
                     supply_a=supply_a - rest_current_a(robot.battery),
                 )
             if self._near:
-                added += neighbours_field_nt(self.scene, self._near, motion, t, now)
+                known_s = math.inf if until_s is None else until_s
+                added += neighbours_field_nt(self.scene, self._near, motion, t, now, known_s)
             for term, rng in self._terms:
                 added += term(columns, self.scene.robot, rng)
             vector = vector + into_sensor(added, mount)

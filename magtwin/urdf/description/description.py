@@ -5,6 +5,7 @@ the XML.
 """
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,7 +27,13 @@ from magtwin.urdf.description.model import (
     read_link,
     read_material,
 )
+from magtwin.urdf.description.names import check_names
+from magtwin.urdf.repairs import LOSS, NOTE, Repairs
 from magtwin.urdf.source.source import Source, read_source
+
+Element = ElementTree.Element
+
+_SCHEME = re.compile(r"^(package|model):/*")
 
 JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "planar", "floating")
 """Types of joints that can be converted."""
@@ -60,11 +67,8 @@ class Description:
     materials: Mapping[str | None, Material] = field(default_factory=dict)
     """Robot-wide materials by name."""
 
-    notes: list[str] = field(default_factory=list)
-    """Every repair, guess and omission of a conversion, one line each."""
-
-    dropped: list[str] = field(default_factory=list)
-    """The notes on losses."""
+    repairs: Repairs = field(default_factory=Repairs)
+    """Every repair, loss and guess of a conversion."""
 
     @property
     def path(self) -> Path:
@@ -72,47 +76,69 @@ class Description:
         return self.source.path
 
     @property
-    def xml(self) -> ElementTree.Element:
+    def xml(self) -> Element:
         """The whole `<robot>`, with everything that `links` and `joints` lack."""
         return self.source.xml
 
-    def where(self, element: ElementTree.Element | None) -> str:
+    def where(self, element: Element | None) -> str:
         """`file:line` of an element of `xml`."""
         return self.source.where(element)
 
     def find_file(self, filename: str, what: str) -> Path:
         """The file that a `filename=` refers to, see `Source.find_file`.
 
-        Raises:
-            MissingFileError: The file does not exist.
-            InputError: The file may not be read, or its package was not found.
+        Backslashes, too many or too few slashes after a scheme, and names relative to the package are
+        repaired.
         """
-        named = (e for e in self.xml.iter() if e.get("filename") == filename)
+        element = next((e for e in self.xml.iter() if e.get("filename") == filename), None)
+        usual = _SCHEME.sub(r"\1://", filename.replace("\\", "/"))
+        if usual != filename:
+            self.repair("file-name", f"{what} {filename!r} is read as {usual!r}", element)
         try:
-            return self.source.find_file(filename, what, next(named, None))
+            path = self.source.find_file(usual, what, element)
         finally:
             self._take_notes()
+        if ":" not in usual and not (self.path.parent / usual).is_file():
+            self.repair(
+                "file-name", f"{what} {filename!r} is found in the package, not beside the file", element
+            )
+        return path
+
+    def mesh_element(self, filename: str) -> Element | None:
+        """The first `<mesh>` of a file."""
+        return next((e for e in self.xml.iter("mesh") if e.get("filename") == filename), None)
 
     def note(self, text: str, *, lost: bool = False) -> None:
         """Add a note for the user, once.
 
         Args:
-            text: What was repaired, guessed or left out, and where.
+            text: What was guessed or left out, and where.
             lost: Whether the stage lacks something of the description; `Options.strict` refuses that.
         """
-        if text not in self.notes:
-            self.notes.append(text)
-            if lost:
-                self.dropped.append(text)
+        self.repairs.add(LOSS if lost else NOTE, text)
+
+    def repair(self, kind: str, text: str, about: Element | tuple[str, str] | None = None) -> None:
+        """Add a repair, which `Options.strict` refuses.
+
+        Args:
+            kind: A key of `repairs.FAULTS`.
+            text: What was found and done, in words.
+            about: The element with the fault; or the tag and name of its link or joint.
+        """
+        element = self._find(*about) if isinstance(about, tuple) else about
+        self.repairs.add(kind, text, self.source.place(element))
 
     def refused(self, kind: str, name: str, text: str) -> InputError:
         """An error with the line of the link or joint called `name`."""
-        element = next((e for e in self.xml.findall(kind) if e.get("name") == name), None)
-        return InputError(f"{self.source.where(element)}: {kind} {name!r} {text}")
+        return InputError(f"{self.source.where(self._find(kind, name))}: {kind} {name!r} {text}")
+
+    def _find(self, kind: str, name: str) -> Element | None:
+        """The `<link>` or `<joint>` called `name`."""
+        return next((e for e in self.xml.findall(kind) if e.get("name") == name), None)
 
     def _take_notes(self) -> None:
-        """Take over the notes of the source, which grow as files are searched."""
-        for note in (*self.source.notes, *self.source.packages.notes):
+        """Take over the notes on packages, which grow as files are searched."""
+        for note in self.source.packages.notes:
             self.note(note)
 
     def poses(self) -> dict[str, NDArray[np.float64]]:
@@ -140,11 +166,12 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
     """
     if not isinstance(source, Source):
         source = read_source(source)
-    _check_names(source)
-    description = Description(source=source, name=source.xml.get("name", ""), root="", links={}, joints={})
+    description = Description(source, "", "", links={}, joints={}, repairs=source.repairs)
     description._take_notes()
+    check_names(source, description.repair)
+    description = replace(description, name=source.xml.attrib["name"])
     clean = [
-        check_grammar(part, description.where, description.note)
+        check_grammar(part, description.where, description.repair)
         for part in source.xml
         if part.tag in ("link", "joint", "material")
     ]
@@ -152,9 +179,10 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
     for link in links:
         for role, shapes in (("visual", link.visuals), ("collision", link.collisions)):
             for kind in (shape.geometry.kind for shape in shapes if shape.geometry.empty):
-                description.note(f"link {link.name!r}: a {role} {kind} of size 0 is left out", lost=True)
-    joints = [read_joint(e) for e in clean if e.tag == "joint"]
-    materials = [read_material(e) for e in clean if e.tag == "material"]
+                text = f"link {link.name!r}: a {role} {kind} of size 0 is left out"
+                description.repair("shape-empty", text, ("link", link.name))
+    joints = _leading(description, links, [read_joint(e) for e in clean if e.tag == "joint"])
+    materials = _materials(description, [e for e in clean if e.tag == "material"])
     held = {joint.child: joint for joint in joints}
     description = replace(
         description,
@@ -167,9 +195,10 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
             for link in links
         },
         joints=held,
-        materials=MappingProxyType({m.name: m for m in materials}),
+        materials=MappingProxyType(materials),
     )
     _check_joints(description, joints)
+    held = _without_bad_mimics(description, joints)
     roots = [name for name in description.links if name not in held]
     if not roots:
         first = joints[0].name
@@ -189,39 +218,45 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
     )
 
 
-def _check_names(source: Source) -> None:
-    """Check that every link and joint has a unique name."""
-    xml, where = source.xml, source.where
-    if not xml.get("name"):
-        raise InputError(f"{where(xml)}: <robot> has no name")
-    for kind in ("link", "joint"):
-        seen: dict[str, ElementTree.Element] = {}
-        for element in xml.findall(kind):
-            name = element.get("name")
-            if not name:
-                raise InputError(f"{where(element)}: a <{kind}> has no name")
-            if name in seen:
-                file, line = source.places[seen[name]]
-                first = f"line {line}" if file == source.places[element][0] else f"{file}:{line}"
-                raise InputError(
-                    f"{where(element)}: {kind} {name!r} exists twice, first on {first}; rename one"
-                )
-            seen[name] = element
-    if not xml.findall("link"):
-        raise InputError(f"{where(xml)}: the robot has no <link>")
-    for joint in xml.findall("joint"):
-        for end in ("parent", "child"):
-            named = joint.find(end)
-            if named is None or not named.get("link"):
-                raise InputError(f"{where(joint)}: joint {joint.get('name')!r} has no <{end} link=>")
+def _materials(description: Description, elements: Sequence[Element]) -> dict[str | None, Material]:
+    """Robot-wide materials by name; the first of a name is used."""
+    materials: dict[str | None, Material] = {}
+    for element in elements:
+        material = read_material(element)
+        about = ("material", material.name or "")
+        if material.name is None:
+            description.repair("tag-empty", "a <material> of the robot without name= is left out", about)
+        elif material.name in materials:
+            alike = _look(materials[material.name]) == _look(material)
+            text = f"material {material.name!r} is defined twice, {'alike' if alike else 'with two looks'}"
+            description.repair("material-twice", f"{text}: the first definition is used", about)
+        else:
+            materials[material.name] = material
+    return materials
+
+
+def _look(material: Material) -> tuple[object, ...]:
+    """What a material looks like."""
+    return material.texture, None if material.rgba is None else tuple(material.rgba)
+
+
+def _leading(description: Description, links: Sequence[Link], joints: Sequence[Joint]) -> list[Joint]:
+    """The joints without those that lead to no link, if all links are connected without them."""
+    names, children = {link.name for link in links}, {joint.child for joint in joints}
+    if len(names - children) != 1:
+        return list(joints)  # a misspelt child leaves a link behind: see `_check_joints`
+    for joint in joints:
+        if joint.child not in names:
+            text = f"joint {joint.name!r} leads to no link {joint.child!r}: left out"
+            description.repair("name-unknown", text, ("joint", joint.name))
+    return [joint for joint in joints if joint.child in names]
 
 
 def _check_joints(description: Description, joints: Sequence[Joint]) -> None:
-    """Check types, links, axes, limits and mimics of joints."""
+    """Check types, links and axes of joints."""
     held: dict[str, str] = {}
-    named = {joint.name: joint for joint in joints}
     for joint in joints:
-        limit, problem = joint.limit, ""
+        problem = ""
         missing = next((link for link in (joint.parent, joint.child) if link not in description.links), None)
         if joint.type not in JOINT_TYPES:
             problem = f"is of type {joint.type!r}; known: {', '.join(JOINT_TYPES)}"
@@ -231,31 +266,41 @@ def _check_joints(description: Description, joints: Sequence[Joint]) -> None:
             problem = f"holds {joint.child!r}, which {held[joint.child]!r} holds already"
         elif joint.type in AXIAL and not np.linalg.norm(joint.axis) > 0:
             problem = "moves about an axis of length 0"
-        elif limit is not None and joint.type not in ("fixed", "continuous"):
-            low, high = limit.lower, limit.upper
-            if low is not None and high is not None and low > high:
-                problem = f"has its lower limit {low:g} above its upper {high:g}"
         if problem:
             raise description.refused("joint", joint.name, problem)
         held[joint.child] = joint.name
-        if joint.mimic is not None:
-            _check_mimic(description, joint, named)
 
 
-def _check_mimic(description: Description, joint: Joint, named: Mapping[str, Joint]) -> None:
-    """Check that the leader of a joint exists, moves, and does not follow it in turn."""
-    chain = [joint.name]
-    while (mimic := named[chain[-1]].mimic) is not None:
-        if mimic.joint not in named:
-            text = f"mimics no joint {mimic.joint!r}; {hint(mimic.joint, named)}"
-            raise description.refused("joint", chain[-1], text)
-        if mimic.joint in chain:
-            text = f"mimics itself: {' -> '.join([*chain, mimic.joint])}"
-            raise description.refused("joint", joint.name, text)
-        chain.append(mimic.joint)
-    if named[chain[-1]].type not in MOVING:
-        text = f"mimics {chain[-1]!r}, which is {named[chain[-1]].type}; give one that moves"
-        raise description.refused("joint", joint.name, text)
+def _without_bad_mimics(description: Description, joints: Sequence[Joint]) -> dict[str, Joint]:
+    """Joints by child link; a mimic that its joint cannot follow is left out."""
+    named, leads, held = {joint.name: joint for joint in joints}, dict[str, str](), dict[str, Joint]()
+    for joint in joints:
+        held[joint.child] = joint
+        if joint.mimic is None:
+            continue
+        leader, problem, about = joint.mimic.joint, "", ("joint", joint.name)
+        chain = [joint.name, leader]
+        while chain[-1] in leads and chain[-1] != joint.name:
+            chain.append(leads[chain[-1]])
+        if leader not in named:
+            problem = f"no joint {leader!r} ({hint(leader, named)})"
+        elif chain[-1] == joint.name:
+            problem = f"itself: {' -> '.join(chain)}"
+        elif joint.type not in (*MOVING, "fixed"):
+            problem = f"{leader!r} but is {joint.type}, which has no single value"
+        elif named[leader].type in ("planar", "floating"):
+            problem = f"{leader!r}, which is {named[leader].type} and has no single value"
+        if problem:
+            text = f"joint {joint.name!r} mimics {problem}: the mimic is left out"
+            description.repair("mimic-leader", text, about)
+            held[joint.child] = replace(joint, mimic=None)
+            continue
+        leads[joint.name] = leader
+        still = "fixed" if named[leader].type == "fixed" else "taken 0 times" * (joint.mimic.multiplier == 0)
+        if still and joint.type != "fixed":
+            text = f"joint {joint.name!r} mimics {leader!r}, which is {still}: it is fixed at its offset"
+            description.repair("mimic-fixed", text, about)
+    return held
 
 
 def _order(root: str, joints: Sequence[Joint]) -> list[str]:

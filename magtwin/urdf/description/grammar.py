@@ -8,13 +8,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from xml.etree import ElementTree
 
-from magtwin.errors import InputError, hint
+from magtwin.errors import InputError, hint, near
+from magtwin.urdf.repairs import NOTE
 
 Element = ElementTree.Element
 
 
-Note = Callable[..., None]
-"""Receives a note for the user; with `lost=True` if something was left out."""
+Repair = Callable[[str, str, Element], None]
+"""Receives the kind of a repair, its text, and the element with the fault."""
+
+
+class _ShapeError(Exception):
+    """A visual or collision has no shape that can be made; the text gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -27,10 +32,16 @@ class Number:
     required: bool = False
 
     least: float = -math.inf
-    """Smaller numbers are refused."""
+    """Smaller numbers are raised to it."""
 
     most: float = math.inf
     """Larger numbers are reduced to it."""
+
+    vital: bool = False
+    """Whether an unreadable number is refused; others count as not given, as they have a default."""
+
+    signed: bool = True
+    """Whether the sign matters; without it, the absolute value is used."""
 
     endless: bool = False
     """Whether numbers may be infinite."""
@@ -39,29 +50,32 @@ class Number:
     """Value that completes the smallest count to the largest."""
 
 
+TURN = 2 * math.pi
+"""Range from which a revolute joint without effort and velocity counts as a wheel [rad]."""
+
 LARGEST = 1e30
 """Larger numbers count as infinite: USD stores single precision, and volumes are cubes."""
 
-XYZ = Number(counts=(3,))
-SIZE = Number(required=True, least=0.0)
+XYZ = Number(counts=(3,), vital=True)
+SIZE = Number(required=True, vital=True, signed=False)
 AMOUNT = Number(least=0.0)
 
 NUMBERS: Mapping[str, Mapping[str, Number]] = {
     "origin": {"xyz": XYZ, "rpy": XYZ},
-    "mass": {"value": Number(required=True, least=0.0)},
-    "inertia": {name: Number() for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")},
-    "box": {"size": Number(counts=(3,), required=True, least=0.0)},
+    "mass": {"value": Number()},
+    "inertia": {name: Number() for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz", "iyx", "izx", "izy")},
+    "box": {"size": Number(counts=(3,), required=True, vital=True, signed=False)},
     "cylinder": {"radius": SIZE, "length": SIZE},
     "capsule": {"radius": SIZE, "length": SIZE},
     "sphere": {"radius": SIZE},
-    "mesh": {"scale": Number(counts=(1, 3))},
-    "color": {"rgba": Number(counts=(3, 4), required=True, least=0.0, most=1.0, rest="1")},
+    "mesh": {"scale": Number(counts=(1, 3), vital=True)},
+    "color": {"rgba": Number(counts=(3, 4), least=0.0, most=1.0, rest="1")},
     "axis": {"xyz": XYZ},
     "limit": {
         "lower": Number(endless=True),
         "upper": Number(endless=True),
         "effort": Number(endless=True),
-        "velocity": Number(least=0.0, endless=True),
+        "velocity": Number(endless=True),
     },
     "dynamics": {"damping": AMOUNT, "friction": AMOUNT},
     "mimic": {"multiplier": Number(), "offset": Number()},
@@ -91,140 +105,307 @@ CHILDREN: Mapping[str, tuple[str, ...]] = {
 MANY = frozenset({"visual", "collision"})
 """Elements that may occur several times."""
 
-NEEDED: Mapping[str, str] = {"visual": "geometry", "collision": "geometry"}
-"""Required child by element."""
+NAMED: Mapping[str, str] = {"mesh": "filename", "texture": "filename", "mimic": "joint", "color": "rgba"}
+"""Attribute without which an element is empty."""
 
-TEXTS: Mapping[str, str] = {"mesh": "filename", "texture": "filename", "mimic": "joint"}
-"""Required text attribute by element."""
+LOOKS = ("color", "texture")
+"""Contents of a material."""
+
+MIRRORED = {"iyx": "ixy", "izx": "ixz", "izy": "iyz"}
+"""Products of inertia below the diagonal, which URDF does not have, by those above it."""
 
 
-def check_grammar(part: Element, where: Callable[[Element], str], note: Note) -> Element:
-    """Check a link, joint or material; anything outside the grammar is left out with a note.
+def check_grammar(part: Element, where: Callable[[Element], str], repair: Repair) -> Element:
+    """Check a link, joint or material, and repair what has an evident reading.
 
     Args:
         part: The element.
         where: File and line of an element, for error messages.
-        note: Receives notes of repairs and omissions.
+        repair: Receives every repair.
 
     Returns:
         `part` with known elements and attributes only, and numbers separated by blanks.
 
     Raises:
-        InputError: A number is missing, invalid, not finite or too small; there are too many or too few
-            numbers; or a geometry does not have exactly one known shape.
+        InputError: A number of a pose, an axis or a size is invalid, so that the shape of the robot is
+            unknown.
     """
-    label = f"{part.tag} {part.get('name')!r}"
-    clean = _clean(part, label, where, note)
-    _drop_zeros(clean, label, note)
-    _complete_limit(clean, label, note)
+    clean = _Checker(f"{part.tag} {part.get('name')!r}", where, repair).cleaned(part)
+    assert clean is not None  # only the elements below it can be left out
     return clean
 
 
-def _drop_zeros(link: Element, label: str, note: Note) -> None:
-    """Leave out a mass of 0 and an inertia of zeros: they are placeholders."""
-    inertial = link.find("inertial")
-    if inertial is None:
-        return
-    mass, tensor = inertial.find("mass"), inertial.find("inertia")
-    if tensor is not None and not any(map(float, tensor.attrib.values())):
-        inertial.remove(tensor)
-        if mass is None or float(mass.attrib["value"]) != 0:
-            note(f"{label}: an <inertia> of zeros counts as none")
-        tensor = None
-    if mass is not None and float(mass.attrib["value"]) == 0:
-        link.remove(inertial)
-        note(f"{label}: a mass of 0 counts as none", lost=tensor is not None)
+@dataclass(frozen=True)
+class _Checker:
+    """Checks one link, joint or material."""
 
+    label: str
+    where: Callable[[Element], str]
+    report: Repair
 
-def _complete_limit(joint: Element, label: str, note: Note) -> None:
-    """Set a missing end of a range to 0, URDF's default; ignore the range of a continuous joint."""
-    limit, ends = joint.find("limit"), ("lower", "upper")
-    if limit is None:
-        return
-    given = {end: float(limit.attrib[end]) for end in ends if end in limit.attrib}
-    if joint.get("type") == "continuous":
-        if any(map(math.isfinite, given.values())):
-            words = ", ".join(f"{end} {value:g}" for end, value in given.items())
-            note(f"{label} is continuous, which has no range: {words} of its <limit> is ignored")
-    elif joint.get("type") in ("revolute", "prismatic") and len(given) == 1:
-        missing = next(end for end in ends if end not in given)
-        limit.set(missing, "0")
-        note(f"{label} gives no {missing} limit: 0, URDF's default")
+    def repair(self, kind: str, text: str, element: Element) -> None:
+        self.report(kind, f"{self.label}: {text}", element)
 
+    def cleaned(self, element: Element) -> Element | None:
+        """An element as the grammar has it; None if it is left out."""
+        attributes = self._attributes(element)
+        wanted = NAMED.get(element.tag)
+        if wanted is not None and not attributes.get(wanted):
+            if element.tag == "mesh":
+                raise _ShapeError("a <mesh> without filename=")
+            kind = "mimic-leader" if element.tag == "mimic" else "tag-empty"
+            if wanted != "rgba" or not element.get(wanted, "").strip():  # an unreadable colour is reported
+                self.repair(kind, f"a <{element.tag}> without {wanted}= is left out", element)
+            return None
+        clean = Element(element.tag, attributes)
+        astray = self._misplaced(element)
+        for child in element:
+            if child not in astray and self._is_known(child, element, clean):
+                self._append(clean, child)
+        if element.tag == "geometry" and len(clean) != 1:
+            raise _ShapeError("a <geometry> without a shape")
+        if element.tag in MANY and clean.find("geometry") is None:
+            raise _ShapeError(f"a <{element.tag}> without <geometry>")
+        if element.tag == "visual":
+            self._rehouse(clean, astray + [e for e in element.iterfind("geometry/*") if e.tag in _LOOKING])
+        for tag, finish in (("link", self._finish_link), ("joint", self._finish_joint)):
+            if element.tag == tag:
+                finish(clean, element)
+        return clean
 
-def _clean(element: Element, label: str, where: Callable[[Element], str], note: Note) -> Element:
-    start = f"{where(element)}: {label}"
-    clean = Element(element.tag, _attributes(element, where(element), label, note))
-    known = CHILDREN.get(element.tag, ())
-    seen: set[str] = set()
-    for child in element:
-        if child.tag not in known:
-            if element.tag == "geometry":
-                raise InputError(
-                    f"{where(child)}: {label} has a geometry {child.tag!r}; {hint(child.tag, SHAPES)}"
-                )
-            near = hint(child.tag, known) if known else ""
-            note(
-                f"{label}: <{child.tag}> is unknown in <{element.tag}> and left out"
-                + (f"; {near}" if near.startswith("did") else ""),
-                lost=True,
-            )
-            continue
-        if child.tag in seen and child.tag not in MANY:
-            note(f"{label}: a second <{child.tag}> in <{element.tag}> is left out", lost=True)
-            continue
-        if child.tag == "texture" and child.get("filename") == "":
-            note(f"{label}: a <texture> of no file is left out")
-            continue
-        seen.add(child.tag)
-        clean.append(_clean(child, label, where, note))
-    if element.tag == "geometry" and len(clean) != 1:
-        raise InputError(f"{start} has a <geometry> of {len(clean)} shapes; give one of {', '.join(SHAPES)}")
-    if NEEDED.get(element.tag, element.tag) not in {element.tag, *seen}:
-        raise InputError(f"{start} has a <{element.tag}> without <{NEEDED[element.tag]}>")
-    return clean
-
-
-def _attributes(element: Element, place: str, label: str, note: Note) -> dict[str, str]:
-    """Attributes of an element, with numbers checked."""
-    start = f"{place}: {label}"
-    numbers = NUMBERS.get(element.tag, {})
-    made = {name: value for name, value in element.items() if name not in numbers and ":" not in name}
-    made.pop("xmlns", None)
-    text = TEXTS.get(element.tag)
-    if text is not None and not made.get(text):
-        raise InputError(f"{start} has a <{element.tag}> without {text}=")
-    for name, kind in numbers.items():
-        given = element.get(name)
-        if given is None or not given.strip():
-            if kind.required:
-                raise InputError(f"{start} has a <{element.tag}> without {name}=")
-            continue
-        made[name] = _numbers(given, kind, place, f"{label}: {name} of <{element.tag}>", note)
-    return made
-
-
-def _numbers(given: str, kind: Number, place: str, label: str, note: Note) -> str:
-    """Numbers of an attribute, separated by blanks; refuses invalid ones."""
-    start = f"{place}: {label}"
-    words = given.replace(",", " ").split()
-    counts = " or ".join(map(str, kind.counts))
-    wanted = "a finite number" if kind.counts == (1,) else f"{counts} finite numbers"
-    for word in words:
+    def _append(self, clean: Element, child: Element) -> None:
+        """Add a child as the grammar has it."""
         try:
-            value = float(word)
-        except ValueError:
-            value = math.nan
-        if "_" in word or math.isnan(value) or (abs(value) > LARGEST and not kind.endless):
-            raise InputError(f"{start} must be {wanted}, got {given!r}")
-        if value < kind.least:
-            raise InputError(f"{start} must not be below {kind.least:g}, got {given!r}")
-    if len(words) not in kind.counts:
-        raise InputError(f"{start} must be {wanted}, got {given!r}")
-    if any(float(word) > kind.most for word in words):
-        note(f"{label} is above {kind.most:g} in {given!r}: reduced to it")
-        words = [word if float(word) <= kind.most else f"{kind.most:g}" for word in words]
-    if len(words) < max(kind.counts) and kind.rest:
-        note(f"{label} has {len(words)} numbers in {given!r}: completed by {kind.rest}")
-        words += [kind.rest] * (max(kind.counts) - len(words))
-    return " ".join(words)
+            made = self.cleaned(child)
+        except _ShapeError as error:
+            if child.tag not in MANY:
+                raise
+            self.repair("shape-missing", f"{error}: the {child.tag} is left out", child)
+            return
+        if made is not None:
+            clean.append(made)
+
+    def _is_known(self, child: Element, parent: Element, clean: Element) -> bool:
+        """Whether a child is part of the grammar and the first of its kind."""
+        known = CHILDREN.get(parent.tag, ())
+        if child.tag not in known:
+            if parent.tag == "geometry" and child.tag in _LOOKING:
+                return False  # misplaced, see `_rehouse`
+            if parent.tag == "geometry":
+                raise _ShapeError(f"a geometry {child.tag!r} ({hint(child.tag, SHAPES)})")
+            text = f"<{child.tag}> is unknown in <{parent.tag}>{near(child.tag, known)} and left out"
+            self.repair("tag-unknown", text, child)
+            return False
+        first = clean.find(child.tag)
+        if parent.tag == "geometry" and len(clean):
+            first = clean[0]
+        if first is not None and child.tag not in MANY:
+            self.repair("tag-twice", f"a second <{child.tag}> in <{parent.tag}> is left out", child)
+            return False
+        return True
+
+    def _misplaced(self, element: Element) -> list[Element]:
+        """Children of a visual or link that belong into the visual's material."""
+        tags = {"visual": LOOKS, "link": ("material",)}.get(element.tag, ())
+        return [child for child in element if child.tag in tags]
+
+    def _rehouse(self, visual: Element, astray: list[Element]) -> None:
+        """Move misplaced looks into the material of their visual."""
+        for look in astray:
+            made = self.cleaned(look)
+            if made is None:
+                continue
+            material = visual.find("material")
+            if material is None:
+                material = ElementTree.SubElement(visual, "material")
+            parts = list(made) if look.tag == "material" else [made]
+            if look.tag == "material" and "name" in made.attrib:
+                material.attrib.setdefault("name", made.attrib["name"])
+            for part in parts:
+                if material.find(part.tag) is None:
+                    material.append(part)
+            self.repair("tag-misplaced", f"<{look.tag}> moved into the <material> of its visual", look)
+
+    def _finish_link(self, clean: Element, link: Element) -> None:
+        """Give a link's own material to its visuals, and check its mass and inertia."""
+        materials = [child for child in link if child.tag == "material"]
+        for material in materials:
+            made = self.cleaned(material)
+            for visual in clean.findall("visual"):
+                if visual.find("material") is None and made is not None:
+                    visual.append(made)
+            self.repair("tag-misplaced", "<material> moved from the link to its visuals", material)
+        inertial, source = clean.find("inertial"), link.find("inertial")
+        if inertial is not None and source is not None:
+            self._check_inertia(inertial, source)
+            self._check_mass(clean, inertial, source)
+
+    def _check_inertia(self, inertial: Element, source: Element) -> None:
+        """Leave out an inertia of zeros, or with a part that cannot be read; make it symmetric."""
+        tensor, given = inertial.find("inertia"), source.find("inertia")
+        if tensor is None or given is None:
+            return
+        for below, above in MIRRORED.items():
+            if below not in tensor.attrib:
+                continue
+            one, other = float(tensor.attrib.pop(below)), float(tensor.get(above, 0.0))
+            if one != other:
+                tensor.set(above, repr((one + other) / 2))
+                text = f"{above} {other:g} and {below} {one:g} of <inertia> differ: their mean"
+                self.repair("inertia-asymmetric", text, given)
+        if any(
+            name not in tensor.attrib
+            for name in given.attrib
+            if name in NUMBERS["inertia"] and name not in MIRRORED
+        ):
+            inertial.remove(tensor)
+            self.repair("inertia-unreadable", "an <inertia> that cannot be read counts as none", given)
+        elif not any(map(float, tensor.attrib.values())):
+            inertial.remove(tensor)
+            mass = inertial.find("mass")
+            if mass is None or float(mass.get("value", 0.0)) != 0:
+                self.repair(NOTE, "an <inertia> of zeros counts as none", given)
+
+    def _check_mass(self, link: Element, inertial: Element, source: Element) -> None:
+        """Leave out an inertial without a mass above 0."""
+        mass = inertial.find("mass")
+        value = None if mass is None else mass.get("value")
+        if value is not None and float(value) > 0:
+            return
+        link.remove(inertial)
+        given = source.find("mass")
+        what = "no mass" if value is None else f"a mass of {float(value):g}"
+        self.repair("mass-invalid", f"{what} counts as none", source if given is None else given)
+
+    def _finish_joint(self, clean: Element, joint: Element) -> None:
+        """Complete limits; see `repairs.FAULTS`."""
+        limit, given, kind = clean.find("limit"), joint.find("limit"), clean.get("type")
+        about = joint if given is None else given
+        given_ends = {} if limit is None else limit.attrib
+        ends: dict[str, float] = {e: float(given_ends[e]) for e in ("lower", "upper") if e in given_ends}
+        for name in ("effort", "velocity"):
+            if limit is not None and float(limit.get(name, 0.0)) < 0:
+                value = limit.attrib.pop(name)
+                self.repair("effort-invalid", f"{name} {value} of <limit> counts as not given", about)
+        if kind == "continuous" and any(map(math.isfinite, ends.values())):
+            words = ", ".join(f"{end} {value:g}" for end, value in ends.items())
+            text = f"is continuous, which has no range: {words} of its <limit> is ignored"
+            self.report("limit-ignored", f"{self.label} {text}", about)
+        if kind not in ("revolute", "prismatic"):
+            return
+        if not ends:
+            self._free(clean, limit)
+            self.report("limit-missing", f"{self.label} is {kind} without limits: it moves without", about)
+            return
+        assert limit is not None
+        if len(ends) == 1:
+            missing = "lower" if "upper" in ends else "upper"
+            limit.set(missing, "0")
+            ends[missing] = 0.0
+            text = f"gives no {missing} limit: 0, URDF's default"
+            self.report("limit-one-end", f"{self.label} {text}", about)
+        if ends["lower"] > ends["upper"]:
+            limit.attrib["lower"], limit.attrib["upper"] = limit.attrib["upper"], limit.attrib["lower"]
+            text = f"has its lower limit {ends['lower']:g} above its upper {ends['upper']:g}: swapped"
+            self.report("limit-swapped", f"{self.label} {text}", about)
+        powerless = all(float(limit.get(name, 1.0)) == 0 for name in ("effort", "velocity"))
+        span = abs(ends["upper"] - ends["lower"])
+        if kind == "revolute" and powerless and (set(ends.values()) == {0.0} or span >= TURN):
+            self._free(clean, limit)
+            words = (
+                "range, effort and velocity"
+                if span == 0
+                else f"effort and velocity of 0 and a range of {span:g} rad"
+            )
+            text = f"is revolute with {words}" + (" of 0" if span == 0 else "") + ": a wheel without limits"
+            self.report("limit-zeros", f"{self.label} {text}", about)
+
+    def _free(self, joint: Element, limit: Element | None) -> None:
+        """Let a joint move without limits."""
+        if joint.get("type") == "revolute":
+            joint.set("type", "continuous")
+            for end in ("lower", "upper"):
+                if limit is not None:
+                    limit.attrib.pop(end, None)
+            return
+        limit = ElementTree.SubElement(joint, "limit") if limit is None else limit
+        limit.set("lower", "-inf")
+        limit.set("upper", "inf")
+
+    def _attributes(self, element: Element) -> dict[str, str]:
+        """Attributes of an element, with numbers checked."""
+        numbers = NUMBERS.get(element.tag, {})
+        made = {name: value for name, value in element.items() if name not in numbers and ":" not in name}
+        made.pop("xmlns", None)
+        for name, kind in numbers.items():
+            given = element.get(name)
+            if given is not None and given.strip():
+                words = self._numbers(given, kind, element, name)
+                if words:
+                    made[name] = words
+            elif kind.required:
+                raise _ShapeError(f"a <{element.tag}> without {name}=")
+        return made
+
+    def _numbers(self, given: str, kind: Number, element: Element, name: str) -> str:
+        """Numbers of an attribute, separated by blanks; "" if they count as not given."""
+        label, words = f"{name} of <{element.tag}>", given.replace(",", " ").split()
+        counts = " or ".join(map(str, kind.counts))
+        wanted = "a finite number" if kind.counts == (1,) else f"{counts} finite numbers"
+        values = [_value(word, endless=kind.endless) for word in words]
+        counted = self._counted(words, values, kind)
+        if counted is None or None in values:
+            if kind.vital:
+                start = f"{self.where(element)}: {self.label}"
+                raise InputError(f"{start}: {label} must be {wanted}, got {given!r}")
+            self.repair("number-unreadable", f"{label} must be {wanted}, not {given!r}: not used", element)
+            return ""
+        bounded = [_bounded(word, kind) for word in words]
+        if bounded != words:
+            above = any(float(word) > kind.most for word in words)
+            text = f"is above {kind.most:g} in {given!r}: reduced to it"
+            if not above:
+                done = "raised to it" if kind.signed else "used without its sign"
+                text = f"is below 0 in {given!r}: {done}"
+            self.repair("number-range", f"{label} {text}", element)
+            counted = self._counted(bounded, values, kind)
+        assert counted is not None
+        if counted != bounded:
+            longer = len(counted) > len(words) and kind.rest
+            done = f"completed by {kind.rest}" if longer else f"read as {' '.join(counted)}"
+            self.repair("number-count", f"{label} has {len(words)} numbers in {given!r}: {done}", element)
+        return " ".join(counted)
+
+    def _counted(self, words: list[str], values: list[float | None], kind: Number) -> list[str] | None:
+        """As many numbers as wanted; None if there is no evident reading."""
+        most, least = max(kind.counts), min(kind.counts)
+        if len(words) in kind.counts:
+            return words + [kind.rest] * (most - len(words)) if kind.rest else words
+        if len(words) > most and (not any(values[most:]) or kind.rest):
+            return words[:most]
+        if len(words) == 1 and most == 3 and (values == [0.0] or not kind.signed):
+            return words * least
+        return None
+
+
+_LOOKING = ("material", *LOOKS)
+
+
+def _value(word: str, *, endless: bool) -> float | None:
+    """A number; None if it is none, or not finite."""
+    try:
+        value = float(word)
+    except ValueError:
+        return None
+    unreadable = "_" in word or math.isnan(value) or (abs(value) > LARGEST and not endless)
+    return None if unreadable else value
+
+
+def _bounded(word: str, kind: Number) -> str:
+    """A number within its range."""
+    value = float(word)
+    if not kind.signed and value < 0:
+        return f"{-value:g}"
+    if value < kind.least or value > kind.most:
+        return f"{kind.least if value < kind.least else kind.most:g}"
+    return word

@@ -43,11 +43,12 @@ def link_poses(
     description = read_description(read_source(urdf, packages=packages, arguments=arguments))
     values = _values(description, positions)
     bare = ElementTree.Element("robot", name=description.name)
+    names = {joint.name for joint in description.joints.values()}
     for part in description.xml:
         if part.tag == "link":
             ElementTree.SubElement(bare, "link", name=part.attrib["name"])
-        elif part.tag == "joint":
-            bare.append(check_grammar(part, description.where, description.note))
+        elif part.tag == "joint" and part.get("name") in names:
+            bare.append(check_grammar(part, description.where, description.repair))
             for mimic in bare[-1].findall("mimic"):  # yourdfpy does not support a mimic of a mimic
                 bare[-1].remove(mimic)
     model = yourdfpy.URDF.load(io.BytesIO(ElementTree.tostring(bare)), load_meshes=False)

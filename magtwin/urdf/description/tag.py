@@ -8,9 +8,9 @@ from xml.etree import ElementTree
 import numpy as np
 from pxr import Usd, Vt
 
-from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description
 from magtwin.urdf.description.grammar import CHILDREN
+from magtwin.urdf.source.markup import plain_text
 
 Element = ElementTree.Element
 
@@ -72,25 +72,27 @@ class Tags:
         least: float = -np.inf,
         above: float = -np.inf,
     ) -> float | None:
-        """A finite number at one of the paths; None if there is none.
+        """A finite number at one of the paths; None if there is none, or if it is invalid.
 
-        Raises:
-            InputError: It is not a number, below `least` or not above `above`; the message gives the line.
+        A number below `least` is raised to it. One that is not above `above`, and a text that is no number,
+        count as not given.
         """
         match = self.find(element, *paths)
         if match is None:
             return None
-        try:
-            value = float(_text_of(match))
-        except ValueError:
-            value = np.nan
-        if not np.isfinite(value) or value < least or not (value > above or above == -np.inf):
-            want = f" above {above:g}" if above > -np.inf else f" not below {least:g}"
-            want = want if max(least, above) > -np.inf else ""
-            raise InputError(
-                f"{self.description.where(match)}: {match.tag} must be a finite number{want}, "
-                f"got {_text_of(match)!r}"
-            )
+        text, value = _text_of(match), np.nan
+        with contextlib.suppress(ValueError):
+            value = float(text)
+        repair = self.description.repair
+        if not np.isfinite(value):
+            repair("number-unreadable", f"{match.tag} must be a finite number, not {text!r}: not used", match)
+            return None
+        if value < least:
+            repair("number-range", f"{match.tag} {text} is below {least:g}: raised to it", match)
+            return least
+        if not (value > above or above == -np.inf):
+            repair("number-range", f"{match.tag} {text} is not above {above:g}: not used", match)
+            return None
         return value
 
     def nothing(self, element: Element | None, *paths: str) -> None:
@@ -102,18 +104,15 @@ class Tags:
                     self.find(element, path)
 
     def flag(self, element: Element | None, *paths: str) -> bool | None:
-        """A boolean at one of the paths; None if there is none.
-
-        Raises:
-            InputError: It is not a boolean; the message gives the line.
-        """
+        """A boolean at one of the paths; None if there is none, or if it is no boolean."""
         match = self.find(element, *paths)
         if match is None:
             return None
         word = _text_of(match).lower()
         if word not in ("true", "false", "1", "0"):
-            where = self.description.where(match)
-            raise InputError(f"{where}: {match.tag} must be true or false, got {word!r}")
+            text = f"{match.tag} must be true or false, not {word!r}: not used"
+            self.description.repair("number-unreadable", text, match)
+            return None
         return word in ("true", "1")
 
     def keep(self, prim_of: Callable[[str], Usd.Prim]) -> dict[str, int]:
@@ -131,7 +130,9 @@ class Tags:
             for way, left in self._unread(element):
                 counts["/".join((*(e.tag for e in way), left.tag))] += 1
                 inside = "/".join(_label(e) for e in way)
-                texts.setdefault(name, []).append(f"{inside}: {_plain(left)}" if inside else _plain(left))
+                texts.setdefault(name, []).append(
+                    f"{inside}: {plain_text(left)}" if inside else plain_text(left)
+                )
         for name, kept in texts.items():
             prim = prim_of(name)
             there = prim.GetCustomDataByKey(KEPT) or ()
@@ -167,9 +168,3 @@ def _label(element: Element) -> str:
     """Tag of an element, with its name if it has one."""
     name = element.get("name")
     return f"{element.tag}({name})" if name else element.tag
-
-
-def _plain(element: Element) -> str:
-    """An element as text on one line, with sorted attributes."""
-    text = ElementTree.canonicalize(ElementTree.tostring(element, encoding="unicode"), strip_text=True)
-    return " ".join(text.split())

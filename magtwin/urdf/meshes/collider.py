@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.urdf.meshes.mesh import Mesh, has_area
+from magtwin.urdf.meshes.mesh import Mesh, UnreadableMeshError, has_area
 from magtwin.urdf.options import Collision
 
 EXTRA = 'pip install "magtwin[decomposition]"'
@@ -17,17 +17,24 @@ Solid = tuple[NDArray[np.float32], NDArray[np.int64]]
 """Vertices [m], shape (V, 3), and triangles, counter-clockwise from outside, shape (F, 3)."""
 
 
-def solids_of(mesh: Mesh, collision: Collision) -> tuple[Solid, ...]:
+PLATE = 0.005
+"""Thickness of the plate that replaces a flat mesh, relative to the mesh's diagonal."""
+
+
+def solids_of(mesh: Mesh, collision: Collision) -> tuple[tuple[Solid, ...], float]:
     """The solids of a mesh: one, or the parts of a convex decomposition.
 
     The decomposition is coacd's (Wei et al. 2022, doi:10.1145/3528223.3530103). A hull has its faces in a
-    fixed order and none without an area.
+    fixed order and none without an area. A flat mesh, which has no hull, is thickened to a plate.
+
+    Returns:
+        The solids; and the thickness of the plate in the unit of the file, 0 if the mesh is not flat.
 
     Raises:
-        InputError: The mesh is flat and has no hull; or coacd is not installed.
+        InputError: coacd is not installed, or finds no parts.
     """
     if collision == "mesh":
-        return ((mesh.points, mesh.faces),)
+        return ((mesh.points, mesh.faces),), 0.0
     if collision == "decomposition":
         try:
             import coacd
@@ -40,16 +47,29 @@ def solids_of(mesh: Mesh, collision: Collision) -> tuple[Solid, ...]:
         parts = coacd.run_coacd(whole, threshold=CONCAVITY, seed=0)
         if not parts:
             raise InputError(f"{mesh.path}: coacd finds no convex parts in it; use --collision hull")
-        return tuple((np.asarray(v, np.float32), np.asarray(f, np.int64)) for v, f in parts)
-    faces = hull_faces(mesh.points.astype(float))
+        return tuple((np.asarray(v, np.float32), np.asarray(f, np.int64)) for v, f in parts), 0.0
+    points, thickness = mesh.points, 0.0
+    faces = hull_faces(points.astype(float))
     if faces is None:
-        raise InputError(f"{mesh.path}: is flat and has no convex hull to collide with; use a box instead")
+        points, thickness = _thickened(points)
+        faces = hull_faces(points.astype(float))
+    if faces is None:
+        raise UnreadableMeshError(f"{mesh.path}: is flat and has no convex hull to collide with")
     first = np.argmin(faces, axis=1)[:, None]
     faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
     faces = faces[np.lexsort(faces.T[::-1])]
-    faces = faces[has_area(mesh.points, faces)]
+    faces = faces[has_area(points, faces)]
     used, index = np.unique(faces, return_inverse=True)
-    return ((mesh.points[used], index.reshape(-1, 3)),)
+    return ((points[used], index.reshape(-1, 3)),), thickness
+
+
+def _thickened(points: NDArray) -> tuple[NDArray[np.float32], float]:
+    """Points (V, 3) of a plane on both sides of a plate, shape (2 V, 3), and its thickness."""
+    centred = points.astype(float) - points.mean(axis=0)
+    normal = np.linalg.eigh(centred.T @ centred)[1][:, 0]  # of least extent
+    thickness = PLATE * float(np.linalg.norm(np.ptp(points.astype(float), axis=0)))
+    half = thickness / 2 * normal
+    return np.vstack([points + half, points - half]).astype(np.float32), thickness
 
 
 def hull_faces(points: NDArray) -> NDArray[np.int64] | None:

@@ -24,6 +24,7 @@ from magtwin.urdf.meshes.piece import Paint, Piece
 from magtwin.urdf.meshes.polygon import strips
 from magtwin.urdf.meshes.reading import Reading
 from magtwin.urdf.meshes.texture import Image, image_of, read_image
+from magtwin.urdf.source.markup import UnsafeError
 from magtwin.usd.geometry import linear_from_srgb, srgb_from_linear
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -215,7 +216,7 @@ class _Gltf:
             else:
                 file = self._reading.path.parent / unquote(uri)
                 if not self._reading.may_read(file):
-                    raise InputError(
+                    raise UnsafeError(
                         f"{self._reading.path}: buffer {uri!r} lies outside the robot's packages; move it in"
                     )
                 if not file.is_file():

@@ -11,10 +11,15 @@ from magtwin.errors import InputError
 from magtwin.files import existing_file
 from magtwin.urdf.meshes.piece import Paint, Piece
 from magtwin.urdf.meshes.reading import Note, Reading
+from magtwin.urdf.source.markup import UnsafeError
 from magtwin.usd.solids import corner_normals
 
 SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
 """Formats that can be read."""
+
+
+class UnreadableMeshError(InputError):
+    """A mesh file is damaged, empty or of an unknown format."""
 
 
 @dataclass(frozen=True)
@@ -72,18 +77,22 @@ def read_mesh(path: Path, may_read: Callable[[Path], bool] | None = None) -> Mes
             in the folder of the mesh and below.
 
     Raises:
-        InputError: The file cannot be read, has no triangle, or has vertices that are not finite.
+        UnreadableMeshError: The file cannot be read, has no triangle, or has vertices that are not finite.
+        UnsafeError: It refers to files that it may not read, or has entities.
     """
     folder = path.resolve().parent
     allowed = may_read or (lambda other: other.resolve().is_relative_to(folder))
     reading = Reading(existing_file(path, "mesh file", "mesh"), allowed)
     try:
         return _join(reading, _reader(path)(reading))
-    except InputError:
+    except UnsafeError:
         raise
+    except InputError as error:
+        raise UnreadableMeshError(str(error)) from error
     except Exception as error:  # readers raise many types on a damaged file
         reason = str(error).strip().splitlines() or [type(error).__name__]
-        raise InputError(f"{path}: cannot be read as a mesh: {reason[0]}; export it again") from error
+        text = f"{path}: cannot be read as a mesh: {reason[0]}; export it again"
+        raise UnreadableMeshError(text) from error
 
 
 def _reader(path: Path) -> Reader:

@@ -16,11 +16,11 @@ from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description
 from magtwin.urdf.description.model import Geometry
 from magtwin.urdf.meshes.collider import Solid, solids_of
-from magtwin.urdf.meshes.mesh import SUFFIXES, Mesh, distinct, face_normals, read_mesh
+from magtwin.urdf.meshes.mesh import SUFFIXES, Mesh, UnreadableMeshError, distinct, face_normals, read_mesh
 from magtwin.urdf.meshes.piece import PLAIN, Paint
 from magtwin.urdf.meshes.texture import Textures
 from magtwin.urdf.options import DEFAULTS, Collision, Options
-from magtwin.urdf.source.source import MissingFileError
+from magtwin.urdf.source.package import MissingFileError
 from magtwin.usd import solids
 from magtwin.usd.layers import describe_stage
 
@@ -74,6 +74,8 @@ class MeshLayer:
         self._stage = Usd.Stage.CreateInMemory()
         describe_stage(self._stage, f"{description.name}: triangles of its meshes.")
         self._stage.SetDefaultPrim(UsdGeom.Scope.Define(self._stage, ROOT).GetPrim())
+        self.failed: dict[str, MissingFileError | UnreadableMeshError] = {}
+        """Errors of the meshes that are missing or unreadable, by filename."""
         self._names: set[str] = set()
         self._found: dict[str, Path] = {}
         self._files: dict[Path, Mesh] = {}
@@ -90,7 +92,8 @@ class MeshLayer:
 
         Raises:
             MissingFileError: The file does not exist.
-            InputError: The file may not be read, is unreadable or empty, or the scale is invalid.
+            UnreadableMeshError: It is damaged or empty.
+            InputError: The file may not be read, or the scale is invalid.
         """
         path, scale = self._file(mesh)
         key = (path, scale)
@@ -132,7 +135,10 @@ class MeshLayer:
         key = (path, scale)
         if key not in self._colliders:
             if path not in self._solids:
-                self._solids[path] = solids_of(self._read(path), self.options.collision)
+                self._solids[path], flat = solids_of(self._read(path), self.options.collision)
+                if flat:
+                    text = f"mesh {mesh.filename!r} is flat: it collides as a plate {flat:.2g} m thick"
+                    self._description.repair("mesh-flat", text, self._description.mesh_element(mesh.filename))
             made = []
             for solid in self._solids[path]:
                 points, faces = _scaled(*solid, np.array(scale))
@@ -144,22 +150,12 @@ class MeshLayer:
             self._colliders[key] = tuple(made)
         return self._colliders[key]
 
-    def try_add(self, mesh: Geometry, add: Callable[[Geometry], T], label: str = "") -> T | None:
-        """The result of `visual` or `collider`; None if the file is missing and the options allow that.
-
-        Args:
-            mesh: The mesh.
-            add: `visual` or `collider`.
-            label: Owner of the mesh, for the note; "" for no note.
-        """
+    def try_add(self, mesh: Geometry, add: Callable[[Geometry], T]) -> T | None:
+        """The result of `visual` or `collider`; None if the file is missing or unreadable, see `failed`."""
         try:
             return add(mesh)
-        except MissingFileError:
-            if self.options.missing_meshes != "note":
-                raise
-            if label:
-                text = f"{label} is left out: its mesh {mesh.filename!r} is missing"
-                self._description.note(text, lost=True)
+        except (MissingFileError, UnreadableMeshError) as error:
+            self.failed[mesh.filename] = error
             return None
 
     def vertices(self, mesh: Geometry) -> NDArray[np.float64]:
@@ -175,7 +171,7 @@ class MeshLayer:
         """File and scale of a URDF `<mesh>`."""
         name, urdf = mesh.filename, self._description.path
         if Path(name).suffix.lower() not in SUFFIXES:
-            raise InputError(f"{urdf}: mesh {name!r} is of no known format ({', '.join(SUFFIXES)})")
+            raise UnreadableMeshError(f"{urdf}: mesh {name!r} is of no known format ({', '.join(SUFFIXES)})")
         if name not in self._found:
             self._found[name] = self._description.find_file(name, "mesh")
         if not mesh.size.all():
@@ -240,12 +236,14 @@ class MeshLayer:
 def gather(description: Description, options: Options, textures: str) -> MeshLayer:
     """The layer of all meshes of a description; arguments as for `MeshLayer`.
 
+    Meshes that are missing or unreadable are in its `failed`; see `placeholder`.
+
     Raises:
-        InputError: A mesh cannot be read, or is missing and `options` do not allow that.
+        UnsafeError: The description may not read a mesh.
     """
     meshes = MeshLayer(description, options, textures)
     colliding = False
-    for name, link in description.links.items():
+    for link in description.links.values():
         for form in (visual.geometry for visual in link.visuals if visual.geometry.kind != "mesh"):
             meshes.primitive(form)
         for role, shapes, add in (
@@ -253,7 +251,7 @@ def gather(description: Description, options: Options, textures: str) -> MeshLay
             ("collision", link.collisions, meshes.collider),
         ):
             for form in (shape.geometry for shape in shapes if shape.geometry.kind == "mesh"):
-                meshes.try_add(form, add, f"link {name!r}: {role}")
+                meshes.try_add(form, add)
                 colliding |= role == "collision"
     if options.collision == "mesh" and colliding:
         description.note(

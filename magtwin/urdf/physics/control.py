@@ -76,10 +76,7 @@ def read_commands(tags: Tags, mechanism: Mechanism) -> tuple[DriveRule, ...]:
     """Drive rules from `<ros2_control>` and `<transmission>`; the user's rules come before them.
 
     A velocity or position interface becomes a drive with the default gains; effort leaves the joint free.
-    Joints that cannot move or that follow another get no rule.
-
-    Raises:
-        InputError: A joint is unknown; the message gives the line.
+    Joints that cannot move or that follow another get no rule. Interfaces of unknown joints are left out.
     """
     rules: dict[str, DriveRule] = {}
     for name, kind in _commands(tags):
@@ -120,7 +117,11 @@ def _commands(tags: Tags) -> Iterator[tuple[str, str]]:
                     text = [
                         kind for kind in COMMANDS if kind in tags.text(joint, "hardwareInterface").lower()
                     ]
-                name = _known(tags, joint.get("name", ""), joint)
+                name = joint.get("name", "")
+                if all(name != known.name for known in tags.description.joints.values()):
+                    fault = f"<{tag}> names no joint {name!r}: its interfaces are left out"
+                    tags.description.repair("name-unknown", fault, joint)
+                    continue
                 kind = next((kind for kind in COMMANDS if kind in text), None)
                 if kind is not None:
                     yield name, COMMANDS[kind]

@@ -10,7 +10,7 @@ from fnmatch import fnmatchcase
 import numpy as np
 from pxr import Sdf, Usd, UsdPhysics
 
-from magtwin.errors import hint
+from magtwin.errors import near
 from magtwin.urdf.description.tag import Tags
 from magtwin.urdf.options import Options
 
@@ -61,9 +61,8 @@ def read_surfaces(tags: Tags) -> dict[str, Surface]:
     for block in tags.blocks("gazebo"):
         link = block.get("reference", "")
         if link and link not in known:
-            where = description.where(block).rpartition("/")[2]
-            text = f"{where}: <gazebo> is about {link!r}, which is no link or joint; {hint(link, known)}"
-            description.note(f"{text}; kept as text", lost=True)
+            text = f"<gazebo> is about {link!r}, which is no link or joint{near(link, known)}: kept as text"
+            description.repair("name-unknown", text, block)
         if link not in description.links:
             continue
         friction = tags.number(block, *FRICTION, least=0.0)

@@ -8,13 +8,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pxr import Usd, UsdGeom
 
-from magtwin.errors import InputError
 from magtwin.frames import canonical
 from magtwin.urdf.meshes.collider import hull_faces
 from magtwin.urdf.meshes.mesh_layer import primitive_of
 
-NEAR_MISS = 0.02
-"""Relative excess of the largest moment over the sum of the others that is still repaired."""
+ROUNDING = 1e-6
+"""Relative excess of the largest moment over the sum of the others that single precision can cause."""
+
+SLIMMEST = 1e-3
+"""Smallest principal moment of a repaired tensor, relative to the largest: engines divide by it."""
+
+WATER = 1000.0
+"""Density of a body whose size is unknown [kg/m3]."""
 
 
 @dataclass(frozen=True)
@@ -51,22 +56,48 @@ def combined(bodies: Sequence[MassProperties]) -> MassProperties:
     return MassProperties(mass, centre, inertia)
 
 
-def principal_axes(inertia: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64], bool]:
-    """Principal moments of an inertia tensor, and the rotation to its principal axes.
+def nearest_possible(inertia: ArrayLike) -> NDArray[np.float64] | None:
+    """The possible inertia tensor that is nearest to a given one in the Frobenius norm.
 
-    I = R diag(I_1, I_2, I_3) R^T, with the principal axes as columns of R. Of the 24 orders and signs, R is
-    the one nearest to the identity, so that a diagonal tensor keeps its axes. Real bodies have I_i > 0
-    and I_i + I_j >= I_k (Goldstein 2002, section 5.4).
+    Real bodies have I_i > 0 and I_i + I_j >= I_k (Goldstein 2002, section 5.4), that is, second moments of
+    mass p_i = (I_1 + I_2 + I_3) / 2 - I_i >= 0. The norm and the conditions do not depend on the axes, so the
+    nearest tensor has the same ones, and its moments are I = A p with A = 1 1^T - 1 and p >= 0 nearest to the
+    given moments: a projection to a cone with three edges, found by trying every set of edges.
 
     Args:
         inertia: Tensor about the centre of mass [kg m2], shape (3, 3).
 
     Returns:
-        Moments [kg m2], shape (3,); the quaternion xyzw of R, shape (4,); and whether a moment was
-        reduced to the sum of the others, which it exceeded by less than NEAR_MISS.
+        The tensor, shape (3, 3): the given one if it is possible. Its least moment is at least `SLIMMEST`
+        of the largest. None if the nearest tensor is 0, which tells nothing.
+    """
+    given = np.asarray(inertia, float)
+    moments, R = np.linalg.eigh((given + given.T) / 2)
+    if moments[0] > 0 and moments[2] <= (moments[0] + moments[1]) * (1 + ROUNDING):
+        return given
+    A, best, least = np.ones((3, 3)) - np.eye(3), np.zeros(3), float(moments @ moments)
+    for edges in ([0], [1], [2], [0, 1], [0, 2], [1, 2]):
+        p, *_ = np.linalg.lstsq(A[:, edges], moments, rcond=None)
+        distance = float(np.sum((A[:, edges] @ p - moments) ** 2))
+        if (p >= 0).all() and distance < least:
+            best, least = A[:, edges] @ p, distance
+    if not best.max() > 0:
+        return None
+    best = np.maximum(best, SLIMMEST * best.max())
+    return np.asarray(R @ np.diag(best) @ R.T)
 
-    Raises:
-        InputError: No body has such a tensor; the message gives the moments.
+
+def principal_axes(inertia: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Principal moments of an inertia tensor, and the rotation to its principal axes.
+
+    I = R diag(I_1, I_2, I_3) R^T, with the principal axes as columns of R. Of the 24 orders and signs, R is
+    the one nearest to the identity, so that a diagonal tensor keeps its axes.
+
+    Args:
+        inertia: Possible tensor about the centre of mass [kg m2], shape (3, 3).
+
+    Returns:
+        Moments [kg m2], shape (3,), none above the sum of the others; the quaternion xyzw of R, shape (4,).
     """
     tensor = np.asarray(inertia, float)
     tensor = (tensor + tensor.T) / 2
@@ -80,15 +111,8 @@ def principal_axes(inertia: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.
         if np.linalg.det(R) < 0:
             R[:, np.argmin(np.diag(R))] *= -1
     largest = int(np.argmax(moments))
-    others = moments.sum() - moments[largest]
-    start = f"no body has principal moments of inertia {', '.join(f'{m:.3g}' for m in moments)} kg m2"
-    if not (np.isfinite(moments).all() and moments.min() > 0):
-        raise InputError(f"{start}; all must be above 0")
-    if moments[largest] > others * (1 + NEAR_MISS):
-        raise InputError(f"{start}; none may exceed the sum of the others")
-    repaired = bool(moments[largest] > others * (1 + 1e-6))
-    moments[largest] = min(moments[largest], others)
-    return moments, quaternion(R), repaired
+    moments[largest] = min(moments[largest], moments.sum() - moments[largest])
+    return moments, quaternion(R)
 
 
 def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -103,6 +127,12 @@ def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
         ]
     )
     return canonical(np.linalg.eigh(K)[1][:, -1])
+
+
+def ball_of(mass: float) -> MassProperties:
+    """A ball of water of some mass [kg] at the origin: a body whose size is unknown."""
+    radius = (3 * mass / (4 * np.pi * WATER)) ** (1 / 3)
+    return MassProperties(mass, np.zeros(3), WATER * sphere(radius).inertia)
 
 
 def box(size: ArrayLike) -> MassProperties:

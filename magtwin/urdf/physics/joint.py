@@ -70,9 +70,6 @@ def define_joint(
         mechanism: Joints of the description, which receives notes.
         options: Drives and profile.
         wheels: Driven wheels.
-
-    Raises:
-        InputError: A limit is missing; the message gives the line.
     """
     if joint.name in mechanism.welded:
         return define_fixed_joint(stage, path, ends, T)
@@ -174,8 +171,9 @@ def _free_axes(made: Any, joint: Joint, token: str, description: Description) ->
         limit = joint.limit
         if joint.type == "continuous":
             return ["angular"]
-        if limit is None or limit.lower is None or limit.upper is None:
-            raise description.refused("joint", joint.name, f"is {joint.type} and needs <limit lower= upper=>")
+        assert limit is not None  # the grammar completes limits
+        assert limit.lower is not None
+        assert limit.upper is not None
         if not limit.lower <= 0 <= limit.upper:
             description.note(
                 f"joint {joint.name!r} stands at 0, outside its limits {limit.lower:g} to {limit.upper:g}: "

@@ -7,11 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Usd, UsdPhysics
 
-from magtwin.errors import InputError
-from magtwin.frames import matrix_from_quat, wxyz_from_xyzw
+from magtwin.frames import wxyz_from_xyzw
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Link
-from magtwin.urdf.physics.inertia import MassProperties, combined, principal_axes, read_solid
+from magtwin.urdf.physics.inertia import (
+    MassProperties,
+    ball_of,
+    combined,
+    nearest_possible,
+    principal_axes,
+    read_solid,
+)
 
 LINK_API, SITE_API = "IsaacLinkAPI", "IsaacSiteAPI"
 """Isaac Sim's applied schemas; their plugins are not installed here."""
@@ -48,9 +54,6 @@ def define_body(
         parts: The body's own link, and links merged into it.
         description: Receives notes of repairs and guesses.
         density: Density of links without mass [kg/m3]; None leaves them without.
-
-    Raises:
-        InputError: A mass is not above 0, or an inertia is impossible; the message gives the line.
     """
     prim.AddAppliedSchema(LINK_API)
     UsdPhysics.RigidBodyAPI.Apply(prim).CreateRigidBodyEnabledAttr(True)
@@ -63,11 +66,9 @@ def define_body(
     mass = UsdPhysics.MassAPI.Apply(prim)
     mass.CreateMassAttr(whole.mass)
     mass.CreateCenterOfMassAttr(Gf.Vec3f(*(round(float(v), 12) + 0.0 for v in whole.centre)))
-    if not np.isfinite(whole.inertia).all():
-        return prim  # the engine computes it, see the note
     tensor = whole.inertia.copy()
     tensor[np.abs(tensor) < 1e-9 * np.abs(tensor).max()] = 0.0
-    moments, q, _ = principal_axes(tensor)
+    moments, q = principal_axes(tensor)
     mass.CreateDiagonalInertiaAttr(Gf.Vec3f(*map(float, moments)))
     mass.CreatePrincipalAxesAttr(Gf.Quatf(*(round(float(v), 7) + 0.0 for v in wxyz_from_xyzw(q))))
     return prim
@@ -76,27 +77,29 @@ def define_body(
 def _mass_properties(
     part: Rider, body: Usd.Prim, description: Description, density: float | None, alone: bool
 ) -> MassProperties | None:
-    """Mass properties of a link in its body's frame; None if unknown.
-
-    If a link is a body of its own and has a mass but no inertia, the inertia is NaN: the engine computes it.
-    """
+    """Mass properties of a link in its body's frame; None if unknown."""
     link, inertial = part.link, part.link.inertial
     if inertial is None:
         return _from_shapes(part, body, description, density, alone)
-    if inertial.mass is None or not (np.isfinite(inertial.mass) and inertial.mass > 0):
-        raise description.refused("link", link.name, f"has a mass of {inertial.mass!r} kg; give one above 0")
+    assert inertial.mass is not None  # the grammar leaves out an <inertial> without one
     mass, centre = float(inertial.mass), (part.pose @ origin_of(inertial))[:3, 3]
-    if inertial.inertia is not None:
-        tensor = _checked(link, np.asarray(inertial.inertia, float), origin_of(inertial), description)
-        return MassProperties(mass, centre, part.pose[:3, :3] @ tensor @ part.pose[:3, :3].T)
-    if alone:
-        description.note(f"link {link.name!r} has no <inertia>: engines take it from its colliders")
-        return MassProperties(mass, centre, np.full((3, 3), np.nan))
-    solid = read_solid(part.colliders or part.visuals, body)
+    about, start = ("link", link.name), f"link {link.name!r}"
+    tensor = None if inertial.inertia is None else _turned(inertial.inertia, origin_of(inertial))
+    nearest = None if tensor is None else nearest_possible(tensor)
+    if tensor is not None and nearest is not tensor:
+        moments = ", ".join(f"{m:.3g}" for m in np.linalg.eigvalsh(tensor))
+        done = "the nearest possible tensor is used" if nearest is not None else "it counts as none"
+        text = f"{start}: no body has principal moments of inertia {moments} kg m2: {done}"
+        description.repair("inertia-impossible", text, about)
+    if nearest is not None:
+        return MassProperties(mass, centre, part.pose[:3, :3] @ nearest @ part.pose[:3, :3].T)
+    used, solid = "its colliders", read_solid(part.colliders, body)
     if solid is None:
-        description.note(f"link {link.name!r} has no <inertia> and no shape: its mass counts as a point")
-        return MassProperties(mass, centre, np.zeros((3, 3)))
-    description.note(f"link {link.name!r} has no <inertia>: taken from its shape, filled evenly")
+        used, solid = "its visuals", read_solid(part.visuals, body)
+    if solid is None:
+        used, solid = "a ball of water", ball_of(mass)
+    text = f"{start} has no <inertia>: that of {used}, filled evenly with its {mass:g} kg"
+    description.repair("inertia-missing", text, about)
     return MassProperties(mass, centre, mass / solid.mass * solid.inertia)
 
 
@@ -122,18 +125,7 @@ def _from_shapes(
     return MassProperties(mass, solid.centre, density * solid.inertia)
 
 
-def _checked(link: Link, tensor: NDArray, origin: NDArray, description: Description) -> NDArray[np.float64]:
-    """A tensor (3, 3) at an `origin` (4, 4) in its link's axes, repaired if slightly impossible."""
-    turned = origin[:3, :3] @ tensor @ origin[:3, :3].T
-    cleared = np.where(np.abs(turned) < 1e-9 * np.abs(turned).max(), 0.0, turned)
-    try:
-        moments, q, repaired = principal_axes(cleared)
-    except InputError as error:
-        raise description.refused("link", link.name, f"has an impossible inertia: {error}") from error
-    if not repaired:
-        return turned
-    description.note(
-        f"link {link.name!r}: its largest moment of inertia exceeded the sum of the others; reduced to it"
-    )
-    R = matrix_from_quat(q)
-    return R @ np.diag(moments) @ R.T
+def _turned(inertia: NDArray, origin: NDArray) -> NDArray[np.float64]:
+    """A tensor (3, 3) at an `origin` (4, 4) in its link's axes, without rounding errors off its diagonal."""
+    turned = origin[:3, :3] @ np.asarray(inertia, float) @ origin[:3, :3].T
+    return np.where(np.abs(turned) < 1e-9 * np.abs(turned).max(), 0.0, turned)

@@ -48,10 +48,7 @@ def read_mechanism(description: Description, options: Options = DEFAULTS) -> Mec
     A joint is welded if it is fixed, if its limits leave no range, or if its limits give neither effort nor
     speed, unless it is continuous, where exporters fill in zeros. With the profile diff-drive, a prismatic
     joint without one of the two is welded too: it stands for a suspension whose spring a URDF cannot
-    describe. A joint that follows a welded joint is welded.
-
-    Raises:
-        InputError: A mimicking joint has several axes, or the multiplier 0; the message gives the line.
+    describe. A joint that follows a welded joint, or another with multiplier 0, is welded.
     """
     joints = {joint.name: joint for joint in description.joints.values()}
     welded = {}
@@ -74,9 +71,10 @@ def read_mechanism(description: Description, options: Options = DEFAULTS) -> Mec
             continue
         if joint.mimic is None:
             continue
-        mimic = _resolved(joint, joints, description)
-        if mimic.joint in welded:
-            welded[name] = f"follows {mimic.joint!r}, which cannot move"
+        mimic = _resolved(joint, joints)
+        if mimic.joint in welded or mimic.multiplier == 0:
+            still = "which cannot move" if mimic.joint in welded else "taken 0 times"
+            welded[name] = f"follows {mimic.joint!r}, {still}"
             description.note(f"joint {name!r} {welded[name]}: welded")
         else:
             mimics[name] = mimic
@@ -114,18 +112,13 @@ def _weld_reason(joint: Joint, options: Options) -> str | None:
     return None
 
 
-def _resolved(joint: Joint, joints: Mapping[str, Joint], description: Description) -> Mimic:
+def _resolved(joint: Joint, joints: Mapping[str, Joint]) -> Mimic:
     """The first joint of a chain of mimics, with the total ratio; the description has no circle."""
     multiplier, offset, at = 1.0, 0.0, joint
     while at.mimic is not None:
-        if at.mimic.multiplier == 0:
-            raise description.refused("joint", at.name, "mimics with multiplier 0; make it fixed")
         offset += multiplier * at.mimic.offset
         multiplier *= at.mimic.multiplier
         at = joints[at.mimic.joint]
-    if joint.type not in SINGLE:
-        text = f"is {joint.type} and has no single value to mimic {at.name!r} with"
-        raise description.refused("joint", joint.name, text)
     return Mimic(at.name, multiplier, offset)
 
 

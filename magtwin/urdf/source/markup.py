@@ -1,6 +1,7 @@
 """Markup: XML with the line of each element, without external references or entities."""
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,10 @@ from magtwin.files import read_bytes
 
 _LONGEST_TAG = re.compile(rb"<[^<>]{%d}" % (1 << 20))
 """An element of over a million characters of attributes, which expat holds all at once."""
+
+
+class UnsafeError(InputError):
+    """A file that could read other files or fill the memory; never repaired."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +50,7 @@ def parse_markup(text: bytes, path: Path) -> Markup:
     lines: dict[ElementTree.Element, int] = {}
     most_levels, most_elements = BUDGETS["XML"].depth, BUDGETS["XML"].count
     if _LONGEST_TAG.search(text):
-        raise InputError(f"{path}: not XML: an element of over a million characters")
+        raise UnsafeError(f"{path}: not XML: an element of over a million characters")
     parser = expat.ParserCreate()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
@@ -54,8 +59,11 @@ def parse_markup(text: bytes, path: Path) -> Markup:
         count += 1 + len(attributes)
         if depth > most_levels or count > most_elements:
             where = f"{path}:{parser.CurrentLineNumber}"
-            check_depth(where, "XML", depth, "elements")
-            check_count(where, "XML", count, "elements and attributes")
+            try:
+                check_depth(where, "XML", depth, "elements")
+                check_count(where, "XML", count, "elements and attributes")
+            except InputError as error:
+                raise UnsafeError(str(error)) from error
         lines[builder.start(tag, attributes)] = parser.CurrentLineNumber
 
     def end(tag: str) -> None:
@@ -64,7 +72,7 @@ def parse_markup(text: bytes, path: Path) -> Markup:
         builder.end(tag)
 
     def doctype(*_: Any) -> None:
-        raise InputError(
+        raise UnsafeError(
             f"{path}:{parser.CurrentLineNumber}: has a DOCTYPE, whose entities are not followed; "
             "remove it and write the values in full"
         )
@@ -86,6 +94,14 @@ def parse_markup(text: bytes, path: Path) -> Markup:
             raise
         raise InputError(f"{path}:1: not XML: {error}; save the file as UTF-8") from error
     return Markup(builder.close(), lines)
+
+
+def plain_text(element: ElementTree.Element) -> str:
+    """An element as text on one line, with sorted attributes."""
+    text = ElementTree.tostring(element, encoding="unicode").strip()
+    with suppress(ElementTree.ParseError):  # a prefix without a namespace
+        text = ElementTree.canonicalize(text, strip_text=True)
+    return " ".join(text.split())
 
 
 def _undecodable(text: bytes, line: int) -> str:

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from magtwin.errors import InputError, hint
+from magtwin.errors import InputError, hint, near
 from magtwin.urdf.source.markup import read_markup
 
 MANIFEST = "package.xml"
@@ -14,21 +14,40 @@ DEPTH, FOLDERS = 3, 5_000
 """Depth of the search for packages below a folder, and most folders searched."""
 
 MARKS = (
-    *(MANIFEST, "CMakeLists.txt", "launch", "mesh", "meshes", "model.config", "models", "robots", "urdf"),
-    "xacro",
+    *(MANIFEST, "CMakeLists.txt", "launch", "mesh", "meshes", "model", "model.config", "models", "robots"),
+    *("urdf", "xacro"),
 )
 """Contents, any of which marks a folder without a manifest as a package."""
+
+
+SUBFOLDERS = ("robot", "robots", "urdf", "xacro")
+"""Usual names of a folder with descriptions, inside the folder of a robot."""
+
+BESIDE = ("materials", "mesh", "meshes", "textures", *SUBFOLDERS)
+"""Folders beside such a folder that a description without a package may read."""
+
+
+class MissingFileError(InputError):
+    """A file or package named in a description is missing; the caller may be able to continue without it."""
+
+    supply = ""
+    """Option of the command line that would supply it, such as `--package arm=FOLDER`."""
+
+    near = ""
+    """The nearest known name, as an addition to a text."""
 
 
 class Packages:
     """Folders of packages by name: those given by the user, then those found around a file.
 
     The search order is: given packages; packages above the file, by their `package.xml`; packages beside
-    those, down to DEPTH folders below (below the file's folder if no package contains the file); last, a
-    folder of that name that contains the file or lies beside it or a parent, at most DEPTH levels up. That
-    last folder must look like a package (see MARKS), because the description chooses the name:
-    `package://home` must not lead to a home folder. Nothing is executed, environment variables are not
-    read, and symbolic links are not followed.
+    those, down to DEPTH folders below (below the file's folder if no package contains the file); a folder
+    of that name that contains the file or lies beside it or a parent, at most DEPTH levels up; last, the
+    packages of ROS: `share/NAME` below each folder of AMENT_PREFIX_PATH, then the `package.xml` at most
+    DEPTH folders below each folder of ROS_PACKAGE_PATH. A folder found by its name alone must look like a
+    package (see MARKS), because the description chooses the name: `package://home` must not lead to a home
+    folder. Of the packages of ROS, only those that the description names are read. Nothing is executed,
+    and symbolic links around the file are not followed.
     """
 
     def __init__(self, given: Mapping[str, Path], file: Path) -> None:
@@ -38,7 +57,10 @@ class Packages:
         self._given = {name: Path(folder).resolve() for name, folder in given.items()}
         self._folder = file.resolve().parent
         self._above = [p for p in (self._folder, *self._folder.parents) if (p / MANIFEST).is_file()]
+        beside = self._folder.parent if not self._above and self._folder.name in SUBFOLDERS else None
+        self._beside = [beside / name for name in BESIDE] if beside else []
         self._found: dict[str, list[Path]] | None = None
+        self._installed: dict[str, Path] = {}
         self._complete = True
         self.notes: list[str] = []
         """Ambiguous packages, one line each."""
@@ -52,7 +74,7 @@ class Packages:
         """Folder of a package.
 
         Raises:
-            InputError: No package of that name was found; the message suggests a near name.
+            MissingFileError: No package of that name was found; the message suggests a near name.
         """
         if name in self._given:
             return self._given[name]
@@ -70,15 +92,27 @@ class Packages:
                 for path in (parent, parent / name):
                     if path.name == name and (path == self._folder or _looks_like_package(path)):
                         return path
+            folder = self._installed.get(name) or _installed(name)
+            if folder is not None:
+                self._installed[name] = folder
+                return folder
         known = {*self._given, *found}
         stopped = "" if self._complete else f" (the search ended after {FOLDERS} folders)"
         advice = f"; {hint(name, known)}" if known else ""
-        raise InputError(f"no package {name!r} around it{stopped}; give --package {name}=FOLDER{advice}")
+        error = MissingFileError(
+            f"no package {name!r} around it{stopped}; give --package {name}=FOLDER{advice}"
+        )
+        error.supply, error.near = f"--package {name}=FOLDER", near(name, known)
+        raise error
 
     def holds(self, path: Path) -> bool:
-        """Whether a file lies in the home folder, in a given package or in a package that was found."""
-        path = path.resolve()
-        if any(path.is_relative_to(folder) for folder in (self.home, *self._given.values())):
+        """Whether a file lies in the home folder, beside it (see BESIDE), or in a package.
+
+        Packages are those given, those around the file, and those of ROS that `find` found.
+        """
+        path, installed = path.resolve(), self._installed.values()
+        allowed = (self.home, *self._given.values(), *self._beside, *installed)
+        if any(path.is_relative_to(folder) for folder in allowed):
             return True
         return any(path.is_relative_to(p) for folders in self._search().values() for p in folders)
 
@@ -105,6 +139,35 @@ def _add(folder: Path, found: dict[str, list[Path]]) -> None:
         folders = found.setdefault(name or folder.name, [])
         if folder not in folders:
             folders.append(folder)
+
+
+def _installed(name: str) -> Path | None:
+    """Folder of a package of ROS in AMENT_PREFIX_PATH or ROS_PACKAGE_PATH; None if there is none."""
+    if not name or Path(name).name != name:
+        return None
+    prefixes, workspaces = (
+        [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
+        for variable in ("AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH")
+    )
+    for folder in (prefix / "share" / name for prefix in prefixes):
+        if _has_manifest(folder):
+            return folder.resolve()
+    left = FOLDERS
+    for workspace in workspaces:
+        for folder in (workspace, *_below(workspace, DEPTH)):
+            left -= 1
+            if left < 0:
+                return None
+            if folder.name == name and _has_manifest(folder):
+                return folder.resolve()
+    return None
+
+
+def _has_manifest(folder: Path) -> bool:
+    try:
+        return (folder / MANIFEST).is_file()
+    except OSError:  # the name is too long, or the folder is not readable
+        return False
 
 
 def _looks_like_package(folder: Path) -> bool:

@@ -1,22 +1,18 @@
 """Source: a robot description as plain URDF, with the files and packages around it."""
 
-import difflib
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from xml.etree import ElementTree
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, near
 from magtwin.files import existing
-from magtwin.urdf.source.markup import read_markup
-from magtwin.urdf.source.package import Packages
+from magtwin.urdf.repairs import Repairs
+from magtwin.urdf.source.markup import UnsafeError, read_markup
+from magtwin.urdf.source.package import MissingFileError, Packages
 from magtwin.urdf.source.xacro import expand
-
-
-class MissingFileError(InputError):
-    """A file named in a description is missing; the caller may be able to continue without it."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +31,8 @@ class Source:
     packages: Packages
     """Finds the folders of `package://`."""
 
-    notes: tuple[str, ...] = ()
-    """Notes on the expansion, one line each."""
+    repairs: Repairs = field(default_factory=Repairs)
+    """Receives every repair and note of the conversion; those of the expansion so far."""
 
     def where(self, element: ElementTree.Element | None) -> str:
         """File and line of an element, as `file:line`; the file alone if it has none."""
@@ -45,11 +41,18 @@ class Source:
         file, line = self.places[element]
         return f"{file}:{line}"
 
+    def place(self, element: ElementTree.Element | None) -> tuple[str, int]:
+        """File, relative to the folder of the description, and line of an element; ("", 0) if unknown."""
+        if element is None or element not in self.places:
+            return "", 0
+        file, line = self.places[element]
+        return Path(os.path.relpath(file, self.path.parent)).as_posix(), line
+
     def find_file(self, filename: str, what: str, element: ElementTree.Element | None = None) -> Path:
         """The file that a `filename=` refers to.
 
         `package://NAME/rest` and `model://NAME/rest` lie in that package. Any other name is relative to the
-        folder of the description, and may lie in its package or in other packages.
+        folder of the description, or else to its package, and may lie in its package or in other packages.
 
         Args:
             filename: Name in the description.
@@ -57,8 +60,10 @@ class Source:
             element: Element with the name, for error messages.
 
         Raises:
-            MissingFileError: The file does not exist; the message suggests a near name.
-            InputError: Its package was not found, or the description may not read the file.
+            MissingFileError: The file or its package does not exist; the message suggests a near name. Or
+                its scheme is unknown, such as https: nothing is downloaded.
+            UnsafeError: The description may not read the file.
+            InputError: It cannot be looked for.
         """
         start = f"{self.where(element)}: {what} {filename!r}"
         try:
@@ -71,30 +76,34 @@ class Source:
         """The file of `find_file`; `start` begins its error messages."""
         scheme, separator, rest = filename.partition("://")
         if separator and scheme not in ("package", "model", "file"):
-            raise InputError(f"{start} has scheme {scheme!r}; known: file, model, package")
+            raise MissingFileError(f"{start} has scheme {scheme!r}; known: file, model, package")
         if separator and scheme != "file":
             name, _, rest = rest.partition("/")
             try:
                 folder = self.packages.find(name)
-            except InputError as error:
-                raise InputError(f"{start} is in a package: {error}") from error
+            except MissingFileError as error:
+                missing = MissingFileError(f"{start} is in a package: {error}")
+                missing.supply, missing.near = error.supply, error.near
+                raise missing from error
             path = Path(os.path.normpath(folder / rest))
             inside = path.resolve().is_relative_to(folder.resolve())
         else:
             path = Path(os.path.normpath(self.path.resolve().parent / (rest if separator else filename)))
             folder, inside = self.packages.home, self.packages.holds(path)
+            other = self.packages.home / filename
+            if inside and not path.is_file() and self.packages.holds(other) and other.is_file():
+                path = Path(os.path.normpath(other))
         if not inside:
-            raise InputError(
+            raise UnsafeError(
                 f"{start} lies outside {folder}; files are read from there only: move it in, "
                 "or name its folder by --package NAME=FOLDER"
             )
         if not path.is_file():
             siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-            near = difflib.get_close_matches(path.name, siblings, n=1)
-            advice = f"; did you mean {near[0]!r}?" if near else ""
-            if what == "mesh":
-                advice += "; --missing-meshes note leaves it out"
-            raise MissingFileError(f"{start} is missing; looked for {path}{advice}")
+            advice = near(path.name, siblings)
+            absent = MissingFileError(f"{start} is missing{advice}; looked for {path}")
+            absent.near = advice
+            raise absent
         return path
 
 
@@ -103,6 +112,7 @@ def read_source(
     *,
     packages: Mapping[str, Path] = MappingProxyType({}),
     arguments: Mapping[str, str] = MappingProxyType({}),
+    skip_missing_includes: bool = False,
 ) -> Source:
     """Read a URDF, or a xacro with its macros expanded.
 
@@ -110,6 +120,7 @@ def read_source(
         path: The file; it is a xacro if its suffix is .xacro or it has elements `xacro:`.
         packages: Folders of packages by name; they override packages that are found.
         arguments: Values of a xacro's `<xacro:arg>`.
+        skip_missing_includes: Whether to skip missing includes of a xacro of which no macro is called.
 
     Raises:
         InputError: The file is missing, is not XML, has a DOCTYPE, is not a `<robot>`, or has macros that
@@ -122,8 +133,9 @@ def read_source(
         raise InputError(f"{path}:{line}: a URDF begins with <robot>, this file with <{markup.root.tag}>")
     around = Packages(packages, path)
     if path.suffix == ".xacro" or any(element.tag.startswith("xacro:") for element in markup.lines):
-        xml, places, notes = expand(path, around, arguments)
-        return Source(path, xml, MappingProxyType(places), around, notes)
+        repairs = Repairs()
+        xml, places = expand(path, around, arguments, repairs, skip_missing_includes=skip_missing_includes)
+        return Source(path, xml, MappingProxyType(places), around, repairs)
     if arguments:
         raise InputError(f"{path}: is not a xacro and takes no arguments; leave out {', '.join(arguments)}")
     return Source(

@@ -16,13 +16,14 @@ from types import ModuleType
 from typing import Any
 from xml.dom import minidom
 from xml.etree import ElementTree
-from xml.parsers.expat import ErrorString, ExpatError
+from xml.parsers.expat import ExpatError
 
 from magtwin.errors import InputError, hint
 from magtwin.files import read_bytes
+from magtwin.urdf.repairs import NOTE, Repairs
 from magtwin.urdf.source.expression import GLOBALS, LARGEST, Budget, ExpressionError, check_size, evaluate
-from magtwin.urdf.source.markup import parse_markup
-from magtwin.urdf.source.package import Packages
+from magtwin.urdf.source.markup import UnsafeError, parse_markup
+from magtwin.urdf.source.package import MissingFileError, Packages
 
 UNITS, ELEMENT = 20_000_000, 100
 """Budget of an expansion, and the cost of each element."""
@@ -49,34 +50,50 @@ Place = tuple[Path, int]
 
 
 def expand(
-    path: Path, packages: Packages, arguments: Mapping[str, str]
-) -> tuple[ElementTree.Element, dict[ElementTree.Element, Place], tuple[str, ...]]:
+    path: Path,
+    packages: Packages,
+    arguments: Mapping[str, str],
+    repairs: Repairs,
+    *,
+    skip_missing_includes: bool = False,
+) -> tuple[ElementTree.Element, dict[ElementTree.Element, Place]]:
     """Expand a xacro to URDF.
+
+    A package that is missing and from which nothing is included is a repair: files in it count as missing.
 
     Args:
         path: The xacro.
         packages: Packages for `$(find)`, and the folders from which files may be included.
         arguments: Values of `<xacro:arg>`; they override its defaults.
+        repairs: Receives repairs and notes.
+        skip_missing_includes: Whether to skip missing includes of which no macro is called.
 
     Returns:
-        `<robot>`; file and line of each element; and notes for the user, one line each.
+        `<robot>`; and file and line of each element.
 
     Raises:
         InputError: The file is not XML, reads outside the packages, has an expression outside the language,
-            or expands without end; the message gives file and line.
+            or expands without end; the message gives file and line. Or includes, arguments or macros are
+            missing; the message lists all, with the options that would supply them.
     """
-    return _Expansion(path, packages, arguments).run()
+    return _Expansion(path, packages, arguments, repairs, skip_missing_includes).run()
 
 
 class _Expansion:
     """One expansion, on a fresh instance of the library's module, because the library keeps global state."""
 
-    def __init__(self, path: Path, packages: Packages, arguments: Mapping[str, str]) -> None:
+    def __init__(
+        self, path: Path, packages: Packages, arguments: Mapping[str, str], repairs: Repairs, skip: bool
+    ) -> None:
         self._path, self._packages, self._arguments = path, packages, dict(arguments)
+        self._repairs, self._skip = repairs, skip
+        self._absent: dict[str, str] = {}  # what the expansion cannot do without, and where
+        self._skipped: dict[str, str] = {}  # includes, and where
+        self._near: dict[str, str] = {}  # near names of missing packages
+        self._optional = self._including = False
         self._asked: set[str] = set()
         self._budget = Budget(UNITS)
         self._at: Place = (path, 1)
-        self._notes: list[str] = []
         self._library = _library()
         library = self._library
         ours: dict[str, Callable[..., Any]] = {  # of every function that evaluates, reads or prints
@@ -89,6 +106,7 @@ class _Expansion:
         }
         for name in ("check_attrs", "eval_all", "handle_macro_call", "reqd_attrs"):
             ours[name] = self._followed(getattr(library, name))
+        ours["handle_macro_call"] = self._called(ours["handle_macro_call"])
         for name, replacement in ours.items():
             if not hasattr(library, name):
                 raise InputError(f"xacro: this version has no {name}; install xacro 2.1")
@@ -98,7 +116,33 @@ class _Expansion:
         xacro = {**shown, **names, "arg": self._argument, "fatal": _fatal, "tokenize": _tokenize}
         vars(library)["_global_symbols"] = {**GLOBALS, **shown, "xacro": xacro}
 
-    def run(self) -> tuple[ElementTree.Element, dict[ElementTree.Element, Place], tuple[str, ...]]:
+    def run(self) -> tuple[ElementTree.Element, dict[ElementTree.Element, Place]]:
+        try:
+            document = self._expanded()
+        except UnsafeError:
+            raise
+        except InputError as error:
+            self._check_absent()  # what is missing may be the cause
+            if not self._skipped:
+                raise
+            supplied = " ".join(self._repairs.supplies) or "the files in their place"
+            raise InputError(
+                f"{error}; this may come from a skipped include: {', '.join(self._skipped)}; give {supplied}"
+            ) from error
+        self._check_absent()
+        for include, place in self._skipped.items():
+            file, _, line = place.rpartition(":")
+            self._repairs.add(
+                "include-skipped", f"include {include!r} is missing: skipped", (file, int(line))
+            )
+        unknown = [name for name in self._arguments if name not in self._asked]
+        if unknown:
+            known = hint(unknown[0], self._asked) if self._asked else "it has none"
+            raise InputError(f"{self._path}: no xacro argument {unknown[0]!r}; {known}")
+        assert document.documentElement is not None
+        return _to_tree(document.documentElement, (self._path, 1))
+
+    def _expanded(self) -> minidom.Document:
         library = self._library
         try:
             library.init_stacks(str(self._path))
@@ -114,13 +158,62 @@ class _Expansion:
             raise
         except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
             raise self._refused(f"cannot be expanded: {error}") from error
-        unknown = [name for name in self._arguments if name not in self._asked]
-        if unknown:
-            known = hint(unknown[0], self._asked) if self._asked else "it has none"
-            raise InputError(f"{self._path}: no xacro argument {unknown[0]!r}; {known}")
-        assert document.documentElement is not None
-        root, places = _to_tree(document.documentElement, (self._path, 1))
-        return root, places, tuple(self._notes)
+        return document
+
+    def _check_absent(self) -> None:
+        """Refuse everything that is missing, in one line.
+
+        Raises:
+            InputError: Something is missing, and the expansion cannot do without it.
+        """
+        absent = dict(self._absent)
+        if absent or not self._skip:
+            near = {name: self._near.get("/".join(name.split("/")[:3]), "") for name in self._skipped}
+            includes = {f"include {name!r}{near[name]}": place for name, place in self._skipped.items()}
+            absent = includes | absent
+        if not absent:
+            return
+        faults = ", ".join(f"{what} ({place})" for what, place in absent.items())
+        supplied = " ".join(self._repairs.supplies)
+        advice = f"; give {supplied}" if supplied else "; put the files in their place"
+        if self._skipped and not self._absent:
+            advice += ", or `skip_missing_includes=True` if none of their macros is called"
+        raise InputError(f"{self._path}: missing: {faults}{advice}")
+
+    def _miss(self, what: str, supply: str = "") -> None:
+        """Record something without which the expansion cannot be used."""
+        self._absent.setdefault(what, self._place())
+        if supply:
+            self._repairs.supplies[supply] = None
+
+    def _repair(self, kind: str, text: str, place: str | None = None) -> None:
+        """Add a repair at a place. Default: the current node's."""
+        file, _, line = (place or self._place()).rpartition(":")
+        self._repairs.add(kind, text, (file, int(line)))
+
+    def _place(self) -> str:
+        """File, relative to the folder of the xacro, and line of the current node."""
+        file, line = self._at
+        return f"{Path(os.path.relpath(file, self._path.parent)).as_posix()}:{line}"
+
+    def _called(self, handle: Callable[..., Any]) -> Callable[..., Any]:
+        """The library's macro call; an unknown macro counts as missing if an include is missing."""
+
+        def call(node: minidom.Element, *arguments: Any) -> Any:
+            try:
+                return handle(node, *arguments)
+            except self._library.XacroException as error:
+                unknown = f"unknown macro name: {node.tagName}" in str(error.args[0] or "")
+                if not unknown or (not self._skipped and self._path.suffix == ".xacro"):
+                    raise
+                if self._skipped:
+                    self._miss(f"macro {node.tagName!r}")
+                else:
+                    self._repair("macro-unknown", f"<{node.tagName}> is no macro: left out")
+                self._library.replace_node(node, by=None)
+                return True
+
+        return call
 
     def _refused(self, text: str) -> InputError:
         file, line = self._at
@@ -134,6 +227,8 @@ class _Expansion:
             self._at = node.getUserData(PLACE) or self._at
             if node.tagName == "xacro:arg":
                 self._asked.add(node.getAttribute("name"))
+            if node.tagName == "xacro:include":
+                self._optional = node.getAttribute("optional").lower() in ("true", "1")
             return function(node, *arguments)
 
         return follow
@@ -186,14 +281,21 @@ class _Expansion:
     def _find(self, name: str) -> str:
         try:
             return str(self._packages.find(name))
-        except InputError as error:
-            raise ExpressionError(f"$(find {name}): {error}") from error
+        except MissingFileError as error:
+            self._repairs.supplies[error.supply] = None
+            self._near[f"package://{name}"] = error.near
+            if not self._including:
+                self._repair(
+                    "package-missing", f"$(find {name}): no such package: files in it count as missing"
+                )
+            return f"package://{name}"
 
     def _argument(self, name: str) -> Any:
         self._asked.add(name)
         table = self._library.substitution_args_context["arg"]
         if name not in table:
-            raise ExpressionError(f"no argument {name!r}; give --arg {name}=VALUE")
+            self._miss(f"argument {name!r}", f"--arg {name}=VALUE")
+            return "0"
         return table[name]
 
     def _variable(self, name: str, default: str | None = None) -> str:
@@ -201,13 +303,23 @@ class _Expansion:
         if name in self._arguments:
             return self._arguments[name]
         if default is None:
-            raise ExpressionError(f"environment variables are not read; give --arg {name}=VALUE")
+            self._miss(f"environment variable {name!r}, which is not read", f"--arg {name}=VALUE")
+            return ""
         self._note(f"environment variable {name} is not read, {default!r} is taken; give --arg {name}=VALUE")
         return default
 
     def _included(self, filename: str, names: Mapping[str, Any]) -> Iterator[str]:
         """Files of an `<xacro:include>`."""
-        wanted = self._library.abs_filename_spec(str(self._text(filename, names)))
+        self._including = True
+        try:
+            text = str(self._text(filename, names))
+        finally:
+            self._including = False
+        if text.startswith("package://"):
+            if not self._optional:
+                self._skipped[text] = self._place()
+            return
+        wanted = self._library.abs_filename_spec(text)
         files = [wanted]
         if pattern := re.search(r"[*?\[]", wanted):
             self._check_inside(os.path.dirname(wanted[: pattern.start()]), "include")  # noqa: PTH120
@@ -215,7 +327,10 @@ class _Expansion:
         if not files:
             self._note(f"include {filename!r} matches no file")
         for file in files:
-            self._check_inside(file, "include")
+            path = self._check_inside(file, "include")
+            if not (path.exists() or self._optional):
+                self._skipped[os.path.relpath(path, self._path.parent)] = self._place()
+                continue
             yield file
 
     def _check_inside(self, file: str, what: str) -> Path:
@@ -242,9 +357,12 @@ class _Expansion:
         markup = parse_markup(content, path)
         self._budget.spend(ELEMENT * len(markup.lines))
         try:
-            document = minidom.parseString(content)  # with namespaces
+            document = minidom.parseString(content)
         except ExpatError as error:
-            raise InputError(f"{path}:{error.lineno}: not XML: {ErrorString(error.code)}") from error
+            reason = f"{error}".partition(":")[0]
+            raise InputError(
+                f"{path}:{error.lineno}: not XML: {reason}; declare xmlns:xacro in <robot>"
+            ) from error
         elements = document.getElementsByTagName("*")
         for element, line in zip(elements, markup.lines.values(), strict=True):
             element.setUserData(PLACE, (path, line), _KEEP)
@@ -256,6 +374,9 @@ class _Expansion:
 
         from magtwin.urdf.source.settings import Loader
 
+        if str(filename).startswith("package://"):
+            self._miss(f"settings {filename!r}")
+            return {}
         path = self._check_inside(self._library.abs_filename_spec(str(filename)), "load_yaml")
 
         class UnitLoader(Loader):
@@ -281,8 +402,7 @@ class _Expansion:
 
     def _note(self, *words: Any, **_: Any) -> str:
         text = f"{self._at[0].name}:{self._at[1]}: " + " ".join(map(str, words))
-        if text not in self._notes:
-            self._notes.append(text)
+        self._repairs.add(NOTE, text)
         return ""
 
 

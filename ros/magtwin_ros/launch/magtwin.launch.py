@@ -2,8 +2,8 @@
 
     ros2 launch magtwin_ros magtwin.launch.py scene:=lab.usda path:=figure8
 
-`sim:=false` launches the magnetometer without the simulator, for a real robot. For Isaac Sim, add
-`use_sim_time:=true`. Without `path` there is no follower.
+`sim:=false` launches the magnetometer without the simulator, for a real robot on the network. For Isaac Sim,
+add `use_sim_time:=true`. Without `path` there is no follower.
 """
 
 from launch import LaunchDescription
@@ -21,10 +21,21 @@ def generate_launch_description() -> LaunchDescription:
     """The arguments and the nodes."""
     value = {
         name: LaunchConfiguration(name)
-        for name in ("scene", "namespace", "sim", "use_sim_time", "units", "settings", "path", "speed")
+        for name in (
+            "scene",
+            "namespace",
+            "sim",
+            "use_sim_time",
+            "units",
+            "settings",
+            "path",
+            "speed",
+            "discovery",
+        )
     }
     words = {name: ParameterValue(argument, value_type=str) for name, argument in value.items()}
     timed = {"use_sim_time": ParameterValue(value["use_sim_time"], value_type=bool)}
+    found = {"discovery": words["discovery"]}
     nodes = {"package": "magtwin_ros", "namespace": value["namespace"], "output": "screen"}
     return LaunchDescription(
         [
@@ -42,11 +53,16 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 "settings", default_value=SETTINGS, description="parameter file of the magnetometer"
             ),
+            DeclareLaunchArgument(
+                "discovery",
+                default_value=PythonExpression(["'' if '", value["sim"], "' == 'true' else 'subnet'"]),
+                description="which machines find the nodes: localhost, subnet; empty: by the environment",
+            ),
             DeclareLaunchArgument("path", default_value="", description="path to follow; empty: no follower"),
             DeclareLaunchArgument("speed", default_value="0.2", description="forward speed [m/s]"),
             Node(
                 executable="sim",
-                parameters=[{"scene": words["scene"], "magnetometer": "none"}],
+                parameters=[{"scene": words["scene"], "magnetometer": "none", **found}],
                 condition=IfCondition(value["sim"]),
                 **nodes,
             ),
@@ -54,13 +70,13 @@ def generate_launch_description() -> LaunchDescription:
                 executable="magnetometer",
                 parameters=[
                     value["settings"],
-                    {"scene": words["scene"], "units": words["units"], **timed},
+                    {"scene": words["scene"], "units": words["units"], **timed, **found},
                 ],
                 **nodes,
             ),
             Node(
                 executable="follow",
-                parameters=[{"path": words["path"], "speed": words["speed"], **timed}],
+                parameters=[{"path": words["path"], "speed": words["speed"], **timed, **found}],
                 condition=IfCondition(PythonExpression(["'", value["path"], "' != ''"])),
                 **nodes,
             ),

@@ -20,9 +20,15 @@ FIRST = {
 }
 """Executables, and the parameter of each that is the positional argument of its command."""
 
+NETWORK = ("discovery", "qos", "backend", "domain")
+"""Parameters of every node that are options; an empty one is not set."""
+
 OPTIONS = {
-    "magnetometer": ("network", "online", "measured", "duration_s"),
-    "localize": ("method", "option", "map", "sensor", "odometry", "map_length_m", "seed", "duration_s"),
+    "magnetometer": ("network", "online", "measured", "duration_s", "frame_prefix", *NETWORK),
+    "localize": (
+        *("method", "option", "map", "sensor", "odometry", "map_length_m", "seed", "duration_s"),
+        *("frame_prefix", *NETWORK),
+    ),
 }
 """Parameters of these nodes that are options; their other parameters are settings, name:=value."""
 
@@ -75,6 +81,8 @@ def arguments(node: str, given: list[str]) -> list[str]:
     whole = f"{options.get('namespace', 'robot')}/{options.get('node-name', f'magtwin_{node}')}".strip("/")
     parameters = {name: value for file in files for name, value in _read(file, whole).items()} | explicit
     for name, value in parameters.items():
+        if name in NETWORK and not value:
+            continue
         if name == FIRST[node]:
             first = [value]
         elif node in OPTIONS and name not in OPTIONS[node]:

@@ -9,11 +9,13 @@ import pytest
 from magtwin.errors import InputError
 from magtwin.run.run import Run
 from magtwin.sim.runs.live import LiveRobot
+from magtwin.sim.runs.multi_robot import simulate_robots
 from magtwin.sim.runs.sensing import streams
 from magtwin.sim.runs.simulate import simulate
 from magtwin.sim.sensors.lidar import scans_of
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.sim.session import draw_session
+from magtwin.spec.scene import PlacedRobot
 from magtwin.twin import Twin, open_twin
 
 SEED = 3
@@ -99,3 +101,51 @@ def test_a_command_that_is_not_finite_is_refused(twin: Twin) -> None:
         robot.step()
     with pytest.raises(InputError, match="not finite"):
         robot.step((np.nan, 0.0))
+
+
+def test_robots_beside_each_other_read_what_simulate_robots_gives(lab_scene: Path) -> None:
+    twin = open_twin(lab_scene, magnetometer="physical")
+    bob = PlacedRobot(robot=replace(twin.scene.robot, name="bob"), start=(0.1, 0.75, 2.0))
+    scene = replace(
+        twin.scene, robot=replace(twin.scene.robot, name="ann"), start=(0.0, 0.0, 0.3), others=(bob,)
+    )
+    names = ("ann", "bob")
+    rngs = {name: np.random.default_rng(k) for k, name in enumerate(names)}
+    robots = {
+        name: LiveRobot(
+            scene.led_by(name), anomaly_map=twin.field, rng=np.random.default_rng(k), obstacles=twin.obstacles
+        )
+        for k, name in enumerate(names)
+    }
+    for name, robot in robots.items():
+        robot.beside(other for key, other in robots.items() if key != name)
+    blocks: dict[str, list[Run]] = {name: [] for name in names}
+    for k in range(200):
+        robots["ann"].drive((0.25, 0.4))
+        robots["bob"].drive((0.2, -0.5) if k % 5 == 0 else None)
+        for name, robot in robots.items():
+            blocks[name].append(robot.read())
+    runs = simulate_robots(
+        scene,
+        {name: robot.commands for name, robot in robots.items()},
+        anomaly_map=twin.field,
+        rngs=rngs,
+        meet="flag",
+        duration_s=4.0,
+        obstacles=twin.obstacles,
+    )
+    for name in names:
+        live, run = Run.concat(blocks[name]), runs[name]
+        alone = simulate(
+            scene.led_by(name),
+            robots[name].commands,
+            anomaly_map=twin.field,
+            rng=np.random.default_rng(names.index(name)),
+            obstacles=twin.obstacles,
+            duration_s=4.0,
+        )
+        assert np.ptp(run["b_truth_nt"] - alone["b_truth_nt"]) > 20  # they feel each other
+        for column in run.keys() & live.keys():
+            # The rate of the other's field is differenced to one side at the end of a live step.
+            atol = 0.05 if column.startswith("b_") else 1e-9
+            np.testing.assert_allclose(live[column], run[column], rtol=1e-9, atol=atol, err_msg=column)

@@ -33,9 +33,10 @@ from magtwin.errors import InputError
 from magtwin.io.bags.cdr import NS
 from magtwin.io.bags.topics import CLOCK, Qos
 from magtwin.io.bags.types import typestore
-from magtwin.ros.bus import Bus, Handler, Message, Names, Publisher, Subscription, localhost_only
-from magtwin.ros.clock import Alarm, Clock
-from magtwin.ros.types import raw, ros_name, struct_of
+from magtwin.ros.bus.bus import Bus, Handler, Message, Offers, Publisher, Subscription, offered
+from magtwin.ros.bus.clock import Alarm, Clock
+from magtwin.ros.bus.names import Names, Range
+from magtwin.ros.bus.types import raw, ros_name, struct_of
 
 MOST_TAKEN = 256
 """Messages of a topic taken at a time."""
@@ -47,10 +48,13 @@ _COMMON = (
     "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"  # differs in Kilted
     "<Tracing><Verbosity>none</Verbosity></Tracing>"
 )
+# A node that announces itself by multicast alone, as ROS does by default, is found by our announcements to
+# each port of this machine; they go on, as such a node may start at any time.
 _HERE = (
     '<General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'
     "<AllowMulticast>false</AllowMulticast></General>"
     "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
+    "<SPDPInterval>1s</SPDPInterval><InitialLocatorPruneDelay>inf</InitialLocatorPruneDelay>"
     '<Peers><Peer address="127.0.0.1"/></Peers></Discovery>'
 )
 _ANYWHERE = "<Discovery><ParticipantIndex>auto</ParticipantIndex></Discovery>"
@@ -75,11 +79,13 @@ class DdsBus(Bus):
 
     backend = "cyclonedds"
 
-    def __init__(self, name: str, names: Names, *, sim_time: bool, domain: int) -> None:
-        self.name, self._names = name, names
+    def __init__(
+        self, name: str, names: Names, *, sim_time: bool, domain: int, reach: Range, offers: Offers
+    ) -> None:
+        self.name, self._names, self.reach, self._offers_as = name, names, reach, offers
         try:
             if domain not in _DOMAINS and "CYCLONEDDS_URI" not in os.environ:
-                where = _HERE if localhost_only() else _ANYWHERE
+                where = _HERE if reach == "localhost" else _ANYWHERE
                 xml = f'<CycloneDDS><Domain Id="any">{where}{_COMMON}</Domain></CycloneDDS>'
                 _DOMAINS[domain] = Domain(domain, xml)
             self._participant = DomainParticipant(domain)
@@ -94,15 +100,17 @@ class DdsBus(Bus):
         self._readers: list[tuple[DataReader[Any], str, Handler]] = []
         self._conditions: list[ReadCondition] = []
         self._offers: BuiltinDataReader | None = None
-        self._offered: dict[Any, tuple[str, str]] = {}
+        self._offered: dict[Any, tuple[str, str, bool]] = {}
         self.clock = Clock(sim_time=sim_time)
         if sim_time:
-            self.subscribe(CLOCK.name, CLOCK.kind, self._tick, replace(CLOCK.qos, depth=CLOCK_DEPTH))
+            self.subscribe(CLOCK.name, CLOCK.kind, self._tick, replace(CLOCK.qos.heard, depth=CLOCK_DEPTH))
 
     def publisher(self, topic: str, kind: str, qos: Qos) -> Publisher:
         """As for `Bus`."""
         whole = self._names.resolve(topic)
-        writer: DataWriter[Any] = DataWriter(self._participant, self._topic(whole, kind), qos_of(qos))
+        writer: DataWriter[Any] = DataWriter(
+            self._participant, self._topic(whole, kind), qos_of(offered(qos, self._offers_as))
+        )
         self._writers.append(writer)  # its latched message lives as long as it does
         held = weakref.proxy(writer)  # a publisher that outlives its closed bus must not keep the participant
         return Publisher(
@@ -129,11 +137,15 @@ class DdsBus(Bus):
 
     def types(self, topic: str) -> tuple[str, ...]:
         """As for `Bus`."""
-        return tuple(sorted({kind for kind in self._offers_of(topic) if kind}))
+        return tuple(sorted({kind for kind, _ in self._offers_of(topic) if kind}))
 
     def publishers(self, topic: str) -> int:
         """As for `Bus`."""
         return len(self._offers_of(topic))
+
+    def reliable(self, topic: str) -> bool:
+        """As for `Bus`."""
+        return all(reliable for _, reliable in self._offers_of(topic))
 
     def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> Alarm:
         """As for `Bus`."""
@@ -164,18 +176,19 @@ class DdsBus(Bus):
         self._offers = None
         del self._waiting, self._participant
 
-    def _offers_of(self, topic: str) -> list[str]:
-        """The type of each publisher of a topic; "" if it is not a ROS type."""
+    def _offers_of(self, topic: str) -> list[tuple[str, bool]]:
+        """Type of each publisher of a topic, "" if it is not a ROS type, and whether it is reliable."""
         if self._offers is None:
             self._offers = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         while taken := self._offers.take(N=MOST_TAKEN):
             for offer in taken:
                 if offer.sample_info.valid_data:
-                    self._offered[offer.key] = offer.topic_name, ros_name(offer.type_name)
+                    reliable = isinstance(offer.qos[Policy.Reliability], Policy.Reliability.Reliable)
+                    self._offered[offer.key] = offer.topic_name, ros_name(offer.type_name), reliable
                 elif offer.sample_info.instance_state != InstanceState.Alive:
                     self._offered.pop(offer.key, None)
         whole = f"rt{self._names.resolve(topic)}"
-        return [kind for name, kind in self._offered.values() if name == whole]
+        return [(kind, reliable) for name, kind, reliable in self._offered.values() if name == whole]
 
     def _topic(self, whole: str, kind: str) -> "DdsTopic[Any]":
         known = self._topics.get(whole)

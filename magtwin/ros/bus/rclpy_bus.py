@@ -1,8 +1,10 @@
 """RclpyBus: a node over rclpy, from a sourced installation of ROS 2 or from its wheels."""
 
 import importlib
+import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import rclpy
@@ -16,11 +18,26 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from magtwin.errors import InputError
 from magtwin.io.bags.topics import Qos
-from magtwin.ros.bus import Bus, Handler, Message, Names, Publisher, Subscription
+from magtwin.ros.bus.bus import Bus, Handler, Message, Offers, Publisher, Subscription, offered
+from magtwin.ros.bus.names import Names, Range
 from magtwin.ros.parameters import Parameter, checked
 
 MOST_AT_ONCE = 256
 """Callbacks that run before `spin_once` returns."""
+
+
+@contextmanager
+def _environment(**values: str | None) -> Iterator[None]:
+    """Set variables of the environment, which rclpy reads when it starts; None unsets one."""
+    before = {name: os.environ.pop(name, None) for name in values}
+    os.environ.update({name: value for name, value in values.items() if value is not None})
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
 
 
 def qos_of(qos: Qos) -> QoSProfile:
@@ -54,10 +71,13 @@ class RclpyBus(Bus):
 
     backend = "rclpy"
 
-    def __init__(self, name: str, names: Names, *, sim_time: bool, domain: int) -> None:
-        self.name, self._names = name, names
+    def __init__(
+        self, name: str, names: Names, *, sim_time: bool, domain: int, reach: Range, offers: Offers
+    ) -> None:
+        self.name, self._names, self.reach, self._offers_as = name, names, reach, offers
         self._context = Context()
-        rclpy.init(args=[], context=self._context, domain_id=domain)
+        with _environment(ROS_AUTOMATIC_DISCOVERY_RANGE=reach.upper(), ROS_LOCALHOST_ONLY=None):
+            rclpy.init(args=[], context=self._context, domain_id=domain)
         self._node = Node(
             name,
             context=self._context,
@@ -72,7 +92,9 @@ class RclpyBus(Bus):
     def publisher(self, topic: str, kind: str, qos: Qos) -> Publisher:
         """As for `Bus`."""
         whole = self._names.resolve(topic)
-        sender = self._node.create_publisher(class_of(kind), whole, qos_of(qos))  # takes CDR bytes
+        sender = self._node.create_publisher(
+            class_of(kind), whole, qos_of(offered(qos, self._offers_as))
+        )  # takes CDR bytes
         return Publisher(whole, kind, sender.publish, sender.get_subscription_count)
 
     def subscribe(self, topic: str, kind: str, handler: Handler, qos: Qos) -> Subscription:
@@ -145,6 +167,11 @@ class RclpyBus(Bus):
     def publishers(self, topic: str) -> int:
         """As for `Bus`."""
         return int(self._node.count_publishers(self._names.resolve(topic)))
+
+    def reliable(self, topic: str) -> bool:
+        """As for `Bus`."""
+        offers = self._node.get_publishers_info_by_topic(self._names.resolve(topic))
+        return all(offer.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for offer in offers)
 
     def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> Any:
         """As for `Bus`."""

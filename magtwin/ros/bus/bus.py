@@ -9,22 +9,27 @@ import importlib
 import importlib.util
 import os
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from magtwin.errors import InputError, find
 from magtwin.io.bags.cdr import Messages, decode, encode
-from magtwin.io.bags.topics import Qos
+from magtwin.io.bags.topics import SENSOR_DATA, Qos
 from magtwin.io.bags.types import layout
+from magtwin.ros.bus.names import Names, Range, range_of
 from magtwin.ros.parameters import Parameter
 
 Backend = Literal["auto", "rclpy", "cyclonedds"]
 
+Offers = Literal["reliable", "sensor-data"]
+"""QoS in which streams of sensor data are offered: reliable, which every subscriber matches, or best effort
+with depth 5, the sensor-data profile of ROS."""
+
 BACKENDS: Mapping[str, tuple[str, str]] = {
-    "rclpy": ("magtwin.ros.rclpy_bus", "RclpyBus"),
-    "cyclonedds": ("magtwin.ros.dds", "DdsBus"),
+    "rclpy": ("magtwin.ros.bus.rclpy_bus", "RclpyBus"),
+    "cyclonedds": ("magtwin.ros.bus.dds", "DdsBus"),
 }
 """Module and class of each backend; the first one that can be imported is the default."""
 
@@ -110,13 +115,20 @@ class Bus(Protocol):
 
     name: str
     backend: str
-    _names: "Names"
+    reach: Range
+    """How far the node can be discovered."""
+
+    _names: Names
 
     def publisher(self, topic: str, kind: str, qos: Qos) -> Publisher:
         """Advertise a topic; `Names` resolves its name."""
 
     def subscribe(self, topic: str, kind: str, handler: Handler, qos: Qos) -> Subscription:
-        """Call `handler` for each message of a topic, in the thread that spins."""
+        """Call `handler` for each message of a topic, in the thread that spins.
+
+        A reliable subscription receives nothing from a best-effort publisher; `Qos.heard` matches every
+        publisher.
+        """
 
     def service(self, name: str, called: Callable[[], None]) -> bool:
         """Offer a service without arguments (std_srvs/srv/Empty); whether the backend can.
@@ -152,6 +164,9 @@ class Bus(Protocol):
     def publishers(self, topic: str) -> int:
         """Number of publishers of a topic, including this node, as far as discovered."""
 
+    def reliable(self, topic: str) -> bool:
+        """Whether every discovered publisher of a topic offers it reliably."""
+
     def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> Timer:
         """Call `due` every `period_s` of the bus's clock, or of wall time, in the thread that spins."""
 
@@ -168,52 +183,6 @@ class Bus(Protocol):
         """Leave the network."""
 
 
-@dataclass(frozen=True)
-class Names:
-    """Names of a node on the network: its namespace and its remaps."""
-
-    namespace: str = "/robot"
-    """Namespace of relative names; "" is the root."""
-
-    remaps: Mapping[str, str] = field(default_factory=dict)
-    """Name on the network, by the name that the node uses, with or without its namespace."""
-
-    def resolve(self, name: str) -> str:
-        """The full name of a topic on the network.
-
-        A relative name (`odom`) is in the namespace, `/clock` is global. `/robot/...` of
-        `magtwin.io.bags.topics.TOPICS` counts as relative.
-        """
-        relative = name.removeprefix("/robot/")
-        space = f"/{self.namespace.strip('/')}".rstrip("/")
-        whole = relative if relative.startswith("/") else f"{space}/{relative}"
-        target = next((self.remaps[n] for n in (name, relative, whole) if n in self.remaps), whole)
-        return target if target.startswith("/") else f"{space}/{target}"
-
-
-def names_of(namespace: str = "robot", remaps: Iterable[str] = ()) -> Names:
-    """Names from a command line: `remaps` of the form a:=b.
-
-    Raises:
-        InputError: A remap has another form, or a name is not a ROS name.
-    """
-    table = {}
-    for remap in remaps:
-        left, sign, right = remap.partition(":=")
-        if not sign or not is_name(left) or not is_name(right):
-            raise InputError(f"a remap is a name:=another, such as odom:=/vicon/odom; got {remap!r}")
-        table[left] = right
-    if namespace and not is_name(namespace):
-        raise InputError(f"namespace {namespace!r} is not a ROS name: use letters, digits, _ and /")
-    return Names(namespace, table)
-
-
-def is_name(name: str) -> bool:
-    """Whether a text is a ROS name."""
-    parts = name.strip("/").split("/")
-    return all(part.isidentifier() and part.isascii() for part in parts)
-
-
 def available() -> tuple[str, ...]:
     """Names of the backends that can be imported, the preferred one first."""
     return tuple(name for name in BACKENDS if importlib.util.find_spec(name) is not None)
@@ -226,6 +195,8 @@ def open_bus(
     sim_time: bool = False,
     backend: Backend = "auto",
     domain: int | None = None,
+    discovery: Range | None = None,
+    offers: Offers = "reliable",
 ) -> Bus:
     """Join ROS 2 as a node.
 
@@ -235,9 +206,11 @@ def open_bus(
         sim_time: Use the time of /clock.
         backend: ROS client library; "auto" is rclpy if it can be imported, else cyclonedds.
         domain: ROS domain. Default: ROS_DOMAIN_ID, or 0.
+        discovery: How far the node can be discovered; see `magtwin.ros.bus.names.range_of`.
+        offers: QoS in which streams of sensor data are offered.
 
     Raises:
-        InputError: The backend cannot be imported, or the domain is out of range.
+        InputError: The backend cannot be imported, or the domain or a variable of the environment is wrong.
     """
     if not name.isidentifier():
         raise InputError(f"a node's name has letters, digits and _; got {name!r}")
@@ -259,12 +232,14 @@ def open_bus(
         except ImportError as error:
             broken.append(f"{candidate} is installed but cannot be imported: {str(error).splitlines()[0]}")
             continue
-        bus: Bus = opened(name, names or Names(), sim_time=sim_time, domain=domain)
+        reach = range_of(discovery)
+        bus: Bus = opened(
+            name, names or Names(), sim_time=sim_time, domain=domain, reach=reach, offers=offers
+        )
         return bus
     raise InputError("; ".join(broken) or MISSING)
 
 
-def localhost_only() -> bool:
-    """Whether the environment variables of ROS 2 restrict it to this machine."""
-    reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
-    return os.environ.get("ROS_LOCALHOST_ONLY", "") == "1" or reach == "LOCALHOST"
+def offered(qos: Qos, offers: Offers) -> Qos:
+    """The QoS of a publisher, from that of its topic."""
+    return SENSOR_DATA if qos.sensor and offers == "sensor-data" else qos

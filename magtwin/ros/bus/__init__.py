@@ -1,0 +1,34 @@
+"""Bus: the interface of a node to ROS 2, and its two backends.
+
+`bus` has the interface and `open_bus`; `names` has the names and the reach of a node; `dds` and `rclpy_bus`
+are the backends.
+"""
+
+from magtwin.ros.bus.bus import (
+    Backend,
+    Bus,
+    Handler,
+    Message,
+    Publisher,
+    Subscription,
+    Timer,
+    open_bus,
+    to_bytes,
+)
+from magtwin.ros.bus.names import Names, Range, is_name, names_of
+
+__all__ = [
+    "Backend",
+    "Bus",
+    "Handler",
+    "Message",
+    "Names",
+    "Publisher",
+    "Range",
+    "Subscription",
+    "Timer",
+    "is_name",
+    "names_of",
+    "open_bus",
+    "to_bytes",
+]

@@ -1,0 +1,434 @@
+"""Each fault of a description: repaired by default, counted with its line, and refused by strict."""
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from places import TESTS
+from pxr import Usd, UsdGeom, UsdPhysics
+from scipy.optimize import nnls
+
+from magtwin.errors import InputError
+from magtwin.urdf.convert import convert_with_report
+from magtwin.urdf.options import Options
+from magtwin.urdf.physics.inertia import SLIMMEST, nearest_possible
+from magtwin.urdf.repairs import FAULTS
+
+HEAD = '<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+BASE = '<link name="base"><inertial><mass value="2"/>{}</inertial>{}</link>'
+TENSOR = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+GOOD = BASE.format(TENSOR, "")
+HAND = GOOD.replace("base", "hand")
+TIP = GOOD.replace("base", "tip")
+
+
+def look(content, role="visual"):
+    return BASE.format(TENSOR, f"<{role}>{content}</{role}>")
+
+
+RED = '<material name="m"><color rgba="1 0 0 1"/></material>'
+BALL = '<geometry><sphere radius="0.1"/></geometry>'
+
+
+def joint(kind, content="", name="j", child="hand", parent="base"):
+    ends = f'<parent link="{parent}"/><child link="{child}"/>'
+    return f'<joint name="{name}" type="{kind}">{ends}\n<axis xyz="0 0 1"/>{content}</joint>'
+
+
+def moving(kind, content=""):
+    return f"{GOOD}\n{HAND}\n{joint(kind, content)}"
+
+
+def follower(mimic, lead='<limit lower="-1" upper="1" effort="1" velocity="1"/>', kind="revolute"):
+    range_ = '<limit lower="-1" upper="1" effort="1" velocity="1"/>'
+    return "\n".join(
+        [GOOD, HAND, TIP, joint(kind, lead), joint("revolute", f"{range_}{mimic}", "f", "tip", "hand")]
+    )
+
+
+def sensor(kind, content):
+    start = f'{GOOD}\n<gazebo reference="base">\n<sensor name="s" type="{kind}"><update_rate>5</update_rate>'
+    return f"{start}{content}</sensor></gazebo>"
+
+
+SCAN = """<ray><scan><horizontal><samples>9</samples><min_angle>{}</min_angle><max_angle>{}</max_angle>
+</horizontal></scan><range><min>{}</min><max>{}</max></range></ray>"""
+EYE = """<camera><horizontal_fov>{}</horizontal_fov><image><width>{}</width><height>48</height></image>
+<clip><near>{}</near><far>{}</far></clip></camera>"""
+
+FAULTY = {
+    "inertia-impossible": [
+        (
+            BASE.format(TENSOR.replace('izz="1"', 'izz="9"'), ""),
+            2,
+            "no body has principal moments of inertia",
+        ),
+        (BASE.format(TENSOR.replace('ixx="1"', 'ixx="-1"'), ""), 2, "-1, 1, 1 kg m2: the nearest possible"),
+    ],
+    "inertia-missing": [
+        (BASE.format(TENSOR.replace("1", "0"), ""), 2, "that of a ball of water"),
+        (BASE.format("", f"<collision>{BALL}</collision>"), 2, "that of its colliders"),
+    ],
+    "inertia-asymmetric": [
+        (BASE.format(TENSOR.replace("/>", ' iyx="0.1"/>'), ""), 2, "ixy 0 and iyx 0.1 of <inertia> differ")
+    ],
+    "inertia-unreadable": [(BASE.format(TENSOR.replace('ixx="1"', 'ixx="big"'), ""), 2, "counts as none")],
+    "mass-invalid": [
+        (f"{GOOD}\n{HAND.replace(chr(34) + '2', chr(34) + '-2')}\n{joint('fixed')}", 3, "a mass of -2"),
+        (
+            f"{GOOD}\n{HAND.replace('<mass value=' + chr(34) + '2' + chr(34) + '/>', '')}\n{joint('fixed')}",
+            3,
+            "no mass counts as none",
+        ),
+    ],
+    "mimic-leader": [
+        (
+            follower('<mimic joint="jj"/>'),
+            7,
+            "mimics no joint 'jj' (did you mean 'j'?): the mimic is left out",
+        ),
+        (follower('<mimic joint="f"/>'), 7, "mimics itself: f -> f"),
+        (follower('<mimic multiplier="2"/>'), 8, "a <mimic> without joint= is left out"),
+        (follower('<mimic joint="j"/>', "", "planar"), 7, "'j', which is planar"),
+    ],
+    "mimic-fixed": [
+        (follower('<mimic joint="j"/>', "", "fixed"), 7, "'j', which is fixed: it is fixed at its offset"),
+        (follower('<mimic joint="j" multiplier="0"/>'), 7, "'j', which is taken 0 times"),
+    ],
+    "limit-missing": [
+        (moving("revolute"), 4, "is revolute without limits"),
+        (moving("prismatic", '<limit effort="1" velocity="1"/>'), 5, "is prismatic without limits"),
+    ],
+    "limit-one-end": [
+        (moving("revolute", '<limit upper="1" effort="1" velocity="1"/>'), 5, "no lower limit")
+    ],
+    "limit-zeros": [
+        (
+            moving("revolute", '<limit lower="0" upper="0" effort="0" velocity="0"/>'),
+            5,
+            "range, effort and velo",
+        ),
+        (moving("revolute", '<limit lower="-180" upper="180" effort="0" velocity="0"/>'), 5, "of 360 rad"),
+    ],
+    "limit-swapped": [
+        (moving("revolute", '<limit lower="1" upper="-1" effort="1" velocity="1"/>'), 5, "above its upper -1")
+    ],
+    "limit-ignored": [(moving("continuous", '<limit lower="-1" upper="1"/>'), 5, "which has no range")],
+    "effort-invalid": [
+        (
+            moving("revolute", '<limit lower="0" upper="1" effort="-1" velocity="1"/>'),
+            5,
+            "effort -1 of <limit>",
+        )
+    ],
+    "sensor-range": [
+        (sensor("ray", SCAN.format(-3.1416, 3.1416, 0.1, 9)), 4, "become -3.1416 to 3.141585"),
+        (sensor("ray", SCAN.format(1, -1, 0.1, 9)), 4, "from 1 to -1 rad become -1 to 1"),
+        (sensor("ray", SCAN.format(-1, 1, 9, 0.1)), 4, "is read in the other order"),
+        (sensor("camera", EYE.format(3.2, 64, 0.1, 9)), 4, "horizontal_fov of 3.2 rad is reduced"),
+        (sensor("camera", EYE.format(1, "1e9", 0.1, 9)), 4, "pixels becomes 65536 x 48"),
+        (sensor("imu", "<pose>1 2 3</pose>"), 4, "its pose is not x y z roll pitch yaw"),
+    ],
+    "sensor-missing": [
+        (sensor("camera", ""), 4, "has no <camera>: kept as a frame with its type and rate"),
+        (sensor("ray", SCAN.format(-1, 1, 1, 1)), 4, "its range from 1 to 1.0 m is empty"),
+    ],
+    "number-range": [
+        (look('<geometry><sphere radius="-0.1"/></geometry>'), 2, "used without its sign"),
+        (moving("revolute", '<limit lower="0" upper="1"/><dynamics damping="-1"/>'), 5, "raised to it"),
+        (look(f'{BALL}<material name="m"><color rgba="255 0 0 1"/></material>'), 2, "reduced to it"),
+        (f'{GOOD}\n<gazebo reference="base"><mu1>-1</mu1></gazebo>', 3, "mu1 -1 is below 0: raised to it"),
+    ],
+    "number-count": [
+        (look(f'<origin xyz="1 2 3 0"/>{BALL}'), 2, "has 4 numbers in '1 2 3 0': read as 1 2 3"),
+        (look(f'<origin rpy="0"/>{BALL}'), 2, "read as 0 0 0"),
+        (look('<geometry><box size="0.1"/></geometry>'), 2, "read as 0.1 0.1 0.1"),
+        (look(f'{BALL}<material name="m"><color rgba="1 0 0"/></material>'), 2, "completed by 1"),
+    ],
+    "number-unreadable": [
+        (
+            moving("continuous", '<dynamics damping="soft"/>'),
+            5,
+            "damping of <dynamics> must be a finite number",
+        ),
+        (look(f'{BALL}<material name="m"><color rgba="red"/></material>'), 2, "rgba of <color> must be"),
+        (f'{GOOD}\n<gazebo reference="base"><selfCollide>maybe</selfCollide></gazebo>', 3, "true or false"),
+    ],
+    "tag-unknown": [(BASE.format(TENSOR, "<colision/>"), 2, "did you mean 'collision'?")],
+    "tag-twice": [
+        (
+            look('<geometry><sphere radius="1"/><box size="1 1 1"/></geometry>'),
+            2,
+            "a second <box> in <geometry>",
+        )
+    ],
+    "tag-misplaced": [
+        (
+            look(f'<geometry><sphere radius="1"/>{RED}</geometry>'),
+            2,
+            "<material> moved into the <material> of its visual",
+        ),
+        (look(f'{BALL}<color rgba="1 0 0 1"/>'), 2, "<color> moved"),
+        (
+            BASE.format(
+                TENSOR, f'<visual>{BALL}</visual><material name="m"><color rgba="1 0 0 1"/></material>'
+            ),
+            2,
+            "moved from the link to its visuals",
+        ),
+    ],
+    "tag-empty": [
+        (look(f'{BALL}<material name="m"><texture/></material>'), 2, "a <texture> without filename="),
+        (look(f'{BALL}<material name="m"><color/></material>'), 2, "a <color> without rgba="),
+        (f'<material><color rgba="1 0 0 1"/></material>\n{GOOD}', 0, "of the robot without name="),
+    ],
+    "shape-missing": [
+        (look("<origin/>"), 2, "a <visual> without <geometry>"),
+        (look("<geometry/>", "collision"), 2, "a <geometry> without a shape"),
+        (look('<geometry><cylindre radius="1"/></geometry>'), 2, "did you mean 'cylinder'?"),
+        (look("<geometry><mesh/></geometry>"), 2, "a <mesh> without filename="),
+        (look("<geometry><sphere/></geometry>"), 2, "a <sphere> without radius="),
+    ],
+    "shape-empty": [(look('<geometry><box size="0 0 0"/></geometry>'), 2, "a visual box of size 0")],
+    "material-twice": [
+        (
+            f'{RED}\n<material name="m"><color rgba="{rgba}"/></material>\n{GOOD}',
+            2,
+            told,
+        )
+        for rgba, told in (("1 0 0 1", "twice, alike"), ("0 1 0 1", "twice, with two looks"))
+    ],
+    "name-twice": [
+        (f"{GOOD}\n{GOOD}", 3, "link 'base' exists twice, first on line 2: the second is equal and left out"),
+        (f"{GOOD}\n{HAND}\n{TIP}\n{joint('fixed')}\n{joint('fixed', child='tip')}", 7, "is called 'j_2'"),
+        (
+            "\n".join(
+                [GOOD, HAND, look(BALL).replace("base", "hand"), joint("fixed"), joint("fixed", name="k")]
+            ),
+            4,
+            "is called 'hand_2'",
+        ),
+    ],
+    "name-unknown": [
+        (
+            f'{GOOD}\n<transmission name="t"><joint name="nobody"/></transmission>',
+            3,
+            "names no joint 'nobody'",
+        )
+    ],
+    "name-missing": [(f"{GOOD}", 1, "<robot> has no name: 'arm', as its file")],
+    "mesh-missing": [
+        (look('<geometry><mesh filename="nowhere.stl"/></geometry>'), 2, "a box of 1.73 x 1.73 x 1.73 m"),
+        (look('<geometry><mesh filename="package://absent/a.stl"/></geometry>'), 2, "a box of"),
+        (look('<geometry><mesh filename="https://example.com/a.stl"/></geometry>'), 2, "a box of"),
+    ],
+    "mesh-unreadable": [
+        (look('<geometry><mesh filename="broken.stl"/></geometry>'), 2, "cannot be read: a box"),
+        (look('<geometry><mesh filename="a.step"/></geometry>'), 2, "cannot be read: a box"),
+    ],
+    "mesh-flat": [
+        (look('<geometry><mesh filename="flat.stl"/></geometry>', "collision"), 2, "as a plate 0.0071 m")
+    ],
+    "file-name": [
+        (
+            look('<geometry><mesh filename="parts/box.stl"/></geometry>'),
+            2,
+            "is found in the package, not beside",
+        ),
+        (look('<geometry><mesh filename="package:///arms/flat.stl"/></geometry>'), 2, "'package://arms/"),
+    ],
+    "package-missing": [
+        (
+            f"{GOOD}\n<gazebo><plugin><parameters>$(find absent)/c.yaml</parameters></plugin></gazebo>",
+            3,
+            "$(find absent): no such package",
+        )
+    ],
+    "macro-unknown": [(f'{GOOD}\n<xacro:lidar name="l"/>', 3, "<xacro:lidar> is no macro: left out")],
+    "include-skipped": [
+        (f'{GOOD}\n<xacro:include filename="$(find absent)/eye.xacro"/>', 3, "eye.xacro' is missing: skipped")
+    ],
+}
+"""Descriptions with one fault: the text, its line (0 if it has none), and a part of the report's text."""
+
+CASES = [(kind, number) for kind, cases in FAULTY.items() for number in range(len(cases))]
+
+
+def write(tmp_path, kind, number):
+    text, line, told = FAULTY[kind][number]
+    head = HEAD.replace(' name="arm"', "") if kind == "name-missing" else HEAD
+    xacro = kind in ("package-missing", "include-skipped")
+    folder = tmp_path / "arms"
+    folder.mkdir()
+    (folder / "package.xml").write_text("<package><name>arms</name></package>")
+    (folder / "parts").mkdir()
+    trimesh.creation.box().export(folder / "parts" / "box.stl")
+    (folder / "broken.stl").write_bytes(b"no triangles")
+    (folder / "a.step").write_bytes(b"")
+    flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    flat.export(folder / "flat.stl")
+    path = folder / ("urdf/arm.urdf" if "parts/" in text else "arm.urdf.xacro" if xacro else "arm.urdf")
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(f"{head}\n{text}\n</robot>\n")
+    return path, line, told
+
+
+def test_every_fault_has_a_description():
+    assert FAULTY.keys() == FAULTS.keys()
+
+
+def test_the_documentation_names_every_fault():
+    text = (TESTS.parent / "docs" / "urdf.md").read_text(encoding="utf-8")
+    for kind, (fault, done) in FAULTS.items():
+        assert f"| `{kind}` | {fault} | {done} |" in text
+
+
+@pytest.mark.parametrize(("kind", "number"), CASES)
+def test_a_fault_is_repaired_and_counted_and_strict_refuses_it(tmp_path, kind, number):
+    path, line, told = write(tmp_path, kind, number)
+    report = convert_with_report(
+        path, tmp_path / "a" / "arm.usda", options=Options(skip_missing_includes=True)
+    )
+    (entry,) = [entry for row in report.repairs if row.kind == kind for entry in row.entries]
+    assert told in entry.text
+    assert (entry.file, entry.line) == ((path.name, line) if line else ("", 0))
+    assert [row.count for row in report.repairs if row.kind == kind] == [1]
+    assert entry.text in report.notes
+    place = f"{path.name}:{line}: " if line else ""
+    with pytest.raises(InputError) as refusal:
+        convert_with_report(
+            path, tmp_path / "b" / "arm.usda", options=Options(strict=True, skip_missing_includes=True)
+        )
+    assert f"{place}{entry.text}" in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+    assert not list((tmp_path / "b").iterdir())
+
+
+def test_strict_names_all_faults_and_the_options_that_supply_what_is_missing(tmp_path):
+    shapes = "".join(
+        f'<visual><geometry><mesh filename="package://{name}/a.stl"/></geometry></visual>' for name in "xy"
+    )
+    path = tmp_path / "arm.urdf"
+    path.write_text(f"{HEAD}\n{BASE.format(TENSOR, '<colision/>' + shapes)}\n</robot>")
+    for options in (Options(strict=True), Options(missing_meshes="refuse")):
+        with pytest.raises(InputError) as refusal:
+            convert_with_report(path, tmp_path / "arm.usda", options=options)
+        for part in ("package://x/a.stl", "package://y/a.stl", "--package x=FOLDER --package y=FOLDER"):
+            assert part in str(refusal.value)
+    report = convert_with_report(path, tmp_path / "arm.usda")
+    assert report.supply == "--package x=FOLDER --package y=FOLDER"
+    shown = {figure.name: (figure.value, figure.note) for figure in report.summary().figures}
+    fault, done = FAULTS["mesh-missing"]
+    assert shown[fault] == (2, f"{done}: arm.urdf:2")
+
+
+def test_what_a_xacro_lacks_is_listed_in_one_run(tmp_path):
+    path = tmp_path / "arm.xacro"
+    lines = [
+        '<xacro:include filename="$(find lidars)/lidar.xacro"/>',
+        '<xacro:include filename="eye.xacro"/>',
+        '<xacro:lidar name="$(arg prefix)lidar"/>',
+        '<link name="$(env HAND)"/>',
+    ]
+    path.write_text("\n".join([HEAD, *lines, "</robot>"]))
+    wanted = [
+        "include 'package://lidars/lidar.xacro' (arm.xacro:2)",
+        "include 'eye.xacro' (arm.xacro:3)",
+        "macro 'xacro:lidar' (arm.xacro:4)",
+        "environment variable 'HAND', which is not read (arm.xacro:5)",
+        "give --package lidars=FOLDER --arg HAND=VALUE",
+    ]
+    for skip in (False, True):
+        with pytest.raises(InputError) as refusal:
+            convert_with_report(path, tmp_path / "arm.usda", options=Options(skip_missing_includes=skip))
+        for text in wanted:
+            assert text in str(refusal.value)
+
+
+def test_packages_of_ros_are_found_by_the_name_in_the_description_and_only_so(tmp_path, monkeypatch):
+    box = trimesh.creation.box()
+    for folder in ("install/share/hands", "install/share/other", "ws/src/eyes"):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "package.xml").write_text("<package/>")
+        box.export(tmp_path / folder / "a.stl")
+    path = tmp_path / "here" / "deep" / "er" / "still" / "arm.urdf"
+    path.parent.mkdir(parents=True)
+    names = ("hands", "eyes")
+    shapes = "".join(
+        f'<visual><geometry><mesh filename="package://{n}/a.stl"/></geometry></visual>' for n in names
+    )
+    path.write_text(f"{HEAD}\n{BASE.format(TENSOR, shapes)}\n</robot>")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path}/none:{tmp_path}/install")
+    monkeypatch.setenv("ROS_PACKAGE_PATH", f"{tmp_path}/ws")
+    assert not convert_with_report(path, tmp_path / "arm.usda").repairs
+    outside = tmp_path / "install" / "share" / "other" / "a.stl"
+    path.write_text(
+        f"{HEAD}\n{look(f'<geometry><mesh filename={chr(34)}{outside}{chr(34)}/></geometry>')}\n</robot>"
+    )
+    with pytest.raises(InputError, match="lies outside"):
+        convert_with_report(path, tmp_path / "b.usda")
+
+
+def test_a_folder_of_meshes_beside_a_folder_urdf_is_read_and_nothing_else_there(tmp_path):
+    for folder in ("urdf", "meshes", "secret"):
+        (tmp_path / folder).mkdir()
+        trimesh.creation.box().export(tmp_path / folder / "a.stl")
+    path = tmp_path / "urdf" / "arm.urdf"
+    path.write_text(
+        f"{HEAD}\n{look('<geometry><mesh filename=' + repr('../meshes/a.stl') + '/></geometry>')}</robot>"
+    )
+    assert not convert_with_report(path, tmp_path / "a.usda").repairs
+    path.write_text(path.read_text().replace("../meshes", "../secret"))
+    with pytest.raises(InputError, match="lies outside"):
+        convert_with_report(path, tmp_path / "b.usda")
+
+
+def test_a_placeholder_has_the_inertia_of_its_link_or_the_box_of_its_other_shapes(tmp_path):
+    size, mass = np.array([0.1, 0.2, 0.4]), 3.0
+    a, b, c = size**2
+    ixx, iyy, izz = mass / 12 * np.array([b + c, a + c, a + b])
+    inertia = f'<inertia ixx="{ixx}" iyy="{iyy}" izz="{izz}" ixy="0" ixz="0" iyz="0"/>'
+    inertial = f'<inertial><origin xyz="1 0 0"/><mass value="{mass}"/>{inertia}</inertial>'
+    lost = '<visual><origin xyz="5 5 5"/><geometry><mesh filename="lost.stl"/></geometry></visual>'
+    shown = '<collision><origin xyz="0 0 1"/><geometry><box size="0.2 0.4 0.6"/></geometry></collision>'
+    path = tmp_path / "arm.urdf"
+    cases = {"a": (inertial + lost, [1, 0, 0], size), "b": (shown + lost, [0, 0, 1], [0.2, 0.4, 0.6])}
+    for name, (body, centre, edges) in cases.items():
+        path.write_text(f'{HEAD}\n<link name="base">{body}</link>\n</robot>')
+        convert_with_report(path, tmp_path / name / "arm.usda")
+        stage = Usd.Stage.Open(str(tmp_path / name / "arm.usda"))
+        cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), [UsdGeom.Tokens.default_])
+        extent = cache.ComputeWorldBound(stage.GetPrimAtPath("/arm/base")).ComputeAlignedRange()
+        assert_allclose(extent.GetMidpoint(), centre, atol=1e-6)
+        assert_allclose(extent.GetSize(), edges, atol=2e-6)
+
+
+@given(st.lists(st.floats(-1, 1), min_size=6, max_size=6))
+def test_the_nearest_possible_tensor_is_possible_and_no_other_is_nearer(values):
+    xx, yy, zz, xy, xz, yz = values
+    tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    nearest = nearest_possible(tensor)
+    moments = np.linalg.eigvalsh(tensor)
+    second, _ = nnls(np.ones((3, 3)) - np.eye(3), moments)  # a peer: SciPy's non-negative least squares
+    peer = (np.ones((3, 3)) - np.eye(3)) @ second
+    if nearest is None:
+        assert peer.max() < 1e-9
+        return
+    made = np.linalg.eigvalsh(nearest)
+    assert_allclose(made, np.maximum(peer, SLIMMEST * peer.max()), atol=1e-7)
+    again = nearest_possible(nearest)
+    assert again is nearest or np.allclose(again, nearest, rtol=1e-5)
+
+
+def test_a_repaired_inertia_keeps_mass_and_axes(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(
+        f"{HEAD}\n{BASE.format(TENSOR.replace('izz=' + chr(34) + '1', 'izz=' + chr(34) + '3'), '')}</robot>"
+    )
+    convert_with_report(path, tmp_path / "arm.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "arm.usda"))
+    mass = UsdPhysics.MassAPI(stage.GetPrimAtPath("/arm/base"))
+    assert mass.GetMassAttr().Get() == 2
+    assert_allclose(mass.GetDiagonalInertiaAttr().Get(), [4 / 3, 4 / 3, 8 / 3], rtol=1e-6)
