@@ -10,7 +10,7 @@ from pxr import Sdf, Usd, UsdPhysics
 
 from magtwin.author.shape import drive_of, footprint_of, stand_on_floor
 from magtwin.errors import InputError, hint
-from magtwin.files import from_table, read_toml
+from magtwin.files import existing_file, from_table, read_toml
 from magtwin.sim.plant_families import draw_plant
 from magtwin.spec.base import Spec
 from magtwin.spec.drive import DriveSpec
@@ -170,7 +170,7 @@ def read_description(asset: str | os.PathLike[str]) -> str:
     if source is None:
         return ""
     try:
-        text = source.read_text(encoding="utf-8")
+        text = existing_file(source, "URDF file", "XML").read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise InputError(f"{source}: is not UTF-8, as ROS descriptions must be; save it as UTF-8") from error
     return reroot(text, BASE_LINK, source)

@@ -27,7 +27,7 @@ from magtwin.usd.geometry import (
     read_shapes,
     srgb_from_linear,
 )
-from magtwin.usd.layers import open_stage
+from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.solids import corner_normals
 
 Array = NDArray[np.float64]
@@ -180,6 +180,7 @@ def room_above(points: ArrayLike) -> Array:
     return np.array(list(itertools.product(*ends)))
 
 
+@translates
 def _draw(
     plotter: Any,
     path: str | os.PathLike[str],

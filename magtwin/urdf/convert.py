@@ -46,7 +46,7 @@ from magtwin.urdf.shape import COLLISIONS, VISUALS, define_collider, define_no_c
 from magtwin.urdf.simready import check_metadata, metadata
 from magtwin.urdf.source.source import read_source
 from magtwin.usd.attributes import read_pose, write_pose
-from magtwin.usd.layers import describe_stage, open_stage
+from magtwin.usd.layers import describe_stage, open_stage, translates
 
 JOINTS = "joints"
 """Scope of the joints below the robot's prim."""
@@ -121,6 +121,7 @@ def convert_with_report(
     return report
 
 
+@translates
 def read_notes(asset: str | os.PathLike[str]) -> tuple[str, ...]:
     """Notes of a conversion on repairs, guesses and omissions, one line each.
 

@@ -6,11 +6,8 @@ Samples are authored on the layer itself, since a stage would recompose for each
 
 import json
 import os
-import subprocess
-import sys
 from collections import deque
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import repeat
 from pathlib import Path
@@ -22,7 +19,7 @@ from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
 from magtwin.errors import InputError, find
-from magtwin.files import existing, output
+from magtwin.files import output
 from magtwin.frames import quat_conjugate, quat_multiply, rotate
 from magtwin.run.resample import grid
 from magtwin.run.run import COLUMNS, Column, Run, check_clock
@@ -30,7 +27,7 @@ from magtwin.spec.base import Quat, Vec3
 from magtwin.usd.attributes import read_pose, target, targets
 from magtwin.usd.epochs import EPOCH
 from magtwin.usd.geometry import BASE_LINK, read_links
-from magtwin.usd.layers import SUFFIXES, WORLD, describe_stage, open_stage
+from magtwin.usd.layers import SUFFIXES, WORLD, describe_stage, open_layer, open_stage, translates
 from magtwin.usd.placement import lab_on, labs_on, take_to_origin
 from magtwin.usd.schema import attribute_name, only_prim_with, place, prims_with
 from magtwin.usd.schema.versions import creator
@@ -69,18 +66,6 @@ READINGS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 _BARE = WORLD.AppendChild("robot")
 """Robot of a run without a scene."""
 
-_PROBE = """
-import sys
-from pxr import Sdf
-
-layer = Sdf.Layer.OpenAsAnonymous(sys.argv[1])
-layer.Traverse("/", lambda path: path.IsPropertyPath() and layer.GetObjectAtPath(path).GetInfo("default"))
-"""
-"""Script that reads every value of a layer."""
-
-PATIENCE_S = 60.0
-"""Time limit of that script, plus 1 s per megabyte [s]."""
-
 _FACTS = "magtwinFacts"
 _DTYPES = ("f8", "f4", "f2", "i4", "i8", "u1", "u4", "u8", "b1")
 _NAMES = ("double", "float", "half", "int", "int64", "uchar", "uint", "uint64", "bool")
@@ -105,6 +90,7 @@ class _Stand:
     )
 
 
+@translates
 def write_animation(
     run: Run,
     path: str | os.PathLike[str],
@@ -198,8 +184,7 @@ def read_animation(path: str | os.PathLike[str]) -> Run:
     Raises:
         InputError: The file is missing, not USD, truncated, or holds no run.
     """
-    _check_decodes(path)
-    layer = _open_layer(path)
+    layer = open_layer(path)
     try:
         run = _read(layer, path)
     except InputError:
@@ -210,44 +195,15 @@ def read_animation(path: str | os.PathLike[str]) -> Run:
     return run
 
 
+@translates
 def is_animation(path: str | os.PathLike[str]) -> bool:
     """Whether a USD file holds a run.
 
     Raises:
         InputError: The file is missing or not USD.
     """
-    layer = _open_layer(path)
+    layer = open_layer(path)
     return bool(layer.GetAttributeAtPath(_run_path(layer).AppendProperty("magtwin:run:t")))
-
-
-def _check_decodes(path: str | os.PathLike[str]) -> None:
-    """Refuse a damaged binary file, on which USD's reader would end the process."""
-    path = existing(path, "USD file")
-    if path.is_dir():
-        return
-    with open(path, "rb") as file:
-        if file.read(8) != b"PXR-USDC":  # text
-            return
-    command = [sys.executable, "-P", "-c", _PROBE, str(path)]
-    patience = PATIENCE_S + path.stat().st_size / 1e6
-    try:
-        done = subprocess.run(command, capture_output=True, check=False, timeout=patience)
-    except subprocess.TimeoutExpired as error:
-        raise InputError(f"{path}: damaged: USD does not come to its end; copy it again") from error
-    if done.returncode not in (0, 1):  # another error is raised when the file is read here
-        raise InputError(f"{path}: damaged: USD cannot decode it; copy it again, or write it again")
-
-
-def _open_layer(path: str | os.PathLike[str]) -> Sdf.Layer:
-    """A layer, read from disk, without the files that it names."""
-    path = existing(path, "USD file")
-    if path.is_dir():
-        raise InputError(f"{path}: a folder; give a USD file in it")
-    with suppress(Tf.ErrorException):
-        layer = Sdf.Layer.OpenAsAnonymous(str(path))
-        if layer is not None:
-            return layer
-    raise InputError(f"{path}: cannot be opened as USD; it is damaged, cut short, or not USD")
 
 
 def _read(layer: Sdf.Layer, path: str | os.PathLike[str]) -> Run:

@@ -12,7 +12,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 from magtwin.errors import InputError
 from magtwin.frames import IDENTITY_XYZW, canonical
 from magtwin.spec.base import ZERO3, Quat, Vec3
-from magtwin.usd.layers import open_stage
+from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.solids import Solid, solid_of
 
 GREY = (0.5, 0.5, 0.5, 1.0)
@@ -117,6 +117,7 @@ class ColourScale:
     """Path of the heat map's mesh."""
 
 
+@translates
 def read_shapes(stage: Usd.Stage | str | os.PathLike[str], *, purposes: Sequence[str] = SHOWN) -> list[Shape]:
     """All visible shapes of a stage as triangles, in order of the prims.
 
@@ -183,6 +184,7 @@ def read_triangles(
     return found
 
 
+@translates
 def read_links(stage: Usd.Stage | str | os.PathLike[str]) -> dict[str, Link]:
     """The rigid bodies of a stage by name, with their poses at rest in the base of their robot.
 

@@ -12,7 +12,9 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.budget import BUDGETS
 from magtwin.errors import InputError
+from magtwin.files import read_bytes
 from magtwin.urdf.meshes.piece import GREY, Map, Paint, Piece, Rgba, linear, normal_map, smoothness
 from magtwin.urdf.meshes.polygon import cut_polygons, strips
 from magtwin.urdf.meshes.reading import Reading, numbers
@@ -26,9 +28,6 @@ SHADERS = ("phong", "lambert", "blinn", "constant")
 
 POLYGONS = ("triangles", "polylist", "polygons", "tristrips", "trifans")
 """Primitives with faces."""
-
-NODES = 50_000
-"""Most nodes of a scene, counting instances: nodes that instance each other twice grow exponentially."""
 
 LUMINANCE = (0.212671, 0.715160, 0.072169)
 """Weights of linear red, green and blue, from the specification."""
@@ -53,7 +52,7 @@ class _Collada:
 
     def __init__(self, reading: Reading) -> None:
         self._reading = reading
-        text = reading.path.read_bytes()
+        text = read_bytes(reading.path, "mesh file", "XML")
         if re.match(rb"\s*<\?xml[^>]*encoding", text) is None:  # names in other encodings are harmless
             text = text.decode("utf-8", errors="replace").encode()
         markup = parse_markup(text, reading.path)
@@ -85,6 +84,7 @@ class _Collada:
             for node in scene.findall("node")
             for geometry, instance, T in self._walk(node, np.diag([metre, metre, metre, 1.0]), ())
             for piece in self._geometry(geometry, instance, shown)
+            if self._reading.spend(piece.nbytes)
         ]
         for geometry in self._root.iterfind("library_geometries/geometry"):
             if geometry not in shown:
@@ -98,8 +98,8 @@ class _Collada:
     ) -> Iterator[tuple[Element, Element, NDArray]]:
         """Geometries below a node, with their instance elements and their transforms to metres."""
         self._visited += 1
-        if self._visited > NODES:
-            raise self._refused(node, f"shows over {NODES} nodes")
+        if self._visited > BUDGETS["mesh"].count:  # nodes that instance each other twice grow exponentially
+            raise self._refused(node, f"shows over {BUDGETS['mesh'].count} nodes")
         if node in above:
             raise self._refused(node, f"node {node.get('id')!r} is within itself")
         T = T @ self._transform(node)

@@ -16,7 +16,9 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.budget import BUDGETS
 from magtwin.errors import InputError
+from magtwin.files import read_bytes
 from magtwin.frames import matrix_from_quat
 from magtwin.urdf.meshes.piece import Map, Paint, Piece, normal_map
 from magtwin.urdf.meshes.polygon import strips
@@ -74,7 +76,12 @@ class _Gltf:
         else:
             below = {child for node in nodes for child in node.get("children", ())}
             roots = [i for i in range(len(nodes)) if i not in below]
-        pieces = [piece.moved(T) for node, T in self._walk(roots) for piece in self._mesh(node)]
+        pieces = [
+            piece.moved(T)
+            for node, T in self._walk(roots)
+            for piece in self._mesh(node)
+            if self._reading.spend(piece.nbytes)
+        ]
         for kind in ("skins", "animations"):
             if self._json.get(kind):
                 self._reading.lose(f"its {kind} are left out")
@@ -145,7 +152,7 @@ class _Gltf:
             red, green, blue = (float(c) for c in srgb_from_linear((r, g, b)))
             alpha = material.get("alphaMode", "OPAQUE")
             self._paints[index] = Paint(
-                name=material.get("name", f"material_{index}"),
+                name=str(material.get("name", f"material_{index}")),
                 rgba=(red, green, blue, 1.0 if alpha == "OPAQUE" else float(a)),
                 image=image,
                 wrap=wrap,
@@ -230,6 +237,7 @@ class _Gltf:
         stride = view.get("byteStride", dtype.itemsize * width)
         if count and len(data) < stride * (count - 1) + dtype.itemsize * width:
             raise self._refused(f"accessor {index} is longer than its buffer")
+        self._reading.spend(8 * count * width)  # before a stride of 0 repeats a few bytes without end
         values = np.ndarray((count, width), dtype, data, 0, (stride, dtype.itemsize))
         if accessor.get("normalized"):
             return np.maximum(values / np.iinfo(dtype).max, -1.0)
@@ -258,7 +266,7 @@ class _Gltf:
                     )
                 if not file.is_file():
                     raise InputError(f"{self._reading.path}: buffer {uri!r} is missing; looked for {file}")
-                self._buffers[index] = file.read_bytes()
+                self._buffers[index] = read_bytes(file, "buffer", "mesh")
         return self._buffers[index]
 
     def _refused(self, text: str) -> InputError:
@@ -267,9 +275,9 @@ class _Gltf:
 
 def _parse(path: Path) -> tuple[dict[str, Any], bytes]:
     """JSON and binary chunk of a file (section 4)."""
-    data = path.read_bytes()
+    data = path.read_bytes()  # its size is checked
     if data[:4] != b"glTF":
-        return json.loads(data), b""
+        return _table(data, path), b""
     if len(data) < 20 or struct.unpack_from("<I", data, 8)[0] > len(data):
         raise InputError(f"{path}: is cut short; export it again")
     chunks: dict[int, bytes] = {}
@@ -278,7 +286,17 @@ def _parse(path: Path) -> tuple[dict[str, Any], bytes]:
         length, kind = struct.unpack_from("<II", data, at)
         chunks.setdefault(kind, data[at + 8 : at + 8 + length])
         at += 8 + length
-    return json.loads(chunks[JSON_CHUNK]), chunks.get(BINARY_CHUNK, b"")
+    return _table(chunks[JSON_CHUNK], path), chunks.get(BINARY_CHUNK, b"")
+
+
+def _table(text: bytes, path: Path) -> dict[str, Any]:
+    """The JSON of a file."""
+    if len(text) > BUDGETS["JSON"].file:
+        raise InputError(
+            f"{path}: its JSON has {len(text):,} bytes; at most {BUDGETS['JSON'].file:,} are read"
+        )
+    table: dict[str, Any] = json.loads(text)
+    return table
 
 
 def _inline(uri: str) -> bytes:

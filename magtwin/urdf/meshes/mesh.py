@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
+from magtwin.files import existing_file
 from magtwin.urdf.meshes.piece import Paint, Piece
 from magtwin.urdf.meshes.reading import Note, Reading
 from magtwin.urdf.source.markup import UnsafeError
@@ -84,7 +85,7 @@ def read_mesh(path: Path, may_read: Callable[[Path], bool] | None = None) -> Mes
     """
     folder = path.resolve().parent
     allowed = may_read or (lambda other: other.resolve().is_relative_to(folder))
-    reading = Reading(path, allowed)
+    reading = Reading(existing_file(path, "mesh file", "mesh"), allowed)
     try:
         return _join(reading, _reader(path)(reading))
     except UnsafeError:
@@ -115,7 +116,7 @@ def _reader(path: Path) -> Reader:
 
 def _join(reading: Reading, pieces: Sequence[Piece]) -> Mesh:
     """All pieces as one mesh, with equal points merged and triangles without an area removed."""
-    path, pieces = reading.path, [piece for piece in pieces if len(piece.faces)]
+    path, pieces = reading.path, [piece for piece in pieces if piece.faces.size]
     if not pieces:
         raise InputError(f"{path}: holds no triangle; export it again, or use a primitive")
     for piece in pieces:

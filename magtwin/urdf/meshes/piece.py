@@ -156,6 +156,12 @@ class Piece:
     colours: NDArray | None = None
     """Linear red, green, blue at each corner, 0 to 1, shape (F, 3, 3)."""
 
+    @property
+    def nbytes(self) -> int:
+        """Size of its arrays."""
+        arrays = (self.points, self.faces, self.normals, self.uvs, self.colours)
+        return sum(array.nbytes for array in arrays if array is not None)
+
     def moved(self, T: NDArray) -> "Piece":
         """The piece under an affine map T, shape (4, 4); faces stay outwards under a reflection.
 

@@ -18,6 +18,9 @@ from magtwin.usd.geometry import linear_from_srgb
 STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 """A triangle of a binary STL, after 80 bytes of text and the number of triangles."""
 
+LONGEST_LINE = 4096
+"""Most characters of a line of a PLY's header."""
+
 
 def read_scan(reading: Reading) -> list[Piece]:
     """The triangles of an STL or PLY file, for `read_mesh`.
@@ -39,6 +42,7 @@ def read_scan(reading: Reading) -> list[Piece]:
     else:
         from trimesh.exchange.ply import load_ply
 
+        _check_counts(data, reading)
         read = load_ply(io.BytesIO(data))
     parts = read["geometry"].values() if "geometry" in read else [read]  # an ASCII STL may have several
     pieces = [_piece(part) for part in parts if part.get("faces") is not None and len(part["faces"])]
@@ -53,6 +57,23 @@ def _binary_stl(data: bytes) -> NDArray[np.float32] | None:
     if len(data) < 84 or len(data) != 84 + count * STL.itemsize:
         return None
     return np.frombuffer(data, STL, offset=84)["corners"].reshape(-1, 3)
+
+
+def _check_counts(data: bytes, reading: Reading) -> None:
+    """Refuse a PLY whose header claims more elements than the file has bytes, before they are read."""
+    header = io.BytesIO(data)
+    for line in iter(lambda: header.readline(LONGEST_LINE), b""):
+        words = line.split()
+        if words[:1] == [b"element"]:
+            count = int(words[2])
+            if len(words) != 3 or not 0 <= count <= len(data):
+                raise InputError(
+                    f"{reading.path}: claims {count} of {words[1].decode()[:40]} in {len(data)} bytes"
+                )
+        if words[:1] == [b"end_header"]:
+            break
+    else:
+        raise ValueError("its header has no end")
 
 
 def _piece(part: dict[str, Any]) -> Piece:

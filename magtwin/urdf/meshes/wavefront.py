@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
+from magtwin.files import existing_file
 from magtwin.urdf.meshes.piece import GREY, Map, Paint, Piece, linear, normal_map, smoothness
 from magtwin.urdf.meshes.polygon import cut_polygons
 from magtwin.urdf.meshes.reading import Reading, numbers
@@ -87,7 +88,7 @@ def read_wavefront(reading: Reading) -> list[Piece]:
 def _statements(path: Path) -> Iterator[tuple[int, str, str]]:
     """Line, keyword and the rest of each statement; a backslash continues a line."""
     held = ""
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with existing_file(path, "OBJ or MTL file", "OBJ").open(encoding="utf-8", errors="replace") as file:
         for number, text in enumerate(file, 1):
             line = held + text if held else text
             if line.endswith("\\\n"):
