@@ -123,11 +123,12 @@ def localize_live(
 
     The node needs qtfm/magnitude and odom; it passes IMU, battery, commands and scans on to the method. It
     publishes estimate/pose (PoseWithCovarianceStamped), estimate/lost (Bool), estimate/particles (PoseArray),
-    the transform from map to odom, and /diagnostics. It starts again at each pose on /initialpose.
+    estimate/path (Path), the transform from map to odom, and /diagnostics. It starts again at each pose on
+    /initialpose.
 
     Settings have the form of ROS, name:=value: rate_hz (5), use_sim_time (false), prior (wait, global or
-    x,y,yaw; default wait), max_age_s (0.5), silent_s (0.5), tf_broadcast (true), cloud_hz (1), particles
-    (500). docs/localize.md explains them.
+    x,y,yaw; default wait), max_age_s (0.5), silent_s (0.5), tf_broadcast (true), tf_ahead_s (0.2), cloud_hz
+    (1), particles (500). docs/localize.md explains them.
 
     Parameters
     ----------

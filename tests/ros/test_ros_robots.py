@@ -22,7 +22,8 @@ pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 
 OWN = ("odom", "imu", "enu/pose", "battery_state", "scan", "joint_states", "robot_description")
 OWN = (*OWN, "qtfm/magnitude", "qtfm/field", "qtfm/total_field_nt", "magtwin/reading", "magtwin/columns")
-SHARED = ("/clock", "/tf", "/tf_static", "/diagnostics")
+OWN = (*OWN, "ground_truth", "ground_truth/readings", "ground_truth/path")
+SHARED = ("/clock", "/tf", "/tf_static", "/diagnostics", "/map", "/anomaly_map", "/anomaly_map/grid")
 DURATION_S = 4.0
 
 
@@ -124,11 +125,13 @@ def test_robots_share_one_clock_that_never_goes_back(heard: Heard) -> None:
     assert heard.reset == pytest.approx((0.2, 0.2))  # both begin again together
 
 
-def test_the_frames_of_both_are_one_tree_below_the_map(heard: Heard) -> None:
+def test_no_frame_of_either_has_two_parents_and_the_map_leaves_odom_to_a_localizer(heard: Heard) -> None:
     parents = {child: parent for parent, child in heard.frames}
     assert len(parents) == len(heard.frames)  # no frame has two parents
     for name in ("ann", "bob"):
-        assert parents[f"{name}/odom"] == "map"
+        assert f"{name}/odom" not in parents  # a localizer is to publish it
+        assert parents[f"{name}/ground_truth"] == "map"
+        assert parents[f"{name}/base_footprint"] == f"{name}/base_link"
         assert parents[f"{name}/base_link"] == f"{name}/odom"
         assert parents[f"{name}/magnetometer_link"] == f"{name}/base_link"
     assert all(child.startswith(("ann/", "bob/")) for child in parents)

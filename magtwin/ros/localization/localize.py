@@ -16,7 +16,7 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.field.units import NT_PER
-from magtwin.frames import yaw_from_quat
+from magtwin.frames import quat_from_yaw, yaw_from_quat
 from magtwin.io.bags.bag import unit_of
 from magtwin.io.bags.cdr import NS
 from magtwin.io.bags.sender import prefixed, sender_of
@@ -46,6 +46,8 @@ from magtwin.ros.localization.poses import (
     INITIAL,
     LOST,
     LOST_KIND,
+    PATH,
+    PATH_KIND,
     POSE_KIND,
     START_SD,
     TF_KIND,
@@ -55,6 +57,7 @@ from magtwin.ros.localization.poses import (
     prior_from,
 )
 from magtwin.ros.parameters import Parameter
+from magtwin.ros.views import Trail, path_bytes
 from magtwin.twin import Twin
 
 PARAMETERS: Mapping[str, Parameter] = MappingProxyType(
@@ -67,6 +70,9 @@ PARAMETERS: Mapping[str, Parameter] = MappingProxyType(
             0.5, "silence of the magnetometer after which odometry is used alone [s]", 0.05, 60.0
         ),
         "tf_broadcast": Parameter(True, "publish the transform from map to odom on /tf"),
+        "tf_ahead_s": Parameter(
+            0.2, "time by which this transform is stamped after its reading, so that it holds on [s]", 0.0, 10.0
+        ),
         "cloud_hz": Parameter(1.0, "rate of the particle cloud, 0 for none [Hz]", 0.0, 100.0),
         "particles": Parameter(500, "largest number of particles in a cloud", 1, 100_000),
     }
@@ -81,6 +87,9 @@ QUEUE = Qos(depth=1000, reliable=False)
 
 LOOK_S = 0.5
 """Time between searches for new topics [s]."""
+
+PATH_S = 1.0
+"""Time between messages of the estimated path [s]."""
 
 HELD_S = 30.0
 """Age up to which slow topics, such as the battery's, are passed on [s]."""
@@ -134,6 +143,8 @@ class LocalizerNode:
         self._pose = bus.publisher(ESTIMATE, POSE_KIND, Qos())
         self._lost = bus.publisher(LOST, LOST_KIND, Qos())
         self._cloud = bus.publisher(CLOUD, CLOUD_KIND, Qos(depth=1))
+        self._path = bus.publisher(PATH, PATH_KIND, Qos(depth=1))
+        self._trail = Trail()
         self._tf = None
         if settings["tf_broadcast"] and bus.knows(TF_KIND):
             self._tf = bus.publisher(TF.name, TF_KIND, TF.qos)
@@ -144,7 +155,7 @@ class LocalizerNode:
         self._tick0, self._done = 0.0, 0
         self._heard_ns, self._stamp_ns, self._period_s = -1, -1, 0.0  # -1: none yet
         self._yaw: float | None = None
-        self._cloud_ns = -NS * 10**6
+        self._cloud_ns = self._path_ns = -NS * 10**6
         self._own_tf: deque[int] = deque(maxlen=64)
         self._estimates, self._skipped, self._blind, self._resets, self._broken = 0, 0, 0, 0, 0
         self._other_tf, self._is_lost, self._missing = False, False, ""
@@ -268,11 +279,19 @@ class LocalizerNode:
         self._estimates += 1
         self.latencies_s.append(time.monotonic() - arrived)
         if self._tf is not None:
-            self._own_tf.append(stamp_ns)
+            valid_ns = stamp_ns + round(self._settings["tf_ahead_s"] * NS)
+            self._own_tf.append(valid_ns)
             frames = (frame, self._sender.odom_frame)
             p, q = odometry[0]["odom_p"][0], odometry[0]["odom_q_xyzw"][0]
-            self._tf.publish(odom_bytes(stamp_ns, frames, estimate, p, q))
+            self._tf.publish(odom_bytes(valid_ns, frames, estimate, p, q))
+        self._publish_path(stamp_ns, pose)
         self._publish_cloud(stamp_ns, algorithm)
+
+    def _publish_path(self, stamp_ns: int, pose: tuple[float, float, float]) -> None:
+        self._trail.add([*pose[:2], 0.0], quat_from_yaw(pose[2]))
+        if stamp_ns - self._path_ns >= PATH_S * NS:
+            self._path_ns = stamp_ns
+            self._path.publish(path_bytes(stamp_ns, self._sender.map_frame, self._trail.poses))
 
     def _publish_cloud(self, stamp_ns: int, algorithm: Localizer) -> None:
         rate = self._settings["cloud_hz"]
@@ -315,7 +334,8 @@ class LocalizerNode:
             raise LocalizerError(f"{self._method}.reset raised {type(error).__name__}: {error}") from error
         self._algorithm = algorithm
         self._tick0, self._done, self._stamp_ns, self._yaw = stamp_ns / NS, 0, -1, None
-        self._cloud_ns = -NS * 10**6
+        self._cloud_ns = self._path_ns = -NS * 10**6
+        self._trail = Trail()
 
     def _restart(self) -> None:
         """Begin anew, after a restart of time; the inputs notice it themselves."""

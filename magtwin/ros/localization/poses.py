@@ -16,8 +16,10 @@ POSE_KIND = "geometry_msgs/msg/PoseWithCovarianceStamped"
 CLOUD_KIND = "geometry_msgs/msg/PoseArray"
 LOST_KIND = "std_msgs/msg/Bool"
 TF_KIND = "tf2_msgs/msg/TFMessage"
+PATH_KIND = "nav_msgs/msg/Path"
 
 ESTIMATE, CLOUD, LOST = "estimate/pose", "estimate/particles", "estimate/lost"
+PATH = "estimate/path"
 """Topics of a localizer, in the robot's namespace."""
 
 INITIAL = "/initialpose"
