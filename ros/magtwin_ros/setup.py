@@ -11,8 +11,21 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/magtwin_ros"]),
         ("share/magtwin_ros", ["package.xml"]),
-        ("share/magtwin_ros/launch", ["launch/magtwin.launch.py"]),
-        ("share/magtwin_ros/config", ["config/magnetometer.yaml"]),
+        (
+            "share/magtwin_ros/launch",
+            [
+                *("launch/magtwin.launch.py", "launch/slam.launch.py", "launch/navigation.launch.py"),
+                *("launch/ekf.launch.py", "launch/gazebo.launch.py", "launch/view.launch.py"),
+            ],
+        ),
+        (
+            "share/magtwin_ros/config",
+            [
+                *("config/magnetometer.yaml", "config/slam_toolbox.yaml", "config/nav2.yaml"),
+                *("config/robot_localization.yaml", "config/ros_gz_bridge.yaml"),
+                *("config/magtwin.rviz", "config/foxglove.json"),
+            ],
+        ),
     ],
     install_requires=["setuptools", "pyyaml"],
     zip_safe=True,
