@@ -155,9 +155,9 @@ def sim(
     stamps
         Time of the messages: sim, from 0, or wall.
     tf
-        Transforms of the drive on /tf. odom: odom to base_link, for a localizer that publishes map to odom.
-        all: also map to odom, by the true pose. none: neither, for a filter that publishes both. The true pose
-        is on ground_truth, and unless all, it is the frame ground_truth in the map.
+        Transforms of the drive on /tf. odom: odom to base_link, beside a localizer that publishes map to
+        odom. all: also map to odom, by the true pose. none: neither, beside a filter that publishes both. The
+        true pose is on ground_truth, and unless all, it is the frame ground_truth in the map.
     """
     from magtwin.ros.simulate import Simulator
     from magtwin.twin import open_twin, with_plant

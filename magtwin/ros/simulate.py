@@ -102,8 +102,8 @@ class Simulator:
             magnetometer: Publish the magnetometer's readings; else another node does.
             frame_prefix: Prefix of the names of frames, such as "tb4/". Default: none; for several robots the
                 name of each, "ann/", which a given prefix precedes.
-            tf: Transforms of the drive on /tf: "odom", odom to base_link, for a localizer that publishes map to
-                odom; "all", also map to odom, by the true pose; or "none", for a filter that publishes both.
+            tf: Transforms of the drive on /tf: "odom", odom to base_link, beside a localizer that publishes
+                map to odom; "all", also map to odom, by the true pose; "none", beside a filter of both.
             say: Called with messages for the user.
 
         Raises:

@@ -86,7 +86,7 @@ def test_wrong_resolutions_and_suffixes_are_refused(tmp_path: Path) -> None:
     for resolution, match in ((0.0, "above 0"), (np.nan, "above 0"), (1e-4, "too many")):
         with pytest.raises(InputError, match=match):
             occupancy_of(room, resolution_m=resolution)
-    with pytest.raises(InputError, match="is a .yaml file"):
+    with pytest.raises(InputError, match=r"is a \.yaml file"):
         occupancy_of(room).save(tmp_path / "lab.pgm")
 
 

@@ -177,7 +177,9 @@ def test_readings_and_paths_are_where_the_robot_was(heard: Heard, twin: Twin) ->
     rate = twin.scene.robot.magnetometer.rate_hz
     assert len(table) == pytest.approx(rate * DURATION_S, rel=0.03)
     b_nt = twin.field.overview()
-    assert np.nanmin(b_nt.values_nt) - 500 < table[:, 3].min() <= table[:, 3].max() < b_nt.values_nt.max() + 500
+    assert (
+        np.nanmin(b_nt.values_nt) - 500 < table[:, 3].min() <= table[:, 3].max() < b_nt.values_nt.max() + 500
+    )
     assert table[:, 2] == pytest.approx(twin.scene.robot.p_base_magnetometer[2] - 0.00445, abs=1e-3)
     true = np.array([[m.pose.pose.position.x, m.pose.pose.position.y]
                      for m in map(content, heard.messages[TRUTH.name])])  # fmt: skip
@@ -239,7 +241,9 @@ def test_the_lab_is_latched_as_grid_and_cloud(twin: Twin, node: Callable[..., Bu
 @pytest.mark.parametrize("frame", ["map", "a_map", ""])
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
 def test_a_path_is_one_to_the_reference_reader(frame: str, count: int) -> None:
-    poses = np.column_stack([np.random.default_rng(1).normal(size=(count, 3)), np.tile([0, 0, 0, 1.0], (count, 1))])
+    poses = np.column_stack(
+        [np.random.default_rng(1).normal(size=(count, 3)), np.tile([0, 0, 0, 1.0], (count, 1))]
+    )
     data = path_bytes(3_000_000_007, frame, poses)
     path = typestore().deserialize_cdr(data, PATH.kind)
     assert bytes(typestore().serialize_cdr(path, PATH.kind)) == data

@@ -1,6 +1,8 @@
 """The ament package: what ROS says of a node becomes the command line of magtwin, which takes it."""
 
 import ast
+import json
+import re
 import subprocess
 import sys
 from types import ModuleType, SimpleNamespace
@@ -122,8 +124,10 @@ def test_where_this_python_has_no_magtwin_the_command_on_the_path_is_taken(tmp_p
 def test_every_executable_is_a_function_and_a_command(arguments) -> None:
     import magtwin_ros.nodes
 
+    from magtwin.cli import load
     from magtwin.cli.ros import ros_app
 
+    load("ros")
     assert called("NODES") == NODES == tuple(magtwin_ros.nodes.FIRST)
     for name in NODES:
         assert callable(getattr(magtwin_ros.nodes, name))
@@ -177,61 +181,222 @@ def test_the_file_of_settings_holds_what_they_are_unless_given() -> None:
     assert settings == {n: p.default for n, p in PARAMETERS.items() if n not in launched}
 
 
+def stand_in(name: str):
+    return lambda *args, **rest: SimpleNamespace(made=name, args=args, **rest)
+
+
 @pytest.fixture
-def launched(monkeypatch: pytest.MonkeyPatch) -> list:
-    """What the launch file describes, by stand-ins that keep what they are given."""
-
-    def kept(name: str):
-        return lambda *args, **rest: SimpleNamespace(made=name, args=args, **rest)
-
+def describe(monkeypatch: pytest.MonkeyPatch):
+    """What a launch file describes, by stand-ins for ROS's classes that keep what they are given."""
     for module, names in {
         "launch": ["LaunchDescription"],
-        "launch.actions": ["DeclareLaunchArgument"],
+        "launch.actions": ["DeclareLaunchArgument", "IncludeLaunchDescription"],
         "launch.conditions": ["IfCondition"],
+        "launch.launch_description_sources": ["PythonLaunchDescriptionSource"],
         "launch.substitutions": ["LaunchConfiguration", "PathJoinSubstitution", "PythonExpression"],
         "launch_ros": [],
         "launch_ros.actions": ["Node"],
         "launch_ros.parameter_descriptions": ["ParameterValue"],
         "launch_ros.substitutions": ["FindPackageShare"],
     }.items():
-        stand_in = ModuleType(module)
+        made = ModuleType(module)
         for name in names:
-            setattr(stand_in, name, kept(name))
-        monkeypatch.setitem(sys.modules, module, stand_in)
-    file = PACKAGE / "launch" / "magtwin.launch.py"
-    space: dict = {"__name__": "launch_file"}
-    exec(compile(file.read_text(), file, "exec"), space)
-    return space["generate_launch_description"]().args[0]
+            setattr(made, name, stand_in(name))
+        monkeypatch.setitem(sys.modules, module, made)
+
+    def described(name: str) -> list:
+        file = PACKAGE / "launch" / f"{name}.launch.py"
+        space: dict = {"__name__": "launch_file"}
+        exec(compile(file.read_text(), file, "exec"), space)
+        return space["generate_launch_description"]().args[0]
+
+    return described
 
 
-def test_the_launch_file_starts_commands_that_magtwin_takes(arguments, launched, tmp_path) -> None:
+VALUES = {
+    "path": "figure8", "speed": "0.2", "scene": "lab.usda", "units": "T", "use_sim_time": "true",
+    "discovery": "", "sim": "true", "prior": "0,0,0", "localizer": "amcl", "map": "",
+}  # fmt: skip
+OURS = {
+    "magtwin": ["sim", "magnetometer", "follow"],
+    "slam": ["sim", "follow"],
+    "navigation": ["sim", "localize"],
+    "ekf": ["sim", "localize", "follow"],
+    "gazebo": ["magnetometer"],
+    "view": [],
+}
+"""Launch files, and the nodes of magtwin in each."""
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_the_launch_files_start_commands_that_magtwin_takes(arguments, describe, name: str) -> None:
+    import magtwin_ros.nodes
+
+    from magtwin.cli import load
     from magtwin.cli.ros import ros_app
 
-    values = {
-        "path": "figure8",
-        "speed": "0.2",
-        "scene": "lab.usda",
-        "units": "T",
-        "use_sim_time": "true",
-        "discovery": "",
-    }
+    load("ros")
+    launched = describe(name)
     declared = {one.args[0] for one in launched if one.made == "DeclareLaunchArgument"}
-    nodes = [one for one in launched if one.made == "Node"]
-    assert [node.executable for node in nodes] == ["sim", "magnetometer", "follow"]
+    nodes = [one for one in launched if one.made == "Node" and one.package == "magtwin_ros"]
+    assert [node.executable for node in nodes] == OURS[name]
     for node in nodes:
         words = ["--ros-args", "-r", "__ns:=/robot"]
         for part in node.parameters:
             if not isinstance(part, dict):
                 words += ["--params-file", str(PACKAGE / "config" / "magnetometer.yaml")]
                 continue
-            for name, value in part.items():
+            for key, value in part.items():
                 if isinstance(value, SimpleNamespace):
                     assert value.args[0].args[0] in declared
-                    value = value.value_type is bool or values[name]
-                words += ["-p", f"{name}:={value}"]
+                    value = value.value_type is bool or VALUES[value.args[0].args[0]]
+                words += ["-p", f"{key}:={value}"]
+        for theirs, ours in getattr(node, "remappings", ()):
+            words += ["-r", f"{theirs}:={ours if isinstance(ours, str) else '/map'}"]
         command, bound, _ = ros_app.parse_args(arguments(node.executable, words)[1:], exit_on_error=False)
         assert command is ros_app[node.executable].default_command
-        assert bound.arguments[FIRST[node.executable]]
+        assert bound.arguments[magtwin_ros.nodes.FIRST[node.executable]]
 
 
-FIRST = {"sim": "scene", "magnetometer": "scene", "follow": "path"}
+DECLARED = json.loads((ROOT / "tests" / "ros" / "declared.json").read_text())
+"""Names of what other projects' nodes and viewers take, read from their sources; the file names these."""
+
+ANY = {"use_sim_time"}
+
+
+def config(name: str):
+    return yaml.safe_load((PACKAGE / "config" / name).read_text())
+
+
+def unknown(node: str, settings: dict) -> set[str]:
+    """Parameters of a nav2 node that neither it nor its plugins declare."""
+    known, wrong = {*DECLARED["nodes"][node], *ANY}, set()
+    for name, value in settings.items():
+        if not isinstance(value, dict):
+            wrong |= {name} - known
+            continue
+        takes = {"plugin", *DECLARED["plugins"][value["plugin"]]}
+        for key, inner in value.items():  # a costmap's source of observations has the keys of its layer
+            wrong |= {f"{name}.{k}" for k in (inner if isinstance(inner, dict) else {key}) if k not in takes}
+        sources = str(value.get("observation_sources", "")).split()
+        assert [key for key, inner in value.items() if isinstance(inner, dict)] == sources
+    return wrong
+
+
+def test_nav2s_nodes_declare_every_parameter_of_its_file() -> None:
+    content = config("nav2.yaml")
+    for name, section in content.items():
+        node = "lifecycle_manager" if name.startswith("lifecycle_manager") else name
+        node = "costmap" if name.endswith("costmap") else node
+        settings = (section[name] if node == "costmap" else section)["ros__parameters"]
+        assert not unknown(node, settings), name
+        plugins = [v for k, v in settings.items() if k in ("plugins", "navigators") or k.endswith("_plugins")]
+        named = [plugin for value in plugins for plugin in value]
+        assert all(isinstance(settings[plugin], dict) for plugin in named)
+    assert unknown("amcl", {"alpha_1": 0.2, "alpha1": 0.2}) == {"alpha_1"}
+
+
+def test_what_nav2s_launch_file_starts_has_its_section_and_its_manager(describe) -> None:
+    nodes = {n.name: n for n in describe("navigation") if n.made == "Node" and n.package != "magtwin_ros"}
+    content = config("nav2.yaml")
+    costmaps = {"local_costmap", "global_costmap"}  # of controller_server and planner_server
+    assert set(nodes) == set(content) - costmaps
+    managed = [
+        n for name in nodes if "manager" in name for n in content[name]["ros__parameters"]["node_names"]
+    ]
+    assert sorted(managed) == sorted(name for name in nodes if "manager" not in name)
+    for name in ("controller_server", "behavior_server"):  # both drive
+        assert nodes[name].remappings == [("cmd_vel", "/robot/cmd_vel")]
+
+
+def test_slam_toolbox_and_robot_localization_declare_every_parameter_of_their_files() -> None:
+    slam = config("slam_toolbox.yaml")["slam_toolbox"]["ros__parameters"]
+    assert set(slam) <= {*DECLARED["nodes"]["slam_toolbox"]}
+    ekf = config("robot_localization.yaml")["ekf_filter_node"]["ros__parameters"]
+    for name, value in ekf.items():
+        sensor = re.fullmatch(r"(odom|imu|pose|twist)\d(_\w+)?", name)
+        assert (
+            name in DECLARED["ekf"] if sensor is None else (sensor[2] or "_config") in DECLARED["ekf_sensor"]
+        )
+        if name.endswith("_config"):
+            assert len(value) == 15
+
+
+def test_the_bridge_gives_topics_in_types_that_magtwin_reads() -> None:
+    from magtwin.io.bags.topics import TOPICS
+
+    given = {}
+    for entry in config("ros_gz_bridge.yaml"):
+        assert set(entry) <= {*DECLARED["bridge_keys"]}
+        assert DECLARED["bridge_types"][entry["ros_type_name"]] == entry["gz_type_name"]
+        topic = TOPICS[entry["ros_topic_name"]]
+        assert entry["ros_type_name"] in {topic.kind, *topic.reads}
+        assert entry["direction"] == ("ROS_TO_GZ" if topic.name == "/robot/cmd_vel" else "GZ_TO_ROS")
+        given[topic.name] = entry
+    assert {"/clock", "/robot/odom", "/robot/imu", "/robot/enu/pose", "/robot/battery_state"} <= set(given)
+
+
+def kinds() -> dict[str, str]:
+    """Message type of each topic of the simulator and the localizer."""
+    from magtwin.ros.localization import poses
+    from magtwin.ros.topics import LIVE
+
+    known = {topic.name: topic.kind for topic in LIVE} | {poses.INITIAL: poses.POSE_KIND}
+    return known | {
+        f"/robot/{poses.ESTIMATE}": poses.POSE_KIND,
+        f"/robot/{poses.CLOUD}": poses.CLOUD_KIND,
+        f"/robot/{poses.PATH}": poses.PATH_KIND,
+    }
+
+
+def test_rviz_shows_topics_that_exist_with_displays_of_their_type_and_offers_that_match() -> None:
+    from magtwin.ros.topics import LIVE
+
+    names = {
+        "OccupancyGrid": "Map",
+        "PoseWithCovarianceStamped": "PoseWithCovariance",
+        "String": "RobotModel",
+    }
+    latched = {topic.name for topic in LIVE if topic.qos.latched}
+    shown = set()
+    content = config("magtwin.rviz")["Visualization Manager"]
+    for display in content["Displays"]:
+        plugin, _, kind = display["Class"].partition("/")
+        assert plugin == "rviz_default_plugins"
+        extra = set(display) - {"Class", "Name", "Enabled", "Topic", *DECLARED["rviz"][kind]}
+        assert not extra, display["Name"]
+        topic = display.get("Topic", display.get("Description Topic"))
+        if topic is None:
+            continue
+        message = kinds()[topic["Value"]].rpartition("/")[2]
+        assert names.get(message, message) == kind
+        assert (topic["Durability Policy"] == "Transient Local") == (topic["Value"] in latched)
+        shown.add(topic["Value"])
+    assert {"/map", "/anomaly_map", "/robot/ground_truth/readings", "/robot/estimate/pose"} <= shown
+    assert content["Global Options"]["Fixed Frame"] == "map"
+
+
+def test_foxglove_shows_topics_and_fields_that_exist() -> None:
+    from magtwin.io.bags.types import layout
+
+    content = json.loads((PACKAGE / "config" / "foxglove.json").read_text())
+    panels = content["configById"]
+
+    def placed(node) -> list[str]:
+        return [node] if isinstance(node, str) else [*placed(node["first"]), *placed(node["second"])]
+
+    assert sorted(placed(content["layout"])) == sorted(panels)
+    for name, panel in panels.items():
+        kind = name.partition("!")[0]
+        assert kind in ("3D", "Plot", "DiagnosticSummary")
+        for topic, settings in panel.get("topics", {}).items():
+            assert set(settings) <= {*DECLARED["foxglove"][kinds()[topic]]}, topic
+        for path in panel.get("paths", ()):
+            topic, _, leaf = path["value"].partition(".")
+            parts = {
+                part
+                for known in layout(kinds()[topic])
+                for part in (known.name, f"{known.name}.x", f"{known.name}.y")
+            }
+            assert leaf in parts, path["value"]
+    assert panels["3D!lab"]["followTf"] == "map"

@@ -176,7 +176,7 @@ def sender_for(twin: "Twin | None", unit: Unit, rate_hz: Any = None) -> Sender:
 
 
 def _footprint(description: str) -> tuple[FixedFrame, ...]:
-    """The frame base_footprint of a URDF whose root is base_link; it has no body, so the stage has no link."""
+    """The frame base_footprint of a URDF whose root is base_link. It has no body, so stages have no link."""
     if not description:
         return ()
     from magtwin.urdf.source.markup import parse_markup

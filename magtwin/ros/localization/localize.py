@@ -71,7 +71,10 @@ PARAMETERS: Mapping[str, Parameter] = MappingProxyType(
         ),
         "tf_broadcast": Parameter(True, "publish the transform from map to odom on /tf"),
         "tf_ahead_s": Parameter(
-            0.2, "time by which this transform is stamped after its reading, so that it holds on [s]", 0.0, 10.0
+            0.2,
+            "time by which this transform is stamped after its reading, so that it holds on [s]",
+            0.0,
+            10.0,
         ),
         "cloud_hz": Parameter(1.0, "rate of the particle cloud, 0 for none [Hz]", 0.0, 100.0),
         "particles": Parameter(500, "largest number of particles in a cloud", 1, 100_000),

@@ -1,4 +1,4 @@
-"""The simulated robot, robot_localization for odom to base_link, and magtwin's localizer for map to odom. Not run here.
+"""The simulated robot; robot_localization gives odom to base_link, magtwin's localizer map to odom. Not run.
 
     ros2 launch magtwin_ros ekf.launch.py scene:=lab.usda path:=figure8
 

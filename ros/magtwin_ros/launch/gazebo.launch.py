@@ -1,4 +1,4 @@
-"""Gazebo's topics for magtwin: the bridge, and the magnetometer that Gazebo's robot carries. Not run here.
+"""Gazebo's topics for magtwin: the bridge, and the magnetometer that Gazebo's robot carries. Not run.
 
     ros2 launch magtwin_ros gazebo.launch.py scene:=lab.usda
 

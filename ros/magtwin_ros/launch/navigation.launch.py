@@ -1,11 +1,12 @@
-"""nav2 with AMCL or magtwin's localizer, beside the simulated robot or a real one. Not run here.
+"""nav2 with AMCL or magtwin's localizer, beside the simulated robot or a real one. Not run.
 
-    ros2 launch magtwin_ros navigation.launch.py scene:=lab.usda                        # localized by the LiDAR
-    ros2 launch magtwin_ros navigation.launch.py scene:=lab.usda localizer:=magtwin     # by the magnetic map
+    ros2 launch magtwin_ros navigation.launch.py scene:=lab.usda
+    ros2 launch magtwin_ros navigation.launch.py scene:=lab.usda localizer:=magtwin
     ros2 launch magtwin_ros navigation.launch.py scene:=lab.usda sim:=false map:=map.yaml
 
-Goals come from RViz ("2D Goal Pose") or the action navigate_to_pose. The simulator publishes /map; `map` names
-a file of `magtwin map occupancy` instead.
+AMCL localizes by the LiDAR, magtwin's localizer by the magnetic map. Goals come from RViz ("2D Goal Pose")
+or the action navigate_to_pose. The simulator publishes /map; `map` names a file of `magtwin map occupancy`
+instead.
 """
 
 from launch import LaunchDescription
@@ -56,13 +57,16 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 "discovery",
                 default_value=PythonExpression(["'' if '", value["sim"], "' == 'true' else 'subnet'"]),
-                description="which machines find magtwin's nodes: localhost, subnet; empty: by the environment",
+                description="which machines find the nodes: localhost, subnet; empty: by the environment",
             ),
             Node(
                 executable="sim",
                 parameters=[{"scene": words["scene"], "lidar": "on", "tf": "odom", **found}],
                 remappings=[
-                    ("/map", PythonExpression(["'/map' if '", value["map"], "' == '' else '/ground_truth/map'"]))
+                    (
+                        "/map",
+                        PythonExpression(["'/map' if '", value["map"], "' == '' else '/ground_truth/map'"]),
+                    )
                 ],
                 condition=IfCondition(value["sim"]),
                 **ours,

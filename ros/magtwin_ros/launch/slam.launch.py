@@ -1,4 +1,4 @@
-"""The simulated robot and slam_toolbox, which publishes /map and the transform from map to odom. Not run here.
+"""The simulated robot and slam_toolbox, which publishes /map and the transform from map to odom. Not run.
 
     ros2 launch magtwin_ros slam.launch.py scene:=lab.usda path:=figure8
 

@@ -1,4 +1,4 @@
-"""RViz with the field along the path, the maps, the robot and the estimate. Not run here.
+"""RViz with the field along the path, the maps, the robot and the estimate. Not run.
 
     ros2 launch magtwin_ros view.launch.py
 
