@@ -123,7 +123,7 @@ class SimulatedRobot:
 
     def path(self, stamp_ns: int) -> tuple[str, bytes]:
         """Topic and message of its true path so far."""
-        return self._name(PATH), self._truth.path(stamp_ns)
+        return self._renamed(PATH).name, self._truth.path(stamp_ns)
 
     def commanded(self, message: Message) -> None:
         """Take a command."""

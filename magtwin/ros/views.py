@@ -1,7 +1,7 @@
 """Views: what RViz and Foxglove show of a simulation: maps of the lab, readings and the path driven."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -94,7 +94,7 @@ def grid_fields(
     }
 
 
-def cloud_fields(frame: str, columns: dict[str, ArrayLike]) -> dict[str, Any]:
+def cloud_fields(frame: str, columns: Mapping[str, ArrayLike]) -> dict[str, Any]:
     """Fields of a PointCloud2 of float32 columns, which are named as its fields, each of shape (N,)."""
     table = np.column_stack([np.asarray(values, "<f4") for values in columns.values()])
     fields: dict[str, Any] = {"header.frame_id": frame, "fields": len(columns)}
@@ -143,7 +143,7 @@ class Trail:
     def add(self, p: ArrayLike, q_xyzw: ArrayLike) -> None:
         """Add a pose if it is far enough from the last one."""
         pose = np.concatenate([np.asarray(p, float), np.asarray(q_xyzw, float)])
-        if self.poses and math.dist(self.poses[-1][:2], pose[:2]) < STEP_M:
+        if self.poses and math.dist(self.poses[-1][:2], pose[:2]) < STEP_M - 1e-9:
             return
         self.poses.append(pose)
         del self.poses[:-MOST_POSES]
