@@ -58,7 +58,7 @@ class OccupancyGrid(Summarized):
         grey = np.full(self.cells.shape, PIXELS[UNKNOWN], np.uint8)
         for value in (FREE, OCCUPIED):
             grey[self.cells == value] = PIXELS[value]
-        rows, columns = grey.shape[0], grey.shape[1]
+        rows, columns = self.cells.shape
         x, y = self.origin_m
         text = (
             f"image: {picture.name}\nmode: trinary\nresolution: {self.resolution_m:.9g}\n"

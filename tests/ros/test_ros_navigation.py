@@ -28,7 +28,7 @@ from magtwin.twin import Twin, open_twin, room_of
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 
 MANY = Qos(depth=2000)
-DURATION_S = 12.0
+DURATION_S = 10.0
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ from typing import Literal
 from magtwin.cli.app import app
 from magtwin.cli.options import Force
 from magtwin.cli.terminal import Done, announce
+from magtwin.errors import InputError
 
 
 @app.command
@@ -13,7 +14,7 @@ def export(
     scene: Path,
     *,
     out: Path,
-    target: Literal["omniverse", "isaac", "newton", "viewer"] | None = None,
+    target: Literal["omniverse", "isaac", "newton", "viewer", "gazebo"] | None = None,
     run: Path | None = None,
     onnx: bool = True,
     thumbnail: bool = True,
@@ -26,10 +27,12 @@ def export(
     scene
         A scene or any other stage (.usd, .usda, .usdc, .usdz), or the name of a shipped one: lab.
     out
-        What to make: a folder, a package (.usdz), one layer (.usd, .usdc), or a .glb for the web.
+        What to make: a folder, a package (.usdz), one layer (.usd, .usdc), a .glb for the web, or a world of
+        Gazebo (.sdf).
     target
-        Program to export for: omniverse; isaac, with an Action Graph for ROS 2; newton; or viewer, one layer
-        for simple viewers. Default: omniverse for folders and packages, else viewer.
+        Program to export for: omniverse; isaac, with an Action Graph for ROS 2; newton; viewer, one layer for
+        simple viewers; or gazebo, the lab without robots. Default: omniverse for folders and packages, gazebo
+        for .sdf, else viewer.
     run
         Run in any format that magtwin reads, to play over the stage.
     onnx
@@ -43,6 +46,12 @@ def export(
 
     check_free(out, force=force)
     stage = scene_file(scene)
+    if target == "gazebo" or (target is None and out.suffix == ".sdf"):
+        from magtwin.export.gazebo import export_world
+
+        if run is not None:
+            raise InputError("a world of Gazebo plays no run; leave out --run")
+        return Done(wrote=export_world(stage, out, force=force))
     animation = None
     if run is not None:
         from magtwin.io.formats import read_run
