@@ -415,6 +415,7 @@ def replay(
     pace: float = 1.0,
     out_unit: OutUnit = None,
     frame_prefix: FramePrefix = None,
+    tf: Literal["all", "odom", "none"] = "odom",
 ) -> Done:
     """Publish a recorded run on its robot's ROS topics, in real time.
 
@@ -428,6 +429,8 @@ def replay(
         Scene of the run, for frames, covariances, /tf_static and the robot's description. Default: none.
     pace
         Simulated seconds per second.
+    tf
+        Transforms of the drive on /tf, as for `magtwin ros sim`.
     """
     from magtwin.io.formats import read_run
     from magtwin.ros.record import Player
@@ -439,7 +442,7 @@ def replay(
     twin = None if scene is None else open_twin(scene, model_error=False)
     with where.bus("magtwin_replay") as bus:
         player = Player(
-            whole, bus, twin, units=out_unit or "T", topics=topic, frame_prefix=frame_prefix or ""
+            whole, bus, twin, units=out_unit or "T", topics=topic, frame_prefix=frame_prefix or "", tf=tf
         )
         announce(f"replaying {whole['t'][-1] - whole['t'][0]:.0f} s by {bus.backend}; Ctrl-C ends")
         step("Replaying")

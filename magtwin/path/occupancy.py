@@ -11,10 +11,17 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.files import check_free, output
 from magtwin.path.room import Room
+from magtwin.spec.obstacles import Obstacles
 from magtwin.summary import Summarized, Summary
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 """Values of cells, those of nav_msgs/OccupancyGrid."""
+
+RESOLUTION_M = 0.05
+"""Default side of a cell [m]."""
+
+FEW_CELLS = 1_000_000
+"""Number of cells above which the default side is doubled."""
 
 MOST_CELLS = 16_000_000
 """Largest number of cells."""
@@ -83,7 +90,7 @@ class OccupancyGrid(Summarized):
         )
 
 
-def occupancy_of(room: Room, *, resolution_m: float = 0.05) -> OccupancyGrid:
+def occupancy_of(room: Room, *, resolution_m: float | None = None) -> OccupancyGrid:
     """The occupancy grid of a room, over its floor and all obstacles.
 
     A cell is occupied if its centre is less than half a cell from the outline of an obstacle, or if a corner
@@ -92,17 +99,18 @@ def occupancy_of(room: Room, *, resolution_m: float = 0.05) -> OccupancyGrid:
 
     Args:
         room: Floor and obstacles.
-        resolution_m: Side of a cell [m].
+        resolution_m: Side of a cell [m]. Default: `RESOLUTION_M`, doubled until at most `FEW_CELLS` remain.
 
     Raises:
         InputError: The resolution is not above 0, or gives more than `MOST_CELLS` cells.
     """
+    if resolution_m is None:
+        resolution_m = RESOLUTION_M
+        while _extent(room, resolution_m)[1].prod() > FEW_CELLS:
+            resolution_m *= 2
     if not (math.isfinite(resolution_m) and resolution_m > 0):
         raise InputError(f"resolution_m must be above 0 m, got {resolution_m!r}", parameter="resolution_m")
-    half = np.asarray(room.floor_m) / 2
-    corners = np.concatenate([[-half, half], *room.obstacles.outlines])
-    low = np.floor(corners.min(axis=0) / resolution_m - 1e-9) - 1  # one cell more on each side
-    count = np.ceil(corners.max(axis=0) / resolution_m + 1e-9) + 1 - low
+    low, count = _extent(room, resolution_m)
     if count.prod() > MOST_CELLS:
         raise InputError(
             f"{count[0]:.0f} x {count[1]:.0f} cells of {resolution_m:g} m are too many; at most "
@@ -111,13 +119,27 @@ def occupancy_of(room: Room, *, resolution_m: float = 0.05) -> OccupancyGrid:
         )
     columns, rows = count.astype(int).tolist()
     x, y = ((low[k] + np.arange(n) + 0.5) * resolution_m for k, n in enumerate((columns, rows)))
+    half = np.asarray(room.floor_m) / 2
     on_floor = (np.abs(y) <= half[1])[:, None] & (np.abs(x) <= half[0])[None, :]
     cells = np.where(on_floor, FREE, UNKNOWN).astype(np.int8)
-    at = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    distance, _ = room.obstacles.clearance(at, reach_m=resolution_m)
-    cells[(distance < resolution_m / 2 * (1 - 1e-6)).reshape(rows, columns)] = OCCUPIED
-    for outline in room.obstacles.outlines:  # corners move inwards a little, off the borders of cells
-        at = outline + 1e-6 * (outline.mean(axis=0) - outline)
-        column, row = np.floor(at / resolution_m - low).astype(int).T
+    for name, outline in zip(room.obstacles.names, room.obstacles.outlines, strict=True):
+        first = (np.floor(outline.min(axis=0) / resolution_m - low) - 1).astype(int)
+        last = (np.ceil(outline.max(axis=0) / resolution_m - low) + 1).astype(int)
+        window = (slice(first[1], last[1]), slice(first[0], last[0]))
+        at = np.stack(np.meshgrid(x[window[1]], y[window[0]]), axis=-1)
+        distance, _ = Obstacles((name,), (outline,)).clearance(at.reshape(-1, 2))
+        cells[window][(distance < resolution_m / 2 * (1 - 1e-6)).reshape(at.shape[:2])] = OCCUPIED
+        # corners move inwards a little, off the borders of cells
+        corners = outline + 1e-6 * (outline.mean(axis=0) - outline)
+        column, row = np.floor(corners / resolution_m - low).astype(int).T
         cells[row, column] = OCCUPIED
     return OccupancyGrid(cells, resolution_m, (low[0] * resolution_m, low[1] * resolution_m))
+
+
+def _extent(room: Room, resolution_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lower left corner, in cells, and numbers of columns and rows, with two cells more on each side."""
+    half = np.asarray(room.floor_m) / 2
+    corners = np.concatenate([[-half, half], *room.obstacles.outlines])
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        low = np.floor(corners.min(axis=0) / resolution_m - 1e-9) - 2
+        return low, np.ceil(corners.max(axis=0) / resolution_m + 1e-9) + 2 - low

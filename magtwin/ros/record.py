@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from magtwin.errors import InputError
 from magtwin.io.bags import RawBagWriter
 from magtwin.io.bags.cdr import NS, encode
-from magtwin.io.bags.sender import Unit, prefixed, sender_for
+from magtwin.io.bags.sender import Transforms, Unit, prefixed, sender_for
 from magtwin.io.bags.stream import Stream
 from magtwin.io.bags.topics import Qos
 from magtwin.io.bags.types import layout
@@ -118,6 +119,7 @@ class Player:
         units: Unit = "T",
         topics: Sequence[str] = (),
         frame_prefix: str = "",
+        tf: Transforms = "odom",
     ) -> None:
         """Advertise its topics.
 
@@ -128,13 +130,14 @@ class Player:
             units: Unit of magnetic fields.
             topics: Names of topics to publish. Default: all.
             frame_prefix: Prefix of the names of frames, such as "tb4/".
+            tf: Transforms of the drive on /tf, as for `magtwin.ros.simulate.Simulator`.
 
         Raises:
             InputError: The run has no column of these topics.
         """
         self._run = run
         sender = sender_for(twin, units, run.metadata.get("rate_hz"))
-        sender = prefixed(sender, checked_prefix(frame_prefix))
+        sender = replace(prefixed(sender, checked_prefix(frame_prefix)), transforms=tf)
         self._stream = Stream(run, sender, None, topics=(*SAMPLED.values(), *READ), whole=True)
         chosen = [t for t in self._stream.topics if bus.knows(t.kind) and (not topics or t.name in topics)]
         if not chosen:
