@@ -29,9 +29,9 @@ app = App(
     config=[Env("MAGTWIN_", show=False), Toml("magtwin.toml", search_parents=False)],
     default_parameter=Parameter(negative_iterable="", negative_none=""),
     help_epilogue="Options can also be set in the environment (MAGTWIN_RUN_SEED=1) and in magtwin.toml. "
-    "Exit status: 0 done, 1 an input was refused, 2 wrong usage. Each command also takes --debug, which shows "
-    "the traceback of a refusal, and --allow DIR, which lets a stage name files in that folder; without it a "
-    "stage may name files in its own folder. --allow can be repeated.",
+    "Exit status: 0 done, 1 an input was refused, 2 wrong usage. Each command also takes --debug, which "
+    "shows the traceback of a refusal, and --allow DIR, which lets stages name files in that folder, beside "
+    "their own and magtwin's; it can be repeated.",
 )
 
 HELP = {"--help", "-h"}

@@ -76,8 +76,9 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
 
     Raises:
         InputError: The file is missing or not USD, or a sublayer or reference is missing; the text has USD's
-            own message. It names a file outside its folder that is not allowed (`check_stage`). Or a layer has changes in this process that are not saved, which would be lost; or is
-            of a later version of the schema.
+            own message. It names a file outside its folder that is not allowed (`check_stage`). Or a layer
+            has changes in this process that are not saved, which would be lost; or is of a later version of
+            the schema.
     """
     path = check_stage(path)
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal

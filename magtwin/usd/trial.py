@@ -136,7 +136,7 @@ def _working_folder() -> str:
     try:
         return str(Path.cwd())
     except FileNotFoundError:
-        return os.path.abspath(os.sep)
+        return Path(sys.executable).anchor
 
 
 def _stamp(file: str) -> Stamp | None:
@@ -152,7 +152,7 @@ def _outside(path: Path, names: list[dict[str, str]]) -> str:
     """The refusal of a stage that names files out of its folder."""
     first, others = names[0], len({name["file"] for name in names}) - 1
     where = first["where"].removeprefix(str(path.absolute())).strip()
-    folders = sorted({os.path.dirname(os.path.realpath(name["file"].partition("[")[0])) for name in names})
+    folders = sorted({name["folder"] for name in names})
     least = [f for f in folders if not any(f != g and Path(f).is_relative_to(g) for g in folders)]
     call = ", ".join(map(repr, least))
     more = f", and {others} more" if others else ""

@@ -11,6 +11,7 @@ import json
 import os
 import re
 import sys
+from pathlib import Path
 from typing import Any
 
 from pxr import Ar, Sdf, Usd, UsdUtils
@@ -26,12 +27,13 @@ MOST_LAYERS = 100_000
 LISTED = 20
 """Names out of the folders that an answer lists at most."""
 
+_MEMORY = Path("/proc/self/statm")
 _ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 _PATTERN = re.compile(r"<UDIM>|#+")
 """The part of a texture's or a clip's name that stands for numbers."""
 
 
-class Refused(Exception):
+class RefusedError(Exception):
     """The text of a refusal."""
 
 
@@ -40,6 +42,7 @@ class Audit:
 
     Attributes:
         layers: The layers, by identifier.
+        named_files: Every file that a layer names, even if there is none.
         outside: Files out of the folders that layers name: layer, prim or property, name and file.
     """
 
@@ -47,26 +50,27 @@ class Audit:
         self.inside: list[str] = job["inside"]
         self.room, self.most_values = job["room"], job["values"]
         self.layers: dict[str, Any] = {}
+        self.named_files: set[str] = set()
         self.outside: list[dict[str, str]] = []
         self.resolver = Ar.GetResolver()
 
     def is_inside(self, file: str) -> bool:
         """Whether a file is in one of the folders, with symlinks resolved."""
-        real = os.path.realpath(file)
-        return any(real.startswith(os.path.join(folder, "")) for folder in self.inside)
+        real = on_disk(file).resolve()
+        return any(real.is_relative_to(folder) for folder in self.inside)
 
     def open(self, name: str) -> Any:
         """A layer that is inside, with its values tried; None if it cannot be opened, as USD says later."""
-        file = Ar.SplitPackageRelativePathOuter(name)[0]
-        if os.path.exists(file) and not os.path.isfile(file) and not os.path.isdir(file):
-            raise Refused(f"names {file}, which is no regular file")
-        if not os.path.isfile(file):
+        file = on_disk(name)
+        if file.exists() and not file.is_file() and not file.is_dir():
+            raise RefusedError(f"names {file}, which is no regular file")
+        if not file.is_file():
             return None
         if name not in self.layers:
-            size = os.stat(file).st_size
+            size = file.stat().st_size
             self.room += 4 * size
             limit_memory(self.room)
-            with open(file, "rb") as head:
+            with file.open("rb") as head:
                 crate = head.read(8) == b"PXR-USDC"
             self.layers[name] = None
             try:
@@ -75,7 +79,7 @@ class Audit:
                     try_values(layer)
             except Exception as error:
                 if crate:
-                    raise Refused(f"cannot be opened as USD: {text_of(error)}") from error
+                    raise RefusedError(f"cannot be opened as USD: {text_of(error)}") from error
                 return None  # raised again, with its text, where it is opened
             self.layers[name] = layer
         return self.layers[name]
@@ -96,7 +100,7 @@ class Audit:
                 continue
             seen.add(key)
             if len(seen) > MOST_LAYERS:
-                raise Refused(f"names over {MOST_LAYERS} layers")
+                raise RefusedError(f"names over {MOST_LAYERS} layers")
             for file, may_be_sublayer in self.named(layer, variables):
                 if Sdf.FileFormat.FindByExtension(file) is not None:
                     pending += [(file, variables, is_sublayer) for is_sublayer in {False, may_be_sublayer}]
@@ -121,15 +125,21 @@ class Audit:
             if address := _ADDRESS.match(asset):
                 if asset in arcs or address.group()[:-3].lower() in Ar.GetRegisteredURISchemes():
                     where = place_of(layer, asset, variables)
-                    raise Refused(f"{where} names {asset}, an address; download the file, and name the copy")
+                    raise RefusedError(
+                        f"{where} names {asset}, an address; download the file, and name the copy"
+                    )
                 continue  # nobody opens it
             for file in self.files(layer, Sdf.Layer.SplitIdentifier(asset)[0]):
-                if self.is_inside(Ar.SplitPackageRelativePathOuter(file)[0]):
+                if self.is_inside(file):
                     found.append((file, asset in copy.subLayerPaths))
                 elif len(self.outside) < LISTED:
-                    where = place_of(layer, asset, variables)
-                    self.outside.append({"where": where, "asset": asset, "file": file})
+                    self.leave_out(place_of(layer, asset, variables), asset, file)
         return found
+
+    def leave_out(self, where: str, asset: str, file: str) -> None:
+        """Note a file out of the folders."""
+        real = on_disk(file).resolve()
+        self.outside.append({"where": where, "asset": asset, "file": str(real), "folder": str(real.parent)})
 
     def files(self, layer: Any, asset: str) -> list[str]:
         """The existing files that a name stands for: one, or those of a pattern such as `wood.<UDIM>.png`."""
@@ -137,18 +147,23 @@ class Audit:
         resolved = str(self.resolver.Resolve(absolute))
         files = [resolved] if resolved else []
         if _PATTERN.search(asset):
-            home = os.path.dirname(layer.realPath)
-            for base in {absolute, os.path.join(home, asset), os.path.abspath(asset)}:
-                parts = (glob.escape(part) for part in _PATTERN.split(base))
-                files += sorted(glob.glob("*".join(parts)))
-        return [file for file in files if not os.path.isdir(file)]
+            bases = (Path(absolute), Path(layer.realPath).parent / asset, Path(asset))
+            for base in {Path(os.path.normpath(Path.cwd() / base)) for base in bases}:
+                parts = map(glob.escape, _PATTERN.split(str(base.relative_to(base.anchor))))
+                files += map(str, sorted(Path(base.anchor).glob("*".join(parts))))
+        self.named_files.update(str(on_disk(file)) for file in (absolute, *files))
+        return [file for file in files if not Path(file).is_dir()]
+
+
+def on_disk(name: str) -> Path:
+    """The file of a layer, which can be a member of a package: `a.usdz[b.usda]`."""
+    return Path(Ar.SplitPackageRelativePathOuter(name)[0])
 
 
 def limit_memory(room: int) -> None:
     """Let this process take `room` more bytes than it has now."""
-    if resource is not None and os.path.exists("/proc/self/statm"):
-        with open("/proc/self/statm") as file:
-            size = int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    if resource is not None and _MEMORY.exists():
+        size = int(_MEMORY.read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
         hard = resource.getrlimit(resource.RLIMIT_AS)[1]
         resource.setrlimit(resource.RLIMIT_AS, (size + room, hard))
 
@@ -215,13 +230,12 @@ def compose(root: str, audit: Audit) -> None:
     except Exception:
         return  # raised again, with its text, where it is opened
     for layer in stage.GetUsedLayers():
-        file = Ar.SplitPackageRelativePathOuter(layer.realPath)[0]
-        if file and not audit.is_inside(file):
-            audit.outside.append({"where": root, "asset": layer.identifier, "file": file})
+        if layer.realPath and not audit.is_inside(layer.realPath):
+            audit.leave_out(root, layer.identifier, layer.realPath)
 
 
 def answer_to(job: dict[str, Any]) -> dict[str, Any]:
-    """Do a job: `refused`, `memory`, `outside`, or nothing but the `files` that were opened."""
+    """Do a job. The answer has `refused`, `memory`, or names `outside` and the `files` that it depends on."""
     limit_time(job["seconds"])
     audit = Audit(job)
     try:
@@ -235,12 +249,15 @@ def answer_to(job: dict[str, Any]) -> dict[str, Any]:
             audit.open(job["file"])
     except MemoryError:
         return {"memory": True}
-    except Refused as error:
+    except RefusedError as error:
         memory = isinstance(error.__cause__, MemoryError) or "bad_alloc" in str(error)
         return {"memory": True} if memory else {"refused": str(error)}
     except Exception as error:  # what cannot be checked is not opened
         return {"refused": f"cannot be opened as USD: {text_of(error)}"}
-    return {"outside": audit.outside, "files": [Ar.SplitPackageRelativePathOuter(f)[0] for f in audit.layers]}
+    return {
+        "outside": audit.outside,
+        "files": sorted({str(on_disk(name)) for name in audit.layers} | audit.named_files),
+    }
 
 
 def main() -> None:
@@ -250,7 +267,8 @@ def main() -> None:
         for kind in (resource.RLIMIT_CORE, resource.RLIMIT_FSIZE):  # it writes nothing
             resource.setrlimit(kind, (0, 0))
     for line in sys.stdin:
-        print(json.dumps(answer_to(json.loads(line))), flush=True)
+        sys.stdout.write(json.dumps(answer_to(json.loads(line))) + "\n")
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":

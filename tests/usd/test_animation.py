@@ -264,7 +264,8 @@ def test_bytes_that_end_the_process_of_usds_own_reader_are_refused_in_a_line(pla
         (tmp_path / "run.usdc").write_bytes(content)
         with suppress(InputError):
             read_animation(tmp_path / "run.usdc")
-    monkeypatch.setattr(trial, "_PROGRAM", "import os; os.abort()")
+    (tmp_path / "crash.py").write_text("import os; os.abort()")
+    monkeypatch.setattr(trial, "PROGRAM", tmp_path / "crash.py")
     monkeypatch.setattr(trial, "_TRIAL", trial._Trial())
     with pytest.raises(InputError, match="damaged: USD crashes on it"):
         read_animation(played)
