@@ -189,7 +189,7 @@ def try_values(layer: Any) -> None:
 
 def place_of(layer: Any, asset: str, variables: dict[str, Any]) -> str:
     """Layer, and prim or property, that names a file."""
-    found = []
+    found: list[str] = []
 
     def names(value: Any) -> bool:
         if isinstance(value, str):

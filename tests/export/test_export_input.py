@@ -122,7 +122,10 @@ def test_a_texture_that_is_not_there_is_refused_with_the_property_that_names_it(
 
 def test_a_file_that_is_nothing_a_stage_needs_is_not_handed_on(tmp_path):
     text = 'def Xform "World"\n{\n    asset picture = @/etc/passwd@\n}\n'
-    refuse(r"</World\.picture>: names /etc/passwd, .* not exported", write(tmp_path, HEAD + text), tmp_path)
+    stage = write(tmp_path, HEAD + text)
+    refuse(r"</World\.picture> names /etc/passwd, outside the stage's folder", stage, tmp_path)
+    with allow("/etc"):
+        refuse(r"</World\.picture>: names /etc/passwd, .* not exported", stage, tmp_path)
 
 
 def test_a_material_that_omniverse_brings_may_be_named(tmp_path):
