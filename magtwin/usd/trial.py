@@ -47,7 +47,7 @@ class _Trial:
     def check(self, path: Path, *, composed: bool) -> None:
         """As `try_stage`."""
         file = str(path.absolute())
-        inside = [str(path.resolve().parent), *(str(shipped(name)) for name in SHIPPED), *allowed_folders()]
+        inside = folders_of(path)
         key = (file, composed, *inside)
         with self._lock:
             if self._owner != os.getpid():
@@ -160,6 +160,11 @@ def _outside(path: Path, names: list[dict[str, str]]) -> str:
         f"{path}: {f'{where} ' if where else ''}names {first['asset']}{more}, outside the stage's folder; if "
         f"you trust the stage, give `magtwin.allow({call})`"
     )
+
+
+def folders_of(stage: Path) -> list[str]:
+    """Folders in which a stage may name files: its own, those shipped with magtwin, and allowed ones."""
+    return [str(stage.resolve().parent), *(str(shipped(name)) for name in SHIPPED), *allowed_folders()]
 
 
 _TRIAL = _Trial()
