@@ -263,7 +263,7 @@ def test_map_to_odom_puts_base_link_at_the_estimate_and_another_publisher_is_tol
     hand.tick(3, x=0.7)
     hand.settle()
     names = [f"transforms.0.{name}" for name in ("header.frame_id", "child_frame_id")]
-    read = hand.tf[-1].read([*names, "transforms.0.transform.translation"], {"transforms": 1})
+    read = hand.tf[-1].read([*names, "transforms.0.transform.translation"])
     assert [read[name] for name in names] == ["map", "odom"]
     _, pose, _ = poses(hand.heard)
     origin = read["transforms.0.transform.translation"]

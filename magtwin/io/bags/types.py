@@ -9,22 +9,48 @@ from magtwin.io.bags.cdr import Leaf
 
 _CODES = {"float64": "f8", "float32": "f4", "bool": "u1", "byte": "u1", "char": "u1", "string": "text"}
 _CODES |= {f"{sign}int{8 * size}": f"{sign[:1] or 'i'}{size}" for sign in ("u", "") for size in (1, 2, 4, 8)}
-_TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+"""Types of stamps, one leaf of whole nanoseconds."""
+
+
+@cache
+def _stores() -> tuple[Any, ...]:
+    """The typestores of the distributions, oldest first; the newer ones change a few types and add some."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return tuple(get_typestore(s) for s in (Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.LATEST))
 
 
 @cache
 def typestore() -> Any:
-    """The message types of ROS 2 Humble, a `rosbags.typesys.Typestore`."""
+    """The message types of ROS 2 Humble and those that later distributions added.
+
+    It is a `rosbags.typesys.Typestore`.
+    """
     from rosbags.typesys import Stores, get_typestore
 
-    return get_typestore(Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    newest = _stores()[-1].fielddefs
+    store.register({kind: defined for kind, defined in newest.items() if kind not in store.fielddefs})
+    return store
 
 
 @cache
-def definition_of(kind: str) -> tuple[str, str]:
-    """The definition of a message type as text, and its REP 2011 hash."""
+def definition_of(kind: str, digest: str = "") -> tuple[str, str]:
+    """The definition of a message type as text, and its REP 2011 hash.
+
+    Args:
+        kind: The type.
+        digest: Hash of the wanted definition, as distributions may differ. Default: that of `typestore`.
+
+    Raises:
+        InputError: The type is unknown, or no distribution defines it with that hash.
+    """
     fields_of(kind)
-    return typestore().generate_msgdef(kind, ros_version=2)[0], typestore().hash_rihs01(kind)
+    for store in (typestore(), *_stores()):
+        if kind in store.fielddefs and (own := store.hash_rihs01(kind)) == (digest or own):
+            return store.generate_msgdef(kind, ros_version=2)[0], own
+    raise InputError(f"{kind} is defined in another way than by ROS 2 (hash {digest[:19]}...)")
 
 
 def fields_of(kind: str) -> list[tuple[str, Any]]:
@@ -92,7 +118,7 @@ def _leaves(kind: str, prefix: str, counts: Mapping[str, Any]) -> list[Leaf]:
 
 
 def _structure(kind: str, name: str, counts: Mapping[str, Any]) -> list[Leaf]:
-    if kind in _TIMES:
+    if kind in TIMES:
         return [Leaf(name, "time")]
     inner = _leaves(kind, f"{name}.", counts)
     same = {(leaf.kind, leaf.count) for leaf in inner}

@@ -328,7 +328,7 @@ class LocalizerNode:
         first = "transforms.0"
         names = [f"{first}.header.stamp", f"{first}.header.frame_id", f"{first}.child_frame_id"]
         try:
-            read = message.read(names, {"transforms": 1})
+            read = message.read(names)
         except InputError:
             return  # empty, or damaged
         frames = (str(read[names[1]]).strip("/"), str(read[names[2]]).strip("/"))
