@@ -16,8 +16,8 @@ import numpy as np
 from magtwin.files import shipped
 from magtwin.io.bags.topics import COMMAND, MAGNITUDE, TF, TF_STATIC, Qos
 from magtwin.ros.bus import Message, open_bus
-from magtwin.ros.diagnostics import KIND, from_message
-from magtwin.ros.follow import command_bytes
+from magtwin.ros.commands import command_bytes
+from magtwin.ros.diagnostics import KIND
 from magtwin.ros.topics import LIVE
 
 SECONDS = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
@@ -64,7 +64,7 @@ def main() -> None:
             qos = Qos(depth=1000, reliable=topic.qos.reliable)
             bus.subscribe(topic.name, topic.kind, heard[topic.name].append, qos)
     bus.subscribe(
-        "/diagnostics", KIND, lambda m: statuses.update({s.name: s for s in from_message(m)}), Qos()
+        "/diagnostics", KIND, lambda m: statuses.update({s.name: s for s in m.content.status}), Qos()
     )
     commands = bus.publisher(COMMAND.name, COMMAND.kind, COMMAND.qos)
     try:
@@ -102,7 +102,8 @@ def main() -> None:
     # A reading is made at a tick of /clock, the newest of its inputs; stamps are that tick's.
     late = [m.sent_ns - clock[t] for t, m in zip(stamps, heard[MAGNITUDE.name], strict=True) if t in clock]
     p50, p99 = np.percentile(late, [50, 99]) * 1e-6
-    own = statuses["magtwin_magnetometer: readings"].values["p99 latency [ms]"]
+    values = statuses["magtwin_magnetometer: readings"].values
+    own = next(pair.value for pair in values if pair.key == "p99 latency [ms]")
     print(
         f"from newest input to reading: p50 {p50:.2f} ms, p99 {p99:.2f} ms (by the node {own})"
         "   standard 5 ms"

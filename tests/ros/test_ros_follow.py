@@ -210,7 +210,7 @@ def test_an_open_path_is_driven_back_and_forth(nodes: Callable[..., Bus]) -> Non
 def test_a_flipped_path_is_driven_from_its_end_with_stamped_commands(nodes: Callable[..., Bus]) -> None:
     robot = Ideal(nodes, "geometry_msgs/msg/TwistStamped")
     robot.x, robot.y, robot.yaw = 0.5, 0.1, np.pi
-    node, bus = started(robot, nodes, flip=True, speed=0.3, stamped_commands=True, controller="stanley")
+    node, bus = started(robot, nodes, flip=True, speed=0.3, commands="TwistStamped", controller="stanley")
     while not node.done and robot.t < 20:
         robot.tick(bus, 5)
     np.testing.assert_allclose((robot.x, robot.y), LINE.p_xy[0], atol=0.03)

@@ -19,8 +19,8 @@ from magtwin.localization.problem import Estimate, Prior
 from magtwin.localization.track import LocalizerError
 from magtwin.localizing import live_problem, localization, localize, new_localizer
 from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
+from magtwin.ros.commands import command_bytes
 from magtwin.ros.diagnostics import KIND
-from magtwin.ros.follow import command_bytes
 from magtwin.ros.localization.localize import PARAMETERS, LocalizerNode
 from magtwin.ros.localization.poses import (
     CLOUD,

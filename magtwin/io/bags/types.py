@@ -14,23 +14,22 @@ TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
 
 @cache
-def _stores() -> tuple[Any, ...]:
-    """The typestores of the distributions, oldest first; the newer ones change a few types and add some."""
+def store_of(distribution: str) -> Any:
+    """The message types of a distribution of ROS 2, a `rosbags.typesys.Typestore`; "latest" is the newest."""
     from rosbags.typesys import Stores, get_typestore
 
-    return tuple(get_typestore(s) for s in (Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.LATEST))
+    return get_typestore(
+        Stores.LATEST if distribution == "latest" else Stores[f"ROS2_{distribution.upper()}"]
+    )
 
 
 @cache
 def typestore() -> Any:
-    """The message types of ROS 2 Humble and those that later distributions added.
-
-    It is a `rosbags.typesys.Typestore`.
-    """
+    """The message types of ROS 2 Humble and those that later distributions added."""
     from rosbags.typesys import Stores, get_typestore
 
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    newest = _stores()[-1].fielddefs
+    store = get_typestore(Stores.ROS2_HUMBLE)  # not that of `store_of`, which stays as it is
+    newest = store_of("latest").fielddefs
     store.register({kind: defined for kind, defined in newest.items() if kind not in store.fielddefs})
     return store
 
@@ -47,7 +46,7 @@ def definition_of(kind: str, digest: str = "") -> tuple[str, str]:
         InputError: The type is unknown, or no distribution defines it with that hash.
     """
     fields_of(kind)
-    for store in (typestore(), *_stores()):
+    for store in (typestore(), *map(store_of, ("jazzy", "latest"))):
         if kind in store.fielddefs and (own := store.hash_rihs01(kind)) == (digest or own):
             return store.generate_msgdef(kind, ros_version=2)[0], own
     raise InputError(f"{kind} is defined in another way than by ROS 2 (hash {digest[:19]}...)")

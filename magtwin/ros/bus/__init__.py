@@ -7,6 +7,7 @@ messages; `dds` and `rclpy_bus` are the backends.
 from magtwin.ros.bus.bus import (
     Backend,
     Bus,
+    Endpoint,
     Handler,
     Message,
     Publisher,
@@ -20,6 +21,7 @@ from magtwin.ros.bus.names import Names, Range, is_name, names_of
 __all__ = [
     "Backend",
     "Bus",
+    "Endpoint",
     "Handler",
     "Message",
     "Names",

@@ -98,6 +98,19 @@ class Subscription:
     """Number of publishers."""
 
 
+@dataclass(frozen=True)
+class Endpoint:
+    """A publisher or subscriber of a topic, as discovered."""
+
+    kind: str
+    """Message type; "" if it is not a ROS type."""
+
+    reliable: bool
+    latched: bool
+    digest: str = ""
+    """REP 2011 hash of its type; "" before ROS 2 Iron."""
+
+
 class Timer(Protocol):
     """Something called at a regular interval."""
 
@@ -153,14 +166,23 @@ class Bus(Protocol):
         """The full name of a topic on the network."""
         return self._names.resolve(topic)
 
+    def offers(self, topic: str) -> list[Endpoint]:
+        """The publishers of a topic, including those of this node, as far as discovered."""
+
+    def wants(self, topic: str) -> list[Endpoint]:
+        """The subscribers of a topic, including those of this node, as far as discovered."""
+
     def types(self, topic: str) -> tuple[str, ...]:
         """Types in which a topic is published, as far as discovered."""
+        return tuple(sorted({offer.kind for offer in self.offers(topic)} - {""}))
 
     def publishers(self, topic: str) -> int:
         """Number of publishers of a topic, including this node, as far as discovered."""
+        return len(self.offers(topic))
 
     def reliable(self, topic: str) -> bool:
         """Whether every discovered publisher of a topic offers it reliably."""
+        return all(offer.reliable for offer in self.offers(topic))
 
     def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> Timer:
         """Call `due` every `period_s` of the bus's clock, or of wall time, in the thread that spins."""

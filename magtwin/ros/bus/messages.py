@@ -49,7 +49,7 @@ def content_of(kind: str, data: bytes) -> Any:
     """A message as an object of rosbags, with an attribute for each field.
 
     Raises:
-        InputError: The message is too short or too long for its type, or not plain CDR; or the type is unknown.
+        InputError: The type is unknown, or the message has another length or is not plain CDR.
     """
     from rosbags.serde import SerdeError
 
