@@ -1,7 +1,7 @@
-"""Two nodes of ROS 2 on loopback, the simulator and the magnetometer: rates, loss, latency and cost.
+"""Two nodes of ROS 2 on loopback, the simulator and the magnetometer: rates, loss, latency, cost and memory.
 
 There is no peer to hold it against; the standards are printed beside the figures. `python benchmarks/ros.py
-[seconds]`, 60 unless given.
+[seconds]`, 60 unless given; 600 is a soak.
 """
 
 import os
@@ -34,6 +34,12 @@ RATES = {
     "/robot/scan": 7.5,
     "/robot/battery_state": 0.5,
 }
+
+
+def memory_mib(process: subprocess.Popen) -> float:
+    """Resident memory of a process [MiB]."""
+    pages = int(Path(f"/proc/{process.pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def cpu_s(process: subprocess.Popen) -> float:
@@ -73,11 +79,15 @@ def main() -> None:
         for messages in heard.values():
             messages.clear()
         begin, sent, before = time.monotonic(), 0.0, (cpu_s(sim), cpu_s(node))
+        memory: list[tuple[float, float]] = []
         while (now := time.monotonic()) < begin + SECONDS:
             if now - sent > 0.1:
                 sent = now
                 commands.publish(command_bytes(COMMAND.kind, 0.2, 0.8 * np.sin(0.7 * (now - begin)), 0))
             bus.spin_once(0.02)
+            if now - begin > (len(memory) + 1) * SECONDS / 4:
+                memory.append((memory_mib(sim), memory_mib(node)))
+        memory.append((memory_mib(sim), memory_mib(node)))
         wall = time.monotonic() - begin
         cost = [after - first for after, first in zip((cpu_s(sim), cpu_s(node)), before, strict=True)]
     finally:
@@ -108,6 +118,9 @@ def main() -> None:
         f"from newest input to reading: p50 {p50:.2f} ms, p99 {p99:.2f} ms (by the node {own})"
         "   standard 5 ms"
     )
+    for name, parts in zip(("simulator", "magnetometer"), zip(*memory, strict=True), strict=True):
+        quarters = ", ".join(f"{part:.1f}" for part in parts)
+        print(f"memory of the {name} after each quarter [MiB]: {quarters}   standard flat")
     parts = ", ".join(
         f"{name} {100 * s / wall:.0f} %" for name, s in zip(("simulator", "magnetometer"), cost, strict=True)
     )

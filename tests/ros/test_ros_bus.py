@@ -1,5 +1,6 @@
 """The bus: what one node says another hears, over DDS and in rclpy, on this machine only."""
 
+import json
 import os
 import subprocess
 import time
@@ -301,7 +302,7 @@ def test_endpoints_carry_the_hash_of_their_type(pair: tuple[Bus, Bus]) -> None:
     one.publisher("field", FIELD, Qos())
     one.subscribe("odom", ODOMETRY.kind, lambda m: None, Qos())
     spin(lambda: other.offers("field") and other.wants("odom"), one, other)
-    # as `ros2 topic info -v` of Jazzy prints it
+    # as rclpy of Jazzy gives it in `topic_type_hash`
     wanted = "RIHS01_e80f32f56a20486c9923008fc1a1db07bbb273cbbf6a5b3bfa00835ee00e4dff"
     assert other.offers("field")[0].digest == definition_of(FIELD)[1] == wanted
     assert other.wants("odom")[0].digest == definition_of(ODOMETRY.kind)[1]
@@ -352,3 +353,42 @@ def test_rclpy_hears_what_cyclonedds_says_and_the_reverse(jazzy: Path, domain: i
     assert [one["header.stamp"] for one in read] == [k * 10**9 + 7 for k in range(20)]
     assert {one["header.frame_id"] for one in read} == {"head"}
     np.testing.assert_array_equal([one["magnetic_field"] for one in read], [field] * 20)
+
+
+BOTH = """
+import json, sys, time
+sys.path.insert(0, sys.argv[1])
+from magtwin.io.bags.topics import Qos
+from magtwin.ros.bus import open_bus
+node, heard = open_bus("peer", backend="rclpy"), set()
+for kind in ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"):
+    node.subscribe("cmd_vel", kind, lambda m: heard.add(m.kind), Qos())
+last = time.monotonic() + 20
+while time.monotonic() < last:
+    node.spin_once(0.05)
+    names = node._node.get_node_names_and_namespaces()
+    if len(heard) == 2 and ("one", "/robot") in names:
+        break
+names = [name for name, _ in names]
+print(json.dumps([sorted(heard), names, {end.kind: end.digest for end in node.offers("cmd_vel")}]))
+"""
+
+
+def test_rclpy_takes_both_types_of_commands_and_lists_nodes_of_cyclonedds(jazzy: Path, domain: int) -> None:
+    env = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+    peer = subprocess.Popen([jazzy, "-c", BOTH, str(ROOT)], env=env, stdout=subprocess.PIPE, text=True)
+    node = open_bus("one", backend="cyclonedds", domain=domain)
+    kinds = ["geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"]
+    sent = [node.publisher("cmd_vel", kind, Qos()) for kind in kinds]
+    try:
+        while peer.poll() is None:
+            for publisher in sent:
+                publisher.publish(to_bytes(publisher.kind, {}))
+            node.spin_once(0.05)
+        heard, names, digests = json.loads(peer.communicate()[0])
+    finally:
+        peer.kill()
+        node.close()
+    assert heard == kinds
+    assert "one" in names
+    assert digests == {kind: definition_of(kind)[1] for kind in kinds}
