@@ -139,8 +139,8 @@ class Input:
                 "machine's: synchronize them (chrony), or count from arrival (stamps)"
             )
         return (
-            f"its stamps are {abs(behind):.1f} s {_off(behind)} this node's clock when they are sent: correct "
-            "them in its driver, or count from arrival (stamps)"
+            f"its stamps are {abs(behind):.1f} s {_off(behind)} this node's clock when they are sent: "
+            "correct them in its driver, or count from arrival (stamps)"
         )
 
     def fresh(self, now_ns: int) -> Columns | None:

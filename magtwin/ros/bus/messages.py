@@ -172,9 +172,8 @@ def _setter(message: Any, kind: str, name: str) -> Callable[[Any], None]:
 
         return structure
     if node is Nodetype.BASE:
-        convert = {"string": str, "bool": bool}.get(described[0])
-        if convert is None:
-            convert = float if described[0].startswith("float") else operator.index
+        whole = float if described[0].startswith("float") else operator.index
+        convert: Callable[[Any], Any] = {"string": str, "bool": bool}.get(described[0], whole)
         return lambda value: setattr(owner, last, convert(_item(value)))
     (inner_node, element), count = described
     if inner_node is not Nodetype.BASE:
@@ -222,15 +221,14 @@ def _getter(kind: str, name: str) -> Callable[[Any], Any]:
     from rosbags.interfaces import Nodetype
 
     steps, (node, described) = _described(kind, name)
-    if all(isinstance(step, str) for step in steps):
-        part = operator.attrgetter(name)
-    else:
 
-        def part(message: Any) -> Any:
-            for step in steps:
-                message = message[step] if isinstance(step, int) else getattr(message, step)
-            return message
+    def indexed(message: Any) -> Any:
+        for step in steps:
+            message = message[step] if isinstance(step, int) else getattr(message, step)
+        return message
 
+    plain = all(isinstance(step, str) for step in steps)
+    part: Callable[[Any], Any] = operator.attrgetter(name) if plain else indexed
     if node is Nodetype.NAME:
         if described in TIMES:
             return lambda message: (stamp := part(message)).sec * NS + stamp.nanosec
