@@ -14,7 +14,7 @@ from places import ROOT
 
 from magtwin.errors import InputError
 from magtwin.io.bags.topics import LATCHED, ODOMETRY, POSE, SENSOR_DATA, TOPICS, Qos
-from magtwin.io.bags.types import definition_of, layout, typestore
+from magtwin.io.bags.types import definition_of, layout, store_of, typestore
 from magtwin.ros.bus import Bus, Message, names_of, open_bus, to_bytes
 from magtwin.ros.bus.clock import Clock
 from magtwin.ros.bus.names import range_of
@@ -306,6 +306,47 @@ def test_endpoints_carry_the_hash_of_their_type(pair: tuple[Bus, Bus]) -> None:
     wanted = "RIHS01_e80f32f56a20486c9923008fc1a1db07bbb273cbbf6a5b3bfa00835ee00e4dff"
     assert other.offers("field")[0].digest == definition_of(FIELD)[1] == wanted
     assert other.wants("odom")[0].digest == definition_of(ODOMETRY.kind)[1]
+
+
+@pytest.mark.parametrize("form", ["humble", "jazzy"])
+def test_a_node_is_listed_in_the_form_of_its_peers_and_not_among_both_forms(domain: int, form: str) -> None:
+    from cyclonedds.core import Policy
+    from cyclonedds.core import Qos as DdsQos
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.sub import DataReader
+    from cyclonedds.topic import Topic
+
+    from magtwin.ros.bus.graph import LISTS, LISTS_KIND, Listed
+    from magtwin.ros.bus.types import struct_in
+
+    def peer(bus: Bus, of: str) -> tuple[object, DataReader]:
+        """A node of a distribution, as its middleware announces it."""
+        store = store_of(of)
+        digest = b"" if of == "humble" else f"typehash={store.hash_rihs01(LISTS_KIND)};".encode()
+        qos = DdsQos(Policy.Reliability.Reliable(10**8), Policy.Durability.TransientLocal)
+        topic = Topic(bus._participant, LISTS, struct_in(LISTS_KIND, store))  # type: ignore[attr-defined]
+        writer = DataWriter(bus._participant, topic, qos + DdsQos(Policy.Userdata(digest)))  # type: ignore[attr-defined]
+        return writer, DataReader(bus._participant, topic, qos)  # type: ignore[attr-defined]
+
+    node, other, third = (
+        open_bus(n, backend="cyclonedds", domain=domain) for n in ("node", "other", "third")
+    )
+    node.publisher("field", FIELD, Qos())
+    writer, reader = peer(other, form)
+    heard: list[bytes] = []
+    spin(lambda: heard.extend(sample.cdr for sample in reader.take(10)) or heard, node)
+    entry = store_of(form).deserialize_cdr(heard[-1], LISTS_KIND)
+    (listed,) = entry.node_entities_info_seq
+    assert (listed.node_namespace, listed.node_name) == ("/robot", "node")
+    assert bytes(entry.gid.data)[:16] == node._participant.guid.bytes  # type: ignore[attr-defined]
+    assert [bytes(gid.data)[:16] for gid in listed.writer_gid_seq] == [w.guid.bytes for w in node._writers]  # type: ignore[attr-defined]
+    assert {len(gid.data) for gid in listed.writer_gid_seq} == {24 if form == "humble" else 16}
+    listing: Listed = node._listed  # type: ignore[attr-defined]
+    kept = peer(third, "jazzy" if form == "humble" else "humble")
+    spin(lambda: listing._writer is None, node)
+    for bus in (node, other, third):
+        bus.close()
+    del writer, kept
 
 
 @pytest.fixture(scope="module")
