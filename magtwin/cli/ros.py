@@ -340,15 +340,14 @@ def teleop(
         Bag to record the robot's topics to, as `magtwin ros record` does. Default: none.
     """
     from magtwin.cli.runs.drive import device
-    from magtwin.files import existing
     from magtwin.io.bags import RawBagWriter
     from magtwin.ros.record import Recorder
     from magtwin.ros.teleop import Teleop
     from magtwin.sim.motion.manual import HELP, Hand, Keyboard
     from magtwin.sim.motion.manual import Gamepad as Pad
 
-    if gamepad is not None:
-        existing(gamepad, "gamepad")
+    if gamepad is not None and not gamepad.is_char_device():
+        raise InputError(f"{gamepad}: not a gamepad; name one, such as /dev/input/js0")
     drive = _drive_of(asset)
     hand: Hand = Keyboard(drive) if gamepad is None else Pad(drive)
     with ExitStack() as stack:

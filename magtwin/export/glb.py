@@ -17,7 +17,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 
 from magtwin.errors import InputError
 from magtwin.usd.geometry import Shape, read_shapes
-from magtwin.usd.layers import open_stage
+from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.schema import NOUNS, attribute_name, prims_with
 from magtwin.usd.tiled_maps import is_tiled
 from magtwin.version import __version__
@@ -42,6 +42,7 @@ _COMPONENTS = {"f4": 5126, "u4": 5125, "u1": 5121}
 _VERTICES, _INDICES = 34962, 34963
 
 
+@translates
 def write_glb(stage_file: Path, out: Path) -> None:
     """Write the visible shapes of a stage.
 
@@ -59,6 +60,9 @@ def write_glb(stage_file: Path, out: Path) -> None:
     shapes = [shape for shape in read_shapes(stage) if len(shape.faces)]
     if not shapes:
         raise InputError(f"{stage_file}: has no visible surface")
+    for shape in shapes:
+        if not np.isfinite(shape.vertices).all():
+            raise InputError(f"{stage_file} <{shape.prim}>: has points or transforms that are not finite")
     homes: dict[Sdf.Path, list[Shape]] = {}  # prim of the node: the body, or a child of the default prim
     for shape in shapes:
         body = prim = stage.GetPrimAtPath(shape.prim)
@@ -117,7 +121,10 @@ class _Scene:
         prim = self.stage.GetPrimAtPath(path)
         if path == Sdf.Path.absoluteRootPath or not prim:
             return Gf.Matrix4d(1)
-        return cache.GetLocalToWorldTransform(prim).RemoveScaleShear()
+        frame = cache.GetLocalToWorldTransform(prim).RemoveScaleShear()
+        if not np.isfinite(np.array(frame)).all():
+            raise InputError(f"{path}: its transform is not finite; correct its translation or scale")
+        return frame
 
     def show(self, home: Sdf.Path, shapes: list[Shape]) -> None:
         """Add a mesh to a node, with one primitive per material."""

@@ -173,7 +173,7 @@ class Scenery:
         shapes, links = read_shapes(stage), read_links(stage)
         moving = _links_of(links, [placed.robot.name for placed in scene.robots], run)
         drive = scene.led_by(str(run.metadata["robot"])).robot.drive if scene.others else scene.robot.drive
-        self._sides = {drive.left_wheel_joint: 0, drive.right_wheel_joint: 1}
+        self._sides = drive.sides
         still = [shape for shape in shapes if shape.link not in moving]
         if not shapes:
             raise InputError(f"{scene_file}: shows nothing")

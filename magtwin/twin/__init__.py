@@ -5,6 +5,7 @@
 
 from magtwin.twin.authoring import author_scene, new_scene, scene_from_toml
 from magtwin.twin.opening import check_scene, led_by, locate, open_twin, scene_file, scene_of, twin_of
+from magtwin.twin.robot_scene import scene_with_robot
 from magtwin.twin.simulation import engine_named, path_metadata, scan, simulate, simulate_robots
 from magtwin.twin.sweeps import MIXTURE, sweep
 from magtwin.twin.twin import (
@@ -42,6 +43,7 @@ __all__ = [
     "scene_file",
     "scene_from_toml",
     "scene_of",
+    "scene_with_robot",
     "simulate",
     "simulate_robots",
     "sweep",

@@ -110,7 +110,7 @@ def _variants(prim: Usd.Prim) -> Iterator[tuple[str, Sdf.Layer]]:
 
 def _samples(prim: Usd.Prim) -> tuple[Sdf.Layer, Sdf.Path, list[float]] | None:
     """Layer, prim and time codes of an older map's epochs, read there: layer offsets would round them."""
-    for spec in prim.GetAttribute(attribute_name("anomalyMap", "valuesNt")).GetPropertyStack():
+    for spec in prim.GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack():
         if times := spec.layer.ListTimeSamplesForPath(spec.path):
             return spec.layer, spec.path.GetPrimPath(), list(times)
     return None

@@ -8,7 +8,7 @@ from pxr import Usd, UsdGeom, UsdPhysics
 from magtwin.errors import InputError
 from magtwin.report import Figure, Report
 from magtwin.usd.epochs import epochs_of
-from magtwin.usd.layers import open_stage
+from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.placement import AT_ORIGIN, labs_on, pose_of
 from magtwin.usd.scene import open_scene
 from magtwin.usd.schema import prims_with
@@ -18,6 +18,7 @@ _MANY = ("MagtwinMagneticSourceAPI", "MagtwinFurnitureAPI", "MagtwinMapTileAPI")
 """Schemas that are on many prims, so that only their number is shown."""
 
 
+@translates
 def info_of_stage(path: Path) -> Report:
     """Units, extent, bodies, joints, mass and magnetic prims of a stage."""
     stage = open_stage(path)

@@ -21,7 +21,7 @@ from magtwin.field.maps.tiles import TILED_FROM, Tile, TiledMap, Tiling
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.usd.epochs import define_epoch, each_epoch, epochs_of, selected_epoch, warn_of_time_codes
 from magtwin.usd.heat_map import MAP, Floor, define_colours, define_heat_map
-from magtwin.usd.layers import new_stage, open_stage
+from magtwin.usd.layers import new_stage, open_stage, translates
 from magtwin.usd.map_attributes import (
     CHECKSUM_VERSION,
     GRID,
@@ -116,6 +116,7 @@ def _refuse_tables(path: str | os.PathLike[str]) -> None:
         )
 
 
+@translates
 def load_map(path: str | os.PathLike[str], date: str | datetime.date | None = None) -> AnomalyMap:
     """The map of a layer, or of a stage that holds one.
 
@@ -139,6 +140,7 @@ def load_map(path: str | os.PathLike[str], date: str | datetime.date | None = No
     return at_date(_epochs(prim), day)
 
 
+@translates
 def load_epochs(path: str | os.PathLike[str]) -> tuple[AnomalyMap, ...]:
     """Every epoch of a layer's or stage's map, the earliest first.
 
@@ -156,6 +158,7 @@ def _epochs(prim: Usd.Prim) -> tuple[AnomalyMap, ...]:
     return tuple(_read(at, date) for date, at in each_epoch(prim))
 
 
+@translates
 def is_map_layer(path: str | os.PathLike[str]) -> bool:
     """Whether a USD file is a map: it holds an anomaly map and no robot.
 
@@ -168,6 +171,7 @@ def is_map_layer(path: str | os.PathLike[str]) -> bool:
     return len(prims_with(root, "anomalyMap")) == 1 and not prims_with(root, "robot")
 
 
+@translates
 def read_map(prim: Usd.Prim) -> AnomalyMap:
     """The map of a prim, at the epoch that its stage selects; errors as for `load_map`."""
     warn_of_time_codes(prim)

@@ -23,7 +23,7 @@ from magtwin.usd.epochs import select_epoch, selected_epoch
 from magtwin.usd.furniture import read_magnets
 from magtwin.usd.geometry import Link, Shape, read_links, read_shapes
 from magtwin.usd.lab import read_lab
-from magtwin.usd.layers import layer_sha256, open_stage, relative_asset, save_layer, stage_sha256
+from magtwin.usd.layers import layer_sha256, open_stage, relative_asset, save_layer, stage_sha256, translates
 from magtwin.usd.map_attributes import MADE_FROM
 from magtwin.usd.maps import read_map
 from magtwin.usd.obstacles import read_obstacles
@@ -114,6 +114,7 @@ class OpenedScene:
         return replace(self, stage=stage, scene=scene)
 
 
+@translates
 def open_scene(
     path: str | os.PathLike[str], *, lab: str = "", epoch: str = "", check_network: bool = True
 ) -> OpenedScene:
@@ -198,6 +199,7 @@ def read_scene(path: str | os.PathLike[str], **options: Any) -> Scene:
     return open_scene(path, **options).scene
 
 
+@translates
 def robots_in(path: str | os.PathLike[str], *, lab: str = "") -> dict[str, str | Path]:
     """Default path of each robot of a lab, by the robot's name, in the stage's order.
 
@@ -208,6 +210,7 @@ def robots_in(path: str | os.PathLike[str], *, lab: str = "") -> dict[str, str |
     return {prim.GetName(): read_path(prim) for prim in _robot_prims(stage)}
 
 
+@translates
 def open_alone(path: str | os.PathLike[str], robot: str, *, lab: str = "", epoch: str = "") -> Usd.Stage:
     """A stage in the axes of a lab, on which other labs and all robots but one are inactive.
 
