@@ -297,7 +297,9 @@ def test_commands_of_both_types_are_obeyed(twin: Twin, nodes: Callable[..., Bus]
         return bool(simulator.online.commands.rows[:, 1:].any())
 
     simulator.run(ended, duration_s=20.0)
-    assert simulator.online.commands.rows[-1, 1:].tolist() == [0.25, 0.0]
+    driven = simulator.online.commands.rows[:, 1:].tolist()
+    assert [0.25, 0.0] in driven
+    assert all(row in ([0.0, 0.0], [0.25, 0.0]) for row in driven)
 
 
 def test_diagnostics_say_what_they_were_given() -> None:
