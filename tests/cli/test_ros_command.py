@@ -80,8 +80,8 @@ def test_a_named_topic_that_was_not_recorded_ends_with_status_1_and_the_others_a
     publisher = node.publisher("/notes", text, LATCHED)
     publisher.publish(to_bytes(text, {"data": "once"}))
     out = tmp_path / "bag.mcap"
+    topics = ["--topic", "/notes", "--topic", "/odomm"]
     with pytest.raises(SystemExit) as ended:
-        topics = ["--topic", "/notes", "--topic", "/odomm"]
         main(["ros", "record", str(out), *topics, "--duration-s", "4", "--json"])
     node.close()
     assert ended.value.code == 1
