@@ -127,8 +127,8 @@ def localize_live(
     /initialpose.
 
     Settings have the form of ROS, name:=value: rate_hz (5), use_sim_time (false), prior (wait, global or
-    x,y,yaw; default wait), max_age_s (0.5), silent_s (0.5), tf_broadcast (true), tf_ahead_s (0.2), cloud_hz
-    (1), particles (500). docs/localize.md explains them.
+    x,y,yaw; default wait), max_age_s (0.5), stamps (header, arrival), silent_s (0.5), tf_broadcast
+    (true), tf_ahead_s (0.2), cloud_hz (1), particles (500). docs/localize.md explains them.
 
     Parameters
     ----------
