@@ -14,8 +14,7 @@ from magtwin.io.bags.topics import COMMAND, LATCHED, ODOMETRY, TF, TF_STATIC, TR
 from magtwin.io.bags.types import typestore
 from magtwin.localizing import live_problem
 from magtwin.path.occupancy import occupancy_of
-from magtwin.ros.bus import Bus, Message, open_bus
-from magtwin.ros.follow import command_bytes
+from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
 from magtwin.ros.localization.localize import PARAMETERS, LocalizerNode
 from magtwin.ros.localization.poses import ESTIMATE, POSE_KIND, read_pose
 from magtwin.ros.localization.poses import PATH as ESTIMATED_PATH
@@ -101,7 +100,7 @@ def heard(twin: Twin, node: Callable[..., Bus]) -> Heard:
     def others() -> bool:
         if simulator.online.t - sent[-1] > 0.2:
             sent.append(simulator.online.t)
-            drive.publish(command_bytes(COMMAND.kind, 0.2, 0.35, 0))
+            drive.publish(to_bytes(COMMAND.kind, {"linear": [0.2, 0.0, 0.0], "angular": [0.0, 0.0, 0.35]}))
         for each in (bus, ear):
             each.spin_once(0.0)
         return False
