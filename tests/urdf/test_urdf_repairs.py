@@ -111,6 +111,11 @@ FAULTY = {
             "range, effort and velo",
         ),
         (moving("revolute", '<limit lower="-180" upper="180" effort="0" velocity="0"/>'), 5, "of 360 rad"),
+        (
+            moving("revolute", '<limit lower="-1" upper="1" effort="0" velocity="0"/>'),
+            5,
+            "it moves within it",
+        ),
     ],
     "limit-swapped": [
         (moving("revolute", '<limit lower="1" upper="-1" effort="1" velocity="1"/>'), 5, "above its upper -1")
@@ -238,6 +243,27 @@ FAULTY = {
             "is found in the package, not beside",
         ),
         (look('<geometry><mesh filename="package:///arms/flat.stl"/></geometry>'), 2, "'package://arms/"),
+    ],
+    "drive-incomplete": [
+        (
+            f'{moving("continuous")}\n<gazebo><plugin name="diff_drive">\n<left_joint>jj</left_joint>'
+            "<right_joint>j</right_joint></plugin></gazebo>",
+            7,
+            "<left_joint>: no joint 'jj'; did you mean 'j'",
+        ),
+        (
+            f'{moving("continuous")}\n<gazebo><plugin name="diff_drive"><left_joint>j</left_joint>'
+            "</plugin></gazebo>",
+            6,
+            "the drive plugin has no <right_joint>: the drive is kept as text",
+        ),
+        (
+            f"{moving('continuous')}\n{TIP}\n{joint('continuous', name='k', child='tip')}\n"
+            '<gazebo><plugin name="diff_drive"><left_joint>j</left_joint>'
+            "<right_joint>k</right_joint></plugin></gazebo>",
+            9,
+            "a drive needs wheels on the left (y > 0) and right",
+        ),
     ],
     "package-missing": [
         (
