@@ -203,8 +203,8 @@ class Trial:
     def drive(self, wheels: list[Wheel]) -> dict:
         """Roll ahead; the distance as a share of what the wheels should turn.
 
-        Wheels without friction cannot roll: with a description's friction mu the floor moves the robot by at
-        most mu g t^2 / 2. If that is less than half of the distance, the share is that of the wheels' own turn.
+        With a description's friction mu the floor moves the robot by at most mu g t^2 / 2. If that is less
+        than half of the distance, the share is that of the wheels' own turn.
         """
         targets = self.control.joint_target_qd.numpy().copy()
         start, ahead, before = self.places()[0][:2], self.ahead(wheels), self.positions()

@@ -52,10 +52,11 @@ class Mechanism:
 def read_mechanism(description: Description, options: Options = DEFAULTS) -> Mechanism:
     """Determine which joints move.
 
-    A joint is welded if it is fixed, if its limits leave no range, or if it slides and its limits give neither
-    effort nor speed: a suspension. A joint that turns moves even so, since exporters fill in zeros. With the profile diff-drive, a prismatic
-    joint without one of the two is welded too: it stands for a suspension whose spring a URDF cannot
-    describe. A joint that follows a welded joint, or another with multiplier 0, is welded.
+    A joint is welded if it is fixed, if its limits leave no range, or if it slides and its limits give
+    neither effort nor speed: a suspension. A joint that turns moves even so, since exporters fill in zeros.
+    With the profile diff-drive, a prismatic joint without one of the two is welded too: it stands for a
+    suspension whose spring a URDF cannot describe. A joint that follows a welded joint, or another with
+    multiplier 0, is welded.
     """
     joints = {joint.name: joint for joint in description.joints.values()}
     welded = {}
