@@ -76,7 +76,7 @@ def base_of_plugin_settings(tags: Tags) -> MobileBase | None:
                     tags.description.note(f"controllers are unknown, {reason}", lost=True)
                     continue
                 tags.read(element)
-                tables = read_settings(path)
+                tables = list(read_settings(path))  # reads the file
                 try:
                     base = _first(tags, tables, path)
                 except InputError as error:
