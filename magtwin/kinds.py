@@ -35,7 +35,8 @@ TRAIN_TOML = Kind("the settings of a training", "magtwin train SET --config {fil
 TOML = Kind("a TOML", "give the file that is named there, or see --help for what takes a TOML")
 URDF = Kind(
     "a robot description",
-    "magtwin robot {file} --out FOLDER converts it; magtwin scene --robot {file} --out FOLDER puts it into a room",
+    "magtwin robot {file} --out FOLDER converts it; magtwin scene --robot {file} --out FOLDER puts it "
+    "into a room",
 )
 STAGE = Kind("a USD file", "magtwin info {file} describes it")
 SCENE_FOLDER = Kind("the folder of a scene", "magtwin run {file} drives in it; or name the stage inside")

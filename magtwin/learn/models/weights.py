@@ -117,7 +117,7 @@ def is_checkpoint(path: str | os.PathLike[str]) -> bool:
     path = existing(path, "weights file")
     if path.is_dir() and kind_of(path) is None:
         raise InputError(f"{path}: a folder; give a weights file, .safetensors or .pth")
-    wanted(path, "weights file")
+    expected(path, "weights file")
     with path.open("rb") as file:
         return file.read(4) == _ZIP or path.suffix in (".pth", ".pt")
 
