@@ -69,6 +69,7 @@ USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 ACCEPTED: dict[str, tuple[Kind, ...]] = {
     "run": (RUN, STAGE, JSON, TABLE, PATH, COMMANDS),
     "stage": (STAGE,),
+    "USD file": (STAGE,),
     "map": (STAGE, SURVEY),
     "survey": (RUN, SWEEP, READINGS, SURVEY, TABLE, COMMANDS, PATH),
     "robot description": (URDF,),
