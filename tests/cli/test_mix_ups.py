@@ -163,3 +163,48 @@ def test_an_empty_file_is_refused_as_empty(slot, files, capsys, monkeypatch, tmp
     empty.touch()
     line = refusal(capsys, slot.replace("FILE", str(empty)).split())
     assert "empty" in line
+
+
+LONG, BYTES = "n" * 300, os.fsdecode(b"b\xff\xfe")
+
+
+@pytest.mark.parametrize(
+    ("command", "text"),
+    [
+        (["new", f"{LONG}.toml"], "305 characters is too long for a file; shorten it"),
+        (["convert", "run.npz", f"{LONG}.csv"], "too long for a file; shorten it"),
+        (["run", LONG], "too long for a file; shorten it"),
+        (["scene", LONG, "--out", "new"], "too long for a file; shorten it"),
+        (["train", LONG, "--out", "new.safetensors"], "too long for a file; shorten it"),
+        (["info", f"{LONG}.usda"], "File name too long"),
+        (
+            ["info", "-x.npz"],
+            "-x.npz: begins with a dash, so it is read as an option; for a file write ./-x.npz",
+        ),
+        (["convert", "run.npz", "--out", "-y.csv"], "for a file write ./-y.csv"),
+        (["new", f"{BYTES}.toml"], "its name is not UTF-8"),
+        (["convert", "run.npz", f"{BYTES}.parquet"], "its name is not UTF-8"),
+        (["robot", "robot.urdf", "--out", BYTES], "its name is not UTF-8"),
+        (["convert", "run.npz", "page.html/new.csv"], "page.html/new.csv: cannot be written"),
+        (
+            ["convert", "run.npz", "path.csv"],
+            "path.csv: exists already; give --force to replace it, or another name",
+        ),
+        (["robot", "robot.urdf", "--out", "set"], "set: exists already; give --force"),
+        (["sweep", "lab", "--count", "1e12", "--out", "new"], "a whole number is wanted, got '1e12'"),
+        (
+            ["sweep", "lab", "--count", "1000000000000", "--out", "new"],
+            "too many for one sweep (at most 1,000,000)",
+        ),
+        (
+            ["picture", "map.usdc", "--size", "1000000x1000000", "--out", "new.png"],
+            "must lie in 16..16384 pixels",
+        ),
+    ],
+    ids=lambda value: None if isinstance(value, list) else value[:30],
+)
+def test_odd_names_and_huge_numbers_are_refused_with_the_remedy(command, text, files, capsys, monkeypatch):
+    monkeypatch.chdir(files)
+    before = sorted(os.listdir())
+    assert text in refusal(capsys, command)
+    assert sorted(os.listdir()) == before
