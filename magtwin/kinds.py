@@ -68,10 +68,10 @@ USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 
 ACCEPTED: dict[str, tuple[Kind, ...]] = {
     "run": (RUN, STAGE, JSON, TABLE, PATH, COMMANDS),
-    "stage": (STAGE,),
+    "scene": (STAGE,),
     "USD file": (STAGE,),
     "map": (STAGE, SURVEY),
-    "survey": (RUN, SWEEP, READINGS, SURVEY, TABLE, COMMANDS, PATH),
+    "source of readings": (RUN, SWEEP, READINGS, SURVEY, TABLE, COMMANDS, PATH),
     "robot description": (URDF,),
     "robot": (URDF, STAGE),
     "weights file": (WEIGHTS, CHECKPOINT),
@@ -81,7 +81,7 @@ ACCEPTED: dict[str, tuple[Kind, ...]] = {
     "suite": (SUITE_TOML, TOML),
     "settings of a robot": (ROBOT_TOML, TOML),
     "settings of a training": (TRAIN_TOML, TOML),
-    "path": (PATH, TABLE),
+    "path file": (PATH, TABLE),
     "file of commands": (COMMANDS, TABLE),
     "Tolles-Lawson model": (MODEL, JSON),
 }
@@ -91,9 +91,12 @@ _REMEDIES = {
     ("robot description", STAGE): "magtwin robot {file} --out F.urdf writes the URDF of a stage",
     ("TOML of a scene", STAGE): "magtwin run {file} drives in a scene that is authored already",
     ("TOML of a scene", URDF): "magtwin scene --robot {file} --out FOLDER puts it into a room",
-    ("survey", STAGE): "give the survey that the map was made of, or survey a scene: magtwin map survey",
+    (
+        "source of readings",
+        STAGE,
+    ): "give the survey that the map was made of, or survey a scene: magtwin map survey",
     ("data set", SWEEP): "build one first: magtwin dataset build {file} --map MAP --out SET",
-    ("stage", RUN): "give the scene; magtwin run SCENE --replay {file} repeats a run in it",
+    ("scene", RUN): "give the scene; magtwin run SCENE --replay {file} repeats a run in it",
     ("USD file", RUN): "magtwin convert {file} F.usda makes one of it; if a scene is meant, give that",
 }
 """Better remedies for single pairs of what is needed and what was given."""

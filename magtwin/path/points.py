@@ -60,7 +60,7 @@ def read_path_csv(file: str | os.PathLike[str]) -> Path:
     Raises:
         InputError: The file is missing, empty, or has a line that is not two numbers.
     """
-    file = existing_file(expected(file, "path"), "path file", "text")
+    file = existing_file(expected(file, "path file"), "path file", "text")
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:

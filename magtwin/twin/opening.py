@@ -147,7 +147,7 @@ def scene_file(scene: str | FilePath) -> FilePath:
     if inside.is_file():
         return inside
     if file.suffix or file.exists() or len(file.parts) > 1:
-        return expected(file, "stage")
+        return expected(file, "scene")
     stages = {
         stage.stem: stage for stage in shipped("scenes").glob("*/*.usda") if stage.stem == stage.parent.name
     }
@@ -365,7 +365,7 @@ def scene_of(
         InputError: The metadata name none, or it is missing.
     """
     if scene is not None:
-        return expected(scene, "stage")
+        return expected(scene, "scene")
     if "scene_file" not in run.metadata:
         raise InputError("the run does not name its scene; name it with `scene`", parameter="scene")
     place = locate(str(run.metadata["scene_file"]), near)

@@ -243,8 +243,8 @@ def _first(source: Source) -> Path:
     """The path of a source, or of the first of its joined files."""
     path = Path(source)
     if path.exists() or "+" not in str(source):
-        return expected(path, "survey")
-    return expected(Path(str(source).split("+")[0]), "survey")
+        return expected(path, "source of readings")
+    return expected(Path(str(source).split("+")[0]), "source of readings")
 
 
 def _only_unit(path: Path, columns: Columns) -> None:
