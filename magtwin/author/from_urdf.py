@@ -8,7 +8,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magtwin.files import existing, output
+from magtwin.files import output
+from magtwin.kinds import expected
 from magtwin.urdf.convert import convert_with_report
 from magtwin.urdf.options import DEFAULTS, DriveRule, Options
 from magtwin.urdf.report import ConversionReport
@@ -70,7 +71,7 @@ def from_urdf(
     Raises:
         InputError: The description or the settings are invalid, or the folder exists; nothing is written.
     """
-    urdf = existing(urdf, "URDF")
+    urdf = expected(urdf, "robot description")
     name = f"{urdf.name.lstrip('.').split('.')[0] or 'robot'}.usda"
     asset = Path(out) / name
     if settings is None:

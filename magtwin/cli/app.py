@@ -1,5 +1,6 @@
 """The application: configuration, options that every command has, warnings, errors and exit status."""
 
+import errno
 import functools
 import inspect
 import signal
@@ -71,7 +72,7 @@ def main(arguments: list[str] | None = None) -> None:
                 **_help_options(arguments),
             )
     except CycloptsError as error:
-        _fail(renamed(error, arguments) or str(error), status=2)
+        _fail(renamed(error, arguments) or _dashed(arguments) or str(error), status=2)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # `magtwin info ... | head`
@@ -82,6 +83,8 @@ def main(arguments: list[str] | None = None) -> None:
             raise
         if isinstance(error, InputError):
             _fail(error.in_flags(_flags))
+        if text := _wrong_name(error, arguments):
+            _fail(text)
         if isinstance(error, OSError | MemoryError):
             _fail(f"{error} ({type(error).__name__})")
         _fail(f"a fault in magtwin, {type(error).__name__}: {error}; please report it, with --debug")
@@ -101,6 +104,26 @@ def _allowed(arguments: list[str]) -> tuple[list[str], list[str]]:
     if "" in folders:
         _fail("--allow wants a folder: --allow DIR", status=2)
     return others, folders
+
+
+def _dashed(arguments: list[str]) -> str:
+    """The refusal of a file whose name begins with a dash and was read as an option; "" if there is none."""
+    for word in arguments:
+        if word.startswith("-") and "=" not in word and "." in word and not word[1:2].isdigit():
+            return f"{word}: begins with a dash, so it is read as an option; for a file write ./{word}"
+    return ""
+
+
+def _wrong_name(error: Exception, arguments: list[str]) -> str:
+    """The refusal of a file whose name is too long or is not UTF-8; "" if the error is another one."""
+    if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+        name = str(error.filename)
+        return f"{name[:60]}...: its name of {len(name)} characters is too long for a file; shorten it"
+    if isinstance(error, UnicodeEncodeError):
+        for word in arguments:
+            if any("\udc80" <= letter <= "\udcff" for letter in word):
+                return f"{word}: its name is not UTF-8, and the file format stores names as UTF-8; rename it"
+    return ""
 
 
 def share_options(group: App = app) -> None:
@@ -168,7 +191,7 @@ def _warnings_in_lines() -> Iterator[None]:
                 show(message, category, *where, **more)
             elif str(message) not in printed:
                 printed.add(str(message))
-                print_error(f"warning: {message}", style="1;33")
+                print_error(f"warning: {InputError(str(message)).in_flags(_flags)}", style="1;33")
 
         warnings.showwarning = line
         yield

@@ -41,6 +41,20 @@ MIXTURE = ("sine", "lawnmower", "figure8", "continuous_cycle", "random")
 """Paths that a sweep drives by default. A model trained on one kind of path fails on the others."""
 
 
+MOST_RUNS = 1_000_000
+"""Largest number of runs of one sweep; their seeds and jobs are held in memory."""
+
+
+def check_count(count: int) -> None:
+    """Refuse more runs than one sweep makes."""
+    if count > MOST_RUNS:
+        raise InputError(
+            f"{count:,} runs are too many for one sweep (at most {MOST_RUNS:,}); make several, each with "
+            "another `seed`",
+            parameter="count",
+        )
+
+
 def sweep(
     twin: Twin | Scene | str | FilePath,
     paths: "Path | Commands | Run | str | FilePath | ArrayLike | Iterable[Any] | None" = None,
@@ -118,6 +132,7 @@ def sweep(
     if isinstance(seeds, int | np.integer):
         if isinstance(seeds, bool) or seeds < 1:
             raise InputError(f"seeds must be at least one run, got {seeds}")
+        check_count(int(seeds))
         seeds = range(first, first + int(seeds))
     numbers = [checked_seed(number) for number in seeds]
     count = len(numbers)

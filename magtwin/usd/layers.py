@@ -16,6 +16,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 from magtwin.budget import check_depth
 from magtwin.errors import InputError
 from magtwin.files import existing, existing_file, output, sha256
+from magtwin.kinds import USD_SUFFIXES, kind_of, refused
 from magtwin.usd.schema.versions import creator, is_upgraded, upgrade_stage
 from magtwin.usd.trial import try_stage
 
@@ -137,8 +138,15 @@ def check_stage(path: str | os.PathLike[str], *, composed: bool = True) -> Path:
     path = existing(path, "USD file")
     if path.is_dir():
         raise InputError(f"{path}: a folder; give a USD file in it")
+    if path.suffix not in USD_SUFFIXES:
+        if kind := kind_of(path):
+            raise refused(path, kind, "USD file")
+        raise InputError(f"{path}: no USD file; its name must end in {', '.join(USD_SUFFIXES)}")
     with path.open("rb") as file:
-        binary = file.read(8) == b"PXR-USDC" or path.suffix == ".usdz"
+        head = file.read(8)
+        binary = head == b"PXR-USDC" or path.suffix == ".usdz"
+    if not head:
+        raise InputError(f"{path}: is empty (0 bytes); make or copy it again")
     existing_file(path, "USD file", "USD" if binary else "USD text")
     if not binary:
         _check_nesting(path)

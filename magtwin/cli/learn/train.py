@@ -7,6 +7,7 @@ from magtwin.cli.app import app
 from magtwin.cli.options import Flag, Force, Names, Whole
 from magtwin.cli.terminal import Done, check_suffix, progress
 from magtwin.errors import InputError
+from magtwin.kinds import SWEEP, kind_of
 
 if TYPE_CHECKING:
     from magtwin.learn.models.descent import Epoch
@@ -112,7 +113,7 @@ def train(
     from magtwin.learn.training.train import train as train_model
 
     check_suffix(out, (".safetensors",), "a network")
-    if dataset.is_dir() and not (dataset / "dataset.json").exists():
+    if dataset.is_dir() and kind_of(dataset) in (None, SWEEP):
         build = f"magtwin dataset build {dataset} --map MAP --out SET"
         raise InputError(f"{dataset}: is no data set; build one from the runs first: {build}")
     picture, table = (out.with_suffix(end) for end in (".png", ".csv"))
