@@ -44,8 +44,8 @@ ALIASES = {
 }
 """Options of the command line whose parameter has another name in Python."""
 
-_flags: dict[str, str] = {}
-"""Flag of each parameter of the command that is running."""
+_running: list[App] = []
+"""The command that is running."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None) -> None:
     signal.signal(
         signal.SIGTERM, lambda *_: sys.exit(143)
     )  # an exception, so that partial outputs are removed
-    _flags.clear()
+    _running.clear()
     try:
         with watched(), _warnings_in_lines():
             app(
@@ -76,7 +76,7 @@ def main(arguments: list[str] | None = None) -> None:
         if debug:
             raise
         if isinstance(error, InputError):
-            _fail(error.in_flags(_flags))
+            _fail(error.in_flags(_flags()))
         if isinstance(error, OSError | MemoryError):
             _fail(f"{error} ({type(error).__name__})")
         _fail(f"a fault in magtwin, {type(error).__name__}: {error}; please report it, with --debug")
@@ -98,10 +98,7 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
 
     @functools.wraps(function)
     def wrapped(*args: Any, json: bool = False, quiet: bool = False, **options: Any) -> None:
-        for argument in command.assemble_argument_collection(parse_docstring=False):
-            if argument.name.startswith("--"):
-                _flags[argument.name.removeprefix("--").replace("-", "_")] = argument.name
-        _flags.update({name: _flags[key] for name, key in ALIASES.items() if key in _flags})
+        _running[:] = [command]
         with output_mode(as_json=json, quiet=quiet):
             done = function(*args, **options)
             if isinstance(done, Done):
@@ -118,6 +115,16 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
     wrapped.shares_options = True  # type: ignore[attr-defined]
     wrapped.__annotations__ = {**function.__annotations__, **added}
     return wrapped
+
+
+def _flags() -> dict[str, str]:
+    """Flag of each parameter of the command that is running; assembled for an error only, as it takes long."""
+    flags = {}
+    for command in _running:
+        for argument in command.assemble_argument_collection(parse_docstring=False):
+            if argument.name.startswith("--"):
+                flags[argument.name.removeprefix("--").replace("-", "_")] = argument.name
+    return flags | {name: flags[key] for name, key in ALIASES.items() if key in flags}
 
 
 def _help_options(arguments: list[str]) -> dict[str, Any]:
