@@ -118,7 +118,7 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
 
 
 def _flags() -> dict[str, str]:
-    """Flag of each parameter of the command that is running; assembled for an error only, as it takes long."""
+    """Flag of each parameter of the command that is running, assembled only for an error: it takes long."""
     flags = {}
     for command in _running:
         for argument in command.assemble_argument_collection(parse_docstring=False):

@@ -69,17 +69,21 @@ def describe_stage(stage: Usd.Stage, documentation: str) -> None:
     layer.customLayerData = creator()
 
 
-def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
+def open_stage(path: str | os.PathLike[str], *, own: bool = False) -> Usd.Stage:
     """Open the stage of a USD file, reloaded from disk.
 
     Layers of an older version of the schema get its names of today in memory, with a warning.
+
+    Args:
+        path: The file.
+        own: Whether this process has just written it; then it is not tried in another process first.
 
     Raises:
         InputError: The file is missing or not USD, or a sublayer or reference is missing; the text has USD's
             own message. Or a layer has changes in this process that are not saved, which would be lost; or is
             of a later version of the schema.
     """
-    path = _checked(path)
+    path = _checked(path, own=own)
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
     try:
         with translated(path, "cannot be opened as USD"):
@@ -123,8 +127,8 @@ _NESTED = 1 << 24
 """Bytes of text whose nesting is counted at once."""
 
 
-def _checked(path: str | os.PathLike[str]) -> Path:
-    """A USD file that this process may open: regular, within the budget, and tried in another process."""
+def _checked(path: str | os.PathLike[str], *, own: bool = False) -> Path:
+    """A USD file that this process may open: regular, within the budget, and tried or its `own`."""
     path = existing(path, "USD file")
     if path.is_dir():
         raise InputError(f"{path}: a folder; give a USD file in it")
@@ -133,7 +137,8 @@ def _checked(path: str | os.PathLike[str]) -> Path:
     existing_file(path, "USD file", "USD" if binary else "USD text")
     if not binary:
         _check_nesting(path)
-    try_stage(path)
+    if not own:
+        try_stage(path)
     return path
 
 

@@ -20,6 +20,7 @@ from magtwin.run.run import COLUMNS, Column, Run
 from magtwin.spec.robot import PlacedRobot
 from magtwin.twin import open_twin, simulate
 from magtwin.usd import trial
+from magtwin.usd.layers import open_stage
 from magtwin.usd.animation import is_animation, read_animation, write_animation
 from magtwin.usd.geometry import read_links
 
@@ -268,6 +269,7 @@ def test_bytes_that_end_the_process_of_usds_own_reader_are_refused_in_a_line(pla
     monkeypatch.setattr(trial, "_TRIAL", trial._Trial())
     with pytest.raises(InputError, match="damaged: USD crashes on it"):
         read_animation(played)
+    assert open_stage(played, own=True).GetRootLayer().realPath == str(played.resolve())
 
 
 @pytest.mark.parametrize(
