@@ -20,9 +20,9 @@ from magtwin.run.run import COLUMNS, Column, Run
 from magtwin.spec.robot import PlacedRobot
 from magtwin.twin import open_twin, simulate
 from magtwin.usd import trial
-from magtwin.usd.layers import open_stage
 from magtwin.usd.animation import is_animation, read_animation, write_animation
 from magtwin.usd.geometry import read_links
+from magtwin.usd.layers import open_stage
 
 MAGNETOMETER = "/World/turtlebot4/magnetometer_link/magnetometer"
 
