@@ -127,6 +127,9 @@ def Xform "Building"
 magtwin run building.usda --lab /Building/LabB
 ```
 
+Here `lab/` is in the folder of `building.usda`. A stage may name files in its own folder; `--allow DIR` allows another folder:
+`magtwin run building.usda --lab /Building/LabB --allow ../labs` ([SECURITY.md](../SECURITY.md)).
+
 * **Readings** of a moved and turned lab equal those of the lab at the origin, to the byte. Poses and fields
   are in the lab's axes. The run's metadata keep the lab's path (`lab`, on a stage of several labs) and its
   x, y, z [m] and yaw [rad] on the stage (`lab_pose`).

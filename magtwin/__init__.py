@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from magtwin.field.maps.map import AnomalyMap as AnomalyMap
     from magtwin.field.survey.readings import Readings as Readings
     from magtwin.figures.plot import plot as plot
+    from magtwin.folders import allow as allow
     from magtwin.io.formats import read_run, write_run
     from magtwin.io.provenance import repeat_of
     from magtwin.io.surveys.survey import read_survey as read_survey
@@ -66,6 +67,7 @@ _NAMES = {
     "Run": "run.run",
     "Scene": "spec.scene",
     "Twin": "twin",
+    "allow": "folders",
     "author_scene": "twin",
     "benchmark": "bench.runner",
     "build_dataset": "learning",

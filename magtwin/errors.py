@@ -1,14 +1,16 @@
 """Refusals of wrong input, and look-ups by name."""
 
+import ast
 import difflib
 import re
+import shlex
 from collections.abc import Iterable, Mapping
 from typing import TypeVar
 
 T = TypeVar("T")
 
-_PARAMETER = re.compile(r"`([a-z_][a-z0-9_]*)(?:=([^`]*))?`")
-"""A parameter in the text of a refusal: `force=True`, `map_layer`."""
+_PARAMETER = re.compile(r"`(?:magtwin\.)?([a-z_][a-z0-9_]*)(?:=([^`]*)|\(([^`]*)\))?`")
+"""A parameter in the text of a refusal: `force=True`, `map_layer`, `magtwin.allow('folder')`."""
 
 
 class InputError(ValueError):
@@ -37,9 +39,12 @@ class InputError(ValueError):
         """
 
         def flag(match: re.Match[str]) -> str:
-            name, value = match.groups()
+            name, value, arguments = match.groups()
             if name not in flags:
                 return match.group()
+            if arguments is not None:
+                texts = ast.literal_eval(f"({arguments},)")
+                return " ".join(f"{flags[name]} {shlex.quote(text)}" for text in texts)
             value = (value or "").strip("\"'")
             return f"{flags[name]} {value}" if value not in ("", "True") else flags[name]
 

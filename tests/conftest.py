@@ -1,5 +1,6 @@
 """What tests share: the real data beside the checkout, and the default lab, authored once."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,15 @@ def isaac_rules(real_data: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         pytest.skip(f"Isaac Sim's rules are not at {folder}; `magtwin fetch isaac-rules` gets them")
     monkeypatch.setenv("MAGTWIN_ISAACSIM", str(folder))
     return folder
+
+
+@pytest.fixture
+def allow_neighbours(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Lets stages name files in the folders of other tests, such as the lab that is authored once."""
+    from magtwin.folders import allow
+
+    with allow(tmp_path_factory.getbasetemp()):
+        yield
 
 
 @pytest.fixture(scope="session")

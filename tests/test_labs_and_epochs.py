@@ -87,6 +87,7 @@ def test_a_twin_reads_the_epoch_that_is_named_or_else_the_one_that_the_stage_sel
     assert_array_equal(map_of(runs[0]).values_nt, maps[0].values_nt)
 
 
+@pytest.mark.usefixtures("allow_neighbours")
 def test_what_a_stage_selects_is_what_it_reads(building, maps, tmp_path):
     stage = Usd.Stage.CreateNew(str(tmp_path / "before.usda"))
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)

@@ -209,7 +209,8 @@ def _copied_asset(asset: Path, folder: Path) -> Path:
         raise InputError(f"{asset}: names {outside[0]}, outside its folder; copy it into {asset.parent}")
     common = Path(os.path.commonpath([file.parent for file in files]))
     picture = asset.parent / THUMBNAILS / f"{asset.name}.png"
-    for file in (*files, *([picture] if picture.is_file() else [])):
+    shown = picture.is_file() and picture.resolve().is_relative_to(asset.parent)  # no link out of the folder
+    for file in (*files, *([picture] if shown else [])):
         _copied(file, (folder / file.relative_to(common)).parent)
     if (urdf := urdf_of(asset)) is not None:
         _copied(urdf, (folder / asset.relative_to(common)).parent)

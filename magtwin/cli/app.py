@@ -18,6 +18,7 @@ from magtwin.cli.progress import watched
 from magtwin.cli.renamed import renamed
 from magtwin.cli.terminal import Done, output_mode, print_error
 from magtwin.errors import CalibrationWarning, InputError, MismatchWarning
+from magtwin.folders import allow
 from magtwin.version import __version__
 
 app = App(
@@ -28,7 +29,9 @@ app = App(
     config=[Env("MAGTWIN_", show=False), Toml("magtwin.toml", search_parents=False)],
     default_parameter=Parameter(negative_iterable="", negative_none=""),
     help_epilogue="Options can also be set in the environment (MAGTWIN_RUN_SEED=1) and in magtwin.toml. "
-    "Exit status: 0 done, 1 an input was refused, 2 wrong usage. --debug shows the traceback of a refusal.",
+    "Exit status: 0 done, 1 an input was refused, 2 wrong usage. Each command also takes --debug, which "
+    "shows the traceback of a refusal, and --allow DIR, which lets stages name files in that folder, beside "
+    "their own and magtwin's; it can be repeated.",
 )
 
 HELP = {"--help", "-h"}
@@ -57,9 +60,10 @@ def main(arguments: list[str] | None = None) -> None:
     )  # an exception, so that partial outputs are removed
     _running.clear()
     try:
-        with watched(), _warnings_in_lines():
+        arguments, folders = _allowed([a for a in arguments if a != "--debug"])
+        with watched(), _warnings_in_lines(), allow(*folders):
             app(
-                [a for a in arguments if a != "--debug"],
+                arguments,
                 exit_on_error=False,
                 print_error=False,
                 result_action="return_value",
@@ -80,6 +84,22 @@ def main(arguments: list[str] | None = None) -> None:
         if isinstance(error, OSError | MemoryError):
             _fail(f"{error} ({type(error).__name__})")
         _fail(f"a fault in magtwin, {type(error).__name__}: {error}; please report it, with --debug")
+
+
+def _allowed(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """The arguments without --allow DIR, and the folders. No magtwin.toml can allow any."""
+    others, folders = list[str](), list[str]()
+    words = iter(arguments)
+    for word in words:
+        if word == "--allow":
+            folders.append(next(words, ""))
+        elif word.startswith("--allow="):
+            folders.append(word.partition("=")[2])
+        else:
+            others.append(word)
+    if "" in folders:
+        _fail("--allow wants a folder: --allow DIR", status=2)
+    return others, folders
 
 
 def share_options(group: App = app) -> None:
@@ -119,7 +139,7 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
 
 def _flags() -> dict[str, str]:
     """Flag of each parameter of the command that is running, assembled only for an error: it takes long."""
-    flags = {}
+    flags = {"allow": "--allow"}
     for command in _running:
         for argument in command.assemble_argument_collection(parse_docstring=False):
             if argument.name.startswith("--"):

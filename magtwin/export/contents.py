@@ -192,8 +192,9 @@ def _copy_layer(file: Path, layer: Sdf.Layer, folder: Path, places: Mapping[Path
     else:
         copied(file, folder / place)
     picture = THUMBNAIL / f"{file.name}.png"
-    if (file.parent / picture).is_file():
-        copied(file.parent / picture, folder / place.parent / picture)
+    found = (file.parent / picture).resolve()
+    if found.is_file() and found.is_relative_to(file.parent):  # no link out of the layer's folder
+        copied(found, folder / place.parent / picture)
 
 
 def _udim(pattern: Path, places: Mapping[Path, Path]) -> Path | None:

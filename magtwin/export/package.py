@@ -25,6 +25,7 @@ from magtwin.export.structure import structure
 from magtwin.export.usdz import pack, unpack
 from magtwin.export.validation.inspection import inspect
 from magtwin.files import check_free, existing, output, sha256
+from magtwin.folders import allow
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run
 from magtwin.summary import in_markdown, printable
@@ -152,9 +153,10 @@ def export_scene(
     for target in filter(None, (out, beside)):
         if target.resolve() in (scene_file.resolve(), *scene_file.resolve().parents):
             raise InputError(f"{target}: is or contains the exported stage; give another output")
-    with TemporaryDirectory() as scratch, _renamed(Path(scratch, "stage"), scene_file):
+    with TemporaryDirectory() as scratch, _renamed(Path(scratch, "stage"), scene_file), ExitStack() as own:
         work = _Work(Path(scratch, "stage"), scene_file, name, progress)
         work.gather(trusted=trusted)
+        own.enter_context(allow(work.folder))  # which flattened layers beside it name
         work.check()
         if to_onnx is not None and name != "viewer":
             work.onnx_of(to_onnx)

@@ -80,10 +80,11 @@ def open_stage(path: str | os.PathLike[str], *, own: bool = False) -> Usd.Stage:
 
     Raises:
         InputError: The file is missing or not USD, or a sublayer or reference is missing; the text has USD's
-            own message. Or a layer has changes in this process that are not saved, which would be lost; or is
-            of a later version of the schema.
+            own message. It names a file outside its folder that is not allowed (`check_stage`). Or a layer
+            has changes in this process that are not saved, which would be lost; or is of a later version of
+            the schema.
     """
-    path = _checked(path, own=own)
+    path = check_stage(path, own=own)
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
     try:
         with translated(path, "cannot be opened as USD"):
@@ -115,7 +116,7 @@ def open_layer(path: str | os.PathLike[str]) -> Sdf.Layer:
     Raises:
         InputError: The file is missing or not USD; the text has USD's own message.
     """
-    path = _checked(path)
+    path = check_stage(path, composed=False)
     with translated(path, "cannot be opened as USD"):
         layer = Sdf.Layer.OpenAsAnonymous(str(path))
     if layer is None:
@@ -127,8 +128,17 @@ _NESTED = 1 << 24
 """Bytes of text whose nesting is counted at once."""
 
 
-def _checked(path: str | os.PathLike[str], *, own: bool = False) -> Path:
-    """A USD file that this process may open: regular, within the budget, and tried or its `own`."""
+def check_stage(path: str | os.PathLike[str], *, composed: bool = True, own: bool = False) -> Path:
+    """A USD file that this process may open. Every file that a user names passes through here.
+
+    Args:
+        path: The file.
+        composed: Whether the files that it names will be opened too.
+        own: Whether this process has just written it; then it is not tried.
+
+    Raises:
+        InputError: It is missing, no regular file, or larger than the budget; or as for `try_stage`.
+    """
     path = existing(path, "USD file")
     if path.is_dir():
         raise InputError(f"{path}: a folder; give a USD file in it")
@@ -138,7 +148,7 @@ def _checked(path: str | os.PathLike[str], *, own: bool = False) -> Path:
     if not binary:
         _check_nesting(path)
     if not own:
-        try_stage(path)
+        try_stage(path, composed=composed)
     return path
 
 
@@ -233,6 +243,7 @@ def layer_sha256(path: str | os.PathLike[str]) -> str:
     with path.open("rb") as file:
         crate = file.read(8) == b"PXR-USDC"
     if crate and path.stat().st_size > TILED_BYTES:
+        check_stage(path, composed=False)
         layer = Sdf.Layer.OpenAsAnonymous(str(path))
         prim = layer.GetPrimAtPath(TILED_MAP)
         if prim and f"{MAP_PREFIX}tileCells" in prim.attributes:
@@ -250,7 +261,7 @@ def stage_sha256(path: str | os.PathLike[str]) -> str:
     Raises:
         InputError: No such file, or it or a layer that it names is not USD.
     """
-    return _content_sha256(existing(path, "USD file").resolve(), ())
+    return _content_sha256(check_stage(path).resolve(), ())
 
 
 def _content_sha256(file: Path, above: tuple[Path, ...]) -> str:

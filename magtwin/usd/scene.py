@@ -44,6 +44,7 @@ from magtwin.usd.robot import read_robot
 from magtwin.usd.schema import NOUNS, attribute_name, only_prim_with, place, prims_with, require_api
 from magtwin.usd.sensors import MAP_CHECKSUM, MAP_RELATIONSHIP, read_path
 from magtwin.usd.sources import read_transform
+from magtwin.usd.trial import folders_of
 from magtwin.usd.units import check_units
 
 LEVEL_M = 1e-3
@@ -347,7 +348,7 @@ def use_map(opened: OpenedScene, map_layer: str | os.PathLike[str], *, dry: bool
 
     Raises:
         InputError: The old map is no sublayer of this stage: it comes from another stage by reference, or is
-            part of the root layer.
+            part of the root layer. Or the new map is outside the stage's folder.
     """
     stage, map_layer = opened.stage, Path(map_layer)
     old = opened.scene.map_layer
@@ -361,6 +362,12 @@ def use_map(opened: OpenedScene, map_layer: str | os.PathLike[str], *, dry: bool
         raise InputError(
             f"{opened.file}: the map {old} is no sublayer of this stage, so it cannot be replaced here; "
             "survey the stage that has it as a sublayer",
+            parameter="adopt",
+        )
+    if not any(map_layer.resolve().is_relative_to(folder) for folder in folders_of(opened.file)):
+        raise InputError(
+            f"{map_layer}: is not in the folder of {opened.file}, so the stage may not name it; write the "
+            f"map into {opened.file.resolve().parent}",
             parameter="adopt",
         )
     if dry:

@@ -1,8 +1,10 @@
 """Trial: a stage is opened in a process of its own first, as a damaged or malicious one can end its reader.
 
 OpenUSD's readers can crash, loop, or fill the memory on a damaged .usdc, on deeply nested dictionaries, and
-on references that multiply each other. A child process, which lives as long as this one, opens each file
-before this process does, within limits of memory and time. It costs one start, then milliseconds a stage.
+on references that multiply each other. A stage can also name any file of the machine. A child process, which
+lives as long as this one, opens each file before this process does, within limits of memory and time, and
+refuses names out of the stage's folder. It costs one start, then milliseconds a stage. Stages that ship with
+magtwin are not tried.
 """
 
 import atexit
@@ -18,92 +20,19 @@ from typing import Any
 from magtwin.budget import BUDGETS, SPARE, allowed
 from magtwin.errors import InputError
 from magtwin.files import shipped
+from magtwin.folders import allowed_folders
 
 VALUES = 16_000_000
 """Bytes of a layer up to which its values are tried too."""
 
-_PROGRAM = """
-import json, os, sys
+PROGRAM = Path(__file__).with_name("trial_process.py")
+"""What the child runs."""
 
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None
-os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-from pxr import Sdf, Usd
+SHIPPED = ("maps", "robots", "scenes", "weights")
+"""Folders that ship with magtwin: trusted as its code is."""
 
-def sizes():
-    with open("/proc/self/statm") as file:
-        return int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-
-def limit(room):
-    if resource is not None and os.path.exists("/proc/self/statm"):
-        hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-        resource.setrlimit(resource.RLIMIT_AS, (sizes() + room, hard))
-
-def values(layer):
-    def read(path):
-        if path.IsPropertyPath():
-            spec = layer.GetObjectAtPath(path)
-            spec.GetInfo("default"), spec.GetInfo("timeSamples")
-    layer.Traverse("/", read)
-
-def text(error):
-    said = getattr(error.args[0], "commentary", None) if error.args else None
-    return " ".join(str(said or error).split())
-
-def special(file):
-    return os.path.exists(file) and not os.path.isfile(file) and not os.path.isdir(file)
-
-def layers(root, room, most_values):
-    pending, seen = [root], {}
-    while pending:
-        file = pending.pop()
-        if special(file):
-            raise Refused("names " + file + ", which is no regular file")
-        if file in seen or not os.path.isfile(file):
-            continue
-        size = os.stat(file).st_size
-        room += 4 * size
-        limit(room)
-        with open(file, "rb") as head:
-            crate = head.read(8) == b"PXR-USDC"
-        try:
-            layer = seen[file] = Sdf.Layer.FindOrOpen(file)
-            if layer is None:
-                continue
-            if crate and size <= most_values:
-                values(layer)
-        except Exception as error:
-            if crate:
-                raise Refused("cannot be opened as USD: " + text(error)) from error
-            continue  # raised again, with its text, where it is opened
-        for asset in layer.GetCompositionAssetDependencies():
-            if asset:
-                pending.append(os.path.realpath(layer.ComputeAbsolutePath(asset)))
-    return seen
-
-class Refused(Exception):
-    pass
-
-for line in sys.stdin:
-    job, answer = json.loads(line), ""
-    held = stage = None
-    try:
-        held = layers(job["file"], job["room"], job["values"])
-        stage = Usd.Stage.Open(job["file"])
-    except MemoryError:
-        answer = "memory"
-    except Refused as error:
-        memory = isinstance(error.__cause__, MemoryError) or "bad_alloc" in str(error)
-        answer = "memory" if memory else str(error)
-    except Exception:
-        pass  # raised again, with its text, where it is opened
-    held = stage = None
-    print(json.dumps(answer), flush=True)
-"""
-
-Key = tuple[int, int, int, int]
+Stamp = tuple[int, int, int, int, int]
+"""Device, number, size and times of change of a file."""
 
 
 class _Trial:
@@ -113,32 +42,41 @@ class _Trial:
         self._child: subprocess.Popen[str] | None = None
         self._owner = 0
         self._lock = threading.Lock()
-        self._passed: set[Key] = set()
+        self._passed: dict[tuple[object, ...], dict[str, Stamp | None]] = {}
 
-    def check(self, path: Path) -> None:
+    def check(self, path: Path, *, composed: bool) -> None:
         """As `try_stage`."""
-        about = path.stat()
-        key = (about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns)
+        file = str(path.absolute())
+        inside = folders_of(path)
+        key = (file, composed, *inside)
         with self._lock:
             if self._owner != os.getpid():
                 self._child, self._owner = None, os.getpid()
-            if key in self._passed:
+            before = self._passed.get(key)
+            if before is not None and all(_stamp(name) == stamp for name, stamp in before.items()):
                 return
-            self._ask(path, about.st_size)
-            self._passed.add(key)
+            job = {
+                "file": file,
+                "folder": _working_folder(),
+                "inside": inside,
+                "composed": composed,
+                "room": max(SPARE, allowed()),
+                "values": VALUES,
+            }
+            self._passed[key] = self._ask(path, job)
 
-    def _ask(self, path: Path, size: int) -> None:
+    def _ask(self, path: Path, job: dict[str, Any]) -> dict[str, Stamp | None]:
+        """Let the child do a job; returns the files that it opened."""
+        patience = BUDGETS["USD"].seconds + path.stat().st_size / 1e6
         for attempt in range(2):
             child = self._started()
             assert child.stdin is not None
             assert child.stdout is not None
-            job = {"file": str(path.resolve()), "room": max(SPARE, allowed()), "values": VALUES}
-            patience = BUDGETS["USD"].seconds + size / 1e6
             late = threading.Event()
             timer = threading.Timer(patience, _too_late, (child, late))
             timer.start()
             try:
-                child.stdin.write(json.dumps(job) + "\n")
+                child.stdin.write(json.dumps(job | {"seconds": patience}) + "\n")
                 child.stdin.flush()
                 answer = child.stdout.readline()
             except BrokenPipeError:
@@ -156,20 +94,23 @@ class _Trial:
             if attempt:  # alone in a fresh process
                 raise InputError(f"{path}: damaged: USD crashes on it; copy it, or write it again")
         said = json.loads(answer)
-        if said == "memory":
+        if "memory" in said:
             self.stop()
             raise InputError(
                 f"{path}: damaged, or its contents need over {max(SPARE, allowed()) / 1e9:g} GB and 4 times "
                 "the size of its files; copy it again, or set MAGTWIN_ALLOW_GB"
             )
-        if said:
-            raise InputError(f"{path}: {said}")
+        if "refused" in said:
+            raise InputError(f"{path}: {said['refused']}")
+        if said["outside"]:
+            raise InputError(_outside(path, said["outside"]), parameter="allow")
+        return {name: _stamp(name) for name in said["files"]}
 
     def _started(self) -> "subprocess.Popen[str]":
         if self._child is None or self._child.poll() is not None:
             # None of Python's settings of this process: they may print, or import from the working folder.
             options: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-            self._child = subprocess.Popen([sys.executable, "-P", "-c", _PROGRAM], **options)
+            self._child = subprocess.Popen([sys.executable, "-P", str(PROGRAM)], **options)
         return self._child
 
     def stop(self) -> None:
@@ -190,16 +131,57 @@ def _too_late(child: "subprocess.Popen[str]", late: threading.Event) -> None:
     child.kill()
 
 
+def _working_folder() -> str:
+    """The working folder; "/" if it was removed."""
+    try:
+        return str(Path.cwd())
+    except FileNotFoundError:
+        return Path(sys.executable).anchor
+
+
+def _stamp(file: str) -> Stamp | None:
+    """What changes if a file does; None if there is none."""
+    try:
+        about = Path(file).stat()
+    except OSError:
+        return None
+    return about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns
+
+
+def _outside(path: Path, names: list[dict[str, str]]) -> str:
+    """The refusal of a stage that names files out of its folder."""
+    first, others = names[0], len({name["file"] for name in names}) - 1
+    where = first["where"].removeprefix(str(path.absolute())).strip()
+    folders = sorted({name["folder"] for name in names})
+    least = [f for f in folders if not any(f != g and Path(f).is_relative_to(g) for g in folders)]
+    call = ", ".join(map(repr, least))
+    more = f", and {others} more" if others else ""
+    return (
+        f"{path}: {f'{where} ' if where else ''}names {first['asset']}{more}, outside the stage's folder; if "
+        f"you trust the stage, give `magtwin.allow({call})`"
+    )
+
+
+def folders_of(stage: Path) -> list[str]:
+    """Folders in which a stage may name files: its own, those shipped with magtwin, and allowed ones."""
+    return [str(stage.resolve().parent), *(str(shipped(name)) for name in SHIPPED), *allowed_folders()]
+
+
 _TRIAL = _Trial()
 atexit.register(_TRIAL.stop)
 
 
-def try_stage(path: Path) -> None:
-    """Open a stage in another process; a file that has not changed is tried once.
+def try_stage(path: Path, *, composed: bool = True) -> None:
+    """Open a stage in another process, and check the files that it names; unchanged files are tried once.
+
+    Args:
+        path: A regular file.
+        composed: Whether the stage will be composed. Otherwise its root layer alone is opened.
 
     Raises:
-        InputError: USD crashes on it, does not end, or takes more memory than the budget; or it names a pipe
-            or device as a layer.
+        InputError: USD crashes on it, does not end, or takes more memory than the budget. Or it names a file
+            that is not in its folder, in those of `magtwin.folders.allow`, or shipped with magtwin; an
+            address in the network; or a pipe or device as a layer.
     """
-    if not any(path.resolve().is_relative_to(shipped(name)) for name in ("maps", "robots", "scenes")):
-        _TRIAL.check(path)
+    if not any(path.resolve().is_relative_to(shipped(name)) for name in SHIPPED):
+        _TRIAL.check(path, composed=composed)

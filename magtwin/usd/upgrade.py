@@ -8,7 +8,7 @@ from pxr import Sdf, Tf, UsdUtils
 
 from magtwin.errors import InputError
 from magtwin.files import existing, output
-from magtwin.usd.layers import export_like, layer_sha256
+from magtwin.usd.layers import check_stage, export_like, layer_sha256
 from magtwin.usd.schema.versions import stamp, upgrade_layer
 from magtwin.usd.sensors import MAP_CHECKSUM
 
@@ -35,6 +35,7 @@ def upgrade(path: str | os.PathLike[str]) -> list[Path]:
             f"{path}: files inside a package cannot be rewritten; `magtwin export {path.name} --out DIR` "
             "unpacks and upgrades it"
         )
+    check_stage(path)
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
     try:
         layers = [layer for layer in UsdUtils.ComputeAllDependencies(str(path))[0] if layer.realPath]

@@ -36,6 +36,8 @@ from magtwin.usd.layers import new_stage
 from magtwin.usd.maps import save_map
 from magtwin.usd.scene import open_alone, read_scene, robots_in
 
+pytestmark = pytest.mark.usefixtures("allow_neighbours")  # scenes by reference
+
 EARTH = EarthFieldSpec(
     b_world_nt=(-2_000.5, 23_000.25, -39_000.125),
     latitude_deg=29.6,

@@ -11,6 +11,8 @@ from magtwin.spec.robot import PlacedRobot
 from magtwin.twin import scene_from_toml
 from magtwin.usd.scene import read_scene
 
+pytestmark = pytest.mark.usefixtures("allow_neighbours")  # scenes by reference
+
 DERIVED = (
     "base_height_m",
     "p_base_magnetometer",

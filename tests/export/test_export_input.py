@@ -17,6 +17,7 @@ from magtwin.export.package import export_scene
 from magtwin.export.structure import structure
 from magtwin.export.usdz import pack, unpack
 from magtwin.files import sha256, shipped
+from magtwin.folders import allow
 from magtwin.io.tables import write_parquet
 from magtwin.run.run import Run
 
@@ -121,7 +122,10 @@ def test_a_texture_that_is_not_there_is_refused_with_the_property_that_names_it(
 
 def test_a_file_that_is_nothing_a_stage_needs_is_not_handed_on(tmp_path):
     text = 'def Xform "World"\n{\n    asset picture = @/etc/passwd@\n}\n'
-    refuse(r"</World\.picture>: names /etc/passwd, .* not exported", write(tmp_path, HEAD + text), tmp_path)
+    stage = write(tmp_path, HEAD + text)
+    refuse(r"</World\.picture> names /etc/passwd, outside the stage's folder", stage, tmp_path)
+    with allow("/etc"):
+        refuse(r"</World\.picture>: names /etc/passwd, .* not exported", stage, tmp_path)
 
 
 def test_a_material_that_omniverse_brings_may_be_named(tmp_path):
@@ -146,7 +150,10 @@ def test_a_package_that_names_a_layer_outside_of_itself_is_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.usdz", "w") as archive:
         text = HEAD.replace("    upAxis", f"    subLayers = [@{secret}@]\n    upAxis")
         archive.writestr("a.usda", text + CUBE)
-    refuse(r"a\.usdz/a\.usda: names .*stage\.usda, outside its package", tmp_path / "a.usdz", tmp_path)
+    package = tmp_path / "a.usdz"
+    refuse(r"a\.usdz/a\.usda: names .*stage\.usda, outside the stage's folder", package, tmp_path)
+    with allow(tmp_path):
+        refuse(r"a\.usdz/a\.usda: names .*stage\.usda, outside its package", package, tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -277,6 +277,7 @@ def test_every_collider_has_a_physics_material(authored):
         assert material.GetPrim().HasAPI(UsdPhysics.MaterialAPI), prim.GetPath()
 
 
+@pytest.mark.usefixtures("allow_neighbours")
 def test_robots_that_share_a_lab_have_topics_of_their_own_and_one_clock(lab_scene, tmp_path):
     scene = read_scene(lab_scene)
     second = PlacedRobot(robot=replace(scene.robot, name="second"), start=(1.0, 1.0, 0.0))

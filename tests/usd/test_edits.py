@@ -169,6 +169,10 @@ def test_a_map_that_comes_by_reference_is_not_adopted(room, tmp_path):
     file = building(tmp_path, room, LabA=TURNED)
     with pytest.raises(InputError, match="no sublayer of this stage, so it cannot be replaced here"):
         survey_scene(file, tmp_path / "new.usdc", adopt=True, headings_rad=[0.0])
+    with pytest.raises(
+        InputError, match=r"new\.usdc: is not in the folder of .*; write the map into .*room$"
+    ):
+        survey_scene(room, tmp_path / "new.usdc", adopt=True, headings_rad=[0.0])
     assert not (tmp_path / "new.usdc").exists()
 
 
@@ -438,15 +442,15 @@ def test_one_that_does_not_is_refused(room, tmp_path):
         readings(file)
 
 
-def test_a_thing_in_centimetres_in_our_stage_is_refused_until_it_is_scaled(room, tmp_path):
-    thing = Usd.Stage.CreateNew(str(tmp_path / "thing.usda"))
+def test_a_thing_in_centimetres_in_our_stage_is_refused_until_it_is_scaled(room):
+    thing = Usd.Stage.CreateNew(str(room.parent / "thing.usda"))
     UsdGeom.SetStageMetersPerUnit(thing, 0.01)
     UsdGeom.SetStageUpAxis(thing, "Y")
     thing.SetDefaultPrim(UsdGeom.Cube.Define(thing, "/Thing").GetPrim())
     thing.Save()
     stage, _ = edited(room)
     xform = UsdGeom.Xform.Define(stage, "/World/Thing")
-    xform.GetPrim().GetReferences().AddReference(str(tmp_path / "thing.usda"))
+    xform.GetPrim().GetReferences().AddReference("./thing.usda")
     stage.Save()
     with pytest.raises(InputError, match=r"</World/Thing>: brings in .*give it scale 0.01 and rotateX 90"):
         read_scene(room)

@@ -135,6 +135,7 @@ def test_an_old_map_is_read_as_it_was_with_one_warning(tmp_path):
     assert upgrade(file) == []
 
 
+@pytest.mark.usefixtures("allow_neighbours")
 def test_an_old_scene_runs_to_the_same_readings_and_warns_once(copied, old_scene):
     wanted, none = heard(drive, copied)
     assert none == []
@@ -150,6 +151,7 @@ def test_an_old_scene_runs_to_the_same_readings_and_warns_once(copied, old_scene
         assert older_properties(Sdf.Layer.OpenAsAnonymous(str(file))) == []
 
 
+@pytest.mark.usefixtures("allow_neighbours")
 def test_an_edit_with_an_older_name_counts_and_is_told(copied, tmp_path):
     edit = tmp_path / "edit.usda"
     edit.write_text(

@@ -61,8 +61,12 @@ def inspect(
         fix: Names of fixes to apply first.
 
     Raises:
-        InputError: The file crashes its reader, is no stage, or cannot be fixed.
+        InputError: The file crashes its reader, is no stage, names files outside its folder, or cannot be
+            fixed.
     """
+    from magtwin.usd.layers import check_stage
+
+    check_stage(root or file)
     with tempfile.TemporaryDirectory() as folder:
         answer = Path(folder, "answer.json")
         job = {

@@ -49,9 +49,11 @@ def validate(
         progress: Function that is called with the name of each validator.
 
     Raises:
-        InputError: The file is missing, not USD or damaged; a package has an entry outside its folder; or a
-            name is not in `AGAINST` or `SAFE`.
+        InputError: The file is missing, not USD or damaged; a package has an entry outside its folder; the
+            stage names files outside its folder; or a name is not in `AGAINST` or `SAFE`.
     """
+    from magtwin.usd.layers import check_stage
+
     file = existing(file, "USD file")
     if file.is_dir():
         raise InputError(f"{file}: a folder; give the root layer in it")
@@ -63,6 +65,7 @@ def validate(
         raise InputError(
             f"{file}: a package cannot be fixed; `magtwin export` it to a folder, fix that, and pack it again"
         )
+    check_stage(file)
     say = progress or (lambda name: None)
     with tempfile.TemporaryDirectory() as folder:
         home = Path(folder) if file.suffix == ".usdz" else None

@@ -1,0 +1,275 @@
+"""The process that opens stages before magtwin does. `trial` runs this file; it imports only pxr.
+
+Each line of the input is a job, each line of the output its answer, both in JSON. A job has the file, the
+working folder, the folders in which files may be named (`inside`), limits of memory, time and values, and
+whether the stage is composed. The layers of a composed stage are opened one by one, and all files that they
+name are checked before any of them is opened.
+"""
+
+import glob
+import json
+import os
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+from pxr import Ar, Sdf, Usd, UsdUtils
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
+MOST_LAYERS = 100_000
+"""Layers of a stage, each counted once for each set of expression variables."""
+
+LISTED = 20
+"""Names out of the folders that an answer lists at most."""
+
+_MEMORY = Path("/proc/self/statm")
+_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
+_PATTERN = re.compile(r"<UDIM>|#+")
+"""The part of a texture's or a clip's name that stands for numbers."""
+
+
+class RefusedError(Exception):
+    """The text of a refusal."""
+
+
+class Audit:
+    """Layers of a stage, opened one by one; no file out of `inside` is opened.
+
+    Attributes:
+        layers: The layers, by identifier.
+        named_files: Every file that a layer names, even if there is none.
+        outside: Files out of the folders that layers name: layer, prim or property, name and file.
+    """
+
+    def __init__(self, job: dict[str, Any]) -> None:
+        self.inside: list[str] = job["inside"]
+        self.room, self.most_values = job["room"], job["values"]
+        self.layers: dict[str, Any] = {}
+        self.named_files: set[str] = set()
+        self.outside: list[dict[str, str]] = []
+        self.resolver = Ar.GetResolver()
+
+    def is_inside(self, file: str) -> bool:
+        """Whether a file is in one of the folders, with symlinks resolved."""
+        real = on_disk(file).resolve()
+        return any(real.is_relative_to(folder) for folder in self.inside)
+
+    def open(self, name: str) -> Any:
+        """A layer that is inside, with its values tried; None if it cannot be opened, as USD says later."""
+        file = on_disk(name)
+        if file.exists() and not file.is_file() and not file.is_dir():
+            raise RefusedError(f"names {file}, which is no regular file")
+        if not file.is_file():
+            return None
+        if name not in self.layers:
+            size = file.stat().st_size
+            self.room += 4 * size
+            limit_memory(self.room)
+            with file.open("rb") as head:
+                crate = head.read(8) == b"PXR-USDC"
+            self.layers[name] = None
+            try:
+                layer = Sdf.Layer.FindOrOpen(name)
+                if crate and layer is not None and size <= self.most_values:
+                    try_values(layer)
+            except Exception as error:
+                if crate:
+                    raise RefusedError(f"cannot be opened as USD: {text_of(error)}") from error
+                return None  # raised again, with its text, where it is opened
+            self.layers[name] = layer
+        return self.layers[name]
+
+    def look(self, root: str) -> None:
+        """Open a stage's root layer, and all layers that it names, in any variant or payload."""
+        pending: list[tuple[str, dict[str, Any], bool]] = [(root, {}, False)]
+        seen = set()
+        while pending:
+            name, given, is_sublayer = pending.pop()
+            layer = self.open(name)
+            if layer is None:
+                continue
+            # As USD composes them: those of the layer above win, and a sublayer's own do not count.
+            variables = given if is_sublayer else {**layer.expressionVariables, **given}
+            key = (name, json.dumps(variables, sort_keys=True, default=str))
+            if key in seen:
+                continue
+            seen.add(key)
+            if len(seen) > MOST_LAYERS:
+                raise RefusedError(f"names over {MOST_LAYERS} layers")
+            for file, may_be_sublayer in self.named(layer, variables):
+                if Sdf.FileFormat.FindByExtension(file) is not None:
+                    pending += [(file, variables, is_sublayer) for is_sublayer in {False, may_be_sublayer}]
+
+    def named(self, layer: Any, variables: dict[str, Any]) -> list[tuple[str, bool]]:
+        """The existing files that a layer names inside, and whether as sublayers; others go to `outside`."""
+        copy = Sdf.Layer.CreateAnonymous(".usda")
+        copy.TransferContent(layer)
+        copy.expressionVariables = variables
+        arcs = copy.GetCompositionAssetDependencies()
+        names: dict[str, None] = {}
+
+        def keep(asset: str) -> str:
+            names[asset] = None
+            return asset
+
+        UsdUtils.ModifyAssetPaths(copy, keep)  # sublayers, arcs, values, clips and metadata, evaluated
+        found = []
+        for asset in [*names, *(arc for arc in arcs if arc not in names)]:
+            if not asset or asset.startswith("anon:"):
+                continue
+            if address := _ADDRESS.match(asset):
+                if asset in arcs or address.group()[:-3].lower() in Ar.GetRegisteredURISchemes():
+                    where = place_of(layer, asset, variables)
+                    raise RefusedError(
+                        f"{where} names {asset}, an address; download the file, and name the copy"
+                    )
+                continue  # nobody opens it
+            for file in self.files(layer, Sdf.Layer.SplitIdentifier(asset)[0]):
+                if self.is_inside(file):
+                    found.append((file, asset in copy.subLayerPaths))
+                elif len(self.outside) < LISTED:
+                    self.leave_out(place_of(layer, asset, variables), asset, file)
+        return found
+
+    def leave_out(self, where: str, asset: str, file: str) -> None:
+        """Note a file out of the folders."""
+        real = on_disk(file).resolve()
+        self.outside.append({"where": where, "asset": asset, "file": str(real), "folder": str(real.parent)})
+
+    def files(self, layer: Any, asset: str) -> list[str]:
+        """The existing files that a name stands for: one, or those of a pattern such as `wood.<UDIM>.png`."""
+        absolute = layer.ComputeAbsolutePath(asset)
+        resolved = str(self.resolver.Resolve(absolute))
+        files = [resolved] if resolved else []
+        if _PATTERN.search(asset):
+            bases = (Path(absolute), Path(layer.realPath).parent / asset, Path(asset))
+            for base in {Path(os.path.normpath(Path.cwd() / base)) for base in bases}:
+                parts = map(glob.escape, _PATTERN.split(str(base.relative_to(base.anchor))))
+                files += map(str, sorted(Path(base.anchor).glob("*".join(parts))))
+        self.named_files.update(str(on_disk(file)) for file in (absolute, *files))
+        return [file for file in files if not Path(file).is_dir()]
+
+
+def on_disk(name: str) -> Path:
+    """The file of a layer, which can be a member of a package: `a.usdz[b.usda]`."""
+    return Path(Ar.SplitPackageRelativePathOuter(name)[0])
+
+
+def limit_memory(room: int) -> None:
+    """Let this process take `room` more bytes than it has now."""
+    if resource is not None and _MEMORY.exists():
+        size = int(_MEMORY.read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+        hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+        resource.setrlimit(resource.RLIMIT_AS, (size + room, hard))
+
+
+def limit_time(seconds: float) -> None:
+    """End this process after `seconds` of each core, should the process that gave the job be gone."""
+    if resource is not None:
+        used = sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
+        most = int(used + seconds * (os.cpu_count() or 1)) + 1
+        resource.setrlimit(resource.RLIMIT_CPU, (most, resource.getrlimit(resource.RLIMIT_CPU)[1]))
+
+
+def try_values(layer: Any) -> None:
+    """Read every value of a layer."""
+
+    def read(path: Any) -> None:
+        if path.IsPropertyPath():
+            spec = layer.GetObjectAtPath(path)
+            spec.GetInfo("default"), spec.GetInfo("timeSamples")
+
+    layer.Traverse("/", read)
+
+
+def place_of(layer: Any, asset: str, variables: dict[str, Any]) -> str:
+    """Layer, and prim or property, that names a file."""
+    found: list[str] = []
+
+    def names(value: Any) -> bool:
+        if isinstance(value, str):
+            if Sdf.VariableExpression.IsExpression(value):
+                value = Sdf.VariableExpression(value).Evaluate(variables).value
+            return bool(value == asset)
+        if isinstance(value, Sdf.AssetPath):
+            return names(value.path)
+        if isinstance(value, Sdf.Reference | Sdf.Payload):
+            return names(value.assetPath) or names(getattr(value, "customData", {}))
+        if isinstance(value, dict):
+            return any(map(names, value.values()))
+        if isinstance(value, Sdf.ReferenceListOp | Sdf.PayloadListOp):
+            return any(map(names, (*value.GetAddedOrExplicitItems(), *value.deletedItems)))
+        return isinstance(value, Sdf.AssetPathArray | list | tuple) and any(map(names, value))
+
+    def visit(path: Any) -> None:
+        spec = None if found or path.IsAbsoluteRootPath() else layer.GetObjectAtPath(path)
+        if spec is not None and any(names(spec.GetInfo(key)) for key in spec.ListInfoKeys()):
+            found.append(f" <{path}>")
+
+    layer.Traverse("/", visit)
+    return layer.identifier + "".join(found)
+
+
+def text_of(error: Exception) -> str:
+    """The text of an error, in one line."""
+    said = getattr(error.args[0], "commentary", None) if error.args else None
+    return " ".join(str(said or error).split())
+
+
+def compose(root: str, audit: Audit) -> None:
+    """Open a stage whole, and look at its layers once more, should a name have escaped the audit."""
+    try:
+        stage = Usd.Stage.Open(root)
+    except MemoryError:
+        raise
+    except Exception:
+        return  # raised again, with its text, where it is opened
+    for layer in stage.GetUsedLayers():
+        if layer.realPath and not audit.is_inside(layer.realPath):
+            audit.leave_out(root, layer.identifier, layer.realPath)
+
+
+def answer_to(job: dict[str, Any]) -> dict[str, Any]:
+    """Do a job. The answer has `refused`, `memory`, or names `outside` and the `files` that it depends on."""
+    limit_time(job["seconds"])
+    audit = Audit(job)
+    try:
+        os.chdir(job["folder"])
+        if job["composed"]:
+            with Ar.ResolverContextBinder(audit.resolver.CreateDefaultContextForAsset(job["file"])):
+                audit.look(job["file"])
+            if not audit.outside:
+                compose(job["file"], audit)
+        else:
+            audit.open(job["file"])
+    except MemoryError:
+        return {"memory": True}
+    except RefusedError as error:
+        memory = isinstance(error.__cause__, MemoryError) or "bad_alloc" in str(error)
+        return {"memory": True} if memory else {"refused": str(error)}
+    except Exception as error:  # what cannot be checked is not opened
+        return {"refused": f"cannot be opened as USD: {text_of(error)}"}
+    return {
+        "outside": audit.outside,
+        "files": sorted({str(on_disk(name)) for name in audit.layers} | audit.named_files),
+    }
+
+
+def main() -> None:
+    """Answer jobs until the input ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+    if resource is not None:
+        for kind in (resource.RLIMIT_CORE, resource.RLIMIT_FSIZE):  # it writes nothing
+            resource.setrlimit(kind, (0, 0))
+    for line in sys.stdin:
+        sys.stdout.write(json.dumps(answer_to(json.loads(line))) + "\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
