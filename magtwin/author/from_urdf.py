@@ -88,7 +88,7 @@ def from_urdf(
     with output(out, force=force) as folder:
         folder.mkdir()
         report = build_robot(urdf, given, folder / name, options=options, thumbnail=thumbnail)
-    return Robot(asset, load_robot(asset), report)
+    return Robot(asset, load_robot(asset, own=True), report)
 
 
 def __getattr__(name: str) -> Any:

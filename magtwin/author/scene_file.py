@@ -276,7 +276,7 @@ def _robot(
             build_robot(table.urdf, settings, asset)
         except InputError as error:
             raise InputError(f"{where} {error}") from error
-        robot = load_robot(asset)
+        robot = load_robot(asset, own=True)
     return replace(robot, name=table.name) if named else robot
 
 

@@ -48,8 +48,8 @@ ALIASES = {
 }
 """Options of the command line whose parameter has another name in Python."""
 
-_flags: dict[str, str] = {}
-"""Flag of each parameter of the command that is running."""
+_running: list[App] = []
+"""The command that is running."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -59,8 +59,7 @@ def main(arguments: list[str] | None = None) -> None:
     signal.signal(
         signal.SIGTERM, lambda *_: sys.exit(143)
     )  # an exception, so that partial outputs are removed
-    _flags.clear()
-    _flags["allow"] = "--allow"
+    _running.clear()
     try:
         arguments, folders = _allowed([a for a in arguments if a != "--debug"])
         with watched(), _warnings_in_lines(), allow(*folders):
@@ -82,7 +81,7 @@ def main(arguments: list[str] | None = None) -> None:
         if debug:
             raise
         if isinstance(error, InputError):
-            _fail(error.in_flags(_flags))
+            _fail(error.in_flags(_flags()))
         if text := _wrong_name(error, arguments):
             _fail(text)
         if isinstance(error, OSError | MemoryError):
@@ -142,10 +141,7 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
 
     @functools.wraps(function)
     def wrapped(*args: Any, json: bool = False, quiet: bool = False, **options: Any) -> None:
-        for argument in command.assemble_argument_collection(parse_docstring=False):
-            if argument.name.startswith("--"):
-                _flags[argument.name.removeprefix("--").replace("-", "_")] = argument.name
-        _flags.update({name: _flags[key] for name, key in ALIASES.items() if key in _flags})
+        _running[:] = [command]
         with output_mode(as_json=json, quiet=quiet):
             done = function(*args, **options)
             if isinstance(done, Done):
@@ -162,6 +158,16 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
     wrapped.shares_options = True  # type: ignore[attr-defined]
     wrapped.__annotations__ = {**function.__annotations__, **added}
     return wrapped
+
+
+def _flags() -> dict[str, str]:
+    """Flag of each parameter of the command that is running, assembled only for an error: it takes long."""
+    flags = {"allow": "--allow"}
+    for command in _running:
+        for argument in command.assemble_argument_collection(parse_docstring=False):
+            if argument.name.startswith("--"):
+                flags[argument.name.removeprefix("--").replace("-", "_")] = argument.name
+    return flags | {name: flags[key] for name, key in ALIASES.items() if key in flags}
 
 
 def _help_options(arguments: list[str]) -> dict[str, Any]:

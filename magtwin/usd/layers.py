@@ -70,10 +70,14 @@ def describe_stage(stage: Usd.Stage, documentation: str) -> None:
     layer.customLayerData = creator()
 
 
-def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
+def open_stage(path: str | os.PathLike[str], *, own: bool = False) -> Usd.Stage:
     """Open the stage of a USD file, reloaded from disk.
 
     Layers of an older version of the schema get its names of today in memory, with a warning.
+
+    Args:
+        path: The file.
+        own: Whether this process has just written it; then it is not tried in another process first.
 
     Raises:
         InputError: The file is missing or not USD, or a sublayer or reference is missing; the text has USD's
@@ -81,7 +85,7 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
             has changes in this process that are not saved, which would be lost; or is of a later version of
             the schema.
     """
-    path = check_stage(path)
+    path = check_stage(path, own=own)
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
     try:
         with translated(path, "cannot be opened as USD"):
@@ -125,12 +129,13 @@ _NESTED = 1 << 24
 """Bytes of text whose nesting is counted at once."""
 
 
-def check_stage(path: str | os.PathLike[str], *, composed: bool = True) -> Path:
+def check_stage(path: str | os.PathLike[str], *, composed: bool = True, own: bool = False) -> Path:
     """A USD file that this process may open. Every file that a user names passes through here.
 
     Args:
         path: The file.
         composed: Whether the files that it names will be opened too.
+        own: Whether this process has just written it; then it is not tried.
 
     Raises:
         InputError: It is missing, no regular file, or larger than the budget; or as for `try_stage`.
@@ -150,7 +155,8 @@ def check_stage(path: str | os.PathLike[str], *, composed: bool = True) -> Path:
     existing_file(path, "USD file", "USD" if binary else "USD text")
     if not binary:
         _check_nesting(path)
-    try_stage(path, composed=composed)
+    if not own:
+        try_stage(path, composed=composed)
     return path
 
 

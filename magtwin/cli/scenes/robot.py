@@ -81,16 +81,19 @@ def robot(
         Full report to write (.json).
     """
     given = dict(locals())
-    from magtwin.author.from_urdf import DriveRule, from_urdf, write_urdf
     from magtwin.files import output
 
     if out.suffix == ".urdf":
+        from magtwin.author.from_urdf import write_urdf
+
         own = ("urdf", "out", "thumbnail", "force")
         if any(value is not None for name, value in given.items() if name not in own):
             raise InputError("a stage is written as a URDF without other options than --force; drop them")
         if urdf.suffix in (".urdf", ".xacro"):
             raise InputError(f"{urdf}: is no stage; a URDF is written from .usd, .usda, .usdc or .usdz")
         return Done(write_urdf(urdf, out, force=force), out)
+    from magtwin.author.from_urdf import DriveRule, from_urdf
+
     check_output(report, (".json",), "a report", force=force)
     same = ["missing_meshes", "skip_missing_includes", "collision", "profile", "fix_base", "merge_fixed"]
     same += ["single_file", "strict"]

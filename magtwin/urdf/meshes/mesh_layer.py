@@ -205,8 +205,9 @@ class MeshLayer:
         corners = slice(None, None, -1) if np.prod(scale) < 0 else slice(None)
         normals = file.shaded()[:, corners] / scale
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        normals = np.round(normals, 4, out=normals).astype(np.float32)  # in place: a scan has millions
         mesh = self._define_mesh(xform.GetPath().AppendChild(MESH), points, faces)
-        _primvar(mesh, "normals", Sdf.ValueTypeNames.Normal3fArray, np.round(normals, 4))
+        _primvar(mesh, "normals", Sdf.ValueTypeNames.Normal3fArray, normals)
         if any(paint is not None and paint.double_sided for paint in file.paints):
             mesh.CreateDoubleSidedAttr(True)
         if file.uvs is not None:
@@ -325,9 +326,9 @@ def _primvar(
     interpolation: str = UsdGeom.Tokens.faceVarying,
 ) -> None:
     """Author a primvar, by default of values at corners, shape (F, 3, K), indexed by distinct values."""
-    rows = values.reshape(-1, values.shape[-1]).astype(np.float32) + np.float32(0)
+    rows = np.ascontiguousarray(values, np.float32).reshape(-1, values.shape[-1])
     first, index = distinct(rows)
     arrays = {2: Vt.Vec2fArray, 3: Vt.Vec3fArray}
     primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(name, kind, interpolation)
-    primvar.Set(arrays[rows.shape[1]].FromNumpy(np.ascontiguousarray(rows[first])))
+    primvar.Set(arrays[rows.shape[1]].FromNumpy(rows[first] + np.float32(0)))  # + 0 makes -0 into 0
     primvar.SetIndices(Vt.IntArray.FromNumpy(index.astype(np.int32)))
