@@ -214,6 +214,26 @@ class Outputs:
                     text = text.replace(str(place), str(target))
                 raise InputError(text, parameter=error.parameter) from error
 
+    @contextmanager
+    def kept(self) -> Iterator[Callable[[Run], None]]:
+        """A function that keeps the blocks of a long run until all its outputs are written.
+
+        They are in the folder F.parts of the first output F, and remain there if the run is broken off, or
+        its process is killed; `read_run` reads them.
+        """
+        from magtwin.io.tables import ParquetParts
+
+        parts: list[ParquetParts] = []
+
+        def keep(block: Run) -> None:
+            if not parts:
+                parts.append(ParquetParts(self.targets[0], force=self.force))
+            parts[0].append(block)
+
+        yield keep
+        for one in parts:
+            shutil.rmtree(one.folder)
+
     def check_live(self) -> None:
         """Refuse partial files of an earlier run that was shown live."""
         for target in self._runs():

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError, find
 from magtwin.report import Figure, Report
+from magtwin.run.mapped import release
 from magtwin.run.resample import RULES, Interpolation, bracket, check_instants, grid
 from magtwin.run.summary import run_summary
 from magtwin.summary import Summarized, Summary
@@ -486,6 +487,7 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
             if len(values):
                 note = f"{values.min():.0f} to {values.max():.0f}"
                 figures.append(Figure(name, float(values.mean()), "nT", float(values.std()), note))
+            release()
         known = {"b_total_nt", "b_truth_nt"} <= set(self)
         error = self["b_total_nt"] - self["b_truth_nt"] if known else np.array([])
         if np.nanmax(np.abs(error), initial=0.0) > 0:

@@ -24,6 +24,7 @@ from magtwin.io.bags.types import definition_of, layout
 from magtwin.io.recorder import PARTIAL, Sink, partial_of
 from magtwin.run.arrow import metadata_to_json
 from magtwin.run.run import Run
+from magtwin.run.spool import blocks
 from magtwin.version import __version__
 
 if TYPE_CHECKING:
@@ -77,8 +78,8 @@ def write_bag(
         try:
             stream = Stream(run, sender, scans)
             bag.begin(run, stream)
-            for first in range(0, max(run.rows, 1), BLOCK):
-                bag.send(stream.messages(run.take(slice(first, first + BLOCK))))
+            for block in blocks(run, BLOCK):
+                bag.send(stream.messages(block))
             bag.send(stream.last())
             bag.close()
         except BaseException:

@@ -17,12 +17,22 @@ from magtwin.errors import InputError
 from magtwin.files import existing, output
 from magtwin.io.recorder import PARTIAL
 from magtwin.io.rerun.layout import RUN_COLOURS, Shown, comparison_layout, plotted
-from magtwin.io.rerun.recording import ROOM, Recording, content_id, recording_of, size_of, stream, title_of
+from magtwin.io.rerun.recording import (
+    PATIENCE_S,
+    ROOM,
+    Recording,
+    content_id,
+    recording_of,
+    size_of,
+    stream,
+    title_of,
+)
 from magtwin.io.rerun.series import COLUMNS_ENTITY, entity_of, table_of
 from magtwin.io.rerun.viewer import check_decodes, show
 from magtwin.io.rerun.world import Interior, Robot, heading_of, send_room
 from magtwin.path import Path
 from magtwin.run.run import Run
+from magtwin.run.spool import blocks
 from magtwin.sim.sensors.lidar import Scans
 from magtwin.twin import Twin
 
@@ -63,7 +73,10 @@ def write_rrd(
             run, content_id(run), name, twin, **shown, room=size, file=aside, final=FilePath(path)
         ) as recording,
     ):
-        recording.append(run)
+        for block in blocks(run):
+            recording.append(block)
+            if block.rows < run.rows:  # Rerun queues what it has not written
+                recording.rec.flush(timeout_sec=PATIENCE_S)
         recording.close()
 
 
