@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from magtwin.errors import InputError
-from magtwin.files import check_free, output
+from magtwin.files import check_free, output, transaction
 from magtwin.io.bags.stream import scans_at
 from magtwin.io.formats import format_of, read_run, write_run
 from magtwin.io.recorder import Recorder, Sink, in_step, partial_of
@@ -193,6 +193,7 @@ class Outputs:
     def aside(self) -> Iterator["Outputs"]:
         """The same outputs in temporary places, which replace the targets at the end: all, or none."""
         with ExitStack() as stack:
+            stack.enter_context(transaction())
             places: dict[Path, Path] = {}
             for target in self.targets:
                 if target.suffix in USD:  # names its scene by a relative path: written in place, last

@@ -200,7 +200,9 @@ class ParquetParts(Sink):
             raise InputError(
                 f"the block to append begins at {run['t'][0]:.9g} s, and the last ended at {self._last:.9g} s"
             )
-        write_parquet(run, self.folder / f"part-{self._count:06d}.parquet")
+        table = table_of(run)
+        with output(self.folder / f"part-{self._count:06d}.parquet", at_once=True) as aside:
+            _write_table(table, aside)
         self._count, self._last = self._count + 1, run["t"][-1]
 
     def close(self) -> None:
@@ -383,7 +385,7 @@ def write_npz(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
     Arguments and errors are those of `write_parquet`.
     """
     check_clock(run, "the run to write")
-    run.members()  # refuses other than numbers
+    run.take(slice(0, 1)).members()  # refuses other than numbers
     if _ABOUT in run:
         raise InputError(f"column {_ABOUT!r} has the name that npz uses for metadata; rename it")
     columns = {

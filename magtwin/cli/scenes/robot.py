@@ -79,7 +79,7 @@ def robot(
     """
     given = dict(locals())
     from magtwin.author.from_urdf import DriveRule, from_urdf, write_urdf
-    from magtwin.files import output
+    from magtwin.files import output, transaction
 
     if out.suffix == ".urdf":
         own = ("urdf", "out", "thumbnail", "force")
@@ -99,17 +99,18 @@ def robot(
         "mass": mass_kg,
     }
     step("Converting the robot")
-    made = from_urdf(
-        urdf,
-        out,
-        settings=settings,
-        force=force,
-        thumbnail=_thumbnail if thumbnail else None,
-        **{name: choice for name, choice in choices.items() if choice is not None},
-    )
-    if report is not None:
-        with output(report, force=force) as aside:
-            aside.write_text(made.report.to_json(), encoding="utf-8")
+    with transaction():
+        made = from_urdf(
+            urdf,
+            out,
+            settings=settings,
+            force=force,
+            thumbnail=_thumbnail if thumbnail else None,
+            **{name: choice for name, choice in choices.items() if choice is not None},
+        )
+        if report is not None:
+            with output(report, force=force) as aside:
+                aside.write_text(made.report.to_json(), encoding="utf-8")
     return Done(made.report.summary(), made.asset)
 
 
