@@ -1,7 +1,7 @@
 """Outputs: files and folders that appear whole, or not at all, whatever happens to the process or the disk.
 
 An output is written in a hidden folder beside its place, is brought to the disk, and is then renamed. The
-hidden folder holds a file that the writing process keeps locked. A folder whose lock is free was left by a
+writing process keeps the hidden folder locked. One whose lock is free was left by a
 process that was killed: the next process that writes there removes it, after it has completed or undone what
 the other had begun to rename.
 """
@@ -13,6 +13,7 @@ import shutil
 import signal
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -29,9 +30,15 @@ except ImportError:  # Windows, where nothing is swept
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors of a disk that is full or read-only."""
 
-_LOCK, _OLD, _FIRST, _COMMIT = ".magtwin", ".old", ".first", ".commit"
-"""Files in a hidden folder: its lock, what the output replaces, the name of the first folder of its
-transaction, and, in that folder, the renames of a transaction that is complete."""
+_OURS = ".magtwin-"
+"""In the name of every hidden folder."""
+
+_OLD, _FIRST, _COMMIT, _LIST = ".old", ".first", ".commit", ".list"
+"""Files in a hidden folder: what the output replaces, the first folder of its transaction, and in that folder
+the renames of a transaction that is complete, and the same while they are written down."""
+
+_SETTLED_S = 60.0
+"""Age from which an empty hidden folder was left behind, and is not just being locked [s]."""
 
 _asides: set[Path] = set()
 """Hidden folders of this process."""
@@ -169,17 +176,13 @@ class _Aside:
     @classmethod
     def beside(cls, place: Path) -> "_Aside":
         """A new folder beside a place."""
-        folder = Path(tempfile.mkdtemp(prefix=f".{place.name}.", dir=place.parent))
+        name = place.name[:60]  # a longer one with what is added could be too long for the disk
+        folder, lock = Path(tempfile.mkdtemp(prefix=f".{name}{_OURS}", dir=place.parent)), -1
         _asides.add(folder)
-        try:
-            lock = os.open(folder / "lock", os.O_CREAT | os.O_RDWR)
-            with suppress(OSError):  # a file system without locks: its folders are not swept
-                if fcntl is not None:
-                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    (folder / "lock").rename(folder / _LOCK)  # it is there only once it is locked
-        except BaseException:
-            cls(place, folder).remove()
-            raise
+        if fcntl is not None:
+            with suppress(OSError):  # a file system without locks
+                lock = os.open(folder, os.O_RDONLY)
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return cls(place, folder, lock)
 
     @property
@@ -221,7 +224,7 @@ class _Aside:
     def complete(self) -> None:
         """Do the `swap` that another process did not come to."""
         beside = self.folder.parent == self.place.parent and not self.folder.is_symlink()
-        if not beside or not self.folder.name.startswith(f".{self.place.name}."):
+        if not beside or _OURS not in self.folder.name:
             return  # not a list that magtwin wrote
         if self.new.exists():
             self.swap(keep=False)
@@ -264,9 +267,9 @@ def _announce(asides: list[_Aside]) -> None:
         (aside.folder / _FIRST).write_text(str(first), encoding="utf-8")
         _sync(aside.folder / _FIRST)
     renames = [[str(aside.place), str(aside.folder)] for aside in asides]
-    (first / "renames").write_text(json.dumps(renames), encoding="utf-8")
-    _sync(first / "renames")
-    (first / "renames").rename(first / _COMMIT)
+    (first / _LIST).write_text(json.dumps(renames), encoding="utf-8")
+    _sync(first / _LIST)
+    (first / _LIST).rename(first / _COMMIT)
     _sync_entry(first)
 
 
@@ -277,24 +280,30 @@ def _sweep(parent: Path) -> None:
     _swept.add(parent)
     with suppress(OSError):
         for entry in os.scandir(parent):
-            if entry.name.startswith(".") and entry.is_dir(follow_symlinks=False):
+            hidden = entry.name.startswith(".") and _OURS in entry.name
+            if hidden and entry.is_dir(follow_symlinks=False):
                 with suppress(OSError, ValueError, TypeError):
                     _recover(Path(entry.path))
 
 
 def _recover(folder: Path) -> None:
-    """Sweep a hidden folder; raises OSError if it is not ours, or its process lives."""
-    lock = os.open(folder / _LOCK, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
+    """Sweep a hidden folder; raises OSError if its process lives."""
+    lock = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        head, own = folder, _Aside(folder.with_name(folder.name[1:].rpartition(".")[0]), folder)
-        if (folder / _FIRST).is_file():
+        names = {entry.name for entry in os.scandir(folder)}
+        if not names and time.time() - folder.stat().st_mtime < _SETTLED_S:
+            return
+        head = folder
+        if _FIRST in names:
             head = Path((folder / _FIRST).read_text(encoding="utf-8"))
         if (head / _COMMIT).is_file():  # a transaction that was complete: rename the rest of it
             for place, aside in json.loads((head / _COMMIT).read_text(encoding="utf-8")):
                 _Aside(Path(place), Path(aside)).complete()
-        elif own.old.is_dir() and not own.place.exists():  # killed between two renames
-            own.old.rename(own.place)
+        elif len(left := names - {_OLD, _FIRST, _LIST}) == 1:  # perhaps killed between two renames
+            own = _Aside(folder.with_name(left.pop()), folder)
+            if own.old.is_dir() and not own.place.exists():
+                own.old.rename(own.place)
         shutil.rmtree(folder, ignore_errors=True)
     finally:
         os.close(lock)
