@@ -6,9 +6,6 @@ While a command runs, Ctrl-C raises `KeyboardInterrupt`, so that partial outputs
 
 import os
 import signal
-import sys
-import threading
-from typing import Any
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
@@ -17,14 +14,25 @@ AGAIN_S = 0.02
 """Time after which an interrupt that a destructor or a callback swallowed is sent again [s]."""
 
 
+def _end(*_: object) -> None:
+    os._exit(INTERRUPTED)
+
+
+# Only the entry of the program imports this module, so it acts here, before the imports below.
+_ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN  # started in the background: not for us
+if not _ignored:
+    signal.signal(signal.SIGINT, _end)
+
+import sys  # noqa: E402
+import threading  # noqa: E402
+from typing import Any  # noqa: E402
+
+
 def main() -> None:
     """Run the `magtwin` command of the command line."""
-    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN  # started in the background: not for us
-    if not ignored:
-        signal.signal(signal.SIGINT, _end)
     from magtwin.cli import main as run
 
-    if ignored:
+    if _ignored:
         run()
         return
     came: list[int] = []
@@ -45,10 +53,6 @@ def main() -> None:
         raise
     finally:
         signal.signal(signal.SIGINT, _end)
-
-
-def _end(*_: object) -> None:
-    os._exit(INTERRUPTED)
 
 
 def _sent_again(fault: Any) -> None:

@@ -21,8 +21,8 @@ from rerun.experimental import Timeline, View, ViewerClient
 
 from magtwin.errors import InputError
 from magtwin.files import existing, output
-from magtwin.parallel.machine import ends_with_parent
 from magtwin.io.rerun.series import TIMELINE
+from magtwin.parallel.machine import ends_with_parent
 
 LOCALHOST = "127.0.0.1"
 
