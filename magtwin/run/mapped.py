@@ -11,6 +11,7 @@ import mmap
 import os
 import tempfile
 import weakref
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,15 @@ def release() -> None:
     if hasattr(mmap, "MADV_DONTNEED"):
         for content in list(_maps):
             content.madvise(mmap.MADV_DONTNEED)
+
+
+def parts(rows: int) -> Iterator[slice]:
+    """Slices of columns: all rows, or the blocks of a long run; gives the memory back after each."""
+    size = BLOCK if rows > LONG else max(rows, 1)
+    for first in range(0, rows, size):
+        yield slice(first, min(first + size, rows))
+        if rows > LONG:
+            release()
 
 
 def joined(parts: "list[NDArray[Any]]") -> NDArray[Any]:

@@ -27,10 +27,11 @@ from magtwin.io.rerun.recording import (
     stream,
     title_of,
 )
-from magtwin.io.rerun.series import COLUMNS_ENTITY, entity_of, table_of
+from magtwin.io.rerun.series import COLUMNS_ENTITY, STATES, entity_of, table_of
 from magtwin.io.rerun.viewer import check_decodes, show
 from magtwin.io.rerun.world import Interior, Robot, heading_of, send_room
 from magtwin.path import Path
+from magtwin.run import mapped
 from magtwin.run.run import Run
 from magtwin.run.spool import blocks
 from magtwin.sim.sensors.lidar import Scans
@@ -67,6 +68,11 @@ def write_rrd(
     _check_rows(run, path)
     name, size = title_of(run) or FilePath(path).stem, size_of(run, scans)
     shown: dict[str, Any] = {"planned": planned, "scans": scans}
+    if run.rows > mapped.LONG:  # the layout looks at some rows, and at the last one
+        some = np.append(np.arange(0, run.rows - 1, -(-run.rows // mapped.LONG)), run.rows - 1)
+        events = [key for key in STATES if key in run and run[key].any()]
+        shown |= {"known": run.take(some), "events": events}
+        mapped.release()
     with (
         output(path, force=force) as aside,
         recording_of(
