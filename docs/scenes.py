@@ -130,8 +130,10 @@ magtwin run building.usda --lab /Building/LabB
 * **Readings** of a moved and turned lab equal those of the lab at the origin, to the byte. Poses and fields
   are in the lab's axes. The run's metadata keep the lab's path (`lab`, on a stage of several labs) and its
   x, y, z [m] and yaw [rad] on the stage (`lab_pose`).
-* **Commands.** `run`, `sweep` and `map survey` take `--lab`; in Python, `open_twin(stage, lab=...)`. Newton
-  and, for several labs, `magtwin export` take the lab's own stage.
+* **Commands.** `run`, `sweep`, `drive`, `ros sim`, `ros magnetometer` and `map survey` take `--lab`, a
+  benchmark's scenario has the key `lab`, and in Python it is `open_twin(stage, lab=...)`, also of the gym
+  environments. Newton drives a lab wherever it stands. Of several labs, `magtwin export` takes the lab's own
+  stage.
 * **Earth's field.** The lab's own field turns with the lab, because its map was measured with it. If another
   field on the stage differs by more than 1 nT in the lab's axes, a run warns: the stage then has two norths.
   A lab without a field of its own takes that of the stage, turned into its axes.

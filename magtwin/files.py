@@ -2,8 +2,11 @@
 
 import dataclasses
 import difflib
+import errno
 import hashlib
 import os
+import re
+import stat
 import subprocess
 import tomllib
 import types
@@ -12,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from magtwin.budget import check_depth, check_size
 from magtwin.errors import InputError, hint
 from magtwin.outputs import afterwards as afterwards
 from magtwin.outputs import check_free as check_free
@@ -35,23 +39,85 @@ def shipped(*parts: str) -> Path:
     return path
 
 
+_SPECIAL = (
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+"""Kinds of files that may never end, or never begin."""
+
+
 def existing(path: str | os.PathLike[str], what: str) -> Path:
-    """`path` if it exists.
+    """`path` if it is a regular file or a folder. Every file that a user names passes through here.
 
     Raises:
-        InputError: It does not exist; the text names the expected kind of file and a similar name.
+        InputError: It does not exist, or its links form a circle; the text names the expected kind of file
+            and a similar name. Or it is a pipe, a socket or a device, which could be read without end.
     """
     path = Path(path)
-    if not path.exists():
+    try:
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
         siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
         near = difflib.get_close_matches(path.name, siblings, n=1)
-        raise InputError(f"{path}: no such {what}" + (f"; did you mean {near[0]!r}?" if near else ""))
+        raise InputError(
+            f"{path}: no such {what}" + (f"; did you mean {near[0]!r}?" if near else "")
+        ) from None
+    except ValueError as error:  # a null character
+        raise InputError(f"{str(path)!r}: no name of a {what}: {error}") from error
+    except OSError as error:
+        reason = "its links form a circle" if error.errno == errno.ELOOP else error.strerror
+        raise InputError(f"{path}: no {what} can be read there ({reason})") from error
+    for is_kind, kind in _SPECIAL:
+        if is_kind(mode):
+            raise InputError(f"{path}: {kind}, not a {what}; copy what it gives into a file")
     return path
+
+
+def existing_file(path: str | os.PathLike[str], what: str, kind: str) -> Path:
+    """`path` if it is a regular file of a size that is read.
+
+    Args:
+        path: The file.
+        what: Expected kind of file, for error messages ("path file").
+        kind: Format in `magtwin.budget.BUDGETS`.
+
+    Raises:
+        InputError: As for `existing`; or it is a folder, or too large for its format.
+    """
+    path = existing(path, what)
+    if path.is_dir():
+        raise InputError(f"{path}: cannot be read (a folder); expected a {what}")
+    check_size(path, kind)
+    return path
+
+
+def read_bytes(path: str | os.PathLike[str], what: str, kind: str) -> bytes:
+    """Contents of a file; arguments and errors as for `existing_file`."""
+    path = existing_file(path, what, kind)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); expected a {what}") from error
+
+
+def read_text(path: str | os.PathLike[str], what: str, kind: str, encoding: str = "utf-8") -> str:
+    """Text of a file, with lines that end in a line feed.
+
+    Arguments and errors are those of `existing_file`; a text that is not in the encoding is refused too.
+    """
+    data = read_bytes(path, what, kind)
+    try:
+        text = data.decode(encoding)
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file ({error}); expected a {what} in UTF-8") from error
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def sha256(path: str | os.PathLike[str]) -> str:
     """SHA-256 of a file, lower-case hex."""
-    with open(path, "rb") as file:
+    with existing(path, "file").open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -80,15 +146,42 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The tables of a TOML file.
 
     Raises:
-        InputError: The file is missing or not TOML; the text has the line.
+        InputError: The file is missing, too large, nests too deep, or is not TOML; the text has the line.
     """
-    path = existing(path, "TOML file")
-    if path.is_dir():
-        raise InputError(f"{path}: a folder; give a TOML file")
+    return parse_toml(read_text(path, "TOML file", "TOML"), path)
+
+
+def parse_toml(text: str, where: object) -> dict[str, Any]:
+    """The tables of a TOML text.
+
+    tomllib recurses into arrays, and its memory grows with the square of the parts of a dotted key, so that
+    both depths are checked before.
+
+    Args:
+        text: The text.
+        where: Its file, for error messages.
+
+    Raises:
+        InputError: It nests too deep or is not TOML.
+    """
+    plain = _TOML_WORDS.sub("s", text)
+    check_depth(where, "TOML", max((run.count(".") for run in _TOML_KEY.findall(plain)), default=0))
+    depth = 0
+    for bracket in _TOML_BRACKET.findall(plain):
+        depth += 1 if bracket in "[{" else -1
+        check_depth(where, "TOML", depth)
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not TOML: {error}") from error
+        return tomllib.loads(text)
+    except (ValueError, RecursionError, OverflowError) as error:  # numbers of too many digits are ValueError
+        raise InputError(f"{where}: not TOML: {error}") from error
+
+
+_TOML_WORDS = re.compile(
+    r'"""(?:[^"\\]|\\.|"(?!""))*+"""|\'\'\'.*?\'\'\'|"(?:[^"\\\n]|\\.)*+"|\'[^\'\n]*\'|#[^\n]*', re.DOTALL
+)
+"""Texts and comments of a TOML file."""
+
+_TOML_KEY, _TOML_BRACKET = re.compile(r"[\w. \t-]+"), re.compile(r"[][{}]")
 
 
 def from_table(

@@ -1,6 +1,7 @@
 """Summary: the display of an object, in five lines at a prompt and as a table in a notebook."""
 
 import math
+import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from html import escape
@@ -90,6 +91,20 @@ class Summarized:
 def printable(text: object) -> str:
     """A text in one line, with control characters escaped."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in str(text))
+
+
+def printable_lines(text: object) -> str:
+    """A text whose lines are `printable`, but for tabs: what goes to a terminal, as names come from files.
+
+    Control characters could move the cursor, change colours or titles, or set the direction of the text, so
+    that it reads as another.
+    """
+    return "".join(c if c.isprintable() or c in "\n\t" else repr(c)[1:-1] for c in str(text))
+
+
+def in_markdown(text: object) -> str:
+    """A text in one line of a Markdown page, with the characters escaped that have a meaning there."""
+    return re.sub(r"([\\`*\[\]<>|!#~$]|(?<!\w)_|_(?!\w))", r"\\\1", printable(text))
 
 
 def clipped(text: str, most: int) -> str:

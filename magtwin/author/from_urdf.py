@@ -4,20 +4,29 @@ import dataclasses
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from magtwin.author.robot import RobotSettings, build_robot, read_settings
 from magtwin.files import existing, output
-from magtwin.spec.robot import RobotSpec
 from magtwin.urdf.convert import convert_with_report
-from magtwin.urdf.description.kinematics import link_poses
 from magtwin.urdf.options import DEFAULTS, DriveRule, Options
 from magtwin.urdf.report import ConversionReport
-from magtwin.urdf.write import write_urdf
-from magtwin.usd.robot import load_robot
+
+if TYPE_CHECKING:
+    from magtwin.author.robot import RobotSettings
+    from magtwin.spec.robot import RobotSpec
+    from magtwin.urdf.description.kinematics import link_poses
+    from magtwin.urdf.write import write_urdf
 
 __all__ = ["DriveRule", "Options", "Robot", "RobotSettings", "from_urdf", "link_poses", "write_urdf"]
+
+LATER = {
+    "RobotSettings": "magtwin.author.robot",
+    "link_poses": "magtwin.urdf.description.kinematics",
+    "write_urdf": "magtwin.urdf.write",
+}
+"""Modules of names that are imported when they are used, since a small conversion takes no longer."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +36,7 @@ class Robot:
     asset: Path
     """Root layer of the articulation."""
 
-    spec: RobotSpec | None
+    spec: "RobotSpec | None"
     """Parameters for the simulator; None without settings."""
 
     report: ConversionReport
@@ -38,7 +47,7 @@ def from_urdf(
     urdf: str | os.PathLike[str],
     out: str | os.PathLike[str],
     *,
-    settings: str | os.PathLike[str] | RobotSettings | None = None,
+    settings: "str | os.PathLike[str] | RobotSettings | None" = None,
     force: bool = False,
     thumbnail: Callable[[Path, Path], object] | None = None,
     **choices: Any,
@@ -62,15 +71,27 @@ def from_urdf(
         InputError: The description or the settings are invalid, or the folder exists; nothing is written.
     """
     urdf = existing(urdf, "URDF")
-    if settings is not None and not isinstance(settings, RobotSettings):
-        settings = read_settings(settings)
-    options = dataclasses.replace(settings.conversion if settings else DEFAULTS, **choices)
     name = f"{urdf.name.lstrip('.').split('.')[0] or 'robot'}.usda"
+    asset = Path(out) / name
+    if settings is None:
+        options = dataclasses.replace(DEFAULTS, **choices)
+        with output(out, force=force) as folder:
+            folder.mkdir()
+            report = convert_with_report(urdf, folder / name, options=options, thumbnail=thumbnail)
+        return Robot(asset, None, report)
+    from magtwin.author.robot import RobotSettings, build_robot, read_settings
+    from magtwin.usd.robot import load_robot
+
+    given = settings if isinstance(settings, RobotSettings) else read_settings(settings)
+    options = dataclasses.replace(given.conversion, **choices)
     with output(out, force=force) as folder:
         folder.mkdir()
-        if settings is None:
-            report = convert_with_report(urdf, folder / name, options=options, thumbnail=thumbnail)
-        else:
-            report = build_robot(urdf, settings, folder / name, options=options, thumbnail=thumbnail)
-    asset = Path(out) / name
-    return Robot(asset, load_robot(asset) if settings else None, report)
+        report = build_robot(urdf, given, folder / name, options=options, thumbnail=thumbnail)
+    return Robot(asset, load_robot(asset), report)
+
+
+def __getattr__(name: str) -> Any:
+    """A name of `LATER`."""
+    if name not in LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(LATER[name]), name)

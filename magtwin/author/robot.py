@@ -10,7 +10,7 @@ from pxr import Sdf, Usd, UsdPhysics
 
 from magtwin.author.shape import drive_of, footprint_of, stand_on_floor
 from magtwin.errors import InputError, hint
-from magtwin.files import from_table, read_toml
+from magtwin.files import existing_file, from_table, read_toml
 from magtwin.sim.plant_families import draw_plant
 from magtwin.spec.base import Spec
 from magtwin.spec.drive import DriveSpec
@@ -170,7 +170,7 @@ def read_description(asset: str | os.PathLike[str]) -> str:
     if source is None:
         return ""
     try:
-        text = source.read_text(encoding="utf-8")
+        text = existing_file(source, "URDF file", "XML").read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise InputError(f"{source}: is not UTF-8, as ROS descriptions must be; save it as UTF-8") from error
     return reroot(text, BASE_LINK, source)
@@ -186,7 +186,7 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
         notes.append(f"footprint_radius_m not given: {radius:g} m, from the robot's shape")
     define_footprint(robot, radius)
     if settings.drive is not None or not prims_with(robot, "drive"):
-        drive, found = drive_of(robot, settings.drive or DriveSpec())
+        drive, found = _drive(robot, settings.drive or DriveSpec())
         define_drive(robot, drive)
         notes += found
     notes += stand_on_floor(robot, read_drive(robot))
@@ -215,6 +215,25 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
         notes += _replace_sensors(robot, "magnetometer", path)
         define_magnetometer(stage, path, replace(magnetometer, link=path.GetParentPath().name))
     return notes
+
+
+def _drive(robot: Usd.Prim, given: DriveSpec) -> tuple[DriveSpec, list[str]]:
+    """The drive of the settings, filled in from that of the conversion or from the shape, and notes of this.
+
+    A field of the settings that has its default, that of a TurtleBot 4, is not given.
+    """
+    if not prims_with(robot, "drive"):
+        return drive_of(robot, given)
+    found, default = read_drive(robot), DriveSpec()
+    names = [f.name for f in fields(DriveSpec)]
+    own = {name: getattr(given, name) for name in names if getattr(given, name) != getattr(default, name)}
+    taken = [n for n in names if n not in own and getattr(found, n) != getattr(default, n)]
+    wheels = {"left_wheel_joint", "right_wheel_joint"}
+    if wheels & own.keys():  # other wheels than those of the plugin, which may have more
+        own |= {"more_left_wheel_joints": given.more_left_wheel_joints}
+        own |= {"more_right_wheel_joints": given.more_right_wheel_joints}
+    notes = [f"[drive] filled in from the description: {', '.join(taken)}"] if taken and own else []
+    return replace(found, **own), notes
 
 
 def _replace_sensors(robot: Usd.Prim, noun: str, path: Sdf.Path) -> list[str]:

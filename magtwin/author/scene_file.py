@@ -117,6 +117,9 @@ def scene_from_toml(
     map_layer: str | os.PathLike[str] | None = None,
     network: str | os.PathLike[str] | None = None,
     workshop: str | os.PathLike[str] | None = None,
+    robot: Path | None = None,
+    name: str = "",
+    scale: float = 1.0,
     inputs_of: Callable[[Path], tuple[str, ...]] = lambda weights: (),
     survey_of: Callable[[Scene, SurveySpec, int, Obstacles], Path] | None = None,
 ) -> Scene:
@@ -128,6 +131,10 @@ def scene_from_toml(
             `magtwin.twin.scene_from_toml` refuses a map that contradicts them.
         network: Weights that replace the TOML's.
         workshop: Folder for the asset of a robot that the TOML gives as a URDF.
+        robot: USD asset of a robot that replaces those of the TOML. Without `map_layer`, the scene is then
+            surveyed by this robot, if the TOML has an Earth field.
+        name: Name of the scene, in place of the TOML's.
+        scale: Factor on the floor and on the places of furniture and sources; their sizes stay.
         inputs_of: Function from a weights file to the names of its inputs, see
             `magtwin.twin.scene_from_toml`. By default the scene names no inputs.
         survey_of: Function that surveys a scene without a map and returns the map layer. It gets the scene,
@@ -137,6 +144,14 @@ def scene_from_toml(
         InputError: A key is unknown or missing, or a file is missing; the text has file and line.
     """
     table = read_toml(path)
+    if name:
+        table["name"] = name
+    if robot is not None:
+        table["robot"] = {"asset": str(Path(robot).resolve())}
+        if "earth" in table:
+            table.pop("map", None)
+    if scale != 1.0:
+        table = _scaled(table, scale)
     alone = isinstance(table.get("robot"), dict)  # [robot], not [[robot]]
     if alone:
         table = table | {"robot": [table["robot"]]}
@@ -168,17 +183,17 @@ def scene_from_toml(
     robots: list[PlacedRobot] = []
     for number, (robot_table, keys) in enumerate(zip(given.robot, table["robot"], strict=True)):
         where = f"{path}: [robot]" if alone else f"{path}: [[robot]] {robot_table.name!r}"
-        robot = _robot(robot_table, keys, where, workshop, named=not alone)
-        robot = _with_network(robot, robot_table, network, where, inputs_of)
+        made = _robot(robot_table, keys, where, workshop, named=not alone)
+        made = _with_network(made, robot_table, network, where, inputs_of)
         drives = _path(robot_table.path, Path(path).parent, where)
         start, of_robot = robot_table.start, True
         if start is None:
             of_robot = not (alone or (not robots and "start" in table))
             start = ZERO3 if of_robot else given.start
             if of_robot and drives not in ("", "random"):  # so that robots do not start inside each other
-                way = path_in(Room(lab.floor_m, robot.footprint_radius_m, standing), drives)
+                way = path_in(Room(lab.floor_m, made.footprint_radius_m, standing), drives)
                 start = float(way.p_xy[0, 0]), float(way.p_xy[0, 1]), float(way.heading(0.0))
-        robots.append(PlacedRobot(robot=robot, start=start, path=drives))
+        robots.append(PlacedRobot(robot=made, start=start, path=drives))
         try:
             check_start(robots[-1], lab, standing)
         except InputError as error:
@@ -212,6 +227,20 @@ def scene_from_toml(
             raise InputError(f"{path}: cannot be surveyed: {error}") from error
         scene = replace(scene, map_layer=surveyed, map_sha256=layer_sha256(surveyed))
     return scene
+
+
+def _scaled(table: Mapping[str, Any], scale: float) -> dict[str, Any]:
+    """The table of a scene whose floor is `scale` times as wide, with all things in the same part of it."""
+
+    def placed(thing: Mapping[str, Any]) -> dict[str, Any]:
+        x, y, z = thing["p_world"]
+        return {**thing, "p_world": [x * scale, y * scale, z]}
+
+    lab = dict(table.get("lab", {}))
+    if "floor_m" in lab:
+        lab["floor_m"] = [round(side * scale, 3) for side in lab["floor_m"]]
+    things = {key: [placed(thing) for thing in table[key]] for key in ("furniture", "source") if key in table}
+    return {**table, "lab": lab, **things}
 
 
 def _robot(

@@ -14,6 +14,9 @@ ALIKE_M = 0.01
 OFF = 0.02
 """Relative difference above which the robot's shape replaces a default."""
 
+FULL_TURN_DEG = 361.0
+"""Range of a joint above which it turns without end [deg]; exporters write -180 to 180 rad for no limits."""
+
 SUNK_M = 1e-3
 """Largest distance between wheels and floor of a robot that stands on it [m]."""
 
@@ -87,11 +90,11 @@ def stand_on_floor(robot: Usd.Prim, drive: DriveSpec) -> list[str]:
 
 
 def wheels_of(robot: Usd.Prim) -> list[Wheel]:
-    """The bodies of a robot on joints without limits."""
+    """The bodies of a robot on joints that turn without end."""
     found = []
     for prim in Usd.PrimRange(robot):
         joint = UsdPhysics.RevoluteJoint(prim)
-        if not joint or math.isfinite(joint.GetLowerLimitAttr().Get() or 0.0):
+        if not joint or not _range(joint) > FULL_TURN_DEG:
             continue
         bodies = joint.GetBody1Rel().GetTargets()
         box = _box(robot, prim.GetStage().GetPrimAtPath(bodies[0])) if bodies else None
@@ -101,6 +104,12 @@ def wheels_of(robot: Usd.Prim) -> list[Wheel]:
         name = prim.GetDisplayName() or prim.GetName()
         found.append(Wheel(name, x, y, z, max(size[0], size[2]) / 2))
     return found
+
+
+def _range(joint: UsdPhysics.RevoluteJoint) -> float:
+    """Range of a joint [deg], which may be infinite."""
+    low, high = joint.GetLowerLimitAttr().Get(), joint.GetUpperLimitAttr().Get()
+    return (0.0 if high is None else high) - (0.0 if low is None else low)
 
 
 def footprint_of(robot: Usd.Prim) -> float | None:

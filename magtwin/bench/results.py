@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from magtwin.bench.suite import Chunk, Suite, load_suite
 from magtwin.errors import InputError, find
-from magtwin.files import existing, output
+from magtwin.files import existing, output, read_text
 from magtwin.report import Figure, Report
 from magtwin.summary import Summarized, Summary, listed
 
@@ -193,7 +193,7 @@ def read_about(folder: Path) -> dict[str, Any]:
     """
     file = folder / ABOUT
     try:
-        about = json.loads(file.read_text(encoding="utf-8"))
+        about = json.loads(read_text(file, "description of results", "JSON"))
         known = (
             isinstance(about, dict)
             and {"name", "version", "sha256", "seeds", "magtwin", "data"} <= about.keys()

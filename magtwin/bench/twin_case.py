@@ -33,6 +33,9 @@ STREAMS = ("odometry", "noise", "prior", "map", "kidnap", "moved", "localizer")
 SESSION = 7
 """Second word of the seed of what a session has in common."""
 
+Place = tuple[str, str, str]
+"""Stage of a scene, its lab and the epoch of its map, as `open_twin` takes them."""
+
 
 def twin_case(scenario: Scenario, scene: str, seed: int, session: int, fields: Path | None = None) -> Case:
     """One run of a scenario in a twin.
@@ -48,9 +51,10 @@ def twin_case(scenario: Scenario, scene: str, seed: int, session: int, fields: P
     Raises:
         InputError: A path or the scene is unknown, or the drive leaves no room for a kidnap.
     """
+    place = scene, scenario.lab, scenario.epoch
     rngs = dict(zip(STREAMS, np.random.default_rng((seed, 1)).spawn(len(STREAMS)), strict=True))
-    field = _field(scene, fields)
-    drive = _drive(scenario, scene, seed, session)
+    field = _field(place, fields)
+    drive = _drive(scenario, place, seed, session)
     t, pose, cuts, rows = _kidnapped(scenario, drive, rngs["kidnap"])
     true_field = world.certain(field)
     if scenario.moved_nt:
@@ -91,14 +95,14 @@ def twin_case(scenario: Scenario, scene: str, seed: int, session: int, fields: P
         }
     )
     problem = Problem(
-        belief=_belief(scenario, scene, fields, rngs["map"]),
+        belief=_belief(scenario, place, fields, rngs["map"]),
         extent=field.extent,
         prior=drawn_prior(scenario.prior, pose[0], rngs["prior"]),
         sensor=replace(scenario.sensor, lever_arm_m=_lever(drive)),
         odometry=scenario.told_odometry,
         map_length_m=scenario.map_length_m,
         rate_hz=scenario.rate_hz,
-        calibration=_calibration(scenario, scene, session),
+        calibration=_calibration(scenario, place, session),
         seed=int(rngs["localizer"].integers(2**31)),
     )
     truth = Truth(t, pose, true_field, tuple(t[cuts].tolist()), scenario.map_error_nt)
@@ -106,35 +110,36 @@ def twin_case(scenario: Scenario, scene: str, seed: int, session: int, fields: P
 
 
 @lru_cache(maxsize=4)
-def _twin(scene: str, magnetometer: str) -> "Twin":
+def _twin(place: Place, magnetometer: str) -> "Twin":
     from magtwin.twin import open_twin
 
-    return open_twin(scene, magnetometer=magnetometer)  # type: ignore[arg-type]
+    scene, lab, epoch = place
+    return open_twin(scene, lab=lab, epoch=epoch, magnetometer=magnetometer)  # type: ignore[arg-type]
 
 
 @lru_cache(maxsize=64)
-def _in_session(scene: str, magnetometer: str, session: int) -> "Twin":
+def _in_session(place: Place, magnetometer: str, session: int) -> "Twin":
     from magtwin.twin import in_session
 
-    return in_session(_twin(scene, magnetometer), session)
+    return in_session(_twin(place, magnetometer), session)
 
 
-def _field(scene: str, fields: Path | None) -> AnomalyMap:
+def _field(place: Place, fields: Path | None) -> AnomalyMap:
     """The true field of the twin, or of a survey."""
     if fields is None:
-        return _twin(scene, "map-only").field
+        return _twin(place, "map-only").field
     return world.fitted_field(fields / "truth.npz")
 
 
 def _drive(
-    scenario: Scenario, scene: str, seed: int, session: int, *, duration_s: float | None = None
+    scenario: Scenario, place: Place, seed: int, session: int, *, duration_s: float | None = None
 ) -> Run:
     """A simulated drive, long enough for the kidnaps."""
     from magtwin.sim.motion.drive_input import drive_input
     from magtwin.twin import room_of, simulate
 
     kind = "map-only" if scenario.truth == "map" else "physical"
-    twin = _in_session(scene, kind, session)
+    twin = _in_session(place, kind, session)
     path = drive_input(scenario.paths[seed % len(scenario.paths)], room_of(twin), fit=True)
     length = scenario.duration_s * (2 if scenario.kidnaps else 1) if duration_s is None else duration_s
     run = simulate(twin, path, seed=seed, duration_s=length, rate_hz=scenario.rate_hz, outside="clamp")
@@ -237,7 +242,7 @@ def fogm(t: Array, sensor: SensorModel, rng: np.random.Generator) -> Array:
 
 
 def _belief(
-    scenario: Scenario, scene: str, fields: Path | None, rng: np.random.Generator
+    scenario: Scenario, place: Place, fields: Path | None, rng: np.random.Generator
 ) -> AnomalyMap | None:
     """What the localizer gets."""
     if scenario.belief == "none":
@@ -245,32 +250,32 @@ def _belief(
     if scenario.belief == "trilinear":
         if fields is not None:
             return world.fitted_field(fields / "nodes.npz")
-        return _sparse(scene, scenario.survey_spacing_m)
+        return _sparse(place, scenario.survey_spacing_m)
     if scenario.map_error_nt:
-        return world.with_error(_field(scene, fields), scenario.map_error_nt, scenario.map_length_m, rng)
+        return world.with_error(_field(place, fields), scenario.map_error_nt, scenario.map_length_m, rng)
     if scenario.truth == "scene":
-        return _field(scene, fields)  # with the variance of its survey
-    return _certain(scene, fields)
+        return _field(place, fields)  # with the variance of its survey
+    return _certain(place, fields)
 
 
 @lru_cache(maxsize=4)
-def _certain(scene: str, fields: Path | None) -> AnomalyMap:
-    return world.certain(_field(scene, fields))
+def _certain(place: Place, fields: Path | None) -> AnomalyMap:
+    return world.certain(_field(place, fields))
 
 
 @lru_cache(maxsize=4)
-def _sparse(scene: str, spacing_m: float) -> AnomalyMap:
-    return world.trilinear(_field(scene, None), spacing_m)
+def _sparse(place: Place, spacing_m: float) -> AnomalyMap:
+    return world.trilinear(_field(place, None), spacing_m)
 
 
-def _calibration(scenario: Scenario, scene: str, session: int) -> Run | None:
+def _calibration(scenario: Scenario, place: Place, session: int) -> Run | None:
     """A labelled drive of the session, with true poses."""
     if not scenario.calibration_s:
         return None
     if scenario.truth != "scene":
         raise InputError(f'scenario {scenario.name!r}: calibration_s needs truth = "scene"')
     drive = _drive(
-        replace(scenario, paths=("figure8",)), scene, session, session, duration_s=scenario.calibration_s
+        replace(scenario, paths=("figure8",)), place, session, session, duration_s=scenario.calibration_s
     )
     return drive.select(
         "p_world_base",

@@ -1,12 +1,61 @@
 """The command line: one typed function for each command. Commands parse, call a public function and print."""
 
-from magtwin.cli import bench, completion, doctor, localize, ros  # noqa: F401 - each registers its commands
-from magtwin.cli.app import main, share_options
-from magtwin.cli.learn import calibrate, compensate, dataset, evaluate, network, train  # noqa: F401
-from magtwin.cli.maps import fit, look  # noqa: F401
-from magtwin.cli.runs import drive, file, picture, report, reproduce, run, sweep  # noqa: F401
-from magtwin.cli.scenes import export, robot, scene, schema, validate  # noqa: F401
+import sys
+from importlib import import_module
 
-share_options()
+from magtwin.cli import app as application
 
-__all__ = ["main"]
+MODULES = {
+    "bench": ("bench",),
+    "calibrate": ("learn.calibrate",),
+    "compare": ("runs.report",),
+    "compensate": ("learn.compensate",),
+    "completion": ("completion",),
+    "convert": ("runs.file",),
+    "dataset": ("learn.dataset",),
+    "demo": ("runs.run",),
+    "doctor": ("doctor",),
+    "drive": ("runs.drive",),
+    "evaluate": ("learn.evaluate",),
+    "export": ("scenes.export",),
+    "fetch": ("runs.file",),
+    "film": ("runs.picture",),
+    "info": ("runs.file",),
+    "localize": ("localize",),
+    "map": ("maps.fit", "maps.look"),
+    "network": ("learn.network",),
+    "new": ("scenes.scene",),
+    "picture": ("runs.picture",),
+    "report": ("runs.report",),
+    "reproduce": ("runs.reproduce",),
+    "robot": ("scenes.robot",),
+    "ros": ("ros", "localize"),
+    "run": ("runs.run",),
+    "scene": ("scenes.scene",),
+    "schema": ("scenes.schema",),
+    "sweep": ("runs.sweep",),
+    "train": ("learn.train",),
+    "upgrade": ("scenes.schema",),
+    "validate": ("scenes.validate",),
+    "view": ("runs.file",),
+}
+"""Modules that register each command; the others stay unloaded while it runs."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the `magtwin` command; `arguments` default to those of the command line."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    name = arguments[0] if arguments else ""
+    load(name if name in MODULES and name != "completion" else None)
+    application.main(arguments)
+
+
+def load(command: str | None = None) -> None:
+    """Register one command, or all."""
+    for name in MODULES if command is None else (command,):
+        for module in MODULES[name]:
+            import_module(f"magtwin.cli.{module}")
+    application.share_options()
+
+
+__all__ = ["load", "main"]

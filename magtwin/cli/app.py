@@ -87,7 +87,8 @@ def share_options(group: App = app) -> None:
     for name in group:
         if not name.startswith("-"):
             share_options(group[name])
-    if group.default_command is not None and group is not app:
+    shared = getattr(group.default_command, "shares_options", False)
+    if group.default_command is not None and group is not app and not shared:
         group.default_command = _with_output_options(group, group.default_command)
 
 
@@ -114,6 +115,7 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
     wrapped.__signature__ = signature.replace(  # type: ignore[attr-defined]
         parameters=[*signature.parameters.values(), *parameters]
     )
+    wrapped.shares_options = True  # type: ignore[attr-defined]
     wrapped.__annotations__ = {**function.__annotations__, **added}
     return wrapped
 

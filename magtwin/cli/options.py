@@ -93,6 +93,14 @@ Lab = Annotated[
         "only lab.",
     ),
 ]
+Epoch = Annotated[
+    str,
+    Parameter(
+        name="--epoch",
+        help="Epoch of the map, if it has several: its date, YYYY-MM-DD. Default: the epoch that the stage "
+        "selects.",
+    ),
+]
 Network = Annotated[
     Path | None,
     Parameter(

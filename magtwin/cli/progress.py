@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from threading import Event, Lock, Thread
 from typing import Any, TextIO
 
+from magtwin.summary import printable_lines
+
 FIRST_S = 1.5
 """Silence after which the first line is printed [s]."""
 
@@ -194,7 +196,7 @@ class Watch:
 
     def _print(self, line: str) -> None:
         with suppress(OSError, ValueError):  # stderr is closed
-            print(line, file=self._stream or sys.stderr, flush=True)
+            print(printable_lines(line), file=self._stream or sys.stderr, flush=True)
 
     @contextmanager
     def _drawn(self, step: Step) -> Iterator[Callable[[], None]]:

@@ -6,15 +6,17 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import (
+    Epoch,
     Flag,
     Force,
     Gamepad,
+    Lab,
     Lidar,
     ModelError,
     Network,
@@ -115,6 +117,8 @@ def sim(
     scene: Path,
     *,
     where: Where = HERE,
+    lab: Lab = "",
+    epoch: Epoch = "",
     pace: float = 1.0,
     duration_s: float | None = None,
     seed: Seed = 0,
@@ -155,8 +159,8 @@ def sim(
 
     announce(f"opening {scene}")
     kind = None if magnetometer == "none" else magnetometer
-    twin = open_twin(scene, network=network, magnetometer=kind, model_error=model_error)
-    twin = with_plant(twin, plant)
+    opening: Any = {"network": network, "magnetometer": kind, "model_error": model_error}
+    twin = with_plant(open_twin(scene, lab=lab, epoch=epoch, **opening), plant)
     with where.bus("magtwin_sim", duration_s=duration_s, several=bool(twin.scene.others)) as bus:
         node = Simulator(
             twin,
@@ -190,6 +194,8 @@ def magnetometer(
     scene: Path,
     *settings: str,
     where: Where = HERE,
+    lab: Lab = "",
+    epoch: Epoch = "",
     network: Network = None,
     online: str | None = None,
     measured: str | None = None,
@@ -224,7 +230,9 @@ def magnetometer(
 
     values = settings_of(PARAMETERS, settings)
     announce(f"opening {scene}")
-    twin = open_twin(scene, network=network, model_error=False)  # it predicts for a robot that reads
+    twin = open_twin(
+        scene, lab=lab, epoch=epoch, network=network, model_error=False
+    )  # it predicts for a robot that reads
     with where.bus("magtwin_magnetometer", sim_time=values["use_sim_time"], duration_s=duration_s) as bus:
         Magnetometer(
             twin, bus, values, online=online, measured=measured, frame_prefix=frame_prefix or "", say=announce
@@ -323,15 +331,14 @@ def teleop(
         Bag to record the robot's topics to, as `magtwin ros record` does. Default: none.
     """
     from magtwin.cli.runs.drive import device
-    from magtwin.files import existing
     from magtwin.io.bags import RawBagWriter
     from magtwin.ros.record import Recorder
     from magtwin.ros.teleop import Teleop
     from magtwin.sim.motion.manual import HELP, Hand, Keyboard
     from magtwin.sim.motion.manual import Gamepad as Pad
 
-    if gamepad is not None:
-        existing(gamepad, "gamepad")
+    if gamepad is not None and not gamepad.is_char_device():
+        raise InputError(f"{gamepad}: not a gamepad; name one, such as /dev/input/js0")
     drive = _drive_of(asset)
     hand: Hand = Keyboard(drive) if gamepad is None else Pad(drive)
     with ExitStack() as stack:

@@ -11,7 +11,7 @@ from typing import Any, TextIO, cast
 
 from magtwin.cli.progress import announce, current, progress, silence, step
 from magtwin.errors import InputError
-from magtwin.summary import printable
+from magtwin.summary import printable, printable_lines
 
 __all__ = ["announce", "printable", "progress", "silence", "step"]  # commands import these from here too
 
@@ -45,7 +45,8 @@ class Done:
                 data = {} if self.report is None else json.loads(self.report.to_json())
             if wrote and isinstance(data, dict):
                 data = {**data, "wrote": wrote}
-            print(json.dumps(data, indent=2, ensure_ascii=False))  # noqa: T201
+            text = json.dumps(data, indent=2, ensure_ascii=False)
+            print("".join(c if c.isprintable() or c == "\n" else json.dumps(c)[1:-1] for c in text))  # noqa: T201
         else:
             if self.table is not None:
                 self.table()
@@ -83,18 +84,18 @@ def output_mode(*, as_json: bool, quiet: bool) -> Iterator[None]:
 def say(text: str) -> None:
     """Print a line on stdout; nothing with --json or --quiet."""
     if not (_mode.json or _mode.quiet):
-        print(text)  # noqa: T201
+        print(printable_lines(text))  # noqa: T201
 
 
 def note(text: str) -> None:
     """Print an indented line on stderr; nothing with --quiet."""
     if not _mode.quiet:
-        print(f"  {text}", file=sys.stderr)  # noqa: T201
+        print(f"  {printable_lines(text)}", file=sys.stderr)  # noqa: T201
 
 
 def print_error(text: str, style: str = "") -> None:
     """Print one line on stderr, in colour on a terminal; --quiet prints it too."""
-    text = f"magtwin: {' '.join(text.split())}"
+    text = f"magtwin: {printable(' '.join(text.split()))}"
     coloured = style and sys.stderr.isatty()
     print(f"\033[{style}m{text}\033[0m" if coloured else text, file=sys.stderr)  # noqa: T201
 
@@ -129,11 +130,35 @@ def stdout_console() -> Any:
     from rich.console import Console
 
     if _mode.json or _mode.quiet:
-        return Console(file=io.StringIO(), highlight=False)
-    if sys.stdout.isatty():
-        return Console(highlight=False)
-    width = None if os.environ.get("COLUMNS") else WIDE
-    return Console(highlight=False, width=width, file=cast(TextIO, _Trimmed()))
+        console = Console(file=io.StringIO(), highlight=False)
+    elif sys.stdout.isatty():
+        console = Console(highlight=False)
+    else:
+        width = None if os.environ.get("COLUMNS") else WIDE
+        console = Console(highlight=False, width=width, file=cast(TextIO, _Trimmed()))
+    console.push_render_hook(cast(Any, _PrintableTexts()))
+    return console
+
+
+class _PrintableTexts:
+    """Hook of a console: escapes control characters in all that is printed, but for those of styles."""
+
+    def process_renderables(self, renderables: list[Any]) -> list[Any]:
+        """What a console is to print, escaped."""
+        return [_Escaped(renderable) for renderable in renderables]
+
+
+@dataclass(frozen=True)
+class _Escaped:
+    """Something to print, with control characters of its texts escaped."""
+
+    content: Any
+
+    def __rich_console__(self, console: Any, options: Any) -> Iterator[Any]:
+        from rich.segment import Segment
+
+        for text, style, control in console.render(self.content, options):
+            yield Segment(text if control else printable_lines(text), style, control)
 
 
 def check_suffix(path: Path, suffixes: tuple[str, ...], what: str) -> None:

@@ -16,7 +16,7 @@ from pxr import Sdf, Usd, UsdUtils, Vt
 from magtwin.errors import InputError
 from magtwin.export.contents import kind_of, named_files
 from magtwin.files import sha256
-from magtwin.usd.layers import open_stage, relative_asset
+from magtwin.usd.layers import open_stage, relative_asset, translates
 from magtwin.usd.schema import place as prim_place
 from magtwin.usd.schema.versions import creator
 
@@ -29,6 +29,7 @@ KINDS = ("weights", "paths")
 NAME, BYTES, SHA256, OF = (f"magtwin:file:{name}" for name in ("name", "bytes", "sha256", "of"))
 
 
+@translates
 def attach(root: Path, *more: Path) -> None:
     """Move files of a stage's folder into a new sublayer of the root layer, `files.usdc`.
 
@@ -104,6 +105,7 @@ def _define(layer: Sdf.Layer, scope: Sdf.Path, named: dict[Path, list[Sdf.Path]]
             of.targetPathList.explicitItems.append(path)
 
 
+@translates
 def detach(root: Path) -> tuple[Path, ...]:
     """Write a stage's attached files beside its root layer, and restore the properties that named them.
 

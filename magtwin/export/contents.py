@@ -12,7 +12,7 @@ from pxr import Sdf, UsdUtils
 from safetensors import SafetensorError, safe_open
 
 from magtwin.errors import InputError
-from magtwin.usd.layers import SUFFIXES, open_stage
+from magtwin.usd.layers import SUFFIXES, open_stage, translates
 
 KINDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -37,6 +37,7 @@ def kind_of(file: str | os.PathLike[str]) -> str:
     return next((kind for kind, suffixes in KINDS.items() if suffix in suffixes), "")
 
 
+@translates
 def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> Path:
     """Copy a stage and every file that it names, in any variant, into a folder.
 

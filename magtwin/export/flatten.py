@@ -5,9 +5,10 @@ from pathlib import Path
 from pxr import Sdf, Usd, UsdUtils
 
 from magtwin.export.contents import kind_of
-from magtwin.usd.layers import open_stage, relative_asset
+from magtwin.usd.layers import open_stage, relative_asset, translates
 
 
+@translates
 def flatten(root: Path, out: Path) -> None:
     """Write a stage as a single layer.
 

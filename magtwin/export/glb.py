@@ -17,8 +17,9 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 
 from magtwin.errors import InputError
 from magtwin.usd.geometry import Shape, read_shapes
-from magtwin.usd.layers import open_stage
+from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.schema import NOUNS, attribute_name, prims_with
+from magtwin.usd.tiled_maps import is_tiled
 from magtwin.version import __version__
 
 CREASE = np.deg2rad(40.0)
@@ -41,6 +42,7 @@ _COMPONENTS = {"f4": 5126, "u4": 5125, "u1": 5121}
 _VERTICES, _INDICES = 34962, 34963
 
 
+@translates
 def write_glb(stage_file: Path, out: Path) -> None:
     """Write the visible shapes of a stage.
 
@@ -58,6 +60,9 @@ def write_glb(stage_file: Path, out: Path) -> None:
     shapes = [shape for shape in read_shapes(stage) if len(shape.faces)]
     if not shapes:
         raise InputError(f"{stage_file}: has no visible surface")
+    for shape in shapes:
+        if not np.isfinite(shape.vertices).all():
+            raise InputError(f"{stage_file} <{shape.prim}>: has points or transforms that are not finite")
     homes: dict[Sdf.Path, list[Shape]] = {}  # prim of the node: the body, or a child of the default prim
     for shape in shapes:
         body = prim = stage.GetPrimAtPath(shape.prim)
@@ -116,7 +121,10 @@ class _Scene:
         prim = self.stage.GetPrimAtPath(path)
         if path == Sdf.Path.absoluteRootPath or not prim:
             return Gf.Matrix4d(1)
-        return cache.GetLocalToWorldTransform(prim).RemoveScaleShear()
+        frame = cache.GetLocalToWorldTransform(prim).RemoveScaleShear()
+        if not np.isfinite(np.array(frame)).all():
+            raise InputError(f"{path}: its transform is not finite; correct its translation or scale")
+        return frame
 
     def show(self, home: Sdf.Path, shapes: list[Shape]) -> None:
         """Add a mesh to a node, with one primitive per material."""
@@ -174,19 +182,19 @@ class _Scene:
         for attribute in prim.GetAuthoredAttributes():
             if attribute.GetNamespace().startswith("magtwin:"):
                 value = _json_value(attribute.Get())
-                if value is not None:
+                if value not in (None, []):
                     extras[attribute.GetName()] = value
-        if prim.HasAPI(NOUNS["anomalyMap"]):
+        if prim.HasAPI(NOUNS["anomalyMap"]) and not is_tiled(prim):
             values = np.array(prim.GetAttribute(attribute_name("anomalyMap", "values")).Get(), "<f4")
             valid = np.array(prim.GetAttribute(attribute_name("anomalyMap", "valid")).Get(), "u1")
             valid &= np.isfinite(values)
             numbers = {"values": np.where(valid, values, 0).astype("<f4"), "valid": valid}
             for name, array in numbers.items():
                 extras[attribute_name("anomalyMap", name)] = {"accessor": self._accessor(array)}
-            for child in prim.GetChildren():
-                scale = child.GetCustomDataByKey("magtwin") or {}
-                if "colourMap" in scale:
-                    extras["colours"] = {key: _json_value(value) for key, value in scale.items()}
+        for child in prim.GetChildren() if prim.HasAPI(NOUNS["anomalyMap"]) else ():
+            scale = child.GetCustomDataByKey("magtwin") or {}
+            if "colourMap" in scale:
+                extras["colours"] = {key: _json_value(value) for key, value in scale.items()}
 
     def animate(self) -> None:
         """Animate the nodes of prims with time samples."""

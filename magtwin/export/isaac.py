@@ -228,21 +228,27 @@ def _drive(graph: Graph, robot: RobotSpec, parts: _Parts, topic: str) -> None:
         maxAngularAcceleration=drive.alpha_max,
         maxWheelSpeed=drive.wheel_rate_max,
     )
-    graph.node(
-        "wheels",
-        f"{CORE}IsaacArticulationController",
-        targetPrim=parts.articulation,
-        jointNames=[drive.left_wheel_joint, drive.right_wheel_joint],
-    )
+    lefts = (drive.left_wheel_joint, *drive.more_left_wheel_joints)
+    rights = (drive.right_wheel_joint, *drive.more_right_wheel_joints)
+    axles = [f"wheels_{i + 1}" if i else "wheels" for i in range(max(len(lefts), len(rights)))]
+    for i, axle in enumerate(axles):  # two rates each, which is what the controller makes
+        names = [lefts[min(i, len(lefts) - 1)], rights[min(i, len(rights) - 1)]]
+        graph.node(
+            axle,
+            f"{CORE}IsaacArticulationController",
+            targetPrim=parts.articulation,
+            jointNames=names,
+        )
     _published(graph, "command", HEARD_QOS, stamp=False)
     graph.connect("tick.tick", "controller.execIn")  # each frame, as its limits of acceleration go by time
     graph.connect("tick.deltaSeconds", "controller.dt")
-    graph.connect("tick.tick", "wheels.execIn")
+    for axle in axles:
+        graph.connect("tick.tick", f"{axle}.execIn")
+        graph.connect("controller.velocityCommand", f"{axle}.velocityCommand")
     graph.connect("command.linearVelocity", "forward.tuple")
     graph.connect("command.angularVelocity", "turning.tuple")
     graph.connect("forward.x", "controller.linearVelocity")
     graph.connect("turning.z", "controller.angularVelocity")
-    graph.connect("controller.velocityCommand", "wheels.velocityCommand")
 
 
 def frame_of(mount: MountSpec, name: str) -> str:

@@ -12,7 +12,7 @@ from shlex import quote
 from tempfile import TemporaryDirectory
 from typing import Literal
 
-from jinja2 import Template
+from jinja2 import Environment
 from pxr import Sdf, UsdGeom
 
 from magtwin.errors import InputError, MismatchWarning, find
@@ -27,6 +27,7 @@ from magtwin.export.validation.inspection import inspect
 from magtwin.files import check_free, existing, output, sha256
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run
+from magtwin.summary import in_markdown, printable
 from magtwin.urdf.simready import UNKNOWN
 from magtwin.usd.animation import write_animation
 from magtwin.usd.layers import open_stage, stage_sha256
@@ -406,7 +407,9 @@ class _Work:
             for name in GENERATED:
                 copied(SCHEMA / name, folder / PLUGIN / name)
         text = Path(__file__).with_name("readme.md.jinja").read_text(encoding="utf-8")
-        template = Template(text, trim_blocks=True)
+        pages = Environment(trim_blocks=True, finalize=lambda value: printable(value).replace("`", "'"))
+        pages.filters["marked"] = in_markdown
+        template = pages.from_string(text)
         page = template.render(
             name=self.source.stem,
             version=__version__,

@@ -7,9 +7,10 @@ from pxr import Sdf, UsdUtils
 
 from magtwin.errors import InputError
 from magtwin.urdf.layout import GEOMETRIES, PAYLOADS, write_layers
-from magtwin.usd.layers import open_stage
+from magtwin.usd.layers import open_stage, translates
 
 
+@translates
 def structure(asset: Path) -> None:
     """Split a robot's asset in place, unless it has the structure already.
 

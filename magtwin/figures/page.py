@@ -20,7 +20,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from magtwin.errors import InputError
 from magtwin.figures.canvas import Picture
 from magtwin.files import output
-from magtwin.summary import printable
+from magtwin.summary import in_markdown, printable, printable_lines
 from magtwin.version import __version__
 
 LONGEST_TEXT = 500
@@ -212,7 +212,7 @@ def _markdown_table(table: Table, level: int) -> list[str]:
 
 def _marked(text: str) -> str:
     """Text with the characters escaped that have a meaning in Markdown."""
-    return re.sub(r"([\\`*\[\]<>|!#~$]|(?<!\w)_|_(?!\w))", r"\\\1", text_of(text))
+    return in_markdown(text_of(text))
 
 
 def _finite(value: Any) -> Any:
@@ -223,11 +223,17 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def _shown(value: Any) -> Any:
+    """A value for a page; a text without control characters. Jinja escapes it for HTML."""
+    return printable_lines(value) if type(value) is str else value
+
+
 _TEMPLATES = Environment(
     loader=FileSystemLoader(Path(__file__).parent),
     autoescape=True,
     trim_blocks=True,
     lstrip_blocks=True,
     undefined=StrictUndefined,
+    finalize=_shown,
 )
 _TEMPLATES.filters |= {"text": text_of, "base64": lambda data: base64.b64encode(data).decode("ascii")}

@@ -21,12 +21,14 @@ from magtwin.spec.base import Vec3
 from magtwin.usd.geometry import (
     ColourScale,
     Shape,
+    linear_from_srgb,
     read_colour_scale,
     read_links,
     read_shapes,
     srgb_from_linear,
 )
-from magtwin.usd.layers import open_stage
+from magtwin.usd.layers import open_stage, translates
+from magtwin.usd.solids import corner_normals
 
 Array = NDArray[np.float64]
 
@@ -54,6 +56,9 @@ LIGHTS = (((0.6, 0.9, 1.4), 0.75), ((0.9, -1.0, 0.5), 0.45), ((-0.9, 0.2, 0.6), 
 
 VEIL = 0.3
 """Opacity of an object where it stands in front of the heat-map, the robot or the trail."""
+
+MOST_TEXELS = 2048
+"""Texels along the longer side of a texture as drawn; larger images are scaled down."""
 
 AMBIENT, DIFFUSE = 0.22, 0.8
 """Share of an object's colour visible without light, and share added by light at normal incidence."""
@@ -175,6 +180,7 @@ def room_above(points: ArrayLike) -> Array:
     return np.array(list(itertools.product(*ends)))
 
 
+@translates
 def _draw(
     plotter: Any,
     path: str | os.PathLike[str],
@@ -204,8 +210,11 @@ def _draw(
         around = room_above(np.vstack([v for v, chosen in zip(worlds, subject, strict=True) if chosen]))
     camera, screens = camera or Camera(), []
     for shape, vertices, chosen in zip(shapes, worlds, subject, strict=True):
-        flat = shape.vertex_colours is not None
-        actor = plotter.add_mesh(mesh_of(shape, vertices), opacity=shape.colour[3], **style_of(flat))
+        if shape.texture is not None:
+            actor = add_textured(plotter, shape, vertices)
+        else:
+            flat = shape.vertex_colours is not None
+            actor = plotter.add_mesh(mesh_of(shape, vertices), opacity=shape.colour[3], **style_of(flat))
         if not chosen and any(subject):
             screens.append(actor)
     if ground is None:
@@ -332,6 +341,32 @@ def mesh_of(shape: Shape, vertices: NDArray) -> Any:
     colour = (255 * np.array(srgb_from_linear(shape.colour[:3]))).round().astype(np.uint8)
     mesh["rgb"] = np.tile(colour, (mesh.n_points, 1))
     return mesh
+
+
+def add_textured(plotter: Any, shape: Shape, vertices: NDArray) -> Any:
+    """Draw a shape with its texture; returns its actor."""
+    import pyvista
+    from PIL import Image
+
+    texture = shape.texture
+    assert texture is not None
+    points = np.asarray(vertices, np.float32)
+    corners = np.arange(shape.faces.size).reshape(-1, 3)
+    mesh = pyvista.PolyData.from_regular_faces(points[shape.faces].reshape(-1, 3), corners)
+    with np.errstate(invalid="ignore", divide="ignore"):  # a triangle without an area has no normal
+        normals = np.nan_to_num(corner_normals(points, shape.faces)).reshape(-1, 3)
+    mesh.point_data.active_normals = normals
+    mesh.active_texture_coordinates = texture.uvs.reshape(-1, 2)
+    with Image.open(texture.file) as image:
+        image.thumbnail((MOST_TEXELS, MOST_TEXELS))
+        texels = np.asarray(image.convert("RGBA" if texture.see_through else "RGB"))
+    if texture.factor != (1.0, 1.0, 1.0):
+        scaled = srgb_from_linear(linear_from_srgb(texels[..., :3] / 255) * texture.factor)
+        texels = np.concatenate([(255 * scaled).round().astype(np.uint8), texels[..., 3:]], axis=-1)
+    drawn = pyvista.Texture(texels)
+    drawn.repeat, drawn.interpolate, drawn.mipmap = True, True, True
+    style = {name: value for name, value in style_of(False).items() if name not in ("scalars", "rgb")}
+    return plotter.add_mesh(mesh, texture=drawn, color="white", opacity=shape.colour[3], **style)
 
 
 def bake(mesh: Any) -> None:

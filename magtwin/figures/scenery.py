@@ -37,6 +37,7 @@ from magtwin.frames import matrix_from_quat, quat_from_yaw
 from magtwin.run.compare import FIELDS, HEADINGS, POSITIONS
 from magtwin.run.run import Run
 from magtwin.spec.base import Vec3
+from magtwin.twin import lab_and_epoch
 from magtwin.usd.geometry import ColourScale, Link, Shape, read_colour_scale, read_links, read_shapes
 from magtwin.usd.scene import open_scene
 
@@ -167,12 +168,12 @@ class Scenery:
         self._times, self._speed, self._view, self._size = np.asarray(times, float), speed, view, size
         self._position = _position(run)
         self._pose(run)
-        opened = open_scene(scene_file, lab=str(run.metadata.get("lab", "")), check_network=False)
+        opened = open_scene(scene_file, check_network=False, **lab_and_epoch(run.metadata))
         stage, scene = opened.stage, opened.scene
         shapes, links = read_shapes(stage), read_links(stage)
         moving = _links_of(links, [placed.robot.name for placed in scene.robots], run)
         drive = scene.led_by(str(run.metadata["robot"])).robot.drive if scene.others else scene.robot.drive
-        self._sides = {drive.left_wheel_joint: 0, drive.right_wheel_joint: 1}
+        self._sides = drive.sides
         still = [shape for shape in shapes if shape.link not in moving]
         if not shapes:
             raise InputError(f"{scene_file}: shows nothing")

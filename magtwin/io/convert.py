@@ -9,7 +9,7 @@ from magtwin.errors import InputError, MismatchWarning
 from magtwin.files import check_free
 from magtwin.io.formats import format_of, read_run, write_run
 from magtwin.run.run import Run
-from magtwin.twin import Twin, led_by, open_twin, scene_of
+from magtwin.twin import Twin, lab_and_epoch, led_by, open_twin, scene_of
 
 
 def convert_run(
@@ -72,7 +72,8 @@ def twin_to_show(run: Run, file: Path, scene: str | Path | None = None) -> Twin 
         InputError: `scene` was given and cannot be opened.
     """
     try:
-        twin = open_twin(scene_of(run, scene, near=file), magnetometer="map-only")  # needs no network
+        stage = scene_of(run, scene, near=file)
+        twin = open_twin(stage, magnetometer="map-only", **lab_and_epoch(run.metadata))  # needs no network
         if "robot" in run.metadata:
             twin = led_by(twin, str(run.metadata["robot"]))
     except InputError as error:

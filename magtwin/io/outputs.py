@@ -52,6 +52,7 @@ def drive(
     commands: str | Path | None = None,
     replay: str | Path | None = None,
     lab: str = "",
+    epoch: str = "",
     network: str | Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
     model_error: bool = True,
@@ -73,6 +74,7 @@ def drive(
         commands: CSV of commands to drive by, in place of the path.
         replay: Run to drive again, in place of the path.
         lab: As for `magtwin.open_twin`.
+        epoch: As for `magtwin.open_twin`.
         network: As for `magtwin.open_twin`.
         magnetometer: As for `magtwin.open_twin`.
         model_error: As for `magtwin.open_twin`.
@@ -100,6 +102,7 @@ def drive(
     twin = open_twin(
         scene_file,
         lab=lab,
+        epoch=epoch,
         network=network,
         magnetometer=magnetometer,
         model_error=model_error,

@@ -15,7 +15,16 @@ from magtwin.io.formats import read_run, write_run
 from magtwin.path import CASES, PATHS, Path, path_named, read_path_csv
 from magtwin.report import Figure, Report
 from magtwin.run.run import COLUMNS, Run
-from magtwin.twin import in_session_of, locate, path_metadata, scene_of, simulate, simulate_robots, twin_of
+from magtwin.twin import (
+    in_session_of,
+    lab_and_epoch,
+    locate,
+    path_metadata,
+    scene_of,
+    simulate,
+    simulate_robots,
+    twin_of,
+)
 
 CAUSES: Mapping[str, str] = {
     "magtwin": "another version of magtwin",
@@ -180,10 +189,11 @@ def map_of(
     from magtwin.usd.maps import load_map
     from magtwin.usd.scene import read_scene
 
-    layer = read_scene(scene_of(run, scene, near=near), check_network=False).map_layer
+    where = lab_and_epoch(run.metadata)
+    layer = read_scene(scene_of(run, scene, near=near), check_network=False, **where).map_layer
     if "map_sha256" in run.metadata and run.metadata["map_sha256"] != layer_sha256(layer):
         raise InputError(f"{layer}: is not the map of the run")
-    return load_map(layer)
+    return load_map(layer, where["epoch"] or None)
 
 
 def planned_of(run: Run, *, near: str | FilePath | None = None) -> NDArray[np.float64] | None:

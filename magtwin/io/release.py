@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.budget import check_size
 from magtwin.errors import InputError, hint
 from magtwin.files import existing, sha256
 from magtwin.frames import canonical, quat_from_yaw, wrap_angle
@@ -79,6 +80,7 @@ def read_release(path: str | os.PathLike[str]) -> Run:
     path = existing(path, "recording")
     if path.is_dir():
         raise InputError(f"{path}: a folder; name the .json file in it")
+    check_size(path, "recording")
     text, at, table, last = *_opened(path), array("d"), -math.inf
     for number in count(1):
         at = _BETWEEN.match(text, at).end()  # type: ignore[union-attr]

@@ -6,12 +6,14 @@ CSV is for spreadsheets; its metadata are in lines that begin with #. npz is for
 
 import io
 import json
+import math
 import os
 import shutil
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from tokenize import TokenError
+from typing import IO, Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +21,7 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from magtwin.budget import check_count, check_decoded, check_size
 from magtwin.errors import InputError, find
 from magtwin.files import check_free, existing, output
 from magtwin.io.recorder import Sink
@@ -143,10 +146,38 @@ def load_parquet(path: Path, load: Callable[[Path], Any] = pq.read_table) -> Any
     if tail != _MAGIC:
         raise InputError(f"{path}: Parquet cut short: its end is missing; write it again, or copy it again")
     try:
+        check_parquet(path)
         return load(path)
     except (pa.ArrowException, OSError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"{path}: damaged Parquet ({reason}); write it again") from error
+
+
+_BATCH = 1000
+"""Rows of texts that are measured at once."""
+
+
+def check_parquet(path: Path) -> None:
+    """Refuse a Parquet file that would be too large in memory: equal values take no room in the file.
+
+    Raises:
+        InputError: Its columns, decoded, are over the budget, or there are too many of them.
+    """
+    size = check_size(path, "Parquet")
+    with pq.ParquetFile(path) as file:
+        about = file.metadata
+        check_count(path, "Parquet", about.num_columns, "columns")
+        values, texts = 0, list[str]()
+        for i in range(about.num_columns):
+            column = about.schema.column(i)
+            count = sum(about.row_group(k).column(i).num_values for k in range(about.num_row_groups))
+            values += 8 * max(count, about.num_rows if column.max_repetition_level == 0 else 0)
+            if column.physical_type.endswith("BYTE_ARRAY"):
+                texts.append(column.path)
+        check_decoded(path, size, values)
+        for batch in file.iter_batches(_BATCH, columns=texts) if texts else ():
+            values += batch.nbytes
+            check_decoded(path, size, values)
 
 
 def _check_file(path: Path, kind: str) -> None:
@@ -262,10 +293,12 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
     """
     path = existing(path, "CSV file")
     _check_file(path, "a CSV file")
+    check_size(path, "CSV")
     with open(path, "rb") as file:
         about, names, skipped = _csv_head(file, path)
         file.seek(-1, os.SEEK_END)
         cut = file.read(1) != b"\n"
+    check_count(path, "CSV", len(names), "columns")
     rows, metadata, said = _csv_about(about, path)
     if columns:
         names = _renamed(names, columns, path)
@@ -426,9 +459,12 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
     """
     path = existing(path, "npz file")
     _check_file(path, "an npz file")
+    size = check_size(path, "npz")
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
+            check_count(path, "npz", len(names), "arrays")
+            check_decoded(path, size, sum(entry.file_size for entry in archive.infolist()))
             if twice := sorted({name for name in names if names.count(name) > 1}):
                 raise InputError(f"{path}: two arrays are called {twice[0]!r}; write it again")
             arrays = {name.removesuffix(".npy"): _array(archive, name, path) for name in names}
@@ -464,7 +500,18 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
 def _array(archive: zipfile.ZipFile, name: str, path: Path) -> NDArray[Any]:
     try:
         with archive.open(name) as file:
+            _check_header(file, archive.getinfo(name).file_size)
+            file.seek(0)
             return np.lib.format.read_array(file, allow_pickle=False)  # type: ignore[arg-type]
-    except (ValueError, MemoryError, OverflowError) as error:
+    except (ValueError, MemoryError, OverflowError, SyntaxError, TokenError) as error:
         reason = _short(" ".join(str(error).split()))
         raise InputError(f"{path}: {name} is no whole array of plain numbers ({reason})") from error
+
+
+def _check_header(file: IO[bytes], size: int) -> None:
+    """Refuse an array whose header claims more than its file holds, before room is made for it."""
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    if math.prod(shape) * max(dtype.itemsize, 1) > size:
+        raise ValueError(f"its header claims shape {shape} of {dtype} in {size:,} bytes")

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from magtwin.errors import InputError, find
 from magtwin.files import from_table
@@ -168,6 +167,8 @@ def draw_session_plant(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
     factors = 1 + plant.session_std * rng.standard_normal(4)
     phase = rng.uniform()
     hard = plant.hard_iron_std_nt * rng.standard_normal(3)
+    from scipy.spatial.transform import Rotation  # takes 0.3 s to import
+
     turns = Rotation.from_rotvec(plant.current_direction_std * rng.standard_normal((4, 3))).as_matrix()
     offset = np.add(mocap.offset_m, plant.marker_offset_std_m * rng.standard_normal(2))
     latency = max(0.0, mocap.latency_s + plant.mocap_latency_std_s * rng.standard_normal())

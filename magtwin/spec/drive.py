@@ -1,13 +1,17 @@
 """The differential drive of a robot."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from magtwin.spec.base import Spec, Vec2, Vec3
+from magtwin.spec.base import LATER, Spec, Vec2, Vec3
 
 
 @dataclass(frozen=True, kw_only=True)
 class DriveSpec(Spec):
-    """A differential drive: dimensions, limits and odometry."""
+    """A differential drive: dimensions, limits and odometry.
+
+    It stands for every drive that moves along its heading: skid steering with an effective separation, four
+    mecanum wheels without sideways motion, and with `turning_radius_m` a car about its rear axle.
+    """
 
     left_wheel_joint: str = "left_wheel_joint"
     """Name of the left wheel's joint."""
@@ -15,8 +19,18 @@ class DriveSpec(Spec):
     right_wheel_joint: str = "right_wheel_joint"
     """Name of the right wheel's joint."""
 
+    more_left_wheel_joints: tuple[str, ...] = field(default=(), metadata={LATER: True})
+    """Names of the joints of further wheels on the left, which turn as the left wheel does."""
+
+    more_right_wheel_joints: tuple[str, ...] = field(default=(), metadata={LATER: True})
+    """Names of the joints of further wheels on the right, which turn as the right wheel does."""
+
     wheel_separation_m: float = 0.233
-    """Distance between the wheels' contact points [m]."""
+    """Distance between the wheels' contact points [m]. Wheels that scrub, such as those of a skid-steered
+    robot, have an effective separation that is larger: wheel speeds differ by it times the yaw rate."""
+
+    turning_radius_m: float = field(default=0.0, metadata={LATER: True})
+    """Smallest turning radius of a robot that steers like a car [m]; 0: it turns on the spot."""
 
     wheel_radius_m: float = 0.03575
     """Radius of a wheel [m]."""
@@ -109,3 +123,14 @@ class DriveSpec(Spec):
         self._require("wheel_errors", min(self.wheel_errors) > -1, "be above -1", self.wheel_errors)
         left, right = self.left_wheel_joint, self.right_wheel_joint
         self._require("right_wheel_joint", left != right, "differ from left_wheel_joint", right)
+        names = [left, right, *self.more_left_wheel_joints, *self.more_right_wheel_joints]
+        twice = [name for i, name in enumerate(names) if name in names[:i]]
+        self._require("more_left_wheel_joints", not twice, "name each wheel once", twice)
+        self._not_negative("turning_radius_m")
+
+    @property
+    def sides(self) -> dict[str, int]:
+        """Side of each driven wheel by its joint: 0 for left, 1 for right. The first wheels come first."""
+        left, right = self.left_wheel_joint, self.right_wheel_joint
+        more = dict.fromkeys(self.more_left_wheel_joints, 0) | dict.fromkeys(self.more_right_wheel_joints, 1)
+        return {left: 0, right: 1} | more

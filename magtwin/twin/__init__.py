@@ -5,6 +5,7 @@
 
 from magtwin.twin.authoring import author_scene, new_scene, scene_from_toml
 from magtwin.twin.opening import check_scene, led_by, locate, open_twin, scene_file, scene_of, twin_of
+from magtwin.twin.robot_scene import scene_with_robot
 from magtwin.twin.simulation import engine_named, path_metadata, scan, simulate, simulate_robots
 from magtwin.twin.sweeps import MIXTURE, sweep
 from magtwin.twin.twin import (
@@ -13,6 +14,7 @@ from magtwin.twin.twin import (
     Twin,
     in_session,
     in_session_of,
+    lab_and_epoch,
     model_error_of,
     room_of,
     with_plant,
@@ -29,6 +31,7 @@ __all__ = [
     "engine_named",
     "in_session",
     "in_session_of",
+    "lab_and_epoch",
     "led_by",
     "locate",
     "model_error_of",
@@ -40,6 +43,7 @@ __all__ = [
     "scene_file",
     "scene_from_toml",
     "scene_of",
+    "scene_with_robot",
     "simulate",
     "simulate_robots",
     "sweep",

@@ -30,6 +30,9 @@ def scene_from_toml(
     map_layer: str | FilePath | None = None,
     network: str | FilePath | None = None,
     workshop: str | FilePath | None = None,
+    robot: FilePath | None = None,
+    name: str = "",
+    scale: float = 1.0,
     report: Report = lambda text: None,
     progress: Progress = lambda done, total, what: None,
 ) -> Scene:
@@ -45,6 +48,9 @@ def scene_from_toml(
         network: Weights (.safetensors or .pth) that replace those of the TOML.
         workshop: Folder for a robot converted from a URDF and for the map of a survey. Default: a temporary
             folder, deleted when Python ends; `author_scene` copies from it.
+        robot: USD asset of a robot that replaces those of the TOML, see `scene_with_robot`.
+        name: Name of the scene, in place of the TOML's.
+        scale: Factor on the floor and on the places of furniture and sources; their sizes stay.
         report: Called with a line about the survey, and about a map that differs from the sources.
         progress: Called during a survey with headings done, headings in all, and the current step.
 
@@ -87,6 +93,9 @@ def scene_from_toml(
         map_layer=map_layer,
         network=network,
         workshop=workshop,
+        robot=robot,
+        name=name,
+        scale=scale,
         inputs_of=inputs_of,
         survey_of=survey_of,
     )

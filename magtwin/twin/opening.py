@@ -20,6 +20,7 @@ from magtwin.twin.twin import (
     Kind,
     Metadata,
     Twin,
+    lab_and_epoch,
     scene_sha256,
     without_model_error,
     without_tracking_error,
@@ -36,6 +37,7 @@ def open_twin(
     scene: Scene | str | FilePath,
     *,
     lab: str = "",
+    epoch: str = "",
     network: str | FilePath | None = None,
     magnetometer: Kind | None = None,
     model_error: bool = True,
@@ -54,6 +56,8 @@ def open_twin(
             written to a temporary folder first. Colliders added to a stage by hand are not part of a
             `Scene`.
         lab: Path of the lab's root prim on a stage of several labs. Default: the only lab.
+        epoch: Date of the map's epoch, YYYY-MM-DD, if the map has several. Default: the epoch that the stage
+            selects.
         network: Weights (.safetensors or .pth) that replace those of the scene; or "none" for a physical
             magnetometer.
         magnetometer: Kind that replaces the scene's: "physical", "neural" or "map-only".
@@ -70,13 +74,13 @@ def open_twin(
     options: Any = {"network": network, "magnetometer": magnetometer, "model_error": model_error}
     options["tracking_error"] = tracking_error
     if isinstance(scene, Scene):
-        return _open_in_memory(scene, **options)  # has one lab
+        return _open_in_memory(scene, epoch=epoch, **options)  # has one lab
     from magtwin.usd.layers import layer_sha256
     from magtwin.usd.scene import open_scene
 
     file = scene_file(scene)
     neural = network is None and magnetometer in (None, "neural")
-    stage = open_scene(file, lab=lab, check_network=neural)
+    stage = open_scene(file, lab=lab, epoch=epoch, check_network=neural)
     read = stage.scene
     read = dataclasses.replace(
         read,
@@ -93,6 +97,8 @@ def open_twin(
     metadata |= {"map": field.name, "map_sha256": layer_sha256(read.map_layer)}
     if stage.lab:
         metadata["lab"] = stage.lab
+    if stage.epoch:
+        metadata["map_epoch"] = stage.epoch
     if stage.pose is not None:
         metadata["lab_pose"] = " ".join(map(repr, (*stage.pose.p, stage.pose.yaw)))
     stale = [_stale(stage)] if stage.changes else []
@@ -153,14 +159,17 @@ def opened(
     magnetometer: Kind | None,
     model_error: bool,
     function: str,
+    **where: Any,
 ) -> Twin:
-    """The twin, opened if it is a scene; `function` is named in the refusal of options that come too late."""
+    """The twin, opened if it is a scene; `function` is named in the refusal of options that come too late.
+
+    `where` are the options `lab` and `epoch`.
+    """
     if not isinstance(twin, Twin):
-        return open_twin(twin, network=network, magnetometer=magnetometer, model_error=model_error)
-    if network is not None or magnetometer is not None:
-        raise InputError(
-            f"give `network` and `magnetometer` to open_twin, not to {function}, which got a Twin"
-        )
+        return open_twin(twin, network=network, magnetometer=magnetometer, model_error=model_error, **where)
+    if network is not None or magnetometer is not None or any(where.values()):
+        names = ", ".join(f"`{name}`" for name in ("network", *where))
+        raise InputError(f"give {names} and `magnetometer` to open_twin, not to {function}, which got a Twin")
     return twin if model_error else without_model_error(twin)
 
 
@@ -313,7 +322,7 @@ def twin_of(
     network = str(metadata["network_file"]) if "network_file" in metadata else None
     twin = open_twin(
         scene,
-        lab=str(metadata.get("lab", "")),
+        **lab_and_epoch(metadata),
         network=network if network is None else locate(network, near) or network,
         magnetometer=kind if network is None else None,
         model_error=bool(metadata.get("model_error", False)),

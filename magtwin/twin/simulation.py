@@ -24,6 +24,7 @@ from magtwin.twin.twin import (
     checked_seed,
     in_session,
     in_session_of,
+    lab_and_epoch,
     model_error_of,
     room_of,
     scene_sha256,
@@ -277,12 +278,12 @@ def engine_named(
     if name != "newton":
         return ENGINES[name]
     check_installed()
+    placed, robot = "", twin.scene.robot
     if {"lab", "lab_pose"} & twin.metadata.keys():
-        raise InputError(
-            f"{twin.scene_file}: Newton drives a lab at the origin of its own stage, and this one is placed "
-            "in another; open the lab's own stage"
-        )
-    return Newton(twin.scene_file, twin.scene.robot, progress)
+        from magtwin.usd.scene import as_layer, open_alone
+
+        placed = as_layer(open_alone(twin.scene_file, robot.name, **lab_and_epoch(twin.metadata)))
+    return Newton(twin.scene_file, robot, progress, placed=placed)
 
 
 def path_metadata(path: "Path | Commands | Run | str") -> Metadata:

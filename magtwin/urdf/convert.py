@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
 
@@ -23,7 +24,7 @@ from magtwin.urdf.meshes.mesh_layer import MeshLayer, free_name, gather
 from magtwin.urdf.meshes.texture import TEXTURES
 from magtwin.urdf.options import DEFAULTS, Options
 from magtwin.urdf.physics.articulation import define_articulation, filter_overlaps
-from magtwin.urdf.physics.control import define_differential, read_commands, read_drive
+from magtwin.urdf.physics.control import define_differential, read_base, read_commands
 from magtwin.urdf.physics.drive import NO_WHEELS, Wheels, check_rules
 from magtwin.urdf.physics.gazebo import (
     Surface,
@@ -36,16 +37,16 @@ from magtwin.urdf.physics.joint import define_fixed_joint, define_joint, define_
 from magtwin.urdf.physics.link import SITE_API, Rider, define_body, is_marker
 from magtwin.urdf.physics.mechanism import Mechanism, read_mechanism
 from magtwin.urdf.physics.merge import WORLD, Place, carried, place_links, riders
-from magtwin.urdf.physics.wheel import find_wheels, fit_wheels, grip, not_on
+from magtwin.urdf.physics.mobile_base import MobileBase, drive_spec
+from magtwin.urdf.physics.wheel import find_base, fit_wheels, grip, not_on, wheel_radius
 from magtwin.urdf.placeholder import replace_failed
 from magtwin.urdf.report import ConversionReport, Ledger, make_report
 from magtwin.urdf.sensor import define_sensors
 from magtwin.urdf.shape import COLLISIONS, VISUALS, define_collider, define_no_contact, define_visual, pose_of
 from magtwin.urdf.simready import check_metadata, metadata
 from magtwin.urdf.source.source import read_source
-from magtwin.usd.layers import describe_stage, open_stage
-from magtwin.usd.schema.versions import creator
-from magtwin.usd.sensors import write_pose
+from magtwin.usd.attributes import read_pose, write_pose
+from magtwin.usd.layers import describe_stage, open_stage, translates
 
 JOINTS = "joints"
 """Scope of the joints below the robot's prim."""
@@ -120,6 +121,7 @@ def convert_with_report(
     return report
 
 
+@translates
 def read_notes(asset: str | os.PathLike[str]) -> tuple[str, ...]:
     """Notes of a conversion on repairs, guesses and omissions, one line each.
 
@@ -197,7 +199,7 @@ class _Author:
             self.ledger,
             name=self.out.name,
             sha256=checksum,
-            poses=read_mechanism(description, options).poses(),
+            poses=self._poses(stage),
             lint=lint(description, mass=options.mass, vertices=self.meshes.vertices),
         )
         description.repairs.check(report.source, strict=options.strict)
@@ -213,6 +215,17 @@ class _Author:
         }
         return stage, report
 
+    def _poses(self, stage: Usd.Stage) -> dict[str, NDArray]:
+        """T_root_link of each link as authored, (4, 4); `finish` may have raised the whole robot."""
+        poses = read_mechanism(self.description, self.options).poses()
+        first = next((n for n, (became, _) in self.ledger.bodies.items() if became == "body"), None)
+        if first is not None:
+            place, _ = read_pose(stage.GetPrimAtPath(self.ledger.bodies[first][1]))
+            shift = np.eye(4)
+            shift[:3, 3] = place - poses[first][:3, 3]
+            poses = {name: shift @ pose for name, pose in poses.items()}
+        return poses
+
     def _robot(self, stage: Usd.Stage, layer: str) -> Usd.Prim:
         """The robot's prim with everything below it."""
         description, ledger = self.description, self.ledger
@@ -223,15 +236,17 @@ class _Author:
         names |= _free_names(description.links, {JOINTS, LOOKS, VISUALS, COLLISIONS}, "", description)
         mechanism, tags = read_mechanism(description, self.options), Tags(description)
         check_rules(mechanism, self.options)
-        (drive, named), commands = read_drive(tags, mechanism), read_commands(tags, mechanism)
+        base, commands = read_base(tags, self.options.controllers), read_commands(tags, mechanism)
         surfaces = read_surfaces(tags)
         driven: tuple[str, ...] = ()
         if self.options.profile == "diff-drive":
-            driven = find_wheels(mechanism, named)
+            base = find_base(mechanism, base)
+            driven = base.wheels
             surfaces = grip(mechanism, driven, surfaces)
             commands = not_on(driven, commands)
         options = replace(self.options, drives=(*self.options.drives, *commands))
-        places, poses = place_links(mechanism, merge=options.merge_fixed), mechanism.poses()
+        places = place_links(mechanism, merge=options.merge_fixed, filled=options.density is not None)
+        poses = mechanism.poses()
         robot = _define(stage, Sdf.Path.absoluteRootPath.AppendChild(names[""]), description.name)
         stage.SetDefaultPrim(robot)
         Usd.ModelAPI(robot).SetKind("component")
@@ -271,16 +286,42 @@ class _Author:
         robot.AddAppliedSchema(ROBOT_API)
         jointed = [stage.GetPrimAtPath(joint) for joint in joints]
         held = any(robot.GetPath() in UsdPhysics.Joint(joint).GetBody0Rel().GetTargets() for joint in jointed)
-        base = bodies.get(_base(places), robot)
-        define_articulation(robot if held else base, self_collision=self_collides(tags))
+        first = bodies.get(_base(places), robot)
+        define_articulation(robot if held else first, self_collision=self_collides(tags))
         filter_overlaps(bodies, colliders, jointed)
         links = [body.GetPath() for body in bodies.values()]
         for name, paths_listed in (("robotLinks", links), ("robotJoints", joints)):
             relationship = robot.CreateRelationship(f"isaac:physics:{name}", custom=False)
             for path in paths_listed:  # each is prepended, so that a stronger layer can add to the list
                 relationship.AddTarget(path)
-        self._equip(robot, tags, options, drive)
+        self._equip(robot, tags, options, self._drive(base, mechanism, bodies, tags), held)
         return robot
+
+    def _drive(
+        self, base: MobileBase | None, mechanism: Mechanism, bodies: dict[str, Usd.Prim], tags: Tags
+    ) -> DriveSpec | None:
+        """The drive of the robot's base; None if it has none, or one whose wheels are not known."""
+        if base is None:
+            return None
+        joints = {joint.name: joint for joint in self.description.joints.values()}
+        if len(base.wheels) < 2:
+            try:
+                base = find_base(mechanism, base)
+            except InputError:
+                text = f"{base.source} moves the base, but no wheels are known: kept as text"
+                self.description.note(text, lost=True)
+                if base.element is not None:
+                    tags.forget(base.element)
+                return None
+
+        def radius_of(name: str) -> float:
+            link = self.description.links[joints[name].child]
+            forms = [part.geometry for part in (*link.collisions, *link.visuals)]
+            round_ones = [form.radius for form in forms if form.kind in ("cylinder", "sphere")]
+            body = bodies.get(link.name)
+            return round_ones[0] if round_ones else wheel_radius(body, joints[name].axis) if body else 0.0
+
+        return drive_spec(base, mechanism, radius_of)
 
     def _joints(
         self,
@@ -320,7 +361,9 @@ class _Author:
             define_mimic(made[name], made[mimic.joint], joints[name], joints[mimic.joint], mechanism)
         return [prim.GetPath() for prim in made.values()]
 
-    def _equip(self, robot: Usd.Prim, tags: Tags, options: Options, drive: DriveSpec | None) -> None:
+    def _equip(
+        self, robot: Usd.Prim, tags: Tags, options: Options, drive: DriveSpec | None, held: bool
+    ) -> None:
         """Author the contents of tags outside URDF's grammar; the rest is kept as text."""
         stage, ledger = robot.GetStage(), self.ledger
 
@@ -332,8 +375,9 @@ class _Author:
 
         define_springs(tags, joint_of, options)
         define_weightless(tags, link_of)
-        if not options.fix_base and (drive is not None or options.profile == "diff-drive"):
-            robot.CreateAttribute("isaac:robotType", Sdf.ValueTypeNames.Token, custom=False).Set("Wheeled")
+        wheeled = not options.fix_base and (drive is not None or options.profile == "diff-drive")
+        kind = "Wheeled" if wheeled else "Manipulator" if held else "Default"  # of Isaac Sim's list
+        robot.CreateAttribute("isaac:robotType", Sdf.ValueTypeNames.Token, custom=False).Set(kind)
         if drive is not None:
             define_differential(robot, drive, {name: path.name for name, path in ledger.joints.items()})
         define_sensors(tags, robot, link_of)

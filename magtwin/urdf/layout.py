@@ -6,6 +6,7 @@
     payloads/geometries.usdc        triangles
     payloads/materials.usda         looks
     payloads/robot.usda             schemas of Isaac Sim and magtwin; a sublayer of base
+    payloads/arrays.usdc            long arrays of sensors, if there are any; a sublayer of base
     payloads/Physics/physics.usda   bodies, masses, joints, colliders, friction: UsdPhysics and Newton
     payloads/Physics/physx.usda     attributes for PhysX only, over physics
     payloads/Physics/mujoco.usda    attributes for MuJoCo only, over physics
@@ -50,6 +51,7 @@ LAYERS = {
     "instances": ("instances.usda", "visuals and colliders of its links"),
     "materials": ("materials.usda", "looks"),
     "robot": ("robot.usda", "schemas of Isaac Sim and magtwin"),
+    "arrays": ("arrays.usdc", "long arrays of its sensors"),
     "physics": (VARIANTS["physics"], "bodies, joints and contact, for any engine"),
     "physx": (VARIANTS["physx"], "attributes for PhysX only"),
     "mujoco": (VARIANTS["mujoco"], "attributes for MuJoCo only"),
@@ -79,6 +81,9 @@ NAMESPACES = (
     ("isaac:", "robot"),
 )
 """Layer of a property by the start of its name."""
+
+LONG = 64
+"""Longest array in a layer of text; usd-validation-nvidia refuses longer ones."""
 
 INSTANCES = Sdf.Path("/Instances")
 SHAPES = (VISUALS, COLLISIONS)
@@ -130,6 +135,8 @@ def split(flat: Sdf.Layer) -> dict[str, Sdf.Layer]:
     parts = {name: Sdf.Layer.CreateAnonymous(f"{name}.usda") for name in ("interface", *FILES)}
     with Sdf.ChangeBlock():
         _Splitter(flat, parts).route(robot)
+    if not parts["arrays"].rootPrims:
+        del parts["arrays"]
     for name, layer in parts.items():
         layer.RemoveInertSceneDescription()
         _describe(layer, flat, name, robot.name)
@@ -164,6 +171,8 @@ class _Splitter:
             name = _by_start(prop.name, NAMESPACES, owner)
             if owner == "instances" and prop.name.startswith("material:binding") and name == owner:
                 name = "base"  # its target is outside the prims that base references
+            if name == owner == "base" and _is_long(prop):
+                name = "arrays"
             where = path if name == owner else spec.path
             _prim(self.parts[name], where)
             to = where.AppendProperty(prop.name)
@@ -216,6 +225,13 @@ class _Splitter:
             here.SetInfo("apiSchemas", listed)
 
 
+def _is_long(prop: Sdf.PropertySpec) -> bool:
+    """Whether a property is a long array."""
+    if not isinstance(prop, Sdf.AttributeSpec) or not prop.typeName.isArray:
+        return False
+    return prop.HasDefaultValue() and len(prop.default) > LONG
+
+
 def _repoint(prop: Sdf.PropertySpec, old: Sdf.Path, new: Sdf.Path) -> None:
     """Update targets and connections of a property whose prims moved with it."""
     while old.name == new.name and old.pathElementCount > 1 and new.pathElementCount > 1:
@@ -258,7 +274,9 @@ def _describe(layer: Sdf.Layer, flat: Sdf.Layer, name: str, robot: str) -> None:
 
 def _compose(parts: dict[str, Sdf.Layer], robot: Sdf.PrimSpec) -> None:
     """Add the composition arcs between the layers."""
-    parts["base"].subLayerPaths.append(f"./{FILES['robot']}")
+    for name in ("robot", "arrays"):
+        if name in parts:
+            parts["base"].subLayerPaths.append(f"./{FILES[name]}")
     for name in ("physx", "mujoco"):
         parts[name].subLayerPaths.append("./physics.usda")
     top = _prim(parts["interface"], robot.path)

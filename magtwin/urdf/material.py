@@ -1,9 +1,15 @@
 """Material: the look of a surface (UsdPreviewSurface) and its friction (UsdPhysics)."""
 
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
 
 from magtwin.urdf.meshes.mesh_layer import MeshLayer
-from magtwin.urdf.meshes.piece import PLAIN, Paint
+from magtwin.urdf.meshes.piece import PLAIN, Map, Paint
+from magtwin.urdf.meshes.texture import Image
 from magtwin.urdf.physics.gazebo import Surface
 from magtwin.usd.geometry import linear_from_srgb
 
@@ -12,6 +18,8 @@ PHYSX_API, MUJOCO_API = "PhysxMaterialAPI", "MjcCollisionAPI"
 
 SLIPPERY = 0.2
 """Friction below which a surface slides on any floor."""
+
+NO_IMAGE = Image("", b"", (0.0, 0.0, 0.0))
 
 LOOKS = "Looks"
 """Scope of all materials below the robot's prim."""
@@ -28,15 +36,38 @@ def define_look(robot: Usd.Prim, look: Paint, meshes: MeshLayer) -> UsdShade.Mat
     stage, kinds = robot.GetStage(), Sdf.ValueTypeNames
     scope = UsdGeom.Scope.Define(stage, robot.GetPath().AppendChild(LOOKS)).GetPath()
     colour = linear_from_srgb(look.rgba[:3]) if look.image is None else look.display_colour
-    inputs = [
-        ("diffuseColor", kinds.Color3f, Gf.Vec3f(*(round(float(c), 5) for c in colour))),
+    mapped = {name for name, _ in look.maps}
+    inputs: list[tuple[str, Sdf.ValueTypeName, Any]] = [
+        ("diffuseColor", kinds.Color3f, _vector(colour)),
         ("opacity", kinds.Float, round(look.rgba[3], 4)),
         ("roughness", kinds.Float, round(look.roughness, 4)),
         ("metallic", kinds.Float, round(look.metallic, 4)),
-        *([("opacityThreshold", kinds.Float, round(look.cutoff, 4))] if look.cutoff else []),
     ]
-    texture = "" if look.image is None else meshes.textures.add(look.image)
-    shown = (*(value for _, _, value in inputs), texture, look.see_through, look.by_vertex)
+    if look.cutoff:
+        inputs.append(("opacityThreshold", kinds.Float, round(look.cutoff, 4)))
+    if max(look.emissive) > 0 or "emissiveColor" in mapped:
+        inputs.append(("emissiveColor", kinds.Color3f, _vector(look.emissive)))
+    if look.specular is not None:
+        inputs += [
+            ("useSpecularWorkflow", kinds.Int, 1),
+            ("specularColor", kinds.Color3f, _vector(look.specular)),
+        ]
+    if look.ior is not None:
+        inputs.append(("ior", kinds.Float, round(look.ior, 4)))
+    maps = list(look.maps)
+    if look.image is not None:
+        factor = (*linear_from_srgb(look.rgba[:3]), look.rgba[3])
+        own = Map(look.image, scale=factor, colour=True, wrap=look.wrap)
+        maps.insert(0, ("diffuseColor", own))
+        if look.see_through:
+            maps.insert(1, ("opacity", replace(own, channel="a")))
+    files = [meshes.textures.add(each.image) for _, each in maps]
+    shown = (
+        tuple(inputs),
+        tuple(files),
+        tuple((n, replace(m, image=NO_IMAGE)) for n, m in maps),
+        look.by_vertex,
+    )
     hexed = "".join(f"{round(c * 255):02x}" for c in look.rgba)
     stem, number = Tf.MakeValidIdentifier(look.name) if look.name else f"colour_{hexed}", 1
     path = scope.AppendChild(stem)
@@ -54,39 +85,59 @@ def define_look(robot: Usd.Prim, look: Paint, meshes: MeshLayer) -> UsdShade.Mat
     if look.by_vertex:
         reader = _reader(stage, path, "UsdPrimvarReader_float3", "displayColor", kinds.Float3)
         surface.GetInput("diffuseColor").ConnectToSource(reader)
-    elif texture:
-        _connect_texture(stage, path, surface, look, texture)
+    for (name, each), file in zip(maps, files, strict=True):
+        _connect_map(stage, path, surface, name, each, file)
     surface.CreateOutput("surface", kinds.Token)
     material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
     return material
 
 
-def _connect_texture(
-    stage: Usd.Stage, path: Sdf.Path, surface: UsdShade.Shader, look: Paint, file: str
+def _vector(colour: ArrayLike) -> Gf.Vec3f:
+    return Gf.Vec3f(*(round(float(c), 5) for c in np.asarray(colour)))
+
+
+def _connect_map(
+    stage: Usd.Stage, path: Sdf.Path, surface: UsdShade.Shader, name: str, each: Map, file: str
 ) -> None:
-    """Connect a texture, mapped by the mesh's `st`, to the colour and, if used, the opacity."""
+    """Connect a texture, mapped by the mesh's `st`, to an input of a surface.
+
+    The colour and an opacity from the same file share a shader.
+    """
     kinds = Sdf.ValueTypeNames
-    texture = UsdShade.Shader.Define(stage, path.AppendChild("texture"))
-    texture.CreateIdAttr("UsdUVTexture")
-    texture.CreateInput("file", kinds.Asset).Set(Sdf.AssetPath(file))
-    st = _reader(stage, path, "UsdPrimvarReader_float2", "st", kinds.Float2)
-    texture.CreateInput("st", kinds.Float2).ConnectToSource(st)
-    for side in ("wrapS", "wrapT"):
-        texture.CreateInput(side, kinds.Token).Set("repeat")
-    texture.CreateInput("sourceColorSpace", kinds.Token).Set("sRGB")
-    factor = (*linear_from_srgb(look.rgba[:3]), look.rgba[3])
-    if factor != (1, 1, 1, 1):
-        texture.CreateInput("scale", kinds.Float4).Set(Gf.Vec4f(*(round(float(c), 5) for c in factor)))
-    surface.GetInput("diffuseColor").ConnectToSource(texture.CreateOutput("rgb", kinds.Float3))
-    if look.see_through:
-        surface.GetInput("opacity").ConnectToSource(texture.CreateOutput("a", kinds.Float))
+    prim = path.AppendChild("texture" if name == "diffuseColor" else f"{name}_texture")
+    shared = stage.GetPrimAtPath(path.AppendChild("texture")) if name == "opacity" else None
+    if shared and shared.GetAttribute("inputs:file").Get().path == file:
+        prim = shared.GetPath()
+    texture = UsdShade.Shader(stage.GetPrimAtPath(prim))
+    if not texture:
+        texture = UsdShade.Shader.Define(stage, prim)
+        texture.CreateIdAttr("UsdUVTexture")
+        texture.CreateInput("file", kinds.Asset).Set(Sdf.AssetPath(file))
+        st = _reader(stage, path, "UsdPrimvarReader_float2", "st", kinds.Float2)
+        texture.CreateInput("st", kinds.Float2).ConnectToSource(st)
+        for side, wrap in zip(("wrapS", "wrapT"), each.wrap, strict=True):
+            texture.CreateInput(side, kinds.Token).Set(wrap)
+        texture.CreateInput("sourceColorSpace", kinds.Token).Set("sRGB" if each.colour else "raw")
+        for key, values, usual in (("scale", each.scale, 1), ("bias", each.bias, 0)):
+            if any(value != usual for value in values):
+                rounded = (round(float(c), 5) for c in values)
+                texture.CreateInput(key, kinds.Float4).Set(Gf.Vec4f(*rounded))
+    wide = each.channel == "rgb"
+    output = texture.CreateOutput(each.channel, kinds.Float3 if wide else kinds.Float)
+    kind = kinds.Normal3f if name == "normal" else kinds.Color3f if wide else kinds.Float
+    surface.CreateInput(name, kind).ConnectToSource(output)
 
 
 def _reader(
     stage: Usd.Stage, path: Sdf.Path, kind: str, primvar: str, type_: Sdf.ValueTypeName
 ) -> UsdShade.Output:
     """Output of a shader that reads a primvar."""
-    reader = UsdShade.Shader.Define(stage, path.AppendChild("reader"))
+    names = ("reader", f"reader_{primvar}")
+    for prim in map(stage.GetPrimAtPath, map(path.AppendChild, names)):
+        if prim and prim.GetAttribute("inputs:varname").Get() == primvar:
+            return UsdShade.Shader(prim).GetOutput("result")
+    name = names[1] if stage.GetPrimAtPath(path.AppendChild(names[0])) else names[0]
+    reader = UsdShade.Shader.Define(stage, path.AppendChild(name))
     reader.CreateIdAttr(kind)
     reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set(primvar)
     return reader.CreateOutput("result", type_)

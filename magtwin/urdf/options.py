@@ -97,6 +97,9 @@ class Options:
     drives: tuple[DriveRule, ...] = ()
     """Drive rules; the first match wins and overrides the URDF."""
 
+    controllers: Path | None = None
+    """YAML with the settings of the robot's controllers (ros_control, ros2_control), for its drive."""
+
     density: float | None = None
     """Density of links without inertia [kg/m3]; None leaves them without."""
 

@@ -15,6 +15,7 @@ from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Shape
 from magtwin.urdf.meshes.mesh import bounds
 from magtwin.urdf.meshes.mesh_layer import MeshLayer
+from magtwin.urdf.physics.mass import engine_masses
 from magtwin.urdf.repairs import FAULTS, Repair
 from magtwin.usd.geometry import read_vertices
 
@@ -32,6 +33,9 @@ ROUND_TOLERANCE = 0.01
 PLACES, LINES = 3, 8
 """Most places of one kind of fault, and most guesses and doubts, that the terminal shows."""
 
+ADDED = 1e-3
+"""Share of the URDF's mass above which a note gives the mass that links without mass add."""
+
 
 @dataclass(frozen=True)
 class LinkLine:
@@ -44,6 +48,7 @@ class LinkLine:
     """Path of its prim, or ""."""
     mass_in_kg: float | None
     mass_out_kg: float | None
+    """Mass of its body as physics engines compute it, with all merged links; None if it is not a body."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +132,7 @@ class ConversionReport:
     geometries: tuple[GeometryLine, ...]
     mass_in_kg: float
     mass_out_kg: float
+    """Mass as physics engines compute it, see `engine_masses`."""
     box_in: Box | None
     """Box of all visuals in the description."""
     box_out: Box | None
@@ -162,7 +168,12 @@ class ConversionReport:
             Figure("links", len(self.links), note=f"{bodies} bodies, the rest frames on them"),
             Figure("joints", len(self.joints), note=f"{len(moving)} move"),
             Figure("shapes", len(self.geometries), note=f"{kept} with their true bounding box"),
-            Figure("mass", round(self.mass_out_kg, 6), "kg", note=f"{self.mass_in_kg:.6g} kg in the URDF"),
+            Figure(
+                "mass",
+                round(self.mass_out_kg, 6),
+                "kg",
+                note=f"in engines; {self.mass_in_kg:.6g} kg in the URDF",
+            ),
         ]
         if self.box_out is not None:
             size = np.subtract(self.box_out[1], self.box_out[0])
@@ -231,11 +242,10 @@ def make_report(
         lint: Lines of `lint.lint`.
     """
     lines = _geometries(description, meshes, stage, ledger, poses or description.poses())
-    links, joints = [], []
+    links, joints, masses = [], [], engine_masses(stage)
     for link in description.links.values():
         became, path = ledger.bodies.get(link.name, ("nothing", Sdf.Path.emptyPath))
-        mass = UsdPhysics.MassAPI(stage.GetPrimAtPath(path)).GetMassAttr() if became == "body" else None
-        mass_out = round(float(mass.Get()), 9) if mass and mass.HasAuthoredValue() else None
+        mass_out = round(masses[path], 9) if path in masses and became == "body" else None
         mass_in = None if link.inertial is None else link.inertial.mass
         links.append(LinkLine(link.name, became, str(path), mass_in, mass_out))
     for joint in description.joints.values():
@@ -244,11 +254,7 @@ def make_report(
         joints.append(JointLine(joint.name, joint.type, kind, str(path)))
     visuals = [line for line in lines if line.role == "visual"]
     given = sum(line.mass_in_kg or 0.0 for line in links)
-    total = sum(
-        float(UsdPhysics.MassAPI(prim).GetMassAttr().Get() or 0.0)
-        for prim in stage.Traverse()
-        if prim.HasAPI(UsdPhysics.MassAPI)
-    )
+    total = sum(masses.values())
     losses = [f"link {line.name!r} has no prim" for line in links if line.became == "nothing"]
     for line in lines:
         if line.box_in is not None and not line.kept:
@@ -258,6 +264,10 @@ def make_report(
         losses.append(f"mass {given:.6g} kg became {total:.6g} kg")
     for loss in losses:
         description.note(loss, lost=True)
+    if total > (1 + ADDED) * given > 0:
+        description.note(
+            f"physics engines compute {total:.6g} kg, {total / given - 1:.2%} above the URDF's mass"
+        )
     repairs = description.repairs
     return ConversionReport(
         robot=description.name,
@@ -290,13 +300,18 @@ def _geometries(
     ledger: Ledger,
     poses: Mapping[str, NDArray],
 ) -> tuple[GeometryLine, ...]:
-    boxes, lines = _boxes(stage), []
+    below: dict[Sdf.Path, list[Box]] = {prim: [] for prims in ledger.shapes.values() for prim in prims}
+    for path, box in _boxes(stage, set(below)).items():
+        for prim in path.GetPrefixes():
+            if prim in below:
+                below[prim].append(box)
+    lines = []
     for name, link in description.links.items():
         for role, shapes in (("visual", link.visuals), ("collision", link.collisions)):
             for index, shape in enumerate(shapes):
                 prims, form = ledger.shapes.get((name, role, index), []), shape.geometry
                 box_in = _box_of(shape, poses[name] @ origin_of(shape), meshes)
-                box_out = [box for prim in prims for path, box in boxes.items() if path.HasPrefix(prim)]
+                box_out = [box for prim in prims for box in below[prim]]
                 kind = form.filename.rpartition("/")[2] if form.kind == "mesh" else form.kind
                 paths = tuple(map(str, prims))
                 lines.append(GeometryLine(name, role, index, kind, paths, box_in, _union(box_out)))
@@ -315,14 +330,18 @@ def _box_of(shape: Shape, T: NDArray[np.float64], meshes: MeshLayer) -> Box | No
     return _corners(*bounds(points @ T[:3, :3].T + T[:3, 3]))
 
 
-def _boxes(stage: Usd.Stage) -> dict[Sdf.Path, Box]:
-    """The box around each gprim of a stage, including colliders, in the frame of its default prim."""
+def _boxes(stage: Usd.Stage, prims: set[Sdf.Path]) -> dict[Sdf.Path, Box]:
+    """The box around each gprim at or below `prims`, in the frame of the default prim."""
     to_robot = UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetDefaultPrim()).GetInverse()
     bodies = {str(p.GetPath()): p for p in stage.Traverse() if p.HasAPI(UsdPhysics.RigidBodyAPI)}
     by_name = {p.GetName(): p for p in bodies.values()} | bodies
     cache, boxes = UsdGeom.XformCache(), {}
     tokens = UsdGeom.Tokens
-    shown = read_vertices(stage, purposes=(tokens.default_, tokens.render, tokens.guide))
+    shown = read_vertices(
+        stage,
+        purposes=(tokens.default_, tokens.render, tokens.guide),
+        wanted=lambda prim, _: not prims.isdisjoint(prim.GetPath().GetPrefixes()),
+    )
     for path, (link, vertices) in shown.items():
         points = vertices.astype(float)
         if link:

@@ -28,7 +28,7 @@ from magtwin.urdf.physics.joint import AXIS
 from magtwin.urdf.physics.link import SITE_API
 from magtwin.urdf.physics.mechanism import displacement
 from magtwin.usd.geometry import SHOWN, Shape, read_shapes, srgb_from_linear
-from magtwin.usd.layers import open_stage
+from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.schema import place
 
 Array = NDArray[np.float64]
@@ -80,6 +80,7 @@ class _Link:
     body: bool
 
 
+@translates
 def write_urdf(asset: str | os.PathLike[str], out: str | os.PathLike[str], *, force: bool = False) -> Report:
     """Write the URDF of a stage's robot.
 

@@ -6,11 +6,8 @@ Samples are authored on the layer itself, since a stage would recompose for each
 
 import json
 import os
-import subprocess
-import sys
 from collections import deque
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import repeat
 from pathlib import Path
@@ -22,18 +19,19 @@ from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
 from magtwin.errors import InputError, find
-from magtwin.files import existing, output
+from magtwin.files import output
 from magtwin.frames import quat_conjugate, quat_multiply, rotate
 from magtwin.run.resample import grid
 from magtwin.run.run import COLUMNS, Column, Run, check_clock
 from magtwin.spec.base import Quat, Vec3
-from magtwin.usd.attributes import read_pose, target
+from magtwin.usd.attributes import read_pose, target, targets
+from magtwin.usd.epochs import EPOCH
 from magtwin.usd.geometry import BASE_LINK, read_links
-from magtwin.usd.layers import SUFFIXES, WORLD, describe_stage, open_stage
+from magtwin.usd.layers import SUFFIXES, WORLD, describe_stage, open_layer, open_stage, translates
 from magtwin.usd.placement import lab_on, labs_on, take_to_origin
 from magtwin.usd.schema import attribute_name, only_prim_with, place, prims_with
 from magtwin.usd.schema.versions import creator
-from magtwin.usd.sensors import JOINT_FIELDS
+from magtwin.usd.sensors import JOINT_FIELDS, WHEELS_FIELDS
 
 FPS = 30.0
 """Default frame rate [Hz]."""
@@ -68,18 +66,6 @@ READINGS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 _BARE = WORLD.AppendChild("robot")
 """Robot of a run without a scene."""
 
-_PROBE = """
-import sys
-from pxr import Sdf
-
-layer = Sdf.Layer.OpenAsAnonymous(sys.argv[1])
-layer.Traverse("/", lambda path: path.IsPropertyPath() and layer.GetObjectAtPath(path).GetInfo("default"))
-"""
-"""Script that reads every value of a layer."""
-
-PATIENCE_S = 60.0
-"""Time limit of that script, plus 1 s per megabyte [s]."""
-
 _FACTS = "magtwinFacts"
 _DTYPES = ("f8", "f4", "f2", "i4", "i8", "u1", "u4", "u8", "b1")
 _NAMES = ("double", "float", "half", "int", "int64", "uchar", "uint", "uint64", "bool")
@@ -96,13 +82,15 @@ class _Stand:
     p_root_base: Vec3 = (0.0, 0.0, 0.0)
     """Origin of the base link in the robot's root [m]."""
     q_root_base_xyzw: Quat = (0.0, 0.0, 0.0, 1.0)
-    wheels: tuple[tuple[Sdf.Path, Vec3, Quat, Vec3], ...] = ()
-    """Left and right wheel: prim, position [m] and orientation in its parent, and axis in its own frame."""
+    wheels: tuple[tuple[int, Sdf.Path, Vec3, Quat, Vec3], ...] = ()
+    """Driven wheels: side (0 for left, 1 for right), prim, position [m] and orientation in its parent, and
+    axis in its own frame."""
     sensors: Mapping[str, Sdf.Path] = field(
         default_factory=lambda: {"magnetometer": _BARE.AppendChild("magnetometer"), "robot": _BARE}
     )
 
 
+@translates
 def write_animation(
     run: Run,
     path: str | os.PathLike[str],
@@ -148,7 +136,7 @@ def write_animation(
         rules: Any = {p_name: "linear", q_name: "quaternion"}  # it moves between recorded poses
         frames = run.select(*wanted).resample(grid(t[0], t[-1], fps), interpolation=rules)
         codes = np.arange(frames.rows, dtype=float)
-    stand = _Stand()
+    stand, maps = _Stand(), list[Sdf.Path]()
     if scene_file is not None:
         stage = open_stage(scene_file)
         world = stage.GetDefaultPrim()
@@ -157,6 +145,7 @@ def write_animation(
         if path.resolve() in (Path(layer.realPath).resolve() for layer in stage.GetUsedLayers()):
             raise InputError(f"{path}: is a part of the scene; give another name")
         stand = _stand(stage, world, str(run.metadata.get("robot", "")))
+        maps = [prim.GetPath() for prim in prims_with(stage.GetPseudoRoot(), "anomalyMap")]
     with output(path, force=force) as aside:
         layer = Sdf.Layer.CreateNew(str(aside))
         if layer is None:
@@ -177,6 +166,9 @@ def write_animation(
             for bare in (stand.world, stand.robot, stand.sensors["magnetometer"]):
                 spec = Sdf.CreatePrimInLayer(layer, bare)
                 spec.specifier, spec.typeName = Sdf.SpecifierDef, "Xform"
+        if epoch := str(run.metadata.get("map_epoch", "")):
+            for prim in maps:
+                Sdf.CreatePrimInLayer(layer, prim).variantSelections[EPOCH] = epoch
         _animate(layer, stand, frames, codes.tolist())
         _sample_readings(layer, stand, run, frames, codes.tolist(), rate)
         _store(layer, stand.world.AppendChild(RUN), run)
@@ -192,8 +184,7 @@ def read_animation(path: str | os.PathLike[str]) -> Run:
     Raises:
         InputError: The file is missing, not USD, truncated, or holds no run.
     """
-    _check_decodes(path)
-    layer = _open_layer(path)
+    layer = open_layer(path)
     try:
         run = _read(layer, path)
     except InputError:
@@ -204,44 +195,15 @@ def read_animation(path: str | os.PathLike[str]) -> Run:
     return run
 
 
+@translates
 def is_animation(path: str | os.PathLike[str]) -> bool:
     """Whether a USD file holds a run.
 
     Raises:
         InputError: The file is missing or not USD.
     """
-    layer = _open_layer(path)
+    layer = open_layer(path)
     return bool(layer.GetAttributeAtPath(_run_path(layer).AppendProperty("magtwin:run:t")))
-
-
-def _check_decodes(path: str | os.PathLike[str]) -> None:
-    """Refuse a damaged binary file, on which USD's reader would end the process."""
-    path = existing(path, "USD file")
-    if path.is_dir():
-        return
-    with open(path, "rb") as file:
-        if file.read(8) != b"PXR-USDC":  # text
-            return
-    command = [sys.executable, "-P", "-c", _PROBE, str(path)]
-    patience = PATIENCE_S + path.stat().st_size / 1e6
-    try:
-        done = subprocess.run(command, capture_output=True, check=False, timeout=patience)
-    except subprocess.TimeoutExpired as error:
-        raise InputError(f"{path}: damaged: USD does not come to its end; copy it again") from error
-    if done.returncode not in (0, 1):  # another error is raised when the file is read here
-        raise InputError(f"{path}: damaged: USD cannot decode it; copy it again, or write it again")
-
-
-def _open_layer(path: str | os.PathLike[str]) -> Sdf.Layer:
-    """A layer, read from disk, without the files that it names."""
-    path = existing(path, "USD file")
-    if path.is_dir():
-        raise InputError(f"{path}: a folder; give a USD file in it")
-    with suppress(Tf.ErrorException):
-        layer = Sdf.Layer.OpenAsAnonymous(str(path))
-        if layer is not None:
-            return layer
-    raise InputError(f"{path}: cannot be opened as USD; it is damaged, cut short, or not USD")
 
 
 def _read(layer: Sdf.Layer, path: str | os.PathLike[str]) -> Run:
@@ -312,19 +274,23 @@ def _stand(stage: Usd.Stage, default: Usd.Prim, name: str) -> _Stand:
         robot=prim.GetPath(),
         p_root_base=(x, y, z),
         q_root_base_xyzw=(*map(float, turn.GetImaginary()), float(turn.GetReal())),  # type: ignore[arg-type]
-        wheels=tuple(_wheel(prim, field_, stage) for field_ in JOINT_FIELDS),
+        wheels=tuple(
+            _wheel(side, joint, stage)
+            for fields_ in (JOINT_FIELDS, WHEELS_FIELDS)
+            for side, field_ in enumerate(fields_)
+            for joint in targets(prim, attribute_name("drive", field_))
+        ),
         sensors=sensors,
     )
 
 
-def _wheel(robot: Usd.Prim, joint_field: str, stage: Usd.Stage) -> tuple[Sdf.Path, Vec3, Quat, Vec3]:
-    joint = target(robot, attribute_name("drive", joint_field))
+def _wheel(side: int, joint: Usd.Prim, stage: Usd.Stage) -> tuple[int, Sdf.Path, Vec3, Quat, Vec3]:
     body = target(joint, "physics:body1")
     links = read_links(stage).values()
     axis = next((link.axis_link for link in links if link.joint == joint.GetName()), None)
     if axis is None:
         raise InputError(f"{place(joint)}: is no revolute joint between two bodies, as a wheel needs")
-    return body.GetPath(), *read_pose(body), axis
+    return side, body.GetPath(), *read_pose(body), axis
 
 
 def _animate(layer: Sdf.Layer, stand: _Stand, frames: Run, codes: list[float]) -> None:
@@ -338,8 +304,8 @@ def _animate(layer: Sdf.Layer, stand: _Stand, frames: Run, codes: list[float]) -
     _move(layer, stand.robot, at, Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(p)), q)
     if "wheel_angle" not in frames or not stand.wheels:
         return
-    for (path, p_rest, q_rest, axis), angle in zip(stand.wheels, frames["wheel_angle"].T, strict=True):
-        half = angle[:, None] / 2
+    for side, path, p_rest, q_rest, axis in stand.wheels:
+        half = frames["wheel_angle"][:, side, None] / 2
         turn = np.hstack([np.sin(half) * axis, np.cos(half)])
         _move(layer, path, codes, Gf.Vec3d(p_rest), quat_multiply(q_rest, turn))
 

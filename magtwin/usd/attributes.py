@@ -107,6 +107,19 @@ def target(prim: Usd.Prim, relationship: str) -> Usd.Prim:
     return there
 
 
+def targets(prim: Usd.Prim, relationship: str) -> list[Usd.Prim]:
+    """The prims that a relationship of `prim` points to.
+
+    Raises:
+        InputError: One of them is not on the stage.
+    """
+    found = prim.GetRelationship(relationship)
+    there = [prim.GetStage().GetPrimAtPath(path) for path in (found.GetForwardedTargets() if found else [])]
+    if not all(there):
+        raise InputError(f"{place(prim)}: {relationship} points to a prim that is not on the stage")
+    return there
+
+
 def check_prim_name(name: str, what: str) -> str:
     """`name` if a prim can have it.
 

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +12,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 from magtwin.errors import InputError
 from magtwin.frames import IDENTITY_XYZW, canonical
 from magtwin.spec.base import ZERO3, Quat, Vec3
-from magtwin.usd.layers import open_stage
+from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.solids import Solid, solid_of
 
 GREY = (0.5, 0.5, 0.5, 1.0)
@@ -22,6 +23,23 @@ SHOWN = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
 
 BASE_LINK = "base_link"
 """Name of the link whose frame is the robot's, as in REP-105."""
+
+
+@dataclass(frozen=True)
+class Texture:
+    """An image on the triangles of a shape."""
+
+    file: Path
+    """The image."""
+
+    uvs: NDArray[np.float32]
+    """Texture coordinates at the corners of the triangles, from the image's lower left, shape (F, 3, 2)."""
+
+    factor: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Linear colour that multiplies it."""
+
+    see_through: bool = False
+    """Whether its alpha is the opacity."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +63,9 @@ class Shape:
 
     vertex_colours: NDArray[np.float32] | None = None
     """Red, green, blue of each vertex, 0 to 1, linear, shape (V, 3); None for a single colour."""
+
+    texture: Texture | None = None
+    """Its colour texture, of which `colour` is the mean; None if it has none that can be read."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +117,7 @@ class ColourScale:
     """Path of the heat map's mesh."""
 
 
+@translates
 def read_shapes(stage: Usd.Stage | str | os.PathLike[str], *, purposes: Sequence[str] = SHOWN) -> list[Shape]:
     """All visible shapes of a stage as triangles, in order of the prims.
 
@@ -117,16 +139,24 @@ def read_shapes(stage: Usd.Stage | str | os.PathLike[str], *, purposes: Sequence
 
 
 def read_vertices(
-    stage: Usd.Stage, *, purposes: Sequence[str] = SHOWN
+    stage: Usd.Stage,
+    *,
+    purposes: Sequence[str] = SHOWN,
+    wanted: Callable[[Usd.Prim, bool], bool] = lambda prim, carried: True,
 ) -> dict[Sdf.Path, tuple[str, NDArray[np.float32]]]:
     """The vertices of the shapes that `read_shapes` reads, which is faster.
+
+    Args:
+        stage: A stage.
+        purposes: USD purposes to read.
+        wanted: Function of a prim, and of whether a rigid body carries it: whether to read it.
 
     Returns:
         By path of the gprim: the name of its body ("" for none), and the vertices of its faces in the body's
         frame or else in world [m], shape (V, 3).
     """
     found = {}
-    for gprim, solid, to_frame, name in _shown(stage, purposes):
+    for gprim, solid, to_frame, name in _shown(stage, purposes, wanted):
         used = np.zeros(len(solid.points), bool)
         used[solid.corners] = True
         if used.any():
@@ -154,6 +184,7 @@ def read_triangles(
     return found
 
 
+@translates
 def read_links(stage: Usd.Stage | str | os.PathLike[str]) -> dict[str, Link]:
     """The rigid bodies of a stage by name, with their poses at rest in the base of their robot.
 
@@ -306,6 +337,10 @@ def _shapes(gprim: UsdGeom.Gprim, solid: Solid, to_frame: NDArray, link: str) ->
         material = _material_colour(part)
         vertices, corners = points, solid.corners[solid.triangles[mask]]
         colours = None if material is not None else _display_colours(gprim, solid, mask)
+        texture = None if material is not None else _texture(part, gprim, solid.triangles[mask], mirrored)
+        if texture is not None and colours is not None:
+            r, g, b = map(float, colours.mean(axis=0))
+            material, colours = (r, g, b, 1.0), None
         if colours is not None and len(colours) != len(points):  # each corner has its own
             vertices, corners = points[corners.ravel()], np.arange(corners.size).reshape(-1, 3)
         used, faces = np.unique(corners[:, ::-1] if mirrored else corners, return_inverse=True)
@@ -317,6 +352,7 @@ def _shapes(gprim: UsdGeom.Gprim, solid: Solid, to_frame: NDArray, link: str) ->
                 faces=faces.reshape(-1, 3).astype(np.int32),
                 colour=_display_colour(gprim) if material is None else material,
                 vertex_colours=None if colours is None else colours[used].astype(np.float32),
+                texture=texture,
             )
         )
     return shapes
@@ -339,6 +375,40 @@ def _material_colour(prim: Usd.Prim) -> tuple[float, float, float, float] | None
     r, g, b = (diffuse.Get() if diffuse else None) or (0.18, 0.18, 0.18)  # the schema's own fallback
     a = opacity.Get() if opacity else None
     return (float(r), float(g), float(b), 1.0 if a is None else float(a))
+
+
+def _texture(prim: Usd.Prim, gprim: UsdGeom.Gprim, triangles: NDArray, mirrored: bool) -> Texture | None:
+    """The texture of the bound material's colour, on triangles of face-vertex indices, shape (F, 3)."""
+    triangles = triangles[:, ::-1] if mirrored else triangles
+    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+    surface = material.ComputeSurfaceSource()[0] if material else None
+    shader, channel = _source(surface, "diffuseColor")
+    reader, _ = _source(shader, "st")
+    if channel != "rgb" or shader is None or reader is None or shader.GetIdAttr().Get() != "UsdUVTexture":
+        return None
+    asset, name = shader.GetInput("file"), reader.GetInput("varname")
+    path = asset.Get().resolvedPath if asset and asset.Get() else ""
+    if not name or not Path(path).is_file():  # missing, or within a .usdz
+        return None
+    primvar = UsdGeom.PrimvarsAPI(gprim).FindPrimvarWithInheritance(str(name.Get()))
+    values = primvar.ComputeFlattened() if primvar else None
+    uvs = np.array(values if values else np.empty((0, 2)), np.float32).reshape(-1, 2)
+    by_corner = primvar and primvar.GetInterpolation() == UsdGeom.Tokens.faceVarying
+    if not by_corner or triangles.max(initial=0) >= len(uvs):
+        return None
+    scale = shader.GetInput("scale").Get() if shader.GetInput("scale") else None
+    r, g, b = (1.0, 1.0, 1.0) if scale is None else (float(c) for c in scale[:3])
+    cut_out, alpha = _source(surface, "opacity")
+    return Texture(Path(path), uvs[triangles], (r, g, b), bool(cut_out) and alpha == "a")
+
+
+def _source(shader: UsdShade.Shader | None, name: str) -> tuple[UsdShade.Shader | None, str]:
+    """The shader that is connected to an input, and its output."""
+    given = shader.GetInput(name) if shader else None
+    if not given or not given.HasConnectedSource():
+        return None, ""
+    source = given.GetConnectedSources()[0][0]
+    return UsdShade.Shader(source.source.GetPrim()), source.sourceName
 
 
 def _display_colour(gprim: UsdGeom.Gprim) -> tuple[float, float, float, float]:

@@ -57,8 +57,8 @@ def nodes_shown(grid: Grid) -> tuple[int, NDArray[np.intp], NDArray[np.intp]]:
     return every, j, i
 
 
-def define_heat_map(stage: Usd.Stage, floor: Floor, times: Sequence[float]) -> None:
-    """A grid of quads with a vertex at every node, or every few, and one colour variant per heading."""
+def define_heat_map(stage: Usd.Stage, floor: Floor) -> UsdGeom.Mesh:
+    """A grid of quads with a vertex at every node, or every few; `define_colours` colours it."""
     grid, rows, columns = floor.grid, len(floor.j), len(floor.i)
     x, y = np.meshgrid(grid.x_m[floor.i], grid.y_m[floor.j])
     points = np.stack([x, y, np.full_like(x, HEAT_MAP_HEIGHT_M)], axis=-1).reshape(-1, 3).astype(np.float32)
@@ -77,22 +77,25 @@ def define_heat_map(stage: Usd.Stage, floor: Floor, times: Sequence[float]) -> N
     low, high = floor.limits
     scale = {"colourMap": COLOUR_MAP, "least": low, "greatest": high, "unit": UNIT}
     mesh.GetPrim().SetCustomData({"magtwin": scale | {"everyNode": floor.every}})  # stride over the nodes
+    return mesh
+
+
+def define_colours(mesh: UsdGeom.Mesh, floor: Floor, epoch: int = -1) -> None:
+    """One variant of the floor's colours for each heading, of one epoch, in the stage's edit target."""
+    low, high = floor.limits
+    values, valid = floor.shown[epoch]
     primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
         "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex
     )
     variants = mesh.GetPrim().GetVariantSets().AddVariantSet("heading")
-    names, palette = heading_variants(np.array(grid.headings_rad)), viridis()
+    names, palette = heading_variants(np.array(floor.grid.headings_rad)), viridis()
     for h, name in enumerate(names):
         variants.AddVariant(name)
         variants.SetVariantSelection(name)
         with variants.GetVariantEditContext():
-            layers = [colour_index(values[h], valid[h], low, high) for values, valid in floor.shown]
-            used, index = np.unique(np.stack(layers), return_inverse=True)
-            index = index.reshape(len(floor.shown), -1).astype(np.int32)
+            used, index = np.unique(colour_index(values[h], valid[h], low, high), return_inverse=True)
             primvar.Set(Vt.Vec3fArray.FromNumpy(palette[used]))
-            primvar.SetIndices(Vt.IntArray.FromNumpy(index[-1]))
-            for time, row in zip(times, index, strict=bool(times)):
-                primvar.SetIndices(Vt.IntArray.FromNumpy(row), time)
+            primvar.SetIndices(Vt.IntArray.FromNumpy(index.ravel().astype(np.int32)))
     variants.SetVariantSelection(names[0])
 
 

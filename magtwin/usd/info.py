@@ -7,15 +7,18 @@ from pxr import Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
 from magtwin.report import Figure, Report
-from magtwin.usd.layers import open_stage
+from magtwin.usd.epochs import epochs_of
+from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.placement import AT_ORIGIN, labs_on, pose_of
 from magtwin.usd.scene import open_scene
+from magtwin.usd.schema import prims_with
 
 _PREFIX = "Magtwin"
-_MANY = ("MagtwinMagneticSourceAPI", "MagtwinFurnitureAPI")
+_MANY = ("MagtwinMagneticSourceAPI", "MagtwinFurnitureAPI", "MagtwinMapTileAPI")
 """Schemas that are on many prims, so that only their number is shown."""
 
 
+@translates
 def info_of_stage(path: Path) -> Report:
     """Units, extent, bodies, joints, mass and magnetic prims of a stage."""
     stage = open_stage(path)
@@ -70,6 +73,9 @@ def _labs(path: Path, stage: Usd.Stage) -> list[Figure]:
         except InputError as error:
             figures.append(Figure("cannot be run", str(error)))
             continue
+        if opened.epoch:
+            dates = ", ".join(epochs_of(prims_with(opened.stage.GetPseudoRoot(), "anomalyMap")[0]))
+            figures.append(Figure("map epoch", opened.epoch, note=f"of {dates}; --epoch reads another"))
         if opened.map.made_from is not None:
             figures.append(Figure("map made from", str(opened.map.made_from)))
         if opened.changes:

@@ -1,18 +1,26 @@
 """Layers: create them with units and default prim, open them, and name files relative to them."""
 
+import functools
 import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
 
+import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
+from magtwin.budget import check_depth
 from magtwin.errors import InputError
-from magtwin.files import existing, output, sha256
+from magtwin.files import existing, existing_file, output, sha256
 from magtwin.usd.schema.versions import creator, is_upgraded, upgrade_stage
+from magtwin.usd.trial import try_stage
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 WORLD = Sdf.Path("/World")
 """Default prim of maps and scenes."""
@@ -71,33 +79,118 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
             own message. Or a layer has changes in this process that are not saved, which would be lost; or is
             of a later version of the schema.
     """
-    path = existing(path, "USD file")
-    if path.is_dir():
-        raise InputError(f"{path}: a folder; give a USD file in it")
+    path = _checked(path)
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
     try:
-        stage = Usd.Stage.Open(str(path))
-        layers = [layer for layer in stage.GetUsedLayers() if layer.realPath]
-        held = [layer for layer in layers if is_upgraded(layer)]  # by another stage; a reload would undo it
-        unsaved = [layer.identifier for layer in layers if layer.dirty and layer not in held]
-        if unsaved:
-            raise InputError(
-                f"{path}: {unsaved[0]} has changes in this process that are not saved; save them "
-                "(`stage.Save()`), or drop them (`layer.Reload()`)"
-            )
-        if held:
-            Sdf.Layer.ReloadLayers([layer for layer in layers if layer not in held])
-        else:
-            stage.Reload()  # a layer that is still held elsewhere would be stale
-        errors = stage.GetCompositionErrors()
-    except Tf.ErrorException as error:
-        raise InputError(f"{path}: cannot be opened as USD: {_reason(error)}") from error
+        with translated(path, "cannot be opened as USD"):
+            stage = Usd.Stage.Open(str(path))
+            layers = [layer for layer in stage.GetUsedLayers() if layer.realPath]
+            held = [layer for layer in layers if is_upgraded(layer)]  # elsewhere; a reload would undo it
+            unsaved = [layer.identifier for layer in layers if layer.dirty and layer not in held]
+            if unsaved:
+                raise InputError(
+                    f"{path}: {unsaved[0]} has changes in this process that are not saved; save them "
+                    "(`stage.Save()`), or drop them (`layer.Reload()`)"
+                )
+            if held:
+                Sdf.Layer.ReloadLayers([layer for layer in layers if layer not in held])
+            else:
+                stage.Reload()  # a layer that is still held elsewhere would be stale
+            errors = stage.GetCompositionErrors()
     finally:
         diagnostics.TakeUncoalescedDiagnostics()
     if errors:
         raise InputError(f"{path}: {_one_line(_text(errors[0]))}")
     upgrade_stage(stage, str(path))
     return stage
+
+
+def open_layer(path: str | os.PathLike[str]) -> Sdf.Layer:
+    """A layer of its own, read from disk, without the files that it names.
+
+    Raises:
+        InputError: The file is missing or not USD; the text has USD's own message.
+    """
+    path = _checked(path)
+    with translated(path, "cannot be opened as USD"):
+        layer = Sdf.Layer.OpenAsAnonymous(str(path))
+    if layer is None:
+        raise InputError(f"{path}: cannot be opened as USD; it is damaged, cut short, or not USD")
+    return layer
+
+
+_NESTED = 1 << 24
+"""Bytes of text whose nesting is counted at once."""
+
+
+def _checked(path: str | os.PathLike[str]) -> Path:
+    """A USD file that this process may open: regular, within the budget, and tried in another process."""
+    path = existing(path, "USD file")
+    if path.is_dir():
+        raise InputError(f"{path}: a folder; give a USD file in it")
+    with path.open("rb") as file:
+        binary = file.read(8) == b"PXR-USDC" or path.suffix == ".usdz"
+    existing_file(path, "USD file", "USD" if binary else "USD text")
+    if not binary:
+        _check_nesting(path)
+    try_stage(path)
+    return path
+
+
+def _check_nesting(path: Path) -> None:
+    """Refuse text whose braces nest so deep that the parser's stack ends."""
+    depth = 0
+    with path.open("rb") as file:
+        while block := file.read(_NESTED):
+            text = np.frombuffer(block, np.uint8)
+            steps = (text == ord("{")).astype(np.int32) - (text == ord("}"))
+            levels = depth + np.cumsum(steps)
+            check_depth(path, "USD text", int(levels.max()))
+            depth = int(levels[-1])
+
+
+@contextmanager
+def translated(where: object, what: str = "damaged USD") -> Iterator[None]:
+    """Raise USD's own errors in the block as an `InputError`.
+
+    USD reports damaged contents when they are used, by errors of its own kinds: `Tf.ErrorException`, and
+    ArgumentError of the Boost library for values of another type.
+
+    Args:
+        where: The file, or the place in it.
+        what: What the errors mean.
+    """
+    try:
+        yield
+    except (Tf.ErrorException, UnicodeDecodeError, TypeError) as error:
+        if isinstance(error, TypeError) and type(error).__name__ != "ArgumentError":
+            raise
+        raise InputError(f"{where}: {what}: {_reason(error)}") from error
+
+
+def translates(function: Callable[P, R]) -> Callable[P, R]:
+    """A function that reads USD, with USD's own errors `translated`.
+
+    Its first argument is a file, a stage, a layer or a prim, which the errors name.
+    """
+
+    @functools.wraps(function)
+    def translating(*args: P.args, **options: P.kwargs) -> R:
+        with translated(_place(next(iter((*args, *options.values())), None))):
+            return function(*args, **options)
+
+    return translating
+
+
+def _place(given: Any) -> object:
+    """The name of a file, stage, layer or prim, for errors."""
+    if isinstance(given, Usd.Prim):
+        return f"{given.GetStage().GetRootLayer().identifier} <{given.GetPath()}>" if given else "a prim"
+    if isinstance(given, Usd.Stage):
+        return given.GetRootLayer().identifier
+    if isinstance(given, Sdf.Layer):
+        return given.identifier
+    return given if isinstance(given, str | os.PathLike) else "a stage"
 
 
 def save_layer(layer: Sdf.Layer) -> None:
@@ -161,12 +254,11 @@ def _content_sha256(file: Path, above: tuple[Path, ...]) -> str:
         return "circle"  # composition refuses a circle; here it must end
     if file.suffix not in SUFFIXES:
         return sha256(file)
-    try:
+    existing_file(file, "USD file", "USD")
+    with translated(file, "cannot be opened as USD"):
         if not any(UsdUtils.ExtractExternalReferences(str(file))):
             return layer_sha256(file)
         layer = Sdf.Layer.OpenAsAnonymous(str(file))
-    except Tf.ErrorException as error:
-        raise InputError(f"{file}: cannot be opened as USD: {_reason(error)}") from error
 
     def checksum(asset: str) -> str:
         named = file.parent / asset
@@ -176,8 +268,12 @@ def _content_sha256(file: Path, above: tuple[Path, ...]) -> str:
     return hashlib.sha256(layer.ExportToString().encode()).hexdigest()
 
 
-def _reason(error: Tf.ErrorException) -> str:
+def _reason(error: Exception) -> str:
     """USD's first message, without its place in USD's sources."""
+    if isinstance(error, UnicodeDecodeError):
+        return f"a text is not UTF-8 (byte 0x{error.object[error.start]:02x})"
+    if isinstance(error, TypeError):
+        return f"a value of another type ({_one_line(str(error)).partition(' did not match')[0]})"
     text = getattr(error.args[0], "commentary", str(error)) if error.args else str(error)
     return re.sub(r"pxrInternal_\w*?pxrReserved__(::|_)", "", _one_line(text))
 

@@ -3,12 +3,11 @@
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Gf, Sdf, Usd, Vt
+from pxr import Gf, Usd, Vt
 
 from magtwin.errors import InputError
 from magtwin.field.grid import Grid
@@ -36,24 +35,10 @@ TILED_CHECKSUM_VERSION = 3
 """Version of the checksum of a map in tiles: over the checksums of its tiles."""
 
 
-@dataclass(frozen=True)
-class Sample:
-    """A time sample in the layer of a map's epochs, read there so that no layer offset rounds its time."""
-
-    layer: Sdf.Layer
-    prim: Sdf.Path
-    time: float
-
-    def get(self, attribute: str) -> Any:
-        """An attribute's value at exactly this time, or None."""
-        value = self.layer.QueryTimeSample(self.prim.AppendProperty(attribute), self.time)
-        return None if isinstance(value, Sdf.ValueBlock) else value
-
-
-def get(prim: Usd.Prim, name: str, sample: Sample | None = None) -> Any:
+def get(prim: Usd.Prim, name: str) -> Any:
     """Value of one of the map's attributes, of the schema's type."""
     attribute = prim.GetAttribute(attribute_name("anomalyMap", name))
-    return check_type(attribute, sample.get(attribute.GetName()) if sample else attribute.Get())
+    return check_type(attribute, attribute.Get())
 
 
 def check_type(attribute: Usd.Attribute, value: Any) -> Any:
@@ -97,13 +82,13 @@ def read_parameters(text: str) -> dict[str, Any]:
     return figures
 
 
-def read_made_from(prim: Usd.Prim, sample: Sample | None = None) -> MadeFrom | None:
+def read_made_from(prim: Usd.Prim) -> MadeFrom | None:
     """What a prim's map was made from, or what was authored over it; None if that is not recorded.
 
     Raises:
         InputError: The attribute holds something else; names the prim.
     """
-    text = get(prim, "madeFrom", sample)
+    text = get(prim, "madeFrom")
     if not text:
         return None
     try:
@@ -121,19 +106,17 @@ def _spelled(made_from: MadeFrom | None) -> str:
     return "" if made_from is None else json.dumps(made_from.table(), ensure_ascii=False)
 
 
-def read_harmonic(prim: Usd.Prim, sample: Sample | None) -> dict[str, NDArray] | None:
-    """The arrays of the harmonic field in the schema's order; None if there is none at that time."""
+def read_harmonic(prim: Usd.Prim) -> dict[str, NDArray] | None:
+    """The arrays of the harmonic field in the schema's order; None if there is none."""
     if not prim.HasAPI(NOUNS["harmonic"]):
         return None
     arrays = {}
     for name, shape in HARMONIC.items():
         attribute = prim.GetAttribute(attribute_name("harmonic", name))
         source = attribute.GetResolveInfo(Usd.TimeCode.Default()).GetSource()
-        authored = source == Usd.ResolveInfoSourceDefault
-        value = sample.get(attribute.GetName()) if sample else attribute.Get() if authored else None
-        if value is None:
+        if source != Usd.ResolveInfoSourceDefault:
             continue
-        check_type(attribute, value)
+        value = check_type(attribute, attribute.Get())
         arrays[name] = np.array(value, float).reshape([-1 if n < 0 else n for n in shape])
     if arrays and len(arrays) < len(HARMONIC):
         lost = ", ".join(attribute_name("harmonic", name) for name in HARMONIC.keys() - arrays.keys())

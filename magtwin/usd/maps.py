@@ -11,23 +11,23 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Sdf, Usd, UsdGeom, Vt
+from pxr import Usd, UsdGeom, Vt
 
 from magtwin.errors import InputError
-from magtwin.field.days import ORIGIN, day_number
+from magtwin.field.days import parse_day
 from magtwin.field.maps.epochs import at_date, day_of, in_order
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.tiles import TILED_FROM, Tile, TiledMap, Tiling
 from magtwin.field.sources.harmonic import HarmonicField
-from magtwin.usd.heat_map import MAP, Floor, define_heat_map
-from magtwin.usd.layers import new_stage, open_stage
+from magtwin.usd.epochs import define_epoch, each_epoch, epochs_of, selected_epoch, warn_of_time_codes
+from magtwin.usd.heat_map import MAP, Floor, define_colours, define_heat_map
+from magtwin.usd.layers import new_stage, open_stage, translates
 from magtwin.usd.map_attributes import (
     CHECKSUM_VERSION,
     GRID,
     MOST_CHARACTERS,
     PLACES,
     TEXTS,
-    Sample,
     check_type,
     get,
     grid_numbers,
@@ -46,9 +46,6 @@ from magtwin.usd.tiled_maps import is_tiled, read_tiled, tiled_checksums, write_
 
 RECORDED = ("recorded_nt", "recorded_yaw")
 """What only a survey has: its exact readings, and their headings."""
-
-DAYS_PER_SECOND = 24.0
-"""Time codes (days) that a viewer plays per second; USD's own default."""
 
 
 def save_map(
@@ -93,10 +90,10 @@ def save_map(
 
 
 def save_map_series(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], *, force: bool = False) -> None:
-    """Write the epochs of a map as one layer: one time sample per date, in days since 2000-01-01.
+    """Write the epochs of a map as one layer: the variant set `epoch`, with one variant per date.
 
-    Shared attributes are written once. The default values are those of the latest epoch. A viewer that plays
-    the layer shows the drift of the field.
+    Shared attributes are written once. The latest epoch is selected; any program that reads USD can select
+    another one, also in a stage that brings the layer in. The colours of all epochs have one scale.
 
     Args:
         maps: Two or more maps of one grid, each with its date in `created`, in any order.
@@ -119,25 +116,31 @@ def _refuse_tables(path: str | os.PathLike[str]) -> None:
         )
 
 
+@translates
 def load_map(path: str | os.PathLike[str], date: str | datetime.date | None = None) -> AnomalyMap:
     """The map of a layer, or of a stage that holds one.
 
     Args:
         path: The layer or stage.
         date: Date of the map, or its text YYYY-MM-DD; the map is interpolated linearly in time between two
-            epochs. Default: the latest epoch.
+            epochs. Default: the epoch that the file selects, which is the latest unless someone changed it.
 
     Raises:
         InputError: The file is missing or not USD, holds no map or several, or its arrays are inconsistent
             or do not match the checksum; or the date is not valid or outside the epochs.
     """
     _refuse_tables(path)
-    if date is not None:
-        return at_date(load_epochs(path), date)
     stage = open_stage(path)
-    return read_map(only_prim_with(stage.GetPseudoRoot(), "anomalyMap"))
+    prim = only_prim_with(stage.GetPseudoRoot(), "anomalyMap")
+    if date is None:
+        return read_map(prim)
+    day = parse_day(date).isoformat()
+    if day in epochs_of(prim):
+        return next(_read(at) for _, at in each_epoch(prim, [day]))
+    return at_date(_epochs(prim), day)
 
 
+@translates
 def load_epochs(path: str | os.PathLike[str]) -> tuple[AnomalyMap, ...]:
     """Every epoch of a layer's or stage's map, the earliest first.
 
@@ -146,22 +149,16 @@ def load_epochs(path: str | os.PathLike[str]) -> tuple[AnomalyMap, ...]:
     """
     stage = open_stage(path)
     prim = only_prim_with(stage.GetPseudoRoot(), "anomalyMap")
-    epochs = tuple(_read(prim, sample) for sample in _samples(prim))
-    if not epochs:
-        return (read_map(prim),)
-    for sample, epoch in zip(_samples(prim), epochs, strict=True):
-        try:
-            day = day_of(epoch)
-        except InputError as error:
-            raise InputError(f"{place(prim)}: at time {sample.time:g}, {error}") from error
-        if sample.time != day_number(day):
-            raise InputError(
-                f"{place(prim)}: its epoch at time {sample.time:g} must be of the day that many days after "
-                f"{ORIGIN}, got {attribute_name('anomalyMap', 'created')} {day}; make the map anew"
-            )
-    return epochs
+    return _epochs(prim)
 
 
+def _epochs(prim: Usd.Prim) -> tuple[AnomalyMap, ...]:
+    if not epochs_of(prim) and not warn_of_time_codes(prim):
+        return (_read(prim),)
+    return tuple(_read(at, date) for date, at in each_epoch(prim))
+
+
+@translates
 def is_map_layer(path: str | os.PathLike[str]) -> bool:
     """Whether a USD file is a map: it holds an anomaly map and no robot.
 
@@ -174,13 +171,15 @@ def is_map_layer(path: str | os.PathLike[str]) -> bool:
     return len(prims_with(root, "anomalyMap")) == 1 and not prims_with(root, "robot")
 
 
+@translates
 def read_map(prim: Usd.Prim) -> AnomalyMap:
-    """The map of a prim, its latest epoch; errors as for `load_map`."""
-    return _read(prim, None)
+    """The map of a prim, at the epoch that its stage selects; errors as for `load_map`."""
+    warn_of_time_codes(prim)
+    return _read(prim)
 
 
 def checksums(prim: Usd.Prim) -> list[tuple[str, str]]:
-    """The stored and the computed checksum of a map: of the default, then of each epoch.
+    """The stored and the computed checksum of a map: of each epoch, if it has several.
 
     That of a map in tiles covers the checksums of its tiles, not the tiles: `tile_faults` checks those.
 
@@ -189,12 +188,14 @@ def checksums(prim: Usd.Prim) -> list[tuple[str, str]]:
     """
     if is_tiled(prim):
         return [tiled_checksums(prim)]
-    pairs, grid = [], _covered_grid(prim)
-    for sample in (None, *_samples(prim)):
-        values, valid, variance = (np.array(get(prim, n, sample)) for n in ("values", "valid", "variance"))
-        taken = _checksum(values, valid, variance, read_harmonic(prim, sample), grid)
-        pairs.append((get(prim, "checksum", sample), taken))
-    return pairs
+    pairs = [_checksums(at) for _, at in each_epoch(prim)]
+    return pairs or [_checksums(prim)]
+
+
+def _checksums(prim: Usd.Prim) -> tuple[str, str]:
+    values, valid, variance = (np.array(get(prim, name)) for name in ("values", "valid", "variance"))
+    taken = _checksum(values, valid, variance, read_harmonic(prim), _covered_grid(prim))
+    return get(prim, "checksum"), taken
 
 
 def _covered_grid(prim: Usd.Prim) -> NDArray[np.float64] | None:
@@ -210,26 +211,19 @@ def _covered_grid(prim: Usd.Prim) -> NDArray[np.float64] | None:
     return np.concatenate([np.ravel(np.array(get(prim, name), float)) for name in GRID])
 
 
-def _samples(prim: Usd.Prim) -> list[Sample]:
-    """Time samples of the map's values, the earliest first."""
-    for spec in prim.GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack():
-        if times := spec.layer.ListTimeSamplesForPath(spec.path):
-            return [Sample(spec.layer, spec.path.GetPrimPath(), time) for time in times]
-    return []
-
-
-def _read(prim: Usd.Prim, sample: Sample | None) -> AnomalyMap:
-    """The map of a prim at a time, or its default."""
-    checksum = get(prim, "checksum", sample)
-    if is_tiled(prim) and sample is None:
+def _read(prim: Usd.Prim, date: str = "") -> AnomalyMap:
+    """The map of a prim as its stage shows it; `date` is that of its epoch, if that is known otherwise."""
+    date = date or selected_epoch(prim)
+    checksum = get(prim, "checksum")
+    if is_tiled(prim):
         return read_tiled(prim)
     if not re.fullmatch("[0-9a-f]{64}", checksum):
         raise InputError(
             f"{place(prim)}: {attribute_name('anomalyMap', 'checksum')} must be a SHA-256, 64 digits 0-9a-f, "
             f"got {checksum[:MOST_CHARACTERS]!r}; make the map anew"
         )
-    values, valid, variance = (np.array(get(prim, name, sample)) for name in ("values", "valid", "variance"))
-    harmonic = read_harmonic(prim, sample)
+    values, valid, variance = (np.array(get(prim, name)) for name in ("values", "valid", "variance"))
+    harmonic = read_harmonic(prim)
     shape = tuple(get(prim, "shape"))
     if len(shape) != 3 or min(shape) < 1 or not values.size == valid.size == math.prod(shape):
         raise InputError(
@@ -249,39 +243,44 @@ def _read(prim: Usd.Prim, sample: Sample | None) -> AnomalyMap:
         text = f"the map's values do not match its checksum{also}; make the map anew"
         raise InputError(f"{place(prim)}: {text}")
     spreads = variance.reshape(-1, *shape).astype(float)  # of the nodes, and between them
-    recorded = _read_recorded(prim, RECORDED[0], sample, shape)
+    recorded = _read_recorded(prim, RECORDED[0], shape)
     if recorded is not None and not np.array_equal(recorded.ravel().astype("f4"), values, equal_nan=True):
         raise InputError(
             f"{place(prim)}: the map's values are not those that were recorded, in single precision; make "
             "the map anew"
         )
     try:
-        return AnomalyMap(
+        field = AnomalyMap(
             values_nt=values.reshape(shape).astype(float) if recorded is None else recorded,
             valid=valid.reshape(shape).astype(bool),
             variance_nt2=spreads[0] if len(spreads) else None,
             between_nt2=spreads[1:] if len(spreads) > 1 else None,
-            recorded_yaw=_read_recorded(prim, RECORDED[1], sample, shape),
+            recorded_yaw=_read_recorded(prim, RECORDED[1], shape),
             origin_m=tuple(get(prim, "origin")),
             cell_m=tuple(get(prim, "cellSize")),
             headings_rad=np.deg2rad(headings),
             height_m=read_height(prim),
-            parameters=read_parameters(get(prim, "parameters", sample)),
+            parameters=read_parameters(get(prim, "parameters")),
             harmonic=None if harmonic is None else HarmonicField(**harmonic),
-            made_from=read_made_from(prim, sample),
+            made_from=read_made_from(prim),
             **{name: get(prim, name) for name in PLACES},
-            **{name: get(prim, name, sample) for name in TEXTS},
+            **{name: get(prim, name) for name in TEXTS},
         )
+        day = day_of(field).isoformat() if date else ""
     except InputError as error:
-        raise InputError(f"{place(prim)}: {error}") from error
+        raise InputError(f"{place(prim)}: {f'epoch {date}: ' if date else ''}{error}") from error
+    if day != date:
+        raise InputError(
+            f"{place(prim)}: its epoch {date} must be of that day, got "
+            f"{attribute_name('anomalyMap', 'created')} {day}; make the map anew"
+        )
+    return field
 
 
-def _read_recorded(
-    prim: Usd.Prim, name: str, sample: Sample | None, shape: tuple[int, ...]
-) -> NDArray | None:
+def _read_recorded(prim: Usd.Prim, name: str, shape: tuple[int, ...]) -> NDArray | None:
     """Recorded numbers at the nodes; None if there are none."""
     attribute = prim.GetAttribute(attribute_name("anomalyMap", name))
-    value = sample.get(attribute.GetName()) if sample else attribute.Get()
+    value = attribute.Get()
     if value is None or not len(value):
         return None
     recorded = np.array(check_type(attribute, value), float)
@@ -293,11 +292,10 @@ def _read_recorded(
 
 
 def _save(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], force: bool) -> None:
-    """Write maps of one grid, earliest first: the last as the default, several as time samples."""
+    """Write maps of one grid, earliest first: a single one, or several as epochs with the last selected."""
     if Path(path).suffix not in (".usdc", ".usd"):
         raise InputError(f"{path}: a map layer ends in .usdc or .usd")
     latest = maps[-1]
-    times = [float(day_number(day_of(m))) for m in maps] if len(maps) > 1 else []
     samples = [_epoch_values(m) for m in maps]
     for name in (attribute_name("anomalyMap", field) for field in RECORDED):
         if all(sample[name] is None for sample in samples):
@@ -307,17 +305,17 @@ def _save(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], force: bool)
         prim = apply_api(UsdGeom.Xform.Define(stage, MAP).GetPrim(), "anomalyMap")
         if any(m.harmonic is not None for m in maps):
             apply_api(prim, "harmonic")
-        set_values(prim, {**shared_values(latest, latest.grid, CHECKSUM_VERSION), **samples[-1]})
-        for time, sample in zip(times, samples, strict=bool(times)):
-            for name, value in sample.items():
-                if attribute := prim.GetAttribute(name):
-                    attribute.Set(Sdf.ValueBlock() if value is None else value, time)
-        if times:
-            stage.SetStartTimeCode(times[0])
-            stage.SetEndTimeCode(times[-1])
-            stage.SetTimeCodesPerSecond(DAYS_PER_SECOND)
-            stage.SetFramesPerSecond(DAYS_PER_SECOND)
-        define_heat_map(stage, Floor.of(maps), times)
+        shared, floor = shared_values(latest, latest.grid, CHECKSUM_VERSION), Floor.of(maps)
+        if len(maps) == 1:
+            set_values(prim, {**shared, **samples[0]})
+            define_colours(define_heat_map(stage, floor), floor)
+            return
+        set_values(prim, shared)
+        mesh = define_heat_map(stage, floor)
+        for k, sample in enumerate(samples):
+            with define_epoch(prim, day_of(maps[k]).isoformat()):
+                set_values(prim, sample)
+                define_colours(mesh, floor, k)
 
 
 def _epoch_values(field: AnomalyMap) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from pxr import Usd, UsdGeom, UsdPhysics
 
 from magtwin.spec.obstacles import Obstacles
 from magtwin.usd.geometry import SHOWN, read_triangles
-from magtwin.usd.layers import open_stage
+from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.schema import prims_with
 
 LOWEST_M = 0.01
@@ -27,6 +27,7 @@ MOST_FACES = 1000
 """A concave part of a mesh with more triangles counts as its convex hull, others face by face."""
 
 
+@translates
 def read_obstacles(stage: Usd.Stage | str | os.PathLike[str], *, height_m: float | None = None) -> Obstacles:
     """The colliders of a stage that no rigid body carries, in order of their prims.
 

@@ -12,7 +12,7 @@ from magtwin.frames import IDENTITY_XYZW, canonical, xyzw_from_wxyz
 from magtwin.spec.base import Quat, Vec3
 from magtwin.spec.robot import RobotSpec
 from magtwin.usd.geometry import BASE_LINK
-from magtwin.usd.layers import open_stage
+from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.schema import only_prim_with, place
 from magtwin.usd.sensors import (
     read_battery,
@@ -30,6 +30,7 @@ PARALLEL = 1e-12
 """Largest sine of half the angle between parallel axes."""
 
 
+@translates
 def load_robot(file: str | os.PathLike[str]) -> RobotSpec:
     """The spec of a robot's asset. Whether the weights that it names exist is not checked.
 
@@ -99,6 +100,7 @@ def urdf_of(asset: str | os.PathLike[str]) -> Path | None:
     return source
 
 
+@translates
 def _conversion(asset: str | os.PathLike[str]) -> dict[str, Any]:
     """Metadata that the converter wrote to an asset."""
     stage = open_stage(existing(asset, "robot asset"))  # held in a name: a layer does not outlive its stage

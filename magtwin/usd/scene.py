@@ -5,9 +5,10 @@ import os
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from pxr import Gf, Usd, UsdGeom
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
@@ -18,10 +19,11 @@ from magtwin.spec.robot import PlacedRobot
 from magtwin.spec.scene import Scene
 from magtwin.usd.attributes import plain_value, read_pose, target
 from magtwin.usd.earth import AGREES_NT, read_earth
+from magtwin.usd.epochs import select_epoch, selected_epoch
 from magtwin.usd.furniture import read_magnets
 from magtwin.usd.geometry import Link, Shape, read_links, read_shapes
 from magtwin.usd.lab import read_lab
-from magtwin.usd.layers import layer_sha256, open_stage, relative_asset, save_layer, stage_sha256
+from magtwin.usd.layers import layer_sha256, open_stage, relative_asset, save_layer, stage_sha256, translates
 from magtwin.usd.map_attributes import MADE_FROM
 from magtwin.usd.maps import read_map
 from magtwin.usd.obstacles import read_obstacles
@@ -67,6 +69,9 @@ class OpenedScene:
     pose: Pose | None = None
     """Pose of the lab in its stage; None if it is at the origin."""
 
+    epoch: str = ""
+    """Date of the map's epoch; "" if the map has no epochs."""
+
     changes: tuple[str, ...] = ()
     """What has changed on the stage since the map was made."""
 
@@ -105,11 +110,14 @@ class OpenedScene:
         scene = replace(self.scene.led_by(robot), others=())
         if not self.scene.others:
             return self
-        stage = _alone(_placed(Usd.Stage.Open(self.stage.GetRootLayer()), self.lab), robot)
+        stage = _alone(_placed(Usd.Stage.Open(self.stage.GetRootLayer()), self.lab, self.epoch), robot)
         return replace(self, stage=stage, scene=scene)
 
 
-def open_scene(path: str | os.PathLike[str], *, lab: str = "", check_network: bool = True) -> OpenedScene:
+@translates
+def open_scene(
+    path: str | os.PathLike[str], *, lab: str = "", epoch: str = "", check_network: bool = True
+) -> OpenedScene:
     """Open the stage of a scene once: its Scene and map, and its obstacles and geometry when asked for.
 
     All places are in the axes of the lab, wherever it stands on the stage (`magtwin.usd.placement`).
@@ -118,6 +126,7 @@ def open_scene(path: str | os.PathLike[str], *, lab: str = "", check_network: bo
         path: Root layer, as `author_scene` wrote it or as others edited it. A start's yaw is computed from a
             quaternion, so its last bits can differ from what was authored.
         lab: Path of the lab's root on a stage of several labs. Default: the only lab.
+        epoch: Date of the map's epoch, YYYY-MM-DD. Default: the epoch that the stage selects.
         check_network: Whether the weights that the magnetometer names must exist.
 
     Raises:
@@ -138,6 +147,7 @@ def open_scene(path: str | os.PathLike[str], *, lab: str = "", check_network: bo
     earth, notes = earth_in(stage, where)
     take_to_origin(stage, where)
     world = stage.GetPseudoRoot()
+    _select_epoch(stage, epoch)
     prims = _robot_prims(stage)
     robots = [_read_placed(prim, check_network, notes) for prim in prims]
     magnetometers = [only_prim_with(prim, "magnetometer") for prim in prims]
@@ -178,16 +188,18 @@ def open_scene(path: str | os.PathLike[str], *, lab: str = "", check_network: bo
         anomaly_map,
         lab=where.path if several else "",
         pose=None if pose == AT_ORIGIN else pose,
+        epoch=selected_epoch(maps[0]),
         changes=() if made is None else tuple(made.changes(scene)),
         notes=tuple(notes),
     )
 
 
-def read_scene(path: str | os.PathLike[str], *, lab: str = "", check_network: bool = True) -> Scene:
+def read_scene(path: str | os.PathLike[str], **options: Any) -> Scene:
     """The scene of a stage; arguments and errors as for `open_scene`."""
-    return open_scene(path, lab=lab, check_network=check_network).scene
+    return open_scene(path, **options).scene
 
 
+@translates
 def robots_in(path: str | os.PathLike[str], *, lab: str = "") -> dict[str, str | Path]:
     """Default path of each robot of a lab, by the robot's name, in the stage's order.
 
@@ -198,25 +210,47 @@ def robots_in(path: str | os.PathLike[str], *, lab: str = "") -> dict[str, str |
     return {prim.GetName(): read_path(prim) for prim in _robot_prims(stage)}
 
 
-def open_alone(path: str | os.PathLike[str], robot: str, *, lab: str = "") -> Usd.Stage:
+@translates
+def open_alone(path: str | os.PathLike[str], robot: str, *, lab: str = "", epoch: str = "") -> Usd.Stage:
     """A stage in the axes of a lab, on which other labs and all robots but one are inactive.
 
     Args:
         path: Root layer of a scene.
         robot: Name of the robot that stays. If there is no such robot, all stay.
         lab: As for `open_scene`. A stage without a lab stays where it is.
+        epoch: As for `open_scene`.
 
     Raises:
-        InputError: The file is missing or not USD, or as for `open_scene`, for `lab`.
+        InputError: The file is missing or not USD, or as for `open_scene`, for `lab` and `epoch`.
     """
-    return _alone(_placed(open_stage(path), lab), robot)
+    return _alone(_placed(open_stage(path), lab, epoch), robot)
 
 
-def _placed(stage: Usd.Stage, lab: str) -> Usd.Stage:
-    """The stage in the axes of a lab, if it has one."""
+def as_layer(stage: Usd.Stage) -> str:
+    """Text of a layer that other programs open as `open_alone` has it: its edits over the stage's file."""
+    layer, root = Sdf.Layer.CreateAnonymous(".usda"), stage.GetRootLayer()
+    layer.TransferContent(stage.GetSessionLayer())
+    layer.subLayerPaths = [Path(root.realPath).as_posix()]
+    layer.defaultPrim = root.defaultPrim
+    placed = Usd.Stage.Open(layer)
+    UsdGeom.SetStageMetersPerUnit(placed, UsdGeom.GetStageMetersPerUnit(stage))
+    UsdGeom.SetStageUpAxis(placed, UsdGeom.GetStageUpAxis(stage))
+    UsdPhysics.SetStageKilogramsPerUnit(placed, UsdPhysics.GetStageKilogramsPerUnit(stage))
+    return str(layer.ExportToString())
+
+
+def _placed(stage: Usd.Stage, lab: str, epoch: str = "") -> Usd.Stage:
+    """The stage in the axes of a lab, if it has one, with an epoch of its map."""
     if labs_on(stage):
         take_to_origin(stage, lab_on(stage, lab))
+    _select_epoch(stage, epoch)
     return stage
+
+
+def _select_epoch(stage: Usd.Stage, epoch: str) -> None:
+    """Show an epoch of the maps of a stage of one lab; "" leaves what the stage selects."""
+    for prim in prims_with(stage.GetPseudoRoot(), "anomalyMap") if epoch else ():
+        select_epoch(prim, epoch)
 
 
 def earth_in(stage: Usd.Stage, lab: Lab) -> tuple[EarthFieldSpec | None, list[str]]:

@@ -17,7 +17,7 @@ from magtwin.spec.drive import DriveSpec
 from magtwin.spec.magnetics import PlatformFieldSpec
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec, MountSpec
-from magtwin.usd.attributes import read_pose, read_spec, target, write_pose, write_spec
+from magtwin.usd.attributes import read_pose, read_spec, target, targets, write_pose, write_spec
 from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, require_api
 
 S = TypeVar("S")
@@ -27,6 +27,9 @@ POSE_FIELDS = frozenset(("link", "p_link_sensor", "q_link_sensor_xyzw"))
 
 JOINT_FIELDS = ("left_wheel_joint", "right_wheel_joint")
 """Fields of a DriveSpec that are relationships to joints."""
+
+WHEELS_FIELDS = ("more_left_wheel_joints", "more_right_wheel_joints")
+"""Fields of a DriveSpec that are relationships to any number of joints."""
 
 MAP_RELATIONSHIP = "magtwin:magnetometer:map"
 MAP_CHECKSUM = "magtwin:magnetometer:mapSha256"
@@ -208,16 +211,17 @@ def define_drive(prim: Usd.Prim, spec: DriveSpec) -> Usd.Prim:
     Raises:
         InputError: There is no joint of that name.
     """
-    write_spec(apply_api(prim, "drive"), "drive", spec, skip=JOINT_FIELDS)
+    write_spec(apply_api(prim, "drive"), "drive", spec, skip={*JOINT_FIELDS, *WHEELS_FIELDS})
     prims = [p for p in Usd.PrimRange(prim) if p.IsA(UsdPhysics.Joint)]
     joints = {p.GetDisplayName() or p.GetName(): p for p in prims} | {p.GetName(): p for p in prims}
-    for field in JOINT_FIELDS:
-        name = getattr(spec, field)
-        if name not in joints:
-            raise InputError(f"{place(prim)}: no joint {name!r} for {field}; {hint(name, joints)}")
+    for field in (*JOINT_FIELDS, *WHEELS_FIELDS):
+        names = (getattr(spec, field),) if field in JOINT_FIELDS else getattr(spec, field)
+        for name in names:
+            if name not in joints:
+                raise InputError(f"{place(prim)}: no joint {name!r} for {field}; {hint(name, joints)}")
         relationship = prim.GetRelationship(attribute_name("drive", field))
-        if relationship.GetTargets() != [joints[name].GetPath()]:
-            relationship.SetTargets([joints[name].GetPath()])
+        if relationship.GetTargets() != [joints[name].GetPath() for name in names]:
+            relationship.SetTargets([joints[name].GetPath() for name in names])
     return prim
 
 
@@ -228,7 +232,9 @@ def read_drive(prim: Usd.Prim) -> DriveSpec:
         InputError: The prim has no drive, a value is out of range, or a wheel's joint is missing.
     """
     require_api(prim, "drive")
-    joints = {f: target(prim, attribute_name("drive", f)).GetName() for f in JOINT_FIELDS}
+    joints: dict[str, Any] = {f: target(prim, attribute_name("drive", f)).GetName() for f in JOINT_FIELDS}
+    for field in WHEELS_FIELDS:
+        joints[field] = tuple(joint.GetName() for joint in targets(prim, attribute_name("drive", field)))
     return read_spec(DriveSpec, prim, "drive", **joints)
 
 

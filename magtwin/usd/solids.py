@@ -17,6 +17,12 @@ CREASE = np.radians(35)
 FAN = 64
 """Where more faces than this meet, as at tips and in the middle of discs, each keeps its own normal."""
 
+SMOOTH = np.cos(CREASE / 2) + 1e-5
+"""Cosine of the angle to their common normal below which all faces of a point are within CREASE."""
+
+PAIRS = 2**19
+"""Most pairs of corners that are compared at once."""
+
 Triangles = tuple[NDArray, NDArray]
 """Points [m], shape (V, 3), and the corners of triangles, counter-clockwise from outside, shape (F, 3)."""
 
@@ -172,27 +178,38 @@ def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float32]:
     Returns:
         Normals, shape (F, 3, 3).
     """
-    a, b, c = (points[faces[:, i]].astype(float) for i in range(3))
-    area = np.cross(b - a, c - a)
+    area = _cross(points.astype(float), faces)
     size = np.linalg.norm(area, axis=1, keepdims=True)
     area = (area / size.mean()).astype(np.float32)
     unit = area / np.linalg.norm(area, axis=1, keepdims=True)
-    flat = faces.ravel().astype(np.int32)
-    by_point = np.argsort(flat, kind="stable")  # corners of one point stand together
+    flat, own = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
     count = np.bincount(flat, minlength=len(points))
-    first = np.cumsum(count) - count
-    corner = by_point[count[flat[by_point]] <= FAN]
-    around = count[flat[corner]]  # each corner is paired with each corner of its point
-    mine = np.repeat(np.arange(len(corner)), around)
-    start = np.repeat(first[flat[corner]] - np.cumsum(around) + around, around)
-    theirs = (by_point // 3)[start + np.arange(len(mine))]
-    near = np.einsum("ij,ij->i", np.repeat(unit[corner // 3], around, axis=0), unit[theirs]) >= np.cos(CREASE)
-    mine, theirs = mine[near], theirs[near]
-    normals = np.repeat(unit, 3, axis=0)
-    for axis in range(3):
-        normals[corner, axis] = np.bincount(mine, area[theirs, axis], len(corner))
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return (normals / length).reshape(-1, 3, 3)
+    together = np.column_stack([np.bincount(flat, area[own, i], len(points)) for i in range(3)])
+    length = np.maximum(np.linalg.norm(together, axis=1, keepdims=True), 1e-30)
+    off = np.einsum("ij,ij->i", unit[own], (together / length).astype(np.float32)[flat]) < SMOOTH
+    creased = np.bincount(flat[off], minlength=len(points)) > 0  # elsewhere, all faces are within CREASE
+    normals = unit[own]
+    shared = ~creased[flat] & (count[flat] <= FAN)
+    normals[shared] = together.astype(np.float32)[flat[shared]]
+    corner = np.flatnonzero(creased[flat] & (count[flat] <= FAN))
+    corner = corner[np.argsort(flat[corner], kind="stable")]  # corners of one point stand together
+    around = count[flat[corner]]
+    for number in np.flatnonzero(np.bincount(around)):
+        points_of = corner[around == number].reshape(-1, number)
+        step = max(PAIRS // int(number) ** 2, 1)  # so that memory stays bounded
+        for some in (points_of[i : i + step] for i in range(0, len(points_of), step)):
+            directions, areas = unit[own[some]], area[own[some]].astype(float)
+            near = directions @ directions.transpose(0, 2, 1) >= np.float32(np.cos(CREASE))
+            normals[some] = near.astype(float) @ areas
+    return (normals / np.linalg.norm(normals, axis=1, keepdims=True)).reshape(-1, 3, 3)
+
+
+def _cross(points: NDArray, faces: NDArray) -> NDArray[np.float64]:
+    """Twice the area of each triangle times its normal, shape (F, 3); column by column, which is faster."""
+    x, y, z = np.ascontiguousarray(points.T)
+    a, b, c = np.ascontiguousarray(faces.T)
+    (ux, vx), (uy, vy), (uz, vz) = ((p[b] - p[a], p[c] - p[a]) for p in (x, y, z))
+    return np.column_stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx])
 
 
 def define_triangles(
@@ -218,6 +235,9 @@ def define_triangles(
         primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
             "normals", Sdf.ValueTypeNames.Normal3fArray, UsdGeom.Tokens.faceVarying
         )
-        rows, index = np.unique(normals, axis=0, return_inverse=True)
-        primvar.Set(Vt.Vec3fArray.FromNumpy(rows))
-        primvar.SetIndices(Vt.IntArray.FromNumpy(index.ravel().astype(np.int32)))
+        order = np.lexsort(normals.T[::-1])  # as np.unique, which imports numpy.ma
+        starts = np.append(True, (normals[order[1:]] != normals[order[:-1]]).any(axis=1))
+        index = np.empty(len(order), np.int32)
+        index[order] = np.cumsum(starts) - 1
+        primvar.Set(Vt.Vec3fArray.FromNumpy(normals[order[starts]]))
+        primvar.SetIndices(Vt.IntArray.FromNumpy(index))

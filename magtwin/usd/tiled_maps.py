@@ -17,7 +17,7 @@ from magtwin.field.maps.statistics import colour_limits
 from magtwin.field.maps.tiles import Tile, TiledMap, Tiling
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.files import output
-from magtwin.usd.heat_map import MAP, Floor, define_heat_map, nodes_shown
+from magtwin.usd.heat_map import MAP, Floor, define_colours, define_heat_map, nodes_shown
 from magtwin.usd.layers import WORLD, describe_stage
 from magtwin.usd.map_attributes import (
     GRID,
@@ -129,12 +129,12 @@ def _tiled_checksum(
 
 def tiled_checksums(prim: Usd.Prim) -> tuple[str, str]:
     """The stored and the computed checksum of a map in tiles: of its tiles' checksums, figures and grid."""
-    return get(prim, "checksum"), _tiled_checksum(*_tree(prim), read_harmonic(prim, None))
+    return get(prim, "checksum"), _tiled_checksum(*_tree(prim), read_harmonic(prim))
 
 
 def read_tiled(prim: Usd.Prim) -> TiledMap:
     """The map of a prim whose arrays are in tiles, none of which is read yet."""
-    tree, harmonic = _tree(prim), read_harmonic(prim, None)
+    tree, harmonic = _tree(prim), read_harmonic(prim)
     if get(prim, "checksum") != _tiled_checksum(*tree, harmonic):
         raise InputError(
             f"{place(prim)}: the map's grid and the checksums of its tiles do not match its checksum; make "
@@ -250,6 +250,6 @@ def write_tiled(
         shared = shared_values(field, grid, TILED_CHECKSUM_VERSION)
         set_values(prim, {**shared, **named, **texts_of(field), **harmonic_values(harmonic)})
         floor = Floor(grid, every, j, i, [(shown, flags)], colour_limits(shown[flags].astype(float)))
-        define_heat_map(stage, floor, ())
+        define_colours(define_heat_map(stage, floor), floor)
         stage.Save()
         del stage, prim

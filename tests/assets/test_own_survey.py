@@ -107,8 +107,8 @@ def test_the_summary_of_the_scene_lists_what_the_shape_told(followed, capsys):
     said = " ".join(capsys.readouterr().out.split())
     for note in (
         "footprint_radius_m not given: 0.252 m, from the robot's shape",
-        "wheel_separation_m not given: 0.32 m, from the robot's shape",
-        "wheel_radius_m not given: 0.07 m, from the robot's shape",
+        "drive: wheel separation 0.32 m, not given: the distance between the wheel joints",
+        "drive: wheel radius 0.07 m, not given: from the wheels' shape",
         "the robot is raised by 0.07 m, so that its wheels stand on the floor",
         "no imu given: placed at the origin of base_link",
     ):

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from magtwin.cli import main
+from magtwin.cli import MODULES, load, main
 from magtwin.cli.app import app
 from magtwin.cli.renamed import COMMANDS
 from magtwin.errors import InputError
@@ -22,7 +22,12 @@ def commands(group=app, words=()):
             yield from commands(group[name], (*words, name))
 
 
+load()
 ALL = dict(commands())
+
+
+def test_each_command_is_loaded_by_its_name():
+    assert {words[0] for words in ALL} == set(MODULES)
 
 
 @pytest.mark.parametrize("words", ALL, ids=" ".join)

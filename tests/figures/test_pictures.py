@@ -201,3 +201,50 @@ def test_a_machine_without_opengl_is_told_the_packages(lacks, stage, tmp_path, m
     with pytest.raises(InputError, match=r"no OpenGL here, .*: apt-get install libegl1 libgl1-mesa-dri"):
         picture_of_stage(tmp_path / "stage.usda", tmp_path / "a.png")
     assert not (tmp_path / "a.png").exists()
+
+
+def test_a_texture_is_drawn_upright_and_times_its_factor(stage, tmp_path):
+    """Seen from x, y is on the right. Without blue, white becomes yellow."""
+    from PIL import Image
+
+    image = Image.new("RGB", (64, 64), (255, 0, 0))
+    image.paste((255, 255, 255), (32, 0, 64, 32))
+    image.paste((0, 255, 0), (32, 32, 64, 64))
+    image.save(tmp_path / "t.png")
+    mesh = UsdGeom.Mesh.Define(stage, "/sheet")
+    mesh.CreatePointsAttr([(0, 0, 0), (0, 1, 0), (0, 1, 1), (0, 0, 1)])
+    mesh.CreateFaceVertexCountsAttr([4])
+    mesh.CreateFaceVertexIndicesAttr([0, 1, 2, 3])
+    mesh.CreateSubdivisionSchemeAttr("none")
+    st_ = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, "faceVarying")
+    st_.Set([(0, 0), (1, 0), (1, 1), (0, 1)])
+    material = UsdShade.Material.Define(stage, "/look")
+    surface, texture, reader = (UsdShade.Shader.Define(stage, f"/look/{n}") for n in ("s", "t", "r"))
+    surface.CreateIdAttr("UsdPreviewSurface")
+    texture.CreateIdAttr("UsdUVTexture")
+    reader.CreateIdAttr("UsdPrimvarReader_float2")
+    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
+    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set("./t.png")
+    texture.CreateInput("scale", Sdf.ValueTypeNames.Float4).Set((1, 1, 0, 1))
+    texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(
+        reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+    )
+    surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(
+        texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
+    )
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+    image = draw(stage, tmp_path, camera=Camera(azimuth_deg=0, elevation_deg=0))
+    rows, columns = (np.flatnonzero(drawn(image).any(axis=axis)) for axis in (1, 0))
+
+    def at(across, up):
+        row = rows[0] + round((1 - up) * (rows[-1] - rows[0]))
+        return image[row, columns[0] + round(across * (columns[-1] - columns[0]))]
+
+    left, upper, lower = at(0.25, 0.5), at(0.75, 0.75), at(0.75, 0.25)
+    assert left[0] > 100
+    assert left[1:].max() < 40
+    assert upper[:2].min() > 100
+    assert upper[2] < 40
+    assert lower[1] > 100
+    assert lower[[0, 2]].max() < 40

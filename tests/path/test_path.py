@@ -215,7 +215,7 @@ def test_a_csv_that_is_not_text_or_not_there_is_refused(tmp_path):
         read_path_csv(tmp_path / "p.csv")
     with pytest.raises(InputError, match=r"q\.csv: no such path file; did you mean 'p\.csv'"):
         read_path_csv(tmp_path / "q.csv")
-    with pytest.raises(InputError, match="not a text file"):
+    with pytest.raises(InputError, match=r"cannot be read \(a folder\); expected a path file"):
         read_path_csv(tmp_path)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils
 from test_urdf import BALL, BODY, INERTIAL
 from validators import assert_valid
@@ -136,6 +137,23 @@ def test_the_files_are_those_of_isaac_sims_structure(tmp_path):
     assert [r.assetPath for r in interface.referenceList.prependedItems] == ["./payloads/base.usda"]
     assert set(interface.variantSets["Physics"].variants.keys()) == {"none", "physics", "physx", "mujoco"}
     assert not interface.nameChildren  # the interface holds arcs, no opinions
+
+
+def test_long_arrays_of_a_sensor_are_in_a_binary_layer(tmp_path):
+    """usd-validation-nvidia refuses them in text, as of the LiDARs of Neobotix' robots."""
+    fan = """<gazebo reference="hand"><sensor name="fan" type="ray"><ray><scan><horizontal>
+    <samples>90</samples><min_angle>-1</min_angle><max_angle>1</max_angle></horizontal></scan>
+    <range><min>0.1</min><max>9</max></range></ray></sensor></gazebo>"""
+    one, two = both(arm(tmp_path, extra=fan), tmp_path)
+    assert_equal(one, two)
+    out = tmp_path / "two" / "a.usda"
+    layer = Sdf.Layer.FindOrOpen(str(out.parent / "payloads" / "arrays.usdc"))
+    sensor = next(path for path, metadata in two.items() if metadata["type"] == "OmniLidar")
+    kept = set(layer.GetPrimAtPath(sensor).attributes.keys())
+    azimuth = "omni:sensor:Core:emitterState:s001:azimuthDeg"
+    assert azimuth in kept
+    assert_allclose(np.degrees([-1, 1]), np.array(two[sensor][azimuth][1])[[0, -1]], rtol=1e-6)
+    assert_valid(out, tmp_path)
 
 
 def test_each_layer_contains_its_own_opinions(tmp_path):

@@ -14,6 +14,8 @@ from magtwin.urdf import convert_urdf, read_notes
 from magtwin.urdf.options import DriveRule, Options
 from magtwin.urdf.physics import inertia as solids
 from magtwin.urdf.physics.inertia import MassProperties, combined
+from magtwin.urdf.physics.mass import engine_masses
+from magtwin.usd.sensors import read_drive
 
 LIMIT = '<limit effort="3" velocity="2" lower="-1" upper="0.5"/>'
 
@@ -145,12 +147,51 @@ def test_a_mesh_weighs_what_it_encloses_and_an_open_one_what_its_hull_does(tmp_p
         assert_allclose(mass_of(robot.GetPrimAtPath("hand"))[0], 2000 * mesh.volume, rtol=1e-4)
 
 
-def test_without_a_density_a_link_without_inertial_is_left_to_the_engine_and_noted(tmp_path):
-    _stage, robot, notes = convert(arm(tmp_path, "fixed|", f"<collision>{BALL}</collision>"))
-    assert not robot.GetPrimAtPath("hand").HasAPI(UsdPhysics.MassAPI)
-    assert "link 'hand' has no <inertial>: engines take its mass from its colliders" in notes
-    _stage, robot, notes = convert(arm(tmp_path, "fixed|", f"<visual>{BALL}</visual>"))
-    assert any("without a collider, engines cannot find its mass" in note for note in notes)
+def test_engines_fill_a_body_without_mass_as_usdphysics_tells():
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageMetersPerUnit(stage, 1)
+    for name, density in (("plain", None), ("light", 10.0)):
+        body = UsdGeom.Xform.Define(stage, f"/{name}").GetPrim()
+        UsdPhysics.RigidBodyAPI.Apply(body)
+        box = UsdGeom.Cube.Define(stage, f"/{name}/box")
+        box.CreateSizeAttr(0.5)
+        UsdPhysics.CollisionAPI.Apply(box.GetPrim())
+        if density:
+            UsdPhysics.MassAPI.Apply(body).CreateDensityAttr(density)
+    assert_allclose(list(engine_masses(stage).values()), [1000 / 8, 10 / 8], rtol=1e-6)
+
+
+def test_a_massless_base_takes_the_mass_of_the_inertial_link_welded_to_it(tmp_path):
+    parts = (
+        f'<link name="base"><collision>{BALL}</collision></link>'
+        '<link name="mass"><inertial><origin xyz="0 0 0.1"/><mass value="46"/>'
+        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        f'<link name="lid"><collision>{BALL}</collision>{INERTIAL}</link>'
+    )
+    for name, z in (("mass", 0.2), ("lid", 0.5)):
+        parts += (
+            f'<joint name="{name}_joint" type="fixed"><parent link="base"/><child link="{name}"/>'
+            f'<origin xyz="0 0 {z}"/></joint>'
+        )
+    stage, robot, notes = convert(urdf(tmp_path, parts))
+    mass, centre, _ = mass_of(robot.GetPrimAtPath("base"))
+    assert_allclose([mass, *centre], [46, 0, 0, 0.3], rtol=1e-6, atol=1e-7)
+    assert [path.name for path in engine_masses(stage)] == ["base", "lid"]  # the lid stays a body
+    assert_allclose(sum(engine_masses(stage).values()), 47, rtol=1e-6)
+    assert "link 'base' has no <inertial>: it takes that of 'mass'" in notes
+
+
+@pytest.mark.parametrize("shape", ["collision", "visual"])
+def test_a_link_without_inertial_adds_no_mass_in_an_engine(tmp_path, shape):
+    shapes = f"<{shape}>{BALL}</{shape}>"
+    stage, robot, notes = convert(arm(tmp_path, "fixed|", shapes))
+    assert "link 'hand' has no <inertial>: it is part of the body of 'base_link'" in notes
+    assert not robot.GetPrimAtPath("base_link/hand").HasAPI(UsdPhysics.RigidBodyAPI)
+    fixed = sum(engine_masses(stage).values())
+    stage, robot, notes = convert(arm(tmp_path, "continuous|", shapes))
+    assert "link 'hand' has no <inertial>: 0.001 kg, so that engines add none" in notes
+    assert_allclose(sum(engine_masses(stage).values()), fixed + 0.001, rtol=1e-6)
+    assert_allclose(mass_of(robot.GetPrimAtPath("hand"))[0], 0.001, rtol=1e-6)
 
 
 ZEROS = '<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/>'
@@ -287,6 +328,14 @@ def test_merging_the_real_robot_leaves_three_bodies_of_the_same_mass_and_balance
 # --- bases and joints -----------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("fix_base", "kind"), [(True, "Manipulator"), (False, "Default")])
+def test_a_robot_without_a_drive_has_one_of_isaacs_types(tmp_path, fix_base, kind):
+    _stage, robot, _ = convert(
+        urdf(tmp_path, """<link name="base">{BODY}</link>""", "arm"), fix_base=fix_base
+    )
+    assert robot.GetAttribute("isaac:robotType").Get() == kind
+
+
 def test_a_fixed_base_is_bolted_to_the_robots_prim_where_it_stands(tmp_path):
     body = """<link name="base_footprint"/><link name="base">{BODY}</link>
     <joint name="up" type="fixed"><parent link="base_footprint"/><child link="base"/>
@@ -363,7 +412,7 @@ def follower(tmp_path, mimic, kind="revolute", lead=LIMIT):
     return urdf(tmp_path, body, "pair")
 
 
-def test_a_mimic_is_authored_for_newton_and_for_physx_and_has_no_drive_of_its_own(tmp_path):
+def test_a_mimic_is_authored_for_newton_and_for_physx_and_its_own_drive_has_no_gains(tmp_path):
     path = follower(tmp_path, '<mimic joint="lead" multiplier="-2" offset="0.1"/>')
     _stage, robot, _ = convert(path)
     joint, lead = prim(robot, "f"), prim(robot, "lead").GetPath()
@@ -377,9 +426,22 @@ def test_a_mimic_is_authored_for_newton_and_for_physx_and_has_no_drive_of_its_ow
     assert_allclose(joint.GetAttribute(f"{space}:offset").Get(), -np.degrees(0.1), rtol=1e-6)
     applied = set(joint.GetPrimTypeInfo().GetAppliedAPISchemas())
     assert {"NewtonMimicAPI", "PhysxMimicJointAPI:rotY"} <= applied
-    assert "PhysicsDriveAPI:angular" not in applied
+    assert drive_of(robot, "f")[1:] == (0, 0)
+    assert_allclose(joint.GetAttribute("state:angular:physics:position").Get(), np.degrees(0.1), rtol=1e-6)
     hand = UsdGeom.XformCache().GetLocalToWorldTransform(robot.GetPrimAtPath("c"))
     assert_allclose(hand.ExtractRotation().GetAngle(), np.degrees(0.1), atol=1e-6)  # where it rests
+
+
+def test_the_limits_of_a_follower_overlap_those_of_its_leader_times_the_gearing(tmp_path):
+    """Isaac Sim's MimicAPICheck, which the fingers of Panda and HSR failed: they close at 0."""
+    closed = '<limit lower="0" upper="0.7" effort="3" velocity="2"/>'
+    path = follower(tmp_path, '<mimic joint="lead"/>', lead=closed)
+    path.write_text(path.read_text().replace(LIMIT, closed))
+    _stage, robot, _ = convert(path)
+    joint = prim(robot, "f")
+    low, high = (joint.GetAttribute(f"physics:{end}Limit").Get() for end in ("lower", "upper"))
+    assert -0.001 < low < 0
+    assert_allclose(high, np.degrees(0.7), rtol=1e-6)
 
 
 def test_a_slide_that_follows_a_turn_gears_in_metres_per_degree(tmp_path):
@@ -432,11 +494,59 @@ def test_the_first_rule_that_fits_a_joint_drives_it(tmp_path):
     assert drive_of(robot, "f")[1:] == (0, 0)
 
 
+def test_moments_in_single_precision_are_those_of_a_body_too(tmp_path):
+    """Isaac Sim's RigidBodyHasMassAPI: I1 + I2 = I3, but not after rounding, as in a finger of Allegro."""
+    rng = np.random.default_rng(0)
+    for small, large in rng.uniform(1e-6, 1e-4, (20, 2)):
+        tensor = f'<inertia ixx="{small}" iyy="{large}" izz="{small + large}" ixy="0" ixz="0" iyz="0"/>'
+        path = tmp_path / "plate.urdf"
+        link = f'<link name="a"><inertial><mass value="1"/>{tensor}</inertial></link>'
+        path.write_text(f'<robot name="plate">{link}</robot>')
+        _stage, robot, _ = convert(path)
+        moments = np.array(UsdPhysics.MassAPI(prim(robot, "a")).GetDiagonalInertiaAttr().Get(), float)
+        assert moments[0] + moments[1] >= moments[2]
+        assert_allclose(moments, [small, large, small + large], rtol=1e-6)
+
+
+CRANE = """<link name="a">{{BODY}}</link>
+<link name="b"><inertial><origin xyz="0.5 0 0"/><mass value="{mass}"/>
+  <inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="c"><inertial><origin xyz="0 0 0.1"/><mass value="3"/>
+  <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="lift" type="prismatic"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+  <limit lower="0" upper="1" effort="0" velocity="1"/></joint>
+<joint name="elbow" type="revolute"><parent link="b"/><child link="c"/><origin xyz="1 0 0" rpy="0 0 1"/>
+  <axis xyz="0 2 0"/><limit lower="-1" upper="1" effort="40" velocity="1"/></joint>{extra}"""
+
+
+@pytest.mark.parametrize("mass", [2, 200])
+def test_a_joint_with_limits_holds_what_it_carries_at_10_hz(tmp_path, mass):
+    """Torsos sank and arms fell: 100 N/m held the lift of HSR, 100 N m/rad the shoulder of Baxter."""
+    path = urdf(tmp_path, CRANE.format(mass=mass, extra=""), "crane")
+    _stage, robot, _ = convert(path)
+    square = (2 * np.pi * 10) ** 2
+    drive, stiffness, damping = drive_of(robot, "lift", "linear")
+    assert_allclose([stiffness, damping], [square * (mass + 3), square * (mass + 3) / 10], rtol=5e-3)
+    assert_allclose(drive.GetMaxForceAttr().Get(), 2 * 9.80665 * (mass + 3), rtol=5e-3)  # the URDF gives 0
+    drive, stiffness, _ = drive_of(robot, "elbow")
+    assert_allclose(stiffness, square * (0.1 + 3 * 0.1**2), rtol=5e-3)
+    assert drive.GetMaxForceAttr().Get() == 40
+
+
+def test_a_joint_with_limits_is_held_although_it_is_commanded_by_effort(tmp_path):
+    """The arms of Panda and PR2 fell: their transmissions are for effort, with controllers above them."""
+    tags = """<transmission name="t"><joint name="elbow"><hardwareInterface>
+    hardware_interface/EffortJointInterface</hardwareInterface></joint></transmission>"""
+    path = urdf(tmp_path, CRANE.format(mass=2, extra=tags), "crane")
+    _stage, robot, _ = convert(path)
+    assert drive_of(robot, "elbow")[1] > 100
+
+
 def test_a_rule_drives_each_free_axis_of_a_planar_joint(tmp_path):
     path = arm(tmp_path, 'planar|<axis xyz="0 0 1"/>')
     _stage, robot, _ = convert(path)
-    joint = prim(robot, "j")
-    assert not [a for a in joint.GetPrimTypeInfo().GetAppliedAPISchemas() if "DriveAPI" in a]
+    for axis in ("transX", "transY", "rotZ"):
+        assert drive_of(robot, "j", axis)[1:] == (0, 0)
     _stage, robot, _ = convert(path, drives=(DriveRule(joints="j", damping=2.0, max_force=5.0),))
     joint = prim(robot, "j")
     applied = joint.GetPrimTypeInfo().GetAppliedAPISchemas()
@@ -557,7 +667,8 @@ def test_all_wheels_that_a_plugin_names_are_driven_not_the_first_of_each_side(tm
     assert len(joints) == 4
     assert all(UsdPhysics.DriveAPI(joint, "angular").GetDampingAttr().Get() > 0 for joint in joints)
     assert not any("caster" in note or "freely" in note for note in notes)
-    assert "drive plugin: the first of 2 <left_joint> is used" in notes
+    spec = read_drive(stage.GetDefaultPrim())
+    assert spec.sides == {"j0": 0, "j1": 1, "j2": 0, "j3": 1}
 
 
 def test_the_urdfs_values_of_wheels_override_the_profile(tmp_path):

@@ -19,7 +19,7 @@ from magtwin.frames import rotate
 from magtwin.run.run import COLUMNS, Column, Run
 from magtwin.spec.robot import PlacedRobot
 from magtwin.twin import open_twin, simulate
-from magtwin.usd import animation
+from magtwin.usd import trial
 from magtwin.usd.animation import is_animation, read_animation, write_animation
 from magtwin.usd.geometry import read_links
 
@@ -264,8 +264,9 @@ def test_bytes_that_end_the_process_of_usds_own_reader_are_refused_in_a_line(pla
         (tmp_path / "run.usdc").write_bytes(content)
         with suppress(InputError):
             read_animation(tmp_path / "run.usdc")
-    monkeypatch.setattr(animation, "_PROBE", "import os; os.abort()")
-    with pytest.raises(InputError, match="damaged: USD cannot decode it"):
+    monkeypatch.setattr(trial, "_PROGRAM", "import os; os.abort()")
+    monkeypatch.setattr(trial, "_TRIAL", trial._Trial())
+    with pytest.raises(InputError, match="damaged: USD crashes on it"):
         read_animation(played)
 
 

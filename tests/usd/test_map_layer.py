@@ -2,6 +2,7 @@
 
 import datetime
 import hashlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,8 +19,8 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import colour_limits
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.usd.heat_map import HEAT_MAP, MAP, colour_index, heading_variants, viridis
-from magtwin.usd.maps import load_epochs, load_map, save_map, save_map_series
-from magtwin.usd.schema import attribute_name
+from magtwin.usd.maps import checksums, load_epochs, load_map, read_map, save_map, save_map_series
+from magtwin.usd.schema import NOUNS, attribute_name
 
 VALUES = "magtwin:anomalyMap:valuesNt"
 HEIGHT = "magtwin:anomalyMap:heightM"
@@ -190,36 +191,81 @@ def test_between_two_epochs_the_field_is_linear_in_time_and_surer_than_each(tmp_
     assert load_map(tmp_path / "m.usdc", "2026-01-20").variance_nt2 is None
 
 
-def test_a_reader_that_knows_usd_alone_sees_the_drift_at_days_since_2000(tmp_path):
+def test_a_program_that_knows_usd_alone_selects_an_epoch_and_finds_no_time_codes(tmp_path):
     maps = epochs()
     save_map_series(maps, tmp_path / "m.usdc")
     stage = Usd.Stage.Open(str(tmp_path / "m.usdc"))
-    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (9496.0, 9528.0)
-    values = stage.GetPrimAtPath(MAP).GetAttribute(VALUES)
-    assert values.GetTimeSamples() == [9496.0, 9506.0, 9528.0]
-    halfway = np.array(values.Get(9501.0)).reshape(4, 3, 5)
-    assert_allclose(halfway, (maps[0].values_nt + maps[1].values_nt) / 2, rtol=1e-6)
+    prim = stage.GetPrimAtPath(MAP)
+    variants = prim.GetVariantSet("epoch")
+    assert variants.GetVariantNames() == ["2025-12-31", "2026-01-10", "2026-02-01"]
+    assert variants.GetVariantSelection() == "2026-02-01"
+    assert not stage.HasAuthoredTimeCodeRange()
+    for field in maps:
+        variants.SetVariantSelection(field.created)
+        assert_array_equal(prim.GetAttribute(VALUES).Get(), field.values_nt.ravel().astype(np.float32))
+        assert prim.GetAttribute("magtwin:anomalyMap:source").Get() == field.source
+        assert not any(a.ValueMightBeTimeVarying() for p in stage.Traverse() for a in p.GetAttributes())
 
 
-def test_a_series_comes_along_with_a_stage_that_runs_at_another_pace(tmp_path):
+def test_a_stage_that_references_the_map_selects_its_epoch(tmp_path):
+    """In a stronger layer, at another frame rate, below another prim, twice."""
     maps = epochs()
     save_map_series(maps, tmp_path / "m.usdc")
     stage = Usd.Stage.CreateNew(str(tmp_path / "scene.usda"))
-    stage.SetTimeCodesPerSecond(30.0)  # USD stretches the layer's time codes by 30 / 24
-    stage.GetRootLayer().subLayerPaths.append("./m.usdc")
+    stage.SetTimeCodesPerSecond(30.0)
+    for name, day in (("Before", "2025-12-31"), ("After", "2026-01-10")):
+        prim = stage.DefinePrim(f"/Site/{name}")
+        prim.GetReferences().AddReference("./m.usdc", MAP)
+        prim.GetVariantSets().SetSelection("epoch", day)
     stage.Save()
+    before, after = (stage.GetPrimAtPath(f"/Site/{name}") for name in ("Before", "After"))
+    assert (read_map(before), read_map(after)) == (maps[0], maps[1])
+    stage.RemovePrim("/Site/Before")
+    stage.Save()
+    assert load_map(tmp_path / "scene.usda") == maps[1]
     assert load_epochs(tmp_path / "scene.usda") == tuple(maps)
 
 
-def test_the_coloured_floor_of_a_series_changes_with_time(tmp_path):
+@pytest.mark.parametrize(
+    ("epoch", "said"),
+    [("", "no epoch is selected; select one of 2025-12-31, "), ("2026-03-01", "the epoch '2026-03-01' is")],
+)
+def test_a_selection_that_is_no_epoch_is_refused_with_the_epochs(tmp_path, epoch, said):
+    save_map_series(epochs(), tmp_path / "m.usdc")
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
+    layer.GetPrimAtPath(MAP).variantSelections["epoch"] = epoch
+    layer.Save()
+    with pytest.raises(InputError, match=f"m.usdc </World/AnomalyMap>: {said}"):
+        load_map(tmp_path / "m.usdc")
+    assert load_map(tmp_path / "m.usdc", "2026-01-10") == epochs()[1]
+
+
+def test_only_the_selected_epoch_is_read(tmp_path):
+    """The bytes of another epoch's arrays may be damaged: nobody asks for them."""
+    wide = a_map((4, 60, 80), created="2026-01-01")
+    days = [wide, replace(wide, values_nt=wide.values_nt + 0.5, created="2026-02-01")]
+    save_map_series(days, tmp_path / "m.usdc")
+    data = (tmp_path / "m.usdc").read_bytes()
+    piece = days[0].values_nt.astype("<f4").ravel()[1000:1016].tobytes()
+    assert data.count(piece) == 1
+    (tmp_path / "m.usdc").write_bytes(data.replace(piece, bytes(64)))
+    assert load_map(tmp_path / "m.usdc") == days[1]
+    with pytest.raises(InputError, match="do not match its checksum"):
+        load_map(tmp_path / "m.usdc", "2026-01-01")
+
+
+def test_the_coloured_floor_shows_the_epoch_and_the_heading_that_are_selected(tmp_path):
     maps = epochs()
     save_map_series(maps, tmp_path / "m.usdc")
     stage = Usd.Stage.Open(str(tmp_path / "m.usdc"))
     prim = stage.GetPrimAtPath(HEAT_MAP)
     legend, primvar = prim.GetCustomDataByKey("magtwin"), UsdGeom.Mesh(prim).GetDisplayColorPrimvar()
-    for time, field in ((9496.0, maps[0]), (9506.0, maps[1]), (Usd.TimeCode.Default(), maps[2])):
-        index = colour_index(field.values_nt[0], field.valid[0], legend["least"], legend["greatest"])
-        assert_array_equal(np.array(primvar.ComputeFlattened(time)), viridis()[index.ravel()])
+    for field in maps:
+        stage.GetPrimAtPath(MAP).GetVariantSet("epoch").SetVariantSelection(field.created)
+        for h, heading in ((0, "0"), (2, "180")):
+            prim.GetVariantSet("heading").SetVariantSelection(heading)
+            index = colour_index(field.values_nt[h], field.valid[h], legend["least"], legend["greatest"])
+            assert_array_equal(np.array(primvar.ComputeFlattened()), viridis()[index.ravel()])
 
 
 @pytest.mark.parametrize("date", ["2025-12-30", "2026-02-02"])
@@ -270,15 +316,21 @@ def test_grids_of_other_size_and_a_single_map_are_no_series(tmp_path):
         save_map_series([a_map()], tmp_path / "m.usdc")
 
 
+def of_epoch(layer: Sdf.Layer, day: str, name: str) -> Sdf.AttributeSpec:
+    return layer.GetAttributeAtPath(MAP.AppendVariantSelection("epoch", day).AppendProperty(name))
+
+
 def test_an_epoch_that_was_tampered_with_is_refused_when_it_is_asked_for(tmp_path):
     maps = epochs()
     save_map_series(maps, tmp_path / "m.usdc")
     layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
-    layer.SetTimeSample(MAP.AppendProperty(VALUES), 9506.0, [4e4] * 60)
+    of_epoch(layer, "2026-01-10", VALUES).default = [4e4] * 60
     layer.Save()
     assert load_map(tmp_path / "m.usdc") == maps[2]
     with pytest.raises(InputError, match="do not match its checksum"):
         load_map(tmp_path / "m.usdc", "2026-01-10")
+    stage = Usd.Stage.Open(layer)
+    assert [said == taken for said, taken in checksums(stage.GetPrimAtPath(MAP))] == [True, False, True]
 
 
 @pytest.mark.parametrize(
@@ -286,19 +338,49 @@ def test_an_epoch_that_was_tampered_with_is_refused_when_it_is_asked_for(tmp_pat
     [
         (
             "2026-01-11",
-            "its epoch at time 9506 must be of the day that many days after 2000-01-01, got .*11;",
+            "its epoch 2026-01-10 must be of that day, got magtwin:anomalyMap:created 2026-01-11;",
         ),
-        ("soon", "created of AnomalyMap must be a day YYYY-MM-DD, got 'soon'"),
-        ("", "at time 9506, map 'survey 1' has no day"),
+        ("soon", "epoch 2026-01-10: created of AnomalyMap must be a day YYYY-MM-DD, got 'soon'"),
+        ("", "epoch 2026-01-10: map 'survey 1' has no day"),
     ],
 )
-def test_an_epoch_whose_day_is_not_that_of_its_time_is_refused_with_its_prim(tmp_path, day, said):
+def test_an_epoch_whose_day_is_not_that_of_its_variant_is_refused_with_its_prim(tmp_path, day, said):
     save_map_series(epochs(), tmp_path / "m.usdc")
     layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
-    layer.SetTimeSample(MAP.AppendProperty("magtwin:anomalyMap:created"), 9506.0, day)
+    of_epoch(layer, "2026-01-10", "magtwin:anomalyMap:created").default = day
     layer.Save()
-    with pytest.raises(InputError, match=f"m.usdc </World/AnomalyMap>: .*{said}"):
+    with pytest.raises(InputError, match=f"m.usdc </World/AnomalyMap>: {said}"):
         load_epochs(tmp_path / "m.usdc")
+
+
+def test_epochs_that_an_older_version_wrote_as_time_codes_are_read_with_a_warning(tmp_path):
+    """Each value of an epoch is a time sample, in days since 2000-01-01; a missing one is blocked."""
+    maps = epochs()
+    save_map(maps[2], tmp_path / "old.usdc")
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "old.usdc"))
+    prim = layer.GetPrimAtPath(MAP)
+    schemas = [NOUNS["anomalyMap"], NOUNS["harmonic"]]
+    prim.SetInfo("apiSchemas", Sdf.TokenListOp.Create(prependedItems=schemas))
+    for k, (field, code) in enumerate(zip(maps, (9496.0, 9506.0, 9528.0), strict=True)):
+        save_map(field, tmp_path / f"{k}.usdc")
+        single = Sdf.Layer.FindOrOpen(str(tmp_path / f"{k}.usdc"))
+        own = single.GetPrimAtPath(MAP)
+        shared = ("shape", "origin", "cellSize", "headings", "unit", "checksumVersion")
+        for spec in own.attributes:
+            if spec.name.rpartition(":")[2] not in shared:
+                if spec.name not in prim.attributes:
+                    Sdf.AttributeSpec(prim, spec.name, spec.typeName, spec.variability)
+                layer.SetTimeSample(MAP.AppendProperty(spec.name), code, spec.default)
+    layer.Save()
+    with pytest.warns(UserWarning, match=r"old.usdc .*time codes, .*: magtwin map epochs OLD.usdc --out NEW"):
+        assert load_map(tmp_path / "old.usdc") == maps[2]
+    with pytest.warns(UserWarning, match="time codes"):
+        old = load_epochs(tmp_path / "old.usdc")
+    assert old == tuple(maps)
+    with pytest.warns(UserWarning, match="time codes"):
+        assert load_map(tmp_path / "old.usdc", "2026-01-10") == maps[1]
+    save_map_series(old, tmp_path / "new.usdc")
+    assert load_epochs(tmp_path / "new.usdc") == tuple(maps)
 
 
 def test_the_coloured_floor_of_a_fine_map_stays_light_and_reaches_its_border(tmp_path):

@@ -210,9 +210,7 @@ def test_a_later_second_number_is_read_and_told(tmp_path):
 
 
 def with_version(version: str) -> str:
-    return OLD_MAP.replace(
-        'string creator = "magtwin" }', f'string magtwinSchemaVersion = "{version}" }}'
-    )
+    return OLD_MAP.replace('string creator = "magtwin" }', f'string magtwinSchemaVersion = "{version}" }}')
 
 
 @pytest.mark.parametrize(

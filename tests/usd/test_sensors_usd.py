@@ -53,7 +53,7 @@ def stage_with_link() -> Usd.Stage:
 
 def stage_with_wheels(spec: DriveSpec) -> Usd.Stage:
     stage = stage_with_link()
-    for joint in (spec.left_wheel_joint, spec.right_wheel_joint):
+    for joint in spec.sides:
         UsdPhysics.RevoluteJoint.Define(stage, f"/robot/joints/{joint}")
     return stage
 
@@ -155,8 +155,9 @@ def test_motion_capture_survives_the_stage(data):
 @unhurried
 @given(st.data())
 def test_a_drive_survives_the_stage(data):
-    names = data.draw(st.lists(name, min_size=2, max_size=2, unique=True))
-    joints = dict(zip(sensors.JOINT_FIELDS, names, strict=True))
+    names = data.draw(st.lists(name, min_size=2, max_size=5, unique=True))
+    joints = dict(zip(sensors.JOINT_FIELDS, names, strict=False))
+    joints |= dict(zip(sensors.WHEELS_FIELDS, (tuple(names[2:3]), tuple(names[3:])), strict=True))
     figures = {
         f.name: tuple(data.draw(above_zero) for _ in f.default) if isinstance(f.default, tuple)
         else data.draw(above_zero)

@@ -142,9 +142,10 @@ def map_epochs(*files: Sources, out: Path, force: Force = False) -> Done:
     Parameters
     ----------
     files
-        Map layers of one grid, each with the date of its survey, in any order.
+        Map layers of one grid, each with the date of its survey, in any order. One with several epochs counts
+        with all of them, so that this also converts a layer of an older version.
     out
-        Map layer to write (.usdc), with one time sample per date; time codes are days since 2000-01-01.
+        Map layer to write (.usdc), with a variant of the variant set `epoch` for each date.
     """
     from magtwin.field.maps.epochs import drift, in_order
     from magtwin.usd.maps import load_epochs, save_map_series

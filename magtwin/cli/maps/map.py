@@ -35,7 +35,8 @@ Earth = Annotated[
     ),
 ]
 Date = Annotated[
-    str | None, Parameter(help="Date between the map's epochs, YYYY-MM-DD. Default: the latest epoch.")
+    str | None,
+    Parameter(help="Date between the map's epochs, YYYY-MM-DD. Default: the epoch that the file selects."),
 ]
 Sources = Annotated[Path, Parameter(required=True)]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Gamepad, ModelError, Network, Plant, Seed, Session
+from magtwin.cli.options import Epoch, Force, Gamepad, Lab, ModelError, Network, Plant, Seed, Session
 from magtwin.cli.runs.run import save_picture
 from magtwin.cli.terminal import Done, announce, note, silence
 from magtwin.errors import InputError
@@ -27,6 +27,8 @@ def drive(
     scene: Path,
     *,
     out: Path = Path("drive"),
+    lab: Lab = "",
+    epoch: Epoch = "",
     gamepad: Gamepad = None,
     network: Network = None,
     model_error: ModelError = True,
@@ -53,7 +55,7 @@ def drive(
     """
     import numpy as np
 
-    from magtwin.files import existing, output
+    from magtwin.files import output
     from magtwin.io.outputs import Outputs
     from magtwin.io.outputs import drive as drive_again
     from magtwin.sim.motion.commands import write_commands
@@ -64,10 +66,11 @@ def drive(
     from magtwin.twin import in_session, open_twin, scene_file, with_plant
 
     scene = scene_file(scene)
-    if gamepad is not None and existing(gamepad, "gamepad").is_dir():
-        raise InputError(f"{gamepad}: a folder; name a gamepad in it, such as /dev/input/js0")
+    if gamepad is not None and not gamepad.is_char_device():
+        raise InputError(f"{gamepad}: not a gamepad; name one, such as /dev/input/js0")
     with output(out, force=force) as folder:
-        twin = with_plant(open_twin(scene, network=network, model_error=model_error), plant)
+        twin = open_twin(scene, lab=lab, epoch=epoch, network=network, model_error=model_error)
+        twin = with_plant(twin, plant)
         twin = in_session(twin, session, seed=seed)
         robot, dt = twin.scene.robot, 1.0 / CONTROL_RATE_HZ
         errors = draw_wheel_errors(robot.drive, streams(np.random.default_rng(seed))["drive"])
@@ -94,6 +97,8 @@ def drive(
         driven = drive_again(
             scene,
             commands=folder / "commands.csv",
+            lab=lab,
+            epoch=epoch,
             network=network,
             model_error=model_error,
             seed=seed,
@@ -104,8 +109,8 @@ def drive(
         )
         Outputs(folder, picture=save_picture).write(driven)
     again = f"magtwin run {scene} --commands {out / 'commands.csv'} --seed {seed}"
-    again += "" if session is None else f" --session {session}"
-    again += "" if plant is None else f" --plant {plant}"
+    options = {"lab": lab or None, "epoch": epoch or None, "session": session, "plant": plant}
+    again += "".join(f" --{name} {value}" for name, value in options.items() if value is not None)
     return Done(driven.run.report(f"Manual drive in {scene}"), out, text=f"Wrote {out}; again: {again}")
 
 

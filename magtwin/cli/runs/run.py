@@ -12,6 +12,7 @@ from cyclopts import Parameter
 from magtwin.cli.app import app
 from magtwin.cli.options import (
     SENSING,
+    Epoch,
     Flag,
     Force,
     Lab,
@@ -84,6 +85,7 @@ def run(
     fit: Flag = False,
     commands: Path | None = None,
     lab: Lab = "",
+    epoch: Epoch = "",
     robot: str | None = None,
     meet: Literal["refuse", "flag"] | None = None,
     engine: Literal["kinematic", "newton"] = "kinematic",
@@ -207,7 +209,16 @@ def run(
         if robot is None and (path or free or fit):
             raise InputError(f"which of {names} is to drive {what}? name it with --robot NAME")
         return _run_robots(
-            scene, outputs, lab=lab, robot=robot, path=path, fit=fit, meet=meet, scans=scans, **options
+            scene,
+            outputs,
+            lab=lab,
+            epoch=epoch,
+            robot=robot,
+            path=path,
+            fit=fit,
+            meet=meet,
+            scans=scans,
+            **options,
         )
     if meet is not None:
         raise InputError(f"--meet is for several robots, and {scene} has one; drop it")
@@ -227,6 +238,7 @@ def run(
                 scene,
                 what,
                 lab=lab,
+                epoch=epoch,
                 fit=fit,
                 scans=scans,
                 engine=engine,
@@ -256,6 +268,7 @@ def _run_robots(
     outputs: "Outputs",
     *,
     lab: str,
+    epoch: str,
     robot: str | None,
     path: str | None,
     fit: bool,
@@ -276,7 +289,7 @@ def _run_robots(
     opening = {
         name: options.pop(name) for name in ("network", "magnetometer", "model_error", "tracking_error")
     }
-    twin = open_twin(scene, lab=lab, **opening)
+    twin = open_twin(scene, lab=lab, epoch=epoch, **opening)
     ways: dict[str, Any] = {spec.robot.name: spec.path or "figure8" for spec in twin.scene.robots}
     if robot is not None and (commands or replay or path):
         ways[robot] = read_commands(commands) if commands else read_run(replay) if replay else path

@@ -7,6 +7,7 @@ from magtwin.cli.app import app
 from magtwin.cli.options import (
     SENSING,
     Dask,
+    Epoch,
     Flag,
     Force,
     Jobs,
@@ -34,6 +35,7 @@ def sweep(
     path: Names = None,
     fit: Flag = False,
     lab: Lab = "",
+    epoch: Epoch = "",
     seed: Seed = 0,
     sessions: Whole | None = None,
     session: Literal["survey"] | None = None,
@@ -104,7 +106,7 @@ def sweep(
     opening = {
         name: options.pop(name) for name in ("network", "magnetometer", "model_error", "tracking_error")
     }
-    twin = open_twin(scene, lab=lab, **opening)
+    twin = open_twin(scene, lab=lab, epoch=epoch, **opening)
     announce(f"Driving {count} runs")
     runs = drive_many(
         twin,

@@ -22,6 +22,7 @@ def robot(
     collision: Literal["hull", "decomposition", "mesh"] | None = None,
     profile: Literal["general", "diff-drive"] | None = None,
     drive: list[str] | None = None,
+    controllers: Path | None = None,
     fix_base: bool | None = None,
     merge_fixed: bool | None = None,
     density_kg_m3: float | None = None,
@@ -60,6 +61,8 @@ def robot(
     drive
         PATTERN:TYPE[:stiffness=X][:damping=X][:max_force=X], TYPE velocity, position or none: drive of the
         joints whose name fits. May be repeated; the first that fits wins.
+    controllers
+        YAML with the settings of the robot's controllers (ros_control, ros2_control), for its drive.
     fix_base
         Fix the base to the world.
     merge_fixed
@@ -95,6 +98,7 @@ def robot(
         "packages": {name: Path(folder) for name, folder in pairs("package", package).items()} or None,
         "arguments": pairs("arg", arg, empty=True) or None,
         "drives": tuple(DriveRule.parse(text) for text in drive or ()) or None,
+        "controllers": controllers,
         "density": density_kg_m3,
         "mass": mass_kg,
     }

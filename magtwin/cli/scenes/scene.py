@@ -4,10 +4,12 @@ import shlex
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Network
+from magtwin.cli.options import Force, Network, pairs
 from magtwin.cli.terminal import Done, announce, check_output, progress
+from magtwin.errors import InputError
 
 
 @app.command
@@ -42,9 +44,15 @@ def new(out: Path, *, force: Force = False) -> Done:
 
 @app.command
 def scene(
-    spec: str,
+    spec: str | None = None,
     *,
     out: Path,
+    robot: Path | None = None,
+    magnetometer: str | None = None,
+    controllers: Path | None = None,
+    package: list[str] | None = None,
+    arg: list[str] | None = None,
+    skip_missing_includes: bool | None = None,
     map: Path | None = None,  # noqa: A002 - the option is called --map
     network: Network = None,
     force: Force = False,
@@ -57,27 +65,64 @@ def scene(
     Parameters
     ----------
     spec
-        TOML file, or the name of a scene that ships with magtwin: lab, aprilab.
+        TOML file, or the name of a scene that ships with magtwin: lab, aprilab. Default with --robot: a
+        furnished room of the robot's size.
     out
         Folder to make. It holds everything that the stage needs and can be moved.
+    robot
+        URDF or xacro of a mobile robot, or an asset of `magtwin robot --settings`. It replaces the robot of
+        the TOML, and surveys the room unless --map is given.
+    magnetometer
+        LINK or LINK:X,Y,Z: link of the URDF that carries the magnetometer, and its position on it [m].
+    controllers
+        YAML of the URDF's controllers (ros_control, ros2_control): wheels, separation, limits.
+    package
+        NAME=DIR: folder of a package that the URDF names. May be repeated.
+    arg
+        NAME=VALUE: argument of the xacro. May be repeated.
+    skip_missing_includes
+        Skip files and packages that a xacro includes but that are missing, if none of their macros is
+        called.
     map
         Map layer that replaces the one of the TOML. Earth, sources and furniture stay. A map that contradicts
         them is refused, and the difference is given in nT.
     """
     from magtwin.author.scene import author_scene
     from magtwin.files import check_free
-    from magtwin.twin import scene_from_toml
+    from magtwin.twin import scene_from_toml, scene_with_robot
     from magtwin.usd.info import info_of_stage
     from magtwin.usd.robot import conversion_notes
 
     check_free(out, force=force)
     lines: list[str] = []
     with TemporaryDirectory() as workshop:
-        announce(f"Reading {spec}")
         with progress("Reading the scene", "headings") as advance:
-            read = scene_from_toml(
-                spec, map_layer=map, network=network, workshop=workshop, report=lines.append, progress=advance
-            )
+            choices: dict[str, Any] = {
+                "map_layer": map,
+                "network": network,
+                "workshop": workshop,
+                "report": lines.append,
+                "progress": advance,
+            }
+            if robot is not None:
+                announce(f"Converting {robot}")
+                read = scene_with_robot(
+                    robot,
+                    magnetometer,
+                    spec,
+                    name=out.resolve().name,
+                    controllers=controllers,
+                    packages={name: Path(folder) for name, folder in pairs("package", package).items()},
+                    arguments=pairs("arg", arg, empty=True),
+                    skip_missing_includes=bool(skip_missing_includes),
+                    **choices,
+                )
+            elif spec is None:
+                raise InputError("name a scene: a TOML, a scene that ships, or a robot with --robot")
+            else:
+                _check_unused(magnetometer=magnetometer, controllers=controllers, package=package, arg=arg)
+                announce(f"Reading {spec}")
+                read = scene_from_toml(spec, **choices)
         announce("Authoring the stage")
         root = author_scene(read, out, force=force)
         made = [s.robot for s in read.robots if s.robot.asset.is_relative_to(Path(workshop).resolve())]
@@ -85,3 +130,10 @@ def scene(
     report = info_of_stage(root)
     report = replace(report, metadata={**report.metadata, **notes})
     return Done(report, root, text="\n".join([*lines, f"Wrote {root}"]))
+
+
+def _check_unused(**options: object) -> None:
+    """Refuse options that only matter with --robot."""
+    used = [f"--{name}" for name, value in options.items() if value is not None]
+    if used:
+        raise InputError(f"{', '.join(used)} goes with --robot; a TOML names these in [robot]")

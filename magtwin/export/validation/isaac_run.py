@@ -36,7 +36,8 @@ FOLDER_RULES = ("CleanFolder", "RobotNaming", "ThumbnailExists")
 
 NO_ROBOT = "the stage has no robot in a separate asset"
 ONE_LAYER = (
-    "the robot is not in the layers of Isaac Sim's asset structure, see `magtwin export --target isaac`"
+    "the robot is in one layer; `magtwin robot` without --single-file, or `magtwin export --target isaac`, "
+    "makes the layers of Isaac Sim's asset structure, which these rules check"
 )
 PACKED = "a package has no folder"
 
@@ -102,11 +103,12 @@ def _findings(rule: BaseRuleChecker, file: Path, robot: str) -> dict[tuple[str, 
         NeedsKitError: The rule needs what has no stand-in.
     """
     stage, name = Usd.Stage.Open(str(file)), type(rule).__name__
+    views = list(_variants(stage)) if robot else [stage]  # kept in a variable: the issues name their prims
     try:
         if type(rule).CheckStage is not BaseRuleChecker.CheckStage:
             rule.CheckStage(stage)
         if type(rule).CheckPrim is not BaseRuleChecker.CheckPrim:
-            for view in _variants(stage) if robot else (stage,):
+            for view in views:
                 for prim in Usd.PrimRange.Stage(view, Usd.TraverseInstanceProxies()):
                     rule.CheckPrim(prim)
     except NeedsKitError:

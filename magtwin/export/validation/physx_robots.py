@@ -10,11 +10,11 @@ from pxr import Usd, UsdGeom, UsdPhysics
 from magtwin.author.shape import drive_of, footprint_of, wheels_of
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.usd.attributes import target
+from magtwin.usd.attributes import targets
 from magtwin.usd.geometry import BASE_LINK
 from magtwin.usd.obstacles import read_obstacles
 from magtwin.usd.schema import NOUNS, attribute_name
-from magtwin.usd.sensors import JOINT_FIELDS, read_drive
+from magtwin.usd.sensors import JOINT_FIELDS, WHEELS_FIELDS, read_drive
 
 ROBOT_API = "IsaacRobotAPI"
 """Isaac Sim's applied schema of a robot."""
@@ -37,8 +37,14 @@ class DrivenRobot:
     base: str
     """Path of its base, a rigid body."""
 
-    joints: tuple[str, str]
-    """Paths of the joints of the left and the right wheel."""
+    joints: tuple[str, ...]
+    """Paths of the joints of the left and the right wheel, then of further driven wheels."""
+
+    sides: tuple[int, ...]
+    """Side of each: 0 for left, 1 for right."""
+
+    turns: bool
+    """Whether it turns on the spot without scrubbing: two wheels that are not steered."""
 
     start: tuple[float, float, float]
     """x [m], y [m] and yaw [rad] of its base: at the robot if there is room for `AHEAD_M`, or near it."""
@@ -83,6 +89,8 @@ def read_driven(stage: Usd.Stage) -> list[DrivenRobot]:
                 prim=str(prim.GetPath()),
                 base=str(base.GetPath()),
                 joints=joints,
+                sides=tuple(spec.sides.values()),
+                turns=len(joints) == 2 and not spec.turning_radius_m,
                 start=find_room(obstacles, places[prim], footprint_of(prim) or 0.0, others),
                 height_m=height,
                 lowest_m=_height(prim) + min(wheels, default=0.0),
@@ -147,11 +155,12 @@ def driven_table(stage: Usd.Stage) -> dict[str, Any]:
     }
 
 
-def _drive(robot: Usd.Prim) -> tuple[DriveSpec, tuple[str, str]] | None:
+def _drive(robot: Usd.Prim) -> tuple[DriveSpec, tuple[str, ...]] | None:
     """The drive of a robot and the paths of its wheels' joints; None if it does not have two wheels."""
     if robot.HasAPI(NOUNS["drive"]):
-        left, right = (str(target(robot, attribute_name("drive", name)).GetPath()) for name in JOINT_FIELDS)
-        return read_drive(robot), (left, right)
+        wheels = [attribute_name("drive", field) for field in (*JOINT_FIELDS, *WHEELS_FIELDS)]
+        joints = [joint for name in wheels for joint in targets(robot, name)]
+        return read_drive(robot), tuple(str(joint.GetPath()) for joint in joints)
     drive, _ = drive_of(robot, DriveSpec())
     paths = {p.GetDisplayName() or p.GetName(): str(p.GetPath()) for p in Usd.PrimRange(robot)}
     names = drive.left_wheel_joint, drive.right_wheel_joint

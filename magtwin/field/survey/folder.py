@@ -18,7 +18,7 @@ from magtwin.field.survey.header import ERROR, MASKED, header_lines, read_header
 from magtwin.field.survey.node_errors import node_errors
 from magtwin.field.survey.readings import Readings
 from magtwin.field.units import check_unit, nt_per
-from magtwin.files import existing, output, sha256
+from magtwin.files import existing, existing_file, output, sha256
 from magtwin.frames import wrap_angle
 from magtwin.report import Figure, Report
 
@@ -293,7 +293,7 @@ def _degrees_of(headings: Sequence[float]) -> str:
 
 def _read_layer(path: Path, heading_deg: float, unit: str, scale: float | None) -> _Layer:
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = existing_file(path, "layer of a survey", "text").read_text(encoding="utf-8-sig")
     except (UnicodeDecodeError, OSError) as error:
         raise InputError(f"{path}: not a text file ({error}); a survey is CSV in UTF-8") from error
     if not text.strip():

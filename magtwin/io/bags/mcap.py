@@ -21,6 +21,7 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from magtwin.budget import BUDGETS
 from magtwin.errors import InputError
 from magtwin.io.bags.cdr import Bytes, Index, Messages
 from magtwin.io.bags.storage import ROOM, Batch, Connection, StoredTopic, in_time
@@ -30,7 +31,7 @@ MAGIC = b"\x89MCAP0\r\n"
 CHUNK = 1 << 20
 """Approximate bytes of a chunk before compression."""
 
-LARGEST_CHUNK = 1 << 30
+LARGEST_CHUNK = BUDGETS["bag"].count
 """Largest chunk that is read [bytes]."""
 
 MOST_RATIO = 1000

@@ -250,7 +250,7 @@ class Robot:
     def __post_init__(self) -> None:
         rec, root = self.rec, entity_of("world/robot", self.name)
         drive, links = self.interior.robot.drive, self.interior.links
-        sides = {drive.left_wheel_joint: 0, drive.right_wheel_joint: 1}
+        sides = drive.sides
         bases = [name for name, link in links.items() if not link.joint] or [""]
         base = BASE_LINK if BASE_LINK in links else bases[0]
         for name, link in links.items():

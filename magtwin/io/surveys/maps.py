@@ -45,7 +45,7 @@ def open_map(file: Source, date: str | None = None) -> AnomalyMap:
 
     Args:
         file: Layer, stage, or folder with one CSV per heading.
-        date: Date between the epochs of a layer, YYYY-MM-DD. None: the latest epoch.
+        date: Date between the epochs of a layer, YYYY-MM-DD. None: the epoch that it selects.
 
     Raises:
         InputError: There is no map, it is damaged, or a folder is asked for a date.

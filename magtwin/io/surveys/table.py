@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from magtwin.budget import check_size
 from magtwin.errors import InputError, hint
 from magtwin.files import existing
 from magtwin.io.tables import load_parquet
@@ -146,6 +147,7 @@ def read_csv(path: str | os.PathLike[str]) -> Table:
     path = existing(path, "file of readings")
     if path.is_dir():
         raise InputError(f"{path}: a folder; name the file in it")
+    check_size(path, "readings")
     lines = list(_lines(path))
     above: list[tuple[int, str]] = []
     while lines and lines[0][1].lstrip().startswith("#"):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError, find
-from magtwin.files import existing
+from magtwin.files import read_text
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run
 from magtwin.verdict import verdict
@@ -219,9 +219,10 @@ class TollesLawson:
         Raises:
             InputError: The file is missing, no JSON, or no such model.
         """
-        file = existing(path, "Tolles-Lawson model")
+        file = Path(path)
+        text = read_text(file, "Tolles-Lawson model", "JSON")
         try:
-            data = json.loads(file.read_text(encoding="utf-8"))
+            data = json.loads(text)
             model = cls(
                 tuple(str(t) for t in data["terms"]),
                 tuple(float(c) for c in data["coefficients"]),

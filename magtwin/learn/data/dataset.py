@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.tiles import TiledMap
-from magtwin.files import existing, output, sha256
+from magtwin.files import existing, output, read_text, sha256
 from magtwin.learn.data.alignment import Alignment, fit_alignment
 from magtwin.learn.data.features import FEATURES, SETS, columns_of, feature_names
 from magtwin.learn.data.features import features as features_of
@@ -46,7 +46,6 @@ KIND, VERSION = "magtwin data set", 1
 MANIFEST, RUNS = "dataset.json", "runs"
 
 BLOCK_ROWS = 65_536  # Rows of a row group, about 20 MB of columns
-MOST_BYTES = 64 << 20  # Largest manifest; 100,000 recordings take half of it
 ALIGNED_AT_HZ = 25.0  # Rate at which recordings are held in memory while an alignment is fitted [Hz]
 
 ALIGNED = (
@@ -420,10 +419,9 @@ def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
     path = existing(folder / MANIFEST, "manifest of a data set") if folder.is_dir() else folder
     if not folder.is_dir():
         raise InputError(f"{folder}: a file; a data set is the folder that `magtwin dataset build` makes")
-    if path.stat().st_size > MOST_BYTES:
-        raise InputError(f"{path}: {path.stat().st_size:,} bytes, at most {MOST_BYTES:,} are read")
+    text = read_text(path, "manifest of a data set", "JSON")
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(text)
         if not isinstance(data, dict) or data.get("kind") != KIND:
             raise InputError(f"{path}: not the manifest of a data set")
         if data["version"] != VERSION:
@@ -445,7 +443,15 @@ def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
         if str(path) in str(error):
             raise
         raise InputError(f"{path}: {error}") from error
-    except (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
+    except (
+        ValueError,
+        OverflowError,
+        KeyError,
+        TypeError,
+        IndexError,
+        AttributeError,
+        RecursionError,
+    ) as error:
         raise InputError(
             f"{path}: not the manifest of a data set ({type(error).__name__}: {error}); build it anew"
         ) from error

@@ -1,6 +1,5 @@
 """Trials: recordings that models are judged by, and checks that no model learned from them."""
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.files import sha256
+from magtwin.files import parse_toml, sha256
 from magtwin.learn.data.dataset import MANIFEST, Dataset
 from magtwin.learn.data.recording import Source
 from magtwin.learn.data.split import split
@@ -48,7 +47,7 @@ def unseen(dataset: Dataset, candidates: Sequence[Candidate]) -> tuple[tuple[str
         if candidate.metadata.get("dataset_sha256") != checksum:
             continue
         try:
-            config = tomllib.loads(str(candidate.metadata.get("config", "")))
+            config = parse_toml(str(candidate.metadata.get("config", "")), candidate.name)
             by, seed, hold_out = config["split"], int(config["seed"]), tuple(config.get("hold_out", ()))
         except (ValueError, KeyError, TypeError) as error:
             raise InputError(

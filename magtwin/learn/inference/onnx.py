@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.budget import check_size
 from magtwin.errors import InputError
 from magtwin.files import check_free, existing, output, sha256
 from magtwin.learn.data.features import FEATURES
@@ -82,6 +83,7 @@ def report_onnx(path: str | os.PathLike[str]) -> Report:
     path = existing(path, "ONNX file")
     if path.is_dir():
         raise InputError(f"{path}: a folder; give an ONNX file")
+    check_size(path, "ONNX")
     onnx = _onnx()
     try:
         model = onnx.ModelProto.FromString(path.read_bytes())

@@ -17,10 +17,9 @@ import numpy as np
 import torch
 from numpy._core import multiarray
 
+from magtwin.budget import check_count, check_decoded
 from magtwin.errors import InputError
-from magtwin.files import existing
-
-MOST_BYTES = 1 << 30  # Largest checkpoint that is read, unpacked
+from magtwin.files import existing_file
 
 KEYS = ("model_state_dict", "scaler_X", "scaler_y")
 
@@ -54,7 +53,7 @@ def read_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tenso
     Raises:
         InputError: Not a checkpoint, damaged, or its pickle names a global that no network needs.
     """
-    path = existing(path, "checkpoint")
+    path = existing_file(path, "checkpoint", "checkpoint")
     saved = _load(path)
     try:
         tensors = _layers(saved["model_state_dict"])
@@ -78,8 +77,8 @@ def _load(path: Path) -> dict[str, Any]:
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(info.file_size for info in archive.infolist())
-            if size > MOST_BYTES:
-                raise InputError(f"{path}: {size:,} bytes unpacked; at most {MOST_BYTES:,} are read")
+            check_decoded(path, path.stat().st_size, size)
+            check_count(path, "checkpoint", len(archive.infolist()), "members")
             if damaged := archive.testzip():  # torch itself tests no checksum
                 raise InputError(f"{path}: member {ascii(damaged)[:60]} is damaged; get the file again")
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, OSError, EOFError, RuntimeError) as error:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
+from magtwin.budget import check_size
 from magtwin.errors import InputError
 from magtwin.files import existing, output
 
@@ -73,6 +74,7 @@ def load_state(
     path = existing(path, "checkpoint")
     if path.is_dir():
         raise InputError(f"{path}: a folder; give the checkpoint of a training")
+    check_size(path, "weights")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}

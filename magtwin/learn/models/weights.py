@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from magtwin.errors import InputError
-from magtwin.files import existing, output
+from magtwin.files import existing, existing_file, output
 from magtwin.learn.data.features import FEATURES, feature_names
 
 MetadataValue = str | int | float | bool
@@ -171,7 +171,7 @@ def read_weights(path: str | os.PathLike[str]) -> Weights:
     Raises:
         InputError: No such file, no safetensors, damaged, or not written by magtwin.
     """
-    path = existing(path, "weights file")
+    path = existing_file(path, "weights file", "weights")
     with path.open("rb") as file:
         if file.read(9)[8:] != b"{":
             raise InputError(f"{path}: no weights: neither safetensors nor a PyTorch checkpoint (.pth)")

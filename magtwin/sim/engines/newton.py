@@ -27,6 +27,9 @@ STEP_S = 0.001
 TOUCH_M = 0.003
 """Distance at which the footprint counts as touching an obstacle [m], since shapes are not circles."""
 
+PLACED = "placed.usda"
+"""Name of the stage with its lab at the origin."""
+
 UPRIGHT = 0.8
 """Cosine of the tilt at which the robot counts as fallen over."""
 
@@ -52,6 +55,9 @@ class Newton:
 
     step_s: float = STEP_S
     """Approximate length of a physics step [s]; a control step has a whole number of them."""
+
+    placed: str = ""
+    """Text of a stage that Newton loads instead: `stage` with its lab at the origin. "" loads `stage`."""
 
     name = "newton"
 
@@ -137,17 +143,20 @@ class Newton:
         """The process that steps the stage."""
         drive, root = closed_loop.drive, str(FilePath(__file__).resolve().parents[3])
         job = {
-            "stage": str(FilePath(self.stage).resolve()),
+            "stage": PLACED if self.placed else str(FilePath(self.stage).resolve()),
             "robot": self.robot.name,
             "base": "base_link",
-            "joints": [drive.left_wheel_joint, drive.right_wheel_joint],
+            "joints": list(drive.sides),
+            "sides": list(drive.sides.values()),
             "start": list(closed_loop.pose0),
             "step_s": step_s,
             "scrub": drive.yaw_slip > 0,
         }
         path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
         command = [sys.executable, "-m", "magtwin.sim.engines.newton_world"]
-        return WorldProcess(command, job, "Newton", environment={**os.environ, "PYTHONPATH": path})
+        files = {PLACED: self.placed} if self.placed else {}
+        environment = {**os.environ, "PYTHONPATH": path}
+        return WorldProcess(command, job, "Newton", environment=environment, files=files)
 
 
 def check_installed() -> None:

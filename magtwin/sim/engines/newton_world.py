@@ -3,12 +3,12 @@
     python -m magtwin.sim.engines.newton_world
 
 Newton needs its USD schemas registered before USD is first used, so `newton.py` starts this as another
-process. In: a line of JSON, `{"stage", "robot", "joints": [left, right], "base", "start":
-[x, y, yaw], "step_s", "scrub"}`, then a line per control step with the rates of both wheels [rad/s], a pair
-per physics step. Out: a line after the robot has settled and one after each control step: x, y, yaw, v, w,
-both wheels' angles, height of the base [m], and the z component of its up axis. Newton reads the stage, its
-contacts and drives. Then the MuJoCo model of its solver is stepped in C, because a step through Newton's
-arrays takes a millisecond.
+process. In: a line of JSON, `{"stage", "robot", "joints": [left, right, ...], "sides": [0, 1, ...], "base",
+"start": [x, y, yaw], "step_s", "scrub"}`, then a line per control step with the rates of both sides
+[rad/s], a pair per physics step. Out: a line after the robot has settled and one after each control step:
+x, y, yaw, v, w, both wheels' angles, height of the base [m], and the z component of its up axis. Newton reads
+the stage, its contacts and drives. Then the MuJoCo model of its solver is stepped in C, because a step
+through Newton's arrays takes a millisecond.
 """
 
 import json
@@ -60,7 +60,7 @@ class World:
         base = _only(bodies, job["robot"], job["base"])
         root = self._model.body_rootid[base]
         joints = [self._model.joint(i).name for i in range(self._model.njnt)]
-        self._base = base
+        self._base, self._sides = base, job["sides"]
         self._wheels = [_only(joints, job["robot"], joint) for joint in job["joints"]]
         if not job["scrub"]:
             self._narrow()
@@ -91,7 +91,7 @@ class World:
     def step(self, rates: list[list[float]]) -> None:
         """Physics steps, each with its wheel rates [rad/s]."""
         for pair in rates:
-            self._data.ctrl[self._ctrl] = pair
+            self._data.ctrl[self._ctrl] = [pair[side] for side in self._sides]
             mujoco.mj_step(self._model, self._data)
 
     def seen(self) -> list[float]:
@@ -103,7 +103,7 @@ class World:
         vx, vy, _, wx, wy, wz = self._data.qvel[self._qd : self._qd + 6].tolist()
         w = turn[2, 0] * wx + turn[2, 1] * wy + turn[2, 2] * wz  # MuJoCo gives it in the body's axes
         v = vx * math.cos(yaw) + vy * math.sin(yaw)
-        left, right = (a - b for a, b in zip(self._angles(), self._zero, strict=True))
+        left, right = (a - b for a, b in zip(self._angles()[:2], self._zero[:2], strict=True))
         return [x, y, yaw, v, float(w), left, right, z, float(turn[2, 2])]
 
     def _angles(self) -> list[float]:

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path as FilePath
+from types import MappingProxyType
 from typing import Any
 
 from magtwin.errors import InputError
@@ -27,6 +28,7 @@ class WorldProcess:
         *,
         environment: Mapping[str, str] | None = None,
         limit_s: float | None = None,
+        files: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         """Prepare the process; the block starts it.
 
@@ -36,13 +38,16 @@ class WorldProcess:
             engine: Name of the engine, for messages.
             environment: Its environment. Default: that of this process.
             limit_s: Time after which the process is killed [s]. None for no limit.
+            files: Texts of files in the folder that it runs in, by name.
         """
         self._command, self._job, self._engine = list(command), dict(job), engine
         self._environment, self._limit_s = environment, limit_s
-        self._late = False
+        self._files, self._late = files, False
 
     def __enter__(self) -> "WorldProcess":
         self._folder = tempfile.TemporaryDirectory()  # engines write logs there
+        for name, text in self._files.items():
+            FilePath(self._folder.name, name).write_text(text, encoding="utf-8")
         self._log = open(FilePath(self._folder.name, "log"), "w+", encoding="utf-8", errors="replace")
         self._process = subprocess.Popen(
             self._command,

@@ -1,5 +1,6 @@
 """The differential drive: exact integration of twists, wheels, limits."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -70,7 +71,7 @@ def wheel_rates(v: ArrayLike, w: ArrayLike, drive: DriveSpec) -> Array:
     return np.stack([v - side, v + side], axis=-1) / drive.wheel_radius_m
 
 
-def limits(drive: DriveSpec, dt: float) -> tuple[float, float, float, float, float, float]:
+def limits(drive: DriveSpec, dt: float) -> tuple[float, float, float, float, float, float, float]:
     """Limits of a drive for steps of `dt` [s], as arguments of `magtwin.sim.motion.loop.limited`."""
     rim = drive.wheel_rate_max * drive.wheel_radius_m
     return (
@@ -80,6 +81,7 @@ def limits(drive: DriveSpec, dt: float) -> tuple[float, float, float, float, flo
         drive.alpha_max * dt,
         rim,
         drive.wheel_separation_m / 2,
+        1 / drive.turning_radius_m if drive.turning_radius_m else math.inf,
     )
 
 

@@ -23,7 +23,7 @@ from magtwin.sim.motion.walls import Columns, Numbers, clearance, free_way
 COMMANDS, RELEASE, FOLLOWER, STANLEY, PURE_PURSUIT = range(5)
 """Numbers of the built-in controllers; see `controllers.py`."""
 
-FIGURES = 22 + 4 + 2 * 3 * 3
+FIGURES = 23 + 4 + 2 * 3 * 3
 """Number of figures of a robot and its controller; see `drive_on`."""
 
 TABLE = 6
@@ -105,7 +105,7 @@ def wrapped(angle: float) -> float:
 
 
 def limited(
-    limits: tuple[float, float, float, float, float, float],
+    limits: tuple[float, float, float, float, float, float, float],
     v_wanted: float,
     w_wanted: float,
     v: float,
@@ -113,17 +113,18 @@ def limited(
 ) -> tuple[float, float]:
     """The nearest twist to a wanted one within every limit of a drive.
 
-    If a wheel would turn too fast, the forward speed is reduced, as quickly as it may change.
+    If a wheel would turn too fast, the forward speed is reduced, as quickly as it may change. A robot that
+    steers like a car has a yaw rate of at most the highest curvature times its speed.
 
     Args:
         limits: Highest speed [m/s], yaw rate [rad/s], change of either in a step, speed of a wheel's rim
-            [m/s], and half the distance between wheels [m].
+            [m/s], half the distance between wheels [m], and highest curvature [1/m], which may be infinite.
         v_wanted: Forward speed [m/s].
         w_wanted: Yaw rate [rad/s].
         v: Last forward speed, within the limits [m/s].
         w: Last yaw rate, within the limits [rad/s].
     """
-    v_max, w_max, dv, dw, rim, half = limits
+    v_max, w_max, dv, dw, rim, half, bend = limits
     slowest = abs(v) - dv
     low, high = v - dv, v + dv
     if low < -v_max:
@@ -145,6 +146,9 @@ def limited(
             room = slowest
             w = math.copysign((rim - room) / half, w)
         v = math.copysign(room, v)
+    bend *= abs(v)
+    if abs(w) > bend:  # never if it is infinite, or infinity times 0
+        w = math.copysign(bend, w)
     return v, w
 
 
@@ -394,7 +398,7 @@ def drive_on(
 
     Args:
         law: Number of its controller.
-        figures: dt [s]; the six limits of `limited`; share of the last speed that is left at the end of a
+        figures: dt [s]; the seven limits of `limited`; share of the last speed that is left at the end of a
             step, and its share in the mean of the step; slip per change of speed in a step [s/m]; scales of v
             and w; age at which a command is void [s]; radius of the footprint [m]; the eight
             `gains` of `along_path`; the errors of `perceived`, which scripts ignore.
@@ -411,12 +415,11 @@ def drive_on(
         How many steps were made.
     """
     dt = figures[0]
-    limits = (figures[1], figures[2], figures[3], figures[4], figures[5], figures[6])
-    left_at_end, left_in_mean, slip = figures[7], figures[8], figures[9]
-    scale_v, scale_w = figures[10], figures[11]
-    timeout, radius, rest_w = figures[12], figures[13], REST_M_S / figures[6]
+    limits = (figures[1], figures[2], figures[3], figures[4], figures[5], figures[6], figures[7])
+    left_at_end, left_in_mean, slip = figures[8], figures[9], figures[10]
+    scale_v, scale_w = figures[11], figures[12]
+    timeout, radius, rest_w = figures[13], figures[14], REST_M_S / figures[6]
     gains = (
-        figures[14],
         figures[15],
         figures[16],
         figures[17],
@@ -424,9 +427,10 @@ def drive_on(
         figures[19],
         figures[20],
         figures[21],
+        figures[22],
     )
     blurred = law != COMMANDS and (
-        figures[22] != 0.0 or figures[23] != 0.0 or figures[24] != 0.0 or figures[25] != 0.0
+        figures[23] != 0.0 or figures[24] != 0.0 or figures[25] != 0.0 or figures[26] != 0.0
     )
     count = len(table[0])
     x, y, yaw = state[0], state[1], state[2]
@@ -440,7 +444,7 @@ def drive_on(
         t = (first + k) * dt
         px, py, pyaw = x, y, yaw
         if blurred:
-            px, py, pyaw = perceived(figures, 22, t, x, y, yaw, v, w)
+            px, py, pyaw = perceived(figures, 23, t, x, y, yaw, v, w)
         v_cmd, w_cmd, node, driven = commanded(
             law, table, gains, timeout, node, driven, t, px, py, pyaw, v, w
         )

@@ -42,6 +42,10 @@ _CORNER_RAD = math.radians(45.0)
 """Angle above which the robot stops to turn [rad]: a bend of radius below about 4 cm."""
 
 
+_TURN_SHARE, _TURN_SLACK = 0.2, 1.02
+"""Length of the chords that measure how tightly a path turns, in turning radii, and the tolerance of it."""
+
+
 @dataclass(frozen=True, eq=False)
 class Piece:
     """A part of a path between two stops, ready to be driven; arrays of its M nodes."""
@@ -95,14 +99,35 @@ def plan(path: Path, drive: DriveSpec, *, speed: float) -> list[Piece]:
         speed: Wanted forward speed [m/s].
 
     Raises:
-        InputError: `speed` is not above 0 or is more than the drive allows.
+        InputError: `speed` is not above 0 or is more than the drive allows, or the path turns more tightly
+            than a robot that steers like a car can.
     """
     top = min(drive.v_max, drive.wheel_rate_max * drive.wheel_radius_m)
     if not 0 < speed <= top:
         which = "v_max" if top == drive.v_max else "wheel_rate_max times its wheels' radius"
         raise InputError(f"speed must be above 0 and at most {top:g} m/s, the drive's {which}; got {speed!r}")
+    if drive.turning_radius_m:
+        _check_turns(path, drive.turning_radius_m)
     stops = np.concatenate([[0.0], corners(path), [path.length]])
     return [_piece(path, a, b, drive, speed) for a, b in itertools.pairwise(stops)]
+
+
+def _check_turns(path: Path, turning_radius_m: float) -> None:
+    """Refuse a path that turns more tightly than a robot can.
+
+    The radius at a point is L / a, for chords of length L before and after it that differ by the angle a.
+    """
+    chord = max(_CORNER_REACH_M, _TURN_SHARE * turning_radius_m)
+    s = np.arange(chord, path.length - chord, chord / 2)
+    turn = np.abs(path.turn(s, chord))
+    if len(s) and turn.max() * turning_radius_m > _TURN_SLACK * chord:
+        place = s[int(np.argmax(turn))]
+        (x, y), radius = path.at(np.array([place]))[0], chord / turn.max()
+        raise InputError(
+            f"path {path.name}: it turns with a radius of {radius:.2g} m at ({x:.2f}, {y:.2f}) m, and this "
+            f"robot steers like a car, with a turning_radius_m of {turning_radius_m:.3g}; take a wider path",
+            parameter="path",
+        )
 
 
 def _piece(path: Path, s_first: float, s_last: float, drive: DriveSpec, speed: float) -> Piece:

@@ -60,6 +60,10 @@ class Tags:
         self._read.add(element)
         return element
 
+    def forget(self, element: Element) -> None:
+        """Unmark an element and everything below it, so that `keep` keeps it."""
+        self._read -= set(element.iter())
+
     def text(self, element: Element | None, *paths: str) -> str:
         """Text of the first element at one of the paths; "" if there is none."""
         match = self.find(element, *paths)

@@ -12,8 +12,10 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.budget import BUDGETS
 from magtwin.errors import InputError
-from magtwin.urdf.meshes.piece import GREY, Paint, Piece, Rgba
+from magtwin.files import read_bytes
+from magtwin.urdf.meshes.piece import GREY, Map, Paint, Piece, Rgba, linear, normal_map, smoothness
 from magtwin.urdf.meshes.polygon import cut_polygons, strips
 from magtwin.urdf.meshes.reading import Reading, numbers
 from magtwin.urdf.meshes.texture import Image, read_image
@@ -26,9 +28,6 @@ SHADERS = ("phong", "lambert", "blinn", "constant")
 
 POLYGONS = ("triangles", "polylist", "polygons", "tristrips", "trifans")
 """Primitives with faces."""
-
-NODES = 50_000
-"""Most nodes of a scene, counting instances: nodes that instance each other twice grow exponentially."""
 
 LUMINANCE = (0.212671, 0.715160, 0.072169)
 """Weights of linear red, green and blue, from the specification."""
@@ -53,7 +52,7 @@ class _Collada:
 
     def __init__(self, reading: Reading) -> None:
         self._reading = reading
-        text = reading.path.read_bytes()
+        text = read_bytes(reading.path, "mesh file", "XML")
         if re.match(rb"\s*<\?xml[^>]*encoding", text) is None:  # names in other encodings are harmless
             text = text.decode("utf-8", errors="replace").encode()
         markup = parse_markup(text, reading.path)
@@ -85,6 +84,7 @@ class _Collada:
             for node in scene.findall("node")
             for geometry, instance, T in self._walk(node, np.diag([metre, metre, metre, 1.0]), ())
             for piece in self._geometry(geometry, instance, shown)
+            if self._reading.spend(piece.nbytes)
         ]
         for geometry in self._root.iterfind("library_geometries/geometry"):
             if geometry not in shown:
@@ -98,8 +98,8 @@ class _Collada:
     ) -> Iterator[tuple[Element, Element, NDArray]]:
         """Geometries below a node, with their instance elements and their transforms to metres."""
         self._visited += 1
-        if self._visited > NODES:
-            raise self._refused(node, f"shows over {NODES} nodes")
+        if self._visited > BUDGETS["mesh"].count:  # nodes that instance each other twice grow exponentially
+            raise self._refused(node, f"shows over {BUDGETS['mesh'].count} nodes")
         if node in above:
             raise self._refused(node, f"node {node.get('id')!r} is within itself")
         T = T @ self._transform(node)
@@ -182,7 +182,7 @@ class _Collada:
             triangles = cut_polygons(points, corners, counts)
         binding = bound.get(primitive.get("material"))
         paint, uvs, colours = self._paint(primitive, binding), None, None
-        if paint is None or paint.image is not None:
+        if paint is None or paint.textured:
             binds = [] if binding is None else binding.findall("bind_vertex_input")
             of_uvs = (b.get("input_set", 0) for b in binds if b.get("input_semantic") == "TEXCOORD")
             uvs = self._picked(inputs, "TEXCOORD", 2, index, triangles, int(next(of_uvs, -1)))
@@ -304,9 +304,83 @@ class _Collada:
         texture = diffuse.find("texture")
         image = None if texture is None else self._image(texture, profile)
         if image is not None:
-            return Paint(name, (1.0, 1.0, 1.0, opacity), image, double_sided=double_sided)
-        r, g, b, _ = GREY if texture is not None else self._colour(diffuse, profile)
-        return Paint(name, (r, g, b, opacity), double_sided=double_sided)
+            r, g, b = 1.0, 1.0, 1.0
+        else:
+            r, g, b, _ = GREY if texture is not None else self._colour(diffuse, profile)
+        emissive, emission = (0.0, 0.0, 0.0), shader.find("emission")
+        if emission is not None and diffuse is not emission and self._has_colour(emission):
+            emissive = linear(self._colour(emission, profile))
+        cut_out = self._cut_out(shader, profile, name)
+        maps = self._maps(effect, shader, profile, name)
+        if cut_out is not None and cut_out != image:
+            maps = (*maps, ("opacity", Map(cut_out, "a", (opacity,) * 4)))
+        return Paint(
+            name,
+            (r, g, b, opacity),
+            image,
+            emissive=emissive,
+            **self._highlight(shader, profile, name),
+            maps=maps,
+            see_through=cut_out is not None and cut_out == image,
+            double_sided=double_sided,
+        )
+
+    def _cut_out(self, shader: Element, profile: Element, name: str) -> Image | None:
+        """The image whose alpha is the opacity; None if the shader has none."""
+        transparent = shader.find("transparent")
+        texture = None if transparent is None else transparent.find("texture")
+        image = None if texture is None else self._image(texture, profile)
+        if transparent is None or image is None:
+            return None
+        if transparent.get("opaque", "A_ONE") == "A_ONE" and image.has_alpha:
+            return image
+        self._reading.lose(f"material {name!r}: its map of transparency without alpha is left out")
+        return None
+
+    @staticmethod
+    def _has_colour(element: Element) -> bool:
+        return element.find("color") is not None or element.find("param") is not None
+
+    def _highlight(self, shader: Element, profile: Element, name: str) -> dict[str, Any]:
+        """Roughness and reflectance of a phong or blinn shader, see `smoothness`, as arguments of a paint.
+
+        Exporters write the exponent of phong and blinn from 0 to 1 or to 1000; below 1 it is a share of 128.
+        """
+        specular, shininess = shader.find("specular"), shader.find("shininess")
+        if specular is None or shininess is None:
+            return {}
+        if specular.find("texture") is not None:
+            self._reading.lose(f"material {name!r}: its map of highlights is left out")
+        number = numbers(shininess.findtext("float", ""), float)
+        if not self._has_colour(specular) or len(number) != 1 or not np.isfinite(number).all():
+            return {}
+        exponent = float(number[0]) * (128 if number[0] < 1 else 1)
+        highlight = linear(self._colour(specular, profile))
+        if max(highlight) == 0:
+            return {"roughness": 1.0}
+        roughness, reflectance = smoothness(exponent, highlight)
+        return {"roughness": roughness, "specular": reflectance}
+
+    def _maps(
+        self, effect: Element, shader: Element, profile: Element, name: str
+    ) -> tuple[tuple[str, Map], ...]:
+        """Maps of emission and of normals (`<bump>`, an extension); others are counted as lost."""
+        maps = []
+        emission = shader.find("emission/texture")
+        image = None if emission is None else self._image(emission, profile)
+        if image is not None:
+            maps.append(("emissiveColor", Map(image, colour=True)))
+        for bump in effect.iter("bump"):
+            texture = bump.find("texture")
+            image = None if texture is None else self._image(texture, profile)
+            if image is not None and (bump.get("bumptype") == "NORMALMAP" or image.shows_normals):
+                maps.append(("normal", normal_map(image)))
+                break
+            if image is not None:
+                self._reading.lose(f"material {name!r}: its map of heights {image.name!r} is left out")
+        if shader.find("reflective/texture") is not None:
+            self._reading.lose(f"material {name!r}: its map of reflections is left out")
+        return tuple(maps)
 
     def _image(self, texture: Element, profile: Element) -> Image | None:
         """The image of a `<texture>`: through sampler and surface, through a sampler (1.5), or directly."""

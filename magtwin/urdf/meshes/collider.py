@@ -12,6 +12,8 @@ EXTRA = 'pip install "magtwin[decomposition]"'
 CONCAVITY = 0.05
 """Largest depth of a hollow, relative to the mesh, that a convex part may fill (coacd's threshold)."""
 
+FLAT = 1e-13
+"""Volume of a hull, relative to the cube of its longest side, that counts as none."""
 
 Solid = tuple[NDArray[np.float32], NDArray[np.int64]]
 """Vertices [m], shape (V, 3), and triangles, counter-clockwise from outside, shape (F, 3)."""
@@ -59,8 +61,8 @@ def solids_of(mesh: Mesh, collision: Collision) -> tuple[tuple[Solid, ...], floa
     faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
     faces = faces[np.lexsort(faces.T[::-1])]
     faces = faces[has_area(points, faces)]
-    used, index = np.unique(faces, return_inverse=True)
-    return ((points[used], index.reshape(-1, 3)),), thickness
+    used = np.bincount(faces.ravel(), minlength=len(points)) > 0
+    return ((points[used], (np.cumsum(used) - 1)[faces]),), thickness
 
 
 def _thickened(points: NDArray) -> tuple[NDArray[np.float32], float]:
@@ -74,13 +76,15 @@ def _thickened(points: NDArray) -> tuple[NDArray[np.float32], float]:
 
 def hull_faces(points: NDArray) -> NDArray[np.int64] | None:
     """Triangles of the convex hull, counter-clockwise from outside, shape (F, 3); None if it is flat."""
-    from scipy.spatial import ConvexHull, QhullError
+    from manifold3d import Manifold  # scipy's hull is as good, but importing it takes as long as a conversion
 
-    try:
-        hull = ConvexHull(points)
-    except QhullError:
+    points = np.ascontiguousarray(points, float) + 0.0  # + 0 makes -0 into 0
+    hull = Manifold.hull_points(points)
+    if hull.volume() <= FLAT * float(np.ptp(points, axis=0).max(initial=0.0)) ** 3:
         return None
-    faces = hull.simplices.astype(np.int64)
-    a, b, c = (points[faces[:, i]] for i in range(3))
-    inwards = np.sum(np.cross(b - a, c - a) * hull.equations[:, :3], axis=1) < 0
-    return np.where(inwards[:, None], faces[:, ::-1], faces)
+    mesh = hull.to_mesh64()
+    corners = np.ascontiguousarray(mesh.vert_properties[:, :3], float) + 0.0
+    x = np.sort(corners[:, 0])
+    alike = np.flatnonzero(x[np.searchsorted(x, points[:, 0]) % len(x)] == points[:, 0])
+    index = {points[i].tobytes(): i for i in alike}
+    return np.array([index[corner.tobytes()] for corner in corners])[mesh.tri_verts]

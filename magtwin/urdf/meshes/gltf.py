@@ -16,9 +16,11 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.budget import BUDGETS
 from magtwin.errors import InputError
+from magtwin.files import read_bytes
 from magtwin.frames import matrix_from_quat
-from magtwin.urdf.meshes.piece import Paint, Piece
+from magtwin.urdf.meshes.piece import Map, Paint, Piece, normal_map
 from magtwin.urdf.meshes.polygon import strips
 from magtwin.urdf.meshes.reading import Reading
 from magtwin.urdf.meshes.texture import Image, image_of, read_image
@@ -30,6 +32,10 @@ Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+
+REPEAT = 10497
+WRAPS = {33071: "clamp", 33648: "mirror", REPEAT: "repeat"}
+"""Wrapping of UsdUVTexture by that of a sampler."""
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
 """Modes of primitives with faces."""
@@ -70,7 +76,12 @@ class _Gltf:
         else:
             below = {child for node in nodes for child in node.get("children", ())}
             roots = [i for i in range(len(nodes)) if i not in below]
-        pieces = [piece.moved(T) for node, T in self._walk(roots) for piece in self._mesh(node)]
+        pieces = [
+            piece.moved(T)
+            for node, T in self._walk(roots)
+            for piece in self._mesh(node)
+            if self._reading.spend(piece.nbytes)
+        ]
         for kind in ("skins", "animations"):
             if self._json.get(kind):
                 self._reading.lose(f"its {kind} are left out")
@@ -134,31 +145,72 @@ class _Gltf:
             material = self._json["materials"][index]
             surface = material.get("pbrMetallicRoughness", {})
             r, g, b, a = surface.get("baseColorFactor", (1, 1, 1, 1))
-            image = None
-            if "baseColorTexture" in surface:
-                texture = surface["baseColorTexture"]
-                moved = "KHR_texture_transform" in texture.get("extensions", {})
-                if texture.get("texCoord", 0) != 0 or moved:
-                    text = f"material {index}'s texture uses other coordinates than the first set"
-                    self._reading.lose(text)
-                image = self._image(self._json["textures"][texture["index"]])
-            kinds = ("normalTexture", "occlusionTexture", "emissiveTexture", "metallicRoughnessTexture")
-            for other in kinds:
-                if other in material or other in surface:
-                    self._reading.lose(f"material {index}'s {other} is left out")
+            image, wrap = self._texture(surface.get("baseColorTexture"), index)
+            roughness, metallic = (
+                float(surface.get(f"{name}Factor", 1.0)) for name in ("roughness", "metallic")
+            )
             red, green, blue = (float(c) for c in srgb_from_linear((r, g, b)))
             alpha = material.get("alphaMode", "OPAQUE")
             self._paints[index] = Paint(
-                name=material.get("name", f"material_{index}"),
+                name=str(material.get("name", f"material_{index}")),
                 rgba=(red, green, blue, 1.0 if alpha == "OPAQUE" else float(a)),
                 image=image,
-                roughness=float(surface.get("roughnessFactor", 1.0)),
-                metallic=float(surface.get("metallicFactor", 1.0)),
+                wrap=wrap,
+                roughness=roughness,
+                metallic=metallic,
+                emissive=self._emissive(material),
+                maps=self._maps(material, index, roughness, metallic),
                 double_sided=bool(material.get("doubleSided", False)),
                 see_through=alpha != "OPAQUE",
                 cutoff=float(material.get("alphaCutoff", 0.5)) if alpha == "MASK" else 0.0,
             )
         return self._paints[index]
+
+    def _emissive(self, material: dict[str, Any]) -> tuple[float, float, float]:
+        strength = material.get("extensions", {}).get("KHR_materials_emissive_strength", {})
+        by = float(strength.get("emissiveStrength", 1.0))
+        r, g, b = (by * float(c) for c in material.get("emissiveFactor", (0, 0, 0)))
+        return (r, g, b)
+
+    def _maps(
+        self, material: dict[str, Any], index: int, roughness: float, metallic: float
+    ) -> tuple[tuple[str, Map], ...]:
+        """Textures besides the colour (section 3.9.2): green is roughness, blue metallic, red occlusion."""
+        maps: list[tuple[str, Map]] = []
+        surface = material.get("pbrMetallicRoughness", {})
+        image, wrap = self._texture(surface.get("metallicRoughnessTexture"), index)
+        if image is not None:
+            for name, channel, factor in (("roughness", "g", roughness), ("metallic", "b", metallic)):
+                maps.append((name, Map(image, channel, (factor,) * 4, wrap=wrap)))
+        given = material.get("normalTexture", {})
+        image, wrap = self._texture(given, index)
+        if image is not None:
+            maps.append(("normal", normal_map(image, float(given.get("scale", 1.0)), wrap)))
+        given = material.get("occlusionTexture", {})
+        image, wrap = self._texture(given, index)
+        if image is not None:  # 1 + strength (texel - 1)
+            s = float(given.get("strength", 1.0))
+            maps.append(("occlusion", Map(image, "r", (s,) * 4, (1 - s,) * 4, wrap=wrap)))
+        image, wrap = self._texture(material.get("emissiveTexture"), index)
+        emissive = self._emissive(material)
+        if image is not None and max(emissive) > 0:
+            maps.append(("emissiveColor", Map(image, "rgb", (*emissive, 1.0), colour=True, wrap=wrap)))
+        for name in material.get("extensions", {}):
+            if name not in SUPPORTED:
+                self._reading.lose(f"material {index}'s extension {name} is left out")
+        return tuple(maps)
+
+    def _texture(self, given: dict[str, Any] | None, index: int) -> tuple[Image | None, tuple[str, str]]:
+        """Image and wrapping of a texture of a material."""
+        if not given:
+            return None, ("repeat", "repeat")
+        moved = "KHR_texture_transform" in given.get("extensions", {})
+        if given.get("texCoord", 0) != 0 or moved:
+            self._reading.lose(f"material {index}'s texture uses other coordinates than the first set")
+        texture = self._json["textures"][given["index"]]
+        sampler = self._json["samplers"][texture["sampler"]] if "sampler" in texture else {}
+        s, t = (WRAPS[sampler.get(f"wrap{side}", REPEAT)] for side in "ST")
+        return self._image(texture), (s, t)
 
     def _image(self, texture: dict[str, Any]) -> Image | None:
         """The image of a texture: in a file, inline, or in a buffer."""
@@ -185,6 +237,7 @@ class _Gltf:
         stride = view.get("byteStride", dtype.itemsize * width)
         if count and len(data) < stride * (count - 1) + dtype.itemsize * width:
             raise self._refused(f"accessor {index} is longer than its buffer")
+        self._reading.spend(8 * count * width)  # before a stride of 0 repeats a few bytes without end
         values = np.ndarray((count, width), dtype, data, 0, (stride, dtype.itemsize))
         if accessor.get("normalized"):
             return np.maximum(values / np.iinfo(dtype).max, -1.0)
@@ -213,7 +266,7 @@ class _Gltf:
                     )
                 if not file.is_file():
                     raise InputError(f"{self._reading.path}: buffer {uri!r} is missing; looked for {file}")
-                self._buffers[index] = file.read_bytes()
+                self._buffers[index] = read_bytes(file, "buffer", "mesh")
         return self._buffers[index]
 
     def _refused(self, text: str) -> InputError:
@@ -222,9 +275,9 @@ class _Gltf:
 
 def _parse(path: Path) -> tuple[dict[str, Any], bytes]:
     """JSON and binary chunk of a file (section 4)."""
-    data = path.read_bytes()
+    data = path.read_bytes()  # its size is checked
     if data[:4] != b"glTF":
-        return json.loads(data), b""
+        return _table(data, path), b""
     if len(data) < 20 or struct.unpack_from("<I", data, 8)[0] > len(data):
         raise InputError(f"{path}: is cut short; export it again")
     chunks: dict[int, bytes] = {}
@@ -233,7 +286,17 @@ def _parse(path: Path) -> tuple[dict[str, Any], bytes]:
         length, kind = struct.unpack_from("<II", data, at)
         chunks.setdefault(kind, data[at + 8 : at + 8 + length])
         at += 8 + length
-    return json.loads(chunks[JSON_CHUNK]), chunks.get(BINARY_CHUNK, b"")
+    return _table(chunks[JSON_CHUNK], path), chunks.get(BINARY_CHUNK, b"")
+
+
+def _table(text: bytes, path: Path) -> dict[str, Any]:
+    """The JSON of a file."""
+    if len(text) > BUDGETS["JSON"].file:
+        raise InputError(
+            f"{path}: its JSON has {len(text):,} bytes; at most {BUDGETS['JSON'].file:,} are read"
+        )
+    table: dict[str, Any] = json.loads(text)
+    return table
 
 
 def _inline(uri: str) -> bytes:

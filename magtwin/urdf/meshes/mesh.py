@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
+from magtwin.files import existing_file
 from magtwin.urdf.meshes.piece import Paint, Piece
 from magtwin.urdf.meshes.reading import Note, Reading
 from magtwin.urdf.source.markup import UnsafeError
@@ -15,6 +16,9 @@ from magtwin.usd.solids import corner_normals
 
 SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
 """Formats that can be read."""
+
+HASH = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)
+"""Odd factors of the key that `distinct` sorts by, one a column; any work."""
 
 
 class UnreadableMeshError(InputError):
@@ -81,7 +85,7 @@ def read_mesh(path: Path, may_read: Callable[[Path], bool] | None = None) -> Mes
     """
     folder = path.resolve().parent
     allowed = may_read or (lambda other: other.resolve().is_relative_to(folder))
-    reading = Reading(path, allowed)
+    reading = Reading(existing_file(path, "mesh file", "mesh"), allowed)
     try:
         return _join(reading, _reader(path)(reading))
     except UnsafeError:
@@ -112,7 +116,7 @@ def _reader(path: Path) -> Reader:
 
 def _join(reading: Reading, pieces: Sequence[Piece]) -> Mesh:
     """All pieces as one mesh, with equal points merged and triangles without an area removed."""
-    path, pieces = reading.path, [piece for piece in pieces if len(piece.faces)]
+    path, pieces = reading.path, [piece for piece in pieces if piece.faces.size]
     if not pieces:
         raise InputError(f"{path}: holds no triangle; export it again, or use a primitive")
     for piece in pieces:
@@ -125,7 +129,7 @@ def _join(reading: Reading, pieces: Sequence[Piece]) -> Mesh:
     faces = np.vstack([piece.faces + n for piece, n in zip(pieces, first, strict=False)]).astype(np.int64)
     if not np.isfinite(points[faces]).all():
         raise InputError(f"{path}: has vertices that are not finite numbers; export it again")
-    pieces = [_coloured(piece, reading) for piece in pieces]
+    pieces = [_textured(_coloured(piece, reading), reading) for piece in pieces]
     paints = tuple(dict.fromkeys(piece.paint for piece in pieces))
     paint = np.repeat([paints.index(p.paint) for p in pieces], [len(p.faces) for p in pieces])
     kept, index = distinct(points)
@@ -139,7 +143,7 @@ def _join(reading: Reading, pieces: Sequence[Piece]) -> Mesh:
     faces, paint = faces[solid], paint[solid]
     used = np.zeros(len(points), bool)
     used[faces] = True
-    shown = np.unique(paint)
+    shown = np.flatnonzero(np.bincount(paint))
     return Mesh(
         path=path,
         points=points[used],
@@ -161,6 +165,15 @@ def _coloured(piece: Piece, reading: Reading) -> Piece:
         return replace(piece, paint=Paint("vertex_colours", by_vertex=True))
     reading.lose("colours of vertices are left out where a material covers them")
     return replace(piece, colours=None)
+
+
+def _textured(piece: Piece, reading: Reading) -> Piece:
+    """A piece with a textured paint only if it has texture coordinates."""
+    paint = piece.paint
+    if paint is None or not paint.textured or piece.uvs is not None:
+        return piece
+    reading.lose(f"material {paint.name!r}: its textures are left out where there are no texture coordinates")
+    return replace(piece, paint=paint.without_textures)
 
 
 def _at_corners(
@@ -211,8 +224,24 @@ def distinct(rows: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         Index of the first row of each kind, shape (D,), and the kind of each row, shape (N,).
     """
     words = np.ascontiguousarray(rows + np.float32(0), np.float32).view(np.uint32)  # + 0 makes -0 into 0
+    if not len(words):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    keys = words.astype(np.uint64) @ np.array(HASH[: words.shape[1]], np.uint64)
+    order = np.argsort(keys)
+    starts = np.flatnonzero(np.append(True, keys[order[1:]] != keys[order[:-1]]))
+    kind = np.empty_like(order)
+    kind[order] = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(order))))
+    first = np.minimum.reduceat(order, starts)
+    if (words != words[first[kind]]).any():  # different rows with one key: by their bits
+        return _distinct_words(words)
+    rank = np.argsort(np.argsort(first))
+    return np.sort(first), rank[kind]
+
+
+def _distinct_words(words: NDArray[np.uint32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """`distinct` of rows of bits; takes longer."""
     order = np.lexsort(words.T)  # is stable: of equal rows, the first is first
-    starts = np.append(True, (words[order[1:]] != words[order[:-1]]).any(axis=1))[: len(order)]
+    starts = np.append(True, (words[order[1:]] != words[order[:-1]]).any(axis=1))
     first = np.empty_like(order)
     first[order] = order[starts][np.cumsum(starts) - 1]
     is_first = first == np.arange(len(order))

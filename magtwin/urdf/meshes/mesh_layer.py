@@ -271,18 +271,32 @@ def primitive_of(prim: Usd.Prim) -> Geometry | None:
 
 def free_name(name: str, taken: set[str]) -> str:
     """A name that is not in `taken`, to which it is added: `name`, or `name_2` and so on."""
-    unique, number = name, 1
-    while unique in taken:
-        number += 1
-        unique = f"{name}_{number}"
+    unique = _free(name, lambda other: other in taken)
     taken.add(unique)
     return unique
 
 
 def free_child(prim: Usd.Prim, name: str) -> Sdf.Path:
     """A free path below a prim, called `name` if possible."""
-    taken = {child.GetName() for child in prim.GetChildren()}
-    return prim.GetPath().AppendChild(free_name(Tf.MakeValidIdentifier(name), taken))
+    stage, path = prim.GetStage(), prim.GetPath()
+    free = _free(
+        Tf.MakeValidIdentifier(name), lambda other: bool(stage.GetPrimAtPath(path.AppendChild(other)))
+    )
+    return path.AppendChild(free)
+
+
+def _free(name: str, taken: Callable[[str], bool]) -> str:
+    """The name, or the name with a number, found by bisection, since a link may have thousands of boxes."""
+    if not taken(name):
+        return name
+    high = 2
+    while taken(f"{name}_{high}"):
+        high *= 2
+    low = high // 2
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if taken(f"{name}_{middle}") else (low, middle)
+    return f"{name}_{high}"
 
 
 def _scaled(points: NDArray, faces: NDArray, scale: NDArray) -> tuple[NDArray[np.float32], NDArray]:

@@ -15,6 +15,26 @@ GREY: Rgba = (0.5, 0.5, 0.5, 1.0)
 
 
 @dataclass(frozen=True)
+class Map:
+    """An image that gives an input of a surface: scale x texel + bias, for each channel."""
+
+    image: Image
+
+    channel: str = "rgb"
+    """"rgb", or the one channel that is read: "r", "g", "b" or "a"."""
+
+    scale: Rgba = (1.0, 1.0, 1.0, 1.0)
+
+    bias: Rgba = (0.0, 0.0, 0.0, 0.0)
+
+    colour: bool = False
+    """Whether its texels are sRGB colours; else they are numbers."""
+
+    wrap: tuple[str, str] = ("repeat", "repeat")
+    """Outside 0 to 1, along s and t: "repeat", "mirror" or "clamp"."""
+
+
+@dataclass(frozen=True)
 class Paint:
     """The look of a surface: a material of a mesh file, or of the URDF."""
 
@@ -39,6 +59,21 @@ class Paint:
     cutoff: float = 0.0
     """Opacity threshold between invisible and opaque; 0 blends."""
 
+    emissive: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Light that it gives off, linear."""
+
+    specular: tuple[float, float, float] | None = None
+    """Reflectance at normal incidence, linear; it replaces `metallic`. None: from `metallic` and `ior`."""
+
+    ior: float | None = None
+    """Index of refraction. None: 1.5."""
+
+    maps: tuple[tuple[str, Map], ...] = ()
+    """Textures of other inputs than the colour, by the input of UsdPreviewSurface."""
+
+    wrap: tuple[str, str] = ("repeat", "repeat")
+    """The colour texture outside 0 to 1, as in `Map`."""
+
     double_sided: bool = False
     """Whether it is visible from behind."""
 
@@ -46,11 +81,54 @@ class Paint:
     """Whether the colours at the corners replace `rgba`."""
 
     @property
+    def textured(self) -> bool:
+        """Whether it needs texture coordinates."""
+        return self.image is not None or bool(self.maps)
+
+    @property
+    def without_textures(self) -> "Paint":
+        """The paint for a mesh without texture coordinates, with the mean colour of its texture."""
+        r, g, b = (1.0, 1.0, 1.0) if self.image is None else self.image.mean
+        mean = (self.rgba[0] * r, self.rgba[1] * g, self.rgba[2] * b, self.rgba[3])
+        return replace(self, rgba=mean, image=None, maps=(), see_through=False)
+
+    @property
     def display_colour(self) -> tuple[float, float, float]:
         """Linear colour for viewers without materials."""
         mean = (1.0, 1.0, 1.0) if self.image is None else self.image.mean
         r, g, b = (round(float(c), 5) for c in linear_from_srgb(self.rgba[:3]) * linear_from_srgb(mean))
         return (r, g, b)
+
+
+def smoothness(exponent: float, highlight: tuple[float, float, float]) -> tuple[float, tuple]:
+    """Roughness and reflectance of a Phong highlight.
+
+    A microfacet lobe of width a has the shape of a highlight with the exponent n if a^2 = 2 / (n + 2)
+    (Walter et al. 2007, doi:10.2312/EGWR/EGSR07/195-206), and `UsdPreviewSurface` takes the root of a. Its
+    peak, F / 4 a^2, is as high as that of the highlight, k, if the reflectance F is 4 a^2 k.
+
+    Args:
+        exponent: Exponent n of the highlight, 0 or more.
+        highlight: Its colour k, linear.
+
+    Returns:
+        Roughness, 0 to 1, and reflectance F at normal incidence, linear.
+    """
+    squared = 2 / (max(exponent, 0.0) + 2)
+    r, g, b = (min(4 * squared * c, 1.0) for c in highlight)
+    return squared**0.25, (r, g, b)
+
+
+def normal_map(image: Image, strength: float = 1.0, wrap: tuple[str, str] = ("repeat", "repeat")) -> Map:
+    """The map of a tangent-space normal map: texels from 0 to 1 become -1 to 1, x and y times `strength`."""
+    s = strength
+    return Map(image, scale=(2 * s, 2 * s, 2.0, 1.0), bias=(-s, -s, -1.0, 0.0), wrap=wrap)
+
+
+def linear(rgb: tuple[float, ...]) -> tuple[float, float, float]:
+    """Linear red, green, blue of an sRGB colour."""
+    r, g, b = (float(c) for c in linear_from_srgb(rgb[:3]))
+    return (r, g, b)
 
 
 PLAIN = Paint(rgba=GREY)
@@ -77,6 +155,12 @@ class Piece:
 
     colours: NDArray | None = None
     """Linear red, green, blue at each corner, 0 to 1, shape (F, 3, 3)."""
+
+    @property
+    def nbytes(self) -> int:
+        """Size of its arrays."""
+        arrays = (self.points, self.faces, self.normals, self.uvs, self.colours)
+        return sum(array.nbytes for array in arrays if array is not None)
 
     def moved(self, T: NDArray) -> "Piece":
         """The piece under an affine map T, shape (4, 4); faces stay outwards under a reflection.

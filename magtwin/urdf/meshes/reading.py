@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.budget import check_decoded
+
 Note = tuple[str, bool]
 """A note for the user on a file, and whether something of the file was left out."""
 
@@ -23,6 +25,19 @@ class Reading:
 
     notes: list[Note] = field(default_factory=list)
     """Repairs, guesses and omissions, each once."""
+
+    spent: list[int] = field(default_factory=lambda: [0])
+    """Bytes of its decoded arrays so far."""
+
+    def spend(self, count: int) -> bool:
+        """Count bytes of decoded arrays against the file's budget; True if they are within.
+
+        Raises:
+            InputError: The file decodes to more than it may.
+        """
+        self.spent[0] += count
+        check_decoded(self.path, self.path.stat().st_size, self.spent[0])
+        return True
 
     def note(self, text: str, *, lost: bool = False) -> None:
         """Add a note on a repair or guess, or an omission if `lost`."""

@@ -1,5 +1,10 @@
-"""Scan: STL and PLY, triangles without materials, read by trimesh."""
+"""Scan: STL and PLY, triangles without materials.
 
+trimesh reads PLY and STL in text. Binary STL is an array; it is read here, since importing trimesh takes
+longer than most conversions.
+"""
+
+import io
 from typing import Any
 
 import numpy as np
@@ -10,6 +15,12 @@ from magtwin.urdf.meshes.piece import Piece
 from magtwin.urdf.meshes.reading import Reading
 from magtwin.usd.geometry import linear_from_srgb
 
+STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+"""A triangle of a binary STL, after 80 bytes of text and the number of triangles."""
+
+LONGEST_LINE = 4096
+"""Most characters of a line of a PLY's header."""
+
 
 def read_scan(reading: Reading) -> list[Piece]:
     """The triangles of an STL or PLY file, for `read_mesh`.
@@ -17,20 +28,52 @@ def read_scan(reading: Reading) -> list[Piece]:
     Normals of an STL are ignored: they are those of the faces, from which smooth ones are computed. Texture
     coordinates of a PLY are ignored, since the format references no image.
     """
-    with reading.path.open("rb") as stream:
-        if reading.path.suffix.lower() == ".stl":
-            from trimesh.exchange.stl import load_stl
+    data = reading.path.read_bytes()
+    stl = reading.path.suffix.lower() == ".stl"
+    points = _binary_stl(data) if stl else None
+    if points is not None and len(points):
+        return [Piece(points=points, faces=np.arange(len(points)).reshape(-1, 3))]
+    if points is not None:
+        read: dict[str, Any] = {"geometry": {}}
+    elif stl:
+        from trimesh.exchange.stl import load_stl_ascii
 
-            read = load_stl(stream)
-        else:
-            from trimesh.exchange.ply import load_ply
+        read = load_stl_ascii(io.BytesIO(data))
+    else:
+        from trimesh.exchange.ply import load_ply
 
-            read = load_ply(stream)
+        _check_counts(data, reading)
+        read = load_ply(io.BytesIO(data))
     parts = read["geometry"].values() if "geometry" in read else [read]  # an ASCII STL may have several
     pieces = [_piece(part) for part in parts if part.get("faces") is not None and len(part["faces"])]
-    if not pieces and reading.path.suffix.lower() == ".stl":
+    if not pieces and stl:
         raise InputError(f"{reading.path}: holds no triangle, or is cut short; export it again")
     return pieces
+
+
+def _binary_stl(data: bytes) -> NDArray[np.float32] | None:
+    """Corners of the triangles of a binary STL, shape (3 F, 3); None if the count does not fit the file."""
+    count = int.from_bytes(data[80:84], "little")
+    if len(data) < 84 or len(data) != 84 + count * STL.itemsize:
+        return None
+    return np.frombuffer(data, STL, offset=84)["corners"].reshape(-1, 3)
+
+
+def _check_counts(data: bytes, reading: Reading) -> None:
+    """Refuse a PLY whose header claims more elements than the file has bytes, before they are read."""
+    header = io.BytesIO(data)
+    for line in iter(lambda: header.readline(LONGEST_LINE), b""):
+        words = line.split()
+        if words[:1] == [b"element"]:
+            count = int(words[2])
+            if len(words) != 3 or not 0 <= count <= len(data):
+                raise InputError(
+                    f"{reading.path}: claims {count} of {words[1].decode()[:40]} in {len(data)} bytes"
+                )
+        if words[:1] == [b"end_header"]:
+            break
+    else:
+        raise ValueError("its header has no end")
 
 
 def _piece(part: dict[str, Any]) -> Piece:

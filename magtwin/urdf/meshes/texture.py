@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote
 
+from magtwin.budget import BUDGETS
 from magtwin.errors import InputError
+from magtwin.files import read_bytes
 from magtwin.urdf.meshes.reading import Reading
 
 TEXTURES = "textures"
@@ -14,9 +16,6 @@ TEXTURES = "textures"
 
 KEPT = {"JPEG": ".jpg", "PNG": ".png"}
 """Formats that every USD viewer reads, by Pillow's names; others are converted to PNG."""
-
-MAX_PIXELS = 2**27
-"""Largest image that is opened."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +29,14 @@ class Image:
 
     mean: tuple[float, float, float]
     """Mean colour (sRGB), 0 to 1, for viewers without textures."""
+
+    has_alpha: bool = False
+
+    @property
+    def shows_normals(self) -> bool:
+        """Whether it is a map of normals, by its mean: (0.5, 0.5, 1) is up; maps of height are grey."""
+        r, g, b = self.mean
+        return b > 0.7 and abs(r - 0.5) < 0.2 and abs(g - 0.5) < 0.2
 
 
 def read_image(name: str, reading: Reading, folder: Path | None = None) -> Image | None:
@@ -49,7 +56,7 @@ def read_image(name: str, reading: Reading, folder: Path | None = None) -> Image
         if not path.is_file():
             reading.lose(f"texture {name!r} is missing and is left out; looked for {path}")
             return None
-        data = path.read_bytes()
+        data = read_bytes(path, "image", "image")
     except (OSError, ValueError) as error:  # the name is too long, or contains a null byte
         reading.lose(f"texture {name!r} cannot be read and is left out ({error})")
         return None
@@ -70,8 +77,9 @@ def image_of(data: bytes, name: str, reading: Reading) -> Image | None:
     try:
         with Pillow.open(io.BytesIO(data)) as picture:
             kind, (width, height) = picture.format or "", picture.size
-            if width * height > MAX_PIXELS:
+            if width * height > BUDGETS["image"].count:
                 raise InputError(f"{width} x {height} pixels are too many")
+            alpha = "A" in picture.getbands() or "transparency" in picture.info
             rgba = picture.convert("RGBA")
     except (OSError, InputError, SyntaxError, ValueError, Pillow.DecompressionBombError) as error:
         reason = str(error).partition(" <")[0]  # without the object's address
@@ -83,7 +91,7 @@ def image_of(data: bytes, name: str, reading: Reading) -> Image | None:
         buffer = io.BytesIO()
         rgba.save(buffer, "PNG")
         data, kind = buffer.getvalue(), "PNG"
-    return Image(stem + KEPT[kind], data, (r, g, b))
+    return Image(stem + KEPT[kind], data, (r, g, b), alpha)
 
 
 class Textures:

@@ -8,19 +8,30 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.urdf.meshes.piece import Paint, Piece
+from magtwin.files import existing_file
+from magtwin.urdf.meshes.piece import GREY, Map, Paint, Piece, linear, normal_map, smoothness
 from magtwin.urdf.meshes.polygon import cut_polygons
 from magtwin.urdf.meshes.reading import Reading, numbers
-from magtwin.urdf.meshes.texture import read_image
+from magtwin.urdf.meshes.texture import Image, read_image
 from magtwin.usd.geometry import linear_from_srgb
 
 UNREAD = ("curv", "curv2", "surf", "l", "p")
 """Statements that draw lines, points or curves."""
+
+LEFT_OUT = {
+    "map_ks": "map of highlights",
+    "map_ns": "map of exponents",
+    "disp": "map of displacements",
+    "decal": "decal",
+    "refl": "map of reflections",
+}
+"""Maps that UsdPreviewSurface does not have, or not together with the others."""
 
 MAP_ARGUMENTS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}
 """Most numbers after an option of a texture; other options have one word."""
@@ -77,7 +88,7 @@ def read_wavefront(reading: Reading) -> list[Piece]:
 def _statements(path: Path) -> Iterator[tuple[int, str, str]]:
     """Line, keyword and the rest of each statement; a backslash continues a line."""
     held = ""
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with existing_file(path, "OBJ or MTL file", "OBJ").open(encoding="utf-8", errors="replace") as file:
         for number, text in enumerate(file, 1):
             line = held + text if held else text
             if line.endswith("\\\n"):
@@ -156,8 +167,7 @@ def _picked(table: NDArray, index: NDArray) -> NDArray | None:
 def _read_library(name: str, reading: Reading) -> dict[str, Paint]:
     """Materials of an .mtl by name; empty with a note if it cannot be read.
 
-    `Kd` is the colour and `d` (or 1 - `Tr`) the opacity. With `map_Kd`, the image replaces `Kd`, in which
-    exporters write arbitrary values.
+    `Kd` is the colour, which multiplies `map_Kd`, and `d` (or 1 - `Tr`) the opacity.
     """
     library = reading.path.parent / name.replace("\\", "/")
     if not reading.may_read(library):
@@ -177,21 +187,107 @@ def _read_library(name: str, reading: Reading) -> dict[str, Paint]:
 
 
 def _paint(name: str, table: dict[str, list[str]], folder: Path, reading: Reading) -> Paint:
+    library = _Material(name, table, folder, reading)
     try:
-        words = (table.get("kd") or ["0.5", "0.5", "0.5"])[:3]
-        r, g, b = (float(np.clip(float(word), 0, 1)) for word in words)
+        r, g, b = library.colour("kd") or GREY[:3]
         if "d" in table:
             opacity = float(table["d"][-1])
         else:
             opacity = 1 - float(table["tr"][-1]) if "tr" in table else 1.0
     except (ValueError, IndexError):
         reading.note(f"material {name!r} has a malformed colour; grey is used")
-        r, g, b, opacity = 0.5, 0.5, 0.5, 1.0
-    if not opacity > 0:
+        r, g, b, opacity = GREY
+    if not opacity > 0 and "map_d" not in table:
         reading.note(f"material {name!r} would be invisible; made opaque")
     opacity = min(opacity, 1.0) if opacity > 0 else 1.0
-    image = read_image(_file_of(table["map_kd"]), reading, folder) if table.get("map_kd") else None
-    return Paint(name, (r, g, b, opacity) if image is None else (1.0, 1.0, 1.0, opacity), image)
+    image = library.image("map_kd")
+    if image is not None and ("kd" not in table or (r, g, b) == (0, 0, 0)):
+        r, g, b = 1.0, 1.0, 1.0  # black is what exporters write beside a texture that they mean to show
+    surface = library.surface()
+    maps = library.maps(opacity, surface.get("emissive", (0.0, 0.0, 0.0)))
+    return Paint(name, (r, g, b, opacity), image, **surface, maps=maps)
+
+
+@dataclass
+class _Material:
+    """The statements of a material besides its colour."""
+
+    name: str
+    table: dict[str, list[str]]
+    """Words after each keyword, in small letters."""
+    folder: Path
+    reading: Reading
+
+    def colour(self, key: str) -> tuple[float, float, float] | None:
+        """A colour (sRGB); one number stands for grey. None without the keyword."""
+        if key not in self.table:
+            return None
+        words = self.table[key][:3] if len(self.table[key]) >= 3 else self.table[key][:1] * 3
+        r, g, b = (float(np.clip(float(word), 0, 1)) for word in words)
+        return (r, g, b)
+
+    def image(self, key: str) -> Image | None:
+        """The image of a map."""
+        words = self.table.get(key)
+        return read_image(_file_of(words), self.reading, self.folder) if words else None
+
+    def surface(self) -> dict[str, Any]:
+        """Emission, roughness, metallic, reflectance and index of refraction, as arguments of a paint.
+
+        `Pr` and `Pm` are those of the PBR extension of MTL. Without them `Ks` and `Ns` are, see `smoothness`.
+        """
+        made: dict[str, Any] = {}
+        try:
+            emissive, highlight = self.colour("ke"), self.colour("ks")
+            pr, pm, ns, ni = (self._number(key) for key in ("pr", "pm", "ns", "ni"))
+        except (ValueError, IndexError):
+            self.reading.lose(f"material {self.name!r} has malformed Ke, Ks, Ns, Pr, Pm or Ni; left out")
+            return made
+        if emissive is not None:
+            made["emissive"] = linear(emissive)
+        if pr is not None or pm is not None:
+            made |= {"roughness": _share(pr, 0.5), "metallic": _share(pm, 0.0)}
+        elif highlight is not None and max(highlight) > 0 and ns is not None:
+            made["roughness"], made["specular"] = smoothness(ns, linear(highlight))
+        elif ns is not None and highlight is not None:
+            made["roughness"] = 1.0  # without a highlight
+        if ni is not None and 1 < ni <= 4 and "specular" not in made:
+            made["ior"] = ni
+        return made
+
+    def maps(self, opacity: float, emissive: tuple[float, float, float]) -> tuple[tuple[str, Map], ...]:
+        """Maps of emission, roughness, metallic, opacity and normals; others are counted as lost."""
+        maps: list[tuple[str, Map]] = []
+        for key, name in (("map_pr", "roughness"), ("map_pm", "metallic")):
+            image = self.image(key)
+            if image is not None:
+                maps.append((name, Map(image, "r")))
+        image = self.image("map_ke")
+        if image is not None:
+            black = max(emissive) == 0  # as exporters write beside a texture that they mean to show
+            scale = (1.0, 1.0, 1.0, 1.0) if black else (*emissive, 1.0)
+            maps.append(("emissiveColor", Map(image, scale=scale, colour=True)))
+        image = self.image("map_d")
+        if image is not None:
+            scale = (opacity, opacity, opacity, opacity)
+            maps.append(("opacity", Map(image, "a" if image.has_alpha else "r", scale)))
+        key = next((key for key in ("norm", "map_bump", "bump") if key in self.table), "")
+        image = self.image(key)
+        if image is not None and (key == "norm" or image.shows_normals):
+            maps.append(("normal", normal_map(image)))
+        elif image is not None:
+            self.reading.lose(f"material {self.name!r}: its map of heights {image.name!r} is left out")
+        for key, what in LEFT_OUT.items():
+            if key in self.table:
+                self.reading.lose(f"material {self.name!r}: its {what} ({key}) is left out")
+        return tuple(maps)
+
+    def _number(self, key: str) -> float | None:
+        return float(self.table[key][0]) if key in self.table else None
+
+
+def _share(value: float | None, default: float) -> float:
+    return default if value is None else float(np.clip(value, 0, 1))
 
 
 def _file_of(words: list[str]) -> str:

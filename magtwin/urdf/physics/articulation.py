@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
-from magtwin.usd.geometry import read_triangles
+from magtwin.usd.geometry import read_vertices
 
 NEWTON_API, PHYSX_API = "NewtonArticulationRootAPI", "PhysxArticulationAPI"
 """Applied schemas of Newton and PhysX; their plugins are not installed here."""
@@ -20,6 +20,12 @@ SELF_COLLISION = (
 
 OVERLAP_M = 0.001
 """Colliders whose convex hulls overlap by less can touch, such as the closed fingers of a gripper [m]."""
+
+NEAR = 1e-7
+"""Distance between two hulls, relative to their size, that counts as none."""
+
+ITERATIONS = 200
+"""Most steps of `_overlap`; hulls that take more are too near to tell."""
 
 
 def define_articulation(root: Usd.Prim, *, self_collision: bool) -> None:
@@ -76,46 +82,64 @@ def _ends(joint: Usd.Prim) -> list[Sdf.Path]:
 def _hulls(
     bodies: Mapping[str, Usd.Prim], colliders: Mapping[str, Sequence[Usd.Prim]]
 ) -> dict[str, list[NDArray[np.float64]]]:
-    """Corners of the hull of each collider of each body, shrunk by half of `OVERLAP_M`, shape (N, 3)."""
+    """Points of each collider of each body, shrunk by half of `OVERLAP_M`, shape (N, 3)."""
     hulls: dict[str, list[NDArray[np.float64]]] = {name: [] for name in bodies}
     if not bodies:
         return hulls
     owner = {prim.GetPath(): name for name, prims in colliders.items() for prim in prims}
     stage = next(iter(bodies.values())).GetStage()
-    triangles = read_triangles(
+    places = UsdGeom.XformCache()
+    vertices = read_vertices(
         stage, purposes=(UsdGeom.Tokens.guide,), wanted=lambda prim, _: prim.GetPath() in owner
     )
-    places = UsdGeom.XformCache()
-    for path, corners in triangles.items():
+    for path, (_, corners) in vertices.items():
         T = np.array(places.GetLocalToWorldTransform(bodies[owner[path]]))
-        points = np.unique(corners.reshape(-1, 3), axis=0) @ T[:3, :3] + T[3, :3]
+        points = corners.astype(float) @ T[:3, :3] + T[3, :3]
         away = points - points.mean(axis=0)
         far = np.linalg.norm(away, axis=1, keepdims=True)
         shrunk = points - away * np.minimum(1.0, OVERLAP_M / 2 / np.maximum(far, 1e-12))
-        hulls[owner[path]].append(_outermost(shrunk))
+        hulls[owner[path]].append(shrunk)
     return hulls
-
-
-def _outermost(points: NDArray) -> NDArray[np.float64]:
-    """The points (N, 3) that are corners of their convex hull; all of them if they are in one plane."""
-    from scipy.spatial import ConvexHull, QhullError  # takes 0.1 s
-
-    try:
-        return np.asarray(points[ConvexHull(points).vertices], float)
-    except QhullError:
-        return points
 
 
 def _overlap(a: NDArray, b: NDArray) -> bool:
     """Whether the convex hulls of points (N, 3) and (M, 3) have a point in common.
 
-    Weights u, v >= 0 with sum 1 each and a^T u = b^T v exist if and only if they do (a linear program).
+    They do if and only if the hull of all differences p - q contains the origin. Its point nearest to the
+    origin is found with Wolfe's algorithm (1976, doi:10.1007/BF01580381), which needs only the differences
+    that are farthest along a direction.
     """
     if np.any(a.min(axis=0) > b.max(axis=0)) or np.any(b.min(axis=0) > a.max(axis=0)):
         return False
-    from scipy.optimize import linprog
+    size = float(np.abs(a).max() + np.abs(b).max())
+    corral = np.array([a[0] - b[0]])
+    weights = np.ones(1)
+    x = corral[0]
+    for _ in range(ITERATIONS):
+        new = a[np.argmin(a @ x)] - b[np.argmax(b @ x)]
+        if new @ x > 0:
+            return False  # the plane across x lies between them
+        if x @ x < (NEAR * size) ** 2 or x @ x - new @ x < NEAR**2 * size**2:
+            return True
+        corral, weights = np.vstack([corral, new]), np.append(weights, 0.0)
+        while True:  # drop points until the nearest point of the plane through the rest lies between them
+            wanted = _nearest(corral)
+            if (wanted > 0).all():
+                weights = wanted
+                break
+            low = wanted <= 0
+            step = np.min(weights[low] / np.maximum(weights[low] - wanted[low], 1e-300))
+            weights = weights + min(step, 1.0) * (wanted - weights)
+            kept = weights > 1e-12
+            kept[np.flatnonzero(low)[np.argmin(weights[low])]] = False
+            corral, weights = corral[kept], weights[kept] / weights[kept].sum()
+        x = weights @ corral
+    return True
 
-    ones = np.concatenate([np.ones(len(a)), np.zeros(len(b))])
-    equal = np.vstack([np.hstack([a.T, -b.T]), ones, 1 - ones])
-    found = linprog(np.zeros(len(ones)), A_eq=equal, b_eq=[0, 0, 0, 1, 1], bounds=(0, None), method="highs")
-    return bool(found.status == 0)
+
+def _nearest(points: NDArray) -> NDArray[np.float64]:
+    """Weights with sum 1 of points (N, 3), of which the sum is nearest to the origin; may be below 0."""
+    n = len(points)
+    system = np.ones((n + 1, n + 1))
+    system[:n, :n], system[n, n] = points @ points.T, 0
+    return np.linalg.lstsq(system, np.append(np.zeros(n), 1.0), rcond=None)[0][:n]

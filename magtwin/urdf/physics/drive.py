@@ -29,10 +29,17 @@ within one step: MuJoCo's implicit integrator then corrects the wheel but not th
 of 5 kg."""
 
 POSITION_STIFFNESS = 100.0
-"""Default gain of a limited joint's position drive [N m/rad, N/m]; the damping is a tenth of it."""
+"""Least default gain of a limited joint's position drive [N m/rad, N/m]; the damping is a tenth of it."""
+
+POSITION_HZ = 10.0
+"""Natural frequency of the drive with what it carries, above that gain: an arm of length L then sags by about
+g / (2 pi f)^2 = 2.5 mm, whatever its mass."""
 
 DEFAULT_EFFORT = 10.0
-"""Default maximum effort of a drive [N m, N]."""
+"""Least default for the maximum effort of a drive [N m, N]."""
+
+RESERVE = 2.0
+"""Default maximum effort of a position drive, relative to the weight that it carries."""
 
 
 Wheels = Mapping[str, tuple[float, float]]
@@ -70,10 +77,11 @@ def define_drive(
     options: Options,
     wheels: Wheels = NO_WHEELS,
 ) -> None:
-    """Author the drive of a joint that moves, unless it follows another or has several axes and no rule.
+    """Author the drive of a joint that moves.
 
     The first rule that matches wins. By default, wheels and continuous joints hold a velocity and limited
-    joints a position; with the profile diff-drive, continuous joints that are not wheels are left free.
+    joints a position; with the profile diff-drive, continuous joints that are not wheels are left free. The
+    gains of a joint that follows another, or has several axes and no rule, are 0: it moves freely.
 
     Args:
         prim: Prim of the joint.
@@ -88,10 +96,16 @@ def define_drive(
     """
     rule = next((r for r in options.drives if fnmatchcase(joint.name, r.joints)), None)
     if joint.name in mechanism.mimics or (joint.type not in SINGLE and rule is None):
+        effort = None if joint.limit is None else joint.limit.effort
+        force = float(effort) if effort and 0 < effort < np.inf else DEFAULT_EFFORT
+        for axis in axes:  # Isaac Sim's rules want a drive on every joint that moves
+            _define_gains(prim, axis, force, 0.0, 0.0)
         return
     damping, force = wheels.get(joint.name, (WHEEL_DAMPING, DEFAULT_EFFORT))
-    if rule is None and joint.type != "continuous":
-        gain = POSITION_STIFFNESS
+    if rule is None and joint.type != "continuous" and joint.name not in wheels:
+        load = mechanism.loads[joint.name]
+        gain = max(POSITION_STIFFNESS, float(f"{(2 * np.pi * POSITION_HZ) ** 2 * load.inertia:.3g}"))
+        force = max(DEFAULT_EFFORT, float(f"{RESERVE * load.weight:.3g}"))
         rule = DriveRule(joints=joint.name, type="position", stiffness=gain, damping=gain / 10)
     elif rule is None and options.profile == "diff-drive" and joint.name not in wheels:
         rule = DriveRule(joints=joint.name, type="none")
@@ -101,24 +115,32 @@ def define_drive(
     force = _effort(joint, force, mechanism.description) if rule.max_force is None else rule.max_force
     for axis in axes:
         unit = np.pi / 180 if axis == "angular" or axis.startswith("rot") else 1.0
-        made = UsdPhysics.DriveAPI.Apply(prim, axis)
-        made.CreateTypeAttr(UsdPhysics.Tokens.force)
-        made.CreateMaxForceAttr(force)
-        made.CreateStiffnessAttr(round(rule.stiffness * unit, 9))
-        made.CreateDampingAttr(round(rule.damping * unit, 9))
+        made = _define_gains(prim, axis, force, rule.stiffness * unit, rule.damping * unit)
         if rule.type == "position":
             made.CreateTargetPositionAttr(_target(joint) / unit)
         else:
             made.CreateTargetVelocityAttr(0.0)
 
 
+def _define_gains(
+    prim: Usd.Prim, axis: str, force: float, stiffness: float, damping: float
+) -> UsdPhysics.DriveAPI:
+    """A drive of a joint's axis with gains in the units of UsdPhysics; with gains of 0 it exerts nothing."""
+    made = UsdPhysics.DriveAPI.Apply(prim, axis)
+    made.CreateTypeAttr(UsdPhysics.Tokens.force)
+    made.CreateMaxForceAttr(force)
+    made.CreateStiffnessAttr(round(stiffness, 9))
+    made.CreateDampingAttr(round(damping, 9))
+    return made
+
+
 def rotor_inertia(prim: Usd.Prim, joint: Joint) -> float:
-    """Inertia of the motor of a continuous joint that holds a velocity [kg m2]; 0 for other joints.
+    """Inertia of the motor of a rotary joint that holds a velocity [kg m2]; 0 for other joints.
 
     At most gain times `RESPONSE`, so that the rotor of a small robot does not slow its drive.
     """
     drive = UsdPhysics.DriveAPI(prim, "angular")
-    if joint.type != "continuous" or not prim.HasAPI(UsdPhysics.DriveAPI, "angular"):
+    if joint.type not in ("continuous", "revolute") or not prim.HasAPI(UsdPhysics.DriveAPI, "angular"):
         return 0.0
     damping, stiffness = drive.GetDampingAttr().Get() * 180 / np.pi, drive.GetStiffnessAttr().Get()
     return 0.0 if stiffness else float(f"{min(ROTOR_KG_M2, damping * RESPONSE):.3g}")

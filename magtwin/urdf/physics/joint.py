@@ -41,6 +41,11 @@ LOCKED = (1.0, -1.0)
 WHEEL_SPEED = 30.0
 """Default maximum speed of a driven wheel [rad/s]: about 1 m/s at the rim of a small wheel."""
 
+LIMITS = ("physics:lowerLimit", "physics:upperLimit")
+
+LIMIT_MARGIN = 1e-4
+"""Overlap of the limits of a follower with those of its leader, see `_widen` [deg or m]."""
+
 MIMIC_FREQUENCY = 100.0
 """Natural frequency of PhysX's mimic [1/s]; without effect at a damping ratio of 0 (hard coupling)."""
 
@@ -85,7 +90,7 @@ def define_joint(
     define_drive(prim, axes, joint, mechanism, options, wheels)
     _tune(prim, joint, axes, joint.name in wheels, description)
     if joint.type != "planar":
-        _define_state(prim, axes[0])
+        _define_state(prim, axes[0], mechanism.rests.get(joint.name, 0.0) * _unit(joint))
     prim.AddAppliedSchema(JOINT_API)
     return prim
 
@@ -111,8 +116,8 @@ def define_mimic(prim: Usd.Prim, leader: Usd.Prim, joint: Joint, lead: Joint, me
 
     Newton: q = coef0 + coef1 q_leader, with coef0 in degrees if the follower rotates. PhysX, until it reads
     Newton's attributes: q + gearing q_leader + offset = 0, in degrees or metres, with limits on a joint
-    that rotates. The follower has no drive, so that the coupling alone moves it; a runtime that supports
-    neither lets it move freely.
+    that rotates. The follower's drive has no gains, so that the coupling alone moves it; a runtime that
+    supports neither lets it move freely.
 
     Args:
         prim: Prim of the follower.
@@ -142,6 +147,21 @@ def define_mimic(prim: Usd.Prim, leader: Usd.Prim, joint: Joint, lead: Joint, me
     _write(prim, f"{space}:offset", -mimic.offset * unit)
     _write(prim, f"{space}:naturalFrequency", MIMIC_FREQUENCY)
     _write(prim, f"{space}:dampingRatio", 0.0)
+    _widen(prim, leader, -mimic.multiplier * unit / lead_unit)
+
+
+def _widen(prim: Usd.Prim, leader: Usd.Prim, gearing: float) -> None:
+    """Widen the limits of a follower to overlap those of its leader times the gearing.
+
+    Isaac Sim's rule MimicAPICheck wants that, with the opposite sign of PhysX's gearing, so that the fingers
+    of a gripper that closes at 0 fail it. The coupling keeps the follower within its leader's limits anyway.
+    """
+    low, high = sorted(leader.GetAttribute(name).Get() * gearing for name in LIMITS)
+    least, most = (prim.GetAttribute(name) for name in LIMITS)
+    if not least.Get() < high:
+        least.Set(high - LIMIT_MARGIN)
+    if not most.Get() > low:
+        most.Set(low + LIMIT_MARGIN)
 
 
 def _define(
@@ -206,11 +226,11 @@ def _quatf(R: NDArray) -> Gf.Quatf:
     return Gf.Quatf(*(round(float(v), 9) + 0.0 for v in wxyz_from_xyzw(quaternion(R))))
 
 
-def _define_state(prim: Usd.Prim, axis: str) -> None:
-    """Author where a joint stands, at 0 and at rest: Isaac Sim writes its state there while it runs."""
+def _define_state(prim: Usd.Prim, axis: str, position: float) -> None:
+    """Author where a joint stands, without motion: Isaac Sim writes its state there while it runs."""
     prim.AddAppliedSchema(f"{STATE_API}:{axis}")
-    for name in ("position", "velocity"):
-        _write(prim, f"state:{axis}:physics:{name}", 0.0)
+    _write(prim, f"state:{axis}:physics:position", position)
+    _write(prim, f"state:{axis}:physics:velocity", 0.0)
 
 
 def _unit(joint: Joint) -> float:

@@ -19,6 +19,11 @@ from magtwin.urdf.physics.inertia import (
     read_solid,
 )
 
+MASSLESS_KG = 0.001
+"""Mass of a body whose links have none [kg]. Without an explicit mass, engines fill the colliders with
+1000 kg/m3, and give a body without colliders 1 kg."""
+
+
 LINK_API, SITE_API = "IsaacLinkAPI", "IsaacSiteAPI"
 """Isaac Sim's applied schemas; their plugins are not installed here."""
 
@@ -53,15 +58,16 @@ def define_body(
         prim: The Xform, with its shapes below it.
         parts: The body's own link, and links merged into it.
         description: Receives notes of repairs and guesses.
-        density: Density of links without mass [kg/m3]; None leaves them without.
+        density: Density of links without mass [kg/m3]. None leaves them without; a body of such links gets
+            `MASSLESS_KG`.
     """
     prim.AddAppliedSchema(LINK_API)
     UsdPhysics.RigidBodyAPI.Apply(prim).CreateRigidBodyEnabledAttr(True)
     parts = [part for part in parts if part is parts[0] or not is_marker(part.link)]
-    properties = [_mass_properties(part, prim, description, density, len(parts) == 1) for part in parts]
+    properties = [_mass_properties(part, prim, description, density) for part in parts]
     known = [each for each in properties if each is not None]
     if not known:
-        return prim
+        known = [_massless(parts[0], prim, description)]
     whole = known[0] if len(known) == 1 else combined(known)
     mass = UsdPhysics.MassAPI.Apply(prim)
     mass.CreateMassAttr(whole.mass)
@@ -69,18 +75,28 @@ def define_body(
     tensor = whole.inertia.copy()
     tensor[np.abs(tensor) < 1e-9 * np.abs(tensor).max()] = 0.0
     moments, q = principal_axes(tensor)
-    mass.CreateDiagonalInertiaAttr(Gf.Vec3f(*map(float, moments)))
+    mass.CreateDiagonalInertiaAttr(_single(moments))
     mass.CreatePrincipalAxesAttr(Gf.Quatf(*(round(float(v), 7) + 0.0 for v in wxyz_from_xyzw(q))))
     return prim
 
 
+def _single(moments: NDArray) -> Gf.Vec3f:
+    """Principal moments in single precision, where none may exceed the sum of the others either."""
+    rounded = np.asarray(moments, np.float32)
+    largest = int(np.argmax(rounded))
+    others = sum(float(rounded[i]) for i in range(3) if i != largest)
+    while float(rounded[largest]) > others:
+        rounded[largest] = np.nextafter(rounded[largest], np.float32(0))
+    return Gf.Vec3f(*map(float, rounded))
+
+
 def _mass_properties(
-    part: Rider, body: Usd.Prim, description: Description, density: float | None, alone: bool
+    part: Rider, body: Usd.Prim, description: Description, density: float | None
 ) -> MassProperties | None:
     """Mass properties of a link in its body's frame; None if unknown."""
     link, inertial = part.link, part.link.inertial
     if inertial is None:
-        return _from_shapes(part, body, description, density, alone)
+        return _from_shapes(part, body, description, density)
     assert inertial.mass is not None  # the grammar leaves out an <inertial> without one
     mass, centre = float(inertial.mass), (part.pose @ origin_of(inertial))[:3, 3]
     about, start = ("link", link.name), f"link {link.name!r}"
@@ -103,16 +119,20 @@ def _mass_properties(
     return MassProperties(mass, centre, mass / solid.mass * solid.inertia)
 
 
+def _massless(part: Rider, body: Usd.Prim, description: Description) -> MassProperties:
+    """Mass properties of a body whose links have no mass: `MASSLESS_KG`, spread over its shapes."""
+    kg = MASSLESS_KG
+    description.note(f"link {part.link.name!r} has no <inertial>: {kg:g} kg, so that engines add none")
+    solid = read_solid(part.colliders, body) or read_solid(part.visuals, body) or ball_of(kg)
+    return MassProperties(kg, solid.centre, kg / solid.mass * solid.inertia)
+
+
 def _from_shapes(
-    part: Rider, body: Usd.Prim, description: Description, density: float | None, alone: bool
+    part: Rider, body: Usd.Prim, description: Description, density: float | None
 ) -> MassProperties | None:
     """Mass properties of a link without `<inertial>`: its shapes at a density, if one is given."""
     name = part.link.name
     if density is None:
-        lacks = "engines take its mass from its colliders" if alone else "it adds none to its body's"
-        if alone and not part.colliders:
-            lacks = "without a collider, engines cannot find its mass; give a density"
-        description.note(f"link {name!r} has no <inertial>: {lacks}")
         return None
     used, solid = "colliders", read_solid(part.colliders, body)
     if solid is None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Joint, Mimic
 from magtwin.urdf.options import DEFAULTS, Options
+from magtwin.urdf.physics.load import Load, read_loads
 
 SINGLE = ("revolute", "continuous", "prismatic")
 """Joints with one degree of freedom: only these can have mimics and default drives."""
@@ -33,6 +35,11 @@ class Mechanism:
         """T_parent_child of a joint's links at rest, shape (4, 4)."""
         T, rest = origin_of(joint), self.rests.get(joint.name, 0.0)
         return T @ displacement(joint.axis, rest, slides=joint.type == "prismatic") if rest else T
+
+    @cached_property
+    def loads(self) -> Mapping[str, Load]:
+        """What each joint carries, by name."""
+        return read_loads(self.description, self.poses())
 
     def poses(self) -> dict[str, NDArray[np.float64]]:
         """T_root_link of each link at rest, shape (4, 4)."""

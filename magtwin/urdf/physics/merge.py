@@ -18,18 +18,24 @@ WORLD = ""
 """Name of the world, which is not a body; joints to it hold the robot at its prim's frame."""
 
 
-def place_links(mechanism: Mechanism, *, merge: bool = False) -> dict[str, Place]:
+def place_links(mechanism: Mechanism, *, merge: bool = False, filled: bool = False) -> dict[str, Place]:
     """The body that each link is or rides on, with its pose in it; parents before children.
 
     Links that are only frames ride on the nearest body above; those above the first body, such as
     base_footprint, on that. If a joint moves everything relative to a root without mass, such as the rail of
     a slide, the root is the world.
 
+    No body should be without mass, because engines fill its colliders with a default density. A link with
+    shapes and without mass rides on the body that it is welded to, if there is one above it. Otherwise it
+    takes over a link with mass that is welded to it, such as the inertial_link of a massless base_link.
+
     Args:
-        mechanism: Joints of the description.
+        mechanism: Joints of the description, which receives notes.
         merge: Whether links with mass or shape that cannot move also ride on the body above.
+        filled: Whether links without mass get one from a density, so that they stay bodies.
     """
     description = mechanism.description
+    taken = {} if merge or filled else _taken_over(mechanism)
     base, above = _base(mechanism)
     poses = mechanism.poses()
     home = np.eye(4) if base == WORLD else poses[base]
@@ -41,8 +47,14 @@ def place_links(mechanism: Mechanism, *, merge: bool = False) -> dict[str, Place
             continue
         joint = description.joints[name]
         body, pose = places[joint.parent]
-        if joint.name in mechanism.welded and (is_marker(link) or (merge and body != WORLD)):
+        massless = link.inertial is None and not filled
+        rides = is_marker(link) or (body != WORLD and (merge or massless or name in taken))
+        if joint.name in mechanism.welded and rides:
             places[name] = (body, pose @ mechanism.pose(joint))
+            if massless and not merge and not is_marker(link):
+                description.note(f"link {name!r} has no <inertial>: it is part of the body of {body!r}")
+            elif name in taken:
+                description.note(f"link {taken[name]!r} has no <inertial>: it takes that of {name!r}")
         else:
             places[name] = (name, np.eye(4))
     return {name: places[name] for name in description.links}
@@ -68,6 +80,24 @@ def carried(shapes: Iterable[Shape], pose: NDArray, link: str, body: str) -> lis
     if link == body:
         return list(shapes)
     return [replace(shape, origin=pose @ origin_of(shape), name=shape.name or link) for shape in shapes]
+
+
+def _taken_over(mechanism: Mechanism) -> dict[str, str]:
+    """Links with mass by which links without become bodies with mass: those links by the former's names.
+
+    Of several links that are welded to a link without mass, one without shapes is preferred.
+    """
+    description = mechanism.description
+    welded = [(child, j.parent) for child, j in description.joints.items() if j.name in mechanism.welded]
+    taken: dict[str, str] = {}
+    for name, link in description.links.items():
+        if link.inertial is not None or is_marker(link):
+            continue
+        massive = [c for c, parent in welded if parent == name and description.links[c].inertial is not None]
+        massive.sort(key=lambda c: bool(description.links[c].visuals or description.links[c].collisions))
+        if massive:
+            taken[massive[0]] = name
+    return taken
 
 
 def _base(mechanism: Mechanism) -> tuple[str, list[str]]:

@@ -14,7 +14,8 @@ from magtwin.urdf.description.model import Joint, Link
 from magtwin.urdf.options import DriveRule
 from magtwin.urdf.physics.drive import DEFAULT_EFFORT, RESPONSE, WHEEL_DAMPING, Wheels
 from magtwin.urdf.physics.gazebo import Surface
-from magtwin.urdf.physics.mechanism import Mechanism
+from magtwin.urdf.physics.mechanism import SINGLE, Mechanism
+from magtwin.urdf.physics.mobile_base import Kind, MobileBase
 
 WHEEL_FRICTION, CASTER_FRICTION = 1.0, 0.05
 """Default friction of driven wheels (rubber) and of sliding parts (a polished ball)."""
@@ -22,48 +23,76 @@ WHEEL_FRICTION, CASTER_FRICTION = 1.0, 0.05
 GRAVITY = 9.81
 """[m/s2]."""
 
+FULL_TURN = 6.3
+"""Range of a joint above which it is a wheel's [rad]; exporters write -180 to 180 in place of no limits."""
+
 CASTER_NAMES = ("caster", "castor")
 """Words in the names of links that slide."""
+
+WHEEL_HEIGHT_M = 0.4
+"""Largest height of a wheel's axle above the lowest link of the robot [m]; fingers are higher."""
 
 FLOOR = 0.002
 """Height above the lowest point of the wheels within which other parts touch the floor [m]."""
 
 
-def find_wheels(mechanism: Mechanism, named: Iterable[str] = ()) -> tuple[str, ...]:
-    """Names of the joints of a robot's driven wheels.
+def find_base(mechanism: Mechanism, told: MobileBase | None = None) -> MobileBase:
+    """The mobile base of a description, by its joints where no plugin or controller tells it.
 
-    These are the joints that a drive plugin names. Without a plugin, they are the continuous joints about a
-    horizontal axis, except casters: joints with such a name, or below a joint that swivels.
+    Wheels are the joints without limits about a horizontal axis, no higher than `WHEEL_HEIGHT_M` above the
+    lowest link, except casters: joints with such a name, or below a joint that swivels. If several have
+    "wheel" in their name or their link's, the others are none. Wheels below a joint with limits about a
+    vertical axis are steered; with others that are not, it is a car.
 
     Args:
         mechanism: Joints of the description.
-        named: Joints that a drive plugin names.
+        told: Base of a plugin or controller; what it lacks is found.
 
     Raises:
-        InputError: There are fewer than two.
+        InputError: There are fewer than two wheels.
     """
-    description, poses = mechanism.description, mechanism.poses()
+    description = mechanism.description
     joints = {joint.name: joint for joint in description.joints.values()}
-    wheels = tuple(n for n in named if n in joints and joints[n].type in ("continuous", "revolute"))
-    if not wheels:
-        slopes = {
-            name: abs(poses[joint.child][2, :3] @ joint.axis) / np.linalg.norm(joint.axis)
-            for name, joint in joints.items()
-            if joint.type == "continuous"
-        }
-        wheels = tuple(
-            name
-            for name, slope in slopes.items()
-            if slope < 0.5  # within 30 degrees of the horizontal
-            and not any(word in f"{name} {joints[name].child}".lower() for word in CASTER_NAMES)
-            and not any(slopes.get(above.name, 0) >= 0.5 for above in _above(joints[name], description))
+    told_wheels = () if told is None else tuple(n for n in told.wheels if _turns(joints[n]))
+    if told is not None and len(told_wheels) > 1:
+        return replace(told, wheels=told_wheels)
+    poses = mechanism.poses()
+    up = {name: abs(_axis(joint, poses)[2]) for name, joint in joints.items() if joint.type in SINGLE}
+    lowest = min(float(T[2, 3]) for T in poses.values())
+    wheels = [
+        name
+        for name, slope in up.items()
+        if poses[joints[name].child][2, 3] < lowest + WHEEL_HEIGHT_M
+        and _turns(joints[name])
+        and slope < 0.5  # within 30 degrees of the horizontal
+        and not any(word in _words(joints[name]) for word in CASTER_NAMES)
+        and not any(
+            _turns(above) and up.get(above.name, 0) >= 0.5 for above in _above(joints[name], description)
         )
+    ]
+    named = [name for name in wheels if "wheel" in _words(joints[name])]
+    wheels = named if len(named) > 1 else wheels
+    hinges = {
+        name: above.name
+        for name in wheels
+        for above in _above(joints[name], description)
+        if above.type == "revolute" and above.name not in mechanism.welded and up[above.name] > 0.8
+    }
+    fixed = [name for name in wheels if name not in hinges]
+    steered = tuple(dict.fromkeys(hinges.values())) if fixed else ()
+    lateral = all(abs(_axis(joints[name], poses)[1]) > 0.8 for name in fixed or wheels)
+    wheels = fixed or wheels
     if len(wheels) < 2:
         raise InputError(
             f"{description.path}: profile diff-drive needs two wheels, continuous joints about a horizontal "
-            f"axis; found {', '.join(wheels) or 'none'}; convert with the profile general"
+            f"axis near the floor; found {', '.join(wheels) or 'none'}. A robot without them can be "
+            "converted with the profile general, but not driven"
         )
-    return wheels
+    if told is not None:
+        return replace(told, wheels=tuple(wheels), steered=told.steered or steered)
+    kind: Kind = "differential" if len(wheels) == 2 else "skid-steer"
+    kind = "car" if steered else kind if lateral else "holonomic"
+    return MobileBase(kind=kind, source="the joints", wheels=tuple(wheels), steered=steered)
 
 
 def not_on(wheels: Iterable[str], rules: Iterable[DriveRule]) -> tuple[DriveRule, ...]:
@@ -96,7 +125,7 @@ def fit_wheels(mechanism: Mechanism, wheels: Iterable[str], bodies: Mapping[str,
     joints = {joint.name: joint for joint in mechanism.description.joints.values()}
     for name in names:
         body = bodies.get(joints[name].child)
-        radius = 0.0 if body is None else _radius(body, joints[name].axis)
+        radius = 0.0 if body is None else wheel_radius(body, joints[name].axis)
         fitted[name] = (WHEEL_DAMPING, DEFAULT_EFFORT)
         if share * radius > 0:
             torque = WHEEL_FRICTION * share * GRAVITY * radius
@@ -135,13 +164,32 @@ def grip(mechanism: Mechanism, wheels: Iterable[str], surfaces: Mapping[str, Sur
     return given
 
 
-def _radius(body: Usd.Prim, axis: NDArray) -> float:
+def wheel_radius(body: Usd.Prim, axis: NDArray) -> float:
     """Half the largest extent of a wheel across its axis [m]; 0 if it has no shape."""
     purposes = [UsdGeom.Tokens.guide, UsdGeom.Tokens.default_, UsdGeom.Tokens.render]
     cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), purposes)
     extent = cache.ComputeUntransformedBound(body).ComputeAlignedRange()
     across = np.abs(axis) / np.linalg.norm(axis) < 0.7
     return 0.0 if extent.IsEmpty() else float(np.max(np.asarray(extent.GetSize())[across]) / 2)
+
+
+def _turns(joint: Joint) -> bool:
+    """Whether a joint turns without end: it is continuous, or has a range of more than a turn."""
+    limit = joint.limit
+    if joint.type != "revolute" or limit is None or limit.lower is None or limit.upper is None:
+        return joint.type == "continuous"
+    return limit.upper - limit.lower > FULL_TURN
+
+
+def _axis(joint: Joint, poses: Mapping[str, NDArray]) -> NDArray[np.float64]:
+    """Unit axis of a joint in the root's frame, shape (3,)."""
+    axis = np.asarray(joint.axis, float)
+    return np.asarray(poses[joint.child][:3, :3] @ axis / np.linalg.norm(axis))
+
+
+def _words(joint: Joint) -> str:
+    """Names of a joint and its link."""
+    return f"{joint.name} {joint.child}".lower()
 
 
 def _above(joint: Joint, description: Description) -> Iterable[Joint]:

@@ -1,5 +1,6 @@
 """Markup: XML with the line of each element, without external references or entities."""
 
+import re
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,10 +8,12 @@ from typing import Any
 from xml.etree import ElementTree
 from xml.parsers import expat
 
+from magtwin.budget import BUDGETS, check_count, check_depth
 from magtwin.errors import InputError
+from magtwin.files import read_bytes
 
-MAX_DEPTH = 200
-"""Most levels of nested elements; deeper nesting would exhaust the stack."""
+_LONGEST_TAG = re.compile(rb"<[^<>]{%d}" % (1 << 20))
+"""An element of over a million characters of attributes, which expat holds all at once."""
 
 
 class UnsafeError(InputError):
@@ -35,26 +38,32 @@ def read_markup(path: Path, what: str) -> Markup:
         what: Kind of file, for error messages ("URDF file").
 
     Raises:
-        InputError: The file cannot be read or decoded, is not XML, nests too deep, or has a DOCTYPE, whose
-            entities could read other files or fill the memory. The message gives the line.
+        InputError: The file cannot be read or decoded, is not XML, is too large, nests too deep, or has a
+            DOCTYPE, whose entities could read other files or fill the memory. The message gives the line.
     """
-    try:
-        text = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); expected a {what}") from error
-    return parse_markup(text, path)
+    return parse_markup(read_bytes(path, what, "XML"), path)
 
 
 def parse_markup(text: bytes, path: Path) -> Markup:
     """Elements of an XML text read from `path`; errors as for `read_markup`."""
-    builder, lines, depth = ElementTree.TreeBuilder(), {}, 0
+    builder, depth, count = ElementTree.TreeBuilder(), 0, 0
+    lines: dict[ElementTree.Element, int] = {}
+    most_levels, most_elements = BUDGETS["XML"].depth, BUDGETS["XML"].count
+    if _LONGEST_TAG.search(text):
+        raise UnsafeError(f"{path}: not XML: an element of over a million characters")
     parser = expat.ParserCreate()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal depth
+        nonlocal depth, count
         depth += 1
-        if depth > MAX_DEPTH:
-            raise UnsafeError(f"{path}:{parser.CurrentLineNumber}: nests deeper than {MAX_DEPTH} elements")
+        count += 1 + len(attributes)
+        if depth > most_levels or count > most_elements:
+            where = f"{path}:{parser.CurrentLineNumber}"
+            try:
+                check_depth(where, "XML", depth, "elements")
+                check_count(where, "XML", count, "elements and attributes")
+            except InputError as error:
+                raise UnsafeError(str(error)) from error
         lines[builder.start(tag, attributes)] = parser.CurrentLineNumber
 
     def end(tag: str) -> None:

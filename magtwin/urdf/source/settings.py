@@ -6,13 +6,12 @@ from typing import Any
 
 import yaml
 
+from magtwin.budget import BUDGETS
 from magtwin.errors import InputError
+from magtwin.files import read_text
 
-ENTRIES = 10_000
-"""Most entries of a table, including those merged from others."""
-
-SIZE, NODES = 1_000_000, 10_000
-"""Most bytes and tables of a file."""
+ENTRIES = BUDGETS["YAML"].count
+"""Most tables of a file, and most entries of a table, including those merged from others."""
 
 
 class Loader(yaml.SafeLoader):
@@ -33,16 +32,15 @@ def read_settings(path: Path) -> Iterator[dict[str, Any]]:
     Raises:
         InputError: The file is too big or is not YAML.
     """
-    if path.stat().st_size > SIZE:
-        raise InputError(f"{path}: over {SIZE} bytes, too big for settings")
+    text = read_text(path, "settings file", "YAML")
     try:
-        pending = [yaml.load(path.read_text(encoding="utf-8"), Loader)]
+        pending = [yaml.load(text, Loader)]
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # an impossible date is a ValueError
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark is not None else ""
         reason = getattr(error, "problem", None) or str(error).partition(";")[0] or "cannot be read"
         raise InputError(f"{path}{line}: not YAML: {reason}") from error
-    for _ in range(NODES):  # aliases of aliases could go on without end
+    for _ in range(ENTRIES):  # aliases of aliases could go on without end
         if not pending:
             return
         node = pending.pop()

@@ -19,6 +19,7 @@ from xml.etree import ElementTree
 from xml.parsers.expat import ExpatError
 
 from magtwin.errors import InputError, hint
+from magtwin.files import read_bytes
 from magtwin.urdf.repairs import NOTE, Repairs
 from magtwin.urdf.source.expression import GLOBALS, LARGEST, Budget, ExpressionError, check_size, evaluate
 from magtwin.urdf.source.markup import UnsafeError, parse_markup
@@ -345,13 +346,16 @@ class _Expansion:
         """The DOM of a file; each element carries its file and line."""
         path = Path(os.path.normpath(filename))
         try:
-            content = path.read_bytes()
-        except OSError as error:
+            path.stat()
+            content = read_bytes(path, "xacro file", "XML")
+        except (OSError, InputError) as error:
             self._library.filestack.pop()
+            reason = getattr(error, "strerror", None) or error
             raise self._library.XacroException(
-                f"include {str(path)!r} cannot be read: {error.strerror}", exc=error
+                f"include {str(path)!r} cannot be read: {reason}", exc=error
             ) from error
         markup = parse_markup(content, path)
+        self._budget.spend(ELEMENT * len(markup.lines))
         try:
             document = minidom.parseString(content)
         except ExpatError as error:
@@ -362,7 +366,6 @@ class _Expansion:
         elements = document.getElementsByTagName("*")
         for element, line in zip(elements, markup.lines.values(), strict=True):
             element.setUserData(PLACE, (path, line), _KEEP)
-        self._budget.spend(ELEMENT * len(elements))
         return document
 
     def _yaml(self, filename: str) -> Any:
@@ -387,7 +390,7 @@ class _Expansion:
         for tag, factor in UNIT_TAGS.items():
             UnitLoader.add_constructor(tag, number(factor))
         try:
-            content = path.read_bytes()
+            content = read_bytes(path, "YAML file", "YAML")
             self._budget.spend(len(content))
             return check_size(yaml.load(content, UnitLoader), self._budget)
         except OSError as error:

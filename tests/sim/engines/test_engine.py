@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from pxr import Gf, Usd, UsdGeom
 
 from magtwin.cli import main
 from magtwin.errors import InputError
@@ -307,10 +308,24 @@ def test_newtons_wheels_have_the_errors_of_a_session(twin):
 
 
 @physics
-def test_newton_follows_a_path_by_the_same_controller_and_gives_the_same_bits_again(twin):
+def test_newton_follows_a_path_and_gives_the_same_bits_again_in_a_lab_that_is_moved_and_turned(
+    twin, tmp_path
+):
     path = sine(x_first_m=-0.3, x_last_m=0.3, amplitude_m=0.15)
-    exact = without_tracking_error(twin)
-    runs = [simulate(exact, path, engine="newton", seed=1) for _ in range(2)]
+    stage = Usd.Stage.CreateNew(str(tmp_path / "building.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, "Z")
+    for name, x in (("LabA", 0.0), ("LabB", 12.0)):
+        lab = UsdGeom.Xform.Define(stage, f"/Building/{name}")
+        lab.GetPrim().GetReferences().AddReference(str(twin.scene_file))
+        lab.AddTranslateOp().Set(Gf.Vec3d(x, 0, 3))
+        lab.AddRotateZOp().Set(40 + x)
+    stage.Save()
+    placed = open_twin(tmp_path / "building.usda", lab="LabB", network="none")
+    runs = [
+        simulate(without_tracking_error(each), path, engine="newton", seed=1)
+        for each in (open_twin(twin.scene_file, network="none"), placed)
+    ]
     for name in runs[0]:
         assert_array_equal(runs[0][name], runs[1][name], err_msg=name)
     _, aside = path.nearest(runs[0]["p_world_base"][:, :2])

@@ -1,0 +1,126 @@
+"""Robot scene: a mobile robot from its URDF, with a magnetometer, in a room."""
+
+import tempfile
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path as FilePath
+from typing import Any
+
+from magtwin.errors import InputError
+from magtwin.files import existing, shipped
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import MagnetometerSpec
+from magtwin.twin.authoring import scene_from_toml
+
+ROOM_RADIUS_M, ROOM_TURN_M = 0.3, 0.28
+"""Footprint radius and turning radius of robots for which the room has space [m]."""
+
+PATHS = ("figure8", "continuous_cycle", "narrow_figure8", "loops", "lawnmower")
+"""Paths that such a scene may have as its default; the first that the robot can drive is taken."""
+
+
+def scene_with_robot(
+    robot: str | FilePath,
+    magnetometer: str | None = None,
+    spec: str | FilePath | None = None,
+    *,
+    name: str = "",
+    controllers: str | FilePath | None = None,
+    packages: Mapping[str, FilePath] | None = None,
+    arguments: Mapping[str, str] | None = None,
+    skip_missing_includes: bool = False,
+    workshop: str | FilePath | None = None,
+    **choices: Any,
+) -> Scene:
+    """A scene with a mobile robot, which surveys the room unless there is a map.
+
+    Args:
+        robot: URDF or xacro, converted with the profile diff-drive; or a USD asset with its settings.
+        magnetometer: "LINK" or "LINK:x,y,z": link that carries the magnetometer, and its position on it [m].
+            Default: the magnetometer of the URDF's tags.
+        spec: TOML of a scene, or the name of one that ships, whose robots are replaced. Default: the
+            furnished room of `new_scene`, scaled to the robot.
+        name: Name of the scene. Default: that of `spec`, or of the robot's file.
+        controllers: YAML of the robot's controllers, see `Options.controllers`.
+        packages: Folders of packages by name.
+        arguments: Arguments of a xacro.
+        skip_missing_includes: See `Options`.
+        workshop: Folder for the robot and the map. Default: as for `scene_from_toml`.
+        **choices: Further arguments of `scene_from_toml`.
+
+    Raises:
+        InputError: The robot cannot be converted or has no wheels, the link is unknown, or as for
+            `scene_from_toml`.
+    """
+    from magtwin.author.robot import RobotSettings, build_robot
+    from magtwin.urdf.options import Options
+    from magtwin.usd.robot import load_robot
+
+    file = existing(FilePath(robot), "robot")
+    if workshop is None:
+        from magtwin.twin import authoring
+
+        authoring._WORKSHOPS.append(tempfile.TemporaryDirectory(prefix="magtwin-"))
+        workshop = authoring._WORKSHOPS[-1].name
+    asset, stem = file, file.name.lstrip(".").split(".")[0] or "robot"
+    if file.suffix in (".urdf", ".xacro", ".xml"):
+        options = Options(
+            profile="diff-drive",
+            controllers=None if controllers is None else existing(FilePath(controllers), "controllers"),
+            packages=dict(packages or {}),
+            arguments=dict(arguments or {}),
+            skip_missing_includes=skip_missing_includes,
+        )
+        settings = RobotSettings(magnetometer=_mounted(magnetometer), conversion=options)
+        asset = FilePath(workshop) / "robot" / f"{stem}.usda"
+        asset.parent.mkdir(parents=True, exist_ok=True)
+        build_robot(file, settings, asset)
+    elif magnetometer or controllers or packages or arguments:
+        raise InputError(
+            f"{file}: an asset has its magnetometer and drive already; give its URDF instead",
+            parameter="robot",
+        )
+    scale = 1.0
+    if spec is None:
+        made = load_robot(asset)
+        sizes = made.footprint_radius_m / ROOM_RADIUS_M, made.drive.turning_radius_m / ROOM_TURN_M
+        scale = max(1.0, *sizes)
+        spec, name = shipped("scenes", "starter.toml"), name or stem
+    return _with_path(
+        scene_from_toml(spec, robot=asset, name=name, scale=scale, workshop=workshop, **choices)
+    )
+
+
+def _with_path(scene: Scene) -> Scene:
+    """The scene with a default path that the robot can drive, if it has none."""
+    from magtwin.author.room import obstacles_in
+    from magtwin.path import check_clear
+    from magtwin.path.room import Room, path_in
+    from magtwin.sim.motion.plan import plan
+
+    robot, obstacles = scene.robot, obstacles_in(scene.lab, scene.furniture)
+    if scene.path:
+        return scene
+    room = Room(scene.lab.floor_m, robot.footprint_radius_m, obstacles)
+    for path in PATHS:
+        with suppress(InputError):
+            way = path_in(room, path)
+            check_clear(way, obstacles, robot.footprint_radius_m)
+            plan(way, robot.drive, speed=min(0.2, robot.drive.v_max))
+            return replace(scene, path=path)
+    return scene
+
+
+def _mounted(text: str | None) -> "MagnetometerSpec | None":
+    """A magnetometer from "LINK" or "LINK:x,y,z"."""
+    if text is None:
+        return None
+    link, _, place = text.partition(":")
+    try:
+        p = tuple(float(part) for part in place.split(",")) if place else (0.0, 0.0, 0.0)
+    except ValueError:
+        p = ()
+    if not link or len(p) != 3:
+        raise InputError(f"magnetometer must be LINK or LINK:X,Y,Z, got {text!r}", parameter="magnetometer")
+    return MagnetometerSpec(link=link, p_link_sensor=p)

@@ -1,0 +1,223 @@
+"""A bomb of each format is refused before it takes memory; each fault that a fuzzer found stays a refusal."""
+
+import io
+import json
+import resource
+import struct
+import zipfile
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from magtwin import budget
+from magtwin.errors import InputError
+from magtwin.files import read_toml
+from magtwin.io.formats import read_run
+from magtwin.urdf.meshes.mesh import read_mesh
+from magtwin.urdf.source.source import read_source
+from magtwin.usd.layers import open_stage
+
+MOST = 300_000_000
+"""Memory that a refusal may take [bytes]."""
+
+
+def npz(path, shape, data=0):
+    """An npz of one array `t`, whose header claims a shape."""
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("t.npy", head.getvalue() + bytes(data))
+
+
+def parquet(path):
+    """40 columns of 500,000 equal numbers: 160 MB."""
+    one = pa.array(np.zeros(100_000))
+    table = pa.table({f"c{i}": one for i in range(40)})
+    with pq.ParquetWriter(path, table.schema, compression="zstd", use_dictionary=True) as writer:
+        for _ in range(5):
+            writer.write_table(table)
+
+
+def glb(path, accessor, **more):
+    """A glTF of one triangle mesh whose positions are `accessor`."""
+    view = {"buffer": 0, "byteLength": 36} | more
+    uri = "data:application/octet-stream;base64," + "A" * 48
+    table = {
+        "asset": {"version": "2.0"},
+        "nodes": [{"mesh": 0}],
+        "scenes": [{"nodes": [0]}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "type": "VEC3"} | accessor],
+        "bufferViews": [view],
+        "buffers": [{"byteLength": 36, "uri": uri}],
+    }
+    path.write_text(json.dumps(table))
+
+
+def laughs(count):
+    """A stage in which each prim holds the one before twice."""
+    text = '#usda 1.0\ndef "a0" {\ndef "x" {}\n}\n'
+    for i in range(1, count):
+        halves = "".join(f'def "{n}" (\nprepend references = </a{i - 1}>\n) {{}}\n' for n in "xy")
+        text += f'def "a{i}" {{\n{halves}}}\n'
+    return text
+
+
+BOMBS = {
+    "dotted.toml": (lambda p: p.write_text("a" + ".a" * 20_000 + " = 1"), read_toml, "deeper than 16 levels"),
+    "nested.toml": (lambda p: p.write_text("a = " + "[" * 9000 + "]" * 9000), read_toml, "deeper than 16"),
+    "large.toml": (lambda p: p.write_text("#" * 3_000_000), read_toml, "too large for TOML"),
+    "zeros.npz": (lambda p: npz(p, (10_000_000,), 80_000_000), read_run, "that decode to 80.0 MB"),
+    "claims.npz": (lambda p: npz(p, (1 << 40,)), read_run, "its header claims shape"),
+    "equal.parquet": (parquet, read_run, "that decode to 160.0 MB"),
+    "deep.urdf": (
+        lambda p: p.write_text("<a>" * 9000 + "</a>" * 9000),
+        read_source,
+        "deeper than 200 elements",
+    ),
+    "wide.urdf": (
+        lambda p: p.write_text("<a " + 'b="1" ' * 200_000 + "/>"),
+        read_source,
+        "a million characters",
+    ),
+    "stride.gltf": (
+        lambda p: glb(p, {"count": 2_000_000_000}, byteStride=0),
+        read_mesh,
+        "that decode to 48.0 GB",
+    ),
+    "count.ply": (
+        lambda p: p.write_text("ply\nformat ascii 1.0\nelement vertex 999999999\nend_header\n"),
+        read_mesh,
+        "claims 999999999 of vertex in",
+    ),
+    "deep.usda": (lambda p: p.write_text("#usda 1.0\n" + 'def "a" {' * 9000), open_stage, "deeper than 128"),
+    "laughs.usda": (lambda p: p.write_text(laughs(30)), open_stage, "references multiply each other"),
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_bomb_is_refused_before_it_takes_memory(name, tmp_path, monkeypatch):
+    write, read, message = BOMBS[name]
+    write(tmp_path / name)
+    monkeypatch.setattr(budget, "SPARE", 50_000_000)
+    table = dict(budget.BUDGETS, USD=budget.Budget(seconds=3.0))
+    monkeypatch.setattr("magtwin.budget.BUDGETS", table)
+    monkeypatch.setattr("magtwin.usd.trial.BUDGETS", table)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    with pytest.raises(InputError, match=message) as refusal:
+        read(tmp_path / name)
+    assert "\n" not in str(refusal.value)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before < MOST
+
+
+def test_a_large_file_is_read_if_the_user_allows_it(tmp_path, monkeypatch):
+    (tmp_path / "large.toml").write_text("#" * 3_000_000 + "\na = 1\n")
+    monkeypatch.setenv(budget.ALLOW, "0.01")
+    assert read_toml(tmp_path / "large.toml") == {"a": 1}
+    monkeypatch.setenv(budget.ALLOW, "much")
+    with pytest.raises(InputError, match="must be a number of gigabytes"):
+        read_toml(tmp_path / "large.toml")
+
+
+def test_each_format_of_the_table_has_sane_limits():
+    for name, limits in budget.BUDGETS.items():
+        assert limits.file > 0, name
+        assert 0 < limits.depth <= 200, name  # Python's stack holds 1000 frames
+    assert budget.decoded_limit(0) == budget.SPARE
+    assert budget.decoded_limit(10**9) == 5 * 10**9
+
+
+def usda(body):
+    return f'#usda 1.0\n(defaultPrim = "W")\ndef Xform "W" {{\n{body}\n}}\n'.encode(
+        "utf-8", "surrogateescape"
+    )
+
+
+STAGES = {
+    "an operation without a name": 'uniform token[] xformOpOrder = [""]',
+    "an operation of no known kind": "double3 xformOp:translAte = (0, 0, 0)\n"
+    'uniform token[] xformOpOrder = ["xformOp:translAte"]',
+    "a translation of another type": "bool xformOp:translate = 1\n"
+    'uniform token[] xformOpOrder = ["xformOp:translate"]',
+    "a text that is not UTF-8": 'string doc = "\udcff"\ndef Xform "x" (kind = "\udcff") {}',
+    "no end": 'def Xform "x" {',
+}
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_a_fault_in_a_stage_is_a_refusal_or_a_report(name, tmp_path):
+    from magtwin.usd.geometry import read_shapes
+    from magtwin.usd.info import info_of_stage
+
+    (tmp_path / "s.usda").write_bytes(usda(STAGES[name]))
+    for read in (info_of_stage, read_shapes):
+        refusal = None
+        try:
+            read(tmp_path / "s.usda")
+        except InputError as error:
+            refusal = str(error)
+        assert refusal is None or ("s.usda" in refusal and "\n" not in refusal)
+
+
+def test_a_crate_whose_counts_lie_is_refused_without_its_memory(tmp_path):
+    """Each 8 bytes of a crate's sections in turn become a huge number."""
+    from pxr import Sdf
+
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    layer.ImportFromString(usda("double[] x = [1, 2, 3, 4]\nint y = 3").decode())
+    layer.Export(str(tmp_path / "whole.usdc"))
+    whole, refused = (tmp_path / "whole.usdc").read_bytes(), 0
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    for at in range(88, len(whole) - 8, 23):
+        content = bytearray(whole)
+        content[at : at + 8] = struct.pack("<Q", 0x7FFFFFFFFFF)
+        (tmp_path / f"{at}.usdc").write_bytes(content)
+        try:
+            open_stage(tmp_path / f"{at}.usdc")
+        except InputError:
+            refused += 1
+    assert refused
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before < MOST
+
+
+def test_damaged_npy_headers_are_refused(tmp_path):
+    for head in (b"{'descr': '<f8', 'shape': (", b"{'descr': '''", b"{'a': (((((", b"\xff" * 20):
+        with zipfile.ZipFile(tmp_path / "h.npz", "w") as archive:
+            archive.writestr("t.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head)
+        with pytest.raises(InputError, match="is no whole array of plain numbers"):
+            read_run(tmp_path / "h.npz")
+
+
+def test_a_xacro_with_an_unknown_prefix_is_refused_with_its_line(tmp_path):
+    (tmp_path / "r.xacro").write_text(
+        '<robot name="b" xmlns:xacro="http://www.ros.org/wiki/xacro">\n'
+        '<xacro:arg name="w"/>\n<u:link/></robot>'
+    )
+    with pytest.raises(InputError, match=r"r\.xacro:3: not XML: unbound prefix"):
+        read_source(tmp_path / "r.xacro")
+
+
+def test_a_manifest_with_an_endless_number_is_refused(tmp_path):
+    from magtwin.learn.data.dataset import KIND, MANIFEST, VERSION, open_dataset
+
+    part = {"lever_arm_m": [10**400, 0], "lever_arm_sd_m": [0, 0], "latency_s": 0, "latency_sd_s": 0}
+    (tmp_path / MANIFEST).write_text(json.dumps({"kind": KIND, "version": VERSION, "alignment": part}))
+    with pytest.raises(InputError, match="not the manifest of a data set"):
+        open_dataset(tmp_path)
+
+
+def test_a_mesh_without_corners_or_with_a_strange_name_is_refused_or_read(tmp_path):
+    ply = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+    ply += "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n0\n"
+    (tmp_path / "m.ply").write_text(ply)
+    with pytest.raises(InputError, match=r"m\.ply"):
+        read_mesh(tmp_path / "m.ply")
+    glb(tmp_path / "m.gltf", {"count": 3})
+    table = json.loads((tmp_path / "m.gltf").read_text())
+    table["materials"] = [{"name": {"a": 1}}]
+    table["meshes"][0]["primitives"][0]["material"] = 0
+    (tmp_path / "m.gltf").write_text(json.dumps(table))
+    with pytest.raises(InputError, match="no triangle with an area"):  # all points are 0
+        read_mesh(tmp_path / "m.gltf")

@@ -1,0 +1,109 @@
+"""Numpy in place of a library that takes longer to import: it agrees with the library."""
+
+import io
+
+import numpy as np
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.optimize import linprog
+from scipy.spatial import ConvexHull
+from trimesh.exchange.stl import load_stl
+
+from magtwin.urdf.meshes.collider import hull_faces
+from magtwin.urdf.meshes.mesh import _distinct_words, distinct
+from magtwin.urdf.meshes.scan import _binary_stl
+from magtwin.urdf.physics.articulation import _overlap
+from magtwin.usd.solids import CREASE, corner_normals
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def cloud(rng, kind):
+    """Points: a cloud, a lattice with planes of many points, a flat cloud, or a sphere; shape (N, 3)."""
+    points = rng.normal(size=(rng.integers(4, 80), 3)) * rng.uniform(0.1, 1, 3)
+    if kind == 1:
+        return np.round(2 * points)
+    if kind == 2:
+        points[:, 2] = 0.25
+    if kind == 3:
+        points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return points
+
+
+def test_binary_stl_is_read_as_trimesh_reads_it():
+    data = trimesh.exchange.stl.export_stl(trimesh.creation.icosphere())
+    assert_array_equal(_binary_stl(data), load_stl(io.BytesIO(data))["vertices"])
+    assert _binary_stl(data[:-1]) is None
+    assert _binary_stl(b"solid text\nendsolid") is None
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=SEEDS, width=st.integers(1, 3))
+def test_rows_are_told_apart_with_and_without_keys(seed, width):
+    rows = np.random.default_rng(seed).integers(-2, 3, (60, width)).astype(np.float32)
+    first, kind = distinct(rows)
+    assert_array_equal(rows[first][kind], rows)
+    assert len(first) == len(np.unique(rows, axis=0))
+    assert (np.diff(first) > 0).all()
+    words = np.ascontiguousarray(rows + np.float32(0)).view(np.uint32)
+    for fast, slow in zip((first, kind), _distinct_words(words), strict=True):
+        assert_array_equal(fast, slow)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=SEEDS, kinds=st.tuples(st.integers(0, 3), st.integers(0, 3)), apart=st.floats(0, 4))
+def test_hulls_overlap_where_a_linear_program_has_a_solution(seed, kinds, apart):
+    rng = np.random.default_rng(seed)
+    a, b = (cloud(rng, kind) for kind in kinds)
+    b = b + apart * rng.normal(size=3) + 1e-4 * rng.normal(size=3)
+    ones = np.concatenate([np.ones(len(a)), np.zeros(len(b))])
+    equal = np.vstack([np.hstack([a.T, -b.T]), ones, 1 - ones])
+    found = linprog(np.zeros(len(ones)), A_eq=equal, b_eq=[0, 0, 0, 1, 1], bounds=(0, None), method="highs")
+    assert _overlap(a, b) == (found.status == 0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=SEEDS, kind=st.sampled_from([0, 1, 3]))
+def test_a_hull_is_scipys(seed, kind):
+    points = cloud(np.random.default_rng(seed), kind)
+    points = points[distinct(points)[0]].astype(np.float32).astype(float)
+    faces = hull_faces(points)
+    if np.linalg.matrix_rank(points - points.mean(axis=0), tol=1e-6) < 3:
+        assert faces is None
+        return
+    peer = ConvexHull(points)
+    a, b, c = (points[faces[:, i]] for i in range(3))
+    assert_allclose(np.sum(a * np.cross(b, c)) / 6, peer.volume, rtol=1e-6)
+    outwards = np.cross(b - a, c - a)
+    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    assert ((points @ outwards.T - np.sum(a * outwards, axis=1)) < 1e-6).all()
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()  # closed
+
+
+def test_a_plane_has_no_hull():
+    assert hull_faces(cloud(np.random.default_rng(0), 2)) is None
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS, flat=st.booleans())
+def test_a_corners_normal_is_the_mean_of_the_faces_within_the_crease(seed, flat):
+    """The definition, face by face; `flat` has smooth points, else most have creases."""
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.arange(6.0), np.arange(6.0))
+    z = rng.normal(size=x.shape) * (0.05 if flat else 0.6)
+    points = np.column_stack([x.ravel(), y.ravel(), z.ravel()]).astype(np.float32)
+    i = np.arange(36).reshape(6, 6)
+    a, b, c, d = (k.ravel() for k in (i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]))
+    faces = np.vstack([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    area = np.cross(*(points[faces[:, k]].astype(float) - points[faces[:, 0]] for k in (1, 2)))
+    unit = area / np.linalg.norm(area, axis=1, keepdims=True)
+    made = corner_normals(points, faces)
+    for face, corners in enumerate(faces):
+        for k, point in enumerate(corners):
+            around = np.flatnonzero((faces == point).any(axis=1))
+            near = around[unit[around] @ unit[face] >= np.cos(CREASE)]
+            mean = area[near].sum(axis=0)
+            assert_allclose(made[face, k], mean / np.linalg.norm(mean), atol=1e-5)
