@@ -44,7 +44,7 @@ def _cgroup(name: str) -> str:
 
 
 def ends_with_parent() -> Callable[[], None] | None:
-    """What a child process calls before its program starts, so that it is killed when this thread's process is.
+    """What a child process calls before its program, so that it is killed when this thread's process is.
 
     None where the system cannot.
     """

@@ -219,6 +219,7 @@ class Motion:
             "acceleration": np.diff(v, prepend=0.0) / self.dt,
         }
         columns = (v, w, known["acceleration"], known["v_cmd"], known["w_cmd"], known["bump"])
+        mapped.release()
         parts = (poses[:-1], angles[:-1], rates, *(column[:, None] for column in columns))
         known["_steps"] = _table(parts)
         for name, array in known.items():
@@ -260,7 +261,8 @@ def _table(parts: Sequence[Array]) -> Array:
     """Columns (K, ...) side by side, in a mapped file if they are long."""
     rows, width = len(parts[0]), sum(part.shape[1] for part in parts)
     table = mapped.zeros((rows, width)) if rows > mapped.LONG else np.empty((rows, width))
-    np.concatenate(parts, axis=1, out=table, casting="unsafe")
+    for some in mapped.parts(rows):
+        np.concatenate([part[some] for part in parts], axis=1, out=table[some], casting="unsafe")
     return table
 
 
