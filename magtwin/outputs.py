@@ -144,6 +144,16 @@ def transaction() -> Iterator[None]:
         function()
 
 
+@contextmanager
+def at_once() -> Iterator[None]:
+    """Make outputs of the block appear at once, even in a transaction."""
+    token = _pending.set(None)
+    try:
+        yield
+    finally:
+        _pending.reset(token)
+
+
 def afterwards(function: Callable[[], object]) -> None:
     """Call a function once all outputs of the transaction are in their places; outside of one, now."""
     pending = _pending.get()

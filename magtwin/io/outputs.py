@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from magtwin.errors import InputError
-from magtwin.files import check_free, output, transaction
+from magtwin.files import at_once, check_free, output, transaction
 from magtwin.io.bags.stream import scans_at
 from magtwin.io.formats import format_of, read_run, write_run
 from magtwin.io.recorder import Recorder, Sink, in_step, partial_of
@@ -45,6 +45,7 @@ class Driven:
     scans: "Scans | None" = None
 
 
+@at_once()  # what a simulation writes for itself is no output of the command
 def drive(
     scene_file: str | Path,
     path: str = "figure8",

@@ -1,5 +1,6 @@
 """`magtwin robot`: a description in, a USD articulation out, and back."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Literal
 
@@ -82,7 +83,7 @@ def robot(
     """
     given = dict(locals())
     from magtwin.author.from_urdf import DriveRule, from_urdf, write_urdf
-    from magtwin.files import output, transaction
+    from magtwin.files import output
 
     if out.suffix == ".urdf":
         own = ("urdf", "out", "thumbnail", "force")
@@ -103,7 +104,7 @@ def robot(
         "mass": mass_kg,
     }
     step("Converting the robot")
-    with transaction():
+    with output(report, force=force) if report is not None else nullcontext() as aside:
         made = from_urdf(
             urdf,
             out,
@@ -112,9 +113,8 @@ def robot(
             thumbnail=_thumbnail if thumbnail else None,
             **{name: choice for name, choice in choices.items() if choice is not None},
         )
-        if report is not None:
-            with output(report, force=force) as aside:
-                aside.write_text(made.report.to_json(), encoding="utf-8")
+        if aside is not None:
+            aside.write_text(made.report.to_json(), encoding="utf-8")
     return Done(made.report.summary(), made.asset)
 
 
