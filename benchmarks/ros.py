@@ -1,7 +1,7 @@
-"""Two nodes of ROS 2 on loopback, the simulator and the magnetometer: rates, loss, latency and cost.
+"""Two nodes of ROS 2 on loopback, the simulator and the magnetometer: rates, loss, latency, cost and memory.
 
 There is no peer to hold it against; the standards are printed beside the figures. `python benchmarks/ros.py
-[seconds]`, 60 unless given.
+[seconds]`, 60 unless given; 600 is a soak.
 """
 
 import os
@@ -16,8 +16,8 @@ import numpy as np
 from magtwin.files import shipped
 from magtwin.io.bags.topics import COMMAND, MAGNITUDE, TF, TF_STATIC, Qos
 from magtwin.ros.bus import Message, open_bus
-from magtwin.ros.diagnostics import KIND, from_message
-from magtwin.ros.follow import command_bytes
+from magtwin.ros.commands import command_bytes
+from magtwin.ros.diagnostics import KIND
 from magtwin.ros.topics import LIVE
 
 SECONDS = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
@@ -34,6 +34,12 @@ RATES = {
     "/robot/scan": 7.5,
     "/robot/battery_state": 0.5,
 }
+
+
+def memory_mib(process: subprocess.Popen) -> float:
+    """Resident memory of a process [MiB]."""
+    pages = int(Path(f"/proc/{process.pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def cpu_s(process: subprocess.Popen) -> float:
@@ -64,7 +70,7 @@ def main() -> None:
             qos = Qos(depth=1000, reliable=topic.qos.reliable)
             bus.subscribe(topic.name, topic.kind, heard[topic.name].append, qos)
     bus.subscribe(
-        "/diagnostics", KIND, lambda m: statuses.update({s.name: s for s in from_message(m)}), Qos()
+        "/diagnostics", KIND, lambda m: statuses.update({s.name: s for s in m.content.status}), Qos()
     )
     commands = bus.publisher(COMMAND.name, COMMAND.kind, COMMAND.qos)
     try:
@@ -73,11 +79,15 @@ def main() -> None:
         for messages in heard.values():
             messages.clear()
         begin, sent, before = time.monotonic(), 0.0, (cpu_s(sim), cpu_s(node))
+        memory: list[tuple[float, float]] = []
         while (now := time.monotonic()) < begin + SECONDS:
             if now - sent > 0.1:
                 sent = now
                 commands.publish(command_bytes(COMMAND.kind, 0.2, 0.8 * np.sin(0.7 * (now - begin)), 0))
             bus.spin_once(0.02)
+            if now - begin > (len(memory) + 1) * SECONDS / 4:
+                memory.append((memory_mib(sim), memory_mib(node)))
+        memory.append((memory_mib(sim), memory_mib(node)))
         wall = time.monotonic() - begin
         cost = [after - first for after, first in zip((cpu_s(sim), cpu_s(node)), before, strict=True)]
     finally:
@@ -102,11 +112,15 @@ def main() -> None:
     # A reading is made at a tick of /clock, the newest of its inputs; stamps are that tick's.
     late = [m.sent_ns - clock[t] for t, m in zip(stamps, heard[MAGNITUDE.name], strict=True) if t in clock]
     p50, p99 = np.percentile(late, [50, 99]) * 1e-6
-    own = statuses["magtwin_magnetometer: readings"].values["p99 latency [ms]"]
+    values = statuses["magtwin_magnetometer: readings"].values
+    own = next(pair.value for pair in values if pair.key == "p99 latency [ms]")
     print(
         f"from newest input to reading: p50 {p50:.2f} ms, p99 {p99:.2f} ms (by the node {own})"
         "   standard 5 ms"
     )
+    for name, parts in zip(("simulator", "magnetometer"), zip(*memory, strict=True), strict=True):
+        quarters = ", ".join(f"{part:.1f}" for part in parts)
+        print(f"memory of the {name} after each quarter [MiB]: {quarters}   standard flat")
     parts = ", ".join(
         f"{name} {100 * s / wall:.0f} %" for name, s in zip(("simulator", "magnetometer"), cost, strict=True)
     )

@@ -64,19 +64,8 @@ def spin(until: Callable[[], object], *nodes: Bus) -> None:
 
 def from_message(message: Message) -> list[Status]:
     """The statuses of a DiagnosticArray."""
-    counts = {"status": 0}
-    total = int(message.read(["status"], counts)["status"])
-    for k in range(total):
-        name = f"status.{k}.values"
-        counts |= {"status": k + 1, name: 0}
-        counts[name] = int(message.read([name], counts)[name])
     names = list(LEVELS)
-    statuses = []
-    for k in range(total):
-        keys = [f"status.{k}.values.{n}" for n in range(counts[f"status.{k}.values"])]
-        parts = [f"status.{k}.{part}" for part in ("level", "name", "message")]
-        read = message.read([*parts, *(f"{key}.{part}" for key in keys for part in ("key", "value"))], counts)
-        level = names[int(read[parts[0]])]
-        values = {read[f"{key}.key"]: read[f"{key}.value"] for key in keys}
-        statuses.append(Status(read[parts[1]], level, read[parts[2]], values))
-    return statuses
+    return [
+        Status(s.name, names[s.level], s.message, {pair.key: pair.value for pair in s.values})
+        for s in message.content.status
+    ]

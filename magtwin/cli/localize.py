@@ -126,8 +126,8 @@ def localize_live(
     the transform from map to odom, and /diagnostics. It starts again at each pose on /initialpose.
 
     Settings have the form of ROS, name:=value: rate_hz (5), use_sim_time (false), prior (wait, global or
-    x,y,yaw; default wait), max_age_s (0.5), silent_s (0.5), tf_broadcast (true), cloud_hz (1), particles
-    (500). docs/localize.md explains them.
+    x,y,yaw; default wait), max_age_s (0.5), stamps (header, arrival), silent_s (0.5), tf_broadcast
+    (true), cloud_hz (1), particles (500). docs/localize.md explains them.
 
     Parameters
     ----------

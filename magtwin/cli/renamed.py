@@ -38,6 +38,7 @@ OPTIONS = {
     "--ridge": "--penalty",
     "--spacing": "--spacing-m",
     "--speed": "--pace",
+    "--stamped-commands": "--commands TwistStamped",
     "--time": "--time-s",
     "--to-urdf": "--out FILE.urdf",
     "--topic": "--remap OURS:=THEIRS",

@@ -103,7 +103,16 @@ Where = Annotated[Node, Parameter(name="*")]
 HERE = Node()
 WallS = Annotated[float | None, Parameter(help="Duration in real time [s]. Default: until Ctrl-C.")]
 SimTime = Annotated[bool, Parameter(negative="", help="Use the time of /clock, for a simulated robot.")]
-Stamped = Annotated[bool, Parameter(negative="", help="cmd_vel is a TwistStamped in place of a Twist.")]
+Commands = Annotated[
+    Literal["auto", "Twist", "TwistStamped"],
+    Parameter(
+        help="Type of cmd_vel. auto: what the robot subscribes to; if both, what ROS_DISTRO's robots take."
+    ),
+]
+Stamps = Annotated[
+    Literal["header", "arrival"],
+    Parameter(help="Time of poses and odometry: the stamps of their headers, or their arrival at this node."),
+]
 FramePrefix = Annotated[
     str | None, Parameter(help="Prefix of the names of the robot's frames, such as tb4/. Default: none.")
 ]
@@ -131,14 +140,13 @@ def sim(
     out_unit: OutUnit = None,
     lidar: Lidar = "schedule",
     stamps: Literal["sim", "wall"] = "sim",
-    stamped_commands: Stamped = False,
     frame_prefix: FramePrefix = None,
 ) -> Done:
     """Simulate a scene's robots in real time: the topics of real robots, and /clock.
 
-    cmd_vel drives a robot; it stops after half a second without one. A message on reset (std_msgs/Empty) puts
-    the robots back to their start. Of several robots, each has its name as namespace and before its frames:
-    /ann/odom, ann/base_link. Ctrl-C ends it.
+    cmd_vel, a Twist or a TwistStamped, drives a robot; it stops after half a second without one. A message on
+    reset (std_msgs/Empty) puts the robots back to their start. Of several robots, each has its name as
+    namespace and before its frames: /ann/odom, ann/base_link. Ctrl-C ends it.
 
     Parameters
     ----------
@@ -172,7 +180,6 @@ def sim(
             units=out_unit or "T",
             lidar=lidar,
             stamps=stamps,
-            stamped_commands=stamped_commands,
             magnetometer=magnetometer != "none",
             frame_prefix=frame_prefix,
             say=announce,
@@ -207,8 +214,8 @@ def magnetometer(
     It reads pose (/robot/enu/pose), odometry, IMU, battery and scans, as far as the network needs them. It
     publishes qtfm/magnitude and qtfm/total_field_nt while its inputs are fresh, and its state in
     /diagnostics. Inputs may come and go. Settings have the form of ROS, name:=value: rate_hz (135), units
-    (T or nT), use_sim_time, max_age_s (0.5), battery_max_age_s (30), lidar (scan, on, off), outside
-    (silent, clamp); with --online also buffer_s (60), pose_sd_m (0), map_frame (map).
+    (T or nT), use_sim_time, max_age_s (0.5), battery_max_age_s (30), stamps (header, arrival), lidar (scan,
+    on, off), outside (silent, clamp); with --online also buffer_s (60), pose_sd_m (0), map_frame (map).
 
     Parameters
     ----------
@@ -255,7 +262,8 @@ def follow(
     continuous: Flag = False,
     flip: Flag = False,
     sim_time: SimTime = False,
-    stamped_commands: Stamped = False,
+    commands: Commands = "auto",
+    stamps: Stamps = "header",
 ) -> Done:
     """Drive a robot along a path by its reported pose; it stops at the end, and while the pose is lost.
 
@@ -292,7 +300,8 @@ def follow(
             laps=laps,
             continuous=continuous,
             flip=flip,
-            stamped_commands=stamped_commands,
+            commands=commands,
+            stamps=stamps,
             say=announce,
         )
         announce(f"driving {way.name}, {way.length:.1f} m, by {bus.backend}; Ctrl-C ends")
@@ -316,7 +325,7 @@ def teleop(
     asset: Asset = None,
     gamepad: Gamepad = None,
     out: Path | None = None,
-    stamped_commands: Stamped = False,
+    commands: Commands = "auto",
     sim_time: SimTime = False,
     force: Force = False,
 ) -> Done:
@@ -350,7 +359,7 @@ def teleop(
         recorder = None if writer is None else Recorder(bus, writer, say=_warn, sim_time=sim_time)
         source = stack.enter_context(device(gamepad))
         announce(HELP if gamepad is None else "left stick drives, Start ends")
-        node = Teleop(bus, hand, source, stamped_commands=stamped_commands)
+        node = Teleop(bus, hand, source, commands=commands)
         with silence(), suppress(KeyboardInterrupt):
             node.run(recorder.step if recorder else lambda: None)
         node.stop()
@@ -370,14 +379,16 @@ def record(
 ) -> Done:
     """Record a robot's topics as a rosbag2, which magtwin convert, info, report and dataset read as a run.
 
-    Topics may come and go. Ctrl-C ends it.
+    Topics may come and go, and may have any type of ROS 2's common packages. If time jumps back, as after a
+    reset of the simulator, the recording goes on in another bag: drive_2.mcap after drive.mcap. The exit
+    status is 1 if a topic that was asked for was not recorded. Ctrl-C ends it.
 
     Parameters
     ----------
     out
         Folder to make, or a file (.mcap).
     topic
-        Topic to record. May be repeated. Default: all of the robot's.
+        Topic to record, such as odom or /map. May be repeated. Default: all of the robot's.
     """
     from magtwin.io.bags import RawBagWriter
     from magtwin.ros.record import Recorder
@@ -395,8 +406,14 @@ def record(
     if not sum(counts.values()):
         raise InputError("nothing was recorded: no node offers these topics; check --domain and --namespace")
     lines = [f"{count:8d}  {name}" for name, count in counts.items()]
-    text = "\n".join([*lines, f"Wrote {out}; magtwin info {out}"])
-    return Done(text=text, data={"messages": counts}, wrote=out)
+    wrote = tuple(writer.paths)
+    text = "\n".join([*lines, f"Wrote {', '.join(map(str, wrote))}; magtwin info {wrote[0]}"])
+    missing = recorder.missing()
+    for name, why in missing.items():
+        _warn(f"{name} was not recorded: {why}")
+    return Done(
+        text=text, data={"messages": counts, "missing": missing}, wrote=wrote, status=1 if missing else 0
+    )
 
 
 @ros_app.command(name="replay")
@@ -407,6 +424,7 @@ def replay(
     scene: Path | None = None,
     where: Where = HERE,
     pace: float = 1.0,
+    stamps: Literal["run", "wall"] = "run",
     out_unit: OutUnit = None,
     frame_prefix: FramePrefix = None,
 ) -> Done:
@@ -421,7 +439,9 @@ def replay(
     scene
         Scene of the run, for frames, covariances, /tf_static and the robot's description. Default: none.
     pace
-        Simulated seconds per second.
+        Seconds of the run per second.
+    stamps
+        Time of the messages and of /clock: that of the run, or wall time, for programs without use_sim_time.
     """
     from magtwin.io.formats import read_run
     from magtwin.ros.record import Player
@@ -433,7 +453,13 @@ def replay(
     twin = None if scene is None else open_twin(scene, model_error=False)
     with where.bus("magtwin_replay") as bus:
         player = Player(
-            whole, bus, twin, units=out_unit or "T", topics=topic, frame_prefix=frame_prefix or ""
+            whole,
+            bus,
+            twin,
+            units=out_unit or "T",
+            topics=topic,
+            stamps=stamps,
+            frame_prefix=frame_prefix or "",
         )
         announce(f"replaying {whole['t'][-1] - whole['t'][0]:.0f} s by {bus.backend}; Ctrl-C ends")
         step("Replaying")

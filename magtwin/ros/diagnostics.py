@@ -1,5 +1,7 @@
 """Diagnostics: the state of a node, on /diagnostics, for ROS monitors."""
 
+import math
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -18,10 +20,13 @@ KIND = "diagnostic_msgs/msg/DiagnosticArray"
 TOPIC = "/diagnostics"
 
 REPORT_S = 1.0
-"""Time between diagnostics [s]."""
+"""Time between diagnostics, of the node's clock [s]."""
+
+LEAST_S = 0.9
+"""Least wall time between diagnostics [s]: 1 Hz is usual in ROS, whatever the pace of simulated time."""
 
 WATCH_S = 1.5
-"""Wall time after which an unchanged clock counts as stopped [s]."""
+"""Wall time after which an unchanged clock counts as stopped, and a slow one is not waited for [s]."""
 
 
 @dataclass(frozen=True)
@@ -77,21 +82,28 @@ class Reporter:
     def __init__(self, bus: Bus) -> None:
         """Advertise /diagnostics."""
         self._bus, self._publisher = bus, bus.publisher(TOPIC, KIND, Qos())
-        self._watched_ns = -1
+        self._watched_ns, self._reported_s = -1, -math.inf
 
     def each(self, report: Callable[[str], None]) -> None:
-        """Call `report` every `REPORT_S` of the node's clock, and by wall time while that clock stands still.
+        """Call `report` every `REPORT_S` of the node's clock, but every `LEAST_S` to `WATCH_S` of wall time.
 
         Its argument is the problem of the clock, "" if there is none.
         """
 
-        def watch() -> None:
-            now = self._bus.now_ns()
-            if now == self._watched_ns:
-                report("/clock stands still" if now else "nobody publishes /clock")
-            self._watched_ns = now
+        def due() -> None:
+            if time.monotonic() - self._reported_s >= LEAST_S:
+                self._reported_s = time.monotonic()
+                report("")
 
-        self._bus.timer(REPORT_S, lambda: report(""))
+        def watch() -> None:
+            now, before = self._bus.now_ns(), self._watched_ns
+            self._watched_ns = now
+            if now == before:
+                report("/clock stands still" if now else "nobody publishes /clock")
+            elif time.monotonic() - self._reported_s >= WATCH_S:
+                report("")
+
+        self._bus.timer(REPORT_S, due)
         self._bus.timer(WATCH_S, watch, wall=True)
 
     def report(self, statuses: Sequence[Status], stamp_ns: int) -> None:

@@ -13,9 +13,10 @@ from magtwin.frames import yaw_from_quat
 from magtwin.io.bags.cdr import NS
 from magtwin.io.bags.topics import COMMAND, ODOMETRY, POSE, Topic
 from magtwin.path import Path
-from magtwin.ros.bus import Bus, to_bytes
+from magtwin.ros.bus import Bus
+from magtwin.ros.commands import Commands, CommandType
 from magtwin.ros.diagnostics import Reporter, Status
-from magtwin.ros.inputs import Input
+from magtwin.ros.inputs import Input, Stamps
 from magtwin.sim.motion.controllers import Guide, guide_along
 from magtwin.sim.motion.follow import CONTROL_RATE_HZ
 from magtwin.sim.motion.loop import RELEASE
@@ -82,7 +83,8 @@ class Follower:
         laps: int = 1,
         continuous: bool = False,
         flip: bool = False,
-        stamped_commands: bool = False,
+        commands: CommandType = "auto",
+        stamps: Stamps = "header",
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
         """Plan the path, and search for the robot.
@@ -98,7 +100,8 @@ class Follower:
             laps: Number of laps; an open path is driven back and forth.
             continuous: Drive without end.
             flip: Drive from the end to the beginning.
-            stamped_commands: Send TwistStamped, not Twist.
+            commands: Message type of the commands, as for `magtwin.ros.commands.Commands`.
+            stamps: Whether poses count from the stamps of their headers, or from their arrival.
             say: Called with messages for the user.
 
         Raises:
@@ -115,10 +118,11 @@ class Follower:
         self._now_ns = 0
         self._guide = self._guided(path)
         topic, self._p, self._q = find("source", source, SOURCES)
-        self._pose = Input(bus, topic, max_age_s=MAX_AGE_S)
-        self._twist = self._pose if topic is ODOMETRY else Input(bus, ODOMETRY, max_age_s=MAX_AGE_S)
-        self._kind = "geometry_msgs/msg/TwistStamped" if stamped_commands else COMMAND.kind
-        self._commands = bus.publisher(COMMAND.name, self._kind, COMMAND.qos)
+        self._pose = Input(bus, topic, max_age_s=MAX_AGE_S, stamps=stamps, say=say)
+        self._twist = self._pose
+        if topic is not ODOMETRY:
+            self._twist = Input(bus, ODOMETRY, max_age_s=MAX_AGE_S, stamps=stamps, say=say)
+        self._commands = Commands(bus, commands)
         self._reporter = Reporter(bus)
         self._state, self._stand_s = "", STAND_S
         self._last = (0.0, 0.0)
@@ -232,7 +236,7 @@ class Follower:
         v = min(max(v, -drive.v_max), drive.v_max)
         w = min(max(w, -drive.w_max), drive.w_max)
         self._last = (v, w)
-        self._commands.publish(command_bytes(self._kind, v, w, self._bus.now_ns()))
+        self._commands.send(v, w)
 
     def _announce(self, text: str) -> None:
         if text != self._state:
@@ -244,7 +248,7 @@ class Follower:
         fares = not clock and (self._guide.done or self._pose.fresh(now) is not None)
         level: Any = "ok" if fares else "error"
         message = clock or ("at the end" if self._guide.done else self._state)
-        if (others := self._bus.publishers(COMMAND.name) - 1) > 0:
+        if (others := self._bus.publishers(COMMAND.name) - self._commands.offered) > 0:
             level = "warn" if fares else level
             message += f"; {others} others command the robot too"
         values = {
@@ -255,12 +259,3 @@ class Follower:
         }
         status = Status("drive", level, message, values)
         self._reporter.report([status, self._pose.status(now)], now)
-
-
-def command_bytes(kind: str, v: float, w: float, now_ns: int) -> bytes:
-    """A command of forward speed [m/s] and yaw rate [rad/s], as a Twist or a TwistStamped."""
-    linear, angular = COMMAND.leaves(kind)
-    fields: dict[str, Any] = {linear: [v, 0.0, 0.0], angular: [0.0, 0.0, w]}
-    if kind.endswith("Stamped"):
-        fields |= {"header.stamp": np.int64(now_ns), "header.frame_id": "base_link"}
-    return to_bytes(kind, fields)

@@ -1,7 +1,8 @@
 """Inputs of a node, joined by stamp: of each topic the newest message that is not in the future."""
 
 from collections import deque
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,9 @@ from magtwin.ros.bus import Bus, Message, Subscription
 from magtwin.ros.diagnostics import Level, Status, status_of
 
 Columns = dict[str, NDArray[Any]]
+
+Stamps = Literal["header", "arrival"]
+"""Time of a message: the stamp of its header, or its arrival at this node."""
 
 KEPT = 64
 """Messages kept per topic, beside those of `Input.history_s`."""
@@ -31,6 +35,12 @@ AHEAD_S = 0.05
 OTHER_S = 1e7
 """Stamps further from the node's clock than this belong to another clock: simulated time begins at 0 [s]."""
 
+SKEW_S = 1.0
+"""Difference between the stamps of an input and the node's clock above which it is explained [s]."""
+
+SKEWED = 3
+"""Number of messages in a row whose stamps must differ so."""
+
 GRAVITY = 9.80665
 """Standard gravity [m/s2]."""
 
@@ -42,7 +52,14 @@ class Input:
     """A topic, subscribed to when it is first published, in any of its readable types."""
 
     def __init__(
-        self, bus: Bus, topic: Topic, *, max_age_s: float, wanted: frozenset[str] | None = None
+        self,
+        bus: Bus,
+        topic: Topic,
+        *,
+        max_age_s: float,
+        wanted: frozenset[str] | None = None,
+        stamps: Stamps = "header",
+        say: Callable[[str], None] = lambda text: None,
     ) -> None:
         """Start to search for it.
 
@@ -51,6 +68,8 @@ class Input:
             topic: Its name, and the columns of its messages.
             max_age_s: Age at which its newest message is stale [s].
             wanted: Columns that must be valid. Default: all.
+            stamps: Time of its messages.
+            say: Called with messages for the user.
         """
         self.topic, self.max_age_s, self._bus, self._wanted = topic, max_age_s, bus, wanted
         self.name = bus.resolve(topic.name)
@@ -64,6 +83,9 @@ class Input:
         self.sent_ns = 0
         self._heard_before, self._reported_ns = 0, 0
         self._trouble = ""
+        self._stamps, self._say = stamps, say
+        self._behind_s: deque[tuple[float, float]] = deque(maxlen=SKEWED)
+        self._skewed = False
         self.silence = ""
         """Meaning of silence, if silence is not a fault."""
         self._gravity: Gravity | None = Gravity() if "imu_a" in topic.needs else None
@@ -92,6 +114,34 @@ class Input:
     def forget(self) -> None:
         """Drop all messages, after a restart of time."""
         self._kept.clear()
+        self._behind_s.clear()
+
+    def count_from(self, stamps: Stamps) -> None:
+        """Change the time of messages."""
+        if stamps != self._stamps:
+            self._stamps = stamps
+            self.forget()
+
+    def skew(self) -> str:
+        """What to do about stamps far from the node's clock, in one line; "" if they are near.
+
+        A sender whose clock differs also sends at another time than that of receipt. Otherwise the stamps are
+        wrong, or late, by themselves.
+        """
+        if self._stamps == "arrival" or len(self._behind_s) < SKEWED:
+            return ""
+        behind, sent = min(self._behind_s, key=lambda pair: abs(pair[0]))
+        if not SKEW_S < abs(behind) < OTHER_S or len({late > 0 for late, _ in self._behind_s}) > 1:
+            return ""
+        if abs(sent) > SKEW_S / 2:
+            return (
+                f"the clock of its sender is {abs(sent):.1f} s {_off(sent)} this "
+                "machine's: synchronize them (chrony), or count from arrival (stamps)"
+            )
+        return (
+            f"its stamps are {abs(behind):.1f} s {_off(behind)} this node's clock when they are sent: "
+            "correct them in its driver, or count from arrival (stamps)"
+        )
 
     def fresh(self, now_ns: int) -> Columns | None:
         """Columns as for `at`; None if they are stale."""
@@ -104,6 +154,8 @@ class Input:
 
     def _other_clock(self, now_ns: int) -> str:
         """Hint at stamps of another clock; "" if there are none."""
+        if skew := self.skew():
+            return f": {skew}"
         if not self._kept or abs(now_ns - self._kept[-1][0]) < OTHER_S * NS:
             return ""
         simulated = self._kept[-1][0] < now_ns
@@ -122,6 +174,7 @@ class Input:
             stale = self._trouble or "nobody publishes it"
         elif latest is None:
             stale = "every stamp is ahead of the clock" if self._kept else "nothing received yet"
+            stale += self._other_clock(now_ns)
         elif latest[1] > self.max_age_s:
             stale = f"its newest is {latest[1]:.2f} s old, more than {self.max_age_s:g} s"
             stale += self._other_clock(now_ns)
@@ -132,6 +185,7 @@ class Input:
             (bool(self.broken), f"{self.broken} messages could not be used"),
             (bool(self.jumps), f"stamps jumped back {self.jumps} times"),
             (bool(self.ahead), f"{self.ahead} stamps were ahead of this node's clock"),
+            (self.skew() and not stale, self.skew()),
         )
         values = {
             "topic": self.name,
@@ -160,6 +214,7 @@ class Input:
                 self.broken += 1
                 return
         now = self._bus.now_ns()
+        self._compare(now, stamp, message)
         if now and stamp > now + AHEAD_S * NS:  # before the first /clock, all stamps are ahead
             self.ahead += 1
         if self._kept and stamp < self._kept[-1][0]:
@@ -174,15 +229,30 @@ class Input:
         while len(self._kept) > KEPT and self._kept[1][0] < stamp - round(self.history_s * NS):
             self._kept.popleft()
 
+    def _compare(self, now: int, stamp: int, message: Message) -> None:
+        """Compare a stamp with the node's clock; reports a large difference once."""
+        if not now:
+            return
+        self._behind_s.append(((now - stamp) / NS, (message.received_ns - message.sent_ns) / NS))
+        if bool(skew := self.skew()) != self._skewed:
+            self._skewed = bool(skew)
+            self._say(f"{self.name}: {skew}" if skew else f"{self.name}: its stamps are near the clock again")
+
     def _read(self, message: Message) -> tuple[int, Columns]:
         stamped = layout(message.kind)[0].name == "header.stamp"
         wanted = (*self.topic.leaves(message.kind), *(("header.stamp",) if stamped else ()))
         fields = message.read(wanted)
         stamp = int(fields.pop("header.stamp")) if stamped else self._bus.now_ns()
+        if self._stamps == "arrival":
+            stamp = self._bus.now_ns()
         columns = self.topic.read(message.kind, {name: np.asarray(v)[None] for name, v in fields.items()})
         if self._gravity is not None:
             columns = self._gravity.without(columns)
         return stamp, columns
+
+
+def _off(late_s: float) -> str:
+    return "behind" if late_s > 0 else "ahead of"
 
 
 class Gravity:

@@ -55,6 +55,11 @@ PARAMETERS: Mapping[str, Parameter] = MappingProxyType(
             "whether the LiDAR spins: while scans arrive, always (on) or never (off)",
             words=("scan", "on", "off"),
         ),
+        "stamps": Parameter(
+            "header",
+            "time of the inputs: the stamps of their headers, or their arrival",
+            words=("header", "arrival"),
+        ),
         "outside": Parameter(
             "silent", "outside the map: no reading, or the reading at its border", words=("silent", "clamp")
         ),
@@ -131,7 +136,14 @@ class Magnetometer:
         chosen = [topic for topic in INPUTS if topic is POSE or needed & set(topic.needs)]
         read = needed | ({"imu_q_xyzw"} if "imu_a" in needed else frozenset())  # to subtract gravity
         self.inputs = {
-            topic.name: Input(bus, topic, max_age_s=settings["max_age_s"], wanted=read | _ALWAYS)
+            topic.name: Input(
+                bus,
+                topic,
+                max_age_s=settings["max_age_s"],
+                wanted=read | _ALWAYS,
+                stamps=settings["stamps"],
+                say=say,
+            )
             for topic in chosen
         }
         if COMMAND.name in self.inputs:
@@ -203,6 +215,7 @@ class Magnetometer:
         settings, robot = self._settings, self._twin.scene.robot
         for source in self.inputs.values():
             source.max_age_s = settings["battery_max_age_s" if source.topic is BATTERY else "max_age_s"]
+            source.count_from(settings["stamps"])
         if self.online is not None:
             kept: list[Input | Scanning | Measured] = [self.online.measured]
             kept += [source for source in self.inputs.values() if source.topic is not POSE]

@@ -2,7 +2,9 @@
 
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from functools import partial
+from typing import Literal
 
 import numpy as np
 
@@ -10,12 +12,12 @@ from magtwin.errors import InputError
 from magtwin.io.bags import RawBagWriter
 from magtwin.io.bags.cdr import NS, encode
 from magtwin.io.bags.sender import Unit, prefixed, sender_for
-from magtwin.io.bags.stream import Stream
+from magtwin.io.bags.stream import Stream, shifted
 from magtwin.io.bags.topics import Qos
 from magtwin.io.bags.types import layout
 from magtwin.ros.bus import Bus, Message, Publisher
 from magtwin.ros.bus.names import checked_prefix
-from magtwin.ros.topics import READ, RECORDED, SAMPLED
+from magtwin.ros.topics import READ, RECORDED, SAMPLED, TICKS
 from magtwin.run.run import Run
 from magtwin.twin import Twin
 
@@ -36,7 +38,10 @@ AT_A_TIME = 1024
 
 
 class Recorder:
-    """Records topics, each from when it is first published."""
+    """Records topics of any type, each from when it is first published.
+
+    If time jumps back, as after a reset of a simulator, the bag ends and the next one begins.
+    """
 
     def __init__(
         self,
@@ -58,10 +63,14 @@ class Recorder:
         """
         self._bus, self._writer, self._say, self._sim_time = bus, writer, say, sim_time
         known = {topic.name: topic for topic in RECORDED}
-        names = list(topics) or list(known)
-        self._waited = {name: known.get(name) for name in names}
+        self._named = tuple(dict.fromkeys(topics))
+        self._waited = {name: known.get(name) for name in self._named or known}
+        self._refused: dict[str, str] = {}
+        self._latched: dict[str, bytes | None] = {}
         self._looked, self._flushed = 0.0, time.monotonic()
-        self._last_ns = -1
+        self._last_ns, self._clock_ns = -1, -1
+        self.resets = 0
+        """How often time jumped back."""
 
     def run(self, until: Callable[[], bool] = lambda: False, *, duration_s: float | None = None) -> None:
         """Record until `until` is true, or for a wall time [s]."""
@@ -80,30 +89,70 @@ class Recorder:
             self._flushed = now
             self._writer.flush()
 
+    def missing(self) -> dict[str, str]:
+        """The topics asked for by name of which nothing was recorded, each with the reason."""
+        counts = self._writer.counts
+        silent = {name: "no message came" for name in self._named if name not in self._waited}
+        reasons = dict.fromkeys(self._named, "nobody publishes it") | silent | self._refused
+        return {name: reasons[name] for name in self._named if not counts.get(name)}
+
     def _look(self) -> None:
         """Subscribe to new topics."""
         for name, topic in list(self._waited.items()):
-            kinds = [kind for kind in self._bus.types(name) if self._bus.knows(kind)]
+            offers = self._bus.offers(name)
+            kinds = sorted({offer.kind for offer in offers if offer.kind and self._bus.knows(offer.kind)})
             if not kinds:
+                others = sorted({offer.kind or "no ROS type" for offer in offers})
+                if others:
+                    self._refuse(name, f"it is published as {', '.join(others)}, which is not known here")
+                continue
+            kind = topic.kind if topic is not None and topic.kind in kinds else kinds[0]
+            of_kind = [offer for offer in offers if offer.kind == kind]
+            latched = all(offer.latched for offer in of_kind)
+            qos = Qos(depth=DEPTH, reliable=all(offer.reliable for offer in of_kind), latched=latched)
+            try:
+                self._writer.add(name, kind, qos, digest=of_kind[0].digest)
+            except InputError as error:
+                self._refuse(name, str(error))
                 continue
             del self._waited[name]
-            kind = topic.kind if topic is not None and topic.kind in kinds else kinds[0]
+            self._refused.pop(name, None)
             if len(kinds) > 1:
                 self._say(f"{name} is published as {' and as '.join(kinds)}; recording {kind}")
-            latched = topic is not None and topic.qos.latched
-            qos = Qos(depth=DEPTH, reliable=latched or self._bus.reliable(name), latched=latched)
-            self._writer.add(name, kind, qos)
+            if latched:
+                self._latched[name] = None
             self._bus.subscribe(name, kind, partial(self._heard, name), qos)
+
+    def _refuse(self, name: str, why: str) -> None:
+        if self._refused.get(name) != why:
+            self._refused[name] = why
+            self._say(f"{name} is not recorded: {why}")
 
     def _heard(self, name: str, message: Message) -> None:
         now = self._bus.now_ns()
-        if self._sim_time and now < self._last_ns:
-            raise InputError(
-                f"time jumped back from {self._last_ns / NS:.3f} to {now / NS:.3f} s, as after a reset: the "
-                "recording ends here; start a new one"
-            )
+        if self._jumped(name, message, now):
+            self.resets += 1
+            path = self._writer.next()
+            self._say(f"time jumped back, as after a reset: recording goes on in {path}")
+            for latched, data in self._latched.items():
+                if data is not None and latched != name:
+                    self._writer.write(latched, now, data)
+            self._last_ns = -1
         self._last_ns = now = max(now, self._last_ns)  # times in the bag never go back
+        if name in self._latched:
+            self._latched[name] = message.data
         self._writer.write(name, now, message.data)
+
+    def _jumped(self, name: str, message: Message, now_ns: int) -> bool:
+        """Whether time jumped back: that of the node, or in the recorded /clock."""
+        if self._sim_time:
+            return now_ns < self._last_ns
+        if name != TICKS.name:
+            return False
+        with suppress(InputError):  # a damaged message
+            before, self._clock_ns = self._clock_ns, int(message.read(["clock"])["clock"])
+            return self._clock_ns < before
+        return False
 
 
 class Player:
@@ -117,6 +166,7 @@ class Player:
         *,
         units: Unit = "T",
         topics: Sequence[str] = (),
+        stamps: Literal["run", "wall"] = "run",
         frame_prefix: str = "",
     ) -> None:
         """Advertise its topics.
@@ -127,12 +177,13 @@ class Player:
             twin: The twin of the run: gives frames, covariances, /tf_static and the robot's description.
             units: Unit of magnetic fields.
             topics: Names of topics to publish. Default: all.
+            stamps: Time of the messages and of /clock: that of the run, or wall time.
             frame_prefix: Prefix of the names of frames, such as "tb4/".
 
         Raises:
             InputError: The run has no column of these topics.
         """
-        self._run = run
+        self._run, self._wall = run, stamps == "wall"
         sender = sender_for(twin, units, run.metadata.get("rate_hz"))
         sender = prefixed(sender, checked_prefix(frame_prefix))
         self._stream = Stream(run, sender, None, topics=(*SAMPLED.values(), *READ), whole=True)
@@ -149,11 +200,15 @@ class Player:
         first = float(self._run["t"][0])
         begin = max(time.monotonic(), self._begun + SETTLE_S)
         count = 0
+        # at a pace other than 1, stamps run at that pace from the wall time of the beginning
+        shift = time.time_ns() + round((begin - time.monotonic() - first) * NS) if self._wall else 0
         for row in range(0, self._run.rows, AT_A_TIME):
             rows = self._run.take(slice(row, row + AT_A_TIME))
             messages: list[tuple[int, Publisher, bytes]] = []
             for topic, times, fields in self._stream.messages(rows):
                 if topic.name in self._publishers and len(times):
+                    if shift:
+                        fields = shifted(fields, shift)
                     encoded = encode(layout(topic.kind, fields), fields, len(times))
                     for t, data in zip(np.asarray(times).tolist(), encoded, strict=True):
                         messages.append((t, self._publishers[topic.name], data.tobytes()))

@@ -45,7 +45,6 @@ class SimulatedRobot:
         seed: int,
         rate_hz: float | None,
         lidar: LidarMode,
-        stamped_commands: bool,
         magnetometer: bool,
     ) -> None:
         """Subscribe to its commands.
@@ -59,14 +58,15 @@ class SimulatedRobot:
             seed: As for `Simulator`, like the rest.
             rate_hz: Rate of the magnetometer.
             lidar: Whether the LiDAR spins.
-            stamped_commands: cmd_vel is a TwistStamped.
             magnetometer: Publish the magnetometer's readings.
         """
         self._twin, self._bus, self._which, self._seed = twin, bus, which, seed
         self._rate, self._lidar, self._reads = rate_hz, lidar, magnetometer
         self.sender, self.within = sender, within
-        self._kind = "geometry_msgs/msg/TwistStamped" if stamped_commands else COMMAND.kind
-        self._input = bus.subscribe(self._name(COMMAND), self._kind, self.commanded, COMMAND.qos.heard)
+        self._inputs = [
+            bus.subscribe(self._name(COMMAND), kind, self.commanded, COMMAND.qos.heard)
+            for kind in COMMAND.reads
+        ]
         self._command: tuple[float, float] | None = None
         self._commands, self._refused = 0, 0
         self._stream: Stream | None = None
@@ -117,8 +117,8 @@ class SimulatedRobot:
             yield self._renamed(SCAN), came, SCAN.write({"ranges_m": scans.ranges_m}, moments, self.sender)
 
     def commanded(self, message: Message) -> None:
-        """Take a command."""
-        linear, angular = COMMAND.leaves(self._kind)
+        """Take a command, a Twist or a TwistStamped."""
+        linear, angular = COMMAND.leaves(message.kind)
         try:
             read = message.read([linear, angular])
             v, w = float(read[linear][0]), float(read[angular][2])
@@ -132,14 +132,18 @@ class SimulatedRobot:
 
     def state(self) -> tuple[list[tuple[Any, str]], dict[str, str]]:
         """Problems since the last call, and values, for diagnostics."""
-        senders, command = self._input.publishers(), self._name(COMMAND)
-        others = [kind for kind in self._bus.types(command) if kind != self._kind]
+        senders = sum(source.publishers() for source in self._inputs)
+        command = self._name(COMMAND)
+        others = [kind for kind in self._bus.types(command) if kind not in COMMAND.reads]
         magnitude = self._name(MAGNITUDE)
         readers = self._bus.publishers(magnitude) if self._reads else 0
         problems = [
-            (senders > 1, f"{senders} publishers on {self._input.topic}: the last command wins"),
+            (senders > 1, f"{senders} publishers on {self._inputs[0].topic}: the last command wins"),
             (self._refused, f"{self._refused} commands were not finite"),
-            (others, f"commands of type {', '.join(others)} are ignored; {self._kind} is expected"),
+            (
+                others,
+                f"commands of type {', '.join(others)} are ignored; {' or '.join(COMMAND.reads)} is expected",
+            ),
             (readers > 1, f"{readers} publishers on {self._bus.resolve(magnitude)}"),
         ]
         values = {

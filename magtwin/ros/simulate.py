@@ -10,7 +10,7 @@ from typing import Literal
 from magtwin.errors import InputError
 from magtwin.io.bags.cdr import NS, encode
 from magtwin.io.bags.sender import Unit, prefixed, sender_for
-from magtwin.io.bags.stream import Sent
+from magtwin.io.bags.stream import Sent, shifted
 from magtwin.io.bags.topics import Qos, Topic
 from magtwin.io.bags.types import layout
 from magtwin.ros.bus import Bus, Publisher
@@ -79,7 +79,6 @@ class Simulator:
         units: Unit = "T",
         lidar: Literal["schedule", "on", "off"] = "schedule",
         stamps: Literal["sim", "wall"] = "sim",
-        stamped_commands: bool = False,
         magnetometer: bool = True,
         frame_prefix: str | None = None,
         say: Callable[[str], None] = lambda text: None,
@@ -96,7 +95,6 @@ class Simulator:
             units: Unit of magnetic fields: "T", as in ROS, or "nT", as APRILab's robot publishes them.
             lidar: Whether the LiDAR follows its schedule, or stays on or off.
             stamps: Stamp messages with simulated time, from 0 on, or with wall time.
-            stamped_commands: cmd_vel is a TwistStamped, not a Twist.
             magnetometer: Publish the magnetometer's readings; else another node does.
             frame_prefix: Prefix of the names of frames, such as "tb4/". Default: none; for several robots the
                 name of each, "ann/", which a given prefix precedes.
@@ -135,7 +133,6 @@ class Simulator:
                 seed=seed,
                 rate_hz=rate_hz,
                 lidar=lidar,
-                stamped_commands=stamped_commands,
                 magnetometer=magnetometer,
             )
             self.robots.append(robot)
@@ -223,10 +220,7 @@ class Simulator:
         if publisher is None or not len(times):
             return
         if self._begin_ns:
-            fields = {
-                name: value + self._begin_ns if name.endswith("stamp") or name == "clock" else value
-                for name, value in fields.items()
-            }
+            fields = shifted(fields, self._begin_ns)
         for t, data in zip(
             times.tolist(), encode(layout(topic.kind, fields), fields, len(times)), strict=True
         ):

@@ -4,9 +4,8 @@ import os
 import select
 from collections.abc import Callable
 
-from magtwin.io.bags.topics import COMMAND
 from magtwin.ros.bus import Bus
-from magtwin.ros.follow import command_bytes
+from magtwin.ros.commands import Commands, CommandType
 from magtwin.sim.motion.manual import Hand
 
 RATE_HZ = 20.0
@@ -16,18 +15,17 @@ RATE_HZ = 20.0
 class Teleop:
     """The node: repeats the last command of a keyboard or gamepad."""
 
-    def __init__(self, bus: Bus, hand: Hand, source: int, *, stamped_commands: bool = False) -> None:
+    def __init__(self, bus: Bus, hand: Hand, source: int, *, commands: CommandType = "auto") -> None:
         """Advertise commands.
 
         Args:
             bus: The node.
             hand: The keyboard or gamepad.
             source: File descriptor of the terminal or gamepad.
-            stamped_commands: Send TwistStamped, not Twist.
+            commands: Message type of the commands, as for `magtwin.ros.commands.Commands`.
         """
         self._bus, self._hand, self._source = bus, hand, source
-        self._kind = "geometry_msgs/msg/TwistStamped" if stamped_commands else COMMAND.kind
-        self._commands = bus.publisher(COMMAND.name, self._kind, COMMAND.qos)
+        self._commands = Commands(bus, commands)
         self.sent = 0
         """Number of commands so far."""
         self._timer = bus.timer(1 / RATE_HZ, self._command)
@@ -47,8 +45,8 @@ class Teleop:
     def stop(self) -> None:
         """Command the robot to stand; call it before the node ends."""
         self._timer.cancel()
-        self._commands.publish(command_bytes(self._kind, 0.0, 0.0, self._bus.now_ns()))
+        self._commands.send(0.0, 0.0)
 
     def _command(self) -> None:
         self.sent += 1
-        self._commands.publish(command_bytes(self._kind, *self._hand.command, self._bus.now_ns()))
+        self._commands.send(*self._hand.command)

@@ -1,5 +1,6 @@
 """`magtwin ros`: nodes from the command line, and one line where they cannot be."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,9 @@ from nodes import DOMAINS
 
 from magtwin.cli import main
 from magtwin.files import shipped
+from magtwin.io.bags.topics import LATCHED
 from magtwin.io.formats import write_run
+from magtwin.ros.bus import open_bus, to_bytes
 from magtwin.run.run import Run
 
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")
@@ -68,6 +71,24 @@ def test_a_recording_of_nothing_is_said(tmp_path: Path, capsys: pytest.CaptureFi
     said = refused(["record", str(tmp_path / "bag"), "--duration-s", "0.1"], capsys)
     assert "nothing was recorded" in said
     assert not list(tmp_path.iterdir())
+
+
+def test_a_named_topic_that_was_not_recorded_ends_with_status_1_and_the_others_are_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    node, text = open_bus("notes", backend="cyclonedds"), "std_msgs/msg/String"
+    publisher = node.publisher("/notes", text, LATCHED)
+    publisher.publish(to_bytes(text, {"data": "once"}))
+    out = tmp_path / "bag.mcap"
+    topics = ["--topic", "/notes", "--topic", "/odomm"]
+    with pytest.raises(SystemExit) as ended:
+        main(["ros", "record", str(out), *topics, "--duration-s", "4", "--json"])
+    node.close()
+    assert ended.value.code == 1
+    told = json.loads(capsys.readouterr().out)
+    assert told["messages"] == {"/notes": 1}
+    assert told["missing"] == {"/odomm": "nobody publishes it"}
+    assert out.is_file()
 
 
 @pytest.mark.parametrize(

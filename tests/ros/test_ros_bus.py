@@ -1,5 +1,6 @@
 """The bus: what one node says another hears, over DDS and in rclpy, on this machine only."""
 
+import json
 import os
 import subprocess
 import time
@@ -13,6 +14,7 @@ from places import ROOT
 
 from magtwin.errors import InputError
 from magtwin.io.bags.topics import LATCHED, ODOMETRY, POSE, SENSOR_DATA, TOPICS, Qos
+from magtwin.io.bags.types import definition_of, layout, store_of, typestore
 from magtwin.ros.bus import Bus, Message, names_of, open_bus, to_bytes
 from magtwin.ros.bus.clock import Clock
 from magtwin.ros.bus.names import range_of
@@ -62,7 +64,9 @@ def test_every_type_of_the_table_crosses_unchanged(pair: tuple[Bus, Bus]) -> Non
     for k, kind in enumerate(KINDS):
         offered.append(one.publisher(f"t{k}", kind, Qos()))
         other.subscribe(f"t{k}", kind, lambda m: heard.__setitem__(m.kind, m), Qos())
-        said[kind] = to_bytes(kind, {"header.frame_id": "base_link", "pose.position": [1.0, 2.0, 3.0]})
+        some = {"header.frame_id": "base_link", "pose.position": [1.0, 2.0, 3.0]}
+        known = {leaf.name for leaf in layout(kind)}
+        said[kind] = to_bytes(kind, {name: value for name, value in some.items() if name in known})
     spin(lambda: all(p.subscribers() for p in offered), one, other)
     for publisher in offered:
         publisher.publish(said[publisher.kind])
@@ -77,7 +81,7 @@ def test_our_bytes_are_those_that_cyclonedds_itself_writes() -> None:
 
     from magtwin.ros.bus.types import _struct
 
-    struct = _struct(FIELD)
+    struct = _struct(FIELD, typestore())
     header, field = (struct.__annotations__[name] for name in ("header", "magnetic_field"))
     stamp = header.__annotations__["stamp"]
     sample = struct(
@@ -279,10 +283,70 @@ def test_where_rclpy_is_broken_cyclonedds_is_taken_and_who_asks_for_rclpy_is_tol
         open_bus("node", domain=domain, backend="rclpy")
 
 
-def test_a_topic_is_of_one_type_in_a_node(pair: tuple[Bus, Bus]) -> None:
-    pair[0].publisher("odom", ODOMETRY.kind, SENSOR_DATA)
-    with pytest.raises(InputError, match="/robot/odom is a nav_msgs/msg/Odometry"):
-        pair[0].subscribe("odom", FIELD, lambda m: None, SENSOR_DATA)
+def test_a_node_takes_a_topic_in_two_types(pair: tuple[Bus, Bus]) -> None:
+    one, other = pair
+    kinds = ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped")
+    heard: list[str] = []
+    for kind in kinds:
+        one.subscribe("cmd_vel", kind, lambda m: heard.append(m.kind), Qos().heard)
+    sent = [other.publisher("cmd_vel", kind, Qos()) for kind in kinds]
+    spin(lambda: all(p.subscribers() for p in sent) and len(other.wants("cmd_vel")) == 2, one, other)
+    for publisher in sent:
+        publisher.publish(to_bytes(publisher.kind, {}))
+    spin(lambda: sorted(heard) == sorted(kinds), one, other)
+    assert {end.kind for end in other.wants("cmd_vel")} == set(kinds)
+
+
+def test_endpoints_carry_the_hash_of_their_type(pair: tuple[Bus, Bus]) -> None:
+    one, other = pair
+    one.publisher("field", FIELD, Qos())
+    one.subscribe("odom", ODOMETRY.kind, lambda m: None, Qos())
+    spin(lambda: other.offers("field") and other.wants("odom"), one, other)
+    # as rclpy of Jazzy gives it in `topic_type_hash`
+    wanted = "RIHS01_e80f32f56a20486c9923008fc1a1db07bbb273cbbf6a5b3bfa00835ee00e4dff"
+    assert other.offers("field")[0].digest == definition_of(FIELD)[1] == wanted
+    assert other.wants("odom")[0].digest == definition_of(ODOMETRY.kind)[1]
+
+
+@pytest.mark.parametrize("form", ["humble", "jazzy"])
+def test_a_node_is_listed_in_the_form_of_its_peers_and_not_among_both_forms(domain: int, form: str) -> None:
+    from cyclonedds.core import Policy
+    from cyclonedds.core import Qos as DdsQos
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.sub import DataReader
+    from cyclonedds.topic import Topic
+
+    from magtwin.ros.bus.graph import LISTS, LISTS_KIND, Listed
+    from magtwin.ros.bus.types import struct_in
+
+    def peer(bus: Bus, of: str) -> tuple[object, DataReader]:
+        """A node of a distribution, as its middleware announces it."""
+        store = store_of(of)
+        digest = b"" if of == "humble" else f"typehash={store.hash_rihs01(LISTS_KIND)};".encode()
+        qos = DdsQos(Policy.Reliability.Reliable(10**8), Policy.Durability.TransientLocal)
+        topic = Topic(bus._participant, LISTS, struct_in(LISTS_KIND, store))  # type: ignore[attr-defined]
+        writer = DataWriter(bus._participant, topic, qos + DdsQos(Policy.Userdata(digest)))  # type: ignore[attr-defined]
+        return writer, DataReader(bus._participant, topic, qos)  # type: ignore[attr-defined]
+
+    node, other, third = (
+        open_bus(n, backend="cyclonedds", domain=domain) for n in ("node", "other", "third")
+    )
+    node.publisher("field", FIELD, Qos())
+    writer, reader = peer(other, form)
+    heard: list[bytes] = []
+    spin(lambda: heard.extend(sample.cdr for sample in reader.take(10)) or heard, node)
+    entry = store_of(form).deserialize_cdr(heard[-1], LISTS_KIND)
+    (listed,) = entry.node_entities_info_seq
+    assert (listed.node_namespace, listed.node_name) == ("/robot", "node")
+    assert bytes(entry.gid.data)[:16] == node._participant.guid.bytes  # type: ignore[attr-defined]
+    assert [bytes(gid.data)[:16] for gid in listed.writer_gid_seq] == [w.guid.bytes for w in node._writers]  # type: ignore[attr-defined]
+    assert {len(gid.data) for gid in listed.writer_gid_seq} == {24 if form == "humble" else 16}
+    listing: Listed = node._listed  # type: ignore[attr-defined]
+    kept = peer(third, "jazzy" if form == "humble" else "humble")
+    spin(lambda: listing._writer is None, node)
+    for bus in (node, other, third):
+        bus.close()
+    del writer, kept
 
 
 @pytest.fixture(scope="module")
@@ -330,3 +394,42 @@ def test_rclpy_hears_what_cyclonedds_says_and_the_reverse(jazzy: Path, domain: i
     assert [one["header.stamp"] for one in read] == [k * 10**9 + 7 for k in range(20)]
     assert {one["header.frame_id"] for one in read} == {"head"}
     np.testing.assert_array_equal([one["magnetic_field"] for one in read], [field] * 20)
+
+
+BOTH = """
+import json, sys, time
+sys.path.insert(0, sys.argv[1])
+from magtwin.io.bags.topics import Qos
+from magtwin.ros.bus import open_bus
+node, heard = open_bus("peer", backend="rclpy"), set()
+for kind in ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"):
+    node.subscribe("cmd_vel", kind, lambda m: heard.add(m.kind), Qos())
+last = time.monotonic() + 20
+while time.monotonic() < last:
+    node.spin_once(0.05)
+    names = node._node.get_node_names_and_namespaces()
+    if len(heard) == 2 and ("one", "/robot") in names:
+        break
+names = [name for name, _ in names]
+print(json.dumps([sorted(heard), names, {end.kind: end.digest for end in node.offers("cmd_vel")}]))
+"""
+
+
+def test_rclpy_takes_both_types_of_commands_and_lists_nodes_of_cyclonedds(jazzy: Path, domain: int) -> None:
+    env = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+    peer = subprocess.Popen([jazzy, "-c", BOTH, str(ROOT)], env=env, stdout=subprocess.PIPE, text=True)
+    node = open_bus("one", backend="cyclonedds", domain=domain)
+    kinds = ["geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"]
+    sent = [node.publisher("cmd_vel", kind, Qos()) for kind in kinds]
+    try:
+        while peer.poll() is None:
+            for publisher in sent:
+                publisher.publish(to_bytes(publisher.kind, {}))
+            node.spin_once(0.05)
+        heard, names, digests = json.loads(peer.communicate()[0])
+    finally:
+        peer.kill()
+        node.close()
+    assert heard == kinds
+    assert "one" in names
+    assert digests == {kind: definition_of(kind)[1] for kind in kinds}

@@ -14,6 +14,7 @@ from magtwin.frames import quat_from_yaw
 from magtwin.io.bags.topics import CLOCK, COMMAND, ODOMETRY, POSE, Qos
 from magtwin.path import PATHS, Path
 from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
+from magtwin.ros.commands import Commands
 from magtwin.ros.diagnostics import KIND, Status
 from magtwin.ros.follow import Follower
 from magtwin.ros.simulate import Simulator
@@ -210,10 +211,40 @@ def test_an_open_path_is_driven_back_and_forth(nodes: Callable[..., Bus]) -> Non
 def test_a_flipped_path_is_driven_from_its_end_with_stamped_commands(nodes: Callable[..., Bus]) -> None:
     robot = Ideal(nodes, "geometry_msgs/msg/TwistStamped")
     robot.x, robot.y, robot.yaw = 0.5, 0.1, np.pi
-    node, bus = started(robot, nodes, flip=True, speed=0.3, stamped_commands=True, controller="stanley")
+    node, bus = started(robot, nodes, flip=True, speed=0.3, commands="TwistStamped", controller="stanley")
     while not node.done and robot.t < 20:
         robot.tick(bus, 5)
     np.testing.assert_allclose((robot.x, robot.y), LINE.p_xy[0], atol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "distribution", "wanted"),
+    [
+        (["Twist"], "jazzy", "Twist"),
+        (["TwistStamped"], "humble", "TwistStamped"),
+        (["Twist", "TwistStamped"], "jazzy", "TwistStamped"),
+        (["Twist", "TwistStamped"], "humble", "Twist"),
+        (["Twist", "TwistStamped"], "", "Twist"),
+    ],
+)
+def test_commands_have_the_type_that_the_robot_subscribes_to(
+    nodes: Callable[..., Bus],
+    monkeypatch: pytest.MonkeyPatch,
+    kinds: list[str],
+    distribution: str,
+    wanted: str,
+) -> None:
+    monkeypatch.setenv("ROS_DISTRO", distribution)
+    robot, hand = nodes("robot"), nodes("hand")
+    heard: list[Message] = []
+    for kind in kinds:
+        robot.subscribe(COMMAND.name, f"geometry_msgs/msg/{kind}", heard.append, Qos())
+    spin(lambda: len(hand.wants(COMMAND.name)) == len(kinds), hand)
+    commands = Commands(hand)
+    spin(commands.subscribers, hand)
+    commands.send(0.2, 0.1)
+    spin(lambda: heard, robot)
+    assert [m.kind for m in heard] == [f"geometry_msgs/msg/{wanted}"]
 
 
 @pytest.mark.parametrize(

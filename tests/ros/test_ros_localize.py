@@ -19,8 +19,8 @@ from magtwin.localization.problem import Estimate, Prior
 from magtwin.localization.track import LocalizerError
 from magtwin.localizing import live_problem, localization, localize, new_localizer
 from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
+from magtwin.ros.commands import command_bytes
 from magtwin.ros.diagnostics import KIND
-from magtwin.ros.follow import command_bytes
 from magtwin.ros.localization.localize import PARAMETERS, LocalizerNode
 from magtwin.ros.localization.poses import (
     CLOUD,
@@ -263,7 +263,7 @@ def test_map_to_odom_puts_base_link_at_the_estimate_and_another_publisher_is_tol
     hand.tick(3, x=0.7)
     hand.settle()
     names = [f"transforms.0.{name}" for name in ("header.frame_id", "child_frame_id")]
-    read = hand.tf[-1].read([*names, "transforms.0.transform.translation"], {"transforms": 1})
+    read = hand.tf[-1].read([*names, "transforms.0.transform.translation"])
     assert [read[name] for name in names] == ["map", "odom"]
     _, pose, _ = poses(hand.heard)
     origin = read["transforms.0.transform.translation"]

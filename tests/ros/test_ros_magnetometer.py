@@ -14,7 +14,7 @@ from magtwin.frames import into_base, quat_from_yaw
 from magtwin.io.bags.topics import BATTERY, CLOCK, IMU, MAGNITUDE, ODOMETRY, POSE, Qos, Topic
 from magtwin.learn.data.features import SETS
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
-from magtwin.ros.bus import Bus, Message, Publisher, names_of, open_bus, to_bytes
+from magtwin.ros.bus import Bus, Message, Publisher, Subscription, names_of, open_bus, to_bytes
 from magtwin.ros.diagnostics import KIND, Status
 from magtwin.ros.inputs import GRAVITY, Gravity, Input
 from magtwin.ros.magnetometer import PARAMETERS, Magnetometer
@@ -152,6 +152,7 @@ def world(twin: Twin) -> Iterator[World]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         patch.delenv("CYCLONEDDS_URI", raising=False)
+        patch.setattr("magtwin.ros.diagnostics.LEAST_S", 0.0)  # the clock runs faster than the wall
         made = World(twin, next(DOMAINS))
         yield made
         for bus in made.buses:
@@ -308,6 +309,39 @@ def test_a_message_that_is_cut_short_is_not_used(world: World) -> None:
     assert world.heard(bus)
     for topic in (POSE, ODOMETRY, IMU, BATTERY):
         assert "messages could not be used" in said[f"input {topic.name}"].message
+
+
+@pytest.mark.parametrize(
+    ("stamp_s", "sent_s", "line"),
+    [
+        (-3.0, -3.0, "the clock of its sender is 3.0 s behind this machine's: synchronize them (chrony)"),
+        (3.0, 3.0, "the clock of its sender is 3.0 s ahead of this machine's: synchronize them (chrony)"),
+        (-3.0, 0.0, "its stamps are 3.0 s behind this node's clock when they are sent: correct them"),
+        (-0.9, -0.9, ""),
+    ],
+)
+def test_a_skewed_clock_is_explained_once_and_does_not_matter_by_arrival(
+    world: World, stamp_s: float, sent_s: float, line: str
+) -> None:
+    bus, lines = world.bus("node"), list[str]()
+    one = Input(bus, BATTERY, max_age_s=0.5, say=lines.append)
+    two = Input(bus, BATTERY, max_age_s=0.5, stamps="arrival", say=lines.append)
+    for source in (one, two):
+        source._kind = BATTERY.kind
+        source._subscription = Subscription(source.name, lambda: 1)
+        for _ in range(5):
+            now = bus.now_ns()
+            fields = {"header.stamp": np.int64(now + round(stamp_s * NS)), "voltage": 15.0}
+            sent = now + round(sent_s * NS)
+            source._hear(Message(BATTERY.kind, to_bytes(BATTERY.kind, fields), sent, now))
+    assert [text.startswith(f"{one.name}: {line}") for text in lines] == ([True] if line else [])
+    now = bus.now_ns()
+    assert one.fresh(now) is None
+    assert line in one.status(now).message
+    assert two.fresh(now) is not None
+    assert two.status(now).message == "fresh"
+    two.count_from("header")
+    assert two.fresh(bus.now_ns()) is None
 
 
 def test_what_no_column_is_read_of_may_be_no_number(world: World) -> None:

@@ -70,11 +70,11 @@ def heard(twin: Twin) -> Iterator[Heard]:
 
     def transforms(message: Message) -> None:
         seen.counts[message.kind] += 1
-        count = int(message.read(["transforms"], {"transforms": 0})["transforms"])
+        count = int(message.read(["transforms"])["transforms"])
         names = [
             f"transforms.{k}.{end}" for k in range(count) for end in ("header.frame_id", "child_frame_id")
         ]
-        read = message.read(names, {"transforms": count})
+        read = message.read(names)
         seen.frames |= {(read[a], read[b]) for a, b in zip(names[::2], names[1::2], strict=True)}
 
     ear.subscribe(

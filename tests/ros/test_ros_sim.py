@@ -21,6 +21,7 @@ from magtwin.io.formats import read_run
 from magtwin.learn.data.recording import Source
 from magtwin.learn.data.recording import read as read_source
 from magtwin.ros.bus import Bus, Message, names_of, open_bus, to_bytes
+from magtwin.ros.commands import command_bytes
 from magtwin.ros.diagnostics import KIND, Status, to_fields
 from magtwin.ros.record import Player, Recorder
 from magtwin.ros.simulate import RESET, Simulator
@@ -265,7 +266,7 @@ def test_commands_that_it_cannot_hear_and_others_on_its_topics_are_said(
     simulator, hand = Simulator(twin, nodes("sim"), speed=2.0), nodes("hand")
     said: list[Status] = []
     hand.subscribe("/diagnostics", KIND, lambda m: said.extend(from_message(m)), Qos())
-    nodes("stamped").publisher(COMMAND.name, "geometry_msgs/msg/TwistStamped", COMMAND.qos)
+    nodes("other").publisher(COMMAND.name, "geometry_msgs/msg/Vector3", COMMAND.qos)
     for topic in (CLOCK, MAGNITUDE):
         hand.publisher(topic.name, topic.kind, topic.qos)
     spin(lambda: hand.types("/diagnostics"), hand)
@@ -279,10 +280,26 @@ def test_commands_that_it_cannot_hear_and_others_on_its_topics_are_said(
     simulator.run(settled)
     assert said[0].level == "warn"
     assert "1 commands were not finite" in said[0].message
-    assert "commands of type geometry_msgs/msg/TwistStamped are ignored" in said[0].message
+    assert "commands of type geometry_msgs/msg/Vector3 are ignored" in said[0].message
     assert "2 publishers on /clock" in said[-1].message
     assert others in said[-1].message
     assert simulator.online.commands.rows[:, 1:].any() == np.False_
+
+
+@pytest.mark.parametrize("kind", ["Twist", "TwistStamped"])
+def test_commands_of_both_types_are_obeyed(twin: Twin, nodes: Callable[..., Bus], kind: str) -> None:
+    simulator, hand = Simulator(twin, nodes("sim"), speed=4.0), nodes("hand")
+    drive = hand.publisher(COMMAND.name, f"geometry_msgs/msg/{kind}", COMMAND.qos)
+    spin(drive.subscribers, hand)
+
+    def ended() -> bool:
+        drive.publish(command_bytes(drive.kind, 0.25, 0.0, 0))
+        return bool(simulator.online.commands.rows[:, 1:].any())
+
+    simulator.run(ended, duration_s=20.0)
+    driven = simulator.online.commands.rows[:, 1:].tolist()
+    assert [0.25, 0.0] in driven
+    assert all(row in ([0.0, 0.0], [0.25, 0.0]) for row in driven)
 
 
 def test_diagnostics_say_what_they_were_given() -> None:

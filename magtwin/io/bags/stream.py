@@ -194,6 +194,12 @@ class Stream:
         return json.dumps(table, ensure_ascii=False, indent=1)
 
 
+def shifted(fields: Mapping[str, Any], by_ns: int) -> dict[str, Any]:
+    """Fields of messages with all stamps later by a time [ns]."""
+    stamped = ("stamp", "clock")
+    return {n: value + by_ns if n.rpartition(".")[2] in stamped else value for n, value in fields.items()}
+
+
 def scans_at(scans: "Scans", rows: Any) -> "Scans":
     """Some scans, by a slice or a mask."""
     return type(scans)(*(getattr(scans, f.name)[rows] for f in dataclasses.fields(scans)))

@@ -9,22 +9,47 @@ from magtwin.io.bags.cdr import Leaf
 
 _CODES = {"float64": "f8", "float32": "f4", "bool": "u1", "byte": "u1", "char": "u1", "string": "text"}
 _CODES |= {f"{sign}int{8 * size}": f"{sign[:1] or 'i'}{size}" for sign in ("u", "") for size in (1, 2, 4, 8)}
-_TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+"""Types of stamps, one leaf of whole nanoseconds."""
+
+
+@cache
+def store_of(distribution: str) -> Any:
+    """The message types of a distribution of ROS 2, a `rosbags.typesys.Typestore`; "latest" is the newest."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(
+        Stores.LATEST if distribution == "latest" else Stores[f"ROS2_{distribution.upper()}"]
+    )
 
 
 @cache
 def typestore() -> Any:
-    """The message types of ROS 2 Humble, a `rosbags.typesys.Typestore`."""
+    """The message types of ROS 2 Humble and those that later distributions added."""
     from rosbags.typesys import Stores, get_typestore
 
-    return get_typestore(Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.ROS2_HUMBLE)  # not that of `store_of`, which stays as it is
+    newest = store_of("latest").fielddefs
+    store.register({kind: defined for kind, defined in newest.items() if kind not in store.fielddefs})
+    return store
 
 
 @cache
-def definition_of(kind: str) -> tuple[str, str]:
-    """The definition of a message type as text, and its REP 2011 hash."""
+def definition_of(kind: str, digest: str = "") -> tuple[str, str]:
+    """The definition of a message type as text, and its REP 2011 hash.
+
+    Args:
+        kind: The type.
+        digest: Hash of the wanted definition, as distributions may differ. Default: that of `typestore`.
+
+    Raises:
+        InputError: The type is unknown, or no distribution defines it with that hash.
+    """
     fields_of(kind)
-    return typestore().generate_msgdef(kind, ros_version=2)[0], typestore().hash_rihs01(kind)
+    for store in (typestore(), *map(store_of, ("jazzy", "latest"))):
+        if kind in store.fielddefs and (own := store.hash_rihs01(kind)) == (digest or own):
+            return store.generate_msgdef(kind, ros_version=2)[0], own
+    raise InputError(f"{kind} is defined in another way than by ROS 2 (hash {digest[:19]}...)")
 
 
 def fields_of(kind: str) -> list[tuple[str, Any]]:
@@ -92,7 +117,7 @@ def _leaves(kind: str, prefix: str, counts: Mapping[str, Any]) -> list[Leaf]:
 
 
 def _structure(kind: str, name: str, counts: Mapping[str, Any]) -> list[Leaf]:
-    if kind in _TIMES:
+    if kind in TIMES:
         return [Leaf(name, "time")]
     inner = _leaves(kind, f"{name}.", counts)
     same = {(leaf.kind, leaf.count) for leaf in inner}

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import sqlite3
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -111,9 +112,9 @@ class _Bag:
         for topic in stream.topics:
             self.add(topic.name, topic.kind, topic.qos)
 
-    def add(self, topic: str, kind: str, qos: Qos) -> None:
+    def add(self, topic: str, kind: str, qos: Qos, digest: str = "") -> None:
         """Register a topic, before its first message."""
-        definition, digest = definition_of(kind)
+        definition, digest = definition_of(kind, digest)
         connection = Connection(len(self.connections) + 1, topic, kind, definition, digest, qos)
         self.connections[topic] = connection
         self.store.add(connection)
@@ -280,9 +281,18 @@ class RawBagWriter(_GrowingBag):
             self._raw = self._bag = self._open()
         self._waiting: dict[str, list[tuple[int, int, bytes]]] = {}
         self._arrived = 0
+        self._first, self._before = self._path, Counter[str]()
+        self.paths: list[Path] = []
+        """The bags that have ended, one for each `next` and `close` with messages."""
 
-    def add(self, topic: str, kind: str, qos: Qos) -> None:
+    def add(self, topic: str, kind: str, qos: Qos, *, digest: str = "") -> None:
         """Register a topic, before its first message.
+
+        Args:
+            topic: Its name.
+            kind: Its message type.
+            qos: Its quality of service.
+            digest: As for `magtwin.io.bags.types.definition_of`.
 
         Raises:
             InputError: Its message type is unknown.
@@ -290,9 +300,29 @@ class RawBagWriter(_GrowingBag):
         if topic not in self._raw.connections:
             try:
                 with one_line(self._path):
-                    self._raw.add(topic, kind, qos)
+                    self._raw.add(topic, kind, qos, digest)
             except InputError as error:
                 raise InputError(f"{topic}: {error}") from error
+
+    def next(self) -> Path:
+        """End the bag, and begin another with the same topics; returns its path.
+
+        The bags after `drive.mcap` are `drive_2.mcap` and so on.
+        """
+        connections = list(self._raw.connections.values())
+        self.close()
+        self._before = Counter(self.counts)
+        number = len(self.paths) + 1
+        self._path = self._first.with_stem(f"{self._first.stem}_{number}") if number > 1 else self._first
+        check_free(self._path, force=self._force)
+        self.partial = partial_of(self._path)
+        if self.partial.exists() and not self._force:
+            raise InputError(f"{self.partial}: left by a recording that did not end; read and remove it")
+        with one_line(self._path):
+            self._raw = self._bag = self._open()
+        for c in connections:
+            self.add(c.topic, c.kind, c.qos, digest=c.digest)
+        return self._path
 
     def write(self, topic: str, received_ns: int, data: bytes) -> None:
         """Take a message of a registered topic; the next `flush` writes it."""
@@ -301,11 +331,13 @@ class RawBagWriter(_GrowingBag):
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Messages so far, by topic."""
-        return {
-            topic: self._raw.store.counts[c.id] + len(self._waiting.get(topic, ()))
-            for topic, c in self._raw.connections.items()
-        }
+        """Messages so far, by topic, also those of earlier bags."""
+        return {topic: self._before[topic] + self._count(topic) for topic in self._raw.connections}
+
+    def _count(self, topic: str) -> int:
+        """Messages of a topic in this bag."""
+        stored = self._raw.store.counts[self._raw.connections[topic].id]
+        return int(stored) + len(self._waiting.get(topic, ()))
 
     def flush(self) -> None:
         """Make all messages outlive this process."""
@@ -321,8 +353,9 @@ class RawBagWriter(_GrowingBag):
         """End the bag and give it its name. Nothing is left if nothing was written."""
         self.flush()
         with one_line(self._path):
-            if any(self.counts.values()):
+            if any(map(self._count, self._raw.connections)):
                 self._finish()
+                self.paths.append(self._path)
                 return
             self._raw.abort()
             if self.partial.is_dir():

@@ -1,7 +1,7 @@
 """Bus: the interface of a node to ROS 2.
 
 There are two backends: rclpy, if it can be imported, and cyclonedds, which reaches any ROS 2 over the network
-from any Python. Both take and give messages as CDR bytes of `magtwin.io.bags.cdr`, so a node behaves the same
+from any Python. Both take and give messages as CDR bytes, so a node behaves the same
 with either.
 """
 
@@ -10,14 +10,12 @@ import importlib.util
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, Protocol
 
-import numpy as np
-
 from magtwin.errors import InputError, find
-from magtwin.io.bags.cdr import Messages, decode, encode
 from magtwin.io.bags.topics import SENSOR_DATA, Qos
-from magtwin.io.bags.types import layout
+from magtwin.ros.bus.messages import content_of, leaves_of
 from magtwin.ros.bus.names import Names, Range, range_of
 from magtwin.ros.parameters import Parameter
 
@@ -39,16 +37,6 @@ MISSING = (
 )
 
 
-def to_bytes(kind: str, fields: Mapping[str, Any]) -> bytes:
-    """One message in CDR.
-
-    Args:
-        kind: Its type, such as `sensor_msgs/msg/Imu`.
-        fields: Values by leaf name, as for `magtwin.io.bags.cdr.encode`.
-    """
-    return encode(layout(kind, fields), fields, 1).tobytes()
-
-
 @dataclass(frozen=True)
 class Message:
     """A received message."""
@@ -63,19 +51,26 @@ class Message:
     received_ns: int
     """Wall time of receipt [ns]."""
 
-    def read(self, wanted: Iterable[str], counts: Mapping[str, int] | None = None) -> dict[str, Any]:
+    @cached_property
+    def content(self) -> Any:
+        """The message as an object of rosbags, with an attribute for each field.
+
+        Raises:
+            InputError: It is too short or too long for its type, or not plain CDR.
+        """
+        return content_of(self.kind, self.data)
+
+    def read(self, wanted: Iterable[str]) -> dict[str, Any]:
         """Values of some leaves: numbers, arrays, strings; stamps in whole nanoseconds.
 
         Args:
-            wanted: Names of the leaves.
-            counts: Lengths of sequences of structures, as for `magtwin.io.bags.types.layout`.
+            wanted: Names of the leaves, such as `transforms.0.header.stamp`; the name of a sequence of
+                structures is its length.
 
         Raises:
-            InputError: It is too short for its type, or not plain CDR.
+            InputError: As for `content`; or it has fewer elements.
         """
-        buffer = np.frombuffer(self.data, np.uint8)
-        message = Messages(np.zeros(1, np.int64), buffer, np.zeros(1, np.int64), np.array([len(buffer)]))
-        return {name: value[0] for name, value in decode(layout(self.kind, counts), message, wanted).items()}
+        return leaves_of(self.kind, self.content, wanted)
 
 
 Handler = Callable[[Message], None]
@@ -101,6 +96,19 @@ class Subscription:
     topic: str
     publishers: Callable[[], int]
     """Number of publishers."""
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """A publisher or subscriber of a topic, as discovered."""
+
+    kind: str
+    """Message type; "" if it is not a ROS type."""
+
+    reliable: bool
+    latched: bool
+    digest: str = ""
+    """REP 2011 hash of its type; "" before ROS 2 Iron."""
 
 
 class Timer(Protocol):
@@ -158,14 +166,23 @@ class Bus(Protocol):
         """The full name of a topic on the network."""
         return self._names.resolve(topic)
 
+    def offers(self, topic: str) -> list[Endpoint]:
+        """The publishers of a topic, including those of this node, as far as discovered."""
+
+    def wants(self, topic: str) -> list[Endpoint]:
+        """The subscribers of a topic, including those of this node, as far as discovered."""
+
     def types(self, topic: str) -> tuple[str, ...]:
         """Types in which a topic is published, as far as discovered."""
+        return tuple(sorted({offer.kind for offer in self.offers(topic)} - {""}))
 
     def publishers(self, topic: str) -> int:
         """Number of publishers of a topic, including this node, as far as discovered."""
+        return len(self.offers(topic))
 
     def reliable(self, topic: str) -> bool:
         """Whether every discovered publisher of a topic offers it reliably."""
+        return all(offer.reliable for offer in self.offers(topic))
 
     def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> Timer:
         """Call `due` every `period_s` of the bus's clock, or of wall time, in the thread that spins."""

@@ -1,8 +1,8 @@
 """DdsBus: a node over cyclonedds, which reaches any ROS 2 on the network from any Python.
 
 It follows the mapping of ROS 2: `/robot/odom` is the DDS topic `rt/robot/odom`, QoS profiles are DDS
-policies, and messages are plain CDR. Such a node sends and receives like any other, but `ros2 node list`
-does not show it, and it has no parameters.
+policies, and messages are plain CDR. Such a node sends and receives like any other and is in the lists of
+`ros2 node list`, but has no services, and so no parameters.
 """
 
 import os
@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
-from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+from cyclonedds.builtin import BuiltinTopicDcpsSubscription
 from cyclonedds.core import (
     DDSException,
     InstanceState,
@@ -33,10 +33,11 @@ from magtwin.errors import InputError
 from magtwin.io.bags.cdr import NS
 from magtwin.io.bags.topics import CLOCK, Qos
 from magtwin.io.bags.types import typestore
-from magtwin.ros.bus.bus import Bus, Handler, Message, Offers, Publisher, Subscription, offered
+from magtwin.ros.bus.bus import Bus, Endpoint, Handler, Message, Offers, Publisher, Subscription, offered
 from magtwin.ros.bus.clock import Alarm, Clock
+from magtwin.ros.bus.graph import Discovered, Listed, user_data
 from magtwin.ros.bus.names import Names, Range
-from magtwin.ros.bus.types import raw, ros_name, struct_of
+from magtwin.ros.bus.types import raw, struct_of
 
 MOST_TAKEN = 256
 """Messages of a topic taken at a time."""
@@ -63,14 +64,15 @@ _DOMAINS: dict[int, Domain] = {}
 """Configured domains; they must be configured before the first participant and outlive it."""
 
 
-def qos_of(qos: Qos) -> DdsQos:
-    """DDS policies of a quality of service."""
+def qos_of(qos: Qos, kind: str) -> DdsQos:
+    """DDS policies of a quality of service, for an endpoint of a message type."""
     reliable = Policy.Reliability.Reliable(max_blocking_time=NS // 10)
     return DdsQos(
         reliable if qos.reliable else Policy.Reliability.BestEffort,
         Policy.History.KeepLast(qos.depth),
         Policy.Durability.TransientLocal if qos.latched else Policy.Durability.Volatile,
         Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),
+        user_data(kind),
     )
 
 
@@ -88,19 +90,20 @@ class DdsBus(Bus):
                 where = _HERE if reach == "localhost" else _ANYWHERE
                 xml = f'<CycloneDDS><Domain Id="any">{where}{_COMMON}</Domain></CycloneDDS>'
                 _DOMAINS[domain] = Domain(domain, xml)
-            self._participant = DomainParticipant(domain)
+            self._participant = DomainParticipant(domain, qos=DdsQos(Policy.Userdata(b"enclave=/;")))
         except DDSException as error:
             raise InputError(
                 f"cyclonedds cannot join domain {domain} ({error}); is CYCLONEDDS_URI right, the network up, "
                 "and are there fewer than 32 nodes on this machine?"
             ) from error
         self._waiting = WaitSet(self._participant)
-        self._topics: dict[str, tuple[str, DdsTopic[Any]]] = {}
+        self._topics: dict[tuple[str, str], DdsTopic[Any]] = {}
         self._writers: list[DataWriter[Any]] = []
         self._readers: list[tuple[DataReader[Any], str, Handler]] = []
         self._conditions: list[ReadCondition] = []
-        self._offers: BuiltinDataReader | None = None
-        self._offered: dict[Any, tuple[str, str, bool]] = {}
+        self._offers = Discovered(self._participant)
+        self._wants: Discovered | None = None
+        self._listed = Listed(self._participant, name, names.namespace, self._offers, self._gids)
         self.clock = Clock(sim_time=sim_time)
         if sim_time:
             self.subscribe(CLOCK.name, CLOCK.kind, self._tick, replace(CLOCK.qos.heard, depth=CLOCK_DEPTH))
@@ -109,7 +112,7 @@ class DdsBus(Bus):
         """As for `Bus`."""
         whole = self._names.resolve(topic)
         writer: DataWriter[Any] = DataWriter(
-            self._participant, self._topic(whole, kind), qos_of(offered(qos, self._offers_as))
+            self._participant, self._topic(whole, kind), qos_of(offered(qos, self._offers_as), kind)
         )
         self._writers.append(writer)  # its latched message lives as long as it does
         held = weakref.proxy(writer)  # a publisher that outlives its closed bus must not keep the participant
@@ -123,7 +126,7 @@ class DdsBus(Bus):
     def subscribe(self, topic: str, kind: str, handler: Handler, qos: Qos) -> Subscription:
         """As for `Bus`."""
         whole = self._names.resolve(topic)
-        reader: DataReader[Any] = DataReader(self._participant, self._topic(whole, kind), qos_of(qos))
+        reader: DataReader[Any] = DataReader(self._participant, self._topic(whole, kind), qos_of(qos, kind))
         fresh = ReadCondition(reader, SampleState.NotRead | ViewState.Any | InstanceState.Any)
         self._waiting.attach(fresh)
         self._conditions.append(fresh)
@@ -132,20 +135,18 @@ class DdsBus(Bus):
         return Subscription(whole, lambda: len(held.get_matched_publications()))
 
     def knows(self, kind: str) -> bool:
-        """As for `Bus`: the types of ROS 2 Humble."""
+        """As for `Bus`: the types of the distributions of ROS 2."""
         return kind in typestore().fielddefs
 
-    def types(self, topic: str) -> tuple[str, ...]:
+    def offers(self, topic: str) -> list[Endpoint]:
         """As for `Bus`."""
-        return tuple(sorted({kind for kind, _ in self._offers_of(topic) if kind}))
+        return self._offers.of(f"rt{self._names.resolve(topic)}")
 
-    def publishers(self, topic: str) -> int:
+    def wants(self, topic: str) -> list[Endpoint]:
         """As for `Bus`."""
-        return len(self._offers_of(topic))
-
-    def reliable(self, topic: str) -> bool:
-        """As for `Bus`."""
-        return all(reliable for _, reliable in self._offers_of(topic))
+        if self._wants is None:
+            self._wants = Discovered(self._participant, BuiltinTopicDcpsSubscription)
+        return self._wants.of(f"rt{self._names.resolve(topic)}")
 
     def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> Alarm:
         """As for `Bus`."""
@@ -161,6 +162,7 @@ class DdsBus(Bus):
 
     def spin_once(self, timeout_s: float) -> None:
         """As for `Bus`."""
+        self._listed.look()
         left = self.clock.left_s(timeout_s)
         if self._conditions and left > 0:
             self._waiting.wait(round(left * NS))
@@ -173,31 +175,16 @@ class DdsBus(Bus):
         """As for `Bus`."""
         for held in (self._conditions, self._readers, self._writers, self._topics):
             held.clear()  # type: ignore[attr-defined]
-        self._offers = None
-        del self._waiting, self._participant
+        del self._waiting, self._listed, self._offers, self._wants, self._participant
 
-    def _offers_of(self, topic: str) -> list[tuple[str, bool]]:
-        """Type of each publisher of a topic, "" if it is not a ROS type, and whether it is reliable."""
-        if self._offers is None:
-            self._offers = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
-        while taken := self._offers.take(N=MOST_TAKEN):
-            for offer in taken:
-                if offer.sample_info.valid_data:
-                    reliable = isinstance(offer.qos[Policy.Reliability], Policy.Reliability.Reliable)
-                    self._offered[offer.key] = offer.topic_name, ros_name(offer.type_name), reliable
-                elif offer.sample_info.instance_state != InstanceState.Alive:
-                    self._offered.pop(offer.key, None)
-        whole = f"rt{self._names.resolve(topic)}"
-        return [(kind, reliable) for name, kind, reliable in self._offered.values() if name == whole]
+    def _gids(self) -> tuple[list[bytes], list[bytes]]:
+        """Identifiers of the subscriptions and publishers of this node."""
+        return [reader.guid.bytes for reader, *_ in self._readers], [w.guid.bytes for w in self._writers]
 
     def _topic(self, whole: str, kind: str) -> "DdsTopic[Any]":
-        known = self._topics.get(whole)
-        if known is None:
-            known = kind, DdsTopic(self._participant, f"rt{whole}", struct_of(kind))
-            self._topics[whole] = known
-        if known[0] != kind:
-            raise InputError(f"topic {whole} is a {known[0]} in this node and cannot also be a {kind}")
-        return known[1]
+        if (whole, kind) not in self._topics:
+            self._topics[whole, kind] = DdsTopic(self._participant, f"rt{whole}", struct_of(kind))
+        return self._topics[whole, kind]
 
     def _take(self) -> None:
         """Handle all received messages in the order of sending."""

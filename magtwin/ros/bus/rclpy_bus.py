@@ -18,12 +18,16 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from magtwin.errors import InputError
 from magtwin.io.bags.topics import Qos
-from magtwin.ros.bus.bus import Bus, Handler, Message, Offers, Publisher, Subscription, offered
+from magtwin.ros.bus.bus import Bus, Endpoint, Handler, Message, Offers, Publisher, Subscription, offered
 from magtwin.ros.bus.names import Names, Range
 from magtwin.ros.parameters import Parameter, checked
 
 MOST_AT_ONCE = 256
 """Callbacks that run before `spin_once` returns."""
+
+
+OTHER_S = 0.02
+"""Longest wait for messages while there is a second node, which is looked at in between [s]."""
 
 
 @contextmanager
@@ -66,6 +70,16 @@ def class_of(kind: str) -> Any:
         ) from error
 
 
+def _endpoint(info: Any) -> Endpoint:
+    digest = str(getattr(info, "topic_type_hash", ""))  # none in Humble
+    return Endpoint(
+        kind=info.topic_type,
+        reliable=info.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT,
+        latched=info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+        digest=digest if digest.startswith("RIHS01_") else "",
+    )
+
+
 class RclpyBus(Bus):
     """As `magtwin.ros.bus.Bus`."""
 
@@ -75,24 +89,39 @@ class RclpyBus(Bus):
         self, name: str, names: Names, *, sim_time: bool, domain: int, reach: Range, offers: Offers
     ) -> None:
         self.name, self._names, self.reach, self._offers_as = name, names, reach, offers
-        self._context = Context()
-        with _environment(ROS_AUTOMATIC_DISCOVERY_RANGE=reach.upper(), ROS_LOCALHOST_ONLY=None):
-            rclpy.init(args=[], context=self._context, domain_id=domain)
-        self._node = Node(
+        self._domain, self._sim_time = domain, sim_time
+        self._context, self._node, self._executor = self._joined(name)
+        self._calls, self._due_ns, self._kinds = 0, 0, dict[str, str]()
+        self._other: tuple[Context, Node, SingleThreadedExecutor] | None = None
+
+    def _joined(self, name: str) -> tuple[Context, Node, SingleThreadedExecutor]:
+        """A node and what spins it."""
+        context = Context()
+        with _environment(ROS_AUTOMATIC_DISCOVERY_RANGE=self.reach.upper(), ROS_LOCALHOST_ONLY=None):
+            rclpy.init(args=[], context=context, domain_id=self._domain)
+        node = Node(
             name,
-            context=self._context,
-            namespace=names.namespace or "/",
+            context=context,
+            namespace=self._names.namespace or "/",
             use_global_arguments=False,
-            parameter_overrides=[rclpy.parameter.Parameter("use_sim_time", value=sim_time)],
+            parameter_overrides=[rclpy.parameter.Parameter("use_sim_time", value=self._sim_time)],
         )
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
-        self._calls, self._due_ns = 0, 0
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+        return context, node, executor
+
+    def _node_for(self, whole: str, kind: str) -> Node:
+        """The node for a topic of a type; a node of rclpy can have a topic in one type only."""
+        if self._kinds.setdefault(whole, kind) == kind:
+            return self._node
+        if self._other is None:
+            self._other = self._joined(f"{self.name}_other_types")
+        return self._other[1]
 
     def publisher(self, topic: str, kind: str, qos: Qos) -> Publisher:
         """As for `Bus`."""
         whole = self._names.resolve(topic)
-        sender = self._node.create_publisher(
+        sender = self._node_for(whole, kind).create_publisher(
             class_of(kind), whole, qos_of(offered(qos, self._offers_as))
         )  # takes CDR bytes
         return Publisher(whole, kind, sender.publish, sender.get_subscription_count)
@@ -105,8 +134,9 @@ class RclpyBus(Bus):
             self._calls += 1
             handler(Message(kind, bytes(data), int(info["source_timestamp"]), time.time_ns()))
 
-        self._node.create_subscription(class_of(kind), whole, receive, qos_of(qos), raw=True)
-        return Subscription(whole, lambda: int(self._node.count_publishers(whole)))
+        node = self._node_for(whole, kind)
+        node.create_subscription(class_of(kind), whole, receive, qos_of(qos), raw=True)
+        return Subscription(whole, lambda: sum(offer.kind == kind for offer in self.offers(topic)))
 
     def service(self, name: str, called: Callable[[], None]) -> bool:
         """As for `Bus`; needs std_srvs."""
@@ -158,20 +188,15 @@ class RclpyBus(Bus):
         except InputError:
             return False
 
-    def types(self, topic: str) -> tuple[str, ...]:
+    def offers(self, topic: str) -> list[Endpoint]:
         """As for `Bus`."""
-        whole = self._names.resolve(topic)
-        offers = self._node.get_publishers_info_by_topic(whole)
-        return tuple(sorted({offer.topic_type for offer in offers}))
+        found = self._node.get_publishers_info_by_topic(self._names.resolve(topic))
+        return [_endpoint(info) for info in found]
 
-    def publishers(self, topic: str) -> int:
+    def wants(self, topic: str) -> list[Endpoint]:
         """As for `Bus`."""
-        return int(self._node.count_publishers(self._names.resolve(topic)))
-
-    def reliable(self, topic: str) -> bool:
-        """As for `Bus`."""
-        offers = self._node.get_publishers_info_by_topic(self._names.resolve(topic))
-        return all(offer.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for offer in offers)
+        found = self._node.get_subscriptions_info_by_topic(self._names.resolve(topic))
+        return [_endpoint(info) for info in found]
 
     def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> Any:
         """As for `Bus`."""
@@ -195,6 +220,9 @@ class RclpyBus(Bus):
     def spin_once(self, timeout_s: float) -> None:
         """As for `Bus`."""
         before = self._calls
+        if self._other is not None:
+            self._other[2].spin_once(timeout_sec=0.0)
+            timeout_s = min(timeout_s, OTHER_S)
         self._executor.spin_once(timeout_sec=timeout_s)
         for _ in range(MOST_AT_ONCE):
             if self._calls == before:
@@ -204,6 +232,8 @@ class RclpyBus(Bus):
 
     def close(self) -> None:
         """As for `Bus`."""
-        self._executor.shutdown()
-        self._node.destroy_node()
-        rclpy.shutdown(context=self._context)
+        parts = [(self._context, self._node, self._executor), *([self._other] if self._other else [])]
+        for context, node, executor in parts:
+            executor.shutdown()
+            node.destroy_node()
+            rclpy.shutdown(context=context)

@@ -12,7 +12,7 @@ from cyclonedds.idl import types as idl
 from cyclonedds.idl.annotations import final
 from rosbags.interfaces import Nodetype
 
-from magtwin.io.bags.types import fields_of
+from magtwin.io.bags.types import fields_of, typestore
 
 _BASES = {"bool": bool, "byte": idl.byte, "char": idl.uint8, "string": str}
 _BASES |= {name: getattr(idl, name) for name in ("float32", "float64")}
@@ -36,13 +36,19 @@ def ros_name(dds: str) -> str:
 @cache
 def struct_of(kind: str) -> type[IdlStruct]:
     """The structure of a message type, whose samples are bytes; a `DataWriter` takes what `raw` makes."""
-    struct = _struct(kind)
+    fields_of(kind)
+    return struct_in(kind, typestore())
+
+
+def struct_in(kind: str, store: Any) -> type[IdlStruct]:
+    """The structure of a message type as a typestore defines it, for `sample_of`."""
+    struct = _struct(kind, store)
 
     def serialize(self: Any, buffer: Any = None, endianness: Any = None, use_version_2: Any = None) -> bytes:
         return bytes(self.cdr)
 
     def deserialize(cls: Any, data: bytes, has_header: bool = True, use_version_2: Any = None) -> Any:
-        return raw(kind, data)
+        return sample_of(cls, data)
 
     struct.serialize = serialize  # type: ignore[method-assign]
     struct.deserialize = classmethod(deserialize)  # type: ignore[assignment]
@@ -51,22 +57,29 @@ def struct_of(kind: str) -> type[IdlStruct]:
 
 def raw(kind: str, data: bytes) -> Any:
     """A sample of a message type with these bytes as its CDR."""
-    sample = object.__new__(struct_of(kind))
+    return sample_of(struct_of(kind), data)
+
+
+def sample_of(struct: type[IdlStruct], data: bytes) -> Any:
+    """A sample of a structure with these bytes as its CDR."""
+    sample: Any = object.__new__(struct)
     sample.cdr = data
     return sample
 
 
-def _struct(kind: str) -> type[IdlStruct]:
+def _struct(kind: str, store: Any) -> type[IdlStruct]:
     name = dds_name(kind)
-    members = {field: _member(described) for field, described in fields_of(kind)}
+    members = {field: _member(described, store) for field, described in store.fielddefs[kind][1]}
     return final(make_idl_struct(name.rpartition("::")[2], name, members))
 
 
-def _member(described: Any) -> Any:
+def _member(described: Any, store: Any) -> Any:
     node, content = described
     if node is Nodetype.BASE:
         return _BASES[content[0]]
     if node is Nodetype.NAME:
-        return _struct(content)
+        return _struct(content, store)
     element, count = content
-    return idl.array[_member(element), count] if node is Nodetype.ARRAY else idl.sequence[_member(element)]
+    if node is Nodetype.ARRAY:
+        return idl.array[_member(element, store), count]
+    return idl.sequence[_member(element, store)]

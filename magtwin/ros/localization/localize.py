@@ -63,6 +63,11 @@ PARAMETERS: Mapping[str, Parameter] = MappingProxyType(
         "use_sim_time": Parameter(False, "use the time of /clock"),
         "prior": Parameter("wait", "start: wait for /initialpose, global, or a pose x,y,yaw [m, m, rad]"),
         "max_age_s": Parameter(0.5, "age at which odometry is stale [s]", 0.01, 60.0),
+        "stamps": Parameter(
+            "header",
+            "time of the inputs: the stamps of their headers, or their arrival",
+            words=("header", "arrival"),
+        ),
         "silent_s": Parameter(
             0.5, "silence of the magnetometer after which odometry is used alone [s]", 0.05, 60.0
         ),
@@ -123,8 +128,9 @@ class LocalizerNode:
         sender = sender_of(twin.scene.robot, unit="T", rate_hz=settings["rate_hz"])
         self._sender = prefixed(sender, checked_prefix(frame_prefix))
         age = settings["max_age_s"]
-        self.inputs = {ODOMETRY.name: Input(bus, ODOMETRY, max_age_s=age)}
-        self.inputs |= {topic.name: Input(bus, topic, max_age_s=HELD_S) for topic in OTHERS}
+        told: Any = {"stamps": settings["stamps"], "say": say}
+        self.inputs = {ODOMETRY.name: Input(bus, ODOMETRY, max_age_s=age, **told)}
+        self.inputs |= {topic.name: Input(bus, topic, max_age_s=HELD_S, **told) for topic in OTHERS}
         for topic in OTHERS:
             self.inputs[topic.name].silence = "not there: the method gets none of it"
         lidar = twin.scene.robot.lidar
@@ -193,7 +199,7 @@ class LocalizerNode:
         """A reading of the magnetometer; the method gets it if it is the last one before a tick."""
         arrived = time.monotonic()
         leaf = MAGNITUDE.leaves(message.kind)[0]
-        stamped = message.kind.startswith("sensor_msgs")
+        stamped = message.kind.startswith("sensor_msgs") and self._settings["stamps"] == "header"
         try:
             read = message.read([leaf, *(("header.stamp",) if stamped else ())])
         except InputError:
@@ -328,7 +334,7 @@ class LocalizerNode:
         first = "transforms.0"
         names = [f"{first}.header.stamp", f"{first}.header.frame_id", f"{first}.child_frame_id"]
         try:
-            read = message.read(names, {"transforms": 1})
+            read = message.read(names)
         except InputError:
             return  # empty, or damaged
         frames = (str(read[names[1]]).strip("/"), str(read[names[2]]).strip("/"))
