@@ -197,7 +197,7 @@ def _warnings_in_lines() -> Iterator[None]:
                 show(message, category, *where, **more)
             elif str(message) not in printed:
                 printed.add(str(message))
-                print_error(f"warning: {InputError(str(message)).in_flags(_flags)}", style="1;33")
+                print_error(f"warning: {InputError(str(message)).in_flags(_flags())}", style="1;33")
 
         warnings.showwarning = line
         yield

@@ -1,5 +1,6 @@
 """`magtwin robot`: a description in, a USD articulation out, and back."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Literal
 
@@ -106,16 +107,16 @@ def robot(
         "mass": mass_kg,
     }
     step("Converting the robot")
-    made = from_urdf(
-        urdf,
-        out,
-        settings=settings,
-        force=force,
-        thumbnail=_thumbnail if thumbnail else None,
-        **{name: choice for name, choice in choices.items() if choice is not None},
-    )
-    if report is not None:
-        with output(report, force=force) as aside:
+    with output(report, force=force) if report is not None else nullcontext() as aside:
+        made = from_urdf(
+            urdf,
+            out,
+            settings=settings,
+            force=force,
+            thumbnail=_thumbnail if thumbnail else None,
+            **{name: choice for name, choice in choices.items() if choice is not None},
+        )
+        if aside is not None:
             aside.write_text(made.report.to_json(), encoding="utf-8")
     return Done(made.report.summary(), made.asset)
 

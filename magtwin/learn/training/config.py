@@ -99,7 +99,8 @@ class TrainConfig:
     """Sessions, runs, paths or recordings to put into the test."""
 
     threads: int | None = None
-    """Threads of torch; None leaves them as they are. Another number gives other bits."""
+    """Threads of torch and of numpy's products. None: one, whatever the number of processors. Another number
+    gives other bits."""
 
     device: Device | None = None
     """Where torch trains: "cpu", "cuda", or "auto" (a GPU if torch sees one)."""
