@@ -42,8 +42,10 @@ def measure(tool: str, urdf: Path, out: Path, packages: list[str]) -> tuple[floa
     shutil.rmtree(out, ignore_errors=True)
     command = [word.format(urdf=urdf, out=out) for word in COMMANDS[tool]]
     command += [word for package in packages for word in ("--package", package)]
+    # byte code of the modules is kept, as in an installed package; pip compiled that of the peer
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     with tempfile.TemporaryFile() as log:
-        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
         _, status, usage = os.wait4(process.pid, 0)
         if status:
             log.seek(0)

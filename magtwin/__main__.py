@@ -1,5 +1,5 @@
 """`python -m magtwin` is `magtwin`."""
 
-from magtwin.cli import main
+from magtwin.start import main
 
 main()

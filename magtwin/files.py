@@ -6,25 +6,24 @@ import errno
 import hashlib
 import os
 import re
-import shutil
 import stat
 import subprocess
-import tempfile
 import tomllib
 import types
 import typing
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from magtwin.budget import check_depth, check_size
 from magtwin.errors import InputError, hint
+from magtwin.outputs import afterwards as afterwards
+from magtwin.outputs import at_once as at_once
+from magtwin.outputs import check_free as check_free
+from magtwin.outputs import output as output
+from magtwin.outputs import transaction as transaction
 
 T = TypeVar("T")
-
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
-"""Errors of a disk that is full or read-only."""
 
 
 def shipped(*parts: str) -> Path:
@@ -115,68 +114,6 @@ def read_text(path: str | os.PathLike[str], what: str, kind: str, encoding: str 
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not a text file ({error}); expected a {what} in UTF-8") from error
     return text.replace("\r\n", "\n").replace("\r", "\n")
-
-
-def check_free(path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """`path` if it does not exist yet, or if `force` is True.
-
-    Raises:
-        InputError: It exists and `force` is False.
-    """
-    path = Path(path)
-    if path.exists() and not force:
-        raise InputError(
-            f"{path}: exists already; give `force=True` to replace it, or another name", parameter="force"
-        )
-    return path
-
-
-@contextmanager
-def output(path: str | os.PathLike[str], *, force: bool = False) -> Iterator[Path]:
-    """Write a file or a folder aside; it replaces `path` at the end of the block.
-
-    Create the file or folder at the yielded path, which has the suffix of `path`. If the block raises,
-    nothing is left behind, so no output is ever half-written.
-
-    Args:
-        path: The file or folder to make. Its parents are created.
-        force: Whether to replace an existing file or folder.
-
-    Raises:
-        InputError: It exists and `force` is False, its folder cannot be written, or the disk is full.
-    """
-    path = check_free(path, force=force)
-    place = Path.cwd() / path  # absolute, since the working folder can be renamed
-    if place.resolve() in (Path.cwd(), *Path.cwd().parents):
-        raise InputError(f"{path}: is the working folder or contains it; give a folder inside it")
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        raise InputError(f"{path}: a device or pipe, which cannot be replaced; give a file")
-    try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        aside = Path(tempfile.mkdtemp(prefix=f".{place.name}.", dir=place.parent))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
-    new, old = aside / place.name, aside / ".old"
-    try:
-        yield new
-        if place.exists() and place.is_dir() != new.is_dir():
-            kind = "folder" if place.is_dir() else "file"
-            raise InputError(f"{path}: is a {kind}, and the output is not; remove it first")
-        if place.is_dir():
-            place.rename(old)
-            try:
-                new.rename(place)
-            except BaseException:
-                old.rename(place)
-                raise
-        else:
-            new.replace(place)
-    except OSError as error:
-        if error.errno not in _FULL:
-            raise
-        raise InputError(f"{path}: cannot be written ({os.strerror(error.errno)})") from error
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
 
 
 def sha256(path: str | os.PathLike[str]) -> str:

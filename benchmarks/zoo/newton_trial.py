@@ -12,6 +12,7 @@ MuJoCo solver on the CPU steps the model, with the settings of magtwin's own eng
 import json
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import newton
@@ -30,10 +31,24 @@ STIFF_STEPS = 4.0
 SPEED_M_S, TURN_RAD, SLIDE_M = 0.1, 0.2, 0.02
 """Speed of wheels, and steps of a rotary and of a sliding joint."""
 
-FAR_M = 100.0
+FAR_M, GRAVITY = 100.0, 9.81
 
 LIMIT_GB = 8
 """Most memory of a trial [GB]."""
+
+
+class Wheel(NamedTuple):
+    """A wheel that stands on the floor."""
+
+    joint: int
+
+    axle: np.ndarray
+    """Unit axis of the joint on the floor, shape (2,)."""
+
+    radius: float
+    """Height of its centre [m]."""
+
+    friction: float
 
 
 class Trial:
@@ -61,6 +76,7 @@ class Trial:
         self.now, self.then, self.control = model.state(), model.state(), model.control()
         newton.eval_fk(model, model.joint_q, model.joint_qd, self.now)
         self.top_speed = 0.0
+        self.up_at_start = self.up()
 
     def _put_on_the_floor(self) -> None:
         """Lower or raise the robot until its lowest collider touches the plane."""
@@ -138,49 +154,73 @@ class Trial:
         at = self.qd_at[joint]
         return float(self.model.joint_target_ke.numpy()[at]), float(self.model.joint_target_kd.numpy()[at])
 
-    def wheels(self) -> list[tuple[int, float]]:
-        """Joints with a velocity drive whose body stands on the floor, with rad of the joint per metre."""
-        on_floor = set()
+    def on_floor(self) -> dict[str, float]:
+        """Bodies that touch the floor, by their name in MuJoCo, with the largest friction of a contact."""
+        touching: dict[str, float] = {}
         plane = mujoco.mjtGeom.mjGEOM_PLANE
         for contact in self.data.contact[: self.data.ncon]:
             for a, b in ((contact.geom1, contact.geom2), (contact.geom2, contact.geom1)):
                 if self.mj.geom_type[a] == plane:
-                    on_floor.add(self.mj.body(self.mj.geom_bodyid[b]).name)
-        found = []
+                    name = self.mj.body(self.mj.geom_bodyid[b]).name
+                    touching[name] = max(touching.get(name, 0.0), float(contact.friction[0]))
+        return touching
+
+    def wheels(self) -> list[Wheel]:
+        """Joints with a velocity drive whose body stands on the floor."""
+        wheels, touching = [], self.on_floor()
         child, place = self.model.joint_child.numpy(), self.places()
         for joint in self.single():
             ke, kd = self.gains(joint)
             body = int(child[joint])
-            if ke or not kd or self.bodies[body].replace("/", "_") not in on_floor:
+            friction = touching.get(self.bodies[body].replace("/", "_"))
+            if ke or not kd or friction is None:
                 continue
-            name = self.labels[joint].replace("/", "_")
-            axis = self.data.xaxis[self.mj.joint(name).id]
-            radius = place[body][2]
-            if abs(axis[2]) < 0.3 and radius > 0.005:
-                left = np.array([-self.ahead()[1], self.ahead()[0]])
-                found.append((joint, float(np.sign(axis[:2] @ left)) / radius))
-        return found
+            axis = self.data.xaxis[self.mj.joint(self.labels[joint].replace("/", "_")).id]
+            if abs(axis[2]) < 0.3 and place[body][2] > 0.005:
+                wheels.append(Wheel(joint, axis[:2] / np.linalg.norm(axis[:2]), place[body][2], friction))
+        return wheels
 
-    def ahead(self) -> np.ndarray:
-        """The x axis of the base on the floor."""
+    def ahead(self, wheels: list[Wheel]) -> np.ndarray:
+        """The direction on the floor in which the wheels roll, shape (2,): across their axles.
+
+        The x axis of the base, or for a base that is turned in its description, its y axis.
+        """
         x, y, z, w = self.places()[0][3:7]
         v = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w)])
-        return v / max(np.linalg.norm(v), 1e-9)
+        v /= max(np.linalg.norm(v), 1e-9)
+        along = np.mean([abs(wheel.axle @ v) for wheel in wheels])
+        return np.array([-v[1], v[0]]) if along > math.cos(math.radians(30)) else v
+
+    def up(self) -> np.ndarray:
+        """The z axis of the base, shape (3,)."""
+        x, y, z, w = self.now.body_q.numpy().astype(float)[0][3:7]
+        return np.array([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)])
 
     def tilt(self) -> float:
-        x, y, *_ = self.places()[0][3:7]
-        return math.degrees(math.acos(max(-1.0, min(1.0, 1 - 2 * (x * x + y * y)))))
+        """Angle between the z axis of the base now and at the start [deg]."""
+        return math.degrees(math.acos(max(-1.0, min(1.0, float(self.up() @ self.up_at_start)))))
 
-    def drive(self, wheels: list[tuple[int, float]]) -> dict:
-        """Roll ahead; the distance as a share of what the wheels turn."""
+    def drive(self, wheels: list[Wheel]) -> dict:
+        """Roll ahead; the distance as a share of what the wheels should turn.
+
+        With a description's friction mu the floor moves the robot by at most mu g t^2 / 2. If that is less
+        than half of the distance, the share is that of the wheels' own turn.
+        """
         targets = self.control.joint_target_qd.numpy().copy()
-        for joint, rate in wheels:
+        start, ahead, before = self.places()[0][:2], self.ahead(wheels), self.positions()
+        left, distance = np.array([-ahead[1], ahead[0]]), SPEED_M_S * MOVE_S
+        rates = {w.joint: float(np.sign(w.axle @ left)) / w.radius for w in wheels}
+        for joint, rate in rates.items():
             targets[self.qd_at[joint]] = rate * SPEED_M_S
-        start, ahead = self.places()[0][:2], self.ahead()
         self.control.joint_target_qd.assign(targets)
-        fine = self.run(MOVE_S)
-        share = float((self.places()[0][:2] - start) @ ahead) / (SPEED_M_S * MOVE_S) if fine else math.nan
-        return {"what": f"{len(wheels)} wheels", "share": share}
+        what, friction = f"{len(wheels)} wheels", max(w.friction for w in wheels)
+        if not self.run(MOVE_S):
+            return {"what": what, "share": math.nan}
+        if friction * GRAVITY * MOVE_S**2 / 2 < distance / 2:
+            turned = self.positions() - before
+            shares = [turned[self.q_at[joint]] / (rate * distance) for joint, rate in rates.items()]
+            return {"what": f"{what} turn, on friction {friction:.2g}", "share": float(np.mean(shares))}
+        return {"what": what, "share": float((self.places()[0][:2] - start) @ ahead) / distance}
 
     def move(self) -> dict | None:
         """Move the first joint that has a drive; the motion as a share of the step."""
@@ -225,7 +265,7 @@ def main(job_file: str) -> None:
     start = trial.places()
     fine = trial.run(SETTLE_S)
     if fine:
-        settled = trial.places()
+        settled, tilt = trial.places(), trial.tilt()
         fine = trial.run(WATCH_S)
     if fine:
         after = trial.places()
@@ -235,9 +275,13 @@ def main(job_file: str) -> None:
             "creep_m": float(creep.max()),
             "creeps": trial.bodies[int(creep.argmax())],
             "base_moved_m": float(moved[0]),
+            "base_sank_m": float(start[0, 2] - after[0, 2]),
+            "base_creep_m": float(abs(after[0, 2] - settled[0, 2])),
             "moved_m": float(moved.max()),
             "moves": trial.bodies[int(moved.argmax())],
             "tilt_deg": trial.tilt(),
+            "tilt_creep_deg": abs(trial.tilt() - tilt),
+            "on_floor": sorted(trial.on_floor()),
         }
         wheels = trial.wheels() if trial.floats else []
         seen["motion"] = trial.drive(wheels) if wheels else trial.move()

@@ -6,6 +6,7 @@ A server of jobs, see `serving.py`. `zoo.py` writes them.
 """
 
 import json
+import re
 import time
 from pathlib import Path
 from xml.etree import ElementTree
@@ -45,9 +46,17 @@ def convert(job: dict, row: dict):
         "repairs": {line.kind: line.count for line in report.repairs},
         "lint": len(report.lint),
         "meshes_absent": sum(line.count for line in report.repairs if line.kind == "mesh-missing"),
+        "boxes": boxes(report),
         "mass_kg": report.mass_out_kg,
     }
     return made
+
+
+def boxes(report) -> list[str]:
+    """Links with a placeholder for a collision mesh that is absent."""
+    texts = [entry.text for line in report.repairs for entry in line.entries]
+    found = [re.match(r"link '(.*?)': collision mesh .* a box of", text) for text in texts]
+    return sorted({match[1] for match in found if match})
 
 
 def check(asset: Path, row: dict) -> None:

@@ -5,6 +5,9 @@ import re
 MOST_CREEP_M = 0.005
 """A robot is at rest if no link moves by more in a second [m]."""
 
+MOST_CREEP_DEG = 0.5
+"""And if its base turns by no more [deg]."""
+
 MOST_SPEED_M_S = 20.0
 """A link that is faster was thrown [m/s]."""
 
@@ -18,8 +21,26 @@ BEGIN, END = "<!-- zoo: begin -->", "<!-- zoo: end -->"
 
 ENGINES = ("newton", "physx")
 
-TIPPED_DEG = 30.0
-"""A robot that ends with a larger tilt has tipped over [deg]."""
+LEVEL_DEG, SUNK_M = 3.0, 0.005
+"""A robot stands if its base tilts and sinks by no more from its authored place."""
+
+FALLEN_DEG = 30.0
+"""A robot whose base tilts by more has fallen over [deg]."""
+
+STANDING = ("mobile", "mobile manipulator")
+"""Kinds that must stand without a controller."""
+
+
+def stance(seen: dict) -> str:
+    """How a floating robot ends in an engine: "stands", or what it does instead; "" if it is fixed."""
+    if not seen.get("floats") or "tilt_deg" not in seen:
+        return ""
+    tilt, sunk = seen["tilt_deg"], seen.get("base_sank_m", 0.0)
+    if tilt > FALLEN_DEG:
+        return f"falls over ({tilt:.0f} deg)"
+    if tilt > LEVEL_DEG:
+        return f"leans {tilt:.1f} deg"
+    return "stands" if sunk <= SUNK_M else f"sinks {1e3 * sunk:.0f} mm"
 
 
 def faults(row: dict) -> list[str]:
@@ -54,17 +75,30 @@ def trial_faults(seen: dict, row: dict) -> list[str]:
         texts.append(f"is thrown at {seen['top_speed_m_s']:.0f} m/s")
     if seen["creep_m"] > MOST_CREEP_M:
         texts.append(f"creeps {1e3 * seen['creep_m']:.0f} mm/s ({seen['creeps'].rpartition('/')[2]})")
+    if seen.get("base_creep_m", 0.0) > MOST_CREEP_M or seen.get("tilt_creep_deg", 0.0) > MOST_CREEP_DEG:
+        texts.append(f"does not come to rest: {1e3 * seen['base_creep_m']:.0f} mm/s")
+    if row.get("kind") in STANDING and stance(seen) not in ("", "stands"):
+        texts.append(stance(seen))
     motion = seen.get("motion")
-    if motion and not row.get("meshes_absent") and not MOTION[0] <= motion["share"] <= MOTION[1]:
+    if motion and not on_boxes(row, seen) and not MOTION[0] <= motion["share"] <= MOTION[1]:
         texts.append(f"{motion['what']}: {100 * motion['share']:.0f} % of the commanded motion")
     return texts
+
+
+def on_boxes(row: dict, seen: dict) -> list[str]:
+    """Links that touch the floor with a placeholder for an absent collision mesh."""
+    touching = {name.rpartition("/")[2] for name in seen.get("on_floor", ())}
+    return [link for link in row.get("boxes", ()) if any(name.endswith(link) for name in touching)]
 
 
 def summary(rows: list[dict]) -> str:
     """One line."""
     converted = [r for r in rows if "convert_cpu_s" in r]
     good = [r for r in rows if not faults(r)]
-    return f"{len(rows)} robots: {len(converted)} converted, {len(good)} without a fault"
+    text = f"{len(rows)} robots: {len(converted)} converted, {len(good)} without a fault"
+    stances = [stance(row[engine]) for row in rows for engine in ENGINES[:1] if engine in row]
+    floating = [s for s in stances if s]
+    return f"{text}; {floating.count('stands')} of {len(floating)} that float stand" if floating else text
 
 
 def replaced(text: str, rows: list[dict]) -> str:
@@ -79,20 +113,23 @@ def markdown(rows: list[dict]) -> str:
     lines = [
         f"{summary(rows)}.",
         "",
-        "| robot | kind | description | links | mass, kg | rules | at rest: creep, mm | motion | remarks |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| robot | kind | description | links | mass, kg | rules | stance | creep, mm | motion | remarks |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     lines += [_line(row) for row in rows]
     lines += ["", "## What is wrong", ""]
     bad = [(row["name"], text) for row in rows for text in faults(row)]
+    known = {row["name"]: row["known"] for row in rows if row.get("known")}
     lines += [f"- {name}: {_plain(text)}" for name, text in bad] or ["Nothing."]
+    told = [f"- {name}: {known[name]}" for name in dict.fromkeys(name for name, _ in bad) if name in known]
+    lines += ["", "The reasons, where they are in the descriptions:", "", *told] if told else []
     return "\n".join(lines)
 
 
 def _line(row: dict) -> str:
     where = f"`{row['source']}` {row['commit'][:10]}, `{row['path']}`"
     if "convert_cpu_s" not in row:
-        return f"| {row['name']} | {row['kind']} | {where} | | | | | | not converted |"
+        return f"| {row['name']} | {row['kind']} | {where} | | | | | | | not converted |"
     count = sum(map(len, row.get("errors", {}).values()))
     rules = "not run" if "errors" not in row else "passed" if not count else f"{count} errors"
     seen = next((row[engine] for engine in ENGINES if engine in row), {})
@@ -107,9 +144,12 @@ def _line(row: dict) -> str:
         remarks.append("repaired: " + ", ".join(f"{kind} {count}" for kind, count in row["repairs"].items()))
     if "yourdfpy" in row.get("steps_failed", {}):
         remarks.append("yourdfpy refuses it")
-    if seen.get("floats") and seen.get("tilt_deg", 0.0) > TIPPED_DEG:
-        remarks.append("tips over")
-    cells = [row["name"], row["kind"], where, row["links"], mass, rules, creep, share, "; ".join(remarks)]
+    if on_boxes(row, seen):
+        remarks.append(
+            f"motion not judged: {', '.join(on_boxes(row, seen))} stands on a box for its absent mesh"
+        )
+    said = "; ".join(remarks)
+    cells = [row["name"], row["kind"], where, row["links"], mass, rules, stance(seen), creep, share, said]
     return f"| {' | '.join(map(str, cells))} |"
 
 

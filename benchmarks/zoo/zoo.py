@@ -85,14 +85,15 @@ def job_of(robot: dict, commits: dict, folder: Path | None, engines: list, build
 
 def run(robot: dict, commits: dict, folder: Path | None, servers: dict, fresh: bool, build: Path) -> dict:
     """The row of a robot, kept or made."""
-    engines = [name for name in servers if name != "robot"]
+    engines, known = [name for name in servers if name != "robot"], robot.get("known", "")
+    robot = {key: value for key, value in robot.items() if key != "known"}
     kept = build / "rows" / f"{robot['name']}.json"
     key = hashlib.sha256(json.dumps([robot, commits[robot["source"]], sorted(engines)]).encode()).hexdigest()
     if kept.is_file() and not fresh:
         row = json.loads(kept.read_text())
         if row["key"] == key:
-            return row
-    row = {"key": key, **robot, "commit": commits[robot["source"]]}
+            return row | {"known": known}
+    row = {"key": key, "known": known, **robot, "commit": commits[robot["source"]]}
     try:
         job = job_of(robot, commits, folder, engines, build)
         work = Path(job["answer"]).parent

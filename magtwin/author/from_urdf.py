@@ -8,7 +8,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magtwin.files import existing, output
+from magtwin.files import output
+from magtwin.kinds import expected
 from magtwin.urdf.convert import convert_with_report
 from magtwin.urdf.options import DEFAULTS, DriveRule, Options
 from magtwin.urdf.report import ConversionReport
@@ -70,7 +71,7 @@ def from_urdf(
     Raises:
         InputError: The description or the settings are invalid, or the folder exists; nothing is written.
     """
-    urdf = existing(urdf, "URDF")
+    urdf = expected(urdf, "robot description")
     name = f"{urdf.name.lstrip('.').split('.')[0] or 'robot'}.usda"
     asset = Path(out) / name
     if settings is None:
@@ -87,7 +88,7 @@ def from_urdf(
     with output(out, force=force) as folder:
         folder.mkdir()
         report = build_robot(urdf, given, folder / name, options=options, thumbnail=thumbnail)
-    return Robot(asset, load_robot(asset), report)
+    return Robot(asset, load_robot(asset, own=True), report)
 
 
 def __getattr__(name: str) -> Any:

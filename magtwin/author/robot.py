@@ -11,6 +11,7 @@ from pxr import Sdf, Usd, UsdPhysics
 from magtwin.author.shape import drive_of, footprint_of, stand_on_floor
 from magtwin.errors import InputError, hint
 from magtwin.files import existing_file, from_table, read_toml
+from magtwin.kinds import expected
 from magtwin.sim.plant_families import draw_plant
 from magtwin.spec.base import Spec
 from magtwin.spec.drive import DriveSpec
@@ -157,7 +158,7 @@ def read_settings(settings: str | os.PathLike[str]) -> RobotSettings:
     Raises:
         InputError: The file is missing or not TOML, or a key or value is wrong; the text has the line.
     """
-    return from_table(RobotSettings, read_toml(settings), settings)
+    return from_table(RobotSettings, read_toml(expected(settings, "settings of a robot")), settings)
 
 
 def read_description(asset: str | os.PathLike[str]) -> str:

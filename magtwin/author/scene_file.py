@@ -12,6 +12,7 @@ from magtwin.author.room import asset_named, check_name, check_start, lab_of, ob
 from magtwin.author.scene import check_names, check_things
 from magtwin.errors import InputError
 from magtwin.files import existing, from_table, read_toml, refused_at, sha256
+from magtwin.kinds import expected
 from magtwin.path import resolve_path
 from magtwin.path.room import Room, path_in
 from magtwin.spec.base import ZERO3, Vec3
@@ -275,7 +276,7 @@ def _robot(
             build_robot(table.urdf, settings, asset)
         except InputError as error:
             raise InputError(f"{where} {error}") from error
-        robot = load_robot(asset)
+        robot = load_robot(asset, own=True)
     return replace(robot, name=table.name) if named else robot
 
 
@@ -289,7 +290,7 @@ def _with_network(
     """The robot with the weights and the kind of its table; `network` replaces the weights."""
     weights = Path(network).resolve() if network is not None else table.network
     if weights is not None:
-        weights = existing(weights, "weights file")
+        weights = expected(weights, "weights file")
         magnetometer = replace(
             robot.magnetometer,
             kind="neural",

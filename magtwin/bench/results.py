@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 
 from magtwin.bench.suite import Chunk, Suite, load_suite
 from magtwin.errors import InputError, find
-from magtwin.files import existing, output, read_text
+from magtwin.files import output, read_text
+from magtwin.kinds import expected
 from magtwin.report import Figure, Report
 from magtwin.summary import Summarized, Summary, listed
 
@@ -166,7 +167,7 @@ def read_results(*folders: str | os.PathLike[str]) -> Results:
     """
     if not folders:
         raise InputError("no folder of results; give at least one")
-    made = results_in(*(existing(folder, "folder of results") for folder in folders))
+    made = results_in(*(expected(folder, "folder of results") for folder in folders))
     if not len(made.rows["run"]):
         raise InputError(f"{folders[0]}: no rows yet; let magtwin bench go on")
     return made

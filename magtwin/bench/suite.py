@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from magtwin.errors import InputError, find
 from magtwin.files import existing, from_table, read_toml, refused_at
+from magtwin.kinds import expected
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import OdometryModel, SensorModel
 from magtwin.sim.motion.drive_input import drive_input
@@ -377,7 +378,7 @@ def load_suite(file: str | os.PathLike[str]) -> Suite:
     Raises:
         InputError: There is no such file; a key is unknown or missing; a value has the wrong type or range.
     """
-    path = suite_file(file)
+    path = expected(suite_file(file), "suite")
     suite = from_table(Suite, read_toml(path), path)
     base = path.resolve().parent / suite.base
     data = {name: str(base / where) for name, where in suite.data.items()}

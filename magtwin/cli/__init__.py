@@ -1,5 +1,6 @@
 """The command line: one typed function for each command. Commands parse, call a public function and print."""
 
+import gc
 import sys
 from importlib import import_module
 
@@ -42,9 +43,14 @@ MODULES = {
 """Modules that register each command; the others stay unloaded while it runs."""
 
 
+GARBAGE = 50_000
+"""New objects after which Python looks for circles: the default of 700 takes a tenth of a short command."""
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the `magtwin` command; `arguments` default to those of the command line."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    gc.set_threshold(GARBAGE)
     name = arguments[0] if arguments else ""
     load(name if name in MODULES and name != "completion" else None)
     application.main(arguments)

@@ -1,5 +1,6 @@
 """The application: configuration, options that every command has, warnings, errors and exit status."""
 
+import errno
 import functools
 import inspect
 import signal
@@ -47,8 +48,8 @@ ALIASES = {
 }
 """Options of the command line whose parameter has another name in Python."""
 
-_flags: dict[str, str] = {}
-"""Flag of each parameter of the command that is running."""
+_running: list[App] = []
+"""The command that is running."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -58,8 +59,7 @@ def main(arguments: list[str] | None = None) -> None:
     signal.signal(
         signal.SIGTERM, lambda *_: sys.exit(143)
     )  # an exception, so that partial outputs are removed
-    _flags.clear()
-    _flags["allow"] = "--allow"
+    _running.clear()
     try:
         arguments, folders = _allowed([a for a in arguments if a != "--debug"])
         with watched(), _warnings_in_lines(), allow(*folders):
@@ -71,7 +71,7 @@ def main(arguments: list[str] | None = None) -> None:
                 **_help_options(arguments),
             )
     except CycloptsError as error:
-        _fail(renamed(error, arguments) or str(error), status=2)
+        _fail(renamed(error, arguments) or _dashed(arguments) or str(error), status=2)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # `magtwin info ... | head`
@@ -81,7 +81,9 @@ def main(arguments: list[str] | None = None) -> None:
         if debug:
             raise
         if isinstance(error, InputError):
-            _fail(error.in_flags(_flags))
+            _fail(error.in_flags(_flags()))
+        if text := _wrong_name(error, arguments):
+            _fail(text)
         if isinstance(error, OSError | MemoryError):
             _fail(f"{error} ({type(error).__name__})")
         _fail(f"a fault in magtwin, {type(error).__name__}: {error}; please report it, with --debug")
@@ -103,6 +105,26 @@ def _allowed(arguments: list[str]) -> tuple[list[str], list[str]]:
     return others, folders
 
 
+def _dashed(arguments: list[str]) -> str:
+    """The refusal of a file whose name begins with a dash and was read as an option; "" if there is none."""
+    for word in arguments:
+        if word.startswith("-") and "=" not in word and "." in word and not word[1:2].isdigit():
+            return f"{word}: begins with a dash, so it is read as an option; for a file write ./{word}"
+    return ""
+
+
+def _wrong_name(error: Exception, arguments: list[str]) -> str:
+    """The refusal of a file whose name is too long or is not UTF-8; "" if the error is another one."""
+    if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+        name = str(error.filename)
+        return f"{name[:60]}...: its name of {len(name)} characters is too long for a file; shorten it"
+    if isinstance(error, UnicodeEncodeError):
+        for word in arguments:
+            if any("\udc80" <= letter <= "\udcff" for letter in word):
+                return f"{word}: its name is not UTF-8, and the file format stores names as UTF-8; rename it"
+    return ""
+
+
 def share_options(group: App = app) -> None:
     """Give every command of a group --json and --quiet."""
     for name in group:
@@ -119,10 +141,7 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
 
     @functools.wraps(function)
     def wrapped(*args: Any, json: bool = False, quiet: bool = False, **options: Any) -> None:
-        for argument in command.assemble_argument_collection(parse_docstring=False):
-            if argument.name.startswith("--"):
-                _flags[argument.name.removeprefix("--").replace("-", "_")] = argument.name
-        _flags.update({name: _flags[key] for name, key in ALIASES.items() if key in _flags})
+        _running[:] = [command]
         with output_mode(as_json=json, quiet=quiet):
             done = function(*args, **options)
             if isinstance(done, Done):
@@ -139,6 +158,16 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
     wrapped.shares_options = True  # type: ignore[attr-defined]
     wrapped.__annotations__ = {**function.__annotations__, **added}
     return wrapped
+
+
+def _flags() -> dict[str, str]:
+    """Flag of each parameter of the command that is running, assembled only for an error: it takes long."""
+    flags = {"allow": "--allow"}
+    for command in _running:
+        for argument in command.assemble_argument_collection(parse_docstring=False):
+            if argument.name.startswith("--"):
+                flags[argument.name.removeprefix("--").replace("-", "_")] = argument.name
+    return flags | {name: flags[key] for name, key in ALIASES.items() if key in flags}
 
 
 def _help_options(arguments: list[str]) -> dict[str, Any]:
@@ -168,7 +197,7 @@ def _warnings_in_lines() -> Iterator[None]:
                 show(message, category, *where, **more)
             elif str(message) not in printed:
                 printed.add(str(message))
-                print_error(f"warning: {message}", style="1;33")
+                print_error(f"warning: {InputError(str(message)).in_flags(_flags())}", style="1;33")
 
         warnings.showwarning = line
         yield

@@ -3,8 +3,6 @@
 import re
 import shutil
 import sys
-from ctypes.util import find_library
-from importlib.metadata import PackageNotFoundError, metadata, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -59,6 +57,8 @@ def doctor() -> Done:
 
 def diagnose() -> dict[str, Any]:
     """Versions, tools and extras of this installation, as a table for JSON."""
+    from ctypes.util import find_library
+
     drivers = [file.stem for folder in DRIVERS for file in sorted(Path(folder).glob("*.json"))]
     vulkan = ", ".join(drivers) if find_library("vulkan") else ""
     tools = (
@@ -84,6 +84,8 @@ def diagnose() -> dict[str, Any]:
 
 def _extras() -> dict[str, dict[str, Any]]:
     """Each extra: which of its packages are missing, what it adds and how to install it."""
+    from importlib.metadata import PackageNotFoundError, metadata
+
     try:
         required = metadata("magtwin").get_all("Requires-Dist") or []
     except PackageNotFoundError:  # run from a source tree
@@ -104,6 +106,8 @@ def _extras() -> dict[str, dict[str, Any]]:
 
 def _version(package: str) -> str:
     """Version of an installed package, "" if it is not installed."""
+    from importlib.metadata import PackageNotFoundError, version
+
     try:
         return version(package)
     except PackageNotFoundError:

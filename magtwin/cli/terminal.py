@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -125,8 +126,6 @@ class _Trimmed(io.TextIOBase):
 
 def stdout_console() -> Any:
     """A console on stdout: as wide as the terminal, or as its text if stdout is no terminal."""
-    import os
-
     from rich.console import Console
 
     if _mode.json or _mode.quiet:
@@ -178,6 +177,11 @@ def check_output(path: Path | None, suffixes: tuple[str, ...], what: str, *, for
 
 def print_report(report: Any) -> None:
     """Print a report as tables."""
+    if not (_mode.json or _mode.quiet or sys.stdout.isatty() or os.environ.get("COLUMNS")):
+        lines = _lines(report)
+        if all(line.replace("±", "").isascii() and line.isprintable() for line in lines):
+            print(*lines, sep="\n")  # noqa: T201
+            return  # the same text, without importing rich, which takes a tenth of a small conversion
     from rich.table import Table
     from rich.text import Text
 
@@ -188,32 +192,65 @@ def print_report(report: Any) -> None:
     numbers.add_column("note", overflow="fold")
     words.add_column("name", no_wrap=True)
     words.add_column("text", overflow="fold")
-    lists: list[tuple[str, Any]] = []
-    for figure in report.figures:
-        if isinstance(figure.value, str):
-            note = f"  ({figure.note})" if figure.note else ""
-            words.add_row(Text(figure.name), Text(printable(f"{figure.value} {figure.unit}{note}".strip())))
-        else:
-            value = f"{figure.value:,.6g}" if isinstance(figure.value, float) else f"{figure.value:,}"
-            spread = f"± {_rounded(figure.spread)}" if figure.spread is not None else ""
-            cells = (figure.name, value, f"{spread} {figure.unit}".strip())
-            numbers.add_row(*map(Text, cells), Text(figure.note, style="dim"))
-    for name, entry in report.metadata.items():
-        if isinstance(entry, (dict, list)):
-            lists.append((name, entry))
-        elif entry != "":
-            words.add_row(Text(name), Text(printable(str(entry))))
+    rows, pairs, lists = _content(report)
+    for *cells, note in rows:
+        numbers.add_row(*map(Text, cells), Text(note, style="dim"))
+    for pair in pairs:
+        words.add_row(*map(Text, pair))
     console.print(Text(printable(report.title), style="bold"))
     for table in (numbers, words):
         if table.row_count:
             console.print(table)
     if report.verdict:
         console.print(Text(printable(report.verdict), style="bold"), soft_wrap=True)
-    for name, entry in lists:
+    for name, entries in lists:
         console.print(Text(name))
-        entries = entry.items() if isinstance(entry, dict) else (("", item) for item in entry)
         for key, item in entries:
-            _print_entry(console, printable(str(key)), printable(str(item)))
+            _print_entry(console, key, item)
+
+
+Rows = list[tuple[str, ...]]
+
+
+def _content(report: Any) -> tuple[Rows, Rows, list[tuple[str, Rows]]]:
+    """A report's figures as name, value, unit and note; its words by name; and its lists by name."""
+    numbers: Rows = []
+    words: Rows = []
+    lists: list[tuple[str, Rows]] = []
+    for figure in report.figures:
+        if isinstance(figure.value, str):
+            note = f"  ({figure.note})" if figure.note else ""
+            words.append((figure.name, printable(f"{figure.value} {figure.unit}{note}".strip())))
+        else:
+            value = f"{figure.value:,.6g}" if isinstance(figure.value, float) else f"{figure.value:,}"
+            spread = f"± {_rounded(figure.spread)}" if figure.spread is not None else ""
+            numbers.append((figure.name, value, f"{spread} {figure.unit}".strip(), figure.note))
+    for name, entry in report.metadata.items():
+        if isinstance(entry, (dict, list)):
+            entries = entry.items() if isinstance(entry, dict) else (("", item) for item in entry)
+            lists.append((name, [(printable(str(key)), printable(str(item))) for key, item in entries]))
+        elif entry != "":
+            words.append((name, printable(str(entry))))
+    return numbers, words, lists
+
+
+def _lines(report: Any) -> list[str]:
+    """The lines of a report for a file or another program, of any length."""
+    numbers, words, lists = _content(report)
+    lines = [printable(report.title)]
+    for rows in (numbers, words):
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        for row in rows:
+            cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+            if rows is numbers:
+                cells[1] = row[1].rjust(widths[1])
+            lines.append("  ".join(cells))
+    if report.verdict:
+        lines.append(printable(report.verdict))
+    for name, entries in lists:
+        lines.append(name)
+        lines += [f"  {key}  {item}" if key else f"  {item}" for key, item in entries if key or item]
+    return [line.rstrip(" ") for line in lines]
 
 
 def _rounded(spread: float) -> str:

@@ -1,14 +1,14 @@
 """Units of a field in files, and whether values can be the Earth's field in them."""
 
 from collections.abc import Callable
-from typing import Literal, cast
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Literal, cast
 
 from magtwin.errors import InputError
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    import numpy as np  # else only where it is used, since the command line imports this module for its help
+    from numpy.typing import NDArray
+
 Unit = Literal["nT", "uT", "T", "mG", "G"]
 
 # Bounds of a survey's mean [nT]. The Earth's field is 22,000 to 67,000 nT; a building bends it.
@@ -31,7 +31,7 @@ def nt_per(unit: str | None, scale: float | None) -> float:
 
 
 def check_unit(
-    b_nt: Array,
+    b_nt: "NDArray[np.float64]",
     where: str,
     column: str,
     unit: str = "nT",
@@ -52,6 +52,8 @@ def check_unit(
         InputError: The mean is outside 10,000..100,000 nT (the text names the unit that would fit), or more
             than 1 % of the readings are off by the factor of another unit.
     """
+    import numpy as np
+
     usual = float(np.sort(b_nt)[len(b_nt) // 2])
     for other, factor in NT_PER.items():
         ratio = b_nt / usual * factor / NT_PER[unit]
@@ -90,12 +92,14 @@ def check_unit(
     )
 
 
-def unit_by_size(b: Array) -> Unit | None:
+def unit_by_size(b: "NDArray[np.float64]") -> Unit | None:
     """Deduce the unit in which magnitudes have the size of the Earth's field indoors; None if none fits.
 
     Args:
         b: Magnitudes as the file has them, shape (N,); nan is ignored.
     """
+    import numpy as np
+
     b = np.abs(b[np.isfinite(b)])
     if not len(b):
         return None

@@ -34,6 +34,7 @@ from magtwin.figures.canvas import (
 )
 from magtwin.figures.maps import draw_cells, mean_field_ut
 from magtwin.run.compare import FIELDS, POSITIONS
+from magtwin.run.mapped import LONG
 from magtwin.run.run import Run
 
 MOST_OTHER = 4
@@ -57,6 +58,8 @@ def draw_run(run: Run, field: AnomalyMap | None = None, planned: ArrayLike | Non
     """
     if not run.rows:
         raise InputError("the run has no rows to draw")
+    if run.rows > LONG:
+        run = run.take(slice(None, None, -(-run.rows // LONG)))  # more points than a picture shows
     place, panels = position_name(run), panels_of(run)
     both = place is not None and bool(panels)
     figure = new_figure(13.5 if both else 8.0, 7.0 if len(panels) > 2 or not both else 5.5)

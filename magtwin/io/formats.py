@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from magtwin.errors import InputError, hint
 from magtwin.extend import Registry
-from magtwin.files import existing
+from magtwin.kinds import expected
 from magtwin.run.run import Run, check_clock
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def read_run(path: str | os.PathLike[str], **options: Any) -> Run:
         InputError: The file is missing, of unknown format, damaged, or holds no run; or its format has no
             such option.
     """
-    path = existing(path, "run")
+    path = expected(path, "run")
     file, format_ = _in_folder(path) if path.is_dir() else (path, format_of(path))
     if unknown := sorted(options.keys() - format_.reads):
         raise InputError(f"{path}: {format_.name} has no option {unknown[0]!r}; drop it")

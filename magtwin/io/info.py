@@ -10,6 +10,7 @@ from magtwin.field.maps.statistics import map_metadata
 from magtwin.field.survey.folder import read_survey
 from magtwin.files import existing
 from magtwin.io.formats import FORMATS, read_run
+from magtwin.kinds import kind_of
 from magtwin.report import Figure, Report
 
 STAGES = (".usd", ".usda", ".usdc", ".usdz")
@@ -38,6 +39,8 @@ def info_of(path: str | os.PathLike[str]) -> Report:
         return _info_of_usd(file)
     if file.suffix in FORMATS:
         return info_of_run(file)
+    if kind := kind_of(file):
+        raise InputError(f"{file}: is {kind.noun}; {kind.remedy.format(file=file)}")
     known = hint(file.suffix, {*FORMATS, *STAGES, *NETWORKS})
     raise InputError(f"{file}: unknown kind of file {file.suffix!r}; {known}")
 

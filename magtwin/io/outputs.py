@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from magtwin.errors import InputError
-from magtwin.files import check_free, output
+from magtwin.files import at_once, check_free, output, transaction
 from magtwin.io.bags.stream import scans_at
 from magtwin.io.formats import format_of, read_run, write_run
 from magtwin.io.recorder import Recorder, Sink, in_step, partial_of
@@ -45,6 +45,7 @@ class Driven:
     scans: "Scans | None" = None
 
 
+@at_once()  # what a simulation writes for itself is no output of the command
 def drive(
     scene_file: str | Path,
     path: str = "figure8",
@@ -196,6 +197,7 @@ class Outputs:
     def aside(self) -> Iterator["Outputs"]:
         """The same outputs in temporary places, which replace the targets at the end: all, or none."""
         with ExitStack() as stack:
+            stack.enter_context(transaction())
             places: dict[Path, Path] = {}
             for target in self.targets:
                 if target.suffix in USD:  # names its scene by a relative path: written in place, last
@@ -216,6 +218,26 @@ class Outputs:
                 for target, place in places.items():
                     text = text.replace(str(place), str(target))
                 raise InputError(text, parameter=error.parameter) from error
+
+    @contextmanager
+    def kept(self) -> Iterator[Callable[[Run], None]]:
+        """A function that keeps the blocks of a long run until all its outputs are written.
+
+        They are in the folder F.parts of the first output F, and remain there if the run is broken off, or
+        its process is killed; `read_run` reads them.
+        """
+        from magtwin.io.tables import ParquetParts
+
+        parts: list[ParquetParts] = []
+
+        def keep(block: Run) -> None:
+            if not parts:
+                parts.append(ParquetParts(self.targets[0], force=self.force))
+            parts[0].append(block)
+
+        yield keep
+        for one in parts:
+            shutil.rmtree(one.folder)
 
     def check_live(self) -> None:
         """Refuse partial files of an earlier run that was shown live."""

@@ -25,6 +25,7 @@ from magtwin.budget import check_count, check_decoded, check_size
 from magtwin.errors import InputError, find
 from magtwin.files import check_free, existing, output
 from magtwin.io.recorder import Sink
+from magtwin.run import mapped
 from magtwin.run.arrow import (
     FACTS,
     metadata_from_json,
@@ -35,6 +36,7 @@ from magtwin.run.arrow import (
     table_of,
 )
 from magtwin.run.run import COLUMNS, Run, check_clock
+from magtwin.run.spool import blocks
 
 _MAGIC = b"PAR1"
 _ABOUT = "magtwin"
@@ -56,9 +58,22 @@ def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool = False
         InputError: The file exists and `force` is not set, or cannot be written, or a column cannot stand
             in a table.
     """
+    if run.rows > mapped.LONG:
+        _write_long(run, path, force=force)
+        return
     table = table_of(run)
     with output(path, force=force) as aside:
         _write_table(table, aside)
+
+
+def _write_long(run: Run, path: str | os.PathLike[str], *, force: bool) -> None:
+    """Write a run that memory does not hold, in groups of `BLOCK` rows."""
+    check_clock(run, "the run to write")
+    schema = table_of(run.take(slice(0, 1))).schema
+    options = _options(schema)
+    with output(path, force=force) as aside, pq.ParquetWriter(aside, schema, **options) as writer:
+        for block in blocks(run):
+            writer.write_table(table_of(block))
 
 
 def parquet_of(run: Run) -> bytes:
@@ -70,8 +85,13 @@ def parquet_of(run: Run) -> bytes:
 
 
 def _write_table(table: pa.Table, where: Any) -> None:
-    split = {f.name: "BYTE_STREAM_SPLIT" for f in table.schema if pa.types.is_floating(f.type)}
-    pq.write_table(table, where, compression="zstd", use_dictionary=False, column_encoding=split)
+    pq.write_table(table, where, **_options(table.schema))
+
+
+def _options(schema: pa.Schema) -> dict[str, Any]:
+    """Compression and encoding of a Parquet file."""
+    split = {f.name: "BYTE_STREAM_SPLIT" for f in schema if pa.types.is_floating(f.type)}
+    return {"compression": "zstd", "use_dictionary": False, "column_encoding": split}
 
 
 def read_parquet(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None = None) -> Run:
@@ -211,7 +231,9 @@ class ParquetParts(Sink):
             raise InputError(
                 f"the block to append begins at {run['t'][0]:.9g} s, and the last ended at {self._last:.9g} s"
             )
-        write_parquet(run, self.folder / f"part-{self._count:06d}.parquet")
+        table = table_of(run)
+        with output(self.folder / f"part-{self._count:06d}.parquet", at_once=True) as aside:
+            _write_table(table, aside)
         self._count, self._last = self._count + 1, run["t"][-1]
 
     def close(self) -> None:
@@ -235,9 +257,10 @@ def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
 
     Arguments and errors are those of `write_parquet`.
     """
-    table = table_of(run)
+    check_clock(run, "the run to write")
+    table = table_of(run.take(slice(0, 1)))
     lines = [f"# {_ABOUT} run: metadata, then columns by name with unit, frame and meaning, in JSON"]
-    lines.append(f"# rows {table.num_rows}")
+    lines.append(f"# rows {run.rows}")
     lines.append(f"# facts {_line_safe(json.loads(metadata_to_json(run)))}")
     for field in table.schema:
         about = {key.decode(): text.decode() for key, text in field.metadata.items()}
@@ -248,7 +271,9 @@ def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
     lines.append(",".join(table.column_names))
     with output(path, force=force) as aside, open(aside, "wb") as file:
         file.write(("\n".join(lines) + "\n").encode())
-        pa.csv.write_csv(table, file, pa.csv.WriteOptions(include_header=False, quoting_style="none"))
+        for block in blocks(run):
+            bare = pa.csv.WriteOptions(include_header=False, quoting_style="none")
+            pa.csv.write_csv(table_of(block), file, bare)
 
 
 def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None = None) -> Run:
@@ -393,7 +418,7 @@ def write_npz(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
     Arguments and errors are those of `write_parquet`.
     """
     check_clock(run, "the run to write")
-    run.members()  # refuses other than numbers
+    run.take(slice(0, 1)).members()  # refuses other than numbers
     if _ABOUT in run:
         raise InputError(f"column {_ABOUT!r} has the name that npz uses for metadata; rename it")
     columns = {
@@ -401,7 +426,25 @@ def write_npz(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
     }
     about = json.dumps({"facts": json.loads(metadata_to_json(run)), "columns": columns}, ensure_ascii=False)
     with output(path, force=force) as aside, open(aside, "wb") as file:
-        np.savez(file, allow_pickle=False, **{_ABOUT: np.array(about)}, **run.columns)
+        if run.rows <= mapped.LONG:
+            np.savez(file, allow_pickle=False, **{_ABOUT: np.array(about)}, **run.columns)
+            return
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
+            for name, values in {_ABOUT: np.array(about), **run.columns}.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                    _write_array(member, values)
+
+
+def _write_array(member: Any, values: NDArray[Any]) -> None:
+    """Write an array as numpy does, block by block."""
+    if not values.ndim:
+        np.lib.format.write_array(member, values, allow_pickle=False)
+        return
+    head = np.lib.format.header_data_from_array_1_0(values)
+    np.lib.format.write_array_header_1_0(member, {**head, "fortran_order": False})
+    for first in range(0, len(values), mapped.BLOCK):
+        member.write(values[first : first + mapped.BLOCK].tobytes())
+        mapped.release()
 
 
 def read_npz(path: str | os.PathLike[str]) -> Run:

@@ -1,9 +1,16 @@
-"""Processors and memory that this process may use."""
+"""Processors and memory that this process may use, and the end of its children."""
 
 import contextlib
+import ctypes
 import math
 import os
+import signal
+import sys
+from collections.abc import Callable
 from pathlib import Path
+
+PR_SET_PDEATHSIG = 1
+"""Request of prctl(2): the signal that a process gets when its parent dies."""
 
 
 def processors() -> int:
@@ -34,3 +41,18 @@ def _cgroup(name: str) -> str:
         return Path("/sys/fs/cgroup", name).read_text(encoding="ascii").strip()
     except OSError:
         return ""
+
+
+def ends_with_parent() -> Callable[[], None] | None:
+    """What a child process calls before its program, so that it is killed when this thread's process is.
+
+    None where the system cannot.
+    """
+    if not sys.platform.startswith("linux"):
+        return None
+    prctl = ctypes.CDLL(None).prctl  # looked up here: the child may not
+
+    def ask() -> None:
+        prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+    return ask

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from magtwin.errors import InputError, hint
 from magtwin.files import existing_file
+from magtwin.kinds import expected
 from magtwin.path.curves import CASES, PATHS, path_named
 from magtwin.path.polyline import SAME_M, Path, without_repeats
 
@@ -59,7 +60,7 @@ def read_path_csv(file: str | os.PathLike[str]) -> Path:
     Raises:
         InputError: The file is missing, empty, or has a line that is not two numbers.
     """
-    file = existing_file(file, "path file", "text")
+    file = existing_file(expected(file, "path file"), "path file", "text")
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:

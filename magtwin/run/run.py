@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError, find
-from magtwin.report import Figure, Report
+from magtwin.report import Report
+from magtwin.run import mapped
+from magtwin.run.figures import run_report
 from magtwin.run.resample import RULES, Interpolation, bracket, check_instants, grid
 from magtwin.run.summary import run_summary
 from magtwin.summary import Summarized, Summary
-from magtwin.verdict import HOLDS_ONE, Tally
+from magtwin.verdict import Tally
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -476,38 +478,20 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
 
     def report(self, title: str = "Run") -> Report:
         """The run in a few figures; missing columns are skipped."""
-        figures = [Figure("duration", self.duration_s, "s"), Figure("readings", self.rows)]
-        if "p_world_base" in self:
-            steps = np.diff(self["p_world_base"][:, :2], axis=0)
-            figures.append(Figure("distance driven", float(np.hypot(*steps.T).sum()), "m"))
-        for name in ("b_total_nt", "b_map_nt", "b_disturbance_nt"):
-            values = self.columns.get(name, np.array([]))
-            values = values[np.isfinite(values)]
-            if len(values):
-                note = f"{values.min():.0f} to {values.max():.0f}"
-                figures.append(Figure(name, float(values.mean()), "nT", float(values.std()), note))
-        known = {"b_total_nt", "b_truth_nt"} <= set(self)
-        error = self["b_total_nt"] - self["b_truth_nt"] if known else np.array([])
-        if np.nanmax(np.abs(error), initial=0.0) > 0:
-            note = "mean absolute difference of b_total_nt from b_truth_nt"
-            figures.append(Figure("error", float(np.nanmean(np.abs(error))), "nT", None, note))
-        for name in self:
-            if name.startswith("flag_") and self[name].any():
-                note = COLUMNS[name].doc if name in COLUMNS else ""
-                figures.append(Figure(name, int(self[name].sum()), "readings", None, note))
-        tally = Tally()  # how well a network predicted the exact field, if there was one
-        self.add_to(tally)
-        verdict = tally.verdict("the exact field of this run, one session", holds=HOLDS_ONE)
-        return Report(title, tuple(figures), dict(self.metadata), verdict)
+        return run_report(self, title)
 
     def add_to(self, tally: Tally) -> None:
         """Add the errors of a simulated run's network against the exact field, if it has both."""
         wanted = {"b_sd_nt", "b_total_nt", "b_map_nt", "b_truth_nt"}
         if self.metadata.get("magnetometer") != "neural" or not wanted <= set(self):
             return
-        truth, mean = self["b_truth_nt"], float(self.metadata.get("network_label_mean_nt", 0.0))
+        mean = float(self.metadata.get("network_label_mean_nt", 0.0))
         tally.than = "the map plus the mean disturbance in the training data" if mean else "the map alone"
-        tally.add(self["b_total_nt"] - truth, self["b_map_nt"] + mean - truth, self["b_sd_nt"])
+        for rows in mapped.parts(self.rows):
+            total, level, truth, sd = (
+                self[name][rows] for name in ("b_total_nt", "b_map_nt", "b_truth_nt", "b_sd_nt")
+            )
+            tally.add(total - truth, level + mean - truth, sd)
 
     def _derived(self, step: str, columns: Mapping[str, NDArray[Any]] | None = None) -> "Run":
         """This run after a step, which is noted in its metadata."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from magtwin.errors import InputError, find
 from magtwin.files import check_free, output, sha256, shipped
+from magtwin.kinds import expected
 from magtwin.spec.lab import SurveySpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.scene import Scene
@@ -87,7 +88,7 @@ def scene_from_toml(
         report(f"{scene.name} names no map: {surveyed}")
         return layer
 
-    path = _file_of(path)
+    path = expected(_file_of(path), "TOML of a scene")
     scene = read_toml_scene(
         path,
         map_layer=map_layer,
@@ -112,7 +113,8 @@ def _file_of(path: str | FilePath) -> FilePath:
     file = FilePath(path)
     if file.suffix or file.is_file():
         return file
-    return find("scene", str(path), {toml.stem: toml for toml in sorted(shipped("scenes").glob("*.toml"))})
+    known = {toml.stem: toml for toml in sorted(shipped("scenes").glob("*.toml"))}
+    return file if file.exists() and str(path) not in known else find("scene", str(path), known)
 
 
 def author_scene(

@@ -12,7 +12,8 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any
 
 from magtwin.errors import InputError, MismatchWarning, find
-from magtwin.files import existing, git_revision, shipped
+from magtwin.files import git_revision, shipped
+from magtwin.kinds import SCENE_TOML, TOML, expected, kind_of
 from magtwin.run.run import Run
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
@@ -140,13 +141,13 @@ def scene_file(scene: str | FilePath) -> FilePath:
         InputError: The file is missing, there is no scene of that name, or it is a TOML.
     """
     file = FilePath(scene)
-    if file.suffix == ".toml":
+    if file.suffix == ".toml" and kind_of(file) in (None, TOML, SCENE_TOML):
         raise InputError(f"{scene}: describes a scene; author it first: magtwin scene {scene} --out FOLDER")
     inside = file / f"{file.resolve().name}.usda"
     if inside.is_file():
         return inside
     if file.suffix or file.exists() or len(file.parts) > 1:
-        return existing(file, "scene")
+        return expected(file, "scene")
     stages = {
         stage.stem: stage for stage in shipped("scenes").glob("*/*.usda") if stage.stem == stage.parent.name
     }
@@ -364,7 +365,7 @@ def scene_of(
         InputError: The metadata name none, or it is missing.
     """
     if scene is not None:
-        return existing(scene, "scene")
+        return expected(scene, "scene")
     if "scene_file" not in run.metadata:
         raise InputError("the run does not name its scene; name it with `scene`", parameter="scene")
     place = locate(str(run.metadata["scene_file"]), near)

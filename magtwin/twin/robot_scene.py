@@ -9,6 +9,7 @@ from typing import Any
 
 from magtwin.errors import InputError
 from magtwin.files import existing, shipped
+from magtwin.kinds import expected
 from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import MagnetometerSpec
 from magtwin.twin.authoring import scene_from_toml
@@ -57,7 +58,7 @@ def scene_with_robot(
     from magtwin.urdf.options import Options
     from magtwin.usd.robot import load_robot
 
-    file = existing(FilePath(robot), "robot")
+    file = expected(FilePath(robot), "robot")
     if workshop is None:
         from magtwin.twin import authoring
 

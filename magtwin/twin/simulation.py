@@ -62,6 +62,7 @@ def simulate(
     sensors: "Iterable[str | SensorFactory]" = (),
     interference: "Iterable[str | Interference]" = (),
     progress: Callable[[int, int, str], Any] | None = None,
+    each: Callable[[Run], Any] | None = None,
 ) -> Run:
     """Drive the scene's robot along a path and read every sensor.
 
@@ -94,11 +95,12 @@ def simulate(
             are added to the run; see `magtwin.sim.extensions`.
         interference: Custom terms of the field at the magnetometer: names of registered ones, or functions.
         progress: Called by slow engines as progress(steps done, maximum number of steps, simulated time
-            as text).
+            as text), and in a long run with readings in place of steps.
+        each: Called with each block of readings of a long run as soon as they are made.
 
     Returns:
         A Run with the columns of `magtwin.COLUMNS`. Its metadata contain everything that is needed to
-        reproduce it.
+        reproduce it. The columns of a run of more than 524,288 readings are in unnamed files in TMPDIR.
 
     Raises:
         InputError: The path leaves the floor or hits an obstacle; the whole path is outside the map; an
@@ -114,6 +116,13 @@ def simulate(
     path = drive_input(path, room_of(twin))
     check_commands(path, twin.magnetometer)
     reads: list[Read] = []
+    sha256, driven = scene_sha256(twin.scene), path_metadata(path)
+
+    def complete(block: Run) -> Run:
+        read = reads.pop() if reads else None
+        known: Any = {"seed": seed, "duration_s": duration_s, "config_sha256": sha256}
+        return finished(twin, block, driven, read, **known)
+
     run = run_scene(
         twin.scene,
         path,
@@ -131,9 +140,12 @@ def simulate(
         engine=engine_named(engine, twin, progress=progress) if isinstance(engine, str) else engine,
         sensors=sensors,
         interference=interference,
+        complete=complete,
+        progress=progress,
+        each=each,
     )
     check_read(run, twin.field)
-    return finished(twin, run, path, reads[-1] if reads else None, seed=seed, duration_s=duration_s)
+    return run
 
 
 def simulate_robots(
@@ -297,7 +309,7 @@ def path_metadata(path: "Path | Commands | Run | str") -> Metadata:
 def finished(
     twin: Twin,
     run: Run,
-    path: "Path | Commands | Run | str",
+    path: "Path | Commands | Run | str | Metadata",
     read: "Read | None",
     *,
     seed: int,
@@ -310,7 +322,7 @@ def finished(
     Args:
         twin: The twin in its session.
         run: What the simulator made.
-        path: What was driven.
+        path: What was driven, or what `path_metadata` gave for it.
         read: What the network read. None without a network.
         seed: Seed of the run.
         duration_s: Duration that was asked for [s].
@@ -329,7 +341,8 @@ def finished(
         metadata["asked_duration_s"] = float(duration_s)
     if twin.scene.robot.plant != PlantSpec():
         metadata["plant"] = OF_SCENE  # unless the twin's metadata name another
-    metadata |= dict(twin.session) | path_metadata(path) | dict(twin.metadata)
+    driven = path if isinstance(path, dict) else path_metadata(path)
+    metadata |= dict(twin.session) | driven | dict(twin.metadata)
     metadata["config_sha256"] = config_sha256 or scene_sha256(twin.scene)
     return run.with_metadata(**metadata)
 

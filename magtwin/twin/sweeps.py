@@ -41,6 +41,20 @@ MIXTURE = ("sine", "lawnmower", "figure8", "continuous_cycle", "random")
 """Paths that a sweep drives by default. A model trained on one kind of path fails on the others."""
 
 
+MOST_RUNS = 1_000_000
+"""Largest number of runs of one sweep; their seeds and jobs are held in memory."""
+
+
+def check_count(count: int) -> None:
+    """Refuse more runs than one sweep makes."""
+    if count > MOST_RUNS:
+        raise InputError(
+            f"{count:,} runs are too many for one sweep (at most {MOST_RUNS:,}); make several, each with "
+            "another `seed`",
+            parameter="count",
+        )
+
+
 def sweep(
     twin: Twin | Scene | str | FilePath,
     paths: "Path | Commands | Run | str | FilePath | ArrayLike | Iterable[Any] | None" = None,
@@ -118,6 +132,7 @@ def sweep(
     if isinstance(seeds, int | np.integer):
         if isinstance(seeds, bool) or seeds < 1:
             raise InputError(f"seeds must be at least one run, got {seeds}")
+        check_count(int(seeds))
         seeds = range(first, first + int(seeds))
     numbers = [checked_seed(number) for number in seeds]
     count = len(numbers)
@@ -152,7 +167,9 @@ def sweep(
         lidar=lidar,
         outside=outside,
     )
-    return Runs(jobs, conditions, finish, columns=columns, block=BLOCK if block is None else block)
+    if block is None:  # fewer runs at a time if they are longer than 10 minutes
+        block = max(1, min(BLOCK, int(BLOCK * 600 / (duration_s or 600))))
+    return Runs(jobs, conditions, finish, columns=columns, block=block)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -167,9 +184,7 @@ class _Finish:
 
     duration_s: float | None
 
-    def __call__(self, jobs: Sequence["Job"], sensed: Sequence["Sensed"]) -> list[Run]:
-        from magtwin.sim.exact import check_read
-
+    def __call__(self, jobs: Sequence["Job"], sensed: Sequence["Sensed"], *, check: bool = True) -> list[Run]:
         predictor, known = self.predictor, self._known
         flagged = "flag_out_of_distribution" in sensed[0].wanted
         rows = [each.run for each in sensed]
@@ -180,10 +195,17 @@ class _Finish:
             run = each.read(
                 (read.disturbance_nt, read.sd_nt) if read else None, model_error_of(own, job.seed)
             )
-            check_read(run, self.field)
+            if check:
+                self.check(run)
             options: Any = {"duration_s": self.duration_s, "config_sha256": config, "add": False}
             runs.append(finished(own, run, job.path, read, seed=job.seed, **options))
         return runs
+
+    def check(self, run: Run) -> None:
+        """Refuse a run that was driven off the map."""
+        from magtwin.sim.exact import check_read
+
+        check_read(run, self.field)
 
     def identity(self, job: "Job") -> str:
         """What tells a run of a job from others, but for what all runs of the sweep have in common."""

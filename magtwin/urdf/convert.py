@@ -38,6 +38,7 @@ from magtwin.urdf.physics.link import SITE_API, Rider, define_body, is_marker
 from magtwin.urdf.physics.mechanism import Mechanism, read_mechanism
 from magtwin.urdf.physics.merge import WORLD, Place, carried, place_links, riders
 from magtwin.urdf.physics.mobile_base import MobileBase, drive_spec
+from magtwin.urdf.physics.plugin import leave_out
 from magtwin.urdf.physics.wheel import find_base, fit_wheels, grip, not_on, wheel_radius
 from magtwin.urdf.placeholder import replace_failed
 from magtwin.urdf.report import ConversionReport, Ledger, make_report
@@ -321,7 +322,13 @@ class _Author:
             body = bodies.get(link.name)
             return round_ones[0] if round_ones else wheel_radius(body, joints[name].axis) if body else 0.0
 
-        return drive_spec(base, mechanism, radius_of)
+        try:
+            return drive_spec(base, mechanism, radius_of)
+        except InputError as error:
+            if self.options.profile == "diff-drive" or self.options.controllers is not None:
+                raise
+            leave_out(tags, base.element, error)
+            return None
 
     def _joints(
         self,

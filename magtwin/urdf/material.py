@@ -26,7 +26,7 @@ LOOKS = "Looks"
 
 
 def define_look(robot: Usd.Prim, look: Paint, meshes: MeshLayer) -> UsdShade.Material:
-    """The material of a look, shared by all prims with that look.
+    """The material of a look, shared by all prims that look so, whatever its name.
 
     Args:
         robot: Root prim; looks are in a scope below it.
@@ -70,13 +70,14 @@ def define_look(robot: Usd.Prim, look: Paint, meshes: MeshLayer) -> UsdShade.Mat
     )
     hexed = "".join(f"{round(c * 255):02x}" for c in look.rgba)
     stem, number = Tf.MakeValidIdentifier(look.name) if look.name else f"colour_{hexed}", 1
+    same = meshes.same_look(shown, look.name)
+    if same is not None:
+        return UsdShade.Material(stage.GetPrimAtPath(same))
     path = scope.AppendChild(stem)
     while stage.GetPrimAtPath(path):
-        if meshes.looks.get(path) == shown:
-            return UsdShade.Material(stage.GetPrimAtPath(path))
         path = scope.AppendChild(f"{stem}_{hexed}" if number == 1 else f"{stem}_{hexed}_{number}")
         number += 1  # two looks have the same name
-    meshes.looks[path] = shown
+    meshes.looks[shown] = path, look.name
     material = UsdShade.Material.Define(stage, path)
     surface = UsdShade.Shader.Define(stage, path.AppendChild("surface"))
     surface.CreateIdAttr("UsdPreviewSurface")

@@ -32,8 +32,9 @@ FAULTS: Mapping[str, tuple[str, str]] = {
     "limit-missing": ("joint without limits", "moves without limits"),
     "limit-one-end": ("joint with one limit", "the other limit is 0, URDF's default"),
     "limit-zeros": (
-        "revolute joint with effort and velocity of 0, and a range of 0 or over one turn",
-        "turns without limits, as a wheel",
+        "revolute joint with effort and velocity of 0",
+        "with a range of 0 or over one turn a wheel without limits; else it moves within its range, and the "
+        "two count as not given",
     ),
     "limit-swapped": ("lower limit above the upper", "the two are swapped"),
     "limit-ignored": ("range of a continuous joint", "ignored"),
@@ -52,6 +53,10 @@ FAULTS: Mapping[str, tuple[str, str]] = {
     "material-twice": ("material defined twice", "the first definition is used"),
     "name-twice": ("link or joint name used twice", "the second is renamed, or left out if it is equal"),
     "name-unknown": ("tag about a joint that is missing", "left out"),
+    "drive-incomplete": (
+        "drive plugin or its controller with an unknown joint, no wheels on a side, or an invalid figure",
+        "kept as text; the robot gets no drive from it",
+    ),
     "name-missing": ("robot without a name", "the name of its file"),
     "mesh-missing": ("missing mesh", "a box of the link's size as a placeholder"),
     "mesh-unreadable": ("mesh that cannot be read", "a box of the link's size as a placeholder"),

@@ -257,7 +257,8 @@ def make_report(
     total = sum(masses.values())
     losses = [f"link {line.name!r} has no prim" for line in links if line.became == "nothing"]
     for line in lines:
-        if line.box_in is not None and not line.kept:
+        plate = meshes.flat.get(line.shape, 0.0) if line.role == "collision" else 0.0
+        if line.box_in is not None and not line.kept and not (plate and line.error_m <= plate):
             what = "did not arrive" if line.box_out is None else f"changed its box by {line.error_m:.3g} m"
             losses.append(f"{line.role} {line.index} of link {line.link!r} ({line.shape}) {what}")
     if given - total > 1e-6 * max(given, 1e-9):

@@ -210,7 +210,10 @@ def _read(layer: Sdf.Layer, path: str | os.PathLike[str]) -> Run:
     """The run of a layer."""
     prim = layer.GetPrimAtPath(_run_path(layer))
     if not prim:
-        raise InputError(f"{path}: plays no run: it has no prim {_run_path(layer)} that holds one")
+        raise InputError(
+            f"{path}: plays no run: it has no prim {_run_path(layer)} that holds one; give a layer that "
+            "`magtwin run --out F.usda` or `magtwin convert` wrote"
+        )
     columns, specs = {}, {}
     for attribute in sorted(prim.properties, key=lambda column: column.customData.get("number", np.inf)):
         name = attribute.name.removeprefix("magtwin:run:")

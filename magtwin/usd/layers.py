@@ -16,6 +16,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 from magtwin.budget import check_depth
 from magtwin.errors import InputError
 from magtwin.files import existing, existing_file, output, sha256
+from magtwin.kinds import USD_SUFFIXES, kind_of, refused
 from magtwin.usd.schema.versions import creator, is_upgraded, upgrade_stage
 from magtwin.usd.trial import try_stage
 
@@ -69,10 +70,14 @@ def describe_stage(stage: Usd.Stage, documentation: str) -> None:
     layer.customLayerData = creator()
 
 
-def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
+def open_stage(path: str | os.PathLike[str], *, own: bool = False) -> Usd.Stage:
     """Open the stage of a USD file, reloaded from disk.
 
     Layers of an older version of the schema get its names of today in memory, with a warning.
+
+    Args:
+        path: The file.
+        own: Whether this process has just written it; then it is not tried in another process first.
 
     Raises:
         InputError: The file is missing or not USD, or a sublayer or reference is missing; the text has USD's
@@ -80,7 +85,7 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
             has changes in this process that are not saved, which would be lost; or is of a later version of
             the schema.
     """
-    path = check_stage(path)
+    path = check_stage(path, own=own)
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
     try:
         with translated(path, "cannot be opened as USD"):
@@ -124,12 +129,13 @@ _NESTED = 1 << 24
 """Bytes of text whose nesting is counted at once."""
 
 
-def check_stage(path: str | os.PathLike[str], *, composed: bool = True) -> Path:
+def check_stage(path: str | os.PathLike[str], *, composed: bool = True, own: bool = False) -> Path:
     """A USD file that this process may open. Every file that a user names passes through here.
 
     Args:
         path: The file.
         composed: Whether the files that it names will be opened too.
+        own: Whether this process has just written it; then it is not tried.
 
     Raises:
         InputError: It is missing, no regular file, or larger than the budget; or as for `try_stage`.
@@ -137,12 +143,20 @@ def check_stage(path: str | os.PathLike[str], *, composed: bool = True) -> Path:
     path = existing(path, "USD file")
     if path.is_dir():
         raise InputError(f"{path}: a folder; give a USD file in it")
+    if path.suffix not in USD_SUFFIXES:
+        if kind := kind_of(path):
+            raise refused(path, kind, "USD file")
+        raise InputError(f"{path}: no USD file; its name must end in {', '.join(USD_SUFFIXES)}")
     with path.open("rb") as file:
-        binary = file.read(8) == b"PXR-USDC" or path.suffix == ".usdz"
+        head = file.read(8)
+        binary = head == b"PXR-USDC" or path.suffix == ".usdz"
+    if not head:
+        raise InputError(f"{path}: is empty (0 bytes); make or copy it again")
     existing_file(path, "USD file", "USD" if binary else "USD text")
     if not binary:
         _check_nesting(path)
-    try_stage(path, composed=composed)
+    if not own:
+        try_stage(path, composed=composed)
     return path
 
 

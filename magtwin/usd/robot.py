@@ -31,14 +31,18 @@ PARALLEL = 1e-12
 
 
 @translates
-def load_robot(file: str | os.PathLike[str]) -> RobotSpec:
+def load_robot(file: str | os.PathLike[str], *, own: bool = False) -> RobotSpec:
     """The spec of a robot's asset. Whether the weights that it names exist is not checked.
+
+    Args:
+        file: The asset.
+        own: As for `open_stage`.
 
     Raises:
         InputError: The file is missing, is not USD, or is not an asset that `build_robot` made.
     """
     path = existing(file, "robot asset").resolve()
-    stage = open_stage(path)
+    stage = open_stage(path, own=own)
     if not stage.GetDefaultPrim():
         raise InputError(f"{path}: has no default prim, so no robot; make the asset with `magtwin robot`")
     return read_robot(stage.GetDefaultPrim(), path)

@@ -7,7 +7,8 @@ from pathlib import Path
 from pxr import Sdf, Tf, UsdUtils
 
 from magtwin.errors import InputError
-from magtwin.files import existing, output
+from magtwin.files import output
+from magtwin.kinds import expected
 from magtwin.usd.layers import check_stage, export_like, layer_sha256
 from magtwin.usd.schema.versions import stamp, upgrade_layer
 from magtwin.usd.sensors import MAP_CHECKSUM
@@ -29,7 +30,7 @@ def upgrade(path: str | os.PathLike[str]) -> list[Path]:
         InputError: The file is missing, a package or not USD, a layer cannot be written or upgraded, or is of
             a later version. Nothing is written unless every layer can be upgraded.
     """
-    path = existing(path, "USD file")
+    path = expected(path, "USD file")
     if path.suffix == ".usdz":
         raise InputError(
             f"{path}: files inside a package cannot be rewritten; `magtwin export {path.name} --out DIR` "

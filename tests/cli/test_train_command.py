@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import torch
 from rerun.chunk import RrdReader
+from threadpoolctl import threadpool_limits
 
 from magtwin.cli import main
+from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files import sha256
 from magtwin.io.formats import read_run
@@ -202,6 +204,37 @@ def test_threads_are_those_asked_for_while_training_and_told(data, tmp_path, cap
     main(["train", str(data), "--out", str(tmp_path / "f.safetensors"), *words])
     assert (seen, torch.get_num_threads()) == ([2], 1)
     assert json.loads(capsys.readouterr().out)["metadata"]["threads"] == 2
+
+
+@pytest.mark.parametrize("kind", ["paper", "hybrid", "linear"])
+def test_the_number_of_processors_changes_no_bit_of_a_training(data, tmp_path, kind):
+    """The default is one thread, whatever torch and numpy would take."""
+    options = TINY if kind == "paper" else ["--model", kind, "--features", "odom_v_x,yaw_sin,yaw_cos"]
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        with threadpool_limits(threads):
+            main(["train", str(data), "--out", str(tmp_path / f"{threads}" / "f.safetensors"), *options])
+        assert torch.get_num_threads() == threads
+    torch.set_num_threads(1)
+    one, three = (tmp_path / name / "f.safetensors" for name in "13")
+    assert one.read_bytes() == three.read_bytes()
+
+
+def test_a_curve_that_cannot_be_drawn_leaves_no_weights_and_keeps_the_checkpoint(data, tmp_path, monkeypatch):
+    """All outputs of a training are one transaction, and the training is not lost."""
+    out = tmp_path / "f.safetensors"
+
+    def full(*args, **options):
+        raise InputError("f.png: cannot be written (No space left on device)")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("magtwin.figures.canvas.save", full)
+        with pytest.raises(SystemExit):
+            main(["train", str(data), "--out", str(out), *TINY])
+    assert [file.name for file in tmp_path.iterdir()] == ["f.checkpoint"]
+    main(["train", str(data), "--out", str(out), *TINY, "--resume"])
+    ends = sorted(file.suffix for file in tmp_path.iterdir())
+    assert ends == [".csv", ".md", ".png", ".safetensors"]
 
 
 def test_a_split_by_row_carries_its_warning_everywhere(data, tmp_path, capsys):

@@ -209,6 +209,39 @@ def test_a_rule_sees_schemas_without_plugins_and_one_that_fails_or_needs_kit_end
     assert check.scope == "3 of 4 rules of isaacsim.asset.validation"
 
 
+def test_a_finding_in_a_variant_that_is_not_chosen_names_its_prim(own_rules, tmp_path):
+    own_rules("""
+from omni.asset_validator.core import BaseRuleChecker, registerRule
+
+@registerRule("IsaacSim.RobotRules")
+class Spots(BaseRuleChecker):
+    def CheckPrim(self, prim):
+        if prim.GetName().startswith("odd"):
+            self._AddError(message="is odd", at=prim)
+""")
+    asset = tmp_path / "bot.usda"
+    variant = '"{0}" {{\ndef Xform "odd_{0}"\n{{\n}}\n}}\n'
+    asset.write_text(f"""#usda 1.0
+(
+    defaultPrim = "bot"
+)
+def Xform "bot" (
+    variants = {{
+        string kind = "a"
+    }}
+    prepend variantSets = "kind"
+)
+{{
+    variantSet "kind" = {{
+{variant.format("a")}{variant.format("b")}{variant.format("c")}}}
+}}
+""")
+    check = isaac(asset, {"/bot": asset})
+    assert [(f.rule, f.where, f.text) for f in check.findings] == [
+        ("Spots", f"/bot/odd_{name}", "is odd") for name in "abc"
+    ]
+
+
 @pytest.mark.parametrize(
     ("text", "said", "patience_s"),
     [("while True: pass", "took longer than 1 s", 1.0), ("import nothing_known", "nothing_known", 60.0)],

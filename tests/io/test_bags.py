@@ -245,6 +245,8 @@ def test_the_same_run_gives_the_same_bytes(bags, made, twin, tmp_path):
         files = [tmp_path / name] if Path(name).suffix else sorted((tmp_path / name).iterdir())
         for file in files:
             assert file.read_bytes() == (bags / file.relative_to(tmp_path)).read_bytes()
+    write_bag(made[0], tmp_path / "other name.mcap", twin, scans=made[1])
+    assert (tmp_path / "other name.mcap").read_bytes() == (bags / "run.mcap").read_bytes()
 
 
 def test_fields_are_in_tesla_with_the_predicted_variance_or_in_nt(bags, made, heard):

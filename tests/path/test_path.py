@@ -190,7 +190,7 @@ def test_a_csv_is_read_with_or_without_a_header(tmp_path, text):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("", r"p\.csv: no points in it"),
+        ("", r"p\.csv: is empty"),
         ("x,y\n", r"p\.csv: no points in it"),
         ("1,2\n", r"p\.csv: only one point in it"),
         ("1,2\n1,2\n", r"p\.csv: only one point in it"),

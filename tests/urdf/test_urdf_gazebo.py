@@ -445,22 +445,30 @@ def test_a_bad_tag_is_repaired_with_its_line(tmp_path, name):
     assert fault.place == f"cart.urdf:{line}"
 
 
-REFUSED = {
-    "joint": (GZ.replace(">left<", ">lefft<"), r":11: no joint 'lefft'; did you mean 'left'"),
+INCOMPLETE = {
+    "joint": (GZ.replace(">left<", ">lefft<"), "cart.urdf:11", "no joint 'lefft'; did you mean 'left'"),
     "no joint": (
         GZ.replace("<left_joint>left</left_joint>", ""),
-        r":10: the drive plugin has no <left_joint>",
+        "cart.urdf:10",
+        "the drive plugin has no <left_joint>",
     ),
 }
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_a_bad_drive_is_refused_with_its_line_and_nothing_is_written(tmp_path, name):
-    tags, message = REFUSED[name]
-    with pytest.raises(InputError, match=message) as refusal:
-        cart(tmp_path, tags)
+@pytest.mark.parametrize("name", INCOMPLETE)
+def test_an_incomplete_drive_is_kept_as_text_with_its_line_and_strict_refuses_it(tmp_path, name):
+    tags, place, told = INCOMPLETE[name]
+    _stage, robot, report = cart(tmp_path, tags)
+    (fault,) = [entry for row in report.repairs for entry in row.entries]
+    assert (fault.kind, fault.place) == ("drive-incomplete", place)
+    assert told in fault.text
+    assert not prims_with(robot, "drive")
+    assert any("gz-sim-diff-drive-system" in text for text in robot.GetCustomDataByKey("magtwin:unconverted"))
+    for path in tmp_path.glob("cart*.usda"):
+        path.unlink()
+    with pytest.raises(InputError, match=told) as refusal:
+        cart(tmp_path, tags, strict=True)
     assert "\n" not in str(refusal.value)
-    assert [p.name for p in tmp_path.iterdir()] == ["cart.urdf"]
 
 
 @pytest.mark.parametrize(
@@ -471,14 +479,32 @@ def test_a_bad_drive_is_refused_with_its_line_and_nothing_is_written(tmp_path, n
         ("a: 2001-99-99", r"control\.yaml: not YAML: month must be in 1\.\.12"),
         ("a: " + "9" * 5000, r"control\.yaml: not YAML: .*digits"),
         ("a: " + "[" * 5000, r"control\.yaml: not YAML"),
-        (YAML.replace("0.04", "round"), r"control\.yaml: wheel_radius must be a number above 0, got 'round'"),
-        (YAML.replace("[left]", "[lefft]"), r"left_wheel_names: no joint 'lefft'; did you mean 'left'"),
     ],
 )
-def test_bad_settings_are_refused(tmp_path, text, message):
+def test_settings_that_are_not_yaml_are_refused(tmp_path, text, message):
     (tmp_path / "control.yaml").write_text(text)
     with pytest.raises(InputError, match=message):
         cart(tmp_path, CONTROL)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (YAML.replace("0.04", "round"), "control.yaml: wheel_radius must be a number above 0, got 'round'"),
+        (
+            YAML.replace("[left]", "[lefft]"),
+            "control.yaml: left_wheel_names: no joint 'lefft'; did you mean 'left'",
+        ),
+    ],
+)
+def test_bad_settings_of_a_plugin_are_left_out_and_those_of_the_user_refused(tmp_path, text, message):
+    (tmp_path / "control.yaml").write_text(text)
+    _stage, robot, report = cart(tmp_path, CONTROL)
+    (fault,) = [entry for row in report.repairs for entry in row.entries if row.kind == "drive-incomplete"]
+    assert fault.text.startswith(message)
+    assert not prims_with(robot, "drive")
+    with pytest.raises(InputError, match=message.partition(": ")[2].partition(",")[0]):
+        cart(tmp_path, "", controllers=tmp_path / "control.yaml")
 
 
 def test_settings_that_grow_exponentially_are_ignored(tmp_path):

@@ -19,7 +19,16 @@ ALL = {"fl": (1, 1), "fr": (1, -1), "rl": (-1, 1), "rr": (-1, -1)}
 
 
 def rover(
-    tmp_path, tags="", *, wheels=ALL, steered=(), joint="continuous", limit="", name="rover", **options
+    tmp_path,
+    tags="",
+    *,
+    wheels=ALL,
+    steered=(),
+    joint="continuous",
+    limit="",
+    axis="0 0 1",
+    name="rover",
+    **options,
 ):
     """A robot with wheels fl, fr, rl and rr; those in `steered` turn about hinges fl_steer, ..."""
     parts = [f'<link name="base">{MASS.format(20)}</link>']
@@ -36,7 +45,7 @@ def rover(
         parts.append(
             f'<link name="{wheel}_tyre">{WHEEL}</link><joint name="{wheel}" type="{joint}"><parent '
             f'link="{above}"/><child link="{wheel}_tyre"/><origin xyz="{place}" rpy="-1.5707963 0 0"/>'
-            f'<axis xyz="0 0 1"/>{limit}</joint>'
+            f'<axis xyz="{axis}"/>{limit}</joint>'
         )
     path = tmp_path / f"{name}.urdf"
     path.write_text(f'<robot name="rover">{"".join(parts)}{tags}</robot>')
@@ -63,6 +72,15 @@ OLD_CORNERS = (
     "<leftRearJoint>rl</leftRearJoint><rightRearJoint>rr</rightRearJoint>"
 )
 SIDES = {"fl": 0, "fr": 1, "rl": 0, "rr": 1}
+
+
+def test_wheels_that_roll_along_y_are_no_drive_since_left_and_right_would_be_front_and_rear(tmp_path):
+    text = plugin("libgazebo_ros_skid_steer_drive.so", OLD_CORNERS)
+    with pytest.raises(InputError, match=r"the wheels roll along y of 'base', but x is ahead"):
+        rover(tmp_path, text, axis="1 0 0")
+    _stage, drive, report = rover(tmp_path, text, axis="1 0 0", profile="general")
+    assert drive is None
+    assert [(row.kind, row.count) for row in report.repairs] == [("drive-incomplete", 1)]
 
 
 def test_a_skid_steer_plugin_drives_all_wheels_of_each_side(tmp_path):

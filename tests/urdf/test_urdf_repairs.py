@@ -111,6 +111,11 @@ FAULTY = {
             "range, effort and velo",
         ),
         (moving("revolute", '<limit lower="-180" upper="180" effort="0" velocity="0"/>'), 5, "of 360 rad"),
+        (
+            moving("revolute", '<limit lower="-1" upper="1" effort="0" velocity="0"/>'),
+            5,
+            "it moves within it",
+        ),
     ],
     "limit-swapped": [
         (moving("revolute", '<limit lower="1" upper="-1" effort="1" velocity="1"/>'), 5, "above its upper -1")
@@ -239,6 +244,29 @@ FAULTY = {
         ),
         (look('<geometry><mesh filename="package:///arms/flat.stl"/></geometry>'), 2, "'package://arms/"),
     ],
+    "drive-incomplete": [
+        (
+            f'{moving("continuous")}\n<gazebo><plugin name="diff_drive">\n<left_joint>jj</left_joint>'
+            "<right_joint>j</right_joint></plugin></gazebo>",
+            7,
+            "<left_joint>: no joint 'jj'; did you mean 'j'",
+        ),
+        (
+            f'{moving("continuous")}\n<gazebo><plugin name="diff_drive"><left_joint>j</left_joint>'
+            "</plugin></gazebo>",
+            6,
+            "the drive plugin has no <right_joint>: the drive is kept as text",
+        ),
+        (
+            (
+                f"{moving('continuous')}\n{TIP}\n{joint('continuous', name='k', child='tip')}\n"
+                '<gazebo><plugin name="diff_drive"><left_joint>j</left_joint>'
+                "<right_joint>k</right_joint></plugin></gazebo>"
+            ).replace("0 0 1", "0 1 0"),
+            9,
+            "a drive needs wheels on the left (y > 0) and right",
+        ),
+    ],
     "package-missing": [
         (
             f"{GOOD}\n<gazebo><plugin><parameters>$(find absent)/c.yaml</parameters></plugin></gazebo>",
@@ -273,6 +301,27 @@ def write(tmp_path, kind, number):
     path.parent.mkdir(exist_ok=True)
     path.write_text(f"{head}\n{text}\n</robot>\n")
     return path, line, told
+
+
+def test_a_flat_collider_is_reported_once_and_not_as_a_changed_box_too(tmp_path):
+    path, _line, _told = write(tmp_path, "mesh-flat", 0)
+    report = convert_with_report(path, tmp_path / "a" / "arm.usda")
+    assert [(row.kind, row.count) for row in report.repairs] == [("mesh-flat", 1)]
+    assert report.losses == ()
+
+
+def test_what_a_mesh_file_loses_is_reported_with_the_file(tmp_path):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "a.obj").write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n")
+    (tmp_path / "arm.urdf").write_text(
+        HEAD + look("<geometry><mesh filename='parts/a.obj'/></geometry>") + "</robot>"
+    )
+    report = convert_with_report(tmp_path / "arm.urdf", tmp_path / "a" / "arm.usda")
+    losses = [entry for row in report.repairs if row.kind == "loss" for entry in row.entries]
+    assert {entry.place for entry in losses} == {"parts/a.obj"}
+    assert any("a.mtl" in entry.text for entry in losses)
+    with pytest.raises(InputError, match=r"parts/a\.obj: .*a\.mtl"):
+        convert_with_report(tmp_path / "arm.urdf", tmp_path / "b" / "arm.usda", options=Options(strict=True))
 
 
 def test_every_fault_has_a_description():

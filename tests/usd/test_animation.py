@@ -22,6 +22,7 @@ from magtwin.twin import open_twin, simulate
 from magtwin.usd import trial
 from magtwin.usd.animation import is_animation, read_animation, write_animation
 from magtwin.usd.geometry import read_links
+from magtwin.usd.layers import open_stage
 
 MAGNETOMETER = "/World/turtlebot4/magnetometer_link/magnetometer"
 
@@ -271,6 +272,7 @@ def test_bytes_that_end_the_process_of_usds_own_reader_are_refused_in_a_line(pla
     monkeypatch.setattr(trial, "_TRIAL", trial._Trial())
     with pytest.raises(InputError, match="damaged: USD crashes on it"):
         read_animation(played)
+    assert open_stage(played, own=True).GetRootLayer().realPath == str(played.resolve())
 
 
 @pytest.mark.parametrize(

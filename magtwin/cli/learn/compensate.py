@@ -8,6 +8,7 @@ from cyclopts import App
 from magtwin.cli.app import app
 from magtwin.cli.options import Flag, Force
 from magtwin.cli.terminal import Done, check_output, step
+from magtwin.kinds import expected
 
 compensate_app = App(name="compensate", help="Remove the platform's field from a run (Tolles-Lawson).")
 app.command(compensate_app)
@@ -60,7 +61,7 @@ def fit(
     names = tuple(name.strip() for name in terms.split(",") if name.strip())
     step("Fitting the model")
     model = fit_run(
-        read_parquet(run),
+        read_parquet(expected(run, "run")),
         vector="exact" if truth else "measured",
         terms=names,
         band_hz=None if no_band else band_hz,
@@ -89,6 +90,8 @@ def apply(run: Path, model: Path, *, out: Path, force: Force = False) -> Done:
     from magtwin.learn.compensation.tolles_lawson import TollesLawson, compensate_run
 
     check_output(out, (".parquet",), "a run", force=force)
-    compensated, report = compensate_run(read_parquet(run), TollesLawson.load(model))
+    compensated, report = compensate_run(
+        read_parquet(expected(run, "run")), TollesLawson.load(expected(model, "Tolles-Lawson model"))
+    )
     write_parquet(compensated, out, force=force)
     return Done(report, out)

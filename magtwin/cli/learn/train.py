@@ -7,6 +7,7 @@ from magtwin.cli.app import app
 from magtwin.cli.options import Flag, Force, Names, Whole
 from magtwin.cli.terminal import Done, check_suffix, progress
 from magtwin.errors import InputError
+from magtwin.kinds import SWEEP, kind_of
 
 if TYPE_CHECKING:
     from magtwin.learn.models.descent import Epoch
@@ -88,7 +89,7 @@ def train(
     hold_out
         Sessions, runs or paths to put into the test.
     threads
-        Threads of torch; another number gives other bits.
+        Threads of torch and numpy. Default: 1. More are faster, and another number gives other bits.
     device
         Where to train: cpu, cuda, or auto (default: a GPU if torch sees one).
     init
@@ -106,13 +107,13 @@ def train(
 
     from magtwin.figures.canvas import save
     from magtwin.figures.training import draw_learning_curve, write_learning_curve
-    from magtwin.files import check_free
+    from magtwin.files import check_free, transaction
     from magtwin.io.rerun.learning import record_learning_curve
     from magtwin.learn.training.config import TrainConfig, read_config
     from magtwin.learn.training.train import train as train_model
 
     check_suffix(out, (".safetensors",), "a network")
-    if dataset.is_dir() and not (dataset / "dataset.json").exists():
+    if dataset.is_dir() and kind_of(dataset) in (None, SWEEP):
         build = f"magtwin dataset build {dataset} --map MAP --out SET"
         raise InputError(f"{dataset}: is no data set; build one from the runs first: {build}")
     picture, table = (out.with_suffix(end) for end in (".png", ".csv"))
@@ -130,24 +131,25 @@ def train(
             raise InputError(f"--rrd: a {options.model} model is fitted at once and has no learning curve")
     for path in (*curves, *([rrd] if rrd else [])):
         check_free(path, force=force)
-    with progress("Training", "rows") as show:
-        pace = _Pace(show, options.epochs)
-        result = train_model(
-            dataset,
-            out=out,
-            config=options,
-            force=force,
-            resume=resume,
-            progress=pace.epoch,
-            advance=pace.rows,
-        )
-    if result.history:
-        naive = result.parts[0].naive_rmse_nt
-        curve = draw_learning_curve(result.history, naive_rmse_nt=naive, title=out.name)
-        save(curve, picture, force=force)
-        write_learning_curve(result.history, table, force=force)
-        if rrd is not None:
-            record_learning_curve(result.history, rrd, naive_rmse_nt=naive, title=out.name, force=force)
+    with transaction():
+        with progress("Training", "rows") as show:
+            pace = _Pace(show, options.epochs)
+            result = train_model(
+                dataset,
+                out=out,
+                config=options,
+                force=force,
+                resume=resume,
+                progress=pace.epoch,
+                advance=pace.rows,
+            )
+        if result.history:
+            naive = result.parts[0].naive_rmse_nt
+            curve = draw_learning_curve(result.history, naive_rmse_nt=naive, title=out.name)
+            save(curve, picture, force=force)
+            write_learning_curve(result.history, table, force=force)
+            if rrd is not None:
+                record_learning_curve(result.history, rrd, naive_rmse_nt=naive, title=out.name, force=force)
     shown = [path.name for path in curves if result.history]
     return Done(result.report(str(out)), (out, out.with_suffix(".md").name, *shown))
 

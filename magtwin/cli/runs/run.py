@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -226,13 +226,14 @@ def run(
         what = str(next(iter(robots.values())) or what)
     step("Opening the scene")
     with ExitStack() as stack:
-        places = outputs
+        places, keep = outputs, None
         if live or viewer:
             outputs.check_live()
         else:
+            keep = stack.enter_context(outputs.kept())
             places = stack.enter_context(outputs.aside())
-        newton = progress("Driving in Newton", "steps") if engine == "newton" else nullcontext()
-        with newton as advance:
+        newton = engine == "newton"
+        with progress("Driving in Newton" if newton else "Driving", "steps" if newton else "") as advance:
             driven = drive(
                 scene,
                 what,
@@ -242,6 +243,7 @@ def run(
                 scans=scans,
                 engine=engine,
                 progress=advance,
+                each=keep,
                 report=announce,
                 **options,
             )

@@ -91,11 +91,13 @@ def sweep(
     from magtwin.sim.motion.drive_input import drive_input
     from magtwin.twin import MIXTURE, open_twin, room_of, scene_file
     from magtwin.twin import sweep as drive_many
+    from magtwin.twin.sweeps import check_count
 
     scene = scene_file(scene)
     for name, value, least in (("count", count, 1), ("sessions", sessions, 1), ("seed", seed, 0)):
         if value is not None and value < least:
             raise InputError(f"--{name} must be a whole number from {least} up, got {value}")
+    check_count(count)
     if sessions is not None and session is not None:
         raise InputError("--session survey is one session; drop --sessions")
     check_free(out, force=force)

@@ -1,5 +1,6 @@
 """`magtwin robot`: a description in, a USD articulation out, and back."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Literal
 
@@ -81,16 +82,19 @@ def robot(
         Full report to write (.json).
     """
     given = dict(locals())
-    from magtwin.author.from_urdf import DriveRule, from_urdf, write_urdf
     from magtwin.files import output
 
     if out.suffix == ".urdf":
+        from magtwin.author.from_urdf import write_urdf
+
         own = ("urdf", "out", "thumbnail", "force")
         if any(value is not None for name, value in given.items() if name not in own):
             raise InputError("a stage is written as a URDF without other options than --force; drop them")
         if urdf.suffix in (".urdf", ".xacro"):
             raise InputError(f"{urdf}: is no stage; a URDF is written from .usd, .usda, .usdc or .usdz")
         return Done(write_urdf(urdf, out, force=force), out)
+    from magtwin.author.from_urdf import DriveRule, from_urdf
+
     check_output(report, (".json",), "a report", force=force)
     same = ["missing_meshes", "skip_missing_includes", "collision", "profile", "fix_base", "merge_fixed"]
     same += ["single_file", "strict"]
@@ -103,16 +107,16 @@ def robot(
         "mass": mass_kg,
     }
     step("Converting the robot")
-    made = from_urdf(
-        urdf,
-        out,
-        settings=settings,
-        force=force,
-        thumbnail=_thumbnail if thumbnail else None,
-        **{name: choice for name, choice in choices.items() if choice is not None},
-    )
-    if report is not None:
-        with output(report, force=force) as aside:
+    with output(report, force=force) if report is not None else nullcontext() as aside:
+        made = from_urdf(
+            urdf,
+            out,
+            settings=settings,
+            force=force,
+            thumbnail=_thumbnail if thumbnail else None,
+            **{name: choice for name, choice in choices.items() if choice is not None},
+        )
+        if aside is not None:
             aside.write_text(made.report.to_json(), encoding="utf-8")
     return Done(made.report.summary(), made.asset)
 

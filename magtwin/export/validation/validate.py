@@ -19,6 +19,7 @@ from magtwin.export.validation.isaac_sim import isaac
 from magtwin.export.validation.physx_drive import physx
 from magtwin.export.validation.validators import newton, nvidia, simready
 from magtwin.files import existing
+from magtwin.kinds import expected
 
 AGAINST = ("core", "nvidia", "simready", "isaac", "newton", "physx", "magtwin")
 """Validators, in the order of the results."""
@@ -57,6 +58,7 @@ def validate(
     file = existing(file, "USD file")
     if file.is_dir():
         raise InputError(f"{file}: a folder; give the root layer in it")
+    expected(file, "USD file")
     if file.suffix not in SUFFIXES:
         raise InputError(f"{file}: no USD file; {hint(file.suffix, SUFFIXES)}")
     names = {name: name for name in AGAINST}

@@ -25,6 +25,7 @@ from magtwin.io.bags.types import definition_of, layout
 from magtwin.io.recorder import PARTIAL, Sink, partial_of
 from magtwin.run.arrow import metadata_to_json
 from magtwin.run.run import Run
+from magtwin.run.spool import blocks
 from magtwin.version import __version__
 
 if TYPE_CHECKING:
@@ -39,6 +40,9 @@ NOTE = "magtwin"
 
 BLOCK = 16_384
 """Rows written at a time."""
+
+INSIDE = "run.mcap"
+"""Name that a single storage file gives itself, so that its bytes do not depend on the one that it has."""
 
 
 def write_bag(
@@ -78,8 +82,8 @@ def write_bag(
         try:
             stream = Stream(run, sender, scans)
             bag.begin(run, stream)
-            for first in range(0, max(run.rows, 1), BLOCK):
-                bag.send(stream.messages(run.take(slice(first, first + BLOCK))))
+            for block in blocks(run, BLOCK):
+                bag.send(stream.messages(block))
             bag.send(stream.last())
             bag.close()
         except BaseException:
@@ -136,7 +140,9 @@ class _Bag:
         self.store.flush()
         if self._folder is not None:
             aside = self._folder / "metadata.yaml.new"
-            aside.write_text(to_yaml({"rosbag2_bagfile_information": self._metadata()}), encoding="utf-8")
+            aside.write_text(
+                to_yaml({"rosbag2_bagfile_information": self._metadata(self._file.name)}), encoding="utf-8"
+            )
             aside.replace(self._folder / "metadata.yaml")
 
     def close(self) -> None:
@@ -153,11 +159,9 @@ class _Bag:
         with suppress(OSError, sqlite3.Error):
             self.store.abort()
 
-    def _metadata(self) -> dict[str, Any]:
+    def _metadata(self, file: str = INSIDE) -> dict[str, Any]:
         store, connections = self.store, list(self.connections.values())
-        return bag_metadata(
-            self._file.name, connections, store.counts, (store.first, store.last), self.custom
-        )
+        return bag_metadata(file, connections, store.counts, (store.first, store.last), self.custom)
 
 
 class _GrowingBag:

@@ -17,12 +17,23 @@ from magtwin.errors import InputError
 from magtwin.files import existing, output
 from magtwin.io.recorder import PARTIAL
 from magtwin.io.rerun.layout import RUN_COLOURS, Shown, comparison_layout, plotted
-from magtwin.io.rerun.recording import ROOM, Recording, content_id, recording_of, size_of, stream, title_of
-from magtwin.io.rerun.series import COLUMNS_ENTITY, entity_of, table_of
+from magtwin.io.rerun.recording import (
+    PATIENCE_S,
+    ROOM,
+    Recording,
+    content_id,
+    recording_of,
+    size_of,
+    stream,
+    title_of,
+)
+from magtwin.io.rerun.series import COLUMNS_ENTITY, STATES, entity_of, table_of
 from magtwin.io.rerun.viewer import check_decodes, show
 from magtwin.io.rerun.world import Interior, Robot, heading_of, send_room
 from magtwin.path import Path
+from magtwin.run import mapped
 from magtwin.run.run import Run
+from magtwin.run.spool import blocks
 from magtwin.sim.sensors.lidar import Scans
 from magtwin.twin import Twin
 
@@ -57,13 +68,21 @@ def write_rrd(
     _check_rows(run, path)
     name, size = title_of(run) or FilePath(path).stem, size_of(run, scans)
     shown: dict[str, Any] = {"planned": planned, "scans": scans}
+    if run.rows > mapped.LONG:  # the layout looks at some rows, and at the last one
+        some = np.append(np.arange(0, run.rows - 1, -(-run.rows // mapped.LONG)), run.rows - 1)
+        events = [key for key in STATES if key in run and run[key].any()]
+        shown |= {"known": run.take(some), "events": events}
+        mapped.release()
     with (
         output(path, force=force) as aside,
         recording_of(
             run, content_id(run), name, twin, **shown, room=size, file=aside, final=FilePath(path)
         ) as recording,
     ):
-        recording.append(run)
+        for block in blocks(run):
+            recording.append(block)
+            if block.rows < run.rows:  # Rerun queues what it has not written
+                recording.rec.flush(timeout_sec=PATIENCE_S)
         recording.close()
 
 

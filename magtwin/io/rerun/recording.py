@@ -16,12 +16,14 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.io.rerun.layout import layout
 from magtwin.io.rerun.series import COLUMNS_ENTITY, ROWS, Flags, entity_of, send_columns, send_metadata
 from magtwin.io.rerun.world import Feed, Interior, Robot, heading_of, send_room
 from magtwin.path import Path
+from magtwin.run import mapped
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
 from magtwin.twin import Twin
@@ -242,12 +244,18 @@ def content_id(*runs: Run) -> str:
     """An id that depends only on the content of the runs."""
     digest = hashlib.sha256()
     for run in runs:
-        sums = {
-            name: (str(values.dtype), values.shape, zlib.crc32(np.ascontiguousarray(values).data))
-            for name, values in run.items()
-        }
+        sums = {name: (str(values.dtype), values.shape, _crc(values)) for name, values in run.items()}
         digest.update(json.dumps([sums, dict(run.metadata)], sort_keys=True).encode())
     return digest.hexdigest()[:32]
+
+
+def _crc(values: NDArray[Any]) -> int:
+    """CRC-32 of an array's content, read block by block."""
+    crc = 0
+    for first in range(0, len(values), mapped.BLOCK):
+        crc = zlib.crc32(np.ascontiguousarray(values[first : first + mapped.BLOCK]).data, crc)
+    mapped.release()
+    return crc
 
 
 def metadata_page(metadata: Mapping[str, Any], rows: int | None = None) -> rr.TextDocument:

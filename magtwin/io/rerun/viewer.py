@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import Timeline, View, ViewerClient
@@ -22,6 +22,7 @@ from rerun.experimental import Timeline, View, ViewerClient
 from magtwin.errors import InputError
 from magtwin.files import existing, output
 from magtwin.io.rerun.series import TIMELINE
+from magtwin.parallel.machine import ends_with_parent
 
 LOCALHOST = "127.0.0.1"
 
@@ -56,7 +57,8 @@ def show(rrd: str | os.PathLike[str], *, source: str | os.PathLike[str] | None =
     """
     rrd = existing(rrd, "recording")
     command = [_binary(), "--bind", LOCALHOST, "--port", "auto", str(rrd)]
-    result = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
+    options: dict[str, Any] = {"stderr": subprocess.PIPE, "text": True, "preexec_fn": ends_with_parent()}
+    result = subprocess.run(command, check=False, **options)
     if result.returncode:
         advice = "view the .rrd of this run, which a browser shows too"
         if source is None:
@@ -167,7 +169,8 @@ def live_viewer(
     with tempfile.TemporaryFile("w+") as log:
         try:
             with _interrupt_later() as interrupts:
-                process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+                options: dict[str, Any] = {"start_new_session": True, "preexec_fn": ends_with_parent()}
+                process = subprocess.Popen(command, stdout=log, stderr=log, **options)
                 client = _connected(process, port, log, interrupts)
             assert client is not None  # else the interrupt was raised
             yield f"rerun+http://{LOCALHOST}:{port}/proxy", client

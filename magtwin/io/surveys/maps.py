@@ -20,6 +20,7 @@ from magtwin.files import check_free, sha256
 from magtwin.io.surveys.about import About
 from magtwin.io.surveys.columns import Columns
 from magtwin.io.surveys.readings import is_pattern, read_readings, save_readings
+from magtwin.kinds import expected
 from magtwin.report import Report
 
 Method = Literal["auto", "trilinear", "cubic", "gp", "harmonic"]
@@ -56,7 +57,7 @@ def open_map(file: Source, date: str | None = None) -> AnomalyMap:
         return load_map(file, date)
     if date is not None:
         raise InputError(f"{file}: a folder of CSVs has no dates; leave out `date`", parameter="date")
-    return read_folder(file)[0]
+    return read_folder(expected(file, "map"))[0]
 
 
 def read_survey(

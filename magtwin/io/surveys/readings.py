@@ -23,6 +23,7 @@ from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
 from magtwin.io.surveys.columns import FIELDS, HEADINGS, NO_HEADING, TIMES, VECTORS, Columns
 from magtwin.io.surveys.table import Table, read_csv, read_parquet_table
 from magtwin.io.tables import load_parquet, read_parquet
+from magtwin.kinds import expected
 from magtwin.run.arrow import FACTS
 from magtwin.run.run import Run
 
@@ -242,8 +243,8 @@ def _first(source: Source) -> Path:
     """The path of a source, or of the first of its joined files."""
     path = Path(source)
     if path.exists() or "+" not in str(source):
-        return existing(path, "source of readings")
-    return existing(Path(str(source).split("+")[0]), "source of readings")
+        return expected(path, "source of readings")
+    return expected(Path(str(source).split("+")[0]), "source of readings")
 
 
 def _only_unit(path: Path, columns: Columns) -> None:

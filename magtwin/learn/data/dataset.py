@@ -25,6 +25,7 @@ from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.tiles import TiledMap
 from magtwin.files import existing, output, read_text, sha256
+from magtwin.kinds import expected
 from magtwin.learn.data.alignment import Alignment, fit_alignment
 from magtwin.learn.data.features import FEATURES, SETS, columns_of, feature_names
 from magtwin.learn.data.features import features as features_of
@@ -415,7 +416,7 @@ def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
     Raises:
         InputError: It is missing, not a data set, or of another version.
     """
-    folder = existing(folder, "data set")
+    folder = expected(folder, "data set")
     path = existing(folder / MANIFEST, "manifest of a data set") if folder.is_dir() else folder
     if not folder.is_dir():
         raise InputError(f"{folder}: a file; a data set is the folder that `magtwin dataset build` makes")

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from magtwin import files
 from magtwin.errors import InputError
+from magtwin.kinds import expected
 from magtwin.learn.data.features import columns_of, features
 from magtwin.learn.models.predictor import Predictor, load_predictor
 from magtwin.learn.models.regressor import summary_of
@@ -59,7 +60,7 @@ class NeuralMagnetometer(Summarized):
         Raises:
             InputError: No such file, another checksum, or not a predictor.
         """
-        path = files.existing(path, "weights file")
+        path = expected(path, "weights file")
         checksum = files.sha256(path)
         if sha256 and checksum != sha256.lower():
             raise InputError(

@@ -11,7 +11,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.files import existing, sha256
+from magtwin.files import sha256
+from magtwin.kinds import expected
 from magtwin.learn.data.features import FULL, feature_names
 from magtwin.learn.data.inputs import Inputs, inputs_of
 from magtwin.learn.models.checkpoint import read_checkpoint
@@ -232,7 +233,7 @@ def convert(
     Raises:
         InputError: Not such a checkpoint, or `out` exists.
     """
-    net = net_of_checkpoint(existing(checkpoint, "checkpoint"))
+    net = net_of_checkpoint(expected(checkpoint, "weights file"))
     if licence:
         net.metadata["licence"] = licence
     net.save(out, force=force)

@@ -51,7 +51,7 @@ def save_state(
     about = {"format_version": FORMAT_VERSION, "settings": settings, "history": history}
     metadata = {"magtwin training": json.dumps(about, sort_keys=True, allow_nan=False)}
     whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    with output(path, force=True) as aside:
+    with output(path, force=True, at_once=True) as aside:
         aside.write_bytes(save(whole, metadata))
 
 

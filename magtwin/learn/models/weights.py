@@ -14,6 +14,7 @@ from safetensors.torch import save
 
 from magtwin.errors import InputError
 from magtwin.files import existing, existing_file, output
+from magtwin.kinds import expected, kind_of
 from magtwin.learn.data.features import FEATURES, feature_names
 
 MetadataValue = str | int | float | bool
@@ -90,14 +91,14 @@ class Weights:
         Raises:
             InputError: A tensor is missing, unknown, of another shape or type, or not finite.
         """
-        for name, expected in like.items():
+        for name, wanted in like.items():
             if name not in self.tensors:
                 raise InputError(f"{self.path}: tensor {name!r} is missing; train the {self.kind} again")
             tensor = self.tensors[name]
-            if tensor.shape != expected.shape or tensor.dtype != expected.dtype:
+            if tensor.shape != wanted.shape or tensor.dtype != wanted.dtype:
                 raise InputError(
                     f"{self.path}: tensor {name!r} is {say(tensor)}, the {len(self.features)} features and "
-                    f"the other layers ask for {say(expected)}"
+                    f"the other layers ask for {say(wanted)}"
                 )
             if name not in unknown and not bool(torch.isfinite(tensor).all()):
                 raise InputError(f"{self.path}: tensor {name!r} has numbers that are nan or infinite")
@@ -114,8 +115,9 @@ def is_checkpoint(path: str | os.PathLike[str]) -> bool:
         InputError: No such file, or a folder.
     """
     path = existing(path, "weights file")
-    if path.is_dir():
+    if path.is_dir() and kind_of(path) is None:
         raise InputError(f"{path}: a folder; give a weights file, .safetensors or .pth")
+    expected(path, "weights file")
     with path.open("rb") as file:
         return file.read(4) == _ZIP or path.suffix in (".pth", ".pt")
 

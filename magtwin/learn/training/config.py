@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from magtwin.errors import InputError, find
 from magtwin.files import from_table, read_toml
+from magtwin.kinds import expected
 from magtwin.learn.data.features import feature_names
 from magtwin.learn.data.split import By
 from magtwin.learn.models.linear import Weighting
@@ -98,7 +99,8 @@ class TrainConfig:
     """Sessions, runs, paths or recordings to put into the test."""
 
     threads: int | None = None
-    """Threads of torch; None leaves them as they are. Another number gives other bits."""
+    """Threads of torch and of numpy's products. None: one, whatever the number of processors. Another number
+    gives other bits."""
 
     device: Device | None = None
     """Where torch trains: "cpu", "cuda", or "auto" (a GPU if torch sees one)."""
@@ -203,4 +205,4 @@ def read_config(path: str | os.PathLike[str]) -> TrainConfig:
         InputError: No such file, not TOML, an unknown key (the nearest one is named), an option that the
             model does not read, or an invalid value, each with its line.
     """
-    return from_table(TrainConfig, read_toml(path), path)
+    return from_table(TrainConfig, read_toml(expected(path, "settings of a training")), path)

@@ -4,15 +4,17 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from magtwin.errors import InputError
-from magtwin.files import check_free, output, sha256
+from magtwin.files import afterwards, check_free, output, sha256, transaction
 from magtwin.learn.data.dataset import MANIFEST, Dataset, open_dataset
 from magtwin.learn.data.origin import ROBOT_METADATA
 from magtwin.learn.data.residuals import HeldOut, held_out_errors, residuals
@@ -90,10 +92,14 @@ def train(
         advance=advance,
     )
     if out is not None and checkpoint is not None:
-        result.predictor.save(out, force=force)
-        with output(out.with_suffix(".md"), force=force) as aside:
-            aside.write_text(model_card(result, out.name, sha256(out)), encoding="utf-8")
-        checkpoint.unlink(missing_ok=True)
+        with (
+            transaction(),
+            output(out, force=force) as weights,
+            output(out.with_suffix(".md"), force=force) as card,
+        ):
+            result.predictor.save(weights)
+            card.write_text(model_card(result, out.name, sha256(weights)), encoding="utf-8")
+        afterwards(partial(checkpoint.unlink, missing_ok=True))
     return result
 
 
@@ -124,6 +130,29 @@ def fit(
         InputError: A part has no rows, the data set lacks a column of a feature, or the model cannot be
             fitted.
     """
+    threads, before = config.threads or 1, torch.get_num_threads()
+    with threadpool_limits(threads):  # the products of numpy and scipy
+        torch.set_num_threads(threads)
+        try:
+            return _fit(
+                config, dataset, split, rng, checkpoint, resume=resume, progress=progress, advance=advance
+            )
+        finally:
+            torch.set_num_threads(before)
+
+
+def _fit(
+    config: TrainConfig,
+    dataset: Dataset,
+    split: Split,
+    rng: np.random.Generator,
+    checkpoint: Path | None,
+    *,
+    resume: bool,
+    progress: Callable[[Epoch], None] | None,
+    advance: Callable[[int, int], None] | None,
+) -> TrainingResult:
+    """As `fit`, with threads set."""
     data = read_training_data(dataset, split, config.inputs)
     init = None if config.init is None else load_predictor(config.init)
     if init is not None and init.kind != config.kind:
@@ -149,13 +178,7 @@ def fit(
         progress=progress,
         advance=advance,
     )
-    threads = torch.get_num_threads()
-    if config.threads is not None:
-        torch.set_num_threads(config.threads)
-    try:
-        fitted = PREDICTORS[config.kind].fit(task)
-    finally:
-        torch.set_num_threads(threads)
+    fitted = PREDICTORS[config.kind].fit(task)
     predictor, labels = fitted.model, task.train.y
     mean, sd = float(labels.mean()), float(labels.std())
     models = [predictor] if init is None else [predictor, init]
@@ -288,8 +311,7 @@ def _provenance(
         "magtwin": __version__,
     }
     if config.kind not in ("linear", "mixed"):
-        threads = config.threads or torch.get_num_threads()
-        metadata |= {"threads": threads, "torch": str(torch.__version__), "device": device}
+        metadata |= {"threads": config.threads or 1, "torch": str(torch.__version__), "device": device}
     if config.licence:
         metadata["licence"] = config.licence
     if config.init is not None:

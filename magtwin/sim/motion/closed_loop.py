@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from magtwin.compiled import Loops, in_threads
 from magtwin.errors import InputError
 from magtwin.field.maps import lookup
+from magtwin.run.mapped import joined
 from magtwin.sim.motion import loop
 from magtwin.sim.motion.controllers import Guide
 from magtwin.sim.motion.drive import Motion, Pose, limits
@@ -192,7 +193,7 @@ def _in_python(closed_loop: ClosedLoop, obstacles: Obstacles) -> Motion:
         first += made
         if made < steps:
             break
-    return _motion(closed_loop, np.concatenate(records, axis=1))
+    return _motion(closed_loop, joined(records))
 
 
 def _compiled(loops: Sequence[ClosedLoop], obstacles: Obstacles) -> list[Motion]:
@@ -213,7 +214,7 @@ def _compiled(loops: Sequence[ClosedLoop], obstacles: Obstacles) -> list[Motion]
             records[n].append(rows[:, :count].copy())
         first += steps
         going = going[(made == steps) & (most[going] > first)]
-    return [_motion(c, np.concatenate(r, axis=1)) for c, r in zip(loops, records, strict=True)]
+    return [_motion(c, joined(r)) for c, r in zip(loops, records, strict=True)]
 
 
 def _block(

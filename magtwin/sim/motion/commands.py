@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.files import existing_file, output
+from magtwin.kinds import expected
 from magtwin.spec.drive import DriveSpec
 from magtwin.summary import Summarized, Summary
 
@@ -63,7 +64,7 @@ def read_commands(file: str | os.PathLike[str]) -> Commands:
         InputError: The file is missing or empty, a line is not three finite numbers, or times do not ascend
             from 0 s; the text has the number of the line.
     """
-    file = existing_file(file, "file of commands", "text")
+    file = existing_file(expected(file, "file of commands"), "file of commands", "text")
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:

@@ -1,14 +1,16 @@
 """The differential drive: exact integration of twists, wheels, limits."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
+from magtwin.run import mapped
 from magtwin.sim.motion.loop import limited
 from magtwin.spec.drive import DriveSpec
 
@@ -209,16 +211,31 @@ class Motion:
         if poses.shape != (len(v) + 1, 3):
             raise InputError(f"poses of a Motion must have shape {(len(v) + 1, 3)}, got {poses.shape}")
         rates = wheel_rates(known["wheel_v"], known["wheel_w"], self.drive)
+        angles = np.vstack([[0.0, 0.0], np.cumsum(rates, axis=0) * self.dt])
         known |= {
             "poses": poses,
             "wheel_rates": rates,
-            "wheel_angles": np.vstack([[0.0, 0.0], np.cumsum(rates, axis=0) * self.dt]),
+            "wheel_angles": angles,
             "acceleration": np.diff(v, prepend=0.0) / self.dt,
         }
-        parts = (poses[:-1], known["wheel_angles"][:-1], rates, v, w, known["acceleration"])
-        known["_steps"] = np.column_stack([*parts, known["v_cmd"], known["w_cmd"], known["bump"]])
+        columns = (v, w, known["acceleration"], known["v_cmd"], known["w_cmd"], known["bump"])
+        mapped.release()
+        parts = (poses[:-1], angles[:-1], rates, *(column[:, None] for column in columns))
+        known["_steps"] = _table(parts)
         for name, array in known.items():
             object.__setattr__(self, name, array)
+
+        if len(v) > mapped.LONG:  # views of the table, so that only that is kept
+            places: dict[str, Any] = {
+                "wheel_rates": slice(5, 7),
+                "v": 7,
+                "w": 8,
+                "acceleration": 9,
+                "v_cmd": 10,
+                "w_cmd": 11,
+            }
+            for name, place in places.items():
+                object.__setattr__(self, name, self._steps[:, place])
 
     @property
     def duration_s(self) -> float:
@@ -240,6 +257,15 @@ class Motion:
         return replace(moment, **stopped)
 
 
+def _table(parts: Sequence[Array]) -> Array:
+    """Columns (K, ...) side by side, in a mapped file if they are long."""
+    rows, width = len(parts[0]), sum(part.shape[1] for part in parts)
+    table = mapped.zeros((rows, width)) if rows > mapped.LONG else np.empty((rows, width))
+    for some in mapped.parts(rows):
+        np.concatenate([part[some] for part in parts], axis=1, out=table[some], casting="unsafe")
+    return table
+
+
 def moment_in_steps(steps: Array, dt: float, t: Array, *, first: int = 0) -> Moment:
     """A motion within its control steps, exact.
 
@@ -249,6 +275,10 @@ def moment_in_steps(steps: Array, dt: float, t: Array, *, first: int = 0) -> Mom
         t: Times within the steps [s], shape (N,).
         first: Number of the first of these steps since the start.
     """
+    if len(t):  # only the steps around these times
+        low = min(max(int(np.min(t) / dt) - first - 2, 0), len(steps) - 1)
+        high = min(max(int(np.max(t) / dt) - first + 3, low + 1), len(steps))
+        first, steps = first + low, steps[low:high]
     starts = np.arange(first, first + len(steps)) * dt
     k = np.maximum(np.searchsorted(starts, t, side="right") - 1, 0)
     into = np.clip(t - starts[k], 0.0, dt)

@@ -8,11 +8,11 @@ made in any order and in blocks of any size, and any run can be made again.
 import hashlib
 import importlib
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from typing import Any, overload
+from typing import Any, Protocol, overload
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from magtwin.sim.motion.engine import Travel
 from magtwin.sim.motion.follow import check_arrived, loop_along, loop_by_commands
 from magtwin.sim.motion.pose_error import draw_pose_error
 from magtwin.sim.runs.sensing import Conditions, Sensing, streams
-from magtwin.sim.runs.simulate import Metadata, Sensed, check_run, sense_all, travel
+from magtwin.sim.runs.simulate import Metadata, Sensed, check_run, read_all, readings, sense_all, travel
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.scene import Scene
 from magtwin.summary import Summarized, Summary, listed
@@ -54,8 +54,23 @@ class Job:
     """Forward speed on straight parts of the path [m/s]."""
 
 
-Finish = Callable[[Sequence[Job], Sequence[Sensed]], list[Run]]
-"""From jobs and their sensed runs to whole runs: where a network predicts, for all rows at once."""
+class Finish(Protocol):
+    """From jobs and their sensed runs to whole runs: where a network predicts, for all rows at once."""
+
+    def __call__(self, jobs: Sequence[Job], sensed: Sequence[Sensed], *, check: bool = True) -> list[Run]:
+        """Whole runs; `check` is False for blocks of a run."""
+
+    def check(self, run: Run) -> None:
+        """Refuse a run that is not to be kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Driven:
+    """A long run that has been driven, and is sensed block by block."""
+
+    sensing: Sensing
+    motion: Travel
+    metadata: Metadata
 
 
 class Runs(Summarized, Sequence[Run]):
@@ -126,7 +141,7 @@ class Runs(Summarized, Sequence[Run]):
     def __getitem__(self, index: int | slice) -> Run | list[Run]:
         numbers = range(len(self))[index]
         if isinstance(numbers, int):
-            return self._finish([self._jobs[numbers]], self._sensed([numbers]))[0]
+            return next(self._finished([self._jobs[numbers]], self._sensed([numbers])))
         return list(self._made(numbers))
 
     def __iter__(self) -> Iterator[Run]:
@@ -168,10 +183,30 @@ class Runs(Summarized, Sequence[Run]):
                 sensed = ahead.result()
                 if after is not None:
                     ahead = pool.submit(self._sensed, after)
-                yield from self._finish([self._jobs[i] for i in block], sensed)
+                yield from self._finished([self._jobs[i] for i in block], sensed)
 
-    def _sensed(self, numbers: Sequence[int]) -> list[Sensed]:
-        """Drive and sense some runs."""
+    def _finished(self, jobs: Sequence[Job], sensed: list[Any]) -> Iterator[Run]:
+        """Whole runs: all at once, or one by one if any of them is long."""
+        if all(isinstance(one, Sensed) for one in sensed):
+            yield from self._finish(jobs, sensed)
+            return
+        for job in jobs:
+            yield self._read(job, sensed.pop(0))
+
+    def _read(self, job: Job, sensed: "Sensed | _Driven") -> Run:
+        """A run, which is sensed block by block if it is long."""
+        if isinstance(sensed, Sensed):
+            return self._finish([job], [sensed])[0]
+
+        def read(block: Sensed) -> Run:
+            return self._finish([job], [block], check=False)[0]
+
+        run = read_all(sensed.sensing, sensed.motion, sensed.metadata, read)
+        self._finish.check(run)
+        return run
+
+    def _sensed(self, numbers: Sequence[int]) -> list[Any]:
+        """Drive some runs, and sense those that are not long."""
         common = self._conditions
         draws = {i: streams(np.random.default_rng(self._jobs[i].seed)) for i in numbers}
         loops: dict[int, ClosedLoop] = {}
@@ -182,7 +217,7 @@ class Runs(Summarized, Sequence[Run]):
                 pose_error = draw_pose_error(drive, draws[i]["drive"])
                 loops[i] = replace(planned, drive=drive, wheel_errors=errors, pose_error=pose_error)
         motions = dict(zip(loops, run_loops(list(loops.values()), common.obstacles), strict=True))
-        sensed = []
+        sensed: list[Sensed | _Driven] = []
         for i in numbers:
             job = self._jobs[i]
             with self._numbered(i):
@@ -194,7 +229,10 @@ class Runs(Summarized, Sequence[Run]):
                 else:
                     motion, metadata = travel(job.scene, job.path, draws[i], job.speed, common)
                 sensing = Sensing(job.scene, draws[i], common, wanted=self._columns)
-                sensed.append(sense_all(sensing, motion, metadata))
+                count = len(readings(sensing, motion, metadata)[0])
+                long = sensing.rows_at_once(count) < count
+                make = _Driven if long else sense_all
+                sensed.append(make(sensing, motion, metadata))
         return sensed
 
     def _metadata(self, job: Job) -> Metadata:

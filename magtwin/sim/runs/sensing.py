@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import into_base, quat_from_yaw, wrap_angle
+from magtwin.run import mapped
 from magtwin.run.run import COLUMNS, Column
 from magtwin.sim.exact import ExactField
 from magtwin.sim.extensions import INTERFERENCE, Interference, SensorFactory, start_sensors
@@ -264,6 +265,17 @@ class Sensing:
             columns["b_noise_nt"] = columns["b_noise_nt"] - np.where(lost, error, 0.0)
         names = [*(name for name in COLUMNS if name in self.wanted), *self.specs]
         return {name: columns[name] for name in names}
+
+    def rows_at_once(self, count: int) -> int:
+        """Readings of a run of `count` readings that are sensed at a time: all, or a block of a long run."""
+        rates = [sensor.clock.rate_hz for sensor in self.sampled.values()]
+        samples = max([self.rate_hz, *rates]) / self.rate_hz  # at most, for each reading
+        return count if count * samples <= mapped.LONG else max(1, int(mapped.BLOCK / samples))
+
+    def forget(self) -> None:
+        """Drop the samples that nobody took, so that they do not pile up in a long run."""
+        for sensor in self.sampled.values():
+            sensor.clock.take_fresh()
 
     def _mapped(self, xy: Array, yaw: Array) -> Columns:
         """Map at base_link's poses, its gradient in base_link's axes if needed, and whether it is known."""

@@ -6,11 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.path import Path, check_on_floor
 from magtwin.run.run import Run
+from magtwin.run.spool import Spool
 from magtwin.sim.engines.replay import replayed
 from magtwin.sim.exact import check_truth
 from magtwin.sim.extensions import Interference, SensorFactory
@@ -38,7 +40,7 @@ RANDOM_S = 60.0
 """Default time for which a random driver drives [s]."""
 
 MOST_READINGS = 20_000_000
-"""Most readings of a run: about 8 GB of columns."""
+"""Most readings of a run: about 12 GB of columns on the disk."""
 
 
 def simulate(
@@ -59,6 +61,9 @@ def simulate(
     engine: Engine | None = None,
     sensors: Iterable[str | SensorFactory] = (),
     interference: Iterable[str | Interference] = (),
+    complete: Callable[[Run], Run] = lambda block: block,
+    progress: Callable[[int, int, str], Any] | None = None,
+    each: Callable[[Run], Any] | None = None,
 ) -> Run:
     """Drive a scene's robot along a path and read its sensors.
 
@@ -83,7 +88,8 @@ def simulate(
         obstacles: What the path must be clear of, and what stops the robot if it leaves its path.
         controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`, or a custom controller.
         disturbance_nt: From a Run with all other sensors, the vector axes too, to the disturbance of each
-            reading [nT], shape (N,), alone or with the standard deviation of its error. Called once.
+            reading [nT], shape (N,), alone or with the standard deviation of its error. Called once, or for
+            each block of a long run.
         model_error: Statistics of that error; None draws no error.
         outside: What the map reads outside its extent: nan, the nearest value inside, or a refusal.
         lidar: Whether the LiDAR follows its schedule, or stays on or off.
@@ -91,6 +97,9 @@ def simulate(
         sensors: Custom sensors whose columns the run has too: names of registered sensors, or factories; see
             `magtwin.sim.extensions`.
         interference: Custom terms that are added to the field at the magnetometer: names or functions.
+        complete: Called with the run, or with each block of a long one; returns it as it is to be kept.
+        progress: Called with readings made, readings in all and the simulated time as text, in a long run.
+        each: Called with each block of a long run, as `complete` gave it.
 
     Returns:
         A Run with every column of `COLUMNS`, in their order. `b_sd_nt` is nan and `flag_out_of_distribution`
@@ -115,8 +124,12 @@ def simulate(
     draws = streams(rng)
     sensing = Sensing(scene, draws, conditions, sensors=sensors, interference=interference)
     motion, metadata = travel(scene, path, draws, speed, conditions)
-    sensed = sense_all(sensing, motion, metadata)
-    return sensed.read(None if disturbance_nt is None else disturbance_nt(sensed.run), model_error)
+
+    def read(sensed: Sensed) -> Run:
+        predicted = None if disturbance_nt is None else disturbance_nt(sensed.run)
+        return complete(sensed.read(predicted, model_error))
+
+    return read_all(sensing, motion, metadata, read, progress=progress, each=each)
 
 
 def travel(
@@ -221,12 +234,54 @@ def sense_all(sensing: Sensing, motion: Travel, metadata: Mapping[str, str | int
         motion: What the robot did.
         metadata: How the motion came about.
     """
+    t, known = readings(sensing, motion, metadata)
+    return Sensed(Run(sensing.sense(motion, t), known, sensing.specs), sensing)
+
+
+def read_all(
+    sensing: Sensing,
+    motion: Travel,
+    metadata: Mapping[str, str | int | float | bool],
+    read: Callable[[Sensed], Run],
+    *,
+    progress: Callable[[int, int, str], Any] | None = None,
+    each: Callable[[Run], Any] | None = None,
+) -> Run:
+    """Read the sensors of a whole run, a long one block by block; the bytes do not depend on the blocks.
+
+    Args:
+        sensing: Sensors that have not been read yet.
+        motion: What the robot did.
+        metadata: How the motion came about.
+        read: Reads the magnetometer of the run, or of a block.
+        progress: Called after each block with readings made, readings in all and the simulated time as text.
+        each: Called with each block of a long run.
+    """
+    times, known = readings(sensing, motion, metadata)
+    whole, rows = Spool(len(times)), sensing.rows_at_once(len(times))
+    for first in range(0, len(times), rows):
+        t = times[first : first + rows]
+        block = read(Sensed(Run(sensing.sense(motion, t), known, sensing.specs), sensing))
+        whole.append(block)
+        if rows == len(times):
+            break
+        sensing.forget()
+        if each is not None:
+            each(block)
+        if progress is not None:
+            progress(first + len(t), len(times), f"{t[-1]:,.0f} s")
+    return whole.run
+
+
+def readings(
+    sensing: Sensing, motion: Travel, metadata: Mapping[str, str | int | float | bool]
+) -> tuple[NDArray[np.float64], Metadata]:
+    """Times of the readings of a run [s], shape (N,), and its metadata; arguments as for `sense_all`."""
     conditions = sensing.conditions
     end = motion.duration_s if conditions.duration_s is None else conditions.duration_s
     _check_readings(end, sensing.rate_hz)
     t = np.arange(max(1, math.ceil(end * sensing.rate_hz - 1e-9))) / sensing.rate_hz
-    known = {**run_metadata(sensing), **metadata, "duration_s": round(float(end), 9)}
-    return Sensed(Run(sensing.sense(motion, t), known, sensing.specs), sensing)
+    return t, {**run_metadata(sensing), **metadata, "duration_s": round(float(end), 9)}
 
 
 def run_metadata(sensing: Sensing) -> Metadata:

@@ -168,7 +168,8 @@ class Battery(SampledSensor):
             start = self.rest(self._lidar_on(np.zeros(1)))
             self._history = np.column_stack([start.power_w, start.fraction, start.voltage_v, start.current_a])
         else:
-            self._history, self._first = self._history[-1:], self._done
+            self._history = self._history[-2:]  # steps go on past the last reading, by less than one
+            self._first = self._done - len(self._history) + 1
         last = max(int(np.ceil((until_s - 1e-9) / STEP_S)) - 1, self._done)
         times: Array = np.arange(self._done, last + 1, dtype=float) * STEP_S
         self._done = last

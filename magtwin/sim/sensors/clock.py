@@ -55,7 +55,7 @@ class SampleClock:
             jitter_s: Mean of the further delay of each sample [s].
             rng: Source of the delays; not needed if `jitter_s` is 0.
         """
-        self._rate, self._latency, self._jitter, self._rng = rate_hz, latency_s, jitter_s, rng
+        self.rate_hz, self._latency, self._jitter, self._rng = rate_hz, latency_s, jitter_s, rng
         self._next = -math.ceil(min(latency_s * rate_hz, 1e18))
         self._first, self._last = self._next, -math.inf
         self._arrivals = np.zeros(0)
@@ -68,9 +68,9 @@ class SampleClock:
         Raises:
             InputError: There are more than memory can hold.
         """
-        check_count("samples of a sensor", until_s - self._next / self._rate, self._rate)
-        last = math.ceil(until_s * self._rate - _TOLERANCE)
-        stamps = np.arange(self._next, max(last, self._next)) / self._rate
+        check_count("samples of a sensor", until_s - self._next / self.rate_hz, self.rate_hz)
+        last = math.ceil(until_s * self.rate_hz - _TOLERANCE)
+        stamps = np.arange(self._next, max(last, self._next)) / self.rate_hz
         self._next += len(stamps)
         return stamps
 

@@ -108,14 +108,16 @@ class Description:
         """The first `<mesh>` of a file."""
         return next((e for e in self.xml.iter("mesh") if e.get("filename") == filename), None)
 
-    def note(self, text: str, *, lost: bool = False) -> None:
+    def note(self, text: str, *, lost: bool = False, file: Path | None = None) -> None:
         """Add a note for the user, once.
 
         Args:
             text: What was guessed or left out, and where.
             lost: Whether the stage lacks something of the description; `Options.strict` refuses that.
+            file: The file that it is about, if it is not the description.
         """
-        self.repairs.add(LOSS if lost else NOTE, text)
+        near = "" if file is None else Path(os.path.relpath(file, self.path.parent)).as_posix()
+        self.repairs.add(LOSS if lost else NOTE, text, (near, 0))
 
     def repair(self, kind: str, text: str, about: Element | tuple[str, str] | None = None) -> None:
         """Add a repair, which `Options.strict` refuses.

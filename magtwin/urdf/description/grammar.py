@@ -319,6 +319,11 @@ class _Checker:
             )
             text = f"is revolute with {words}" + (" of 0" if span == 0 else "") + ": a wheel without limits"
             self.report("limit-zeros", f"{self.label} {text}", about)
+        elif kind == "revolute" and powerless and span > 0:
+            text = (
+                f"is revolute with effort and velocity of 0 and a range of {span:g} rad: it moves within it"
+            )
+            self.report("limit-zeros", f"{self.label} {text}", about)
 
     def _free(self, joint: Element, limit: Element | None) -> None:
         """Let a joint move without limits."""

@@ -86,5 +86,10 @@ def hull_faces(points: NDArray) -> NDArray[np.int64] | None:
     corners = np.ascontiguousarray(mesh.vert_properties[:, :3], float) + 0.0
     x = np.sort(corners[:, 0])
     alike = np.flatnonzero(x[np.searchsorted(x, points[:, 0]) % len(x)] == points[:, 0])
-    index = {points[i].tobytes(): i for i in alike}
-    return np.array([index[corner.tobytes()] for corner in corners])[mesh.tri_verts]
+    rows = np.vstack([points[alike], corners])
+    order = np.lexsort(rows.T)
+    kind = np.empty_like(order)
+    kind[order] = np.cumsum(np.append(0, (rows[order[1:]] != rows[order[:-1]]).any(axis=1)))
+    last = np.full(len(rows), -1)
+    np.maximum.at(last, kind[: len(alike)], alike)  # of equal points
+    return last[kind[len(alike) :]][mesh.tri_verts]

@@ -125,15 +125,17 @@ def _join(reading: Reading, pieces: Sequence[Piece]) -> Mesh:
                 f"{path}: a face names vertex {piece.faces.max()} of {len(piece.points)}; export it again"
             )
     first = np.cumsum([0, *(len(piece.points) for piece in pieces)])
-    points = np.vstack([piece.points for piece in pieces]).astype(np.float32)
-    faces = np.vstack([piece.faces + n for piece, n in zip(pieces, first, strict=False)]).astype(np.int64)
-    if not np.isfinite(points[faces]).all():
+    points = np.vstack([np.asarray(piece.points, np.float32) for piece in pieces])
+    faces = np.vstack([np.asarray(piece.faces, np.int64) for piece in pieces])
+    faces += np.repeat(first[:-1], [len(piece.faces) for piece in pieces])[:, None]
+    if not np.isfinite(points).all() and not np.isfinite(points[faces]).all():
         raise InputError(f"{path}: has vertices that are not finite numbers; export it again")
-    pieces = [_textured(_coloured(piece, reading), reading) for piece in pieces]
+    pieces = [replace(_textured(_coloured(piece, reading), reading), points=points[:0]) for piece in pieces]
     paints = tuple(dict.fromkeys(piece.paint for piece in pieces))
     paint = np.repeat([paints.index(p.paint) for p in pieces], [len(p.faces) for p in pieces])
     kept, index = distinct(points)
     points, faces = points[kept], index[faces]
+    del kept, index  # as long as the file
     solid = has_area(points, faces)
     if not solid.any():
         raise InputError(f"{path}: holds no triangle with an area; export it again, or use a primitive")
@@ -226,16 +228,21 @@ def distinct(rows: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     words = np.ascontiguousarray(rows + np.float32(0), np.float32).view(np.uint32)  # + 0 makes -0 into 0
     if not len(words):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    keys = words.astype(np.uint64) @ np.array(HASH[: words.shape[1]], np.uint64)
+    keys = np.zeros(len(words), np.uint64)
+    for column, factor in zip(words.T, HASH, strict=False):  # integers have no fast matrix product
+        keys += column * np.uint64(factor)
     order = np.argsort(keys)
-    starts = np.flatnonzero(np.append(True, keys[order[1:]] != keys[order[:-1]]))
-    kind = np.empty_like(order)
-    kind[order] = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(order))))
-    first = np.minimum.reduceat(order, starts)
-    if (words != words[first[kind]]).any():  # different rows with one key: by their bits
-        return _distinct_words(words)
-    rank = np.argsort(np.argsort(first))
-    return np.sort(first), rank[kind]
+    keys = keys[order]
+    is_start = np.append(True, keys[1:] != keys[:-1])
+    of_key = np.minimum.reduceat(order, np.flatnonzero(is_start))
+    first = keys.view(np.int64)  # from here on, the first row that is equal to each
+    first[order] = of_key[np.cumsum(is_start) - 1]
+    for column in words.T:
+        if (column != column[first]).any():  # different rows with one key: by their bits
+            return _distinct_words(words)
+    is_first = np.zeros(len(words), bool)
+    is_first[of_key] = True
+    return np.flatnonzero(is_first), (np.cumsum(is_first) - 1)[first]
 
 
 def _distinct_words(words: NDArray[np.uint32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

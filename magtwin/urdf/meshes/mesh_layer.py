@@ -68,14 +68,16 @@ class MeshLayer:
             textures: Asset path of the folder for textures, relative to the robot's layer.
         """
         self.textures = Textures(textures)
-        self.looks: dict[Sdf.Path, tuple[Any, ...]] = {}
-        """Values of each material on the robot's stage by its path, see `material`."""
+        self.looks: dict[tuple[Any, ...], tuple[Sdf.Path, str]] = {}
+        """Path and name of each material on the robot's stage by its values, see `material`."""
         self._description, self.options = description, options
         self._stage = Usd.Stage.CreateInMemory()
         describe_stage(self._stage, f"{description.name}: triangles of its meshes.")
         self._stage.SetDefaultPrim(UsdGeom.Scope.Define(self._stage, ROOT).GetPrim())
         self.failed: dict[str, MissingFileError | UnreadableMeshError] = {}
         """Errors of the meshes that are missing or unreadable, by filename."""
+        self.flat: dict[str, float] = {}
+        """Thickness of the plates of flat colliders [m], by the file's name without folders."""
         self._names: set[str] = set()
         self._found: dict[str, Path] = {}
         self._files: dict[Path, Mesh] = {}
@@ -86,6 +88,15 @@ class MeshLayer:
 
     def __len__(self) -> int:
         return len(self._visuals) + len(self._colliders) + len(self._primitives)
+
+    def same_look(self, shown: tuple[Any, ...], name: str) -> Sdf.Path | None:
+        """Path of the look with these values, or None; a name that is lost is noted."""
+        path, first = self.looks.get(shown, (None, name))
+        if name and name != first:
+            self._description.note(
+                f"material {name!r} looks like {first or path.name!r}: the two are one in USD"
+            )
+        return path
 
     def visual(self, mesh: Geometry) -> Entry:
         """The prim of a URDF `<mesh>` as a visual.
@@ -137,6 +148,7 @@ class MeshLayer:
             if path not in self._solids:
                 self._solids[path], flat = solids_of(self._read(path), self.options.collision)
                 if flat:
+                    self.flat[mesh.filename.rpartition("/")[2]] = flat * max(map(abs, scale))
                     text = f"mesh {mesh.filename!r} is flat: it collides as a plate {flat:.2g} m thick"
                     self._description.repair("mesh-flat", text, self._description.mesh_element(mesh.filename))
             made = []
@@ -184,7 +196,7 @@ class MeshLayer:
         if path not in self._files:
             self._files[path] = read_mesh(path, self._description.source.packages.holds)
             for note, lost in self._files[path].notes:
-                self._description.note(note, lost=lost)
+                self._description.note(note, lost=lost, file=path)
         return self._files[path]
 
     def _define_visual(self, file: Mesh, scale: NDArray) -> Entry:
@@ -193,8 +205,9 @@ class MeshLayer:
         corners = slice(None, None, -1) if np.prod(scale) < 0 else slice(None)
         normals = file.shaded()[:, corners] / scale
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        normals = np.round(normals, 4, out=normals).astype(np.float32)  # in place: a scan has millions
         mesh = self._define_mesh(xform.GetPath().AppendChild(MESH), points, faces)
-        _primvar(mesh, "normals", Sdf.ValueTypeNames.Normal3fArray, np.round(normals, 4))
+        _primvar(mesh, "normals", Sdf.ValueTypeNames.Normal3fArray, normals)
         if any(paint is not None and paint.double_sided for paint in file.paints):
             mesh.CreateDoubleSidedAttr(True)
         if file.uvs is not None:
@@ -313,9 +326,9 @@ def _primvar(
     interpolation: str = UsdGeom.Tokens.faceVarying,
 ) -> None:
     """Author a primvar, by default of values at corners, shape (F, 3, K), indexed by distinct values."""
-    rows = values.reshape(-1, values.shape[-1]).astype(np.float32) + np.float32(0)
+    rows = np.ascontiguousarray(values, np.float32).reshape(-1, values.shape[-1])
     first, index = distinct(rows)
     arrays = {2: Vt.Vec2fArray, 3: Vt.Vec3fArray}
     primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(name, kind, interpolation)
-    primvar.Set(arrays[rows.shape[1]].FromNumpy(np.ascontiguousarray(rows[first])))
+    primvar.Set(arrays[rows.shape[1]].FromNumpy(rows[first] + np.float32(0)))  # + 0 makes -0 into 0
     primvar.SetIndices(Vt.IntArray.FromNumpy(index.astype(np.int32)))

@@ -1,7 +1,6 @@
 """Articulation: which prim is its root, and which of its bodies do not collide with each other."""
 
 from collections.abc import Mapping, Sequence
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,11 +61,10 @@ def filter_overlaps(
         The pairs of link names.
     """
     jointed = {frozenset(_ends(joint)) for joint in joints}
-    hulls = _hulls(bodies, colliders)
     pairs = []
-    for first, second in combinations([name for name in bodies if hulls[name]], 2):
+    for (first, second), near in _near(_hulls(bodies, colliders)).items():
         ends = bodies[first].GetPath(), bodies[second].GetPath()
-        if frozenset(ends) in jointed or not any(_overlap(a, b) for a in hulls[first] for b in hulls[second]):
+        if frozenset(ends) in jointed or not any(_overlap(a, b) for a, b in near):
             continue
         UsdPhysics.FilteredPairsAPI.Apply(bodies[first]).CreateFilteredPairsRel().AddTarget(ends[1])
         pairs.append((first, second))
@@ -100,6 +98,24 @@ def _hulls(
         shrunk = points - away * np.minimum(1.0, OVERLAP_M / 2 / np.maximum(far, 1e-12))
         hulls[owner[path]].append(shrunk)
     return hulls
+
+
+def _near(
+    hulls: Mapping[str, Sequence[NDArray]],
+) -> dict[tuple[str, str], list[tuple[NDArray, NDArray]]]:
+    """Hulls of different bodies whose boxes meet, by pair of bodies, in the order of the bodies."""
+    owner = [name for name, some in hulls.items() for _ in some]
+    whole = [points for some in hulls.values() for points in some]
+    low, high = (np.array([f(points, axis=0) for points in whole]).reshape(-1, 3) for f in (np.min, np.max))
+    ends = dict(zip(hulls, np.cumsum([len(some) for some in hulls.values()]), strict=True))
+    near: dict[tuple[str, str], list[tuple[NDArray, NDArray]]] = {}
+    for i, name in enumerate(owner):
+        end = ends[name]
+        meets = ((low[end:] <= high[i]) & (low[i] <= high[end:])).all(axis=1)
+        for j in end + np.flatnonzero(meets):
+            near.setdefault((name, owner[j]), []).append((whole[i], whole[j]))
+    order = {name: k for k, name in enumerate(hulls)}
+    return {pair: near[pair] for pair in sorted(near, key=lambda pair: (order[pair[0]], order[pair[1]]))}
 
 
 def _overlap(a: NDArray, b: NDArray) -> bool:

@@ -30,8 +30,8 @@ def read_base(tags: Tags, controllers: Path | None = None) -> MobileBase | None:
         controllers: YAML with the settings of controllers, which precede plugins.
 
     Raises:
-        InputError: It names an unknown joint or has an invalid number (the message gives the line), or the
-            file has no controller that drives wheels.
+        InputError: The file of `controllers` names an unknown joint, has an invalid number, or has no
+            controller that drives wheels.
     """
     if controllers is None:
         return base_of_plugin(tags) or base_of_plugin_settings(tags)

@@ -13,6 +13,7 @@ import numpy as np
 from magtwin.errors import InputError, hint
 from magtwin.urdf.description.tag import Tags
 from magtwin.urdf.physics.mobile_base import Kind, MobileBase
+from magtwin.urdf.physics.plugin import leave_out
 
 SIDES = (("left_wheel_names", "left_wheel"), ("right_wheel_names", "right_wheel"))
 """Keys of the wheels of a differential drive."""
@@ -54,11 +55,13 @@ HALF_SUM = ("kinematics.sum_of_robot_center_projection_on_X_Y_axis",)
 
 
 def base_of_plugin_settings(tags: Tags) -> MobileBase | None:
-    """The base in the settings that a ros2_control plugin names, or None.
+    """The base in the settings that a ros2_control plugin names; None if there is none, or not completely.
 
     Raises:
-        InputError: They name an unknown joint, or have an invalid number.
+        InputError: The file cannot be read, or is not YAML.
     """
+    from magtwin.urdf.source.settings import read_settings  # needs yaml
+
     for block in tags.blocks("gazebo"):
         for plugin in block.findall("plugin"):
             if "ros2_control" not in f"{plugin.get('name', '')} {plugin.get('filename', '')}":
@@ -73,7 +76,13 @@ def base_of_plugin_settings(tags: Tags) -> MobileBase | None:
                     tags.description.note(f"controllers are unknown, {reason}", lost=True)
                     continue
                 tags.read(element)
-                base = base_of_settings(tags, path)
+                tables = list(read_settings(path))  # reads the file
+                try:
+                    base = _first(tags, tables, path)
+                except InputError as error:
+                    text = str(error).replace(str(path), path.name)
+                    leave_out(tags, element, InputError(text))
+                    continue
                 if base is not None:
                     return base
     return None
@@ -87,7 +96,12 @@ def base_of_settings(tags: Tags, path: Path) -> MobileBase | None:
     """
     from magtwin.urdf.source.settings import read_settings  # needs yaml
 
-    for table in read_settings(path):
+    return _first(tags, read_settings(path), path)
+
+
+def _first(tags: Tags, tables: Iterable[dict[str, Any]], path: Path) -> MobileBase | None:
+    """The base of the first controller that drives wheels, or None."""
+    for table in tables:
         base = _Settings(tags, table, path).base()
         if base is not None:
             return base

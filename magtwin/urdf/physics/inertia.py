@@ -18,6 +18,9 @@ ROUNDING = 1e-6
 SLIMMEST = 1e-3
 """Smallest principal moment of a repaired tensor, relative to the largest: engines divide by it."""
 
+SAME = 1e-8
+"""Points of a mesh that are nearer to each other than about this are one [m]."""
+
 WATER = 1000.0
 """Density of a body whose size is unknown [kg/m3]."""
 
@@ -169,10 +172,27 @@ def polyhedron(points: NDArray, faces: NDArray) -> MassProperties:
         points: Corners [m], shape (V, 3).
         faces: Triangles, counter-clockwise from outside, shape (F, 3).
     """
-    from trimesh.triangles import mass_properties
+    from magtwin.field.sources.bodies import mesh_moments  # not needed by most robots
 
-    found = mass_properties(points[faces])
-    return MassProperties(float(found.volume), np.asarray(found.center_mass), np.asarray(found.inertia))
+    volume, centre, spread = mesh_moments(points, faces)
+    return MassProperties(volume, centre, volume * (np.trace(spread) * np.eye(3) - spread))
+
+
+def is_closed(points: NDArray, faces: NDArray) -> bool:
+    """Whether triangles bound a volume: each edge has two, which turn through it in opposite directions.
+
+    Args:
+        points: Corners [m], shape (V, 3); those that are equal to `SAME` count as one.
+        faces: Triangles, shape (F, 3).
+    """
+    grid = np.round(points / SAME)
+    order = np.lexsort(grid.T)
+    kind = np.empty(len(points), np.int64)
+    kind[order] = np.cumsum(np.append(0, (grid[order[1:]] != grid[order[:-1]]).any(axis=1)))
+    start, end = kind[faces].ravel(), kind[faces[:, [1, 2, 0]]].ravel()
+    forth, back = np.sort(start * len(points) + end), np.sort(end * len(points) + start)
+    once = bool((forth[1:] != forth[:-1]).all() and (start != end).all())
+    return once and np.array_equal(forth, back)
 
 
 def read_solid(prims: Iterable[Usd.Prim], frame: Usd.Prim) -> MassProperties | None:
@@ -222,11 +242,10 @@ def _read_gprim(prim: Usd.Prim, T: NDArray) -> MassProperties | None:
 
 def _read_mesh(mesh: UsdGeom.Mesh, T: NDArray) -> MassProperties | None:
     """The solid of a closed mesh of triangles under T, or of its hull; None if that is flat."""
-    from trimesh import Trimesh
-
     points = np.array(mesh.GetPointsAttr().Get(), float) @ T[:3, :3].T + T[:3, 3]
     faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
-    if Trimesh(points, faces).is_volume:  # merges equal points
-        return polyhedron(points, faces)
+    solid = polyhedron(points, faces) if is_closed(points, faces) else None
+    if solid is not None and solid.mass > 0:
+        return solid
     hull = hull_faces(points)
     return None if hull is None else polyhedron(points, hull)

@@ -52,10 +52,11 @@ class Mechanism:
 def read_mechanism(description: Description, options: Options = DEFAULTS) -> Mechanism:
     """Determine which joints move.
 
-    A joint is welded if it is fixed, if its limits leave no range, or if its limits give neither effort nor
-    speed, unless it is continuous, where exporters fill in zeros. With the profile diff-drive, a prismatic
-    joint without one of the two is welded too: it stands for a suspension whose spring a URDF cannot
-    describe. A joint that follows a welded joint, or another with multiplier 0, is welded.
+    A joint is welded if it is fixed, if its limits leave no range, or if it slides and its limits give
+    neither effort nor speed: a suspension. A joint that turns moves even so, since exporters fill in zeros.
+    With the profile diff-drive, a prismatic joint without one of the two is welded too: it stands for a
+    suspension whose spring a URDF cannot describe. A joint that follows a welded joint, or another with
+    multiplier 0, is welded.
     """
     joints = {joint.name: joint for joint in description.joints.values()}
     welded = {}
@@ -110,7 +111,7 @@ def _weld_reason(joint: Joint, options: Options) -> str | None:
     limit = joint.limit
     if joint.type == "fixed" or limit is None:
         return "" if joint.type == "fixed" else None
-    powerless = limit.effort == 0 and limit.velocity == 0 and joint.type != "continuous"
+    powerless = limit.effort == 0 and limit.velocity == 0 and joint.type not in ("continuous", "revolute")
     closed = limit.lower is not None and limit.lower == limit.upper
     if powerless or (closed and joint.type in ("revolute", "prismatic")):
         return "cannot move by its own limits"

@@ -52,6 +52,9 @@ UNITS = {
 }
 """Names and units of figures in notes."""
 
+BESIDE = 0.2
+"""Largest share of y in the axles of wheels that roll along y."""
+
 BESIDE_M = 0.01
 """Distance from the robot's middle plane above which a wheel is on a side [m]."""
 
@@ -101,6 +104,13 @@ def drive_spec(base: MobileBase, mechanism: Mechanism, radius_of: Callable[[str]
     description, poses = mechanism.description, mechanism.poses()
     joints = {joint.name: joint for joint in description.joints.values()}
     places = {name: poses[joints[name].child][:3, 3] for name in base.wheels}
+    axes = [poses[joints[name].child][:3, :3] @ np.asarray(joints[name].axis, float) for name in base.wheels]
+    across = [abs(axis[1]) / np.linalg.norm(axis) for axis in axes]
+    if across and max(across) < BESIDE:
+        raise InputError(
+            f"{base.source}: the wheels roll along y of {description.root!r}, but x is ahead (REP 103); "
+            "turn the joint of the base by 90 degrees"
+        )
     left, right = _sides(base, places)
     given: dict[str, Any] = dict(base.figures)
 

@@ -67,11 +67,7 @@ STEERED = ("left_steering_joint", "right_steering_joint")
 
 
 def base_of_plugin(tags: Tags) -> MobileBase | None:
-    """The mobile base that a plugin of the description defines, or None.
-
-    Raises:
-        InputError: A joint is unknown, a wheel missing or a number invalid; the message gives the line.
-    """
+    """The mobile base that a plugin of the description defines; None if none does, or not completely."""
     for block in tags.blocks("gazebo"):
         for plugin in block.findall("plugin"):
             label = f"{plugin.get('name', '')} {plugin.get('filename', '')}".lower()
@@ -81,19 +77,39 @@ def base_of_plugin(tags: Tags) -> MobileBase | None:
                 if any(word in filename for word in kind.words) or (
                     not _known(filename) and any(word in label for word in kind.words)
                 ):
-                    return _base(tags, tags.read(plugin), kind)
+                    try:
+                        return _base(tags, tags.read(plugin), kind)
+                    except IncompleteDriveError as error:
+                        leave_out(tags, plugin, error)
+                        return None
     return None
+
+
+class IncompleteDriveError(InputError):
+    """A drive that lacks a joint; `element` is the tag with the fault."""
+
+    def __init__(self, text: str, element: Element) -> None:
+        super().__init__(text)
+        self.element = element
+
+
+def leave_out(tags: Tags, element: Element | None, error: InputError) -> None:
+    """Report a drive that cannot be used, and let its tag be kept as text."""
+    about = error.element if isinstance(error, IncompleteDriveError) else element
+    tags.description.repair("drive-incomplete", f"{error}: the drive is kept as text", about)
+    if element is not None:
+        tags.forget(element)
 
 
 def known_joint(tags: Tags, name: str, element: Element) -> str:
     """`name`, if a joint has it.
 
     Raises:
-        InputError: None has; the message gives the line.
+        IncompleteDriveError: None has.
     """
     names = [joint.name for joint in tags.description.joints.values()]
     if name not in names:
-        raise InputError(f"{tags.description.where(element)}: no joint {name!r}; {hint(name, names)}")
+        raise IncompleteDriveError(f"<{element.tag}>: no joint {name!r}; {hint(name, names)}", element)
     return name
 
 
@@ -109,7 +125,7 @@ def _base(tags: Tags, plugin: Element, kind: _Plugin) -> MobileBase:
         wheels += [known_joint(tags, (e.text or "").strip(), e) for e in elements]
     if kind.required and len(wheels) < 2:
         tag = next(n[0] for n in kind.wheels if not any(plugin.find(name) is not None for name in n))
-        raise InputError(f"{where}: the drive plugin has no <{tag}>")
+        raise IncompleteDriveError(f"the drive plugin has no <{tag}>", plugin)
     steered = [e for name in STEERED for e in tags.findall(plugin, name)] if kind.kind == "car" else []
     figures = {field: tags.number(plugin, *names, above=0.0) for field, names in FIGURES.items()}
     figures |= {field: tags.number(plugin, *names, least=0.0) or None for field, names in OR_ZERO.items()}

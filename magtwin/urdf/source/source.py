@@ -12,7 +12,6 @@ from magtwin.files import existing
 from magtwin.urdf.repairs import Repairs
 from magtwin.urdf.source.markup import UnsafeError, read_markup
 from magtwin.urdf.source.package import MissingFileError, Packages
-from magtwin.urdf.source.xacro import expand
 
 
 @dataclass(frozen=True)
@@ -133,6 +132,8 @@ def read_source(
         raise InputError(f"{path}:{line}: a URDF begins with <robot>, this file with <{markup.root.tag}>")
     around = Packages(packages, path)
     if path.suffix == ".xacro" or any(element.tag.startswith("xacro:") for element in markup.lines):
+        from magtwin.urdf.source.xacro import expand  # with its interpreter, which a plain URDF does not need
+
         repairs = Repairs()
         xml, places = expand(path, around, arguments, repairs, skip_missing_includes=skip_missing_includes)
         return Source(path, xml, MappingProxyType(places), around, repairs)

@@ -144,6 +144,22 @@ def prims_with(root: Usd.Prim, noun: str) -> list[Usd.Prim]:
     return [prim for prim in Usd.PrimRange(root) if prim.HasAPI(api)]
 
 
+def _advice(root: Usd.Prim, noun: str) -> str:
+    """What a whole file is, if it lacks the prim that is looked for, and which command takes it."""
+    file = root.GetStage().GetRootLayer().realPath
+    if not root.IsPseudoRoot() or prims_with(root, noun) or not file:
+        return ""
+    if noun in ("lab", "robot", "earthField") and prims_with(root, "anomalyMap"):
+        return (
+            f"; it is a map without a scene: magtwin map info {file}, or name it as `map` in a scene's TOML"
+        )
+    if noun == "lab" and prims_with(root, "robot"):
+        return f"; it is a robot without a scene: magtwin scene --robot {file} --out FOLDER makes one"
+    if noun == "anomalyMap":
+        return "; give a map layer (magtwin map fit) or a scene (magtwin scene)"
+    return ""
+
+
 def only_prim_with(root: Usd.Prim, noun: str) -> Usd.Prim:
     """The only prim at or below `root` with the schema of `noun`.
 
@@ -153,5 +169,7 @@ def only_prim_with(root: Usd.Prim, noun: str) -> Usd.Prim:
     prims = prims_with(root, noun)
     if len(prims) != 1:
         seen = ", ".join(str(prim.GetPath()) for prim in prims) or "none"
-        raise InputError(f"{place(root)}: needs one prim with {NOUNS[noun]} below it, found {seen}")
+        raise InputError(
+            f"{place(root)}: needs one prim with {NOUNS[noun]} below it, found {seen}{_advice(root, noun)}"
+        )
     return prims[0]

@@ -247,7 +247,8 @@ def test_a_truncated_weights_file_is_refused(tmp_path):
 def test_a_file_of_another_kind_is_refused(tmp_path, content):
     path = tmp_path / "n.bin"
     path.write_bytes(content)
-    with pytest.raises(InputError, match="no weights: neither safetensors nor a PyTorch checkpoint"):
+    text = "no weights: neither safetensors nor a PyTorch checkpoint" if content else "n.bin: is empty"
+    with pytest.raises(InputError, match=text):
         load_net(path)
 
 

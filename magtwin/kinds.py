@@ -1,0 +1,224 @@
+"""Kinds: what a file is, from its name and its first bytes, and which command takes it.
+
+Readers call `expected` first. A file of another kind is then refused with the command that takes it, in place
+of a fault of the parser. Kinds of USD files are told apart in `magtwin.usd`.
+"""
+
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from magtwin.errors import InputError
+from magtwin.files import existing
+
+HEAD = 1 << 16
+"""Bytes that are read at the beginning and at the end of a file."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file."""
+
+    noun: str
+    """What it is, with its article."""
+
+    remedy: str
+    """What to do with one; {file} stands for its name."""
+
+
+SCENE_TOML = Kind("the TOML of a scene", "author its stage first: magtwin scene {file} --out FOLDER")
+SUITE_TOML = Kind("the TOML of a suite", "magtwin bench {file} --out FOLDER runs it")
+ROBOT_TOML = Kind("the settings of a robot", "magtwin robot URDF --settings {file} --out FOLDER takes it")
+TRAIN_TOML = Kind("the settings of a training", "magtwin train SET --config {file} takes it")
+TOML = Kind("a TOML", "give the file that is named there, or see --help for what takes a TOML")
+URDF = Kind(
+    "a robot description",
+    "magtwin robot {file} --out FOLDER converts it; magtwin scene --robot {file} --out FOLDER puts it "
+    "into a room",
+)
+STAGE = Kind("a USD file", "magtwin info {file} describes it")
+SCENE_FOLDER = Kind("the folder of a scene", "magtwin run {file} drives in it; or name the stage inside")
+RUN = Kind("a run", "magtwin info {file} describes it, and magtwin picture, report and localize take it")
+SWEEP = Kind(
+    "a folder of runs", "name one of its .parquet files; magtwin report and magtwin dataset build take all"
+)
+READINGS = Kind("a table of survey readings", "magtwin map fit {file} --out MAP.usdc fits a map to it")
+SURVEY = Kind(
+    "a survey, one CSV per heading", "magtwin map import {file} --out MAP.usdc makes a map layer of it"
+)
+DATASET = Kind(
+    "a data set", "magtwin train {file} --out F.safetensors and magtwin dataset info {file} take it"
+)
+RESULTS = Kind("a folder of results", "magtwin bench report {file} takes it")
+WEIGHTS = Kind("a network", "magtwin info {file} describes it, and magtwin evaluate and --network take it")
+ONNX = Kind("a network as ONNX, which runs without magtwin", "give its .safetensors or .pth")
+CHECKPOINT = Kind("a PyTorch checkpoint", "magtwin network convert {file} --out F.safetensors converts it")
+PATH = Kind("a path", "magtwin run SCENE --path {file} drives it")
+COMMANDS = Kind("a file of commands", "magtwin run SCENE --commands {file} drives them")
+MODEL = Kind("a Tolles-Lawson model", "magtwin compensate apply RUN {file} --out F.parquet applies it")
+JSON = Kind("a JSON", "give another file")
+PICTURE = Kind("a picture or film", "give the file that it was drawn from")
+PAGE = Kind("a page", "give the file that it was made from")
+PYTHON = Kind("a Python file", "magtwin localize RUN --map MAP --method MODULE:CLASS takes a class in it")
+TABLE = Kind("a table", "give its columns to magtwin map fit, or the file that it was made from")
+
+USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+
+ACCEPTED: dict[str, tuple[Kind, ...]] = {
+    "run": (RUN, STAGE, JSON, TABLE, PATH, COMMANDS),
+    "scene": (STAGE,),
+    "USD file": (STAGE,),
+    "map": (STAGE, SURVEY),
+    "source of readings": (RUN, SWEEP, READINGS, SURVEY, TABLE, COMMANDS, PATH),
+    "robot description": (URDF,),
+    "robot": (URDF, STAGE),
+    "weights file": (WEIGHTS, CHECKPOINT),
+    "data set": (DATASET,),
+    "folder of results": (RESULTS,),
+    "TOML of a scene": (SCENE_TOML, TOML),
+    "suite": (SUITE_TOML, TOML),
+    "settings of a robot": (ROBOT_TOML, TOML),
+    "settings of a training": (TRAIN_TOML, TOML),
+    "path file": (PATH, TABLE),
+    "file of commands": (COMMANDS, TABLE),
+    "Tolles-Lawson model": (MODEL, JSON),
+}
+"""Kinds that a reader of a noun reads. A table is let through where its columns decide."""
+
+_REMEDIES = {
+    ("robot description", STAGE): "magtwin robot {file} --out F.urdf writes the URDF of a stage",
+    ("TOML of a scene", STAGE): "magtwin run {file} drives in a scene that is authored already",
+    ("TOML of a scene", URDF): "magtwin scene --robot {file} --out FOLDER puts it into a room",
+    (
+        "source of readings",
+        STAGE,
+    ): "give the survey that the map was made of, or survey a scene: magtwin map survey",
+    ("data set", SWEEP): "build one first: magtwin dataset build {file} --map MAP --out SET",
+    ("scene", RUN): "give the scene; magtwin run SCENE --replay {file} repeats a run in it",
+    ("USD file", RUN): "magtwin convert {file} F.usda makes one of it; if a scene is meant, give that",
+}
+"""Better remedies for single pairs of what is needed and what was given."""
+
+_TOMLS = (
+    (SUITE_TOML, re.compile(rb"^\s*\[\[\s*(scenario|localizer)\s*\]\]", re.M)),
+    (
+        SCENE_TOML,
+        re.compile(
+            rb"^\s*(\[\s*(lab|robot|earth|survey)[\].]|\[\[\s*(furniture|source|robots?)\s*\]\]|map\s*=)",
+            re.M,
+        ),
+    ),
+    (
+        ROBOT_TOML,
+        re.compile(
+            rb"^\s*(\[\s*(drive|battery|platform|magnetometer|imu|lidar|conversion|mocap)\s*\]|footprint_radius_m\s*=)",
+            re.M,
+        ),
+    ),
+    (
+        TRAIN_TOML,
+        re.compile(rb"^\s*(model|layers|features|epochs|batch|lr|dropout|penalty|weighting|split)\s*=", re.M),
+    ),
+)
+"""Kinds of TOML by a line that each has, the most particular first."""
+
+
+def expected(path: str | os.PathLike[str], noun: str) -> Path:
+    """`path` if it may be the file of a noun in `ACCEPTED`; a file of an unknown kind may be.
+
+    Raises:
+        InputError: As for `magtwin.files.existing`; or it is empty, or of another kind, and the text names
+            the command that takes it.
+    """
+    path = existing(path, noun)
+    if path.is_file() and path.stat().st_size == 0:
+        raise InputError(f"{path}: is empty (0 bytes); a {noun} is needed, so make or copy it again")
+    kind = kind_of(path)
+    if kind is not None and kind not in ACCEPTED[noun]:
+        raise refused(path, kind, noun)
+    return path
+
+
+def refused(path: str | os.PathLike[str], kind: Kind, noun: str) -> InputError:
+    """The refusal of a file of a kind where a noun is needed."""
+    remedy = _REMEDIES.get((noun, kind), kind.remedy)
+    return InputError(f"{path}: is {kind.noun}, not a {noun}; {remedy.format(file=path)}")
+
+
+def kind_of(path: Path) -> Kind | None:
+    """The kind of a file or folder; None if it is not known, or cannot be read."""
+    try:
+        return _kind_of_folder(path) if path.is_dir() else _BY_SUFFIX.get(path.suffix.lower(), _unknown)(path)
+    except OSError:
+        return None
+
+
+def _unknown(path: Path) -> None:
+    return None
+
+
+def _is(kind: Kind) -> Callable[[Path], Kind]:
+    return lambda path: kind
+
+
+def _kind_of_folder(folder: Path) -> Kind | None:
+    for name, kind in (
+        ("dataset.json", DATASET),
+        ("suite.json", RESULTS),
+        ("metadata.yaml", RUN),
+        ("run.parquet", RUN),
+        ("runs.csv", SWEEP),
+        (f"{folder.resolve().name}.usda", SCENE_FOLDER),
+    ):
+        if (folder / name).is_file():
+            return kind
+    return SURVEY if next(folder.glob("*_map.csv"), None) else None
+
+
+def _kind_of_toml(path: Path) -> Kind:
+    head = _head(path)
+    return next((kind for kind, line in _TOMLS if line.search(head)), TOML)
+
+
+def _kind_of_csv(path: Path) -> Kind:
+    lines = [line.strip() for line in _head(path).decode("utf-8", "replace").splitlines()]
+    words = next((line.lstrip("\ufeff") for line in lines if line and not line.startswith("#")), "")
+    names = [word.strip().strip('"').lower() for word in words.split(",")]
+    return PATH if names == ["x", "y"] else COMMANDS if names == ["t", "v", "w"] else TABLE
+
+
+def _kind_of_parquet(path: Path) -> Kind:
+    """By the metadata at the end of the file, which are plain text."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 4 * HEAD))
+        tail = file.read()
+    return READINGS if b"magtwin_readings" in tail else RUN if b"magtwin_facts" in tail else TABLE
+
+
+def _kind_of_json(path: Path) -> Kind:
+    head = _head(path)
+    return MODEL if b'"coefficients"' in head and b'"terms"' in head else JSON
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(HEAD)
+
+
+_BY_SUFFIX: dict[str, Callable[[Path], Kind | None]] = {
+    ".toml": _kind_of_toml,
+    ".csv": _kind_of_csv,
+    ".json": _kind_of_json,
+    ".parquet": _kind_of_parquet,
+    ".safetensors": _is(WEIGHTS),
+    ".onnx": _is(ONNX),
+    ".py": _is(PYTHON),
+    **dict.fromkeys((".urdf", ".xacro"), _is(URDF)),
+    **dict.fromkeys(USD_SUFFIXES, _is(STAGE)),
+    **dict.fromkeys((".npz", ".rrd", ".mcap", ".db3"), _is(RUN)),
+    **dict.fromkeys((".pth", ".pt"), _is(CHECKPOINT)),
+    **dict.fromkeys((".png", ".jpg", ".jpeg", ".svg", ".gif", ".mp4"), _is(PICTURE)),
+    **dict.fromkeys((".html", ".md"), _is(PAGE)),
+}

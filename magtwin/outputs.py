@@ -1,0 +1,362 @@
+"""Outputs: files and folders that appear whole, or not at all, whatever happens to the process or the disk.
+
+An output is written in a hidden folder beside its place, is brought to the disk, and is then renamed. The
+writing process keeps the hidden folder locked. One whose lock is free was left by a
+process that was killed: the next process that writes there removes it, after it has completed or undone what
+the other had begun to rename.
+"""
+
+import errno
+import json
+import os
+import shutil
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from magtwin.errors import InputError
+
+try:
+    import fcntl
+except ImportError:  # Windows, where nothing is swept
+    fcntl = None  # type: ignore[assignment]
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+"""Errors of a disk that is full or read-only."""
+
+_OURS = ".magtwin-"
+"""In the name of every hidden folder."""
+
+_OLD, _FIRST, _COMMIT, _LIST = ".old", ".first", ".commit", ".list"
+"""Files in a hidden folder: what the output replaces, the first folder of its transaction, and in that folder
+the renames of a transaction that is complete, and the same while they are written down."""
+
+_SETTLED_S = 60.0
+"""Age from which an empty hidden folder was left behind, and is not just being locked [s]."""
+
+_asides: set[Path] = set()
+"""Hidden folders of this process."""
+
+_swept: set[Path] = set()
+"""Folders that this process has swept."""
+
+_pending: ContextVar["_Pending | None"] = ContextVar("pending", default=None)
+"""What waits for the end of the transaction; None outside of one."""
+
+
+def check_free(path: str | os.PathLike[str], *, force: bool = False) -> Path:
+    """`path` if it does not exist yet, or if `force` is True.
+
+    Raises:
+        InputError: It exists and `force` is False.
+    """
+    path = Path(path)
+    _sweep((Path.cwd() / path).parent)
+    if path.exists() and not force:
+        raise InputError(
+            f"{path}: exists already; give `force=True` to replace it, or another name", parameter="force"
+        )
+    return path
+
+
+@contextmanager
+def output(path: str | os.PathLike[str], *, force: bool = False, at_once: bool = False) -> Iterator[Path]:
+    """Write a file or a folder aside; it replaces `path` at the end of the block, or of the transaction.
+
+    Create the file or folder at the yielded path, which has the suffix of `path`. If the block raises,
+    nothing is left behind, so no output is ever half-written.
+
+    Args:
+        path: The file or folder to make. Its parents are created.
+        force: Whether to replace an existing file or folder.
+        at_once: Whether it appears at the end of the block even in a transaction.
+
+    Raises:
+        InputError: It exists and `force` is False, its folder cannot be written, or the disk is full.
+    """
+    path = check_free(path, force=force)
+    place = Path.cwd() / path  # absolute, since the working folder can be renamed
+    if place.resolve() in (Path.cwd(), *Path.cwd().parents):
+        raise InputError(f"{path}: is the working folder or contains it; give a folder inside it")
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError(f"{path}: a device or pipe, which cannot be replaced; give a file")
+    inner = any(folder in place.parents for folder in _asides)  # a part of another output
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        aside = _Aside.beside(place)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+    waits = False
+    try:
+        yield aside.new
+        if place.exists() and place.is_dir() != aside.new.is_dir():
+            kind = "folder" if place.is_dir() else "file"
+            raise InputError(f"{path}: is a {kind}, and the output is not; remove it first")
+        if not inner:
+            _sync(aside.new)
+        others = _pending.get()
+        if others is None or inner or at_once:
+            _commit([aside])
+        else:
+            others.asides.append(aside)
+            waits = True
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        raise InputError(f"{path}: cannot be written ({os.strerror(error.errno)})") from error
+    finally:
+        if not waits:
+            aside.remove()
+
+
+@contextmanager
+def transaction() -> Iterator[None]:
+    """Make the outputs of the block appear at its end: all of them, or none if it raises.
+
+    A transaction inside another one is a part of it. Outputs of other threads do not take part.
+
+    Raises:
+        InputError: An output cannot be renamed.
+    """
+    if _pending.get() is not None:
+        yield
+        return
+    pending = _Pending()
+    token = _pending.set(pending)
+    try:
+        yield
+        _commit(pending.asides)
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        raise InputError(f"the outputs cannot be written ({os.strerror(error.errno)})") from error
+    finally:
+        _pending.reset(token)
+        for aside in reversed(pending.asides):  # the first one last: it holds the list of renames
+            aside.remove()
+    for function in pending.functions:
+        function()
+
+
+@contextmanager
+def at_once() -> Iterator[None]:
+    """Make outputs of the block appear at once, even in a transaction."""
+    token = _pending.set(None)
+    try:
+        yield
+    finally:
+        _pending.reset(token)
+
+
+def afterwards(function: Callable[[], object]) -> None:
+    """Call a function once all outputs of the transaction are in their places; outside of one, now."""
+    pending = _pending.get()
+    if pending is None:
+        function()
+    else:
+        pending.functions.append(function)
+
+
+@dataclass
+class _Pending:
+    """What waits for the end of a transaction."""
+
+    asides: "list[_Aside]" = field(default_factory=list)
+    functions: list[Callable[[], object]] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class _Aside:
+    """A hidden folder in which an output is written."""
+
+    place: Path
+    """Where the output is to be."""
+
+    folder: Path
+
+    lock: int = -1
+    """File descriptor of the lock; -1 if it is not held."""
+
+    @classmethod
+    def beside(cls, place: Path) -> "_Aside":
+        """A new folder beside a place."""
+        name = place.name[:60]  # a longer one with what is added could be too long for the disk
+        folder, lock = Path(tempfile.mkdtemp(prefix=f".{name}{_OURS}", dir=place.parent)), -1
+        _asides.add(folder)
+        if fcntl is not None:
+            with suppress(OSError):  # a file system without locks
+                lock = os.open(folder, os.O_RDONLY)
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return cls(place, folder, lock)
+
+    @property
+    def new(self) -> Path:
+        """The output until it is renamed."""
+        return self.folder / self.place.name
+
+    @property
+    def old(self) -> Path:
+        """What it replaces, until that is removed."""
+        return self.folder / _OLD
+
+    def swap(self, *, keep: bool) -> None:
+        """Rename the output to its place; `keep` an old file, so that `undo` can put it back."""
+        if self.place.is_dir():
+            self.place.rename(self.old)
+            try:
+                self.new.rename(self.place)
+            except BaseException:
+                self.old.rename(self.place)
+                raise
+            return
+        if keep and self.place.exists():
+            try:
+                os.link(self.place, self.old)
+            except OSError:  # a file system without hard links
+                shutil.copy2(self.place, self.old)
+        self.new.replace(self.place)
+
+    def undo(self) -> None:
+        """Take a `swap` back."""
+        if self.old.is_file():
+            self.old.replace(self.place)
+            return
+        self.place.rename(self.new)
+        if self.old.exists():
+            self.old.rename(self.place)
+
+    def complete(self) -> None:
+        """Do the `swap` that another process did not come to."""
+        beside = self.folder.parent == self.place.parent and not self.folder.is_symlink()
+        if not beside or _OURS not in self.folder.name:
+            return  # not a list that magtwin wrote
+        if self.new.exists():
+            self.swap(keep=False)
+        elif self.old.is_dir() and not self.place.exists():
+            self.old.rename(self.place)
+
+    def remove(self) -> None:
+        """Remove the folder."""
+        (self.folder / _COMMIT).unlink(missing_ok=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
+        _asides.discard(self.folder)
+        if self.lock >= 0:
+            os.close(self.lock)
+
+
+def _commit(asides: list[_Aside]) -> None:
+    """Rename outputs to their places: all, or none."""
+    with _uninterrupted():
+        several = len(asides) > 1
+        if several:
+            _announce(asides)
+        done: list[_Aside] = []
+        try:
+            for aside in asides:
+                aside.swap(keep=several)
+                done.append(aside)
+        except BaseException:
+            (asides[0].folder / _COMMIT).unlink(missing_ok=True)
+            for aside in reversed(done):
+                aside.undo()
+            raise
+        for parent in {aside.place.parent for aside in asides}:
+            _sync_entry(parent)
+
+
+def _announce(asides: list[_Aside]) -> None:
+    """Write down the renames of a transaction, so that they are completed if this process is killed."""
+    first = asides[0].folder
+    for aside in asides[1:]:
+        (aside.folder / _FIRST).write_text(str(first), encoding="utf-8")
+        _sync(aside.folder / _FIRST)
+    renames = [[str(aside.place), str(aside.folder)] for aside in asides]
+    (first / _LIST).write_text(json.dumps(renames), encoding="utf-8")
+    _sync(first / _LIST)
+    (first / _LIST).rename(first / _COMMIT)
+    _sync_entry(first)
+
+
+def _sweep(parent: Path) -> None:
+    """Complete or undo, and remove, what killed processes left in a folder; once a process."""
+    if fcntl is None or parent in _swept or not parent.is_dir():
+        return
+    _swept.add(parent)
+    with suppress(OSError):
+        for entry in os.scandir(parent):
+            hidden = entry.name.startswith(".") and _OURS in entry.name
+            if hidden and entry.is_dir(follow_symlinks=False):
+                with suppress(OSError, ValueError, TypeError):
+                    _recover(Path(entry.path))
+
+
+def _recover(folder: Path) -> None:
+    """Sweep a hidden folder; raises OSError if its process lives."""
+    lock = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        names = {entry.name for entry in os.scandir(folder)}
+        if not names and time.time() - folder.stat().st_mtime < _SETTLED_S:
+            return
+        head = folder
+        if _FIRST in names:
+            head = Path((folder / _FIRST).read_text(encoding="utf-8"))
+        if (head / _COMMIT).is_file():  # a transaction that was complete: rename the rest of it
+            for place, aside in json.loads((head / _COMMIT).read_text(encoding="utf-8")):
+                _Aside(Path(place), Path(aside)).complete()
+        elif len(left := names - {_OLD, _FIRST, _LIST}) == 1:  # perhaps killed between two renames
+            own = _Aside(folder.with_name(left.pop()), folder)
+            if own.old.is_dir() and not own.place.exists():
+                own.old.rename(own.place)
+        shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        os.close(lock)
+
+
+def _sync(path: Path) -> None:
+    """Bring a file, or all in a folder, to the disk."""
+    if path.is_dir() and not path.is_symlink():
+        for child in path.iterdir():
+            _sync(child)
+        _sync_entry(path)
+    elif path.is_file():
+        with open(path, "rb") as file:
+            os.fsync(file.fileno())
+
+
+def _sync_entry(folder: Path) -> None:
+    """Bring the names in a folder to the disk, where the system can."""
+    if os.name == "nt":
+        return
+    with suppress(OSError):
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Delay Ctrl-C and the request to end to the end of the block."""
+    if threading.current_thread() is not threading.main_thread():  # Python interrupts the main thread only
+        yield
+        return
+    came: list[int] = []
+    before = {sign: signal.getsignal(sign) for sign in (signal.SIGINT, signal.SIGTERM)}
+    before = {sign: handler for sign, handler in before.items() if handler is not None}
+    for sign in before:
+        signal.signal(sign, lambda number, frame: came.append(number))
+    try:
+        yield
+    finally:
+        for sign, handler in before.items():
+            signal.signal(sign, handler)
+        for number in dict.fromkeys(came):
+            signal.raise_signal(number)

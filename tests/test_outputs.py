@@ -1,0 +1,207 @@
+"""Outputs of a command appear all at once or not at all, whatever ends the process or fills the disk."""
+
+import errno
+import fcntl
+import os
+import signal
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from magtwin import outputs
+from magtwin.errors import InputError
+from magtwin.files import afterwards, check_free, output, transaction
+
+EVENTS = (
+    (os, "fsync"),
+    (os, "link"),
+    (Path, "rename"),
+    (Path, "replace"),
+    (Path, "write_text"),
+    (Path, "mkdir"),
+)
+"""Calls that reach the disk."""
+
+
+def write_three(folder):
+    """Replace a file and a folder, and make a new file, in one transaction."""
+    with transaction():
+        with output(folder / "a.txt", force=True) as aside:
+            aside.write_text("new")
+        with output(folder / "b", force=True) as aside:
+            aside.mkdir()
+            (aside / "new").write_text("new")
+        with output(folder / "sub" / "c.txt", force=True) as aside:
+            aside.write_text("new")
+
+
+def fill(folder):
+    folder.mkdir()
+    (folder / "a.txt").write_text("old")
+    (folder / "b").mkdir()
+    (folder / "b" / "old").write_text("old")
+    (folder / "sub").mkdir()
+    return folder
+
+
+def content(folder):
+    """Every file below a folder, with its text."""
+    return {p.relative_to(folder).as_posix(): p.read_text() for p in folder.rglob("*") if p.is_file()}
+
+
+OLD = {"a.txt": "old", "b/old": "old"}
+NEW = {"a.txt": "new", "b/new": "new", "sub/c.txt": "new"}
+
+
+def at_event(monkeypatch, number, then):
+    """Call `then` in place of the `number`-th call that reaches the disk; returns the calls so far."""
+    calls = []
+
+    def counted(function):
+        def call(*args, **options):
+            calls.append(function)
+            return then() if len(calls) == number else function(*args, **options)
+
+        return call
+
+    for owner, name in EVENTS:
+        monkeypatch.setattr(owner, name, counted(getattr(owner, name)))
+    return calls
+
+
+def in_child(work):
+    """Run a function in a forked process; its exit status."""
+    child = os.fork()
+    if child == 0:
+        with suppress(BaseException):
+            work()
+            os._exit(0)
+        os._exit(1)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def test_a_kill_between_any_write_sync_and_rename_leaves_all_outputs_old_or_all_new(tmp_path):
+    """The next process that writes there completes or undoes the renames, and removes what was left."""
+    seen, number, status = set(), 0, -signal.SIGKILL
+    while status == -signal.SIGKILL:
+        number += 1
+        folder = fill(tmp_path / f"{number}")
+
+        def work(folder=folder, number=number):
+            with pytest.MonkeyPatch.context() as patch:
+                at_event(patch, number, lambda: os.kill(os.getpid(), signal.SIGKILL))
+                write_three(folder)
+
+        status = in_child(work)
+        outputs._swept.clear()  # as a new process
+        for place in ("a.txt", "sub/c.txt"):
+            check_free(folder / place, force=True)
+        found = content(folder)
+        assert found in (OLD, NEW), number
+        seen.add(found == NEW)
+    assert status == 0
+    assert seen == {True, False}
+    assert number > 20
+
+
+@pytest.mark.parametrize("fault", [errno.ENOSPC, errno.EDQUOT, errno.EROFS])
+def test_a_disk_that_refuses_any_write_sync_or_rename_leaves_the_old_outputs(tmp_path, monkeypatch, fault):
+    number = 0
+    while True:
+        number += 1
+        folder = fill(tmp_path / f"{number}")
+
+        def refuse():
+            raise OSError(fault, os.strerror(fault))
+
+        refusals = []
+        with monkeypatch.context() as patch:
+            calls = at_event(patch, number, refuse)
+            try:
+                write_three(folder)
+            except InputError as error:
+                refusals.append(str(error))
+        if len(calls) < number:
+            break
+        assert content(folder) == (OLD if refusals else NEW), number
+        assert all("cannot be written" in text for text in refusals)
+        assert not list(folder.rglob(".*"))
+    assert content(folder) == NEW
+    assert number > 20
+
+
+def test_an_interrupt_while_outputs_are_renamed_comes_after_the_last_of_them(tmp_path, monkeypatch):
+    folder, replace = fill(tmp_path / "out"), Path.replace
+
+    def interrupted(self, to):
+        signal.raise_signal(signal.SIGINT)
+        return replace(self, to)
+
+    monkeypatch.setattr(Path, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_three(folder)
+    assert content(folder) == NEW
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def write_and_fail(folder, called):
+    with transaction():
+        with output(folder / "a.txt", force=True) as aside:
+            aside.write_text("new")
+        with output(folder / "log.txt", at_once=True) as aside:
+            aside.write_text("kept")
+        afterwards(lambda: called.append(1))
+        assert (folder / "a.txt").read_text() == "old"
+        raise KeyError
+
+
+def test_nothing_appears_before_the_end_and_nothing_at_all_after_an_error(tmp_path):
+    folder, called = fill(tmp_path / "out"), []
+    with pytest.raises(KeyError):
+        write_and_fail(folder, called)
+    assert content(folder) == {**OLD, "log.txt": "kept"}
+    assert not called
+    with transaction():
+        afterwards(lambda: called.append((folder / "a.txt").read_text()))
+        write_three(folder)  # a part of the outer transaction
+        assert (folder / "a.txt").read_text() == "old"
+    assert called == ["new"]
+
+
+def test_a_part_of_an_output_is_there_at_once(tmp_path):
+    with transaction(), output(tmp_path / "run") as folder:
+        folder.mkdir()
+        with output(folder / "part.txt") as aside:
+            aside.write_text("x")
+        assert (folder / "part.txt").read_text() == "x"
+    assert content(tmp_path) == {"run/part.txt": "x"}
+
+
+def test_folders_of_living_processes_and_of_others_are_left_alone(tmp_path):
+    living, dead = tmp_path / ".a.txt.magtwin-living", tmp_path / ".b.txt.magtwin-dead"
+    for folder in (living, dead, tmp_path / ".git"):
+        folder.mkdir()
+        (folder / "x").write_text("x")
+    begun, stale = tmp_path / ".c.txt.magtwin-begun", tmp_path / ".c.txt.magtwin-stale"
+    begun.mkdir()  # by a process that has not locked it yet
+    stale.mkdir()
+    os.utime(stale, (0, 0))
+    lock = os.open(living, os.O_RDONLY)
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    with output(tmp_path / "a.txt") as aside:
+        aside.write_text("new")
+    os.close(lock)
+    assert {p.name for p in tmp_path.iterdir()} == {living.name, begun.name, ".git", "a.txt"}
+
+
+def test_a_list_of_renames_that_magtwin_did_not_write_moves_nothing(tmp_path):
+    """A folder from elsewhere can hold one."""
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "profile").write_text("mine")
+    bad = tmp_path / "from-elsewhere" / ".x.magtwin-12345678"
+    bad.mkdir(parents=True)
+    (bad / "profile").write_text("theirs")
+    (bad / ".commit").write_text(f'[["{tmp_path}/home/profile", "{bad}"]]')
+    check_free(tmp_path / "from-elsewhere" / "y.txt")
+    assert content(tmp_path) == {"home/profile": "mine"}
