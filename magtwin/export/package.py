@@ -146,9 +146,9 @@ def export_scene(
     for target in filter(None, (out, beside)):
         check_free(target, force=force)
     if existing(scene_file, "stage").is_dir():
-        own = scene_file / f"{scene_file.resolve().name}.usda"
+        inner = scene_file / f"{scene_file.resolve().name}.usda"
         raise InputError(
-            f"{scene_file}: a folder; give a USD file in it{f', such as {own}' if own.is_file() else ''}"
+            f"{scene_file}: a folder; give a USD file in it{f', such as {inner}' if inner.is_file() else ''}"
         )
     for target in filter(None, (out, beside)):
         if target.resolve() in (scene_file.resolve(), *scene_file.resolve().parents):

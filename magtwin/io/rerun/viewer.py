@@ -163,8 +163,8 @@ def live_viewer(
     with socket.socket() as probe:
         probe.bind((LOCALHOST, 0))
         port = int(probe.getsockname()[1])
-    options = ["--headless", "--window-size", f"{size[0]}x{size[1]}"] if headless else []
-    command = [_binary(), "--bind", LOCALHOST, "--port", str(port), "--hide-welcome-screen", *options]
+    window = ["--headless", "--window-size", f"{size[0]}x{size[1]}"] if headless else []
+    command = [_binary(), "--bind", LOCALHOST, "--port", str(port), "--hide-welcome-screen", *window]
     process = None
     with tempfile.TemporaryFile("w+") as log:
         try:
