@@ -127,7 +127,7 @@ def Xform "Building"
 magtwin run building.usda --lab /Building/LabB
 ```
 
-Here `lab/` is in the folder of `building.usda`. A stage may name files in its own folder; `--allow DIR` adds one:
+Here `lab/` is in the folder of `building.usda`. A stage names files of its own folder; `--allow` adds others:
 `magtwin run building.usda --lab /Building/LabB --allow ../labs` ([SECURITY.md](../SECURITY.md)).
 
 * **Readings** of a moved and turned lab equal those of the lab at the origin, to the byte. Poses and fields

@@ -23,6 +23,8 @@ MASSLESS_KG = 0.001
 """Mass of a body whose links have none [kg]. Without an explicit mass, engines fill the colliders with
 1000 kg/m3, and give a body without colliders 1 kg."""
 
+THICKER = 5e-7
+"""The largest moment is below the sum of the others by at least this part: roundings of single precision."""
 
 LINK_API, SITE_API = "IsaacLinkAPI", "IsaacSiteAPI"
 """Isaac Sim's applied schemas; their plugins are not installed here."""
@@ -81,12 +83,14 @@ def define_body(
 
 
 def _single(moments: NDArray) -> Gf.Vec3f:
-    """Principal moments in single precision, where none may exceed the sum of the others either."""
+    """Principal moments in single precision, where none may exceed the sum of the others either.
+
+    Engines turn them to a tensor in single precision and back, so a flat body is made thicker by `THICKER`.
+    """
     rounded = np.asarray(moments, np.float32)
     largest = int(np.argmax(rounded))
     others = sum(float(rounded[i]) for i in range(3) if i != largest)
-    while float(rounded[largest]) > others:
-        rounded[largest] = np.nextafter(rounded[largest], np.float32(0))
+    rounded[largest] = min(float(rounded[largest]), others * (1 - THICKER))
     return Gf.Vec3f(*map(float, rounded))
 
 
