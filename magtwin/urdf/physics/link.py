@@ -24,7 +24,7 @@ MASSLESS_KG = 0.001
 1000 kg/m3, and give a body without colliders 1 kg."""
 
 THICKER = 5e-7
-"""The largest moment is below the sum of the others by at least this part: roundings of single precision."""
+"""The largest moment of a body with turned axes is below the sum of the others by at least this part."""
 
 LINK_API, SITE_API = "IsaacLinkAPI", "IsaacSiteAPI"
 """Isaac Sim's applied schemas; their plugins are not installed here."""
@@ -77,20 +77,22 @@ def define_body(
     tensor = whole.inertia.copy()
     tensor[np.abs(tensor) < 1e-9 * np.abs(tensor).max()] = 0.0
     moments, q = principal_axes(tensor)
-    mass.CreateDiagonalInertiaAttr(_single(moments))
+    mass.CreateDiagonalInertiaAttr(_single(moments, turned=abs(q[3]) < 1))
     mass.CreatePrincipalAxesAttr(Gf.Quatf(*(round(float(v), 7) + 0.0 for v in wxyz_from_xyzw(q))))
     return prim
 
 
-def _single(moments: NDArray) -> Gf.Vec3f:
+def _single(moments: NDArray, *, turned: bool) -> Gf.Vec3f:
     """Principal moments in single precision, where none may exceed the sum of the others either.
 
-    Engines turn them to a tensor in single precision and back, so a flat body is made thicker by `THICKER`.
+    Engines turn them to a tensor in single precision and back, so a flat body with turned axes is made
+    thicker by `THICKER`.
     """
     rounded = np.asarray(moments, np.float32)
     largest = int(np.argmax(rounded))
     others = sum(float(rounded[i]) for i in range(3) if i != largest)
-    rounded[largest] = min(float(rounded[largest]), others * (1 - THICKER))
+    while float(rounded[largest]) > others * (1 - THICKER * turned):
+        rounded[largest] = np.nextafter(rounded[largest], np.float32(0))
     return Gf.Vec3f(*map(float, rounded))
 
 
