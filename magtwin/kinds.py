@@ -35,7 +35,7 @@ TRAIN_TOML = Kind("the settings of a training", "magtwin train SET --config {fil
 TOML = Kind("a TOML", "give the file that is named there, or see --help for what takes a TOML")
 URDF = Kind(
     "a robot description",
-    "magtwin robot {file} --out FOLDER converts it; magtwin scene --robot {file} --out FOLDER puts it "
+    "magtwin robot {file} --out FOLDER converts it; magtwin scene --urdf {file} --out FOLDER puts it "
     "into a room",
 )
 STAGE = Kind("a USD file", "magtwin info {file} describes it")
@@ -90,7 +90,7 @@ ACCEPTED: dict[str, tuple[Kind, ...]] = {
 _REMEDIES = {
     ("robot description", STAGE): "magtwin robot {file} --out F.urdf writes the URDF of a stage",
     ("TOML of a scene", STAGE): "magtwin run {file} drives in a scene that is authored already",
-    ("TOML of a scene", URDF): "magtwin scene --robot {file} --out FOLDER puts it into a room",
+    ("TOML of a scene", URDF): "magtwin scene --urdf {file} --out FOLDER puts it into a room",
     (
         "source of readings",
         STAGE,
@@ -134,7 +134,7 @@ def expected(path: str | os.PathLike[str], noun: str) -> Path:
     """
     path = existing(path, noun)
     if path.is_file() and path.stat().st_size == 0:
-        raise InputError(f"{path}: is empty (0 bytes); a {noun} is needed, so make or copy it again")
+        raise InputError(f"{path}: is empty (0 bytes); make or copy the {noun} again")
     kind = kind_of(path)
     if kind is not None and kind not in ACCEPTED[noun]:
         raise refused(path, kind, noun)
@@ -144,7 +144,8 @@ def expected(path: str | os.PathLike[str], noun: str) -> Path:
 def refused(path: str | os.PathLike[str], kind: Kind, noun: str) -> InputError:
     """The refusal of a file of a kind where a noun is needed."""
     remedy = _REMEDIES.get((noun, kind), kind.remedy)
-    return InputError(f"{path}: is {kind.noun}, not a {noun}; {remedy.format(file=path)}")
+    wanted = noun if noun.startswith("settings") else f"a {noun}"
+    return InputError(f"{path}: is {kind.noun}, not {wanted}; {remedy.format(file=path)}")
 
 
 def kind_of(path: Path) -> Kind | None:

@@ -156,7 +156,7 @@ def export_scene(
     with TemporaryDirectory() as scratch, _renamed(Path(scratch, "stage"), scene_file), ExitStack() as own:
         work = _Work(Path(scratch, "stage"), scene_file, name, progress)
         work.gather(trusted=trusted)
-        own.enter_context(allow(work.folder))  # which flattened layers beside it name
+        own.enter_context(allow(scratch))  # flattened layers name files beside them; work.folder moves
         work.check()
         if to_onnx is not None and name != "viewer":
             work.onnx_of(to_onnx)

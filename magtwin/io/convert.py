@@ -61,15 +61,15 @@ def convert_run(
 
 
 def twin_to_show(run: Run, file: Path, scene: str | Path | None = None) -> Twin | None:
-    """The scene to show a run in. Warns, and returns None, if the scene of the metadata is missing.
+    """The scene to show a run in. Warns, and returns None, if the run's own scene cannot be opened.
 
     Args:
         run: The run.
         file: File of the run; its folder is searched for the scene.
-        scene: Scene to use in place of the one of the metadata.
+        scene: Scene to use in place of the one of the metadata. `file`: the scene that the run plays over.
 
     Raises:
-        InputError: `scene` was given and cannot be opened.
+        InputError: Another `scene` was given and cannot be opened.
     """
     try:
         stage = scene_of(run, scene, near=file)
@@ -77,7 +77,7 @@ def twin_to_show(run: Run, file: Path, scene: str | Path | None = None) -> Twin 
         if "robot" in run.metadata:
             twin = led_by(twin, str(run.metadata["robot"]))
     except InputError as error:
-        if scene is not None:
+        if scene not in (None, file):
             raise
         warnings.warn(f"shown without a scene: {error}", MismatchWarning, stacklevel=2)
         return None

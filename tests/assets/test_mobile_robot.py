@@ -20,7 +20,7 @@ CART = DATA / "robots" / "cart.urdf"
 
 
 def test_one_command_puts_a_magnetometer_on_a_link_and_another_drives_the_robot(tmp_path):
-    main(["scene", "--robot", str(CART), "--magnetometer", "mast:0,0,0.42", "--out", str(tmp_path / "mine")])
+    main(["scene", "--urdf", str(CART), "--magnetometer", "mast:0,0,0.42", "--out", str(tmp_path / "mine")])
     scene = read_scene(tmp_path / "mine" / "mine.usda")
     robot = scene.robot
     assert (robot.magnetometer.link, robot.magnetometer.p_link_sensor) == ("mast", (0, 0, 0.42))
@@ -48,7 +48,7 @@ def test_a_wrong_mount_is_refused_in_one_line(mount, message):
 def test_options_of_the_robot_without_a_robot_are_refused(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["scene", "lab", "--magnetometer", "mast", "--out", str(tmp_path / "x")])
-    assert "--magnetometer goes with --robot" in capsys.readouterr().err
+    assert "--magnetometer goes with --urdf" in capsys.readouterr().err
 
 
 def test_keys_of_the_drive_override_those_of_the_plugin_which_fill_in_the_rest(tmp_path):

@@ -227,6 +227,7 @@ def test_an_asset_without_sensors_is_no_robot(tmp_path):
         load_robot(tmp_path / "none.usda")
 
 
+@pytest.mark.usefixtures("allow_neighbours")
 def test_a_network_named_in_the_settings_is_found_from_the_asset(tmp_path):
     (tmp_path / "weights").mkdir()
     network = tmp_path / "weights" / "net.safetensors"

@@ -410,7 +410,7 @@ def test_what_a_kind_cannot_do_is_refused_and_writes_nothing(data, kinds, tmp_pa
         (["--hold-out", "h"], "no session or recording to hold out 'h'"),
         (["--resume"], "f.checkpoint: no such checkpoint"),
         (["--init", "DATA/none.safetensors"], "none.safetensors: no such weights file"),
-        (["--config", "DATA/dataset.json"], "dataset.json: not TOML"),
+        (["--config", "DATA/dataset.json"], "dataset.json: is a JSON, not settings of a training"),
         (["--out", "DATA/f.onnx"], "a network ends in .safetensors"),
     ],
 )

@@ -37,7 +37,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def refuse(text: str, stage: Path, tmp_path: Path, out: str = "out", **options) -> None:
     """The export is refused with a text, one line of it, and leaves nothing behind."""
     place = tmp_path / "place"
-    place.mkdir()
+    place.mkdir(exist_ok=True)
     with pytest.raises(InputError, match=text) as refused:
         export_scene(stage, place / out, **{"trusted": True, **options})
     assert "\n" not in str(refused.value)

@@ -590,6 +590,6 @@ def test_the_command_reports_what_it_mends_and_leaves_checksums(lab, capfd, monk
 
 
 def test_a_package_is_not_mended(tmp_path, lab):
-    (tmp_path / "a.usdz").write_bytes(b"")
+    (tmp_path / "a.usdz").write_bytes(b"PK\x05\x06" + bytes(18))
     with pytest.raises(InputError, match="a package cannot be fixed"):
         validate(tmp_path / "a.usdz", fix=["units"])

@@ -276,7 +276,9 @@ def shown(monkeypatch):
 @pytest.mark.parametrize("name", ["run.csv", "run.usdc", "sqlite3", "run.rrd"])
 def test_view_shows_a_run_of_any_format(name, run, written, shown, capsys):
     main(["view", str(written / name)])
-    assert "has changed" not in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "has changed" not in error
+    assert ("shown without a scene" in error) == ("give --allow" in error) == (name == "run.usdc")
     assert np.array_equal(shown[0]["run"]["b_total_nt"], run["b_total_nt"])
 
 

@@ -99,7 +99,7 @@ def test_scattered_readings_make_no_nodes_and_the_way_on_is_told(tmp_path, capsy
         (("a.csv", "--x", "px"), "no column 'px'; did you mean 'x'"),
         (("a.csv", "--vector", "a,b"), "vector takes 3 columns"),
         (("a.csv", "--unit", "uT"), "give --unit nT"),
-        (("m.usdc",), "m.usdc: a stage or a map, not readings"),
+        (("m.usdc",), "m.usdc: is a USD file, not a source of readings"),
         (("b.csv",), "b.csv: no such source of readings; did you mean 'a.csv'"),
         (("a.csv+b.csv",), "b.csv: no such file of readings"),
         (("a.csv", "--out", "a.txt"), "ends in .usdc or .usd or .parquet"),
@@ -110,7 +110,7 @@ def test_what_cannot_be_imported_is_refused_in_one_line_and_nothing_is_written(
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.csv").write_text("x,y,yaw,field\n0,0,0,41000\n1,0,0,41500\n")
-    (tmp_path / "m.usdc").write_text("")
+    (tmp_path / "m.usdc").write_text("PXR-USDC")
     out = () if "--out" in arguments else ("--out", "a.parquet")
     assert what in refused(capsys, "map", "import", *arguments, *out)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv", "m.usdc"]

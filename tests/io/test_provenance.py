@@ -48,6 +48,7 @@ def test_a_run_of_a_network_named_by_hand_says_its_file(lab_scene):
     assert sha256(network) == twin.metadata["network_sha256"]
 
 
+@pytest.mark.usefixtures("allow_neighbours")
 def test_the_stages_checksum_follows_content_in_any_layer_and_not_the_place(lab_scene, tmp_path):
     for name in ("a", "b/deeper"):
         _chain(tmp_path / name)

@@ -54,7 +54,8 @@ def rover(
     report = convert_with_report(path, out, options=Options(**options), force=True)
     stage = Usd.Stage.Open(str(out))
     stage.Reload()
-    return stage, read_drive(stage.GetDefaultPrim()), report
+    driven = stage.GetDefaultPrim().HasAPI("MagtwinDifferentialDriveAPI")
+    return stage, read_drive(stage.GetDefaultPrim()) if driven else None, report
 
 
 def plugin(file, text):

@@ -468,7 +468,7 @@ def test_a_mimic_of_a_mimic_follows_the_first(tmp_path):
 
 
 def test_what_follows_a_welded_joint_is_welded_too(tmp_path):
-    dead = '<limit lower="0" upper="1" effort="0" velocity="0"/>'
+    dead = '<limit lower="0" upper="0" effort="1" velocity="1"/>'
     _stage, robot, notes = convert(follower(tmp_path, '<mimic joint="lead"/>', lead=dead))
     assert prim(robot, "f").IsA(UsdPhysics.FixedJoint)
     assert "joint 'f' follows 'lead', which cannot move: welded" in notes

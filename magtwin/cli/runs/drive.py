@@ -55,7 +55,7 @@ def drive(
     """
     import numpy as np
 
-    from magtwin.files import output
+    from magtwin.files import existing, output
     from magtwin.io.outputs import Outputs
     from magtwin.io.outputs import drive as drive_again
     from magtwin.sim.motion.commands import write_commands
@@ -67,6 +67,8 @@ def drive(
 
     scene = scene_file(scene)
     if gamepad is not None and not gamepad.is_char_device():
+        if existing(gamepad, "gamepad").is_dir():
+            raise InputError(f"{gamepad}: a folder; name a gamepad in it, such as /dev/input/js0")
         raise InputError(f"{gamepad}: not a gamepad; name one, such as /dev/input/js0")
     with output(out, force=force) as folder:
         twin = open_twin(scene, lab=lab, epoch=epoch, network=network, model_error=model_error)

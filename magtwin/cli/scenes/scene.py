@@ -42,12 +42,12 @@ def new(out: Path, *, force: Force = False) -> Done:
     return Done(wrote=out, text=f"Wrote {out}\nNext:  {author}\n       magtwin run {stage}")
 
 
-@app.command
+@app.command(usage="Usage: magtwin scene [SPEC] --out PATH [OPTIONS]")
 def scene(
     spec: str | None = None,
     *,
     out: Path,
-    robot: Path | None = None,
+    urdf: Path | None = None,
     magnetometer: str | None = None,
     controllers: Path | None = None,
     package: list[str] | None = None,
@@ -65,11 +65,11 @@ def scene(
     Parameters
     ----------
     spec
-        TOML file, or the name of a scene that ships with magtwin: lab, aprilab. Default with --robot: a
+        TOML file, or the name of a scene that ships with magtwin: lab, aprilab. Default with --urdf: a
         furnished room of the robot's size.
     out
         Folder to make. It holds everything that the stage needs and can be moved.
-    robot
+    urdf
         URDF or xacro of a mobile robot, or an asset of `magtwin robot --settings`. It replaces the robot of
         the TOML, and surveys the room unless --map is given.
     magnetometer
@@ -104,10 +104,10 @@ def scene(
                 "report": lines.append,
                 "progress": advance,
             }
-            if robot is not None:
-                announce(f"Converting {robot}")
+            if urdf is not None:
+                announce(f"Converting {urdf}")
                 read = scene_with_robot(
-                    robot,
+                    urdf,
                     magnetometer,
                     spec,
                     name=out.resolve().name,
@@ -118,7 +118,7 @@ def scene(
                     **choices,
                 )
             elif spec is None:
-                raise InputError("name a scene: a TOML, a scene that ships, or a robot with --robot")
+                raise InputError("name a scene: a TOML, a scene that ships, or a robot with --urdf")
             else:
                 _check_unused(magnetometer=magnetometer, controllers=controllers, package=package, arg=arg)
                 announce(f"Reading {spec}")
@@ -133,7 +133,7 @@ def scene(
 
 
 def _check_unused(**options: object) -> None:
-    """Refuse options that only matter with --robot."""
+    """Refuse options that only matter with --urdf."""
     used = [f"--{name}" for name, value in options.items() if value is not None]
     if used:
-        raise InputError(f"{', '.join(used)} goes with --robot; a TOML names these in [robot]")
+        raise InputError(f"{', '.join(used)} goes with --urdf; a TOML names these in [robot]")

@@ -416,10 +416,12 @@ def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
     Raises:
         InputError: It is missing, not a data set, or of another version.
     """
+    if Path(folder).name == MANIFEST:
+        raise InputError(f"{folder}: a file; a data set is the folder that it is in")
     folder = expected(folder, "data set")
-    path = existing(folder / MANIFEST, "manifest of a data set") if folder.is_dir() else folder
     if not folder.is_dir():
         raise InputError(f"{folder}: a file; a data set is the folder that `magtwin dataset build` makes")
+    path = existing(folder / MANIFEST, "manifest of a data set")
     text = read_text(path, "manifest of a data set", "JSON")
     try:
         data = json.loads(text)

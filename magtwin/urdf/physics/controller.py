@@ -60,8 +60,6 @@ def base_of_plugin_settings(tags: Tags) -> MobileBase | None:
     Raises:
         InputError: The file cannot be read, or is not YAML.
     """
-    from magtwin.urdf.source.settings import read_settings  # needs yaml
-
     for block in tags.blocks("gazebo"):
         for plugin in block.findall("plugin"):
             if "ros2_control" not in f"{plugin.get('name', '')} {plugin.get('filename', '')}":
@@ -76,6 +74,8 @@ def base_of_plugin_settings(tags: Tags) -> MobileBase | None:
                     tags.description.note(f"controllers are unknown, {reason}", lost=True)
                     continue
                 tags.read(element)
+                from magtwin.urdf.source.settings import read_settings  # needs yaml
+
                 tables = list(read_settings(path))  # reads the file
                 try:
                     base = _first(tags, tables, path)

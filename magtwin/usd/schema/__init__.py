@@ -154,7 +154,7 @@ def _advice(root: Usd.Prim, noun: str) -> str:
             f"; it is a map without a scene: magtwin map info {file}, or name it as `map` in a scene's TOML"
         )
     if noun == "lab" and prims_with(root, "robot"):
-        return f"; it is a robot without a scene: magtwin scene --robot {file} --out FOLDER makes one"
+        return f"; it is a robot without a scene: magtwin scene --urdf {file} --out FOLDER makes one"
     if noun == "anomalyMap":
         return "; give a map layer (magtwin map fit) or a scene (magtwin scene)"
     return ""
