@@ -44,6 +44,9 @@ COASTED_M = 0.3
 BEGINS_M = 0.1
 """A robot nearer than this to the first point of a path starts from where it stands [m]."""
 
+SKIPPED_M = 0.2
+"""Part of the path that counts as driven then, up to its first stop [m]: twice the farthest marker."""
+
 STAND_S = 1.0
 """Time for which standing is commanded at the end [s]."""
 
@@ -201,13 +204,14 @@ class Follower:
     def _begin_here(self, x: float, y: float) -> None:
         """Count the beginning of the path as reached if the robot stands near it.
 
-        Markers a few centimetres off centre move when the robot turns on the spot, so its
-        reported pose may never come closer.
+        Markers a few centimetres off centre move when the robot turns on the spot. Its reported pose may
+        never come closer to the first nodes, and the robot would turn without end.
         """
         guide = self._guide
         begins = guide.law != RELEASE and guide.node == 0 and guide.table.shape[1] > 1
         if begins and math.hypot(guide.table[0, 0] - x, guide.table[1, 0] - y) < BEGINS_M:
-            guide.node = 1
+            stops = np.flatnonzero(guide.table[5] <= 0)
+            guide.node = max(1, min(round(SKIPPED_M / NODE_M), int(stops[0]) - 1))
 
     def _rejoin(self, x: float, y: float) -> None:
         """Continue where the robot stands now; it coasted before it stood."""
