@@ -29,7 +29,7 @@ import math
 import os
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from types import ModuleType
 from typing import Any
@@ -42,6 +42,9 @@ MOST_THREADS = 8  # Most threads that share a loop; beyond, memory limits the sp
 
 _limit = MOST_THREADS
 """Most threads that share work in this process."""
+
+_steady = False
+"""Whether this process must not pause now to open modules."""
 
 
 class Loops:
@@ -76,10 +79,12 @@ class Loops:
     def after(self, work: float) -> ModuleType | None:
         """The module if it is open, or if opening it pays now; None if the plain code should do the work.
 
+        Within `steady`, the plain code goes on.
+
         Args:
             work: Work to be done now, in the unit of `pays`.
         """
-        if self.code is None:
+        if self.code is None and not _steady:
             self.done += work
             if self.done >= self.pays / (NUMBA_SHARE if "numba" in sys.modules else 1):
                 try:
@@ -126,6 +131,20 @@ def limit_threads(count: int) -> None:
     """Let at most `count` threads share work in this process, as where other processes use the processors."""
     global _limit
     _limit = count
+
+
+@contextlib.contextmanager
+def steady() -> Iterator[None]:
+    """Within the block, open no module only because it pays: a node in real time would pause for seconds.
+
+    Modules that have no plain code, or that are opened before a job, still open.
+    """
+    global _steady
+    before, _steady = _steady, True
+    try:
+        yield
+    finally:
+        _steady = before
 
 
 def threads(most: int) -> int:

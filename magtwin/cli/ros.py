@@ -77,6 +77,7 @@ class Node:
         """The node of one robot or several, until the end of the block or Ctrl-C."""
         if duration_s is not None and not duration_s > 0:
             raise InputError(f"--duration-s must be above 0 s, got {duration_s!r}")
+        from magtwin.compiled import steady
         from magtwin.ros.bus import names_of, open_bus
 
         bus = open_bus(
@@ -93,7 +94,7 @@ class Node:
         _announce_reach(bus)
         signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a script ignore it
         try:
-            with suppress(KeyboardInterrupt):
+            with suppress(KeyboardInterrupt), steady():
                 yield bus
         finally:
             bus.close()

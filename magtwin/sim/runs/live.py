@@ -3,6 +3,7 @@
 If `simulate` drives the same commands from the same seed, it gives the same columns.
 """
 
+from array import array
 from collections.abc import Callable, Iterable
 from typing import Any, Literal
 
@@ -133,7 +134,7 @@ class LiveRobot:
         self._scanner = Scanner(robot, obstacles, draws["lidar"])
         self._noise_sd_nt = robot.magnetometer.noise_density_nt * np.sqrt(self.rate_hz / 2)
         self._readings = 0
-        self._rows: list[tuple[float, float, float]] = []
+        self._commands = array("d")  # three numbers a command: a live robot drives for hours
         self._metadata = {**run_metadata(self._sensing), "controller": "commands"}
 
     @property
@@ -150,7 +151,7 @@ class LiveRobot:
     def commands(self) -> Commands:
         """The commands so far; `simulate` drives the same run from them."""
         end = (self._track.steps * self.step_s, 0.0, 0.0)
-        return Commands("live", np.array([(0.0, 0.0, 0.0), *self._rows, end]))
+        return Commands("live", np.vstack([np.zeros(3), np.array(self._commands).reshape(-1, 3), end]))
 
     def beside(self, others: "Iterable[LiveRobot]") -> None:
         """Put other robots into the lab, which this one senses as in `magtwin.sim.runs.multi_robot`.
@@ -182,7 +183,7 @@ class LiveRobot:
             command = (0.0, 0.0)
         self._chassis.step(command)
         if command is not None and begin > 0:
-            self._rows.append((begin, *command))
+            self._commands.extend((begin, *command))
         self._track.add(self._chassis.last)
 
     def scans(self) -> Scans:
