@@ -25,7 +25,7 @@ from magtwin.field.survey.stuck import mask_stuck
 from magtwin.files import shipped
 from magtwin.sim.interference import ambient_field_nt
 from magtwin.sim.survey import blocked_by, field_at_rest_nt, survey_readings
-from magtwin.usd.obstacles import read_obstacles
+from magtwin.usd.lab.obstacles import read_obstacles
 from magtwin.usd.scene import read_scene
 from magtwin.verdict import Z_90
 

@@ -31,7 +31,7 @@ ROWS = {
 def write(file: Path, side_m: float) -> None:
     from magtwin.field.grid import Grid
     from magtwin.field.maps.tiles import Tile
-    from magtwin.usd.tiled_maps import save_tiled_map
+    from magtwin.usd.maps.tiled_layer import save_tiled_map
 
     rng, nodes = np.random.default_rng(0), round(side_m / SPACING_M) + 1
     headings = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
@@ -69,7 +69,7 @@ def poses(extent: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def measure(what: str, file: Path, side_m: float) -> str:
-    from magtwin.usd.maps import load_map
+    from magtwin.usd.maps.layer import load_map
 
     before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
     busy = time.process_time()

@@ -52,8 +52,8 @@ if TYPE_CHECKING:
     from magtwin.twin import simulate as simulate
     from magtwin.twin import simulate_robots as simulate_robots
     from magtwin.twin import sweep as sweep
-    from magtwin.usd.maps import load_map as load_map
-    from magtwin.usd.maps import save_map as save_map
+    from magtwin.usd.maps.layer import load_map as load_map
+    from magtwin.usd.maps.layer import save_map as save_map
 
     load_run, save_run, reproduce = read_run, write_run, repeat_of
 
@@ -79,7 +79,7 @@ _NAMES = {
     "fit_map": "field.fit.fit",
     "from_urdf": "author.from_urdf",
     "in_session": "twin",
-    "load_map": "usd.maps",
+    "load_map": "usd.maps.layer",
     "localize": "localizing",
     "load_predictor": "learn.models.predictor",
     "load_run": "io.formats:read_run",
@@ -89,7 +89,7 @@ _NAMES = {
     "read_results": "bench.results",
     "read_survey": "io.surveys.survey",
     "reproduce": "io.provenance:repeat_of",
-    "save_map": "usd.maps",
+    "save_map": "usd.maps.layer",
     "save_run": "io.formats:write_run",
     "save_runs": "io.sweeps",
     "scene_from_toml": "twin",

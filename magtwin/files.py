@@ -17,11 +17,6 @@ from typing import Any, TypeVar
 
 from magtwin.budget import check_depth, check_size
 from magtwin.errors import InputError, hint
-from magtwin.outputs import afterwards as afterwards
-from magtwin.outputs import at_once as at_once
-from magtwin.outputs import check_free as check_free
-from magtwin.outputs import output as output
-from magtwin.outputs import transaction as transaction
 
 T = TypeVar("T")
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import check_free, existing, sha256
+from magtwin.files import existing, sha256
 from magtwin.io.formats import read_run
 from magtwin.io.surveys.maps import open_map
 from magtwin.learn.data.alignment import Alignment
@@ -40,6 +40,7 @@ from magtwin.learn.inference.calibrate import calibrate as calibrate_model
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.predictor import Predictor, load_predictor
+from magtwin.outputs import check_free
 from magtwin.run.run import Run
 from magtwin.spec.scene import Scene
 from magtwin.twin import Twin, check_scene, in_session_of, open_twin

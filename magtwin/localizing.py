@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError, MismatchWarning, find
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import existing, output, sha256
+from magtwin.files import existing, sha256
 from magtwin.frames import wrap_angle, yaw_from_quat
 from magtwin.io.formats import read_run
 from magtwin.io.surveys.maps import open_map
@@ -36,6 +36,7 @@ from magtwin.localization.problem import (
 )
 from magtwin.localization.scores import Scores, score, verdict_of
 from magtwin.localization.track import EST_COLUMNS, Track, track
+from magtwin.outputs import output
 from magtwin.own_field import with_own_field
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run
@@ -556,7 +557,7 @@ def _layer_of(file: Path) -> Path | None:
     """The layer that holds the map of a file; None for a folder of CSVs, or a stage that is no scene."""
     if file.is_dir():
         return None
-    from magtwin.usd.maps import is_map_layer
+    from magtwin.usd.maps.layer import is_map_layer
     from magtwin.usd.scene import read_scene
 
     if is_map_layer(file):

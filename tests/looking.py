@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade
 
 from magtwin.spec.lab import LabSpec
-from magtwin.usd.lab import FLOOR_THICKNESS_M
+from magtwin.usd.lab.room import FLOOR_THICKNESS_M
 
 LIGHT_W = (5.0, 100.0)
 """Power of a lamp in Blender, which takes pi times its intensity [W]."""

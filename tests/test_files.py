@@ -8,7 +8,8 @@ from typing import Literal
 import pytest
 
 from magtwin.errors import InputError
-from magtwin.files import check_free, existing, from_table, output, read_toml, sha256, shipped
+from magtwin.files import existing, from_table, read_toml, sha256, shipped
+from magtwin.outputs import check_free, output
 
 
 @dataclass(frozen=True, kw_only=True)

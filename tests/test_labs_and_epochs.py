@@ -18,7 +18,7 @@ from magtwin.errors import InputError
 from magtwin.io.formats import read_run
 from magtwin.io.provenance import map_of
 from magtwin.ros.simulate import Simulator
-from magtwin.usd.maps import load_epochs, save_map_series
+from magtwin.usd.maps.layer import load_epochs, save_map_series
 from magtwin.usd.scene import open_scene
 
 EARLY, LATE = "2026-01-01", "2026-02-01"

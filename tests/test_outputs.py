@@ -11,7 +11,7 @@ import pytest
 
 from magtwin import outputs
 from magtwin.errors import InputError
-from magtwin.files import afterwards, check_free, output, transaction
+from magtwin.outputs import afterwards, check_free, output, transaction
 
 EVENTS = (
     (os, "fsync"),

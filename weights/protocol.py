@@ -32,7 +32,7 @@ from magtwin.io.surveys.readings import read_readings
 from magtwin.spec.lab import LabSpec
 from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
 from magtwin.spec.scene import Scene
-from magtwin.usd.maps import save_map
+from magtwin.usd.maps.layer import save_map
 from magtwin.usd.robot import load_robot
 
 CONSOLE = Console()

@@ -18,10 +18,10 @@ from magtwin.spec.furniture import FurnitureSpec
 from magtwin.spec.lab import LabSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import PlacedRobot
-from magtwin.usd.furniture import FURNITURE, define_furniture
-from magtwin.usd.lab import define_lab
-from magtwin.usd.maps import load_map
-from magtwin.usd.obstacles import read_obstacles
+from magtwin.usd.lab.furniture import FURNITURE, define_furniture
+from magtwin.usd.lab.obstacles import read_obstacles
+from magtwin.usd.lab.room import define_lab
+from magtwin.usd.maps.layer import load_map
 
 
 def obstacles_in(lab: LabSpec, furniture: Sequence[FurnitureSpec]) -> Obstacles:

@@ -12,22 +12,24 @@ from magtwin.author.room import check_name
 from magtwin.errors import InputError
 from magtwin.field.maps.made_from import made_from
 from magtwin.field.sources.magnets import body_of
-from magtwin.files import existing, output
+from magtwin.files import existing
 from magtwin.frames import quat_from_yaw
+from magtwin.outputs import output
 from magtwin.spec.furniture import FurnitureSpec
 from magtwin.spec.magnetics import SourceSpec
 from magtwin.spec.robot import PlacedRobot
 from magtwin.spec.scene import Scene
 from magtwin.urdf.convert import THUMBNAILS
 from magtwin.usd.attributes import check_prim_name, write_pose
-from magtwin.usd.earth import define_earth
-from magtwin.usd.furniture import FURNITURE, define_furniture
-from magtwin.usd.heat_map import MAP
-from magtwin.usd.lab import LAB, PHYSICS_SCENE, define_lab, expose_for_kit
+from magtwin.usd.lab.earth import define_earth
+from magtwin.usd.lab.furniture import FURNITURE, define_furniture
+from magtwin.usd.lab.looks import SHAPES, SHAPES_FILE, VISUALS, define_shapes
+from magtwin.usd.lab.room import LAB, PHYSICS_SCENE, define_lab, expose_for_kit
+from magtwin.usd.lab.sources import LOOKS, SOURCES, define_sources
 from magtwin.usd.layers import WORLD, describe_stage, new_stage, relative_asset
-from magtwin.usd.looks import SHAPES, SHAPES_FILE, VISUALS, define_shapes
-from magtwin.usd.map_attributes import read_made_from, write_made_from
-from magtwin.usd.maps import load_map
+from magtwin.usd.maps.attributes import read_made_from, write_made_from
+from magtwin.usd.maps.heat_map import MAP
+from magtwin.usd.maps.layer import load_map
 from magtwin.usd.robot import load_robot, urdf_of
 from magtwin.usd.scene import check_map
 from magtwin.usd.schema import only_prim_with
@@ -45,7 +47,6 @@ from magtwin.usd.sensors import (
     define_plant,
     define_platform,
 )
-from magtwin.usd.sources import LOOKS, SOURCES, define_sources
 
 EARTH = WORLD.AppendChild("Earth")
 TAKEN = (LAB.name, PHYSICS_SCENE.name, MAP.name, EARTH.name, SOURCES.name, FURNITURE.name, SHAPES.name)

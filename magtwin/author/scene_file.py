@@ -22,7 +22,7 @@ from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import PlacedRobot, RobotSpec
 from magtwin.spec.scene import Scene
-from magtwin.usd.earth import checked
+from magtwin.usd.lab.earth import checked
 from magtwin.usd.layers import layer_sha256
 from magtwin.usd.robot import load_robot
 

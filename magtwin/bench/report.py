@@ -25,7 +25,7 @@ from magtwin.figures.canvas import (
 )
 from magtwin.figures.evaluations import INKS
 from magtwin.figures.page import Page, Section, Table, write_page, write_pages
-from magtwin.files import check_free
+from magtwin.outputs import check_free
 from magtwin.report import Report
 
 Array = NDArray[np.float64]

@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 
 from magtwin.bench.suite import Chunk, Suite, load_suite
 from magtwin.errors import InputError, find
-from magtwin.files import output, read_text
+from magtwin.files import read_text
 from magtwin.kinds import expected
+from magtwin.outputs import output
 from magtwin.report import Figure, Report
 from magtwin.summary import Summarized, Summary, listed
 

@@ -73,10 +73,10 @@ def localize(
         Earlier run of the same session, with true poses.
     """
     from magtwin.figures.localization import save_localization
-    from magtwin.files import check_free
     from magtwin.io.formats import read_run
     from magtwin.localization.problem import OdometryModel, SensorModel
     from magtwin.localizing import ROBOT_NOISE, lever_arm_of, localization
+    from magtwin.outputs import check_free
 
     check_free(out, force=force)
     announce(f"Reading {run}")

@@ -168,7 +168,7 @@ def check_suffix(path: Path, suffixes: tuple[str, ...], what: str) -> None:
 
 def check_output(path: Path | None, suffixes: tuple[str, ...], what: str, *, force: bool) -> None:
     """Refuse an output whose name has another suffix, or that exists without --force."""
-    from magtwin.files import check_free
+    from magtwin.outputs import check_free
 
     if path is not None:
         check_suffix(path, suffixes, what)

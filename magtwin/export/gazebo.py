@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.files import output
-from magtwin.usd.obstacles import ROBOT_HEIGHT_M
+from magtwin.outputs import output
+from magtwin.usd.lab.obstacles import ROBOT_HEIGHT_M
 from magtwin.usd.scene import open_scene
 
 SYSTEMS = {

@@ -18,8 +18,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 from magtwin.errors import InputError
 from magtwin.usd.geometry import Shape, read_shapes
 from magtwin.usd.layers import open_stage, translates
+from magtwin.usd.maps.tiled_layer import is_tiled
 from magtwin.usd.schema import NOUNS, attribute_name, prims_with
-from magtwin.usd.tiled_maps import is_tiled
 from magtwin.version import __version__
 
 CREASE = np.deg2rad(40.0)

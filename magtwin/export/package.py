@@ -24,22 +24,23 @@ from magtwin.export.isaac import GRAPHS, author_graph
 from magtwin.export.structure import structure
 from magtwin.export.usdz import pack, unpack
 from magtwin.export.validation.inspection import inspect
-from magtwin.files import check_free, existing, output, sha256
+from magtwin.files import existing, sha256
 from magtwin.folders import allow
+from magtwin.outputs import check_free, output
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run
 from magtwin.summary import in_markdown, printable
 from magtwin.urdf.simready import UNKNOWN
 from magtwin.usd.animation import write_animation
 from magtwin.usd.layers import open_stage, stage_sha256
-from magtwin.usd.maps import read_map
+from magtwin.usd.maps.layer import read_map
+from magtwin.usd.maps.tiled_layer import check_tiles
 from magtwin.usd.placement import labs_on
 from magtwin.usd.scene import read_scene
 from magtwin.usd.schema import FOLDER as SCHEMA
 from magtwin.usd.schema import attribute_name, place, prims_with
 from magtwin.usd.schema.names import OLDER
 from magtwin.usd.schema.versions import TEXT
-from magtwin.usd.tiled_maps import check_tiles
 from magtwin.usd.units import check_units
 from magtwin.usd.upgrade import upgrade
 from magtwin.version import __version__

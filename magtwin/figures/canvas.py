@@ -21,7 +21,7 @@ from matplotlib.text import Text
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.files import output
+from magtwin.outputs import output
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.figures.scenery import Scenery, View
-from magtwin.files import check_free, output
+from magtwin.outputs import check_free, output
 from magtwin.run.run import Run
 
 Image = NDArray[np.uint8]

@@ -33,11 +33,11 @@ from magtwin.figures.canvas import (
     short_name,
 )
 from magtwin.figures.maps import draw_cells, mean_field_ut
-from magtwin.files import output
 from magtwin.frames import wrap_angle
 from magtwin.io.rerun.localization import write_localization
 from magtwin.localization.tum import save_tum
 from magtwin.localizing import Localization, truth_name
+from magtwin.outputs import output
 
 ESTIMATE_INK, TRUTH_INK, DEAD_INK, BOUND_INK, LOST_INK = "#e8590c", INK, "#1971c2", "#2b8a3e", "#f3d9fa"
 BAND_INK = "#ffd8a8"

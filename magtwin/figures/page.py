@@ -19,7 +19,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from magtwin.errors import InputError
 from magtwin.figures.canvas import Picture
-from magtwin.files import output
+from magtwin.outputs import output
 from magtwin.summary import in_markdown, printable, printable_lines
 from magtwin.version import __version__
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.files import output
 from magtwin.frames import rotate
+from magtwin.outputs import output
 from magtwin.spec.base import Vec3
 from magtwin.usd.geometry import (
     ColourScale,

@@ -32,8 +32,8 @@ from magtwin.figures.pictures import (
     style_of,
     write_png,
 )
-from magtwin.files import output
 from magtwin.frames import matrix_from_quat, quat_from_yaw
+from magtwin.outputs import output
 from magtwin.run.compare import FIELDS, HEADINGS, POSITIONS
 from magtwin.run.run import Run
 from magtwin.spec.base import Vec3

@@ -13,10 +13,11 @@ from magtwin.errors import InputError, MismatchWarning
 from magtwin.figures.canvas import save
 from magtwin.figures.page import write_page
 from magtwin.figures.reports import NamedRun, draw_comparison, page_of_comparison, page_of_runs
-from magtwin.files import check_free, existing
+from magtwin.files import existing
 from magtwin.io.convert import twin_to_show
 from magtwin.io.formats import read_run
 from magtwin.io.provenance import map_of, planned_of
+from magtwin.outputs import check_free
 from magtwin.run.compare import Comparison, compare
 from magtwin.run.run import Run
 from magtwin.usd.layers import stage_sha256

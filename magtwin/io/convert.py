@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from magtwin.errors import InputError, MismatchWarning
-from magtwin.files import check_free
 from magtwin.io.formats import format_of, read_run, write_run
+from magtwin.outputs import check_free
 from magtwin.run.run import Run
 from magtwin.twin import Twin, lab_and_epoch, led_by, open_twin, scene_of
 

@@ -61,7 +61,7 @@ def info_of_run(file: Path) -> Report:
 def _info_of_usd(file: Path) -> Report:
     from magtwin.usd.animation import is_animation
     from magtwin.usd.info import info_of_stage
-    from magtwin.usd.maps import is_map_layer, load_epochs
+    from magtwin.usd.maps.layer import is_map_layer, load_epochs
 
     if file.suffix != ".usdz" and is_animation(file):
         run = info_of_run(file)

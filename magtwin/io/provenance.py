@@ -186,7 +186,7 @@ def map_of(
         InputError: The scene is missing, or its map changed.
     """
     from magtwin.usd.layers import layer_sha256
-    from magtwin.usd.maps import load_map
+    from magtwin.usd.maps.layer import load_map
     from magtwin.usd.scene import read_scene
 
     where = lab_and_epoch(run.metadata)

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from magtwin.errors import InputError
-from magtwin.files import check_free, output
 from magtwin.io.tables import parquet_of, write_parquet
+from magtwin.outputs import check_free, output
 from magtwin.parallel import checked_shard, in_shard, open_pool
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run

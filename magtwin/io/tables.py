@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 
 from magtwin.budget import check_count, check_decoded, check_size
 from magtwin.errors import InputError, find
-from magtwin.files import check_free, existing, output
+from magtwin.files import existing
 from magtwin.io.recorder import Sink
+from magtwin.outputs import check_free, output
 from magtwin.run import mapped
 from magtwin.run.arrow import (
     FACTS,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.files import check_free, output
+from magtwin.outputs import check_free, output
 from magtwin.path.room import Room
 from magtwin.spec.obstacles import Obstacles
 from magtwin.summary import Summarized, Summary

@@ -31,7 +31,7 @@ class Part:
     """Sides of a box; diameter, diameter and height of a cylinder [m]."""
 
     look: str
-    """Material, a name of `magtwin.usd.looks`."""
+    """Material, a name of `magtwin.usd.lab.looks`."""
 
     shape: str = "cuboid"
     """"cuboid", "cylinder" or "mesh"."""

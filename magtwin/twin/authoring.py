@@ -6,8 +6,9 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any
 
 from magtwin.errors import InputError, find
-from magtwin.files import check_free, output, sha256, shipped
+from magtwin.files import sha256, shipped
 from magtwin.kinds import expected
+from magtwin.outputs import check_free, output
 from magtwin.spec.lab import SurveySpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.scene import Scene
@@ -61,7 +62,7 @@ def scene_from_toml(
     """
     from magtwin.author.scene_file import scene_from_toml as read_toml_scene
     from magtwin.sim.contradiction import check_agrees
-    from magtwin.usd.maps import is_map_layer, load_map
+    from magtwin.usd.maps.layer import is_map_layer, load_map
 
     if map_layer is not None and not is_map_layer(map_layer):
         raise InputError(
@@ -79,7 +80,7 @@ def scene_from_toml(
 
     def survey_of(scene: Scene, spec: SurveySpec, seed: int, obstacles: Obstacles) -> FilePath:
         from magtwin.sim.survey import survey_room
-        from magtwin.usd.maps import save_map
+        from magtwin.usd.maps.layer import save_map
 
         source = f"{FilePath(path).name} sha256:{sha256(path)}"
         surveyed = survey_room(scene, spec, seed=seed, obstacles=obstacles, source=source, progress=progress)

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
-from magtwin.files import check_free, output
 from magtwin.frames import matrix_from_quat
+from magtwin.outputs import check_free, output
 from magtwin.report import Figure, Report
 from magtwin.urdf.meshes.mesh_layer import MESH, free_name, primitive_of
 from magtwin.urdf.physics.joint import AXIS

@@ -19,15 +19,15 @@ from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
 from magtwin.errors import InputError, find
-from magtwin.files import output
 from magtwin.frames import quat_conjugate, quat_multiply, rotate
+from magtwin.outputs import output
 from magtwin.run.resample import grid
 from magtwin.run.run import COLUMNS, Column, Run, check_clock
 from magtwin.spec.base import Quat, Vec3
 from magtwin.usd.attributes import read_pose, target, targets
-from magtwin.usd.epochs import EPOCH
 from magtwin.usd.geometry import BASE_LINK, read_links
 from magtwin.usd.layers import SUFFIXES, WORLD, describe_stage, open_layer, open_stage, translates
+from magtwin.usd.maps.epochs import EPOCH
 from magtwin.usd.placement import lab_on, labs_on, take_to_origin
 from magtwin.usd.schema import attribute_name, only_prim_with, place, prims_with
 from magtwin.usd.schema.versions import creator

@@ -7,8 +7,8 @@ from pxr import Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
 from magtwin.report import Figure, Report
-from magtwin.usd.epochs import epochs_of
 from magtwin.usd.layers import open_stage, translates
+from magtwin.usd.maps.epochs import epochs_of
 from magtwin.usd.placement import AT_ORIGIN, labs_on, pose_of
 from magtwin.usd.scene import open_scene
 from magtwin.usd.schema import prims_with

@@ -15,8 +15,9 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
 from magtwin.budget import check_depth
 from magtwin.errors import InputError
-from magtwin.files import existing, existing_file, output, sha256
+from magtwin.files import existing, existing_file, sha256
 from magtwin.kinds import USD_SUFFIXES, kind_of, refused
+from magtwin.outputs import output
 from magtwin.usd.schema.versions import creator, is_upgraded, upgrade_stage
 from magtwin.usd.trial import try_stage
 
@@ -147,17 +148,21 @@ def check_stage(path: str | os.PathLike[str], *, composed: bool = True, own: boo
         if kind := kind_of(path):
             raise refused(path, kind, "USD file")
         raise InputError(f"{path}: no USD file; its name must end in {', '.join(USD_SUFFIXES)}")
-    with path.open("rb") as file:
-        head = file.read(8)
-        binary = head == b"PXR-USDC" or path.suffix == ".usdz"
-    if not head:
+    if not path.stat().st_size:
         raise InputError(f"{path}: is empty (0 bytes); make or copy it again")
+    binary = _is_crate(path) or path.suffix == ".usdz"
     existing_file(path, "USD file", "USD" if binary else "USD text")
     if not binary:
         _check_nesting(path)
     if not own:
         try_stage(path, composed=composed)
     return path
+
+
+def _is_crate(path: Path) -> bool:
+    """Whether a USD file is binary, by its first bytes."""
+    with path.open("rb") as file:
+        return file.read(8) == b"PXR-USDC"
 
 
 def _check_nesting(path: Path) -> None:
@@ -226,8 +231,7 @@ def save_layer(layer: Sdf.Layer) -> None:
 
 def export_like(layer: Sdf.Layer, path: Path, out: Path) -> None:
     """Write a layer to another file, as text or crate as the file `path` is."""
-    with path.open("rb") as old:
-        kind = "usdc" if old.read(8) == b"PXR-USDC" else "usda"
+    kind = "usdc" if _is_crate(path) else "usda"
     layer.Export(str(out), args={"format": kind} if path.suffix == ".usd" else {})
 
 
@@ -248,9 +252,7 @@ def layer_sha256(path: str | os.PathLike[str]) -> str:
     That holds the map's own checksum, which covers every tile, so no tile is read.
     """
     path = Path(path)
-    with path.open("rb") as file:
-        crate = file.read(8) == b"PXR-USDC"
-    if crate and path.stat().st_size > TILED_BYTES:
+    if _is_crate(path) and path.stat().st_size > TILED_BYTES:
         check_stage(path, composed=False)
         layer = Sdf.Layer.OpenAsAnonymous(str(path))
         prim = layer.GetPrimAtPath(TILED_MAP)

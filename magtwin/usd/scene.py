@@ -18,15 +18,16 @@ from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import PlacedRobot
 from magtwin.spec.scene import Scene
 from magtwin.usd.attributes import plain_value, read_pose, target
-from magtwin.usd.earth import AGREES_NT, read_earth
-from magtwin.usd.epochs import select_epoch, selected_epoch
-from magtwin.usd.furniture import read_magnets
 from magtwin.usd.geometry import Link, Shape, read_links, read_shapes
-from magtwin.usd.lab import read_lab
+from magtwin.usd.lab.earth import AGREES_NT, read_earth
+from magtwin.usd.lab.furniture import read_magnets
+from magtwin.usd.lab.obstacles import read_obstacles
+from magtwin.usd.lab.room import read_lab
+from magtwin.usd.lab.sources import read_transform
 from magtwin.usd.layers import layer_sha256, open_stage, relative_asset, save_layer, stage_sha256, translates
-from magtwin.usd.map_attributes import MADE_FROM
-from magtwin.usd.maps import read_map
-from magtwin.usd.obstacles import read_obstacles
+from magtwin.usd.maps.attributes import MADE_FROM
+from magtwin.usd.maps.epochs import select_epoch, selected_epoch
+from magtwin.usd.maps.layer import read_map
 from magtwin.usd.placement import (
     AT_ORIGIN,
     SAME,
@@ -43,7 +44,6 @@ from magtwin.usd.placement import (
 from magtwin.usd.robot import read_robot
 from magtwin.usd.schema import NOUNS, attribute_name, only_prim_with, place, prims_with, require_api
 from magtwin.usd.sensors import MAP_CHECKSUM, MAP_RELATIONSHIP, read_path
-from magtwin.usd.sources import read_transform
 from magtwin.usd.trial import folders_of
 from magtwin.usd.units import check_units
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from pxr import Sdf, Tf, UsdUtils
 
 from magtwin.errors import InputError
-from magtwin.files import output
 from magtwin.kinds import expected
+from magtwin.outputs import output
 from magtwin.usd.layers import check_stage, export_like, layer_sha256
 from magtwin.usd.schema.versions import stamp, upgrade_layer
 from magtwin.usd.sensors import MAP_CHECKSUM

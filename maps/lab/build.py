@@ -21,8 +21,9 @@ from magtwin.field.fit.fit import fit, raster
 from magtwin.field.maps.made_from import made_from
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.readings import Readings
-from magtwin.files import output, shipped
+from magtwin.files import shipped
 from magtwin.frames import quat_from_rpy
+from magtwin.outputs import output
 from magtwin.report import Report
 from magtwin.sim.survey import survey_readings
 from magtwin.spec.base import ZERO3
@@ -31,8 +32,8 @@ from magtwin.spec.lab import LabSpec
 from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
-from magtwin.usd.earth import derived
-from magtwin.usd.maps import save_map
+from magtwin.usd.lab.earth import derived
+from magtwin.usd.maps.layer import save_map
 from magtwin.usd.robot import load_robot
 
 HERE = Path(__file__).resolve().parent

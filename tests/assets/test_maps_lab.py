@@ -16,7 +16,7 @@ from magtwin.path import path_named
 from magtwin.sim.runs.simulate import simulate
 from magtwin.sim.survey import field_at_rest_nt
 from magtwin.spec.magnetics import EarthFieldSpec
-from magtwin.usd.maps import load_map
+from magtwin.usd.maps.layer import load_map
 
 LAB = shipped("maps", "lab")
 

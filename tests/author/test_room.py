@@ -29,8 +29,8 @@ from magtwin.spec.furniture import (
     parts_of,
 )
 from magtwin.twin import author_scene, new_scene, open_twin, scene_from_toml, simulate
-from magtwin.usd.furniture import define_furniture, read_magnets
-from magtwin.usd.maps import save_map
+from magtwin.usd.lab.furniture import define_furniture, read_magnets
+from magtwin.usd.maps.layer import save_map
 from magtwin.usd.scene import read_scene
 
 ROOM = """

@@ -30,10 +30,10 @@ from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSp
 from magtwin.twin import open_twin, simulate
 from magtwin.usd import sensors
 from magtwin.usd.attributes import write_pose
-from magtwin.usd.heat_map import MAP
-from magtwin.usd.lab import LAB, define_lab, read_lab
+from magtwin.usd.lab.room import LAB, define_lab, read_lab
 from magtwin.usd.layers import new_stage
-from magtwin.usd.maps import save_map
+from magtwin.usd.maps.heat_map import MAP
+from magtwin.usd.maps.layer import save_map
 from magtwin.usd.scene import open_alone, read_scene, robots_in
 
 pytestmark = pytest.mark.usefixtures("allow_neighbours")  # scenes by reference

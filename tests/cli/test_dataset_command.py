@@ -12,7 +12,7 @@ from magtwin.files import sha256, shipped
 from magtwin.io.formats import read_run, write_run
 from magtwin.learn.data.dataset import open_dataset
 from magtwin.learn.data.labels import labelled
-from magtwin.usd.maps import load_map
+from magtwin.usd.maps.layer import load_map
 
 MAP = shipped("maps", "lab", "lab.usdc")
 

@@ -18,7 +18,7 @@ from magtwin.learn.data.dataset import build_dataset
 from magtwin.run.compare import traversals
 from magtwin.run.run import COLUMNS, Run
 from magtwin.twin import in_session_of, open_twin, simulate
-from magtwin.usd.maps import save_map
+from magtwin.usd.maps.layer import save_map
 
 
 def a_map(name, level):

@@ -13,7 +13,7 @@ from magtwin.field.maps.epochs import drift
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import map_metadata, source_files
 from magtwin.field.sources.harmonic import HarmonicField
-from magtwin.usd.maps import load_epochs, load_map, save_map, save_map_series
+from magtwin.usd.maps.layer import load_epochs, load_map, save_map, save_map_series
 
 SHA = "0123456789abcdef" * 4
 

@@ -8,7 +8,7 @@ import pytest
 from magtwin.cli import main
 from magtwin.files import sha256
 from magtwin.io.surveys.readings import load_readings
-from magtwin.usd.maps import load_map
+from magtwin.usd.maps.layer import load_map
 
 
 def run(*arguments):

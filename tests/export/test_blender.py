@@ -20,7 +20,7 @@ from magtwin.field.survey.folder import read_survey
 from magtwin.files import shipped
 from magtwin.spec.lab import LabSpec
 from magtwin.urdf import convert_urdf
-from magtwin.usd.maps import save_map
+from magtwin.usd.maps.layer import save_map
 
 BLENDER = os.environ.get("MAGTWIN_BLENDER", "")
 SCRIPT = Path(__file__).resolve().parents[1] / "in_blender.py"

@@ -32,9 +32,9 @@ from magtwin.files import sha256, shipped
 from magtwin.run.run import Run
 from magtwin.usd.animation import read_animation
 from magtwin.usd.geometry import read_shapes
-from magtwin.usd.lab import LAB as LAB_PRIM
-from magtwin.usd.lab import read_lab
-from magtwin.usd.maps import load_map, save_map
+from magtwin.usd.lab.room import LAB as LAB_PRIM
+from magtwin.usd.lab.room import read_lab
+from magtwin.usd.maps.layer import load_map, save_map
 from magtwin.usd.scene import read_scene
 
 LAB = shipped("scenes", "lab", "lab.usda")

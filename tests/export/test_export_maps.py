@@ -17,8 +17,8 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.tiles import TiledMap
 from magtwin.twin import open_twin
 from magtwin.usd.layers import open_stage
-from magtwin.usd.maps import checksums, save_map, save_map_series
-from magtwin.usd.tiled_maps import check_tiles
+from magtwin.usd.maps.layer import checksums, save_map, save_map_series
+from magtwin.usd.maps.tiled_layer import check_tiles
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ from magtwin.spec.obstacles import Obstacles
 from magtwin.twin import open_twin, scene_from_toml
 from magtwin.urdf import convert_urdf
 from magtwin.urdf.options import Options
-from magtwin.usd.obstacles import read_obstacles
+from magtwin.usd.lab.obstacles import read_obstacles
 
 PYTHON, VERSION = find_python()
 

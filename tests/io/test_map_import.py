@@ -15,7 +15,7 @@ from magtwin.cli import main
 from magtwin.field.sources.earth import earth_field_nt
 from magtwin.io.surveys.maps import open_map
 from magtwin.io.surveys.readings import load_readings, save_readings
-from magtwin.usd.maps import load_map
+from magtwin.usd.maps.layer import load_map
 from magtwin.usd.scene import read_scene
 
 

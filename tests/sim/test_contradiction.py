@@ -10,7 +10,7 @@ from magtwin.errors import InputError
 from magtwin.files import shipped
 from magtwin.sim.contradiction import check_agrees, contradiction_nt
 from magtwin.sim.survey import survey
-from magtwin.usd.maps import save_map
+from magtwin.usd.maps.layer import save_map
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,8 @@ from magtwin.field.maps.made_from import MadeFrom
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import colour_limits
 from magtwin.field.sources.harmonic import HarmonicField
-from magtwin.usd.heat_map import HEAT_MAP, MAP, colour_index, heading_variants, viridis
-from magtwin.usd.maps import checksums, load_epochs, load_map, read_map, save_map, save_map_series
+from magtwin.usd.maps.heat_map import HEAT_MAP, MAP, colour_index, heading_variants, viridis
+from magtwin.usd.maps.layer import checksums, load_epochs, load_map, read_map, save_map, save_map_series
 from magtwin.usd.schema import NOUNS, attribute_name
 
 VALUES = "magtwin:anomalyMap:valuesNt"

@@ -16,7 +16,7 @@ from magtwin.field.maps.epochs import at_date
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.folder import read_survey, write_survey
 from magtwin.io.surveys.readings import read_readings
-from magtwin.usd.maps import load_epochs, load_map, save_map, save_map_series
+from magtwin.usd.maps.layer import load_epochs, load_map, save_map, save_map_series
 
 
 def survey(seed=0, **given):

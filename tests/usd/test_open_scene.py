@@ -7,9 +7,9 @@ from pxr import Usd
 
 from magtwin.errors import UnknownNameError
 from magtwin.files import shipped
+from magtwin.usd.lab.obstacles import read_obstacles
 from magtwin.usd.layers import stage_sha256
-from magtwin.usd.maps import load_map
-from magtwin.usd.obstacles import read_obstacles
+from magtwin.usd.maps.layer import load_map
 from magtwin.usd.scene import open_scene, read_scene
 
 LAB = shipped("scenes", "lab", "lab.usda")

@@ -25,7 +25,7 @@ from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec
 from magtwin.usd import schema, sensors
 from magtwin.usd.attributes import plain_value, write_pose
-from magtwin.usd.earth import DERIVED_FROM
+from magtwin.usd.lab.earth import DERIVED_FROM
 from magtwin.usd.schema import attribute_name, generate
 
 SPECS = {

@@ -19,7 +19,7 @@ from magtwin.errors import InputError, MismatchWarning
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files import shipped
 from magtwin.usd.layers import layer_sha256, open_stage
-from magtwin.usd.maps import load_map, save_map
+from magtwin.usd.maps.layer import load_map, save_map
 from magtwin.usd.schema import FILES, FOLDER, NOUNS, attribute_name, publish
 from magtwin.usd.schema.names import REMOVED, RENAMED
 from magtwin.usd.schema.versions import TEXT, older_properties, version_of

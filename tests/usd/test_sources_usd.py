@@ -16,10 +16,10 @@ from magtwin.field.sources.magnets import body_of
 from magtwin.frames import rotate
 from magtwin.spec.furniture import KINDS, FurnitureSpec, parts_of
 from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
-from magtwin.usd.earth import DERIVED_FROM, checked, define_earth, read_earth
-from magtwin.usd.furniture import FURNITURE, define_furniture, read_magnets
+from magtwin.usd.lab.earth import DERIVED_FROM, checked, define_earth, read_earth
+from magtwin.usd.lab.furniture import FURNITURE, define_furniture, read_magnets
+from magtwin.usd.lab.sources import SOURCES, define_source, define_sources, read_source
 from magtwin.usd.schema import apply_api, attribute_name
-from magtwin.usd.sources import SOURCES, define_source, define_sources, read_source
 
 unhurried = settings(deadline=None, max_examples=50)
 
@@ -472,7 +472,8 @@ def test_reading_an_authored_earth_loads_no_model(tmp_path):
     define_earth(stage, "/World/Earth", EARTH)
     stage.Save()
     code = (
-        "import sys; from magtwin.usd.earth import read_earth; from magtwin.usd.layers import open_stage; "
+        "import sys; from magtwin.usd.lab.earth import read_earth; "
+        "from magtwin.usd.layers import open_stage; "
         "stage = open_stage(sys.argv[1]); read_earth(stage.GetPrimAtPath('/World/Earth')); "
         "sys.exit(any(m in sys.modules for m in ('ppigrf', 'pandas', 'magpylib', 'scipy')))"
     )

@@ -17,11 +17,11 @@ from magtwin.field.maps.statistics import map_metadata, statistics
 from magtwin.field.maps.tiles import Tile, TiledMap, Tiling
 from magtwin.twin import open_twin, simulate
 from magtwin.usd import layers
-from magtwin.usd.heat_map import HEAT_MAP, MAP
 from magtwin.usd.layers import layer_sha256
-from magtwin.usd.maps import checksums, load_epochs, load_map, save_map
+from magtwin.usd.maps.heat_map import HEAT_MAP, MAP
+from magtwin.usd.maps.layer import checksums, load_epochs, load_map, save_map
+from magtwin.usd.maps.tiled_layer import check_tiles, save_tiled_map, tile_faults
 from magtwin.usd.scene import open_scene, use_map
-from magtwin.usd.tiled_maps import check_tiles, save_tiled_map, tile_faults
 
 SHAPE = (5, 41, 57)
 CELLS = 8  # 5 x 7 tiles
@@ -199,7 +199,7 @@ def test_a_changed_grid_or_checksum_is_refused_when_the_map_is_opened(both, name
     prim = stage.GetPrimAtPath(MAP)
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         prim.GetAttribute(f"magtwin:anomalyMap:{name}").Set(value)
-    from magtwin.usd.maps import read_map
+    from magtwin.usd.maps.layer import read_map
 
     with pytest.raises(InputError, match="do not match its checksum"):
         read_map(prim)
@@ -241,7 +241,7 @@ def test_a_file_is_written_from_a_function_and_never_holds_two_kinds_of_tile(bot
 def test_size_decides_whether_a_map_is_tiled(tmp_path, monkeypatch):
     save_map(a_map(), tmp_path / "small.usdc")
     assert type(load_map(tmp_path / "small.usdc")) is AnomalyMap
-    monkeypatch.setattr("magtwin.usd.maps.TILED_FROM", np.prod(SHAPE))
+    monkeypatch.setattr("magtwin.usd.maps.layer.TILED_FROM", np.prod(SHAPE))
     save_map(a_map(), tmp_path / "large.usdc")
     assert isinstance(load_map(tmp_path / "large.usdc"), TiledMap)
     single = replace(a_map(), recorded_yaw=np.zeros(SHAPE))

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
-from magtwin.usd.obstacles import read_obstacles
+from magtwin.usd.lab.obstacles import read_obstacles
 
 
 def stage() -> Usd.Stage:

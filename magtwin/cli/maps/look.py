@@ -51,7 +51,7 @@ def map_info(file: MapFile, *, date: Date = None) -> Done:
     from magtwin.field.maps.epochs import at_date
     from magtwin.field.maps.statistics import map_metadata
     from magtwin.io.surveys.maps import open_map
-    from magtwin.usd.maps import load_epochs
+    from magtwin.usd.maps.layer import load_epochs
 
     if file.is_dir():
         return Done(map_metadata(open_map(file, date)))
@@ -108,7 +108,7 @@ def map_upward(
     from magtwin.field.maps.continuation import at_height
     from magtwin.field.maps.statistics import map_metadata
     from magtwin.io.surveys.maps import open_map
-    from magtwin.usd.maps import save_map
+    from magtwin.usd.maps.layer import save_map
 
     check_output(out, LAYERS, "a map layer", force=force)
     step(f"Continuing the field to {height_m:g} m")
@@ -148,7 +148,7 @@ def map_epochs(*files: Sources, out: Path, force: Force = False) -> Done:
         Map layer to write (.usdc), with a variant of the variant set `epoch` for each date.
     """
     from magtwin.field.maps.epochs import drift, in_order
-    from magtwin.usd.maps import load_epochs, save_map_series
+    from magtwin.usd.maps.layer import load_epochs, save_map_series
 
     check_output(out, LAYERS, "a map layer", force=force)
     maps = in_order([epoch for file in files for epoch in load_epochs(file)])

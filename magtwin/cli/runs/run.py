@@ -51,8 +51,9 @@ def demo(
     from magtwin.author.robot import build_robot
     from magtwin.author.scene import author_scene
     from magtwin.figures.pictures import picture_of_stage
-    from magtwin.files import output, shipped
+    from magtwin.files import shipped
     from magtwin.io.outputs import Outputs, drive
+    from magtwin.outputs import output
     from magtwin.twin import scene_from_toml
 
     with output(out, force=force) as folder:

@@ -82,7 +82,7 @@ def robot(
         Full report to write (.json).
     """
     given = dict(locals())
-    from magtwin.files import output
+    from magtwin.outputs import output
 
     if out.suffix == ".urdf":
         from magtwin.author.from_urdf import write_urdf

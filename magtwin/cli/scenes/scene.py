@@ -88,7 +88,7 @@ def scene(
         them is refused, and the difference is given in nT.
     """
     from magtwin.author.scene import author_scene
-    from magtwin.files import check_free
+    from magtwin.outputs import check_free
     from magtwin.twin import scene_from_toml, scene_with_robot
     from magtwin.usd.info import info_of_stage
     from magtwin.usd.robot import conversion_notes

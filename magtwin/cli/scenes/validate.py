@@ -48,8 +48,8 @@ def validate(
 
     from magtwin.export.validation.validate import AGAINST, SAFE
     from magtwin.export.validation.validate import validate as check
-    from magtwin.files import output
     from magtwin.learn.data.features import FEATURES
+    from magtwin.outputs import output
 
     check_output(out, (".json",), "a report", force=force)
     fixes = SAFE if fix else ()

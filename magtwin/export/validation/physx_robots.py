@@ -12,7 +12,7 @@ from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.usd.attributes import targets
 from magtwin.usd.geometry import BASE_LINK
-from magtwin.usd.obstacles import read_obstacles
+from magtwin.usd.lab.obstacles import read_obstacles
 from magtwin.usd.schema import NOUNS, attribute_name
 from magtwin.usd.sensors import JOINT_FIELDS, WHEELS_FIELDS, read_drive
 

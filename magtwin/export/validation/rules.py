@@ -20,14 +20,15 @@ from magtwin.export.validation.findings import Severity
 from magtwin.export.validation.rule import Subject, Wrong, rule, wrong_of
 from magtwin.files import sha256
 from magtwin.usd.attributes import plain_value, target
-from magtwin.usd.earth import read_earth
-from magtwin.usd.furniture import read_magnets
-from magtwin.usd.heat_map import HEAT_MAP, heading_variants
-from magtwin.usd.lab import read_lab
+from magtwin.usd.lab.earth import read_earth
+from magtwin.usd.lab.furniture import read_magnets
+from magtwin.usd.lab.looks import VISUALS
+from magtwin.usd.lab.obstacles import read_obstacles
+from magtwin.usd.lab.room import read_lab
 from magtwin.usd.layers import layer_sha256
-from magtwin.usd.looks import VISUALS
-from magtwin.usd.maps import checksums, read_map
-from magtwin.usd.obstacles import read_obstacles
+from magtwin.usd.maps.heat_map import HEAT_MAP, heading_variants
+from magtwin.usd.maps.layer import checksums, read_map
+from magtwin.usd.maps.tiled_layer import tile_faults
 from magtwin.usd.placement import UPRIGHT, labs_on, pose_of
 from magtwin.usd.robot import read_robot
 from magtwin.usd.scene import earth_in, open_scene
@@ -44,7 +45,6 @@ from magtwin.usd.sensors import (
     read_lidar,
     read_magnetometer,
 )
-from magtwin.usd.tiled_maps import tile_faults
 from magtwin.usd.units import mixed_units
 
 NETWORK = attribute_name("magnetometer", "network")

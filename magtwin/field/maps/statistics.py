@@ -57,8 +57,8 @@ def map_metadata(field: AnomalyMap, epochs: Sequence[AnomalyMap] = ()) -> Report
 
     Args:
         field: The map.
-        epochs: All epochs of the map, from `magtwin.usd.maps.load_epochs`. With two or more, their drift is
-            added.
+        epochs: All epochs of the map, from `magtwin.usd.maps.layer.load_epochs`. With two or more, their
+            drift is added.
 
     Returns:
         Statistics of the map and of each heading, share of valid nodes, standard deviation, height, the

@@ -18,8 +18,9 @@ from magtwin.field.survey.header import ERROR, MASKED, header_lines, read_header
 from magtwin.field.survey.node_errors import node_errors
 from magtwin.field.survey.readings import Readings
 from magtwin.field.units import check_unit, nt_per
-from magtwin.files import existing, existing_file, output, sha256
+from magtwin.files import existing, existing_file, sha256
 from magtwin.frames import wrap_angle
+from magtwin.outputs import output
 from magtwin.report import Figure, Report
 
 Array = NDArray[np.float64]

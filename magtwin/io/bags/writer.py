@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magtwin.errors import InputError, hint
-from magtwin.files import check_free, output
 from magtwin.io.bags.cdr import encode
 from magtwin.io.bags.db3 import Db3Writer
 from magtwin.io.bags.mcap import McapWriter
@@ -23,6 +22,7 @@ from magtwin.io.bags.stream import Sent, Stream
 from magtwin.io.bags.topics import Qos
 from magtwin.io.bags.types import definition_of, layout
 from magtwin.io.recorder import PARTIAL, Sink, partial_of
+from magtwin.outputs import check_free, output
 from magtwin.run.arrow import metadata_to_json
 from magtwin.run.run import Run
 from magtwin.run.spool import blocks

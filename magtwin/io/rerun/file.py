@@ -14,7 +14,7 @@ import numpy as np
 from rerun.chunk import RrdReader
 
 from magtwin.errors import InputError
-from magtwin.files import existing, output
+from magtwin.files import existing
 from magtwin.io.recorder import PARTIAL
 from magtwin.io.rerun.layout import RUN_COLOURS, Shown, comparison_layout, plotted
 from magtwin.io.rerun.recording import (
@@ -30,6 +30,7 @@ from magtwin.io.rerun.recording import (
 from magtwin.io.rerun.series import COLUMNS_ENTITY, STATES, entity_of, table_of
 from magtwin.io.rerun.viewer import check_decodes, show
 from magtwin.io.rerun.world import Interior, Robot, heading_of, send_room
+from magtwin.outputs import output
 from magtwin.path import Path
 from magtwin.run import mapped
 from magtwin.run.run import Run

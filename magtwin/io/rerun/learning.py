@@ -8,9 +8,9 @@ from pathlib import Path
 import rerun as rr
 import rerun.blueprint as rrb
 
-from magtwin.files import output
 from magtwin.io.rerun.recording import stream
 from magtwin.learn.models.descent import Epoch
+from magtwin.outputs import output
 
 
 def record_learning_curve(

@@ -20,8 +20,9 @@ import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import Timeline, View, ViewerClient
 
 from magtwin.errors import InputError
-from magtwin.files import existing, output
+from magtwin.files import existing
 from magtwin.io.rerun.series import TIMELINE
+from magtwin.outputs import output
 from magtwin.parallel.machine import ends_with_parent
 
 LOCALHOST = "127.0.0.1"

@@ -20,7 +20,7 @@ from magtwin.sim.sensors.lidar import Scans
 from magtwin.spec.robot import RobotSpec
 from magtwin.twin import Twin
 from magtwin.usd.geometry import BASE_LINK, Link, Shape, srgb_from_linear
-from magtwin.usd.heat_map import HEAT_MAP, HEAT_MAP_HEIGHT_M
+from magtwin.usd.maps.heat_map import HEAT_MAP, HEAT_MAP_HEIGHT_M
 
 Array = NDArray[np.float64]
 

@@ -16,11 +16,12 @@ from magtwin.field.survey.folder import node_map
 from magtwin.field.survey.folder import read_survey as read_folder
 from magtwin.field.survey.readings import TAKEN, Readings
 from magtwin.field.survey.stuck import mask_stuck
-from magtwin.files import check_free, sha256
+from magtwin.files import sha256
 from magtwin.io.surveys.about import About
 from magtwin.io.surveys.columns import Columns
 from magtwin.io.surveys.readings import is_pattern, read_readings, save_readings
 from magtwin.kinds import expected
+from magtwin.outputs import check_free
 from magtwin.report import Report
 
 Method = Literal["auto", "trilinear", "cubic", "gp", "harmonic"]
@@ -51,7 +52,7 @@ def open_map(file: Source, date: str | None = None) -> AnomalyMap:
     Raises:
         InputError: There is no map, it is damaged, or a folder is asked for a date.
     """
-    from magtwin.usd.maps import load_map
+    from magtwin.usd.maps.layer import load_map
 
     if not Path(file).is_dir():
         return load_map(file, date)
@@ -106,7 +107,7 @@ def import_survey(
     Raises:
         InputError: A source cannot be read, or the output cannot be written.
     """
-    from magtwin.usd.maps import save_map
+    from magtwin.usd.maps.layer import save_map
 
     out, columns, about = check_free(out, force=force), reading.get("columns") or Columns(), about or About()
     name = about.name or out.stem
@@ -162,7 +163,7 @@ def fit_survey(
     """
     from magtwin.field.fit.choice import choice_report
     from magtwin.field.fit.fit import fit, grid_report, raster
-    from magtwin.usd.maps import save_map
+    from magtwin.usd.maps.layer import save_map
 
     out, about = check_free(out, force=force), about or About()
     options = _method_options([method], kernel, earth).get(method, {})
@@ -260,7 +261,7 @@ def survey_scene(
     """
     from magtwin.sim.survey import blocked_by, survey, survey_readings
     from magtwin.usd.layers import layer_files
-    from magtwin.usd.maps import save_map
+    from magtwin.usd.maps.layer import save_map
     from magtwin.usd.scene import open_scene, use_map
 
     out = check_free(out, force=force)

@@ -18,12 +18,13 @@ from magtwin.field.grid import Grid
 from magtwin.field.survey.folder import read_grid
 from magtwin.field.survey.readings import FARTHEST_M, SHAPES, TAKEN, Readings
 from magtwin.field.units import check_unit, nt_per, unit_by_size
-from magtwin.files import existing, output, sha256
+from magtwin.files import existing, sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
 from magtwin.io.surveys.columns import FIELDS, HEADINGS, NO_HEADING, TIMES, VECTORS, Columns
 from magtwin.io.surveys.table import Table, read_csv, read_parquet_table
 from magtwin.io.tables import load_parquet, read_parquet
 from magtwin.kinds import expected
+from magtwin.outputs import output
 from magtwin.run.arrow import FACTS
 from magtwin.run.run import Run
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.tiles import TiledMap
-from magtwin.files import existing, output, read_text, sha256
+from magtwin.files import existing, read_text, sha256
 from magtwin.kinds import expected
 from magtwin.learn.data.alignment import Alignment, fit_alignment
 from magtwin.learn.data.features import FEATURES, SETS, columns_of, feature_names
@@ -33,6 +33,7 @@ from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.origin import map_metadata, shared_metadata
 from magtwin.learn.data.recording import Recording, Rows, Source, plant_name, read, sources_of, thinned
 from magtwin.learn.data.split import Part, Split
+from magtwin.outputs import output
 from magtwin.parallel import run_all
 from magtwin.report import Figure, Report
 from magtwin.run.arrow import run_of, table_of

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.files import output
 from magtwin.learn.evaluation.candidates import Candidate, NamedMap
 from magtwin.learn.evaluation.scores import Errors, Score
+from magtwin.outputs import output
 from magtwin.run.run import Run
 from magtwin.summary import Summarized, Summary
 from magtwin.verdict import SEPARATOR, recordings_text, verdict

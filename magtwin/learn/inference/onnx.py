@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from magtwin.budget import check_size
 from magtwin.errors import InputError
-from magtwin.files import check_free, existing, output, sha256
+from magtwin.files import existing, sha256
 from magtwin.learn.data.features import FEATURES
 from magtwin.learn.data.inputs import Inputs
 from magtwin.learn.mixed.mixed import Mixed
@@ -24,6 +24,7 @@ from magtwin.learn.models.hybrid import Hybrid
 from magtwin.learn.models.linear import Linear
 from magtwin.learn.models.network import FieldNet
 from magtwin.learn.models.predictor import Predictor, load_predictor
+from magtwin.outputs import check_free, output
 from magtwin.report import Figure, Report
 from magtwin.version import __version__
 

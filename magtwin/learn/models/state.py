@@ -14,7 +14,8 @@ from safetensors.torch import save
 
 from magtwin.budget import check_size
 from magtwin.errors import InputError
-from magtwin.files import existing, output
+from magtwin.files import existing
+from magtwin.outputs import output
 
 FORMAT_VERSION = 1  # Version of the file; other versions are refused
 

@@ -13,9 +13,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from magtwin.errors import InputError
-from magtwin.files import existing, existing_file, output
+from magtwin.files import existing, existing_file
 from magtwin.kinds import expected, kind_of
 from magtwin.learn.data.features import FEATURES, feature_names
+from magtwin.outputs import output
 
 MetadataValue = str | int | float | bool
 

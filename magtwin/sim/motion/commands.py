@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.files import existing_file, output
+from magtwin.files import existing_file
 from magtwin.kinds import expected
+from magtwin.outputs import output
 from magtwin.spec.drive import DriveSpec
 from magtwin.summary import Summarized, Summary
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from pxr import Plug, Usd
 
 from magtwin.errors import InputError, find
-from magtwin.files import output
+from magtwin.outputs import output
 from magtwin.usd.schema.names import VERSION, attribute_name
 
 __all__ = [

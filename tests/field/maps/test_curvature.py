@@ -131,7 +131,7 @@ def test_errors_between_nodes_are_refused_below_0_or_of_another_shape_and_droppe
 
 
 def test_a_map_layer_keeps_the_errors_between_nodes(tmp_path):
-    from magtwin.usd.maps import load_map, save_map
+    from magtwin.usd.maps.layer import load_map, save_map
 
     field, _ = survey(10.0)
     save_map(field, tmp_path / "m.usdc")

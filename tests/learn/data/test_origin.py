@@ -18,7 +18,7 @@ from magtwin.sim.session import draw_session
 from magtwin.spec.sensors import MocapSpec
 from magtwin.twin import in_session, open_twin, sweep
 from magtwin.twin.opening import _platform_sha256
-from magtwin.usd.maps import save_map
+from magtwin.usd.maps.layer import save_map
 from magtwin.usd.robot import load_robot
 
 ROBOT = load_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))
@@ -165,7 +165,7 @@ def test_a_run_tells_its_robot_and_motion_capture_as_it_was_in_the_session(lab_s
 def strange(tmp_path):
     """Weights that learned on a map that is off by 300 nT, on another robot."""
     scene_map = shipped("maps", "lab", "lab.usdc")
-    from magtwin.usd.maps import load_map
+    from magtwin.usd.maps.layer import load_map
 
     field = load_map(scene_map)
     off = dataclasses.replace(field, values_nt=field.values_nt + 300.0, harmonic=None, name="off")

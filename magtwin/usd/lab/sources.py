@@ -12,8 +12,8 @@ from magtwin.frames import IDENTITY_XYZW, canonical, quat_conjugate, quat_multip
 from magtwin.spec.base import ZERO3, Quat, Vec3
 from magtwin.spec.magnetics import SourceSpec
 from magtwin.usd.attributes import check_prim_name, plain_value, write_pose
+from magtwin.usd.lab.looks import define_looks, define_visual, hide, visual_path, wear
 from magtwin.usd.layers import WORLD
-from magtwin.usd.looks import define_looks, define_visual, hide, visual_path, wear
 from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, require_api
 from magtwin.usd.solids import define_triangles, mesh_solid
 

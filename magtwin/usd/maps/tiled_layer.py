@@ -16,10 +16,9 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import colour_limits
 from magtwin.field.maps.tiles import Tile, TiledMap, Tiling
 from magtwin.field.sources.harmonic import HarmonicField
-from magtwin.files import output
-from magtwin.usd.heat_map import MAP, Floor, define_colours, define_heat_map, nodes_shown
+from magtwin.outputs import output
 from magtwin.usd.layers import WORLD, describe_stage
-from magtwin.usd.map_attributes import (
+from magtwin.usd.maps.attributes import (
     GRID,
     PLACES,
     TEXTS,
@@ -36,8 +35,9 @@ from magtwin.usd.map_attributes import (
     shared_values,
     texts_of,
 )
+from magtwin.usd.maps.heat_map import MAP, Floor, define_colours, define_heat_map, nodes_shown
+from magtwin.usd.maps.tiles import LayerTiles, tile_path, write_tiles
 from magtwin.usd.schema import apply_api, attribute_name, place
-from magtwin.usd.tiles import LayerTiles, tile_path, write_tiles
 
 
 def save_tiled_map(

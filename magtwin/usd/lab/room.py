@@ -6,8 +6,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, Vt
 from magtwin.frames import quat_from_rpy
 from magtwin.spec.lab import LabSpec
 from magtwin.usd.attributes import read_spec, write_pose, write_spec
+from magtwin.usd.lab.looks import define_box, define_looks, define_visual, hide
 from magtwin.usd.layers import WORLD
-from magtwin.usd.looks import define_box, define_looks, define_visual, hide
 from magtwin.usd.schema import apply_api
 
 LAB = WORLD.AppendChild("Lab")

@@ -11,12 +11,8 @@ from magtwin.frames import IDENTITY_XYZW
 from magtwin.spec.furniture import BODY, GENERIC, FurnitureSpec, Part, parts_of
 from magtwin.spec.magnetics import SourceSpec
 from magtwin.usd.attributes import check_prim_name, plain_value, write_pose
-from magtwin.usd.layers import WORLD
-from magtwin.usd.looks import define_box, define_looks, define_visual, hide, visual_path, wear
-from magtwin.usd.placement import labs_on
-from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, prims_with
-from magtwin.usd.solids import define_triangles
-from magtwin.usd.sources import (
+from magtwin.usd.lab.looks import define_box, define_looks, define_visual, hide, visual_path, wear
+from magtwin.usd.lab.sources import (
     LOOKS,
     SOURCES,
     define_source,
@@ -24,6 +20,10 @@ from magtwin.usd.sources import (
     read_transform,
     source_prims,
 )
+from magtwin.usd.layers import WORLD
+from magtwin.usd.placement import labs_on
+from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, prims_with
+from magtwin.usd.solids import define_triangles
 
 FURNITURE = WORLD.AppendChild("Furniture")
 KIND = attribute_name("furniture", "kind")

@@ -19,10 +19,8 @@ from magtwin.field.maps.epochs import at_date, day_of, in_order
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.tiles import TILED_FROM, Tile, TiledMap, Tiling
 from magtwin.field.sources.harmonic import HarmonicField
-from magtwin.usd.epochs import define_epoch, each_epoch, epochs_of, selected_epoch, warn_of_time_codes
-from magtwin.usd.heat_map import MAP, Floor, define_colours, define_heat_map
 from magtwin.usd.layers import new_stage, open_stage, translates
-from magtwin.usd.map_attributes import (
+from magtwin.usd.maps.attributes import (
     CHECKSUM_VERSION,
     GRID,
     MOST_CHARACTERS,
@@ -41,8 +39,10 @@ from magtwin.usd.map_attributes import (
     shared_values,
     texts_of,
 )
+from magtwin.usd.maps.epochs import define_epoch, each_epoch, epochs_of, selected_epoch, warn_of_time_codes
+from magtwin.usd.maps.heat_map import MAP, Floor, define_colours, define_heat_map
+from magtwin.usd.maps.tiled_layer import is_tiled, read_tiled, tiled_checksums, write_tiled
 from magtwin.usd.schema import apply_api, attribute_name, only_prim_with, place, prims_with
-from magtwin.usd.tiled_maps import is_tiled, read_tiled, tiled_checksums, write_tiled
 
 RECORDED = ("recorded_nt", "recorded_yaw")
 """What only a survey has: its exact readings, and their headings."""
