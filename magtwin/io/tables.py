@@ -21,7 +21,7 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from magtwin.budget import check_count, check_decoded, check_size
+from magtwin.budget import check_count, check_decoded, check_size, decoded_limit
 from magtwin.errors import InputError, find
 from magtwin.files import check_free, existing, output
 from magtwin.io.recorder import Sink
@@ -41,6 +41,9 @@ from magtwin.run.spool import blocks
 _MAGIC = b"PAR1"
 _ABOUT = "magtwin"
 """Name of the member of an npz with the metadata, and first word of a CSV."""
+
+NUMBER = 8
+"""Bytes of a number in memory."""
 
 _CSV_LINE = 1 << 20
 """Longest line of a CSV [bytes]; a header of ten thousand columns is shorter."""
@@ -293,12 +296,16 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
     """
     path = existing(path, "CSV file")
     _check_file(path, "a CSV file")
-    check_size(path, "CSV")
+    size = check_size(path, "CSV")
     with open(path, "rb") as file:
         about, names, skipped = _csv_head(file, path)
         file.seek(-1, os.SEEK_END)
         cut = file.read(1) != b"\n"
     check_count(path, "CSV", len(names), "columns")
+    if NUMBER * size > decoded_limit(0):  # an empty cell is one byte
+        with open(path, "rb") as file:
+            lines = sum(block.count(b"\n") for block in iter(lambda: file.read(_CSV_LINE), b""))
+        check_decoded(path, size, NUMBER * len(names) * lines)
     rows, metadata, said = _csv_about(about, path)
     if columns:
         names = _renamed(names, columns, path)

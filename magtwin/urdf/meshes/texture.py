@@ -2,17 +2,24 @@
 
 import io
 import re
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote
 
-from magtwin.budget import BUDGETS
+from magtwin.budget import BUDGETS, check_decoded
 from magtwin.errors import InputError
 from magtwin.files import read_bytes
 from magtwin.urdf.meshes.reading import Reading
 
 TEXTURES = "textures"
 """Folder of the copies beside an asset's layers."""
+
+READ = ("BMP", "DDS", "GIF", "JPEG", "JPEG2000", "PCX", "PNG", "PPM", "SGI", "TGA", "TIFF", "WEBP")
+"""Formats that are read, by Pillow's names. Of others, EPS would start a program."""
+
+BYTES = 11
+"""Bytes that a pixel takes: as decoded, as RGBA, and as RGB."""
 
 KEPT = {"JPEG": ".jpg", "PNG": ".png"}
 """Formats that every USD viewer reads, by Pillow's names; others are converted to PNG."""
@@ -75,10 +82,14 @@ def image_of(data: bytes, name: str, reading: Reading) -> Image | None:
 
     stem = re.sub(r"[^A-Za-z0-9_-]", "_", Path(name).stem) or "texture"
     try:
-        with Pillow.open(io.BytesIO(data)) as picture:
+        with (
+            warnings.catch_warnings(action="ignore", category=Pillow.DecompressionBombWarning),
+            Pillow.open(io.BytesIO(data), formats=READ) as picture,
+        ):
             kind, (width, height) = picture.format or "", picture.size
             if width * height > BUDGETS["image"].count:
                 raise InputError(f"{width} x {height} pixels are too many")
+            check_decoded("the image", len(data), BYTES * width * height)
             alpha = "A" in picture.getbands() or "transparency" in picture.info
             rgba = picture.convert("RGBA")
     except (OSError, InputError, SyntaxError, ValueError, Pillow.DecompressionBombError) as error:
