@@ -35,6 +35,7 @@ from magtwin.run.arrow import (
     spec_said,
     table_of,
 )
+from magtwin.run.parquet import check_parquet
 from magtwin.run.run import COLUMNS, Run, check_clock
 from magtwin.run.spool import blocks
 
@@ -154,33 +155,6 @@ def load_parquet(path: Path, load: Callable[[Path], Any] = pq.read_table) -> Any
     except (pa.ArrowException, OSError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"{path}: damaged Parquet ({reason}); write it again") from error
-
-
-_BATCH = 1000
-"""Rows of texts that are measured at once."""
-
-
-def check_parquet(path: Path) -> None:
-    """Refuse a Parquet file that would be too large in memory: equal values take no room in the file.
-
-    Raises:
-        InputError: Its columns, decoded, are over the budget, or there are too many of them.
-    """
-    size = check_size(path, "Parquet")
-    with pq.ParquetFile(path) as file:
-        about = file.metadata
-        check_count(path, "Parquet", about.num_columns, "columns")
-        values, texts = 0, list[str]()
-        for i in range(about.num_columns):
-            column = about.schema.column(i)
-            count = sum(about.row_group(k).column(i).num_values for k in range(about.num_row_groups))
-            values += 8 * max(count, about.num_rows if column.max_repetition_level == 0 else 0)
-            if column.physical_type.endswith("BYTE_ARRAY"):
-                texts.append(column.path)
-        check_decoded(path, size, values)
-        for batch in file.iter_batches(_BATCH, columns=texts) if texts else ():
-            values += batch.nbytes
-            check_decoded(path, size, values)
 
 
 def _check_file(path: Path, kind: str) -> None:

@@ -247,7 +247,7 @@ def layer_sha256(path: str | os.PathLike[str]) -> str:
 
     That holds the map's own checksum, which covers every tile, so no tile is read.
     """
-    path = Path(path)
+    path = existing(path, "layer")
     with path.open("rb") as file:
         crate = file.read(8) == b"PXR-USDC"
     if crate and path.stat().st_size > TILED_BYTES:

@@ -117,12 +117,15 @@ def _check_tables(database: sqlite3.Connection) -> None:
         InputError: There is a view, a virtual table or a computed column; or topics share a number, so that
             joining them with their messages multiplies both.
     """
-    for name, kind, sql in database.execute("SELECT name, type, sql FROM sqlite_master").fetchall():
+    contents = database.execute("SELECT name, type, sql FROM sqlite_master").fetchall()
+    for name, kind, sql in contents:
         if kind == "view" or (kind == "table" and str(sql).upper().startswith("CREATE VIRTUAL")):
             raise InputError(f"{name} is computed; a bag has plain tables only")
         columns = database.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,)).fetchall()
         if kind == "table" and any(hidden for (hidden,) in columns):
             raise InputError(f"table {name} has a computed column; a bag has plain tables only")
+    if "topics" not in {name for name, _, _ in contents}:
+        return  # rosbags refuses it
     topics, numbers = database.execute("SELECT count(id), count(DISTINCT id) FROM topics").fetchone()
     if topics != numbers:
         raise InputError(f"{topics} topics have {numbers} numbers; each needs its own")
