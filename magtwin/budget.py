@@ -49,17 +49,17 @@ BUDGETS: dict[str, Budget] = {
         file=128 * MB
     ),  # surveys of foreign CSV, whose words are texts before they are numbers
     "recording": Budget(file=1 * GB),  # of the release, read frame by frame
-    "rrd": Budget(seconds=60.0),
+    "rrd": Budget(),
     "bag": Budget(count=1 << 30),  # bytes of a chunk or message
     "image": Budget(file=512 * MB, count=2**27),
     "mesh": Budget(file=1 * GB, count=50_000),  # nodes, with those that are instanced
     "OBJ": Budget(file=128 * MB),  # its words are texts before they are numbers
     "weights": Budget(file=4 * GB),
     "checkpoint": Budget(file=1 * GB, count=10_000),
-    "ONNX": Budget(file=256 * MB),
+    "ONNX": Budget(file=256 * MB, count=10_000),
     "USD text": Budget(file=1 * GB, depth=128),
     "USD": Budget(seconds=60.0),
-    "package": Budget(file=64 * GB, count=100_000),  # usdz, and zip files in general
+    "package": Budget(file=4 * GB, count=100_000),  # usdz, which has no larger ones
 }
 """Limits by format."""
 

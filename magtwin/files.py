@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import errno
+import functools
 import hashlib
 import os
 import re
@@ -15,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from magtwin.budget import check_depth, check_size
+from magtwin.budget import BUDGETS, check_depth, check_size
 from magtwin.errors import InputError, hint
 
 T = TypeVar("T")
@@ -170,6 +171,22 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
         return tomllib.loads(text)
     except (ValueError, RecursionError, OverflowError) as error:  # numbers of too many digits are ValueError
         raise InputError(f"{where}: not TOML: {error}") from error
+
+
+@functools.cache
+def yaml_loader() -> type:
+    """Loader of PyYAML for safe types. Refuses tables that grow exponentially by merging each other."""
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        def flatten_mapping(self, node: yaml.MappingNode) -> None:
+            super().flatten_mapping(node)
+            if len(node.value) > (most := BUDGETS["YAML"].count):
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"a table of over {most} entries", node.start_mark
+                )
+
+    return Loader
 
 
 _TOML_WORDS = re.compile(

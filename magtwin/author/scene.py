@@ -187,7 +187,7 @@ def _with_copies(scene: Scene, folder: Path) -> Scene:
 
 def _copied(file: Path, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
-    return Path(shutil.copyfile(file, folder / file.name))
+    return Path(shutil.copyfile(existing(file, "file of a scene"), folder / file.name))
 
 
 def _copied_robot(asset: Path, folder: Path) -> Path:

@@ -27,7 +27,7 @@ from magtwin.field.fit.fit import fit
 from magtwin.field.grid import Grid
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.readings import Readings
-from magtwin.files import existing
+from magtwin.files import existing_file
 from magtwin.frames import quat_from_yaw
 from magtwin.localization.problem import OdometryModel, Problem, SensorModel
 from magtwin.run.run import Run
@@ -113,7 +113,7 @@ def read_recording(folder: str | os.PathLike[str], number: int) -> Recording:
     """
     tables: list[Array] = []
     for what, columns in (("time", 1), ("loc", 2), ("mag", 3)):
-        path = existing(Path(folder) / f"{number}-{what}.csv", "file of magnetic-data")
+        path = existing_file(Path(folder) / f"{number}-{what}.csv", "file of magnetic-data", "text")
         try:
             table = np.loadtxt(path, delimiter=",", ndmin=2)
         except ValueError as error:

@@ -16,6 +16,7 @@ import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,7 @@ from numpy.typing import NDArray
 from magtwin.bench.suite import Chunk, Suite, load_suite
 from magtwin.errors import InputError, find
 from magtwin.files import read_text
+from magtwin.io.tables import load_parquet
 from magtwin.kinds import expected
 from magtwin.outputs import output
 from magtwin.report import Figure, Report
@@ -104,7 +106,7 @@ class Results(Summarized):
         made: dict[Run, dict[str, Any]] = {}
         for name in self.suite.scenarios if scenario is None else (scenario,):
             for file in (part for folder in self.folders for part in _parts(folder, TRACKS, name)):
-                for row in pq.read_table(file, filters=match).to_pylist():
+                for row in load_parquet(file, partial(pq.read_table, filters=match)).to_pylist():
                     key = (row.pop("scenario"), row.pop("localizer"), row.pop("run"))
                     arrays = {column: np.array(values, np.float32) for column, values in row.items()}
                     made.setdefault(key, dict(zip(KEY, key, strict=True)) | arrays)
@@ -332,10 +334,9 @@ def _parts(folder: Path, kind: str, scenario: str) -> list[Path]:
 
 def _read_part(file: Path, columns: list[str] | None = None) -> pa.Table:
     try:
-        return pq.read_table(file, columns=columns)
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{file}: damaged ({reason}); remove it and repeat magtwin bench") from error
+        return load_parquet(file, partial(pq.read_table, columns=columns))
+    except InputError as error:
+        raise InputError(f"{error}; or remove it and repeat magtwin bench") from error
 
 
 def _order(suite: Suite) -> tuple[dict[str, int], dict[str, int]]:

@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter
 from magtwin.errors import InputError
 from magtwin.field.maps.curvature import interpolation_error_nt2
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.files import existing_file
 
 Array = NDArray[np.float64]
 
@@ -41,7 +42,7 @@ def fit_field(folder: Path, out: Path) -> None:
 @lru_cache(maxsize=8)
 def fitted_field(file: Path) -> AnomalyMap:
     """A map that `fit_field` wrote."""
-    with np.load(file) as saved:
+    with np.load(existing_file(file, "fitted map", "npz")) as saved:
         arrays = {name: saved[name] for name in saved.files}
     origin, cell = (tuple(map(float, arrays.pop(name))) for name in ("origin_m", "cell_m"))
     return AnomalyMap(origin_m=origin, cell_m=cell, name=file.stem, **arrays)  # type: ignore[arg-type]

@@ -15,7 +15,7 @@ from pxr import Sdf, Usd, UsdUtils, Vt
 
 from magtwin.errors import InputError
 from magtwin.export.contents import kind_of, named_files
-from magtwin.files import sha256
+from magtwin.files import read_bytes, sha256
 from magtwin.usd.layers import open_stage, relative_asset, translates
 from magtwin.usd.schema import place as prim_place
 from magtwin.usd.schema.versions import creator
@@ -96,7 +96,13 @@ def _define(layer: Sdf.Layer, scope: Sdf.Path, named: dict[Path, list[Sdf.Path]]
         given = (
             (NAME, kinds.String, file.name),
             (SHA256, kinds.String, sha256(file)),
-            (BYTES, kinds.UCharArray, Vt.UCharArray.FromNumpy(np.fromfile(file, np.uint8))),
+            (
+                BYTES,
+                kinds.UCharArray,
+                Vt.UCharArray.FromNumpy(
+                    np.frombuffer(read_bytes(file, "file of a stage", "weights"), np.uint8)
+                ),
+            ),
         )
         for key, kind, value in given:
             Sdf.AttributeSpec(prim, key, kind, Sdf.VariabilityUniform, declaresCustom=True).default = value

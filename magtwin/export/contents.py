@@ -12,6 +12,7 @@ from pxr import Sdf, UsdUtils
 from safetensors import SafetensorError, safe_open
 
 from magtwin.errors import InputError
+from magtwin.files import existing
 from magtwin.usd.layers import SUFFIXES, open_stage, translates
 
 KINDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
@@ -209,7 +210,7 @@ def _udim(pattern: Path, places: Mapping[Path, Path]) -> Path | None:
 def copied(file: Path, place: Path) -> None:
     """Copy a file, and make its folder."""
     place.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(file, place)
+    shutil.copyfile(existing(file, "file of a stage"), place)
 
 
 def weights_metadata(file: Path) -> dict[str, str]:

@@ -7,7 +7,7 @@ from pxr import Sdf, UsdUtils
 
 from magtwin.errors import InputError
 from magtwin.urdf.layout import GEOMETRIES, PAYLOADS, write_layers
-from magtwin.usd.layers import open_stage, translates
+from magtwin.usd.layers import check_stage, open_stage, translates
 
 
 @translates
@@ -23,7 +23,7 @@ def structure(asset: Path) -> None:
         InputError: The asset has no default prim, or names several layers.
     """
     folder = asset.parent / PAYLOADS
-    layer = Sdf.Layer.FindOrOpen(str(asset))
+    layer = Sdf.Layer.FindOrOpen(str(check_stage(asset, own=True)))  # a copy of a stage that was opened
     named = sorted(layer.GetCompositionAssetDependencies())
     if f"./{PAYLOADS}/base.usda" in named:
         return

@@ -9,7 +9,9 @@ import struct
 import zipfile
 from pathlib import Path, PurePosixPath
 
+from magtwin.budget import check_count
 from magtwin.errors import InputError
+from magtwin.files import existing_file
 from magtwin.usd.layers import SUFFIXES
 
 ALLOWED = (*SUFFIXES, ".png", ".jpg", ".jpeg", ".exr", ".avif", ".m4a", ".mp3", ".wav")
@@ -75,8 +77,10 @@ def unpack(package: Path, folder: Path) -> Path:
         InputError: The file is no package or is damaged, or an entry is outside the folder or of another
             kind.
     """
+    existing_file(package, "package", "package")
     try:
         with zipfile.ZipFile(package) as archive:
+            check_count(package, "package", len(archive.infolist()), "files")
             entries = [entry for entry in archive.infolist() if not entry.is_dir()]
             _check(package, entries)
             for entry in entries:

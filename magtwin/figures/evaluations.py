@@ -26,6 +26,7 @@ from magtwin.figures.canvas import (
 from magtwin.figures.maps import mean_field_ut
 from magtwin.figures.page import Page, Section, Table, write_pages
 from magtwin.figures.training import draw_correlations, label_epochs
+from magtwin.files import read_text
 from magtwin.learn.data.correlation import correlations
 from magtwin.learn.data.features import FEATURES, FULL, features
 from magtwin.learn.evaluation.evaluation import PAPER, Evaluation, Judged
@@ -125,8 +126,7 @@ def read_curve(weights: str | os.PathLike[str]) -> tuple[Mapping[str, float], ..
     if not path.is_file():
         return ()
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
+        rows = list(csv.DictReader(read_text(path, "learning curve", "text").splitlines()))
         if not rows or EPOCH not in rows[0]:
             return ()
         names = [EPOCH, *(name for name in CURVES if name in rows[0])]

@@ -15,9 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
+from magtwin.files import read_bytes
 from magtwin.frames import rotate
 from magtwin.outputs import output
 from magtwin.spec.base import Vec3
+from magtwin.urdf.meshes.texture import opened_image
 from magtwin.usd.geometry import (
     ColourScale,
     Shape,
@@ -346,7 +348,6 @@ def mesh_of(shape: Shape, vertices: NDArray) -> Any:
 def add_textured(plotter: Any, shape: Shape, vertices: NDArray) -> Any:
     """Draw a shape with its texture; returns its actor."""
     import pyvista
-    from PIL import Image
 
     texture = shape.texture
     assert texture is not None
@@ -357,7 +358,7 @@ def add_textured(plotter: Any, shape: Shape, vertices: NDArray) -> Any:
         normals = np.nan_to_num(corner_normals(points, shape.faces)).reshape(-1, 3)
     mesh.point_data.active_normals = normals
     mesh.active_texture_coordinates = texture.uvs.reshape(-1, 2)
-    with Image.open(texture.file) as image:
+    with opened_image(read_bytes(texture.file, "texture", "image")) as image:
         image.thumbnail((MOST_TEXELS, MOST_TEXELS))
         texels = np.asarray(image.convert("RGBA" if texture.see_through else "RGB"))
     if texture.factor != (1.0, 1.0, 1.0):

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from magtwin.errors import InputError
+from magtwin.files import read_bytes, read_text
 from magtwin.io.tables import parquet_of, write_parquet
 from magtwin.outputs import check_free, output
 from magtwin.parallel import checked_shard, in_shard, open_pool
@@ -219,9 +220,9 @@ class _Parts:
         said = Listed()
         whole = True
         for k in range(len(self.blocks)):
-            try:
-                said.extend(Listed.from_json(self._part(k).read_bytes()))
-            except FileNotFoundError:
+            if self._part(k).exists():
+                said.extend(Listed.from_json(read_bytes(self._part(k), "part of a sweep", "JSON")))
+            else:
                 whole = False
         if whole and self._finish(said):
             return said.report(f"{len(self.runs)} runs in {self.out}", took_s, made)
@@ -236,7 +237,7 @@ class _Parts:
         file = self.folder / ABOUT
         if self.folder.exists():
             try:
-                same = json.loads(file.read_text(encoding="utf-8")) == self.about
+                same = json.loads(read_text(file, "description of a sweep", "JSON")) == self.about
             except (OSError, ValueError):
                 same = False
             if same:

@@ -21,7 +21,7 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from magtwin.budget import check_count, check_decoded, check_size
+from magtwin.budget import check_count, check_decoded, check_size, decoded_limit
 from magtwin.errors import InputError, find
 from magtwin.files import existing
 from magtwin.io.recorder import Sink
@@ -36,12 +36,16 @@ from magtwin.run.arrow import (
     spec_said,
     table_of,
 )
+from magtwin.run.parquet import check_parquet
 from magtwin.run.run import COLUMNS, Run, check_clock
 from magtwin.run.spool import blocks
 
 _MAGIC = b"PAR1"
 _ABOUT = "magtwin"
 """Name of the member of an npz with the metadata, and first word of a CSV."""
+
+NUMBER = 8
+"""Bytes of a number in memory."""
 
 _CSV_LINE = 1 << 20
 """Longest line of a CSV [bytes]; a header of ten thousand columns is shorter."""
@@ -152,33 +156,6 @@ def load_parquet(path: Path, load: Callable[[Path], Any] = pq.read_table) -> Any
     except (pa.ArrowException, OSError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"{path}: damaged Parquet ({reason}); write it again") from error
-
-
-_BATCH = 1000
-"""Rows of texts that are measured at once."""
-
-
-def check_parquet(path: Path) -> None:
-    """Refuse a Parquet file that would be too large in memory: equal values take no room in the file.
-
-    Raises:
-        InputError: Its columns, decoded, are over the budget, or there are too many of them.
-    """
-    size = check_size(path, "Parquet")
-    with pq.ParquetFile(path) as file:
-        about = file.metadata
-        check_count(path, "Parquet", about.num_columns, "columns")
-        values, texts = 0, list[str]()
-        for i in range(about.num_columns):
-            column = about.schema.column(i)
-            count = sum(about.row_group(k).column(i).num_values for k in range(about.num_row_groups))
-            values += 8 * max(count, about.num_rows if column.max_repetition_level == 0 else 0)
-            if column.physical_type.endswith("BYTE_ARRAY"):
-                texts.append(column.path)
-        check_decoded(path, size, values)
-        for batch in file.iter_batches(_BATCH, columns=texts) if texts else ():
-            values += batch.nbytes
-            check_decoded(path, size, values)
 
 
 def _check_file(path: Path, kind: str) -> None:
@@ -294,12 +271,16 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
     """
     path = existing(path, "CSV file")
     _check_file(path, "a CSV file")
-    check_size(path, "CSV")
+    size = check_size(path, "CSV")
     with open(path, "rb") as file:
         about, names, skipped = _csv_head(file, path)
         file.seek(-1, os.SEEK_END)
         cut = file.read(1) != b"\n"
     check_count(path, "CSV", len(names), "columns")
+    if NUMBER * size > decoded_limit(0):  # an empty cell is one byte
+        with open(path, "rb") as file:
+            lines = sum(block.count(b"\n") for block in iter(lambda: file.read(_CSV_LINE), b""))
+        check_decoded(path, size, NUMBER * len(names) * lines)
     rows, metadata, said = _csv_about(about, path)
     if columns:
         names = _renamed(names, columns, path)

@@ -25,6 +25,7 @@ from magtwin.errors import InputError
 from magtwin.outputs import check_free
 from magtwin.urdf.material import LOOKS
 from magtwin.urdf.shape import COLLISIONS, VISUALS
+from magtwin.usd.layers import open_layer
 from magtwin.usd.schema.versions import creator
 
 PAYLOADS = "payloads"
@@ -100,7 +101,7 @@ def check_payloads(out: Path, *, force: bool) -> Path:
     check_free(folder, force=force)
     if folder.exists():
         base = folder / FILES["base"]
-        layer = Sdf.Layer.OpenAsAnonymous(str(base)) if base.is_file() else None
+        layer = open_layer(base) if base.is_file() else None
         owner = layer.customLayerData.get("magtwin", {}).get("interface", "") if layer else ""
         if owner != out.name:
             whose = f"is of {owner}" if owner else "was not made by a conversion"

@@ -251,7 +251,7 @@ def layer_sha256(path: str | os.PathLike[str]) -> str:
 
     That holds the map's own checksum, which covers every tile, so no tile is read.
     """
-    path = Path(path)
+    path = existing(path, "layer")
     if _is_crate(path) and path.stat().st_size > TILED_BYTES:
         check_stage(path, composed=False)
         layer = Sdf.Layer.OpenAsAnonymous(str(path))

@@ -1,14 +1,10 @@
-"""A bomb of each format is refused before it takes memory; each fault that a fuzzer found stays a refusal."""
+"""Limits can be raised, and each fault that a fuzzer found stays a refusal."""
 
-import io
 import json
 import resource
 import struct
 import zipfile
 
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from magtwin import budget
@@ -21,23 +17,6 @@ from magtwin.usd.layers import open_stage
 
 MOST = 300_000_000
 """Memory that a refusal may take [bytes]."""
-
-
-def npz(path, shape, data=0):
-    """An npz of one array `t`, whose header claims a shape."""
-    head = io.BytesIO()
-    np.lib.format.write_array_header_1_0(head, {"descr": "<f8", "fortran_order": False, "shape": shape})
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("t.npy", head.getvalue() + bytes(data))
-
-
-def parquet(path):
-    """40 columns of 500,000 equal numbers: 160 MB."""
-    one = pa.array(np.zeros(100_000))
-    table = pa.table({f"c{i}": one for i in range(40)})
-    with pq.ParquetWriter(path, table.schema, compression="zstd", use_dictionary=True) as writer:
-        for _ in range(5):
-            writer.write_table(table)
 
 
 def glb(path, accessor, **more):
@@ -54,62 +33,6 @@ def glb(path, accessor, **more):
         "buffers": [{"byteLength": 36, "uri": uri}],
     }
     path.write_text(json.dumps(table))
-
-
-def laughs(count):
-    """A stage in which each prim holds the one before twice."""
-    text = '#usda 1.0\ndef "a0" {\ndef "x" {}\n}\n'
-    for i in range(1, count):
-        halves = "".join(f'def "{n}" (\nprepend references = </a{i - 1}>\n) {{}}\n' for n in "xy")
-        text += f'def "a{i}" {{\n{halves}}}\n'
-    return text
-
-
-BOMBS = {
-    "dotted.toml": (lambda p: p.write_text("a" + ".a" * 20_000 + " = 1"), read_toml, "deeper than 16 levels"),
-    "nested.toml": (lambda p: p.write_text("a = " + "[" * 9000 + "]" * 9000), read_toml, "deeper than 16"),
-    "large.toml": (lambda p: p.write_text("#" * 3_000_000), read_toml, "too large for TOML"),
-    "zeros.npz": (lambda p: npz(p, (10_000_000,), 80_000_000), read_run, "that decode to 80.0 MB"),
-    "claims.npz": (lambda p: npz(p, (1 << 40,)), read_run, "its header claims shape"),
-    "equal.parquet": (parquet, read_run, "that decode to 160.0 MB"),
-    "deep.urdf": (
-        lambda p: p.write_text("<a>" * 9000 + "</a>" * 9000),
-        read_source,
-        "deeper than 200 elements",
-    ),
-    "wide.urdf": (
-        lambda p: p.write_text("<a " + 'b="1" ' * 200_000 + "/>"),
-        read_source,
-        "a million characters",
-    ),
-    "stride.gltf": (
-        lambda p: glb(p, {"count": 2_000_000_000}, byteStride=0),
-        read_mesh,
-        "that decode to 48.0 GB",
-    ),
-    "count.ply": (
-        lambda p: p.write_text("ply\nformat ascii 1.0\nelement vertex 999999999\nend_header\n"),
-        read_mesh,
-        "claims 999999999 of vertex in",
-    ),
-    "deep.usda": (lambda p: p.write_text("#usda 1.0\n" + 'def "a" {' * 9000), open_stage, "deeper than 128"),
-    "laughs.usda": (lambda p: p.write_text(laughs(30)), open_stage, "references multiply each other"),
-}
-
-
-@pytest.mark.parametrize("name", BOMBS)
-def test_a_bomb_is_refused_before_it_takes_memory(name, tmp_path, monkeypatch):
-    write, read, message = BOMBS[name]
-    write(tmp_path / name)
-    monkeypatch.setattr(budget, "SPARE", 50_000_000)
-    table = dict(budget.BUDGETS, USD=budget.Budget(seconds=3.0))
-    monkeypatch.setattr("magtwin.budget.BUDGETS", table)
-    monkeypatch.setattr("magtwin.usd.trial.BUDGETS", table)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    with pytest.raises(InputError, match=message) as refusal:
-        read(tmp_path / name)
-    assert "\n" not in str(refusal.value)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before < MOST
 
 
 def test_a_large_file_is_read_if_the_user_allows_it(tmp_path, monkeypatch):

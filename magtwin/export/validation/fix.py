@@ -11,7 +11,7 @@ from magtwin.errors import find
 from magtwin.export.contents import named_files
 from magtwin.export.validation.rule import Subject
 from magtwin.export.validation.rules import is_absolute
-from magtwin.usd.layers import save_layer
+from magtwin.usd.layers import check_stage, save_layer
 from magtwin.usd.schema import NOUNS
 
 
@@ -29,7 +29,7 @@ def mend(file: Path, names: Collection[str]) -> list[str]:
         InputError: A name is unknown, or a file cannot be written; no file is half-written.
     """
     fixes = [find("fix", name, SAFE) for name in names]
-    stage, done = Usd.Stage.Open(str(file)), list[str]()
+    stage, done = Usd.Stage.Open(str(check_stage(file, own=True))), list[str]()  # tried by `validate`
     for fix in fixes:
         subject = Subject(stage, file)
         done += fix(subject)

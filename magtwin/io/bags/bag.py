@@ -4,6 +4,7 @@ import json
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError, hint
 from magtwin.field.units import GREATEST_MEAN_NT, LEAST_MEAN_NT, NT_PER, Unit, check_unit
-from magtwin.files import existing
+from magtwin.files import existing, existing_file, read_text, yaml_loader
 from magtwin.io.bags.cdr import Messages, decode
+from magtwin.io.bags.compression import Room
 from magtwin.io.bags.db3 import RosbagsReader, custom_data
 from magtwin.io.bags.mcap import McapReader
 from magtwin.io.bags.topics import Topic
@@ -25,9 +27,6 @@ from magtwin.run.resample import linear, quaternion
 from magtwin.run.run import Metadata
 
 Array = NDArray[np.float64]
-
-LARGEST_METADATA = 1 << 24
-"""Largest metadata.yaml that is read [bytes]."""
 
 LONGEST_LINE = 2000
 """Most characters of an error message."""
@@ -60,8 +59,12 @@ class Bag:
         self.kinds: dict[str, str] = {}
         self._readers: list[McapReader | RosbagsReader] = []
         with _one_line(self.path), ExitStack() as opened:
-            self.files, self._custom, compressed = _files(self.path)
-            for file in [self.path] if compressed else self.files:
+            self.files, self._custom, self._packed = _files(self.path)
+            files = [existing_file(file, "storage file of a bag", "bag") for file in self.files]
+            if self._packed == "file":
+                folder, room = Path(opened.enter_context(TemporaryDirectory())), Room(self.path, files)
+                files = [room.file(file, folder) for file in files]
+            for file in files:
                 reader = (McapReader if file.suffix == ".mcap" else RosbagsReader)(file)
                 opened.callback(reader.close)
                 self._readers.append(reader)
@@ -96,7 +99,7 @@ class Bag:
 
     def messages(self, topics: Iterable[str]) -> dict[str, Messages]:
         """The messages of topics, each in the order of receipt."""
-        wanted = set(topics)
+        wanted, room = set(topics), Room(self.path, self.files)
         parts: dict[str, list[Messages]] = {topic: [] for topic in wanted}
         for reader in self._readers:
             chosen = {topic.id: topic for topic in reader.topics if topic.topic in wanted}
@@ -104,7 +107,8 @@ class Bag:
                 topic = chosen[number]
                 if len(messages) and topic.encoding != "cdr":
                     raise InputError(f"topic {topic.topic} is encoded as {topic.encoding!r}, not cdr")
-                parts[topic.topic].append(messages)
+                whole = room.messages(messages) if self._packed == "message" else messages
+                parts[topic.topic].append(whole)
         return {topic: _joined(found) for topic, found in parts.items()}
 
     def signal(self, name: str, topic: Topic, messages: Messages) -> "Signal":
@@ -260,31 +264,33 @@ def _printable(text: str) -> str:
     return text if len(text) <= LONGEST_LINE else f"{text[:LONGEST_LINE]} ..."
 
 
-def _files(path: Path) -> tuple[list[Path], dict[str, str], bool]:
-    """The storage files of a bag, its custom data, and whether rosbag2 compressed files or messages."""
+def _files(path: Path) -> tuple[list[Path], dict[str, str], str]:
+    """The storage files of a bag, its custom data, and what rosbag2 compressed: "file", "message" or ""."""
     suffixes = (".mcap", ".db3")
     if path.is_file():
         if path.suffix not in suffixes:
             raise InputError(f"{path}: no bag: a folder with metadata.yaml is one, or a .mcap or .db3 file")
-        return [path], {}, False
+        return [path], {}, ""
     found = sorted(p for p in path.iterdir() if p.suffix in suffixes and p.is_file())
     description = path / "metadata.yaml"
     if not description.is_file():
         if not found:
             raise InputError(f"{path}: no bag: metadata.yaml is missing; give the folder that holds it")
-        return found, {}, False
-    if description.stat().st_size > LARGEST_METADATA:
-        raise InputError("its metadata.yaml is too large")
-    about = yaml.safe_load(description.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+        return found, {}, ""
+    about = yaml.load(read_text(description, "description of a bag", "YAML"), yaml_loader())
+    about = about["rosbag2_bagfile_information"]
     names = [Path(str(name)).name for name in about["relative_file_paths"]]  # never outside of the folder
     missing = [name for name in names if not (path / name).is_file()]
     if missing or not names:
         raise InputError(f"storage file {missing[0] if missing else ''} is missing")
-    compressed = str(about.get("compression_mode") or "none").lower() in ("file", "message")
-    other = [name for name in names if Path(name).suffix not in suffixes]
-    if other and not compressed:
-        raise InputError(f"{other[0]} is neither a .mcap nor a .db3 file")
-    return [path / name for name in names], custom_data(about), compressed
+    packed = str(about.get("compression_mode") or "none").lower()
+    packed = packed if packed in ("file", "message") else ""
+    if packed and about.get("compression_format") != "zstd":
+        raise InputError(f"compressed by {str(about.get('compression_format'))!r}; only zstd is read")
+    for name in names:
+        if Path(name if packed != "file" else Path(name).stem).suffix not in suffixes:
+            raise InputError(f"{name} is neither a .mcap nor a .db3 file")
+    return [path / name for name in names], custom_data(about), packed
 
 
 def _joined(parts: Collection[Messages]) -> Messages:

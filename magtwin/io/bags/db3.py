@@ -1,4 +1,4 @@
-"""db3: bags in sqlite3, and bags compressed as a whole or message by message, through rosbags."""
+"""db3: bags in sqlite3, through rosbags."""
 
 import shutil
 import sqlite3
@@ -11,6 +11,9 @@ import numpy as np
 import yaml
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
+from magtwin.budget import BUDGETS, check_decoded
+from magtwin.errors import InputError
+from magtwin.files import yaml_loader
 from magtwin.io.bags.cdr import Messages
 from magtwin.io.bags.storage import ROOM, VERSION, Batch, Connection, StoredTopic, in_time
 
@@ -61,7 +64,7 @@ class Db3Writer:
 
 
 class RosbagsReader:
-    """A bag that rosbags reads: a .db3 file, or a folder.
+    """A .db3 file, read by rosbags.
 
     Attributes:
         topics: Its topics.
@@ -71,13 +74,18 @@ class RosbagsReader:
     whole = True
 
     def __init__(self, path: Path) -> None:
+        self._path, self._size = path, path.stat().st_size
+        with closing(
+            sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
+        ) as database:
+            _check_tables(database)
+            self.notes = _custom_data(database)
         self._reader = Reader(path)
         self._reader.open()
         self.topics = [
             StoredTopic(c.id, c.topic, c.msgtype, getattr(c.ext, "serialization_format", ""))
             for c in self._reader.connections
         ]
-        self.notes: dict[str, str] = {} if path.is_dir() else _custom_data(path)
 
     def close(self) -> None:
         """Close the bag."""
@@ -86,9 +94,11 @@ class RosbagsReader:
     def messages(self, ids: Collection[int]) -> dict[int, Messages]:
         """The messages of some topics in the order of receipt."""
         found: dict[int, tuple[list[int], list[bytes]]] = {number: ([], []) for number in ids}
-        connections = [c for c in self._reader.connections if c.id in found]
+        connections, held = [c for c in self._reader.connections if c.id in found], 0
         for connection, received, data in self._reader.messages(connections) if connections else ():
             times, contents = found[connection.id]
+            held += len(data)  # rows of a damaged file can share their pages
+            check_decoded(self._path, self._size, held)
             times.append(received)
             contents.append(data)
         joined = {}
@@ -100,16 +110,41 @@ class RosbagsReader:
         return joined
 
 
-def _custom_data(path: Path) -> dict[str, str]:
+def _check_tables(database: sqlite3.Connection) -> None:
+    """Refuse contents that are computed, as a few bytes can make rows without end.
+
+    Raises:
+        InputError: There is a view, a virtual table or a computed column; or topics share a number, so that
+            joining them with their messages multiplies both.
+    """
+    contents = database.execute("SELECT name, type, sql FROM sqlite_master").fetchall()
+    for name, kind, sql in contents:
+        if kind == "view" or (kind == "table" and str(sql).upper().startswith("CREATE VIRTUAL")):
+            raise InputError(f"{name} is computed; a bag has plain tables only")
+        columns = database.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,)).fetchall()
+        if kind == "table" and any(hidden for (hidden,) in columns):
+            raise InputError(f"table {name} has a computed column; a bag has plain tables only")
+    if "topics" not in {name for name, _, _ in contents}:
+        return  # rosbags refuses it
+    topics, numbers = database.execute("SELECT count(id), count(DISTINCT id) FROM topics").fetchone()
+    if topics != numbers:
+        raise InputError(f"{topics} topics have {numbers} numbers; each needs its own")
+
+
+def _custom_data(database: sqlite3.Connection) -> dict[str, str]:
     """The custom data that a .db3 file holds beside its messages; empty if it holds none."""
-    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as database:
-        if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'metadata'").fetchone():
-            return {}
-        row = database.execute("SELECT metadata FROM metadata ORDER BY id DESC LIMIT 1").fetchone()
-    return custom_data(yaml.safe_load(row[0])) if row else {}
+    if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'metadata'").fetchone():
+        return {}
+    row = database.execute("SELECT metadata FROM metadata ORDER BY id DESC LIMIT 1").fetchone()
+    if row and len(row[0]) > BUDGETS["YAML"].file:
+        raise InputError(f"its metadata have {len(row[0]):,} bytes; write it again")
+    return custom_data(yaml.load(row[0], yaml_loader())) if row else {}
 
 
 def custom_data(metadata: Any) -> dict[str, str]:
     """The custom data in a bag's metadata."""
     custom = metadata.get("custom_data") if isinstance(metadata, dict) else None
-    return {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}
+    plain = str, int, float, bool  # aliases of lists would multiply as texts
+    if not isinstance(custom, dict):
+        return {}
+    return {str(key): str(value) for key, value in custom.items() if isinstance(value, plain)}

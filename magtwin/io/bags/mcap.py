@@ -21,7 +21,7 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from magtwin.budget import BUDGETS
+from magtwin.budget import BUDGETS, check_decoded
 from magtwin.errors import InputError
 from magtwin.io.bags.cdr import Bytes, Index, Messages
 from magtwin.io.bags.storage import ROOM, Batch, Connection, StoredTopic, in_time
@@ -222,7 +222,7 @@ class McapReader:
 
     def __init__(self, path: Path) -> None:
         self._file: BinaryIO = open(path, "rb")  # noqa: SIM115
-        self._size = path.stat().st_size
+        self._path, self._size = path, path.stat().st_size
         self.notes: dict[str, dict[str, str]] = {}
         self.whole = False
         self._spare = SPARE
@@ -253,6 +253,7 @@ class McapReader:
         """The messages of some topics in the order of receipt."""
         self._spare = SPARE
         parts: list[tuple[Bytes, Any]] = []
+        held = 0
         for channel, received, place, size in self._loose:
             if channel in ids:
                 raw = np.frombuffer(self._at(place, size), np.uint8)
@@ -261,6 +262,8 @@ class McapReader:
             content = self._content(*chunk)
             found = self._walk(content, ids)
             if len(found):
+                held += len(content)
+                check_decoded(self._path, self._size, held)
                 parts.append((content, found))
         buffer = np.concatenate([raw for raw, _ in parts]) if parts else np.zeros(0, np.uint8)
         bases = np.cumsum([0] + [len(raw) for raw, _ in parts])

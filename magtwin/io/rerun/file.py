@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from rerun.chunk import RrdReader
 
+from magtwin.budget import check_size
 from magtwin.errors import InputError
 from magtwin.files import existing
 from magtwin.io.recorder import PARTIAL
@@ -204,6 +205,7 @@ def read_runs(path: str | os.PathLike[str]) -> dict[str, Run]:
     path = existing(path, "recording")
     if path.is_dir():
         raise InputError(f"{path}: a folder; name the .rrd file in it")
+    check_size(path, "rrd")
     partial = PARTIAL in path.suffixes
     chunks: dict[str, list] = {}
     with _readable(path, partial=partial) as file, warnings.catch_warnings():

@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import socket
+import struct
 import subprocess
 import tempfile
 import threading
@@ -14,21 +15,26 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, BinaryIO
 
 import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import Timeline, View, ViewerClient
 
+from magtwin.budget import BUDGETS, check_decoded
 from magtwin.errors import InputError
 from magtwin.files import existing
 from magtwin.io.rerun.series import TIMELINE
 from magtwin.outputs import output
 from magtwin.parallel.machine import ends_with_parent
+from magtwin.protobuf import fields
 
 LOCALHOST = "127.0.0.1"
 
 MAGIC = b"RRF"
 """First bytes of a recording, before its format number."""
+
+HEADER, ARROW = 12, 2
+"""Bytes of a recording before its first message, and the kind of messages that hold chunks."""
 
 LEAST_SIZE, MOST_SIZE = 200, 8000
 """Least and greatest side of a picture: room for the views, and the limit of a texture [pixels]."""
@@ -241,13 +247,43 @@ def check_decodes(rrd: Path, source: str | os.PathLike[str]) -> None:
                 f"{source}: not a Rerun recording that can be read (it does not start with RRF); "
                 "write it again"
             )
-    done = subprocess.run([_binary(), "rrd", "verify", str(rrd)], capture_output=True, text=True, check=False)
+        _check_decoded(rrd, file, source)
+    command = [_binary(), "rrd", "verify", str(rrd)]
+    patience = BUDGETS["rrd"].seconds + rrd.stat().st_size / 1e6
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=patience)
+    except subprocess.TimeoutExpired:
+        raise InputError(f"{source}: Rerun does not decode it in {patience:.0f} s; write it again") from None
     lines = [line for line in done.stderr.splitlines() if "Missing RRD footer" not in line and line.strip()]
     endless = done.returncode == 1 and [line.rpartition(" with ")[2] for line in lines] == ["1 errors"]
     if done.returncode and not endless:
         raise InputError(
             f"{source}: not a Rerun recording that can be read ({_reason(done.stderr)}); write it again"
         )
+
+
+def _check_decoded(rrd: Path, file: BinaryIO, source: str | os.PathLike[str]) -> None:
+    """Refuse a recording whose messages, decompressed, are over the budget, by the sizes that they state.
+
+    A message is kind, length and content; that of a chunk is protobuf (`ArrowMsg` of Rerun's
+    log_msg/v1alpha1/log_msg.proto), with the uncompressed size as field 3. LZ4 decodes no more than that.
+    """
+    size, decoded, at = rrd.stat().st_size, 0, HEADER
+    while at + 16 <= size:
+        file.seek(at)
+        kind, length = struct.unpack("<QQ", file.read(16))
+        if kind == ARROW:
+            try:
+                decoded += _stated_size(file.read(min(length, size)))
+            except ValueError as error:
+                raise InputError(f"{source}: damaged recording ({error}); write it again") from error
+            check_decoded(source, size, decoded)
+        at += 16 + length
+
+
+def _stated_size(message: bytes) -> int:
+    """The uncompressed size of a chunk, by its message; 0 if it states none."""
+    return max((value for field, value, _, _ in fields(message) if field == 3), default=0)
 
 
 def _binary() -> str:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.tiles import TiledMap
-from magtwin.files import existing, read_text, sha256
+from magtwin.files import existing, existing_file, read_text, sha256
 from magtwin.kinds import expected
 from magtwin.learn.data.alignment import Alignment, fit_alignment
 from magtwin.learn.data.features import FEATURES, SETS, columns_of, feature_names
@@ -37,6 +37,7 @@ from magtwin.outputs import output
 from magtwin.parallel import run_all
 from magtwin.report import Figure, Report
 from magtwin.run.arrow import run_of, table_of
+from magtwin.run.parquet import check_parquet
 from magtwin.run.run import Metadata, Run
 from magtwin.summary import Summarized, Summary, listed, span
 from magtwin.version import __version__
@@ -277,10 +278,12 @@ class Dataset(Summarized):
         return tuple(self.recording(name) for name in dict.fromkeys(names))
 
     def _opened(self, recording: Recording) -> pq.ParquetFile:
-        path = existing(self.folder / RUNS / f"{recording.name}.parquet", "shard of a data set")
+        file = self.folder / RUNS / f"{recording.name}.parquet"
+        path = existing_file(file, "shard of a data set", "Parquet")
         if sha256(path) != recording.sha256:
             raise InputError(f"{path}: its checksum is not that in {MANIFEST}; build the data set anew")
         try:
+            check_parquet(path)
             return pq.ParquetFile(path)
         except (pa.ArrowException, OSError) as error:
             raise InputError(

@@ -7,6 +7,7 @@ not needed.
 
 import codecs
 import os
+import pickletools
 import re
 import zipfile
 import zlib
@@ -17,9 +18,12 @@ import numpy as np
 import torch
 from numpy._core import multiarray
 
-from magtwin.budget import check_count, check_decoded
+from magtwin.budget import BUDGETS, check_count, check_decoded
 from magtwin.errors import InputError
 from magtwin.files import existing_file
+
+PICKLE = 4_000_000
+"""Largest pickle of a checkpoint [bytes]; tensors are beside it."""
 
 KEYS = ("model_state_dict", "scaler_X", "scaler_y")
 
@@ -56,7 +60,7 @@ def read_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tenso
     path = existing_file(path, "checkpoint", "checkpoint")
     saved = _load(path)
     try:
-        tensors = _layers(saved["model_state_dict"])
+        tensors = _layers(saved["model_state_dict"], path)
         for name in ("x", "y"):
             mean, scale = _scaler(f"scaler_{'X' if name == 'x' else name}", saved)
             tensors |= {f"{name}_mean": mean, f"{name}_scale": scale}
@@ -79,9 +83,16 @@ def _load(path: Path) -> dict[str, Any]:
             size = sum(info.file_size for info in archive.infolist())
             check_decoded(path, path.stat().st_size, size)
             check_count(path, "checkpoint", len(archive.infolist()), "members")
+            for name in archive.namelist():
+                if name.endswith("data.pkl"):
+                    if archive.getinfo(name).file_size > PICKLE:
+                        raise InputError(f"{path}: its pickle is too large for a network (over 4 MB)")
+                    _check_encodings(archive.read(name), path)
             if damaged := archive.testzip():  # torch itself tests no checksum
                 raise InputError(f"{path}: member {ascii(damaged)[:60]} is damaged; get the file again")
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, OSError, EOFError, RuntimeError) as error:
+    except InputError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, ValueError) as error:
         raise InputError(
             f"{path}: not the zip that torch.save writes, or damaged ({error}); get the file again"
         ) from error
@@ -103,18 +114,39 @@ def _load(path: Path) -> dict[str, Any]:
     return dict(saved)
 
 
-def _layers(state: Any) -> dict[str, torch.Tensor]:
+def _check_encodings(content: bytes, path: Path) -> None:
+    """Refuse a pickle that names encodings other than Latin-1, that of bytes: each can double a text.
+
+    Raises:
+        InputError: It names another.
+        ValueError: It is no pickle.
+    """
+    for _, text, _ in pickletools.genops(content):
+        if isinstance(text, str) and len(text) < 40 and _is_codec(text):
+            raise InputError(f"{path}: its pickle asks for the encoding {text!r}, which no network needs")
+
+
+def _is_codec(text: str) -> bool:
+    try:
+        return codecs.lookup(text).name != "iso8859-1"
+    except (LookupError, ValueError):
+        return False
+
+
+def _layers(state: Any, path: Path) -> dict[str, torch.Tensor]:
     """Linear layers of a state dict `name.weight`, `name.bias`, numbered in the order of the file."""
     if not isinstance(state, dict) or not state:
         raise InputError("model_state_dict holds no tensors")
     numbers: dict[str, int] = {}
-    tensors = {}
+    tensors, held = {}, 0
     for name, tensor in state.items():
         layer, _, part = str(name).rpartition(".")
         if not isinstance(tensor, torch.Tensor) or part not in ("weight", "bias"):
             raise InputError(f"{ascii(name)[:60]} is neither weight nor bias of a linear layer")
         if tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
             raise InputError(f"tensor {name!r} is larger than what the file stores for it")
+        held += 4 * tensor.numel()  # tensors can share what is stored
+        check_decoded(path, path.stat().st_size, held)
         tensors[f"layers.{numbers.setdefault(layer, len(numbers))}.{part}"] = tensor.float().contiguous()
     return tensors
 
@@ -128,6 +160,8 @@ def _scaler(name: str, saved: dict[str, Any]) -> tuple[torch.Tensor, torch.Tenso
         mean, scale = (np.asarray(values.get(key), float).squeeze() for key in ("mean_", "scale_"))
     except (TypeError, ValueError):
         raise InputError(f"{name} has a mean or a scale that is no array of numbers") from None
+    if max(mean.size, scale.size) > BUDGETS["checkpoint"].count:
+        raise InputError(f"{name} has {max(mean.size, scale.size):,} columns")
     mean = np.zeros_like(mean) if values.get("with_mean") is False else mean
     scale = np.ones_like(mean) if values.get("with_std") is False else scale
     return torch.tensor(mean), torch.tensor(scale)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.budget import check_count, check_size
 from magtwin.errors import InputError
 from magtwin.urdf.meshes.piece import Piece
 from magtwin.urdf.meshes.reading import Reading
@@ -17,6 +18,9 @@ from magtwin.usd.geometry import linear_from_srgb
 
 STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 """A triangle of a binary STL, after 80 bytes of text and the number of triangles."""
+
+WORD = 250
+"""Bytes that a corner of an STL in text takes while it is read: two texts, and its numbers."""
 
 LONGEST_LINE = 4096
 """Most characters of a line of a PLY's header."""
@@ -28,7 +32,7 @@ def read_scan(reading: Reading) -> list[Piece]:
     Normals of an STL are ignored: they are those of the faces, from which smooth ones are computed. Texture
     coordinates of a PLY are ignored, since the format references no image.
     """
-    data = reading.path.read_bytes()
+    data = reading.path.read_bytes()  # its size is checked
     stl = reading.path.suffix.lower() == ".stl"
     points = _binary_stl(data) if stl else None
     if points is not None and len(points):
@@ -36,13 +40,14 @@ def read_scan(reading: Reading) -> list[Piece]:
     if points is not None:
         read: dict[str, Any] = {"geometry": {}}
     elif stl:
+        text = _text(data, reading)
         from trimesh.exchange.stl import load_stl_ascii
 
-        read = load_stl_ascii(io.BytesIO(data))
+        read = load_stl_ascii(io.StringIO(text))
     else:
+        _check_counts(data, reading)
         from trimesh.exchange.ply import load_ply
 
-        _check_counts(data, reading)
         read = load_ply(io.BytesIO(data))
     parts = read["geometry"].values() if "geometry" in read else [read]  # an ASCII STL may have several
     pieces = [_piece(part) for part in parts if part.get("faces") is not None and len(part["faces"])]
@@ -57,6 +62,18 @@ def _binary_stl(data: bytes) -> NDArray[np.float32] | None:
     if len(data) < 84 or len(data) != 84 + count * STL.itemsize:
         return None
     return np.frombuffer(data, STL, offset=84)["corners"].reshape(-1, 3)
+
+
+def _text(data: bytes, reading: Reading) -> str:
+    """The text of an STL in text; it is split into words, each of which takes more room than in the file."""
+    if b"\0" in data:
+        raise InputError(
+            f"{reading.path}: no STL, or cut short: its size does not fit its count; export it again"
+        )
+    check_size(reading.path, "OBJ")
+    reading.spend(WORD * data.lower().count(b"vertex") + 3 * len(data))
+    check_count(reading.path, "mesh", data.lower().count(b"endsolid"), "solids")
+    return data.decode("utf-8", errors="replace")
 
 
 def _check_counts(data: bytes, reading: Reading) -> None:

@@ -2,17 +2,27 @@
 
 import io
 import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
-from magtwin.budget import BUDGETS
+from magtwin.budget import BUDGETS, check_decoded
 from magtwin.errors import InputError
 from magtwin.files import read_bytes
 from magtwin.urdf.meshes.reading import Reading
 
 TEXTURES = "textures"
 """Folder of the copies beside an asset's layers."""
+
+READ = ("BMP", "DDS", "GIF", "JPEG", "JPEG2000", "PCX", "PNG", "PPM", "SGI", "TGA", "TIFF", "WEBP")
+"""Formats that are read, by Pillow's names. Of others, EPS would start a program."""
+
+BYTES = 11
+"""Bytes that a pixel takes: as decoded, as RGBA, and as RGB."""
 
 KEPT = {"JPEG": ".jpg", "PNG": ".png"}
 """Formats that every USD viewer reads, by Pillow's names; others are converted to PNG."""
@@ -63,6 +73,29 @@ def read_image(name: str, reading: Reading, folder: Path | None = None) -> Image
     return image_of(data, path.name, reading)
 
 
+@contextmanager
+def opened_image(data: bytes) -> Iterator[Any]:
+    """Pillow's image of the bytes of a file, whose pixels are not decoded yet.
+
+    Raises:
+        InputError: It is of no format in `READ`, damaged, or would take too much memory.
+    """
+    from PIL import Image as Pillow
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Pillow.DecompressionBombWarning)
+        try:
+            picture = Pillow.open(io.BytesIO(data), formats=READ)
+        except (OSError, SyntaxError, ValueError, Pillow.DecompressionBombError) as error:
+            raise InputError(str(error).partition(" <")[0]) from error  # without the object's address
+    with picture:
+        width, height = picture.size
+        if width * height > BUDGETS["image"].count:
+            raise InputError(f"{width} x {height} pixels are too many")
+        check_decoded("the image", len(data), BYTES * width * height)
+        yield picture
+
+
 def image_of(data: bytes, name: str, reading: Reading) -> Image | None:
     """An image from the bytes of its file; formats not in KEPT are converted to PNG with a note.
 
@@ -75,15 +108,12 @@ def image_of(data: bytes, name: str, reading: Reading) -> Image | None:
 
     stem = re.sub(r"[^A-Za-z0-9_-]", "_", Path(name).stem) or "texture"
     try:
-        with Pillow.open(io.BytesIO(data)) as picture:
-            kind, (width, height) = picture.format or "", picture.size
-            if width * height > BUDGETS["image"].count:
-                raise InputError(f"{width} x {height} pixels are too many")
+        with opened_image(data) as picture:
+            kind = picture.format or ""
             alpha = "A" in picture.getbands() or "transparency" in picture.info
             rgba = picture.convert("RGBA")
-    except (OSError, InputError, SyntaxError, ValueError, Pillow.DecompressionBombError) as error:
-        reason = str(error).partition(" <")[0]  # without the object's address
-        reading.lose(f"texture {name!r} is not a readable image and is left out ({reason})")
+    except (OSError, SyntaxError, ValueError) as error:
+        reading.lose(f"texture {name!r} is not a readable image and is left out ({error})")
         return None
     r, g, b = (c / 255 for c in rgba.convert("RGB").resize((1, 1), Pillow.Resampling.BOX).tobytes())
     if kind not in KEPT:

@@ -21,6 +21,12 @@ from magtwin.urdf.meshes.reading import Reading, numbers
 from magtwin.urdf.meshes.texture import Image, read_image
 from magtwin.usd.geometry import linear_from_srgb
 
+TEXT = 64
+"""Bytes that a text takes beside its characters."""
+
+HELD = 1 << 24
+"""Bytes of texts after which they are counted against the file's budget."""
+
 UNREAD = ("curv", "curv2", "surf", "l", "p")
 """Statements that draw lines, points or curves."""
 
@@ -58,7 +64,12 @@ def read_wavefront(reading: Reading) -> list[Piece]:
     unread: set[str] = set()
     group = _Group("")
     groups = [group]
+    held = 0
     for number, kind, rest in _statements(path):
+        held += TEXT * (1 + rest.count(" ") if kind == "f" else 1) + len(rest)
+        if held > HELD:
+            reading.spend(held)
+            held = 0
         if kind in rows:
             rows[kind].append(rest)
         elif kind == "f":

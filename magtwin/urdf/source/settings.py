@@ -8,22 +8,10 @@ import yaml
 
 from magtwin.budget import BUDGETS
 from magtwin.errors import InputError
-from magtwin.files import read_text
+from magtwin.files import read_text, yaml_loader
 
 ENTRIES = BUDGETS["YAML"].count
-"""Most tables of a file, and most entries of a table, including those merged from others."""
-
-
-class Loader(yaml.SafeLoader):
-    """YAML's safe types. Refuses tables that grow exponentially by merging each other."""
-
-    def flatten_mapping(self, node: yaml.MappingNode) -> None:
-        """Merge the tables of `<<` into one."""
-        super().flatten_mapping(node)
-        if len(node.value) > ENTRIES:
-            raise yaml.constructor.ConstructorError(
-                None, None, f"a table of over {ENTRIES} entries", node.start_mark
-            )
+"""Most tables of a file."""
 
 
 def read_settings(path: Path) -> Iterator[dict[str, Any]]:
@@ -34,7 +22,7 @@ def read_settings(path: Path) -> Iterator[dict[str, Any]]:
     """
     text = read_text(path, "settings file", "YAML")
     try:
-        pending = [yaml.load(text, Loader)]
+        pending = [yaml.load(text, yaml_loader())]
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # an impossible date is a ValueError
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark is not None else ""

@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 from xml.parsers.expat import ExpatError
 
 from magtwin.errors import InputError, hint
-from magtwin.files import read_bytes
+from magtwin.files import read_bytes, yaml_loader
 from magtwin.urdf.repairs import NOTE, Repairs
 from magtwin.urdf.source.expression import GLOBALS, LARGEST, Budget, ExpressionError, check_size, evaluate
 from magtwin.urdf.source.markup import UnsafeError, parse_markup
@@ -372,15 +372,12 @@ class _Expansion:
         """Data of a YAML file, with angles and lengths converted by their unit tags."""
         import yaml
 
-        from magtwin.urdf.source.settings import Loader
-
         if str(filename).startswith("package://"):
             self._miss(f"settings {filename!r}")
             return {}
         path = self._check_inside(self._library.abs_filename_spec(str(filename)), "load_yaml")
 
-        class UnitLoader(Loader):
-            """YAML's safe types, and units."""
+        UnitLoader: Any = type("UnitLoader", (yaml_loader(),), {})
 
         def number(factor: float) -> Callable[[Any, Any], float]:
             return lambda loader, node: (

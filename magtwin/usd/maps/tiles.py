@@ -10,6 +10,7 @@ from pxr import Sdf, Usd, Vt
 
 from magtwin.errors import InputError
 from magtwin.field.maps.tiles import Tile, Tiling
+from magtwin.usd.layers import check_stage
 from magtwin.usd.schema import NOUNS, attribute_name, place
 
 TILES = "Tiles"
@@ -78,7 +79,9 @@ class LayerTiles:
 
 
 def _reopened(file: str, path: str, tiling: Tiling, planes: int) -> LayerTiles:
-    stage = Usd.Stage.Open(file)  # held in a name: a prim does not keep its stage alive
+    stage = Usd.Stage.Open(
+        str(check_stage(file, own=True))
+    )  # held in a name: a prim does not keep its stage alive
     return LayerTiles(stage.GetPrimAtPath(path), tiling, planes)
 
 
