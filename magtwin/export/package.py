@@ -24,7 +24,7 @@ from magtwin.export.isaac import GRAPHS, author_graph
 from magtwin.export.structure import structure
 from magtwin.export.usdz import pack, unpack
 from magtwin.export.validation.inspection import inspect
-from magtwin.files import check_free, existing, output, sha256
+from magtwin.files import check_free, existing, output, sha256, transaction
 from magtwin.folders import allow
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run
@@ -165,7 +165,7 @@ def export_scene(
         work.write_origin()
         if animation is not None:
             work.animate(animation)
-        with ExitStack() as outputs:
+        with transaction(), ExitStack() as outputs:
             aside = outputs.enter_context(output(out, force=force))
             folder = None if beside is None else outputs.enter_context(output(beside, force=force))
             progress(f"Writing the {kind}")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
 
 from magtwin.errors import InputError
-from magtwin.files import check_free, output, sha256
+from magtwin.files import check_free, output, sha256, transaction
 from magtwin.spec.drive import DriveSpec
 from magtwin.urdf.description.description import Description, origin_of, read_description
 from magtwin.urdf.description.tag import Tags
@@ -137,7 +137,7 @@ def read_notes(asset: str | os.PathLike[str]) -> tuple[str, ...]:
 def _write_payloads(author: "_Author", out: Path, force: bool) -> ConversionReport:
     """Write the asset as an interface layer and a folder of payloads."""
     folder = check_payloads(out, force=force)
-    with output(folder, force=force) as aside_folder, output(out, force=force) as aside:
+    with transaction(), output(folder, force=force) as aside_folder, output(out, force=force) as aside:
         work = aside.with_name(PAYLOADS)  # beside the root layer, so that references resolve
         work.mkdir()
         if author.meshes:
@@ -153,7 +153,7 @@ def _write_payloads(author: "_Author", out: Path, force: bool) -> ConversionRepo
 def _write_single(author: "_Author", out: Path, force: bool) -> ConversionReport:
     """Write the asset as one root layer, with a layer of meshes and a folder of textures if needed."""
     beside = out.with_name(f"{out.stem}_meshes.usdc")
-    with output(out, force=force) as aside, ExitStack() as others:
+    with transaction(), output(out, force=force) as aside, ExitStack() as others:
         copy = aside.with_name(beside.name)
         if author.meshes:
             aside_meshes = others.enter_context(output(beside, force=force))

@@ -80,7 +80,9 @@ def _readings(folder: Path) -> None:
             for x in range(6)
             for y in range(5)
         ]
-        (survey / f"{heading}_map.csv").write_text("\n".join(["# x,y,theta,scalar_mag", *rows, ""]), encoding="utf-8")
+        (survey / f"{heading}_map.csv").write_text(
+            "\n".join(["# x,y,theta,scalar_mag", *rows, ""]), encoding="utf-8"
+        )
     _magtwin("map", "import", survey, "--out", folder / "map.usdc")
 
 
@@ -92,12 +94,10 @@ def _days(folder: Path) -> None:
 
 
 def _dataset(folder: Path) -> None:
-    days = folder / "days"
-    days.mkdir()
-    for number in range(5):
-        words = ("--duration-s", 3, "--seed", number, "--session", number)
-        _magtwin("run", "lab", *words, "--out", days / f"{number}.parquet")
-    _magtwin("dataset", "build", days, "--map", ROOT / "maps/lab/lab.usdc", "--out", folder / "set")
+    words = ("--count", 5, "--sessions", 5, "--duration-s", 3, "--path", "sine")
+    _magtwin("sweep", "lab", *words, "--out", folder / "days")
+    files = sorted((folder / "days").glob("*.parquet"))
+    _magtwin("dataset", "build", *files, "--map", ROOT / "maps/lab/lab.usdc", "--out", folder / "set")
 
 
 def _network(folder: Path) -> None:
@@ -194,7 +194,11 @@ COMMANDS = (
     Command("export layer", "export lab --out lab.usdc --target viewer"),
     Command("export web", "export lab --out lab.glb"),
     Command("export gazebo", "export lab --out world.sdf"),
-    Command("dataset build", f"dataset build IN/days --map {LAB_MAP} --out set", ("dataset",)),
+    Command(
+        "dataset build",
+        f"dataset build IN/days/run_00000.parquet IN/days/run_00001.parquet --map {LAB_MAP} --out set",
+        ("dataset",),
+    ),
     Command(
         "train",
         "train IN/set --out net.safetensors --layers 8,8 --epochs 2 --batch 64 --rrd net.rrd",

@@ -121,7 +121,8 @@ class Trace:
                 shown = HIDDEN not in call.path and HIDDEN in call.other
                 self.unsynced |= {call.path + path[len(call.other) :] for path in moved if shown}
                 dirty = {_moved(path, call) for path in dirty}
-                self.written = Counter({_moved(path, call): n for path, n in self.written.items()})
+                kept = {path: n for path, n in self.written.items() if not _within(path, call.path)}
+                self.written = Counter({_moved(path, call): n for path, n in kept.items()})
 
     def at(self, *kinds: str) -> list[int]:
         """Numbers of the calls of some kinds; all but removals by default."""

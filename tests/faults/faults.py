@@ -214,7 +214,9 @@ class Trial:
         if self.command.keeps:
             return found + self._kept(now)
         if (ended.status == 0 or wrote) and not killed and not self._is(now, self.new):
-            found.append(f"status {ended.status}, {'reported' if wrote else 'not reported'}, but {self._unlike(now)}")
+            found.append(
+                f"status {ended.status}, {'reported' if wrote else 'not reported'}, but {self._unlike(now)}"
+            )
         if killed:
             mixed = [n for n in now.keys() | self.new.keys() if not self._either(n, now)]
             if mixed:
@@ -383,7 +385,11 @@ def main() -> int:
     preload()
     results = []
     for command in commands:
-        rng, trial, begun = random.Random(f"{given.seed} {command.name}"), Trial(command, disk, inputs, base), time.time()
+        rng, trial, begun = (
+            random.Random(f"{given.seed} {command.name}"),
+            Trial(command, disk, inputs, base),
+            time.time(),
+        )
         trace = trial.count()
         for at in chosen(trace.at(), given.full, rng):
             trial.attempt(FULL, at, older=True)

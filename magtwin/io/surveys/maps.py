@@ -16,7 +16,7 @@ from magtwin.field.survey.folder import node_map
 from magtwin.field.survey.folder import read_survey as read_folder
 from magtwin.field.survey.readings import TAKEN, Readings
 from magtwin.field.survey.stuck import mask_stuck
-from magtwin.files import check_free, sha256
+from magtwin.files import check_free, output, sha256, transaction
 from magtwin.io.surveys.about import About
 from magtwin.io.surveys.columns import Columns
 from magtwin.io.surveys.readings import is_pattern, read_readings, save_readings
@@ -295,9 +295,10 @@ def survey_scene(
         return surveyed.report()
     field = survey(twin, **options, name=name or out.stem)
     field = replace(field, parameters={**field.parameters, "seed": seed})
-    save_map(field, out, force=force)
-    if adopt:
-        use_map(opened, out)
+    with transaction(), output(out, force=force) as aside:
+        save_map(field, aside)
+        if adopt:
+            use_map(opened, out, written=aside)
     return field.report()
 
 
