@@ -6,6 +6,7 @@ process that was killed: the next process that writes there removes it, after it
 the other had begun to rename.
 """
 
+import ctypes
 import errno
 import json
 import os
@@ -13,7 +14,6 @@ import shutil
 import signal
 import tempfile
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -37,8 +37,11 @@ _OLD, _FIRST, _COMMIT, _LIST = ".old", ".first", ".commit", ".list"
 """Files in a hidden folder: what the output replaces, the first folder of its transaction, and in that folder
 the renames of a transaction that is complete, and the same while they are written down."""
 
-_SETTLED_S = 60.0
-"""Age from which an empty hidden folder was left behind, and is not just being locked [s]."""
+_AT_FDCWD, _EXCHANGE = -100, 2
+"""Arguments of renameat2(2): paths are relative to the working folder; the two files change places."""
+
+_PROBE = 1 << 16
+"""Bytes that are written to see whether a disk is full."""
 
 _asides: set[Path] = set()
 """Hidden folders of this process."""
@@ -106,10 +109,15 @@ def output(path: str | os.PathLike[str], *, force: bool = False, at_once: bool =
         else:
             others.asides.append(aside)
             waits = True
-    except OSError as error:
-        if error.errno not in _FULL:
+    except InputError as error:
+        if str(aside.new) not in str(error):
             raise
-        raise InputError(f"{path}: cannot be written ({os.strerror(error.errno)})") from error
+        text = str(error).replace(str(aside.new), str(path))
+        raise InputError(text, parameter=error.parameter) from error
+    except Exception as error:  # libraries have errors of their own for a full disk
+        if reason := _why_full(error, aside.folder):
+            raise InputError(f"{path}: cannot be written ({reason})") from error
+        raise
     finally:
         if not waits:
             aside.remove()
@@ -187,13 +195,14 @@ class _Aside:
     def beside(cls, place: Path) -> "_Aside":
         """A new folder beside a place."""
         name = place.name[:60]  # a longer one with what is added could be too long for the disk
-        folder, lock = Path(tempfile.mkdtemp(prefix=f".{name}{_OURS}", dir=place.parent)), -1
-        _asides.add(folder)
-        if fcntl is not None:
-            with suppress(OSError):  # a file system without locks
-                lock = os.open(folder, os.O_RDONLY)
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return cls(place, folder, lock)
+        while True:
+            folder = Path(tempfile.mkdtemp(prefix=f".{name}{_OURS}", dir=place.parent))
+            try:
+                lock = _locked(folder)
+            except FileNotFoundError:  # another process swept it before it was locked
+                continue
+            _asides.add(folder)
+            return cls(place, folder, lock)
 
     @property
     def new(self) -> Path:
@@ -208,6 +217,8 @@ class _Aside:
     def swap(self, *, keep: bool) -> None:
         """Rename the output to its place; `keep` an old file, so that `undo` can put it back."""
         if self.place.is_dir():
+            if exchanged(self.new, self.place):
+                return
             self.place.rename(self.old)
             try:
                 self.new.rename(self.place)
@@ -224,6 +235,8 @@ class _Aside:
 
     def undo(self) -> None:
         """Take a `swap` back."""
+        if self.new.exists() and exchanged(self.new, self.place):
+            return
         if self.old.is_file():
             self.old.replace(self.place)
             return
@@ -231,13 +244,18 @@ class _Aside:
         if self.old.exists():
             self.old.rename(self.place)
 
-    def complete(self) -> None:
-        """Do the `swap` that another process did not come to."""
+    def number(self) -> int:
+        """Number of the output on the disk, which stays when it is renamed."""
+        return self.new.stat().st_ino
+
+    def complete(self, number: int) -> None:
+        """Do the `swap` that another process did not come to; `number` is that of the output."""
         beside = self.folder.parent == self.place.parent and not self.folder.is_symlink()
         if not beside or _OURS not in self.folder.name:
             return  # not a list that magtwin wrote
         if self.new.exists():
-            self.swap(keep=False)
+            if self.number() == number:  # else it is what the output has replaced
+                self.swap(keep=False)
         elif self.old.is_dir() and not self.place.exists():
             self.old.rename(self.place)
 
@@ -276,7 +294,7 @@ def _announce(asides: list[_Aside]) -> None:
     for aside in asides[1:]:
         (aside.folder / _FIRST).write_text(str(first), encoding="utf-8")
         _sync(aside.folder / _FIRST)
-    renames = [[str(aside.place), str(aside.folder)] for aside in asides]
+    renames = [[str(aside.place), str(aside.folder), aside.number()] for aside in asides]
     (first / _LIST).write_text(json.dumps(renames), encoding="utf-8")
     _sync(first / _LIST)
     (first / _LIST).rename(first / _COMMIT)
@@ -302,14 +320,13 @@ def _recover(folder: Path) -> None:
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         names = {entry.name for entry in os.scandir(folder)}
-        if not names and time.time() - folder.stat().st_mtime < _SETTLED_S:
-            return
         head = folder
         if _FIRST in names:
             head = Path((folder / _FIRST).read_text(encoding="utf-8"))
         if (head / _COMMIT).is_file():  # a transaction that was complete: rename the rest of it
-            for place, aside in json.loads((head / _COMMIT).read_text(encoding="utf-8")):
-                _Aside(Path(place), Path(aside)).complete()
+            with suppress(ValueError, TypeError):  # not a list that magtwin wrote
+                for place, aside, number in json.loads((head / _COMMIT).read_text(encoding="utf-8")):
+                    _Aside(Path(place), Path(aside)).complete(number)
         elif len(left := names - {_OLD, _FIRST, _LIST}) == 1:  # perhaps killed between two renames
             own = _Aside(folder.with_name(left.pop()), folder)
             if own.old.is_dir() and not own.place.exists():
@@ -317,6 +334,52 @@ def _recover(folder: Path) -> None:
         shutil.rmtree(folder, ignore_errors=True)
     finally:
         os.close(lock)
+
+
+def _locked(folder: Path) -> int:
+    """Lock a folder as long as this process lives; its file descriptor, -1 where folders have no locks.
+
+    Raises:
+        FileNotFoundError: It was removed before it was locked.
+    """
+    if fcntl is None:
+        return -1
+    lock = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not os.path.samestat(os.fstat(lock), folder.stat()):
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(folder))
+    except FileNotFoundError:
+        os.close(lock)
+        raise
+    except OSError:  # a file system without locks
+        pass
+    return lock
+
+
+def exchanged(one: Path, other: Path) -> bool:
+    """Let two folders change places at one moment; False where the system cannot."""
+    try:
+        rename = ctypes.CDLL(None, use_errno=True).renameat2
+    except (AttributeError, OSError, TypeError):
+        return False
+    return rename(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), ctypes.c_uint(_EXCHANGE)) == 0
+
+
+def _why_full(error: Exception, folder: Path) -> str:
+    """In which way the disk of a folder is full, if that is where an error comes from; "" if it is not."""
+    number = error.errno if isinstance(error, OSError) else None
+    reasons = [os.strerror(full) for full in _FULL if full == number or os.strerror(full) in str(error)]
+    if reasons:
+        return reasons[0]
+    try:
+        with open(folder / ".probe", "wb", buffering=0) as file:
+            while file.write(bytes(_PROBE)) < _PROBE:
+                pass
+            os.fsync(file.fileno())
+    except OSError as probe:
+        return os.strerror(probe.errno) if probe.errno in _FULL else ""
+    return ""
 
 
 def _sync(path: Path) -> None:

@@ -183,25 +183,40 @@ def test_folders_of_living_processes_and_of_others_are_left_alone(tmp_path):
     for folder in (living, dead, tmp_path / ".git"):
         folder.mkdir()
         (folder / "x").write_text("x")
-    begun, stale = tmp_path / ".c.txt.magtwin-begun", tmp_path / ".c.txt.magtwin-stale"
-    begun.mkdir()  # by a process that has not locked it yet
-    stale.mkdir()
-    os.utime(stale, (0, 0))
+    (tmp_path / ".c.txt.magtwin-begun").mkdir()  # by a process that was killed before it locked it
     lock = os.open(living, os.O_RDONLY)
     fcntl.flock(lock, fcntl.LOCK_EX)
     with output(tmp_path / "a.txt") as aside:
         aside.write_text("new")
     os.close(lock)
-    assert {p.name for p in tmp_path.iterdir()} == {living.name, begun.name, ".git", "a.txt"}
+    assert {p.name for p in tmp_path.iterdir()} == {living.name, ".git", "a.txt"}
+
+
+def test_a_process_whose_folder_is_swept_before_it_is_locked_takes_another(tmp_path, monkeypatch):
+    lock, begun = fcntl.flock, []
+
+    def late(number, how):
+        if not begun:
+            begun.extend(tmp_path.glob(".*"))
+            begun[0].rmdir()  # as another process does, which took it for that of a killed one
+        lock(number, how)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with output(tmp_path / "a.txt") as aside:
+        assert aside.parent != begun[0]
+        aside.write_text("new")
+    assert content(tmp_path) == {"a.txt": "new"}
 
 
 def test_a_list_of_renames_that_magtwin_did_not_write_moves_nothing(tmp_path):
     """A folder from elsewhere can hold one."""
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "profile").write_text("mine")
-    bad = tmp_path / "from-elsewhere" / ".x.magtwin-12345678"
-    bad.mkdir(parents=True)
-    (bad / "profile").write_text("theirs")
-    (bad / ".commit").write_text(f'[["{tmp_path}/home/profile", "{bad}"]]')
+    for name in ("12345678", "87654321"):
+        bad = tmp_path / "from-elsewhere" / f".x.magtwin-{name}"
+        bad.mkdir(parents=True)
+        (bad / "profile").write_text("theirs")
+        number = f", {(bad / 'profile').stat().st_ino}" if name == "12345678" else ""
+        (bad / ".commit").write_text(f'[["{tmp_path}/home/profile", "{bad}"{number}]]')
     check_free(tmp_path / "from-elsewhere" / "y.txt")
     assert content(tmp_path) == {"home/profile": "mine"}

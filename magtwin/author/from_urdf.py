@@ -88,7 +88,8 @@ def from_urdf(
     with output(out, force=force) as folder:
         folder.mkdir()
         report = build_robot(urdf, given, folder / name, options=options, thumbnail=thumbnail)
-    return Robot(asset, load_robot(asset, own=True), report)
+        spec = dataclasses.replace(load_robot(folder / name, own=True), asset=asset.resolve())
+    return Robot(asset, spec, report)
 
 
 def __getattr__(name: str) -> Any:

@@ -26,7 +26,7 @@ from magtwin.export.usdz import pack, unpack
 from magtwin.export.validation.inspection import inspect
 from magtwin.files import existing, sha256
 from magtwin.folders import allow
-from magtwin.outputs import check_free, output
+from magtwin.outputs import check_free, output, transaction
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run
 from magtwin.summary import in_markdown, printable
@@ -166,7 +166,7 @@ def export_scene(
         work.write_origin()
         if animation is not None:
             work.animate(animation)
-        with ExitStack() as outputs:
+        with transaction(), ExitStack() as outputs:
             aside = outputs.enter_context(output(out, force=force))
             folder = None if beside is None else outputs.enter_context(output(beside, force=force))
             progress(f"Writing the {kind}")

@@ -19,7 +19,7 @@ from typing import Any
 from magtwin.errors import InputError
 from magtwin.files import read_bytes, read_text
 from magtwin.io.tables import parquet_of, write_parquet
-from magtwin.outputs import check_free, output
+from magtwin.outputs import check_free, exchanged, output
 from magtwin.parallel import checked_shard, in_shard, open_pool
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run
@@ -255,9 +255,11 @@ class _Parts:
             with output(self.folder / LISTING, force=True) as aside:
                 aside.write_bytes(said.csv())
             if self.out.exists():  # checked in the beginning: to be replaced
-                old = self.out.with_name(f".{self.out.name}.{os.getpid()}.old")
-                self.out.rename(old)
-                self.folder.rename(self.out)
+                old = self.folder
+                if not exchanged(self.folder, self.out):
+                    old = self.out.with_name(f".{self.out.name}.{os.getpid()}.old")
+                    self.out.rename(old)
+                    self.folder.rename(self.out)
                 shutil.rmtree(old)
             else:
                 self.folder.rename(self.out)

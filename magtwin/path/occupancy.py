@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.outputs import check_free, output
+from magtwin.outputs import check_free, output, transaction
 from magtwin.path.room import Room
 from magtwin.spec.obstacles import Obstacles
 from magtwin.summary import Summarized, Summary
@@ -71,10 +71,11 @@ class OccupancyGrid(Summarized):
             f"image: {picture.name}\nmode: trinary\nresolution: {self.resolution_m:.9g}\n"
             f"origin: [{x:.9g}, {y:.9g}, 0.0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
         )
-        with output(picture, force=force) as aside:
-            aside.write_bytes(f"P5\n{columns} {rows}\n255\n".encode() + grey[::-1].tobytes())
-        with output(file, force=force) as aside:
-            aside.write_text(text, encoding="utf-8")
+        with transaction():
+            with output(picture, force=force) as aside:
+                aside.write_bytes(f"P5\n{columns} {rows}\n255\n".encode() + grey[::-1].tobytes())
+            with output(file, force=force) as aside:
+                aside.write_text(text, encoding="utf-8")
         return file, picture
 
     def _summary(self) -> Summary:

@@ -14,7 +14,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
 
 from magtwin.errors import InputError
 from magtwin.files import sha256
-from magtwin.outputs import check_free, output
+from magtwin.outputs import check_free, output, transaction
 from magtwin.spec.drive import DriveSpec
 from magtwin.urdf.description.description import Description, origin_of, read_description
 from magtwin.urdf.description.tag import Tags
@@ -138,7 +138,7 @@ def read_notes(asset: str | os.PathLike[str]) -> tuple[str, ...]:
 def _write_payloads(author: "_Author", out: Path, force: bool) -> ConversionReport:
     """Write the asset as an interface layer and a folder of payloads."""
     folder = check_payloads(out, force=force)
-    with output(folder, force=force) as aside_folder, output(out, force=force) as aside:
+    with transaction(), output(folder, force=force) as aside_folder, output(out, force=force) as aside:
         work = aside.with_name(PAYLOADS)  # beside the root layer, so that references resolve
         work.mkdir()
         if author.meshes:
@@ -154,7 +154,7 @@ def _write_payloads(author: "_Author", out: Path, force: bool) -> ConversionRepo
 def _write_single(author: "_Author", out: Path, force: bool) -> ConversionReport:
     """Write the asset as one root layer, with a layer of meshes and a folder of textures if needed."""
     beside = out.with_name(f"{out.stem}_meshes.usdc")
-    with output(out, force=force) as aside, ExitStack() as others:
+    with transaction(), output(out, force=force) as aside, ExitStack() as others:
         copy = aside.with_name(beside.name)
         if author.meshes:
             aside_meshes = others.enter_context(output(beside, force=force))

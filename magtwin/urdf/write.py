@@ -21,7 +21,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat
-from magtwin.outputs import check_free, output
+from magtwin.outputs import check_free, output, transaction
 from magtwin.report import Figure, Report
 from magtwin.urdf.meshes.mesh_layer import MESH, free_name, primitive_of
 from magtwin.urdf.physics.joint import AXIS
@@ -111,7 +111,7 @@ def write_urdf(asset: str | os.PathLike[str], out: str | os.PathLike[str], *, fo
     ElementTree.indent(xml)
     text = f'<?xml version="1.0"?>\n{ElementTree.tostring(xml, encoding="unicode")}\n'
     check_free(out, force=force)
-    with ExitStack() as files:
+    with transaction(), ExitStack() as files:
         if writer.meshes:
             aside_meshes = files.enter_context(output(folder, force=force))
             aside_meshes.mkdir()

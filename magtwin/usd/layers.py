@@ -5,9 +5,10 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -17,7 +18,7 @@ from magtwin.budget import check_depth
 from magtwin.errors import InputError
 from magtwin.files import existing, existing_file, sha256
 from magtwin.kinds import USD_SUFFIXES, kind_of, refused
-from magtwin.outputs import output
+from magtwin.outputs import afterwards, output
 from magtwin.usd.schema.versions import creator, is_upgraded, upgrade_stage
 from magtwin.usd.trial import try_stage
 
@@ -221,12 +222,20 @@ def _place(given: Any) -> object:
     return given if isinstance(given, str | os.PathLike) else "a stage"
 
 
-def save_layer(layer: Sdf.Layer) -> None:
-    """Write a changed layer to its file, aside and then renamed, as text or crate as before."""
+def save_layer(layer: Sdf.Layer, sublayers: Mapping[str, str] = MappingProxyType({})) -> None:
+    """Write a changed layer to its file, aside and then renamed, as text or crate as before.
+
+    Args:
+        layer: The layer. It is reloaded at the end of the transaction.
+        sublayers: Names in the file of sublayers that have other names until then.
+    """
     path = Path(layer.realPath)
+    copy = Sdf.Layer.CreateAnonymous(path.name)
+    copy.TransferContent(layer)
+    copy.subLayerPaths = [sublayers.get(name, name) for name in layer.subLayerPaths]
     with output(path, force=True) as aside:
-        export_like(layer, path, aside)
-    layer.Reload(force=True)
+        export_like(copy, path, aside)
+    afterwards(functools.partial(layer.Reload, force=True))
 
 
 def export_like(layer: Sdf.Layer, path: Path, out: Path) -> None:

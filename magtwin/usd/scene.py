@@ -12,6 +12,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.files import transaction
 from magtwin.frames import yaw_from_quat
 from magtwin.spec.magnetics import EarthFieldSpec
 from magtwin.spec.obstacles import Obstacles
@@ -338,12 +339,19 @@ def check_map(scene: Scene, where: str = "") -> None:
         )
 
 
-def use_map(opened: OpenedScene, map_layer: str | os.PathLike[str], *, dry: bool = False) -> None:
+def use_map(
+    opened: OpenedScene,
+    map_layer: str | os.PathLike[str],
+    *,
+    written: Path | None = None,
+    dry: bool = False,
+) -> None:
     """Let the stage of a scene read another map, in place of the old one among its sublayers.
 
     Args:
         opened: The scene.
         map_layer: Layer of the new map, whose prim has the path of the old one.
+        written: Where the new layer is until the end of a transaction. Default: in its place.
         dry: Whether to check only; the new layer need not exist then.
 
     Raises:
@@ -372,23 +380,25 @@ def use_map(opened: OpenedScene, map_layer: str | os.PathLike[str], *, dry: bool
         )
     if dry:
         return
+    written = written or map_layer
     changed = {stage.GetRootLayer()}
     for layer, name in held:
-        new = relative_asset(layer, map_layer)
+        new = relative_asset(layer, written)
         layer.subLayerPaths = [new if n == name else n for n in layer.subLayerPaths]
         changed.add(layer)
-    checksum = layer_sha256(map_layer)
+    checksum = layer_sha256(written)
     with Usd.EditContext(stage, stage.GetRootLayer()):
         for prim in prims_with(stage.GetPseudoRoot(), "magnetometer"):
             prim.GetAttribute(MAP_CHECKSUM).Set(checksum)
     for prim in prims_with(stage.GetPseudoRoot(), "anomalyMap"):
         for layer in stage.GetLayerStack(includeSessionLayers=False):
             over = layer.GetPrimAtPath(prim.GetPath())
-            if layer.realPath != str(map_layer.resolve()) and over and MADE_FROM in over.attributes:
+            if layer.realPath != str(written.resolve()) and over and MADE_FROM in over.attributes:
                 over.RemoveProperty(over.attributes[MADE_FROM])
                 changed.add(layer)
-    for layer in changed:
-        save_layer(layer)
+    with transaction():
+        for layer in changed:
+            save_layer(layer, {relative_asset(layer, written): relative_asset(layer, map_layer)})
 
 
 def _robot_prims(stage: Usd.Stage) -> list[Usd.Prim]:

@@ -8,7 +8,7 @@ from pxr import Sdf, Tf, UsdUtils
 
 from magtwin.errors import InputError
 from magtwin.kinds import expected
-from magtwin.outputs import output
+from magtwin.outputs import output, transaction
 from magtwin.usd.layers import check_stage, export_like, layer_sha256
 from magtwin.usd.schema.versions import stamp, upgrade_layer
 from magtwin.usd.sensors import MAP_CHECKSUM
@@ -49,7 +49,7 @@ def upgrade(path: str | os.PathLike[str]) -> list[Path]:
     files = {Path(layer.realPath): layer_sha256(layer.realPath) for layer in layers}
     copies = {file: Sdf.Layer.OpenAsAnonymous(str(file)) for file in files}
     older = [file for file, copy in copies.items() if _is_changed(copy, file)]
-    with ExitStack() as renamed:  # all files at the end
+    with transaction(), ExitStack() as renamed:  # all files at the end
 
         def write(file: Path) -> Path:
             if not os.access(file, os.W_OK):

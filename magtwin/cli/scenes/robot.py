@@ -82,7 +82,7 @@ def robot(
         Full report to write (.json).
     """
     given = dict(locals())
-    from magtwin.outputs import output
+    from magtwin.outputs import output, transaction
 
     if out.suffix == ".urdf":
         from magtwin.author.from_urdf import write_urdf
@@ -107,7 +107,7 @@ def robot(
         "mass": mass_kg,
     }
     step("Converting the robot")
-    with output(report, force=force) if report is not None else nullcontext() as aside:
+    with transaction(), output(report, force=force) if report is not None else nullcontext() as aside:
         made = from_urdf(
             urdf,
             out,

@@ -11,6 +11,7 @@ from magtwin.errors import find
 from magtwin.export.contents import named_files
 from magtwin.export.validation.rule import Subject
 from magtwin.export.validation.rules import is_absolute
+from magtwin.outputs import transaction
 from magtwin.usd.layers import check_stage, save_layer
 from magtwin.usd.schema import NOUNS
 
@@ -30,12 +31,13 @@ def mend(file: Path, names: Collection[str]) -> list[str]:
     """
     fixes = [find("fix", name, SAFE) for name in names]
     stage, done = Usd.Stage.Open(str(check_stage(file, own=True))), list[str]()  # tried by `validate`
-    for fix in fixes:
-        subject = Subject(stage, file)
-        done += fix(subject)
-        for layer in subject.layers:  # before the next fix
-            if layer.dirty:
-                save_layer(layer)
+    with transaction():
+        for fix in fixes:
+            subject = Subject(stage, file)
+            done += fix(subject)
+            for layer in subject.layers:  # before the next fix
+                if layer.dirty:
+                    save_layer(layer)
     return done
 
 

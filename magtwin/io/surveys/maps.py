@@ -21,7 +21,7 @@ from magtwin.io.surveys.about import About
 from magtwin.io.surveys.columns import Columns
 from magtwin.io.surveys.readings import is_pattern, read_readings, save_readings
 from magtwin.kinds import expected
-from magtwin.outputs import check_free
+from magtwin.outputs import check_free, output, transaction
 from magtwin.report import Report
 
 Method = Literal["auto", "trilinear", "cubic", "gp", "harmonic"]
@@ -296,9 +296,10 @@ def survey_scene(
         return surveyed.report()
     field = survey(twin, **options, name=name or out.stem)
     field = replace(field, parameters={**field.parameters, "seed": seed})
-    save_map(field, out, force=force)
-    if adopt:
-        use_map(opened, out)
+    with transaction(), output(out, force=force) as aside:
+        save_map(field, aside)
+        if adopt:
+            use_map(opened, out, written=aside)
     return field.report()
 
 
