@@ -229,7 +229,7 @@ class Runs(Summarized, Sequence[Run]):
                 else:
                     motion, metadata = travel(job.scene, job.path, draws[i], job.speed, common)
                 sensing = Sensing(job.scene, draws[i], common, wanted=self._columns)
-                count = len(readings(sensing, motion, metadata)[0])
+                count, _ = readings(sensing, motion, metadata)
                 long = sensing.rows_at_once(count) < count
                 make = _Driven if long else sense_all
                 sensed.append(make(sensing, motion, metadata))
