@@ -33,8 +33,8 @@ from magtwin.figures.canvas import (
     shade,
 )
 from magtwin.figures.maps import draw_cells, mean_field_ut
+from magtwin.run import mapped
 from magtwin.run.compare import FIELDS, POSITIONS
-from magtwin.run.mapped import LONG
 from magtwin.run.run import Run
 
 MOST_OTHER = 4
@@ -58,8 +58,9 @@ def draw_run(run: Run, field: AnomalyMap | None = None, planned: ArrayLike | Non
     """
     if not run.rows:
         raise InputError("the run has no rows to draw")
-    if run.rows > LONG:
-        run = run.take(slice(None, None, -(-run.rows // LONG)))  # more points than a picture shows
+    if run.rows > mapped.LONG:
+        run = run.take(slice(None, None, -(-run.rows // mapped.BLOCK)))  # more points than a picture shows
+        mapped.release()
     place, panels = position_name(run), panels_of(run)
     both = place is not None and bool(panels)
     figure = new_figure(13.5 if both else 8.0, 7.0 if len(panels) > 2 or not both else 5.5)

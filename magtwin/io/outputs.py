@@ -229,10 +229,11 @@ class Outputs:
         from magtwin.io.tables import ParquetParts
 
         parts: list[ParquetParts] = []
+        first = self.targets[0] if self.folder is None else _with_name(self.folder, self.robot)
 
         def keep(block: Run) -> None:
             if not parts:
-                parts.append(ParquetParts(self.targets[0], force=self.force))
+                parts.append(ParquetParts(first, force=self.force))
             parts[0].append(block)
 
         yield keep

@@ -156,7 +156,7 @@ def save_runs(
         checked_shard(shard)
         jobs = 1 if jobs is None and dask is None else jobs
     with open_pool(jobs, dask=dask) as pool:
-        return _Parts(runs, Path(out), force).save(pool, shard, progress)
+        return _Parts(runs, Path(out), force, at_hand=dask is None).save(pool, shard, progress)
 
 
 def _save_here(runs: Sequence[Run], out: str | os.PathLike[str], force: bool, progress: Progress) -> Report:
@@ -178,11 +178,17 @@ def _file(number: int) -> str:
     return f"run_{number:05d}.parquet"
 
 
-def make_block(runs: Sequence[Run], numbers: range) -> tuple[list[tuple[str, bytes]], Listed]:
-    """Names and contents of the files of some runs, and what is said of them; in a worker."""
+def make_block(runs: Any, folder: Path | None, numbers: range) -> tuple[list[tuple[str, bytes]], Listed]:
+    """Names and contents of the files of some runs, and what is said of them; in a worker.
+
+    A worker that has the folder writes the files itself, one run at a time, and returns none.
+    """
     files, said = [], Listed()
-    for number, run in zip(numbers, runs[numbers.start : numbers.stop], strict=True):
-        files.append((_file(number), parquet_of(run)))
+    for number, run in zip(numbers, runs.made(numbers), strict=True):
+        if folder is None:
+            files.append((_file(number), parquet_of(run)))
+        else:
+            write_parquet(run, folder / _file(number), force=True)
         said.add(_file(number), run)
     return files, said
 
@@ -190,8 +196,9 @@ def make_block(runs: Sequence[Run], numbers: range) -> tuple[list[tuple[str, byt
 class _Parts:
     """The folder OUT.parts of an unfinished sweep: runs, a part-00000.json per block, and sweep.json."""
 
-    def __init__(self, runs: Any, out: Path, force: bool) -> None:
-        self.runs, self.out, self.force = runs, out, force
+    def __init__(self, runs: Any, out: Path, force: bool, *, at_hand: bool) -> None:
+        """Prepare; the workers can write there themselves if the folder is `at_hand`."""
+        self.runs, self.out, self.force, self.at_hand = runs, out, force, at_hand
         self.folder = out.with_name(f"{out.name}.parts")
         size = max(1, min(BLOCK, len(runs) // BLOCKS))
         self.blocks = [range(k, min(k + size, len(runs))) for k in range(0, len(runs), size)]
@@ -204,13 +211,15 @@ class _Parts:
         total, made, start = sum(len(self.blocks[k]) for k in blocks), 0, time.monotonic()
         progress(0, total)
         try:
-            for outcome in pool.run(partial(make_block, self.runs), [self.blocks[k] for k in blocks]):
+            folder = self.folder.absolute() if self.at_hand else None
+            work = partial(make_block, self.runs, folder)
+            for outcome in pool.run(work, [self.blocks[k] for k in blocks]):
                 files, said = outcome.result()
                 block = blocks[outcome.index]
                 for name, content in (*files, (self._part(block).name, said.to_json())):
                     with output(self.folder / name, force=True) as aside:
                         aside.write_bytes(content)
-                made += len(files)
+                made += len(self.blocks[block])
                 progress(made, total)
         except BaseException:
             if not any(self.folder.glob("part-*.json")):

@@ -10,7 +10,7 @@ import math
 import os
 import shutil
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from tokenize import TokenError
 from typing import IO, Any
@@ -38,7 +38,7 @@ from magtwin.run.arrow import (
 )
 from magtwin.run.parquet import check_parquet
 from magtwin.run.run import COLUMNS, Run, check_clock
-from magtwin.run.spool import blocks
+from magtwin.run.spool import Spool, blocks
 
 _MAGIC = b"PAR1"
 _ABOUT = "magtwin"
@@ -63,40 +63,31 @@ def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool = False
         InputError: The file exists and `force` is not set, or cannot be written, or a column cannot stand
             in a table.
     """
-    if run.rows > mapped.LONG:
-        _write_long(run, path, force=force)
-        return
-    table = table_of(run)
-    with output(path, force=force) as aside:
-        _write_table(table, aside)
-
-
-def _write_long(run: Run, path: str | os.PathLike[str], *, force: bool) -> None:
-    """Write a run that memory does not hold, in groups of `BLOCK` rows."""
     check_clock(run, "the run to write")
-    schema = table_of(run.take(slice(0, 1))).schema
-    options = _options(schema)
-    with output(path, force=force) as aside, pq.ParquetWriter(aside, schema, **options) as writer:
-        for block in blocks(run):
-            writer.write_table(table_of(block))
+    tables = map(table_of, blocks(run))
+    first = next(tables)
+    with output(path, force=force) as aside:
+        _write_tables(first, tables, aside)
 
 
 def parquet_of(run: Run) -> bytes:
     """The content of the file that `write_parquet` writes; arguments and errors are its own."""
-    sink = pa.BufferOutputStream()
-    _write_table(table_of(run), sink)
+    check_clock(run, "the run to write")
+    tables, sink = map(table_of, blocks(run)), pa.BufferOutputStream()
+    _write_tables(next(tables), tables, sink)
     content: bytes = sink.getvalue().to_pybytes()
     return content
 
 
-def _write_table(table: pa.Table, where: Any) -> None:
-    pq.write_table(table, where, **_options(table.schema))
-
-
-def _options(schema: pa.Schema) -> dict[str, Any]:
-    """Compression and encoding of a Parquet file."""
-    split = {f.name: "BYTE_STREAM_SPLIT" for f in schema if pa.types.is_floating(f.type)}
-    return {"compression": "zstd", "use_dictionary": False, "column_encoding": split}
+def _write_tables(first: pa.Table, others: Iterable[pa.Table], where: Any) -> None:
+    """Write the blocks of a run as groups of rows."""
+    split = {f.name: "BYTE_STREAM_SPLIT" for f in first.schema if pa.types.is_floating(f.type)}
+    options: Any = {"compression": "zstd", "use_dictionary": False, "column_encoding": split}
+    with pq.ParquetWriter(where, first.schema, **options) as writer:
+        writer.write_table(first)
+        del first
+        for table in others:
+            writer.write_table(table)
 
 
 def read_parquet(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None = None) -> Run:
@@ -115,6 +106,8 @@ def read_parquet(path: str | os.PathLike[str], *, columns: Mapping[str, str] | N
     try:
         if path.is_dir():
             return _read_parts(path)
+        if load_parquet(path, pq.read_metadata).num_rows > mapped.LONG:
+            return _read_long(path, [path], columns)
         table = load_parquet(path)
         if columns:
             table = _on_the_floor(table.rename_columns(_renamed(table.column_names, columns, path)))
@@ -127,12 +120,39 @@ def _read_parts(path: Path) -> Run:
     parts = sorted(path.glob("part-*.parquet"))
     if not parts:
         raise InputError(f"{path}: a folder without Parquet parts; name the file in it")
+    if sum(load_parquet(part, pq.read_metadata).num_rows for part in parts) > mapped.LONG:
+        return _read_long(path, parts, None)
     tables = [load_parquet(part) for part in parts]
     for part, table in zip(parts, tables, strict=True):
         if table.schema != tables[0].schema:
             raise InputError(f"{part}: has other columns than {parts[0].name}; it belongs to another run")
     metadata = tables[-1].schema.metadata  # the latest
     return run_of(pa.concat_tables(tables).replace_schema_metadata(metadata), path)
+
+
+def _read_long(path: Path, files: Sequence[Path], columns: Mapping[str, str] | None) -> Run:
+    """The run in files one after the other, read in blocks into mapped columns."""
+    abouts = [load_parquet(file, pq.read_metadata) for file in files]
+    schemas = [about.schema.to_arrow_schema() for about in abouts]
+    spool, rows = Spool(sum(about.num_rows for about in abouts)), 0
+
+    def append(file: Path) -> None:
+        nonlocal rows
+        with pq.ParquetFile(file) as source:
+            for batch in source.iter_batches(mapped.BLOCK):
+                table = pa.Table.from_batches([batch]).replace_schema_metadata(schemas[-1].metadata)
+                if columns:
+                    table = _on_the_floor(table.rename_columns(_renamed(table.column_names, columns, path)))
+                spool.append(run_of(table, path, rows))
+                rows += len(table)
+
+    for file, schema in zip(files, schemas, strict=True):
+        if schema != schemas[0]:
+            raise InputError(f"{file}: has other columns than {files[0].name}; it belongs to another run")
+        load_parquet(file, append)
+    run = spool.run
+    check_clock(run, str(path))
+    return run
 
 
 def load_parquet(path: Path, load: Callable[[Path], Any] = pq.read_table) -> Any:
@@ -211,7 +231,7 @@ class ParquetParts(Sink):
             )
         table = table_of(run)
         with output(self.folder / f"part-{self._count:06d}.parquet", at_once=True) as aside:
-            _write_table(table, aside)
+            _write_tables(table, (), aside)
         self._count, self._last = self._count + 1, run["t"][-1]
 
     def close(self) -> None:

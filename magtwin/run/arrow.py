@@ -42,12 +42,13 @@ def table_of(run: Run) -> pa.Table:
     return pa.Table.from_arrays([pa.array(values) for _, _, values in flat.values()], schema=schema)
 
 
-def run_of(table: pa.Table, path: Path) -> Run:
+def run_of(table: pa.Table, path: Path, first: int | None = None) -> Run:
     """The run in a table, which may also be from another program that uses the column names of a Run.
 
     Args:
         table: With or without the metadata of `table_of`.
         path: Its file, for error messages.
+        first: Number of its first row, if it is a block of a longer table; its clock is then not checked.
 
     Raises:
         InputError: It holds no run.
@@ -56,7 +57,7 @@ def run_of(table: pa.Table, path: Path) -> Run:
         raise InputError(f"{path}: two columns are called {twice[0]!r}; rename one")
     columns, specs = {}, {}
     for name, members in _members(table.schema, path).items():
-        parts = [_numpy(table, member, path) for member in members]
+        parts = [_numpy(table, member, path, first or 0) for member in members]
         said = {key.decode(): text.decode() for key, text in _metadata(table, members[0]).items()}
         vector = COLUMNS[name].width > 1 if name in COLUMNS else "part" in said
         columns[name] = np.column_stack(parts) if vector else parts[0]
@@ -65,12 +66,13 @@ def run_of(table: pa.Table, path: Path) -> Run:
             if wrong.any():
                 row = int(np.argmax(wrong))
                 text = f"a flag is 0 or 1, got {columns[name][row]}"
-                raise InputError(f"{path}: column {name!r}, row {row}: {text}")
+                raise InputError(f"{path}: column {name!r}, row {(first or 0) + row}: {text}")
         elif "column" in said:
             named = tuple(_metadata(table, member)[b"part"].decode() for member in members) if vector else ()
             specs[name] = spec_said(said, named)
     run = Run(columns, metadata_from_json((table.schema.metadata or {}).get(FACTS, b"{}"), path), specs)
-    check_clock(run, str(path))
+    if first is None:
+        check_clock(run, str(path))
     return run
 
 
@@ -147,12 +149,12 @@ def _members(schema: pa.Schema, path: Path) -> dict[str, list[str]]:
     return members
 
 
-def _numpy(table: pa.Table, name: str, path: Path) -> NDArray[Any]:
+def _numpy(table: pa.Table, name: str, path: Path, first: int) -> NDArray[Any]:
     column = table.column(name)
     kind = column.type
     if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind)):
         raise InputError(f"{path}: column {name!r} must hold numbers or flags, got {kind}")
     if column.null_count:
-        row = column.is_null().to_numpy().argmax()
+        row = first + column.is_null().to_numpy().argmax()
         raise InputError(f"{path}: column {name!r}, row {row}: no value; write nan for unknown values")
     return column.to_numpy()

@@ -89,6 +89,23 @@ def joined(parts: "list[NDArray[Any]]") -> NDArray[Any]:
     return whole
 
 
+def settle(parts: "list[NDArray[Any]]") -> None:
+    """Move arrays that wait to be `joined` to a mapped file once they are many; their list gets shorter."""
+    waiting = [part for part in parts if part.shape[-1] <= LONG]
+    if sum(part.shape[-1] for part in waiting) > LONG:
+        parts[:] = [*(part for part in parts if part.shape[-1] > LONG), joined(waiting)]
+
+
+def empty(shape: int | tuple[int, ...], dtype: DTypeLike = float) -> NDArray[Any]:
+    """An array to be filled: in memory, or in an unnamed file if its rows are many.
+
+    Raises:
+        InputError: The disk has no room for it.
+    """
+    rows = shape if isinstance(shape, int) else shape[0]
+    return zeros(shape, dtype) if rows > LONG else np.empty(shape, dtype)
+
+
 def _folder() -> Path:
     """Where mapped files are: on a disk rather than in memory, as /tmp is on some systems."""
     if named := os.environ.get("TMPDIR"):

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.frames import wrap_angle
+from magtwin.run import mapped
 
 Array = NDArray[np.float64]
 Interpolation = Literal["linear", "hold", "angle", "quaternion"]
@@ -106,11 +107,12 @@ def check_instants(t: ArrayLike, what: str) -> Array:
     if t.ndim != 1 or t.dtype.kind not in "fiu":
         raise InputError(f"{what}: t must be numbers of shape (N,), got {t.dtype} of shape {t.shape}")
     t = t.astype(float, copy=False)
-    if not np.isfinite(t).all():
+    if not all(np.isfinite(t[rows]).all() for rows in mapped.parts(len(t))):
         row = int(np.argmin(np.isfinite(t)))
         raise InputError(f"{what}: t must be finite, got {t[row]} in row {row}")
-    if (wrong := np.diff(t) <= 0).any():
-        row = int(np.argmax(wrong)) + 1
+    steps = (np.diff(t[max(rows.start - 1, 0) : rows.stop]) for rows in mapped.parts(len(t)))
+    if any((step <= 0).any() for step in steps):
+        row = int(np.argmax(np.diff(t) <= 0)) + 1
         raise InputError(
             f"{what}: t must ascend from row to row, but row {row} has {t[row]:.9g} s "
             f"after {t[row - 1]:.9g} s; sort the rows, or drop those that repeat"

@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.run import mapped
@@ -36,8 +35,7 @@ class Spool:
             return
         for name, values in block.items():
             if not first:
-                make = np.empty if self._rows <= mapped.LONG else mapped.zeros
-                self._columns[name] = make((self._rows, *values.shape[1:]), values.dtype)
+                self._columns[name] = mapped.empty((self._rows, *values.shape[1:]), values.dtype)
             self._columns[name][first : self._done] = values
         mapped.release()
 

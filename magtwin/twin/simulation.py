@@ -166,6 +166,8 @@ def simulate_robots(
     lidar: Literal["schedule", "on", "off"] = "schedule",
     outside: Literal["nan", "clamp", "raise"] = "nan",
     controller: str = "follower",
+    progress: Callable[[int, int, str], Any] | None = None,
+    each: Callable[[str, Run], Any] | None = None,
 ) -> dict[str, Run]:
     """Drive all robots of a scene at the same time. Each robot gets a Run.
 
@@ -191,6 +193,8 @@ def simulate_robots(
         lidar: As for `simulate`.
         outside: As for `simulate`.
         controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`.
+        progress: As for `simulate`, of each long run in turn.
+        each: As for `simulate`, called with the robot's name and each block of its run.
 
     Returns:
         Runs by robot name, in the scene's order. The metadata of each also name the robot, the nearest other
@@ -217,6 +221,14 @@ def simulate_robots(
     for name, path in driven.items():
         check_commands(path, twins[name].magnetometer)
     reads: dict[str, list[Read]] = {name: [] for name in placed}
+    hashes = {name: scene_sha256(own.scene) for name, own in twins.items()}
+    paths_said = {name: path_metadata(path) for name, path in driven.items()}
+
+    def complete(name: str, block: Run) -> Run:
+        read = reads[name].pop() if reads[name] else None
+        known: Any = {"seed": seed, "duration_s": duration_s, "config_sha256": hashes[name]}
+        return finished(twins[name], block, paths_said[name], read, **known)
+
     runs = run_robots(
         twin.scene,
         driven,
@@ -233,11 +245,12 @@ def simulate_robots(
         model_errors={name: model_error_of(twins[name], seed, which=k) for k, name in enumerate(placed)},
         outside=outside,
         lidar=lidar,
+        complete=complete,
+        progress=progress,
+        each=each,
     )
-    for name, run in runs.items():
+    for run in runs.values():
         check_read(run, twin.field)
-        read = reads[name][-1] if reads[name] else None
-        runs[name] = finished(twins[name], run, driven[name], read, seed=seed, duration_s=duration_s)
     return runs
 
 

@@ -1,13 +1,15 @@
 """A Run as a USD layer of time samples over its scene, which any USD viewer plays.
 
 Time code 0 is the run's first row. The prim `Run` also holds every column as one exact array at full rate.
-Samples are authored on the layer itself, since a stage would recompose for each.
+Samples are authored on the layer itself, since a stage would recompose for each. Those of a long run are in
+value clips (`clips.py`), where the array of a column is in parts, one at the first time code of each clip.
 """
 
 import json
 import os
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import repeat
 from pathlib import Path
@@ -20,11 +22,13 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
 from magtwin.errors import InputError, find
 from magtwin.frames import quat_conjugate, quat_multiply, rotate
-from magtwin.outputs import output
+from magtwin.outputs import afterwards, output, transaction
+from magtwin.run import mapped
 from magtwin.run.resample import grid
 from magtwin.run.run import COLUMNS, Column, Run, check_clock
 from magtwin.spec.base import Quat, Vec3
 from magtwin.usd.attributes import read_pose, target, targets
+from magtwin.usd.clips import ClipWriter, Samples, clips_of, folder_of, read_clips, remove_clips
 from magtwin.usd.geometry import BASE_LINK, read_links
 from magtwin.usd.layers import SUFFIXES, WORLD, describe_stage, open_layer, open_stage, translates
 from magtwin.usd.maps.epochs import EPOCH
@@ -67,6 +71,8 @@ _BARE = WORLD.AppendChild("robot")
 """Robot of a run without a scene."""
 
 _FACTS = "magtwinFacts"
+_COLUMN = "magtwin:run:"
+_TRANSLATE, _ORIENT = "xformOp:translate", "xformOp:orient"
 _DTYPES = ("f8", "f4", "f2", "i4", "i8", "u1", "u4", "u8", "b1")
 _NAMES = ("double", "float", "half", "int", "int64", "uchar", "uint", "uint64", "bool")
 _KINDS = {d: Sdf.ValueTypeNames.Find(f"{name}[]") for d, name in zip(_DTYPES, _NAMES, strict=True)}
@@ -102,7 +108,8 @@ def write_animation(
     """Write a run as a layer of time samples over its scene.
 
     Poses and readings are resampled at `fps` with `Run.resample`; flags and the battery are sampled when they
-    change. Bodies are moved by their transforms: for viewing, not for a physics engine.
+    change. Bodies are moved by their transforms: for viewing, not for a physics engine. The samples of a run
+    of more than 524,288 rows are in value clips, in the folder `F.clips` beside the file F.
 
     Args:
         run: The run. The pose is `p_world_base`, or else motion capture or odometry. Among several robots of
@@ -126,16 +133,8 @@ def write_animation(
     t = run["t"]
     if not len(t):
         raise InputError("the run has no rows, there is nothing to play")
-    rate = fps or (round(1 / float(np.median(np.diff(t))), 6) if len(t) > 1 else 1.0)
-    if fps is None:
-        frames, codes = run, (t - t[0]) * rate
-    else:
-        p_name, q_name = _pose_columns(run)
-        sampled = (n for names in READINGS.values() for n in names if COLUMNS[n].interpolation != "hold")
-        wanted = [name for name in (p_name, q_name, "wheel_angle", *sampled) if name in run]
-        rules: Any = {p_name: "linear", q_name: "quaternion"}  # it moves between recorded poses
-        frames = run.select(*wanted).resample(grid(t[0], t[-1], fps), interpolation=rules)
-        codes = np.arange(frames.rows, dtype=float)
+    rate = fps or (round(1 / float(np.median(np.diff(t[: mapped.LONG + 1]))), 6) if len(t) > 1 else 1.0)
+    pose = _pose_columns(run)
     stand, maps = _Stand(), list[Sdf.Path]()
     if scene_file is not None:
         stage = open_stage(scene_file)
@@ -146,7 +145,13 @@ def write_animation(
             raise InputError(f"{path}: is a part of the scene; give another name")
         stand = _stand(stage, world, str(run.metadata.get("robot", "")))
         maps = [prim.GetPath() for prim in prims_with(stage.GetPseudoRoot(), "anomalyMap")]
-    with output(path, force=force) as aside:
+    with ExitStack() as stack:
+        stack.enter_context(transaction())
+        if run.rows > mapped.LONG:
+            folder = stack.enter_context(output(folder_of(path), force=force))
+        elif force:
+            afterwards(lambda: remove_clips(path))
+        aside = stack.enter_context(output(path, force=force))
         layer = Sdf.Layer.CreateNew(str(aside))
         if layer is None:
             raise InputError(f"{path}: cannot be made as a USD layer")
@@ -169,10 +174,28 @@ def write_animation(
         if epoch := str(run.metadata.get("map_epoch", "")):
             for prim in maps:
                 Sdf.CreatePrimInLayer(layer, prim).variantSelections[EPOCH] = epoch
-        _animate(layer, stand, frames, codes.tolist())
-        _sample_readings(layer, stand, run, frames, codes.tolist(), rate)
-        _store(layer, stand.world.AppendChild(RUN), run)
+        readings, columns = _sampled(run, stand), stand.world.AppendChild(RUN)
+        clips = ClipWriter(folder, layer) if run.rows > mapped.LONG else None
+        _declare(layer, stand, readings, wheels="wheel_angle" in run)
         try:
+            _store(layer, columns, run, clipped=clips is not None)
+            moves, path_moved = 0, stand.robot.AppendProperty(_TRANSLATE)
+            for piece in _pieces(run, fps, rate, pose):
+                samples = _samples(stand, readings, pose, piece)
+                moves += len(samples[path_moved][0])
+                if clips is None:
+                    for attribute, (codes, values) in samples.items():
+                        sample(layer, attribute, codes, values)
+                else:
+                    own = piece.rows.take(slice(piece.lead, None))
+                    arrays = {columns.AppendProperty(f"{_COLUMN}{n}"): _vt(own[n]) for n in own}
+                    clips.append(float(piece.row_codes[piece.lead]), samples, arrays)
+            if not moves:
+                raise InputError(
+                    f"no pose {pose[0]!r} of the run is known at the time of a frame; raise `fps`"
+                )
+            if clips is not None:
+                clips.close(Sdf.CreatePrimInLayer(layer, stand.world), folder_of(path).name)
             layer.Save()
         except Tf.ErrorException as error:
             raise InputError(f"{path}: cannot be written; is the disk full?") from error
@@ -203,7 +226,7 @@ def is_animation(path: str | os.PathLike[str]) -> bool:
         InputError: The file is missing or not USD.
     """
     layer = open_layer(path)
-    return bool(layer.GetAttributeAtPath(_run_path(layer).AppendProperty("magtwin:run:t")))
+    return bool(layer.GetAttributeAtPath(_run_path(layer).AppendProperty(f"{_COLUMN}t")))
 
 
 def _read(layer: Sdf.Layer, path: str | os.PathLike[str]) -> Run:
@@ -215,11 +238,16 @@ def _read(layer: Sdf.Layer, path: str | os.PathLike[str]) -> Run:
             "`magtwin run --out F.usda` or `magtwin convert` wrote"
         )
     columns, specs = {}, {}
-    for attribute in sorted(prim.properties, key=lambda column: column.customData.get("number", np.inf)):
-        name = attribute.name.removeprefix("magtwin:run:")
-        if name == attribute.name:
-            continue
-        columns[name] = _array(attribute, path)
+    known = sorted(prim.properties, key=lambda column: column.customData.get("number", np.inf))
+    known = [attribute for attribute in known if attribute.name.startswith(_COLUMN)]
+    clips = clips_of(layer, Path(path)) if not all(a.HasDefaultValue() for a in known) else []
+    parts_of = {}
+    if clips:
+        widths = {a: len([p for p in str(a.customData.get("parts", "")).split(",") if p]) for a in known}
+        parts_of = read_clips(clips, {a.path: (_type_of(a, path), widths[a]) for a in known})
+    for attribute in known:
+        name = attribute.name.removeprefix(_COLUMN)
+        columns[name] = parts_of[attribute.path] if clips else _array(attribute, path)
         if name not in COLUMNS:
             said = {key: str(value) for key, value in attribute.customData.items()}
             parts = tuple(filter(None, said.get("parts", "").split(",")))
@@ -242,7 +270,7 @@ def _run_path(layer: Sdf.Layer) -> Sdf.Path:
 
 def _pose_columns(run: Run) -> tuple[str, str]:
     for p, q in POSES:
-        if p in run and q in run and np.isfinite(run[p]).all(axis=1).any():
+        if p in run and q in run and any(np.isfinite(run[p][r]).all(1).any() for r in mapped.parts(run.rows)):
             return p, q
     known = "; ".join(" and ".join(pair) for pair in POSES)
     raise InputError(f"the run has no pose of the robot; it needs {known}")
@@ -296,70 +324,114 @@ def _wheel(side: int, joint: Usd.Prim, stage: Usd.Stage) -> tuple[int, Sdf.Path,
     return side, body.GetPath(), *read_pose(body), axis
 
 
-def _animate(layer: Sdf.Layer, stand: _Stand, frames: Run, codes: list[float]) -> None:
-    """Author the motion of the robot's root and wheels."""
-    p_name, q_name = _pose_columns(frames)
-    known = np.isfinite(frames[p_name]).all(axis=1) & np.isfinite(frames[q_name]).all(axis=1)
-    p, q = frames[p_name][known], frames[q_name][known]
-    at = [code for code, there in zip(codes, known, strict=True) if there]
-    q = quat_multiply(q, quat_conjugate(stand.q_root_base_xyzw))
-    p = p - rotate(q, stand.p_root_base)
-    _move(layer, stand.robot, at, Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(p)), q)
-    if "wheel_angle" not in frames or not stand.wheels:
-        return
-    for side, path, p_rest, q_rest, axis in stand.wheels:
+@dataclass(frozen=True)
+class _Piece:
+    """Some rows of a run, and the frames in their time."""
+
+    rows: Run
+    """The rows; also the row before them, if there is one."""
+
+    lead: int
+    """1 if the first row is that of the piece before, else 0."""
+
+    row_codes: NDArray[np.float64]
+    """Time codes of `rows`."""
+
+    frames: Run
+    codes: NDArray[np.float64]
+    """Time codes of `frames`."""
+
+
+def _pieces(run: Run, fps: float | None, rate: float, pose: tuple[str, str]) -> Iterator[_Piece]:
+    """A run and its frames: in one piece, or in blocks if it is long; without `fps`, each row is a frame."""
+    t, (p_name, q_name) = run["t"], pose
+    sampled = (n for names in READINGS.values() for n in names if COLUMNS[n].interpolation != "hold")
+    wanted = [name for name in (p_name, q_name, "wheel_angle", *sampled) if name in run]
+    rules: Any = {p_name: "linear", q_name: "quaternion"}  # it moves between recorded poses
+    at = None if fps is None else grid(t[0], t[-1], fps)
+    for rows in mapped.parts(run.rows):
+        lead = int(rows.start > 0)
+        some = run.take(slice(rows.start - lead, rows.stop))
+        row_codes = (some["t"] - t[0]) * rate
+        if at is None:
+            frames, codes = some.take(slice(lead, None)), row_codes[lead:]
+        else:
+            last = rows.stop == run.rows
+            first, end = np.searchsorted(at, [t[rows.start], np.inf if last else t[rows.stop]])
+            near = run.take(slice(rows.start, rows.stop + 1)).select(*wanted)
+            frames = near.resample(at[first:end], interpolation=rules)
+            codes = np.arange(first, end, dtype=float)
+        yield _Piece(some, lead, row_codes, frames, codes)
+
+
+def _sampled(run: Run, stand: _Stand) -> list[tuple[str, str]]:
+    """Sensors and columns that are sampled on their prims: all but those that are never known."""
+    return [
+        (noun, name)
+        for noun, names in READINGS.items()
+        for name in names
+        if name in run
+        and noun in stand.sensors
+        and not all(np.isnan(run[name][rows]).all() for rows in mapped.parts(run.rows))
+    ]
+
+
+def _declare(layer: Sdf.Layer, stand: _Stand, readings: list[tuple[str, str]], *, wheels: bool) -> None:
+    """Author the sampled attributes without their samples."""
+    kinds = Sdf.ValueTypeNames
+    for path, p in ((stand.robot, None), *((w[1], Gf.Vec3d(w[2])) for w in stand.wheels if wheels)):
+        prim = Sdf.CreatePrimInLayer(layer, path)
+        translate = Sdf.AttributeSpec(prim, _TRANSLATE, kinds.Double3)
+        orient = Sdf.AttributeSpec(prim, _ORIENT, kinds.Quatd)
+        order = Sdf.AttributeSpec(prim, "xformOpOrder", kinds.TokenArray, Sdf.VariabilityUniform)
+        order.default = Vt.TokenArray([translate.name, orient.name])
+        if p is not None:
+            translate.default = p
+    for noun, name in readings:
+        prim, spec = Sdf.CreatePrimInLayer(layer, stand.sensors[noun]), COLUMNS[name]
+        kind = {"bool": kinds.Bool}.get(spec.unit, kinds.Double3 if spec.width == 3 else kinds.Double)
+        attribute = Sdf.AttributeSpec(prim, attribute_name(noun, name), kind, declaresCustom=True)
+        attribute.documentation = spec.doc
+        attribute.customData = {key: v for key, v in (("unit", spec.unit), ("frame", spec.frame)) if v}
+
+
+def _samples(stand: _Stand, readings: list[tuple[str, str]], pose: tuple[str, str], piece: _Piece) -> Samples:
+    """Samples of a piece: poses and readings at every frame, held values when they change."""
+    frames, codes = piece.frames, piece.codes.tolist()
+    p, q = (frames[name] for name in pose)
+    known = np.isfinite(p).all(axis=1) & np.isfinite(q).all(axis=1)
+    q = quat_multiply(q[known], quat_conjugate(stand.q_root_base_xyzw))
+    p, at = p[known] - rotate(q, stand.p_root_base), piece.codes[known].tolist()
+    samples: dict[Sdf.Path, tuple[Any, Any]] = {
+        stand.robot.AppendProperty(_TRANSLATE): (at, Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(p))),
+        stand.robot.AppendProperty(_ORIENT): (at, Vt.QuatdArray.FromNumpy(np.ascontiguousarray(q))),
+    }
+    for side, path, _, q_rest, axis in stand.wheels if "wheel_angle" in frames else ():
         half = frames["wheel_angle"][:, side, None] / 2
-        turn = np.hstack([np.sin(half) * axis, np.cos(half)])
-        _move(layer, path, codes, Gf.Vec3d(p_rest), quat_multiply(q_rest, turn))
+        turn = quat_multiply(q_rest, np.hstack([np.sin(half) * axis, np.cos(half)]))
+        turns = Vt.QuatdArray.FromNumpy(np.ascontiguousarray(turn))
+        samples[path.AppendProperty(_ORIENT)] = codes, turns
+    for noun, name in readings:
+        path, spec = stand.sensors[noun].AppendProperty(attribute_name(noun, name)), COLUMNS[name]
+        if spec.interpolation == "hold":
+            values = piece.rows[name]
+            rows = np.flatnonzero(np.append(not piece.lead, values[1:] != values[:-1]))
+            samples[path] = piece.row_codes[rows].tolist(), values[rows].tolist()
+        elif spec.width == 3:
+            samples[path] = codes, Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(frames[name]))
+        else:
+            samples[path] = codes, frames[name].tolist()
+    return samples
 
 
-def _move(layer: Sdf.Layer, path: Sdf.Path, codes: list[float], p: Any, q: NDArray[np.float64]) -> None:
-    """Author the pose of an Xform at each time code; `p` is an array, or one constant position."""
-    prim = Sdf.CreatePrimInLayer(layer, path)
-    translate = Sdf.AttributeSpec(prim, "xformOp:translate", Sdf.ValueTypeNames.Double3)
-    orient = Sdf.AttributeSpec(prim, "xformOp:orient", Sdf.ValueTypeNames.Quatd)
-    order = Sdf.AttributeSpec(prim, "xformOpOrder", Sdf.ValueTypeNames.TokenArray, Sdf.VariabilityUniform)
-    order.default = Vt.TokenArray([translate.name, orient.name])
-    if isinstance(p, Gf.Vec3d):
-        translate.default = p
-    else:
-        sample(layer, translate.path, codes, p)
-    sample(layer, orient.path, codes, Vt.QuatdArray.FromNumpy(np.ascontiguousarray(q)))
-
-
-def sample(layer: Sdf.Layer, path: Sdf.Path, codes: list[float], values: Iterable[Any]) -> None:
+def sample(layer: Sdf.Layer, path: Sdf.Path, codes: Iterable[float], values: Iterable[Any]) -> None:
     """Author samples of an attribute in one change block."""
     with Sdf.ChangeBlock():
         deque(map(layer.SetTimeSample, repeat(path), codes, values), maxlen=0)
 
 
-def _sample_readings(
-    layer: Sdf.Layer, stand: _Stand, run: Run, frames: Run, codes: list[float], rate: float
-) -> None:
-    """Author the readings on the prims of their sensors: at every frame, or when a held value changes."""
-    t, kinds = run["t"], Sdf.ValueTypeNames
-    for noun, names in READINGS.items():
-        for name in names:
-            if name not in run or noun not in stand.sensors or np.isnan(run[name]).all():
-                continue
-            prim, spec = Sdf.CreatePrimInLayer(layer, stand.sensors[noun]), COLUMNS[name]
-            kind = {"bool": kinds.Bool}.get(spec.unit, kinds.Double3 if spec.width == 3 else kinds.Double)
-            attribute = Sdf.AttributeSpec(prim, attribute_name(noun, name), kind, declaresCustom=True)
-            attribute.documentation = spec.doc
-            attribute.customData = {key: v for key, v in (("unit", spec.unit), ("frame", spec.frame)) if v}
-            if spec.interpolation == "hold":
-                values = run[name]
-                rows = np.flatnonzero(np.append(True, values[1:] != values[:-1]))
-                sample(layer, attribute.path, ((t[rows] - t[0]) * rate).tolist(), values[rows].tolist())
-            elif spec.width == 3:
-                vectors = Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(frames[name]))
-                sample(layer, attribute.path, codes, vectors)
-            else:
-                sample(layer, attribute.path, codes, frames[name].tolist())
-
-
-def _store(layer: Sdf.Layer, path: Sdf.Path, run: Run) -> None:
-    """Author every column of a run as an array."""
+def _store(layer: Sdf.Layer, path: Sdf.Path, run: Run, *, clipped: bool) -> None:
+    """Author every column of a run as an array; `clipped` ones without it, as clips hold it in parts."""
     prim = Sdf.CreatePrimInLayer(layer, path)
     prim.specifier, prim.typeName = Sdf.SpecifierDef, "Scope"
     prim.documentation = "Every column of the run; rows of vectors are flattened"
@@ -371,23 +443,37 @@ def _store(layer: Sdf.Layer, path: Sdf.Path, run: Run) -> None:
                 f" digits and _, got {values.dtype} of shape {values.shape}"
             )
         spec = run.spec(name)
-        attribute = Sdf.AttributeSpec(
-            prim, f"magtwin:run:{name}", kind, Sdf.VariabilityUniform, declaresCustom=True
-        )
+        varies = Sdf.VariabilityVarying if clipped else Sdf.VariabilityUniform
+        attribute = Sdf.AttributeSpec(prim, f"{_COLUMN}{name}", kind, varies, declaresCustom=True)
         attribute.documentation = spec.doc
         said: dict[str, Any] = {"unit": spec.unit, "frame": spec.frame, "parts": ",".join(spec.parts)}
         if name not in COLUMNS:
             said["interpolation"] = spec.interpolation
         said = {key: value for key, value in said.items() if value}
         attribute.customData = {**said, "number": number}  # text sorts attributes by name
-        attribute.default = kind.type.pythonClass.FromNumpy(np.ascontiguousarray(values).reshape(-1))
+        if not clipped:
+            attribute.default = _vt(values)
+
+
+def _vt(values: NDArray[Any]) -> Any:
+    """A column as an array of USD."""
+    kind = _KINDS[values.dtype.str[1:]]
+    return kind.type.pythonClass.FromNumpy(np.ascontiguousarray(values).reshape(-1))
+
+
+def _type_of(attribute: Sdf.AttributeSpec, path: str | os.PathLike[str]) -> str:
+    """The type of a column, in numpy's letters."""
+    dtype = next((dtype for dtype, kind in _KINDS.items() if kind == attribute.typeName), None)
+    if dtype is None:
+        raise InputError(f"{path}: <{attribute.path}> must be an array of numbers, got {attribute.typeName}")
+    return dtype
 
 
 def _array(attribute: Sdf.AttributeSpec, path: str | os.PathLike[str]) -> NDArray[Any]:
     """The values of a column."""
-    dtype = next((dtype for dtype, kind in _KINDS.items() if kind == attribute.typeName), None)
-    if dtype is None or attribute.default is None:
-        raise InputError(f"{path}: <{attribute.path}> must be an array of numbers, got {attribute.typeName}")
+    dtype = _type_of(attribute, path)
+    if attribute.default is None:
+        raise InputError(f"{path}: <{attribute.path}> must be an array of numbers, but has no value")
     values = np.array(attribute.default, dtype)
     parts = str(attribute.customData.get("parts", ""))
     width = len(parts.split(","))

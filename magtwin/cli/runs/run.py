@@ -301,13 +301,24 @@ def _run_robots(
     names = list(ways) if robot is None else [robot]
     own = {name: outputs if robot else outputs.of_robot(name) for name in names}
     with ExitStack() as stack:
+        kept = {name: stack.enter_context(own[name].kept()) for name in names}
         folder = stack.enter_context(replace(outputs, files=(), scans=()).aside()).folder
         places = {}
         for name in names:
             aside = stack.enter_context(replace(own[name], folder=None).aside())
             places[name] = replace(aside, folder=folder)
         announce(f"Driving {', '.join(ways)}")
-        runs = simulate_robots(twin, ways, robots=names, meet=meet or "refuse", **options)
+        with progress("Driving", "") as advance:
+            runs = simulate_robots(
+                twin,
+                ways,
+                robots=names,
+                meet=meet or "refuse",
+                progress=advance,
+                each=lambda name, block: kept[name](block),
+                **options,
+            )
+        announce("Writing the runs")
         for name, run in runs.items():
             its = led_by(twin, name)
             planned = ways[name] if isinstance(ways[name], Planned) else None

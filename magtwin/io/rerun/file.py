@@ -71,7 +71,7 @@ def write_rrd(
     name, size = title_of(run) or FilePath(path).stem, size_of(run, scans)
     shown: dict[str, Any] = {"planned": planned, "scans": scans}
     if run.rows > mapped.LONG:  # the layout looks at some rows, and at the last one
-        some = np.append(np.arange(0, run.rows - 1, -(-run.rows // mapped.LONG)), run.rows - 1)
+        some = np.append(np.arange(0, run.rows - 1, -(-run.rows // mapped.BLOCK)), run.rows - 1)
         events = [key for key in STATES if key in run and run[key].any()]
         shown |= {"known": run.take(some), "events": events}
         mapped.release()

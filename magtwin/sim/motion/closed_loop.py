@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magtwin.compiled import Loops, in_threads
 from magtwin.errors import InputError
 from magtwin.field.maps import lookup
-from magtwin.run.mapped import joined
+from magtwin.run import mapped
 from magtwin.sim.motion import loop
 from magtwin.sim.motion.controllers import Guide
 from magtwin.sim.motion.drive import Motion, Pose, limits
@@ -190,10 +190,11 @@ def _in_python(closed_loop: ClosedLoop, obstacles: Obstacles) -> Motion:
         record = [array("d", bytes(8 * steps)) for _ in range(loop.RECORD)]
         made = loop.drive_on(closed_loop.guide.law, figures, table, fence, spans, state, first, steps, record)
         records.append(np.array([np.frombuffer(column)[:made] for column in record]))
+        mapped.settle(records)
         first += made
         if made < steps:
             break
-    return _motion(closed_loop, joined(records))
+    return _motion(closed_loop, mapped.joined(records))
 
 
 def _compiled(loops: Sequence[ClosedLoop], obstacles: Obstacles) -> list[Motion]:
@@ -212,9 +213,10 @@ def _compiled(loops: Sequence[ClosedLoop], obstacles: Obstacles) -> list[Motion]
         state[going] = part
         for n, rows, count in zip(going, record, made, strict=True):
             records[n].append(rows[:, :count].copy())
+            mapped.settle(records[n])
         first += steps
         going = going[(made == steps) & (most[going] > first)]
-    return [_motion(c, joined(r)) for c, r in zip(loops, records, strict=True)]
+    return [_motion(c, mapped.joined(r)) for c, r in zip(loops, records, strict=True)]
 
 
 def _block(
@@ -251,9 +253,10 @@ def _block(
 def _motion(closed_loop: ClosedLoop, record: Array) -> Motion:
     """The motion in a record of `loop.drive_on`, shape (RECORD, K)."""
     x, y, yaw, v, w, wheel_v, wheel_w, v_cmd, w_cmd, bump = record
-    poses = np.empty((len(x) + 1, 3))
+    poses = mapped.empty((len(x) + 1, 3))
     poses[0] = closed_loop.pose0
-    poses[1:, 0], poses[1:, 1], poses[1:, 2] = x, y, yaw
+    for rows in mapped.parts(len(x)):
+        poses[rows.start + 1 : rows.stop + 1] = np.stack([x[rows], y[rows], yaw[rows]], axis=1)
     return Motion(
         closed_loop.drive,
         closed_loop.dt,

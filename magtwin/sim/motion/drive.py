@@ -1,10 +1,9 @@
 """The differential drive: exact integration of twists, wheels, limits."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -210,32 +209,23 @@ class Motion:
         poses = integrate_twist(v, w, self.dt, self.pose0) if self.poses is None else np.asarray(self.poses)
         if poses.shape != (len(v) + 1, 3):
             raise InputError(f"poses of a Motion must have shape {(len(v) + 1, 3)}, got {poses.shape}")
-        rates = wheel_rates(known["wheel_v"], known["wheel_w"], self.drive)
-        angles = np.vstack([[0.0, 0.0], np.cumsum(rates, axis=0) * self.dt])
-        known |= {
-            "poses": poses,
-            "wheel_rates": rates,
-            "wheel_angles": angles,
-            "acceleration": np.diff(v, prepend=0.0) / self.dt,
-        }
-        columns = (v, w, known["acceleration"], known["v_cmd"], known["w_cmd"], known["bump"])
-        mapped.release()
-        parts = (poses[:-1], angles[:-1], rates, *(column[:, None] for column in columns))
-        known["_steps"] = _table(parts)
+        steps, angles = mapped.empty((len(v), 13)), mapped.empty((len(v) + 1, 2))
+        angles[0], turned = 0.0, np.empty((0, 2))
+        for rows in mapped.parts(len(v)):
+            rates = wheel_rates(known["wheel_v"][rows], known["wheel_w"][rows], self.drive)
+            sums = np.cumsum(np.vstack([turned, rates]), axis=0)[len(turned) :]
+            angles[rows.start + 1 : rows.stop + 1], turned = sums * self.dt, sums[-1:]
+            acceleration = np.diff(v[rows], prepend=v[rows.start - 1] if rows.start else 0.0) / self.dt
+            speeds = (v[rows], w[rows], acceleration, *(known[n][rows] for n in ("v_cmd", "w_cmd", "bump")))
+            parts = (poses[rows], angles[rows], rates, *(column[:, None] for column in speeds))
+            np.concatenate(parts, axis=1, out=steps[rows], casting="unsafe")
+        known |= {"poses": poses, "wheel_angles": angles, "_steps": steps}
+        known |= {"wheel_rates": steps[:, 5:7], "acceleration": steps[:, 9]}
+        if len(v) > mapped.LONG:  # views of the table, so that only that is kept
+            places = {"v": 7, "w": 8, "v_cmd": 10, "w_cmd": 11}
+            known |= {name: steps[:, place] for name, place in places.items()}
         for name, array in known.items():
             object.__setattr__(self, name, array)
-
-        if len(v) > mapped.LONG:  # views of the table, so that only that is kept
-            places: dict[str, Any] = {
-                "wheel_rates": slice(5, 7),
-                "v": 7,
-                "w": 8,
-                "acceleration": 9,
-                "v_cmd": 10,
-                "w_cmd": 11,
-            }
-            for name, place in places.items():
-                object.__setattr__(self, name, self._steps[:, place])
 
     @property
     def duration_s(self) -> float:
@@ -255,15 +245,6 @@ class Motion:
             return moment
         stopped = {name: getattr(moment, name) * moving for name in ("v", "w", "a", "v_cmd", "w_cmd")}
         return replace(moment, **stopped)
-
-
-def _table(parts: Sequence[Array]) -> Array:
-    """Columns (K, ...) side by side, in a mapped file if they are long."""
-    rows, width = len(parts[0]), sum(part.shape[1] for part in parts)
-    table = mapped.zeros((rows, width)) if rows > mapped.LONG else np.empty((rows, width))
-    for some in mapped.parts(rows):
-        np.concatenate([part[some] for part in parts], axis=1, out=table[some], casting="unsafe")
-    return table
 
 
 def moment_in_steps(steps: Array, dt: float, t: Array, *, first: int = 0) -> Moment:

@@ -142,10 +142,10 @@ class Runs(Summarized, Sequence[Run]):
         numbers = range(len(self))[index]
         if isinstance(numbers, int):
             return next(self._finished([self._jobs[numbers]], self._sensed([numbers])))
-        return list(self._made(numbers))
+        return list(self.made(numbers))
 
     def __iter__(self) -> Iterator[Run]:
-        return self._made(range(len(self)))
+        return self.made(range(len(self)))
 
     @property
     def identity(self) -> str | None:
@@ -172,8 +172,8 @@ class Runs(Summarized, Sequence[Run]):
         """Write the runs to a folder as Parquet files; see `magtwin.io.sweeps.save_runs`."""
         return importlib.import_module("magtwin").save_runs(self, out, **options)
 
-    def _made(self, numbers: Sequence[int]) -> Iterator[Run]:
-        """Runs by number, in their order."""
+    def made(self, numbers: Sequence[int]) -> Iterator[Run]:
+        """Runs by number, in their order; only those of a block are held at a time."""
         blocks = [numbers[k : k + self._block] for k in range(0, len(numbers), self._block)]
         if not blocks:
             return
@@ -229,7 +229,7 @@ class Runs(Summarized, Sequence[Run]):
                 else:
                     motion, metadata = travel(job.scene, job.path, draws[i], job.speed, common)
                 sensing = Sensing(job.scene, draws[i], common, wanted=self._columns)
-                count = len(readings(sensing, motion, metadata)[0])
+                count, _ = readings(sensing, motion, metadata)
                 long = sensing.rows_at_once(count) < count
                 make = _Driven if long else sense_all
                 sensed.append(make(sensing, motion, metadata))

@@ -5,9 +5,10 @@ robot's sensors are read with the others beside it: their iron at its magnetomet
 own.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from typing import Literal
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from magtwin.run.run import Run
 from magtwin.sim.motion.drive_input import DriveInput
 from magtwin.sim.runs.neighbours import Approach, Neighbour, approaches
 from magtwin.sim.runs.sensing import Conditions, LidarMode, Outside, Sensing, streams
-from magtwin.sim.runs.simulate import Predict, check_run, sense_all, travel
+from magtwin.sim.runs.simulate import Predict, Sensed, check_run, read_all, travel
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.scene import Scene
@@ -40,6 +41,9 @@ def simulate_robots(
     model_errors: Mapping[str, ModelError | None] | None = None,
     outside: Outside = "nan",
     lidar: LidarMode = "schedule",
+    complete: Callable[[str, Run], Run] = lambda name, block: block,
+    progress: Callable[[int, int, str], Any] | None = None,
+    each: Callable[[str, Run], Any] | None = None,
 ) -> dict[str, Run]:
     """Drive robots of a scene at the same time, each with the kinematic engine.
 
@@ -63,6 +67,9 @@ def simulate_robots(
         model_errors: Statistics of the errors of these predictions, by name; None draws no error.
         outside: As for `simulate`.
         lidar: As for `simulate`.
+        complete: As for `simulate`, called with the robot's name and its run, or each block of a long one.
+        progress: As for `simulate`, of each run in turn.
+        each: As for `simulate`, called with the robot's name and each block of its run, if that is long.
 
     Returns:
         A Run for each wanted robot, by name. Its metadata name the robot, and the robot that came nearest,
@@ -104,10 +111,35 @@ def simulate_robots(
         robot, predict = find("robot", name, robots), predicts[name]
         others = [other for key, other in robots.items() if key != name]
         sensing = Sensing(led[name], draws[name], conditions[name], neighbours=others)
-        sensed = sense_all(sensing, robot.motion, metadata[name])
-        run = sensed.read(None if predict is None else predict(sensed.run), (model_errors or {}).get(name))
-        runs[name] = run.with_metadata(robot=name, **_nearest(name, near))
+        own = partial(
+            _read,
+            predict=predict,
+            model_error=(model_errors or {}).get(name),
+            metadata={"robot": name, **_nearest(name, near)},
+            complete=partial(complete, name),
+        )
+        runs[name] = read_all(
+            sensing,
+            robot.motion,
+            metadata[name],
+            own,
+            progress=progress,
+            each=None if each is None else partial(each, name),
+        )
     return runs
+
+
+def _read(
+    sensed: Sensed,
+    *,
+    predict: Predict | None,
+    model_error: ModelError | None,
+    metadata: Mapping[str, str | float],
+    complete: Callable[[Run], Run],
+) -> Run:
+    """Read the magnetometer of a run, or of a block of it."""
+    run = sensed.read(None if predict is None else predict(sensed.run), model_error)
+    return complete(run.with_metadata(**metadata))
 
 
 def _check_apart(near: Iterable[Approach]) -> None:

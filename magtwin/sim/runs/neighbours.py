@@ -9,13 +9,14 @@ Robots do not see each other while they drive. Their least distance is found aft
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
+from magtwin.run import mapped
 from magtwin.sim.interference import NEAREST_M, sensor_places
 from magtwin.sim.motion.drive import Moment
 from magtwin.sim.motion.engine import Travel
@@ -64,6 +65,12 @@ class Approach:
 
     p_meet: tuple[float, float]
     """Place of the first overlap, or else of the least distance, midway between them [m]."""
+
+    def joined(self, later: "Approach") -> "Approach":
+        """The nearest approach of two robots in this time and a later one."""
+        least = later if later.clearance_m < self.clearance_m else self
+        met = next((one for one in (self, later) if one.meet_s is not None), least)
+        return replace(least, meet_s=met.meet_s, p_meet=met.p_meet)
 
 
 def iron_moments(robot: RobotSpec, b_base_nt: ArrayLike) -> Array:
@@ -162,23 +169,28 @@ def approaches(travels: Mapping[str, Neighbour]) -> Iterator[Approach]:
         travels: The robots by name.
     """
     end = max(robot.motion.duration_s for robot in travels.values())
-    t = np.arange(int(end * SEEN_HZ) + 1) / SEEN_HZ
-    places = {name: robot.motion.at(t).pose[:, :2] for name, robot in travels.items()}
-    for a, b in combinations(travels, 2):
-        apart = np.hypot(*(places[a] - places[b]).T)
-        apart -= travels[a].robot.footprint_radius_m + travels[b].robot.footprint_radius_m
-        middle = (places[a] + places[b]) / 2
-        nearest = int(np.argmin(apart))
-        met = np.flatnonzero(apart < 0)
-        first = int(met[0]) if len(met) else nearest
-        yield Approach(
-            names=(a, b),
-            clearance_m=float(apart[nearest]),
-            t_s=float(t[nearest]),
-            p_xy=(float(middle[nearest, 0]), float(middle[nearest, 1])),
-            meet_s=float(t[first]) if len(met) else None,
-            p_meet=(float(middle[first, 0]), float(middle[first, 1])),
-        )
+    count, found = int(end * SEEN_HZ) + 1, dict[tuple[str, str], Approach]()
+    for rows in mapped.parts(count):
+        t = np.arange(rows.start, rows.stop) / SEEN_HZ
+        places = {name: robot.motion.at(t).pose[:, :2] for name, robot in travels.items()}
+        for a, b in combinations(travels, 2):
+            apart = np.hypot(*(places[a] - places[b]).T)
+            apart -= travels[a].robot.footprint_radius_m + travels[b].robot.footprint_radius_m
+            middle = (places[a] + places[b]) / 2
+            nearest = int(np.argmin(apart))
+            met = np.flatnonzero(apart < 0)
+            first = int(met[0]) if len(met) else nearest
+            later = Approach(
+                names=(a, b),
+                clearance_m=float(apart[nearest]),
+                t_s=float(t[nearest]),
+                p_xy=(float(middle[nearest, 0]), float(middle[nearest, 1])),
+                meet_s=float(t[first]) if len(met) else None,
+                p_meet=(float(middle[first, 0]), float(middle[first, 1])),
+            )
+            before = found.get((a, b))
+            found[a, b] = later if before is None else before.joined(later)
+    yield from found.values()
 
 
 def touching(

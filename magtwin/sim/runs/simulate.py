@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
@@ -234,7 +233,8 @@ def sense_all(sensing: Sensing, motion: Travel, metadata: Mapping[str, str | int
         motion: What the robot did.
         metadata: How the motion came about.
     """
-    t, known = readings(sensing, motion, metadata)
+    count, known = readings(sensing, motion, metadata)
+    t = np.arange(count) / sensing.rate_hz
     return Sensed(Run(sensing.sense(motion, t), known, sensing.specs), sensing)
 
 
@@ -257,31 +257,31 @@ def read_all(
         progress: Called after each block with readings made, readings in all and the simulated time as text.
         each: Called with each block of a long run.
     """
-    times, known = readings(sensing, motion, metadata)
-    whole, rows = Spool(len(times)), sensing.rows_at_once(len(times))
-    for first in range(0, len(times), rows):
-        t = times[first : first + rows]
+    count, known = readings(sensing, motion, metadata)
+    whole, rows = Spool(count), sensing.rows_at_once(count)
+    for first in range(0, count, rows):
+        t = np.arange(first, min(first + rows, count)) / sensing.rate_hz
         block = read(Sensed(Run(sensing.sense(motion, t), known, sensing.specs), sensing))
         whole.append(block)
-        if rows == len(times):
+        if rows == count:
             break
         sensing.forget()
         if each is not None:
             each(block)
         if progress is not None:
-            progress(first + len(t), len(times), f"{t[-1]:,.0f} s")
+            progress(first + len(t), count, f"{t[-1]:,.0f} s")
     return whole.run
 
 
 def readings(
     sensing: Sensing, motion: Travel, metadata: Mapping[str, str | int | float | bool]
-) -> tuple[NDArray[np.float64], Metadata]:
-    """Times of the readings of a run [s], shape (N,), and its metadata; arguments as for `sense_all`."""
+) -> tuple[int, Metadata]:
+    """Number of the readings of a run, and its metadata; arguments as for `sense_all`."""
     conditions = sensing.conditions
     end = motion.duration_s if conditions.duration_s is None else conditions.duration_s
     _check_readings(end, sensing.rate_hz)
-    t = np.arange(max(1, math.ceil(end * sensing.rate_hz - 1e-9))) / sensing.rate_hz
-    return t, {**run_metadata(sensing), **metadata, "duration_s": round(float(end), 9)}
+    count = max(1, math.ceil(end * sensing.rate_hz - 1e-9))
+    return count, {**run_metadata(sensing), **metadata, "duration_s": round(float(end), 9)}
 
 
 def run_metadata(sensing: Sensing) -> Metadata:

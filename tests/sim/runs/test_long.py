@@ -1,16 +1,25 @@
 """Long runs are made and written block by block; the bytes are those of a run that is made at once."""
 
+import importlib
 import os
 import signal
+import subprocess
+import sys
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import magtwin as mt
 from magtwin.errors import InputError
+from magtwin.files import shipped
+from magtwin.io import sweeps, tables
 from magtwin.io.formats import read_run, write_run
 from magtwin.io.outputs import Outputs
+from magtwin.io.tables import parquet_of
 from magtwin.run import mapped
+from magtwin.run.run import Column
 from magtwin.run.spool import Spool, blocks
 
 ROWS = 2160
@@ -88,6 +97,96 @@ def test_a_killed_long_run_leaves_what_was_made_of_it(twin, run, tmp_path, long_
     assert content(read_run(tmp_path / "a.mcap.parts")) == content(run.take(slice(3 * 384)))
     with pytest.raises(InputError, match="did not end"), outputs.kept() as keep:
         keep(run)
+
+
+@pytest.mark.parametrize(("suffix", "writer"), [(".mcap", "bags.writer"), (".csv", "tables")])
+def test_a_run_that_is_killed_while_it_is_written_is_whole_in_its_parts(
+    run, tmp_path, monkeypatch, long_runs, suffix, writer
+):
+    def until_killed(run, *rows):
+        for number, block in enumerate(blocks(run, *rows)):
+            if number == 2:
+                os.kill(os.getpid(), signal.SIGKILL)
+            yield block
+
+    file, module = tmp_path / f"a{suffix}", importlib.import_module(f"magtwin.io.{writer}")
+    outputs = Outputs.of([file])
+    child = os.fork()
+    if child == 0:
+        with outputs.kept() as keep, outputs.aside() as places:
+            for block in blocks(run):
+                keep(block)
+            monkeypatch.setattr(module, "blocks", until_killed)
+            write_run(run, places.files[0])
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+    assert not file.exists()
+    assert content(read_run(f"{file}.parts")) == content(run)
+
+
+def test_parquet_of_a_long_run_is_read_in_blocks(run, tmp_path, monkeypatch, long_runs):
+    spec = Column("K", "", "temperature of the head")
+    run = run.with_columns(head_k=np.arange(ROWS)).with_specs(head_k=spec)
+    write_run(run, tmp_path / "a.parquet")
+    assert parquet_of(run) == (tmp_path / "a.parquet").read_bytes()
+    seen, whole = [], tables.run_of
+    monkeypatch.setattr(tables, "run_of", lambda table, *rest: seen.append(len(table)) or whole(table, *rest))
+    again = read_run(tmp_path / "a.parquet")
+    assert content(again) == content(run)
+    assert again.spec("head_k") == spec
+    assert max(seen) <= 384
+    assert sum(seen) == ROWS
+
+
+@pytest.mark.parametrize(
+    ("name", "row", "value", "message"),
+    [
+        ("flag_bump", 1000, 2.0, "'flag_bump', row 1000: a flag is 0 or 1, got 2"),
+        ("b_total_nt", 600, None, "'b_total_nt', row 600: no value"),
+        ("t", 1500, 0.0, r"row 1500 has 0 s after 11\.1"),
+        ("t", 1500, np.nan, "t must be finite, got nan in row 1500"),
+    ],
+)
+def test_faults_in_a_long_table_are_named_by_their_row(run, tmp_path, long_runs, name, row, value, message):
+    columns = {key: run[key].astype(float).tolist() for key in ("t", "b_total_nt", "flag_bump")}
+    columns[name][row] = value
+    pq.write_table(
+        pa.table({key: pa.array(values, pa.float64()) for key, values in columns.items()}),
+        tmp_path / "a.parquet",
+    )
+    with pytest.raises(InputError, match=message):
+        read_run(tmp_path / "a.parquet")
+
+
+def test_workers_of_a_sweep_write_their_long_runs_themselves(twin, tmp_path, long_runs):
+    runs = mt.sweep(twin, ["figure8", "random"], 3, duration_s=8.0, columns=["b_total_nt"])
+    runs.save(tmp_path / "here")
+    files, said = sweeps.make_block(runs, tmp_path, range(3))
+    assert not files
+    sent, _ = sweeps.make_block(runs, None, range(3))
+    assert [name for name, _ in sent] == [f"run_{k:05d}.parquet" for k in range(3)]
+    for name, data in sent:
+        assert (tmp_path / name).read_bytes() == (tmp_path / "here" / name).read_bytes() == data
+    assert said.csv() == (tmp_path / "here" / "runs.csv").read_bytes()
+
+
+@pytest.mark.slow
+def test_later_long_runs_of_a_process_take_no_memory_of_their_own():
+    """Of ten runs of two hours at 1 Hz; in a process that has not made room before."""
+    code = f"""
+import magtwin as mt
+from magtwin.run import mapped
+mapped.LONG = 5000
+def anon_mb():
+    with open("/proc/self/status") as status:
+        return next(int(line.split()[1]) for line in status if line.startswith("RssAnon")) / 1e3
+twin = mt.open_twin({str(shipped("scenes", "lab", "lab.usda"))!r})
+for run in mt.sweep(twin, "figure8", 10, duration_s=7200.0, rate_hz=1.0):
+    print(run.rows, anon_mb())
+"""
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    rows, anon = np.array([line.split() for line in said.splitlines()], float).T
+    assert (rows == 7200).all()
+    assert anon[-1] - anon[3] < 20
 
 
 def test_a_long_run_that_is_written_leaves_no_parts(run, tmp_path, long_runs):

@@ -17,6 +17,7 @@ from magtwin.files import shipped
 from magtwin.io.provenance import repeat
 from magtwin.io.tables import read_parquet
 from magtwin.path import Path
+from magtwin.run import mapped
 from magtwin.run.run import Run
 from magtwin.sim.motion.drive import Motion
 from magtwin.sim.runs.multi_robot import simulate_robots as run_robots
@@ -98,6 +99,20 @@ def drive(scene: Scene = SCENE, ways: dict | None = None, **options) -> dict[str
 def passing() -> dict[str, Run]:
     """Two robots that pass each other at 0.6 m."""
     return drive()
+
+
+def test_long_runs_of_several_robots_are_those_that_are_made_at_once(passing, monkeypatch):
+    monkeypatch.setattr(mapped, "LONG", 300)
+    monkeypatch.setattr(mapped, "BLOCK", 170)
+    seen: dict[str, list[Run]] = {"ann": [], "bob": []}
+    made = drive(each=lambda name, block: seen[name].append(block))
+    for name, run in made.items():
+        assert dict(run.metadata) == dict(passing[name].metadata)
+        assert {key: v.tobytes() for key, v in run.items()} == {
+            key: v.tobytes() for key, v in passing[name].items()
+        }
+        assert_array_equal(np.concatenate([block["t"] for block in seen[name]]), run["t"])
+        assert len(seen[name]) > 4
 
 
 def test_the_moment_for_a_robots_iron_makes_its_field_at_its_own_magnetometer():
