@@ -2,18 +2,18 @@
 
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import pytest
-from nodes import DOMAINS, from_message, spin
+from nodes import from_message, spin
 
 from magtwin.errors import InputError
 from magtwin.files import shipped
 from magtwin.frames import quat_from_yaw
 from magtwin.io.bags.topics import CLOCK, COMMAND, ODOMETRY, POSE, Qos
 from magtwin.path import PATHS, Path
-from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
+from magtwin.ros.bus import Bus, Message, to_bytes
 from magtwin.ros.commands import Commands
 from magtwin.ros.diagnostics import KIND, Status
 from magtwin.ros.follow import Follower
@@ -28,23 +28,6 @@ pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 NS = 10**9
 TICK_S = 0.02
 LINE = Path("line", np.array([[0.0, 0.0], [0.3, 0.0], [0.5, 0.1]]))
-
-
-@pytest.fixture
-def nodes() -> Iterator[Callable[..., Bus]]:
-    """Makes nodes in a domain of the test's own, on loopback only."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        patch.delenv("CYCLONEDDS_URI", raising=False)
-        domain, made = next(DOMAINS), []
-
-        def node(name: str, **rest: object) -> Bus:
-            made.append(open_bus(name, backend="cyclonedds", domain=domain, **rest))  # type: ignore[arg-type]
-            return made[-1]
-
-        yield node
-        for one in made:
-            one.close()
 
 
 @pytest.fixture(scope="module")
