@@ -6,10 +6,13 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-from magtwin.ros.bus import Bus, Message
+import pytest
+
+from magtwin.ros.bus import Bus, Message, open_bus
 from magtwin.ros.diagnostics import LEVELS, Status
 
 SLOWEST_S = 15.0
@@ -51,6 +54,26 @@ def _domains() -> Iterator[int]:
 
 
 DOMAINS = _domains()
+
+
+@contextmanager
+def in_a_domain() -> Iterator[Callable[..., Bus]]:
+    """Makes nodes in a domain of their own, on loopback only, and closes them."""
+    domain, made = next(DOMAINS), list[Bus]()
+
+    def node(name: str, **rest: object) -> Bus:
+        made.append(open_bus(name, backend="cyclonedds", domain=domain, **rest))  # type: ignore[arg-type]
+        return made[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        for name in ("CYCLONEDDS_URI", "ROS_LOCALHOST_ONLY"):
+            patch.delenv(name, raising=False)
+        try:
+            yield node
+        finally:
+            for bus in made:
+                bus.close()
 
 
 def spin(until: Callable[[], object], *nodes: Bus) -> None:

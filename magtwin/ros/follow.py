@@ -41,11 +41,8 @@ MAX_AGE_S = 0.3
 COASTED_M = 0.3
 """Distance that a robot may coast after its pose is lost [m]."""
 
-BEGINS_M = 0.1
-"""A robot nearer than this to the first point of a path starts from where it stands [m]."""
-
-SKIPPED_M = 0.2
-"""Part of the path that counts as driven then, up to its first stop [m]: twice the farthest marker."""
+MARKER_M = 0.1
+"""Distance from the robot's centre that the marker of its pose may have [m]."""
 
 STAND_S = 1.0
 """Time for which standing is commanded at the end [s]."""
@@ -69,6 +66,33 @@ class Progress:
 
     rms_m: float
     """RMS distance since the path was reached [m]; nan before."""
+
+
+class MarkerGuide(Guide):
+    """A guide by the pose of a marker, which may be up to `MARKER_M` off the robot's centre.
+
+    As the robot turns on the spot, a marker at a distance r from its centre moves by up to 2 r. A robot that
+    has reached its path is therefore lost only if it is farther away than that; else it would turn and return
+    by turns at a corner, or at the first point, without end. Within that distance the law of
+    `magtwin.sim.motion.loop.along_path` still has one heading to turn to: its wanted heading changes by at
+    most r / SETTLE_M < 1 per radian of the turn.
+    """
+
+    def __init__(self, guide: Guide) -> None:
+        """Take over a guide that has not been used."""
+        super().__init__(guide.law, guide.table, guide.gains, guide.timeout_s, guide.pose0)
+        self._reached_m = 2 * MARKER_M
+        """Distance from the first point within which the path counts as reached [m]; 0 when it was."""
+
+    def command(self, t: float, x: float, y: float, yaw: float, v: float, w: float) -> tuple[float, float]:
+        """As for `Guide`; a robot that first stands near the path begins from there."""
+        if self._reached_m:
+            away = math.hypot(x - self.table[0, 0], y - self.table[1, 0])
+            if away < self._reached_m:
+                self.gains, self._reached_m = self.gains_within(2 * MARKER_M), 0.0
+            else:
+                self._reached_m = self.lost_m
+        return super().command(t, x, y, yaw, v, w)
 
 
 class Follower:
@@ -149,7 +173,9 @@ class Follower:
         self._command(0.0, 0.0)
 
     def _guided(self, path: Path) -> Guide:
-        return guide_along(self._controller, path, self._drive, speed=self._speed, dt=1 / CONTROL_RATE_HZ)
+        return MarkerGuide(
+            guide_along(self._controller, path, self._drive, speed=self._speed, dt=1 / CONTROL_RATE_HZ)
+        )
 
     def _look(self) -> None:
         self._pose.look()
@@ -178,7 +204,6 @@ class Follower:
         self._announce("driving")
         if self._begin_ns is None:
             self._begin_ns = now
-            self._begin_here(x, y)
         yaw = float(yaw_from_quat(fresh[self._q])[0])
         twist = self._twist.fresh(now)
         v, w = self._last if twist is None else (float(twist["odom_v"][0, 0]), float(twist["odom_w"][0, 2]))
@@ -200,18 +225,6 @@ class Follower:
         self._guide = self._guided(self.path)
         self._begin_ns, self._stand_s = None, STAND_S
         self._laps, self._squares, self._count, self._off = 0, 0.0, 0, math.nan
-
-    def _begin_here(self, x: float, y: float) -> None:
-        """Count the beginning of the path as reached if the robot stands near it.
-
-        Markers a few centimetres off centre move when the robot turns on the spot. Its reported pose may
-        never come closer to the first nodes, and the robot would turn without end.
-        """
-        guide = self._guide
-        begins = guide.law != RELEASE and guide.node == 0 and guide.table.shape[1] > 1
-        if begins and math.hypot(guide.table[0, 0] - x, guide.table[1, 0] - y) < BEGINS_M:
-            stops = np.flatnonzero(guide.table[5] <= 0)
-            guide.node = max(1, min(round(SKIPPED_M / NODE_M), int(stops[0]) - 1))
 
     def _rejoin(self, x: float, y: float) -> None:
         """Continue where the robot stands now; it coasted before it stood."""

@@ -184,10 +184,12 @@ class Simulator:
             self._publish_until(pace, pace.due_s(self.online.t) - LEAD_S)
             if pace.slip(self.online.t, time.monotonic()):
                 self._slips += 1
+            begin = round(self.online.t * NS)
             for robot in self.robots:
                 robot.drive()
             for robot in self.robots:
                 for sent in robot.messages():
+                    self._publish_due(pace, begin)
                     self._queue(sent)
             now = time.monotonic()
             if now - reported > REPORT_S:
@@ -240,11 +242,20 @@ class Simulator:
             if left > 0:
                 self._bus.spin_once(left)
             elif next_s <= due_s:
-                _, _, publisher, data = heapq.heappop(self._events)
-                publisher.publish(data)
+                self._publish_next()
             else:
                 self._bus.spin_once(0.0)
                 return
+
+    def _publish_due(self, pace: Pace, end_ns: int) -> None:
+        """Publish messages that are due by now and before a simulated time."""
+        now = time.monotonic()
+        while self._events and self._events[0][0] < end_ns and pace.due_s(self._events[0][0] / NS) <= now:
+            self._publish_next()
+
+    def _publish_next(self) -> None:
+        _, _, publisher, data = heapq.heappop(self._events)
+        publisher.publish(data)
 
     def _report(self, factor: float) -> None:
         stamp = self._begin_ns + round(self.online.t * NS)

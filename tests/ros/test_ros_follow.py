@@ -1,24 +1,28 @@
 """The path follower and the hand as nodes: they drive the twin, and stand where they do not know where."""
 
+import math
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 import pytest
-from nodes import DOMAINS, from_message, spin
+from nodes import from_message, spin
 
 from magtwin.errors import InputError
 from magtwin.files import shipped
 from magtwin.frames import quat_from_yaw
 from magtwin.io.bags.topics import CLOCK, COMMAND, ODOMETRY, POSE, Qos
 from magtwin.path import PATHS, Path
-from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
+from magtwin.ros.bus import Bus, Message, to_bytes
 from magtwin.ros.commands import Commands
 from magtwin.ros.diagnostics import KIND, Status
-from magtwin.ros.follow import Follower
+from magtwin.ros.follow import MARKER_M, Follower, MarkerGuide
 from magtwin.ros.simulate import Simulator
 from magtwin.ros.teleop import Teleop
+from magtwin.sim.motion.closed_loop import Chassis, ClosedLoop
+from magtwin.sim.motion.controllers import Guide, guide_along
 from magtwin.sim.motion.manual import Keyboard
 from magtwin.spec.drive import DriveSpec
 from magtwin.twin import Twin, open_twin
@@ -28,23 +32,14 @@ pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 NS = 10**9
 TICK_S = 0.02
 LINE = Path("line", np.array([[0.0, 0.0], [0.3, 0.0], [0.5, 0.1]]))
-
-
-@pytest.fixture
-def nodes() -> Iterator[Callable[..., Bus]]:
-    """Makes nodes in a domain of the test's own, on loopback only."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        patch.delenv("CYCLONEDDS_URI", raising=False)
-        domain, made = next(DOMAINS), []
-
-        def node(name: str, **rest: object) -> Bus:
-            made.append(open_bus(name, backend="cyclonedds", domain=domain, **rest))  # type: ignore[arg-type]
-            return made[-1]
-
-        yield node
-        for one in made:
-            one.close()
+CORNERED = {
+    "figure8": PATHS["figure8"](),
+    "corner": Path("corner", np.array([[0.0, 0.0], [0.6, 0.0], [0.6, 0.5]])),
+    "rectangle": Path("rectangle", np.array([[0.0, 0.0], [1, 0], [1, 0.6], [0, 0.6], [0, 0]]), True),
+    "zigzag": Path("zigzag", np.array([[0, 0], [0.3, 0], [0.1, 0.25], [0.5, 0.3], [0.2, 0.6]])),
+}
+LATE = 4
+"""Steps by which the poses of a marker are late."""
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +119,64 @@ def driven(
         bus.spin_once(0.01)
     assert node.done
     return node, np.array(track)
+
+
+def by_marker(
+    path: Path, arm: tuple[float, float], start: tuple[float, float, float], controller: str = "follower"
+) -> tuple[Guide, float, np.ndarray]:
+    """Drive by late poses of a marker, for at most four times the time of the path.
+
+    Args:
+        path: The path.
+        arm: Place of the marker in the robot's frame [m].
+        start: First pose of the robot.
+        controller: As for `guide_along`.
+
+    Returns:
+        The guide, the duration [s], and the robot's x, y from when it was on the path [m], shape (K, 2).
+    """
+    drive = DriveSpec()
+    guide = MarkerGuide(guide_along(controller, path, drive, speed=0.2, dt=TICK_S))
+    robot = Chassis(ClosedLoop(drive=drive, guide=guide, dt=TICK_S, pose0=start, steps=1))
+    poses: deque[tuple[float, float, float]] = deque(maxlen=LATE + 1)
+    track: list[tuple[float, float]] = []
+    while not guide.done and robot.t < 4 * path.length / 0.2:
+        x, y, yaw = robot.pose
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        poses.append((x + arm[0] * cos - arm[1] * sin, y + arm[0] * sin + arm[1] * cos, yaw))
+        robot.step(guide.command(robot.t, *poses[0], *robot.twist))
+        if guide.node > 0:
+            track.append(robot.pose[:2])
+    return guide, robot.t, np.array(track).reshape(-1, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "controller", "start"),
+    [
+        ("figure8", "follower", None),
+        *((name, "follower", None) for name in ("corner", "rectangle", "zigzag")),
+        ("zigzag", "stanley", None),
+        ("zigzag", "pure_pursuit", None),
+        ("corner", "follower", (0.05, -0.04, math.pi)),
+        ("rectangle", "follower", (-0.5, 0.7, 2.0)),
+    ],
+)
+def test_a_path_is_driven_by_a_marker_off_centre(
+    name: str, controller: str, start: tuple[float, float, float] | None
+) -> None:
+    path = CORNERED[name]
+    x, y = path.p_xy[0].tolist()
+    start = start or (x, y, float(path.heading(0.0)))
+    _, centred_s, _ = by_marker(path, (0.0, 0.0), start, controller)
+    for reach, turns in ((0.05, 4), (MARKER_M, 8)):
+        for angle in np.arange(turns) * 2 * math.pi / turns:
+            arm = (reach * math.cos(angle), reach * math.sin(angle))
+            guide, seconds, track = by_marker(path, arm, start, controller)
+            assert guide.done, arm
+            assert seconds < 2 * centred_s
+            _, off = path.nearest(track)
+            assert np.sqrt(np.mean(off**2)) < reach + 0.01  # the marker is on the path, the robot beside it
+            assert np.abs(off).max() < 2 * MARKER_M + 0.01  # as it first turns, or turns at a corner
 
 
 def test_the_twin_is_driven_along_a_path_over_ros_and_stands_at_its_end(

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from nodes import DOMAINS, spin
+from nodes import DOMAINS, in_a_domain, spin
 from scipy.stats import chi2
 
 from magtwin.frames import quat_from_yaw, rotate, wrap_angle, yaw_from_quat
@@ -38,18 +38,8 @@ def twin() -> Twin:
 @pytest.fixture(scope="module")
 def node() -> Iterator[Callable[..., Bus]]:
     """Makes nodes in one domain."""
-    made, domain = list[Bus](), next(DOMAINS)
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("CYCLONEDDS_URI", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOCALHOST_ONLY"):
-            patch.delenv(name, raising=False)
-
-        def make(name: str, **rest: object) -> Bus:
-            made.append(open_bus(name, backend="cyclonedds", domain=domain, **rest))  # type: ignore[arg-type]
-            return made[-1]
-
-        yield make
-    for bus in made:
-        bus.close()
+    with in_a_domain() as made:
+        yield made
 
 
 def content(message: Message):

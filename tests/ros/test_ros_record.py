@@ -2,13 +2,13 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from nodes import DOMAINS, spin
+from nodes import spin
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
@@ -19,7 +19,7 @@ from magtwin.io.bags import RawBagWriter
 from magtwin.io.bags.topics import CLOCK, LATCHED, MAGNITUDE, ODOMETRY, Qos
 from magtwin.io.bags.types import definition_of
 from magtwin.io.formats import read_run
-from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
+from magtwin.ros.bus import Bus, Message, to_bytes
 from magtwin.ros.record import Player, Recorder
 from magtwin.ros.simulate import Simulator
 from magtwin.twin import Twin, open_twin
@@ -31,22 +31,6 @@ COMMON = (
     *("trajectory_msgs", "visualization_msgs"),
 )
 """common_interfaces but std_srvs, which has no messages."""
-
-
-@pytest.fixture
-def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Bus]]:
-    """Makes nodes in a domain of the test's own, on loopback only."""
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
-    domain, made = next(DOMAINS), list[Bus]()
-
-    def node(name: str, **rest: object) -> Bus:
-        made.append(open_bus(name, backend="cyclonedds", domain=domain, **rest))  # type: ignore[arg-type]
-        return made[-1]
-
-    yield node
-    for bus in made:
-        bus.close()
 
 
 @pytest.fixture(scope="module")

@@ -2,13 +2,13 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
-from nodes import DOMAINS, SLOWEST_S, from_message, spin
+from nodes import SLOWEST_S, from_message, in_a_domain, spin
 
 from magtwin.errors import InputError
 from magtwin.files import shipped
@@ -20,7 +20,7 @@ from magtwin.io.bags.types import layout
 from magtwin.io.formats import read_run
 from magtwin.learn.data.recording import Source
 from magtwin.learn.data.recording import read as read_source
-from magtwin.ros.bus import Bus, Message, names_of, open_bus, to_bytes
+from magtwin.ros.bus import Bus, Message, names_of, to_bytes
 from magtwin.ros.commands import command_bytes
 from magtwin.ros.diagnostics import KIND, Status, to_fields
 from magtwin.ros.record import Player, Recorder
@@ -40,27 +40,6 @@ def twin() -> Twin:
     return open_twin(shipped("scenes", "lab", "lab.usda"))
 
 
-@pytest.fixture
-def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Bus]]:
-    """Makes nodes in a domain of the test's own, on loopback only."""
-    with pytest.MonkeyPatch.context() as patch:
-        yield from _nodes(patch)
-
-
-def _nodes(patch: pytest.MonkeyPatch) -> Iterator[Callable[..., Bus]]:
-    patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    patch.delenv("CYCLONEDDS_URI", raising=False)
-    domain, made = next(DOMAINS), []
-
-    def node(name: str, **rest: object) -> Bus:
-        made.append(open_bus(name, backend="cyclonedds", domain=domain, **rest))  # type: ignore[arg-type]
-        return made[-1]
-
-    yield node
-    for one in made:
-        one.close()
-
-
 @dataclass
 class Driven:
     """A simulated robot that was driven over ROS, and what was recorded of that."""
@@ -76,15 +55,13 @@ def command(v: float, w: float) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def driven(twin: Twin, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Driven]:
+def driven(twin: Twin, tmp_path_factory: pytest.TempPathFactory) -> Driven:
     """A robot that is driven for some seconds, at twice real time."""
-    with pytest.MonkeyPatch.context() as patch:
-        yield from _driven(twin, tmp_path_factory.mktemp("recorded") / "bag", patch)
+    with in_a_domain() as node:
+        return _driven(twin, node, tmp_path_factory.mktemp("recorded") / "bag")
 
 
-def _driven(twin: Twin, bag: Path, patch: pytest.MonkeyPatch) -> Iterator[Driven]:
-    made = _nodes(patch)
-    node = next(made)
+def _driven(twin: Twin, node: Callable[..., Bus], bag: Path) -> Driven:
     simulator = Simulator(twin, node("sim"), seed=SEED, speed=2.0, lidar="on")
     listener, hand = node("recorder", sim_time=True), node("hand")
     writer = RawBagWriter(bag)
@@ -108,8 +85,7 @@ def _driven(twin: Twin, bag: Path, patch: pytest.MonkeyPatch) -> Iterator[Driven
     recorder.run(ended)
     recorder.run(duration_s=0.2)
     writer.close()
-    yield Driven(simulator, bag, read_run(bag), said)
-    next(made, None)
+    return Driven(simulator, bag, read_run(bag), said)
 
 
 def test_what_is_recorded_over_ros_is_the_direct_run_of_its_commands(driven: Driven, twin: Twin) -> None:

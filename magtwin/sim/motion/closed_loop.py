@@ -95,9 +95,7 @@ class ClosedLoop:
             radius / separation * (1.0 - drive.yaw_slip),
             drive.command_timeout_s,
             self.footprint_radius_m,
-            *self.guide.gains[:5],
-            (math.sqrt(self.guide.gains[5]) + self.pose_error.reach_m(drive.v_max)) ** 2,
-            *self.guide.gains[6:],
+            *self.guide.gains_within(self.pose_error.reach_m(drive.v_max)),
             *self.pose_error.figures,
         ]
 

@@ -115,6 +115,15 @@ class Guide:
         """Whether the end was reached; it then commands a stop."""
         return self.node >= self.table.shape[1]
 
+    @property
+    def lost_m(self) -> float:
+        """Distance from the path beyond which the robot counts as lost [m]."""
+        return math.sqrt(self.gains[5])
+
+    def gains_within(self, reach_m: float) -> tuple[float, float, float, float, float, float, float, float]:
+        """`gains` for poses that may be off by some distance [m]: the robot is lost only farther away."""
+        return (*self.gains[:5], (self.lost_m + reach_m) ** 2, *self.gains[6:])
+
     def command(self, t: float, x: float, y: float, yaw: float, v: float, w: float) -> tuple[float, float]:
         """As for `Controller`."""
         v_cmd, w_cmd, self.node, self.driven_m = loop.commanded(
