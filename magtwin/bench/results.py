@@ -29,6 +29,7 @@ from magtwin.bench.suite import Chunk, Suite, load_suite
 from magtwin.errors import InputError, find
 from magtwin.files import output, read_text
 from magtwin.kinds import expected
+from magtwin.localization.scores import Scores
 from magtwin.report import Figure, Report
 from magtwin.summary import Summarized, Summary, listed
 
@@ -332,8 +333,8 @@ def _parts(folder: Path, kind: str, scenario: str) -> list[Path]:
 def _read_part(file: Path, columns: list[str] | None = None) -> pa.Table:
     try:
         return pq.read_table(file, columns=columns)
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        reason = (str(error).splitlines() or [""])[0]
         raise InputError(f"{file}: damaged ({reason}); remove it and repeat magtwin bench") from error
 
 
@@ -358,6 +359,7 @@ def _read(folders: Sequence[Path], kind: str, order: tuple[dict[str, int], dict[
     for name in table.column_names:
         values = table[name].to_numpy(zero_copy_only=False)
         columns[name] = values.astype(str) if pa.types.is_string(table[name].type) else values
+    _check_columns(folders[0] / kind, columns, _NUMBERS[kind], scenarios)
     names = {name: k for k, name in enumerate(sorted(set(columns["localizer"].tolist()) - localizers.keys()))}
     place = localizers | {name: len(localizers) + k for name, k in names.items()}
     keys = [
@@ -367,6 +369,31 @@ def _read(folders: Sequence[Path], kind: str, order: tuple[dict[str, int], dict[
     first = {key: row for row, key in reversed(list(enumerate(keys)))}
     picked = [first[key] for key in sorted(first)]
     return {name: values[picked] for name, values in columns.items()}
+
+
+def _check_columns(
+    folder: Path, columns: Columns, numbers: Iterable[str], scenarios: Mapping[str, int]
+) -> None:
+    """Refuse rows without a column, or with another kind of values, and rows of no scenario."""
+    kinds = {"scenario": "U", "localizer": "U", "run": "iu", **dict.fromkeys(numbers, "biuf")}
+    for name, kind in kinds.items():
+        if name not in columns or columns[name].dtype.kind not in kind:
+            what = "texts" if kind == "U" else "numbers"
+            raise InputError(
+                f"{folder}: its rows hold no {what} in column {name!r}: damaged, or of another magtwin; remove "
+                "them and repeat magtwin bench"
+            )
+    if unknown := set(columns["scenario"].tolist()) - scenarios.keys():
+        raise InputError(
+            f"{folder}: rows of scenario {min(unknown)!r}, which the suite does not have; remove them and "
+            "repeat magtwin bench"
+        )
+
+
+_SCORES = [name for name, value in Scores().row().items() if not isinstance(value, str)]
+_COUNTS = ("seed", "session", "readings", "smoother", "global_start", "recovered_in_time")
+_NUMBERS = {ROWS: [*_COUNTS, *(name for name in _SCORES if name != "step_us")], TIMES: ["step_us"]}
+"""Columns of numbers and flags by kind of table; reports read them."""
 
 
 def _aligned(times: Columns, rows: Columns) -> Columns:

@@ -51,7 +51,7 @@ CORPUS = Path(__file__).with_name("corpus")
 
 NUMBERS = ("0", "-1", "nan", "1e-320", "1e400", "-0.0", "0x10", str(1 << 31), str(1 << 64), "9" * 23, "1" * 5000)
 WORDS = ("", "\x00", "é", "../../x", "/dev/null", "a" * 300, "{", "}", "[[", "]]", "<", ">", '"', "'", "@", "\x1b[2J")
-WORDS += ("null", "true", "[]", "{}", '""', "*a", "&a", "<<", "${x}", "#", "\\", "\u202e", "inf")
+WORDS += ("null", "None", "true", "[]", "{}", '""', "*a", "&a", "<<", "${x}", "#", "\\", "\u202e", "inf")
 ENCODED = (*(word.encode() for word in WORDS), b"\xed\x9f\xbf", b"\xff\xfe", b"\xed\xa0\x80", b"\xef\xbb\xbf")
 WHOLE = (0, 1, 0x7F, 0xFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 1 << 40, (1 << 63) - 1, (1 << 64) - 1)
 

@@ -554,8 +554,10 @@ def _magnetic_data(file: Path) -> None:
 def _matlab(file: Path) -> None:
     from scipy.io import savemat
 
-    held = {"p": np.zeros((3, 5)), "q": np.zeros((4, 5)), "T": 0.1, "y_mag": np.ones((3, 5)), "p_0": [1.0, 2, 3]}
-    savemat(file, held)
+    n = 6
+    q = np.tile([[1.0], [0], [0], [0]], n)
+    held = {"p": np.arange(3 * n).reshape(3, n) * 0.1, "q": q, "p_0": np.zeros((3, 1)), "q_0": q[:, :1]}
+    savemat(file, {**held, "T": 0.1, "y_mag": np.ones((3, n))})
 
 
 def text(content: str) -> Callable[[Path], object]:
@@ -762,7 +764,7 @@ FORMATS: Mapping[str, Format] = {
     "results": Format("suite.json", _results, _read_results),
     "results-rows": Format("rows/a/part-00000.parquet", _results, _read_results),
     "magnetic-data": Format("1-loc.csv", _magnetic_data, _reads("bench.magnetic_data:read_recording", folder=True, number=1)),
-    "matlab": Format("x.mat", _matlab, lambda file: call("bench.magslam:_matlab", file, ("p", "q", "T", "y_mag"))),
+    "matlab": Format("Aligned_SquareLoop_1.mat", _matlab, _reads("bench.magslam:ship_case", folder=True, loop=1, seed=1)),
 }
 """Formats by name: every kind of file that a command, a stage or a robot's description may name."""
 

@@ -8,6 +8,7 @@ not needed.
 import codecs
 import os
 import re
+import struct
 import zipfile
 import zlib
 from pathlib import Path
@@ -81,7 +82,9 @@ def _load(path: Path) -> dict[str, Any]:
             check_count(path, "checkpoint", len(archive.infolist()), "members")
             if damaged := archive.testzip():  # torch itself tests no checksum
                 raise InputError(f"{path}: member {ascii(damaged)[:60]} is damaged; get the file again")
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, OSError, EOFError, RuntimeError) as error:
+    except (zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, RuntimeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(
             f"{path}: not the zip that torch.save writes, or damaged ({error}); get the file again"
         ) from error
