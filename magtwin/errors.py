@@ -9,6 +9,9 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
+LONGEST = 1500
+"""Most characters of a refusal; what it quotes from a file may have no end."""
+
 _PARAMETER = re.compile(r"`(?:magtwin\.)?([a-z_][a-z0-9_]*)(?:=([^`]*)|\(([^`]*)\))?`")
 """A parameter in the text of a refusal: `force=True`, `map_layer`, `magtwin.allow('folder')`."""
 
@@ -27,6 +30,8 @@ class InputError(ValueError):
     """Name of the parameter that is wrong, or that would help. None if the error is about none."""
 
     def __init__(self, text: str = "", *, parameter: str | None = None) -> None:
+        if len(text) > LONGEST:  # what is wrong is at the beginning, what to do at the end
+            text = f"{text[: LONGEST * 2 // 3]} ... {text[-LONGEST // 3 :]}"
         super().__init__(text)
         self.parameter = parameter
 

@@ -7,8 +7,12 @@ magnetic field SLAM with loop-closure detection, `eight.mat` and `square.mat`, M
 magtwin ships neither; give the folder that holds them.
 """
 
+import io
 import math
 import os
+import subprocess
+import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,11 +21,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from magtwin.budget import check_size, decoded_limit
 from magtwin.errors import InputError
+from magtwin.files import existing
 from magtwin.localization.problem import OdometryModel, Prior, Problem, SensorModel
 from magtwin.run.run import Run
 
 Array = NDArray[np.float64]
+
+_N = 1 << 60
+"""Stands for the number of readings in shapes of arrays."""
 
 SHIP_UNIT_NT = 50_000.0
 """Field that one unit of the ship's normalised readings is taken for [nT]. No result depends on it."""
@@ -106,7 +115,7 @@ def ship_case(
     if noise not in ("published", "likely"):
         raise InputError(f"noise must be published or likely, got {noise!r}", parameter="noise")
     white, drift, drift_s = (SHIP_NOISE, 0.0, 1.0) if noise == "published" else SHIP_LIKELY
-    data = _matlab(Path(folder) / f"Aligned_SquareLoop_{loop}.mat", ("p", "q", "p_0", "q_0", "T", "y_mag"))
+    data = _matlab(Path(folder) / f"Aligned_SquareLoop_{loop}.mat", _SHIP)
     p, rotation, dt = data["p"].T, _rotation(data["q"].T), float(data["T"].item())
     y_nt = SHIP_UNIT_NT * data["y_mag"].T
     rng, sign = np.random.default_rng([loop, seed // 2]), 1 - 2 * (seed % 2)
@@ -186,8 +195,7 @@ def hand_case(folder: str | os.PathLike[str], name: Literal["eight", "square"]) 
     """
     if name not in HAND_LOOPS:
         raise InputError(f"name must be eight or square, got {name!r}", parameter="name")
-    names = ("dPos", "dPosSmooth", "initPos", "m", "quat", "t")
-    data = _matlab(Path(folder) / f"{name}.mat", names)
+    data = _matlab(Path(folder) / f"{name}.mat", _HAND)
     start, t, rotation = data["initPos"][0], data["t"][:, 0], _rotation(data["quat"])
     reference, odometry = (
         np.vstack([start, start + np.cumsum(data[key], axis=0)]) for key in ("dPos", "dPosSmooth")
@@ -219,18 +227,53 @@ def hand_case(folder: str | os.PathLike[str], name: Literal["eight", "square"]) 
     )
 
 
-def _matlab(path: Path, names: tuple[str, ...]) -> dict[str, Array]:
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
+_LOAD = """
+import sys, numpy, scipy.io
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]) + 2**30, resource.RLIM_INFINITY))
+except (ImportError, ValueError):
+    pass
+read = scipy.io.loadmat(sys.argv[1], variable_names=sys.argv[3:])
+arrays = {name: numpy.asarray(read[name]) for name in sys.argv[3:] if name in read}
+plain = {name: array for name, array in arrays.items() if array.dtype.kind in "biuf"}
+numpy.savez(sys.stdout.buffer, **plain)
+"""
+"""What the process of `_matlab` runs: from a file, a limit of memory and names to an npz of the arrays."""
 
-    try:
-        data = loadmat(path)
-    except (OSError, ValueError, MatReadError, NotImplementedError) as error:
-        raise InputError(f"{path}: cannot be read as a MATLAB file ({error})") from error
-    for name in names:
+_SHIP = {"p": (3, _N), "q": (4, _N), "p_0": (3, 1), "q_0": (4, 1), "T": (1, 1), "y_mag": (3, _N)}
+_HAND = {"m": (_N, 3), "quat": (_N, 4), "t": (_N, 1), "initPos": (1, 3)}
+_HAND |= dict.fromkeys(("dPos", "dPosSmooth"), (_N - 1, 3))
+"""Shapes of the arrays in a file; `_N` stands for the number of readings."""
+
+
+def _matlab(path: Path, shapes: Mapping[str, tuple[int, int]]) -> dict[str, Array]:
+    """Arrays of a MATLAB file, of finite numbers and of these shapes, the first of which has `_N`.
+
+    scipy reads it in a process of its own, which a damaged file can crash.
+    """
+    size = check_size(existing(path, "MATLAB file"), "recording")
+    command = [sys.executable, "-P", "-c", _LOAD, str(path.resolve()), str(decoded_limit(size)), *shapes]
+    done = subprocess.run(command, capture_output=True, check=False)
+    if done.returncode:
+        lines = done.stderr.decode(errors="replace").split("\n")
+        reason = next((line.strip() for line in reversed(lines) if line.strip()), "the reader crashes on it")
+        raise InputError(f"{path}: cannot be read as a MATLAB file ({reason}); get the file again")
+    data: dict[str, Any] = dict(np.load(io.BytesIO(done.stdout), allow_pickle=False))
+    arrays, readings = {}, 0
+    for name, shape in shapes.items():
         if name not in data:
-            raise InputError(f"{path}: has no array {name!r}")
-    return {name: np.asarray(data[name], float) for name in names}
+            raise InputError(f"{path}: has no array of numbers {name!r}")
+        array = np.asarray(data[name], float)
+        readings = readings or max(array.shape, default=0)
+        wanted = tuple(readings + size - _N if size > _N // 2 else size for size in shape)
+        if array.shape != wanted or readings < 3 or not np.isfinite(array).all():
+            raise InputError(
+                f"{path}: array {name!r} of shape {array.shape} must hold finite numbers, of shape {wanted}, "
+                "of 3 readings at least; get the file again"
+            )
+        arrays[name] = array
+    return arrays
 
 
 def _rotation(wxyz: Array) -> Rotation:

@@ -31,6 +31,7 @@ from magtwin.errors import InputError, find
 from magtwin.files import read_text
 from magtwin.io.tables import load_parquet
 from magtwin.kinds import expected
+from magtwin.localization.scores import Scores
 from magtwin.outputs import output
 from magtwin.report import Figure, Report
 from magtwin.summary import Summarized, Summary, listed
@@ -360,6 +361,7 @@ def _read(folders: Sequence[Path], kind: str, order: tuple[dict[str, int], dict[
     for name in table.column_names:
         values = table[name].to_numpy(zero_copy_only=False)
         columns[name] = values.astype(str) if pa.types.is_string(table[name].type) else values
+    _check_columns(folders[0] / kind, columns, _NUMBERS[kind], scenarios)
     names = {name: k for k, name in enumerate(sorted(set(columns["localizer"].tolist()) - localizers.keys()))}
     place = localizers | {name: len(localizers) + k for name, k in names.items()}
     keys = [
@@ -369,6 +371,31 @@ def _read(folders: Sequence[Path], kind: str, order: tuple[dict[str, int], dict[
     first = {key: row for row, key in reversed(list(enumerate(keys)))}
     picked = [first[key] for key in sorted(first)]
     return {name: values[picked] for name, values in columns.items()}
+
+
+def _check_columns(
+    folder: Path, columns: Columns, numbers: Iterable[str], scenarios: Mapping[str, int]
+) -> None:
+    """Refuse rows without a column, or with another kind of values, and rows of no scenario."""
+    kinds = {"scenario": "U", "localizer": "U", "run": "iu", **dict.fromkeys(numbers, "biuf")}
+    for name, kind in kinds.items():
+        if name not in columns or columns[name].dtype.kind not in kind:
+            what = "texts" if kind == "U" else "numbers"
+            raise InputError(
+                f"{folder}: its rows hold no {what} in column {name!r}: damaged, or of another magtwin; "
+                "remove them and repeat magtwin bench"
+            )
+    if unknown := set(columns["scenario"].tolist()) - scenarios.keys():
+        raise InputError(
+            f"{folder}: rows of scenario {min(unknown)!r}, which the suite does not have; remove them and "
+            "repeat magtwin bench"
+        )
+
+
+_SCORES = [name for name, value in Scores().row().items() if not isinstance(value, str)]
+_COUNTS = ("seed", "session", "readings", "smoother", "global_start", "recovered_in_time")
+_NUMBERS = {ROWS: [*_COUNTS, *(name for name in _SCORES if name != "step_us")], TIMES: ["step_us"]}
+"""Columns of numbers and flags by kind of table; reports read them."""
 
 
 def _aligned(times: Columns, rows: Columns) -> Columns:

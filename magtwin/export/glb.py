@@ -63,6 +63,9 @@ def write_glb(stage_file: Path, out: Path) -> None:
     for shape in shapes:
         if not np.isfinite(shape.vertices).all():
             raise InputError(f"{stage_file} <{shape.prim}>: has points or transforms that are not finite")
+        colours = shape.colour if shape.vertex_colours is None else shape.vertex_colours
+        if not np.isfinite(colours).all():
+            raise InputError(f"{stage_file} <{shape.prim}>: has a colour that is not finite; correct it")
     homes: dict[Sdf.Path, list[Shape]] = {}  # prim of the node: the body, or a child of the default prim
     for shape in shapes:
         body = prim = stage.GetPrimAtPath(shape.prim)
@@ -245,8 +248,11 @@ class _Scene:
 
     def glb(self) -> bytes:
         """The file: a header, JSON, and the buffer."""
-        metadata = self.stage.GetRootLayer().customLayerData.get("magtwin", {}).get("export", {})
-        asset = {"version": "2.0", "generator": f"magtwin {__version__}", "extras": dict(metadata)}
+        metadata = self.stage.GetRootLayer().customLayerData
+        for key in ("magtwin", "export"):
+            metadata = metadata.get(key) if isinstance(metadata, dict) else None
+        extras = dict(metadata) if isinstance(metadata, dict) else {}
+        asset = {"version": "2.0", "generator": f"magtwin {__version__}", "extras": extras}
         self.data += bytes(-len(self.data) % 4)
         nodes = [{k: v for k, v in node.items() if v != []} for node in self.nodes]
         said = {
@@ -259,7 +265,13 @@ class _Scene:
         }
         if any("extensions" in material for material in self.parts["materials"]):
             said["extensionsUsed"] = [UNLIT]
-        text = json.dumps(said, separators=(",", ":"), allow_nan=False).encode()
+        try:
+            text = json.dumps(said, separators=(",", ":"), allow_nan=False).encode()
+        except (TypeError, ValueError) as error:
+            name = self.stage.GetRootLayer().identifier
+            raise InputError(
+                f"{name}: a time, place or text in it cannot be written as JSON ({error}); correct it"
+            ) from error
         text += b" " * (-len(text) % 4)
         size = 12 + 8 + len(text) + 8 + len(self.data)
         head = struct.pack("<4sII", b"glTF", 2, size)
@@ -301,7 +313,7 @@ def _roughness(prim: Usd.Prim) -> float:
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
     shader = material.ComputeSurfaceSource()[0] if material else None
     value = shader.GetInput("roughness").Get() if shader and shader.GetInput("roughness") else None
-    return 0.5 if value is None else round(float(value), 6)
+    return round(float(value), 6) if isinstance(value, int | float) and np.isfinite(value) else 0.5
 
 
 def _json_value(value: Any) -> Any:

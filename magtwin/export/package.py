@@ -333,7 +333,8 @@ class _Work:
         }
         metadata = dict(layer.customLayerData)
         metadata["creator"] = metadata.get("creator", "magtwin")
-        metadata["magtwin"] = {**dict(metadata.get("magtwin", {})), "export": origin}
+        own = metadata.get("magtwin")
+        metadata["magtwin"] = {**(own if isinstance(own, dict) else {}), "export": origin}
         layer.customLayerData = metadata
         layer.Save()
 

@@ -88,7 +88,9 @@ def unpack(package: Path, folder: Path) -> Path:
                 place.parent.mkdir(parents=True, exist_ok=True)
                 with archive.open(entry) as source, open(place, "xb") as file:
                     shutil.copyfileobj(source, file)  # checks the CRC
-    except (zipfile.BadZipFile, EOFError, NotImplementedError, struct.error, OSError) as error:
+    except (zipfile.BadZipFile, EOFError, NotImplementedError, struct.error, OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise InputError(f"{package}: damaged, or no .usdz: {reason}; copy or write it again") from error
     return folder / entries[0].filename

@@ -9,7 +9,9 @@ import json
 import math
 import os
 import shutil
+import struct
 import zipfile
+import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from tokenize import TokenError
@@ -173,8 +175,8 @@ def load_parquet(path: Path, load: Callable[[Path], Any] = pq.read_table) -> Any
     try:
         check_parquet(path)
         return load(path)
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        reason = (str(error).splitlines() or [""])[0]
         raise InputError(f"{path}: damaged Parquet ({reason}); write it again") from error
 
 
@@ -470,7 +472,17 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
             if twice := sorted({name for name in names if names.count(name) > 1}):
                 raise InputError(f"{path}: two arrays are called {twice[0]!r}; write it again")
             arrays = {name.removesuffix(".npy"): _array(archive, name, path) for name in names}
-    except (zipfile.BadZipFile, EOFError, OSError, NotImplementedError, RuntimeError) as error:
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        struct.error,
+        EOFError,
+        OSError,
+        RuntimeError,
+        ValueError,
+    ) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path}: not an npz file, damaged, or cut short ({error})") from error
     try:
         about = json.loads(str(arrays.pop(_ABOUT, "{}")))

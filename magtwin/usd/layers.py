@@ -127,6 +127,9 @@ def open_layer(path: str | os.PathLike[str]) -> Sdf.Layer:
     return layer
 
 
+_LONGEST = 500
+"""Most characters of a message of USD that are shown."""
+
 _NESTED = 1 << 24
 """Bytes of text whose nesting is counted at once."""
 
@@ -309,8 +312,13 @@ def _reason(error: Exception) -> str:
         return f"a text is not UTF-8 (byte 0x{error.object[error.start]:02x})"
     if isinstance(error, TypeError):
         return f"a value of another type ({_one_line(str(error)).partition(' did not match')[0]})"
-    text = getattr(error.args[0], "commentary", str(error)) if error.args else str(error)
-    return re.sub(r"pxrInternal_\w*?pxrReserved__(::|_)", "", _one_line(text))
+    try:
+        text = getattr(error.args[0], "commentary", None) if error.args else None
+    except UnicodeDecodeError as undecoded:
+        text = undecoded.object.decode(errors="replace")
+    text = _text(error) if text is None else text
+    text = re.sub(r"pxrInternal_\w*?pxrReserved__(::|_)", "", _one_line(text))
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."  # it quotes the line of the file
 
 
 def _text(error: object) -> str:

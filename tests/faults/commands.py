@@ -166,7 +166,8 @@ COMMANDS = (
     ),
     Command(
         "map survey adopt",
-        "map survey room/room.usda --spacing-m 2 --headings-deg 0,180 --readings 1 --out room/new.usdc --adopt",
+        "map survey room/room.usda --spacing-m 2 --headings-deg 0,180 --readings 1 "
+        "--out room/new.usdc --adopt",
         ("scene",),
         begins="room",
     ),

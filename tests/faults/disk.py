@@ -1,4 +1,4 @@
-"""The preloaded shim `disk.c`: compile it, and say at which call the disk fills up or the process is killed."""
+"""The preloaded shim `disk.c`: compile it; say at which call the disk fills up or the process is killed."""
 
 import ctypes
 import mmap
@@ -35,7 +35,7 @@ class Control(ctypes.Structure):
 
 
 def start_below_the_shim() -> None:
-    """Start this program again with the shim loaded, unless it is. Exits with 77 where nothing compiles it."""
+    """Start this program again with the shim loaded, unless it is. Exits with 77 if nothing compiles it."""
     if "MAGTWIN_FAULTS" in os.environ:
         return
     compiler = shutil.which("cc") or shutil.which("gcc")

@@ -400,7 +400,8 @@ def main() -> int:
         results.append(vars(result))
         print(
             f"{command.name:18s} {result.calls:5d} calls {result.writes:5d} writes {result.full:4d} full "
-            f"{result.kills:4d} kills {result.old:4d} old {len(result.faults):3d} faults {time.time() - begun:6.1f} s "
+            f"{result.kills:4d} kills {result.old:4d} old {len(result.faults):3d} faults "
+            f"{time.time() - begun:6.1f} s "
             f"{'; '.join(result.notes)}",
             flush=True,
         )

@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -118,7 +119,9 @@ class Dataset(Summarized):
         """
         for recording in self._named(names):
             with self._opened(recording) as file:
-                yield recording, self._run(file.read(), recording)
+                with _undamaged(self._path(recording)):
+                    table = file.read()
+                yield recording, self._run(table, recording)
 
     def blocks(
         self, columns: Sequence[str] | None = None, names: Iterable[str] | None = None
@@ -141,13 +144,15 @@ class Dataset(Summarized):
             with self._opened(recording) as file:
                 flat = None
                 if wanted is not None:
-                    schema = file.schema_arrow
+                    names_of = {name.encode() for name in wanted}
                     flat = [
-                        f.name for f in schema if (f.metadata or {}).get(b"column", b"").decode() in wanted
+                        f.name for f in file.schema_arrow if (f.metadata or {}).get(b"column") in names_of
                     ]
                 first = 0
                 for i in range(file.num_row_groups):
-                    block = self._run(file.read_row_group(i, columns=flat), recording)
+                    with _undamaged(self._path(recording)):
+                        table = file.read_row_group(i, columns=flat)
+                    block = self._run(table, recording)
                     yield recording, first, block
                     first += block.rows
 
@@ -278,20 +283,18 @@ class Dataset(Summarized):
         return tuple(self.recording(name) for name in dict.fromkeys(names))
 
     def _opened(self, recording: Recording) -> pq.ParquetFile:
-        file = self.folder / RUNS / f"{recording.name}.parquet"
-        path = existing_file(file, "shard of a data set", "Parquet")
+        path = existing_file(self._path(recording), "shard of a data set", "Parquet")
         if sha256(path) != recording.sha256:
             raise InputError(f"{path}: its checksum is not that in {MANIFEST}; build the data set anew")
-        try:
+        with _undamaged(path):
             check_parquet(path)
             return pq.ParquetFile(path)
-        except (pa.ArrowException, OSError) as error:
-            raise InputError(
-                f"{path}: damaged Parquet ({str(error).splitlines()[0]}); build it anew"
-            ) from error
+
+    def _path(self, recording: Recording) -> Path:
+        return self.folder / RUNS / f"{recording.name}.parquet"
 
     def _run(self, table: pa.Table, recording: Recording) -> Run:
-        return run_of(table, self.folder / RUNS / f"{recording.name}.parquet")
+        return run_of(table, self._path(recording))
 
     def _summary(self) -> Summary:
         rows = sum(recording.rows for recording in self.recordings)
@@ -323,6 +326,16 @@ class Dataset(Summarized):
                 for recording in self.recordings
             ],
         )
+
+
+@contextmanager
+def _undamaged(path: Path) -> Iterator[None]:
+    """Refuse a shard whose bytes pyarrow cannot read."""
+    try:
+        yield
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        reason = (str(error).splitlines() or [""])[0]
+        raise InputError(f"{path}: damaged Parquet ({reason}); build it anew") from error
 
 
 def build_dataset(

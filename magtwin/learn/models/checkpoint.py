@@ -9,6 +9,7 @@ import codecs
 import os
 import pickletools
 import re
+import struct
 import zipfile
 import zlib
 from pathlib import Path
@@ -92,7 +93,15 @@ def _load(path: Path) -> dict[str, Any]:
                 raise InputError(f"{path}: member {ascii(damaged)[:60]} is damaged; get the file again")
     except InputError:
         raise
-    except (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, ValueError) as error:
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        struct.error,
+        OSError,
+        EOFError,
+        RuntimeError,
+        ValueError,
+    ) as error:
         raise InputError(
             f"{path}: not the zip that torch.save writes, or damaged ({error}); get the file again"
         ) from error
