@@ -64,6 +64,10 @@ FAULTS: Mapping[str, tuple[str, str]] = {
     "file-name": ("package path with odd slashes, or path relative to the package", "read as meant"),
     "package-missing": ("missing package of $(find)", "files in it count as missing"),
     "macro-unknown": ("call of an unknown macro in a .urdf", "left out, as readers of URDF do"),
+    "include-renamed": (
+        "missing include with the suffix .xacro or .urdf.xacro, beside a file with the other",
+        "that file is included",
+    ),
     "include-skipped": ("missing include of a xacro", "skipped; none of its macros is called"),
 }
 """Faults by kind: the fault, and its repair."""
