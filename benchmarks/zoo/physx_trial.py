@@ -3,8 +3,8 @@
     python physx_trial.py < JOBS
 
 A server of jobs, see `serving.py`, for a Python with ovphysx; needs neither magtwin nor pxr. A job has
-`room` (the stage, on a ground if it floats), `answer`, `bodies` (paths), `base`, `floats`, and `drives`: path,
-kind, gains and limits of each driven joint, in the units of UsdPhysics.
+`room` (the stage, on a ground if it floats), `answer`, `bodies` (paths), `base`, `floats`, and `drives`:
+path, kind, gains and limits of each driven joint, in the units of UsdPhysics.
 """
 
 import json

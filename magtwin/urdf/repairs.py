@@ -52,7 +52,10 @@ FAULTS: Mapping[str, tuple[str, str]] = {
     "shape-empty": ("shape of size 0", "left out"),
     "material-twice": ("material defined twice", "the first definition is used"),
     "name-twice": ("link or joint name used twice", "the second is renamed, or left out if it is equal"),
-    "name-unknown": ("tag about a joint that is missing", "left out"),
+    "name-unknown": (
+        "tag about a link or joint that is missing",
+        "left out; a <gazebo> is kept as text",
+    ),
     "drive-incomplete": (
         "drive plugin or its controller with an unknown joint, no wheels on a side, or an invalid figure",
         "kept as text; the robot gets no drive from it",

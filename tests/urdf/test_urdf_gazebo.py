@@ -412,26 +412,45 @@ def test_a_safety_controller_is_kept_as_text_on_its_joint(tmp_path):
 
 REPAIRED = {
     "rate": (
-        "KIND-rate", 10,
+        "number-unreadable",
+        10,
         on("eye", IMU.replace(">100<", ">fast<")),
         "update_rate must be a finite number, not 'fast'",
     ),
     "pose": (
-        "KIND-pose", 10,
+        "sensor-range",
+        10,
         on("eye", IMU.replace("0.1 0 0.2 0 0 1.5708", "1 2 3")),
         "its pose is not x y z roll pitch yaw",
     ),
-    "frame": ("KIND-frame", 10, on("eye", IMU.replace("<pose>", '<pose relative_to="world">')), "is relative to 'world'"),
-    "noise": ("KIND-noise", 14, on("eye", IMU.replace(">0.3<", ">-0.3<")), "stddev -0.3 is below 0: raised to it"),
+    "frame": (
+        "sensor-range",
+        10,
+        on("eye", IMU.replace("<pose>", '<pose relative_to="world">')),
+        "is relative to 'world'",
+    ),
+    "noise": (
+        "number-range",
+        14,
+        on("eye", IMU.replace(">0.3<", ">-0.3<")),
+        "stddev -0.3 is below 0: raised to it",
+    ),
     "rays": (
-        "KIND-rays", 10,
+        "sensor-missing",
+        10,
         on("eye", LIDAR.format(type="ray", tag="ray", samples="1e300", least=0, most=1, lines="1e12")),
         "rays, over 2000000: kept as a frame with its type and rate",
     ),
-    "friction": ("KIND-friction", 10, on("base_link", "<mu1>slippery</mu1>"), "mu1 must be a finite number, not 'slippery'"),
-    "radius": ("KIND-radius", 12, GZ.replace("0.041", "0"), "wheel_radius 0 is not above 0: not used"),
+    "friction": (
+        "number-unreadable",
+        10,
+        on("base_link", "<mu1>slippery</mu1>"),
+        "mu1 must be a finite number, not 'slippery'",
+    ),
+    "radius": ("number-range", 12, GZ.replace("0.041", "0"), "wheel_radius 0 is not above 0: not used"),
     "command": (
-        "KIND-command", 10,
+        "name-unknown",
+        10,
         '<ros2_control name="c"><joint name="lefft"></joint></ros2_control>',
         "<ros2_control> names no joint 'lefft': its interfaces are left out",
     ),

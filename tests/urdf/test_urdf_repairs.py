@@ -222,7 +222,14 @@ FAULTY = {
             f'{GOOD}\n<transmission name="t"><joint name="nobody"/></transmission>',
             3,
             "names no joint 'nobody'",
-        )
+        ),
+        (f"{GOOD}\n{HAND}\n{joint('fixed')}\n{joint('fixed', '', 'k', 'arm')}", 6, "leads to no link 'arm'"),
+        (f'{GOOD}\n<gazebo reference="bas"/>', 3, "'bas', which is no link or joint (did you mean 'base'?)"),
+        (
+            f"{moving('continuous')}\n<gazebo reference='j'>\n<sensor name='s' type='imu'/></gazebo>",
+            7,
+            "sensor 's' of link 'j', which is no link",
+        ),
     ],
     "name-missing": [(f"{GOOD}", 1, "<robot> has no name: 'arm', as its file")],
     "mesh-missing": [
@@ -277,7 +284,11 @@ FAULTY = {
     ],
     "macro-unknown": [(f'{GOOD}\n<xacro:lidar name="l"/>', 3, "<xacro:lidar> is no macro: left out")],
     "include-renamed": [
-        (f'{GOOD}\n<xacro:include filename="eye.xacro"/>', 3, "'eye.xacro' is missing: eye.urdf.xacro beside it")
+        (
+            f'{GOOD}\n<xacro:include filename="eye.xacro"/>',
+            3,
+            "'eye.xacro' is missing: eye.urdf.xacro beside it",
+        )
     ],
     "include-skipped": [
         (f'{GOOD}\n<xacro:include filename="$(find absent)/eye.xacro"/>', 3, "eye.xacro' is missing: skipped")

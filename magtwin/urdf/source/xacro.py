@@ -65,8 +65,8 @@ def expand(
     Args:
         path: The xacro.
         packages: Packages for `$(find)`, and the folders from which files may be included.
-        arguments: Values of `<xacro:arg>`; they override its defaults. Where includes are skipped, also values
-            of properties that no file defines.
+        arguments: Values of `<xacro:arg>`; they override its defaults. Where includes are skipped, also
+            values of properties that no file defines.
         repairs: Receives repairs and notes.
         skip_missing_includes: Whether to skip missing includes of which no macro is called.
 
