@@ -3,90 +3,47 @@
     python physx_trial.py < JOBS
 
 A server of jobs, see `serving.py`, for a Python with ovphysx; needs neither magtwin nor pxr. A job has
-`stage`,
-`answer`, `bodies` (paths), `base`, `lowest_m` (height of the lowest collider), `floats`, and `drives`: path,
-kind, gains and limits of each driven joint, in the units of UsdPhysics.
+`room` (the stage, on a ground if it floats), `answer`, `bodies` (paths), `base`, `floats`, and `drives`:
+path, kind, gains and limits of each driven joint, in the units of UsdPhysics.
 """
 
 import json
 import math
+import sys
 from importlib import metadata
 from pathlib import Path
 
 import numpy as np
-import ovphysx
-import ovstage
 from ovphysx.types import SimObjectType
 from serving import serve
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "magtwin" / "export" / "validation"))
+from physx_world import open_stage, read, write
 
 STEP_S = 1 / 240
 SETTLE_S, WATCH_S, MOVE_S = 3.0, 1.0, 1.0
 TURN_DEG, SLIDE_M = math.degrees(0.2), 0.02
 
-SCHEMAS = ("PhysxSchema", "OmniUsdPhysicsDeformableSchema")
-"""Folders of physx-usd-schemas; PhysX refuses to start without both."""
-
 LINK, JOINT = SimObjectType.ARTICULATION_LINK, SimObjectType.ARTICULATION_JOINT
 
 LIMIT_GB = 16
-
-ROOM = """#usda 1.0
-(
-    metersPerUnit = 1
-    subLayers = [@{stage}@]
-    upAxis = "Z"
-)
-
-def PhysicsScene "ZooScene"
-{{
-}}
-{ground}
-"""
-GROUND = """
-def Plane "ZooGround" (
-    prepend apiSchemas = ["PhysicsCollisionAPI", "MaterialBindingAPI", "PhysicsMaterialAPI"]
-)
-{{
-    uniform token axis = "Z"
-    uniform token purpose = "guide"
-    double3 xformOp:translate = (0, 0, {height})
-    uniform token[] xformOpOrder = ["xformOp:translate"]
-}}
-"""
 
 
 class Trial:
     """One robot in PhysX."""
 
     def __init__(self, job: dict) -> None:
-        room = Path(job["answer"]).with_name("physx_room.usda")
-        ground = GROUND.format(height=job["lowest_m"]) if job["floats"] else ""
-        room.write_text(ROOM.format(stage=job["stage"], ground=ground))
-        ovphysx.PhysX.set_cpu_mode(True)
-        self._physx = ovphysx.PhysX()
-        package = metadata.distribution("physx-usd-schemas")
-        folders = [str(package.locate_file(f"physx_usd_schemas/{name}/resources")) for name in SCHEMAS]
-        ovstage.population.register_usd_schemas([*folders, str(ovphysx.newton_schema_root())])
-        self._stage = ovstage.Stage("zoo")
-        domains = ovstage.PopulationDomain.ALL
-        ovstage.population.open_usd(self._stage, str(room), ordinal=1, domains=domains)
-        self._stage.advance_write_floor(ordinal=1).wait()
-        self._physx.wait_task(self._physx.attach_ovstage(self._stage, read_ordinal=1))
+        self._physx, self._stage = open_stage(job["room"])
         self._bodies = job["bodies"]
         self.top_speed = 0.0
 
     def read(self, kind: SimObjectType, path: str, name: str) -> list[float]:
         """An attribute of a prim."""
-        with self._physx.read_sync(kind, [name], pattern=path) as result:
-            (group,) = result.groups
-            return np.asarray(group.tensors[0].numpy(), float).ravel().tolist()
+        return read(self._physx, kind, path, name)
 
     def write(self, path: str, name: str, value: float) -> None:
         """Set an attribute of a joint."""
-        with self._physx.write_sync(JOINT, name, pattern=path) as session:
-            (group,) = session.groups
-            group.tensors[0].numpy()[...] = value
-            session.commit_sync(group)
+        write(self._physx, JOINT, path, name, [value])
 
     def places(self) -> np.ndarray:
         return np.array([self.read(LINK, body, "position") for body in self._bodies])

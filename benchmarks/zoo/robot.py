@@ -183,10 +183,11 @@ def fk_job(report, peer: Peer | None) -> dict:
     }
 
 
-def drives_job(asset: Path, report) -> dict:
-    """Bodies, lowest collider and driven joints of a stage, for an engine that reads none of them itself."""
+def drives_job(asset: Path, report, floats: bool) -> dict:
+    """Room, bodies and driven joints of a stage, for an engine that reads none of them itself."""
     from pxr import Usd, UsdGeom, UsdPhysics
 
+    from magtwin.export.validation.physx_drive import room_text
     from magtwin.usd.geometry import read_triangles
 
     stage = Usd.Stage.Open(str(asset))
@@ -217,7 +218,9 @@ def drives_job(asset: Path, report) -> dict:
                 )
     bodies = [line.prim for line in report.links if line.became == "body"]
     lowest = min((float(c.reshape(-1, 3)[:, 2].min()) for c in enabled), default=0.0)
-    return {"bodies": bodies, "base": bodies[0], "lowest_m": lowest, "drives": drives}
+    room = asset.parent.parent / "physx_room.usda"
+    room.write_text(room_text(asset, lowest if floats else None, scene=True))
+    return {"room": str(room), "bodies": bodies, "base": bodies[0], "drives": drives}
 
 
 def main(job_file: str) -> None:
@@ -240,8 +243,9 @@ def main(job_file: str) -> None:
             step("compare", lambda: compare(made.asset, made.report, peer, row))
         step("validate", lambda: check(made.asset, row))
         poses = step("poses", lambda: fk_job(made.report, peer)) or {}
-        seen = step("drives", lambda: drives_job(made.asset, made.report)) or {}
-        trial = {"stage": str(made.asset), "poses": poses, "floats": not job["fix_base"], **seen}
+        floats = not job["fix_base"]
+        seen = step("drives", lambda: drives_job(made.asset, made.report, floats)) or {}
+        trial = {"stage": str(made.asset), "poses": poses, "floats": floats, **seen}
         for name in job["engines"]:
             text = json.dumps({**trial, "answer": str(work / f"{name}.json")})
             (work / f"{name}_job.json").write_text(text)

@@ -35,7 +35,7 @@ FORGE = "https://github.com"
 BUILD = ROOT / "build" / "zoo"
 
 LIMIT_S, ENGINE_LIMIT_S = 900.0, 600.0
-"""Time limits of a robot, and of its trial in an engine [s]."""
+"""Time limits of a robot, and of its trial in an engine, on an idle machine [s]."""
 
 FIXED = ("arm", "hand")
 """Kinds that are fixed to the world."""
@@ -83,8 +83,10 @@ def job_of(robot: dict, commits: dict, folder: Path | None, engines: list, build
     }
 
 
-def run(robot: dict, commits: dict, folder: Path | None, servers: dict, fresh: bool, build: Path) -> dict:
-    """The row of a robot, kept or made."""
+def run(
+    robot: dict, commits: dict, folder: Path | None, servers: dict, fresh: bool, patience: float, build: Path
+) -> dict:
+    """The row of a robot, kept or made; the time limits are multiplied by `patience`."""
     engines, known = [name for name in servers if name != "robot"], robot.get("known", "")
     robot = {key: value for key, value in robot.items() if key != "known"}
     kept = build / "rows" / f"{robot['name']}.json"
@@ -100,13 +102,13 @@ def run(robot: dict, commits: dict, folder: Path | None, servers: dict, fresh: b
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir(parents=True)
         (work / "job.json").write_text(json.dumps(job))
-        ended = servers["robot"].do(work / "job.json", LIMIT_S)
+        ended = servers["robot"].do(work / "job.json", patience * LIMIT_S)
         if Path(job["answer"]).is_file():
             row |= json.loads(Path(job["answer"]).read_text())
         else:
             row["steps_failed"] = {"process": ended}
         for name in engines if "convert_cpu_s" in row else ():
-            ended = servers[name].do(work / f"{name}_job.json", ENGINE_LIMIT_S)
+            ended = servers[name].do(work / f"{name}_job.json", patience * ENGINE_LIMIT_S)
             answer = work / f"{name}.json"
             row[name] = json.loads(answer.read_text()) if answer.is_file() else {"failed": ended}
     except (ValueError, OSError, subprocess.CalledProcessError) as error:
@@ -127,6 +129,7 @@ def main() -> int:
     parser.add_argument("--engine", nargs="*", choices=("newton", "physx"), default=["newton"])
     parser.add_argument("--list", type=Path, default=LIST, help="descriptions (.toml)")
     parser.add_argument("--build", type=Path, default=BUILD, help="folder of checkouts, assets and rows")
+    parser.add_argument("--patience", type=float, default=1.0, help="factor of the time limits")
     parser.add_argument("--fresh", action="store_true", help="do rows again that are kept")
     parser.add_argument("--docs", action="store_true", help="write the table into docs/zoo.md")
     given = parser.parse_args()
@@ -145,7 +148,8 @@ def main() -> int:
     def row_of(robot: dict) -> dict:
         servers = idle.get()
         try:
-            return run(robot, listed["commits"], given.folder, servers, given.fresh, build)
+            fresh, patience = given.fresh, given.patience
+            return run(robot, listed["commits"], given.folder, servers, fresh, patience, build)
         finally:
             idle.put(servers)
 

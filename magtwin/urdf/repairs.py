@@ -52,7 +52,10 @@ FAULTS: Mapping[str, tuple[str, str]] = {
     "shape-empty": ("shape of size 0", "left out"),
     "material-twice": ("material defined twice", "the first definition is used"),
     "name-twice": ("link or joint name used twice", "the second is renamed, or left out if it is equal"),
-    "name-unknown": ("tag about a joint that is missing", "left out"),
+    "name-unknown": (
+        "tag about a link or joint that is missing",
+        "left out; a <gazebo> is kept as text",
+    ),
     "drive-incomplete": (
         "drive plugin or its controller with an unknown joint, no wheels on a side, or an invalid figure",
         "kept as text; the robot gets no drive from it",
@@ -64,6 +67,10 @@ FAULTS: Mapping[str, tuple[str, str]] = {
     "file-name": ("package path with odd slashes, or path relative to the package", "read as meant"),
     "package-missing": ("missing package of $(find)", "files in it count as missing"),
     "macro-unknown": ("call of an unknown macro in a .urdf", "left out, as readers of URDF do"),
+    "include-renamed": (
+        "missing include with the suffix .xacro or .urdf.xacro, beside a file with the other",
+        "that file is included",
+    ),
     "include-skipped": ("missing include of a xacro", "skipped; none of its macros is called"),
 }
 """Faults by kind: the fault, and its repair."""

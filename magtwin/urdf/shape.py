@@ -32,6 +32,10 @@ NO_CONTACT, NO_CONTACT_RADIUS_M = "no_contact", 0.005
 NEWTON_MESH_API = "NewtonMeshCollisionAPI"
 """Newton's applied schema; its plugin is not installed here."""
 
+NEWTON_HULL = "newton:maxHullVertices"
+"""Its limit on the vertices of a hull; -1 for none. Newton cuts hulls without it to 64, and so lost the casters
+of a Fetch, which are part of its base."""
+
 
 def define_visual(
     body: Usd.Prim, visual: Shape, description: Description, meshes: MeshLayer, layer: str
@@ -89,6 +93,9 @@ def define_collider(
                 APPROXIMATIONS[meshes.options.collision]
             )
             prim.AddAppliedSchema(NEWTON_MESH_API)
+            if meshes.options.collision != "mesh":
+                kind, fixed = Sdf.ValueTypeNames.Int, Sdf.VariabilityUniform
+                prim.CreateAttribute(NEWTON_HULL, kind, custom=False, variability=fixed).Set(-1)
         wear(prim, robot, None, meshes, define_grip(robot, surface))
         define_priority(prim, surface)
     return made

@@ -53,11 +53,13 @@ ROOM = """#usda 1.0
     subLayers = [@{stage}@]
     upAxis = "Z"
 )
-
+"""
+SCENE = """
 def PhysicsScene "MagtwinPhysicsScene"
-{{
-}}
-
+{
+}
+"""
+GROUND = """
 def Plane "MagtwinGround" (
     prepend apiSchemas = ["PhysicsCollisionAPI", "MaterialBindingAPI", "PhysicsMaterialAPI"]
 )
@@ -68,7 +70,6 @@ def Plane "MagtwinGround" (
     uniform token[] xformOpOrder = ["xformOp:translate"]
 }}
 """
-"""A stage with a ground, for a robot's own asset."""
 
 
 def physx(file: Path, driven: Mapping[str, Any]) -> Check:
@@ -131,13 +132,22 @@ def on_ground(file: Path, driven: Mapping[str, Any]) -> Iterator[Path]:
         yield file
         return
     height = min((robot["lowest_m"] for robot in driven["robots"]), default=0.0)
-    text = ROOM.format(stage=file.resolve().as_posix(), height=height)
-    if driven["scene"]:
-        text = text.replace('def PhysicsScene "MagtwinPhysicsScene"\n{\n}\n', "")
     with tempfile.TemporaryDirectory() as folder:
         room = Path(folder, "room.usda")
-        room.write_text(text, encoding="utf-8")
+        room.write_text(room_text(file, height, scene=not driven["scene"]), encoding="utf-8")
         yield room
+
+
+def room_text(stage: Path, height: float | None, *, scene: bool) -> str:
+    """A layer with a robot's stage in a room.
+
+    Args:
+        stage: The robot's asset.
+        height: Height of the ground [m]; None adds no ground.
+        scene: Whether to add a physics scene.
+    """
+    text = ROOM.format(stage=stage.resolve().as_posix()) + (SCENE if scene else "")
+    return text if height is None else text + GROUND.format(height=height)
 
 
 def _stands(world: WorldProcess, robot: Mapping[str, Any]) -> Finding:

@@ -39,21 +39,41 @@ LINK, JOINT, ROBOT = (
 BASE = ("position", "orientation", "linearVelocity", "angularVelocity")
 
 
+def open_stage(file: str) -> tuple[Any, Any]:
+    """PhysX on the CPU with a stage, and the stage, which must be kept as long."""
+    ovphysx.PhysX.set_cpu_mode(True)
+    physx = ovphysx.PhysX()
+    package = metadata.distribution("physx-usd-schemas")
+    folders = [str(package.locate_file(f"physx_usd_schemas/{name}/resources")) for name in SCHEMAS]
+    ovstage.population.register_usd_schemas([*folders, str(ovphysx.newton_schema_root())])
+    stage = ovstage.Stage("world")
+    ovstage.population.open_usd(stage, file, ordinal=1, domains=ovstage.PopulationDomain.ALL)
+    stage.advance_write_floor(ordinal=1).wait()
+    physx.wait_task(physx.attach_ovstage(stage, read_ordinal=1))
+    return physx, stage
+
+
+def read(physx: Any, kind: SimObjectType, path: str, name: str) -> list[float]:
+    """An attribute of a prim."""
+    with physx.read_sync(kind, [name], pattern=path) as result:
+        (group,) = result.groups
+        return np.asarray(group.tensors[0].numpy(), float).ravel().tolist()
+
+
+def write(physx: Any, kind: SimObjectType, path: str, name: str, values: list[float]) -> None:
+    """Set an attribute of a prim."""
+    with physx.write_sync(kind, name, pattern=path) as session:
+        (group,) = session.groups
+        group.tensors[0].numpy()[...] = np.reshape(values, group.tensors[0].numpy().shape)
+        session.commit_sync(group)
+
+
 class World:
     """A stage with one robot that is driven."""
 
     def __init__(self, job: dict[str, Any]) -> None:
         """Load it and let the robot settle at its start."""
-        ovphysx.PhysX.set_cpu_mode(True)
-        self._physx = ovphysx.PhysX()
-        package = metadata.distribution("physx-usd-schemas")
-        folders = [str(package.locate_file(f"physx_usd_schemas/{name}/resources")) for name in SCHEMAS]
-        ovstage.population.register_usd_schemas([*folders, str(ovphysx.newton_schema_root())])
-        self._stage = ovstage.Stage("world")
-        domains = ovstage.PopulationDomain.ALL
-        ovstage.population.open_usd(self._stage, job["stage"], ordinal=1, domains=domains)
-        self._stage.advance_write_floor(ordinal=1).wait()
-        self._physx.wait_task(self._physx.attach_ovstage(self._stage, read_ordinal=1))
+        self._physx, self._stage = open_stage(job["stage"])
         self._step_s, self._base, self._joints = job["step_s"], job["base"], job["joints"]
         self._sides = job.get("sides", (0, 1))
         self._rates = [math.nan, math.nan]
@@ -111,19 +131,14 @@ class World:
 
     def _read(self, kind: SimObjectType, path: str, name: str) -> list[float]:
         """An attribute of a prim."""
-        with self._physx.read_sync(kind, [name], pattern=path) as result:
-            (group,) = result.groups
-            values = np.asarray(group.tensors[0].numpy(), float).ravel().tolist()
+        values = read(self._physx, kind, path, name)
         if not all(map(math.isfinite, values)):
             raise ValueError(f"{path} is lost: its {name} is {values}")
         return values
 
     def _write(self, kind: SimObjectType, path: str, name: str, values: list[float]) -> None:
         """Set an attribute of a prim."""
-        with self._physx.write_sync(kind, name, pattern=path) as session:
-            (group,) = session.groups
-            group.tensors[0].numpy()[...] = np.reshape(values, group.tensors[0].numpy().shape)
-            session.commit_sync(group)
+        write(self._physx, kind, path, name, values)
 
 
 def main() -> None:

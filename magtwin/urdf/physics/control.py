@@ -12,7 +12,7 @@ from magtwin.spec.drive import DriveSpec
 from magtwin.urdf.description.tag import Tags
 from magtwin.urdf.options import DriveRule
 from magtwin.urdf.physics.controller import base_of_plugin_settings, base_of_settings
-from magtwin.urdf.physics.drive import POSITION_STIFFNESS, WHEEL_DAMPING
+from magtwin.urdf.physics.drive import POSITION_STIFFNESS, WHEEL_DAMPING, own_gain
 from magtwin.urdf.physics.mechanism import Mechanism
 from magtwin.urdf.physics.mobile_base import MobileBase
 from magtwin.urdf.physics.plugin import base_of_plugin
@@ -50,16 +50,15 @@ def read_commands(tags: Tags, mechanism: Mechanism) -> tuple[DriveRule, ...]:
     Interfaces of unknown joints are left out.
     """
     rules: dict[str, DriveRule] = {}
-    joints = mechanism.description.joints.values()
-    limited = {joint.name: joint.type in ("revolute", "prismatic") for joint in joints}
+    joints = {joint.name: joint for joint in mechanism.description.joints.values()}
     for name, kind in _commands(tags):
         if name in rules or name in mechanism.welded or name in mechanism.mimics:
             continue
-        if kind != "velocity" and limited.get(name, False):
+        if kind != "velocity" and joints[name].type in ("revolute", "prismatic"):
             continue
         gains: dict[str, float] = {}
         if kind == "velocity":
-            gains = {"damping": WHEEL_DAMPING}
+            gains = {"damping": WHEEL_DAMPING + own_gain(joints[name])}
         elif kind == "position":
             gains = {"stiffness": POSITION_STIFFNESS, "damping": POSITION_STIFFNESS / 10}
         pattern = "".join(f"[{c}]" if c in "*?[" else c for c in name)  # matches this name only

@@ -41,6 +41,13 @@ DEFAULT_EFFORT = 10.0
 RESERVE = 2.0
 """Default maximum effort of a position drive, relative to the weight that it carries."""
 
+STRONGER = 10.0
+"""Gain of a velocity drive over its joint's own damping, and over its friction at 1 rad/s or m/s: it falls
+short of its target by about a tenth."""
+
+OWN_SPEED = {"prismatic": 1.0}
+"""Speed at which a drive overcomes its joint's own damping, if no velocity is given; 10 rad/s if it turns."""
+
 
 Wheels = Mapping[str, tuple[float, float]]
 """Default gain [N m s/rad] and maximum torque [N m] of driven wheels, by joint name."""
@@ -102,6 +109,7 @@ def define_drive(
             _define_gains(prim, axis, force, 0.0, 0.0)
         return
     damping, force = wheels.get(joint.name, (WHEEL_DAMPING, DEFAULT_EFFORT))
+    damping += own_gain(joint)
     if rule is None and joint.type != "continuous" and joint.name not in wheels:
         load = mechanism.loads[joint.name]
         gain = max(POSITION_STIFFNESS, float(f"{(2 * np.pi * POSITION_HZ) ** 2 * load.inertia:.3g}"))
@@ -112,6 +120,7 @@ def define_drive(
         mechanism.description.note(f"joint {joint.name!r} is not a driven wheel: it turns freely")
     elif rule is None:
         rule = DriveRule(joints=joint.name, type="velocity", damping=damping)
+    force += _own_force(joint)
     force = _effort(joint, force, mechanism.description) if rule.max_force is None else rule.max_force
     for axis in axes:
         unit = np.pi / 180 if axis == "angular" or axis.startswith("rot") else 1.0
@@ -120,6 +129,27 @@ def define_drive(
             made.CreateTargetPositionAttr(_target(joint) / unit)
         else:
             made.CreateTargetVelocityAttr(0.0)
+
+
+def own_gain(joint: Joint) -> float:
+    """What a velocity drive's gain needs for the joint's own damping and friction [N m s/rad or N s/m]."""
+    friction, damping = _resistance(joint)
+    return float(f"{STRONGER * (friction + damping):.3g}")
+
+
+def _own_force(joint: Joint) -> float:
+    """What a drive needs to move its joint against its own damping and friction [N m or N]."""
+    friction, damping = _resistance(joint)
+    speed = None if joint.limit is None else joint.limit.velocity
+    if not speed or not np.isfinite(speed):
+        speed = OWN_SPEED.get(joint.type, 10.0)
+    return float(f"{friction + damping * speed:.3g}")
+
+
+def _resistance(joint: Joint) -> tuple[float, float]:
+    """Friction [N m or N] and damping [N m s/rad or N s/m] of a joint."""
+    own = joint.dynamics
+    return (0.0, 0.0) if own is None else (float(own.friction or 0.0), float(own.damping or 0.0))
 
 
 def _define_gains(

@@ -60,11 +60,13 @@ def expand(
     """Expand a xacro to URDF.
 
     A package that is missing and from which nothing is included is a repair: files in it count as missing.
+    So is an include that ends in .xacro or .urdf.xacro where only the other of the two exists.
 
     Args:
         path: The xacro.
         packages: Packages for `$(find)`, and the folders from which files may be included.
-        arguments: Values of `<xacro:arg>`; they override its defaults.
+        arguments: Values of `<xacro:arg>`; they override its defaults. Where includes are skipped, also
+            values of properties that no file defines.
         repairs: Receives repairs and notes.
         skip_missing_includes: Whether to skip missing includes of which no macro is called.
 
@@ -73,8 +75,8 @@ def expand(
 
     Raises:
         InputError: The file is not XML, reads outside the packages, has an expression outside the language,
-            or expands without end; the message gives file and line. Or includes, arguments or macros are
-            missing; the message lists all, with the options that would supply them.
+            or expands without end; the message gives file and line. Or includes, arguments, macros or
+            properties are missing; the message lists all, with the options that would supply them.
     """
     return _Expansion(path, packages, arguments, repairs, skip_missing_includes).run()
 
@@ -89,6 +91,7 @@ class _Expansion:
         self._repairs, self._skip = repairs, skip
         self._absent: dict[str, str] = {}  # what the expansion cannot do without, and where
         self._skipped: dict[str, str] = {}  # includes, and where
+        self._undefined: dict[str, str] = {}  # properties that a skipped include would define, and where
         self._near: dict[str, str] = {}  # near names of missing packages
         self._optional = self._including = False
         self._asked: set[str] = set()
@@ -166,7 +169,7 @@ class _Expansion:
         Raises:
             InputError: Something is missing, and the expansion cannot do without it.
         """
-        absent = dict(self._absent)
+        absent = {**self._absent, **{f"property {name!r}": p for name, p in self._undefined.items()}}
         if absent or not self._skip:
             near = {name: self._near.get("/".join(name.split("/")[:3]), "") for name in self._skipped}
             includes = {f"include {name!r}{near[name]}": place for name, place in self._skipped.items()}
@@ -174,10 +177,13 @@ class _Expansion:
         if not absent:
             return
         faults = ", ".join(f"{what} ({place})" for what, place in absent.items())
-        supplied = " ".join(self._repairs.supplies)
-        advice = f"; give {supplied}" if supplied else "; put the files in their place"
-        if self._skipped and not self._absent:
-            advice += ", or `skip_missing_includes=True` if none of their macros is called"
+        supplies = list(self._repairs.supplies)
+        advice = f"; give {' '.join(supplies)}" if supplies else "; put the files in their place"
+        if self._skipped and not any(what.startswith("macro") for what in self._absent):
+            options = [option for option in supplies if option.startswith("--arg")]
+            options += [f"--arg {name}=VALUE" for name in self._undefined]
+            skip = ["`skip_missing_includes=True`", *options]
+            advice += f", or {' '.join(skip)}, as none of their macros is called"
         raise InputError(f"{self._path}: missing: {faults}{advice}")
 
     def _miss(self, what: str, supply: str = "") -> None:
@@ -245,7 +251,8 @@ class _Expansion:
             if piece.lastgroup == "escaped":
                 content = content[1:]
             elif piece.lastgroup == "expression":
-                value = evaluate(str(self._text(content, symbols)), symbols, self._budget)
+                names = _Supplied(symbols, self) if self._skipped else symbols
+                value = evaluate(str(self._text(content, symbols)), names, self._budget)
                 content = check_size(value, self._budget, plain=True)
             elif piece.lastgroup == "command":
                 content = self._command(str(self._text(content, symbols)))
@@ -298,6 +305,14 @@ class _Expansion:
             return "0"
         return table[name]
 
+    def _property(self, name: str) -> Any:
+        """A property that no file defines, while includes are missing: that of the argument of its name."""
+        self._asked.add(name)
+        if name in self._arguments:
+            return _typed(self._arguments[name])
+        self._undefined.setdefault(name, self._place())
+        return 1
+
     def _variable(self, name: str, default: str | None = None) -> str:
         self._asked.add(name)
         if name in self._arguments:
@@ -329,8 +344,14 @@ class _Expansion:
         for file in files:
             path = self._check_inside(file, "include")
             if not (path.exists() or self._optional):
-                self._skipped[os.path.relpath(path, self._path.parent)] = self._place()
-                continue
+                name, other = os.path.relpath(path, self._path.parent), _other_suffix(path)
+                if not self._check_inside(str(other), "include").is_file():
+                    self._skipped[name] = self._place()
+                    continue
+                self._repair(
+                    "include-renamed", f"include {name!r} is missing: {other.name} beside it is included"
+                )
+                file = str(other)
             yield file
 
     def _check_inside(self, file: str, what: str) -> Path:
@@ -425,6 +446,25 @@ class _Arguments(dict[str, Any]):
         raise KeyError(name)
 
 
+class _Supplied(Mapping[str, Any]):
+    """Properties, where those that no file defines come from arguments."""
+
+    def __init__(self, symbols: Mapping[str, Any], expansion: _Expansion) -> None:
+        self._symbols, self._expansion = symbols, expansion
+
+    def __getitem__(self, name: str) -> Any:
+        try:
+            return self._symbols[name]
+        except KeyError:
+            return self._expansion._property(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._symbols)
+
+    def __len__(self) -> int:
+        return len(self._symbols)
+
+
 class _Keep:
     """Copies the place of a node to its copies (DOM level 3, UserDataHandler)."""
 
@@ -458,6 +498,12 @@ def _tokenize(text: str, sep: str = ",; ", skip_empty: bool = True) -> list[str]
     """Words of a text, split at any of the characters `sep`."""
     words = re.split(f"[{re.escape(sep)}]", text)
     return [word for word in words if word or not skip_empty]
+
+
+def _other_suffix(path: Path) -> Path:
+    """`a.xacro` for `a.urdf.xacro`, and the reverse."""
+    stem, dot, suffixes = path.name.partition(".")
+    return path.with_name(stem + dot + {"urdf.xacro": "xacro", "xacro": "urdf.xacro"}.get(suffixes, suffixes))
 
 
 def _typed(text: str) -> Any:
