@@ -33,8 +33,8 @@ NEWTON_MESH_API = "NewtonMeshCollisionAPI"
 """Newton's applied schema; its plugin is not installed here."""
 
 NEWTON_HULL = "newton:maxHullVertices"
-"""Its limit on the vertices of a hull; -1 for none. Newton cuts hulls without it to 64, and so lost the casters
-of a Fetch, which are part of its base."""
+"""Its limit on the vertices of a hull; -1 for none. Newton cuts hulls without it to 64, and so lost
+the casters of a Fetch, which are part of its base."""
 
 
 def define_visual(

@@ -1,13 +1,13 @@
 """Fuzz the readers of every format: `make fuzz SECONDS=300 SEED=1`, or `python tests/fuzz/fuzz.py npz glb`.
 
 The smallest file of each format (`seeds.py`) is damaged with the format in mind (words, numbers, lines,
-counts, lengths, members of containers), and read. A right result or an `InputError` in one line is fine; another
-exception, a crash, a hang or too much memory is a fault. Inputs that are read, or refused at a new place, are
-damaged further. Batches run in forked processes with limits of processor time, time and memory.
+counts, lengths, members of containers), and read. A right result or an `InputError` in one line is fine;
+another exception, a crash, a hang or too much memory is a fault. Inputs that are read, or refused at a new
+place, are damaged further. Batches run in forked processes with limits of processor time, time and memory.
 
 Faults are grouped by exception and innermost frame of magtwin. The smallest input of each group is reduced
-and kept in build/fuzz/faults; copy it to tests/fuzz/corpus, which `test_corpus.py` reads, and mend the fault. A
-fuzzer that is started again with the same seed goes on where it was.
+and kept in build/fuzz/faults; copy it to tests/fuzz/corpus, which `test_corpus.py` reads, and mend the
+fault. A fuzzer that is started again with the same seed goes on where it was.
 """
 
 import argparse
