@@ -334,11 +334,11 @@ def _map_layer(file: Path) -> None:
     if file.suffix == ".usda":
         from pxr import Sdf
 
-        call("usd.maps:save_map", _map(), file.with_suffix(".usdc"))
+        call("usd.maps.layer:save_map", _map(), file.with_suffix(".usdc"))
         Sdf.Layer.FindOrOpen(str(file.with_suffix(".usdc"))).Export(str(file))
         file.with_suffix(".usdc").unlink()
     else:
-        call("usd.maps:save_map", _map(), file, tile_cells=1 if file.stem == "tiles" else None)
+        call("usd.maps.layer:save_map", _map(), file, tile_cells=1 if file.stem == "tiles" else None)
 
 
 def _robot(file: Path) -> None:
@@ -604,7 +604,7 @@ def _read_recorded(file: Path) -> None:
 
 def _read_stage(file: Path) -> None:
     call("usd.info:info_of_stage", file)
-    for name in ("usd.geometry:read_shapes", "usd.geometry:read_links", "usd.obstacles:read_obstacles"):
+    for name in ("usd.geometry:read_shapes", "usd.geometry:read_links", "usd.lab.obstacles:read_obstacles"):
         _refusable(name, file)
     _refusable("export.glb:write_glb", file, file.with_suffix(".out.glb"))
 
@@ -628,10 +628,10 @@ def _read_package(file: Path) -> None:
 
 
 def _read_map(file: Path) -> None:
-    field = call("usd.maps:load_map", file)
+    field = call("usd.maps.layer:load_map", file)
     str(field.report())
     field.lookup(np.zeros((1, 2)), np.zeros(1))
-    call("usd.maps:load_epochs", file)
+    call("usd.maps.layer:load_epochs", file)
 
 
 def _read_robot(file: Path) -> None:
@@ -644,7 +644,7 @@ def _read_scene(file: Path) -> None:
     root = file.with_name("room.usda")
     call("usd.scene:open_scene", root)
     _refusable("usd.info:info_of_stage", root)
-    call("usd.obstacles:read_obstacles", root)
+    call("usd.lab.obstacles:read_obstacles", root)
     _refusable("twin:open_twin", root)
 
 
