@@ -15,7 +15,7 @@ MOST_MB := 2700
 # Two processes whose linear algebra has threads of its own wait for each other more than they work.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 
-.PHONY: fuzz demo test test-slow readme simready blender ros physics physx lint paper bench zoo wheel-test schema assets pictures clean help
+.PHONY: fuzz faults demo test test-slow readme simready blender ros physics physx lint paper bench zoo wheel-test schema assets pictures clean help
 
 help:  ## Say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -73,8 +73,11 @@ physx: $(VENV)/.dev  ## Drive the labs in NVIDIA's PhysX on the CPU (1 GB, in an
 paper: $(VENV)/.dev  ## Measure the tables of docs/results.md and README again (up to an hour)
 	$(BIN)/python docs/results.py $(if $(wildcard $(SURVEYS)),--surveys $(SURVEYS)) $(if $(wildcard $(RELEASED)),--released $(RELEASED))
 
-fuzz: $(VENV)/.dev  ## Damage files of every format at random and read them (SECONDS=300 SEED=0)
-	$(ONE_THREAD) $(BIN)/python tests/fuzz/fuzz.py --seconds $(or $(SECONDS),300) --seed $(or $(SEED),0)
+fuzz: $(VENV)/.dev  ## Damage files of every format at random and read them (SECONDS=300 SEED=0 JOBS=1)
+	$(ONE_THREAD) $(BIN)/python tests/fuzz/fuzz.py --seconds $(or $(SECONDS),300) --seed $(or $(SEED),0) --jobs $(or $(JOBS),1)
+
+faults: $(VENV)/.dev  ## Fill the disk, or kill the process, at each write of every command (Linux, a C compiler; SEED=0)
+	$(ONE_THREAD) $(BIN)/python tests/faults/faults.py --seed $(or $(SEED),0)
 
 bench: $(VENV)/.dev  ## Compare with peers; prints ratios
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
