@@ -27,6 +27,7 @@ from magtwin.urdf.meshes.mesh_layer import MESH, free_name, primitive_of
 from magtwin.urdf.physics.joint import AXIS
 from magtwin.urdf.physics.link import SITE_API
 from magtwin.urdf.physics.mechanism import displacement
+from magtwin.usd.attributes import read_axis
 from magtwin.usd.geometry import SHOWN, Shape, read_shapes, srgb_from_linear
 from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.schema import place
@@ -359,7 +360,7 @@ class _Writer:
         for schema, tag in ((UsdGeom.Cylinder, "cylinder"), (UsdGeom.Capsule, "capsule")):
             if prim.IsA(schema):
                 gprim, turn = schema(prim), np.eye(4)
-                axis = "XYZ".index(gprim.GetAxisAttr().Get())
+                axis = "XYZ".index(read_axis(gprim.GetPrim()))
                 if axis != 2:  # URDF's primitives are along z
                     turn[:3, :3] = np.roll(np.eye(3), axis + 1, axis=0)
                 sizes = {"radius": gprim.GetRadiusAttr().Get(), "length": gprim.GetHeightAttr().Get()}
@@ -425,7 +426,7 @@ def _frame(p: Any, q: Any) -> Array:
 def _token(prim: Usd.Prim, kind: str) -> str:
     """The axis X, Y or Z of a joint's frame along or about which it moves."""
     if kind != "planar":
-        return str(prim.GetAttribute("physics:axis").Get())
+        return read_axis(prim, "physics:axis")
     free = {
         axis
         for axis in (f"{motion}{letter}" for motion in ("trans", "rot") for letter in "XYZ")

@@ -52,6 +52,18 @@ def read_spec(cls: type[S], prim: Usd.Prim, noun: str, **known: Any) -> S:
         raise InputError(f"{place(prim)}: {error}") from error
 
 
+def read_axis(prim: Usd.Prim, name: str = "axis") -> str:
+    """The axis X, Y or Z of a solid, or of a joint as `physics:axis`.
+
+    Raises:
+        InputError: It is something else.
+    """
+    axis = str(prim.GetAttribute(name).Get())
+    if axis not in ("X", "Y", "Z"):
+        raise InputError(f"{place(prim)}: {name} must be X, Y or Z, got {axis!r}")
+    return axis
+
+
 def write_pose(prim: Usd.Prim, p: Vec3, q_xyzw: Quat | None = None) -> None:
     """Set the pose of an Xform in its parent: position [m] and optional orientation, in double precision.
 

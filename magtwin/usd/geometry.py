@@ -12,6 +12,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 from magtwin.errors import InputError
 from magtwin.frames import IDENTITY_XYZW, canonical
 from magtwin.spec.base import ZERO3, Quat, Vec3
+from magtwin.usd.attributes import read_axis
 from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.solids import Solid, solid_of
 
@@ -302,7 +303,7 @@ def _axis(joint: UsdPhysics.Joint) -> Vec3 | None:
     revolute = UsdPhysics.RevoluteJoint(joint.GetPrim())
     if not revolute:
         return None
-    axis = Gf.Vec3d(*("XYZ".index(revolute.GetAxisAttr().Get()) == i for i in range(3)))
+    axis = Gf.Vec3d(*("XYZ".index(read_axis(revolute.GetPrim(), "physics:axis")) == i for i in range(3)))
     turned = Gf.Rotation(joint.GetLocalRot1Attr().Get()).TransformDir(axis)
     x, y, z = (round(float(c), 9) + 0.0 for c in turned)
     return (x, y, z)

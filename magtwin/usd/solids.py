@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 from pxr import Gf, Sdf, UsdGeom, Vt
 
 from magtwin.errors import InputError
+from magtwin.usd.attributes import read_axis
 
 SEGMENTS = 32
 """Sides of the polygon that approximates a circle."""
@@ -44,7 +45,7 @@ def solid_of(gprim: UsdGeom.Gprim) -> Solid | None:
     """A gprim in its own space; None for kinds without a surface (points, curves).
 
     Raises:
-        InputError: It is an inconsistent mesh; the text names the prim.
+        InputError: It is an inconsistent mesh, or its axis is none; the text names the prim.
     """
     prim = gprim.GetPrim()
     if prim.IsA(UsdGeom.Mesh):
@@ -53,22 +54,22 @@ def solid_of(gprim: UsdGeom.Gprim) -> Solid | None:
         except InputError as error:
             raise InputError(f"{prim.GetPath()}: {error}") from error
     get = {name: prim.GetAttribute(name).Get() for name in ("radius", "height", "size", "width", "length")}
-    axis = prim.GetAttribute("axis").Get()
     kind = prim.GetTypeName()
     if kind == "Cube":
         return _faces(*box(get["size"]))
-    if kind == "Plane":
-        return _faces(*_plane(get["width"], get["length"], axis))
     if kind == "Sphere":
         return _faces(*sphere(get["radius"]))
+    if kind not in ("Plane", "Cone", "Cylinder", "Capsule"):
+        return None
+    axis = read_axis(prim)
+    if kind == "Plane":
+        return _faces(*_plane(get["width"], get["length"], axis))
     if kind == "Cone":
         r, h = get["radius"], get["height"] / 2
         return _faces(*_revolved(np.array([[0, -h], [r, -h], [0, h]]), axis))
     if kind == "Cylinder":
         return _faces(*cylinder(get["radius"], get["height"], axis))
-    if kind == "Capsule":
-        return _faces(*capsule(get["radius"], get["height"], axis))
-    return None
+    return _faces(*capsule(get["radius"], get["height"], axis))
 
 
 def mesh_solid(mesh: UsdGeom.Mesh) -> Solid:

@@ -95,7 +95,7 @@ def _days(folder: Path) -> None:
 
 
 def _dataset(folder: Path) -> None:
-    words = ("--count", 5, "--sessions", 5, "--duration-s", 3, "--path", "sine")
+    words = ("--count", 5, "--sessions", 5, "--duration-s", 3, "--path", "sine", "--magnetometer", "physical")
     _magtwin("sweep", "lab", *words, "--out", folder / "days")
     files = sorted((folder / "days").glob("*.parquet"))
     _magtwin("dataset", "build", *files, "--map", ROOT / "maps/lab/lab.usdc", "--out", folder / "set")

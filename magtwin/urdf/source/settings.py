@@ -26,7 +26,8 @@ def read_settings(path: Path) -> Iterator[dict[str, Any]]:
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # an impossible date is a ValueError
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark is not None else ""
-        reason = getattr(error, "problem", None) or str(error).partition(";")[0] or "cannot be read"
+        said = str(error).partition(";")[0].partition("\n")[0]
+        reason = getattr(error, "problem", None) or said or "cannot be read"
         raise InputError(f"{path}{line}: not YAML: {reason}") from error
     for _ in range(ENTRIES):  # aliases of aliases could go on without end
         if not pending:

@@ -11,7 +11,7 @@ from magtwin.field.sources.magnets import body_of
 from magtwin.frames import IDENTITY_XYZW, canonical, quat_conjugate, quat_multiply, rotate, xyzw_from_wxyz
 from magtwin.spec.base import ZERO3, Quat, Vec3
 from magtwin.spec.magnetics import SourceSpec
-from magtwin.usd.attributes import check_prim_name, plain_value, write_pose
+from magtwin.usd.attributes import check_prim_name, plain_value, read_axis, write_pose
 from magtwin.usd.lab.looks import define_looks, define_visual, hide, visual_path, wear
 from magtwin.usd.layers import WORLD
 from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, require_api
@@ -211,7 +211,7 @@ def _geometry(prim: Usd.Prim, shape: str, scale: Vec3) -> tuple[dict[str, Any], 
         _check_round(scale, "a sphere's scale")
         return {"size_m": (wide * scale[0],) * 3}, IDENTITY_XYZW
     cylinder = UsdGeom.Cylinder(prim)
-    axis = str(cylinder.GetAxisAttr().Get())
+    axis = read_axis(prim)
     along = "XYZ".index(axis)
     across = [scale[k] for k in range(3) if k != along]
     _check_round(across, "a cylinder's scale across its axis")
