@@ -150,7 +150,7 @@ COMMANDS = (
     Command("robot", f"robot {CART} --out cart --report cart.json"),
     Command("robot one file", f"robot {CART} --out cart --single-file"),
     Command("robot to urdf", f"robot {ROOT}/robots/turtlebot4/turtlebot4.usda --out back.urdf"),
-    Command("scene", "scene IN/room.toml --out room --map IN/room/room_map.usdc", ("scene",)),
+    Command("scene", "scene IN/room.toml --out room --map IN/room/map/room.map.usdc", ("scene",)),
     Command("map import", "map import IN/survey --out map.usdc", ("readings",)),
     Command("map import table", "map import IN/survey --out map.parquet", ("readings",)),
     Command("map fit", "map fit IN/survey --out map.usdc", ("readings",)),
