@@ -125,10 +125,10 @@ class Peer:
         return values
 
     def everything(self, values: dict) -> dict:
-        """Values of all joints, those that mimic included."""
+        """Values of all joints, those that mimic included; URDF gives a fixed joint no mimic."""
         every = dict(values)
         for joint in self.joints.values():
-            if joint.mimic is not None and joint.mimic.joint in values:
+            if joint.mimic is not None and joint.type != "fixed" and joint.mimic.joint in values:
                 every[joint.name] = joint.mimic.multiplier * values[joint.mimic.joint] + joint.mimic.offset
         return every
 

@@ -41,6 +41,18 @@ class Mechanism:
         """What each joint carries, by name."""
         return read_loads(self.description, self.poses())
 
+    @cached_property
+    def carriers(self) -> frozenset[str]:
+        """Joints beyond which another moves within limits."""
+        joints, found = self.description.joints, set[str]()
+        for joint in joints.values():
+            at = joint
+            if joint.type in ("revolute", "prismatic") and joint.name not in self.welded:
+                while at.parent in joints and joints[at.parent].name not in found:
+                    at = joints[at.parent]
+                    found.add(at.name)
+        return frozenset(found)
+
     def poses(self) -> dict[str, NDArray[np.float64]]:
         """T_root_link of each link at rest, shape (4, 4)."""
         poses = {self.description.root: np.eye(4)}
