@@ -46,10 +46,6 @@ YIELD_RAD, STIFFEST = 0.1, 1000.0
 """The gain of a joint that turns is at least its effort over this angle [rad], as far as that is at most
 `STIFFEST` [N m/rad]: the knee of a standing robot carries more than the links below it."""
 
-HANGS = 0.25
-"""A joint without limits is no wheel if more than this part of its inertia is due to the distance of its load
-from the axis, and the axis is within 30 degrees of the horizontal."""
-
 ROLLING_NAMES = ("wheel", "caster", "castor")
 """Words in the names of joints and links that roll."""
 
@@ -149,17 +145,14 @@ def define_drive(
 
 
 def holds_position(joint: Joint, mechanism: Mechanism) -> bool:
-    """Whether a joint holds a position by default.
+    """Whether a joint holds a position by default: it has limits, or it bears a load and is no wheel by name.
 
-    It does if it has limits, if it carries a joint with limits, or if its load hangs on it (see `HANGS`): a
-    velocity drive gives way under a load, as in arms and legs whose joints an exporter made continuous.
+    A velocity drive gives way under a load, as in arms and legs whose joints an exporter made continuous.
     """
     if joint.type != "continuous":
         return True
-    if any(word in f"{joint.name} {joint.child}".lower() for word in ROLLING_NAMES):
-        return False
-    load = mechanism.loads[joint.name]
-    return joint.name in mechanism.carriers or (load.beside > HANGS and load.slope < 0.5)
+    rolls = any(word in f"{joint.name} {joint.child}".lower() for word in ROLLING_NAMES)
+    return not rolls and joint.name in mechanism.bearers
 
 
 def _rule(joint: Joint, options: Options) -> DriveRule | None:
