@@ -391,7 +391,8 @@ def picture_of_run(
     t = float(run["t"][-1]) if time_s is None else time_s
     if not run["t"][0] <= t <= run["t"][-1]:
         raise InputError(
-            f"the run goes from {run['t'][0]:g} to {run['t'][-1]:g} s; there is no {t:g} s in it"
+            f"the run goes from {run['t'][0]:g} to {run['t'][-1]:g} s; there is no {t:g} s in it",
+            parameter="time_s",
         )
     with (
         output(out, force=force) as aside,
