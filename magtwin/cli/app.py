@@ -87,6 +87,7 @@ def main(arguments: list[str] | None = None) -> None:
         if debug:
             raise
         if isinstance(error, InputError):
+            _running[:] = _running or [app.parse_commands(arguments)[1][-1]]
             _fail(error.in_flags(_flags()))
         if text := _wrong_name(error, arguments):
             _fail(text)

@@ -155,7 +155,8 @@ def _visit(
 ) -> tuple[Readings, NDArray[np.bool_]]:
     """The readings, and the nodes without one, shape (H, Y, X): lock was lost, or the node is blocked."""
     if not 1 <= readings <= MOST_READINGS:
-        raise InputError(f"readings must be at least 1 and at most {MOST_READINGS:,}, got {readings!r}")
+        most = f" and at most {MOST_READINGS:,}" if readings > MOST_READINGS else ""
+        raise InputError(f"readings must be at least 1{most}, got {readings!r}")
     for name, sd in {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}.items():
         if not 0 <= sd < np.inf:
             raise InputError(f"{name} must not be below 0, got {sd!r}", parameter=name)

@@ -133,7 +133,8 @@ def calibrate(
     what = name or "the drive"
     model = mixed_of_kind(model)
     if not 0 <= pose_sd_m <= MOST_SD_M:
-        raise InputError(f"pose_sd_m must be from 0 to {MOST_SD_M:g} m, got {pose_sd_m!r}")
+        most = f", at most {MOST_SD_M:g} m" if pose_sd_m > MOST_SD_M else ""
+        raise InputError(f"pose_sd_m must be 0 or more and finite{most}, got {pose_sd_m!r}")
     if duration_s is not None and not 0 < duration_s < math.inf:
         raise InputError(f"duration_s must be above 0 s and finite, got {duration_s!r}")
     drive = labelled_drive(model, run, field, name=what)

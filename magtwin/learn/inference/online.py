@@ -149,7 +149,8 @@ def _checked(model: Predictor, delay_s: float, memory_s: float, pose_sd_m: float
     if not 0 <= delay_s < math.inf:
         raise InputError(f"delay_s must be 0 or more and finite, got {delay_s!r}")
     if not 0 <= pose_sd_m <= MOST_SD_M:
-        raise InputError(f"pose_sd_m must be from 0 to {MOST_SD_M:g} m, got {pose_sd_m!r}")
+        most = f", at most {MOST_SD_M:g} m" if pose_sd_m > MOST_SD_M else ""
+        raise InputError(f"pose_sd_m must be 0 or more and finite{most}, got {pose_sd_m!r}")
     if not memory_s > 0:
         raise InputError(f"memory_s must be above 0, got {memory_s!r}")
     return mixed_of_kind(model)
