@@ -29,7 +29,7 @@ PRESETS: Mapping[str, tuple[str, Mapping[str, Any]]] = MappingProxyType(
 """Models that are a kind of predictor with other defaults; all other models are named by their kind."""
 
 MOST_WEIGHTS = 100_000_000  # Largest network; with gradients and Adam's moments it takes 1.6 GB
-MOST_EPOCHS, MOST_THREADS = 100_000, 1024
+MOST = {"epochs": 100_000, "threads": 1024, "batch": 1_000_000_000}
 COMMON = ("model", "seed", "split", "hold_out", "init", "licence")  # Options that every model reads
 
 
@@ -139,7 +139,7 @@ class TrainConfig:
         for name, count in (("patience", self.patience), ("threads", self.threads)):
             if count is not None and count < 1:
                 raise InputError(f"{name} must be 1 at least, got {count!r}; leave it out for none")
-        for name, most in (("epochs", MOST_EPOCHS), ("threads", MOST_THREADS)):
+        for name, most in MOST.items():
             if (getattr(self, name) or 0) > most:
                 raise InputError(f"{name} must be at most {most:,}, got {getattr(self, name):,}")
         if self.penalty is not None and not 0 <= self.penalty < math.inf:
