@@ -4,6 +4,7 @@ There is no peer to hold it against; the standards are printed beside the figure
 [seconds]`, 60 unless given; 600 is a soak.
 """
 
+import json
 import os
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from magtwin.files import shipped
-from magtwin.io.bags.topics import COMMAND, MAGNITUDE, TF, TF_STATIC, Qos
+from magtwin.io.bags.topics import COMMAND, MAGNITUDE, NAMES, POSE, READING, TF, TF_STATIC, Qos
 from magtwin.ros.bus import Message, open_bus
 from magtwin.ros.commands import command_bytes
 from magtwin.ros.diagnostics import KIND
@@ -48,6 +49,18 @@ def cpu_s(process: subprocess.Popen) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
+def unseen(poses: list[int], names: list[Message], readings: list[Message]) -> int:
+    """Poses that the cameras did not see, by the flag of the readings: none is sent in a dropout."""
+    columns = json.loads(names[-1].read(["data"])["data"])["columns"]
+    (place,) = [column["first"] for column in columns if column["name"] == POSE.lost]
+    flags = np.array([m.read(["data"])["data"][place] for m in readings], bool)
+    when = np.array([m.sent_ns for m in readings])[flags]
+    sent = np.array(poses)
+    absent = np.rint(np.diff(sent) * 1e-9 * RATES[POSE.name]).astype(int) - 1
+    flagged = np.searchsorted(when, sent[1:]) > np.searchsorted(when, sent[:-1])
+    return int(absent[flagged].sum())
+
+
 def main() -> None:
     os.environ |= {
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
@@ -73,8 +86,9 @@ def main() -> None:
         "/diagnostics", KIND, lambda m: statuses.update({s.name: s for s in m.content.status}), Qos()
     )
     commands = bus.publisher(COMMAND.name, COMMAND.kind, COMMAND.qos)
+    bus.subscribe(NAMES.name, NAMES.kind, (names := list[Message]()).append, Qos(latched=True))
     try:
-        while len(heard[MAGNITUDE.name]) < 100:  # both have begun
+        while len(heard[MAGNITUDE.name]) < 100 or not names:  # both have begun
             bus.spin_once(0.05)
         for messages in heard.values():
             messages.clear()
@@ -102,9 +116,11 @@ def main() -> None:
     reliable = {topic.name for topic in LIVE if topic.qos.reliable}
     for name, rate in RATES.items():
         sent = [m.sent_ns for m in heard[name]]
-        took = (sent[-1] - sent[0]) * 1e-9 * factor
-        lost = round(took * rate) + 1 - len(sent) if name in reliable else ""
-        seen = (len(sent) - 1) / took
+        took, count = (sent[-1] - sent[0]) * 1e-9 * factor, len(sent)
+        if name == POSE.name:
+            count += unseen(sent, names, heard[READING.name])
+        lost = round(took * rate) + 1 - count if name in reliable else ""
+        seen = (count - 1) / took
         print(f"{name:32s} {seen:8.2f} {rate:8.2f} {100 * (seen / rate - 1):+6.1f}% {lost:>6}")
     stamps = np.array([int(m.read(["header.stamp"])["header.stamp"]) for m in heard[MAGNITUDE.name]])
     steps = np.rint(np.diff(stamps) * 135e-9)
