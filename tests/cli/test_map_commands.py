@@ -213,7 +213,7 @@ def test_continue_writes_the_map_of_another_height(tmp_path, layer, capsys):
     exact = a_field().magnitude_nt(*up.grid.poses(), height_m=1.0)
     assert np.abs(up.values_nt - exact).max() < 0.004
     assert up.method.endswith("continued from 0.35 to 1 m by its harmonic field")
-    assert "height_m is a height above the floor, 0 m or more, got -1.0" in refused(
+    assert "--height-m is a height above the floor, 0 m or more, got -1.0" in refused(
         capsys, "map", "upward", layer, "--height-m", "-1", "--out", tmp_path / "down.usdc"
     )
     assert not (tmp_path / "down.usdc").exists()

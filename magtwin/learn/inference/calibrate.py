@@ -141,10 +141,10 @@ def calibrate(
     end = math.inf if duration_s is None else drive.t[0] + duration_s
     drive = drive.part(np.isfinite(drive.y) & (drive.t <= end))
     if len(drive.t) < LEAST_READINGS:
-        part = "" if duration_s is None else f" in the `duration_s` of {duration_s:g} s"
+        longer = "" if duration_s is None else ", or raise `duration_s`"
         raise InputError(
-            f"{what}: {len(drive.t)} labelled readings at most 4 a second{part}, and {LEAST_READINGS} are "
-            "needed; drive for a minute on the map, in curves"
+            f"{what}: {len(drive.t)} labelled readings at most 4 a second, and {LEAST_READINGS} are needed; "
+            f"drive for a minute on the map, in curves{longer}"
         )
     cautions = _cautions(drive, run, pose_from_map=pose_from_map)
     if "map_samples_nt" in model.metadata and not same_map(model.metadata, field):
