@@ -306,7 +306,8 @@ def test_a_maps_own_texts_do_not_steer_the_terminal(tmp_path, capsys):
     assert "the \\x1b[31mdoor" in told
 
 
-def test_outliers_take_one_line_and_json_lists_them(tmp_path, capsys):
+def test_outliers_take_one_line_and_json_lists_them(tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)  # no line is broken
     rng = np.random.default_rng(0)
     places = [(x / 4, y / 4) for x in range(12) for y in range(12)]
     values = 50_000 + np.array([400 * x + 300 * y * y for x, y in places]) + rng.normal(0, 5, len(places))
