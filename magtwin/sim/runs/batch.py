@@ -37,8 +37,8 @@ BLOCK = 16
 """Runs made at a time: 130,000 readings of a minute each, 0.1 GB, and work for every thread."""
 
 
-PLANNED = 1 << 28
-"""Bytes of plans that are kept: 2,000 of a minute each, or one of a day."""
+PLANNED = 1 << 27
+"""Bytes of plans that are kept, beside the last: 1,000 of a minute each, or none of a day."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,6 +274,9 @@ class Runs(Summarized, Sequence[Run]):
         key = (job.path, job.speed, alike, radius, job.scene.start)
         if key in self._planned:
             return self._planned[key]
+        if self._kept > PLANNED:
+            self._planned.clear()
+            self._kept = 0
         if isinstance(job.path, Path):
             if not isinstance(common.controller, str) or (
                 common.controller not in CONTROLLERS and common.controller in CUSTOM_CONTROLLERS
@@ -298,9 +301,6 @@ class Runs(Summarized, Sequence[Run]):
             )
             planned.check(common.obstacles)
         self._kept += planned.guide.table.nbytes
-        if self._kept > PLANNED:
-            self._planned.clear()
-            self._kept = planned.guide.table.nbytes
         self._planned[key] = planned
         return planned
 
