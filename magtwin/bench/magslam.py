@@ -233,7 +233,8 @@ _LOAD = """
 import sys, numpy, scipy.io
 try:
     import resource
-    resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]) + 2**30, resource.RLIM_INFINITY))
+    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+    resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]) + 2**30, hard))
 except (ImportError, ValueError):
     pass
 read = scipy.io.loadmat(sys.argv[1], variable_names=sys.argv[3:])
