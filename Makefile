@@ -15,7 +15,7 @@ MOST_MB := 2700
 # Two processes whose linear algebra has threads of its own wait for each other more than they work.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 
-.PHONY: fuzz faults demo test test-slow readme simready blender ros physics physx lint paper bench zoo wheel-test schema assets pictures clean help
+.PHONY: fuzz faults demo test test-slow readme simready blender ros released physics physx lint paper bench zoo wheel-test schema assets pictures clean help
 
 help:  ## Say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -38,7 +38,10 @@ simready: $(VENV)/.dev  ## Hold robots against NVIDIA's SimReady profiles, in an
 	MAGTWIN_SIMREADY=$(CURDIR)/build/simready/bin/simready-validate $(BIN)/python -m pytest tests/urdf/test_urdf_layout.py tests/export/test_validate.py -k "simready or layout"
 
 ros: $(VENV)/.dev build/ros-jazzy/.installed build/ros-kilted/.installed  ## Cross our nodes with rclpy of ROS 2 Jazzy and Kilted, in environments of their own
-	$(ONE_THREAD) $(BIN)/python -m pytest tests/ros/test_ros_bus.py tests/ros/test_ros_rclpy.py tests/ros/test_ros_released.py
+	$(ONE_THREAD) $(BIN)/python -m pytest tests/ros/test_ros_bus.py tests/ros/test_ros_rclpy.py
+
+released: $(VENV)/.dev build/ros-jazzy/.installed  ## Drive APRILab's released ROS 2 nodes for a minute beside the simulated robot
+	$(ONE_THREAD) $(BIN)/python -m pytest tests/ros/test_ros_released.py
 
 blender: $(VENV)/.dev build/blender/.installed  ## Import exports in Blender (bpy, 1 GB, Python 3.11), in an environment of its own
 	$(ONE_THREAD) MAGTWIN_BLENDER=$(CURDIR)/build/blender/bin/python $(BIN)/python -m pytest tests/export/test_blender.py

@@ -30,7 +30,8 @@ class Budget:
     """Most levels of nesting."""
 
     count: int = 10_000_000
-    """Most entries: elements of XML, arrays of npz, columns of tables, prims of USD, pixels of images."""
+    """Most entries: elements of XML, arrays of npz, columns of tables, files of a package, pixels of an
+    image."""
 
     seconds: float = 20.0
     """Time limit of formats that are decoded in a process of their own, plus 1 s per megabyte."""

@@ -15,6 +15,9 @@ LONGEST = 1500
 _PARAMETER = re.compile(r"`(?:magtwin\.)?([a-z_][a-z0-9_]*)(?:=([^`]*)|\(([^`]*)\))?`")
 """A parameter in the text of a refusal: `force=True`, `map_layer`, `magtwin.allow('folder')`."""
 
+_FIRST = re.compile(r"\A([a-z]\w*_\w+(?= )|[a-z]+(?= (?:of [^:;,]* )?(?:must|is no option) ))")
+"""A parameter that begins a refusal: rate_hz of the magnetometer must be above 0."""
+
 
 class InputError(ValueError):
     """An input that magtwin refuses. Its text says what is wrong, where, and what to do.
@@ -22,8 +25,8 @@ class InputError(ValueError):
     Everything that a user can get wrong (a file, a name, a number) raises this class or a subclass. The
     command line prints it as one line and exits with status 1.
 
-    A text names a parameter as a Python user writes it, in backticks: `` `force=True` ``. The command line
-    prints `in_flags` instead.
+    A text names a parameter as a Python user writes it, in backticks: `` `force=True` ``, or as its first
+    word: `seed must be 0 or more`. The command line prints `in_flags` instead.
     """
 
     parameter: str | None
@@ -40,7 +43,10 @@ class InputError(ValueError):
 
         Args:
             flags: Flag of each parameter that the command has ({"force": "--force"}). Other words
-                in backticks stay as they are.
+                stay as they are.
+
+        Returns:
+            The text, in which the flag of `parameter` is named in any case.
         """
 
         def flag(match: re.Match[str]) -> str:
@@ -53,7 +59,10 @@ class InputError(ValueError):
             value = (value or "").strip("\"'")
             return f"{flags[name]} {value}" if value not in ("", "True") else flags[name]
 
-        return _PARAMETER.sub(flag, str(self))
+        text = _PARAMETER.sub(flag, str(self))
+        text = _FIRST.sub(lambda match: flags.get(match[1], match[1]), text)
+        named = flags.get(self.parameter or "")
+        return f"{named}: {text}" if named and named not in text else text
 
 
 class MismatchWarning(UserWarning):

@@ -114,7 +114,10 @@ def read_text(path: str | os.PathLike[str], what: str, kind: str, encoding: str 
 
 def sha256(path: str | os.PathLike[str]) -> str:
     """SHA-256 of a file, lower-case hex."""
-    with existing(path, "file").open("rb") as file:
+    path = existing(path, "file")
+    if path.is_dir():
+        raise InputError(f"{path}: a folder; name the file in it")
+    with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -39,6 +39,7 @@ URDF = Kind(
     "into a room",
 )
 STAGE = Kind("a USD file", "magtwin info {file} describes it")
+ROBOT_FOLDER = Kind("the folder of a robot", "name the stage inside")
 SCENE_FOLDER = Kind("the folder of a scene", "magtwin run {file} drives in it; or name the stage inside")
 RUN = Kind("a run", "magtwin info {file} describes it, and magtwin picture, report and localize take it")
 SWEEP = Kind(
@@ -62,12 +63,18 @@ JSON = Kind("a JSON", "give another file")
 PICTURE = Kind("a picture or film", "give the file that it was drawn from")
 PAGE = Kind("a page", "give the file that it was made from")
 PYTHON = Kind("a Python file", "magtwin localize RUN --map MAP --method MODULE:CLASS takes a class in it")
+YAML = Kind("a YAML", "--controllers of magtwin robot and magtwin scene takes one with a robot's controllers")
+OCCUPANCY = Kind("an occupancy map of map_server", "give the scene that magtwin map occupancy made it from")
+BAG_YAML = Kind("the description of a bag", "give the folder that it is in")
+MESH = Kind("a mesh", "magtwin robot converts a URDF that names it")
+GAZEBO = Kind("a world or model of Gazebo", "give the URDF or the stage that it was made from")
+ARCHIVE = Kind("an archive", "unpack it, and give a file in it")
 TABLE = Kind("a table", "give its columns to magtwin map fit, or the file that it was made from")
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 
 ACCEPTED: dict[str, tuple[Kind, ...]] = {
-    "run": (RUN, STAGE, JSON, TABLE, PATH, COMMANDS),
+    "run": (RUN, STAGE, JSON, TABLE),
     "scene": (STAGE,),
     "USD file": (STAGE,),
     "map": (STAGE, SURVEY),
@@ -171,11 +178,24 @@ def _kind_of_folder(folder: Path) -> Kind | None:
         ("metadata.yaml", RUN),
         ("run.parquet", RUN),
         ("runs.csv", SWEEP),
-        (f"{folder.resolve().name}.usda", SCENE_FOLDER),
+        (f"{folder.resolve().name}.usda", _kind_of_stages(folder)),
     ):
         if (folder / name).is_file():
             return kind
     return SURVEY if next(folder.glob("*_map.csv"), None) else None
+
+
+def _kind_of_stages(folder: Path) -> Kind:
+    """The kind of a folder that magtwin made: that of a robot has layers in payloads/, and no map."""
+    robot = (folder / "payloads").is_dir() and not (folder / "robots").is_dir()
+    return ROBOT_FOLDER if robot else SCENE_FOLDER
+
+
+def _kind_of_yaml(path: Path) -> Kind:
+    head = _head(path)
+    if b"rosbag2_bagfile_information" in head:
+        return BAG_YAML
+    return OCCUPANCY if re.search(rb"^image\s*:", head, re.M) else YAML
 
 
 def _kind_of_toml(path: Path) -> Kind:
@@ -185,6 +205,8 @@ def _kind_of_toml(path: Path) -> Kind:
 
 def _kind_of_csv(path: Path) -> Kind:
     lines = [line.strip() for line in _head(path).decode("utf-8", "replace").splitlines()]
+    if lines and lines[0].startswith("# magtwin run"):
+        return RUN
     words = next((line.lstrip("\ufeff") for line in lines if line and not line.startswith("#")), "")
     names = [word.strip().strip('"').lower() for word in words.split(",")]
     return PATH if names == ["x", "y"] else COMMANDS if names == ["t", "v", "w"] else TABLE
@@ -220,6 +242,10 @@ _BY_SUFFIX: dict[str, Callable[[Path], Kind | None]] = {
     **dict.fromkeys(USD_SUFFIXES, _is(STAGE)),
     **dict.fromkeys((".npz", ".rrd", ".mcap", ".db3"), _is(RUN)),
     **dict.fromkeys((".pth", ".pt"), _is(CHECKPOINT)),
-    **dict.fromkeys((".png", ".jpg", ".jpeg", ".svg", ".gif", ".mp4"), _is(PICTURE)),
+    **dict.fromkeys((".png", ".jpg", ".jpeg", ".svg", ".gif", ".mp4", ".pgm"), _is(PICTURE)),
     **dict.fromkeys((".html", ".md"), _is(PAGE)),
+    **dict.fromkeys((".yaml", ".yml"), _kind_of_yaml),
+    **dict.fromkeys((".stl", ".obj", ".dae", ".glb", ".gltf", ".ply"), _is(MESH)),
+    **dict.fromkeys((".sdf", ".world"), _is(GAZEBO)),
+    **dict.fromkeys((".zip", ".gz", ".tgz", ".tar", ".xz", ".bz2", ".7z", ".zst"), _is(ARCHIVE)),
 }

@@ -182,6 +182,8 @@ def evaluate(
         InputError: A file cannot be read; the map of a model is not given; a model was trained on one of
             these recordings; or a recording lacks a column that a model or the evaluation needs.
     """
+    if seed < 0:
+        raise InputError(f"seed must be a whole number from 0 up, got {seed!r}")
     maps = _named_maps([anomaly_map] if _single(anomaly_map) else anomaly_map)  # type: ignore[arg-type,list-item]
     given: list[Any] = [models] if _single(models) or _is_model(models) else list(models)  # type: ignore[arg-type]
     files = iter(short_names([Path(model) for model in given if _single(model)]))

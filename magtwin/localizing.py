@@ -245,6 +245,8 @@ def localization(
         raise InputError("the run has no readings")
     if rate_hz is not None and not rate_hz > 0:
         raise InputError(f"`rate_hz` must be above 0 Hz, got {rate_hz!r}", parameter="rate_hz")
+    if seed < 0:
+        raise InputError(f"seed must be a whole number from 0 up, got {seed!r}", parameter="seed")
     if rate_hz is not None and run.rows > 1 and 1.01 * rate_hz < (run.rows - 1) / run.duration_s:
         run = thinned(run, rate_hz)
     if calibration is not None:

@@ -16,6 +16,21 @@ def test_a_parameter_in_backticks_becomes_its_flag_and_other_words_stay():
     )
 
 
+def test_a_parameter_that_begins_a_text_or_that_an_error_is_about_becomes_its_flag():
+    flags = {"rate_hz": "--rate-hz", "seed": "--seed", "map": "--map"}
+    for text, shown in (
+        ("rate_hz of a controller must be above 0", "--rate-hz of a controller must be above 0"),
+        ("rate_hz 3 is too low", "--rate-hz 3 is too low"),
+        ("seed must be 0 or more", "--seed must be 0 or more"),
+        ("map has no epochs; seed must be 0", "map has no epochs; seed must be 0"),
+        ("a.csv: seed must be 0", "a.csv: seed must be 0"),
+    ):
+        assert InputError(text).in_flags(flags) == shown
+    assert InputError("a date, got 'x'", parameter="map").in_flags(flags) == "--map: a date, got 'x'"
+    assert InputError("give `map`", parameter="map").in_flags(flags) == "give --map"
+    assert InputError("a date, got 'x'", parameter="day").in_flags(flags) == "a date, got 'x'"
+
+
 def test_a_parameter_survives_pickling_and_is_none_by_default():
     assert pickle.loads(pickle.dumps(InputError("give `force=True`", parameter="force"))).parameter == "force"
     assert UnknownNameError("no path").parameter is None

@@ -115,15 +115,16 @@ def ship_case(
     if noise not in ("published", "likely"):
         raise InputError(f"noise must be published or likely, got {noise!r}", parameter="noise")
     white, drift, drift_s = (SHIP_NOISE, 0.0, 1.0) if noise == "published" else SHIP_LIKELY
-    data = _matlab(Path(folder) / f"Aligned_SquareLoop_{loop}.mat", _SHIP)
-    p, rotation, dt = data["p"].T, _rotation(data["q"].T), float(data["T"].item())
+    path = Path(folder) / f"Aligned_SquareLoop_{loop}.mat"
+    data = _matlab(path, _SHIP)
+    p, rotation, dt = data["p"].T, _rotation(data["q"].T, path), float(data["T"].item())
     y_nt = SHIP_UNIT_NT * data["y_mag"].T
     rng, sign = np.random.default_rng([loop, seed // 2]), 1 - 2 * (seed % 2)
     sd = np.sqrt([SHIP_STEP_VARIANCE_M2, SHIP_STEP_VARIANCE_M2, SHIP_HEIGHT_VARIANCE_M2])
     moved = np.diff(p, axis=0) + SHIP_BIAS_M + sign * sd * rng.standard_normal((len(p) - 1, 3))
     turned = (rotation[1:] * rotation[:-1].inv()).as_rotvec()
     turned += sign * math.sqrt(SHIP_TURN_VARIANCE) * rng.standard_normal(turned.shape)
-    p0, R0 = data["p_0"][:, 0], _rotation(data["q_0"].T)[0]
+    p0, R0 = data["p_0"][:, 0], _rotation(data["q_0"].T, path)[0]
     odom_p = np.vstack([p0, p0 + np.cumsum(moved, axis=0)])
     odom_q = _accumulated(R0, Rotation.from_rotvec(turned))
     problem = Problem(
@@ -195,8 +196,9 @@ def hand_case(folder: str | os.PathLike[str], name: Literal["eight", "square"]) 
     """
     if name not in HAND_LOOPS:
         raise InputError(f"name must be eight or square, got {name!r}", parameter="name")
-    data = _matlab(Path(folder) / f"{name}.mat", _HAND)
-    start, t, rotation = data["initPos"][0], data["t"][:, 0], _rotation(data["quat"])
+    path = Path(folder) / f"{name}.mat"
+    data = _matlab(path, _HAND)
+    start, t, rotation = data["initPos"][0], data["t"][:, 0], _rotation(data["quat"], path)
     reference, odometry = (
         np.vstack([start, start + np.cumsum(data[key], axis=0)]) for key in ("dPos", "dPosSmooth")
     )
@@ -231,7 +233,8 @@ _LOAD = """
 import sys, numpy, scipy.io
 try:
     import resource
-    resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]) + 2**30, resource.RLIM_INFINITY))
+    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+    resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]) + 2**30, hard))
 except (ImportError, ValueError):
     pass
 read = scipy.io.loadmat(sys.argv[1], variable_names=sys.argv[3:])
@@ -276,8 +279,11 @@ def _matlab(path: Path, shapes: Mapping[str, tuple[int, int]]) -> dict[str, Arra
     return arrays
 
 
-def _rotation(wxyz: Array) -> Rotation:
-    return Rotation.from_quat(wxyz[:, [1, 2, 3, 0]])
+def _rotation(wxyz: Array, path: Path) -> Rotation:
+    try:
+        return Rotation.from_quat(wxyz[:, [1, 2, 3, 0]])
+    except ValueError as error:
+        raise InputError(f"{path}: a quaternion is 0 ({error}); get the file again") from error
 
 
 def _accumulated(first: Rotation, increments: Rotation) -> Array:

@@ -337,7 +337,9 @@ def _read_part(file: Path, columns: list[str] | None = None) -> pa.Table:
     try:
         return load_parquet(file, partial(pq.read_table, columns=columns))
     except InputError as error:
-        raise InputError(f"{error}; or remove it and repeat magtwin bench") from error
+        reason = str(error).removeprefix(f"{file}: ").partition(";")[0]
+        text = f"{file}: damaged results ({reason}); remove them and repeat magtwin bench"
+        raise InputError(text) from error
 
 
 def _order(suite: Suite) -> tuple[dict[str, int], dict[str, int]]:

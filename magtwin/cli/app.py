@@ -3,6 +3,7 @@
 import errno
 import functools
 import inspect
+import re
 import signal
 import sys
 import warnings
@@ -40,13 +41,18 @@ HELP = {"--help", "-h"}
 ALIASES = {
     "anomaly_map": "map",
     "duration": "duration_s",
+    "fps": "usd_fps",
     "map_layer": "map",
     "localizers": "localizer",
     "net": "network",
     "offsets_s": "offset_s",
     "profile": "target",
+    "ridge": "penalty",
 }
 """Options of the command line whose parameter has another name in Python."""
+
+_TOO_LITTLE = re.compile(r"can't allocate memory|out of memory|std::bad_alloc", re.IGNORECASE)
+"""Texts of errors of libraries that found too little memory, beside MemoryError."""
 
 _running: list[App] = []
 """The command that is running."""
@@ -81,10 +87,14 @@ def main(arguments: list[str] | None = None) -> None:
         if debug:
             raise
         if isinstance(error, InputError):
+            _running[:] = _running or [app.parse_commands(arguments)[1][-1]]
             _fail(error.in_flags(_flags()))
         if text := _wrong_name(error, arguments):
             _fail(text)
-        if isinstance(error, OSError | MemoryError):
+        if isinstance(error, MemoryError) or _TOO_LITTLE.search(str(error)):
+            text = str(error).partition(" for an array")[0].partition(". Error code")[0]
+            _fail(f"not enough memory{f' ({text})' if text else ''}; give less data or smaller options")
+        if isinstance(error, OSError):
             _fail(f"{error} ({type(error).__name__})")
         _fail(f"a fault in magtwin, {type(error).__name__}: {error}; please report it, with --debug")
 

@@ -196,7 +196,15 @@ def _values(option: str, texts: list[str] | None, model: Any = None) -> dict[str
     for name, value in values.items() if model is not None else ():
         if name not in known:
             raise InputError(f"--{option} has no {name!r}; {hint(name, known)}")
-        parts = value if name == "lever_arm_m" and isinstance(value, tuple) else (value,)
-        if not all(isinstance(part, int | float) and not isinstance(part, bool) for part in parts):
-            raise InputError(f"--{option} {name} is a number, got {value!r}")
+        arm = name == "lever_arm_m"
+        parts = value if arm and isinstance(value, tuple) else (value,)
+        numbers = all(isinstance(part, int | float) and not isinstance(part, bool) for part in parts)
+        if not numbers or (arm and len(parts) != 2):
+            form = "two numbers [m], such as [0.1,0]," if arm else "a number,"
+            raise InputError(f"--{option} {name} is {form} got {value!r}")
+    if model is not None:
+        try:
+            model(**values)
+        except InputError as error:
+            raise InputError(f"--{option} {error}") from error
     return values

@@ -42,6 +42,18 @@ def pairs(
     return table
 
 
+LEAST_PACE = 0.001
+"""Lowest pace: 17 minutes for a second of a run."""
+
+
+def check_pace(pace: float) -> None:
+    """Refuse a pace at which nothing would happen."""
+    if not pace > 0:
+        raise InputError(f"--pace must be above 0 simulated seconds per second, got {pace:g}")
+    if pace < LEAST_PACE:
+        raise InputError(f"--pace must be at least {LEAST_PACE:g}, got {pace:g}")
+
+
 Whole = Annotated[int, Parameter(converter=_whole)]
 Flag = Annotated[bool, Parameter(negative="")]
 Names = Annotated[list[str] | None, Parameter(consume_multiple=True)]

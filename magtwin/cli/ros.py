@@ -26,6 +26,7 @@ from magtwin.cli.options import (
     Seed,
     Session,
     Whole,
+    check_pace,
 )
 from magtwin.cli.terminal import Done, announce, progress, silence, step
 from magtwin.errors import InputError
@@ -36,6 +37,9 @@ if TYPE_CHECKING:
 
 ros_app = App(name="ros", help="Run the twin and its sensors as ROS 2 nodes.")
 app.command(ros_app)
+
+LONGEST_S = 1e8
+"""Longest duration of a node that ends by itself [s]: three years."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,6 +81,8 @@ class Node:
         """The node of one robot or several, until the end of the block or Ctrl-C."""
         if duration_s is not None and not duration_s > 0:
             raise InputError(f"--duration-s must be above 0 s, got {duration_s!r}")
+        if duration_s is not None and duration_s > LONGEST_S:
+            raise InputError(f"--duration-s is at most {LONGEST_S:g} s; leave it out to go on until Ctrl-C")
         from magtwin.compiled import steady
         from magtwin.ros.bus import names_of, open_bus
 
@@ -171,6 +177,7 @@ def sim(
     from magtwin.ros.simulate import Simulator
     from magtwin.twin import open_twin, with_plant
 
+    check_pace(pace)
     announce(f"opening {scene}")
     kind = None if magnetometer == "none" else magnetometer
     opening: Any = {"network": network, "magnetometer": kind, "model_error": model_error}
@@ -457,8 +464,7 @@ def replay(
     from magtwin.ros.record import Player
     from magtwin.twin import open_twin
 
-    if not pace > 0:
-        raise InputError(f"--pace must be above 0, got {pace!r}")
+    check_pace(pace)
     whole = read_run(run)
     twin = None if scene is None else open_twin(scene, model_error=False)
     with where.bus("magtwin_replay") as bus:

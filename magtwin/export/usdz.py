@@ -81,7 +81,7 @@ def unpack(package: Path, folder: Path) -> Path:
     try:
         with zipfile.ZipFile(package) as archive:
             check_count(package, "package", len(archive.infolist()), "files")
-            entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+            entries = [entry for entry in archive.infolist() if not entry.filename.endswith("/")]
             _check(package, entries)
             for entry in entries:
                 place = folder / entry.filename

@@ -94,8 +94,8 @@ class Grid(Summarized):
         headings, rows, columns = self.shape
         if headings * rows * columns > MOST_NODES:
             raise InputError(
-                f"a grid of {rows} x {columns} nodes in {headings} headings is beyond {MOST_NODES:,} nodes; "
-                "widen the spacing"
+                f"a grid of {float(rows):g} x {float(columns):g} nodes in {headings} headings is beyond "
+                f"{MOST_NODES:,} nodes; widen `spacing_m`"
             )
         return self
 

@@ -33,6 +33,9 @@ MOST_FRAMES = {".mp4": 100_000, ".gif": 2_000}
 MOST_FPS = {".mp4": 120.0, ".gif": 50.0}
 """Frame rates. GIF counts in hundredths of a second, and viewers slow down frames shorter than two."""
 
+LEAST_FPS = 0.01
+"""Lowest frame rate. GIF stores the duration of a frame in 16 bits."""
+
 
 def film_of_run(
     run: Run,
@@ -74,6 +77,8 @@ def film_of_run(
     if fps > MOST_FPS[suffix]:
         kind = suffix[1:].upper()
         raise InputError(f"fps must be at most {MOST_FPS[suffix]:g} in a {kind}, got {fps:g}")
+    if 0 < fps < LEAST_FPS:
+        raise InputError(f"fps must be at least {LEAST_FPS:g}, got {fps:g}")
     times, speed = frame_times(run, fps, speed, MOST_FRAMES[suffix])
     with Scenery(run, scene_file, times, view=view, size=size, speed=speed) as scenery:
 
@@ -100,15 +105,19 @@ def frame_times(
     """
     if run.rows < 2 or "t" not in run:
         raise InputError(f"the run has {run.rows} readings; two or more are needed to show it")
-    for name, value in (("fps", fps), ("speed", speed)):
+    for name, value, flag in (("fps", fps, "fps"), ("speed", speed, "pace")):
         if value is not None and not 0 < value < math.inf:
-            raise InputError(f"{name} must be above 0 and finite, got {value:g}")
+            raise InputError(f"{name} must be above 0 and finite, got {value:g}", parameter=flag)
     if speed is None:
         speed = max(1.0, run.duration_s / LONGEST_S)
-    count = int(run.duration_s * fps / speed + 1e-9) + 1
-    if count > most:
-        raise InputError(f"the film would have {count:,} frames, and {most:,} are the most; raise the speed")
-    times = run["t"][0] + np.arange(count) * (speed / fps)
+    wanted = run.duration_s * fps / speed
+    if not wanted < most:
+        count = f"{wanted:,.0f}" if wanted < 1e15 else f"{wanted:.3g}"
+        raise InputError(
+            f"the film would have {count} frames, and {most:,} are the most; raise the speed",
+            parameter="pace",
+        )
+    times = run["t"][0] + np.arange(int(wanted + 1e-9) + 1) * (speed / fps)
     return np.minimum(times, run["t"][-1]), speed
 
 

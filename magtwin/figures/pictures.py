@@ -18,6 +18,7 @@ from magtwin.errors import InputError
 from magtwin.files import read_bytes
 from magtwin.frames import rotate
 from magtwin.outputs import output
+from magtwin.parallel import check_room
 from magtwin.spec.base import Vec3
 from magtwin.urdf.meshes.texture import opened_image
 from magtwin.usd.geometry import (
@@ -58,6 +59,9 @@ LIGHTS = (((0.6, 0.9, 1.4), 0.75), ((0.9, -1.0, 0.5), 0.45), ((-0.9, 0.2, 0.6), 
 
 VEIL = 0.3
 """Opacity of an object where it stands in front of the heat-map, the robot or the trail."""
+
+BYTES_PER_PIXEL = 400
+"""Memory that a picture takes while it is drawn, with smooth edges and shadows."""
 
 MOST_TEXELS = 2048
 """Texels along the longer side of a texture as drawn; larger images are scaled down."""
@@ -312,6 +316,12 @@ def check_size(size: tuple[int, int]) -> None:
     """Refuse a size that cannot be drawn."""
     if not (min(size) >= 16 and max(size) <= 16384):
         raise InputError(f"size must lie in 16..16384 pixels each way, got {size[0]} x {size[1]}")
+    check_room(
+        BYTES_PER_PIXEL * size[0] * size[1],
+        f"a picture of {size[0]} x {size[1]} pixels",
+        "take a smaller `size`",
+        "size",
+    )
 
 
 def write_png(image: NDArray[np.uint8], path: Path) -> None:

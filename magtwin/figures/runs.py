@@ -59,7 +59,7 @@ def draw_run(run: Run, field: AnomalyMap | None = None, planned: ArrayLike | Non
     if not run.rows:
         raise InputError("the run has no rows to draw")
     if run.rows > mapped.LONG:
-        run = run.take(slice(None, None, -(-run.rows // mapped.BLOCK)))  # more points than a picture shows
+        run = run.take(np.arange(0, run.rows, -(-run.rows // mapped.BLOCK)))  # more than a picture shows
         mapped.release()
     place, panels = position_name(run), panels_of(run)
     both = place is not None and bool(panels)

@@ -104,10 +104,13 @@ class View:
             x = math.nan
         if not (text.count(":") == 1 and math.isfinite(x) and all(map(math.isfinite, (y, z, tx, ty, tz)))):
             raise InputError(
-                f"no camera {text!r}; known: {', '.join(KINDS)}; or x,y,z:x,y,z, from where to where"
+                f"no camera {text!r}; known: {', '.join(KINDS)}; or x,y,z:x,y,z, from where to where",
+                parameter="camera",
             )
         if (x, y, z) == (tx, ty, tz):
-            raise InputError(f"the camera {text!r} looks at its own place; give another target")
+            raise InputError(
+                f"the camera {text!r} looks at its own place; give another target", parameter="camera"
+            )
         return cls("fixed", (x, y, z), (tx, ty, tz))
 
     def camera(self, seen_s: float = 0.0) -> Camera:
@@ -391,7 +394,8 @@ def picture_of_run(
     t = float(run["t"][-1]) if time_s is None else time_s
     if not run["t"][0] <= t <= run["t"][-1]:
         raise InputError(
-            f"the run goes from {run['t'][0]:g} to {run['t'][-1]:g} s; there is no {t:g} s in it"
+            f"the run goes from {run['t'][0]:g} to {run['t'][-1]:g} s; there is no {t:g} s in it",
+            parameter="time_s",
         )
     with (
         output(out, force=force) as aside,

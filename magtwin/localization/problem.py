@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 Extent = tuple[float, float, float, float]
 """Least x, greatest x, least y, greatest y in world [m]."""
 
+MOST = 1e9
+"""Largest figure of a noise model; squares of it stay finite."""
+
 HEADING_WITHIN = math.radians(10) / math.sqrt(3)
 """Standard deviation of a heading that is known within 10 deg, uniformly [rad]."""
 
@@ -270,6 +273,7 @@ class Compensator(Protocol):
 def _not_negative(model: object) -> None:
     for name, value in vars(model).items():
         numbers = [abs(number) for number in value] if isinstance(value, tuple) else [value]
-        if not all(math.isfinite(number) and number >= 0 for number in numbers):
-            text = f"{name} of {type(model).__name__} must be finite and not negative, got {value}"
+        if not all(0 <= number <= MOST for number in numbers):
+            wanted = f"must be finite and not negative, at most {MOST:g}"
+            text = f"{name} of {type(model).__name__} {wanted}, got {value}"
             raise InputError(text, parameter=name)

@@ -28,7 +28,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from magtwin.errors import InputError
-from magtwin.parallel.machine import free_memory, processors
+from magtwin.parallel.machine import check_room, free_memory, processors
 from magtwin.parallel.pool import RETRIES, C, Failure, Outcome, Pool, R, WorkerError
 from magtwin.parallel.shard import checked_shard, in_shard, parse_shard
 from magtwin.parallel.worker import beat
@@ -40,6 +40,7 @@ __all__ = [
     "Pool",
     "WorkerError",
     "beat",
+    "check_room",
     "checked_shard",
     "free_memory",
     "in_shard",

@@ -9,6 +9,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from magtwin.errors import InputError
+
 PR_SET_PDEATHSIG = 1
 """Request of prctl(2): the signal that a process gets when its parent dies."""
 
@@ -33,6 +35,42 @@ def free_memory() -> int | None:
         cached = dict(line.split() for line in _cgroup("memory.stat").splitlines())
         free.append(max(0, int(most) - int(used) + int(cached.get("inactive_file", 0))))
     return min(free, default=None)
+
+
+def room() -> int | None:
+    """Memory that this process alone can still take [bytes], with its limit of addresses (`ulimit -v`).
+
+    None if that is unknown.
+    """
+    free = [] if (most := free_memory()) is None else [most]
+    with contextlib.suppress(OSError, ValueError, IndexError, ImportError):
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit != resource.RLIM_INFINITY:
+            used = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+            free.append(max(0, limit - used * os.sysconf("SC_PAGE_SIZE")))
+    return min(free, default=None)
+
+
+def check_room(needed: float, what: str, remedy: str, parameter: str) -> None:
+    """Refuse what needs more memory than this process can take, before it is asked for.
+
+    Args:
+        needed: Memory that it takes [bytes].
+        what: What needs it, for the refusal.
+        remedy: What to do.
+        parameter: The parameter that asks for it.
+
+    Raises:
+        InputError: `needed` is above `room()`.
+    """
+    free = room()
+    if free is not None and needed > free:
+        raise InputError(
+            f"{what} needs about {needed / 1e9:.3g} GB of memory, and {free / 1e9:.3g} GB are free; {remedy}",
+            parameter=parameter,
+        )
 
 
 def _cgroup(name: str) -> str:

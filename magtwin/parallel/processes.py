@@ -15,6 +15,7 @@ from multiprocessing.connection import wait
 from typing import Any, Self
 
 from magtwin.errors import InputError
+from magtwin.parallel.machine import free_memory, processors
 from magtwin.parallel.pool import RETRIES, C, Failure, Limit, Outcome, R, WorkerError
 from magtwin.parallel.worker import serve
 
@@ -87,6 +88,22 @@ def _reason(code: int | None) -> str:
     return f"was killed by {name}" + (", as by a lack of memory" if -code == signal.SIGKILL else "")
 
 
+WORKER_BYTES = 300_000_000
+"""Memory of a worker that simulates or labels."""
+
+
+def _check_memory(workers: int) -> None:
+    """Refuse more workers than there are processors if their memory is not free."""
+    free = free_memory()
+    if workers > processors() and free is not None and workers * WORKER_BYTES > free:
+        need, have = (f"{size / 1e9:.3g} GB" for size in (workers * WORKER_BYTES, free))
+        raise InputError(
+            f"{workers:,} processes need about {need} of memory, and {have} are free; give `jobs` of at most "
+            f"{max(processors(), free // WORKER_BYTES)}",
+            parameter="jobs",
+        )
+
+
 class Processes:
     """A pool of processes on this machine. They start when there is work, and stay for the next.
 
@@ -147,6 +164,7 @@ class Processes:
         progress: Callable[[int, int], Any],
     ) -> Iterator[Outcome[Any]]:
         """As `run` for a pickled function; `chunk` and `limit_s` give pickled chunks and limits by number."""
+        _check_memory(min(self.jobs, count))
         waiting, tries, done = deque(range(count)), [0] * count, 0
         progress(0, count)
         try:

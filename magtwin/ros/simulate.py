@@ -108,7 +108,9 @@ class Simulator:
             InputError: A robot starts in an obstacle, or an option is out of range.
         """
         if not 0 < speed <= 100:
-            raise InputError(f"speed must be above 0 and at most 100 times real time, got {speed!r}")
+            raise InputError(
+                f"speed must be above 0 and at most 100 times real time, got {speed!r}", parameter="pace"
+            )
         if rate_hz is not None and rate_hz > MOST_HZ:
             raise InputError(f"rate_hz must be at most {MOST_HZ:g} Hz live, got {rate_hz!r}")
         prefix = checked_prefix(frame_prefix or "")

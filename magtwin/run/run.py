@@ -227,7 +227,12 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
 
     def take(self, rows: "slice | NDArray[Any]") -> "Run":
         """Some rows, by a slice, indices, or a mask of shape (N,)."""
-        return Run({name: values[rows] for name, values in self.items()}, self.metadata, self.specs)
+        taken = {}
+        for name, values in self.items():
+            taken[name] = values[rows]
+            if self.rows > mapped.LONG and not isinstance(rows, slice):
+                mapped.release()  # else the pages of all columns stay in memory
+        return Run(taken, self.metadata, self.specs)
 
     def select(self, *names: str) -> "Run":
         """Some columns in the given order, after the clock `t`, which is always kept.

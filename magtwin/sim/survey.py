@@ -27,6 +27,12 @@ from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
 
+MOST_READINGS = 100_000
+"""Most readings at a node: 12 minutes at 135 Hz."""
+
+LEAST_REACH_M = 0.01
+"""Least distance between the points through which a field is taken as quadratic [m]."""
+
 FLOOR_M = 0.01
 """Height up to which the robot drives over things [m]."""
 
@@ -148,18 +154,22 @@ def _visit(
     jobs: int | None = None,
 ) -> tuple[Readings, NDArray[np.bool_]]:
     """The readings, and the nodes without one, shape (H, Y, X): lock was lost, or the node is blocked."""
-    if readings < 1:
-        raise InputError(f"readings must be at least 1, got {readings!r}")
+    if not 1 <= readings <= MOST_READINGS:
+        most = f" and at most {MOST_READINGS:,}" if readings > MOST_READINGS else ""
+        raise InputError(f"readings must be at least 1{most}, got {readings!r}")
     for name, sd in {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}.items():
         if not 0 <= sd < np.inf:
-            raise InputError(f"{name} must not be below 0, got {sd!r}")
+            raise InputError(f"{name} must not be below 0, got {sd!r}", parameter=name)
     if position_error_m > spacing_m > 0:
         raise InputError(
             f"position_error_m {position_error_m!r} is above the spacing of {spacing_m!r} m; the robot "
             "would not find its nodes"
         )
     if heading_error_rad > np.pi / 2:
-        raise InputError(f"heading_error_rad must not be above pi/2, got {heading_error_rad!r}")
+        raise InputError(
+            f"heading_error_rad must not be above pi/2, got {heading_error_rad!r}",
+            parameter="heading_error_rad",
+        )
     height = sensor_height_m(scene) if height_m is None else height_m
     if not 0 <= height < np.inf:
         raise InputError(f"height_m must be a height above the floor, 0 m or more, got {height!r}")
@@ -314,7 +324,9 @@ def pose_error_nt2(
     if not spread.any():
         return total
     lever = np.asarray(scene.robot.p_base_magnetometer)[:2]
-    around = _parabola(scene, grid, height_m, float(np.hypot(*lever)) + 2 * position_error_m)
+    around = _parabola(
+        scene, grid, height_m, max(float(np.hypot(*lever)) + 2 * position_error_m, LEAST_REACH_M)
+    )
 
     def field(off: Array, yaw: float) -> Array:
         """Magnitude with base_link at an offset from its nodes [nT], shape (Y, X)."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
@@ -155,6 +156,10 @@ def sweep(
         check_commands(path, twin.magnetometer)
         jobs.append(Job(own.scene, path, number, speed))
     predictor = twin.magnetometer
+    if duration_s is not None and not 0 < duration_s < math.inf:
+        raise InputError(
+            f"duration_s must be above 0 s and finite, got {duration_s!r}", parameter="duration_s"
+        )
     finish = _Finish(predictor, twin.field, tuple(known.values()), duration_s)
     conditions = Conditions(
         anomaly_map=twin.field,

@@ -27,7 +27,7 @@ from magtwin.urdf.meshes.mesh_layer import MESH, free_name, primitive_of
 from magtwin.urdf.physics.joint import AXIS
 from magtwin.urdf.physics.link import SITE_API
 from magtwin.urdf.physics.mechanism import displacement
-from magtwin.usd.attributes import read_axis
+from magtwin.usd.attributes import read_axis, read_number
 from magtwin.usd.geometry import SHOWN, Shape, read_shapes, srgb_from_linear
 from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.schema import place
@@ -348,7 +348,7 @@ class _Writer:
             return None
         form = primitive_of(prim)
         if prim.IsA(UsdGeom.Cube) or (form is not None and form.kind == "box"):
-            size = scale * (float(UsdGeom.Cube(prim).GetSizeAttr().Get()) if form is None else form.size)
+            size = scale * (read_number(prim, "size") if form is None else form.size)
             return T, "box", {"size": _text(_shortest(v) for v in size)}
         if not np.allclose(scale, scale[0], rtol=1e-9):
             return None
@@ -356,14 +356,14 @@ class _Writer:
             names = ("radius",) if form.kind == "sphere" else ("radius", "length")
             return T, form.kind, {name: _text([getattr(form, name) * scale[0]]) for name in names}
         if prim.IsA(UsdGeom.Sphere):
-            return T, "sphere", {"radius": _text([UsdGeom.Sphere(prim).GetRadiusAttr().Get() * scale[0]])}
+            return T, "sphere", {"radius": _text([read_number(prim, "radius") * scale[0]])}
         for schema, tag in ((UsdGeom.Cylinder, "cylinder"), (UsdGeom.Capsule, "capsule")):
             if prim.IsA(schema):
-                gprim, turn = schema(prim), np.eye(4)
-                axis = "XYZ".index(read_axis(gprim.GetPrim()))
+                turn = np.eye(4)
+                axis = "XYZ".index(read_axis(prim))
                 if axis != 2:  # URDF's primitives are along z
                     turn[:3, :3] = np.roll(np.eye(3), axis + 1, axis=0)
-                sizes = {"radius": gprim.GetRadiusAttr().Get(), "length": gprim.GetHeightAttr().Get()}
+                sizes = {"radius": read_number(prim, "radius"), "length": read_number(prim, "height")}
                 return T @ turn, tag, {name: _text([size * scale[0]]) for name, size in sizes.items()}
         return None
 

@@ -64,6 +64,18 @@ def read_axis(prim: Usd.Prim, name: str = "axis") -> str:
     return axis
 
 
+def read_number(prim: Usd.Prim, name: str) -> float:
+    """A number, such as the radius of a solid.
+
+    Raises:
+        InputError: It is something else.
+    """
+    value = prim.GetAttribute(name).Get()
+    if not isinstance(value, int | float):
+        raise InputError(f"{place(prim)}: {name} must be a number; correct it")
+    return value
+
+
 def write_pose(prim: Usd.Prim, p: Vec3, q_xyzw: Quat | None = None) -> None:
     """Set the pose of an Xform in its parent: position [m] and optional orientation, in double precision.
 

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 from pxr import Gf, Sdf, UsdGeom, Vt
 
 from magtwin.errors import InputError
-from magtwin.usd.attributes import read_axis
+from magtwin.usd.attributes import read_axis, read_number
 
 SEGMENTS = 32
 """Sides of the polygon that approximates a circle."""
@@ -45,7 +45,7 @@ def solid_of(gprim: UsdGeom.Gprim) -> Solid | None:
     """A gprim in its own space; None for kinds without a surface (points, curves).
 
     Raises:
-        InputError: It is an inconsistent mesh, or its axis is none; the text names the prim.
+        InputError: It is an inconsistent mesh, or its axis or a length is none; the text names the prim.
     """
     prim = gprim.GetPrim()
     if prim.IsA(UsdGeom.Mesh):
@@ -53,23 +53,20 @@ def solid_of(gprim: UsdGeom.Gprim) -> Solid | None:
             return mesh_solid(UsdGeom.Mesh(prim))
         except InputError as error:
             raise InputError(f"{prim.GetPath()}: {error}") from error
-    get = {name: prim.GetAttribute(name).Get() for name in ("radius", "height", "size", "width", "length")}
     kind = prim.GetTypeName()
     if kind == "Cube":
-        return _faces(*box(get["size"]))
+        return _faces(*box(read_number(prim, "size")))
     if kind == "Sphere":
-        return _faces(*sphere(get["radius"]))
+        return _faces(*sphere(read_number(prim, "radius")))
     if kind not in ("Plane", "Cone", "Cylinder", "Capsule"):
         return None
     axis = read_axis(prim)
     if kind == "Plane":
-        return _faces(*_plane(get["width"], get["length"], axis))
+        return _faces(*_plane(read_number(prim, "width"), read_number(prim, "length"), axis))
+    radius, height = read_number(prim, "radius"), read_number(prim, "height")
     if kind == "Cone":
-        r, h = get["radius"], get["height"] / 2
-        return _faces(*_revolved(np.array([[0, -h], [r, -h], [0, h]]), axis))
-    if kind == "Cylinder":
-        return _faces(*cylinder(get["radius"], get["height"], axis))
-    return _faces(*capsule(get["radius"], get["height"], axis))
+        return _faces(*_revolved(np.array([[0, -height / 2], [radius, -height / 2], [0, height / 2]]), axis))
+    return _faces(*(cylinder if kind == "Cylinder" else capsule)(radius, height, axis))
 
 
 def mesh_solid(mesh: UsdGeom.Mesh) -> Solid:

@@ -164,16 +164,20 @@ def limit_memory(room: int) -> None:
     """Let this process take `room` more bytes than it has now."""
     if resource is not None and _MEMORY.exists():
         size = int(_MEMORY.read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-        hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-        resource.setrlimit(resource.RLIMIT_AS, (size + room, hard))
+        _limit(resource.RLIMIT_AS, size + room)
 
 
 def limit_time(seconds: float) -> None:
     """End this process after `seconds` of each core, should the process that gave the job be gone."""
     if resource is not None:
         used = sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
-        most = int(used + seconds * (os.cpu_count() or 1)) + 1
-        resource.setrlimit(resource.RLIMIT_CPU, (most, resource.getrlimit(resource.RLIMIT_CPU)[1]))
+        _limit(resource.RLIMIT_CPU, int(used + seconds * (os.cpu_count() or 1)) + 1)
+
+
+def _limit(kind: int, most: int) -> None:
+    """Set a limit of this process, at most to the one that the user has set (`ulimit`)."""
+    hard = resource.getrlimit(kind)[1]
+    resource.setrlimit(kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
 
 
 def try_values(layer: Any) -> None:

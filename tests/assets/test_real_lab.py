@@ -10,15 +10,11 @@ from magtwin.cli import main
 
 
 @pytest.fixture(scope="session")
-def real_run(tmp_path_factory):
+def real_run(real_data, tmp_path_factory):
     """A Run of the real laboratory, made by the commands of the README; (run, folder of the real data)."""
-    from conftest import REAL
-
     from magtwin.io.tables import read_parquet
 
-    if not REAL.is_dir():
-        pytest.skip(f"the real data are not at {REAL}; `magtwin fetch` gets them for use by hand")
-    real, out = REAL / "aprilab", tmp_path_factory.mktemp("aprilab")
+    real, out = real_data / "aprilab", tmp_path_factory.mktemp("aprilab")
     magtwin = lambda *arguments: main([str(a) for a in arguments])  # noqa: E731
     magtwin("map", "import", real / "maps", "--out", out / "aprilab.usdc", "--licence", "MIT")
     magtwin(

@@ -168,7 +168,16 @@ def test_a_network_predicts_the_own_field_at_the_poses_of_a_first_pass(here: Pat
         (["--rate-hz", "0"], "--rate-hz must be above 0 Hz, got 0.0"),
         (["--sensor", "whit_nt=3"], "--sensor has no 'whit_nt'; did you mean 'white_nt'?"),
         (["--sensor", "white_nt=much"], "--sensor white_nt is a number, got 'much'"),
-        (["--odometry", "yaw_std=-1"], "yaw_std of OdometryModel must be finite and not negative"),
+        (
+            ["--sensor", "lever_arm_m=0.1"],
+            "--sensor lever_arm_m is two numbers [m], such as [0.1,0], got 0.1",
+        ),
+        (
+            ["--sensor", "white_nt=1e300"],
+            "white_nt of SensorModel must be finite and not negative, at most 1e",
+        ),
+        (["--seed", "-1"], "--seed must be a whole number from 0 up, got -1"),
+        (["--odometry", "yaw_std=-1"], "--odometry yaw_std of OdometryModel must be finite and not negative"),
         (["--out", "run.parquet"], "run.parquet: exists already; give --force"),
     ],
 )

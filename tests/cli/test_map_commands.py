@@ -213,7 +213,7 @@ def test_continue_writes_the_map_of_another_height(tmp_path, layer, capsys):
     exact = a_field().magnitude_nt(*up.grid.poses(), height_m=1.0)
     assert np.abs(up.values_nt - exact).max() < 0.004
     assert up.method.endswith("continued from 0.35 to 1 m by its harmonic field")
-    assert "height_m is a height above the floor, 0 m or more, got -1.0" in refused(
+    assert "--height-m is a height above the floor, 0 m or more, got -1.0" in refused(
         capsys, "map", "upward", layer, "--height-m", "-1", "--out", tmp_path / "down.usdc"
     )
     assert not (tmp_path / "down.usdc").exists()
@@ -304,3 +304,22 @@ def test_a_maps_own_texts_do_not_steer_the_terminal(tmp_path, capsys):
     told = capsys.readouterr().out
     assert "\x1b" not in told
     assert "the \\x1b[31mdoor" in told
+
+
+def test_outliers_take_one_line_and_json_lists_them(tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)  # no line is broken
+    rng = np.random.default_rng(0)
+    places = [(x / 4, y / 4) for x in range(12) for y in range(12)]
+    values = 50_000 + np.array([400 * x + 300 * y * y for x, y in places]) + rng.normal(0, 5, len(places))
+    values[[40, 77, 101]] += [4_000, -3_000, 2_500]
+    rows = [f"{x},{y},0,{b:.1f}" for (x, y), b in zip(places, values, strict=True)]
+    (tmp_path / "survey.csv").write_text("\n".join(["x,y,heading,field", *rows]) + "\n")
+    command = ["map", "import", str(tmp_path / "survey.csv"), "--out"]
+    main([*command, str(tmp_path / "a.parquet"), "--json"])
+    report = json.loads(capsys.readouterr().out)
+    listed = report["metadata"]["outliers"]
+    assert len(listed) == report["figures"]["outliers"]["value"] >= 3
+    main([*command, str(tmp_path / "b.parquet")])
+    lines = [line for line in capsys.readouterr().out.splitlines() if " nT at (" in line]
+    assert len(lines) == 1
+    assert lines[0].endswith(f"left in; the largest: {listed[0]}; --json lists {len(listed)}")

@@ -78,13 +78,13 @@ def test_a_survey_becomes_readings_whose_headings_deviate(lab_scene, tmp_path):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--spacing-m", "0"], "spacing_m must be above 0 m"),
-        (["--spacing-m", "9"], "spacing_m 9 leaves no cell on 6 x 3.5 m"),
+        (["--spacing-m", "0"], "--spacing-m must be above 0 m"),
+        (["--spacing-m", "9"], "--spacing-m 9 leaves no cell on 6 x 3.5 m"),
         (["--headings-deg", "north"], "headings are degrees with commas between"),
         (["--readings", "0"], "readings must be at least 1"),
         (["--seed", "-1"], "seed must be a whole number from 0 up"),
-        (["--height-m", "nan"], "height_m must be a height above the floor, 0 m or more"),
-        (["--position-error-m", "-1"], "position_error_m must not be below 0"),
+        (["--height-m", "nan"], "--height-m must be a height above the floor, 0 m or more"),
+        (["--position-error-m", "-1"], "--position-error-m must not be below 0"),
     ],
 )
 def test_a_survey_that_cannot_be_made_is_refused_in_one_line_and_nothing_is_written(

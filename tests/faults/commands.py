@@ -84,7 +84,7 @@ def _readings(folder: Path) -> None:
         (survey / f"{heading}_map.csv").write_text(
             "\n".join(["# x,y,theta,scalar_mag", *rows, ""]), encoding="utf-8"
         )
-    _magtwin("map", "import", survey, "--out", folder / "map.usdc")
+    _magtwin("map", "import", survey, "--height-m", 0.2, "--out", folder / "map.usdc")
 
 
 def _days(folder: Path) -> None:

@@ -390,7 +390,12 @@ def main() -> int:
             Trial(command, disk, inputs, base),
             time.time(),
         )
-        trace = trial.count()
+        try:
+            trace = trial.count()
+        except RuntimeError as error:  # the others are tried
+            results.append({"command": command.name, "faults": [str(error)]})
+            print(f"  FAULT {error}", flush=True)
+            continue
         for at in chosen(trace.at(), given.full, rng):
             trial.attempt(FULL, at, older=True)
         every = [call.number for call in trace.calls]

@@ -218,6 +218,8 @@ def test_the_commands_draw_a_moment_a_film_and_a_stage(run, lab_scene, tmp_path,
         ({"fps": 500}, "fps must be at most 120 in a MP4"),
         ({"speed": float("nan")}, "speed must be above 0 and finite"),
         ({"speed": 1e-4}, "the film would have 1,4"),
+        ({"speed": 1e-300}, r"the film would have 1\.49e\+302 frames, and 100,000 are the most"),
+        ({"fps": 1e-9}, "fps must be at least 0.01, got 1e-09"),
     ],
 )
 def test_a_film_that_cannot_be_is_refused_and_nothing_is_written(run, lab_scene, tmp_path, options, what):

@@ -186,8 +186,8 @@ def test_frame_and_datum_are_said_at_import_or_fit_and_kept_from_readings_to_map
     ("said", "why"),
     [
         (("--created", "yesterday"), "--created must be a day YYYY-MM-DD, got 'yesterday'"),
-        (("--height-m", "-1"), "height_m of Readings is a height above the floor, 0 m or more, got -1.0"),
-        (("--height-m", "nan"), "height_m of Readings is a height above the floor, 0 m or more, got nan"),
+        (("--height-m", "-1"), "--height-m of Readings is a height above the floor, 0 m or more, got -1.0"),
+        (("--height-m", "nan"), "--height-m of Readings is a height above the floor, 0 m or more, got nan"),
     ],
 )
 def test_a_day_or_a_height_that_is_none_is_refused(tmp_path, capsys, real_data, said, why):

@@ -201,3 +201,15 @@ def test_a_wrong_shard_is_refused(text):
 def test_a_wrong_number_of_jobs_is_refused(jobs):
     with pytest.raises(InputError, match="`jobs` must be a whole number from 1 up"):
         open_pool(jobs)
+
+
+def test_more_processes_than_the_memory_holds_are_refused_before_one_starts(monkeypatch):
+    from magtwin.parallel import processes
+
+    monkeypatch.setattr(processes, "free_memory", lambda: 3_000_000_000)
+    monkeypatch.setattr(processes, "processors", lambda: 4)
+    text = r"50 processes need about 15 GB of memory, and 3 GB are free; give `jobs` of at most 10"
+    with open_pool(10**12) as pool, pytest.raises(InputError, match=text):
+        list(pool.run(chunk_work.square, range(50)))
+    with open_pool(10**12) as pool:  # as many workers as chunks
+        assert [outcome.result() for outcome in pool.run(chunk_work.square, [3])] == [9]

@@ -3,6 +3,8 @@
 import json
 import resource
 import struct
+import subprocess
+import sys
 import zipfile
 
 import pytest
@@ -144,3 +146,18 @@ def test_a_mesh_without_corners_or_with_a_strange_name_is_refused_or_read(tmp_pa
     (tmp_path / "m.gltf").write_text(json.dumps(table))
     with pytest.raises(InputError, match="no triangle with an area"):  # all points are 0
         read_mesh(tmp_path / "m.gltf")
+
+
+def test_a_stage_is_tried_below_a_limit_of_the_users(tmp_path):
+    """`ulimit -t` and `ulimit -v` of a shell may be lower than the limits of the trial."""
+    (tmp_path / "s.usda").write_bytes(usda('def Xform "x" {}'))
+    program = (
+        "import resource, sys\n"
+        "resource.setrlimit(resource.RLIMIT_CPU, (30, 30))\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (2_000_000_000,) * 2)\n"
+        "from magtwin.usd.layers import open_stage\n"
+        "print(open_stage(sys.argv[1]).GetDefaultPrim().GetPath())\n"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path / "s.usda")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stdout == "/W\n", done.stderr

@@ -115,6 +115,7 @@ def test_heights_and_shapes_are_broadcast():
         ({"spacing_m": 0.0}, "spacing_m must be above 0 m"),
         ({"spacing_m": np.nan}, "spacing_m must be above 0 m"),
         ({"readings": 0}, "readings must be at least 1, got 0"),
+        ({"readings": 10**12}, "readings must be at least 1 and at most 100,000, got 1000000000000"),
         ({"spacing_m": 4.0}, r"spacing_m 4 leaves no cell on 6 x 3\.5 m"),
         ({"headings_rad": (0.0, 7.0)}, "headings_rad of Grid must ascend"),
     ],
@@ -281,6 +282,12 @@ def test_the_variance_of_a_node_is_the_mean_square_of_what_errors_of_the_pose_do
     ratio = np.mean(off**2, axis=0) / got
     assert ratio.mean() == pytest.approx(1, abs=0.03)
     assert np.abs(ratio - 1).max() < 5 * np.sqrt(2 / times)  # as known as a mean of squares of normals
+
+
+def test_a_sensor_above_the_robots_middle_has_a_finite_error_of_heading_alone():
+    middle = scene(p_base_magnetometer=(0.0, 0.0, 0.4))
+    field = survey(middle, rng=rng(), heading_error_rad=0.03)
+    assert np.isfinite(field.variance_nt2).all()
 
 
 def test_errors_of_the_pose_are_in_the_maps_variance_and_none_where_there_are_none():

@@ -342,12 +342,8 @@ def test_an_output_that_exists_is_kept_unless_forced(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def real_robot(tmp_path_factory):
-    from conftest import REAL
-
-    path = REAL / "turtlebot4" / "turtlebot4.urdf"
-    if not path.is_file():
-        pytest.skip(f"the real robot is not at {path}")
+def real_robot(real_data, tmp_path_factory):
+    path = real_data / "turtlebot4" / "turtlebot4.urdf"
     return path, convert_urdf(path, tmp_path_factory.mktemp("real") / "turtlebot4.usda")
 
 

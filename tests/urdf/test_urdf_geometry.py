@@ -900,7 +900,7 @@ DAMAGED = {
     "m.stl": (nan_stl, r"m\.stl: has vertices that are not finite numbers; export it again"),
     "cut.stl": (
         lambda p: cut(p, stl),
-        r"cut\.stl: holds no triangle, or is cut short; export it again",
+        r"cut\.stl: no STL, or cut short: its size does not fit its count; export it again",
     ),
     "cut_text.stl": (
         lambda p: p.write_text("solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1"),

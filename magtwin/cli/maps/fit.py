@@ -1,16 +1,18 @@
 """`magtwin map import`, `fit`, `validate` and `survey`: surveys to maps."""
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 from magtwin.cli.maps.map import LAYERS, Earth, Kernel, Sources, headings_rad, map_app
-from magtwin.cli.options import Flag, Force, Jobs, Lab, Licence, Seed
+from magtwin.cli.options import Flag, Force, Jobs, Lab, Licence, Seed, Whole
 from magtwin.cli.terminal import Done, check_output, progress, step
 from magtwin.io.surveys.about import About
 from magtwin.io.surveys.columns import Columns
+from magtwin.report import Report
 
 COLUMNS = Columns()
 
@@ -63,7 +65,7 @@ def map_import(
     check_output(out, (*LAYERS, ".parquet"), "a map layer, or a file of readings,", force=force)
     step("Reading the survey")
     report = import_survey(sources, out, about=about, force=force, **vars(reading))
-    return Done(report, out)
+    return _done(report, out)
 
 
 @map_app.command(name="fit")
@@ -117,7 +119,19 @@ def map_fit(
             force=force,
             **vars(reading),
         )
-    return Done(report, out)
+    return _done(report, out)
+
+
+def _done(report: Report, out: Path) -> Done:
+    """A report on a survey, with its outliers in one line; JSON lists them."""
+    outliers = report.metadata.get("outliers", ())
+    if not outliers:
+        return Done(report, out)
+    note = f"left in; the largest: {outliers[0]}; --json lists {len(outliers)}"
+    figures = tuple(replace(f, note=note) if f.name == "outliers" else f for f in report.figures)
+    shown = {name: value for name, value in report.metadata.items() if name != "outliers"}
+    brief = replace(report, figures=figures, metadata=shown)
+    return Done(brief, out, data=json.loads(report.to_json()))
 
 
 @map_app.command(name="validate")
@@ -169,7 +183,7 @@ def map_survey(
     lab: Lab = "",
     spacing_m: float = 0.25,
     headings_deg: str = "0,90,180,270",
-    readings: int = 135,
+    readings: Whole = 135,
     height_m: float | None = None,
     heading_error_deg: float = 2.0,
     position_error_m: float = 0.01,

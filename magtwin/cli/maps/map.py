@@ -12,6 +12,9 @@ from magtwin.errors import InputError
 map_app = App(name="map", help="Import, fit, validate, compare and draw anomaly maps.")
 app.command(map_app)
 
+MOST_HEADINGS = 720
+"""Most headings of a map."""
+
 LAYERS = (".usdc", ".usd")
 PICTURES = (".png", ".svg")
 
@@ -48,5 +51,9 @@ def headings_rad(text: str) -> list[float]:
     except ValueError:
         degrees = []
     if not degrees or any(h != h for h in degrees):
-        raise InputError(f"headings are degrees with commas between, such as 0,90,180,270; got {text!r}")
+        raise InputError(
+            f"--headings-deg: headings are degrees with commas between, such as 0,90,180,270; got {text!r}"
+        )
+    if len(degrees) > MOST_HEADINGS:
+        raise InputError(f"--headings-deg names {len(degrees):,} headings; take {MOST_HEADINGS} at most")
     return [radians(h) for h in degrees]

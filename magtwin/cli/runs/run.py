@@ -23,6 +23,7 @@ from magtwin.cli.options import (
     SensingOptions,
     Session,
     UsdFps,
+    check_pace,
 )
 from magtwin.cli.terminal import Done, announce, note, progress, silence, step
 from magtwin.errors import InputError, find
@@ -174,8 +175,8 @@ def run(
         raise InputError("--live opens a viewer and --viewer names one; give one of them")
     if pace is not None and not (live or viewer):
         raise InputError("--pace is for a run that is shown; give --live, or drop it")
-    if pace is not None and not pace > 0:
-        raise InputError(f"--pace must be above 0 simulated seconds per second, got {pace:g}")
+    if pace is not None:
+        check_pace(pace)
     what = _what(path, commands, replay)
     free = commands or replay  # driven without a path
     no_path = free or path == "random"

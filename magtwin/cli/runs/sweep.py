@@ -94,7 +94,12 @@ def sweep(
     from magtwin.twin.sweeps import check_count
 
     scene = scene_file(scene)
-    for name, value, least in (("count", count, 1), ("sessions", sessions, 1), ("seed", seed, 0)):
+    for name, value, least in (
+        ("count", count, 1),
+        ("sessions", sessions, 1),
+        ("seed", seed, 0),
+        ("jobs", jobs, 1),
+    ):
         if value is not None and value < least:
             raise InputError(f"--{name} must be a whole number from {least} up, got {value}")
     check_count(count)

@@ -69,11 +69,16 @@ def check(
         raise InputError(f"methods of a check must be one or more, each once, got {methods}")
     check_readings(readings)
     named, turns = _turns(readings, split)
+    if within_m is not None and not within_m >= 0:
+        raise InputError(f"within_m must be 0 m or more, got {within_m!r}", parameter="within_m")
     turns = [(train, _near(readings, train, test, within_m)) for train, test in turns]
     tested = np.concatenate([test for _, test in turns])
     if not len(tested):
         near = "" if within_m is None else f" within {within_m:g} m of those that are fitted"
-        raise InputError(f"no good reading of {readings.name!r} is left to predict{near}; widen it")
+        raise InputError(
+            f"no good reading of {readings.name!r} is left to predict{near}; widen it",
+            parameter=None if within_m is None else "within_m",
+        )
     figures = [
         Figure("readings predicted", len(tested), note=f"of {int(readings.good.sum())} good ones"),
         Figure("turns", len(turns), note=f"{min(len(a) for a, _ in turns)} readings fitted at least"),

@@ -209,6 +209,8 @@ def _grid(
         box = (low[0], high[0], low[1], high[1])
         extent = readings.grid.extent if readings.grid is not None else box
     x0, x1, y0, y1 = (float(v) for v in np.asarray(extent, float))
+    if spacing is not None:
+        Grid.over(extent, spacing, (0.0,))  # refuses a wrong spacing before the errors are measured
     if spacing is None and readings.grid is None and min(x1 - x0, y1 - y0) < spacing_m(readings) / NARROW:
         raise InputError(
             f"the readings of {readings.name!r} lie on one line, x {x0:g}..{x1:g}, y {y0:g}..{y1:g} "

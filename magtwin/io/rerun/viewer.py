@@ -20,7 +20,7 @@ from typing import IO, Any, BinaryIO
 import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import Timeline, View, ViewerClient
 
-from magtwin.budget import BUDGETS, check_decoded
+from magtwin.budget import BUDGETS, check_decoded, check_size
 from magtwin.errors import InputError
 from magtwin.files import existing
 from magtwin.io.rerun.series import TIMELINE
@@ -105,6 +105,7 @@ def screenshot(
     if not (min(size) >= LEAST_SIZE and max(size) <= MOST_SIZE):
         limits = f"{LEAST_SIZE}..{MOST_SIZE} pixels each way"
         raise InputError(f"size of a recording's picture must lie in {limits}, got {size[0]} x {size[1]}")
+    check_size(path, "rrd")
     check_decodes(path, rrd)
     window = (size[0], size[1] + TITLE_BAR)
     with output(png, force=force) as aside, live_viewer(headless=True, size=window) as (_, client):

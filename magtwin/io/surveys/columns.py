@@ -83,7 +83,9 @@ class Columns:
             if self.unit is not None:
                 raise InputError("give either the unit of the field or its scale, the factor to nT")
             if not (0 < self.scale < float("inf")):
-                raise InputError(f"scale, the factor to nT, must be above 0, got {self.scale:g}")
+                raise InputError(
+                    f"scale, the factor to nT, must be above 0, got {self.scale:g}", parameter="scale"
+                )
         if self.heading and self.quaternion:
             raise InputError("give either the heading's column or the quaternion's")
 

@@ -267,6 +267,8 @@ def survey_scene(
     out = check_free(out, force=force)
     if seed < 0:
         raise InputError(f"`seed` must be a whole number from 0 up, got {seed}", parameter="seed")
+    if not 0 <= heading_error_deg <= 90:
+        raise InputError(f"heading_error_deg must be from 0 to 90 deg, got {heading_error_deg!r}")
     if adopt and out.suffix == ".parquet":
         raise InputError(f"{out}: a scene reads a map layer (.usdc), not readings", parameter="adopt")
     opened = open_scene(scene_file, lab=lab, check_network=False)
@@ -370,7 +372,10 @@ def _method_options(
     if kernel is not None:
         options["gp"] = options["auto"] = {"kernel": kernel}
     if earth is not None:
-        options["harmonic"] = {"earth_nt": earth_of(earth)}
+        try:
+            options["harmonic"] = {"earth_nt": earth_of(earth)}
+        except InputError as error:
+            raise InputError(str(error), parameter="earth") from error
         options["auto"] = {**options["auto"], **options["harmonic"]}
     return options
 

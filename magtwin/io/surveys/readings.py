@@ -22,8 +22,9 @@ from magtwin.files import existing, sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
 from magtwin.io.surveys.columns import FIELDS, HEADINGS, NO_HEADING, TIMES, VECTORS, Columns
 from magtwin.io.surveys.table import Table, read_csv, read_parquet_table
-from magtwin.io.tables import load_parquet, read_parquet
-from magtwin.kinds import expected
+from magtwin.io.tables import load_parquet, read_npz, read_parquet
+from magtwin.io.tables import read_csv as read_csv_run
+from magtwin.kinds import RUN, expected, kind_of
 from magtwin.outputs import output
 from magtwin.run.arrow import FACTS
 from magtwin.run.run import Run
@@ -35,6 +36,9 @@ BAGS = (".mcap", ".db3")
 """Suffixes of rosbag2 storage files."""
 
 PARQUET = (".parquet", ".pq")
+
+RUNS = (".csv", ".npz", ".rrd")
+"""Suffixes of runs in other formats of magtwin's own."""
 
 LARGEST_TURN = 2 * np.pi + 0.01
 """Headings beyond this are refused unless their unit is given [rad]."""
@@ -269,6 +273,11 @@ def _of_file(source: str, path: Path, columns: Columns) -> Readings:
             if _SURVEY in metadata:
                 return load_readings(path)
             return readings_of_run(read_parquet(path), name=path.stem, source=_sum(path))
+    if path == Path(source) and path.suffix in RUNS and kind_of(path) is RUN:
+        _only_unit(path, columns)
+        if columns.scale is not None:
+            raise InputError(f"{path}: its field is in nT already; leave out --scale")
+        return readings_of_run(_run_of(path), name=path.stem, source=_sum(path))
     paths = [path]
     if path != Path(source):
         paths += [_beside(path, word) for word in source.split("+")[1:]]
@@ -276,6 +285,15 @@ def _of_file(source: str, path: Path, columns: Columns) -> Readings:
     for other in paths[1:]:
         table = table.beside(_read_table(other))
     return _of_table(table, paths, columns)
+
+
+def _run_of(path: Path) -> Run:
+    """The run in a file of magtwin's own."""
+    if path.suffix != ".rrd":
+        return read_csv_run(path) if path.suffix == ".csv" else read_npz(path)
+    from magtwin.io.rerun.file import read_run  # imports rerun
+
+    return read_run(path)
 
 
 def _beside(first: Path, word: str) -> Path:

@@ -409,6 +409,12 @@ def band_pass(
         raise InputError(
             f"band_hz must ascend between 0 and half the rate, {rate_hz / 2:g} Hz, got {low:g}, {high:g}"
         )
+    least = 0.01 * rate_hz / max(len(values), 1)
+    if low < least:
+        raise InputError(
+            f"band_hz must begin at {least:.2g} Hz at least, a hundredth of a period in these readings; got "
+            f"{low:g}"
+        )
     stages = butter(4, band_hz, btype="bandpass", fs=rate_hz, output="sos")
     padding = 3 * (2 * len(stages) + 1) if by.padding is None else by.padding
     least = max(padding, 2 * by.trim)

@@ -31,6 +31,14 @@ FIT_RATE_HZ = 20.0  # Highest rate of readings in the fit [Hz]
 SLOPE_S = 0.2
 """Time over which rates of speed and turning are taken [s]; a motor's torque lasts about as long."""
 
+LIMITS = (
+    ("lever_arm_m", 100.0, "m"),
+    ("latency_s", 60.0, "s"),
+    ("lever_arm_sd_m", 100.0, "m"),
+    ("latency_sd_s", 60.0, "s"),
+)
+"""Largest size of each figure of an alignment, with its unit."""
+
 STARTS = 3  # Number of best latencies that are refined
 
 
@@ -51,9 +59,9 @@ class Alignment(Summarized):
     """Standard deviation of `latency_s` [s]; 0 if it was given."""
 
     def __post_init__(self) -> None:
-        figures = (*self.lever_arm_m, self.latency_s, *self.lever_arm_sd_m, self.latency_sd_s)
-        if not np.all(np.isfinite(figures)):
-            raise InputError(f"an alignment must be finite, got {figures}")
+        for name, most, unit in LIMITS:
+            if not np.all(np.abs(getattr(self, name)) <= most):
+                raise InputError(f"{name} must be within {most:g} {unit} of 0, got {getattr(self, name)}")
 
     def report(self, title: str = "Alignment") -> Report:
         """Lever arm and latency, with their standard deviations."""

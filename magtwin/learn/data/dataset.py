@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.tiles import TiledMap
-from magtwin.files import existing, existing_file, read_text, sha256
+from magtwin.files import existing_file, read_text, sha256
 from magtwin.kinds import expected
 from magtwin.learn.data.alignment import Alignment, fit_alignment
 from magtwin.learn.data.features import FEATURES, SETS, columns_of, feature_names
@@ -438,7 +438,12 @@ def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
     folder = expected(folder, "data set")
     if not folder.is_dir():
         raise InputError(f"{folder}: a file; a data set is the folder that `magtwin dataset build` makes")
-    path = existing(folder / MANIFEST, "manifest of a data set")
+    path = folder / MANIFEST
+    if not path.exists():
+        raise InputError(
+            f"{path}: no such manifest of a data set; make a data set of runs: magtwin dataset build RUN "
+            "--map MAP --out SET"
+        )
     text = read_text(path, "manifest of a data set", "JSON")
     try:
         data = json.loads(text)

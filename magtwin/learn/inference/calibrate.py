@@ -34,6 +34,9 @@ LEAST_READINGS = 20
 SECTORS, FEW_SECTORS = 12, 6
 """Sectors that headings are counted in, and the number below which a warning is given."""
 
+MOST_SD_M = 1000.0
+"""Largest standard deviation of a position [m]."""
+
 FROM_MAP = "pose_from_map"
 """Metadata of a run whose poses were estimated on a magnetic map."""
 
@@ -129,16 +132,19 @@ def calibrate(
     """
     what = name or "the drive"
     model = mixed_of_kind(model)
-    for key, value in (("pose_sd_m", pose_sd_m), ("duration_s", duration_s)):
-        if value is not None and not 0 <= value < math.inf:
-            raise InputError(f"{key} must be 0 or more and finite, got {value!r}")
+    if not 0 <= pose_sd_m <= MOST_SD_M:
+        most = f", at most {MOST_SD_M:g} m" if pose_sd_m > MOST_SD_M else ""
+        raise InputError(f"pose_sd_m must be 0 or more and finite{most}, got {pose_sd_m!r}")
+    if duration_s is not None and not 0 < duration_s < math.inf:
+        raise InputError(f"duration_s must be above 0 s and finite, got {duration_s!r}")
     drive = labelled_drive(model, run, field, name=what)
     end = math.inf if duration_s is None else drive.t[0] + duration_s
     drive = drive.part(np.isfinite(drive.y) & (drive.t <= end))
     if len(drive.t) < LEAST_READINGS:
+        longer = "" if duration_s is None else ", or raise `duration_s`"
         raise InputError(
             f"{what}: {len(drive.t)} labelled readings at most 4 a second, and {LEAST_READINGS} are needed; "
-            "drive for a minute on the map, in curves"
+            f"drive for a minute on the map, in curves{longer}"
         )
     cautions = _cautions(drive, run, pose_from_map=pose_from_map)
     if "map_samples_nt" in model.metadata and not same_map(model.metadata, field):

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap, Outside
-from magtwin.learn.inference.calibrate import labelled_drive, mixed_of_kind
+from magtwin.learn.inference.calibrate import MOST_SD_M, labelled_drive, mixed_of_kind
 from magtwin.learn.inference.magnetometer import Read
 from magtwin.learn.inference.reader import Reader, Reading, Signals
 from magtwin.learn.mixed.mixed import Mixed
@@ -146,9 +146,11 @@ def read_online(
 
 
 def _checked(model: Predictor, delay_s: float, memory_s: float, pose_sd_m: float) -> Mixed:
-    for name, value in (("delay_s", delay_s), ("pose_sd_m", pose_sd_m)):
-        if not 0 <= value < math.inf:
-            raise InputError(f"{name} must be 0 or more and finite, got {value!r}")
+    if not 0 <= delay_s < math.inf:
+        raise InputError(f"delay_s must be 0 or more and finite, got {delay_s!r}")
+    if not 0 <= pose_sd_m <= MOST_SD_M:
+        most = f", at most {MOST_SD_M:g} m" if pose_sd_m > MOST_SD_M else ""
+        raise InputError(f"pose_sd_m must be 0 or more and finite{most}, got {pose_sd_m!r}")
     if not memory_s > 0:
         raise InputError(f"memory_s must be above 0, got {memory_s!r}")
     return mixed_of_kind(model)

@@ -127,11 +127,14 @@ def _check_encodings(content: bytes, path: Path) -> None:
     """Refuse a pickle that names encodings other than Latin-1, that of bytes: each can double a text.
 
     Raises:
-        InputError: It names another.
-        ValueError: It is no pickle.
+        InputError: It names another, or it is no pickle.
     """
-    for _, text, _ in pickletools.genops(content):
-        if isinstance(text, str) and len(text) < 40 and _is_codec(text):
+    try:
+        texts = [text for _, text, _ in pickletools.genops(content) if isinstance(text, str)]
+    except ValueError as error:
+        raise InputError(f"{path}: damaged checkpoint ({error}); get the file again") from error
+    for text in texts:
+        if len(text) < 40 and _is_codec(text):
             raise InputError(f"{path}: its pickle asks for the encoding {text!r}, which no network needs")
 
 

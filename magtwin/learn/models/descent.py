@@ -260,7 +260,8 @@ class _Descent:
         rmse = float(np.sqrt(np.mean(error**2)))
         if not math.isfinite(squares + rmse):
             raise InputError(
-                f"training diverged in epoch {number}; give a step size lr below {self.course.lr:g}"
+                f"training diverged in epoch {number}; give a step size lr below {self.course.lr:g}",
+                parameter="lr",
             )
         better = rmse < self.best
         train_rmse = math.sqrt(squares / self.learner.rows)

@@ -13,8 +13,12 @@ from magtwin.learn.data.features import feature_names
 from magtwin.learn.models.descent import Course, Dropout, Epoch, Learner, check_device, descend
 from magtwin.learn.models.network import FieldNet
 from magtwin.learn.models.state import digest
+from magtwin.parallel import check_room
 
 Array = NDArray[np.float64]
+
+BYTES_PER_UNIT = 24
+"""Memory of a hidden unit for each row of a batch: values, gradients and dropout."""
 
 
 def train(
@@ -93,6 +97,13 @@ def train(
     if patience is not None and patience < 1:
         raise InputError(f"patience must be 1 epoch at least, got {patience}; leave it out to run all epochs")
     check_device(device)
+    if device == "cpu":
+        check_room(
+            BYTES_PER_UNIT * min(batch, len(x)) * sum(layers),
+            f"a batch of {min(batch, len(x)):,} rows through layers {', '.join(map(str, layers))}",
+            "take a smaller `batch` or narrower `layers`",
+            "layers",
+        )
     seed = int(rng.integers(2**62))
     with torch.random.fork_rng(devices=[]):  # torch draws initial weights from its global generator
         torch.manual_seed(seed)

@@ -233,7 +233,10 @@ def convert(
     Raises:
         InputError: Not such a checkpoint, or `out` exists.
     """
-    net = net_of_checkpoint(expected(checkpoint, "weights file"))
+    checkpoint = expected(checkpoint, "weights file")
+    if checkpoint.suffix == ".safetensors":
+        raise InputError(f"{checkpoint}: is a .safetensors already; magtwin info {checkpoint} describes it")
+    net = net_of_checkpoint(checkpoint)
     if licence:
         net.metadata["licence"] = licence
     net.save(out, force=force)

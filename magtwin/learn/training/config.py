@@ -29,6 +29,7 @@ PRESETS: Mapping[str, tuple[str, Mapping[str, Any]]] = MappingProxyType(
 """Models that are a kind of predictor with other defaults; all other models are named by their kind."""
 
 MOST_WEIGHTS = 100_000_000  # Largest network; with gradients and Adam's moments it takes 1.6 GB
+MOST = {"epochs": 100_000, "threads": 1024, "batch": 1_000_000_000}
 COMMON = ("model", "seed", "split", "hold_out", "init", "licence")  # Options that every model reads
 
 
@@ -138,6 +139,9 @@ class TrainConfig:
         for name, count in (("patience", self.patience), ("threads", self.threads)):
             if count is not None and count < 1:
                 raise InputError(f"{name} must be 1 at least, got {count!r}; leave it out for none")
+        for name, most in MOST.items():
+            if (getattr(self, name) or 0) > most:
+                raise InputError(f"{name} must be at most {most:,}, got {getattr(self, name):,}")
         if self.penalty is not None and not 0 <= self.penalty < math.inf:
             raise InputError(f"penalty must be 0 or more and finite, got {self.penalty!r}")
         if self.dropout is not None and not 0 <= self.dropout < 1:
@@ -149,7 +153,8 @@ class TrainConfig:
         weights = sum(a * b for a, b in itertools.pairwise((len(inputs), *self.layers, 1)))
         if weights > MOST_WEIGHTS:
             raise InputError(
-                f"layers {self.layers!r} make {weights:,} weights; take {MOST_WEIGHTS:,} at most"
+                f"layers {self.layers!r} make {weights:,} weights; take {MOST_WEIGHTS:,} at most",
+                parameter="layers",
             )
         if self.freeze and self.init is None:
             raise InputError("freeze keeps layers of trained weights: give init too")

@@ -237,7 +237,7 @@ def open_bus(
             raise InputError(f"ROS_DOMAIN_ID must be a whole number from 0 to 232, got {text!r}")
         domain = int(text)
     if not 0 <= domain <= 232:
-        raise InputError(f"a domain of ROS must be from 0 to 232, got {domain}")
+        raise InputError(f"a domain of ROS must be from 0 to 232, got {domain}", parameter="domain")
     installed, broken = available(), []
     if backend != "auto" and backend not in installed:
         find("backend", backend, BACKENDS)

@@ -17,7 +17,7 @@ from magtwin.sim.motion.controllers import (
 )
 from magtwin.sim.motion.drive import Pose
 from magtwin.sim.motion.engine import KINEMATIC, Engine, Travel
-from magtwin.sim.motion.plan import SLOWEST, drivable
+from magtwin.sim.motion.plan import SLOWEST, check_speed, drivable
 from magtwin.sim.motion.pose_error import EXACT, PoseError
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
@@ -45,12 +45,13 @@ def loop_along(
 ) -> ClosedLoop:
     """The closed loop along a path, ready to run; arguments and refusals are those of `follow`."""
     dt = _step(rate_hz, drive)
+    check_speed(speed, drive)
     if duration_s is not None:
         _check_duration(duration_s)
     if obstacles is not None:
         check_clear(path, obstacles, footprint_radius_m)
     line = path if controller == "release" else drivable(path)
-    if duration_s is not None and 0 < speed < math.inf:  # the plan refuses others
+    if duration_s is not None:
         line = line.prolonged(speed * duration_s)
     if start is not None:
         line = Path(line.name, np.vstack([start[:2], line.p_xy]))
@@ -74,7 +75,7 @@ def loop_along(
         guide=guide,
         dt=dt,
         pose0=guide.pose0 if start is None else start,
-        steps=math.ceil(duration_s / dt - 1e-9),
+        steps=max(math.ceil(duration_s / dt - 1e-9), 1),
         least_steps=int(least_s / dt),
         footprint_radius_m=footprint_radius_m,
         wheel_errors=wheel_errors,
@@ -223,7 +224,7 @@ def loop_by_commands(
         guide=guide,
         dt=dt,
         pose0=start,
-        steps=math.ceil(duration_s / dt - 1e-9),
+        steps=max(math.ceil(duration_s / dt - 1e-9), 1),
         least_steps=int(guide.table[0, -1] / dt),
         footprint_radius_m=footprint_radius_m,
         wheel_errors=wheel_errors,

@@ -102,14 +102,20 @@ def plan(path: Path, drive: DriveSpec, *, speed: float) -> list[Piece]:
         InputError: `speed` is not above 0 or is more than the drive allows, or the path turns more tightly
             than a robot that steers like a car can.
     """
-    top = min(drive.v_max, drive.wheel_rate_max * drive.wheel_radius_m)
-    if not 0 < speed <= top:
-        which = "v_max" if top == drive.v_max else "wheel_rate_max times its wheels' radius"
-        raise InputError(f"speed must be above 0 and at most {top:g} m/s, the drive's {which}; got {speed!r}")
+    check_speed(speed, drive)
     if drive.turning_radius_m:
         _check_turns(path, drive.turning_radius_m)
     stops = np.concatenate([[0.0], corners(path), [path.length]])
     return [_piece(path, a, b, drive, speed) for a, b in itertools.pairwise(stops)]
+
+
+def check_speed(speed: float, drive: DriveSpec) -> None:
+    """Refuse a speed [m/s] that is not above 0 or is more than the drive allows."""
+    top = min(drive.v_max, drive.wheel_rate_max * drive.wheel_radius_m)
+    if not 0 < speed <= top:
+        which = "v_max" if top == drive.v_max else "wheel_rate_max times its wheels' radius"
+        text = f"speed must be above 0 and at most {top:g} m/s, the drive's {which}; got {speed!r}"
+        raise InputError(text, parameter="speed")
 
 
 def _check_turns(path: Path, turning_radius_m: float) -> None:

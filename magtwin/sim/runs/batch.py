@@ -37,6 +37,10 @@ BLOCK = 16
 """Runs made at a time: 130,000 readings of a minute each, 0.1 GB, and work for every thread."""
 
 
+PLANNED = 1 << 27
+"""Bytes of plans that are kept, beside the last: 1,000 of a minute each, or none of a day."""
+
+
 @dataclass(frozen=True, eq=False)
 class Job:
     """A run to be made."""
@@ -112,7 +116,7 @@ class Runs(Summarized, Sequence[Run]):
         for name in sorted(self._columns):
             find("column", name, COLUMNS)
         self._planned: dict[tuple[Path | Commands, float, DriveSpec, float, Pose], ClosedLoop] = {}
-        self._loops: list[ClosedLoop | None] = []
+        self._kept, self._steps = 0, 0  # bytes of plans, and expected steps
         checked = set()
         for i, job in enumerate(jobs):
             with self._numbered(i):
@@ -120,12 +124,13 @@ class Runs(Summarized, Sequence[Run]):
                 if key not in checked:
                     check_run(job.scene, job.path, conditions)
                     checked.add(key)
-                self._loops.append(self._closed_loop(job))
+                if planned := self._closed_loop(job):
+                    self._steps += planned.least_steps
         self._open_loops()
 
     def _open_loops(self) -> None:
         """Open compiled loops if that pays."""
-        if sum(planned.least_steps for planned in self._loops if planned) >= LOOPS.pays:
+        if self._steps >= LOOPS.pays:
             with suppress(ImportError):  # plain Python gives the same bytes
                 warm_up()
 
@@ -211,7 +216,7 @@ class Runs(Summarized, Sequence[Run]):
         draws = {i: streams(np.random.default_rng(self._jobs[i].seed)) for i in numbers}
         loops: dict[int, ClosedLoop] = {}
         for i in numbers:
-            if (planned := self._loops[i]) is not None:
+            if (planned := self._closed_loop(self._jobs[i])) is not None:
                 drive = self._jobs[i].scene.robot.drive
                 errors = draw_wheel_errors(drive, draws[i]["drive"])
                 pose_error = draw_pose_error(drive, draws[i]["drive"])
@@ -244,9 +249,10 @@ class Runs(Summarized, Sequence[Run]):
         return {"path": job.path.name, "controller": name, "speed_m_s": float(job.speed)}
 
     def _closed_loop(self, job: Job) -> ClosedLoop | None:
-        """The closed loop of a job without its wheels' errors, planned once for all jobs that share it.
+        """The closed loop of a job without its wheels' errors, planned once for jobs that share it.
 
-        None if it cannot be planned: a random driver, a custom controller, or a run that is driven again.
+        Plans beyond `PLANNED` bytes are made again when they are needed. None if it cannot be planned: a
+        random driver, a custom controller, or a run that is driven again.
         """
         common, radius = self._conditions, job.scene.robot.footprint_radius_m
         alike = replace(
@@ -268,6 +274,9 @@ class Runs(Summarized, Sequence[Run]):
         key = (job.path, job.speed, alike, radius, job.scene.start)
         if key in self._planned:
             return self._planned[key]
+        if self._kept > PLANNED:
+            self._planned.clear()
+            self._kept = 0
         if isinstance(job.path, Path):
             if not isinstance(common.controller, str) or (
                 common.controller not in CONTROLLERS and common.controller in CUSTOM_CONTROLLERS
@@ -291,6 +300,7 @@ class Runs(Summarized, Sequence[Run]):
                 footprint_radius_m=radius,
             )
             planned.check(common.obstacles)
+        self._kept += planned.guide.table.nbytes
         self._planned[key] = planned
         return planned
 

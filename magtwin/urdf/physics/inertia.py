@@ -11,6 +11,7 @@ from pxr import Usd, UsdGeom
 from magtwin.frames import canonical
 from magtwin.urdf.meshes.collider import hull_faces
 from magtwin.urdf.meshes.mesh_layer import primitive_of
+from magtwin.usd.attributes import read_number
 
 ROUNDING = 1e-6
 """Relative excess of the largest moment over the sum of the others that single precision can cause."""
@@ -230,13 +231,12 @@ def _read_gprim(prim: Usd.Prim, T: NDArray) -> MassProperties | None:
                 return sphere(form.radius).moved(T)
         return (cylinder if form.kind == "cylinder" else capsule)(form.radius, form.length).moved(T)
     if prim.IsA(UsdGeom.Cube):
-        return box(scale * UsdGeom.Cube(prim).GetSizeAttr().Get()).moved(T)
+        return box(scale * read_number(prim, "size")).moved(T)
     if prim.IsA(UsdGeom.Sphere):
-        return sphere(UsdGeom.Sphere(prim).GetRadiusAttr().Get()).moved(T)
+        return sphere(read_number(prim, "radius")).moved(T)
     for schema, shape in ((UsdGeom.Cylinder, cylinder), (UsdGeom.Capsule, capsule)):
         if prim.IsA(schema):  # along z, as the conversion authors them
-            gprim = schema(prim)
-            return shape(gprim.GetRadiusAttr().Get(), gprim.GetHeightAttr().Get()).moved(T)
+            return shape(read_number(prim, "radius"), read_number(prim, "height")).moved(T)
     return None
 
 

@@ -11,7 +11,7 @@ from magtwin.field.sources.magnets import body_of
 from magtwin.frames import IDENTITY_XYZW, canonical, quat_conjugate, quat_multiply, rotate, xyzw_from_wxyz
 from magtwin.spec.base import ZERO3, Quat, Vec3
 from magtwin.spec.magnetics import SourceSpec
-from magtwin.usd.attributes import check_prim_name, plain_value, read_axis, write_pose
+from magtwin.usd.attributes import check_prim_name, plain_value, read_axis, read_number, write_pose
 from magtwin.usd.lab.looks import define_looks, define_visual, hide, visual_path, wear
 from magtwin.usd.layers import WORLD
 from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, require_api
@@ -204,19 +204,18 @@ def _geometry(prim: Usd.Prim, shape: str, scale: Vec3) -> tuple[dict[str, Any], 
         vertices, corners = (tuple(map(tuple, array.tolist())) for array in (points, faces))
         return {"vertices_m": vertices, "faces": corners}, IDENTITY_XYZW
     if shape == "cuboid":
-        size = UsdGeom.Cube(prim).GetSizeAttr().Get()
+        size = read_number(prim, "size")
         return {"size_m": (size * scale[0], size * scale[1], size * scale[2])}, IDENTITY_XYZW
     if shape == "sphere":
-        wide = 2 * UsdGeom.Sphere(prim).GetRadiusAttr().Get()
+        wide = 2 * read_number(prim, "radius")
         _check_round(scale, "a sphere's scale")
         return {"size_m": (wide * scale[0],) * 3}, IDENTITY_XYZW
-    cylinder = UsdGeom.Cylinder(prim)
     axis = read_axis(prim)
     along = "XYZ".index(axis)
     across = [scale[k] for k in range(3) if k != along]
     _check_round(across, "a cylinder's scale across its axis")
-    wide = 2 * cylinder.GetRadiusAttr().Get() * across[0]
-    return {"size_m": (wide, wide, cylinder.GetHeightAttr().Get() * scale[along])}, TURNS[axis]
+    wide = 2 * read_number(prim, "radius") * across[0]
+    return {"size_m": (wide, wide, read_number(prim, "height") * scale[along])}, TURNS[axis]
 
 
 def _triangles(mesh: UsdGeom.Mesh, scale: Vec3) -> tuple[Any, Any]:

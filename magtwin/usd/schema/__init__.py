@@ -155,6 +155,13 @@ def _advice(root: Usd.Prim, noun: str) -> str:
         )
     if noun == "lab" and prims_with(root, "robot"):
         return f"; it is a robot without a scene: magtwin scene --urdf {file} --out FOLDER makes one"
+    if noun in ("lab", "robot") and any(
+        prim.HasAPI("PhysicsArticulationRootAPI") for prim in root.GetStage().Traverse()
+    ):
+        return (
+            "; it is a robot without magtwin's sensors and a scene: magtwin scene --urdf F.urdf --out FOLDER "
+            "makes them from its URDF"
+        )
     if noun == "anomalyMap":
         return "; give a map layer (magtwin map fit) or a scene (magtwin scene)"
     return ""

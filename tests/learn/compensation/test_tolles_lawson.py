@@ -371,6 +371,7 @@ def test_a_model_whose_coefficients_do_not_fit_its_terms_is_refused(tmp_path):
         ({"terms": ()}, "at least one"),
         ({"rate_hz": 0.0}, "rate_hz must be above 0"),
         ({"band_hz": (0.9, 0.1)}, "band_hz must ascend"),
+        ({"band_hz": (1e-300, 0.9)}, "band_hz must begin at"),
         ({"band_hz": (0.1, 10.0)}, "half the rate, 10 Hz"),
         ({"terms": ("permanent", "bias")}, "a pass band excludes a bias"),
         ({"preset": "magnaw"}, "no preset 'magnaw'; did you mean 'magnav'"),

@@ -241,3 +241,12 @@ def test_a_path_off_the_floor_is_refused_with_the_number_of_its_run(physical, tm
 def test_a_robot_with_another_magnetometer_than_the_twins_is_refused(physical, neural):
     with pytest.raises(InputError, match="open a twin for each"):
         sweep(physical, "figure8", [0], robots=neural.scene.robot)
+
+
+def test_plans_beyond_their_limit_are_made_again(physical, monkeypatch):
+    speeds = [0.1, 0.15, 0.2]
+    kept = [run["p_world_base"] for run in sweep(physical, "figure8", 3, speeds=speeds, duration_s=5.0)]
+    monkeypatch.setattr(batch, "PLANNED", 1)
+    runs = sweep(physical, "figure8", 3, speeds=speeds, duration_s=5.0)
+    assert len(runs._planned) == 1
+    assert all(np.array_equal(run["p_world_base"], p) for run, p in zip(runs, kept, strict=True))

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import traceback
 
 import numpy as np
 import pyarrow as pa
@@ -84,16 +85,29 @@ def test_a_long_run_is_written_as_one_that_is_written_at_once(run, twin, tmp_pat
         assert once.read_bytes() == long.read_bytes()
 
 
-def test_a_killed_long_run_leaves_what_was_made_of_it(twin, run, tmp_path, long_runs):
-    outputs = Outputs.of([tmp_path / "a.mcap", tmp_path / "b.csv"])
+def in_child(work):
+    """Run a function in a forked process; its exit status."""
     child = os.fork()
     if child == 0:
+        try:
+            work()
+        except BaseException:
+            traceback.print_exc()
+        os._exit(1)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def test_a_killed_long_run_leaves_what_was_made_of_it(twin, run, tmp_path, long_runs):
+    outputs = Outputs.of([tmp_path / "a.mcap", tmp_path / "b.csv"])
+
+    def work():
         with outputs.kept() as keep, outputs.aside():
             for number, block in enumerate(blocks(run)):
                 if number == 3:
                     os.kill(os.getpid(), signal.SIGKILL)
                 keep(block)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+
+    assert in_child(work) == -signal.SIGKILL
     assert content(read_run(tmp_path / "a.mcap.parts")) == content(run.take(slice(3 * 384)))
     with pytest.raises(InputError, match="did not end"), outputs.kept() as keep:
         keep(run)
@@ -104,21 +118,22 @@ def test_a_run_that_is_killed_while_it_is_written_is_whole_in_its_parts(
     run, tmp_path, monkeypatch, long_runs, suffix, writer
 ):
     def until_killed(run, *rows):
-        for number, block in enumerate(blocks(run, *rows)):
+        for number, block in enumerate(blocks(run)):  # of 384 rows
             if number == 2:
                 os.kill(os.getpid(), signal.SIGKILL)
             yield block
 
     file, module = tmp_path / f"a{suffix}", importlib.import_module(f"magtwin.io.{writer}")
     outputs = Outputs.of([file])
-    child = os.fork()
-    if child == 0:
+
+    def work():
         with outputs.kept() as keep, outputs.aside() as places:
             for block in blocks(run):
                 keep(block)
             monkeypatch.setattr(module, "blocks", until_killed)
             write_run(run, places.files[0])
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+
+    assert in_child(work) == -signal.SIGKILL
     assert not file.exists()
     assert content(read_run(f"{file}.parts")) == content(run)
 
