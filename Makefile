@@ -85,7 +85,7 @@ faults: $(VENV)/.dev  ## Fill the disk, or kill the process, at each write of ev
 bench: $(VENV)/.dev  ## Compare with peers; prints ratios
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
 
-zoo: $(VENV)/.dev  ## Convert, validate and try 84 public robots (FROM=DIR: checkouts OWNER+NAME; ZOO="--only NAME --jobs 2")
+zoo: $(VENV)/.dev  ## Convert, validate and try 83 public robots (FROM=DIR: checkouts OWNER+NAME; ZOO="--only NAME --jobs 2")
 	$(PIP) -e '.[dev,physics]'
 	$(ONE_THREAD) $(BIN)/python benchmarks/zoo/zoo.py $(if $(FROM),--from $(FROM)) $(ZOO)
 

@@ -3,10 +3,10 @@
     python newton_trial.py < JOBS
 
 A server of jobs, see `serving.py`. Newton's USD schemas must be registered before USD is first used, so this
-is a process of its own. A job has `stage`,
-`answer`, and `poses`: positions of joints by prim [rad, m] and the places of bodies that belong to
-them [m], both for forward kinematics. A floating robot starts with its lowest collider on a plane. The
-MuJoCo solver on the CPU steps the model, with the settings of magtwin's own engine.
+is a process of its own. A job has `stage`, `answer`, and `poses`: positions of joints by prim [rad, m] and
+the places of bodies that belong to them [m], both for forward kinematics. Each joint starts at the value
+within its limits that is nearest to 0, and a floating robot with its lowest collider on a plane. The MuJoCo
+solver on the CPU steps the model, with the settings of magtwin's own engine.
 """
 
 import json
@@ -31,6 +31,8 @@ STIFF_STEPS = 4.0
 SPEED_M_S, TURN_RAD, SLIDE_M = 0.1, 0.2, 0.02
 """Speed of wheels, and steps of a rotary and of a sliding joint."""
 
+SINGLE = newton.JointType.REVOLUTE, newton.JointType.PRISMATIC
+
 FAR_M, GRAVITY = 100.0, 9.81
 
 LIMIT_GB = 8
@@ -51,6 +53,21 @@ class Wheel(NamedTuple):
     friction: float
 
 
+def put_within_limits(builder: newton.ModelBuilder) -> None:
+    """Move each joint to the nearest value within its limits, and those that follow another after it."""
+    q_at, qd_at = builder.joint_q_start, builder.joint_qd_start
+    for joint, kind in enumerate(builder.joint_type):
+        if kind in SINGLE:
+            low, high = (
+                ends[qd_at[joint]] for ends in (builder.joint_limit_lower, builder.joint_limit_upper)
+            )
+            builder.joint_q[q_at[joint]] = min(max(builder.joint_q[q_at[joint]], low), high)
+    for joint, leader in enumerate(builder.joint_mimic_joint):
+        if leader is not None and leader >= 0:
+            offset, ratio = builder.joint_mimic_coeffs[joint]
+            builder.joint_q[q_at[joint]] = offset + ratio * builder.joint_q[q_at[leader]]
+
+
 class Trial:
     """One robot in Newton."""
 
@@ -58,6 +75,7 @@ class Trial:
         builder = newton.ModelBuilder(up_axis=newton.Axis.Z)
         newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
         builder.add_usd(stage, load_visual_shapes=False, load_static_visual_shapes=False)
+        put_within_limits(builder)
         self.free = [i for i, kind in enumerate(builder.joint_type) if kind == newton.JointType.FREE]
         self.floats = 0 in self.free
         if self.floats:
@@ -147,8 +165,7 @@ class Trial:
 
     def single(self) -> list[int]:
         """Joints with one degree of freedom."""
-        kinds = (newton.JointType.REVOLUTE, newton.JointType.PRISMATIC)
-        return [i for i, kind in enumerate(self.model.joint_type.numpy().tolist()) if kind in kinds]
+        return [i for i, kind in enumerate(self.model.joint_type.numpy().tolist()) if kind in SINGLE]
 
     def gains(self, joint: int) -> tuple[float, float]:
         at = self.qd_at[joint]

@@ -72,6 +72,13 @@ def check(asset: Path, row: dict) -> None:
         row["errors"].setdefault(name, []).extend(texts)
 
 
+def in_metres(mesh: Path) -> bool:
+    """Whether the unit of a mesh is the metre; yourdfpy ignores another one of COLLADA."""
+    head = mesh.read_text(errors="replace")[:10000] if mesh.suffix.lower() == ".dae" else ""
+    unit = re.search(r"""<unit\b[^>]*\bmeter\s*=\s*["']([^"']+)""", head)
+    return unit is None or float(unit[1]) == 1
+
+
 class Peer:
     """The same description, read by yourdfpy from the expanded text."""
 
@@ -89,14 +96,16 @@ class Peer:
         )
         text = work / "peer.urdf"
         ElementTree.ElementTree(self.source.xml).write(text)
-        self.absent = 0
+        self.absent = self.scaled = 0
 
         def find(fname: str) -> str:
             try:
-                return str(self.source.find_file(fname, "mesh"))
+                file = self.source.find_file(fname, "mesh")
             except ValueError:
                 self.absent += 1
                 return fname
+            self.scaled += not in_metres(file)
+            return str(file)
 
         self.model = yourdfpy.URDF.load(str(text), filename_handler=find, build_collision_scene_graph=False)
         self.joints = {joint.name: joint for joint in self.model.robot.joints}
@@ -125,10 +134,10 @@ class Peer:
         return values
 
     def everything(self, values: dict) -> dict:
-        """Values of all joints, those that mimic included."""
+        """Values of all joints, those that mimic included; URDF gives a fixed joint no mimic."""
         every = dict(values)
         for joint in self.joints.values():
-            if joint.mimic is not None and joint.mimic.joint in values:
+            if joint.mimic is not None and joint.type != "fixed" and joint.mimic.joint in values:
                 every[joint.name] = joint.mimic.multiplier * values[joint.mimic.joint] + joint.mimic.offset
         return every
 
@@ -157,7 +166,8 @@ def compare(asset: Path, report, peer: Peer, row: dict) -> None:
     row["links_compared"] = len(away)
     row["urdf_mass_kg"] = peer.mass()
     bounds = peer.model.scene.bounds if len(peer.model.scene.geometry) else None
-    if bounds is not None and report.box_out is not None and not peer.absent:
+    row["meshes_scaled"] = peer.scaled
+    if bounds is not None and report.box_out is not None and not (peer.absent or peer.scaled):
         size = np.linalg.norm(bounds[1] - bounds[0])
         row["box_error"] = float(np.abs(np.array(report.box_out) - bounds).max() / size)
 

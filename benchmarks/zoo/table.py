@@ -122,7 +122,7 @@ def markdown(rows: list[dict]) -> str:
     known = {row["name"]: row["known"] for row in rows if row.get("known")}
     lines += [f"- {name}: {_plain(text)}" for name, text in bad] or ["Nothing."]
     told = [f"- {name}: {known[name]}" for name in dict.fromkeys(name for name, _ in bad) if name in known]
-    lines += ["", "The reasons, where they are in the descriptions:", "", *told] if told else []
+    lines += ["", "The reasons:", "", *told] if told else []
     return "\n".join(lines)
 
 

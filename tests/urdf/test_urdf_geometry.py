@@ -411,6 +411,16 @@ def test_a_malformed_collada_file_is_refused_with_its_line(tmp_path, case):
         read_mesh(path)
 
 
+def test_the_only_scene_of_a_collada_file_is_shown_although_it_is_named_wrongly(tmp_path):
+    """As in the lamp of Poppy Ergo Jr, whose scene has the id "" and is asked for as #."""
+    path = dae(tmp_path / "n.dae", "<node>{mesh}</node>")
+    wanted = read_mesh(path)
+    path.write_text(path.read_text().replace('id="scene"', 'id=""').replace('url="#scene"', 'url="#"'))
+    mesh = read_mesh(path)
+    assert_allclose(mesh.points, wanted.points)
+    assert ("n.dae: its scene '#' is not there: its only one is shown", False) in mesh.notes
+
+
 def test_a_geometry_that_no_node_shows_is_noted(tmp_path):
     dae(tmp_path / "n.dae", "<node/>")
     with pytest.raises(InputError, match=r"n\.dae: holds no triangle"):

@@ -73,7 +73,11 @@ class _Collada:
         axis = self._root.findtext("asset/up_axis", "Z_UP").strip()
         if axis != "Z_UP":
             self._reading.note(f"its up axis {axis} is not applied, as in RViz; turn the visual instead")
-        scene = self._target(self._root.find("scene/instance_visual_scene"))
+        instance = self._root.find("scene/instance_visual_scene")
+        scene, scenes = self._target(instance), self._root.findall("library_visual_scenes/visual_scene")
+        if scene is None and instance is not None and len(scenes) == 1:
+            scene = scenes[0]
+            self._reading.note(f"its scene {instance.get('url')!r} is not there: its only one is shown")
         if scene is None:
             raise InputError(f"{self._reading.path}: has no scene to show; export it again")
         unit = self._root.find("asset/unit")

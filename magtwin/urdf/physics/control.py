@@ -12,8 +12,8 @@ from magtwin.spec.drive import DriveSpec
 from magtwin.urdf.description.tag import Tags
 from magtwin.urdf.options import DriveRule
 from magtwin.urdf.physics.controller import base_of_plugin_settings, base_of_settings
-from magtwin.urdf.physics.drive import POSITION_STIFFNESS, WHEEL_DAMPING, own_gain
-from magtwin.urdf.physics.mechanism import Mechanism
+from magtwin.urdf.physics.drive import POSITION_STIFFNESS, WHEEL_DAMPING, holds_position, own_gain
+from magtwin.urdf.physics.mechanism import SINGLE, Mechanism
 from magtwin.urdf.physics.mobile_base import MobileBase
 from magtwin.urdf.physics.plugin import base_of_plugin
 from magtwin.usd.sensors import JOINT_FIELDS, WHEELS_FIELDS, define_drive
@@ -45,17 +45,22 @@ def read_commands(tags: Tags, mechanism: Mechanism) -> tuple[DriveRule, ...]:
     """Drive rules from `<ros2_control>` and `<transmission>`; the user's rules come before them.
 
     A velocity or position interface becomes a drive with the default gains; effort leaves a continuous joint
-    free. A joint with limits keeps its default drive, which holds a position, unless it is commanded by
-    velocity: an arm that nothing holds would fall. Joints that cannot move or follow another get no rule.
-    Interfaces of unknown joints are left out.
+    free. A joint that holds a position by default does so unless it is commanded by velocity alone: an arm
+    that nothing holds would fall. Joints that cannot move or follow another get no rule. Interfaces of
+    unknown joints are left out.
     """
     rules: dict[str, DriveRule] = {}
     joints = {joint.name: joint for joint in mechanism.description.joints.values()}
-    for name, kind in _commands(tags):
+    for name, kinds in _commands(tags):
         if name in rules or name in mechanism.welded or name in mechanism.mimics:
             continue
-        if kind != "velocity" and joints[name].type in ("revolute", "prismatic"):
+        if (
+            set(kinds) != {"velocity"}
+            and joints[name].type in SINGLE
+            and holds_position(joints[name], mechanism)
+        ):
             continue
+        kind = COMMANDS[kinds[0]]
         gains: dict[str, float] = {}
         if kind == "velocity":
             gains = {"damping": WHEEL_DAMPING + own_gain(joints[name])}
@@ -80,8 +85,8 @@ def define_differential(robot: Usd.Prim, spec: DriveSpec, prim_names: Mapping[st
     return define_drive(robot, replace(spec, **named))
 
 
-def _commands(tags: Tags) -> Iterator[tuple[str, str]]:
-    """Joint and type of drive of each command."""
+def _commands(tags: Tags) -> Iterator[tuple[str, list[str]]]:
+    """Joint and its interfaces for commands, in the order of `COMMANDS`."""
     for tag in ("ros2_control", "transmission"):
         for block in tags.blocks(tag):
             for joint in tags.findall(block, "joint"):
@@ -97,6 +102,6 @@ def _commands(tags: Tags) -> Iterator[tuple[str, str]]:
                     fault = f"<{tag}> names no joint {name!r}: its interfaces are left out"
                     tags.description.repair("name-unknown", fault, joint)
                     continue
-                kind = next((kind for kind in COMMANDS if kind in text), None)
-                if kind is not None:
-                    yield name, COMMANDS[kind]
+                kinds = [kind for kind in COMMANDS if kind in text]
+                if kinds:
+                    yield name, kinds

@@ -29,11 +29,25 @@ within one step: MuJoCo's implicit integrator then corrects the wheel but not th
 of 5 kg."""
 
 POSITION_STIFFNESS = 100.0
-"""Least default gain of a limited joint's position drive [N m/rad, N/m]; the damping is a tenth of it."""
+"""Least default gain of a position drive that slides, or that a `<ros2_control>` gives to a joint without
+limits [N m/rad, N/m]; the damping of a position drive is a tenth of its gain."""
 
 POSITION_HZ = 10.0
-"""Natural frequency of the drive with what it carries, above that gain: an arm of length L then sags by about
+"""Natural frequency of the drive with what it carries: an arm of length L then sags by about
 g / (2 pi f)^2 = 2.5 mm, whatever its mass."""
+
+PER_INERTIA = (2 * np.pi * POSITION_HZ) ** 2
+"""Stiffness of that frequency over the inertia [1/s2]."""
+
+ROUNDING = 1e-5
+"""Inertia that a gain of three figures may lack, relative to the gain [s2]."""
+
+YIELD_RAD, STIFFEST = 0.1, 1000.0
+"""The gain of a joint that turns is at least its effort over this angle [rad], as far as that is at most
+`STIFFEST` [N m/rad]: the knee of a standing robot carries more than the links below it."""
+
+ROLLING_NAMES = ("wheel", "caster", "castor")
+"""Words in the names of joints and links that roll."""
 
 DEFAULT_EFFORT = 10.0
 """Least default for the maximum effort of a drive [N m, N]."""
@@ -86,9 +100,9 @@ def define_drive(
 ) -> None:
     """Author the drive of a joint that moves.
 
-    The first rule that matches wins. By default, wheels and continuous joints hold a velocity and limited
-    joints a position; with the profile diff-drive, continuous joints that are not wheels are left free. The
-    gains of a joint that follows another, or has several axes and no rule, are 0: it moves freely.
+    The first rule that matches wins. By default a joint holds a position (see `holds_position`), or else a
+    velocity; with the profile diff-drive, the latter is left free unless it is a wheel. The gains of a joint
+    that follows another, or has several axes and no rule, are 0: it moves freely.
 
     Args:
         prim: Prim of the joint.
@@ -101,7 +115,7 @@ def define_drive(
     Raises:
         InputError: The URDF's effort is below 0; the message gives the line.
     """
-    rule = next((r for r in options.drives if fnmatchcase(joint.name, r.joints)), None)
+    rule = _rule(joint, options)
     if joint.name in mechanism.mimics or (joint.type not in SINGLE and rule is None):
         effort = None if joint.limit is None else joint.limit.effort
         force = float(effort) if effort and 0 < effort < np.inf else DEFAULT_EFFORT
@@ -110,10 +124,9 @@ def define_drive(
         return
     damping, force = wheels.get(joint.name, (WHEEL_DAMPING, DEFAULT_EFFORT))
     damping += own_gain(joint)
-    if rule is None and joint.type != "continuous" and joint.name not in wheels:
-        load = mechanism.loads[joint.name]
-        gain = max(POSITION_STIFFNESS, float(f"{(2 * np.pi * POSITION_HZ) ** 2 * load.inertia:.3g}"))
-        force = max(DEFAULT_EFFORT, float(f"{RESERVE * load.weight:.3g}"))
+    if rule is None and joint.name not in wheels and holds_position(joint, mechanism):
+        force = max(DEFAULT_EFFORT, float(f"{RESERVE * mechanism.loads[joint.name].weight:.3g}"))
+        gain = _position_gain(joint, mechanism, force + _own_force(joint))
         rule = DriveRule(joints=joint.name, type="position", stiffness=gain, damping=gain / 10)
     elif rule is None and options.profile == "diff-drive" and joint.name not in wheels:
         rule = DriveRule(joints=joint.name, type="none")
@@ -129,6 +142,31 @@ def define_drive(
             made.CreateTargetPositionAttr(_target(joint) / unit)
         else:
             made.CreateTargetVelocityAttr(0.0)
+
+
+def holds_position(joint: Joint, mechanism: Mechanism) -> bool:
+    """Whether a joint holds a position by default: it has limits, or it bears a load and is no wheel by name.
+
+    A velocity drive gives way under a load, as in arms and legs whose joints an exporter made continuous.
+    """
+    if joint.type != "continuous":
+        return True
+    rolls = any(word in f"{joint.name} {joint.child}".lower() for word in ROLLING_NAMES)
+    return not rolls and joint.name in mechanism.bearers
+
+
+def _rule(joint: Joint, options: Options) -> DriveRule | None:
+    """The first rule that matches a joint."""
+    return next((rule for rule in options.drives if fnmatchcase(joint.name, rule.joints)), None)
+
+
+def _position_gain(joint: Joint, mechanism: Mechanism, default: float) -> float:
+    """Default stiffness of a position drive [N m/rad or N/m]; `default` is its effort if none is given."""
+    least = POSITION_STIFFNESS
+    if joint.type != "prismatic":
+        effort = None if joint.limit is None else joint.limit.effort
+        least = min((effort if effort and effort > 0 else default) / YIELD_RAD, STIFFEST)
+    return float(f"{max(least, PER_INERTIA * mechanism.loads[joint.name].inertia):.3g}")
 
 
 def own_gain(joint: Joint) -> float:
@@ -164,16 +202,22 @@ def _define_gains(
     return made
 
 
-def rotor_inertia(prim: Usd.Prim, joint: Joint) -> float:
-    """Inertia of the motor of a rotary joint that holds a velocity [kg m2]; 0 for other joints.
+def rotor_inertia(prim: Usd.Prim, joint: Joint, mechanism: Mechanism, options: Options) -> float:
+    """Inertia of the motor of a joint [kg m2 or kg]; 0 if it needs none.
 
-    At most gain times `RESPONSE`, so that the rotor of a small robot does not slow its drive.
+    A velocity drive: at most gain times `RESPONSE`, so that the rotor of a small robot does not slow its
+    drive. A default position drive: what its load lacks for `POSITION_HZ`. Without it, a finger of 1e-9 kg m2
+    passes its target by many turns within a step.
     """
-    drive = UsdPhysics.DriveAPI(prim, "angular")
-    if joint.type not in ("continuous", "revolute") or not prim.HasAPI(UsdPhysics.DriveAPI, "angular"):
+    axis = "linear" if joint.type == "prismatic" else "angular"
+    if joint.type not in SINGLE or not prim.HasAPI(UsdPhysics.DriveAPI, axis):
         return 0.0
-    damping, stiffness = drive.GetDampingAttr().Get() * 180 / np.pi, drive.GetStiffnessAttr().Get()
-    return 0.0 if stiffness else float(f"{min(ROTOR_KG_M2, damping * RESPONSE):.3g}")
+    drive, unit = UsdPhysics.DriveAPI(prim, axis), 1.0 if axis == "linear" else 180 / np.pi
+    damping, stiffness = drive.GetDampingAttr().Get() * unit, drive.GetStiffnessAttr().Get() * unit
+    if stiffness:
+        lacks = stiffness / PER_INERTIA - mechanism.loads[joint.name].inertia
+        return 0.0 if _rule(joint, options) or lacks < ROUNDING * stiffness else float(f"{lacks:.3g}")
+    return 0.0 if axis == "linear" else float(f"{min(ROTOR_KG_M2, damping * RESPONSE):.3g}")
 
 
 def _effort(joint: Joint, default: float, description: Description) -> float:

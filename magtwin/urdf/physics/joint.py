@@ -21,6 +21,7 @@ from magtwin.urdf.physics.mechanism import Mechanism
 JOINT_API, NEWTON_API, NEWTON_MIMIC_API = "IsaacJointAPI", "NewtonJointAPI", "NewtonMimicAPI"
 MUJOCO_API = "MjcJointAPI"
 PHYSX_API, PHYSX_AXIS_API, PHYSX_MIMIC_API = "PhysxJointAPI", "PhysxJointAxisAPI", "PhysxMimicJointAPI"
+ROTORS = (NEWTON_API, "newton"), (PHYSX_API, "physxJoint"), (MUJOCO_API, "mjc")
 STATE_API = "PhysicsJointStateAPI"
 """Applied schemas of Isaac Sim, Newton, MuJoCo and PhysX; their plugins are not installed here."""
 
@@ -88,7 +89,8 @@ def define_joint(
         description.note(f"joint {joint.name!r} has an axis of length {length:.3g}: used as a direction")
     axes = _free_axes(made, joint, token, description)
     define_drive(prim, axes, joint, mechanism, options, wheels)
-    _tune(prim, joint, axes, joint.name in wheels, description)
+    rotor = rotor_inertia(prim, joint, mechanism, options)
+    _tune(prim, joint, axes, joint.name in wheels, rotor, description)
     if joint.type != "planar":
         _define_state(prim, axes[0], mechanism.rests.get(joint.name, 0.0) * _unit(joint))
     prim.AddAppliedSchema(JOINT_API)
@@ -243,7 +245,9 @@ def _write(prim: Usd.Prim, name: str, value: float) -> None:
     prim.CreateAttribute(name, Sdf.ValueTypeNames.Float, custom=False).Set(value)
 
 
-def _tune(prim: Usd.Prim, joint: Joint, axes: list[str], wheel: bool, description: Description) -> None:
+def _tune(
+    prim: Usd.Prim, joint: Joint, axes: list[str], wheel: bool, rotor: float, description: Description
+) -> None:
     """Maximum speed, rotor inertia, damping and friction of a joint, for Newton, PhysX and MuJoCo.
 
     PhysX from 2026 on reads the Newton attributes of the whole joint, older ones PhysxJointAPI.
@@ -259,14 +263,9 @@ def _tune(prim: Usd.Prim, joint: Joint, axes: list[str], wheel: bool, descriptio
         _write(prim, "newton:velocityLimit", speed * unit)
         prim.AddAppliedSchema(PHYSX_API)
         _write(prim, "physxJoint:maxJointVelocity", speed * unit)
-    rotor = rotor_inertia(prim, joint)
-    if rotor:
-        _write(prim, "newton:armature", rotor)
-        if speed is None:
-            prim.AddAppliedSchema(PHYSX_API)
-        _write(prim, "physxJoint:armature", rotor)
-        prim.AddAppliedSchema(MUJOCO_API)
-        _write(prim, "mjc:armature", rotor)
+    for schema, name in ROTORS if rotor else ():
+        prim.AddAppliedSchema(schema)
+        _write(prim, f"{name}:armature", rotor)
     if joint.dynamics is None:
         return
     damping, friction = float(joint.dynamics.damping or 0.0), float(joint.dynamics.friction or 0.0)

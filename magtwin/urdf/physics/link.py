@@ -86,9 +86,10 @@ def _single(moments: NDArray, *, turned: bool) -> Gf.Vec3f:
     """Principal moments in single precision, where none may exceed the sum of the others either.
 
     Engines turn them to a tensor in single precision and back, so a flat body with turned axes is made
-    thicker by `THICKER`.
+    thicker by `THICKER`, and a needle first: its two large moments are both near the sum of the others.
     """
     rounded = np.asarray(moments, np.float32)
+    rounded = np.maximum(rounded, np.float32(3 * THICKER * turned) * rounded.max())
     largest = int(np.argmax(rounded))
     others = sum(float(rounded[i]) for i in range(3) if i != largest)
     while float(rounded[largest]) > others * (1 - THICKER * turned):

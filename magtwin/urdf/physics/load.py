@@ -23,6 +23,12 @@ class Load:
     weight: float
     """Largest torque of gravity about the axis, in any attitude [N m]; if the joint slides, the force [N]."""
 
+    beside: float = 0.0
+    """Part of the inertia that is due to the distance of the centre from the axis; 0 if the joint slides."""
+
+    slope: float = 1.0
+    """Size of the axis' component along the root's z at rest."""
+
 
 def read_loads(description: Description, poses: Mapping[str, NDArray]) -> dict[str, Load]:
     """The load of each joint by name, from the masses and tensors that the description gives.
@@ -57,7 +63,10 @@ def read_loads(description: Description, poses: Mapping[str, NDArray]) -> dict[s
         own = second - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
         arm = float(np.linalg.norm(np.cross(axis, centre - poses[child][:3, 3])))
         about = float(axis @ own @ axis) + mass * arm**2
-        loads[joint.name] = Load(max(about, 0.0), float(mass * GRAVITY * arm))
+        beside = mass * arm**2 / about if about > 0 else 0.0
+        loads[joint.name] = Load(
+            max(about, 0.0), float(mass * GRAVITY * arm), float(beside), float(abs(axis[2]))
+        )
     return loads
 
 

@@ -1,6 +1,6 @@
 """Mechanism: which joints move, which follow another, and the rest position of each."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,6 +14,9 @@ from magtwin.urdf.physics.load import Load, read_loads
 
 SINGLE = ("revolute", "continuous", "prismatic")
 """Joints with one degree of freedom: only these can have mimics and default drives."""
+
+BESIDE = 0.25
+"""A load is beside an axis if more than this part of its inertia is due to its distance from it."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,31 @@ class Mechanism:
     def loads(self) -> Mapping[str, Load]:
         """What each joint carries, by name."""
         return read_loads(self.description, self.poses())
+
+    def carriers(self, kinds: Iterable[str]) -> frozenset[str]:
+        """Joints beyond which a joint of one of some types moves."""
+        joints, found = self.description.joints, set[str]()
+        for joint in joints.values():
+            at = joint
+            if joint.type in kinds and joint.name not in self.welded:
+                while at.parent in joints and joints[at.parent].name not in found:
+                    at = joints[at.parent]
+                    found.add(at.name)
+        return frozenset(found)
+
+    @cached_property
+    def bearers(self) -> frozenset[str]:
+        """Joints that bear a load although they may have no limits, as in arms and legs.
+
+        They carry a joint with limits; or their axis is within 30 degrees of the horizontal, and they carry
+        another joint or a load beside the axis. A wheel does none of that, nor the swivel of a caster.
+        """
+        limited, moving = self.carriers(("revolute", "prismatic")), self.carriers(SINGLE)
+        return limited | {
+            name
+            for name, load in self.loads.items()
+            if load.slope < 0.5 and (name in moving or load.beside > BESIDE)
+        }
 
     def poses(self) -> dict[str, NDArray[np.float64]]:
         """T_root_link of each link at rest, shape (4, 4)."""
