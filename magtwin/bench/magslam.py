@@ -14,6 +14,7 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -255,14 +256,8 @@ def _matlab(path: Path, shapes: Mapping[str, tuple[int, int]]) -> dict[str, Arra
 
     scipy reads it in a process of its own, which a damaged file can crash.
     """
-    size = check_size(existing(path, "MATLAB file"), "recording")
-    command = [sys.executable, "-P", "-c", _LOAD, str(path.resolve()), str(decoded_limit(size)), *shapes]
-    done = subprocess.run(command, capture_output=True, check=False)
-    if done.returncode:
-        lines = done.stderr.decode(errors="replace").split("\n")
-        reason = next((line.strip() for line in reversed(lines) if line.strip()), "the reader crashes on it")
-        raise InputError(f"{path}: cannot be read as a MATLAB file ({reason}); get the file again")
-    data: dict[str, Any] = dict(np.load(io.BytesIO(done.stdout), allow_pickle=False))
+    about = existing(path, "MATLAB file").stat()
+    data = _numbers(path.resolve(), tuple(shapes), about.st_size, about.st_mtime_ns)
     arrays, readings = {}, 0
     for name, shape in shapes.items():
         if name not in data:
@@ -277,6 +272,19 @@ def _matlab(path: Path, shapes: Mapping[str, tuple[int, int]]) -> dict[str, Arra
             )
         arrays[name] = array
     return arrays
+
+
+@lru_cache(4)
+def _numbers(path: Path, names: tuple[str, ...], size: int, changed_ns: int) -> dict[str, Array]:
+    """Arrays of numbers of a MATLAB file that had this size, and was changed at this time."""
+    check_size(path, "recording")
+    command = [sys.executable, "-P", "-c", _LOAD, str(path), str(decoded_limit(size)), *names]
+    done = subprocess.run(command, capture_output=True, check=False)
+    if done.returncode:
+        lines = done.stderr.decode(errors="replace").split("\n")
+        reason = next((line.strip() for line in reversed(lines) if line.strip()), "the reader crashes on it")
+        raise InputError(f"{path}: cannot be read as a MATLAB file ({reason}); get the file again")
+    return dict(np.load(io.BytesIO(done.stdout), allow_pickle=False))
 
 
 def _rotation(wxyz: Array, path: Path) -> Rotation:
