@@ -82,7 +82,7 @@ class Runs(Summarized, Sequence[Run]):
 
     `runs[i]` makes one run. `for run in runs` makes all, block by block, so that memory stays bounded.
     `list(runs)` keeps them. A run that is asked for again is made again, with the same bytes. While one block
-    goes through the network, the next is driven and sensed.
+    goes through the network, the next is driven and sensed, unless a run in it is long.
     """
 
     def __init__(
@@ -186,9 +186,12 @@ class Runs(Summarized, Sequence[Run]):
             ahead = pool.submit(self._sensed, blocks[0])
             for block, after in zip(blocks, [*blocks[1:], None], strict=True):
                 sensed = ahead.result()
-                if after is not None:
+                long = any(isinstance(one, _Driven) for one in sensed)  # two at a time would take much memory
+                if after is not None and not long:
                     ahead = pool.submit(self._sensed, after)
                 yield from self._finished([self._jobs[i] for i in block], sensed)
+                if after is not None and long:
+                    ahead = pool.submit(self._sensed, after)
 
     def _finished(self, jobs: Sequence[Job], sensed: list[Any]) -> Iterator[Run]:
         """Whole runs: all at once, or one by one if any of them is long."""
