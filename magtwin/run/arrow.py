@@ -58,7 +58,8 @@ def run_of(table: pa.Table, path: Path, first: int | None = None) -> Run:
     columns, specs = {}, {}
     for name, members in _members(table.schema, path).items():
         parts = [_numpy(table, member, path, first or 0) for member in members]
-        said = {key.decode(): text.decode() for key, text in _metadata(table, members[0]).items()}
+        told = [_said(table.schema.field(member), path) for member in members]
+        said = told[0]
         vector = COLUMNS[name].width > 1 if name in COLUMNS else "part" in said
         columns[name] = np.column_stack(parts) if vector else parts[0]
         if name in COLUMNS:
@@ -68,7 +69,9 @@ def run_of(table: pa.Table, path: Path, first: int | None = None) -> Run:
                 text = f"a flag is 0 or 1, got {columns[name][row]}"
                 raise InputError(f"{path}: column {name!r}, row {(first or 0) + row}: {text}")
         elif "column" in said:
-            named = tuple(_metadata(table, member)[b"part"].decode() for member in members) if vector else ()
+            if vector and not all("part" in each for each in told):
+                raise InputError(f"{path}: column {name!r} has a part without a name; write it again")
+            named = tuple(each["part"] for each in told) if vector else ()
             specs[name] = spec_said(said, named)
     run = Run(columns, metadata_from_json((table.schema.metadata or {}).get(FACTS, b"{}"), path), specs)
     if first is None:
@@ -128,8 +131,13 @@ def check_metadata(metadata: Any, where: str = "") -> Metadata:
     return metadata
 
 
-def _metadata(table: pa.Table, name: str) -> dict[bytes, bytes]:
-    return table.schema.field(name).metadata or {}
+def _said(field: pa.Field, path: Path) -> dict[str, str]:
+    """Metadata of a table column, as `said_of` gives it."""
+    try:
+        return {key.decode(): text.decode() for key, text in (field.metadata or {}).items()}
+    except UnicodeDecodeError as error:
+        text = f"{path}: damaged Parquet (metadata of column {field.name!r} are not UTF-8); write it again"
+        raise InputError(text) from error
 
 
 def _members(schema: pa.Schema, path: Path) -> dict[str, list[str]]:
@@ -137,8 +145,7 @@ def _members(schema: pa.Schema, path: Path) -> dict[str, list[str]]:
     known = {f"{name}_{part}": name for name, column in COLUMNS.items() for part in column.parts}
     members: dict[str, list[str]] = {}
     for field in schema:
-        said = (field.metadata or {}).get(b"column")
-        home = said.decode() if said else known.get(field.name, field.name)
+        home = _said(field, path).get("column") or known.get(field.name, field.name)
         members.setdefault(home, []).append(field.name)
     for name in members.keys() & COLUMNS.keys():
         wanted = [f"{name}_{part}" for part in COLUMNS[name].parts] or [name]

@@ -14,6 +14,7 @@ import hashlib
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import sys
@@ -29,6 +30,9 @@ from disk import COUNT, FULL, HIDDEN, KILL, Disk, Trace, start_below_the_shim
 
 LIMIT_S = 300.0
 """Time after which a command hangs."""
+
+FULL_DISK = re.compile("No space left on device|disk is full|is the disk full")
+"""What the refusal says; Rerun and OpenUSD do not say why they cannot write."""
 
 OLD = "what was there before"
 """Content of older outputs."""
@@ -207,7 +211,7 @@ class Trial:
         if not killed:
             if ended.status not in (0, 1):
                 found.append(f"status {ended.status}: {ended.err.strip()[-300:]}")
-            if ended.status == 1 and (len(said) != 1 or "No space left on device" not in said[0]):
+            if ended.status == 1 and (len(said) != 1 or not FULL_DISK.search(said[0])):
                 found.append(f"says {said or ended.err.strip()[-300:]}")
             if hidden:
                 found.append(f"leaves {hidden}")
