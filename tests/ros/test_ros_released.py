@@ -35,6 +35,9 @@ DRIVEN_S = 60.0
 BEFORE_S = 0.001
 """Wall time before each /clock, in which the messages before it arrive [s]."""
 
+SILENT_S = 2.0
+"""Wall time after which our magnetometer, which is slower at no tick, has nothing to say [s]."""
+
 NODE = "from nn_magnetometer.nn_magnetometer import main; main()"
 FOLLOWER = """
 from nn_magnetometer import path_follower
@@ -91,6 +94,8 @@ class Lockstep:
     def __init__(self, bus: Bus, ear: Bus, alive: Callable[[], None]) -> None:
         self._bus, self._ear, self._alive = bus, ear, alive
         self.ticks: list[int] = []
+        self._heard = True
+        """Whether ours had a reading at the last tick: not where the survey's sensor had lost lock."""
         self.read: tuple[dict[int, float], dict[int, float]] = {}, {}
         for name, kept in zip((MAGNITUDE.name, "ours/magnitude"), self.read, strict=True):
             ear.subscribe(name, MAGNITUDE.kind, partial(self._keep, kept), Qos(depth=1000).heard)
@@ -111,10 +116,14 @@ class Lockstep:
         clock.publish(data)
         stamp = int(Message(CLOCK.kind, data, 0, 0).read(["clock"])["clock"])
         self.ticks.append(stamp)
-        begun = all(self.read)
-        last = time.monotonic() + (SLOWEST_S if begun else 0.01)
+        begun, now = all(self.read), time.monotonic()
+        last = now + (SLOWEST_S if begun else 0.01)
+        silent = now + (SILENT_S if self._heard else 0.01)
         while not all(stamp in kept for kept in self.read) and time.monotonic() < last:
-            self._ear.spin_once(0.005)
+            self._ear.spin_once(0.001)
+            if begun and stamp in self.read[0] and time.monotonic() > silent:
+                break
+        self._heard = stamp in self.read[1]
         self._alive()
 
 
