@@ -64,6 +64,7 @@ def test_a_cluster_writes_the_same_bytes_although_a_worker_is_killed(tmp_path, l
         cluster.close()
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_ends_in_the_middle_is_an_error_and_a_repeat_goes_on(tmp_path):
     (tmp_path / "dask").mkdir()
     cluster = Cluster(tmp_path / "dask")

@@ -147,6 +147,7 @@ def test_nobody_has_to_say_where_the_earths_field_points():
     assert_allclose(found.parameters["uniform field [nT]"], EARTH, atol=4_000)
 
 
+@pytest.mark.slow
 def test_vectors_bring_the_vector_field_at_this_height_and_at_others():
     field = truth()
     model = fit_harmonic(survey(field, vectors=True), earth_nt=EARTH)
