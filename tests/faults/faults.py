@@ -396,7 +396,7 @@ def main() -> int:
         )
         try:
             trace = trial.count()
-        except RuntimeError as error:  # the others are tried
+        except (RuntimeError, OSError) as error:  # the others are tried
             results.append({"command": command.name, "faults": [str(error)]})
             print(f"  FAULT {error}", flush=True)
             continue
