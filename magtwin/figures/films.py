@@ -131,9 +131,15 @@ def _write_mp4(frames: Iterator[Image], aside: Path, size: tuple[int, int], fps:
             process.stdin.close()
         except OSError as error:  # the encoder ended before the frames did
             process.wait()
-            raise InputError(f"{out}: cannot be written: {_last_line(log) or error.strerror}") from error
+            raise InputError(_unwritten(out, _last_line(log) or error.strerror or "")) from error
         if process.wait():
-            raise InputError(f"{out}: cannot be written: {_last_line(log)}")
+            raise InputError(_unwritten(out, _last_line(log)))
+
+
+def _unwritten(out: Path, reason: str) -> str:
+    """What is said of a film that the encoder could not write; it may not tell that the disk is full."""
+    known = "No space left" in reason
+    return f"{out}: cannot be written: {reason.rstrip('.')}{'' if known else '; is the disk full?'}"
 
 
 @contextmanager

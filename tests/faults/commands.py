@@ -191,7 +191,7 @@ COMMANDS = (
     Command("picture", "picture IN/run.parquet --size 160x120 --out run.png", RUN),
     Command("film gif", "film IN/run.parquet --size 160x120 --fps 2 --out run.gif", RUN),
     Command("film mp4", "film IN/run.parquet --size 160x120 --fps 2 --out run.mp4", RUN),
-    Command("export folder", "export lab --out lab --no-thumbnail"),
+    Command("export folder", "export lab --out exported --no-thumbnail"),
     Command("export package", "export lab --out lab.usdz --no-thumbnail"),
     Command("export layer", "export lab --out lab.usdc --target viewer"),
     Command("export web", "export lab --out lab.glb"),
