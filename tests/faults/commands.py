@@ -211,7 +211,7 @@ COMMANDS = (
     Command("network export", "network export IN/net.safetensors --out net.onnx", ("network",)),
     Command(
         "evaluate",
-        "evaluate IN/net.safetensors --dataset IN/set --out scores",
+        f"evaluate IN/net.safetensors --dataset IN/set --map {LAB_MAP} --out scores",
         ("network",),
     ),
     Command("sweep", "sweep lab --count 2 --duration-s 2 --path sine --out runs"),

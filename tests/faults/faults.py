@@ -247,6 +247,8 @@ class Trial:
             known = self.new.get(name)
             if known and name not in self.varies and what not in (known, self.before.get(name)):
                 found.append(f"{name}: neither old nor new")
+        if self._is(now, self.new):  # it was complete
+            return found
         again = forked(lambda: self._magtwin(older=self.command.name.startswith("train")), self.folder)
         now, hidden = tree(self.folder)
         if again.status:
