@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from magtwin.budget import check_size, decoded_limit
+from magtwin.budget import decoded_limit
 from magtwin.errors import InputError
-from magtwin.files import existing
+from magtwin.files import existing_file
 from magtwin.localization.problem import OdometryModel, Prior, Problem, SensorModel
 from magtwin.run.run import Run
 
@@ -256,7 +256,7 @@ def _matlab(path: Path, shapes: Mapping[str, tuple[int, int]]) -> dict[str, Arra
 
     scipy reads it in a process of its own, which a damaged file can crash.
     """
-    about = existing(path, "MATLAB file").stat()
+    about = existing_file(path, "MATLAB file", "recording").stat()
     data = _numbers(path.resolve(), tuple(shapes), about.st_size, about.st_mtime_ns)
     arrays, readings = {}, 0
     for name, shape in shapes.items():
@@ -277,7 +277,6 @@ def _matlab(path: Path, shapes: Mapping[str, tuple[int, int]]) -> dict[str, Arra
 @lru_cache(4)
 def _numbers(path: Path, names: tuple[str, ...], size: int, changed_ns: int) -> dict[str, Array]:
     """Arrays of numbers of a MATLAB file that had this size, and was changed at this time."""
-    check_size(path, "recording")
     command = [sys.executable, "-P", "-c", _LOAD, str(path), str(decoded_limit(size)), *names]
     done = subprocess.run(command, capture_output=True, check=False)
     if done.returncode:

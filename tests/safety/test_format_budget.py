@@ -8,6 +8,7 @@ import sys
 import zipfile
 
 import pytest
+from one_triangle import glb
 
 from magtwin import budget
 from magtwin.errors import InputError
@@ -19,22 +20,6 @@ from magtwin.usd.layers import open_stage
 
 MOST = 300_000_000
 """Memory that a refusal may take [bytes]."""
-
-
-def glb(path, accessor, **more):
-    """A glTF of one triangle mesh whose positions are `accessor`."""
-    view = {"buffer": 0, "byteLength": 36} | more
-    uri = "data:application/octet-stream;base64," + "A" * 48
-    table = {
-        "asset": {"version": "2.0"},
-        "nodes": [{"mesh": 0}],
-        "scenes": [{"nodes": [0]}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
-        "accessors": [{"bufferView": 0, "componentType": 5126, "type": "VEC3"} | accessor],
-        "bufferViews": [view],
-        "buffers": [{"byteLength": 36, "uri": uri}],
-    }
-    path.write_text(json.dumps(table))
 
 
 def test_a_large_file_is_read_if_the_user_allows_it(tmp_path, monkeypatch):
