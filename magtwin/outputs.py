@@ -115,7 +115,7 @@ def output(path: str | os.PathLike[str], *, force: bool = False, at_once: bool =
         text = str(error).replace(str(aside.new), str(path))
         raise InputError(text, parameter=error.parameter) from error
     except Exception as error:  # libraries have errors of their own for a full disk
-        if reason := _why_full(error, aside.folder):
+        if reason := why_full(aside.folder, error):
             raise InputError(f"{path}: cannot be written ({reason})") from error
         raise
     finally:
@@ -366,14 +366,14 @@ def exchanged(one: Path, other: Path) -> bool:
     return rename(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), ctypes.c_uint(_EXCHANGE)) == 0
 
 
-def _why_full(error: Exception, folder: Path) -> str:
-    """In which way the disk of a folder is full, if that is where an error comes from; "" if it is not."""
+def why_full(folder: Path, error: Exception | None = None) -> str:
+    """In which way the disk of a folder is full, or was when an error was raised; "" if it is not."""
     number = error.errno if isinstance(error, OSError) else None
     reasons = [os.strerror(full) for full in _FULL if full == number or os.strerror(full) in str(error)]
     if reasons:
         return reasons[0]
     try:
-        with open(folder / ".probe", "wb", buffering=0) as file:
+        with tempfile.TemporaryFile(dir=folder, buffering=0) as file:
             while file.write(bytes(_PROBE)) < _PROBE:
                 pass
             os.fsync(file.fileno())

@@ -195,7 +195,9 @@ def translated(where: object, what: str = "damaged USD") -> Iterator[None]:
     try:
         yield
     except (Tf.ErrorException, UnicodeDecodeError, TypeError) as error:
-        told = type(error).__name__ == "ArgumentError" or "UnregisteredValue" in _text(error)  # of a wrong type
+        told = type(error).__name__ == "ArgumentError" or "UnregisteredValue" in _text(
+            error
+        )  # of a wrong type
         if isinstance(error, TypeError) and not told:
             raise
         raise InputError(f"{where}: {what}: {_reason(error)}") from error

@@ -648,6 +648,36 @@ except InputError as error:
     }
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="a limit on file sizes is of POSIX")
+def test_a_disk_that_fills_while_rerun_writes_ends_in_a_line(parts, tmp_path):
+    from magtwin.io.tables import write_parquet
+
+    write_parquet(parts[0], tmp_path / "run.parquet")
+    script = """
+import resource, signal
+from magtwin.io.rerun import recording
+from magtwin.io.rerun.file import write_rrd
+from magtwin.io.tables import read_parquet
+from magtwin.errors import InputError
+
+run = read_parquet("run.parquet")
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+recording.check_room = lambda *_: None  # as if there had been room then
+for limit in (0, 100, 3000, 5000, 7000, 20_000, 40_000):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+    try:
+        write_rrd(run, "run.rrd")
+    except InputError as error:
+        print(error)
+"""
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True)
+    lines = done.stdout.splitlines()
+    assert len(lines) == 7
+    assert all(line.startswith("run.rrd: cannot be written (") for line in lines)
+    assert {path.name for path in tmp_path.iterdir()} == {"run.parquet"}
+
+
 @pytest.mark.parametrize("rows", [20, 540])
 @pytest.mark.parametrize("shown", [False, True])
 def test_the_room_asked_of_a_disk_is_enough_and_no_multiple_of_it(rows, shown, parts, tmp_path, monkeypatch):

@@ -19,10 +19,10 @@ from magtwin.files import existing
 from magtwin.io.recorder import PARTIAL
 from magtwin.io.rerun.layout import RUN_COLOURS, Shown, comparison_layout, plotted
 from magtwin.io.rerun.recording import (
-    PATIENCE_S,
     ROOM,
     Recording,
     content_id,
+    flush,
     recording_of,
     size_of,
     stream,
@@ -84,7 +84,7 @@ def write_rrd(
         for block in blocks(run):
             recording.append(block)
             if block.rows < run.rows:  # Rerun queues what it has not written
-                recording.rec.flush(timeout_sec=PATIENCE_S)
+                flush(recording.rec, aside.parent)
         recording.close()
 
 

@@ -20,6 +20,7 @@ from magtwin.io.rerun.recording import (
     ROOM,
     Recording,
     check_room,
+    flush,
     recording_of,
     size_of,
     title_of,
@@ -69,7 +70,7 @@ class _Growing(Sink):
             check_room(file, file.stat().st_size + size_of(run, self._shown["scans"]) + ROOM, self._final)
         try:
             self._recording.append(run)
-            self._recording.rec.flush(timeout_sec=10.0)
+            flush(self._recording.rec, file and file.parent)
         except RuntimeError as error:
             raise unwritten(self._final, error) from error
         self.rows += run.rows

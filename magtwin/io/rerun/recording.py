@@ -1,13 +1,16 @@
-"""Recording: a Run in a Rerun stream, whole or block by block, to a file, a viewer, or both."""
+"""Recording: a Run in a Rerun stream, whole or block by block, to a file or a viewer."""
 
+import atexit
 import errno
 import hashlib
 import json
 import os
 import shutil
 import tempfile
+import threading
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
@@ -22,6 +25,7 @@ from magtwin.errors import InputError
 from magtwin.io.rerun.layout import layout
 from magtwin.io.rerun.series import COLUMNS_ENTITY, ROWS, Flags, entity_of, send_columns, send_metadata
 from magtwin.io.rerun.world import Feed, Interior, Robot, heading_of, send_room
+from magtwin.outputs import why_full
 from magtwin.path import Path
 from magtwin.run import mapped
 from magtwin.run.run import Run
@@ -88,7 +92,7 @@ def stream(
     final: FilePath | None = None,
     room: int = ROOM,
 ) -> Iterator[rr.RecordingStream]:
-    """A stream to a file, to the viewer at an address, or to both; completed and closed with the block.
+    """A stream to a file, or to the viewer at an address; completed and closed with the block.
 
     The viewer merges recordings of one `recording_id`. `views` is the layout that it opens with, `final` the
     file that errors name, and `room` an upper bound of the file's size [bytes]. The file can be read at any
@@ -100,29 +104,70 @@ def stream(
     final = final or file
     if file is not None:
         check_room(file, room, final)
+    folder = None if file is None else file.parent
     strict = rr.strict_mode()
     rec = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False)
     if not rr.is_enabled(rec):
         raise InputError(f"{final}: Rerun is switched off by the environment variable RERUN; unset it")
     rr.set_strict_mode(True)
     try:
-        sinks: list[Any] = [] if file is None else [rr.FileSink(str(file))]
-        sinks += [] if address is None else [rr.GrpcSink(address)]
-        rec.set_sinks(*sinks, default_blueprint=views)
+        sink: Any = rr.GrpcSink(address) if file is None else rr.FileSink(str(file))
+        await_rerun(lambda: rec.set_sinks(sink, default_blueprint=views), folder)
         rec.send_recording_name(name)
         yield rec
-        rec.flush(timeout_sec=PATIENCE_S)
+        flush(rec, folder)
     except RuntimeError as error:
         raise unwritten(final, error) from error
     finally:
         rr.set_strict_mode(strict)
         with suppress(RuntimeError):
-            rec.disconnect()
+            await_rerun(rec.disconnect, folder)
     if file is not None:
         with open(file, "rb") as written:  # Rerun does not report a disk that was full at the end
             written.seek(-min(64, file.stat().st_size), 2)
             if END not in written.read():
                 raise unwritten(final, "its end is missing")
+
+
+def flush(rec: rr.RecordingStream, folder: FilePath | None) -> None:
+    """Wait until the data of a stream is written.
+
+    Raises:
+        RuntimeError: It cannot be written.
+    """
+    await_rerun(lambda: rec.flush(timeout_sec=PATIENCE_S), folder)
+
+
+def await_rerun(work: Callable[[], object], folder: FilePath | None) -> None:
+    """Call a function of Rerun that waits for its writing thread, which a full disk has ended.
+
+    Rerun then waits for ever. So it works in a thread, while this one looks whether the disk of `folder` is
+    full. No folder: it is called as it is.
+
+    Raises:
+        RuntimeError: It fails, or has not ended after `PATIENCE_S`.
+    """
+    if folder is None:
+        work()
+        return
+    done: Future[object] = Future()
+
+    def call() -> None:
+        try:
+            done.set_result(work())
+        except BaseException as error:
+            done.set_exception(error)
+
+    threading.Thread(target=call, daemon=True).start()
+    full = ""
+    for _ in range(int(PATIENCE_S)):
+        with suppress(TimeoutError):
+            done.result(timeout=1.0)
+            return
+        if full := why_full(folder):
+            break
+    atexit.unregister(rr.rerun_shutdown)  # it would wait too
+    raise RuntimeError(full or "Rerun does not end")
 
 
 def unwritten(path: FilePath | None, why: object) -> InputError:
