@@ -56,8 +56,9 @@ def existing(path: str | os.PathLike[str], what: str) -> Path:
     try:
         mode = path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
-        siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-        near = difflib.get_close_matches(path.name, siblings, n=1)
+        if not path.parent.is_dir():
+            raise InputError(f"{path}: no such {what}; there is no folder {str(path.parent)!r}") from None
+        near = difflib.get_close_matches(path.name, [p.name for p in path.parent.iterdir()], n=1)
         raise InputError(
             f"{path}: no such {what}" + (f"; did you mean {near[0]!r}?" if near else "")
         ) from None

@@ -1,5 +1,6 @@
 """What tests share: the real data beside the checkout, and the default lab, authored once."""
 
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +10,8 @@ from hypothesis import settings
 # The same examples on every run; `pytest --hypothesis-profile=default` draws new ones.
 settings.register_profile("fixed", derandomize=True, deadline=None, database=None)
 settings.load_profile("fixed")
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where a shell began this in the background
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -119,6 +119,10 @@ def ship_case(
     path = Path(folder) / f"Aligned_SquareLoop_{loop}.mat"
     data = _matlab(path, _SHIP)
     p, rotation, dt = data["p"].T, _rotation(data["q"].T, path), float(data["T"].item())
+    if not dt > 0:
+        raise InputError(
+            f"{path}: the time 'T' between readings is {dt:g} s, not positive; get the file again"
+        )
     y_nt = SHIP_UNIT_NT * data["y_mag"].T
     rng, sign = np.random.default_rng([loop, seed // 2]), 1 - 2 * (seed % 2)
     sd = np.sqrt([SHIP_STEP_VARIANCE_M2, SHIP_STEP_VARIANCE_M2, SHIP_HEIGHT_VARIANCE_M2])
@@ -200,6 +204,8 @@ def hand_case(folder: str | os.PathLike[str], name: Literal["eight", "square"]) 
     path = Path(folder) / f"{name}.mat"
     data = _matlab(path, _HAND)
     start, t, rotation = data["initPos"][0], data["t"][:, 0], _rotation(data["quat"], path)
+    if not (np.diff(t) > 0).all():
+        raise InputError(f"{path}: the times 't' do not rise; get the file again")
     reference, odometry = (
         np.vstack([start, start + np.cumsum(data[key], axis=0)]) for key in ("dPos", "dPosSmooth")
     )
@@ -250,6 +256,9 @@ _HAND = {"m": (_N, 3), "quat": (_N, 4), "t": (_N, 1), "initPos": (1, 3)}
 _HAND |= dict.fromkeys(("dPos", "dPosSmooth"), (_N - 1, 3))
 """Shapes of the arrays in a file; `_N` stands for the number of readings."""
 
+_LARGEST = 1e9
+"""Bound of the numbers in a file: coordinates [m], fields [uT], times [s]."""
+
 
 def _matlab(path: Path, shapes: Mapping[str, tuple[int, int]]) -> dict[str, Array]:
     """Arrays of a MATLAB file, of finite numbers and of these shapes, the first of which has `_N`.
@@ -265,10 +274,10 @@ def _matlab(path: Path, shapes: Mapping[str, tuple[int, int]]) -> dict[str, Arra
         array = np.asarray(data[name], float)
         readings = readings or max(array.shape, default=0)
         wanted = tuple(readings + size - _N if size > _N // 2 else size for size in shape)
-        if array.shape != wanted or readings < 3 or not np.isfinite(array).all():
+        if array.shape != wanted or readings < 3 or not (np.abs(array) < _LARGEST).all():
             raise InputError(
-                f"{path}: array {name!r} of shape {array.shape} must hold finite numbers, of shape {wanted}, "
-                "of 3 readings at least; get the file again"
+                f"{path}: array {name!r} of shape {array.shape} must hold numbers below {_LARGEST:g}, of "
+                f"shape {wanted}, of 3 readings at least; get the file again"
             )
         arrays[name] = array
     return arrays
@@ -287,10 +296,9 @@ def _numbers(path: Path, names: tuple[str, ...], size: int, changed_ns: int) -> 
 
 
 def _rotation(wxyz: Array, path: Path) -> Rotation:
-    try:
-        return Rotation.from_quat(wxyz[:, [1, 2, 3, 0]])
-    except ValueError as error:
-        raise InputError(f"{path}: a quaternion is 0 ({error}); get the file again") from error
+    if (abs(np.linalg.norm(wxyz, axis=1) - 1) > 0.01).any():
+        raise InputError(f"{path}: a quaternion's length is not 1; get the file again")
+    return Rotation.from_quat(wxyz[:, [1, 2, 3, 0]])
 
 
 def _accumulated(first: Rotation, increments: Rotation) -> Array:

@@ -79,7 +79,8 @@ class Audit:
                     try_values(layer)
             except Exception as error:
                 if crate:
-                    raise RefusedError(f"cannot be opened as USD: {text_of(error)}") from error
+                    text = f"cannot be opened as USD: {text_of(error)}; make or copy it again"
+                    raise RefusedError(text) from error
                 return None  # raised again, with its text, where it is opened
             self.layers[name] = layer
         return self.layers[name]

@@ -83,6 +83,18 @@ def test_wrong_files_are_refused(tmp_path):
     savemat(tmp_path / "Aligned_SquareLoop_1.mat", {"p": np.zeros((3, 4))})
     with pytest.raises(InputError, match="no array of numbers 'q'"):
         ship_case(tmp_path, 1, 0)
+    made_up(tmp_path)
+    whole = {k: v for k, v in loadmat(tmp_path / "Aligned_SquareLoop_1.mat").items() if k[0] != "_"}
+    for name, value, said in (
+        ("T", 0, "'T' .* not positive"),
+        ("q", 2, "length is not 1"),
+        ("p", 1e9, "'p' "),
+    ):
+        savemat(
+            tmp_path / "Aligned_SquareLoop_1.mat", {**whole, name: np.full_like(whole[name], value, float)}
+        )
+        with pytest.raises(InputError, match=said):
+            ship_case(tmp_path, 1, 0)
     with pytest.raises(InputError, match="eight or square"):
         hand_case(tmp_path, "circle")
 

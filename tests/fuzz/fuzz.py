@@ -16,6 +16,7 @@ import contextlib
 import hashlib
 import importlib
 import json
+import math
 import os
 import pickle
 import random
@@ -31,6 +32,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from seeds import FORMATS, Seed, members, read, seed
 
 BATCH, SLOW_BATCH = 100, 25
@@ -82,6 +84,7 @@ WORDS = (
 )
 WORDS += ("null", "None", "true", "[]", "{}", '""', "*a", "&a", "<<", "${x}", "#", "\\", "\u202e", "inf")
 ENCODED = (*(word.encode() for word in WORDS), b"\xed\x9f\xbf", b"\xff\xfe", b"\xed\xa0\x80", b"\xef\xbb\xbf")
+FLOATS = (0.0, -1.0, 1e9, -1e300, 1e300, 5e-324, math.nan, math.inf)
 WHOLE = (0, 1, 0x7F, 0xFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 1 << 40, (1 << 63) - 1, (1 << 64) - 1)
 
 
@@ -135,7 +138,7 @@ def _text(data: bytes, rng: random.Random) -> bytes:
 
 
 def _binary(data: bytes, rng: random.Random) -> bytes:
-    out, at, kind = bytearray(data), rng.randrange(len(data) + 1), rng.randrange(5)
+    out, at, kind = bytearray(data), rng.randrange(len(data) + 1), rng.randrange(6)
     width = rng.choice((1, 2, 4, 8))
     if kind == 0:
         out[at : at + 1] = rng.randbytes(1)
@@ -148,6 +151,13 @@ def _binary(data: bytes, rng: random.Random) -> bytes:
     elif kind == 3:
         start = rng.randrange(len(data) + 1)
         out[at:at] = data[start : start + rng.choice((4, 64, 1024))]
+    elif kind == 4:
+        wide, value = rng.random() < 0.7, rng.choice(FLOATS)
+        with np.errstate(over="ignore"):
+            number = np.array(value, "<f8" if wide else "<f4").tobytes()
+        at -= at % len(number)
+        count = rng.choice((1, 1, len(data)))  # to the end
+        out[at:] = number * min(count, (len(data) - at) // len(number)) + data[at:][len(number) * count :]
     else:
         del out[at:]
     return bytes(out)

@@ -9,6 +9,7 @@ import importlib
 import io
 import json
 import shutil
+import sqlite3
 import sys
 import types
 import zipfile
@@ -849,8 +850,15 @@ def read(kind: str, data: bytes, beside: Mapping[str, bytes], folder: Path) -> N
 def members(data: bytes) -> tuple[list[bytes], Callable[[int, bytes], bytes]] | None:
     """Parts of a container that a change of its bytes would not reach, and how to replace one.
 
-    Members of zips, and the JSON of safetensors and GLB; checksums and lengths are then right.
+    Members of zips, the JSON of safetensors and GLB, columns and metadata of Parquet files, arrays of MATLAB
+    files, and blobs of SQLite files; checksums and lengths are then right.
     """
+    for begin, parts_of in ((b"PAR1", _columns), (b"MATLAB", _arrays), (b"SQLite", _blobs)):
+        if data.startswith(begin):
+            try:
+                return parts_of(data)
+            except Exception:  # too damaged
+                return None
     if data[:4] == b"PK\x03\x04":
         try:
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -890,3 +898,84 @@ def members(data: bytes) -> tuple[list[bytes], Callable[[int, bytes], bytes]] | 
         return len(part).to_bytes(8, "little") + part + rest
 
     return [data[start : start + size]], joined
+
+
+def _columns(data: bytes) -> tuple[list[bytes], Callable[[int, bytes], bytes]]:
+    """The values of the columns of numbers of a Parquet file, its texts, and its metadata."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(io.BytesIO(data), use_threads=False)
+    about = sorted((table.schema.metadata or {}).items())
+    whole = [column.combine_chunks() for column in table.columns]
+    rows = [isinstance(column, pa.FixedSizeListArray) for column in whole]
+    flat = [column.flatten() if listed else column for column, listed in zip(whole, rows, strict=True)]
+    numbers = [i for i, column in enumerate(flat) if pa.types.is_primitive(column.type)]
+    places = [(i, k) for i in numbers for k, part in enumerate(flat[i].buffers()) if part and len(flat[i])]
+    parts = [flat[i].buffers()[k].to_pybytes() for i, k in places]
+    texts = [i for i, column in enumerate(whole) if pa.types.is_string(column.type)]
+    words = [json.dumps(whole[i].to_pylist()).encode() for i in texts]
+
+    def packed(at: int, part: bytes) -> bytes:
+        columns, metadata = list(whole), dict(about)
+        if at < len(parts):
+            i, k = places[at]
+            size, buffers = len(parts[at]), flat[i].buffers()
+            buffers[k] = pa.py_buffer(part[:size].ljust(size, b"\0"))
+            columns[i] = pa.Array.from_buffers(flat[i].type, len(flat[i]), buffers)
+            if rows[i]:
+                columns[i] = pa.FixedSizeListArray.from_arrays(columns[i], type=whole[i].type)
+        elif at < len(parts) + len(texts):
+            i = texts[at - len(parts)]
+            columns[i] = pa.array(json.loads(part), whole[i].type)
+        else:
+            metadata[about[at - len(parts) - len(texts)][0]] = part
+        out = io.BytesIO()
+        pq.write_table(pa.Table.from_arrays(columns, schema=table.schema.with_metadata(metadata)), out)
+        return out.getvalue()
+
+    return [*parts, *words, *(value for _, value in about)], packed
+
+
+def _arrays(data: bytes) -> tuple[list[bytes], Callable[[int, bytes], bytes]]:
+    """The values of the arrays of a MATLAB file."""
+    from scipy.io import loadmat, savemat
+
+    arrays = {name: value for name, value in loadmat(io.BytesIO(data)).items() if not name.startswith("_")}
+    names = [name for name, value in arrays.items() if value.dtype.kind in "biuf"]
+
+    def packed(at: int, part: bytes) -> bytes:
+        old = arrays[names[at]]
+        new = np.frombuffer(part[: old.nbytes].ljust(old.nbytes, b"\0"), old.dtype).reshape(old.shape)
+        out = io.BytesIO()
+        savemat(out, {**arrays, names[at]: new})
+        return out.getvalue()
+
+    return [arrays[name].tobytes() for name in names], packed
+
+
+def _blobs(data: bytes) -> tuple[list[bytes], Callable[[int, bytes], bytes]]:
+    """The texts and blobs of a SQLite file."""
+    base = sqlite3.connect(":memory:")
+    base.deserialize(data)
+    names = [name for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+    places: list[tuple[str, str, int]] = []
+    parts: list[bytes] = []
+    for table in names:
+        for _, column, *_ in base.execute(f'PRAGMA table_info("{table}")').fetchall():
+            for row, value in base.execute(f'SELECT rowid, "{column}" FROM "{table}"').fetchall():
+                if isinstance(value, str | bytes):
+                    places.append((table, column, row))
+                    parts.append(value.encode() if isinstance(value, str) else value)
+
+    def packed(at: int, part: bytes) -> bytes:
+        table, column, row = places[at]
+        copy = sqlite3.connect(":memory:")
+        copy.deserialize(data)
+        (kind,) = copy.execute(f'SELECT typeof("{column}") FROM "{table}" WHERE rowid = ?', (row,)).fetchone()
+        value = part.decode(errors="replace") if kind == "text" else part
+        copy.execute(f'UPDATE "{table}" SET "{column}" = ? WHERE rowid = ?', (value, row))
+        copy.commit()
+        return copy.serialize()
+
+    return parts, packed
