@@ -92,12 +92,15 @@ class HangError(BaseException):
     """An input takes too long. No reader can catch it as an Exception."""
 
 
-def mutated(data: bytes, rng: random.Random) -> bytes:
-    """A file with one to four changes, each in a member of it if it is a container."""
+def mutated(data: bytes, rng: random.Random, sound: bool) -> bytes:
+    """A file with one to four changes, each in a member of it if it is a container.
+
+    Libraries open it for that only if it is sound: a damaged file can crash them.
+    """
     for _ in range(rng.choice((1, 1, 2, 4))):
-        inside = members(data) if rng.random() < 0.7 else None
+        inside = members(data, sound) if rng.random() < 0.7 else None
         if inside is None or not inside[0]:
-            data = _changed(data, rng)
+            data, sound = _changed(data, rng), False
         else:
             parts, packed = inside
             at = rng.randrange(len(parts))
@@ -403,7 +406,8 @@ class Fuzzer:
 
         def make(i: int) -> bytes:
             rng = random.Random(f"{name}/{i}")
-            return mutated(files[0] if rng.random() < 0.5 else rng.choice(files), rng)
+            at = 0 if rng.random() < 0.5 else rng.randrange(len(files))
+            return mutated(files[at], rng, sound=at == 0)
 
         return Batch(kind, SLOW_BATCH if FORMATS[kind].slow else BATCH, make, self.seeds[kind])
 

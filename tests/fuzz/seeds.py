@@ -847,18 +847,15 @@ def read(kind: str, data: bytes, beside: Mapping[str, bytes], folder: Path) -> N
     FORMATS[kind].read(folder / FORMATS[kind].file)
 
 
-def members(data: bytes) -> tuple[list[bytes], Callable[[int, bytes], bytes]] | None:
+def members(data: bytes, sound: bool) -> tuple[list[bytes], Callable[[int, bytes], bytes]] | None:
     """Parts of a container that a change of its bytes would not reach, and how to replace one.
 
     Members of zips, the JSON of safetensors and GLB, columns and metadata of Parquet files, arrays of MATLAB
-    files, and blobs of SQLite files; checksums and lengths are then right.
+    files, and blobs of SQLite files; checksums and lengths are then right. The last three only if `sound`.
     """
     for begin, parts_of in ((b"PAR1", _columns), (b"MATLAB", _arrays), (b"SQLite", _blobs)):
         if data.startswith(begin):
-            try:
-                return parts_of(data)
-            except Exception:  # too damaged
-                return None
+            return parts_of(data) if sound else None
     if data[:4] == b"PK\x03\x04":
         try:
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
