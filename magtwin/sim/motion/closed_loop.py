@@ -236,7 +236,9 @@ def _block(
     places = dict(zip(distinct, ends, strict=True))
     last = np.array([places[id(guide.table)] for guide in guides], np.int64)
     begin = last - [guide.table.shape[1] for guide in guides]
-    tables = np.concatenate(list(distinct.values()), axis=1)
+    tables = next(iter(distinct.values()))
+    if len(distinct) > 1:
+        tables = np.concatenate(list(distinct.values()), axis=1)
     laws = np.array([guide.law for guide in guides], np.int64)
     record, made = np.empty((count, loop.RECORD, steps)), np.empty(count, np.int64)
 
@@ -287,13 +289,15 @@ class Chassis:
         self._figures, self._state = closed_loop.figures(), closed_loop.state()
         self._state[8] = math.inf if not len(obstacles) else 0.0
         self._record = [array("d") for _ in range(loop.RECORD)]
+        self._earlier: list[Array] = []
+        self._steps = 0  # in earlier records
         self._last = (0.0, 0.0)
         self._age_s = 0.0
 
     @property
     def t(self) -> float:
         """Time since the start [s]."""
-        return len(self._record[0]) * self._course.dt
+        return (self._steps + len(self._record[0])) * self._course.dt
 
     @property
     def pose(self) -> Pose:
@@ -332,9 +336,14 @@ class Chassis:
                     f"the command at {self.t:.3f} s is not finite: v = {v!r} m/s, w = {w!r} rad/s"
                 )
             self._last, self._age_s = (float(v), float(w)), 0.0
+        if len(self._record[0]) == BLOCK:
+            self._earlier.append(self._recorded())
+            mapped.settle(self._earlier)
+            self._steps += BLOCK
+            self._record = [array("d") for _ in range(loop.RECORD)]
         for column in self._record:
             column.append(0.0)
-        k = len(self._record[0]) - 1
+        k = self._steps + len(self._record[0]) - 1
         now = [memoryview(column)[-1:] for column in self._record]
         table = ([k * self._course.dt], [self._last[0]], [self._last[1]])
         self._state[10] = 0.0
@@ -347,4 +356,8 @@ class Chassis:
 
     def motion(self) -> Motion:
         """The motion so far."""
-        return _motion(self._course, np.array([np.frombuffer(column) for column in self._record]))
+        return _motion(self._course, mapped.joined([*self._earlier, self._recorded()]))
+
+    def _recorded(self) -> Array:
+        """Record of the last steps, shape (loop.RECORD, K)."""
+        return np.array([np.frombuffer(column) for column in self._record])

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError, find
 from magtwin.extend import Registry
 from magtwin.path import Path
+from magtwin.run import mapped
 from magtwin.sim.motion import loop
 from magtwin.sim.motion.plan import LIMIT_SHARE, drivable, plan
 from magtwin.spec.drive import DriveSpec
@@ -168,7 +169,15 @@ def guide_along(name: str, path: Path, drive: DriveSpec, *, speed: float, dt: fl
             law, np.vstack([p.T, unused]), gains, drive.command_timeout_s, (x, y, math.atan2(dy, dx))
         )
     columns = ("x", "y", "heading", "curvature", "speed2", "left_m")
-    table = np.vstack([np.concatenate([getattr(piece, column) for piece in pieces]) for column in columns])
+    count = sum(len(piece.x) for piece in pieces)
+    table = mapped.zeros((len(columns), count)) if count > mapped.LONG else np.empty((len(columns), count))
+    end = count
+    while pieces:  # from the last one, and freed at once: those of a day take 0.2 GB
+        piece = pieces.pop()
+        begin = end - len(piece.x)
+        for row, column in zip(table, columns, strict=True):
+            row[begin:end] = getattr(piece, column)
+        end = begin
     gains = (
         dt,
         dt + drive.motor_lag_s,

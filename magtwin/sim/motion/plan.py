@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.path import Path
+from magtwin.run import mapped
 from magtwin.spec.drive import DriveSpec
 
 Array = NDArray[np.float64]
@@ -75,7 +76,9 @@ def corners(path: Path) -> Array:
     Among points nearer to each other than the chords that measure the turn, only the sharpest counts.
     """
     s = path.s[1:-1]
-    turn = np.abs(path.turn(s, _CORNER_REACH_M))
+    turn = np.empty(len(s))
+    for rows in _blocks(len(s)):
+        turn[rows] = np.abs(path.turn(s[rows], _CORNER_REACH_M))
     sharp = np.flatnonzero(turn > _CORNER_RAD)
     chosen: list[float] = []
     for i in sharp[np.argsort(-turn[sharp], kind="stable")]:
@@ -138,8 +141,9 @@ def _check_turns(path: Path, turning_radius_m: float) -> None:
 
 def _piece(path: Path, s_first: float, s_last: float, drive: DriveSpec, speed: float) -> Piece:
     count = max(3, math.ceil((s_last - s_first) / NODE_M) + 1)
-    s = np.linspace(s_first, s_last, count)
-    p = path.at(np.minimum(s, path.length))
+    s, p = np.linspace(s_first, s_last, count), np.empty((count, 2))
+    for rows in _blocks(count):
+        p[rows] = path.at(np.minimum(s[rows], path.length))
     # Past its ends the piece is continued by point reflection, so that smoothing leaves the ends in place.
     reach = min(round(_SMOOTH_M / 2 / NODE_M), count - 1)
     before, after = 2 * p[0] - p[reach:0:-1], 2 * p[-1] - p[-2 : -reach - 2 : -1]
@@ -151,12 +155,14 @@ def _piece(path: Path, s_first: float, s_last: float, drive: DriveSpec, speed: f
     if not apart[-1] and len(keep) > 1:
         keep = keep[:-1]  # keeps the end, and no segment has length 0
     x, y = np.append(x[keep], x[-1]), np.append(y[keep], y[-1])
+    del s, p, longer, apart, keep  # a piece of a day takes 33 MB a column
 
     dx, dy = np.gradient(x), np.gradient(y)
     ds = np.maximum(np.hypot(dx, dy), 1e-9)
     heading = np.unwrap(np.arctan2(dy, dx))
     curvature = np.gradient(heading) / ds
     bend = np.abs(np.gradient(curvature)) / ds
+    del dx, dy, ds
     rim = _WHEEL_SHARE * drive.wheel_rate_max * drive.wheel_radius_m
     with np.errstate(divide="ignore"):
         v = np.minimum(
@@ -164,6 +170,7 @@ def _piece(path: Path, s_first: float, s_last: float, drive: DriveSpec, speed: f
         )
     v = np.minimum(v, rim / (1 + np.abs(curvature) * drive.wheel_separation_m / 2))
     v2 = np.clip(v, min(SLOWEST, speed), speed) ** 2
+    del v, bend
     v2[[0, -1]] = 0.0
     gain = (
         2 * LIMIT_SHARE * drive.a_max * np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
@@ -172,6 +179,11 @@ def _piece(path: Path, s_first: float, s_last: float, drive: DriveSpec, speed: f
     v2 = (np.minimum.accumulate((v2 + gain)[::-1]))[::-1] - gain
     left = np.arange(len(x) - 1, -1, -1) * ((s_last - s_first) / (count - 1))
     return Piece(x, y, heading, curvature, np.maximum(v2, 0.0), np.asarray(left, float))
+
+
+def _blocks(count: int) -> list[slice]:
+    """Slices of at most `mapped.BLOCK` rows, to compute long columns with little memory."""
+    return [slice(first, first + mapped.BLOCK) for first in range(0, count, mapped.BLOCK)]
 
 
 def drivable(path: Path) -> Path:
