@@ -11,7 +11,7 @@ from magtwin.author.robot import RobotSettings, build_robot
 from magtwin.author.room import asset_named, check_name, check_start, lab_of, obstacles_in
 from magtwin.author.scene import check_names, check_things
 from magtwin.errors import InputError
-from magtwin.files import existing, from_table, read_toml, refused_at, sha256
+from magtwin.files import existing_file, from_table, read_toml, refused_at, sha256
 from magtwin.kinds import expected
 from magtwin.path import resolve_path
 from magtwin.path.room import Room, path_in
@@ -164,7 +164,9 @@ def scene_from_toml(
     except InputError as error:
         raise refused_at(path, "name", str(error)) from error
     layer = Path(map_layer).resolve() if map_layer is not None else given.map
-    lab = lab_of(given.lab, table, path, None if layer is None else existing(layer, "map layer"))
+    if layer is not None:
+        layer = existing_file(layer, "map layer", "USD")
+    lab = lab_of(given.lab, table, path, layer)
     pieces = placed_furniture(given.furniture, lab, path, seed=given.seed)
     sources = given.source
     if given.sources:
@@ -206,7 +208,7 @@ def scene_from_toml(
         raise InputError(f"{path}: [earth] {error}") from error
     scene = Scene(
         name=given.name,
-        map_layer=Path("surveyed") if layer is None else existing(layer, "map layer"),
+        map_layer=Path("surveyed") if layer is None else layer,
         map_sha256="" if layer is None else layer_sha256(layer),
         robot=robots[0].robot,
         lab=lab,

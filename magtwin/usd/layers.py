@@ -266,7 +266,7 @@ def layer_sha256(path: str | os.PathLike[str]) -> str:
 
     That holds the map's own checksum, which covers every tile, so no tile is read.
     """
-    path = existing(path, "layer")
+    path = existing_file(path, "layer", "USD")
     if _is_crate(path) and path.stat().st_size > TILED_BYTES:
         check_stage(path, composed=False)
         layer = Sdf.Layer.OpenAsAnonymous(str(path))
