@@ -118,6 +118,11 @@ def pose_of(lab: Lab) -> Pose:
     _check_inside(lab)
     stage = lab.root.GetStage()
     metres = UsdGeom.GetStageMetersPerUnit(stage)
+    if not 0 < metres < math.inf:
+        raise InputError(
+            f"{stage.GetRootLayer().identifier}: its metersPerUnit is {metres:g}; set it to 1, and make the "
+            "stage in metres"
+        )
     up = _up(stage)
     world = _world(lab.root)
     rows = np.array(world)[:3, :3] * metres

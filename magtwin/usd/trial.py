@@ -11,6 +11,7 @@ import atexit
 import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -24,6 +25,12 @@ from magtwin.folders import allowed_folders
 
 VALUES = 16_000_000
 """Bytes of a layer up to which its values are tried too."""
+
+PROCESSOR_S = 15.0
+"""Processor time of the child for a stage [s], plus 1 s per megabyte of its layers."""
+
+_CUT_SHORT = -getattr(signal, "SIGXCPU", 1 << 20)
+"""Exit status of a child that needs more."""
 
 PROGRAM = Path(__file__).with_name("trial_process.py")
 """What the child runs."""
@@ -61,6 +68,7 @@ class _Trial:
                 "inside": inside,
                 "composed": composed,
                 "room": max(SPARE, allowed()),
+                "seconds": PROCESSOR_S,
                 "values": VALUES,
             }
             self._passed[key] = self._ask(path, job)
@@ -76,7 +84,7 @@ class _Trial:
             timer = threading.Timer(patience, _too_late, (child, late))
             timer.start()
             try:
-                child.stdin.write(json.dumps(job | {"seconds": patience}) + "\n")
+                child.stdin.write(json.dumps(job) + "\n")
                 child.stdin.flush()
                 answer = child.stdout.readline()
             except BrokenPipeError:
@@ -85,12 +93,14 @@ class _Trial:
                 timer.cancel()
             if answer:
                 break
-            self.stop()
-            if late.is_set():
+            if late.is_set() or child.wait() == _CUT_SHORT:
+                self.stop()
+                took = f"{patience:.0f} s" if late.is_set() else f"{PROCESSOR_S:.0f} s of the processor"
                 raise InputError(
-                    f"{path}: USD does not open it in {patience:.0f} s: damaged, or its references multiply "
-                    "each other; copy or write it again"
+                    f"{path}: USD does not open it in {took}: damaged, or its references multiply each "
+                    "other; copy or write it again"
                 )
+            self.stop()
             if attempt:  # alone in a fresh process
                 raise InputError(f"{path}: damaged: USD crashes on it; copy it, or write it again")
         said = json.loads(answer)

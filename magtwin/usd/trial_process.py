@@ -48,7 +48,8 @@ class Audit:
 
     def __init__(self, job: dict[str, Any]) -> None:
         self.inside: list[str] = job["inside"]
-        self.room, self.most_values = job["room"], job["values"]
+        self.room, self.seconds, self.most_values = job["room"], job["seconds"], job["values"]
+        self.used = used_time()
         self.layers: dict[str, Any] = {}
         self.named_files: set[str] = set()
         self.outside: list[dict[str, str]] = []
@@ -69,7 +70,9 @@ class Audit:
         if name not in self.layers:
             size = file.stat().st_size
             self.room += 4 * size
+            self.seconds += size / 1e6
             limit_memory(self.room)
+            limit_time(self.seconds, self.used)
             with file.open("rb") as head:
                 crate = head.read(8) == b"PXR-USDC"
             self.layers[name] = None
@@ -168,11 +171,15 @@ def limit_memory(room: int) -> None:
         _limit(resource.RLIMIT_AS, size + room)
 
 
-def limit_time(seconds: float) -> None:
-    """End this process after `seconds` of each core, should the process that gave the job be gone."""
+def used_time() -> float:
+    """Processor time of this process so far [s]."""
+    return 0.0 if resource is None else sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
+
+
+def limit_time(seconds: float, used: float) -> None:
+    """End this process, by SIGXCPU, when it has had `seconds` of the processor beyond `used`."""
     if resource is not None:
-        used = sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
-        _limit(resource.RLIMIT_CPU, int(used + seconds * (os.cpu_count() or 1)) + 1)
+        _limit(resource.RLIMIT_CPU, int(used + seconds) + 1)
 
 
 def _limit(kind: int, most: int) -> None:
@@ -241,8 +248,8 @@ def compose(root: str, audit: Audit) -> None:
 
 def answer_to(job: dict[str, Any]) -> dict[str, Any]:
     """Do a job. The answer has `refused`, `memory`, or names `outside` and the `files` that it depends on."""
-    limit_time(job["seconds"])
     audit = Audit(job)
+    limit_time(audit.seconds, audit.used)
     try:
         os.chdir(job["folder"])
         if job["composed"]:

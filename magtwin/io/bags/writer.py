@@ -22,7 +22,7 @@ from magtwin.io.bags.stream import Sent, Stream
 from magtwin.io.bags.topics import Qos
 from magtwin.io.bags.types import definition_of, layout
 from magtwin.io.recorder import PARTIAL, Sink, partial_of
-from magtwin.outputs import check_free, output
+from magtwin.outputs import check_free, output, why_full
 from magtwin.run.arrow import metadata_to_json
 from magtwin.run.run import Run
 from magtwin.run.spool import blocks
@@ -386,7 +386,7 @@ def one_line(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, sqlite3.Error) as error:
-        reason = getattr(error, "strerror", None) or str(error)
+        reason = why_full(path.parent, error) or getattr(error, "strerror", None) or str(error)
         raise InputError(f"{path}: cannot be written ({reason})") from error
 
 
