@@ -95,7 +95,7 @@ class _Trial:
                 break
             if late.is_set() or child.wait() == _CUT_SHORT:
                 self.stop()
-                took = f"{patience:.0f} s" if late.is_set() else f"{PROCESSOR_S:.0f} s of the processor"
+                took = f"{patience:.0f} s" if late.is_set() else f"{PROCESSOR_S:g} s of the processor"
                 raise InputError(
                     f"{path}: USD does not open it in {took}: damaged, or its references multiply each "
                     "other; copy or write it again"

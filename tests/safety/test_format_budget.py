@@ -16,6 +16,7 @@ from magtwin.files import read_toml
 from magtwin.io.formats import read_run
 from magtwin.urdf.meshes.mesh import read_mesh
 from magtwin.urdf.source.source import read_source
+from magtwin.usd import trial
 from magtwin.usd.layers import open_stage
 
 MOST = 300_000_000
@@ -146,3 +147,17 @@ def test_a_stage_is_tried_below_a_limit_of_the_users(tmp_path):
     command = [sys.executable, "-c", program, str(tmp_path / "s.usda")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.stdout == "/W\n", done.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processor time is limited on Linux")
+def test_references_that_multiply_each_other_are_refused_and_the_next_stage_is_read(tmp_path, monkeypatch):
+    for level in range(9):
+        names = f"@{level + 1}.usda@</a>" if level < 8 else "None"
+        inner = "".join(f'def "b{k}" (references = {names}) {{}}\n' for k in range(8))
+        (tmp_path / f"{level}.usda").write_text(f'#usda 1.0\ndef "a" {{\n{inner}}}\n')
+    monkeypatch.setattr(trial, "PROCESSOR_S", 0.5)
+    with pytest.raises(
+        InputError, match=r"0\.usda: USD does not open it in 0\.5 s of the processor: .*multiply"
+    ):
+        open_stage(tmp_path / "0.usda")
+    assert len(list(open_stage(tmp_path / "6.usda").Traverse())) == 1 + 8 + 64 + 512
