@@ -11,7 +11,7 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 
 AGAIN_S = 0.02
-"""Time after which an interrupt that a destructor or a callback swallowed is sent again [s]."""
+"""Time after which an interrupt that came at a wrong moment is sent again [s]."""
 
 
 def _end(*_: object) -> None:
@@ -38,6 +38,9 @@ def main() -> None:
     came: list[int] = []
 
     def interrupt(number: int, frame: Any) -> None:
+        if _in_pxr(frame):
+            _send_again()
+            return
         came.append(number)
         raise KeyboardInterrupt
 
@@ -55,11 +58,25 @@ def main() -> None:
         signal.signal(signal.SIGINT, _end)
 
 
+def _in_pxr(frame: Any) -> bool:
+    """Whether a module of OpenUSD is being imported: it swallows an interrupt, and is half imported then."""
+    while frame is not None:
+        if frame.f_code.co_name == "<module>" and frame.f_globals.get("__name__", "").startswith("pxr"):
+            return True
+        frame = frame.f_back
+    return False
+
+
 def _sent_again(fault: Any) -> None:
     """Send an interrupt again that was raised where nobody could catch it; report other faults as usual."""
     if fault.exc_type is not None and issubclass(fault.exc_type, KeyboardInterrupt):
-        timer = threading.Timer(AGAIN_S, os.kill, (os.getpid(), signal.SIGINT))
-        timer.daemon = True
-        timer.start()
+        _send_again()
     else:
         sys.__unraisablehook__(fault)
+
+
+def _send_again() -> None:
+    """Interrupt this process in a moment."""
+    timer = threading.Timer(AGAIN_S, os.kill, (os.getpid(), signal.SIGINT))
+    timer.daemon = True
+    timer.start()
