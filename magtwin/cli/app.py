@@ -9,6 +9,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from cyclopts import App, Parameter
@@ -96,6 +97,8 @@ def main(arguments: list[str] | None = None) -> None:
             _fail(f"not enough memory{f' ({text})' if text else ''}; give less data or smaller options")
         if isinstance(error, OSError):
             _fail(f"{error} ({type(error).__name__})")
+        if text := _no_room(error):
+            _fail(text)
         _fail(f"a fault in magtwin, {type(error).__name__}: {error}; please report it, with --debug")
 
 
@@ -121,6 +124,21 @@ def _dashed(arguments: list[str]) -> str:
         if word.startswith("-") and "=" not in word and "." in word and not word[1:2].isdigit():
             return f"{word}: begins with a dash, so it is read as an option; for a file write ./{word}"
     return ""
+
+
+def _no_room(error: Exception) -> str:
+    """The refusal of a full disk of temporary files, of which libraries do not speak; "" if it has room."""
+    import tempfile
+
+    from magtwin.outputs import why_full
+
+    folder = tempfile.gettempdir()
+    reason = why_full(Path(folder), error)
+    return (
+        f"{folder}: no room for temporary files ({reason}); set TMPDIR to a folder with room"
+        if reason
+        else ""
+    )
 
 
 def _wrong_name(error: Exception, arguments: list[str]) -> str:

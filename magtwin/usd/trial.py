@@ -153,7 +153,7 @@ def _stamp(file: str) -> Stamp | None:
     """What changes if a file does; None if there is none."""
     try:
         about = Path(file).stat()
-    except OSError:
+    except (OSError, ValueError):  # no name can hold a null character
         return None
     return about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns
 

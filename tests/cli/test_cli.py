@@ -214,6 +214,32 @@ def test_debug_lets_the_traceback_through(tmp_path):
         main(["info", str(tmp_path / "a.usda"), "--debug"])
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="a limit on file sizes is of POSIX")
+def test_a_full_disk_of_temporary_files_is_named_where_a_library_does_not(tmp_path):
+    script = """
+import resource
+from magtwin.cli import main
+import magtwin.io.info
+
+def info_of(*_, **__):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, resource.RLIM_INFINITY))
+    raise RuntimeError("could not close the layer")
+
+magtwin.io.info.info_of = info_of
+main(["info", "run.parquet"])
+"""
+    (tmp_path / "run.parquet").write_bytes(b"")
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False, timeout=120
+    )
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"magtwin: {tmp_path}: no room for temporary files (")
+    assert [file.name for file in tmp_path.iterdir()] == ["run.parquet"]
+
+
 def test_run_takes_the_kind_of_magnetometer(lab_scene, tmp_path, capsys):
     from magtwin.io.tables import read_parquet
 
