@@ -7,7 +7,8 @@ place, are damaged further. Batches run in forked processes with limits of proce
 
 Faults are grouped by exception and innermost frame of magtwin. The smallest input of each group is reduced
 and kept in build/fuzz/faults; copy it to tests/fuzz/corpus, which `test_corpus.py` reads, and mend the
-fault. A fuzzer that is started again with the same seed goes on where it was.
+fault. A fuzzer that is started again with the same seed goes on where it was. `--each` changes one value at
+a time instead, each by extreme ones.
 """
 
 import argparse
@@ -15,6 +16,7 @@ import collections
 import contextlib
 import hashlib
 import importlib
+import itertools
 import json
 import math
 import os
@@ -47,6 +49,9 @@ LONG = 2000
 
 KEPT, LARGEST = 100, 1 << 18
 """Inputs of a format that are damaged further, and the bytes of the largest."""
+
+EACH = 3000
+"""Most inputs of a format of which one value is changed."""
 
 CORPUS = Path(__file__).with_name("corpus")
 """Inputs that were faults once: FORMAT/NAME."""
@@ -164,6 +169,35 @@ def _binary(data: bytes, rng: random.Random) -> bytes:
     else:
         del out[at:]
     return bytes(out)
+
+
+def every_change(data: bytes) -> Iterator[bytes]:
+    """A sound file with one number, word or 8 bytes replaced: each of them, by each extreme value."""
+    inside = members(data, True)
+    if inside is None or not inside[0]:
+        yield from _every_change(data)
+        return
+    parts, packed = inside
+    for at, part in enumerate(parts):
+        for changed in _every_change(part):
+            with contextlib.suppress(Exception):  # names and lengths that no zip holds
+                yield packed(at, changed)
+
+
+def _every_change(data: bytes) -> Iterator[bytes]:
+    if b"\0" in data[:2000]:
+        for at in range(0, min(len(data), LONG) - 7, 8):
+            for value in FLOATS:
+                yield data[:at] + np.array(value).tobytes() + data[at + 8 :]
+        return
+    pieces = re.split(rb"(\s+|[,;:=<>{}()\[\]\"'/@])", data)
+    for i, piece in enumerate(pieces):
+        if re.fullmatch(rb"-?[\d.]+(e-?\d+)?", piece):
+            others = [number.encode() for number in NUMBERS]
+        else:
+            others = [word.encode() for word in WORDS[:4]] if re.fullmatch(rb"[\w.]+", piece) else []
+        for other in others:
+            yield b"".join([*pieces[:i], other, *pieces[i + 1 :]])
 
 
 def judged(kind: str, data: bytes, whole: Seed, folder: Path) -> tuple[str, str, str]:
@@ -451,13 +485,16 @@ class Fuzzer:
             place.mkdir(parents=True, exist_ok=True)
             (place / f"{len(list(place.iterdir())) % KEPT:03}").write_bytes(data)
 
-    def run(self, seconds: float, jobs: int) -> None:
+    def run(self, batches: Iterator[Batch], seconds: float, jobs: int) -> None:
         """Fuzz for some time, in some processes at once."""
         end = time.monotonic() + seconds
-        told, running, order = time.monotonic(), dict[int, Batch](), self._order()
+        told, running = time.monotonic(), dict[int, Batch]()
         while running or time.monotonic() < end:
             while len(running) < jobs and time.monotonic() < end:
-                batch = self.batch(next(order))
+                batch = next(batches, None)
+                if batch is None:
+                    end = 0.0
+                    break
                 running[batch.file] = batch
             ready = select.select(list(running), [], [], 1.0)[0]
             for file in list(running):
@@ -467,10 +504,21 @@ class Fuzzer:
                 told = time.monotonic()
                 print(f"  {self.summary()}", flush=True)
 
-    def _order(self) -> Iterator[str]:
-        """Formats in turn, again and again."""
+    def at_random(self) -> Iterator[Batch]:
+        """Batches of the formats in turn, without end."""
         while True:
-            yield from list(self.files)
+            for kind in self.files:
+                yield self.batch(kind)
+
+    def each(self) -> Iterator[Batch]:
+        """Every change of one number, word or 8 bytes of the seeds; at most `EACH` of a format."""
+        for kind, files in self.files.items():
+            size = SLOW_BATCH if FORMATS[kind].slow else BATCH
+            count = sum(1 for _ in every_change(files[0]))
+            inputs = list(itertools.islice(every_change(files[0]), 0, None, -(-count // EACH) or 1))
+            for first in range(0, len(inputs), size):
+                some = inputs[first : first + size]
+                yield Batch(kind, len(some), some.__getitem__, self.seeds[kind])
 
     def summary(self) -> str:
         """One line: inputs, faults and memory."""
@@ -509,6 +557,9 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1, help="processes at once")
     parser.add_argument(
+        "--each", action="store_true", help="every change of one value instead, up to the time"
+    )
+    parser.add_argument(
         "--minimise", type=float, default=20, help="seconds for each group of faults; 10 groups in all"
     )
     parser.add_argument("--out", type=Path, default=Path("build/fuzz"))
@@ -517,7 +568,8 @@ def main() -> int:
         parser.error(f"no format {min(unknown)!r}; known: {', '.join(FORMATS)}")
     fuzzer = Fuzzer(given.formats or list(FORMATS), given.seed, given.out.resolve())
     try:
-        fuzzer.run(3600 * given.hours or given.seconds, given.jobs)
+        batches = fuzzer.each() if given.each else fuzzer.at_random()
+        fuzzer.run(batches, 3600 * given.hours or given.seconds, given.jobs)
     except KeyboardInterrupt:
         print("ended by hand")
     fuzzer.tell(given.minimise)
