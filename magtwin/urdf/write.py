@@ -416,9 +416,10 @@ def _between(T_above: Array, T_below: Array) -> Array:
 def _frame(p: Any, q: Any) -> Array:
     """A joint's frame in a body, shape (4, 4), its rotation normalised in double precision."""
     T = np.eye(4)
-    T[:3, 3] = [_shortest(v) for v in (p or (0, 0, 0))]
+    T[:3, 3] = [_shortest(v) for v in Gf.Vec3d(p or (0, 0, 0))]
     if q is not None:
-        xyzw = np.array([*q.GetImaginary(), q.GetReal()], float)
+        q = Gf.Quatd(q)
+        xyzw = np.array([*q.GetImaginary(), q.GetReal()])
         T[:3, :3] = matrix_from_quat(xyzw / np.linalg.norm(xyzw))
     return T
 
@@ -505,7 +506,7 @@ def _write_inertial(element: Element, prim: Usd.Prim) -> None:
     if not mass or not mass > 0:
         return
     inertial, centre = Sub(element, "inertial"), api.GetCenterOfMassAttr().Get()
-    if centre is not None and np.isfinite(centre).all() and any(centre):
+    if centre is not None and np.isfinite(Gf.Vec3d(centre)).all() and any(centre):
         Sub(inertial, "origin", xyz=_text(_shortest(v) for v in centre), rpy="0 0 0")
     Sub(inertial, "mass", value=_text([_shortest(mass)]))
     moments = np.array([_shortest(v) for v in api.GetDiagonalInertiaAttr().Get() or (0, 0, 0)])

@@ -388,7 +388,8 @@ def _texture(prim: Usd.Prim, gprim: UsdGeom.Gprim, triangles: NDArray, mirrored:
     if channel != "rgb" or shader is None or reader is None or shader.GetIdAttr().Get() != "UsdUVTexture":
         return None
     asset, name = shader.GetInput("file"), reader.GetInput("varname")
-    path = asset.Get().resolvedPath if asset and asset.Get() else ""
+    file = asset.Get() if asset else None
+    path = file.resolvedPath if isinstance(file, Sdf.AssetPath) else ""
     if not name or not Path(path).is_file():  # missing, or within a .usdz
         return None
     primvar = UsdGeom.PrimvarsAPI(gprim).FindPrimvarWithInheritance(str(name.Get()))

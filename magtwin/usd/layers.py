@@ -186,7 +186,8 @@ def translated(where: object, what: str = "damaged USD") -> Iterator[None]:
     """Raise USD's own errors in the block as an `InputError`.
 
     USD reports damaged contents when they are used, by errors of its own kinds: `Tf.ErrorException`, and
-    ArgumentError of the Boost library for values of another type.
+    ArgumentError of the Boost library for values of another type. A value whose type USD does not know is an
+    `UnregisteredValue`.
 
     Args:
         where: The file, or the place in it.
@@ -194,11 +195,9 @@ def translated(where: object, what: str = "damaged USD") -> Iterator[None]:
     """
     try:
         yield
-    except (Tf.ErrorException, UnicodeDecodeError, TypeError) as error:
-        told = type(error).__name__ == "ArgumentError" or "UnregisteredValue" in _text(
-            error
-        )  # of a wrong type
-        if isinstance(error, TypeError) and not told:
+    except (Tf.ErrorException, UnicodeDecodeError, TypeError, AttributeError) as error:
+        wrong_type = type(error).__name__ == "ArgumentError" or "UnregisteredValue" in _text(error)
+        if isinstance(error, TypeError | AttributeError) and not wrong_type:
             raise
         raise InputError(f"{where}: {what}: {_reason(error)}") from error
 
@@ -313,7 +312,7 @@ def _reason(error: Exception) -> str:
     """USD's first message, without its place in USD's sources."""
     if isinstance(error, UnicodeDecodeError):
         return f"a text is not UTF-8 (byte 0x{error.object[error.start]:02x})"
-    if isinstance(error, TypeError):
+    if isinstance(error, TypeError | AttributeError):
         return f"a value of another type ({_one_line(str(error)).partition(' did not match')[0]})"
     try:
         text = getattr(error.args[0], "commentary", None) if error.args else None
