@@ -151,12 +151,13 @@ def save_runs(
     if shard is not None and force:
         text = "other shards may have written there; remove the folder yourself, and drop `force`"
         raise InputError(text, parameter="force")
+    parts = _Parts(runs, Path(out), force, at_hand=dask is None)
     check_free(out, force=force)
     if shard is not None:
         checked_shard(shard)
         jobs = 1 if jobs is None and dask is None else jobs
     with open_pool(jobs, dask=dask) as pool:
-        return _Parts(runs, Path(out), force, at_hand=dask is None).save(pool, shard, progress)
+        return parts.save(pool, shard, progress)
 
 
 def _save_here(runs: Sequence[Run], out: str | os.PathLike[str], force: bool, progress: Progress) -> Report:
@@ -203,6 +204,7 @@ class _Parts:
         size = max(1, min(BLOCK, len(runs) // BLOCKS))
         self.blocks = [range(k, min(k + size, len(runs))) for k in range(0, len(runs), size)]
         self.about = {"magtwin": __version__, "sweep": runs.identity, "runs": len(runs)}
+        self._tidy()
 
     def save(self, pool: Any, shard: tuple[int, int] | None, progress: Progress) -> Report:
         """Make the blocks of a shard that are not there yet; rename the folder once all are."""
@@ -243,19 +245,14 @@ class _Parts:
 
     def _begin(self) -> None:
         """Make the folder, or check that it is of this sweep."""
-        file = self.folder / ABOUT
         if self.folder.exists():
-            try:
-                same = json.loads(read_text(file, "description of a sweep", "JSON")) == self.about
-            except (OSError, ValueError):
-                same = False
-            if same:
+            if self._about(self.folder) == self.about:
                 return
             if any(self.folder.iterdir()) and not self.force:
                 text = "unfinished runs of another sweep; give `force=True` to replace them, or another name"
                 raise InputError(f"{self.folder}: {text}", parameter="force")
             shutil.rmtree(self.folder)
-        with output(file, force=True) as aside:
+        with output(self.folder / ABOUT, force=True) as aside:
             aside.write_text(json.dumps(self.about), encoding="utf-8")
 
     def _finish(self, said: Listed) -> bool:
@@ -276,6 +273,19 @@ class _Parts:
             if self.folder.exists():
                 raise
             return self.out.exists()
-        for file in (*self.out.glob("part-*.json"), self.out / ABOUT):
-            file.unlink()
+        self._tidy()
         return True
+
+    def _tidy(self) -> None:
+        """Remove the notes of a finished sweep, also those of a process that was killed here."""
+        if self._about(self.out) == self.about:
+            for file in (*self.out.glob("part-*.json"), self.out / ABOUT):  # sweep.json last
+                file.unlink(missing_ok=True)
+
+    @staticmethod
+    def _about(folder: Path) -> Any:
+        """What sweep.json in a folder says; None if it cannot be read."""
+        try:
+            return json.loads(read_text(folder / ABOUT, "description of a sweep", "JSON"))
+        except (OSError, ValueError):
+            return None

@@ -142,6 +142,20 @@ def test_what_is_listed_survives_its_file(runs):
     assert json.loads(said.to_json())["sessions"] == {"0 0": "0"}
 
 
+def test_notes_that_a_kill_left_in_finished_runs_are_removed_by_a_repeat(
+    warm, runs, whole, tmp_path, monkeypatch
+):
+    out = tmp_path / "runs"
+    with monkeypatch.context() as killed:
+        killed.setattr(sweeps._Parts, "_tidy", lambda self: self.out.exists() and chunk_work.refuse(1))
+        with pytest.raises(InputError):
+            save_runs(runs, out, jobs=2)
+    assert {file.name for file in out.iterdir()} > {"sweep.json", "part-00000.json", "runs.csv"}
+    with pytest.raises(InputError, match="exists already"):
+        save_runs(runs, out, jobs=2)
+    assert files_in(out) == files_in(whole[0])
+
+
 def test_an_interrupted_command_is_continued(lab_scene, tmp_path):
     out, parts = tmp_path / "runs", tmp_path / "runs.parts"
     options = ["--count", "30", "--duration-s", "2", "--magnetometer", "physical", "--quiet"]
