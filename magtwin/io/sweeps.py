@@ -152,6 +152,8 @@ def save_runs(
         text = "other shards may have written there; remove the folder yourself, and drop `force`"
         raise InputError(text, parameter="force")
     parts = _Parts(runs, Path(out), force, at_hand=dask is None)
+    if shard is None:
+        parts.take_back()
     check_free(out, force=force)
     if shard is not None:
         checked_shard(shard)
@@ -204,7 +206,11 @@ class _Parts:
         size = max(1, min(BLOCK, len(runs) // BLOCKS))
         self.blocks = [range(k, min(k + size, len(runs))) for k in range(0, len(runs), size)]
         self.about = {"magtwin": __version__, "sweep": runs.identity, "runs": len(runs)}
-        self._tidy()
+
+    def take_back(self) -> None:
+        """Take up a sweep of which a process was killed when the folder was renamed, but had its notes yet."""
+        if self._about(self.out) == self.about and not self.folder.exists():
+            self.out.rename(self.folder)
 
     def save(self, pool: Any, shard: tuple[int, int] | None, progress: Progress) -> Report:
         """Make the blocks of a shard that are not there yet; rename the folder once all are."""
@@ -277,10 +283,9 @@ class _Parts:
         return True
 
     def _tidy(self) -> None:
-        """Remove the notes of a finished sweep, also those of a process that was killed here."""
-        if self._about(self.out) == self.about:
-            for file in (*self.out.glob("part-*.json"), self.out / ABOUT):  # sweep.json last
-                file.unlink(missing_ok=True)
+        """Remove the notes of a finished sweep, sweep.json last."""
+        for file in (*self.out.glob("part-*.json"), self.out / ABOUT):
+            file.unlink(missing_ok=True)
 
     @staticmethod
     def _about(folder: Path) -> Any:

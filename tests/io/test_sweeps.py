@@ -142,18 +142,22 @@ def test_what_is_listed_survives_its_file(runs):
     assert json.loads(said.to_json())["sessions"] == {"0 0": "0"}
 
 
-def test_notes_that_a_kill_left_in_finished_runs_are_removed_by_a_repeat(
+def test_a_sweep_that_was_killed_when_its_folder_was_renamed_is_finished(
     warm, runs, whole, tmp_path, monkeypatch
 ):
     out = tmp_path / "runs"
     with monkeypatch.context() as killed:
-        killed.setattr(sweeps._Parts, "_tidy", lambda self: self.out.exists() and chunk_work.refuse(1))
+        killed.setattr(sweeps._Parts, "_tidy", lambda self: chunk_work.refuse(1))
         with pytest.raises(InputError):
             save_runs(runs, out, jobs=2)
     assert {file.name for file in out.iterdir()} > {"sweep.json", "part-00000.json", "runs.csv"}
+    (out / "part-00000.json").unlink()
+    with pytest.raises(InputError, match="exists already"):
+        save_runs(runs, out, shard=(0, 2))
+    save_runs(runs, out, jobs=2)
+    assert files_in(out) == files_in(whole[0])
     with pytest.raises(InputError, match="exists already"):
         save_runs(runs, out, jobs=2)
-    assert files_in(out) == files_in(whole[0])
 
 
 def test_an_interrupted_command_is_continued(lab_scene, tmp_path):
