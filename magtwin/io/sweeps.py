@@ -208,7 +208,7 @@ class _Parts:
         self.about = {"magtwin": __version__, "sweep": runs.identity, "runs": len(runs)}
 
     def take_back(self) -> None:
-        """Take up a sweep whose process was killed after the folder was renamed, before its notes were gone."""
+        """Take up a sweep whose process was killed between the folder's new name and the end of its notes."""
         if self._about(self.out) == self.about and not self.folder.exists():
             self.out.rename(self.folder)
 
