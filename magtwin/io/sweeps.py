@@ -208,7 +208,7 @@ class _Parts:
         self.about = {"magtwin": __version__, "sweep": runs.identity, "runs": len(runs)}
 
     def take_back(self) -> None:
-        """Take up a sweep whose process was killed between the folder's new name and the end of its notes."""
+        """Take up a sweep whose process was killed after it renamed the folder."""
         if self._about(self.out) == self.about and not self.folder.exists():
             self.out.rename(self.folder)
 
@@ -251,10 +251,11 @@ class _Parts:
 
     def _begin(self) -> None:
         """Make the folder, or check that it is of this sweep."""
-        if self.folder.exists():
-            if self._about(self.folder) == self.about:
-                return
-            if any(self.folder.iterdir()) and not self.force:
+        if self._about(self.folder) == self.about:
+            return
+        check_free(self.folder / ABOUT, force=True)  # removes what a process left that was killed here
+        if self.folder.exists() and any(not file.name.startswith(".") for file in self.folder.iterdir()):
+            if not self.force:
                 text = "unfinished runs of another sweep; give `force=True` to replace them, or another name"
                 raise InputError(f"{self.folder}: {text}", parameter="force")
             shutil.rmtree(self.folder)

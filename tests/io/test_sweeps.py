@@ -160,6 +160,14 @@ def test_a_sweep_that_was_killed_when_its_folder_was_renamed_is_finished(
         save_runs(runs, out, jobs=2)
 
 
+def test_a_sweep_that_was_killed_when_it_began_begins_again(warm, runs, whole, tmp_path):
+    left = tmp_path / "runs.parts" / ".sweep.json.magtwin-abcdefgh"
+    left.mkdir(parents=True)
+    (left / "sweep.json").write_text("{")
+    save_runs(runs, tmp_path / "runs", jobs=2)
+    assert files_in(tmp_path / "runs") == files_in(whole[0])
+
+
 def test_an_interrupted_command_is_continued(lab_scene, tmp_path):
     out, parts = tmp_path / "runs", tmp_path / "runs.parts"
     options = ["--count", "30", "--duration-s", "2", "--magnetometer", "physical", "--quiet"]
