@@ -14,6 +14,7 @@ from magtwin.frames import IDENTITY_XYZW, canonical
 from magtwin.spec.base import ZERO3, Quat, Vec3
 from magtwin.usd.attributes import read_axis
 from magtwin.usd.layers import open_stage, translates
+from magtwin.usd.schema import place
 from magtwin.usd.solids import Solid, solid_of
 
 GREY = (0.5, 0.5, 0.5, 1.0)
@@ -21,6 +22,9 @@ GREY = (0.5, 0.5, 0.5, 1.0)
 
 SHOWN = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
 """USD purposes that a viewer shows."""
+
+FARTHEST_M = 1e9
+"""Farthest that a vertex of a face may lie from the origin [m]."""
 
 BASE_LINK = "base_link"
 """Name of the link whose frame is the robot's, as in REP-105."""
@@ -161,7 +165,7 @@ def read_vertices(
         used = np.zeros(len(solid.points), bool)
         used[solid.corners] = True
         if used.any():
-            found[gprim.GetPath()] = name, _placed(solid, to_frame)[used].astype(np.float32)
+            found[gprim.GetPath()] = name, _placed(gprim, solid, to_frame)[used].astype(np.float32)
     return found
 
 
@@ -180,7 +184,7 @@ def read_triangles(
     """
     found = {}
     for gprim, solid, to_frame, _ in _shown(stage, purposes, wanted):
-        points = _placed(solid, to_frame).astype(np.float32)
+        points = _placed(gprim, solid, to_frame).astype(np.float32)
         found[gprim.GetPath()] = points[solid.corners[solid.triangles]].astype(float)
     return found
 
@@ -324,7 +328,7 @@ def _pose(matrix: Gf.Matrix4d) -> tuple[Vec3, Quat]:
 def _shapes(gprim: UsdGeom.Gprim, solid: Solid, to_frame: NDArray, link: str) -> list[Shape]:
     """The shapes of one gprim: one, plus one for each subset with its own material."""
     prim = gprim.GetPrim()
-    points = _placed(solid, to_frame)
+    points = _placed(gprim, solid, to_frame)
     mirrored = np.linalg.det(to_frame[:3, :3]) < 0
     parts = [(prim, np.ones(len(solid.origin), bool))]
     for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
@@ -359,9 +363,17 @@ def _shapes(gprim: UsdGeom.Gprim, solid: Solid, to_frame: NDArray, link: str) ->
     return shapes
 
 
-def _placed(solid: Solid, to_frame: NDArray) -> NDArray[np.float64]:
+def _placed(gprim: UsdGeom.Gprim, solid: Solid, to_frame: NDArray) -> NDArray[np.float64]:
     """Points of a solid, transformed by a matrix for row vectors (4, 4), shape (V, 3)."""
-    return np.column_stack([solid.points, np.ones(len(solid.points))]) @ to_frame[:, :3]
+    points = np.column_stack([solid.points, np.ones(len(solid.points))]) @ to_frame[:, :3]
+    far = ~(np.abs(points).max(axis=1, initial=0) <= FARTHEST_M)
+    if far.any() and far[solid.corners].any():
+        first = points[solid.corners[far[solid.corners]][0]]
+        raise InputError(
+            f"{place(gprim.GetPrim())}: a vertex is at ({', '.join(f'{x:.4g}' for x in first)}) m, which "
+            f"is not finite or over {FARTHEST_M:.0e} m away; correct the shape or its transform"
+        )
+    return points
 
 
 def _material_colour(prim: Usd.Prim) -> tuple[float, float, float, float] | None:

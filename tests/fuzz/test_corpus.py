@@ -10,6 +10,20 @@ from magtwin.errors import InputError
 
 CORPUS = Path(__file__).with_name("corpus")
 
+OTHERS = {
+    **{kind: (kind,) for kind in ("dataset", "glb", "npz", "ply", "usdz", "xacro")},
+    "usda.glb": ("usda", "robot"),
+    "usda.info": ("usda", "robot"),
+    "usda.magnetics": ("scene-magnetics", "usda"),
+    "usda.robot": ("robot", "usda"),
+    "usda.scene": ("scene", "usda"),
+    "usda.tourdf": ("robot", "usda"),
+    "usda.validate": ("scene", "usda"),
+    "usdc.map": ("map", "usdc"),
+    "usdc.robot": ("usdc",),
+}
+"""Formats as which others' files are read, by the first part of their names."""
+
 
 @cache
 def beside(kind: str, folder: Path) -> Seed:
@@ -21,19 +35,35 @@ def home(tmp_path_factory):
     return tmp_path_factory.mktemp("seeds")
 
 
+def refusal(kind, data, home, folder):
+    """What is said of a file of a format; "" if it is read."""
+    try:
+        read(kind, data, beside(kind, home).beside, folder)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
 @pytest.mark.filterwarnings("default")  # of numbers that overflow
 @pytest.mark.parametrize(
     "file", sorted(CORPUS.glob("*/*")), ids=lambda file: f"{file.parent.name}-{file.name}"
 )
 def test_an_input_that_was_a_fault_is_read_or_refused_in_one_line(file, home, tmp_path):
-    kind = file.parent.name
-    refusal = ""
-    try:
-        read(kind, file.read_bytes(), beside(kind, home).beside, tmp_path / "x")
-    except InputError as error:
-        refusal = str(error)
-    assert "\n" not in refusal
-    assert len(refusal) < 2000
+    said = refusal(file.parent.name, file.read_bytes(), home, tmp_path / "x")
+    assert "\n" not in said
+    assert len(said) < 2000
+
+
+@pytest.mark.filterwarnings("default")
+def test_faults_that_others_found_are_read_or_refused_in_one_line(real_data, home, tmp_path):
+    files = sorted((real_data / "fuzz").iterdir())
+    assert len(files) == 26
+    for number, file in enumerate(files):
+        name = file.name.partition("-")[0]
+        for kind in OTHERS[name]:
+            said = refusal(kind, file.read_bytes(), home, tmp_path / f"{number}{kind}")
+            assert "\n" not in said
+            assert len(said) < 2000
 
 
 def test_every_kind_of_file_that_is_read_is_fuzzed():

@@ -250,10 +250,13 @@ def read_transform(prim: Usd.Prim, *, local: bool = False) -> Transform:
     cache = UsdGeom.XformCache()
     plain = local or cache.GetParentToWorldTransform(prim) == Gf.Matrix4d(1)
     if plain and [op.GetOpName().removeprefix("xformOp:") for op in ops] in (*POSED, []):
-        values = {op.GetOpName(): op.Get() for op in ops}
+        values = {op.GetOpName(): value for op in ops if (value := op.Get()) is not None}
         turn = values.get("xformOp:orient", Gf.Quatd(1))
         turn = turn if isinstance(turn, Gf.Quatd) else Gf.Quatd(turn).GetNormalized()
-        p, scale = (values.get(f"xformOp:{n}", Gf.Vec3d(d)) for n, d in (("translate", 0), ("scale", 1)))
+        p, scale = (
+            Gf.Vec3d(values.get(f"xformOp:{name}", Gf.Vec3d(default)))
+            for name, default in (("translate", 0), ("scale", 1))
+        )
         if min(scale) > 0:
             return _vec3(p), _quat(turn), _vec3(scale)
     matrix = xformable.GetLocalTransformation() if local else cache.GetLocalToWorldTransform(prim)
