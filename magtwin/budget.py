@@ -31,7 +31,7 @@ class Budget:
 
     count: int = 10_000_000
     """Most entries: elements of XML, arrays of npz, columns of tables, files of a package, pixels of an
-    image."""
+    image, prims of a stage."""
 
     seconds: float = 20.0
     """Time limit of formats that are decoded in a process of their own, plus 1 s per megabyte."""
@@ -59,7 +59,7 @@ BUDGETS: dict[str, Budget] = {
     "checkpoint": Budget(file=1 * GB, count=10_000),
     "ONNX": Budget(file=256 * MB, count=10_000),
     "USD text": Budget(file=1 * GB, depth=128),
-    "USD": Budget(seconds=60.0),
+    "USD": Budget(seconds=60.0, count=1_000_000),  # prims, with those of instances
     "package": Budget(file=4 * GB, count=100_000),  # usdz, which has no larger ones
 }
 """Limits by format."""

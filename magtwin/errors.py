@@ -54,7 +54,10 @@ class InputError(ValueError):
             if name not in flags:
                 return match.group()
             if arguments is not None:
-                texts = ast.literal_eval(f"({arguments},)")
+                try:
+                    texts = ast.literal_eval(f"({arguments},)")
+                except (ValueError, SyntaxError):
+                    return match.group()  # text of a file, that looks like a call
                 return " ".join(f"{flags[name]} {shlex.quote(text)}" for text in texts)
             value = (value or "").strip("\"'")
             return f"{flags[name]} {value}" if value not in ("", "True") else flags[name]

@@ -12,11 +12,12 @@ import subprocess
 import tomllib
 import types
 import typing
+import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from magtwin.budget import BUDGETS, check_depth, check_size
+from magtwin.budget import BUDGETS, check_count, check_decoded, check_depth, check_size
 from magtwin.errors import InputError, hint
 
 T = TypeVar("T")
@@ -122,6 +123,29 @@ def sha256(path: str | os.PathLike[str]) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def check_zip(path: Path, archive: zipfile.ZipFile, kind: str, noun: str) -> None:
+    """Refuse a zip file that would become too large in memory.
+
+    Args:
+        path: The file.
+        archive: The file, opened.
+        kind: Format in `magtwin.budget.BUDGETS`.
+        noun: Its entries, for error messages.
+
+    Raises:
+        InputError: It has too many entries, decompresses to too much, or is compressed other than by deflate,
+            which alone needs no more memory than its budget.
+    """
+    entries = archive.infolist()
+    check_count(path, kind, len(entries), noun)
+    check_decoded(path, path.stat().st_size, sum(entry.file_size for entry in entries))
+    for entry in entries:
+        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise InputError(
+                f"{path}: compressed by method {entry.compress_type} of zip; use deflate, or none"
+            )
+
+
 def git_revision(folder: str | os.PathLike[str]) -> str:
     """The commit of the Git checkout that contains a folder, or "" if there is none, or no git."""
     command = [
@@ -194,9 +218,12 @@ def yaml_loader() -> type:
 
 
 _TOML_WORDS = re.compile(
-    r'"""(?:[^"\\]|\\.|"(?!""))*+"""|\'\'\'.*?\'\'\'|"(?:[^"\\\n]|\\.)*+"|\'[^\'\n]*\'|#[^\n]*', re.DOTALL
+    r'''"""(?:[^"\\]|\\.|"(?!""))*+"{0,5}|"(?:[^"\\\n]|\\.)*+"?'''
+    r"""|'''(?:[^']|'(?!''))*+'{0,5}|'[^'\n]*+'?|#[^\n]*""",
+    re.DOTALL,
 )
-"""Texts and comments of a TOML file."""
+"""Texts and comments of a TOML file. A text without an end, which tomllib refuses, goes as far as it can: to
+search for the end of each takes time with the square of the file."""
 
 _TOML_KEY, _TOML_BRACKET = re.compile(r"[\w. \t-]+"), re.compile(r"[][{}]")
 
@@ -256,6 +283,10 @@ def refused_at(
     return _Where(Path(path), section, number).refused(key, text)
 
 
+_Place = tuple[tuple[str, int], ...]
+"""Names and indices of the tables from the top to one."""
+
+
 @dataclasses.dataclass(frozen=True)
 class _Where:
     """A table of a TOML file, for errors that name the line."""
@@ -284,8 +315,8 @@ class _Where:
             lines = self.path.read_text(encoding="utf-8").splitlines()
         except OSError:
             return None
-        here, counts, header = self._place(), dict[str, int](), 0
-        place: tuple[tuple[str, int], ...] = ()
+        here, counts, header = self._place(), dict[_Place, int](), 0
+        place: _Place = ()
         for number, line in enumerate(lines, 1):
             text = line.strip()
             if text.startswith("["):
@@ -311,14 +342,16 @@ class _Where:
         return (*above, (self.section.rpartition(".")[2], self.number)) if self.section else ()
 
 
-def _counted(counts: dict[str, int], name: str, array: bool) -> tuple[tuple[str, int], ...]:
+def _counted(counts: dict[_Place, int], name: str, array: bool) -> _Place:
     """Names and indices of the tables that a header begins; `counts` has those of the headers before."""
+    *above, last = name.split(".", BUDGETS["TOML"].depth)
+    place: _Place = ()
+    for word in above:
+        place = (*place, (word, counts.get((*place, (word, 0)), 0)))
+    first = (*place, (last, 0))
     if array:
-        counts[name] = counts.get(name, -1) + 1
-        for below in [other for other in counts if other.startswith(f"{name}.")]:
-            del counts[below]
-    words = name.split(".")
-    return tuple((word, counts.get(".".join(words[: k + 1]), 0)) for k, word in enumerate(words))
+        counts[first] = counts.get(first, -1) + 1
+    return (*place, (last, counts.get(first, 0)))
 
 
 def _matches(place: Sequence[tuple[str, int]], wanted: Sequence[tuple[str, int | None]]) -> bool:
@@ -330,24 +363,27 @@ def _matches(place: Sequence[tuple[str, int]], wanted: Sequence[tuple[str, int |
 
 def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
     """`value` checked and converted to the annotation `kind`."""
-    wrong = where.refused(key, f"{key} must be {_in_words(kind)}, got {value!r}")
+
+    def wrong() -> InputError:
+        return where.refused(key, f"{key} must be {_in_words(kind)}, got {value!r}")
+
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         return _value(next(a for a in args if a is not type(None)), value, where, key)
     if dataclasses.is_dataclass(kind):
         if not isinstance(value, dict):
-            raise wrong
+            raise wrong()
         return _from_table(kind, value, where.inside(key))  # type: ignore[arg-type]
     if origin is tuple:
         if not isinstance(value, list):
-            raise wrong
+            raise wrong()
         if len(args) == 2 and args[1] is Ellipsis:
             args = (args[0],) * len(value)
         if len(args) != len(value):
-            raise wrong
+            raise wrong()
         if any(dataclasses.is_dataclass(a) for a in args):
             if not all(isinstance(v, dict) for v in value):
-                raise wrong
+                raise wrong()
             return tuple(
                 _from_table(a, v, where.inside(key, k))
                 for k, (a, v) in enumerate(zip(args, value, strict=True))
@@ -359,17 +395,17 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
         return value
     if origin in (dict, Mapping):
         if not isinstance(value, dict):
-            raise wrong
+            raise wrong()
         return {name: _value(args[1], entry, where.inside(key), name) for name, entry in value.items()}
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         if not abs(value) < 1e300:  # nan, inf, and too large integers
-            raise wrong
+            raise wrong()
         return float(value)
     if kind is Path and isinstance(value, str):
         return (where.path.parent / value).resolve()
     if kind is Any or (kind in (str, int, bool) and type(value) is kind):
         return value
-    raise wrong
+    raise wrong()
 
 
 def _in_words(kind: Any) -> str:

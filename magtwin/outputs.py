@@ -12,6 +12,7 @@ import json
 import os
 import shutil
 import signal
+import stat
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
@@ -39,6 +40,16 @@ the renames of a transaction that is complete, and the same while they are writt
 
 _AT_FDCWD, _EXCHANGE = -100, 2
 """Arguments of renameat2(2): paths are relative to the working folder; the two files change places."""
+
+_LARGEST_NOTE = 1 << 24
+"""Most bytes of such a file."""
+
+_WRITTEN = frozenset(
+    " .csv .db3 .html .json .mcap .md .npz .parquet .rrd .safetensors .sdf .svg .toml .tum .urdf .usd .usda .usdc"
+    " .usdz .world .xml .yaml .bmp .exr .gif .hdr .jpeg .jpg .pgm .png .tga .tif .tiff .webp .bin .dae .glb .gltf"
+    " .mtl .obj .ply .stl".split(" ")
+)
+"""Suffixes of files that magtwin writes or copies into folders; "" for a licence."""
 
 _PROBE = 1 << 16
 """Bytes that are written to see whether a disk is full."""
@@ -101,6 +112,7 @@ def output(path: str | os.PathLike[str], *, force: bool = False, at_once: bool =
         if place.exists() and place.is_dir() != aside.new.is_dir():
             kind = "folder" if place.is_dir() else "file"
             raise InputError(f"{path}: is a {kind}, and the output is not; remove it first")
+        _check_replaceable(path, aside.new)
         if not inner:
             _sync(aside.new)
         others = _pending.get()
@@ -121,6 +133,24 @@ def output(path: str | os.PathLike[str], *, force: bool = False, at_once: bool =
     finally:
         if not waits:
             aside.remove()
+
+
+def _check_replaceable(folder: Path, new: Path) -> None:
+    """Refuse to replace a folder with files of the user: of a kind that magtwin writes into no folder.
+
+    Raises:
+        InputError: A file has another suffix, and the new folder has none of its name.
+    """
+    if not folder.is_dir():
+        return
+    same = {file.name for file in new.iterdir()}
+    for file in folder.rglob("*"):
+        part = file.relative_to(folder)
+        if part.parts[0] not in same and file.suffix.lower() not in _WRITTEN and not file.is_dir():
+            raise InputError(
+                f"{folder}: holds {part}, which would be removed with it; move it away, remove the folder, or "
+                "give another name"
+            )
 
 
 @contextmanager
@@ -322,10 +352,10 @@ def _recover(folder: Path) -> None:
         names = {entry.name for entry in os.scandir(folder)}
         head = folder
         if _FIRST in names:
-            head = Path((folder / _FIRST).read_text(encoding="utf-8"))
+            head = Path(_note(folder / _FIRST))
         if (head / _COMMIT).is_file():  # a transaction that was complete: rename the rest of it
-            with suppress(ValueError, TypeError):  # not a list that magtwin wrote
-                for place, aside, number in json.loads((head / _COMMIT).read_text(encoding="utf-8")):
+            with suppress(ValueError, TypeError, RecursionError):  # not a list that magtwin wrote
+                for place, aside, number in json.loads(_note(head / _COMMIT)):
                     _Aside(Path(place), Path(aside)).complete(number)
         elif len(left := names - {_OLD, _FIRST, _LIST}) == 1:  # perhaps killed between two renames
             own = _Aside(folder.with_name(left.pop()), folder)
@@ -334,6 +364,20 @@ def _recover(folder: Path) -> None:
         shutil.rmtree(folder, ignore_errors=True)
     finally:
         os.close(lock)
+
+
+def _note(file: Path) -> str:
+    """The text of a small file in a hidden folder. The folder can come from a stranger.
+
+    Raises:
+        OSError, ValueError: It is no regular file of UTF-8, or a large one.
+    """
+    number = os.open(file, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    with open(number, encoding="utf-8") as text:
+        about = os.fstat(number)
+        if not stat.S_ISREG(about.st_mode) or about.st_size > _LARGEST_NOTE:
+            raise ValueError(f"{file}: no note of magtwin")
+        return text.read()
 
 
 def _locked(folder: Path) -> int:

@@ -30,6 +30,9 @@ from typing import Any  # noqa: E402
 
 def main() -> None:
     """Run the `magtwin` command of the command line."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by the shell, as by `>&-`
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     from magtwin.cli import main as run
 
     if _ignored:

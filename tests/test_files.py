@@ -8,7 +8,7 @@ from typing import Literal
 import pytest
 
 from magtwin.errors import InputError
-from magtwin.files import existing, from_table, read_toml, sha256, shipped
+from magtwin.files import existing, from_table, read_toml, refused_at, sha256, shipped
 from magtwin.outputs import check_free, output
 
 
@@ -143,3 +143,31 @@ def test_shipped_files_are_found_and_missing_ones_refused():
 
 def test_existing_gives_the_path_back(tmp_path):
     assert existing(tmp_path, "folder") == tmp_path
+
+
+@pytest.mark.parametrize(
+    "text", ['"""' * 30_001, "x = '''a" + "\\n''''" * 30_000, 'x = "' + '\\\\"' * 60_000]
+)
+def test_texts_of_toml_without_an_end_are_refused(text, tmp_path):
+    with pytest.raises(InputError, match="not TOML"):
+        read_cart(tmp_path, text)
+
+
+@pytest.mark.parametrize("quote", ['"', "'"])
+def test_levels_after_a_text_that_ends_in_a_quote_are_counted(quote, tmp_path):
+    text = f"x = [{3 * quote}a{4 * quote}, {'[' * 40}{']' * 40}, {2 * quote}]"
+    with pytest.raises(InputError, match="nests deeper than 16 levels"):
+        read_cart(tmp_path, text)
+
+
+def test_a_table_that_is_right_makes_no_refusals(tmp_path, monkeypatch):
+    monkeypatch.delattr("magtwin.files._Where.refused")
+    cart = read_cart(tmp_path, 'name = "a"\nlaps = 2\n' + "[[wheels]]\nradius_m = 0.1\n" * 50)
+    assert len(cart.wheels) == 50
+
+
+def test_the_line_of_a_key_is_found_among_arrays_of_arrays(tmp_path):
+    text = "[[a]]\n[[a.b]]\n[[a.b]]\n[[a]]\n[[a.b]]\nkey = 1\n['" + "." * 1000 + "']\n"
+    (tmp_path / "a.toml").write_text(text)
+    refusal = refused_at(tmp_path / "a.toml", "key", "wrong", section="a.b", number=0)
+    assert str(refusal) == f"{tmp_path / 'a.toml'}:6: [a.b] wrong"

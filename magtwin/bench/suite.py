@@ -21,6 +21,15 @@ from magtwin.twin import scene_file
 HELD_OUT = 1_000_000_000
 """Added to the seed of the suite for the held-out seeds."""
 
+SEEDS = 2**63
+"""Seeds are below this, also the held-out ones."""
+
+RUNS = 1_000_000
+"""Most runs of all scenarios of a suite together."""
+
+TABLES = 1000
+"""Most scenarios, and most localizers, of a suite."""
+
 SUITES = Path(__file__).parent / "suites"
 """Suites that ship with magtwin, NAME.toml."""
 
@@ -218,10 +227,16 @@ class Suite:
             names = [item.name for item in items]
             if not names and kind == "scenario":
                 raise InputError("a suite needs at least one [[scenario]]")
+            if len(names) > TABLES:
+                raise InputError(f"over {TABLES:,} of [[{kind}]]; split the suite")
             if twice := [name for name in names if names.count(name) > 1]:
                 raise InputError(f"two of [[{kind}]] are called {twice[0]!r}; give one another name")
         if self.seed < 0 or self.chunk < 1 or not self.time_limit_s > 0:
             raise InputError("seed must not be negative; chunk and time_limit_s must be above 0")
+        if (runs := sum(s.runs for s in self.scenario)) > RUNS:
+            raise InputError(f"scenario: {runs:,} runs together; at most {RUNS:,}")
+        if self.seed + HELD_OUT + runs >= SEEDS:
+            raise InputError(f"seed must be at most {SEEDS - HELD_OUT - RUNS:,}, got {self.seed}")
         known = {s.name: s for s in self.scenario}
         for entry in self.localizer:
             for name in entry.scenarios:

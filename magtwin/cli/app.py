@@ -213,17 +213,14 @@ def _help_options(arguments: list[str]) -> dict[str, Any]:
 
 @contextmanager
 def _warnings_in_lines() -> Iterator[None]:
-    """Print each warning of magtwin's own once, as a line on stderr; other warnings as usual."""
+    """Print each warning once, as a line on stderr."""
     printed: set[str] = set()
     with warnings.catch_warnings():
         for own in (MismatchWarning, CalibrationWarning):
             warnings.simplefilter("always", own)
-        show = warnings.showwarning
 
-        def line(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
-            if not issubclass(category, MismatchWarning | CalibrationWarning):
-                show(message, category, *where, **more)
-            elif str(message) not in printed:
+        def line(message: Warning | str, *_: Any, **__: Any) -> None:
+            if str(message) not in printed:
                 printed.add(str(message))
                 print_error(f"warning: {InputError(str(message)).in_flags(_flags())}", style="1;33")
 

@@ -200,7 +200,9 @@ def _copy_layer(file: Path, layer: Sdf.Layer, folder: Path, places: Mapping[Path
 
 def _udim(pattern: Path, places: Mapping[Path, Path]) -> Path | None:
     """The new place of a texture's tiles, as a pattern."""
-    begin, end = pattern.name.split("<UDIM>")
+    begin, mark, end = pattern.name.partition("<UDIM>")
+    if not mark:  # it is in a folder's name
+        return None
     for file, place in places.items():
         if file.parent == pattern.parent and file.name.startswith(begin) and file.name.endswith(end):
             return place.with_name(pattern.name)

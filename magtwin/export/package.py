@@ -286,8 +286,9 @@ class _Work:
                 self.licences[self._relative(file)] = licence_of(file) or UNKNOWN
         for layer in stage.GetUsedLayers():
             metadata = layer.customLayerData.get("SimReady_Metadata", {})
-            if layer.realPath and metadata.get("asset_license"):
-                self.licences[self._relative(Path(layer.realPath))] = metadata["asset_license"]
+            licence = metadata.get("asset_license") if isinstance(metadata, dict) else None
+            if layer.realPath and isinstance(licence, str) and licence:
+                self.licences[self._relative(Path(layer.realPath))] = licence
         self.licences = dict(sorted(self.licences.items()))
         is_scene = all(prims_with(world, noun) for noun in ("lab", "robot", "magnetometer"))
         self.scene = read_scene(self.root) if is_scene else None

@@ -214,15 +214,18 @@ def _draw(
     if scale is not None and any(s.prim == scale.prim for s in shapes):
         camera = camera or Camera(elevation_deg=LAB_ELEVATION_DEG)
         around = room_above(np.vstack([v for v, chosen in zip(worlds, subject, strict=True) if chosen]))
-    camera, screens = camera or Camera(), []
+    camera = camera or Camera()
+    bodies: dict[tuple[bool, bool, float], list[Any]] = {}
+    actors = []
     for shape, vertices, chosen in zip(shapes, worlds, subject, strict=True):
         if shape.texture is not None:
-            actor = add_textured(plotter, shape, vertices)
+            actors.append((add_textured(plotter, shape, vertices), chosen))
         else:
-            flat = shape.vertex_colours is not None
-            actor = plotter.add_mesh(mesh_of(shape, vertices), opacity=shape.colour[3], **style_of(flat))
-        if not chosen and any(subject):
-            screens.append(actor)
+            look = (chosen, shape.vertex_colours is not None, shape.colour[3])
+            bodies.setdefault(look, []).append(mesh_of(shape, vertices))
+    for (chosen, flat, opacity), meshes in bodies.items():
+        actors.append((plotter.add_mesh(joined(meshes), opacity=opacity, **style_of(flat)), chosen))
+    screens = [actor for actor, chosen in actors if not chosen] if any(subject) else []
     if ground is None:
         ground = camera.elevation_deg > 0 and all(s.link for s in shapes)
     if ground:  # just below everything, in the colour of the background: only shadows on it are visible
@@ -355,6 +358,11 @@ def mesh_of(shape: Shape, vertices: NDArray) -> Any:
     return mesh
 
 
+def joined(meshes: Sequence[Any]) -> Any:
+    """Meshes of `mesh_of` as one, which is drawn far faster."""
+    return meshes[0] if len(meshes) == 1 else meshes[0].append_polydata(*meshes[1:])
+
+
 def add_textured(plotter: Any, shape: Shape, vertices: NDArray) -> Any:
     """Draw a shape with its texture; returns its actor."""
     import pyvista
@@ -440,7 +448,10 @@ def add_text(plotter: Any, text: str, letters: int) -> Any:
 def add_bar(plotter: Any, colour_map: str, least: float, greatest: float, unit: str) -> None:
     """A colour bar; a map in nT gets one in µT."""
     import pyvista
+    from matplotlib import colormaps
 
+    if colour_map not in colormaps:
+        raise InputError(f"the heat map's colourMap {colour_map!r} is none of matplotlib; correct the stage")
     unit, factor = ("µT", 1e-3) if unit == "nT" else (unit, 1.0)
     table = pyvista.LookupTable(colour_map, scalar_range=(least * factor, greatest * factor))
     points = pyvista.PolyData(np.zeros((2, 3)))

@@ -26,6 +26,7 @@ from magtwin.figures.pictures import (
     check_size,
     is_subject,
     light,
+    joined,
     mesh_of,
     plotter_of,
     room_above,
@@ -291,7 +292,7 @@ class Scenery:
             bodies.setdefault((is_subject(shape, scale), flat, shape.colour[3]), []).append(mesh)
         self._screens = []
         for (subject, flat, opacity), meshes in bodies.items():
-            actor = self.plotter.add_mesh(_joined(meshes), opacity=opacity, **style_of(flat))
+            actor = self.plotter.add_mesh(joined(meshes), opacity=opacity, **style_of(flat))
             if not subject:
                 self._screens.append(actor)
         self._actors: dict[str, Any] = {}
@@ -300,7 +301,7 @@ class Scenery:
             meshes = [mesh_of(s, s.vertices) for s in carried if s.link == name and s.vertex_colours is None]
             if not meshes:
                 continue
-            self._actors[name] = self.plotter.add_mesh(_joined(meshes), **style_of(False))
+            self._actors[name] = self.plotter.add_mesh(joined(meshes), **style_of(False))
             self._links[name] = link
         self._everything = np.vstack([*placed, self._p]).astype(float)
         boxes = np.array([(v.min(axis=0), v.max(axis=0)) for v in placed]).reshape(-1, 2, 3)
@@ -460,10 +461,6 @@ def _placed(shape: Shape, link: Link) -> Array:
     """Vertices of a body that stands still, in world [m]."""
     T = _matrix(link.p_world_link, link.q_world_link_xyzw)
     return shape.vertices @ T[:3, :3].T + T[:3, 3]
-
-
-def _joined(meshes: Sequence[Any]) -> Any:
-    return meshes[0] if len(meshes) == 1 else meshes[0].append_polydata(*meshes[1:])
 
 
 def _matrix(p: ArrayLike, q_xyzw: ArrayLike) -> Array:

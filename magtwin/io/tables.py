@@ -12,6 +12,7 @@ import shutil
 import struct
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from tokenize import TokenError
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 
 from magtwin.budget import check_count, check_decoded, check_size, decoded_limit
 from magtwin.errors import InputError, find
-from magtwin.files import existing
+from magtwin.files import check_zip, existing
 from magtwin.io.recorder import Sink
 from magtwin.outputs import check_free, output
 from magtwin.run import mapped
@@ -174,7 +175,10 @@ def load_parquet(path: Path, load: Callable[[Path], Any] = pq.read_table) -> Any
         raise InputError(f"{path}: Parquet cut short: its end is missing; write it again, or copy it again")
     try:
         check_parquet(path)
-        return load(path)
+        loaded = load(path)
+        if isinstance(loaded, pa.Table):
+            loaded.validate(full=True)  # texts that are not UTF-8 fail later otherwise
+        return loaded
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         reason = (str(error).splitlines() or [""])[0]
         raise InputError(f"{path}: damaged Parquet ({reason}); write it again") from error
@@ -463,13 +467,12 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
     """
     path = existing(path, "npz file")
     _check_file(path, "an npz file")
-    size = check_size(path, "npz")
+    check_size(path, "npz")
     try:
         with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-            check_count(path, "npz", len(names), "arrays")
-            check_decoded(path, size, sum(entry.file_size for entry in archive.infolist()))
-            if twice := sorted({name for name in names if names.count(name) > 1}):
+            check_zip(path, archive, "npz", "arrays")
+            names = Counter(archive.namelist())
+            if twice := sorted(name for name, count in names.items() if count > 1):
                 raise InputError(f"{path}: two arrays are called {twice[0]!r}; write it again")
             arrays = {name.removesuffix(".npy"): _array(archive, name, path) for name in names}
     except (

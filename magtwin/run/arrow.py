@@ -7,6 +7,8 @@ part can be read alone, and byte-stream-split encoding works. Arrow fields have 
 """
 
 import json
+import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -53,12 +55,14 @@ def run_of(table: pa.Table, path: Path, first: int | None = None) -> Run:
     Raises:
         InputError: It holds no run.
     """
-    if twice := sorted({name for name in table.column_names if table.column_names.count(name) > 1}):
+    if twice := sorted(name for name, count in Counter(table.column_names).items() if count > 1):
         raise InputError(f"{path}: two columns are called {twice[0]!r}; rename one")
+    held = dict(zip(table.column_names, table.columns, strict=True))
+    fields = {field.name: field for field in table.schema}
     columns, specs = {}, {}
     for name, members in _members(table.schema, path).items():
-        parts = [_numpy(table, member, path, first or 0) for member in members]
-        told = [_said(table.schema.field(member), path) for member in members]
+        parts = [_numpy(held[member], member, path, first or 0) for member in members]
+        told = [_said(fields[member], path) for member in members]
         said = told[0]
         vector = COLUMNS[name].width > 1 if name in COLUMNS else "part" in said
         columns[name] = np.column_stack(parts) if vector else parts[0]
@@ -128,6 +132,8 @@ def check_metadata(metadata: Any, where: str = "") -> Metadata:
             raise InputError(
                 f"{where}metadata {key!r} must be a text, a number, or true or false, got {value!r}"
             )
+        if isinstance(value, int) and abs(value) > sys.float_info.max:
+            raise InputError(f"{where}metadata {key!r} is a number beyond 1e308; write it as a text")
     return metadata
 
 
@@ -156,8 +162,7 @@ def _members(schema: pa.Schema, path: Path) -> dict[str, list[str]]:
     return members
 
 
-def _numpy(table: pa.Table, name: str, path: Path, first: int) -> NDArray[Any]:
-    column = table.column(name)
+def _numpy(column: pa.ChunkedArray, name: str, path: Path, first: int) -> NDArray[Any]:
     kind = column.type
     if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind)):
         raise InputError(f"{path}: column {name!r} must hold numbers or flags, got {kind}")

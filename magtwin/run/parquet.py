@@ -1,18 +1,23 @@
 """Parquet: what a file would take in memory, from its metadata."""
 
+import mmap
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from magtwin.budget import check_count, check_decoded, check_size
 from magtwin.errors import InputError
 
-_BATCH = 1000
-"""Rows of texts that are measured at once."""
+_BATCH, _BATCH_BYTES = 1000, 1 << 26
+"""Most rows of texts, and about as many bytes, that are measured at once."""
 
-_ROW_GROUPS, _COLUMNS, _ABOUT, _COUNT = 4, 1, 3, 5
-"""Fields of FileMetaData, RowGroup, ColumnChunk and ColumnMetaData, by parquet.thrift of Apache Parquet."""
+_ROW_GROUPS, _COLUMNS, _ABOUT = 4, 1, 3
+_COUNT, _PACKED, _DATA, _DICTIONARY = 5, 7, 9, 11
+_PAGE, _PACKED_PAGE = 2, 3
+"""Fields of FileMetaData, RowGroup and ColumnChunk; of ColumnMetaData; and of PageHeader, by parquet.thrift
+of Apache Parquet."""
 
 
 def check_parquet(path: Path) -> None:
@@ -26,6 +31,7 @@ def check_parquet(path: Path) -> None:
         about = file.metadata
         check_count(path, "Parquet", about.num_columns, "columns")
         columns = [about.schema.column(i) for i in range(about.num_columns)]
+        largest = _largest_page(path, size)
         lists = [i for i, column in enumerate(columns) if column.max_repetition_level]
         values = 8 * about.num_rows * (len(columns) - len(lists))
         if lists:
@@ -33,9 +39,15 @@ def check_parquet(path: Path) -> None:
             values += 8 * sum(count for group in counts for i, count in enumerate(group) if i in lists)
         check_decoded(path, size, values)
         texts = [column.path for column in columns if column.physical_type.endswith("BYTE_ARRAY")]
-        for batch in file.iter_batches(_BATCH, columns=texts) if texts else ():
-            values += batch.nbytes
+        at_once = max(1, min(_BATCH, _BATCH_BYTES // largest))  # a text of a dictionary can be in every row
+        for batch in file.iter_batches(at_once, columns=texts) if texts else ():
+            values += sum(_nbytes(column) for column in batch.columns)
             check_decoded(path, size, values)
+
+
+def _nbytes(column: pa.Array) -> int:
+    """Bytes of a column, each of its texts whole."""
+    return int((column.dictionary_decode() if pa.types.is_dictionary(column.type) else column).nbytes)
 
 
 def _counts(path: Path) -> list[list[int]]:
@@ -44,6 +56,38 @@ def _counts(path: Path) -> list[list[int]]:
     Raises:
         InputError: The metadata are damaged.
     """
+    return [[column[_COUNT] for column in group] for group in _chunks(path)]
+
+
+def _largest_page(path: Path, size: int) -> int:
+    """Bytes of the largest page of a file of `size` bytes, decompressed.
+
+    Raises:
+        InputError: The pages, decompressed, are over the budget, or the metadata are damaged.
+    """
+    total, largest, packed = 0, 1, 0
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        for column in (column for group in _chunks(path) for column in group):
+            at = min(filter(None, (column[_DATA], column[_DICTIONARY])), default=0)
+            end = at + column[_PACKED]
+            packed += column[_PACKED]
+            if not 0 <= at <= end <= size >= packed:
+                raise _damaged(path)
+            while at < end:
+                try:
+                    page, at = _struct(data, at, 0)
+                    total, largest, step = total + page[_PAGE], max(largest, page[_PAGE]), page[_PACKED_PAGE]
+                except (IndexError, KeyError, TypeError, ValueError) as error:
+                    raise _damaged(path) from error
+                if min(page[_PAGE], step) < 0:
+                    raise _damaged(path)
+                at += step
+            check_decoded(path, size, total)
+    return largest
+
+
+def _chunks(path: Path) -> list[list[dict[int, Any]]]:
+    """Metadata of the parts of the columns, by row group; their numbers are numbers."""
     with path.open("rb") as file:
         file.seek(-8, 2)
         length = int.from_bytes(file.read(4), "little")
@@ -51,12 +95,20 @@ def _counts(path: Path) -> list[list[int]]:
         data = file.read(length)
     try:
         groups = _struct(data, 0, 0)[0].get(_ROW_GROUPS, [])
-        return [[int(column[_ABOUT][_COUNT]) for column in group[_COLUMNS]] for group in groups]
+        chunks = [[column[_ABOUT] for column in group[_COLUMNS]] for group in groups]
+        for column in (column for group in chunks for column in group):
+            column |= {field: int(column[field]) for field in (_COUNT, _PACKED, _DATA)}
+            column[_DICTIONARY] = int(column.get(_DICTIONARY, 0))
+        return chunks
     except (IndexError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: damaged Parquet (its metadata); write it again") from error
+        raise _damaged(path) from error
 
 
-def _struct(data: bytes, at: int, depth: int) -> tuple[dict[int, Any], int]:
+def _damaged(path: Path) -> InputError:
+    return InputError(f"{path}: damaged Parquet (its metadata); write it again")
+
+
+def _struct(data: bytes | mmap.mmap, at: int, depth: int) -> tuple[dict[int, Any], int]:
     """Fields by number of a struct in Thrift's compact protocol, and where it ends."""
     fields: dict[int, Any] = {}
     number = 0
@@ -73,7 +125,7 @@ def _struct(data: bytes, at: int, depth: int) -> tuple[dict[int, Any], int]:
     return fields, at + 1
 
 
-def _value(data: bytes, at: int, kind: int, depth: int) -> tuple[Any, int]:
+def _value(data: bytes | mmap.mmap, at: int, kind: int, depth: int) -> tuple[Any, int]:
     if kind in (1, 2, 3):  # in a list, booleans take a byte
         return data[at], at + 1
     if kind in (4, 5, 6):
@@ -99,13 +151,13 @@ def _value(data: bytes, at: int, kind: int, depth: int) -> tuple[Any, int]:
     return values, at
 
 
-def _integer(data: bytes, at: int) -> tuple[int, int]:
+def _integer(data: bytes | mmap.mmap, at: int) -> tuple[int, int]:
     """A signed number, in zigzag code."""
     value, at = _varint(data, at)
     return (value >> 1) ^ -(value & 1), at
 
 
-def _varint(data: bytes, at: int) -> tuple[int, int]:
+def _varint(data: bytes | mmap.mmap, at: int) -> tuple[int, int]:
     """An unsigned number in groups of 7 bits, the lowest first."""
     value = 0
     for shift in range(0, 70, 7):

@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -23,11 +24,12 @@ from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat
 from magtwin.outputs import check_free, output, transaction
 from magtwin.report import Figure, Report
-from magtwin.urdf.meshes.mesh_layer import MESH, free_name, primitive_of
+from magtwin.urdf.description.model import Geometry
+from magtwin.urdf.meshes.mesh_layer import MESH, PRIMITIVE, free_name, primitive_of
 from magtwin.urdf.physics.joint import AXIS
 from magtwin.urdf.physics.link import SITE_API
 from magtwin.urdf.physics.mechanism import displacement
-from magtwin.usd.attributes import read_axis, read_number
+from magtwin.usd.attributes import read_axis, read_number, target
 from magtwin.usd.geometry import SHOWN, Shape, read_shapes, srgb_from_linear
 from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.schema import place
@@ -52,6 +54,9 @@ KINDS = {
     "PhysicsJoint": "planar",
 }
 
+WORDS = ("name", "type", "link", "joint", "filename")
+"""Attributes of a URDF's tags that are no numbers."""
+
 
 @dataclass
 class _Joint:
@@ -63,6 +68,7 @@ class _Joint:
     child: str
     T: Array
     """Pose of the child in the parent at 0, shape (4, 4)."""
+    prim: Usd.Prim
     axis: Array | None = None
     limit: dict[str, float] = field(default_factory=dict)
     dynamics: dict[str, float] = field(default_factory=dict)
@@ -82,6 +88,7 @@ class _Link:
 
 
 @translates
+@np.errstate(all="ignore")  # what is not finite is refused
 def write_urdf(asset: str | os.PathLike[str], out: str | os.PathLike[str], *, force: bool = False) -> Report:
     """Write the URDF of a stage's robot.
 
@@ -94,8 +101,8 @@ def write_urdf(asset: str | os.PathLike[str], out: str | os.PathLike[str], *, fo
         Counts of what was written, and notes on what was left out.
 
     Raises:
-        InputError: The stage has no robot or several, URDF has no such joint, the joints form a circle, or
-            a file exists; nothing is written.
+        InputError: The stage has no robot or several, URDF has no such joint, the joints form a circle, a
+            value is of another type or not finite, or a file exists; nothing is written.
     """
     out = Path(out)
     if out.suffix != ".urdf":
@@ -139,25 +146,28 @@ class _Writer:
         """Triangles by file name, shape (T, 3, 3)."""
         self.cache = UsdGeom.XformCache()
         self.links: dict[Sdf.Path, _Link] = {}
+        self.joint_names: dict[Sdf.Path, str] = {}
         names: set[str] = set()
         for prim in Usd.PrimRange(robot):
             body = prim.HasAPI(UsdPhysics.RigidBodyAPI)
             if prim != robot and (body or SITE_API in prim.GetPrimTypeInfo().GetAppliedAPISchemas()):
                 name = free_name(_name(prim), names)
                 self.links[prim.GetPath()] = _Link(name, self._pose(prim), prim, body)
+        self.world = free_name(WORLD, names)
 
     def write(self) -> Element:
         """The `<robot>`."""
         joints = self._joints()
         root = _root([link.name for link in self.links.values()], joints, self.robot)
         xml = Element("robot", name=_name(self.robot))
-        if root == WORLD and any(joint.parent == WORLD for joint in joints):
-            Sub(xml, "link", name=WORLD)
+        if root == self.world:
+            Sub(xml, "link", name=root)
         shapes = self._shapes()
         for link in self.links.values():
             element = Sub(xml, "link", name=link.name)
             if link.body:
                 _write_inertial(element, link.prim)
+                _check_finite(element, link.prim)
                 self._write_shapes(element, link, shapes)
         for joint in joints:
             element = Sub(xml, "joint", name=joint.name, type=joint.kind)
@@ -172,6 +182,7 @@ class _Writer:
             if joint.mimic is not None:
                 leader, ratio, offset = joint.mimic
                 Sub(element, "mimic", joint=leader, multiplier=_text([ratio]), offset=_text([offset]))
+            _check_finite(element, joint.prim)
         left = {
             name
             for prim in Usd.PrimRange(self.robot)
@@ -188,26 +199,35 @@ class _Writer:
         matrix, _ = self.cache.ComputeRelativeTransform(prim, self.robot)
         T = np.array(matrix, float).T
         scale = np.linalg.norm(T[:3, :3], axis=0)
-        if not np.allclose(scale, 1, rtol=0, atol=SAME):
-            raise InputError(f"{place(prim)}: is scaled, which a URDF cannot do to links; scale its shapes")
         T[:3, :3] /= scale
+        if not np.allclose([*scale, np.linalg.det(T[:3, :3])], 1, rtol=0, atol=SAME):
+            raise InputError(
+                f"{place(prim)}: is scaled, which a URDF cannot do to links, or mirrored, skewed or not "
+                "finite; change its shapes instead"
+            )
         return T
 
     def _joints(self) -> list[_Joint]:
         """The stage's joints, fixed joints for sites, and floating joints for bodies without a joint."""
         taken = set[str]()
-        joints = [
-            self._joint(prim, free_name(_name(prim), taken))
+        prims = [
+            prim
             for prim in Usd.PrimRange(self.robot)
             if prim.IsA(UsdPhysics.Joint) and UsdPhysics.Joint(prim).GetJointEnabledAttr().Get() is not False
         ]
+        self.joint_names = {prim.GetPath(): free_name(_name(prim), taken) for prim in prims}
+        joints = [self._joint(prim, self.joint_names[prim.GetPath()]) for prim in prims]
+        if circle := _circle({joint.name: joint.mimic[0] for joint in joints if joint.mimic is not None}):
+            raise InputError(f"{place(self.robot)}: joints mimic in a circle: {circle}; remove one mimic")
         held = {joint.child for joint in joints}
         free = [link for link in self.links.values() if link.body and link.name not in held]
         base = free[0] if free else None
 
         def hold(kind: str, parent: _Link, child: _Link, named: _Link) -> None:
             name = free_name(f"{named.name}_joint", taken)
-            joints.append(_Joint(name, kind, parent.name, child.name, _between(parent.T, child.T)))
+            joints.append(
+                _Joint(name, kind, parent.name, child.name, _between(parent.T, child.T), child.prim)
+            )
 
         for link in free[1:]:
             hold("floating", free[0], link, link)
@@ -232,17 +252,14 @@ class _Writer:
         parent, child = (self._end(prim, rel) for rel in (joint.GetBody0Rel(), joint.GetBody1Rel()))
         if child is None:
             raise InputError(f"{place(prim)}: its body1 is not a link of the robot; swap the bodies")
-        frames = [
-            _frame(joint.GetLocalPos0Attr().Get(), joint.GetLocalRot0Attr().Get()),
-            _frame(joint.GetLocalPos1Attr().Get(), joint.GetLocalRot1Attr().Get()),
-        ]
+        frames = [_frame(prim, body) for body in (0, 1)]
         if kind != "fixed" and np.abs(frames[1][:3, 3]).max() > SAME:
             raise InputError(
                 f"{place(prim)}: turns about a point of {child.name!r} that is not its origin; in a URDF it "
                 "must be, so move the body's frame there"
             )
         T = _between(np.eye(4) if parent is None else parent.T, child.T)
-        made = _Joint(name, kind, WORLD if parent is None else parent.name, child.name, T)
+        made = _Joint(name, kind, self.world if parent is None else parent.name, child.name, T, prim)
         if kind == "fixed":
             return made
         token = _token(prim, kind)
@@ -269,15 +286,18 @@ class _Writer:
         """Read limits, dynamics and mimic of a joint of one degree of freedom."""
         slides = joint.kind == "prismatic"
         unit, axis = (1.0, "linear") if slides else (math.pi / 180, "angular")
-        ends = {end: prim.GetAttribute(f"physics:{end}Limit").Get() for end in ("lower", "upper")}
-        if not slides and (None in ends.values() or not np.isfinite([*ends.values()]).all()):
+        ends = {end: _read(prim, f"physics:{end}Limit") for end in ("lower", "upper")}
+        if not {None, math.inf, -math.inf}.isdisjoint(ends.values()):
+            if slides:
+                raise InputError(
+                    f"{place(prim)}: slides without an end, unlike a URDF's joints; give it limits"
+                )
             joint.kind = "continuous"
         else:
             joint.limit = {end: _shortest(value, unit) for end, value in ends.items()}
-        force = prim.GetAttribute(f"drive:{axis}:physics:maxForce").Get()
+        force = _read(prim, f"drive:{axis}:physics:maxForce")
         names = ("newton:velocityLimit", "physxJoint:maxJointVelocity")
-        speeds = (prim.GetAttribute(name).Get() for name in names)
-        speed = next((float(value) for value in speeds if value is not None), None)
+        speed = next((value for name in names if (value := _read(prim, name)) is not None), None)
         for name, value, per in (("effort", force, 1.0), ("velocity", speed, unit)):
             if value is not None and math.isfinite(value):
                 joint.limit[name] = _shortest(value, per)
@@ -287,14 +307,20 @@ class _Writer:
                 f"the stage gives joint {joint.name!r} no {' nor '.join(lost)}, which urdfdom requires"
             )
         for name, per in (("damping", 1 / unit), ("friction", 1.0)):
-            value = prim.GetAttribute(f"newton:{name}").Get()
+            value = _read(prim, f"newton:{name}")
             if value is not None:
                 joint.dynamics[name] = _shortest(value, per)
         leads = prim.GetRelationship("newton:mimicJoint")
         if leads and leads.GetTargets():
-            leader = self.stage.GetPrimAtPath(leads.GetTargets()[0])
-            offset, ratio = (float(prim.GetAttribute(f"newton:mimicCoef{i}").Get() or 0.0) for i in (0, 1))
-            joint.mimic = (_name(leader), _shortest(ratio), _shortest(offset, unit))
+            leader = target(prim, "newton:mimicJoint")
+            name = self.joint_names.get(leader.GetPath(), "")
+            if not name or KINDS.get(leader.GetTypeName()) not in ("revolute", "prismatic"):
+                raise InputError(
+                    f"{place(prim)}: mimics <{leader.GetPath()}>, not a joint of the robot that turns or "
+                    "slides; correct newton:mimicJoint"
+                )
+            offset, ratio = (_read(prim, f"newton:mimicCoef{i}") or 0.0 for i in (0, 1))
+            joint.mimic = (name, _shortest(ratio), _shortest(offset, unit))
 
     def _shapes(self) -> dict[Sdf.Path, list[Shape]]:
         """Visuals and colliders by the path of their gprim; a mesh may have several subsets."""
@@ -324,7 +350,7 @@ class _Writer:
                         write_origin(own, T)
                         Sub(Sub(own, "geometry"), tag, sizes)
                     else:
-                        name = re.sub(r"[^\w.-]", "_", f"{link.name}_{role}_{len(self.meshes)}.stl")
+                        name = re.sub(r"[^\w.-]", "_", f"{link.name[:50]}_{role}_{len(self.meshes)}.stl")
                         self.meshes[name] = shape.vertices[shape.faces].astype(float)
                         Sub(Sub(own, "geometry"), "mesh", filename=f"{self.folder}/{name}")
                     if role == "visual":
@@ -332,9 +358,11 @@ class _Writer:
                         if shape.vertex_colours is not None:
                             colour[:3] = shape.vertex_colours.mean(axis=0)
                             self._note("colours by vertex are replaced by their mean")
-                        rgba = " ".join(f"{v:.4g}" for v in [*srgb_from_linear(colour[:3]), colour[3]])
+                        channels = [*srgb_from_linear(colour[:3]), np.clip(colour[3], 0, 1)]
+                        rgba = " ".join(f"{v:.4g}" for v in channels)
                         material = Sub(own, "material", name=f"rgba_{rgba.replace(' ', '_')}")
                         Sub(material, "color", rgba=rgba)
+                    _check_finite(own, prim)
 
     def _primitive(self, prim: Usd.Prim, link: _Link) -> tuple[Array, str, dict[str, str]] | None:
         """Pose, tag and sizes of a gprim that URDF supports; None if it must become triangles."""
@@ -346,7 +374,7 @@ class _Writer:
         T[:3, :3] /= scale
         if not np.allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), rtol=0, atol=1e-9):
             return None
-        form = primitive_of(prim)
+        form = _form(prim)
         if prim.IsA(UsdGeom.Cube) or (form is not None and form.kind == "box"):
             size = scale * (read_number(prim, "size") if form is None else form.size)
             return T, "box", {"size": _text(_shortest(v) for v in size)}
@@ -380,8 +408,51 @@ def _collides(prim: Usd.Prim) -> bool:
 
 
 def _name(prim: Usd.Prim) -> str:
-    """Name of a prim in the description."""
-    return str(prim.GetDisplayName() or prim.GetName())
+    """Name of a prim in the description: its display name if all of that can be printed, and so be in XML."""
+    shown = str(prim.GetDisplayName())
+    return shown if shown and shown.isprintable() else str(prim.GetName())
+
+
+def _form(prim: Usd.Prim) -> Geometry | None:
+    """The primitive that a mesh shows; None for other meshes."""
+    try:
+        form = primitive_of(prim)
+    except (AttributeError, KeyError, TypeError, ValueError):
+        form = Geometry("damaged")
+    if form and (form.kind not in ("box", "capsule", "cylinder", "sphere") or form.size.shape != (3,)):
+        raise InputError(f"{place(prim)}: its customData {PRIMITIVE} is damaged; remove it")
+    return form
+
+
+def _read(prim: Usd.Prim, name: str, kind: Any = None) -> Any:
+    """A number, or a value as the type `kind`, that may be infinite; None if the prim has none."""
+    value = prim.GetAttribute(name).Get()
+    if value is None:
+        return None
+    value = read_number(prim, name) if kind is None else kind(value)
+    if "nan" in str(value):
+        raise InputError(f"{place(prim)}: {name} is {value}; correct it")
+    return value
+
+
+def _check_finite(element: Element, prim: Usd.Prim) -> None:
+    """Refuse numbers of an element, made of a prim, that are not finite."""
+    for part in element.iter():
+        for name, text in part.items():
+            if name not in WORDS and not {"nan", "inf", "-inf"}.isdisjoint(text.split()):
+                raise InputError(
+                    f'{place(prim)}: becomes <{part.tag} {name}="{text}">, but a URDF holds finite numbers '
+                    "only; correct it on the stage"
+                )
+
+
+def _circle(above: dict[str, str]) -> str:
+    """A circle of names of which each is above the next; "" if there is none."""
+    try:
+        TopologicalSorter({name: [up] for name, up in above.items()}).prepare()
+    except CycleError as error:
+        return " -> ".join(error.args[1])
+    return ""
 
 
 def _root(names: list[str], joints: list[_Joint], robot: Usd.Prim) -> str:
@@ -392,11 +463,13 @@ def _root(names: list[str], joints: list[_Joint], robot: Usd.Prim) -> str:
             text = f"{joint.child!r} is held by two joints, in a circle; a URDF is a tree"
             raise InputError(f"{place(robot)}: {text}")
         above[joint.child] = joint.parent
-    names = [*names, *(WORLD for joint in joints if joint.parent == WORLD)]
+    names = [*names, *(joint.parent for joint in joints)]
     roots = [name for name in dict.fromkeys(names) if name not in above]
     if len(roots) != 1:
         seen = ", ".join(roots) or "none"
         raise InputError(f"{place(robot)}: a URDF has one root link, found {seen}; join them")
+    if circle := _circle(above):
+        raise InputError(f"{place(robot)}: joints hold links in a circle: {circle}; a URDF is a tree")
     return roots[0]
 
 
@@ -413,14 +486,23 @@ def _between(T_above: Array, T_below: Array) -> Array:
     return T
 
 
-def _frame(p: Any, q: Any) -> Array:
-    """A joint's frame in a body, shape (4, 4), its rotation normalised in double precision."""
+def _rotation(q: Gf.Quatd) -> Array:
+    """Rotation by a quaternion, normalised in double precision, shape (3, 3)."""
+    xyzw = np.array([*q.GetImaginary(), q.GetReal()])
+    return matrix_from_quat(xyzw / np.linalg.norm(xyzw))
+
+
+def _frame(prim: Usd.Prim, body: int) -> Array:
+    """A joint's frame in its body 0 or 1, shape (4, 4)."""
+    p, q = _read(prim, f"physics:localPos{body}", Gf.Vec3d), _read(prim, f"physics:localRot{body}", Gf.Quatd)
     T = np.eye(4)
-    T[:3, 3] = [_shortest(v) for v in Gf.Vec3d(p or (0, 0, 0))]
-    if q is not None:
-        q = Gf.Quatd(q)
-        xyzw = np.array([*q.GetImaginary(), q.GetReal()])
-        T[:3, :3] = matrix_from_quat(xyzw / np.linalg.norm(xyzw))
+    T[:3, 3] = [_shortest(v) for v in p or (0, 0, 0)]
+    T[:3, :3] = _rotation(q or Gf.Quatd(1))
+    if not np.isfinite(T).all():
+        raise InputError(
+            f"{place(prim)}: physics:localPos{body} is {p} and physics:localRot{body} {q}, not a frame; "
+            "correct them"
+        )
     return T
 
 
@@ -431,8 +513,8 @@ def _token(prim: Usd.Prim, kind: str) -> str:
     free = {
         axis
         for axis in (f"{motion}{letter}" for motion in ("trans", "rot") for letter in "XYZ")
-        if not (limit := UsdPhysics.LimitAPI(prim, axis))
-        or limit.GetLowAttr().Get() <= limit.GetHighAttr().Get()
+        if not UsdPhysics.LimitAPI(prim, axis)
+        or read_number(prim, f"limit:{axis}:physics:low") <= read_number(prim, f"limit:{axis}:physics:high")
     }
     for token in "XYZ":
         if free == {f"rot{token}", *(f"trans{other}" for other in "XYZ" if other != token)}:
@@ -501,20 +583,19 @@ def write_origin(element: Element, T: Array) -> None:
 
 def _write_inertial(element: Element, prim: Usd.Prim) -> None:
     """Mass, centre and inertia of a body, as far as authored."""
-    api = UsdPhysics.MassAPI(prim)
-    mass = api.GetMassAttr().Get() if prim.HasAPI(UsdPhysics.MassAPI) else None
-    if not mass or not mass > 0:
+    mass = _read(prim, "physics:mass") if prim.HasAPI(UsdPhysics.MassAPI) else None
+    if mass is None or mass <= 0:
         return
-    inertial, centre = Sub(element, "inertial"), api.GetCenterOfMassAttr().Get()
-    if centre is not None and np.isfinite(Gf.Vec3d(centre)).all() and any(centre):
+    inertial, centre = Sub(element, "inertial"), _read(prim, "physics:centerOfMass", Gf.Vec3d)
+    if centre is not None and np.isfinite(centre).all() and any(centre):
         Sub(inertial, "origin", xyz=_text(_shortest(v) for v in centre), rpy="0 0 0")
     Sub(inertial, "mass", value=_text([_shortest(mass)]))
-    moments = np.array([_shortest(v) for v in api.GetDiagonalInertiaAttr().Get() or (0, 0, 0)])
+    moments = np.array([_shortest(v) for v in _read(prim, "physics:diagonalInertia", Gf.Vec3d) or (0, 0, 0)])
     if not moments.any():
         return  # engines compute it from the colliders
-    R, q = np.eye(3), api.GetPrincipalAxesAttr().Get()
-    if q is not None and Gf.Quatd(q).GetLength() > 0.5 and q.GetImaginary().GetLength() > 0:
-        R = _frame(None, q)[:3, :3]
+    R, q = np.eye(3), _read(prim, "physics:principalAxes", Gf.Quatd)
+    if q is not None and q.GetLength() > 0.5 and q.GetImaginary().GetLength() > 0:
+        R = _rotation(q)
     tensor = R @ np.diag(moments) @ R.T
     names = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
     Sub(inertial, "inertia", {name: repr(float(tensor[at]) + 0.0) for name, at in names.items()})

@@ -212,7 +212,7 @@ def read_animation(path: str | os.PathLike[str]) -> Run:
         run = _read(layer, path)
     except InputError:
         raise
-    except (Tf.ErrorException, ValueError, AttributeError, TypeError) as error:
+    except (Tf.ErrorException, ValueError, AttributeError, TypeError, RecursionError) as error:
         raise InputError(f"{path}: holds a damaged run; write it again") from error
     check_clock(run, str(path))
     return run

@@ -206,7 +206,7 @@ def read_links(stage: Usd.Stage | str | os.PathLike[str]) -> dict[str, Link]:
     cache, bodies = UsdGeom.XformCache(), _bodies(stage)
     world = {path: _rigid(cache.GetLocalToWorldTransform(stage.GetPrimAtPath(path))) for path in bodies}
     above = {child: (joint, parent) for joint, parent, child in _joints(stage, bodies)}
-    roots = {path: _root(path, above) for path in bodies}
+    roots = _roots(bodies, above)
     named = {roots[path]: path for path in bodies if path.name == BASE_LINK}
     links = {}
     for path, name in bodies.items():
@@ -230,9 +230,18 @@ def read_links(stage: Usd.Stage | str | os.PathLike[str]) -> dict[str, Link]:
 def read_colour_scale(stage: Usd.Stage) -> ColourScale | None:
     """The scale of the first visible heat map of a stage; None if there is none."""
     for prim in _prims(stage):
-        metadata = prim.GetCustomDataByKey("magtwin") or {}
-        if "colourMap" in metadata and UsdGeom.Imageable(prim).ComputeVisibility() != "invisible":
+        metadata = prim.GetCustomDataByKey("magtwin")
+        if not isinstance(metadata, dict) or "colourMap" not in metadata:
+            continue
+        if UsdGeom.Imageable(prim).ComputeVisibility() != "invisible":
             name, least, greatest, unit = map(metadata.get, ("colourMap", "least", "greatest", "unit"))
+            texts = isinstance(name, str) and isinstance(unit, str)
+            numbers = isinstance(least, int | float) and isinstance(greatest, int | float)
+            if not (texts and numbers and np.isfinite(greatest - least)):
+                raise InputError(
+                    f"{place(prim)}: the colour scale in its customData wants colourMap and unit as texts, "
+                    "least and greatest as numbers; correct it"
+                )
             return ColourScale(name, least, greatest, unit, str(prim.GetPath()))
     return None
 
@@ -273,10 +282,12 @@ def _shown(
 def _bodies(stage: Usd.Stage) -> dict:
     """Unique names of the rigid bodies by path."""
     names: dict = {}
+    taken = set()
     for prim in _prims(stage):
         if prim.HasAPI(UsdPhysics.RigidBodyAPI):
-            taken = prim.GetName() in names.values()
-            names[prim.GetPath()] = str(prim.GetPath()) if taken else prim.GetName()
+            name = str(prim.GetPath()) if prim.GetName() in taken else prim.GetName()
+            names[prim.GetPath()] = name
+            taken.add(name)
     return names
 
 
@@ -291,15 +302,22 @@ def _joints(stage: Usd.Stage, bodies: dict) -> Iterator[tuple]:
             yield joint, ends[0][0], ends[1][0]
 
 
-def _root(path, above: dict):  # type: ignore[no-untyped-def]
-    """The root of the tree of joints above a body."""
-    seen = [path]
-    while path in above:
-        path = above[path][1]
-        if path in seen:
-            raise InputError(f"{path}: its joints form a loop: {' -> '.join(map(str, seen))}")
-        seen.append(path)
-    return path
+def _roots(bodies: dict, above: dict) -> dict:
+    """The root of the tree of joints above each body."""
+    roots: dict = {}
+    for path in bodies:
+        seen = [path]
+        known = {path}
+        while seen[-1] in above and seen[-1] not in roots:
+            parent = above[seen[-1]][1]
+            if parent in known:
+                loop = " -> ".join(map(str, seen[seen.index(parent) :]))
+                raise InputError(f"{parent}: its joints form a loop: {loop}")
+            seen.append(parent)
+            known.add(parent)
+        root = roots.get(seen[-1], seen[-1])
+        roots.update(dict.fromkeys(seen, root))
+    return roots
 
 
 def _axis(joint: UsdPhysics.Joint) -> Vec3 | None:
@@ -330,19 +348,24 @@ def _shapes(gprim: UsdGeom.Gprim, solid: Solid, to_frame: NDArray, link: str) ->
     prim = gprim.GetPrim()
     points = _placed(gprim, solid, to_frame)
     mirrored = np.linalg.det(to_frame[:3, :3]) < 0
-    parts = [(prim, np.ones(len(solid.origin), bool))]
+    parts = [prim]
+    part_of = np.zeros(solid.origin.max(initial=-1) + 1, np.int32)  # of each face
     for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
-        own = np.isin(solid.origin, np.array(subset.GetIndicesAttr().Get() or [], int))
-        parts[0] = (prim, parts[0][1] & ~own)
-        parts.append((subset.GetPrim(), own))
+        faces = np.array(subset.GetIndicesAttr().Get() or [], int)
+        part_of[faces[(faces >= 0) & (faces < len(part_of))]] = len(parts)
+        parts.append(subset.GetPrim())
+    part_of = part_of[solid.origin]
+    order = np.argsort(part_of, kind="stable")
+    ends = np.searchsorted(part_of[order], np.arange(len(parts) + 1))
     shapes = []
-    for part, mask in parts:
-        if not mask.any():
+    for part, begin, end in zip(parts, ends, ends[1:], strict=False):
+        rows = order[begin:end]
+        if not len(rows):
             continue
         material = _material_colour(part)
-        vertices, corners = points, solid.corners[solid.triangles[mask]]
-        colours = None if material is not None else _display_colours(gprim, solid, mask)
-        texture = None if material is not None else _texture(part, gprim, solid.triangles[mask], mirrored)
+        vertices, corners = points, solid.corners[solid.triangles[rows]]
+        colours = None if material is not None else _display_colours(gprim, solid, rows)
+        texture = None if material is not None else _texture(part, gprim, solid.triangles[rows], mirrored)
         if texture is not None and colours is not None:
             r, g, b = map(float, colours.mean(axis=0))
             material, colours = (r, g, b, 1.0), None
@@ -385,8 +408,11 @@ def _material_colour(prim: Usd.Prim) -> tuple[float, float, float, float] | None
     diffuse, opacity = surface.GetInput("diffuseColor"), surface.GetInput("opacity")
     if diffuse and diffuse.HasConnectedSource():
         return None
-    r, g, b = (diffuse.Get() if diffuse else None) or (0.18, 0.18, 0.18)  # the schema's own fallback
+    colour = diffuse.Get() if diffuse else None
+    r, g, b = Gf.Vec3f(0.18) if colour is None else Gf.Vec3f(colour)  # the schema's own fallback
     a = opacity.Get() if opacity else None
+    if a is not None and not isinstance(a, int | float):
+        raise InputError(f"{place(surface.GetPrim())}: inputs:opacity must be a number; correct it")
     return (float(r), float(g), float(b), 1.0 if a is None else float(a))
 
 
@@ -411,7 +437,7 @@ def _texture(prim: Usd.Prim, gprim: UsdGeom.Gprim, triangles: NDArray, mirrored:
     if not by_corner or triangles.max(initial=0) >= len(uvs):
         return None
     scale = shader.GetInput("scale").Get() if shader.GetInput("scale") else None
-    r, g, b = (1.0, 1.0, 1.0) if scale is None else (float(c) for c in scale[:3])
+    r, g, b, _ = Gf.Vec4f(1) if scale is None else Gf.Vec4f(scale)
     cut_out, alpha = _source(surface, "opacity")
     return Texture(Path(path), uvs[triangles], (r, g, b), bool(cut_out) and alpha == "a")
 
@@ -434,7 +460,7 @@ def _display_colour(gprim: UsdGeom.Gprim) -> tuple[float, float, float, float]:
     return (float(r), float(g), float(b), float(np.mean(opacities)) if opacities else 1.0)
 
 
-def _display_colours(gprim: UsdGeom.Gprim, solid: Solid, mask: NDArray) -> NDArray | None:
+def _display_colours(gprim: UsdGeom.Gprim, solid: Solid, rows: NDArray) -> NDArray | None:
     """DisplayColor by point (P, 3), or by corner of the chosen triangles (3 F, 3); None if constant."""
     primvar = gprim.GetDisplayColorPrimvar()
     colours = primvar.ComputeFlattened()
@@ -445,9 +471,9 @@ def _display_colours(gprim: UsdGeom.Gprim, solid: Solid, mask: NDArray) -> NDArr
     if kind in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying) and len(values) == len(solid.points):
         return values
     if kind == UsdGeom.Tokens.faceVarying and len(values) == len(solid.corners):
-        return values[solid.triangles[mask]].reshape(-1, 3)
+        return values[solid.triangles[rows]].reshape(-1, 3)
     if kind == UsdGeom.Tokens.uniform and len(values) > solid.origin.max():
-        return np.repeat(values[solid.origin[mask]], 3, axis=0)
+        return np.repeat(values[solid.origin[rows]], 3, axis=0)
     raise InputError(
         f"{gprim.GetPath()}: {len(values)} displayColor values of interpolation {kind!r} do not fit its "
         f"{len(solid.points)} points; author one for each"
@@ -456,11 +482,11 @@ def _display_colours(gprim: UsdGeom.Gprim, solid: Solid, mask: NDArray) -> NDArr
 
 def srgb_from_linear(colour: ArrayLike) -> NDArray[np.float64]:
     """SRGB colours (IEC 61966-2-1) from linear ones as in USD, any shape, 0 to 1."""
-    c = np.clip(np.asarray(colour, float), 0, 1)
+    c = np.clip(np.nan_to_num(np.asarray(colour, float)), 0, 1)
     return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
 
 
 def linear_from_srgb(colour: ArrayLike) -> NDArray[np.float64]:
     """Linear colours as in USD from sRGB, any shape, 0 to 1: inverse of `srgb_from_linear`."""
-    c = np.clip(np.asarray(colour, float), 0, 1)
+    c = np.clip(np.nan_to_num(np.asarray(colour, float)), 0, 1)
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)

@@ -88,25 +88,21 @@ def open_stage(path: str | os.PathLike[str], *, own: bool = False) -> Usd.Stage:
             the schema.
     """
     path = check_stage(path, own=own)
-    diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
-    try:
-        with translated(path, "cannot be opened as USD"):
-            stage = Usd.Stage.Open(str(path))
-            layers = [layer for layer in stage.GetUsedLayers() if layer.realPath]
-            held = [layer for layer in layers if is_upgraded(layer)]  # elsewhere; a reload would undo it
-            unsaved = [layer.identifier for layer in layers if layer.dirty and layer not in held]
-            if unsaved:
-                raise InputError(
-                    f"{path}: {unsaved[0]} has changes in this process that are not saved; save them "
-                    "(`stage.Save()`), or drop them (`layer.Reload()`)"
-                )
-            if held:
-                Sdf.Layer.ReloadLayers([layer for layer in layers if layer not in held])
-            else:
-                stage.Reload()  # a layer that is still held elsewhere would be stale
-            errors = stage.GetCompositionErrors()
-    finally:
-        diagnostics.TakeUncoalescedDiagnostics()
+    with translated(path, "cannot be opened as USD"):
+        stage = Usd.Stage.Open(str(path))
+        layers = [layer for layer in stage.GetUsedLayers() if layer.realPath]
+        held = [layer for layer in layers if is_upgraded(layer)]  # elsewhere; a reload would undo it
+        unsaved = [layer.identifier for layer in layers if layer.dirty and layer not in held]
+        if unsaved:
+            raise InputError(
+                f"{path}: {unsaved[0]} has changes in this process that are not saved; save them "
+                "(`stage.Save()`), or drop them (`layer.Reload()`)"
+            )
+        if held:
+            Sdf.Layer.ReloadLayers([layer for layer in layers if layer not in held])
+        else:
+            stage.Reload()  # a layer that is still held elsewhere would be stale
+        errors = stage.GetCompositionErrors()
     if errors:
         raise InputError(f"{path}: {_one_line(_text(errors[0]))}")
     upgrade_stage(stage, str(path))
@@ -183,7 +179,7 @@ def _check_nesting(path: Path) -> None:
 
 @contextmanager
 def translated(where: object, what: str = "damaged USD") -> Iterator[None]:
-    """Raise USD's own errors in the block as an `InputError`.
+    """Raise USD's own errors in the block as an `InputError`, and keep its warnings off the terminal.
 
     USD reports damaged contents when they are used, by errors of its own kinds: `Tf.ErrorException`, and
     ArgumentError of the Boost library for values of another type. A value whose type USD does not know is an
@@ -193,6 +189,7 @@ def translated(where: object, what: str = "damaged USD") -> Iterator[None]:
         where: The file, or the place in it.
         what: What the errors mean.
     """
+    diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # takes the warnings, which quote the file
     try:
         yield
     except (Tf.ErrorException, UnicodeDecodeError, TypeError, AttributeError) as error:
@@ -200,6 +197,8 @@ def translated(where: object, what: str = "damaged USD") -> Iterator[None]:
         if isinstance(error, TypeError | AttributeError) and not wrong_type:
             raise
         raise InputError(f"{where}: {what}: {_reason(error)}") from error
+    finally:
+        diagnostics.TakeUncoalescedDiagnostics()
 
 
 def translates(function: Callable[P, R]) -> Callable[P, R]:
@@ -285,13 +284,21 @@ def stage_sha256(path: str | os.PathLike[str]) -> str:
     Raises:
         InputError: No such file, or it or a layer that it names is not USD.
     """
-    return _content_sha256(check_stage(path).resolve(), ())
+    return _content_sha256(check_stage(path).resolve(), (), {})
 
 
-def _content_sha256(file: Path, above: tuple[Path, ...]) -> str:
-    """Checksum of a file; `above` are the files on the way to it."""
+def _content_sha256(file: Path, above: tuple[Path, ...], known: dict[Path, str]) -> str:
+    """Checksum of a file; `above` are the files on the way to it, `known` those that are done."""
     if file in above:
         return "circle"  # composition refuses a circle; here it must end
+    if file not in known:
+        check_depth(file, "USD text", len(above), "files that name each other")
+        known[file] = _new_sha256(file, above, known)
+    return known[file]
+
+
+def _new_sha256(file: Path, above: tuple[Path, ...], known: dict[Path, str]) -> str:
+    """As `_content_sha256`, of a file that is not known."""
     if file.suffix not in SUFFIXES:
         return sha256(file)
     existing_file(file, "USD file", "USD")
@@ -302,7 +309,7 @@ def _content_sha256(file: Path, above: tuple[Path, ...]) -> str:
 
     def checksum(asset: str) -> str:
         named = file.parent / asset
-        return _content_sha256(named.resolve(), (*above, file)) if named.is_file() else asset
+        return _content_sha256(named.resolve(), (*above, file), known) if named.is_file() else asset
 
     UsdUtils.ModifyAssetPaths(layer, checksum)
     return hashlib.sha256(layer.ExportToString().encode()).hexdigest()

@@ -78,6 +78,8 @@ def mesh_solid(mesh: UsdGeom.Mesh) -> Solid:
     points = np.array(mesh.GetPointsAttr().Get() or np.empty((0, 3)), float)
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [], int)
     corners = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [], int)
+    if counts.min(initial=0) < 0:
+        raise InputError(f"one of its faces has {counts.min()} corners; export the mesh again")
     outside = len(corners) and not 0 <= corners.min() <= corners.max() < len(points)
     if counts.sum() != len(corners) or outside:
         raise InputError(

@@ -70,6 +70,7 @@ class _Trial:
                 "room": max(SPARE, allowed()),
                 "seconds": PROCESSOR_S,
                 "values": VALUES,
+                "prims": BUDGETS["USD"].count,
             }
             self._passed[key] = self._ask(path, job)
 
@@ -164,7 +165,7 @@ def _outside(path: Path, names: list[dict[str, str]]) -> str:
     where = first["where"].removeprefix(str(path.absolute())).strip()
     folders = sorted({name["folder"] for name in names})
     least = [f for f in folders if not any(f != g and Path(f).is_relative_to(g) for g in folders)]
-    call = ", ".join(map(repr, least))
+    call = ", ".join(map(repr, least)).replace("`", r"\x60")  # which would end the call in the text
     more = f", and {others} more" if others else ""
     return (
         f"{path}: {f'{where} ' if where else ''}names {first['asset']}{more}, outside the stage's folder; if "

@@ -1,11 +1,12 @@
 """The process that opens stages before magtwin does. `trial` runs this file; it imports only pxr.
 
 Each line of the input is a job, each line of the output its answer, both in JSON. A job has the file, the
-working folder, the folders in which files may be named (`inside`), limits of memory, time and values, and
-whether the stage is composed. The layers of a composed stage are opened one by one, and all files that they
+working folder, the folders in which files may be named (`inside`), limits of memory, time, values and prims,
+and whether the stage is composed. The layers of a composed stage are opened one by one, and all files that they
 name are checked before any of them is opened.
 """
 
+import functools
 import glob
 import json
 import os
@@ -14,7 +15,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from pxr import Ar, Sdf, Usd, UsdUtils
+from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 try:
     import resource
@@ -23,6 +24,9 @@ except ImportError:  # Windows
 
 MOST_LAYERS = 100_000
 """Layers of a stage, each counted once for each set of expression variables."""
+
+DEEPEST = 128
+"""Most levels of prims, and of instances within instances."""
 
 LISTED = 20
 """Names out of the folders that an answer lists at most."""
@@ -44,15 +48,18 @@ class Audit:
         layers: The layers, by identifier.
         named_files: Every file that a layer names, even if there is none.
         outside: Files out of the folders that layers name: layer, prim or property, name and file.
+        suspects: Names of attributes whose type is not the one of USD's schemas.
     """
 
     def __init__(self, job: dict[str, Any]) -> None:
         self.inside: list[str] = job["inside"]
         self.room, self.seconds, self.most_values = job["room"], job["seconds"], job["values"]
+        self.most_prims: int = job["prims"]
         self.used = used_time()
         self.layers: dict[str, Any] = {}
         self.named_files: set[str] = set()
         self.outside: list[dict[str, str]] = []
+        self.suspects: set[str] = set()
         self.resolver = Ar.GetResolver()
 
     def is_inside(self, file: str) -> bool:
@@ -78,8 +85,10 @@ class Audit:
             self.layers[name] = None
             try:
                 layer = Sdf.Layer.FindOrOpen(name)
-                if crate and layer is not None and size <= self.most_values:
-                    try_values(layer)
+                if layer is not None:
+                    self.suspects |= wrong_types(layer)
+                    if crate and size <= self.most_values:
+                        try_values(layer)
             except Exception as error:
                 if crate:
                     text = f"cannot be opened as USD: {text_of(error)}; make or copy it again"
@@ -199,6 +208,60 @@ def try_values(layer: Any) -> None:
     layer.Traverse("/", read)
 
 
+def wrong_types(layer: Any) -> set[str]:
+    """Names of a layer's attributes whose type is that of no schema of USD which has the name."""
+    found = set()
+
+    def look(path: Any) -> None:
+        if path.IsPrimPropertyPath() and (kinds := schema_kinds().get(_MULTIPLE.sub(r"\1:", path.name))):
+            spec = layer.GetAttributeAtPath(path)
+            if spec is not None and kind_of(spec.typeName) not in kinds:
+                found.add(path.name)
+
+    layer.Traverse("/", look)
+    return found
+
+
+_MULTIPLE = re.compile(r"^(drive|limit|collection):[^:]+:")
+"""How attributes begin whose schemas are applied several times, each with its own name."""
+
+
+@functools.cache
+def schema_kinds() -> dict[str, set[tuple[bool, str]]]:
+    """Kinds of value of each attribute of USD's schemas, by name; of several applied ones without theirs."""
+    registry, kinds = Usd.SchemaRegistry(), dict[str, set[tuple[bool, str]]]()
+    for schema in Tf.Type.FindByName("UsdSchemaBase").GetAllDerivedTypes():
+        name = registry.GetSchemaTypeName(schema)
+        prim = registry.FindConcretePrimDefinition(name) or registry.FindAppliedAPIPrimDefinition(name)
+        for attribute in prim.GetPropertyNames() if prim else ():
+            if defined := prim.GetAttributeDefinition(attribute):
+                plain = attribute.replace(":__INSTANCE_NAME__", "")
+                kinds.setdefault(plain, set()).add(kind_of(defined.GetTypeName()))
+    return kinds
+
+
+def kind_of(type_name: Any) -> tuple[bool, str]:
+    """Whether a type is an array, and of what: numbers of any precision are one kind."""
+    python = type_name.scalarType.type.pythonClass or type(type_name.scalarType.defaultValue)
+    name = "number" if issubclass(python, int | float) else python.__name__
+    return type_name.isArray, name[:-1] if name.startswith(("Vec", "Quat", "Matrix")) else name
+
+
+def check_types(stage: Any, names: set[str]) -> None:
+    """Refuse attributes of some names whose type is not the one of their prim's schema."""
+    for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
+        for name in names.intersection(prim.GetAuthoredPropertyNames()):
+            defined = prim.GetPrimDefinition().GetAttributeDefinition(name)
+            for spec in prim.GetProperty(name).GetPropertyStack() if defined else ():
+                if not isinstance(spec, Sdf.AttributeSpec) or kind_of(spec.typeName) != kind_of(
+                    defined.GetTypeName()
+                ):
+                    said = spec.typeName if isinstance(spec, Sdf.AttributeSpec) else "relationship"
+                    raise RefusedError(
+                        f"<{prim.GetPath()}> has {name} as {said}, USD as {defined.GetTypeName()}; correct it"
+                    )
+
+
 def place_of(layer: Any, asset: str, variables: dict[str, Any]) -> str:
     """Layer, and prim or property, that names a file."""
     found: list[str] = []
@@ -244,6 +307,36 @@ def compose(root: str, audit: Audit) -> None:
     for layer in stage.GetUsedLayers():
         if layer.realPath and not audit.is_inside(layer.realPath):
             audit.leave_out(root, layer.identifier, layer.realPath)
+    if (prims := count_prims(stage)) > audit.most_prims:
+        raise RefusedError(
+            f"has {prims:.3g} prims, with those of instances; at most {audit.most_prims:,} are read; use fewer"
+        )
+    if audit.suspects:
+        check_types(stage, audit.suspects)
+    purposes = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render]
+    UsdGeom.BBoxCache(Usd.TimeCode.Default(), purposes).ComputeWorldBound(stage.GetPseudoRoot())
+
+
+def count_prims(stage: Any) -> int:
+    """Prims of a stage, those of instances in each place where they stand."""
+    known: dict[Any, int] = {}
+
+    def count(top: Any, level: int) -> int:
+        if level > DEEPEST:
+            raise RefusedError(f"nests instances over {DEEPEST} levels deep; use fewer levels")
+        total = 0
+        for prim in Usd.PrimRange(top):
+            total += 1
+            if prim.GetPath().pathElementCount > DEEPEST:
+                raise RefusedError(f"nests prims over {DEEPEST} levels deep, as <{prim.GetPath()}> does")
+            if prim.IsInstance():
+                prototype = prim.GetPrototype()
+                if prototype.GetPath() not in known:
+                    known[prototype.GetPath()] = count(prototype, level + 1)
+                total += known[prototype.GetPath()] - 1  # the instance is the prototype's root
+        return total
+
+    return count(stage.GetPseudoRoot(), 0)
 
 
 def answer_to(job: dict[str, Any]) -> dict[str, Any]:

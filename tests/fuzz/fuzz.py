@@ -209,7 +209,7 @@ def judged(kind: str, data: bytes, whole: Seed, folder: Path) -> tuple[str, str,
     from magtwin.errors import InputError
 
     _limit_time()
-    before, trial = _children_s(), _trial_s()
+    before = _children_s()
     try:
         read(kind, data, whole.beside, folder)
         said = ("read", "", "")
@@ -223,7 +223,7 @@ def judged(kind: str, data: bytes, whole: Seed, folder: Path) -> tuple[str, str,
         said = (f"{type(error).__name__} in {_place(error)}", "", str(error))
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
-    used = max(_children_s() - before, _trial_s() - trial)
+    used = _children_s() - before
     if used > HANG_S and said[0] in ("read", "refused"):
         return f"hang of a child process, {kind}", "", f"{used:.0f} s of the processor; {said[2]}"
     return said

@@ -6,6 +6,7 @@ import sqlite3
 import subprocess
 import sys
 import textwrap
+from contextlib import closing
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -23,6 +24,7 @@ import magtwin
 from magtwin.errors import InputError
 from magtwin.io.bags import BagWriter, read_bag, read_bag_readings, write_bag
 from magtwin.io.bags.cdr import encode
+from magtwin.io.bags.db3 import RosbagsReader
 from magtwin.io.bags.topics import TOPICS
 from magtwin.io.bags.types import layout
 from magtwin.io.recorder import partial_of
@@ -559,6 +561,55 @@ def test_a_table_of_columns_that_lies_is_refused(bags, made, tmp_path):
         with pytest.raises(InputError, match=text) as refusal:
             read_bag(path)
         assert "\n" not in str(refusal.value)
+
+
+def sqlite_bag(path, topics=1, messages=1):
+    """A bag of empty topics and messages, in pages of 512 bytes."""
+    database = sqlite3.connect(path)
+    database.executescript(
+        "PRAGMA page_size = 512;"
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format);"
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data)"
+    )
+    database.executemany(
+        "INSERT INTO topics VALUES(?, '/m', 'std_msgs/msg/Empty', 'cdr')", ((k,) for k in range(topics))
+    )
+    rows = ((k, k, bytes(100)) for k in range(messages))
+    database.executemany("INSERT INTO messages VALUES(?, 0, ?, ?)", rows)
+    database.commit()
+    return database
+
+
+@pytest.mark.parametrize("table", ["messages", "topics", "sqlite_master"])
+def test_an_sqlite_page_that_is_used_twice_is_refused_before_it_is_read(table, tmp_path):
+    path = tmp_path / "run.db3"
+    with sqlite_bag(path, 200, 200) as database:
+        database.executescript("".join(f"CREATE TABLE t{k}(a);" for k in range(20)))
+        roots = dict(database.execute("SELECT name, rootpage FROM sqlite_master")) | {"sqlite_master": 1}
+    database.close()
+    with closing(RosbagsReader(path)) as reader:
+        assert len(reader.messages([0])[0]) == 200
+    content = bytearray(path.read_bytes())
+    head = 512 * (roots[table] - 1) + (100 if table == "sqlite_master" else 0)
+    assert content[head] == 5  # an inner page
+    first, second = (
+        512 * (roots[table] - 1) + int.from_bytes(content[head + at : head + at + 2]) for at in (12, 14)
+    )
+    content[second : second + 4] = content[first : first + 4]
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="its tables use a page twice"):
+        read_bag(path)
+
+
+def test_an_sqlite_bag_of_too_many_topics_or_of_texts_for_messages_is_refused(tmp_path):
+    sqlite_bag(tmp_path / "topics.db3", 10_001).close()
+    with pytest.raises(InputError, match="10,001 rows of"):
+        read_bag(tmp_path / "topics.db3")
+    with sqlite_bag(tmp_path / "texts.db3") as database:
+        database.execute("UPDATE messages SET data = 'text'")
+    database.close()
+    with pytest.raises(InputError, match="1 of its messages are not bytes"):
+        read_bag(tmp_path / "texts.db3")
 
 
 def test_a_chunk_that_says_it_is_a_thousand_times_its_size_is_refused_unread(bags, tmp_path):

@@ -444,6 +444,33 @@ def test_an_npz_that_holds_no_run_is_refused(arrays, message, tmp_path):
         read_npz(npz(tmp_path / "run.npz", **arrays))
 
 
+def test_an_npz_that_is_compressed_by_lzma_is_refused(tmp_path):
+    npz(tmp_path / "run.npz", t=np.arange(2.0))
+    content = zipfile.ZipFile(tmp_path / "run.npz").read("t.npy")
+    with zipfile.ZipFile(tmp_path / "run.npz", "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("t.npy", content)
+    with pytest.raises(InputError, match="compressed by method 14 of zip; use deflate, or none"):
+        read_npz(tmp_path / "run.npz")
+
+
+@pytest.mark.parametrize("number", [10**400, -(10**309)])
+def test_numbers_in_metadata_that_no_float_holds_are_refused(number, tmp_path):
+    about = json.dumps({"facts": {"seed": number}})
+    with pytest.raises(InputError, match=r"run\.npz: metadata 'seed' is a number beyond 1e308"):
+        read_npz(npz(tmp_path / "run.npz", t=np.arange(2.0), magtwin=np.array(about)))
+    with pytest.raises(InputError, match="metadata 'seed' is a number beyond 1e308"):
+        write_npz(Run({"t": np.arange(2.0)}, {"seed": number}), tmp_path / "out.npz")
+
+
+@pytest.mark.parametrize(("write", "read", "name"), TABLES)
+def test_a_run_of_thousands_of_columns_is_read(write, read, name, tmp_path):
+    run = Run({"t": np.arange(2.0)} | {f"c{k}": np.full(2, float(k)) for k in range(3000)})
+    write(run, tmp_path / name)
+    back = read(tmp_path / name)
+    assert list(back) == list(run)
+    assert back["c2999"].tolist() == [2999.0, 2999.0]
+
+
 def test_parquet_whose_clock_or_flags_are_wrong_is_refused_with_the_row(tmp_path):
     path = tmp_path / "run.parquet"
     pq.write_table(pa.table({"t": [0.0, 2.0, 1.0]}), path)

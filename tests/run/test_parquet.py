@@ -6,7 +6,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from magtwin.errors import InputError
-from magtwin.run.parquet import _counts, check_parquet
+from magtwin.run.parquet import _counts, _largest_page, check_parquet
 
 
 @pytest.fixture
@@ -44,3 +44,25 @@ def test_damaged_metadata_are_refused(path):
                 assert len(_counts(path)) < 20
                 refused -= 1
     assert refused > 5
+
+
+def test_the_largest_page_is_that_of_the_longest_column(tmp_path):
+    path = tmp_path / "a.parquet"
+    table = pa.table({"a": pa.array(np.arange(3.0)), "b": ["x" * 5000, "y", "z"]})
+    pq.write_table(table, path, use_dictionary=["b"])
+    assert _largest_page(path, path.stat().st_size) == 4 * 3 + 5002
+    pq.write_table(table.slice(0, 0), path)
+    assert _largest_page(path, path.stat().st_size) == 1
+
+
+def test_a_long_text_that_all_rows_share_is_refused(tmp_path):
+    path = tmp_path / "a.parquet"
+    texts = pa.DictionaryArray.from_arrays(np.zeros(2000, np.int32), ["x" * 1_000_000])
+    pq.write_table(pa.table({"s": texts}), path, compression="zstd")
+    with pytest.raises(InputError, match="bytes that decode to 1"):
+        check_parquet(path)
+
+
+def test_parts_of_columns_that_overlap_are_refused(path):
+    with pytest.raises(InputError, match="damaged Parquet"):
+        _largest_page(path, path.stat().st_size // 2)

@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import re
 import struct
 import sys
 
@@ -17,8 +18,10 @@ from PIL import Image
 from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
 from validators import assert_valid
 
+from magtwin.budget import BUDGETS, Budget
 from magtwin.errors import InputError
 from magtwin.urdf import convert_urdf, read_notes
+from magtwin.urdf.meshes import mesh, polygon, texture
 from magtwin.urdf.meshes.mesh import distinct, read_mesh
 from magtwin.urdf.meshes.piece import Piece
 from magtwin.urdf.meshes.polygon import cut_polygons
@@ -227,6 +230,38 @@ def test_a_missing_library_or_material_is_noted(tmp_path):
     assert "o.obj: material library 'no.mtl' is missing; shown without it" in notes
     assert "o.obj: material 'red' is in none of its libraries; shown without it" in notes
     assert "o.obj: lines, points and curves (l) are left out" in notes
+
+
+def test_a_file_has_so_many_notes_and_materials_and_groups_share_its_vertices(tmp_path, monkeypatch):
+    faces = "".join(f"usemtl m{i}\nf 1 2 3\n" for i in range(1_100))
+    (tmp_path / "o.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "v 5 5 5\n" * 1_000 + faces)
+    tables = []
+    monkeypatch.setattr(mesh, "distinct", lambda points: tables.append(points) or distinct(points))
+    read = read_mesh(tmp_path / "o.obj")
+    assert len(read.faces) == 1_100
+    assert tables[0].shape == (1_003, 3)
+    assert len(read.notes) == 1_001
+    assert read.notes[-1] == ("o.obj: over 1000 notes; the others are left out", True)
+    monkeypatch.setattr(mesh, "MOST_PAINTS", 1)
+    with pytest.raises(InputError, match=r"squares\.obj: has over 1 materials; merge those that look alike"):
+        read_mesh(tmp_path / squares(tmp_path))
+
+
+def test_an_image_is_decoded_once_for_all_files_and_all_images_have_a_limit(tmp_path, monkeypatch):
+    decoded = []
+    decode = texture.opened_image
+    monkeypatch.setattr(texture, "opened_image", lambda data: decoded.append(data) or decode(data))
+    picture(tmp_path / "t.png")
+    file = squares(tmp_path, "newmtl red\nmap_Kd t.png\nnewmtl blue\nmap_Kd t.png\nmap_Ke ./t.png\n")
+    (tmp_path / "o.obj").write_text(SQUARES)
+    robot(tmp_path, visual(file) + visual("o.obj"))
+    assert len(decoded) == 1
+    monkeypatch.setattr(texture, "BY_BYTE", 0)
+    monkeypatch.setattr(texture, "PIXELS", 3)
+    picture(tmp_path / "u.png", [(0, 255, 0)] * 2)
+    squares(tmp_path, "newmtl red\nmap_Kd t.png\nnewmtl blue\nmap_Kd u.png\n")
+    (note, _), *_ = read_mesh(tmp_path / file).notes
+    assert "texture 'u.png' is not a readable image and is left out (the images to here have 4 pixels" in note
 
 
 # --- COLLADA --------------------------------------------------------------------------------------
@@ -464,6 +499,20 @@ def test_a_concave_face_of_a_wavefront_file_keeps_its_hollow(tmp_path):
     assert_allclose(areas.sum(), 3)
 
 
+def test_many_concave_faces_are_cut_at_once_and_too_large_ones_stay_fans_with_a_note(tmp_path, monkeypatch):
+    darts = np.array([[0, 0, 1], [1, 0, 1], [0.2, 0.2, 1], [0, 1, 1]]) @ [[0, 1, 0], [0, 0, 1], [1, 0, 0]]
+    triangles = cut_polygons(darts, np.tile([1, 2, 3, 0, 3, 2, 1, 0], 1_000), np.full(2_000, 4))
+    corners = np.tile([1, 2, 3, 0, 3, 2, 1, 0], 1_000)[triangles]
+    a, b, c = np.moveaxis(darts[corners], 1, 0)
+    areas = np.cross(b - a, c - a)[:, 0] / 2
+    assert_allclose(areas.reshape(-1, 2, 2).sum(axis=2), np.tile([0.2, -0.2], (1_000, 1)))
+    assert (areas.reshape(-1, 2, 2) * [[1], [-1]] > 0).all()
+    monkeypatch.setattr(polygon, "MOST_CORNERS", 3)
+    (tmp_path / "d.obj").write_text("v 0 0 0\nv 1 0 0\nv 0.2 0.2 0\nv 0 1 0\nf 2 3 4 1\n")
+    notes = read_mesh(tmp_path / "d.obj").notes
+    assert notes == (("d.obj: a concave face of 4 corners is too large to cut: shown as a fan", False),)
+
+
 # --- glTF -----------------------------------------------------------------------------------------
 
 
@@ -517,6 +566,34 @@ def gltf(
     head += struct.pack("<II", len(text), 0x4E4F534A) + text
     path.write_bytes(head + struct.pack("<II", len(body), 0x004E4942) + body)
     return path
+
+
+@pytest.mark.parametrize("kind", ["lines", "empty"])
+@pytest.mark.parametrize("suffix", ["dae", "glb"])
+def test_what_nodes_show_counts_as_often_as_they_show_it_although_it_has_no_faces(
+    kind, suffix, tmp_path, monkeypatch
+):
+    monkeypatch.setitem(BUDGETS, "mesh", Budget(count=500))
+    path = tmp_path / f"m.{suffix}"
+    if suffix == "glb":
+        primitive = {"attributes": {"POSITION": 0}, "mode": 1 if kind == "lines" else 4, "indices": 3}
+        nodes = [{"mesh": 0, "children": [i + 1]} for i in range(29)] + [{"mesh": 0}]
+        none = {"bufferView": 0, "componentType": 5123, "type": "SCALAR", "count": 0}
+        more = {"meshes": [{"primitives": [primitive] * 30}]}
+        table = json.loads(gltf(path, binary=False, nodes=nodes, **more).read_text())
+        table |= {"meshes": more["meshes"], "accessors": [*table["accessors"], none]}
+        path.write_text(json.dumps(table))
+    else:
+        text = dae(path, "<node>{mesh}</node>" * 30).read_text()
+        empty = '<triangles count="0"><input semantic="VERTEX" source="#v" offset="0"/><p/></triangles>'
+        path.write_text(re.sub("<triangles.*</triangles>", empty * 30, text, flags=re.DOTALL))
+    if kind == "lines" and suffix == "dae":  # they are left out before they are counted
+        path.write_text(path.read_text().replace("<triangles", "<lines").replace("</triangles", "</lines"))
+        with pytest.raises(InputError, match="holds no triangle"):
+            read_mesh(path)
+    else:
+        with pytest.raises(InputError, match="shows over 500 nodes; export it again"):
+            read_mesh(path)
 
 
 HALF = float(np.sqrt(0.5))

@@ -188,6 +188,26 @@ def test_an_expression_cannot_take_time_or_memory_without_bound(text):
     assert time.process_time() - start < 1
 
 
+COSTLY = {
+    "[l.count(-1) for l in [list(range(9000))] for i in range(100)]": "expands without end",
+    "[-1 in l for l in [list(range(9000))] for i in range(100)]": "expands without end",
+    "[l == l for l in [list(range(9000))] for i in range(100)]": "expands without end",
+    "[l[1:] for l in [list(range(9000))] for i in range(100)]": "expands without end",
+    "[python.sum(values=l) for l in [list(range(9000))] for i in range(100)]": "expands without end",
+    "[1 for i in range(300) for j in range(300)]": "over 65536 characters or entries",
+    "('%(' + ')' * 20000) % 1": "format requires a mapping",
+    "'%(a(b)c)999d' % {'a(b)c': 1}": "over two digits",
+    "'%(a)s' * 100 % dict(a='\U0001f600' * 2000)": "over 65536 characters or entries",
+    "'%(a)s%s' * 100 % dict(a='', b='x' * 2000)": "over 65536 characters or entries",
+}
+
+
+@pytest.mark.parametrize("text", COSTLY)
+def test_an_expression_pays_for_what_it_looks_at_and_copies(text):
+    with pytest.raises(ExpressionError, match=COSTLY[text]):
+        evaluate(text, GLOBALS, Budget(400_000))
+
+
 SLIPS = {
     "<xacro:property/>": "cannot be expanded: xacro:property: missing attribute 'name'",
     '<xacro:property name="p" value="1" scope="parent"/>': "cannot be expanded: ",

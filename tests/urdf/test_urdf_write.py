@@ -1,6 +1,7 @@
 """URDF -> USD -> URDF: equal kinematics and inertia, shapes where they were; refusals."""
 
 import json
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -223,6 +224,23 @@ def _off(stage):
     UsdPhysics.Joint(stage.GetPrimAtPath("/two/joints/j")).GetLocalPos1Attr().Set(Gf.Vec3f(0.1, 0, 0))
 
 
+def _loop(stage):
+    for name, body0, body1 in (("there", "a", "b"), ("back", "b", "a")):
+        UsdPhysics.RigidBodyAPI.Apply(UsdGeom.Xform.Define(stage, f"/two/{body1}").GetPrim())
+        joint = UsdPhysics.FixedJoint.Define(stage, f"/two/joints/{name}")
+        joint.CreateBody0Rel().SetTargets([Sdf.Path(f"/two/{body0}")])
+        joint.CreateBody1Rel().SetTargets([Sdf.Path(f"/two/{body1}")])
+
+
+def _mirrored(stage):
+    UsdGeom.Xformable(stage.GetPrimAtPath("/two/arm")).AddScaleOp().Set(Gf.Vec3f(1, 1, -1))
+
+
+def _slides(stage):
+    prim = stage.GetPrimAtPath("/two/joints/j")
+    prim.SetTypeName("PhysicsPrismaticJoint")
+
+
 def _no_robot(stage):
     stage.GetPrimAtPath("/two/base_link").RemoveAPI(UsdPhysics.ArticulationRootAPI)
 
@@ -233,6 +251,9 @@ def _no_robot(stage):
         (_ball, "URDF has no PhysicsSphericalJoint"),
         (_second, "'arm' is held by two joints, in a circle"),
         (_scaled, "is scaled, which a URDF cannot do to links"),
+        (_mirrored, "is scaled, .* or mirrored"),
+        (_loop, "hold links in a circle: (a -> b -> a|b -> a -> b); a URDF is a tree"),
+        (_slides, "</two/joints/j>: slides without an end"),
         (_off, "turns about a point of 'arm' that is not its origin"),
         (_no_robot, "a URDF has one articulation, found none"),
     ],
@@ -242,6 +263,186 @@ def test_what_a_urdf_cannot_hold_is_refused_and_nothing_is_written(tmp_path, cha
     with pytest.raises(InputError, match=said):
         write_urdf(asset, tmp_path / "out" / "a.urdf")
     assert not (tmp_path / "out").exists()
+
+
+SMALL = """#usda 1.0
+(defaultPrim = "World"; metersPerUnit = 1; upAxis = "Z")
+def Xform "World" (prepend apiSchemas = ["PhysicsArticulationRootAPI"]) {
+    def Xform "base_link" (
+        prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI"]
+        displayName = "NAME"
+    ) {
+        BODY
+    }
+    def Xform "wheel" (prepend apiSchemas = ["PhysicsRigidBodyAPI"]) {}
+    def PhysicsRevoluteJoint "j" (prepend apiSchemas = ["PhysicsDriveAPI:angular"]) {
+        rel physics:body0 = </World/base_link>
+        rel physics:body1 = </World/wheel>
+        JOINT
+    }
+    MORE
+}
+"""
+
+MIMIC = "rel newton:mimicJoint = </World/k>"
+
+LEADER = """def Xform "puck" (prepend apiSchemas = ["PhysicsRigidBodyAPI"]) {}
+def PhysicsRevoluteJoint "k" (prepend apiSchemas = ["PhysicsLimitAPI:transX"]) {
+    rel physics:body0 = </World/wheel>
+    rel physics:body1 = </World/puck>
+    HERE
+}"""
+
+MARKED = """def Mesh "m" (customData = {dictionary magtwin = {dictionary primitive = {FORM}}}) {
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
+    int[] faceVertexCounts = [3]
+    int[] faceVertexIndices = [0, 1, 2]
+}"""
+
+BALL = """def Sphere "s" {
+    color3f[] primvars:displayColor = [(1, 1, 1)]
+    float[] primvars:displayOpacity = [OPACITY]
+}"""
+
+
+def small(tmp_path, **parts):
+    """The URDF of a stage of two bodies and a joint, with text of a test at the words in capitals."""
+    text = SMALL
+    for part in ("NAME", "BODY", "JOINT", "MORE"):
+        text = text.replace(part, parts.get(part, ""))
+    (tmp_path / "small.usda").write_text(text, encoding="utf-8")
+    write_urdf(tmp_path / "small.usda", tmp_path / "out" / "small.urdf")
+    return ElementTree.parse(tmp_path / "out" / "small.urdf").getroot()
+
+
+@pytest.mark.parametrize(
+    ("parts", "said"),
+    [
+        (
+            {"JOINT": f'string newton:mimicCoef0 = "x"; {MIMIC}', "MORE": LEADER},
+            "j>: newton:mimicCoef0 must be a",
+        ),
+        ({"JOINT": 'string newton:velocityLimit = "x"'}, "j>: newton:velocityLimit must be a number"),
+        ({"JOINT": 'string newton:damping = "x"'}, "j>: newton:damping must be a number"),
+        ({"JOINT": 'string drive:angular:physics:maxForce = "x"'}, "j>.* drive:angular:physics:maxForce"),
+        ({"JOINT": 'string physics:lowerLimit = "x"'}, "j>.* physics:lowerLimit"),
+        ({"BODY": 'string physics:mass = "x"'}, "base_link>.* physics:mass"),
+        (
+            {"BODY": 'float physics:mass = 1; string physics:diagonalInertia = "x"'},
+            "base_link>.*diagonalInertia",
+        ),
+        (
+            {"MORE": LEADER.replace("Revolute", "").replace("HERE", 'string limit:transX:physics:low = "x"')},
+            "low",
+        ),
+        (
+            {"BODY": MARKED.replace("FORM", 'string kind = "a b"')},
+            "m>: its customData magtwin:primitive is damaged",
+        ),
+        ({"BODY": MARKED.replace("FORM", 'string kind = "box"; double2 size = (1, 2)')}, "is damaged"),
+        ({"BODY": MARKED.replace("FORM", "string name = ''")}, "is damaged"),
+    ],
+)
+def test_a_value_of_another_type_is_refused_by_its_name(tmp_path, parts, said):
+    parts = {part: text.replace("HERE", "") for part, text in parts.items()}
+    with pytest.raises(InputError, match=said):
+        small(tmp_path, **parts)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("parts", "said"),
+    [
+        ({"JOINT": "float newton:damping = nan"}, "j>: newton:damping is nan"),
+        ({"JOINT": "float newton:friction = inf"}, 'j>: becomes <dynamics friction="inf">'),
+        ({"JOINT": "float physics:lowerLimit = nan"}, "j>: physics:lowerLimit is nan"),
+        (
+            {"JOINT": "point3f physics:localPos0 = (0, inf, 0)"},
+            "j>: .*localPos0 is .0, inf, 0. .* not a frame",
+        ),
+        ({"JOINT": "quatf physics:localRot1 = (0, 0, 0, 0)"}, "j>: .*localRot1 .0, 0, 0, 0., not a frame"),
+        ({"BODY": "float physics:mass = nan"}, "base_link>: physics:mass is nan"),
+        ({"BODY": "float physics:mass = inf"}, 'base_link>: becomes <mass value="inf">'),
+        ({"BODY": "double physics:mass = 1e300"}, 'base_link>: becomes <mass value="inf">'),
+        (
+            {"BODY": "float physics:mass = 1; point3f physics:centerOfMass = (nan, 0, 0)"},
+            "base_link>: physics:centerOfMass is .nan, 0, 0.",
+        ),
+        (
+            {"BODY": "float physics:mass = 1; float3 physics:diagonalInertia = (1, 1, inf)"},
+            "base_link>: becomes <inertia",
+        ),
+        (
+            {"BODY": 'double3 xformOp:translate = (nan, 0, 0); token[] xformOpOrder = ["xformOp:translate"]'},
+            "not finite",
+        ),
+        ({"BODY": BALL.replace("OPACITY", "nan")}, "s>: becomes <color rgba="),
+        (
+            {"BODY": MARKED.replace("FORM", 'string kind = "sphere"; double radius = nan')},
+            "m>: becomes <sphere radius",
+        ),
+    ],
+)
+def test_a_number_that_is_not_finite_is_refused_and_nothing_is_written(tmp_path, parts, said):
+    with pytest.raises(InputError, match=said):
+        small(tmp_path, **parts)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("leader", "more", "said"),
+    [
+        ("k", "", "j>: newton:mimicJoint must point to one prim of the stage, found /World/k"),
+        ("wheel", "", "j>: mimics </World/wheel>, not a joint of the robot"),
+        ("k", LEADER.replace("Revolute", "Fixed"), "j>: mimics </World/k>, not a joint of the robot"),
+        ("j", "", "joints mimic in a circle: j -> j"),
+        (
+            "k",
+            LEADER.replace("HERE", "rel newton:mimicJoint = </World/j>"),
+            "joints mimic in a circle: j -> k -> j",
+        ),
+    ],
+)
+def test_a_mimic_joint_must_have_another_joint_to_follow(tmp_path, leader, more, said):
+    with pytest.raises(InputError, match=said):
+        small(tmp_path, JOINT=MIMIC.replace("k>", f"{leader}>"), MORE=more.replace("HERE", ""))
+
+
+def test_a_mimic_names_its_leader_as_the_urdf_does_even_if_prims_share_a_name(tmp_path):
+    more = LEADER.replace("HERE", "").replace('"k" (', '"k" (displayName = "j"; ')
+    xml = small(tmp_path, JOINT=f"{MIMIC}; float newton:mimicCoef1 = 2", MORE=more)
+    assert [joint.get("name") for joint in xml.iter("joint")] == ["j", "j_2"]
+    assert xml.find("joint/mimic").attrib == {"joint": "j_2", "multiplier": "2", "offset": "0"}
+
+
+@pytest.mark.parametrize("name", ["a\\x01b", "a\\x1b[31m", "a\ufffe", "\u202eknil", "a\\nb", ""])
+def test_a_display_name_that_cannot_be_printed_gives_way_to_the_name_of_the_prim(tmp_path, name):
+    assert small(tmp_path, NAME=name).find("link").get("name") == "base_link"
+
+
+def test_other_display_names_are_kept_and_cut_for_files(tmp_path):
+    name = "Räder <&> 1" + "x" * 400
+    link = small(tmp_path, NAME=name, BODY=MARKED.replace("FORM", "")).find("link")
+    assert link.get("name") == name
+    assert (tmp_path / "out" / link.find("visual/geometry/mesh").get("filename")).is_file()
+
+
+@pytest.mark.parametrize("limit", ["", "-inf", "None"])
+def test_a_joint_without_a_limit_turns_on_and_on(tmp_path, limit):
+    xml = small(tmp_path, JOINT=limit and f"float physics:lowerLimit = {limit}; float physics:upperLimit = 3")
+    assert xml.find("joint").get("type") == "continuous"
+    assert xml.find("joint/limit") is None
+
+
+def test_an_opacity_above_1_is_written_as_1(tmp_path):
+    assert small(tmp_path, BODY=BALL.replace("OPACITY", "7")).find(".//color").get("rgba") == "1 1 1 1"
+
+
+def test_a_body_called_world_is_not_the_world(tmp_path):
+    more = LEADER.replace("HERE", "").replace('"puck" (', '"puck" (displayName = "world"; ')
+    held = 'def PhysicsFixedJoint "held" {rel physics:body1 = </World/base_link>;}'
+    xml = small(tmp_path, MORE=f"{more}\n{held}")
+    assert [link.get("name") for link in xml.iter("link")] == ["world_2", "base_link", "wheel", "world"]
 
 
 def test_the_command_converts_both_ways_and_lists_what_is_left_out(tmp_path, capfd):

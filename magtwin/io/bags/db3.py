@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from magtwin.budget import BUDGETS, check_decoded
@@ -16,6 +17,12 @@ from magtwin.errors import InputError
 from magtwin.files import yaml_loader
 from magtwin.io.bags.cdr import Messages
 from magtwin.io.bags.storage import ROOM, VERSION, Batch, Connection, StoredTopic, in_time
+
+_HEAD = 100
+"""Bytes of the header of an sqlite file, which its first page begins with."""
+
+_ROWS = 10_000
+"""Most topics and definitions of a bag."""
 
 
 class Db3Writer:
@@ -75,11 +82,19 @@ class RosbagsReader:
 
     def __init__(self, path: Path) -> None:
         self._path, self._size = path, path.stat().st_size
+        pages = _Pages(path)
+        pages.check([1])  # the list of tables, before sqlite reads it
         with closing(
             sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
         ) as database:
+            longest = database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, BUDGETS["text"].file)
+            roots = "SELECT CAST(rootpage AS INTEGER) FROM sqlite_master WHERE rootpage > 0"
+            pages.check([root for (root,) in database.execute(roots)])
             _check_tables(database)
+            _check_rows(database)
             self.notes = _custom_data(database)
+            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, longest)
+            _check_messages(database, path)
         self._reader = Reader(path)
         self._reader.open()
         self.topics = [
@@ -110,6 +125,41 @@ class RosbagsReader:
         return joined
 
 
+class _Pages:
+    """The pages of an sqlite file, which are trees. sqlite follows a page as often as others point to it."""
+
+    def __init__(self, path: Path) -> None:
+        content = np.memmap(path, np.uint8, "r") if path.stat().st_size else np.empty(0, np.uint8)
+        size = int.from_bytes(content[16:18].tobytes())
+        size = 1 << 16 if size == 1 else max(size, 512)  # sqlite refuses a smaller one
+        count = len(content) // size
+        self._pages = content[: count * size].reshape(count, size)
+        self._used = np.zeros(count + 1, bool)
+
+    def check(self, roots: Sequence[int]) -> None:
+        """Refuse trees that use a page twice, or one of an earlier tree.
+
+        Raises:
+            InputError: They do.
+        """
+        level = np.array(roots, np.int64)
+        while len(level := level[(level > 0) & (level < len(self._used))]):  # sqlite refuses others
+            if len(np.unique(level)) < len(level) or self._used[level].any():
+                raise InputError("its tables use a page twice; get the file again")
+            self._used[level] = True
+            kinds = self._pages[level - 1, np.where(level == 1, _HEAD, 0)]
+            inner = level[(kinds == 2) | (kinds == 5)]
+            level = np.concatenate([np.empty(0, np.int64), *map(self._below, inner.tolist())])
+
+    def _below(self, number: int) -> NDArray[np.int64]:
+        """The pages to which an inner page points."""
+        page, head = self._pages[number - 1], _HEAD if number == 1 else 0
+        count = int.from_bytes(page[head + 3 : head + 5].tobytes())
+        cells = np.frombuffer(page[head + 12 : head + 12 + 2 * count].tobytes(), ">u2") & (len(page) - 1)
+        at = np.append(cells[cells <= len(page) - 4], head + 8).astype(np.int64)
+        return page[at[:, None] + np.arange(4)].view(">u4")[:, 0].astype(np.int64)
+
+
 def _check_tables(database: sqlite3.Connection) -> None:
     """Refuse contents that are computed, as a few bytes can make rows without end.
 
@@ -129,6 +179,45 @@ def _check_tables(database: sqlite3.Connection) -> None:
     topics, numbers = database.execute("SELECT count(id), count(DISTINCT id) FROM topics").fetchone()
     if topics != numbers:
         raise InputError(f"{topics} topics have {numbers} numbers; each needs its own")
+
+
+def _check_rows(database: sqlite3.Connection) -> None:
+    """Refuse topics that are too many or too large together, as rows of a damaged file can share their pages.
+
+    Raises:
+        InputError: They are.
+    """
+    rows, held = 0, 0
+    database.text_factory = bytes
+    for table in sorted({"schema", "metadata", "topics", "message_definitions"} & _tables(database)):
+        for row in database.execute(f"SELECT * FROM {table}"):
+            rows, held = rows + 1, held + sum(len(value) for value in row if isinstance(value, bytes))
+            if rows > _ROWS or held > BUDGETS["text"].file:
+                raise InputError(
+                    f"its topics have {rows:,} rows of {held:,} bytes; write it again with fewer"
+                )
+    database.text_factory = str
+
+
+def _check_messages(database: sqlite3.Connection, path: Path) -> None:
+    """Refuse messages that are too large together, which sqlite would sort on the disk.
+
+    Raises:
+        InputError: They are.
+    """
+    if "messages" not in _tables(database):
+        return  # rosbags refuses it
+    sizes = "total(CASE typeof(data) WHEN 'blob' THEN length(data) END), total(typeof(data) <> 'blob')"
+    size, others = database.execute(f"SELECT {sizes} FROM messages").fetchone()
+    if others:
+        raise InputError(f"{others:.0f} of its messages are not bytes; write it again")
+    check_decoded(path, path.stat().st_size, int(size))
+
+
+def _tables(database: sqlite3.Connection) -> set[str]:
+    """Names of its tables, of which sqlite ignores the case."""
+    names = database.execute("SELECT CAST(name AS BLOB) FROM sqlite_master")
+    return {name.decode(errors="replace").lower() for (name,) in names if name is not None}
 
 
 def _custom_data(database: sqlite3.Connection) -> dict[str, str]:

@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from numpy._core import multiarray
 
-from magtwin.budget import BUDGETS, check_count, check_decoded
+from magtwin.budget import BUDGETS, check_decoded
 from magtwin.errors import InputError
-from magtwin.files import existing_file
+from magtwin.files import check_zip, existing_file
 
 PICKLE = 4_000_000
 """Largest pickle of a checkpoint [bytes]; tensors are beside it."""
@@ -81,9 +81,7 @@ def _load(path: Path) -> dict[str, Any]:
     """The dict that a checkpoint holds, its keys checked."""
     try:
         with zipfile.ZipFile(path) as archive:
-            size = sum(info.file_size for info in archive.infolist())
-            check_decoded(path, path.stat().st_size, size)
-            check_count(path, "checkpoint", len(archive.infolist()), "members")
+            check_zip(path, archive, "checkpoint", "members")
             for name in archive.namelist():
                 if name.endswith("data.pkl"):
                     if archive.getinfo(name).file_size > PICKLE:

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -75,9 +76,9 @@ class Weights:
             InputError: It is missing or no such number.
         """
         value = self.expect(key, int | float)
-        if isinstance(value, bool) or not above < value < math.inf:
+        if isinstance(value, bool) or not above < value < math.inf or abs(value) > sys.float_info.max:
             wanted = f"above {above:g} and finite" if above > -math.inf else "a finite number"
-            raise InputError(f"{self.path}: {key!r} of its metadata must be {wanted}, got {value}")
+            raise InputError(f"{self.path}: {key!r} of its metadata must be {wanted}, got {str(value)[:40]}")
         return float(value)
 
     def fit(
@@ -213,7 +214,8 @@ def _about(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
             f"{path}: 'residual_sd_nt' of its metadata must be 0 nT or more and finite, got {sd}"
         )
     for key, value in about["facts"].items():
-        if not isinstance(value, MetadataValue):
+        large = isinstance(value, int) and abs(value) > sys.float_info.max
+        if not isinstance(value, MetadataValue) or large:
             raise InputError(f"{path}: {key!r} of its metadata must be text, a number, true or false")
     for name, unit in zip(about["features"], about["units"], strict=False):
         if name in FEATURES and FEATURES[name].unit != unit:

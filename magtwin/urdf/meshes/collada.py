@@ -12,7 +12,6 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.budget import BUDGETS
 from magtwin.errors import InputError
 from magtwin.files import read_bytes
 from magtwin.urdf.meshes.piece import GREY, Map, Paint, Piece, Rgba, linear, normal_map, smoothness
@@ -28,6 +27,12 @@ SHADERS = ("phong", "lambert", "blinn", "constant")
 
 POLYGONS = ("triangles", "polylist", "polygons", "tristrips", "trifans")
 """Primitives with faces."""
+
+SHOWN = ("node", "instance_node", "instance_geometry", "instance_controller")
+"""Contents of a node that may have faces."""
+
+MOST_INPUTS = 1_000
+"""Most inputs of a primitive."""
 
 LUMINANCE = (0.212671, 0.715160, 0.072169)
 """Weights of linear red, green and blue, from the specification."""
@@ -64,9 +69,13 @@ class _Collada:
                 f"{reading.path}: begins with <{self._root.tag}>; a COLLADA file begins with <COLLADA>"
             )
         self._ids = {e.get("id"): e for e in markup.lines if e.get("id")}
-        self._visited = 0
         self._sources: dict[str, NDArray] = {}
         self._paints: dict[Element, Paint | None] = {}
+        self._placed: dict[Element, tuple[NDArray, list[Element]]] = {}  # transforms and contents of nodes
+        self._primitives: dict[Element, list[Element]] = {}  # of geometries
+        self._vertices: dict[Element, list[Element]] = {}  # inputs of meshes
+        self._parameters: dict[Element, dict[str | None, Element]] = {}  # of profiles
+        self._colours: dict[Element, Rgba] = {}
 
     def pieces(self) -> list[Piece]:
         """The pieces of the file's scene, in metres."""
@@ -88,7 +97,7 @@ class _Collada:
             for node in scene.findall("node")
             for geometry, instance, T in self._walk(node, np.diag([metre, metre, metre, 1.0]), ())
             for piece in self._geometry(geometry, instance, shown)
-            if self._reading.spend(piece.nbytes)
+            if piece.faces.size and self._reading.spend(piece.nbytes)
         ]
         for geometry in self._root.iterfind("library_geometries/geometry"):
             if geometry not in shown:
@@ -101,13 +110,14 @@ class _Collada:
         self, node: Element, T: NDArray, above: tuple[Element, ...]
     ) -> Iterator[tuple[Element, Element, NDArray]]:
         """Geometries below a node, with their instance elements and their transforms to metres."""
-        self._visited += 1
-        if self._visited > BUDGETS["mesh"].count:  # nodes that instance each other twice grow exponentially
-            raise self._refused(node, f"shows over {BUDGETS['mesh'].count} nodes")
         if node in above:
             raise self._refused(node, f"node {node.get('id')!r} is within itself")
-        T = T @ self._transform(node)
-        for child in node:
+        if node not in self._placed:
+            self._placed[node] = self._transform(node), [child for child in node if child.tag in SHOWN]
+        local, children = self._placed[node]
+        T = T @ local
+        for child in children:
+            self._reading.visit(where=self._line(child))  # nodes that show each other twice multiply
             if child.tag == "node":
                 yield from self._walk(child, T, (*above, node))
             elif child.tag == "instance_node":
@@ -164,11 +174,15 @@ class _Collada:
             self._reading.lose(f"geometry {geometry.get('id')!r} is no mesh and is left out")
             return
         bound = {m.get("symbol"): m for m in instance.iter("instance_material")}
-        for primitive in mesh:
-            if primitive.tag in ("lines", "linestrips"):
-                self._reading.note(f"<{primitive.tag}> of geometry {geometry.get('id')!r} are left out")
-            elif primitive.tag in POLYGONS and primitive.find("p") is not None:
-                yield self._piece(primitive, mesh, bound)
+        if geometry not in self._primitives:
+            for kind in ("lines", "linestrips"):
+                if mesh.find(kind) is not None:
+                    self._reading.note(f"<{kind}> of geometry {geometry.get('id')!r} are left out")
+            self._primitives[geometry] = [p for p in mesh if p.tag in POLYGONS and p.find("p") is not None]
+        self._reading.visit(len(bound), self._line(instance))
+        for primitive in self._primitives[geometry]:
+            self._reading.visit(where=self._line(primitive))
+            yield self._piece(primitive, mesh, bound)
 
     def _piece(self, primitive: Element, mesh: Element, bound: dict[str | None, Element]) -> Piece:
         inputs = self._inputs(primitive, mesh)
@@ -183,7 +197,7 @@ class _Collada:
         if primitive.tag in ("tristrips", "trifans"):
             triangles = strips(counts, fans=primitive.tag == "trifans")
         else:
-            triangles = cut_polygons(points, corners, counts)
+            triangles = cut_polygons(points, corners, counts, self._reading)
         binding = bound.get(primitive.get("material"))
         paint, uvs, colours = self._paint(primitive, binding), None, None
         if paint is None or paint.textured:
@@ -203,10 +217,14 @@ class _Collada:
 
     def _inputs(self, primitive: Element, mesh: Element) -> list[_Input]:
         """Inputs of a primitive, with VERTEX replaced by the inputs of the mesh's vertices."""
-        inputs = []
+        if mesh not in self._vertices:
+            self._vertices[mesh] = mesh.findall("vertices/input")
+        inputs: list[_Input] = []
         for element in primitive.findall("input"):
             is_vertex = element.get("semantic") == "VERTEX"
-            for each in mesh.findall("vertices/input") if is_vertex else (element,):
+            if len(inputs) > MOST_INPUTS:
+                raise self._refused(primitive, f"<{primitive.tag}> has over {MOST_INPUTS} inputs")
+            for each in self._vertices[mesh] if is_vertex else (element,):
                 semantic, source = each.get("semantic", ""), each.get("source", "")[1:]
                 offset = int(element.get("offset", 0))
                 inputs.append(_Input(semantic, source, offset, int(each.get("set", 0))))
@@ -214,7 +232,9 @@ class _Collada:
 
     def _index(self, primitive: Element, stride: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Indices at a primitive's corners, shape (C, inputs), and corners of each polygon, shape (P,)."""
-        lists = [numbers(p.text or "", np.int64) for p in primitive.findall("p")]
+        texts = [p.text or "" for p in primitive.findall("p")]
+        self._reading.spend(sum(map(len, texts)))  # nodes that share it read it again
+        lists = [numbers(text, np.int64) for text in texts]
         wanted = 3 * stride * int(primitive.get("count", 0)) if primitive.tag == "triangles" else -1
         for p, values in zip(primitive.findall("p"), lists, strict=True):
             whole = len(values) == wanted or len(values) == len((p.text or "").split())
@@ -300,9 +320,11 @@ class _Collada:
             diffuse = shader.find("emission") if shader.tag == "constant" else None
         if diffuse is None or not len(diffuse):
             return None
-        for given in shader:  # also those not used, for notes on malformed colours
-            if given.find("color") is not None:
-                self._colour(given, profile)
+        if profile not in self._parameters:
+            self._parameters[profile] = {p.get("sid"): p for p in profile.iter("newparam")}
+            for given in shader:  # also those not used, for notes on malformed colours
+                if given.find("color") is not None:
+                    self._colour(given, profile)
         opacity = self._opacity(shader, profile, name)
         double_sided = any((e.text or "").strip() == "1" for e in effect.iter("double_sided"))
         texture = diffuse.find("texture")
@@ -388,10 +410,9 @@ class _Collada:
 
     def _image(self, texture: Element, profile: Element) -> Image | None:
         """The image of a `<texture>`: through sampler and surface, through a sampler (1.5), or directly."""
-        parameters = {p.get("sid"): p for p in profile.iter("newparam")}
         name = texture.get("texture", "")
         for _ in range(2):  # a sampler names a surface, a surface an image
-            parameter = parameters.get(name)
+            parameter = self._parameters[profile].get(name)
             if parameter is not None:
                 url = parameter.find("sampler2D/instance_image")
                 paths = ("sampler2D/source", "surface/init_from")
@@ -426,9 +447,14 @@ class _Collada:
 
     def _colour(self, element: Element, profile: Element) -> Rgba:
         """The `<color>` of an element or of its parameter, 0 to 1, repaired if malformed."""
+        if element not in self._colours:
+            self._colours[element] = self._read_colour(element, profile)
+        return self._colours[element]
+
+    def _read_colour(self, element: Element, profile: Element) -> Rgba:
         parameter = element.find("param")
         if parameter is not None:
-            named = {p.get("sid"): p for p in profile.iter("newparam")}.get(parameter.get("ref"))
+            named = self._parameters[profile].get(parameter.get("ref"))
             text = "" if named is None else named.findtext("float4") or named.findtext("float3") or ""
         else:
             text = element.findtext("color") or ""
@@ -452,7 +478,10 @@ class _Collada:
         return None if element is None else self._ids.get(element.get("url", "").removeprefix("#"))
 
     def _refused(self, element: Any, text: str) -> InputError:
-        return InputError(f"{self._reading.path}:{self._lines[element]}: {text}; export it again")
+        return InputError(f"{self._line(element)}: {text}; export it again")
+
+    def _line(self, element: Any) -> str:
+        return f"{self._reading.path}:{self._lines[element]}"
 
 
 def _part(word: str) -> list[str]:

@@ -67,6 +67,7 @@ class _Gltf:
             )
         self._buffers: dict[int, bytes] = {}
         self._paints: dict[int, Paint] = {}
+        self._images: dict[int, Image | None] = {}
 
     def pieces(self) -> list[Piece]:
         """The pieces of the file's scene, in node order."""
@@ -80,7 +81,7 @@ class _Gltf:
             piece.moved(T)
             for node, T in self._walk(roots)
             for piece in self._mesh(node)
-            if self._reading.spend(piece.nbytes)
+            if piece.faces.size and self._reading.spend(piece.nbytes)
         ]
         for kind in ("skins", "animations"):
             if self._json.get(kind):
@@ -96,6 +97,7 @@ class _Gltf:
             if index in seen:
                 raise self._refused(f"node {index} has two parents")
             seen.add(index)
+            self._reading.visit()
             node = self._json["nodes"][index]
             T = above @ _local(node)
             yield node, T
@@ -105,6 +107,7 @@ class _Gltf:
         if "mesh" not in node:
             return
         for primitive in self._json["meshes"][node["mesh"]]["primitives"]:
+            self._reading.visit()
             mode, attributes = primitive.get("mode", TRIANGLES), primitive["attributes"]
             if mode not in (TRIANGLES, STRIP, FAN):
                 self._reading.lose("lines and points are left out")
@@ -217,10 +220,16 @@ class _Gltf:
         if "source" not in texture:
             self._reading.lose("a texture of an unknown format is left out")
             return None
-        image = self._json["images"][texture["source"]]
-        name = image.get("name") or f"{self._reading.path.stem}_{texture['source']}"
+        source = texture["source"]
+        if source not in self._images:
+            self._images[source] = self._read_image(source)
+        return self._images[source]
+
+    def _read_image(self, source: int) -> Image | None:
+        image = self._json["images"][source]
+        name = image.get("name") or f"{self._reading.path.stem}_{source}"
         if "bufferView" in image:
-            return image_of(self._view(image["bufferView"]), name, self._reading)
+            return image_of(bytes(self._view(image["bufferView"])), name, self._reading)
         if image["uri"].startswith("data:"):
             return image_of(_inline(image["uri"]), name, self._reading)
         return read_image(image["uri"], self._reading)
@@ -243,10 +252,10 @@ class _Gltf:
             return np.maximum(values / np.iinfo(dtype).max, -1.0)
         return values.astype(float) if dtype.kind == "f" else values.astype(np.int64)
 
-    def _view(self, index: int) -> bytes:
+    def _view(self, index: int) -> memoryview:
         view = self._json["bufferViews"][index]
         start = view.get("byteOffset", 0)
-        data = self._buffer(view["buffer"])[start : start + view["byteLength"]]
+        data = memoryview(self._buffer(view["buffer"]))[start : start + view["byteLength"]]  # no copy
         if len(data) < view["byteLength"]:
             raise self._refused(f"buffer {view['buffer']} is cut short")
         return data

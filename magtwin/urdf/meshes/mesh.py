@@ -10,12 +10,15 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.files import existing_file
 from magtwin.urdf.meshes.piece import Paint, Piece
-from magtwin.urdf.meshes.reading import Note, Reading
+from magtwin.urdf.meshes.reading import Images, Note, Reading
 from magtwin.urdf.source.markup import UnsafeError
 from magtwin.usd.solids import corner_normals
 
 SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
 """Formats that can be read."""
+
+MOST_PAINTS = 10_000
+"""Most materials of a mesh; in USD, their prims take time by their square."""
 
 HASH = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)
 """Odd factors of the key that `distinct` sorts by, one a column; any work."""
@@ -68,7 +71,9 @@ class Mesh:
 Reader = Callable[[Reading], list[Piece]]
 
 
-def read_mesh(path: Path, may_read: Callable[[Path], bool] | None = None) -> Mesh:
+def read_mesh(
+    path: Path, may_read: Callable[[Path], bool] | None = None, images: Images | None = None
+) -> Mesh:
     """Read a mesh file.
 
     As in RViz (rviz_rendering, assimp_loader.cpp), COLLADA's unit is applied but not its up axis, and glTF is
@@ -78,6 +83,7 @@ def read_mesh(path: Path, may_read: Callable[[Path], bool] | None = None) -> Mes
         path: The file; its suffix determines the format.
         may_read: Whether a referenced file (material library, texture, buffer) may be read. Default: files
             in the folder of the mesh and below.
+        images: Images that files of the same robot share. Default: none.
 
     Raises:
         UnreadableMeshError: The file cannot be read, has no triangle, or has vertices that are not finite.
@@ -85,7 +91,7 @@ def read_mesh(path: Path, may_read: Callable[[Path], bool] | None = None) -> Mes
     """
     folder = path.resolve().parent
     allowed = may_read or (lambda other: other.resolve().is_relative_to(folder))
-    reading = Reading(existing_file(path, "mesh file", "mesh"), allowed)
+    reading = Reading(existing_file(path, "mesh file", "mesh"), allowed, images or Images())
     try:
         return _join(reading, _reader(path)(reading))
     except UnsafeError:
@@ -124,15 +130,20 @@ def _join(reading: Reading, pieces: Sequence[Piece]) -> Mesh:
             raise InputError(
                 f"{path}: a face names vertex {piece.faces.max()} of {len(piece.points)}; export it again"
             )
-    first = np.cumsum([0, *(len(piece.points) for piece in pieces)])
-    points = np.vstack([np.asarray(piece.points, np.float32) for piece in pieces])
+    tables = {id(piece.points): piece.points for piece in pieces}  # groups of a file share their vertices
+    first = dict(zip(tables, np.cumsum([0, *map(len, tables.values())]), strict=False))
+    points = np.vstack([np.asarray(table, np.float32) for table in tables.values()])
     faces = np.vstack([np.asarray(piece.faces, np.int64) for piece in pieces])
-    faces += np.repeat(first[:-1], [len(piece.faces) for piece in pieces])[:, None]
+    faces += np.repeat([first[id(p.points)] for p in pieces], [len(p.faces) for p in pieces])[:, None]
+    del tables
     if not np.isfinite(points).all() and not np.isfinite(points[faces]).all():
         raise InputError(f"{path}: has vertices that are not finite numbers; export it again")
     pieces = [replace(_textured(_coloured(piece, reading), reading), points=points[:0]) for piece in pieces]
-    paints = tuple(dict.fromkeys(piece.paint for piece in pieces))
-    paint = np.repeat([paints.index(p.paint) for p in pieces], [len(p.faces) for p in pieces])
+    numbers = {paint: number for number, paint in enumerate(dict.fromkeys(p.paint for p in pieces))}
+    paints = tuple(numbers)
+    if len(paints) > MOST_PAINTS:
+        raise InputError(f"{path}: has over {MOST_PAINTS:,} materials; merge those that look alike")
+    paint = np.repeat([numbers[p.paint] for p in pieces], [len(p.faces) for p in pieces])
     kept, index = distinct(points)
     points, faces = points[kept], index[faces]
     del kept, index  # as long as the file

@@ -18,6 +18,7 @@ from magtwin.urdf.description.model import Geometry
 from magtwin.urdf.meshes.collider import Solid, solids_of
 from magtwin.urdf.meshes.mesh import SUFFIXES, Mesh, UnreadableMeshError, distinct, face_normals, read_mesh
 from magtwin.urdf.meshes.piece import PLAIN, Paint
+from magtwin.urdf.meshes.reading import Images
 from magtwin.urdf.meshes.texture import Textures
 from magtwin.urdf.options import DEFAULTS, Collision, Options
 from magtwin.urdf.source.package import MissingFileError
@@ -68,6 +69,7 @@ class MeshLayer:
             textures: Asset path of the folder for textures, relative to the robot's layer.
         """
         self.textures = Textures(textures)
+        self._images = Images()
         self.looks: dict[tuple[Any, ...], tuple[Sdf.Path, str]] = {}
         """Path and name of each material on the robot's stage by its values, see `material`."""
         self._description, self.options = description, options
@@ -194,7 +196,7 @@ class MeshLayer:
 
     def _read(self, path: Path) -> Mesh:
         if path not in self._files:
-            self._files[path] = read_mesh(path, self._description.source.packages.holds)
+            self._files[path] = read_mesh(path, self._description.source.packages.holds, self._images)
             for note, lost in self._files[path].notes:
                 self._description.note(note, lost=lost, file=path)
         return self._files[path]
@@ -217,11 +219,11 @@ class MeshLayer:
         by_paint = np.array([(paint or PLAIN).display_colour for paint in file.paints], np.float32)
         if len(file.paints) > 1:
             api = UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim())
-            for i, paint in enumerate(file.paints):
+            order, counts = np.argsort(file.paint, kind="stable"), np.bincount(file.paint)
+            for paint, own in zip(file.paints, np.split(order, np.cumsum(counts)[:-1]), strict=True):
                 name = Tf.MakeValidIdentifier((paint.name if paint else "") or "plain")
                 subsets.append(free_name(name, taken))
-                of_paint = Vt.IntArray.FromNumpy(np.flatnonzero(file.paint == i).astype(np.int32))
-                api.CreateMaterialBindSubset(subsets[-1], of_paint)
+                api.CreateMaterialBindSubset(subsets[-1], Vt.IntArray.FromNumpy(own.astype(np.int32)))
             api.SetMaterialBindSubsetsFamilyType(tokens.partition)
         if file.colours is not None:
             colours = np.where(np.isfinite(file.colours), file.colours, by_paint[file.paint][:, None])

@@ -4,14 +4,32 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.budget import check_decoded
+from magtwin.budget import BUDGETS, check_decoded
+from magtwin.errors import InputError
 
 Note = tuple[str, bool]
 """A note for the user on a file, and whether something of the file was left out."""
+
+MOST_NOTES = 1_000
+"""Most notes on a file."""
+
+
+@dataclass
+class Images:
+    """Images that were decoded, of one file or of all files of a robot."""
+
+    decoded: dict[bytes, Any] = field(default_factory=dict)
+    """What became of each, by the hash of its bytes."""
+
+    size: int = 0
+    """Bytes of their files."""
+
+    pixels: int = 0
 
 
 @dataclass(frozen=True)
@@ -23,11 +41,17 @@ class Reading:
     may_read: Callable[[Path], bool]
     """Whether a referenced file (material library, texture, buffer) may be read."""
 
-    notes: list[Note] = field(default_factory=list)
-    """Repairs, guesses and omissions, each once."""
+    images: Images = field(default_factory=Images)
+    """Its images, with those of other files if they share it."""
+
+    notes: dict[Note, None] = field(default_factory=dict)
+    """Repairs, guesses and omissions in order, each once."""
 
     spent: list[int] = field(default_factory=lambda: [0])
     """Bytes of its decoded arrays so far."""
+
+    visited: list[int] = field(default_factory=lambda: [0])
+    """Nodes, and what they show, that were visited so far."""
 
     def spend(self, count: int) -> bool:
         """Count bytes of decoded arrays against the file's budget; True if they are within.
@@ -39,11 +63,22 @@ class Reading:
         check_decoded(self.path, self.path.stat().st_size, self.spent[0])
         return True
 
+    def visit(self, count: int = 1, where: object = None) -> None:
+        """Count nodes, and what they show as often as they show it, against the budget of a mesh.
+
+        Raises:
+            InputError: The file shows more than it may.
+        """
+        self.visited[0] += count
+        most = BUDGETS["mesh"].count
+        if self.visited[0] > most:
+            raise InputError(f"{where or self.path}: shows over {most} nodes; export it again")
+
     def note(self, text: str, *, lost: bool = False) -> None:
         """Add a note on a repair or guess, or an omission if `lost`."""
-        note = (f"{self.path.name}: {text}", lost)
-        if note not in self.notes:
-            self.notes.append(note)
+        if len(self.notes) >= MOST_NOTES:
+            text = f"over {MOST_NOTES} notes; the others are left out"
+        self.notes[f"{self.path.name}: {text}", lost] = None
 
     def lose(self, text: str) -> None:
         """Add a note on an omission."""

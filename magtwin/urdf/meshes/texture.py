@@ -1,11 +1,12 @@
 """Texture: images of a robot, copied beside its asset."""
 
+import hashlib
 import io
 import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -13,7 +14,7 @@ from urllib.parse import unquote
 from magtwin.budget import BUDGETS, check_decoded
 from magtwin.errors import InputError
 from magtwin.files import read_bytes
-from magtwin.urdf.meshes.reading import Reading
+from magtwin.urdf.meshes.reading import Images, Reading
 
 TEXTURES = "textures"
 """Folder of the copies beside an asset's layers."""
@@ -23,6 +24,9 @@ READ = ("BMP", "DDS", "GIF", "JPEG", "JPEG2000", "PCX", "PNG", "PPM", "SGI", "TG
 
 BYTES = 11
 """Bytes that a pixel takes: as decoded, as RGBA, and as RGB."""
+
+PIXELS, BY_BYTE = 1 << 28, 16
+"""Most pixels of all images of a robot, and more of them for each byte of their files."""
 
 KEPT = {"JPEG": ".jpg", "PNG": ".png"}
 """Formats that every USD viewer reads, by Pillow's names; others are converted to PNG."""
@@ -104,24 +108,41 @@ def image_of(data: bytes, name: str, reading: Reading) -> Image | None:
         name: Name for notes and for the copy.
         reading: The mesh file.
     """
-    from PIL import Image as Pillow
-
     stem = re.sub(r"[^A-Za-z0-9_-]", "_", Path(name).stem) or "texture"
-    try:
-        with opened_image(data) as picture:
-            kind = picture.format or ""
-            alpha = "A" in picture.getbands() or "transparency" in picture.info
-            rgba = picture.convert("RGBA")
-    except (OSError, SyntaxError, ValueError) as error:
-        reading.lose(f"texture {name!r} is not a readable image and is left out ({error})")
+    key = hashlib.sha256(data).digest()
+    if key not in reading.images.decoded:
+        try:
+            reading.images.decoded[key] = _decoded(data, reading.images)
+        except (OSError, SyntaxError, ValueError) as error:
+            reading.images.decoded[key] = str(error)
+    image = reading.images.decoded[key]
+    if isinstance(image, str):
+        reading.lose(f"texture {name!r} is not a readable image and is left out ({image})")
         return None
-    r, g, b = (c / 255 for c in rgba.convert("RGB").resize((1, 1), Pillow.Resampling.BOX).tobytes())
+    kind, made = image
     if kind not in KEPT:
         reading.note(f"texture {name!r} is {kind}, which not every USD viewer reads; written as PNG")
+    return replace(made, name=stem + KEPT.get(kind, ".png"))
+
+
+def _decoded(data: bytes, images: Images) -> tuple[str, Image]:
+    """Format of an image by Pillow's name, and the image without its name."""
+    from PIL import Image as Pillow
+
+    with opened_image(data) as picture:
+        images.size += len(data)
+        images.pixels += picture.width * picture.height
+        if images.pixels > PIXELS + BY_BYTE * images.size:
+            raise InputError(f"the images to here have {images.pixels:,} pixels, which are too many")
+        kind = picture.format or ""
+        alpha = "A" in picture.getbands() or "transparency" in picture.info
+        rgba = picture.convert("RGBA")
+    r, g, b = (c / 255 for c in rgba.convert("RGB").resize((1, 1), Pillow.Resampling.BOX).tobytes())
+    if kind not in KEPT:
         buffer = io.BytesIO()
         rgba.save(buffer, "PNG")
-        data, kind = buffer.getvalue(), "PNG"
-    return Image(stem + KEPT[kind], data, (r, g, b), alpha)
+        data = buffer.getvalue()
+    return kind, Image("", data, (r, g, b), alpha)
 
 
 class Textures:
@@ -135,6 +156,7 @@ class Textures:
         """
         self.folder = folder
         self._names: dict[bytes, str] = {}
+        self._taken: dict[str, int] = {}  # names in small letters, and the last number tried after each
 
     def __len__(self) -> int:
         return len(self._names)
@@ -143,10 +165,12 @@ class Textures:
         """Asset path of an image's copy."""
         if image.data not in self._names:
             stem, _, suffix = image.name.rpartition(".")
-            taken, name, number = {n.lower() for n in self._names.values()}, image.name, 1
-            while name.lower() in taken:  # some file systems ignore case
+            first = image.name.lower()  # some file systems ignore case
+            name, number = image.name, self._taken.get(first, 1)
+            while name.lower() in self._taken:
                 number += 1
                 name = f"{stem}_{number}.{suffix}"
+            self._taken[name.lower()], self._taken[first] = 1, number
             self._names[image.data] = name
         return f"{self.folder}/{self._names[image.data]}"
 

@@ -93,7 +93,8 @@ def read_wavefront(reading: Reading) -> list[Piece]:
     groups = [g for g in groups if g.counts]
     for missing in dict.fromkeys(g.material for g in groups if g.material and g.material not in paints):
         reading.lose(f"material {missing!r} is in none of its libraries; shown without it")
-    return [_piece(g, paints.get(g.material), v, vt, vn, path) for g in groups]
+    points = v[:, :3]  # one array, so that the pieces share it
+    return [_piece(g, paints.get(g.material), points, v, vt, vn, reading) for g in groups]
 
 
 def _statements(path: Path) -> Iterator[tuple[int, str, str]]:
@@ -149,17 +150,26 @@ def _table(rows: list[str], kind: str, least: int, path: Path) -> NDArray:
         raise InputError(f"{path}: its {kind} are not {least} numbers each; export it again") from error
 
 
-def _piece(group: _Group, paint: Paint | None, v: NDArray, vt: NDArray, vn: NDArray, path: Path) -> Piece:
+def _piece(
+    group: _Group,
+    paint: Paint | None,
+    points: NDArray,
+    v: NDArray,
+    vt: NDArray,
+    vn: NDArray,
+    reading: Reading,
+) -> Piece:
+    path = reading.path
     corners, counts = _corners(group, path), np.array(group.counts)
     for column, table, name in ((0, v, "vertex"), (1, vt, "texture coordinate"), (2, vn, "normal")):
         if corners[:, column].max() >= len(table):
             raise InputError(
                 f"{path}: a face names {name} {corners[:, column].max() + 1} of {len(table)}; export it again"
             )
-    index = corners[cut_polygons(v[:, :3], corners[:, 0], counts)]
+    index = corners[cut_polygons(points, corners[:, 0], counts, reading)]
     faces = index[:, :, 0]
     return Piece(
-        points=v[:, :3],
+        points=points,
         faces=faces,
         paint=paint,
         normals=_picked(vn, index[:, :, 2]),

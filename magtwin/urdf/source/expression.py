@@ -93,6 +93,8 @@ GLOBALS: Mapping[str, Any] = {
 }
 """Names that are available in every expression."""
 
+_SIZED = (str, list, tuple, dict)
+
 METHODS: Mapping[type, frozenset[str]] = {
     str: frozenset(
         (
@@ -129,8 +131,14 @@ OPERATORS: Mapping[type[ast.AST], Callable[..., Any]] = {
     ast.NotIn: lambda a, b: a not in b,
 }
 
-_WIDE = re.compile(r"%(\(.*?\))?[^%a-zA-Z]*?(\*|\d{3})", re.DOTALL)
+_WIDE = re.compile(r"%[^%a-zA-Z)]*(\*|\d{3})")
 """A `%` format with a width or precision of three digits, or with a variable one."""
+
+_WIDE_KEYED = re.compile(_WIDE.pattern.replace("%", "[%)]", 1))
+"""The same in a text with keys, `%(key)`, which end with a parenthesis."""
+
+NARROW = 420
+"""Most characters of a number of type float in a format of two digits, 1e308 as "%.99f"."""
 
 
 def evaluate(text: str, names: Mapping[str, Any], budget: Budget) -> Any:
@@ -177,8 +185,10 @@ def check_size(value: Any, budget: Budget, *, plain: bool = False) -> Any:
         entry = pending.pop()
         if isinstance(entry, str | bytes):
             size += len(entry)
-        elif isinstance(entry, int) and entry.bit_length() > BITS:
-            raise ExpressionError(f"an integer of over {BITS} bits")
+        elif isinstance(entry, int):
+            size += entry.bit_length() // 64  # a number of the usual size costs nothing
+            if entry.bit_length() > BITS:
+                raise ExpressionError(f"an integer of over {BITS} bits")
         elif isinstance(entry, dict | list | tuple):
             size += len(entry)
             if size <= LARGEST:
@@ -221,6 +231,7 @@ class _Interpreter:
                 left = self.value(node.left)
                 for comparison, operand in zip(node.ops, node.comparators, strict=True):
                     right = self.value(operand)
+                    self._pay(comparison, left, right)
                     if not OPERATORS[type(comparison)](left, right):
                         return False
                     left = right
@@ -232,7 +243,8 @@ class _Interpreter:
                 if not isinstance(node.slice, ast.Slice):
                     return values[self.value(node.slice)]
                 ends = (node.slice.lower, node.slice.upper, node.slice.step)
-                return values[slice(*(None if end is None else self.value(end) for end in ends))]
+                part = values[slice(*(None if end is None else self.value(end) for end in ends))]
+                return check_size(part, self._budget)
             case ast.List() | ast.Tuple():
                 values = [self.value(entry) for entry in node.elts]
                 return check_size(tuple(values) if isinstance(node, ast.Tuple) else values, self._budget)
@@ -240,7 +252,10 @@ class _Interpreter:
                 pairs = zip(node.keys, node.values, strict=True)
                 return check_size({self.value(k): self.value(v) for k, v in pairs if k}, self._budget)
             case ast.ListComp() | ast.GeneratorExp():
-                values = [scope.value(node.elt) for scope in self._scopes(node.generators)]
+                values = []
+                for scope in self._scopes(node.generators):
+                    values.append(scope.value(node.elt))
+                    _check_length(len(values))
                 return check_size(values, self._budget)
             case ast.DictComp():
                 scopes = self._scopes(node.generators)
@@ -283,7 +298,7 @@ class _Interpreter:
             if keyword.arg is None:
                 raise ExpressionError("** is not allowed in a call")
             options[keyword.arg] = self.value(keyword.value)
-        for value in arguments:  # paid for before the function works on it
+        for value in (*arguments, *options.values()):  # paid for before the function works on it
             check_size(value, self._budget)
         return check_size(function(*arguments, **options), self._budget)
 
@@ -294,6 +309,8 @@ class _Interpreter:
         holder, name = self.value(node.value), node.attr
         allowed = METHODS.get(type(holder), frozenset())
         if name in allowed:
+            if not isinstance(holder, dict):  # whose methods do not look at its entries
+                check_size(holder, self._budget)
             return lambda *arguments: _call_method(holder, name, *arguments)
         if isinstance(holder, dict):
             return self._attribute(holder, name)
@@ -308,9 +325,29 @@ class _Interpreter:
         integers = isinstance(left, int) and isinstance(right, int)
         if isinstance(kind, ast.Pow) and integers and left.bit_length() * abs(right) > BITS:
             raise ExpressionError(f"an integer of over {BITS} bits")
-        if isinstance(kind, ast.Mod) and isinstance(left, str) and _WIDE.search(left):
-            raise ExpressionError("a format of over two digits is not allowed")
+        if isinstance(kind, ast.Mod) and isinstance(left, str):
+            self._check_format(left, right)
         return check_size(OPERATORS[type(kind)](left, right), self._budget)
+
+    def _pay(self, comparison: ast.cmpop, left: Any, right: Any) -> None:
+        """Pay for the entries and characters that a comparison looks at."""
+        is_within = isinstance(comparison, ast.In | ast.NotIn)
+        if is_within and isinstance(right, dict):
+            check_size(left, self._budget)  # its hash
+        elif is_within or (isinstance(left, _SIZED) and isinstance(right, _SIZED)):
+            check_size(left, self._budget)
+            check_size(right, self._budget)
+
+    def _check_format(self, text: str, operand: Any) -> None:
+        """Refuse a `%` format whose result could be too large."""
+        keyed = "%(" in text
+        if (_WIDE_KEYED if keyed else _WIDE).search(text):
+            raise ExpressionError("a format of over two digits is not allowed")
+        by_key = isinstance(operand, dict) and not re.search(r"%(?!\()", text)  # else it is shown as a whole
+        parts = operand.values() if by_key else operand if isinstance(operand, tuple) else (operand,)
+        largest = max((len(ascii(part)) for part in parts), default=0)  # no format of a text is longer
+        self._budget.spend(largest)
+        _check_length(len(text) + text.count("%") * (largest + NARROW))
 
     def _inside(self, names: dict[str, Any]) -> "_Interpreter":
         return _Interpreter(ChainMap(names, self._names), self._budget)  # type: ignore[arg-type]

@@ -128,4 +128,10 @@ def _time_samples(prim: Usd.Prim) -> Iterator[tuple[str, Sdf.Layer]]:
                 value = layer.QueryTimeSample(spec.path, time)
                 own = Sdf.AttributeSpec(over, name, spec.typeName, spec.variability)
                 own.default = Sdf.ValueBlock() if value is None else value
-        yield (ORIGIN + datetime.timedelta(days=time)).isoformat(), session
+        try:
+            date = ORIGIN + datetime.timedelta(days=time)
+        except (OverflowError, ValueError) as error:
+            raise InputError(
+                f"{place(prim)}: its time code {time:g} is no date, in days since {ORIGIN:%Y-%m-%d}; correct it"
+            ) from error
+        yield date.isoformat(), session

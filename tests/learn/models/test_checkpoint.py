@@ -253,3 +253,9 @@ NAN[1, 2] = np.nan
 )
 def test_a_network_that_does_not_fit_together_is_refused(tmp_path, held, text):
     assert refusal(pth(tmp_path / "a.pth", held)) == text
+
+
+def test_a_checkpoint_that_is_compressed_by_lzma_is_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.pth", "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("a/data.pkl", pickle.dumps({}))
+    assert refusal(tmp_path / "a.pth").startswith("compressed by method 14 of zip; ")

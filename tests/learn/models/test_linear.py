@@ -1,9 +1,11 @@
+import json
 import math
 
 import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from magtwin.errors import InputError
@@ -135,8 +137,6 @@ def test_the_report_gives_coefficients_in_the_units_of_the_features(fitted):
 )
 def test_a_file_that_does_not_hold_together_is_refused(fitted, tmp_path, change, text):
     fitted.model.save(tmp_path / "l.safetensors")
-    from safetensors import safe_open
-
     with safe_open(tmp_path / "l.safetensors", framework="pt") as file:
         metadata = file.metadata()
     held = load_file(tmp_path / "l.safetensors") | change
@@ -145,3 +145,14 @@ def test_a_file_that_does_not_hold_together_is_refused(fitted, tmp_path, change,
     with pytest.raises(InputError) as refused:
         load_predictor(tmp_path / "l.safetensors")
     assert text in str(refused.value)
+
+
+@pytest.mark.parametrize("change", [{"penalty": 10**400}, {"facts": {"seed": 10**400}}])
+def test_numbers_that_are_too_large_are_refused(fitted, tmp_path, change):
+    path = tmp_path / "l.safetensors"
+    fitted.model.save(path)
+    with safe_open(path, framework="pt") as file:
+        about = json.loads(file.metadata()["magtwin"])
+    save_file(load_file(path), path, metadata={"magtwin": json.dumps(about | change)})
+    with pytest.raises(InputError, match="of its metadata must be"):
+        load_predictor(path)
