@@ -45,9 +45,25 @@ _LARGEST_NOTE = 1 << 24
 """Most bytes of such a file."""
 
 _WRITTEN = frozenset(
-    " .csv .db3 .html .json .mcap .md .npz .parquet .rrd .safetensors .sdf .svg .toml .tum .urdf .usd .usda .usdc"
-    " .usdz .world .xml .yaml .bmp .exr .gif .hdr .jpeg .jpg .pgm .png .tga .tif .tiff .webp .bin .dae .glb .gltf"
-    " .mtl .obj .ply .stl".split(" ")
+    (
+        *("", ".csv", ".db3", ".html", ".json", ".mcap", ".md", ".npz", ".parquet", ".rrd", ".safetensors"),
+        *(
+            ".sdf",
+            ".svg",
+            ".toml",
+            ".tum",
+            ".urdf",
+            ".usd",
+            ".usda",
+            ".usdc",
+            ".usdz",
+            ".world",
+            ".xml",
+            ".yaml",
+        ),
+        *(".bmp", ".exr", ".gif", ".hdr", ".jpeg", ".jpg", ".pgm", ".png", ".tga", ".tif", ".tiff", ".webp"),
+        *(".bin", ".dae", ".glb", ".gltf", ".mtl", ".obj", ".ply", ".stl"),
+    )
 )
 """Suffixes of files that magtwin writes or copies into folders; "" for a licence."""
 
@@ -148,8 +164,8 @@ def _check_replaceable(folder: Path, new: Path) -> None:
         part = file.relative_to(folder)
         if part.parts[0] not in same and file.suffix.lower() not in _WRITTEN and not file.is_dir():
             raise InputError(
-                f"{folder}: holds {part}, which would be removed with it; move it away, remove the folder, or "
-                "give another name"
+                f"{folder}: holds {part}, which would be removed with it; move it away, remove the folder, "
+                "or give another name"
             )
 
 

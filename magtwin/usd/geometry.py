@@ -234,15 +234,16 @@ def read_colour_scale(stage: Usd.Stage) -> ColourScale | None:
         if not isinstance(metadata, dict) or "colourMap" not in metadata:
             continue
         if UsdGeom.Imageable(prim).ComputeVisibility() != "invisible":
-            name, least, greatest, unit = map(metadata.get, ("colourMap", "least", "greatest", "unit"))
+            name, unit = metadata["colourMap"], metadata.get("unit")
+            least, greatest = metadata.get("least"), metadata.get("greatest")
             texts = isinstance(name, str) and isinstance(unit, str)
-            numbers = isinstance(least, int | float) and isinstance(greatest, int | float)
-            if not (texts and numbers and np.isfinite(greatest - least)):
+            numbers = [x for x in (least, greatest) if isinstance(x, int | float) and np.isfinite(x)]
+            if not texts or len(numbers) < 2:
                 raise InputError(
                     f"{place(prim)}: the colour scale in its customData wants colourMap and unit as texts, "
                     "least and greatest as numbers; correct it"
                 )
-            return ColourScale(name, least, greatest, unit, str(prim.GetPath()))
+            return ColourScale(str(name), numbers[0], numbers[1], str(unit), str(prim.GetPath()))
     return None
 
 

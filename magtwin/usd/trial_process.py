@@ -1,9 +1,9 @@
 """The process that opens stages before magtwin does. `trial` runs this file; it imports only pxr.
 
 Each line of the input is a job, each line of the output its answer, both in JSON. A job has the file, the
-working folder, the folders in which files may be named (`inside`), limits of memory, time, values and prims,
-and whether the stage is composed. The layers of a composed stage are opened one by one, and all files that they
-name are checked before any of them is opened.
+working folder, the folders in which files may be named (`inside`), limits of memory, time, values and
+prims, and whether the stage is composed. The layers of a composed stage are opened one by one, and all
+files that they name are checked before any of them is opened.
 """
 
 import functools
@@ -309,7 +309,7 @@ def compose(root: str, audit: Audit) -> None:
             audit.leave_out(root, layer.identifier, layer.realPath)
     if (prims := count_prims(stage)) > audit.most_prims:
         raise RefusedError(
-            f"has {prims:.3g} prims, with those of instances; at most {audit.most_prims:,} are read; use fewer"
+            f"has {prims:.3g} prims with those of instances; at most {audit.most_prims:,} are read"
         )
     if audit.suspects:
         check_types(stage, audit.suspects)
@@ -328,7 +328,9 @@ def count_prims(stage: Any) -> int:
         for prim in Usd.PrimRange(top):
             total += 1
             if prim.GetPath().pathElementCount > DEEPEST:
-                raise RefusedError(f"nests prims over {DEEPEST} levels deep, as <{prim.GetPath()}> does")
+                raise RefusedError(
+                    f"nests prims over {DEEPEST} levels deep, in <{prim.GetPath().GetPrefixes()[0]}>"
+                )
             if prim.IsInstance():
                 prototype = prim.GetPrototype()
                 if prototype.GetPath() not in known:

@@ -132,6 +132,6 @@ def _time_samples(prim: Usd.Prim) -> Iterator[tuple[str, Sdf.Layer]]:
             date = ORIGIN + datetime.timedelta(days=time)
         except (OverflowError, ValueError) as error:
             raise InputError(
-                f"{place(prim)}: its time code {time:g} is no date, in days since {ORIGIN:%Y-%m-%d}; correct it"
+                f"{place(prim)}: its time code {time:g} is no day since {ORIGIN:%Y-%m-%d}; correct it"
             ) from error
         yield date.isoformat(), session
