@@ -307,11 +307,19 @@ def _new_sha256(file: Path, above: tuple[Path, ...], known: dict[Path, str]) -> 
             return layer_sha256(file)
         layer = Sdf.Layer.OpenAsAnonymous(str(file))
 
+    errors: list[InputError] = []
+
     def checksum(asset: str) -> str:
         named = file.parent / asset
-        return _content_sha256(named.resolve(), (*above, file), known) if named.is_file() else asset
+        try:
+            return _content_sha256(named.resolve(), (*above, file), known) if named.is_file() else asset
+        except InputError as error:  # USD would put its traceback into the text, at each level again
+            errors.append(error)
+            return asset
 
     UsdUtils.ModifyAssetPaths(layer, checksum)
+    if errors:
+        raise errors[0].with_traceback(None)
     return hashlib.sha256(layer.ExportToString().encode()).hexdigest()
 
 

@@ -1,0 +1,164 @@
+"""Small stages that cost much, crash USD, or hold values of other types are refused in one line."""
+
+# ruff: noqa: E501
+import pytest
+from pxr import Sdf
+
+from magtwin.errors import InputError
+from magtwin.export.package import export_scene
+from magtwin.usd.animation import read_animation
+from magtwin.usd.geometry import read_colour_scale, read_links, read_shapes
+from magtwin.usd.info import info_of_stage
+from magtwin.usd.layers import open_stage, stage_sha256
+
+HEAD = '#usda 1.0\n(\n    defaultPrim = "World"\n    metersPerUnit = 1\n    upAxis = "Z"\n)\n'
+
+
+def stage(folder, text, name="s.usda"):
+    file = folder / name
+    file.write_text(HEAD + text)
+    return file
+
+
+def twice(levels):
+    """Instances of two instances each, some levels deep."""
+    text = 'def Xform "World" (\n    instanceable = true\n    references = </P0>\n)\n{\n}\n'
+    for i in range(levels):
+        halves = "".join(
+            f'    def "{n}" (\n        instanceable = true\n        references = </P{i + 1}>\n    )\n    {{\n    }}\n'
+            for n in "ab"
+        )
+        text += f'def Xform "P{i}"\n{{\n{halves}}}\n'
+    return text + f'def Xform "P{levels}"\n{{\n    def Cube "c"\n    {{\n    }}\n}}\n'
+
+
+@pytest.mark.parametrize(("levels", "reason"), [(30, "prims with those of instances"), (140, "levels deep")])
+def test_instances_of_instances_are_counted_before_they_are_visited(levels, reason, tmp_path):
+    with pytest.raises(InputError, match=reason):
+        open_stage(stage(tmp_path, twice(levels)))
+    assert len(read_shapes(open_stage(stage(tmp_path, twice(3), "few.usda")))) == 8 + 8 + 4 + 2 + 1
+
+
+def test_prims_that_nest_too_deep_for_usd_are_refused(tmp_path):
+    layer = Sdf.Layer.CreateNew(str(tmp_path / "deep.usdc"))
+    prim = Sdf.PrimSpec(layer, "World", Sdf.SpecifierDef, "Xform")
+    layer.defaultPrim = "World"
+    for _ in range(300):
+        prim = Sdf.PrimSpec(prim, "a", Sdf.SpecifierDef, "Xform")
+    layer.Save()
+    with pytest.raises(InputError, match="over 128 levels deep"):
+        info_of_stage(tmp_path / "deep.usdc")
+
+
+def test_an_instancer_of_itself_is_refused(tmp_path):
+    text = """def PointInstancer "World"
+{
+    rel prototypes = </World>
+    int[] protoIndices = [0]
+    point3f[] positions = [(0, 0, 0)]
+}
+"""
+    with pytest.raises(InputError, match="USD crashes on it"):
+        info_of_stage(stage(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('def Mesh "World"\n{\n    string[] points = ["a"]\n}\n', "points as string"),
+        ('def Cube "World"\n{\n    string[] primvars:displayColor = ["a"]\n}\n', "displayColor as string"),
+        (
+            'def Cube "World" (\n    apiSchemas = ["PhysicsMassAPI"]\n)\n{\n    string physics:mass = "a"\n}\n',
+            "mass as",
+        ),
+        (
+            'def PhysicsRevoluteJoint "World" (\n    apiSchemas = ["PhysicsDriveAPI:angular"]\n)\n'
+            '{\n    string drive:angular:physics:damping = "a"\n}\n',
+            "damping as string",
+        ),
+    ],
+)
+def test_a_value_of_another_type_than_the_schema_is_refused_by_name(text, said, tmp_path):
+    with pytest.raises(InputError, match=f"</World> has .*{said}.*correct it"):
+        open_stage(stage(tmp_path, text))
+
+
+def test_other_precisions_and_other_attributes_of_the_same_name_are_read(tmp_path):
+    text = 'def Sphere "World"\n{\n    float radius = 2\n}\ndef Scope "s"\n{\n    custom string radius = "large"\n}\n'
+    assert read_shapes(open_stage(stage(tmp_path, text)))
+
+
+def test_a_face_with_a_negative_number_of_corners_is_refused(tmp_path):
+    text = """def Mesh "World"
+{
+    int[] faceVertexCounts = [300000000, -299999997]
+    int[] faceVertexIndices = [0, 1, 2]
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
+}
+"""
+    with pytest.raises(InputError, match="has -299999997 corners"):
+        read_shapes(open_stage(stage(tmp_path, text)))
+
+
+@pytest.mark.parametrize(
+    "scale", ['string colourMap = "viridis"', 'string colourMap = "a"\nstring least = "b"']
+)
+def test_a_damaged_colour_scale_is_refused(scale, tmp_path):
+    text = f'def Cube "World" (\n    customData = {{\n        dictionary magtwin = {{\n{scale}\n        }}\n    }}\n)\n{{\n}}\n'
+    with pytest.raises(InputError, match="colour scale"):
+        read_colour_scale(open_stage(stage(tmp_path, text)))
+
+
+def test_bodies_in_a_long_chain_have_one_base(tmp_path):
+    count = 300
+    text = "".join(
+        f'    def Xform "b{i}" (\n        apiSchemas = ["PhysicsRigidBodyAPI"]\n    )\n    {{\n    }}\n'
+        for i in range(count)
+    ) + "".join(
+        f'    def PhysicsFixedJoint "j{i}"\n    {{\n        rel physics:body0 = </World/b{i}>\n'
+        f"        rel physics:body1 = </World/b{i + 1}>\n    }}\n"
+        for i in range(count - 1)
+    )
+    links = read_links(open_stage(stage(tmp_path, f'def Xform "World"\n{{\n{text}}}\n')))
+    assert {link.base for link in links.values()} == {"b0"}
+
+
+def diamond(folder, levels):
+    """Layers of which each names the next two in a variant that is not selected."""
+    for i in range(levels, -1, -1):
+        names = ", ".join(f"@./a{k}.usda@" for k in (i + 1, i + 2) if k <= levels)
+        variant = f'    variantSet "v" = {{\n        "x" (\n            references = [{names}]\n        ) {{\n        }}\n    }}\n'
+        stage(
+            folder,
+            f'def "World" (\n    variantSets = "v"\n)\n{{\n{variant if names else ""}}}\n',
+            f"a{i}.usda",
+        )
+    return folder / "a0.usda"
+
+
+def test_layers_that_share_layers_are_summed_once(tmp_path):
+    assert len(stage_sha256(diamond(tmp_path, 40))) == 64
+    (tmp_path / "long").mkdir()
+    with pytest.raises(InputError, match="files that name each other"):
+        stage_sha256(diamond(tmp_path / "long", 300))
+
+
+def test_facts_that_nest_deep_are_a_damaged_run(tmp_path):
+    text = HEAD.replace(
+        "(\n", '(\n    customLayerData = {\n        string magtwinFacts = "' + "[" * 100_000 + '"\n    }\n'
+    )
+    (tmp_path / "r.usda").write_text(text + 'def Xform "World"\n{\n    custom double[] run:t = [0, 1]\n}\n')
+    with pytest.raises(InputError):
+        read_animation(tmp_path / "r.usda")
+
+
+def test_metadata_of_other_kinds_and_tiles_in_folders_are_packed(tmp_path):
+    (tmp_path / "<UDIM>").mkdir()
+    (tmp_path / "<UDIM>" / "x.png").write_bytes(b"x")
+    text = HEAD.replace(
+        "(\n", '(\n    customLayerData = {\n        string SimReady_Metadata = "none"\n    }\n'
+    )
+    text += 'def Cube "World"\n{\n    custom asset a = @./<UDIM>/x.png@\n}\n'
+    (tmp_path / "s.usda").write_text(text)
+    export_scene(tmp_path / "s.usda", tmp_path / "out")
+    assert (tmp_path / "out").is_dir()
