@@ -311,6 +311,8 @@ def _new_sha256(file: Path, above: tuple[Path, ...], known: dict[Path, str]) -> 
 
     def checksum(asset: str) -> str:
         named = file.parent / asset
+        if errors:
+            return asset
         try:
             return _content_sha256(named.resolve(), (*above, file), known) if named.is_file() else asset
         except InputError as error:  # USD would put its traceback into the text, at each level again
