@@ -46,25 +46,11 @@ _LARGEST_NOTE = 1 << 24
 
 _WRITTEN = frozenset(
     (
-        *("", ".csv", ".db3", ".html", ".json", ".mcap", ".md", ".npz", ".parquet", ".rrd", ".safetensors"),
-        *(
-            ".sdf",
-            ".svg",
-            ".toml",
-            ".tum",
-            ".urdf",
-            ".usd",
-            ".usda",
-            ".usdc",
-            ".usdz",
-            ".world",
-            ".xml",
-            ".yaml",
-        ),
-        *(".bmp", ".exr", ".gif", ".hdr", ".jpeg", ".jpg", ".pgm", ".png", ".tga", ".tif", ".tiff", ".webp"),
-        *(".bin", ".dae", ".glb", ".gltf", ".mtl", ".obj", ".ply", ".stl"),
-    )
-)
+        ".bin .bmp .csv .dae .db3 .exr .gif .glb .gltf .hdr .html .jpeg .jpg .json .mcap .md .mtl .npz"
+        " .obj .parquet .pgm .ply .png .rrd .safetensors .sdf .stl .svg .tga .tif .tiff .toml .tum .urdf"
+        " .usd .usda .usdc .usdz .webp .world .xml .yaml"
+    ).split()
+) | {""}
 """Suffixes of files that magtwin writes or copies into folders; "" for a licence."""
 
 _PROBE = 1 << 16

@@ -292,7 +292,7 @@ class Trial:
                 place = self.folder / name
                 if what == "folder":
                     place.mkdir()
-                    place /= "old.txt"
+                    place /= "old.usda"
                 place.write_text(OLD, encoding="utf-8")
         self.before, _ = tree(self.folder)
 
