@@ -10,6 +10,7 @@ import ctypes
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import stat
@@ -44,14 +45,11 @@ _AT_FDCWD, _EXCHANGE = -100, 2
 _LARGEST_NOTE = 1 << 24
 """Most bytes of such a file."""
 
-_WRITTEN = frozenset(
-    (
-        ".bin .bmp .csv .dae .db3 .exr .gif .glb .gltf .hdr .html .jpeg .jpg .json .mcap .md .mtl .npz"
-        " .obj .parquet .pgm .ply .png .rrd .safetensors .sdf .stl .svg .tga .tif .tiff .toml .tum .urdf"
-        " .usd .usda .usdc .usdz .webp .world .xml .yaml"
-    ).split()
-) | {""}
-"""Suffixes of files that magtwin writes or copies into folders; "" for a licence."""
+_WRITTEN = re.compile(
+    r"\.(bin|bmp|csv|dae|db3|exr|gif|glb|gltf|hdr|html|jpe?g|json|mcap|md|mtl|npz|obj|parquet|pgm|ply|png|rrd)"
+    r"|\.(safetensors|sdf|stl|svg|tga|tiff?|toml|tum|urdf|usd[acz]?|webp|world|xml|yaml)|"
+)
+"""Suffixes of files that magtwin writes or copies into folders; none for a licence."""
 
 _PROBE = 1 << 16
 """Bytes that are written to see whether a disk is full."""
@@ -148,7 +146,7 @@ def _check_replaceable(folder: Path, new: Path) -> None:
     same = {file.name for file in new.iterdir()}
     for file in folder.rglob("*"):
         part = file.relative_to(folder)
-        if part.parts[0] not in same and file.suffix.lower() not in _WRITTEN and not file.is_dir():
+        if part.parts[0] not in same and not _WRITTEN.fullmatch(file.suffix.lower()) and not file.is_dir():
             raise InputError(
                 f"{folder}: holds {part}, which would be removed with it; move it away, remove the folder, "
                 "or give another name"

@@ -31,6 +31,11 @@ def test_a_parameter_that_begins_a_text_or_that_an_error_is_about_becomes_its_fl
     assert InputError("a date, got 'x'", parameter="day").in_flags(flags) == "a date, got 'x'"
 
 
+def test_a_text_of_a_file_that_looks_like_a_call_stays():
+    for text in ("name `force(__import__)` is unknown", "name `force(1 +)`", "name `force((((`"):
+        assert InputError(text).in_flags(FLAGS) == text
+
+
 def test_a_parameter_survives_pickling_and_is_none_by_default():
     assert pickle.loads(pickle.dumps(InputError("give `force=True`", parameter="force"))).parameter == "force"
     assert UnknownNameError("no path").parameter is None

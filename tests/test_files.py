@@ -117,6 +117,18 @@ def test_a_folder_is_replaced_whole(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
 
 
+def test_a_folder_with_files_of_a_kind_that_magtwin_does_not_write_is_not_replaced(tmp_path):
+    (tmp_path / "run" / "deep").mkdir(parents=True)
+    (tmp_path / "run" / "deep" / "thesis.tex").write_text("mine")
+    with (
+        pytest.raises(InputError, match=r"run: holds deep/thesis.tex, which would be removed with it"),
+        output(tmp_path / "run", force=True) as aside,
+    ):
+        aside.mkdir()
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+    assert (tmp_path / "run" / "deep" / "thesis.tex").read_text() == "mine"
+
+
 def test_nothing_is_overwritten_unasked(tmp_path):
     (tmp_path / "a.txt").touch()
     with pytest.raises(InputError, match=r"a.txt: exists already; give `force=True`"):

@@ -208,6 +208,25 @@ def test_a_process_whose_folder_is_swept_before_it_is_locked_takes_another(tmp_p
     assert content(tmp_path) == {"a.txt": "new"}
 
 
+@pytest.mark.parametrize("note", ["fifo", "large", "deep"])
+@pytest.mark.parametrize("name", [".first", ".commit"])
+def test_notes_that_magtwin_did_not_write_stop_nothing(tmp_path, name, note):
+    bad = tmp_path / ".x.magtwin-12345678"
+    bad.mkdir()
+    if name == ".commit":
+        (bad / ".first").write_text(str(bad))
+    if note == "fifo":
+        os.mkfifo(bad / name)
+    elif note == "large":
+        with (bad / name).open("wb") as file:
+            file.truncate(1 << 33)
+    else:
+        (bad / name).write_text("[" * 1_000_000)
+    with output(tmp_path / "a.txt") as aside:
+        aside.write_text("new")
+    assert (tmp_path / "a.txt").read_text() == "new"
+
+
 def test_a_list_of_renames_that_magtwin_did_not_write_moves_nothing(tmp_path):
     """A folder from elsewhere can hold one."""
     (tmp_path / "home").mkdir()

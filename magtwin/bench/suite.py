@@ -27,6 +27,9 @@ SEEDS = 2**63
 RUNS = 1_000_000
 """Most runs of all scenarios of a suite together."""
 
+KIDNAPS = 1000
+"""Most kidnaps of a run."""
+
 TABLES = 1000
 """Most scenarios, and most localizers, of a suite."""
 
@@ -139,7 +142,7 @@ class Scenario:
         for key in ("duration_s", "rate_hz", "map_length_m", "survey_spacing_m", "odometry_factor"):
             if not 0 < getattr(self, key) < math.inf:
                 raise InputError(f"{key} must be above 0, got {getattr(self, key)}")
-        if self.kidnaps < 0 or not 0 <= self.kidnap_m[0] < self.kidnap_m[1]:
+        if not 0 <= self.kidnap_m[0] < self.kidnap_m[1]:
             raise InputError(f"kidnap_m must be two ascending distances, got {self.kidnap_m}")
         if not self.paths:
             raise InputError("paths must name at least one path")
@@ -147,6 +150,9 @@ class Scenario:
             raise InputError(
                 f"duration_s {self.duration_s:g} at {self.rate_hz:g} Hz is over a million readings"
             )
+        most = min(KIDNAPS, int(self.duration_s * self.rate_hz / 2))
+        if not 0 <= self.kidnaps <= most:
+            raise InputError(f"kidnaps must be 0 to {most} in a run of that length, got {self.kidnaps}")
 
     @property
     def told_odometry(self) -> OdometryModel:

@@ -66,6 +66,9 @@ BYTES_PER_PIXEL = 400
 MOST_TEXELS = 2048
 """Texels along the longer side of a texture as drawn; larger images are scaled down."""
 
+FACES_AT_A_POINT = 1000
+"""Faces that share a point; of meshes with more, every face is flat, since VTK compares each two of them."""
+
 AMBIENT, DIFFUSE = 0.22, 0.8
 """Share of an object's colour visible without light, and share added by light at normal incidence."""
 
@@ -346,7 +349,10 @@ def mesh_of(shape: Shape, vertices: NDArray) -> Any:
     """A shape as a mesh with colours at its points; with normals for shading unless it is a map."""
     import pyvista
 
-    mesh = pyvista.PolyData.from_regular_faces(np.asarray(vertices, np.float32), shape.faces)
+    faces: NDArray[np.integer] = shape.faces
+    if shape.vertex_colours is None and np.bincount(faces.ravel(), minlength=1).max() > FACES_AT_A_POINT:
+        vertices, faces = vertices[faces.ravel()], np.arange(faces.size).reshape(faces.shape)
+    mesh = pyvista.PolyData.from_regular_faces(np.asarray(vertices, np.float32), faces)
     if shape.vertex_colours is not None:
         mesh["rgb"] = (255 * srgb_from_linear(shape.vertex_colours)).round().astype(np.uint8)
         return mesh

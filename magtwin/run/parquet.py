@@ -76,12 +76,12 @@ def _largest_page(path: Path, size: int) -> int:
             while at < end:
                 try:
                     page, at = _struct(data, at, 0)
-                    total, largest, step = total + page[_PAGE], max(largest, page[_PAGE]), page[_PACKED_PAGE]
+                    length, step = int(page[_PAGE]), int(page[_PACKED_PAGE])
                 except (IndexError, KeyError, TypeError, ValueError) as error:
                     raise _damaged(path) from error
-                if min(page[_PAGE], step) < 0:
+                if min(length, step) < 0:
                     raise _damaged(path)
-                at += step
+                total, largest, at = total + length, max(largest, length), at + step
             check_decoded(path, size, total)
     return largest
 

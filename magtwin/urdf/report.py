@@ -182,7 +182,8 @@ class ConversionReport:
             Figure(line.fault, line.count, note=f"{line.done}: {line.places}".lstrip(": "))
             for line in self.repairs
         ]
-        guesses = [note for note in self.notes if note not in self._faults]
+        faults = self._faults
+        guesses = [note for note in self.notes if note not in faults]
         figures += [
             Figure("unknown tags", sum(self.unknown_tags.values()), note="kept as text"),
             Figure("guesses", len(guesses)),

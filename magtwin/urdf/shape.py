@@ -13,7 +13,7 @@ from magtwin.urdf.description.model import Shape
 from magtwin.urdf.material import define_grip, define_look, define_priority, wear
 from magtwin.urdf.meshes.mesh_layer import MESH, Entry, MeshLayer, free_child
 from magtwin.urdf.meshes.piece import PLAIN, Paint
-from magtwin.urdf.meshes.reading import Reading
+from magtwin.urdf.meshes.reading import Images, Reading
 from magtwin.urdf.meshes.texture import Image, read_image
 from magtwin.urdf.physics.gazebo import Surface
 from magtwin.urdf.physics.inertia import quaternion
@@ -52,7 +52,7 @@ def define_visual(
     Returns:
         The prim; empty if its mesh is missing and the options allow that.
     """
-    paint = _paint_of(visual, description)
+    paint = _paint_of(visual, description, meshes.images)
     if visual.geometry.kind != "mesh":
         path = _path(body, VISUALS, visual.name or visual.geometry.kind)
         prim = body.GetStage().DefinePrim(path, "Mesh")
@@ -145,7 +145,7 @@ def _define_mesh(
     return prim
 
 
-def _paint_of(visual: Shape, description: Description) -> Paint | None:
+def _paint_of(visual: Shape, description: Description, images: Images) -> Paint | None:
     """The URDF material of a visual: its own, or the robot's of that name; None if it has none.
 
     As in urdfdom, a material defined in one visual applies to others that name it. As in RViz, a texture
@@ -163,7 +163,7 @@ def _paint_of(visual: Shape, description: Description) -> Paint | None:
         )
     colour = shared.rgba if shared and material.rgba is None else material.rgba
     texture = material.texture or (shared.texture if shared else None)
-    image = None if texture is None else _image(texture, name, description)
+    image = None if texture is None else _image(texture, name, description, images)
     if image is None and colour is None:
         if texture is None and name:
             description.note(f"material {name!r} is named, but has no colour: shown without it")
@@ -172,9 +172,9 @@ def _paint_of(visual: Shape, description: Description) -> Paint | None:
     return Paint(name, (r, g, b, a)) if image is None else Paint(name, (1.0, 1.0, 1.0, a), image)
 
 
-def _image(filename: str, material: str, description: Description) -> Image | None:
+def _image(filename: str, material: str, description: Description, images: Images) -> Image | None:
     """The image of a URDF `<texture>`; None with a note if it is missing or unreadable."""
-    reading = Reading(description.path, description.source.packages.holds)
+    reading = Reading(description.path, description.source.packages.holds, images)
     try:
         image = read_image(str(description.find_file(filename, "texture")), reading)
     except MissingFileError:

@@ -24,8 +24,7 @@ from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat
 from magtwin.outputs import check_free, output, transaction
 from magtwin.report import Figure, Report
-from magtwin.urdf.description.model import Geometry
-from magtwin.urdf.meshes.mesh_layer import MESH, PRIMITIVE, free_name, primitive_of
+from magtwin.urdf.meshes.mesh_layer import MESH, free_name, primitive_of
 from magtwin.urdf.physics.joint import AXIS
 from magtwin.urdf.physics.link import SITE_API
 from magtwin.urdf.physics.mechanism import displacement
@@ -374,7 +373,7 @@ class _Writer:
         T[:3, :3] /= scale
         if not np.allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), rtol=0, atol=1e-9):
             return None
-        form = _form(prim)
+        form = primitive_of(prim)
         if prim.IsA(UsdGeom.Cube) or (form is not None and form.kind == "box"):
             size = scale * (read_number(prim, "size") if form is None else form.size)
             return T, "box", {"size": _text(_shortest(v) for v in size)}
@@ -411,17 +410,6 @@ def _name(prim: Usd.Prim) -> str:
     """Name of a prim in the description: its display name if all of that can be printed, and so be in XML."""
     shown = str(prim.GetDisplayName())
     return shown if shown and shown.isprintable() else str(prim.GetName())
-
-
-def _form(prim: Usd.Prim) -> Geometry | None:
-    """The primitive that a mesh shows; None for other meshes."""
-    try:
-        form = primitive_of(prim)
-    except (AttributeError, KeyError, TypeError, ValueError):
-        form = Geometry("damaged")
-    if form and (form.kind not in ("box", "capsule", "cylinder", "sphere") or form.size.shape != (3,)):
-        raise InputError(f"{place(prim)}: its customData {PRIMITIVE} is damaged; remove it")
-    return form
 
 
 def _read(prim: Usd.Prim, name: str, kind: Any = None) -> Any:

@@ -30,14 +30,15 @@ def info_of_stage(path: Path) -> Report:
     )
     purposes = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render]
     box = UsdGeom.BBoxCache(Usd.TimeCode.Default(), purposes).ComputeWorldBound(stage.GetPseudoRoot())
-    size = box.ComputeAlignedRange().GetSize()
+    bounds = box.ComputeAlignedRange()
+    size = None if bounds.IsEmpty() else " x ".join(f"{s:.3f}" for s in bounds.GetSize())
     figures = [
         Figure("default prim", str(stage.GetDefaultPrim().GetPath()) if stage.GetDefaultPrim() else "none"),
         Figure("metres per unit", UsdGeom.GetStageMetersPerUnit(stage)),
         Figure("up axis", str(UsdGeom.GetStageUpAxis(stage))),
         Figure("layers", len(stage.GetUsedLayers())),
         Figure("prims", len(prims)),
-        Figure("size", " x ".join(f"{s:.3f}" for s in size), "m"),
+        Figure("size", "no shapes" if size is None else size, "" if size is None else "m"),
         Figure("rigid bodies", len(bodies)),
         Figure("joints", sum(joints.values()), note=", ".join(f"{n} {t}" for t, n in sorted(joints.items()))),
         Figure("mass", float(mass), "kg"),

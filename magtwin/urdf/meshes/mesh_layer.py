@@ -24,6 +24,7 @@ from magtwin.urdf.options import DEFAULTS, Collision, Options
 from magtwin.urdf.source.package import MissingFileError
 from magtwin.usd import solids
 from magtwin.usd.layers import describe_stage
+from magtwin.usd.schema import place
 
 T = TypeVar("T")
 
@@ -69,7 +70,8 @@ class MeshLayer:
             textures: Asset path of the folder for textures, relative to the robot's layer.
         """
         self.textures = Textures(textures)
-        self._images = Images()
+        self.images = Images()
+        """Images of its meshes and of the URDF's materials."""
         self.looks: dict[tuple[Any, ...], tuple[Sdf.Path, str]] = {}
         """Path and name of each material on the robot's stage by its values, see `material`."""
         self._description, self.options = description, options
@@ -196,7 +198,7 @@ class MeshLayer:
 
     def _read(self, path: Path) -> Mesh:
         if path not in self._files:
-            self._files[path] = read_mesh(path, self._description.source.packages.holds, self._images)
+            self._files[path] = read_mesh(path, self._description.source.packages.holds, self.images)
             for note, lost in self._files[path].notes:
                 self._description.note(note, lost=lost, file=path)
         return self._files[path]
@@ -276,12 +278,23 @@ def gather(description: Description, options: Options, textures: str) -> MeshLay
 
 
 def primitive_of(prim: Usd.Prim) -> Geometry | None:
-    """The primitive that a mesh shows; None for other meshes."""
+    """The primitive that a mesh shows; None for other meshes.
+
+    Raises:
+        InputError: The note that says so is damaged.
+    """
     values = prim.GetCustomDataByKey(PRIMITIVE)
     if not values:
         return None
-    radius, length = (float(values.get(name, 0.0)) for name in ("radius", "length"))
-    return Geometry(values["kind"], np.array(values.get("size", (1.0, 1.0, 1.0)), float), radius, length)
+    try:
+        radius, length = (float(values.get(name, 0.0)) for name in ("radius", "length"))
+        size = np.array(values.get("size", (1.0, 1.0, 1.0)), float)
+        kind = str(values["kind"])
+    except (AttributeError, KeyError, TypeError, ValueError):
+        kind, size, radius, length = "", np.ones(3), 0.0, 0.0
+    if kind not in ("box", "capsule", "cylinder", "sphere") or size.shape != (3,):
+        raise InputError(f"{place(prim)}: its customData {PRIMITIVE} is damaged; remove it")
+    return Geometry(kind, size, radius, length)
 
 
 def free_name(name: str, taken: set[str]) -> str:
