@@ -104,7 +104,8 @@ def open_stage(path: str | os.PathLike[str], *, own: bool = False) -> Usd.Stage:
             stage.Reload()  # a layer that is still held elsewhere would be stale
         errors = stage.GetCompositionErrors()
     if errors:
-        raise InputError(f"{path}: {_one_line(_text(errors[0]))}")
+        said = _one_line(_text(errors[0])).removesuffix("; skipping.")
+        raise InputError(f"{path}: {said}")
     upgrade_stage(stage, str(path))
     return stage
 
