@@ -1,9 +1,10 @@
 """Fuzz the readers of every format: `make fuzz SECONDS=300 SEED=1`, or `python tests/fuzz/fuzz.py npz glb`.
 
 The smallest file of each format (`seeds.py`) is damaged with the format in mind (words, numbers, lines,
-counts, lengths, members of containers), and read. A right result or an `InputError` in one line is fine;
-another exception, a crash, a hang or too much memory is a fault. Inputs that are read, or refused at a new
-place, are damaged further. Batches run in forked processes with limits of processor time, time and memory.
+counts, lengths, members of containers, types of values), and read. A right result or an `InputError` in one
+line is fine; another exception, a crash, a hang or too much memory is a fault. Inputs that are read, or
+refused at a new place, are damaged further. Batches run in forked processes with limits of processor time,
+time and memory.
 
 Faults are grouped by exception and innermost frame of magtwin. The smallest input of each group is reduced
 and kept in build/fuzz/faults; copy it to tests/fuzz/corpus, which `test_corpus.py` reads, and mend the
@@ -16,6 +17,7 @@ import collections
 import contextlib
 import hashlib
 import importlib
+import io
 import itertools
 import json
 import math
@@ -90,6 +92,46 @@ WORDS = (
 WORDS += ("null", "None", "true", "[]", "{}", '""', "*a", "&a", "<<", "${x}", "#", "\\", "\u202e", "inf")
 ENCODED = (*(word.encode() for word in WORDS), b"\xed\x9f\xbf", b"\xff\xfe", b"\xed\xa0\x80", b"\xef\xbb\xbf")
 FLOATS = (0.0, -1.0, 1e9, -1e300, 1e300, 5e-324, math.nan, math.inf)
+USD_VALUES = {
+    "asset": "@./x.png@",
+    "asset[]": "[@./x.png@, @../x@]",
+    "bool": "true",
+    "color3f[]": "[(1, 0, 0)]",
+    "double": "nan",
+    "double[]": "[]",
+    "double3": "(1e300, 0, -inf)",
+    "float": "-1",
+    "float2[]": "[(0, 1), (2, 3)]",
+    "half": "7e4",
+    "int": "-2147483648",
+    "int[]": "[-1, 3, 2147483647]",
+    "int64": "-9223372036854775808",
+    "matrix4d": "((0,0,0,0), (0,0,0,0), (0,0,0,0), (0,0,0,0))",
+    "point3f[]": "[(nan, 0, 1e30)]",
+    "quatf": "(0, 0, 0, 0)",
+    "quatd[]": "[(1, 0, 0, 0)]",
+    "string": '"x"',
+    "string[]": '["x", ""]',
+    "timecode": "1",
+    "token": '"x"',
+    "token[]": '["x", "x"]',
+    "uchar": "255",
+    "uint64": "18446744073709551615",
+    "opaque": "None",
+    "rel": "</x>",
+    "add rel": "[</x>, </World>, </x>]",
+}
+"""Values of USD by type."""
+
+USD_ATTRIBUTE = re.compile(
+    rb"\b(?:(?:half|float|double|point3f|normal3f|vector3f|texCoord2f|color3f|quatf|quatd|matrix4d|u?int|u?int64"
+    rb"|bool|token|string|asset|timecode)[234]?[fd]?(?:\[\])?|rel) ([\w:.]+) = ([^\n]*)"
+)
+"""An attribute or relationship of one line in USD's text."""
+
+ARRAY_TYPES = "?", "<i1", "<u8", "<f2", "<f8", ">f4", "<c16", "S3", "U5", "<M8[ns]", "<m8[D]", "V4", "f4,U2"
+"""Types of numpy arrays."""
+
 WHOLE = (0, 1, 0x7F, 0xFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 1 << 40, (1 << 63) - 1, (1 << 64) - 1)
 
 
@@ -103,6 +145,9 @@ def mutated(data: bytes, rng: random.Random, sound: bool) -> bytes:
     Libraries open it for that only if it is sound: a damaged file can crash them.
     """
     for _ in range(rng.choice((1, 1, 2, 4))):
+        if rng.random() < 0.2 and (other := _retyped(data, rng, sound)) is not None:
+            data = other
+            continue
         inside = members(data, sound) if rng.random() < 0.7 else None
         if inside is None or not inside[0]:
             data, sound = _changed(data, rng), False
@@ -114,7 +159,90 @@ def mutated(data: bytes, rng: random.Random, sound: bool) -> bytes:
     return data
 
 
+def _retyped(data: bytes, rng: random.Random, sound: bool) -> bytes | None:
+    """A sound file with a value, array or column of another type or shape; None if it is no such file."""
+    if found := [*USD_ATTRIBUTE.finditer(data)] if data.startswith(b"#usda") else []:
+        match = rng.choice(found)
+        kind = rng.choice(sorted(USD_VALUES))
+        other = f"{kind} {match[1].decode()} = {USD_VALUES[kind]}".encode()
+        return data[: match.start()] + other + data[match.end() :]
+    with contextlib.suppress(Exception):  # damaged, or values that have no such type
+        if data.startswith(b"PAR1") and sound:
+            return _other_column(data, rng)
+        if data.startswith(b"\x93NUMPY"):
+            return _other_array(data, rng)
+    return None
+
+
+def _other_array(data: bytes, rng: random.Random) -> bytes:
+    """A .npy file with an array of another type or shape."""
+    array = np.load(io.BytesIO(data), allow_pickle=False)
+    changes: tuple[Callable[[], Any], ...] = (
+        lambda: np.zeros(array.shape, rng.choice(ARRAY_TYPES)),
+        lambda: array.astype(rng.choice(ARRAY_TYPES)),
+        lambda: array.reshape(-1),
+        lambda: array[None],
+        lambda: array[..., None],
+        lambda: array.T,
+        lambda: array[::-1],
+        lambda: array[:-1],
+        lambda: array[:0],
+        lambda: array[:1],
+        lambda: np.concatenate([array, array]),
+        lambda: np.asfortranarray(array),
+        lambda: array.ravel()[0],
+    )
+    out = io.BytesIO()
+    with np.errstate(all="ignore"):
+        np.save(out, rng.choice(changes)(), allow_pickle=False)
+    return out.getvalue()
+
+
+def _other_column(data: bytes, rng: random.Random) -> bytes:
+    """A Parquet file with a column of another type, name or place, without one, or with other rows."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(io.BytesIO(data))
+    at, rows = rng.randrange(table.num_columns), table.num_rows
+    name, column = table.column_names[at], table.column(at).combine_chunks()
+    columns: tuple[Callable[[], Any], ...] = (
+        lambda: pa.nulls(rows),
+        lambda: pa.nulls(rows, column.type),
+        lambda: pa.array([rng.choice(WORDS)] * rows),
+        lambda: pa.array([b"\xff"] * rows),
+        lambda: pa.array([True] * rows),
+        lambda: pa.array([[1.0, 2.0], *[[1.0]] * (rows - 1)]),
+        lambda: pa.array([{"x": 1}] * rows),
+        lambda: pa.array([10**30] * rows, pa.decimal128(38)),
+        lambda: pa.array([rng.choice(FLOATS)] * rows),
+        lambda: pa.array([rng.choice(WHOLE)] * rows, pa.uint64()),
+        lambda: pa.array(range(rows), pa.timestamp("ns")),
+        lambda: pa.array(range(rows), pa.int32()),
+        lambda: pa.DictionaryArray.from_arrays(pa.array([0] * rows, pa.int8()), column.slice(0, 1)),
+        lambda: column.take(pa.array([*range(rows)][::-1])),
+        lambda: pa.concat_arrays([column.slice(1), pa.nulls(1, column.type)]),
+    )
+    tables: tuple[Callable[[], Any], ...] = (
+        lambda: table.remove_column(at),
+        lambda: table.append_column(name, column),
+        lambda: table.slice(0, 0),
+        lambda: table.slice(0, 1),
+        lambda: pa.concat_tables([table, table]),
+        lambda: table.rename_columns([*table.column_names[:at], "", *table.column_names[at + 1 :]]),
+        lambda: table.replace_schema_metadata({b"": b"\xff"}),
+        lambda: table.replace_schema_metadata(None),
+    )
+    retyped = rng.random() < 0.7
+    table = table.set_column(at, name, rng.choice(columns)()) if retyped else rng.choice(tables)()
+    out = io.BytesIO()
+    pq.write_table(table, out, row_group_size=rng.choice((1, 1000)))
+    return out.getvalue()
+
+
 def _changed(data: bytes, rng: random.Random) -> bytes:
+    if data.startswith(b"\x93NUMPY") and rng.random() < 0.5:
+        return _retyped(data, rng, True) or data
     text = b"\0" not in data[:2000] and rng.random() < 0.85
     return _text(data, rng) if text else _binary(data, rng)
 
