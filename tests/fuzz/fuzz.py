@@ -146,7 +146,7 @@ def mutated(data: bytes, rng: random.Random, sound: bool) -> bytes:
     """
     for _ in range(rng.choice((1, 1, 2, 4))):
         if rng.random() < 0.2 and (other := _retyped(data, rng, sound)) is not None:
-            data = other
+            data, sound = other, False
             continue
         inside = members(data, sound) if rng.random() < 0.7 else None
         if inside is None or not inside[0]:
