@@ -90,7 +90,8 @@ class Listed:
     def report(self, title: str, took_s: float, made: int) -> Report:
         """Numbers of runs and readings, duration, rate, and how well 90 % intervals hold."""
         names = set(self.sessions.values())
-        count = len(self.rows)
+        count, sessions = len(self.rows), len(self.sessions)
+        runs = "one run" if count == 1 else f"{count} runs"
         return Report(
             title,
             (
@@ -102,11 +103,11 @@ class Listed:
             ),
             {
                 "paths": ", ".join(self.paths),
-                "sessions": "survey" if names == {"survey"} else len(self.sessions),
+                "sessions": "survey" if names == {"survey"} else sessions,
             },
             self.tally.verdict(
-                f"the exact field of {count} runs in {len(self.sessions)} sessions",
-                holds=HOLDS_ONE if len(self.sessions) == 1 else HOLDS,
+                f"the exact field of {runs} in {'one session' if sessions == 1 else f'{sessions} sessions'}",
+                holds=HOLDS_ONE if sessions == 1 else HOLDS,
             ),
         )
 

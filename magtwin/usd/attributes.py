@@ -179,7 +179,8 @@ def plain_value(attribute: Usd.Attribute) -> Any:
     value, kind = attribute.Get(), attribute.GetTypeName()
     if not isinstance(value, kind.type.pythonClass or type(kind.defaultValue)):
         raise InputError(
-            f"{place(attribute.GetPrim())}: {attribute.GetName()} must be a {kind}, got a {type(value).__name__}"
+            f"{place(attribute.GetPrim())}: {attribute.GetName()} must be a {kind}, "
+            f"got a {type(value).__name__}"
         )
     if isinstance(value, Sdf.AssetPath):  # the file need not exist
         if not value.path:
