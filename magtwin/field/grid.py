@@ -13,6 +13,10 @@ Array = NDArray[np.float64]
 
 TURN = 2 * np.pi
 
+FARTHEST_M = 1e8  # Largest coordinate accepted [m]: twice round the Earth
+
+NARROWEST_M = 1e-6  # Smallest cell [m], which two nodes still have between them at `FARTHEST_M`
+
 MOST_NODES = 50_000_000  # Larger grids (0.4 GB of values) are refused: the spacing is probably a typo
 
 
@@ -153,4 +157,7 @@ def check_axes(grid: Any) -> None:
         if len(pair) != 2 or not np.all(np.isfinite(pair)) or (name == "cell_m" and min(pair) <= 0):
             above = " above 0" if name == "cell_m" else ""
             raise InputError(f"{name} of {kind} must be two lengths{above} [m], got {pair}")
+        least, most = (NARROWEST_M, FARTHEST_M) if name == "cell_m" else (-FARTHEST_M, FARTHEST_M)
+        if min(pair) < least or max(pair) > most:
+            raise InputError(f"{name} of {kind} must be from {least:g} to {most:g} m, got {pair}")
         object.__setattr__(grid, name, pair)
