@@ -56,6 +56,8 @@ class Grid(Summarized):
         x0, x1, y0, y1 = (float(v) for v in np.asarray(extent, float))
         if not (np.isfinite(spacing_m) and spacing_m > 0):
             raise InputError(f"spacing_m must be above 0 m, got {spacing_m!r}")
+        if spacing_m < NARROWEST_M:
+            raise InputError(f"spacing_m {spacing_m:g} is below {NARROWEST_M:g} m; widen `spacing_m`")
         columns, rows = (int(np.floor(length / spacing_m + 1e-9)) + 1 for length in (x1 - x0, y1 - y0))
         if min(columns, rows) < 2:
             raise InputError(f"spacing_m {spacing_m:g} leaves no cell on {x1 - x0:g} x {y1 - y0:g} m")
