@@ -16,7 +16,7 @@ import signal
 import stat
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -60,6 +60,9 @@ _asides: set[Path] = set()
 _swept: set[Path] = set()
 """Folders that this process has swept."""
 
+_inputs: ContextVar[tuple[Path, ...]] = ContextVar("inputs", default=())
+"""Files and folders that the command reads, which no output may remove."""
+
 _pending: ContextVar["_Pending | None"] = ContextVar("pending", default=None)
 """What waits for the end of the transaction; None outside of one."""
 
@@ -96,7 +99,7 @@ def output(path: str | os.PathLike[str], *, force: bool = False, at_once: bool =
     """
     path = check_free(path, force=force)
     place = Path.cwd() / path  # absolute, since the working folder can be renamed
-    if place.resolve() in (Path.cwd(), *Path.cwd().parents):
+    if Path(os.path.realpath(place)) in (Path.cwd(), *Path.cwd().parents):
         raise InputError(f"{path}: is the working folder or contains it; give a folder inside it")
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise InputError(f"{path}: a device or pipe, which cannot be replaced; give a file")
@@ -136,13 +139,20 @@ def output(path: str | os.PathLike[str], *, force: bool = False, at_once: bool =
 
 
 def _check_replaceable(folder: Path, new: Path) -> None:
-    """Refuse to replace a folder with files of the user: of a kind that magtwin writes into no folder.
+    """Refuse to replace a folder with files of the user: inputs, or of a kind that magtwin writes nowhere.
 
     Raises:
-        InputError: A file has another suffix, and the new folder has none of its name.
+        InputError: It holds an input or a file of another suffix, and the new folder none of its name.
     """
     if not folder.is_dir():
         return
+    real = Path(os.path.realpath(folder))
+    for file in _inputs.get():
+        if real in file.parents and not (new / file.relative_to(real)).exists():
+            raise InputError(
+                f"{folder}: holds {file.relative_to(real)}, which is read and would be removed with it; give "
+                "another name"
+            )
     same = {file.name for file in new.iterdir()}
     for file in folder.rglob("*"):
         part = file.relative_to(folder)
@@ -151,6 +161,24 @@ def _check_replaceable(folder: Path, new: Path) -> None:
                 f"{folder}: holds {part}, which would be removed with it; move it away, remove the folder, "
                 "or give another name"
             )
+
+
+@contextmanager
+def reading(values: Iterable[object]) -> Iterator[None]:
+    """Let no output of the block remove the files among `values`, such as the arguments of a command."""
+    named = {os.path.realpath(v) for v in values if isinstance(v, str | Path) and _is_there(v)}
+    token = _inputs.set(tuple(map(Path, sorted(named))))
+    try:
+        yield
+    finally:
+        _inputs.reset(token)
+
+
+def _is_there(name: str | Path) -> bool:
+    try:
+        return Path(name).exists()
+    except (OSError, ValueError):  # a text that is too long for a name
+        return False
 
 
 @contextmanager

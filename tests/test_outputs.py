@@ -11,7 +11,7 @@ import pytest
 
 from magtwin import outputs
 from magtwin.errors import InputError
-from magtwin.outputs import afterwards, check_free, output, transaction
+from magtwin.outputs import afterwards, check_free, output, reading, transaction
 
 EVENTS = (
     (os, "fsync"),
@@ -239,3 +239,26 @@ def test_a_list_of_renames_that_magtwin_did_not_write_moves_nothing(tmp_path):
         (bad / ".commit").write_text(f'[["{tmp_path}/home/profile", "{bad}"{number}]]')
     check_free(tmp_path / "from-elsewhere" / "y.txt")
     assert content(tmp_path) == {"home/profile": "mine"}
+
+
+def test_a_folder_that_holds_an_input_is_not_replaced_unless_the_output_has_it_too(tmp_path):
+    (tmp_path / "room" / "b").mkdir(parents=True)
+    (tmp_path / "room" / "b" / "in.csv").write_text("old")
+    with reading(["", "x\0", "n" * 5000, tmp_path / "room" / "b" / "in.csv"]):
+        with (
+            pytest.raises(InputError, match=r"holds b/in\.csv, which is read and would be removed"),
+            output(tmp_path / "room", force=True) as aside,
+        ):
+            aside.mkdir()
+        with output(tmp_path / "room", force=True) as aside:
+            (aside / "b").mkdir(parents=True)
+            (aside / "b" / "in.csv").write_text("new")
+    assert content(tmp_path / "room") == {"b/in.csv": "new"}
+
+
+@pytest.mark.parametrize("name", ["loop", "loop/x"])
+def test_a_link_to_itself_is_replaced_or_refused(name, tmp_path):
+    (tmp_path / "loop").symlink_to("loop")
+    with suppress(InputError), output(tmp_path / name) as aside:
+        aside.write_text("new")
+    assert content(tmp_path) in ({"loop": "new"}, {})

@@ -169,8 +169,14 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
 
     @functools.wraps(function)
     def wrapped(*args: Any, json: bool = False, quiet: bool = False, **options: Any) -> None:
+        from magtwin.outputs import reading
+
         _running[:] = [command]
-        with output_mode(as_json=json, quiet=quiet):
+        read = [value for name, value in options.items() if name not in ("out", "report")]
+        values = [
+            v for value in (*args, *read) for v in (value if isinstance(value, list | tuple) else [value])
+        ]
+        with output_mode(as_json=json, quiet=quiet), reading(values):
             done = function(*args, **options)
             if isinstance(done, Done):
                 done.show()

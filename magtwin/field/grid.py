@@ -13,6 +13,10 @@ Array = NDArray[np.float64]
 
 TURN = 2 * np.pi
 
+FARTHEST_M = 1e8  # Largest coordinate accepted [m]: twice round the Earth
+
+NARROWEST_M = 1e-6  # Smallest cell [m], which two nodes still have between them at `FARTHEST_M`
+
 MOST_NODES = 50_000_000  # Larger grids (0.4 GB of values) are refused: the spacing is probably a typo
 
 
@@ -52,6 +56,8 @@ class Grid(Summarized):
         x0, x1, y0, y1 = (float(v) for v in np.asarray(extent, float))
         if not (np.isfinite(spacing_m) and spacing_m > 0):
             raise InputError(f"spacing_m must be above 0 m, got {spacing_m!r}")
+        if spacing_m < NARROWEST_M:
+            raise InputError(f"spacing_m {spacing_m:g} is below {NARROWEST_M:g} m; widen `spacing_m`")
         columns, rows = (int(np.floor(length / spacing_m + 1e-9)) + 1 for length in (x1 - x0, y1 - y0))
         if min(columns, rows) < 2:
             raise InputError(f"spacing_m {spacing_m:g} leaves no cell on {x1 - x0:g} x {y1 - y0:g} m")
@@ -153,4 +159,7 @@ def check_axes(grid: Any) -> None:
         if len(pair) != 2 or not np.all(np.isfinite(pair)) or (name == "cell_m" and min(pair) <= 0):
             above = " above 0" if name == "cell_m" else ""
             raise InputError(f"{name} of {kind} must be two lengths{above} [m], got {pair}")
+        least, most = (NARROWEST_M, FARTHEST_M) if name == "cell_m" else (-FARTHEST_M, FARTHEST_M)
+        if min(pair) < least or max(pair) > most:
+            raise InputError(f"{name} of {kind} must be from {least:g} to {most:g} m, got {pair}")
         object.__setattr__(grid, name, pair)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.outputs import output
+from magtwin.summary import printable_lines
 
 Array = NDArray[np.float64]
 
@@ -105,8 +106,11 @@ def render(figure: Figure, suffix: str) -> bytes:
 
 
 def plain_text(figure: Figure) -> None:
-    """Turn off formulas: a name may contain dollar signs."""
+    """Turn off formulas, and escape control characters: names come from files, and no SVG may hold these."""
     for text in figure.findobj(Text):
+        shown = text.get_text()  # type: ignore[attr-defined]
+        if (plain := printable_lines(shown)) != shown:
+            text.set_text(plain)  # type: ignore[attr-defined]
         text.set_parse_math(False)  # type: ignore[attr-defined]
 
 

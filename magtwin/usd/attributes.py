@@ -125,7 +125,7 @@ def target(prim: Usd.Prim, relationship: str) -> Usd.Prim:
     found = prim.GetRelationship(relationship)
     paths = found.GetForwardedTargets() if found else []
     there = prim.GetStage().GetPrimAtPath(paths[0]) if len(paths) == 1 else None
-    if not there or not there.IsDefined():
+    if not there or not there.IsDefined() or not there.IsActive():
         seen = ", ".join(map(str, paths)) or "none"
         raise InputError(f"{place(prim)}: {relationship} must point to one prim of the stage, found {seen}")
     return there

@@ -326,3 +326,11 @@ def test_plotting_leaves_pyplot_alone(tmp_path):
         "sys.exit('matplotlib.pyplot' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_control_characters_of_a_name_leave_the_picture_well_formed(tmp_path):
+    field = dataclasses.replace(field_map(), name="hall\x1b[31m\x9b\u202e</text>")
+    save(draw_map(field), tmp_path / "map.svg")
+    text = (tmp_path / "map.svg").read_text(encoding="utf-8")
+    ElementTree.fromstring(text)
+    assert not set(text) & set("\x1b\x9b\u202e")

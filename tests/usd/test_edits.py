@@ -165,6 +165,15 @@ def test_the_named_command_makes_the_map_fit_again(room):
     assert open_scene(room).map.name == "new"
 
 
+def test_a_map_that_was_deactivated_is_not_read(room):
+    stage, _ = edited(room)
+    map_prim = next(prim for prim in stage.Traverse() if "MagtwinAnomalyMapAPI" in prim.GetAppliedSchemas())
+    map_prim.SetActive(False)
+    stage.Save()
+    with pytest.raises(InputError, match="magnetometer:map must point to one prim of the stage"):
+        magtwin.open_twin(room, network="none")
+
+
 def test_a_map_that_comes_by_reference_is_not_adopted(room, tmp_path):
     file = building(tmp_path, room, LabA=TURNED)
     with pytest.raises(InputError, match="no sublayer of this stage, so it cannot be replaced here"):

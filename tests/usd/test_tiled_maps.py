@@ -205,6 +205,16 @@ def test_a_changed_grid_or_checksum_is_refused_when_the_map_is_opened(both, name
         read_map(prim)
 
 
+def test_a_shape_of_one_number_is_refused_though_the_checksum_fits(both, tmp_path):
+    stage = Usd.Stage.Open(str(shutil.copy(both[1], tmp_path / "odd.usdc")))
+    prim = stage.GetPrimAtPath(MAP)
+    prim.GetAttribute("magtwin:anomalyMap:shape").Set(Vt.IntArray([5]))
+    prim.GetAttribute("magtwin:anomalyMap:checksum").Set(checksums(prim)[0][1])
+    stage.Save()
+    with pytest.raises(InputError, match=r"shape \[5\] of 5 headings"):
+        load_map(tmp_path / "odd.usdc")
+
+
 def test_a_file_is_written_from_a_function_and_never_holds_two_kinds_of_tile(both, tmp_path):
     flat = both[0]
     grid = Grid(

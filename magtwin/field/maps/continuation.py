@@ -79,7 +79,8 @@ def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
         layers = zip(field.values_nt, field.valid, strict=True)
         values = np.stack([_Layer(v, valid, field.cell_m).continued(step) for v, valid in layers])
         known = field.values_nt[field.valid]
-        parameters["second_order_nt"] = round(float(known.var() / (2 * known.mean())), 3)
+        if (mean := float(known.mean())) > 0:
+            parameters["second_order_nt"] = round(float(known.var()) / (2 * mean), 3)
     variance = between = None
     if field.variance_nt2 is not None and step >= -LARGEST_STEP_DOWN * min(field.cell_m):
         nodes = zip(field.values_nt, field.valid, np.sqrt(field.variance_nt2), strict=True)

@@ -111,10 +111,12 @@ class AnomalyMap(Summarized):
                 f"values_nt of AnomalyMap must be finite at valid nodes, got {self.values_nt[h, j, i]} at "
                 f"heading {h}, row {j}, column {i}; mask the node in `valid`"
             )
-        if self.variance_nt2 is not None and not np.all(self.variance_nt2[self.valid] >= 0):
-            raise InputError("variance_nt2 of AnomalyMap must not be below 0, nor nan, at valid nodes")
-        if self.between_nt2 is not None and not np.all(self.between_nt2[:, self.valid] >= 0):
-            raise InputError("between_nt2 of AnomalyMap must not be below 0, nor nan, at valid nodes")
+        for name in ("variance_nt2", "between_nt2"):
+            part = getattr(self, name)
+            if part is not None and not np.all(is_variance(part[..., self.valid])):
+                raise InputError(
+                    f"{name} of AnomalyMap must not be below 0, nor nan or infinite, at valid nodes"
+                )
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, AnomalyMap):
@@ -449,3 +451,8 @@ def _same(a: Any, b: Any) -> bool:
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         return np.array_equal(a, b, equal_nan=a.dtype != bool)
     return bool(a is b or (not isinstance(a, np.ndarray) and not isinstance(b, np.ndarray) and a == b))
+
+
+def is_variance(array: NDArray) -> NDArray[np.bool_]:
+    """Where numbers can be variances: not below 0, nor nan or infinite."""
+    return np.asarray((array >= 0) & (array < np.inf))

@@ -20,7 +20,7 @@ from magtwin.errors import InputError
 from magtwin.field.days import check_texts
 from magtwin.field.grid import MOST_NODES, Grid
 from magtwin.field.maps.lookup import BLOCK, NONE, Block, Lookup, closed
-from magtwin.field.maps.map import CONSTANT_NT, TEXTS, AnomalyMap, Known, amplitude
+from magtwin.field.maps.map import CONSTANT_NT, TEXTS, AnomalyMap, Known, amplitude, is_variance
 from magtwin.report import Figure, Report
 
 Array = NDArray[np.float64]
@@ -70,8 +70,8 @@ class Tile:
         if not np.all(np.isfinite(self.values_nt) | ~self.valid):
             raise InputError("its values must be finite at valid nodes; mask the others in `valid`")
         for part in (self.variance_nt2, self.between_nt2):
-            if part is not None and not np.all((part >= 0) | ~self.valid):
-                raise InputError("its variances must not be below 0, nor nan, at valid nodes")
+            if part is not None and not np.all(is_variance(part) | ~self.valid):
+                raise InputError("its variances must not be below 0, nor nan or infinite, at valid nodes")
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,13 +8,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.days import check_texts
-from magtwin.field.grid import Grid
+from magtwin.field.grid import FARTHEST_M, Grid
 from magtwin.report import Figure, Report
 from magtwin.summary import Summarized, Summary, listed, rectangle, span
 
 Array = NDArray[np.float64]
-
-FARTHEST_M = 1e8  # Largest coordinate accepted [m]: twice round the Earth
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)

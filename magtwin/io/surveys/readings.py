@@ -14,9 +14,9 @@ import pyarrow.parquet as pq
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.field.grid import Grid
+from magtwin.field.grid import FARTHEST_M, Grid
 from magtwin.field.survey.folder import read_grid
-from magtwin.field.survey.readings import FARTHEST_M, SHAPES, TAKEN, Readings
+from magtwin.field.survey.readings import SHAPES, TAKEN, Readings
 from magtwin.field.units import check_unit, nt_per, unit_by_size
 from magtwin.files import existing, sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat

@@ -25,6 +25,9 @@ from magtwin.spec.obstacles import Obstacles
 CONTROL_RATE_HZ = 50.0
 """Control steps a second [Hz]."""
 
+LONGEST_M = 100_000.0
+"""Longest path [m], 20 million nodes of its plan, 1.5 GB."""
+
 LONGEST_S = 86_400.0
 """Longest run [s]: 11.7 million readings at 135 Hz, which still fit into the memory of a laptop."""
 
@@ -63,6 +66,12 @@ def loop_along(
             f"more than {LONGEST_S:g} s, a day; drive faster than {line.length / LONGEST_S:.2g} m/s, or "
             "give `duration_s`",
             parameter="duration_s",
+        )
+    if line.length > LONGEST_M:
+        raise InputError(
+            f"path {path.name}: {line.length:.4g} m are too long, at most {LONGEST_M:g} m are planned; take "
+            "a part of it",
+            parameter="path",
         )
     guide = guide_along(controller, line, drive, speed=speed, dt=dt)
     assert guide.pose0 is not None

@@ -38,6 +38,15 @@ Predict = Callable[[Run], Predicted]
 RANDOM_S = 60.0
 """Default time for which a random driver drives [s]."""
 
+HIGHEST_HZ = 10_000.0
+"""Highest rate of a sensor beside the magnetometer [Hz]."""
+
+LATEST_S = 3_600.0
+"""Largest offset of a magnetometer's clock [s]."""
+
+FASTEST = 1e6
+"""Highest speed of a drive [m/s, rad/s]."""
+
 MOST_READINGS = 20_000_000
 """Most readings of a run: about 12 GB of columns on the disk."""
 
@@ -197,6 +206,7 @@ def check_run(scene: Scene, path: DriveInput, conditions: Conditions) -> None:
                 'open it as a twin that names one, or take the kind "physical" or "map-only"'
             )
         check_truth(scene, conditions.anomaly_map)
+    _check_numbers(robot)
     lidar_on(robot.lidar, 0.0, conditions.lidar)  # refuses an unknown mode before anything is computed
     if isinstance(path, Path):
         check_on_floor(path, scene.lab.floor_m, robot.footprint_radius_m)
@@ -310,6 +320,23 @@ def robot_metadata(robot: RobotSpec) -> Metadata:
         "mocap_offset_m": ", ".join(f"{value:.6g}" for value in mocap.offset_m),
         "mocap_latency_s": round(mocap.latency_s + mocap.jitter_s + 0.5 / mocap.rate_hz, 6),
     }
+
+
+def _check_numbers(robot: RobotSpec) -> None:
+    """Refuse numbers of a robot that no run can compute or hold in memory."""
+    for spec, name, most in (
+        (robot.drive, "odometry_rate_hz", HIGHEST_HZ),
+        (robot.imu, "rate_hz", HIGHEST_HZ),
+        (robot.mocap, "rate_hz", HIGHEST_HZ),
+        (robot.battery, "rate_hz", HIGHEST_HZ),
+        (robot.magnetometer, "clock_offset_s", LATEST_S),
+        (robot.drive, "v_max", FASTEST),
+        (robot.drive, "w_max", FASTEST),
+    ):
+        value = getattr(spec, name)
+        if abs(value) > most:
+            text = f"{name} of {type(spec).__name__} must be at most {most:g}, got {value!r}"
+            raise InputError(f"robot {robot.name!r}: {text}")
 
 
 def _check_readings(duration_s: float, rate_hz: float) -> None:

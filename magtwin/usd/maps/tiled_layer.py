@@ -140,17 +140,19 @@ def read_tiled(prim: Usd.Prim) -> TiledMap:
             f"{place(prim)}: the map's grid and the checksums of its tiles do not match its checksum; make "
             "the map anew"
         )
-    (headings, rows, columns), cells = get(prim, "shape"), get(prim, "tile_cells")
+    shape, cells = tuple(get(prim, "shape")), get(prim, "tile_cells")
     degrees = np.array(get(prim, "headings"), float)
     try:
-        if cells < 1 or headings != degrees.size:
-            raise InputError(f"{headings} headings in tiles of {cells} cells; make the map anew")
+        if len(shape) != 3 or cells < 1 or shape[0] != degrees.size:
+            raise InputError(
+                f"shape {list(shape)} of {degrees.size} headings in tiles of {cells} cells; make the map anew"
+            )
         grid = Grid(
             origin_m=tuple(get(prim, "origin")),
             cell_m=tuple(get(prim, "cellSize")),
             headings_rad=tuple(np.deg2rad(degrees).tolist()),
-            rows=rows,
-            columns=columns,
+            rows=shape[1],
+            columns=shape[2],
         )
         tiling, planes = Tiling(grid, cells), _planes(prim)
         return TiledMap(

@@ -178,8 +178,12 @@ def test_a_map_keeps_its_own_arrays_and_nobody_writes_to_them():
         ({"headings_rad": [-0.1]}, "ascend"),
         ({"cell_m": (0.25, 0.0)}, "cell_m of AnomalyMap must be two lengths above 0"),
         ({"origin_m": (0.0, np.nan)}, "origin_m of AnomalyMap must be two lengths"),
+        ({"origin_m": (1e300, 0.0)}, r"origin_m of AnomalyMap must be from -1e\+08 to 1e\+08 m"),
+        ({"cell_m": (1e300, 1.0)}, r"cell_m of AnomalyMap must be from 1e-06 to 1e\+08 m"),
+        ({"cell_m": (1e-300, 1e-300)}, "cell_m of AnomalyMap must be from 1e-06"),
         ({"valid": np.ones((1, 3, 4), bool)}, "valid of AnomalyMap must have shape"),
         ({"variance_nt2": -np.ones((1, 3, 3))}, "variance_nt2 of AnomalyMap must not be below 0"),
+        ({"variance_nt2": np.full((1, 3, 3), np.inf)}, "variance_nt2 of AnomalyMap must not be .* infinite"),
         ({"values_nt": np.full((1, 3, 3), np.nan)}, "finite at valid nodes.*heading 0, row 0, column 0"),
     ],
 )

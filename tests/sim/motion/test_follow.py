@@ -316,6 +316,11 @@ def test_what_cannot_be_driven_is_refused(options, says):
         follow(path_named("sine"), DRIVE, **options)
 
 
+def test_a_path_too_long_for_a_plan_is_refused_whatever_its_duration():
+    with pytest.raises(InputError, match=r"path far: 3e\+05 m are too long, at most 100000 m are planned"):
+        follow(Path("far", np.array([[0.0, 0.0], [3e5, 0.0]])), DRIVE, speed=0.2, duration_s=1.0)
+
+
 def test_a_path_of_a_few_millimetres_is_refused():
     with pytest.raises(InputError, match=r"path dot: it lies within 0\.005 m"):
         follow(Path("dot", np.array([[0.0, 0.0], [0.001, 0.0]])), DRIVE, speed=0.2)

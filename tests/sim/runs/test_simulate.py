@@ -497,6 +497,15 @@ def test_a_single_reading_is_a_run_too():
             {"path": Path("far", np.array([[0.0, 0.0], [2.9, 0.0]]))},
             r"path far leaves the floor at point 2 of 2",
         ),
+        *(
+            ({"scene": with_robot(KNOWN, **robot)}, rf"{name} of \w+ must be at most")
+            for name, robot in {
+                "odometry_rate_hz": {"drive": DriveSpec(odometry_rate_hz=1e9)},
+                "v_max": {"drive": DriveSpec(v_max=1e300)},
+                "rate_hz": {"imu": ImuSpec(rate_hz=1e8)},
+                "clock_offset_s": {"magnetometer": MagnetometerSpec(clock_offset_s=1e300)},
+            }.items()
+        ),
         ({"path": np.array([[0.0, 0.0], [1.0, 0.0]])}, "path must be a Path, Commands, a Run or"),
         ({"path": "figure8"}, "path must be a Path"),
         ({"disturbance_nt": lambda run: np.zeros(3)}, r"disturbance_nt must give shape \(\d+,\), got \(3,\)"),
