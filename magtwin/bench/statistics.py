@@ -160,15 +160,14 @@ def paired(
     least = abs(sums.sum()) * (1 - 1e-12)
     if 2**count <= resamples:
         signs = 1 - 2 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)
-        p = np.count_nonzero(np.abs(signs @ sums) >= least) / len(signs)
+        as_far, total, extra = int(np.count_nonzero(np.abs(signs @ sums) >= least)), len(signs), 0
     else:
-        rng, total, as_far = np.random.default_rng(seed), _affordable(resamples, count), 0
+        rng, total, as_far, extra = np.random.default_rng(seed), _affordable(resamples, count), 0, 1
         rows = max(1, BLOCK // count)
         for first in range(0, total, rows):
             signs = rng.choice(np.array([-1, 1]), (min(rows, total - first), count))
-            as_far += np.count_nonzero(np.abs(signs @ sums) >= least)
-        p = (as_far + 1) / (total + 1)
-    return Paired(interval.value, interval.low, interval.high, p)
+            as_far += int(np.count_nonzero(np.abs(signs @ sums) >= least))
+    return Paired(interval.value, interval.low, interval.high, (as_far + extra) / (total + extra))
 
 
 def _affordable(resamples: int, count: int) -> int:
