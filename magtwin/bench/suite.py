@@ -147,6 +147,11 @@ class Scenario:
             raise InputError(
                 f"duration_s {self.duration_s:g} at {self.rate_hz:g} Hz is over a million readings"
             )
+        if self.source == "twin" and self.kidnaps >= max(1.0, self.duration_s * self.rate_hz / 2):
+            raise InputError(
+                f"kidnaps must be fewer than half of the readings, {self.duration_s * self.rate_hz:g}, "
+                f"got {self.kidnaps}"
+            )
 
     @property
     def told_odometry(self) -> OdometryModel:
