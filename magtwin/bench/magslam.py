@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from magtwin.budget import decoded_limit
+from magtwin.budget import check_decoded, decoded_limit
 from magtwin.errors import InputError
 from magtwin.files import existing_file
 from magtwin.localization.problem import OdometryModel, Prior, Problem, SensorModel
@@ -292,7 +292,9 @@ def _numbers(path: Path, names: tuple[str, ...], size: int, changed_ns: int) -> 
         lines = done.stderr.decode(errors="replace").split("\n")
         reason = next((line.strip() for line in reversed(lines) if line.strip()), "the reader crashes on it")
         raise InputError(f"{path}: cannot be read as a MATLAB file ({reason}); get the file again")
-    return dict(np.load(io.BytesIO(done.stdout), allow_pickle=False))
+    arrays = dict(np.load(io.BytesIO(done.stdout), allow_pickle=False))
+    check_decoded(path, size, sum(8 * array.size for array in arrays.values()))  # they become doubles
+    return arrays
 
 
 def _rotation(wxyz: Array, path: Path) -> Rotation:

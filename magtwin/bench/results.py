@@ -18,7 +18,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -26,7 +26,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from magtwin.bench.suite import Chunk, Suite, load_suite
+from magtwin.bench.suite import Chunk, Seeds, Suite, load_suite
 from magtwin.errors import InputError, find
 from magtwin.files import read_text
 from magtwin.io.tables import load_parquet
@@ -41,6 +41,8 @@ if TYPE_CHECKING:
 
 SUITE, ABOUT = "suite.toml", "suite.json"
 ROWS, TIMES, TRACKS = "rows", "times", "tracks"
+_ABOUT_KINDS = {**dict.fromkeys(("name", "sha256", "seeds", "magtwin"), str), "version": int, "data": dict}
+"""Kinds of the values in suite.json."""
 KEY = ("scenario", "localizer", "run")
 
 Columns = dict[str, NDArray[Any]]
@@ -107,10 +109,16 @@ class Results(Summarized):
         made: dict[Run, dict[str, Any]] = {}
         for name in self.suite.scenarios if scenario is None else (scenario,):
             for file in (part for folder in self.folders for part in _parts(folder, TRACKS, name)):
-                for row in load_parquet(file, partial(pq.read_table, filters=match)).to_pylist():
-                    key = (row.pop("scenario"), row.pop("localizer"), row.pop("run"))
-                    arrays = {column: np.array(values, np.float32) for column, values in row.items()}
-                    made.setdefault(key, dict(zip(KEY, key, strict=True)) | arrays)
+                part = _read_part(file, _KINDS[TRACKS], match)
+                if any(len(set(map(len, row))) > 1 for row in zip(*(part[c] for c in _CURVES), strict=True)):
+                    raise InputError(
+                        f"{file}: damaged results (curves of unequal length); remove them and "
+                        "repeat magtwin bench"
+                    )
+                for row in map(
+                    dict, zip(*([(c, v) for v in values] for c, values in part.items()), strict=True)
+                ):
+                    made.setdefault((row["scenario"], row["localizer"], row["run"]), row)
         keys = zip(*(self.rows[name].tolist() for name in KEY), strict=True)
         return [made[key] for key in keys if key in made]
 
@@ -199,11 +207,12 @@ def read_about(folder: Path) -> dict[str, Any]:
     file = folder / ABOUT
     try:
         about = json.loads(read_text(file, "description of results", "JSON"))
-        known = (
-            isinstance(about, dict)
-            and {"name", "version", "sha256", "seeds", "magtwin", "data"} <= about.keys()
+        known = isinstance(about, dict) and all(
+            isinstance(about.get(name), kind) for name, kind in _ABOUT_KINDS.items()
         )
-    except (OSError, ValueError):
+        known = known and all(isinstance(text, str) for text in about["data"].values())
+        known = known and about["seeds"] in get_args(Seeds)
+    except (OSError, ValueError, RecursionError):
         known = False
     if not known or not (folder / SUITE).is_file():
         raise InputError(f"{folder}: no results of magtwin bench; give the folder that it wrote (--out)")
@@ -321,11 +330,14 @@ def done_runs(folder: Path, scenarios: Iterable[str]) -> set[Run]:
     Raises:
         InputError: A file is damaged.
     """
+    kinds = {name: _KINDS[ROWS][name] for name in ("localizer", "run")}
     done: set[Run] = set()
     for scenario in scenarios:
         for file in _parts(folder, ROWS, scenario):
-            table = _read_part(file, columns=["localizer", "run"])
-            done.update((scenario, *pair) for pair in zip(*table.to_pydict().values(), strict=True))
+            columns = _read_part(file, kinds)
+            done.update(
+                (scenario, *pair) for pair in zip(*(columns[name].tolist() for name in kinds), strict=True)
+            )
     return done
 
 
@@ -333,13 +345,33 @@ def _parts(folder: Path, kind: str, scenario: str) -> list[Path]:
     return sorted((folder / kind / scenario).glob("part-*.parquet"))
 
 
-def _read_part(file: Path, columns: list[str] | None = None) -> pa.Table:
+def _read_part(file: Path, kinds: Mapping[str, str], filters: pc.Expression | None = None) -> Columns:
+    """The columns of a part that `kinds` names, of these kinds.
+
+    Raises:
+        InputError: The file is damaged, or a column is missing or holds other values.
+    """
     try:
-        return load_parquet(file, partial(pq.read_table, columns=columns))
+        table = load_parquet(file, partial(pq.read_table, columns=list(kinds), filters=filters))
+        if unlike := next((name for name, kind in kinds.items() if not _is(table, name, kind)), None):
+            raise InputError(f"{file}: column {unlike!r} does not hold {_WORDS[kinds[unlike]]}")
     except InputError as error:
         reason = str(error).removeprefix(f"{file}: ").partition(";")[0]
         text = f"{file}: damaged results ({reason}); remove them and repeat magtwin bench"
         raise InputError(text) from error
+    return {name: table[name].to_numpy(zero_copy_only=False) for name in kinds}
+
+
+def _is(table: pa.Table, name: str, kind: str) -> bool:
+    """Whether a table has one column of a name, of values of a kind, of which none is below 0."""
+    if table.column_names.count(name) != 1:
+        return False
+    column, of = table[name], table[name].type
+    number = pa.types.is_integer(of) or (kind == _NUMBER and pa.types.is_floating(of))
+    if kind in _EXACT:
+        inner = column.combine_chunks().flatten() if kind == _CURVE and of == _EXACT[kind] else column
+        return bool(of == _EXACT[kind]) and not column.null_count + inner.null_count
+    return number and not column.null_count and not pc.any(pc.less(column, 0)).as_py()
 
 
 def _order(suite: Suite) -> tuple[dict[str, int], dict[str, int]]:
@@ -353,17 +385,20 @@ def _order(suite: Suite) -> tuple[dict[str, int], dict[str, int]]:
 def _read(folders: Sequence[Path], kind: str, order: tuple[dict[str, int], dict[str, int]]) -> Columns:
     """All rows of a kind, each run once, in the order of the suite: scenario, localizer, run."""
     scenarios, localizers = order
-    tables = [
-        _read_part(file) for folder in folders for name in scenarios for file in _parts(folder, kind, name)
+    parts = [
+        _read_part(file, _KINDS[kind])
+        for folder in folders
+        for name in scenarios
+        for file in _parts(folder, kind, name)
     ]
-    if not tables:
+    if not parts:
         return {name: np.empty(0, object) for name in (*KEY, "status")}
-    table = pa.concat_tables(tables, promote_options="permissive")
-    columns = {}
-    for name in table.column_names:
-        values = table[name].to_numpy(zero_copy_only=False)
-        columns[name] = values.astype(str) if pa.types.is_string(table[name].type) else values
-    _check_columns(folders[0] / kind, columns, _NUMBERS[kind], scenarios)
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in _KINDS[kind]}
+    if unknown := set(columns["scenario"].tolist()) - scenarios.keys():
+        raise InputError(
+            f"{folders[0] / kind}: rows of scenario {min(unknown)!r}, which the suite does not have; remove "
+            "them and repeat magtwin bench"
+        )
     names = {name: k for k, name in enumerate(sorted(set(columns["localizer"].tolist()) - localizers.keys()))}
     place = localizers | {name: len(localizers) + k for name, k in names.items()}
     keys = [
@@ -375,37 +410,39 @@ def _read(folders: Sequence[Path], kind: str, order: tuple[dict[str, int], dict[
     return {name: values[picked] for name, values in columns.items()}
 
 
-def _check_columns(
-    folder: Path, columns: Columns, numbers: Iterable[str], scenarios: Mapping[str, int]
-) -> None:
-    """Refuse rows without a column, or with another kind of values, and rows of no scenario."""
-    kinds = {"scenario": "U", "localizer": "U", "run": "iu", **dict.fromkeys(numbers, "biuf")}
-    for name, kind in kinds.items():
-        if name not in columns or columns[name].dtype.kind not in kind:
-            what = "texts" if kind == "U" else "numbers"
-            raise InputError(
-                f"{folder}: its rows hold no {what} in column {name!r}: damaged, or of another magtwin; "
-                "remove them and repeat magtwin bench"
-            )
-    if unknown := set(columns["scenario"].tolist()) - scenarios.keys():
-        raise InputError(
-            f"{folder}: rows of scenario {min(unknown)!r}, which the suite does not have; remove them and "
-            "repeat magtwin bench"
-        )
+_TEXT, _FLAG, _WHOLE, _NUMBER, _CURVE = "text", "flag", "whole number", "number", "curve"
+_EXACT = {_TEXT: pa.string(), _FLAG: pa.bool_(), _CURVE: pa.list_(pa.float32())}
+_WORDS = {
+    _TEXT: "texts",
+    _FLAG: "flags",
+    _WHOLE: "whole numbers from 0",
+    _NUMBER: "numbers from 0",
+    _CURVE: "lists of numbers",
+}
 
 
-_SCORES = [name for name, value in Scores().row().items() if not isinstance(value, str)]
-_COUNTS = ("seed", "session", "readings", "smoother", "global_start", "recovered_in_time")
-_NUMBERS = {ROWS: [*_COUNTS, *(name for name in _SCORES if name != "step_us")], TIMES: ["step_us"]}
-"""Columns of numbers and flags by kind of table; reports read them."""
+def _kind(value: object) -> str:
+    """Kind of the values of a column like this one."""
+    kinds = {str: _TEXT, bool: _FLAG, int: _WHOLE}
+    return kinds.get(type(value), _NUMBER)
+
+
+_KEYS = {"scenario": _TEXT, "localizer": _TEXT, "run": _WHOLE}
+_OF_A_RUN = {
+    **dict.fromkeys(("status", "reason"), _TEXT),
+    **dict.fromkeys(("smoother", "global_start"), _FLAG),
+    **dict.fromkeys(("seed", "session", "readings", "recovered_in_time"), _WHOLE),
+}
+_SCORES = {name: _kind(value) for name, value in Scores().row().items() if name not in ("failed", "step_us")}
+_KINDS = {ROWS: {**_KEYS, **_OF_A_RUN, **_SCORES}, TIMES: {**_KEYS, "step_us": _NUMBER}}
+_CURVES = ("t", "error_m", "bound_m", "x", "y", "lost")
+_KINDS |= {TRACKS: {**_KEYS, **dict.fromkeys(_CURVES, _CURVE)}}
+"""Kinds of the columns of each kind of table; reports read them."""
 
 
 def _aligned(times: Columns, rows: Columns) -> Columns:
     """Times in the order of the rows, nan where a run has none."""
     at = {key: k for k, key in enumerate(zip(*(times[name].tolist() for name in KEY), strict=True))}
     picked = [at.get(key, -1) for key in zip(*(rows[name].tolist() for name in KEY), strict=True)]
-    made = {name: rows[name] for name in KEY}
-    for name in times.keys() - rows.keys():
-        values = np.append(times[name].astype(float), np.nan)
-        made[name] = values[picked]
-    return made
+    spent = np.append(times["step_us"].astype(float), np.nan) if at else np.full(1, np.nan)
+    return {**{name: rows[name] for name in KEY}, "step_us": spent[picked]}

@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 
 CELL_M = 0.05  # Nodes of a true field [m]
 HEADINGS = 24  # Headings of a true field that is fitted to a survey
+MOST_NODES = 1_000_000
+"""Most places of a survey; more would take gigabytes."""
+
 SURVEY_HEADINGS = 4  # Headings of a trilinear survey
 DEPTH_M = 0.3  # Depth below the sensor of an object that is moved [m]
 
@@ -90,9 +93,18 @@ def trilinear(field: AnomalyMap, spacing_m: float) -> AnomalyMap:
     """The map of a survey of a true field at rest, at few nodes and four headings, read without noise.
 
     Its variance is that of linear interpolation between the nodes.
+
+    Raises:
+        InputError: It has more than `MOST_NODES`.
     """
     x0, x1, y0, y1 = field.extent
-    x, y = (np.linspace(a, b, max(2, round((b - a) / spacing_m) + 1)) for a, b in ((x0, x1), (y0, y1)))
+    columns, rows = (max(2, round((b - a) / spacing_m) + 1) for a, b in ((x0, x1), (y0, y1)))
+    if columns * rows > MOST_NODES:
+        raise InputError(
+            f"survey_spacing_m of {spacing_m:g} m gives {float(columns):g} x {float(rows):g} nodes; at most "
+            f"{MOST_NODES:,} are surveyed"
+        )
+    x, y = np.linspace(x0, x1, columns), np.linspace(y0, y1, rows)
     headings = np.linspace(0.0, 2 * np.pi, SURVEY_HEADINGS, endpoint=False)
     yaw, gy, gx = np.meshgrid(headings, y, x, indexing="ij")
     values = field.lookup(np.stack([gx, gy], axis=-1), yaw)

@@ -10,6 +10,7 @@ from magtwin.bench import world
 from magtwin.bench.draws import chained, moves, noisy_odometry
 from magtwin.bench.suite import Scenario
 from magtwin.bench.twin_case import fogm, twin_case
+from magtwin.errors import InputError
 from magtwin.files import shipped
 from magtwin.io.surveys.maps import open_map
 from magtwin.localization.problem import OdometryModel, SensorModel
@@ -75,6 +76,11 @@ def test_a_map_with_error_has_the_sd_and_the_length_that_the_localizer_is_told(f
     assert_allclose(belief.variance([[0.0, 0.0]], [0.0]), 150.0**2)
     same = belief.values_nt - field.values_nt
     assert_allclose(same[0], same[7], atol=1e-9)  # alike at all headings
+
+
+def test_a_survey_of_too_many_nodes_is_refused(field):
+    with pytest.raises(InputError, match=r"survey_spacing_m of 0\.0001 m gives .* at most 1,000,000"):
+        world.trilinear(field, 1e-4)
 
 
 def test_a_trilinear_map_states_its_error(field):

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 from scipy.io import loadmat, savemat
 from scipy.spatial.transform import Rotation
 
+from magtwin import budget
 from magtwin.bench.magslam import (
     SHIP_BIAS_M,
     SHIP_FUNCTIONS,
@@ -97,6 +98,13 @@ def test_wrong_files_are_refused(tmp_path):
             ship_case(tmp_path, 1, 0)
     with pytest.raises(InputError, match="eight or square"):
         hand_case(tmp_path, "circle")
+
+
+def test_an_array_that_becomes_too_large_as_doubles_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(budget, "SPARE", 10**6)
+    savemat(tmp_path / "eight.mat", {"m": np.zeros((10**5, 3), np.int8)}, do_compression=True)
+    with pytest.raises(InputError, match=r"that decode to 2\.4 MB"):
+        hand_case(tmp_path, "eight")
 
 
 @needs_ship

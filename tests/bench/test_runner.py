@@ -1,6 +1,7 @@
 """The runner of benchmarks: the same rows over jobs, shards and interruptions, and localizers that fail."""
 
 import json
+import math
 import os
 import shutil
 import signal
@@ -11,6 +12,8 @@ from pathlib import Path
 
 import bad_localizers
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from magtwin.bench import runner
@@ -347,3 +350,34 @@ def test_a_folder_without_results_is_refused(tmp_path):
         read_results(tmp_path)
     with pytest.raises(InputError, match="no such folder of results"):
         read_results(tmp_path / "none")
+
+
+ODD = [
+    ("rows", "diverged", pa.array([1e300, 1.0]), "'diverged' does not hold flags"),
+    ("rows", "kidnapped", pa.array([math.nan, 1.0]), "'kidnapped' does not hold whole numbers from 0"),
+    ("rows", "session", pa.array([None, 1]), "'session' does not hold whole numbers from 0"),
+    ("rows", "anees", pa.array([-1.0, 1.0]), "'anees' does not hold numbers from 0"),
+    ("rows", "reason", pa.array([["x"], []]), "'reason' does not hold texts"),
+    ("tracks", "x", pa.array([["x"], []]), "'x' does not hold lists of numbers"),
+    ("tracks", "x", pa.array([[1.0], []], pa.list_(pa.float32())), "curves of unequal length"),
+]
+
+
+@pytest.mark.parametrize(("kind", "column", "values", "said"), ODD)
+def test_rows_of_other_kinds_are_refused(whole, tmp_path, kind, column, values, said):
+    out = shutil.copytree(whole, tmp_path / "results")
+    part = next(out.glob(f"{kind}/exact/*.parquet"))
+    table = pq.read_table(part)[:2]
+    pq.write_table(table.set_column(table.column_names.index(column), column, values), part)
+    with pytest.raises(InputError, match=f"damaged results .*{said}"):
+        read_results(out).tracks()
+
+
+def test_a_description_of_other_kinds_is_refused(whole, tmp_path):
+    out = shutil.copytree(whole, tmp_path / "results")
+    file = out / "suite.json"
+    about = json.loads(file.read_text())
+    for change in ({"sha256": 3}, {"data": ["x"]}, {"seeds": "other"}, {"version": None}):
+        file.write_text(json.dumps({**about, **change}))
+        with pytest.raises(InputError, match="no results of magtwin bench"):
+            read_results(out)

@@ -5,6 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
+from magtwin.bench import statistics
 from magtwin.bench.statistics import bootstrap, median, paired, proven_rate, rate, rms
 from magtwin.errors import InputError
 
@@ -119,3 +120,12 @@ def test_paired_differences_of_many_sessions_draw_their_swaps():
 def test_wrong_input_is_refused(call, match):
     with pytest.raises(InputError, match=match):
         call()
+
+
+def test_blocks_and_the_limit_of_draws_bound_memory_and_time(monkeypatch):
+    a, b = np.random.default_rng(0).random((2, 50))
+    whole = paired(a, b)
+    monkeypatch.setattr(statistics, "BLOCK", 120)
+    assert paired(a, b) == whole
+    monkeypatch.setattr(statistics, "MOST_DRAWS", 50 * 1000)
+    assert paired(a, b) == paired(a, b, resamples=1000)

@@ -52,6 +52,9 @@ MANIFEST, RUNS = "dataset.json", "runs"
 BLOCK_ROWS = 65_536  # Rows of a row group, about 20 MB of columns
 ALIGNED_AT_HZ = 25.0  # Rate at which recordings are held in memory while an alignment is fitted [Hz]
 
+LARGEST = 1e30
+"""Largest size of an input to learn from; squares of larger ones overflow."""
+
 ALIGNED = (
     *("t", "p_world_base", "yaw", "mocap_p", "mocap_q_xyzw", "odom_v", "odom_w"),
     *("battery_a", "lidar_on", "b_measured_nt", "flag_lost_lock", "flag_pose_lost"),
@@ -193,6 +196,13 @@ class Dataset(Summarized):
         for recording, first, run in self.blocks(columns, number):
             label, values = run["label_nt"], features_of(run, wanted)
             known, complete = np.isfinite(label), np.isfinite(values).all(axis=1)
+            if (vast := complete & (np.abs(values) > LARGEST).any(axis=1)).any():
+                i = int(np.argmax(vast))
+                name = wanted[int(np.argmax(np.abs(values[i])))]
+                raise InputError(
+                    f"{self.folder}: {recording.name!r}, row {first + i}: input {name!r} is "
+                    f"{np.abs(values[i]).max():.3g}; write nan for unknown values, and build it anew"
+                )
             mine = np.ones(run.rows, bool)
             if split is not None and split.by == "row":
                 mine = split.rows(part, recording.name, recording.rows)[first : first + run.rows]

@@ -200,7 +200,7 @@ def thinned(run: Run, rate_hz: float | None) -> Run:
     if rate_hz is None or run.rows < 2:
         return run
     step = float(np.median(np.diff(run["t"])))
-    every = max(1, int(np.ceil(0.99 / (step * rate_hz))))  # to 1 %, as wall clocks go
+    every = max(1, int(np.ceil(min(0.99 / max(step * rate_hz, 1e-300), run.rows))))  # to 1 %, as clocks go
     if every == 1:
         return run
     columns = {name: values[::every] for name, values in run.items()}

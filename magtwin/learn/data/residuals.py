@@ -168,8 +168,11 @@ def _autocovariance(held: Sequence[HeldOut]) -> tuple[Array, Array]:
     count = max(int(longest / step), 1) + 1
     sums, pairs = np.zeros(count), np.zeros(count)
     for errors in held:
-        slot = np.rint((errors.t - errors.t[0]) / step).astype(np.intp)
+        slot = np.rint(np.minimum((errors.t - errors.t[0]) / step, 2.0**53)).astype(np.intp)
         taken, first = np.unique(slot, return_index=True)
+        if taken[-1] > 2 * len(errors.t) + count:  # long gaps, whose empty slots need not be stored
+            _add_products(taken, errors.error_nt[first], sums, pairs)
+            continue
         e, known = np.zeros(taken[-1] + 1), np.zeros(taken[-1] + 1)
         e[taken], known[taken] = errors.error_nt[first], 1.0
         for k in range(min(count, len(e))):
@@ -178,3 +181,12 @@ def _autocovariance(held: Sequence[HeldOut]) -> tuple[Array, Array]:
     with np.errstate(invalid="ignore", divide="ignore"):
         products = sums / pairs
     return np.asarray(np.arange(count) * step, np.float64), np.asarray(products, np.float64)
+
+
+def _add_products(taken: NDArray[np.intp], e: Array, sums: Array, pairs: Array) -> None:
+    """Add the products of errors in slots a lag apart, and their number, to those of each lag, in place."""
+    for k in range(len(sums)):
+        after = np.minimum(np.searchsorted(taken, taken + k), len(taken) - 1)
+        both = taken[after] == taken + k
+        sums[k] += float(e[both] @ e[after[both]])
+        pairs[k] += float(np.count_nonzero(both))

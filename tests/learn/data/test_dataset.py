@@ -12,7 +12,7 @@ from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import build_dataset, open_dataset
 from magtwin.learn.data.features import SETS, features
 from magtwin.learn.data.labels import labelled
-from magtwin.learn.data.recording import Source
+from magtwin.learn.data.recording import Source, thinned
 from magtwin.learn.data.split import split
 from magtwin.run.run import COLUMNS, Run
 
@@ -160,6 +160,17 @@ def test_a_lower_rate_keeps_every_second_row(tmp_path):
     ((one, run),) = found.runs()
     assert one.rows == 120
     assert_array_equal(run["t"], RUNS["a"]["t"][::2])
+
+
+def test_a_clock_of_the_smallest_steps_is_thinned():
+    run = RUNS["a"].with_columns(t=np.arange(RUNS["a"].rows) * 5e-324)
+    assert thinned(run, 5.0).rows == 1
+
+
+def test_an_input_that_is_no_measurement_is_refused(tmp_path):
+    run = RUNS["a"].with_columns(battery_a=np.full(RUNS["a"].rows, 1e300))
+    with pytest.raises(InputError, match=r"'a', row 0: input 'battery_a' is 1e\+300"):
+        build_dataset({"a": run}, FIELD, tmp_path / "d").rows("circular")
 
 
 def test_a_source_is_read_when_its_turn_comes_and_names_its_session(tmp_path):

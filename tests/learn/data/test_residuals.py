@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
-from magtwin.learn.data.residuals import PRIOR_SHARE, HeldOut, residuals
+from magtwin.learn.data.residuals import PRIOR_SHARE, HeldOut, _autocovariance, residuals
 from magtwin.sim.sensors.noise import gauss_markov
 
 OFFSET, WITHIN, TIME_S, RATE_HZ = 100.0, 60.0, 3.0, 10.0
@@ -82,3 +83,18 @@ def test_a_recording_of_one_row_gives_no_time():
     found = residuals([HeldOut(str(k), np.zeros(1), np.array([float(k)])) for k in range(-3, 4)])
     assert found.time_s == 0.0
     assert np.isfinite([found.offset_sd_nt, found.within_sd_nt]).all()
+
+
+def test_a_long_gap_takes_no_memory_and_parts_the_recording_in_two():
+    first, second = drawn(2, 1)
+    joined = HeldOut("0", np.append(first.t, second.t + 1e12), np.append(first.error_nt, second.error_nt))
+    expected, found = (_autocovariance(held) for held in ([first, second], [joined]))
+    count = len(expected[0])
+    assert_allclose(found[0][:count], expected[0])
+    assert_allclose(found[1][:count], expected[1])
+
+
+def test_a_clock_beyond_all_numbers_of_slots_is_read():
+    held = drawn(2, 1)
+    held[0] = HeldOut("0", held[0].t * 1e300, held[0].error_nt)
+    assert residuals(held) is not None
