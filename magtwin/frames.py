@@ -93,9 +93,15 @@ def matrix_from_quat(q: ArrayLike) -> Array:
 
 
 def yaw_from_quat(q: ArrayLike) -> Array:
-    """Heading of each rotated x axis about world z [rad], in [-pi, pi], shape (..., 4) -> (...)."""
+    """Heading of each rotated x axis about world z [rad], in [-pi, pi], shape (..., 4) -> (...).
+
+    Quaternions of another length than 1 count by their direction. That of a quaternion of 0, which motion
+    capture gives when it loses a robot, is nan.
+    """
     x, y, z, w = np.moveaxis(np.asarray(q, float), -1, 0)
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    size = x * x + y * y + z * z + w * w
+    size = np.where(np.abs(size - 1) < 1e-6, 1.0, np.where(size > 0, size, np.nan))
+    return np.arctan2(2 * (w * z + x * y), size - 2 * (y * y + z * z))
 
 
 def wxyz_from_xyzw(q: ArrayLike) -> Array:

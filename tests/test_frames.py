@@ -36,6 +36,11 @@ def test_a_yaw_survives_its_quaternion(yaw):
     same_rotation(q, Rotation.from_euler("z", yaw))
 
 
+def test_the_yaw_of_a_quaternion_is_that_of_its_direction_and_nan_without_one():
+    q = frames.quat_from_yaw([0.3, 0.3, 0.3, 0.3]) * [[1.0], [2.0], [1e-3], [0.0]]
+    assert_allclose(frames.yaw_from_quat(q), [0.3, 0.3, 0.3, np.nan])
+
+
 @given(st.floats(-1e3, 1e3))
 def test_wrapping_changes_an_angle_by_whole_turns_into_minus_pi_to_pi(angle):
     wrapped = frames.wrap_angle(angle)

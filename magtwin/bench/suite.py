@@ -142,6 +142,9 @@ class Scenario:
         for key in ("duration_s", "rate_hz", "map_length_m", "survey_spacing_m", "odometry_factor"):
             if not 0 < getattr(self, key) < math.inf:
                 raise InputError(f"{key} must be above 0, got {getattr(self, key)}")
+        for key in ("map_length_m", "survey_spacing_m"):
+            if getattr(self, key) < 1e-3:
+                raise InputError(f"{key} must be at least 0.001, got {getattr(self, key):g}")
         if not 0 <= self.kidnap_m[0] < self.kidnap_m[1]:
             raise InputError(f"kidnap_m must be two ascending distances, got {self.kidnap_m}")
         if not self.paths:

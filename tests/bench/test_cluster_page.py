@@ -8,8 +8,11 @@ import subprocess
 import pytest
 from places import DOCS
 
+from magtwin import cli
 from magtwin.cli.app import app
 from magtwin.parallel import parse_shard
+
+cli.load()
 
 PAGE = (DOCS / "cluster.md").read_text(encoding="utf-8")
 

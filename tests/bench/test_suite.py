@@ -111,6 +111,7 @@ def test_the_checksum_is_that_of_the_content_and_not_of_the_place(write, tmp_pat
         ),
         ("runs = 3", "runs = 3\nkidnap_m = [4.0, 0.5]", "kidnap_m must be two ascending distances"),
         ("runs = 3", "runs = 3\nduration_s = 1e9", "over a million readings"),
+        ("runs = 3", "runs = 3\nmap_length_m = 1e-300", "map_length_m must be at least 0.001, got 1e-300"),
         ("runs = 3", "runs = 3\nkidnaps = 1_000_000_000_000", "kidnaps must be 0 to "),
         ("runs = 3", "runs = 1_000_000", "1,000,010 runs together; at most 1,000,000"),
         ("[[scenario]]", '[[localizer]]\nmethod = "ekf"\n' * 1000 + "[[scenario]]", "over 1,000 of"),

@@ -102,10 +102,11 @@ def alignment_of(metadata: Mapping[str, Any], where: object = "") -> Alignment:
 def placed(run: Run, alignment: Alignment) -> tuple[Array, Array, Array]:
     """Sensor's place (N, 2), heading (N,) and their rates of change (N, 3) at the time of each reading.
 
-    The pose is that of motion capture if the run has it, else the true pose.
+    The pose is that of motion capture if the run has it, else the true pose. A place without heading is nan.
     """
     if {"mocap_p", "mocap_q_xyzw"} <= set(run):
-        p, yaw = run["mocap_p"][:, :2], np.unwrap(_filled(yaw_from_quat(run["mocap_q_xyzw"])))
+        yaw = yaw_from_quat(run["mocap_q_xyzw"])
+        p, yaw = np.where(np.isfinite(yaw)[:, None], run["mocap_p"][:, :2], np.nan), np.unwrap(_filled(yaw))
     else:
         p, yaw = run["p_world_base"][:, :2], np.unwrap(run["yaw"])
     t = run["t"]

@@ -95,6 +95,14 @@ def test_motion_capture_is_the_pose_where_there_is_one():
     assert_allclose(taken["yaw"], run["yaw"], atol=1e-12)
 
 
+def test_a_quaternion_of_zero_is_a_lost_pose():
+    run = a_run()
+    lost = np.arange(run.rows) % 10 == 0
+    q = np.where(lost[:, None], 0.0, quat_from_yaw(run["yaw"]))
+    run = run.with_columns(mocap_p=np.where(lost[:, None], 0.0, run["p_world_base"]), mocap_q_xyzw=q)
+    assert_array_equal(np.isfinite(labelled(run, FIELD)["label_nt"]), ~lost)
+
+
 def test_a_labelled_run_is_whole_and_says_what_its_labels_are():
     run = labelled(a_run(), FIELD)
     known = np.isfinite(run["label_nt"])
