@@ -367,7 +367,7 @@ def _is(table: pa.Table, name: str, kind: str) -> bool:
     if table.column_names.count(name) != 1:
         return False
     column, of = table[name], table[name].type
-    number = pa.types.is_integer(of) or (kind == _NUMBER and pa.types.is_floating(of))
+    number = pa.types.is_signed_integer(of) or (kind == _NUMBER and pa.types.is_floating(of))
     if kind in _EXACT:
         inner = column.combine_chunks().flatten() if kind == _CURVE and of == _EXACT[kind] else column
         return bool(of == _EXACT[kind]) and not column.null_count + inner.null_count
