@@ -8,6 +8,7 @@ files that they name are checked before any of them is opened.
 
 import functools
 import glob
+import itertools
 import json
 import os
 import re
@@ -213,7 +214,7 @@ def wrong_types(layer: Any) -> set[str]:
     found = set()
 
     def look(path: Any) -> None:
-        if path.IsPrimPropertyPath() and (kinds := schema_kinds().get(_MULTIPLE.sub(r"\1:", path.name))):
+        if path.IsPrimPropertyPath() and (kinds := schema_kinds().get(_plain(path.name))):
             spec = layer.GetAttributeAtPath(path)
             if spec is not None and kind_of(spec.typeName) not in kinds:
                 found.add(path.name)
@@ -222,14 +223,25 @@ def wrong_types(layer: Any) -> set[str]:
     return found
 
 
-_MULTIPLE = re.compile(r"^(drive|limit|collection):[^:]+:")
-"""How attributes begin whose schemas are applied several times, each with its own name."""
+_NAMED = re.compile(r"^(drive|limit|collection):[^:]+:|^(xformOp:[^:]+):.*")
+"""Attributes with a name of their own: of schemas that are applied several times, and transforms."""
+
+_TRANSFORMS = {"translate": "Vec3", "scale": "Vec3", "orient": "Quat", "transform": "Matrix4"}
+_TRANSFORMS |= {f"{op}{axis}": "number" for op in ("translate", "scale", "rotate") for axis in "XYZ"}
+_TRANSFORMS |= {f"rotate{''.join(order)}": "Vec3" for order in itertools.permutations("XYZ")}
+"""Kinds of value of transforms, which are in no schema."""
+
+
+def _plain(name: str) -> str:
+    """Name of an attribute without the part that is its own."""
+    return _NAMED.sub(lambda match: match[2] or f"{match[1]}:", name)
 
 
 @functools.cache
 def schema_kinds() -> dict[str, set[tuple[bool, str]]]:
     """Kinds of value of each attribute of USD's schemas, by name; of several applied ones without theirs."""
-    registry, kinds = Usd.SchemaRegistry(), dict[str, set[tuple[bool, str]]]()
+    registry = Usd.SchemaRegistry()
+    kinds = {f"xformOp:{name}": {(False, kind)} for name, kind in _TRANSFORMS.items()}
     for schema in Tf.Type.FindByName("UsdSchemaBase").GetAllDerivedTypes():
         name = registry.GetSchemaTypeName(schema)
         prim = registry.FindConcretePrimDefinition(name) or registry.FindAppliedAPIPrimDefinition(name)
@@ -252,13 +264,15 @@ def check_types(stage: Any, names: set[str]) -> None:
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
         for name in names.intersection(prim.GetAuthoredPropertyNames()):
             defined = prim.GetPrimDefinition().GetAttributeDefinition(name)
-            for spec in prim.GetProperty(name).GetPropertyStack() if defined else ():
-                if not isinstance(spec, Sdf.AttributeSpec) or kind_of(spec.typeName) != kind_of(
-                    defined.GetTypeName()
-                ):
+            kinds = {kind_of(defined.GetTypeName())} if defined else set[tuple[bool, str]]()
+            if name.startswith("xformOp:") and prim.IsA(UsdGeom.Xformable):
+                kinds = schema_kinds()[_plain(name)]
+            for spec in prim.GetProperty(name).GetPropertyStack() if kinds else ():
+                if not isinstance(spec, Sdf.AttributeSpec) or kind_of(spec.typeName) not in kinds:
                     said = spec.typeName if isinstance(spec, Sdf.AttributeSpec) else "relationship"
+                    wanted = defined.GetTypeName() if defined else next(iter(kinds))[1]
                     raise RefusedError(
-                        f"<{prim.GetPath()}> has {name} as {said}, USD as {defined.GetTypeName()}; correct it"
+                        f"<{prim.GetPath()}> has {name} as {said}, USD as {wanted}; correct it"
                     )
 
 

@@ -50,6 +50,28 @@ def test_prims_that_nest_too_deep_for_usd_are_refused(tmp_path):
         info_of_stage(tmp_path / "deep.usdc")
 
 
+@pytest.mark.parametrize(
+    ("wrong", "right"),
+    [
+        ('string xformOp:translate = "x"', "float3 xformOp:translate = (1, 2, 3)"),
+        ("double xformOp:rotateXYZ:first = 1", "half3 xformOp:rotateXYZ:first = (1, 2, 3)"),
+        ("double3 xformOp:rotateX = (1, 2, 3)", "float xformOp:rotateX = 1"),
+        ("quatf[] xformOp:orient = [(1, 0, 0, 0)]", "quatf xformOp:orient = (1, 0, 0, 0)"),
+        ("matrix3d xformOp:transform:b:c = ((1, 0, 0), (0, 1, 0), (0, 0, 1))", ""),
+    ],
+)
+def test_a_transform_of_another_type_is_refused(wrong, right, tmp_path):
+    for name, text in (("wrong", wrong), ("right", right)):
+        order = f'uniform token[] xformOpOrder = ["{wrong.split()[1]}"]\n' if text else ""
+        text = f'def Xform "World"\n{{\n    {text}\n    {order}\n}}\n'
+        file = stage(tmp_path, text, f"{name}.usda")
+        if name == "right":
+            open_stage(file)
+        else:
+            with pytest.raises(InputError, match=r"</World> has xformOp:\S+ as .*; correct it"):
+                open_stage(file)
+
+
 def test_an_instancer_of_itself_is_refused(tmp_path):
     text = """def PointInstancer "World"
 {
