@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from magtwin.errors import InputError, hint
 from magtwin.extend import Registry
 from magtwin.kinds import expected
-from magtwin.run.run import Run, check_clock
+from magtwin.run.run import Run, check_clock, check_size_of_numbers
 
 if TYPE_CHECKING:
     from magtwin.path import Path as Planned
@@ -105,6 +105,7 @@ def read_run(path: str | os.PathLike[str], **options: Any) -> Run:
         raise InputError(f"{path}: {format_.name} has no option {unknown[0]!r}; drop it")
     run = _function(format_.read)(file, **options)
     check_clock(run, str(path))
+    check_size_of_numbers(run, str(path))
     return run
 
 

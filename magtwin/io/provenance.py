@@ -156,13 +156,13 @@ def made_again(
         seed, rate = int(metadata["seed"]) if seed is None else seed, float(metadata["rate_hz"])
         asked = float(metadata["asked_duration_s"]) if "asked_duration_s" in metadata else None
         speed = float(metadata.get("speed_m_s", 0.2))
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, OverflowError) as error:
         raise InputError(f"the metadata of the run are incomplete: {error}") from error
     moved_by: Any = engine or metadata.get("engine", "kinematic")
     options: dict[str, Any] = {"seed": seed, "speed": speed, "duration_s": asked, "rate_hz": rate}
     options |= {"lidar": metadata.get("lidar", "schedule"), "outside": metadata.get("outside", "nan")}
     if isinstance(what, Path):
-        options["controller"] = metadata.get("controller", "follower")
+        options["controller"] = str(metadata.get("controller", "follower"))
     if engine is None and moved_by not in ("kinematic", "newton", "replay"):
         raise InputError(f"the run used a custom engine, {moved_by!r}, which is not available")
     name = str(metadata.get("robot", ""))

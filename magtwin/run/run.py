@@ -29,6 +29,12 @@ if TYPE_CHECKING:
 
 Metadata = Mapping[str, str | int | float | bool]
 
+LAST_S = 9.2e9
+"""Latest time of a run, and minus the earliest [s]: 64 bits of nanoseconds, as viewers and bags count."""
+
+LARGEST = 1e30
+"""Largest finite number in a column of a file: its square and its 32-bit form are finite too."""
+
 
 @dataclass(frozen=True)
 class Column:
@@ -531,7 +537,21 @@ def check_clock(run: Run, what: str) -> None:
     if "t" not in run.columns:
         known = ", ".join(list(run.columns)[:5]) or "none"
         raise InputError(f"{what}: not a Run: column 't' is missing (columns: {known}, ...)")
-    check_instants(run["t"], what)
+    t = check_instants(run["t"], what)
+    if len(t) and max(-t[0], t[-1]) > LAST_S:
+        far = t[-1] if t[-1] > LAST_S else t[0]
+        raise InputError(f"{what}: t must be seconds, from {-LAST_S:g} to {LAST_S:g}, got {far:g}")
+
+
+def check_size_of_numbers(run: Run, what: str) -> None:
+    """Refuse a run with finite numbers beyond `LARGEST` in `COLUMNS`; `what` names it in the message."""
+    for name in (name for name, column in COLUMNS.items() if name in run.columns and column.unit != "bool"):
+        for rows in mapped.parts(run.rows):
+            values = run[name][rows]
+            if (wrong := np.isfinite(values) & (np.abs(values) > LARGEST)).any():
+                row = rows.start + int(np.argmax(wrong.reshape(len(values), -1).any(axis=1)))
+                text = f"{values[wrong][0]:g} is beyond {LARGEST:g}; write nan for unknown values"
+                raise InputError(f"{what}: column {name!r}, row {row}: {text}")
 
 
 def _resampled(run: Run, at: NDArray[Any], rules: Mapping[str, str]) -> dict[str, NDArray[Any]]:

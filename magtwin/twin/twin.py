@@ -231,7 +231,7 @@ def in_session_of(twin: Twin, metadata: Mapping[str, str | int | float | bool]) 
         return in_session(twin, "survey")
     try:
         seed, session = int(metadata["session_seed"]), int(metadata["session"])
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, OverflowError) as error:
         raise InputError(f"the metadata of the run name no valid session: {error}") from error
     return in_session(twin, session, seed=seed)
 

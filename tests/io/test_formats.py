@@ -319,3 +319,26 @@ def test_a_registered_format_is_read_and_written_by_its_suffix(tmp_path, monkeyp
     FORMATS.register(".txt")(text)
     write_run(Run({"t": [0.0, 1.0]}), tmp_path / "run.txt")
     assert read_run(tmp_path / "run.txt").rows == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("p_world_base", 1e300, r"'p_world_base', row 1: 1e\+300 is beyond 1e\+30"),
+        ("b_total_nt", -1e308, "'b_total_nt', row 1: -1e"),
+        ("t", 1e12, "t must be seconds, from -9.2e"),
+    ],
+)
+def test_numbers_that_no_run_can_hold_are_refused(name, value, message, tmp_path):
+    run = every_column(3)
+    values = run[name].copy()
+    values[slice(1, 2) if name != "t" else slice(2, 3)] = value
+    np.savez(tmp_path / "run.npz", **{**run.columns, name: values})
+    with pytest.raises(InputError, match=message):
+        read_run(tmp_path / "run.npz")
+
+
+def test_a_run_of_repeated_nanoseconds_with_a_nameless_fact_is_recorded(run, twin, tmp_path):
+    short = run.with_columns(t=1e-300 * np.arange(run.rows)).with_metadata(**{"": "nameless"})
+    write_run(short, tmp_path / "run.rrd", twin)
+    assert read_run(tmp_path / "run.rrd").rows == run.rows

@@ -256,3 +256,16 @@ def test_zeros_of_other_sign_and_nan_beside_a_number_differ_and_nan_beside_nan_d
     b = Run({"t": [0.0, 1.0, 2.0, 3.0], "yaw": [-0.0, np.nan, 1.0, 1.0]})
     (yaw,) = differences(a, b)
     assert (yaw.column, yaw.rows, yaw.first) == ("yaw", 2, 0)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("seed", float("inf"), "metadata of the run are incomplete"),
+        ("session_seed", float("inf"), "no valid session"),
+        ("controller", 5, "no controller '5'"),
+    ],
+)
+def test_metadata_of_other_kinds_are_refused(run, key, value, message):
+    with pytest.raises(InputError, match=message):
+        repeat(run.with_metadata(**{"session": 0, "session_seed": 0, key: value}))

@@ -268,7 +268,8 @@ def recording_of(
         interior = Interior.of(twin)
         room += interior.size(twin.field)
     with stream(recording_id, name, views, room=room, **sinks) as rec:
-        kept = {k: v for k, v in run.metadata.items() if not isinstance(v, int) or -(2**63) <= v < 2**63}
+        named = {k: v for k, v in run.metadata.items() if k}  # a property without a name cannot be sent
+        kept = {k: v for k, v in named.items() if not isinstance(v, int) or -(2**63) <= v < 2**63}
         properties: dict[str, Any] = {key: [value] for key, value in kept.items()}
         if properties:
             rec.send_property("run", rr.AnyValues(**properties))

@@ -386,7 +386,7 @@ class Robot:
 
 def _stride(rate_hz: float, most_hz: float) -> int:
     """Step between rows that reduces a rate to `most_hz` at most."""
-    return max(1, math.ceil(rate_hz / most_hz - 1e-6))
+    return max(1, math.ceil(min(rate_hz / most_hz, 1e9) - 1e-6))
 
 
 def _transform(p: Any, q_xyzw: Any) -> rr.Transform3D:
