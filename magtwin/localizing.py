@@ -39,7 +39,7 @@ from magtwin.localization.track import EST_COLUMNS, Track, track
 from magtwin.outputs import output
 from magtwin.own_field import with_own_field
 from magtwin.report import Figure, Report
-from magtwin.run.run import Run
+from magtwin.run.run import Run, numbers_in
 from magtwin.twin import Twin, scene_file
 
 RATE_HZ = 5.0
@@ -472,8 +472,8 @@ def prior_of(run: Run, text: str = "tracking", *, seed: int = 0) -> Prior:
 
 def lever_arm_of(run: Run) -> tuple[float, float]:
     """Place of the magnetometer in base_link from the metadata of a run; (0, 0) if it is not there."""
-    words = str(run.metadata.get("sensor_m", "")).split(",")
-    return (float(words[0]), float(words[1])) if len(words) == 3 else (0.0, 0.0)
+    x, y, _ = numbers_in(run.metadata, "sensor_m", 3) or (0.0, 0.0, 0.0)
+    return x, y
 
 
 def extent_of(run: Run, belief: FieldBelief | None) -> tuple[float, float, float, float]:

@@ -85,7 +85,7 @@ def lab_of(
     """The room of a TOML `table` read from `path`. If it has no floor_m, the floor covers the map.
 
     Raises:
-        InputError: The floor cannot be in metres.
+        InputError: A length cannot be in metres.
     """
     if map_layer is not None and "floor_m" not in table.get("lab", {}):
         x0, x1, y0, y1 = load_map(map_layer).extent
@@ -94,6 +94,10 @@ def lab_of(
     if max(lab.floor_m) > LARGEST_M:
         text = f"floor_m must be in metres, at most {LARGEST_M:g} each way, got {lab.floor_m}"
         raise refused_at(path, "floor_m", text, section="lab")
+    for key in ("wall_height_m", "wall_thickness_m", "post_height_m", "apron_m"):
+        if getattr(lab, key) > LARGEST_M:
+            text = f"{key} must be in metres, at most {LARGEST_M:g}, got {getattr(lab, key):g}"
+            raise refused_at(path, key, text, section="lab")
     return lab
 
 

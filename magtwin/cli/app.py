@@ -95,6 +95,8 @@ def main(arguments: list[str] | None = None) -> None:
         if isinstance(error, MemoryError) or _TOO_LITTLE.search(str(error)):
             text = str(error).partition(" for an array")[0].partition(". Error code")[0]
             _fail(f"not enough memory{f' ({text})' if text else ''}; give less data or smaller options")
+        if isinstance(error, FileNotFoundError) and _folder_gone():
+            _fail("the working folder was removed; change to another one")
         if isinstance(error, OSError):
             _fail(f"{error} ({type(error).__name__})")
         if text := _no_room(error):
@@ -124,6 +126,15 @@ def _dashed(arguments: list[str]) -> str:
         if word.startswith("-") and "=" not in word and "." in word and not word[1:2].isdigit():
             return f"{word}: begins with a dash, so it is read as an option; for a file write ./{word}"
     return ""
+
+
+def _folder_gone() -> bool:
+    """Whether the working folder was removed."""
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        return True
+    return False
 
 
 def _no_room(error: Exception) -> str:

@@ -12,7 +12,7 @@ from magtwin.extend import Registry
 from magtwin.frames import yaw_from_quat
 from magtwin.localization.problem import Array, Compensator, FieldBelief, Reading
 from magtwin.localization.readings import readings_of
-from magtwin.run.run import Column, Run
+from magtwin.run.run import Column, Run, numbers_in
 
 COMPENSATORS: Registry[Any] = Registry(
     "compensator",
@@ -229,8 +229,7 @@ def compensated(run: Run, fitted: Compensator) -> Run:
 def _field_along(run: Run, field: FieldBelief) -> Array:
     """The map at the sensor along the true poses of a run [nT]."""
     yaw = run["yaw"]
-    words = str(run.metadata.get("sensor_m", "")).split(",")
-    lx, ly = (float(words[0]), float(words[1])) if len(words) == 3 else (0.0, 0.0)
+    lx, ly, _ = numbers_in(run.metadata, "sensor_m", 3) or (0.0, 0.0, 0.0)
     c, s = np.cos(yaw), np.sin(yaw)
     p = run["p_world_base"][:, :2] + np.column_stack([c * lx - s * ly, s * lx + c * ly])
     return np.asarray(field.mean(p, yaw), float)

@@ -496,7 +496,7 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         wanted = {"b_sd_nt", "b_total_nt", "b_map_nt", "b_truth_nt"}
         if self.metadata.get("magnetometer") != "neural" or not wanted <= set(self):
             return
-        mean = float(self.metadata.get("network_label_mean_nt", 0.0))
+        (mean,) = numbers_in(self.metadata, "network_label_mean_nt") or (0.0,)
         tally.than = "the map plus the mean disturbance in the training data" if mean else "the map alone"
         for rows in mapped.parts(self.rows):
             total, level, truth, sd = (
@@ -541,6 +541,24 @@ def check_clock(run: Run, what: str) -> None:
     if len(t) and max(-t[0], t[-1]) > LAST_S:
         far = t[-1] if t[-1] > LAST_S else t[0]
         raise InputError(f"{what}: t must be seconds, from {-LAST_S:g} to {LAST_S:g}, got {far:g}")
+
+
+def numbers_in(metadata: Metadata, key: str, count: int = 1) -> tuple[float, ...]:
+    """The numbers of a metadata entry, such as "0.1, 0, 0.4"; none if it is missing.
+
+    Raises:
+        InputError: They are not `count` finite numbers.
+    """
+    if key not in metadata:
+        return ()
+    try:
+        numbers = tuple(float(word) for word in str(metadata[key]).split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count or not max(map(abs, numbers)) < LARGEST:
+        wanted = "a finite number" if count == 1 else f"{count} finite numbers"
+        raise InputError(f"metadata {key!r} must be {wanted}, got {str(metadata[key])[:60]!r}")
+    return numbers
 
 
 def check_size_of_numbers(run: Run, what: str) -> None:

@@ -337,6 +337,11 @@ def test_any_scene_name_works(toml, tmp_path, name):
         ('"crate"', '"shelf"', r"den\.toml:26: .*two pieces of furniture are called 'shelf'"),
         ('"crate"', '"my crate"', r"den\.toml:26: .*'my crate' cannot name a prim"),
         ("[4.0, 3.0]", "[4000, 3000]", r"den\.toml:9: \[lab\] floor_m must be in metres"),
+        (
+            "[4.0, 3.0]",
+            "[4.0, 3.0]\napron_m = 1e30",
+            r"den\.toml:10: \[lab\] apron_m must be in metres, at most",
+        ),
         ("spacing_m = 0.5", "spacing_m = 50", r"den\.toml: cannot be surveyed: spacing_m 50 leaves no cell"),
         (
             "seed = 3",

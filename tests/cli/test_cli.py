@@ -365,3 +365,10 @@ def test_the_working_folder_and_devices_are_not_replaced(tmp_path, monkeypatch, 
     line = refused(capsys, "run", lab_scene, "--duration-s", "1", "--out", "pipe.parquet", "--force")
     assert "a device or pipe" in line
     assert (tmp_path / "here").is_dir()
+
+
+def test_a_working_folder_that_was_removed_is_named(tmp_path, monkeypatch, capsys):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    (tmp_path / "here").rmdir()
+    assert "the working folder was removed" in refused(capsys, "info", "run.parquet")

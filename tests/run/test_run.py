@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 import magtwin
 from magtwin.errors import InputError, UnknownNameError
-from magtwin.run.run import COLUMNS, Column, Run
+from magtwin.run.run import COLUMNS, Column, Run, numbers_in
 
 
 def every_column(rows=40, seed=0, start_s=0.0):
@@ -324,3 +324,11 @@ def test_a_run_is_the_same_in_another_process():
     again = pickle.loads(pickle.dumps(run))
     assert_allclose(again["own"], run["own"], rtol=0)
     assert (dict(again.metadata), again.spec("own")) == ({"seed": 3}, run.spec("own"))
+
+
+@pytest.mark.parametrize("value", ["a, b, c", "nan, 0, 0", "0, 0", "", -1, 10**300])
+def test_metadata_that_must_be_numbers_are_refused_by_name(value):
+    assert numbers_in({"sensor_m": "0.1, 0, 0.4"}, "sensor_m", 3) == (0.1, 0.0, 0.4)
+    assert numbers_in({}, "sensor_m", 3) == ()
+    with pytest.raises(InputError, match="metadata 'sensor_m' must be 3 finite numbers, got"):
+        numbers_in({"sensor_m": value}, "sensor_m", 3)
