@@ -555,7 +555,7 @@ def numbers_in(metadata: Metadata, key: str, count: int = 1) -> tuple[float, ...
         numbers = tuple(float(word) for word in str(metadata[key]).split(","))
     except ValueError:
         numbers = ()
-    if len(numbers) != count or not max(map(abs, numbers)) < LARGEST:
+    if len(numbers) != count or not all(abs(number) < LARGEST for number in numbers):
         wanted = "a finite number" if count == 1 else f"{count} finite numbers"
         raise InputError(f"metadata {key!r} must be {wanted}, got {str(metadata[key])[:60]!r}")
     return numbers
