@@ -133,6 +133,8 @@ def track(
 def _called(what: str, work: Callable[[], Any]) -> Any:
     try:
         return work()
+    except InputError as error:  # it says itself what is wrong
+        raise LocalizerError(f"{what.partition('.')[0]}: {error}") from error
     except Exception as error:
         raise LocalizerError(f"{what} raised {type(error).__name__}: {error}") from error
 

@@ -124,3 +124,12 @@ class Wrong:
 def test_a_wrong_estimate_is_refused_with_its_time(run, estimate, text):
     with pytest.raises(LocalizerError, match=text):
         track(Wrong(estimate), Problem(belief=None, extent=(-3, 3, -2, 2)), run)
+
+
+def test_a_refusal_of_a_localizer_says_what_is_wrong_and_not_where_it_was_raised(run):
+    class Refuses(Wrong):
+        def reset(self, problem):
+            raise mt.InputError("a map is needed")
+
+    with pytest.raises(LocalizerError, match=r"^Refuses: a map is needed$"):
+        track(Refuses(None), Problem(belief=None, extent=(-3, 3, -2, 2)), run)
