@@ -36,6 +36,12 @@ def test_a_text_of_a_file_that_looks_like_a_call_stays():
         assert InputError(text).in_flags(FLAGS) == text
 
 
+def test_a_value_of_several_lines_is_quoted_in_one():
+    assert (
+        str(InputError("got Matrix(1, 2,\n       3, 4); correct it")) == "got Matrix(1, 2, 3, 4); correct it"
+    )
+
+
 def test_a_parameter_survives_pickling_and_is_none_by_default():
     assert pickle.loads(pickle.dumps(InputError("give `force=True`", parameter="force"))).parameter == "force"
     assert UnknownNameError("no path").parameter is None

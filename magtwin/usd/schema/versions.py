@@ -4,6 +4,7 @@ A layer that magtwin writes has its version in customLayerData, as `magtwinSchem
 edit made by hand, is older if it has a name that only an older version had.
 """
 
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -43,18 +44,19 @@ def version_of(layer: Sdf.Layer) -> tuple[int, int] | None:
     text = layer.customLayerData.get(KEY)
     if text is None:
         return None
-    first, _, second = str(text).partition(".")
-    if not (first.isdecimal() and second.isdecimal()):
+    version = re.fullmatch(r"([0-9]{1,9})\.([0-9]{1,9})", str(text))
+    if version is None:
         raise InputError(
             f"{layer.realPath or layer.identifier}: customLayerData {KEY} must be a version such as "
             f"{TEXT!r}, got {text!r}"
         )
-    if int(first) > VERSION[0]:
+    first, second = map(int, version.groups())
+    if first > VERSION[0]:
         raise InputError(
             f"{layer.realPath or layer.identifier}: is of schema {text}, this magtwin knows {TEXT}; read it "
             "with a later magtwin"
         )
-    return int(first), int(second)
+    return first, second
 
 
 def older_properties(layer: Sdf.Layer) -> list[Sdf.Path]:
