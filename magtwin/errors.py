@@ -33,9 +33,8 @@ class InputError(ValueError):
     """Name of the parameter that is wrong, or that would help. None if the error is about none."""
 
     def __init__(self, text: str = "", *, parameter: str | None = None) -> None:
-        text = (
-            " ".join(line.strip() for line in text.split("\n")) if "\n" in text else text
-        )  # values of a file
+        if "\n" in text:  # in a value of a file, such as a matrix
+            text = " ".join(line.strip() for line in text.split("\n"))
         if len(text) > LONGEST:  # what is wrong is at the beginning, what to do at the end
             text = f"{text[: LONGEST * 2 // 3]} ... {text[-LONGEST // 3 :]}"
         super().__init__(text)
