@@ -24,8 +24,8 @@ EVERY_S = 10.0
 TICK_S = 0.1
 """Time between two looks at the clock [s]."""
 
-WINDOW_S = 30.0
-"""Rates are means over this time [s]."""
+WINDOW_S, FEWEST = 30.0, 8
+"""Rates are means over this time [s] and over this many reports: long runs can end several at once."""
 
 LATE_S = 5.0
 """Time without a report after which the rate counts as unknown [s], at least ..."""
@@ -60,7 +60,7 @@ class Step:
             seen.append((now, done))
         else:
             seen[-1] = (now, done)
-        while len(seen) > 2 and now - seen[1][0] > WINDOW_S:
+        while len(seen) > FEWEST and now - seen[1][0] > WINDOW_S:
             seen.popleft()
 
     def rate(self, now: float) -> float | None:

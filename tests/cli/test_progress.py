@@ -126,6 +126,16 @@ def test_a_rate_forgets_what_is_long_ago(clock):
     assert one.rate(109.0) == pytest.approx(1.0, rel=0.05)
 
 
+def test_runs_that_end_in_threes_have_the_rate_of_their_mean():
+    one = Step("Driving", "runs", 0.0)
+    one.advance(0.0, 0, 30)
+    for done in range(1, 10):  # three within a second, every 300 s
+        now = 300.0 * ((done + 2) // 3) + 0.3 * ((done - 1) % 3)
+        one.advance(now, done, 30)
+        assert one.rate(now) == pytest.approx(0.01, rel=0.7)
+    assert one.rate(900.6) == pytest.approx(7 / 600.3)
+
+
 def test_a_rate_does_not_count_what_was_done_before_a_resume():
     one = Step("Training", "rows", 0.0)
     for k in range(5):
