@@ -48,7 +48,7 @@ from magtwin.urdf.shape import COLLISIONS, VISUALS, define_collider, define_no_c
 from magtwin.urdf.simready import check_metadata, metadata
 from magtwin.urdf.source.source import read_source
 from magtwin.usd.attributes import read_pose, write_pose
-from magtwin.usd.layers import describe_stage, open_stage, translates
+from magtwin.usd.layers import describe_stage
 
 JOINTS = "joints"
 """Scope of the joints below the robot's prim."""
@@ -121,18 +121,6 @@ def convert_with_report(
         with output(out.parent / THUMBNAILS / f"{out.name}.png", force=True) as aside:
             thumbnail(out, aside)
     return report
-
-
-@translates
-def read_notes(asset: str | os.PathLike[str]) -> tuple[str, ...]:
-    """Notes of a conversion on repairs, guesses and omissions, one line each.
-
-    Raises:
-        InputError: The file is missing or is not USD.
-    """
-    stage = open_stage(asset)  # kept in a variable: a layer does not outlive its stage
-    metadata = stage.GetRootLayer().customLayerData.get("magtwin", {})
-    return tuple(metadata.get("notes", ()))
 
 
 def _write_payloads(author: "_Author", out: Path, force: bool) -> ConversionReport:

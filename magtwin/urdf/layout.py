@@ -26,6 +26,7 @@ from magtwin.outputs import check_free
 from magtwin.urdf.material import LOOKS
 from magtwin.urdf.shape import COLLISIONS, VISUALS
 from magtwin.usd.layers import open_layer
+from magtwin.usd.robot import conversion_data
 from magtwin.usd.schema.versions import creator
 
 PAYLOADS = "payloads"
@@ -102,7 +103,7 @@ def check_payloads(out: Path, *, force: bool) -> Path:
     if folder.exists():
         base = folder / FILES["base"]
         layer = open_layer(base) if base.is_file() else None
-        owner = layer.customLayerData.get("magtwin", {}).get("interface", "") if layer else ""
+        owner = conversion_data(layer, base).get("interface", "") if layer else ""
         if owner != out.name:
             whose = f"is of {owner}" if owner else "was not made by a conversion"
             raise InputError(f"{folder}: {whose}; give each robot its own folder")

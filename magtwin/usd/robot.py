@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from pxr import Gf, Usd, UsdGeom
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 from magtwin.errors import InputError
 from magtwin.files import existing, sha256
@@ -90,9 +90,13 @@ def read_robot(prim: Usd.Prim, asset: Path | None = None) -> RobotSpec:
         raise InputError(f"{place(prim)}: {error}") from error
 
 
-def conversion_notes(asset: str | os.PathLike[str]) -> list[str]:
-    """What was repaired, guessed or left out when an asset was converted from its URDF."""
-    return [str(note) for note in _conversion(asset).get("notes", [])]
+def read_notes(asset: str | os.PathLike[str]) -> tuple[str, ...]:
+    """What was repaired, guessed or left out when an asset was converted from its URDF, one line each.
+
+    Raises:
+        InputError: The file is missing or is not USD, or what the converter wrote was damaged.
+    """
+    return tuple(map(str, _conversion(asset).get("notes", ())))
 
 
 def urdf_of(asset: str | os.PathLike[str]) -> Path | None:
@@ -108,7 +112,19 @@ def urdf_of(asset: str | os.PathLike[str]) -> Path | None:
 def _conversion(asset: str | os.PathLike[str]) -> dict[str, Any]:
     """Metadata that the converter wrote to an asset."""
     stage = open_stage(existing(asset, "robot asset"))  # held in a name: a layer does not outlive its stage
-    return dict(stage.GetRootLayer().customLayerData.get("magtwin", {}))
+    return conversion_data(stage.GetRootLayer(), asset)
+
+
+def conversion_data(layer: Sdf.Layer, file: str | os.PathLike[str]) -> dict[str, Any]:
+    """Metadata that the converter wrote to the layer of a file; empty if it wrote none.
+
+    Raises:
+        InputError: They are of another type.
+    """
+    data = layer.customLayerData.get("magtwin", {})
+    if not isinstance(data, dict) or not isinstance(data.get("notes", ()), Vt.StringArray | list | tuple):
+        raise InputError(f"{file}: customLayerData magtwin is damaged; convert the robot again")
+    return data
 
 
 def _base(root: Usd.Prim) -> Usd.Prim:

@@ -638,7 +638,7 @@ def _read_map(file: Path) -> None:
 def _read_robot(file: Path) -> None:
     call("usd.robot:load_robot", file)
     _refusable("urdf.write:write_urdf", file, file.with_name("out.urdf"))
-    call("usd.robot:conversion_notes", file)
+    call("usd.robot:read_notes", file)
 
 
 def _read_scene(file: Path) -> None:

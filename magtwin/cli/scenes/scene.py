@@ -91,7 +91,7 @@ def scene(
     from magtwin.outputs import check_free
     from magtwin.twin import scene_from_toml, scene_with_robot
     from magtwin.usd.info import info_of_stage
-    from magtwin.usd.robot import conversion_notes
+    from magtwin.usd.robot import read_notes
 
     check_free(out, force=force)
     lines: list[str] = []
@@ -126,7 +126,7 @@ def scene(
         announce("Authoring the stage")
         root = author_scene(read, out, force=force)
         made = [s.robot for s in read.robots if s.robot.asset.is_relative_to(Path(workshop).resolve())]
-        notes = {f"notes on {robot.name}": conversion_notes(robot.asset) for robot in made}
+        notes = {f"notes on {robot.name}": read_notes(robot.asset) for robot in made}
     report = info_of_stage(root)
     report = replace(report, metadata={**report.metadata, **notes})
     return Done(report, root, text="\n".join([*lines, f"Wrote {root}"]))
