@@ -8,6 +8,7 @@ the other had begun to rename.
 
 import ctypes
 import errno
+import filecmp
 import json
 import os
 import re
@@ -67,11 +68,16 @@ _pending: ContextVar["_Pending | None"] = ContextVar("pending", default=None)
 """What waits for the end of the transaction; None outside of one."""
 
 
-def check_free(path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """`path` if it does not exist yet, or if `force` is True.
+def check_free(path: str | os.PathLike[str], *, force: bool = False, in_place: bool = False) -> Path:
+    """`path` if it does not exist yet, or if `force` is True and the command does not read it.
+
+    Args:
+        path: The file or folder to make.
+        force: Whether an existing one is replaced.
+        in_place: Whether it is a changed version of a file that the command reads.
 
     Raises:
-        InputError: It exists and `force` is False.
+        InputError: It exists and `force` is False, or it is an input of the command.
     """
     path = Path(path)
     _sweep((Path.cwd() / path).parent)
@@ -79,11 +85,15 @@ def check_free(path: str | os.PathLike[str], *, force: bool = False) -> Path:
         raise InputError(
             f"{path}: exists already; give `force=True` to replace it, or another name", parameter="force"
         )
+    if not in_place and Path(os.path.realpath(path)) in _inputs.get():
+        raise InputError(f"{path}: is read by this command and would be replaced; give another name")
     return path
 
 
 @contextmanager
-def output(path: str | os.PathLike[str], *, force: bool = False, at_once: bool = False) -> Iterator[Path]:
+def output(
+    path: str | os.PathLike[str], *, force: bool = False, at_once: bool = False, in_place: bool = False
+) -> Iterator[Path]:
     """Write a file or a folder aside; it replaces `path` at the end of the block, or of the transaction.
 
     Create the file or folder at the yielded path, which has the suffix of `path`. If the block raises,
@@ -93,11 +103,12 @@ def output(path: str | os.PathLike[str], *, force: bool = False, at_once: bool =
         path: The file or folder to make. Its parents are created.
         force: Whether to replace an existing file or folder.
         at_once: Whether it appears at the end of the block even in a transaction.
+        in_place: As for `check_free`.
 
     Raises:
-        InputError: It exists and `force` is False, its folder cannot be written, or the disk is full.
+        InputError: As for `check_free`, or its folder cannot be written, or the disk is full.
     """
-    path = check_free(path, force=force)
+    path = check_free(path, force=force, in_place=in_place)
     place = Path.cwd() / path  # absolute, since the working folder can be renamed
     if Path(os.path.realpath(place)) in (Path.cwd(), *Path.cwd().parents):
         raise InputError(f"{path}: is the working folder or contains it; give a folder inside it")
@@ -106,7 +117,7 @@ def output(path: str | os.PathLike[str], *, force: bool = False, at_once: bool =
     inner = any(folder in place.parents for folder in _asides)  # a part of another output
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
-        aside = _Aside.beside(place)
+        aside = _Aside.beside(place, force=force)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
     waits = False
@@ -142,13 +153,14 @@ def _check_replaceable(folder: Path, new: Path) -> None:
     """Refuse to replace a folder with files of the user: inputs, or of a kind that magtwin writes nowhere.
 
     Raises:
-        InputError: It holds an input or a file of another suffix, and the new folder none of its name.
+        InputError: It holds an input, and the new folder no copy of it; or a file of another suffix, and the
+            new folder none of its name.
     """
     if not folder.is_dir():
         return
     real = Path(os.path.realpath(folder))
     for file in _inputs.get():
-        if real in file.parents and not (new / file.relative_to(real)).exists():
+        if real in file.parents and not _is_copy(new / file.relative_to(real), file):
             raise InputError(
                 f"{folder}: holds {file.relative_to(real)}, which is read and would be removed with it; give "
                 "another name"
@@ -163,6 +175,13 @@ def _check_replaceable(folder: Path, new: Path) -> None:
             )
 
 
+def _is_copy(copy: Path, file: Path) -> bool:
+    """Whether a file has the content of another one, or is a folder as that is."""
+    if copy.is_file() and file.is_file():
+        return filecmp.cmp(copy, file, shallow=False)
+    return copy.is_dir() and file.is_dir()
+
+
 @contextmanager
 def reading(values: Iterable[object]) -> Iterator[None]:
     """Let no output of the block remove the files among `values`, such as the arguments of a command."""
@@ -172,6 +191,12 @@ def reading(values: Iterable[object]) -> Iterator[None]:
         yield
     finally:
         _inputs.reset(token)
+
+
+def not_read(value: str | Path) -> None:
+    """Take a value out of those of `reading`: it is a name that ships, and not the folder of that name."""
+    real = Path(os.path.realpath(value))
+    _inputs.set(tuple(file for file in _inputs.get() if file != real))
 
 
 def _is_there(name: str | Path) -> bool:
@@ -249,8 +274,11 @@ class _Aside:
     lock: int = -1
     """File descriptor of the lock; -1 if it is not held."""
 
+    force: bool = True
+    """Whether it may replace what is there."""
+
     @classmethod
-    def beside(cls, place: Path) -> "_Aside":
+    def beside(cls, place: Path, *, force: bool) -> "_Aside":
         """A new folder beside a place."""
         name = place.name[:60]  # a longer one with what is added could be too long for the disk
         while True:
@@ -260,7 +288,7 @@ class _Aside:
             except FileNotFoundError:  # another process swept it before it was locked
                 continue
             _asides.add(folder)
-            return cls(place, folder, lock)
+            return cls(place, folder, lock, force)
 
     @property
     def new(self) -> Path:
@@ -335,6 +363,10 @@ def _commit(asides: list[_Aside]) -> None:
         done: list[_Aside] = []
         try:
             for aside in asides:
+                if not aside.force and aside.place.exists():
+                    raise InputError(
+                        f"{aside.place}: another process has made it in the meantime; give another name"
+                    )
                 aside.swap(keep=several)
                 done.append(aside)
         except BaseException:

@@ -11,7 +11,7 @@ import pytest
 
 from magtwin import outputs
 from magtwin.errors import InputError
-from magtwin.outputs import afterwards, check_free, output, reading, transaction
+from magtwin.outputs import afterwards, check_free, not_read, output, reading, transaction
 
 EVENTS = (
     (os, "fsync"),
@@ -241,19 +241,45 @@ def test_a_list_of_renames_that_magtwin_did_not_write_moves_nothing(tmp_path):
     assert content(tmp_path) == {"home/profile": "mine"}
 
 
-def test_a_folder_that_holds_an_input_is_not_replaced_unless_the_output_has_it_too(tmp_path):
+def write(folder, texts, *, force=False):
+    """Make a folder of texts by name."""
+    with output(folder, force=force) as aside:
+        aside.mkdir()
+        for name, text in texts.items():
+            (aside / name).parent.mkdir(exist_ok=True)
+            (aside / name).write_text(text)
+
+
+def test_a_folder_that_holds_an_input_is_not_replaced_unless_the_output_has_a_copy(tmp_path):
     (tmp_path / "room" / "b").mkdir(parents=True)
     (tmp_path / "room" / "b" / "in.csv").write_text("old")
     with reading(["", "x\0", "n" * 5000, tmp_path / "room" / "b" / "in.csv"]):
-        with (
-            pytest.raises(InputError, match=r"holds b/in\.csv, which is read and would be removed"),
-            output(tmp_path / "room", force=True) as aside,
-        ):
-            aside.mkdir()
-        with output(tmp_path / "room", force=True) as aside:
-            (aside / "b").mkdir(parents=True)
-            (aside / "b" / "in.csv").write_text("new")
-    assert content(tmp_path / "room") == {"b/in.csv": "new"}
+        for others in ({}, {"b/in.csv": "new"}):
+            with pytest.raises(InputError, match=r"holds b/in\.csv, which is read and would be removed"):
+                write(tmp_path / "room", others, force=True)
+        write(tmp_path / "room", {"b/in.csv": "old", "more.csv": "new"}, force=True)
+    assert content(tmp_path / "room") == {"b/in.csv": "old", "more.csv": "new"}
+
+
+def test_an_input_is_not_replaced_unless_it_is_changed_in_place(tmp_path):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "map.csv").write_text("old")
+    with reading([tmp_path / "runs", tmp_path / "map.csv"]):
+        for name in ("runs", "map.csv", "runs/../map.csv"):
+            with pytest.raises(InputError, match="is read by this command and would be replaced"):
+                check_free(tmp_path / name, force=True)
+        with output(tmp_path / "map.csv", force=True, in_place=True) as aside:
+            aside.write_text("new")
+        not_read(tmp_path / "runs")  # it was a name that ships
+        check_free(tmp_path / "runs", force=True)
+    check_free(tmp_path / "map.csv", force=True)
+    assert content(tmp_path) == {"map.csv": "new"}
+
+
+def test_what_another_process_made_in_the_meantime_is_not_replaced(tmp_path):
+    with pytest.raises(InputError, match="another process has made it in the meantime"):
+        write(tmp_path / "a", {"x.txt": "mine", "../../a/x.txt": "theirs"})
+    assert content(tmp_path) == {"a/x.txt": "theirs"}
 
 
 @pytest.mark.parametrize("name", ["loop", "loop/x"])

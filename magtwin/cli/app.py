@@ -24,12 +24,26 @@ from magtwin.errors import CalibrationWarning, InputError, MismatchWarning
 from magtwin.folders import allow
 from magtwin.version import __version__
 
+
+
+class Settings(Toml):
+    """Options in magtwin.toml of the working folder, read as any TOML of a user."""
+
+    def _load_config(self, path: Path) -> dict[str, Any]:
+        from magtwin.files import read_toml
+
+        try:
+            return read_toml(path)
+        except InputError as error:
+            raise CycloptsError(msg=str(error)) from error
+
+
 app = App(
     name="magtwin",
     help="Author magnetic digital twins of labs and robots in USD, simulate what a robot's magnetometer "
     "reads, fit field maps and train neural magnetometers.",
     version=__version__,
-    config=[Env("MAGTWIN_", show=False), Toml("magtwin.toml", search_parents=False)],
+    config=[Env("MAGTWIN_", show=False), Settings("magtwin.toml")],
     default_parameter=Parameter(negative_iterable="", negative_none=""),
     help_epilogue="Options can also be set in the environment (MAGTWIN_RUN_SEED=1) and in magtwin.toml. "
     "Exit status: 0 done, 1 an input was refused, 2 wrong usage. Each command also takes --debug, which "
@@ -78,7 +92,7 @@ def main(arguments: list[str] | None = None) -> None:
                 **_help_options(arguments),
             )
     except CycloptsError as error:
-        _fail(renamed(error, arguments) or _dashed(arguments) or str(error), status=2)
+        _fail(renamed(error, arguments) or _dashed(arguments) or _with_file(error), status=2)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # `magtwin info ... | head`
@@ -102,6 +116,12 @@ def main(arguments: list[str] | None = None) -> None:
         if text := _no_room(error):
             _fail(text)
         _fail(f"a fault in magtwin, {type(error).__name__}: {error}; please report it, with --debug")
+
+
+def _with_file(error: CycloptsError) -> str:
+    """The text of an error, with the file that a wrong value is in."""
+    text, file = str(error), getattr(getattr(error, "token", None), "source", "")
+    return f"{file}: {text}" if Path(file).is_absolute() and file not in text else text
 
 
 def _allowed(arguments: list[str]) -> tuple[list[str], list[str]]:
@@ -153,7 +173,9 @@ def _no_room(error: Exception) -> str:
 
 
 def _wrong_name(error: Exception, arguments: list[str]) -> str:
-    """The refusal of a file whose name is too long or is not UTF-8; "" if the error is another one."""
+    """The refusal of a file whose name is too long, not UTF-8 or a circle; "" if the error is another one."""
+    if isinstance(error, RuntimeError) and str(error).startswith("Symlink loop from "):  # before Python 3.13
+        return f"{str(error).partition(' from ')[2].strip(chr(39))}: its links form a circle; give another file"
     if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
         name = str(error.filename)
         return f"{name[:60]}...: its name of {len(name)} characters is too long for a file; shorten it"

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from magtwin.errors import InputError, MismatchWarning
+from magtwin.files import existing
 from magtwin.io.formats import format_of, read_run, write_run
 from magtwin.outputs import check_free
 from magtwin.run.run import Run
@@ -43,7 +44,7 @@ def convert_run(
     Raises:
         InputError: The source cannot be read, an option does not fit the formats, or the output exists.
     """
-    source, out = Path(source), check_free(out, force=force)
+    source, out = existing(source, "run"), check_free(out, force=force)
     given = {"storage": storage, "units": out_unit, "fps": usd_fps}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if usd_fps == 0:

@@ -30,7 +30,15 @@ from magtwin.spec.base import Quat, Vec3
 from magtwin.usd.attributes import read_pose, target, targets
 from magtwin.usd.clips import ClipWriter, Samples, clips_of, folder_of, read_clips, remove_clips
 from magtwin.usd.geometry import BASE_LINK, read_links
-from magtwin.usd.layers import SUFFIXES, WORLD, describe_stage, open_layer, open_stage, translates
+from magtwin.usd.layers import (
+    SUFFIXES,
+    WORLD,
+    check_not_part,
+    describe_stage,
+    open_layer,
+    open_stage,
+    translates,
+)
 from magtwin.usd.maps.epochs import EPOCH
 from magtwin.usd.placement import lab_on, labs_on, take_to_origin
 from magtwin.usd.schema import attribute_name, only_prim_with, place, prims_with
@@ -141,8 +149,7 @@ def write_animation(
         world = stage.GetDefaultPrim()
         if labs_on(stage):
             take_to_origin(stage, lab_on(stage, str(run.metadata.get("lab", ""))))
-        if path.resolve() in (Path(layer.realPath).resolve() for layer in stage.GetUsedLayers()):
-            raise InputError(f"{path}: is a part of the scene; give another name")
+        check_not_part(stage, path)
         stand = _stand(stage, world, str(run.metadata.get("robot", "")))
         maps = [prim.GetPath() for prim in prims_with(stage.GetPseudoRoot(), "anomalyMap")]
     with ExitStack() as stack:

@@ -238,9 +238,20 @@ def save_layer(layer: Sdf.Layer, sublayers: Mapping[str, str] = MappingProxyType
     copy = Sdf.Layer.CreateAnonymous(path.name)
     copy.TransferContent(layer)
     copy.subLayerPaths = [sublayers.get(name, name) for name in layer.subLayerPaths]
-    with output(path, force=True) as aside:
+    with output(path, force=True, in_place=True) as aside:
         export_like(copy, path, aside)
     afterwards(functools.partial(layer.Reload, force=True))
+
+
+def check_not_part(stage: Usd.Stage, out: str | os.PathLike[str]) -> None:
+    """Refuse an output that is a layer of a stage.
+
+    Raises:
+        InputError: The stage reads this file.
+    """
+    file = Path(os.path.realpath(out))
+    if any(file == Path(layer.realPath).resolve() for layer in stage.GetUsedLayers() if layer.realPath):
+        raise InputError(f"{out}: is a part of the scene; give another name")
 
 
 def export_like(layer: Sdf.Layer, path: Path, out: Path) -> None:

@@ -54,7 +54,7 @@ def upgrade(path: str | os.PathLike[str]) -> list[Path]:
         def write(file: Path) -> Path:
             if not os.access(file, os.W_OK):
                 raise InputError(f"{file}: cannot be written; upgrade a copy of the stage")
-            aside = renamed.enter_context(output(file, force=True))
+            aside = renamed.enter_context(output(file, force=True, in_place=True))
             export_like(copies[file], file, aside)
             return aside
 

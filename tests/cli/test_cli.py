@@ -271,6 +271,41 @@ def test_options_come_from_the_environment_and_from_magtwin_toml(tmp_path, monke
     assert "speeed" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "a pipe, not a TOML file"),
+        ("[run\n", "not TOML: Expected ']'"),
+        ('[run]\nseed = "x"\n', "Invalid value for [seed]: a whole number is wanted, got 'x'"),
+        ("run = 5\n", "key [run] in"),
+    ],
+)
+def test_a_damaged_magtwin_toml_is_refused_by_its_name(text, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    settings = tmp_path / "magtwin.toml"
+    os.mkfifo(settings) if text is None else settings.write_text(text)
+    with pytest.raises(SystemExit) as stop:
+        main(["run", "lab", "--out", "a"])
+    assert stop.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+    assert "magtwin.toml" in line
+
+
+def test_links_that_form_a_circle_are_refused(tmp_path, capsys):
+    (tmp_path / "loop").symlink_to("loop")
+    for words in (("convert", tmp_path / "loop", "a.csv"), ("run", "lab", "--out", tmp_path / "loop" / "x.csv")):
+        assert "links form a circle" in refused(capsys, *words)
+
+
+def test_a_map_that_the_scene_reads_is_not_replaced_by_a_survey_of_it(lab_scene, capsys):
+    layer = next(lab_scene.parent.glob("map/*.usdc"))
+    before = layer.read_bytes()
+    words = ("--spacing-m", "2", "--readings", "1", "--out", layer, "--force")
+    assert "is a part of the scene" in refused(capsys, "map", "survey", lab_scene, *words)
+    assert layer.read_bytes() == before
+
+
 def test_info_tells_of_stages_runs_and_networks(lab_scene, tmp_path, capsys):
     main(["run", str(lab_scene), "--duration-s", "2", "--out", str(tmp_path / "a.parquet")])
     capsys.readouterr()

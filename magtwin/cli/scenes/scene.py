@@ -88,11 +88,13 @@ def scene(
         them is refused, and the difference is given in nT.
     """
     from magtwin.author.scene import author_scene
-    from magtwin.outputs import check_free
+    from magtwin.outputs import check_free, not_read
     from magtwin.twin import scene_from_toml, scene_with_robot
     from magtwin.usd.info import info_of_stage
     from magtwin.usd.robot import read_notes
 
+    if spec is not None and not Path(spec).is_file():
+        not_read(spec)
     check_free(out, force=force)
     lines: list[str] = []
     with TemporaryDirectory() as workshop:

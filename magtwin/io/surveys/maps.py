@@ -260,7 +260,7 @@ def survey_scene(
         InputError: The scene has no Earth field, a number is out of range, or the output cannot be written.
     """
     from magtwin.sim.survey import blocked_by, survey, survey_readings
-    from magtwin.usd.layers import layer_files
+    from magtwin.usd.layers import check_not_part, layer_files
     from magtwin.usd.maps.layer import save_map
     from magtwin.usd.scene import open_scene, use_map
 
@@ -274,6 +274,8 @@ def survey_scene(
     opened = open_scene(scene_file, lab=lab, check_network=False)
     if adopt:
         use_map(opened, out, dry=True)  # refuses before the survey
+    else:
+        check_not_part(opened.stage, out)
     twin = opened.scene
     day = twin.earth.date if twin.earth is not None else ""
     files = [file for file in layer_files(scene_file) if file.resolve() != twin.map_layer.resolve()]
