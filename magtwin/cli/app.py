@@ -25,7 +25,6 @@ from magtwin.folders import allow
 from magtwin.version import __version__
 
 
-
 class Settings(Toml):
     """Options in magtwin.toml of the working folder, read as any TOML of a user."""
 
@@ -175,7 +174,8 @@ def _no_room(error: Exception) -> str:
 def _wrong_name(error: Exception, arguments: list[str]) -> str:
     """The refusal of a file whose name is too long, not UTF-8 or a circle; "" if the error is another one."""
     if isinstance(error, RuntimeError) and str(error).startswith("Symlink loop from "):  # before Python 3.13
-        return f"{str(error).partition(' from ')[2].strip(chr(39))}: its links form a circle; give another file"
+        name = str(error).removeprefix("Symlink loop from ").strip("'")
+        return f"{name}: its links form a circle; give another file"
     if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
         name = str(error.filename)
         return f"{name[:60]}...: its name of {len(name)} characters is too long for a file; shorten it"

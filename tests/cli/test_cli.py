@@ -294,7 +294,8 @@ def test_a_damaged_magtwin_toml_is_refused_by_its_name(text, said, tmp_path, mon
 
 def test_links_that_form_a_circle_are_refused(tmp_path, capsys):
     (tmp_path / "loop").symlink_to("loop")
-    for words in (("convert", tmp_path / "loop", "a.csv"), ("run", "lab", "--out", tmp_path / "loop" / "x.csv")):
+    loop = tmp_path / "loop"
+    for words in (("convert", loop, "a.csv"), ("run", "lab", "--out", loop / "x.csv")):
         assert "links form a circle" in refused(capsys, *words)
 
 
