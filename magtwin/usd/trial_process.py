@@ -33,7 +33,7 @@ LISTED = 20
 """Names out of the folders that an answer lists at most."""
 
 _MEMORY = Path("/proc/self/statm")
-_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
+_ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://")
 _PATTERN = re.compile(r"<UDIM>|#+")
 """The part of a texture's or a clip's name that stands for numbers."""
 
@@ -133,16 +133,11 @@ class Audit:
 
         UsdUtils.ModifyAssetPaths(copy, keep)  # sublayers, arcs, values, clips and metadata, evaluated
         found = []
-        for asset in [*names, *(arc for arc in arcs if arc not in names)]:
-            if not asset or asset.startswith("anon:"):
-                continue
-            if address := _ADDRESS.match(asset):
-                if asset in arcs or address.group()[:-3].lower() in Ar.GetRegisteredURISchemes():
-                    where = place_of(layer, asset, variables)
-                    raise RefusedError(
-                        f"{where} names {asset}, an address; download the file, and name the copy"
-                    )
-                continue  # nobody opens it
+        for asset in filter(None, [*names, *(arc for arc in arcs if arc not in names)]):
+            address = _ADDRESS.match(asset)
+            if address and (asset in arcs or address[1].lower() in Ar.GetRegisteredURISchemes()):
+                where = place_of(layer, asset, variables)
+                raise RefusedError(f"{where} names {asset}, an address; download the file, and name the copy")
             for file in self.files(layer, Sdf.Layer.SplitIdentifier(asset)[0]):
                 if self.is_inside(file):
                     found.append((file, asset in copy.subLayerPaths))
@@ -156,7 +151,10 @@ class Audit:
         self.outside.append({"where": where, "asset": asset, "file": str(real), "folder": str(real.parent)})
 
     def files(self, layer: Any, asset: str) -> list[str]:
-        """The existing files that a name stands for: one, or those of a pattern such as `wood.<UDIM>.png`."""
+        """The existing files that a name stands for: one, or those of a pattern such as `wood.<UDIM>.png`.
+
+        USD resolves every name: `foo://../../x.png` and `anon:x/../../x.png` can be files too.
+        """
         absolute = layer.ComputeAbsolutePath(asset)
         resolved = str(self.resolver.Resolve(absolute))
         files = [resolved] if resolved else []
