@@ -16,6 +16,7 @@ from magtwin.usd.attributes import read_axis
 from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.schema import place
 from magtwin.usd.solids import Solid, solid_of
+from magtwin.usd.trial import check_named
 
 GREY = (0.5, 0.5, 0.5, 1.0)
 """Colour of a shape without one."""
@@ -431,6 +432,8 @@ def _texture(prim: Usd.Prim, gprim: UsdGeom.Gprim, triangles: NDArray, mirrored:
     path = file.resolvedPath if isinstance(file, Sdf.AssetPath) else ""
     if not name or not Path(path).is_file():  # missing, or within a .usdz
         return None
+    if root := prim.GetStage().GetRootLayer().realPath:
+        check_named(Path(root), Path(path), f"<{asset.GetAttr().GetPath()}>")
     primvar = UsdGeom.PrimvarsAPI(gprim).FindPrimvarWithInheritance(str(name.Get()))
     values = primvar.ComputeFlattened() if primvar else None
     uvs = np.array(values if values else np.empty((0, 2)), np.float32).reshape(-1, 2)
