@@ -24,7 +24,7 @@ from magtwin.files import shipped
 from magtwin.folders import allowed_folders
 
 VALUES = 16_000_000
-"""Bytes of a layer up to which its values are tried too."""
+"""Bytes of a layer up to which its values are converted to Python; those of any layer are decoded."""
 
 PROCESSOR_S = 15.0
 """Processor time of the child for a stage [s], plus 1 s per megabyte of its layers."""

@@ -56,6 +56,7 @@ class Audit:
         self.inside: list[str] = job["inside"]
         self.room, self.seconds, self.most_values = job["room"], job["seconds"], job["values"]
         self.most_prims: int = job["prims"]
+        self.composed: bool = job["composed"]
         self.used = used_time()
         self.layers: dict[str, Any] = {}
         self.named_files: set[str] = set()
@@ -88,7 +89,9 @@ class Audit:
                 layer = Sdf.Layer.FindOrOpen(name)
                 if layer is not None:
                     self.suspects |= wrong_types(layer)
-                    if crate and size <= self.most_values:
+                    if crate and not self.composed:  # `named` copies those of a composed stage
+                        copy_of(layer)
+                    elif crate and size <= self.most_values:
                         try_values(layer)
             except Exception as error:
                 if crate:
@@ -121,8 +124,7 @@ class Audit:
 
     def named(self, layer: Any, variables: dict[str, Any]) -> list[tuple[str, bool]]:
         """The existing files that a layer names inside, and whether as sublayers; others go to `outside`."""
-        copy = Sdf.Layer.CreateAnonymous(".usda")
-        copy.TransferContent(layer)
+        copy = copy_of(layer)
         copy.expressionVariables = variables
         arcs = copy.GetCompositionAssetDependencies()
         names: dict[str, None] = {}
@@ -196,8 +198,15 @@ def _limit(kind: int, most: int) -> None:
     resource.setrlimit(kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
 
 
+def copy_of(layer: Any) -> Any:
+    """A copy of a layer, which decodes every value and all metadata, however large."""
+    copy = Sdf.Layer.CreateAnonymous(".usda")
+    copy.TransferContent(layer)
+    return copy
+
+
 def try_values(layer: Any) -> None:
-    """Read every value of a layer."""
+    """Convert every value of a layer to Python."""
 
     def read(path: Any) -> None:
         if path.IsPropertyPath():

@@ -1,15 +1,17 @@
 """Small stages that cost much, crash USD, or hold values of other types are refused in one line."""
 
 # ruff: noqa: E501
+import numpy as np
 import pytest
-from pxr import Sdf
+from pxr import Sdf, Vt
 
 from magtwin.errors import InputError
 from magtwin.export.package import export_scene
 from magtwin.usd.animation import read_animation
 from magtwin.usd.geometry import read_colour_scale, read_links, read_shapes
 from magtwin.usd.info import info_of_stage
-from magtwin.usd.layers import open_stage, stage_sha256
+from magtwin.usd.layers import open_layer, open_stage, stage_sha256
+from magtwin.usd.trial import VALUES
 
 HEAD = '#usda 1.0\n(\n    defaultPrim = "World"\n    metersPerUnit = 1\n    upAxis = "Z"\n)\n'
 
@@ -143,6 +145,27 @@ def test_bodies_in_a_long_chain_have_one_base(tmp_path):
     )
     links = read_links(open_stage(stage(tmp_path, f'def Xform "World"\n{{\n{text}}}\n')))
     assert {link.base for link in links.values()} == {"b0"}
+
+
+@pytest.mark.parametrize("read", [open_layer, open_stage])
+def test_values_of_a_layer_of_any_size_are_tried(read, tmp_path):
+    """One index of a table of repeated floats is out of the table, in a layer of 17 MB."""
+    layer = Sdf.Layer.CreateNew(str(tmp_path / "s.usdc"))
+    prim = Sdf.CreatePrimInLayer(layer, "/World")
+    layer.defaultPrim = "World"
+    noise = np.random.default_rng(0).normal(size=VALUES // 4 + 250_000).astype(np.float32)
+    few = np.arange(150_000, dtype=np.float32) % 5 * np.float32(0.1)
+    for name, values in (("noise", noise), ("few", few)):
+        kind = Sdf.ValueTypeNames.FloatArray
+        Sdf.AttributeSpec(prim, name, kind).default = Vt.FloatArray.FromNumpy(values)
+    layer.Save()
+    data = bytearray((tmp_path / "s.usdc").read_bytes())
+    table = data.index(few[:5].tobytes())
+    indices = table + 20 + 8  # after the 5 floats and the size of the compressed indices
+    data[indices : indices + 64] = b"\x7f" * 64
+    (tmp_path / "damaged.usdc").write_bytes(data)
+    with pytest.raises(InputError, match=r"damaged|cannot be opened as USD"):
+        read(tmp_path / "damaged.usdc")
 
 
 def diamond(folder, levels):
