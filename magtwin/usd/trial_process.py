@@ -13,10 +13,11 @@ import json
 import os
 import re
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
-from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdUtils
+from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdUtils
 
 try:
     import resource
@@ -28,6 +29,9 @@ MOST_LAYERS = 100_000
 
 DEEPEST = 128
 """Most levels of prims, and of instances within instances."""
+
+STACK = 2 << 20
+"""Bytes of the stack, at most a quarter of magtwin's: what recurses too deep there ends this process first."""
 
 LISTED = 20
 """Names out of the folders that an answer lists at most."""
@@ -334,6 +338,7 @@ def compose(root: str, audit: Audit) -> None:
         )
     if audit.suspects:
         check_types(stage, audit.suspects)
+    follow_chains(stage)
     purposes = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render]
     UsdGeom.BBoxCache(Usd.TimeCode.Default(), purposes).ComputeWorldBound(stage.GetPseudoRoot())
 
@@ -360,6 +365,19 @@ def count_prims(stage: Any) -> int:
         return total
 
     return count(stage.GetPseudoRoot(), 0)
+
+
+def follow_chains(stage: Any) -> None:
+    """Follow relationships, bindings and connections to their ends, which USD does by recursion."""
+    for top in (stage.GetPseudoRoot(), *stage.GetPrototypes()):
+        for prim in Usd.PrimRange(top):
+            relationships = prim.GetAuthoredRelationships()
+            for relationship in relationships:
+                relationship.GetForwardedTargets()
+            if any(relationship.GetName().startswith("material:binding") for relationship in relationships):
+                UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+            if prim.IsA(UsdShade.Material):
+                UsdShade.Material(prim).ComputeSurfaceSource()
 
 
 def answer_to(job: dict[str, Any]) -> dict[str, Any]:
@@ -389,6 +407,17 @@ def answer_to(job: dict[str, Any]) -> dict[str, Any]:
 
 
 def main() -> None:
+    """Answer jobs until the input ends, with less room for recursion than magtwin has."""
+    stack = STACK
+    if resource is not None and (most := resource.getrlimit(resource.RLIMIT_STACK)[0]) > 0:
+        stack = min(stack, most // 4)
+    threading.stack_size(max(stack // 4096 * 4096, 1 << 16))
+    work = threading.Thread(target=answer_all)
+    work.start()
+    work.join()
+
+
+def answer_all() -> None:
     """Answer jobs until the input ends."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     if resource is not None:

@@ -168,6 +168,35 @@ def test_values_of_a_layer_of_any_size_are_tried(read, tmp_path):
         read(tmp_path / "damaged.usdc")
 
 
+def test_chains_of_connections_and_relationships_end_the_trial_not_magtwin(tmp_path):
+    """USD follows each by recursion. A chain of 100 is no fault."""
+
+    def bound(material, text):
+        cube = f'    def Cube "C" (\n        apiSchemas = ["MaterialBindingAPI"]\n    )\n    {{\n        rel material:binding = {material}\n    }}\n'
+        return f'def Xform "World"\n{{\n{cube}{text}}}\n'
+
+    def nodes(count):
+        graphs = [
+            f'        def NodeGraph "N{i}"\n        {{\n            token outputs:o.connect = </World/M/N{i + 1}.outputs:o>\n        }}\n'
+            for i in range(count)
+        ]
+        surface = f"        token outputs:surface.connect = </World/M/N0.outputs:o>\n{''.join(graphs)}"
+        shader = f'        def Shader "N{count}"\n        {{\n            token info:id = "UsdPreviewSurface"\n            color3f inputs:diffuseColor = (1, 0, 0)\n            token outputs:o\n        }}\n'
+        return bound("</World/M>", f'    def Material "M"\n    {{\n{surface}{shader}    }}\n')
+
+    def relationships(count):
+        rels = "".join(f"        rel r{i} = </World/R.r{i + 1}>\n" for i in range(count))
+        return bound(
+            "</World/R.r0>",
+            f'    def Scope "R"\n    {{\n{rels}        rel r{count} = </World/M>\n    }}\n    def Material "M"\n    {{\n    }}\n',
+        )
+
+    for chain in (nodes, relationships):
+        assert len(read_shapes(open_stage(stage(tmp_path, chain(100), f"{chain.__name__}.usda")))) == 1
+        with pytest.raises(InputError, match=r"USD crashes on it|does not open it in"):
+            open_stage(stage(tmp_path, chain(20_000), f"long_{chain.__name__}.usda"))
+
+
 def diamond(folder, levels):
     """Layers of which each names the next two in a variant that is not selected."""
     for i in range(levels, -1, -1):
