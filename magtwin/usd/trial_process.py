@@ -31,7 +31,7 @@ DEEPEST = 128
 """Most levels of prims, and of instances within instances."""
 
 STACK = 2 << 20
-"""Bytes of the stack, at most a quarter of magtwin's: what recurses too deep there ends this process first."""
+"""Most bytes of this process's stack, below magtwin's: what recurses too deep there ends it first."""
 
 LISTED = 20
 """Names out of the folders that an answer lists at most."""

@@ -41,6 +41,14 @@ def test_instances_of_instances_are_counted_before_they_are_visited(levels, reas
     assert len(read_shapes(open_stage(stage(tmp_path, twice(3), "few.usda")))) == 8 + 8 + 4 + 2 + 1
 
 
+def test_shapes_of_instances_are_counted_before_they_are_read(tmp_path, monkeypatch):
+    with pytest.raises(InputError, match="has 196,607 shapes with those of instances"):
+        read_shapes(stage(tmp_path, twice(16)))
+    monkeypatch.setattr("magtwin.usd.geometry.CORNERS", 100)
+    with pytest.raises(InputError, match="has 828 corners of faces with those of instances"):
+        read_shapes(stage(tmp_path, twice(3), "few.usda"))
+
+
 def test_prims_that_nest_too_deep_for_usd_are_refused(tmp_path):
     layer = Sdf.Layer.CreateNew(str(tmp_path / "deep.usdc"))
     prim = Sdf.PrimSpec(layer, "World", Sdf.SpecifierDef, "Xform")
