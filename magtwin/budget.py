@@ -64,6 +64,12 @@ BUDGETS: dict[str, Budget] = {
 }
 """Limits by format."""
 
+SHAPES = 100_000
+"""Most shapes of a stage that are drawn or exported, with those of instances."""
+
+CORNERS = 50_000_000
+"""Most corners of their faces, beyond those that the stage's files hold: of instances and of primitives."""
+
 SPARE = 1 * GB
 """What a file may decode to beyond `RATIO` times its size [bytes]."""
 

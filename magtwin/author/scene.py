@@ -205,7 +205,7 @@ def _copied_asset(asset: Path, folder: Path) -> Path:
     if unresolved:
         raise InputError(f"{asset}: names {unresolved[0]}, which is not there")
     files = sorted({asset, *(Path(layer.realPath).resolve() for layer in layers), *map(Path, assets)})
-    outside = [file for file in files if not file.is_relative_to(asset.parent)]
+    outside = [file for file in files if not file.resolve().is_relative_to(asset.parent)]
     if outside:
         raise InputError(f"{asset}: names {outside[0]}, outside its folder; copy it into {asset.parent}")
     common = Path(os.path.commonpath([file.parent for file in files]))

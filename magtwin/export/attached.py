@@ -19,6 +19,7 @@ from magtwin.files import read_bytes, sha256
 from magtwin.usd.layers import open_stage, relative_asset, translates
 from magtwin.usd.schema import place as prim_place
 from magtwin.usd.schema.versions import creator
+from magtwin.usd.trial import check_named
 
 SCOPE = "Files"
 """Name of the scope, below the default prim."""
@@ -46,7 +47,8 @@ def attach(root: Path, *more: Path) -> None:
         for attribute in prim.GetAuthoredAttributes():
             value = attribute.Get() if attribute.GetTypeName() == Sdf.ValueTypeNames.Asset else None
             if value and value.resolvedPath and kind_of(value.path) in KINDS:
-                named.setdefault(Path(value.resolvedPath).resolve(), []).append(attribute.GetPath())
+                file = check_named(root, Path(value.resolvedPath), f"<{attribute.GetPath()}>")
+                named.setdefault(file.resolve(), []).append(attribute.GetPath())
     if not named:
         return
     default = stage.GetDefaultPrim()

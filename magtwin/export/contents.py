@@ -14,6 +14,7 @@ from safetensors import SafetensorError, safe_open
 from magtwin.errors import InputError
 from magtwin.files import existing
 from magtwin.usd.layers import SUFFIXES, open_stage, translates
+from magtwin.usd.trial import check_named
 
 KINDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -73,6 +74,7 @@ def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> P
             )
     for file in (*files, *others):
         _check_carried(file, layers, within)
+        check_named(root, file)
     places = _places(root, files, others)
     for file, layer in files.items():
         _copy_layer(file, layer, folder, places)

@@ -41,6 +41,7 @@ from magtwin.usd.schema import FOLDER as SCHEMA
 from magtwin.usd.schema import attribute_name, place, prims_with
 from magtwin.usd.schema.names import OLDER
 from magtwin.usd.schema.versions import TEXT
+from magtwin.usd.trial import check_named
 from magtwin.usd.units import check_units
 from magtwin.usd.upgrade import upgrade
 from magtwin.version import __version__
@@ -274,7 +275,7 @@ class _Work:
             named = prim.GetAttribute(NETWORK).Get()
             if not named or not named.path:
                 continue
-            file = Path(named.resolvedPath)
+            file = check_named(self.root, Path(named.resolvedPath), place(prim))
             checksum, actual = prim.GetAttribute(NETWORK_SHA256).Get(), sha256(file)
             if checksum and checksum.lower() != actual:
                 raise InputError(

@@ -15,6 +15,7 @@ from magtwin.frames import wxyz_from_xyzw, xyzw_from_wxyz
 from magtwin.spec.base import Quat, Vec3
 from magtwin.usd.layers import relative_asset
 from magtwin.usd.schema import attribute_name, place, require_api
+from magtwin.usd.trial import check_named
 
 S = TypeVar("S")
 
@@ -30,7 +31,7 @@ def write_spec(prim: Usd.Prim, noun: str, spec: Any, *, skip: Any = ()) -> Usd.P
         attribute = prim.GetAttribute(attribute_name(noun, field.name))
         value = getattr(spec, field.name)
         missing = value not in (None, "", ()) and not attribute.HasAuthoredValue()
-        if missing or plain_value(attribute) != (value.resolve() if isinstance(value, Path) else value):
+        if missing or _value(attribute) != (value.resolve() if isinstance(value, Path) else value):
             attribute.Set(_usd_value(attribute, value))
     return prim
 
@@ -174,8 +175,16 @@ def plain_value(attribute: Usd.Attribute) -> Any:
     """An attribute's value as plain Python: numbers, text, tuples, a Path (which need not exist) or None.
 
     Raises:
-        InputError: The value is not of the type in the schema.
+        InputError: The value is not of the type in the schema, or a file that the stage may not name.
     """
+    value, root = _value(attribute), attribute.GetStage().GetRootLayer().realPath
+    if isinstance(value, Path) and root and value.exists():
+        check_named(Path(root), value, f"<{attribute.GetPath()}>")
+    return value
+
+
+def _value(attribute: Usd.Attribute) -> Any:
+    """As `plain_value`, of a stage that is being written."""
     value, kind = attribute.Get(), attribute.GetTypeName()
     if not isinstance(value, kind.type.pythonClass or type(kind.defaultValue)):
         raise InputError(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 
+from magtwin.budget import CORNERS, SHAPES
 from magtwin.errors import InputError
 from magtwin.frames import IDENTITY_XYZW, canonical
 from magtwin.spec.base import ZERO3, Quat, Vec3
@@ -16,6 +17,7 @@ from magtwin.usd.attributes import read_axis
 from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.schema import place
 from magtwin.usd.solids import Solid, solid_of
+from magtwin.usd.trial import check_named
 
 GREY = (0.5, 0.5, 0.5, 1.0)
 """Colour of a shape without one."""
@@ -134,9 +136,11 @@ def read_shapes(stage: Usd.Stage | str | os.PathLike[str], *, purposes: Sequence
         purposes: USD purposes to read.
 
     Raises:
-        InputError: The file is missing or not USD, or a mesh is inconsistent; the text names the prim.
+        InputError: The file is missing or not USD, or has too many shapes; or a mesh is inconsistent, whose
+            prim the text names.
     """
     stage = stage if isinstance(stage, Usd.Stage) else open_stage(stage)
+    _check_amount(stage)
     shapes: list[Shape] = []
     for gprim, solid, to_frame, name in _shown(stage, purposes):
         shapes += _shapes(gprim, solid, to_frame, name)
@@ -250,6 +254,45 @@ def read_colour_scale(stage: Usd.Stage) -> ColourScale | None:
 def _prims(stage: Usd.Stage) -> Iterator[Usd.Prim]:
     """Every prim, also inside instances."""
     return iter(stage.Traverse(Usd.TraverseInstanceProxies()))
+
+
+_PLAIN = {"Cube": 36, "Plane": 6, "Cone": 192, "Cylinder": 384}
+"""Corners of the triangles of primitives; of a sphere or capsule at most `_ROUND`."""
+
+_ROUND = 3072
+
+
+def _check_amount(stage: Usd.Stage) -> None:
+    """Refuse a stage with too many shapes, those of instances counted in each place, before they are read."""
+    amounts: dict[Sdf.Path, tuple[int, int]] = {}
+    held = 0
+
+    def amount(top: Usd.Prim) -> tuple[int, int]:
+        """Shapes and corners below a prim."""
+        nonlocal held
+        shapes = corners = 0
+        for prim in Usd.PrimRange(top):
+            if prim.IsA(UsdGeom.Gprim):
+                own = _PLAIN.get(prim.GetTypeName(), _ROUND)
+                if prim.IsA(UsdGeom.Mesh):
+                    own = len(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr().Get() or ())
+                    held += own
+                shapes, corners = shapes + 1, corners + own
+            if prim.IsInstance():
+                prototype = prim.GetPrototype()
+                if prototype.GetPath() not in amounts:
+                    amounts[prototype.GetPath()] = amount(prototype)
+                more = amounts[prototype.GetPath()]
+                shapes, corners = shapes + more[0], corners + more[1]
+        return shapes, corners
+
+    shapes, corners = amount(stage.GetPseudoRoot())
+    for count, most, noun in ((shapes, SHAPES, "shapes"), (corners - held, CORNERS, "corners of faces")):
+        if count > most:
+            raise InputError(
+                f"{stage.GetRootLayer().identifier}: has {count:,} {noun} with those of instances; at most "
+                f"{most:,} are drawn or exported; deactivate some"
+            )
 
 
 def _shown(
@@ -431,6 +474,8 @@ def _texture(prim: Usd.Prim, gprim: UsdGeom.Gprim, triangles: NDArray, mirrored:
     path = file.resolvedPath if isinstance(file, Sdf.AssetPath) else ""
     if not name or not Path(path).is_file():  # missing, or within a .usdz
         return None
+    if root := prim.GetStage().GetRootLayer().realPath:
+        check_named(Path(root), Path(path), f"<{asset.GetAttr().GetPath()}>")
     primvar = UsdGeom.PrimvarsAPI(gprim).FindPrimvarWithInheritance(str(name.Get()))
     values = primvar.ComputeFlattened() if primvar else None
     uvs = np.array(values if values else np.empty((0, 2)), np.float32).reshape(-1, 2)

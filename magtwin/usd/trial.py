@@ -24,7 +24,7 @@ from magtwin.files import shipped
 from magtwin.folders import allowed_folders
 
 VALUES = 16_000_000
-"""Bytes of a layer up to which its values are tried too."""
+"""Bytes of a layer up to which its values are converted to Python; those of any layer are decoded."""
 
 PROCESSOR_S = 15.0
 """Processor time of the child for a stage [s], plus 1 s per megabyte of its layers."""
@@ -178,6 +178,29 @@ def folders_of(stage: Path) -> list[str]:
     return [str(stage.resolve().parent), *(str(shipped(name)) for name in SHIPPED), *allowed_folders()]
 
 
+def check_named(stage: Path, file: Path, where: str = "") -> Path:
+    """A file that USD found for a stage, if the stage may name it. A second check, after `try_stage`.
+
+    Args:
+        stage: Root layer of the stage.
+        file: The file.
+        where: Layer, prim or property that names it.
+
+    Raises:
+        InputError: It is out of the stage's folder, and not allowed.
+    """
+    real = file.resolve()
+    if not _is_shipped(stage) and not any(real.is_relative_to(folder) for folder in folders_of(stage)):
+        name = {"where": where, "asset": str(file), "file": str(real), "folder": str(real.parent)}
+        raise InputError(_outside(stage, [name]), parameter="allow")
+    return file
+
+
+def _is_shipped(stage: Path) -> bool:
+    """Whether a stage ships with magtwin."""
+    return any(stage.resolve().is_relative_to(shipped(name)) for name in SHIPPED)
+
+
 _TRIAL = _Trial()
 atexit.register(_TRIAL.stop)
 
@@ -194,5 +217,5 @@ def try_stage(path: Path, *, composed: bool = True) -> None:
             that is not in its folder, in those of `magtwin.folders.allow`, or shipped with magtwin; an
             address in the network; or a pipe or device as a layer.
     """
-    if not any(path.resolve().is_relative_to(shipped(name)) for name in SHIPPED):
+    if not _is_shipped(path):
         _TRIAL.check(path, composed=composed)

@@ -13,10 +13,11 @@ import json
 import os
 import re
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
-from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdUtils
+from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdUtils
 
 try:
     import resource
@@ -29,11 +30,14 @@ MOST_LAYERS = 100_000
 DEEPEST = 128
 """Most levels of prims, and of instances within instances."""
 
+STACK = 2 << 20
+"""Most bytes of this process's stack, below magtwin's: what recurses too deep there ends it first."""
+
 LISTED = 20
 """Names out of the folders that an answer lists at most."""
 
 _MEMORY = Path("/proc/self/statm")
-_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
+_ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://")
 _PATTERN = re.compile(r"<UDIM>|#+")
 """The part of a texture's or a clip's name that stands for numbers."""
 
@@ -56,6 +60,7 @@ class Audit:
         self.inside: list[str] = job["inside"]
         self.room, self.seconds, self.most_values = job["room"], job["seconds"], job["values"]
         self.most_prims: int = job["prims"]
+        self.composed: bool = job["composed"]
         self.used = used_time()
         self.layers: dict[str, Any] = {}
         self.named_files: set[str] = set()
@@ -88,7 +93,9 @@ class Audit:
                 layer = Sdf.Layer.FindOrOpen(name)
                 if layer is not None:
                     self.suspects |= wrong_types(layer)
-                    if crate and size <= self.most_values:
+                    if crate and not self.composed:  # `named` copies those of a composed stage
+                        copy_of(layer)
+                    elif crate and size <= self.most_values:
                         try_values(layer)
             except Exception as error:
                 if crate:
@@ -121,8 +128,7 @@ class Audit:
 
     def named(self, layer: Any, variables: dict[str, Any]) -> list[tuple[str, bool]]:
         """The existing files that a layer names inside, and whether as sublayers; others go to `outside`."""
-        copy = Sdf.Layer.CreateAnonymous(".usda")
-        copy.TransferContent(layer)
+        copy = copy_of(layer)
         copy.expressionVariables = variables
         arcs = copy.GetCompositionAssetDependencies()
         names: dict[str, None] = {}
@@ -133,16 +139,11 @@ class Audit:
 
         UsdUtils.ModifyAssetPaths(copy, keep)  # sublayers, arcs, values, clips and metadata, evaluated
         found = []
-        for asset in [*names, *(arc for arc in arcs if arc not in names)]:
-            if not asset or asset.startswith("anon:"):
-                continue
-            if address := _ADDRESS.match(asset):
-                if asset in arcs or address.group()[:-3].lower() in Ar.GetRegisteredURISchemes():
-                    where = place_of(layer, asset, variables)
-                    raise RefusedError(
-                        f"{where} names {asset}, an address; download the file, and name the copy"
-                    )
-                continue  # nobody opens it
+        for asset in filter(None, [*names, *(arc for arc in arcs if arc not in names)]):
+            address = _ADDRESS.match(asset)
+            if address and (asset in arcs or address[1].lower() in Ar.GetRegisteredURISchemes()):
+                where = place_of(layer, asset, variables)
+                raise RefusedError(f"{where} names {asset}, an address; download the file, and name the copy")
             for file in self.files(layer, Sdf.Layer.SplitIdentifier(asset)[0]):
                 if self.is_inside(file):
                     found.append((file, asset in copy.subLayerPaths))
@@ -156,7 +157,10 @@ class Audit:
         self.outside.append({"where": where, "asset": asset, "file": str(real), "folder": str(real.parent)})
 
     def files(self, layer: Any, asset: str) -> list[str]:
-        """The existing files that a name stands for: one, or those of a pattern such as `wood.<UDIM>.png`."""
+        """The existing files that a name stands for: one, or those of a pattern such as `wood.<UDIM>.png`.
+
+        USD resolves every name: `foo://../../x.png` and `anon:x/../../x.png` can be files too.
+        """
         absolute = layer.ComputeAbsolutePath(asset)
         resolved = str(self.resolver.Resolve(absolute))
         files = [resolved] if resolved else []
@@ -198,8 +202,15 @@ def _limit(kind: int, most: int) -> None:
     resource.setrlimit(kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
 
 
+def copy_of(layer: Any) -> Any:
+    """A copy of a layer, which decodes every value and all metadata, however large."""
+    copy = Sdf.Layer.CreateAnonymous(".usda")
+    copy.TransferContent(layer)
+    return copy
+
+
 def try_values(layer: Any) -> None:
-    """Read every value of a layer."""
+    """Convert every value of a layer to Python."""
 
     def read(path: Any) -> None:
         if path.IsPropertyPath():
@@ -327,6 +338,7 @@ def compose(root: str, audit: Audit) -> None:
         )
     if audit.suspects:
         check_types(stage, audit.suspects)
+    follow_chains(stage)
     purposes = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render]
     UsdGeom.BBoxCache(Usd.TimeCode.Default(), purposes).ComputeWorldBound(stage.GetPseudoRoot())
 
@@ -353,6 +365,19 @@ def count_prims(stage: Any) -> int:
         return total
 
     return count(stage.GetPseudoRoot(), 0)
+
+
+def follow_chains(stage: Any) -> None:
+    """Follow relationships, bindings and connections to their ends, which USD does by recursion."""
+    for top in (stage.GetPseudoRoot(), *stage.GetPrototypes()):
+        for prim in Usd.PrimRange(top):
+            relationships = prim.GetAuthoredRelationships()
+            for relationship in relationships:
+                relationship.GetForwardedTargets()
+            if any(relationship.GetName().startswith("material:binding") for relationship in relationships):
+                UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+            if prim.IsA(UsdShade.Material):
+                UsdShade.Material(prim).ComputeSurfaceSource()
 
 
 def answer_to(job: dict[str, Any]) -> dict[str, Any]:
@@ -382,6 +407,17 @@ def answer_to(job: dict[str, Any]) -> dict[str, Any]:
 
 
 def main() -> None:
+    """Answer jobs until the input ends, with less room for recursion than magtwin has."""
+    stack = STACK
+    if resource is not None and (most := resource.getrlimit(resource.RLIMIT_STACK)[0]) > 0:
+        stack = min(stack, most // 4)
+    threading.stack_size(max(stack // 4096 * 4096, 1 << 16))
+    work = threading.Thread(target=answer_all)
+    work.start()
+    work.join()
+
+
+def answer_all() -> None:
     """Answer jobs until the input ends."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     if resource is not None:

@@ -12,6 +12,7 @@ from magtwin.outputs import output, transaction
 from magtwin.usd.layers import check_stage, export_like, layer_sha256
 from magtwin.usd.schema.versions import stamp, upgrade_layer
 from magtwin.usd.sensors import MAP_CHECKSUM
+from magtwin.usd.trial import check_named
 
 
 def upgrade(path: str | os.PathLike[str]) -> list[Path]:
@@ -46,7 +47,8 @@ def upgrade(path: str | os.PathLike[str]) -> list[Path]:
         diagnostics.TakeUncoalescedDiagnostics()
     if not layers:
         raise InputError(f"{path}: cannot be opened as USD")
-    files = {Path(layer.realPath): layer_sha256(layer.realPath) for layer in layers}
+    found = [check_named(path, Path(layer.realPath)) for layer in layers]
+    files = {file: layer_sha256(file) for file in found}
     copies = {file: Sdf.Layer.OpenAsAnonymous(str(file)) for file in files}
     older = [file for file, copy in copies.items() if _is_changed(copy, file)]
     with transaction(), ExitStack() as renamed:  # all files at the end

@@ -14,7 +14,9 @@ from magtwin.errors import InputError
 from magtwin.export.contents import bring_together
 from magtwin.files import shipped
 from magtwin.folders import ALLOW_DIR
+from magtwin.usd.attributes import plain_value
 from magtwin.usd.layers import layer_sha256, open_layer, open_stage, stage_sha256
+from magtwin.usd.upgrade import upgrade
 
 LAYER = '#usda 1.0\n(defaultPrim = "X")\ndef Xform "X" {\n}\n'
 
@@ -63,6 +65,12 @@ ARCS = {
     "clips' manifest": ("prim", CLIPS % "asset manifestAssetPath = @../out/l.usda@", "/A"),
     "texture": ("inside", "asset inputs:file = @../out/t.png@", "/A.inputs:file"),
     "texture by its absolute name": ("inside", "asset inputs:file = @OUT/t.png@", "/A.inputs:file"),
+    "texture by an unregistered scheme": ("inside", "asset a = @foo://../../out/t.png@", "/A.a"),
+    "texture by https": ("inside", "asset a = @https://../../out/t.png@", "/A.a"),
+    "texture in tiles by a scheme": ("inside", "asset a = @foo://../../out/t.<UDIM>.png@", "/A.a"),
+    "texture like an anonymous layer": ("inside", "asset a = @anon:x/../../out/t.png@", "/A.a"),
+    "layer by a scheme, as a value": ("inside", "asset a = @foo://../../out/l.usda@", "/A.a"),
+    "clips by a scheme": ("prim", CLIPS % "asset[] assetPaths = [@bar://../../out/l.usda@]", "/A"),
     "texture in tiles": ("inside", "asset inputs:file = @../out/t.<UDIM>.png@", "/A.inputs:file"),
     "texture over time": ("inside", "asset inputs:file.timeSamples = { 1: @../out/t.png@ }", "/A.inputs"),
     "array": ("inside", "asset[] files = [@./in.png@, @../out/t.png@]", "/A.files"),
@@ -132,6 +140,22 @@ def test_a_name_out_of_the_folder_is_refused_with_its_prim_until_it_is_allowed(k
         open_stage(stage)
     assert open_layer(stage)  # alone: nothing that it names is read
     assert layer_sha256(stage)
+
+
+def test_a_file_that_escaped_the_audit_is_refused_where_it_is_used(place, monkeypatch):
+    """The second check, for names that OpenUSD resolves otherwise than the audit."""
+    parts = {"layer": "subLayers = [@../out/l.usda@]", "prim": "", "inside": "asset a = @../out/t.png@"}
+    (place / "s.usda").write_text(ROOT % parts)
+    monkeypatch.setattr("magtwin.usd.layers.try_stage", lambda path, composed: None)
+    folder = place.parent / "packed"
+    folder.mkdir()
+    stage = open_stage(place / "s.usda")  # held in a name: a prim does not keep its stage alive
+    for use in (lambda: upgrade(place / "s.usda"), lambda: bring_together(place / "s.usda", folder)):
+        with pytest.raises(InputError, match="outside the stage's folder"):
+            use()
+    with pytest.raises(InputError, match=r"</A\.a> names .*t\.png, outside the stage's folder"):
+        plain_value(stage.GetPrimAtPath("/A").GetAttribute("a"))
+    assert not any(folder.iterdir())
 
 
 @pytest.mark.parametrize("form", ["usdc", "usdz"])

@@ -1,15 +1,17 @@
 """Small stages that cost much, crash USD, or hold values of other types are refused in one line."""
 
 # ruff: noqa: E501
+import numpy as np
 import pytest
-from pxr import Sdf
+from pxr import Sdf, Vt
 
 from magtwin.errors import InputError
 from magtwin.export.package import export_scene
 from magtwin.usd.animation import read_animation
 from magtwin.usd.geometry import read_colour_scale, read_links, read_shapes
 from magtwin.usd.info import info_of_stage
-from magtwin.usd.layers import open_stage, stage_sha256
+from magtwin.usd.layers import open_layer, open_stage, stage_sha256
+from magtwin.usd.trial import VALUES
 
 HEAD = '#usda 1.0\n(\n    defaultPrim = "World"\n    metersPerUnit = 1\n    upAxis = "Z"\n)\n'
 
@@ -37,6 +39,14 @@ def test_instances_of_instances_are_counted_before_they_are_visited(levels, reas
     with pytest.raises(InputError, match=reason):
         open_stage(stage(tmp_path, twice(levels)))
     assert len(read_shapes(open_stage(stage(tmp_path, twice(3), "few.usda")))) == 8 + 8 + 4 + 2 + 1
+
+
+def test_shapes_of_instances_are_counted_before_they_are_read(tmp_path, monkeypatch):
+    with pytest.raises(InputError, match="has 196,607 shapes with those of instances"):
+        read_shapes(stage(tmp_path, twice(16)))
+    monkeypatch.setattr("magtwin.usd.geometry.CORNERS", 100)
+    with pytest.raises(InputError, match="has 828 corners of faces with those of instances"):
+        read_shapes(stage(tmp_path, twice(3), "few.usda"))
 
 
 def test_prims_that_nest_too_deep_for_usd_are_refused(tmp_path):
@@ -143,6 +153,56 @@ def test_bodies_in_a_long_chain_have_one_base(tmp_path):
     )
     links = read_links(open_stage(stage(tmp_path, f'def Xform "World"\n{{\n{text}}}\n')))
     assert {link.base for link in links.values()} == {"b0"}
+
+
+@pytest.mark.parametrize("read", [open_layer, open_stage])
+def test_values_of_a_layer_of_any_size_are_tried(read, tmp_path):
+    """One index of a table of repeated floats is out of the table, in a layer of 17 MB."""
+    layer = Sdf.Layer.CreateNew(str(tmp_path / "s.usdc"))
+    prim = Sdf.CreatePrimInLayer(layer, "/World")
+    layer.defaultPrim = "World"
+    noise = np.random.default_rng(0).normal(size=VALUES // 4 + 250_000).astype(np.float32)
+    few = np.arange(150_000, dtype=np.float32) % 5 * np.float32(0.1)
+    for name, values in (("noise", noise), ("few", few)):
+        kind = Sdf.ValueTypeNames.FloatArray
+        Sdf.AttributeSpec(prim, name, kind).default = Vt.FloatArray.FromNumpy(values)
+    layer.Save()
+    data = bytearray((tmp_path / "s.usdc").read_bytes())
+    table = data.index(few[:5].tobytes())
+    indices = table + 20 + 8  # after the 5 floats and the size of the compressed indices
+    data[indices : indices + 64] = b"\x7f" * 64
+    (tmp_path / "damaged.usdc").write_bytes(data)
+    with pytest.raises(InputError, match=r"damaged|cannot be opened as USD"):
+        read(tmp_path / "damaged.usdc")
+
+
+def test_chains_of_connections_and_relationships_end_the_trial_not_magtwin(tmp_path):
+    """USD follows each by recursion. A chain of 100 is no fault."""
+
+    def bound(material, text):
+        cube = f'    def Cube "C" (\n        apiSchemas = ["MaterialBindingAPI"]\n    )\n    {{\n        rel material:binding = {material}\n    }}\n'
+        return f'def Xform "World"\n{{\n{cube}{text}}}\n'
+
+    def nodes(count):
+        graphs = [
+            f'        def NodeGraph "N{i}"\n        {{\n            token outputs:o.connect = </World/M/N{i + 1}.outputs:o>\n        }}\n'
+            for i in range(count)
+        ]
+        surface = f"        token outputs:surface.connect = </World/M/N0.outputs:o>\n{''.join(graphs)}"
+        shader = f'        def Shader "N{count}"\n        {{\n            token info:id = "UsdPreviewSurface"\n            color3f inputs:diffuseColor = (1, 0, 0)\n            token outputs:o\n        }}\n'
+        return bound("</World/M>", f'    def Material "M"\n    {{\n{surface}{shader}    }}\n')
+
+    def relationships(count):
+        rels = "".join(f"        rel r{i} = </World/R.r{i + 1}>\n" for i in range(count))
+        return bound(
+            "</World/R.r0>",
+            f'    def Scope "R"\n    {{\n{rels}        rel r{count} = </World/M>\n    }}\n    def Material "M"\n    {{\n    }}\n',
+        )
+
+    for chain in (nodes, relationships):
+        assert len(read_shapes(open_stage(stage(tmp_path, chain(100), f"{chain.__name__}.usda")))) == 1
+        with pytest.raises(InputError, match=r"USD crashes on it|does not open it in"):
+            open_stage(stage(tmp_path, chain(20_000), f"long_{chain.__name__}.usda"))
 
 
 def diamond(folder, levels):
