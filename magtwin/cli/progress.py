@@ -78,7 +78,8 @@ class Step:
         rate = self.rate(now)
         if rate is None or not self.total or self.done >= self.total:
             return None
-        return max(0.0, (self.total - self.done) / rate - (now - self.seen[-1][0]))
+        left = (self.total - self.done) / rate - (now - self.seen[-1][0])
+        return left if left > 0 else None  # later than usual
 
     def line(self, now: float) -> str:
         """The step in a line, at a time `now` [s]."""
