@@ -96,6 +96,10 @@ def db3(path, more="", *, data="data BLOB", topics=1, message=b""):
 
 
 ENDLESS = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT x AS schema_version FROM c"
+VIRTUAL = (
+    "PRAGMA writable_schema = ON; INSERT INTO sqlite_master "
+    "VALUES ('table', 'schema', 'schema', 0, 'CREATE  VIRTUAL TABLE schema USING dbstat');"
+)
 COMPUTED = "data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL"
 
 
@@ -229,6 +233,7 @@ BOMBS = {
     "images.mcap": (mcap, read_messages, "that decode to"),
     "endless.db3": (lambda p: db3(p, f"CREATE VIEW schema AS {ENDLESS}"), read_run, "schema is computed"),
     "computed.db3": (lambda p: db3(p, data=COMPUTED), read_messages, "messages has a computed column"),
+    "virtual.db3": (lambda p: db3(p, VIRTUAL), read_run, "schema is computed"),
     "topics.db3": (lambda p: db3(p, topics=9000), read_run, "9000 topics have 1 numbers"),
     "file": (lambda p: bag(p, "FILE"), read_messages, "that decode to"),
     "message": (lambda p: bag(p, "MESSAGE"), read_messages, "that decode to"),
