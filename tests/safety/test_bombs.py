@@ -358,6 +358,15 @@ def test_mcap_messages_outside_of_chunks_take_little_memory(tmp_path):
     assert peak < 4 * (tmp_path / "a.mcap").stat().st_size + 2_000_000
 
 
+def test_metadata_of_an_mcap_file_are_limited_together(tmp_path, monkeypatch):
+    monkeypatch.setitem(budget.BUDGETS, "JSON", budget.Budget(file=1000))
+    record = struct.pack("<II", 0, 400) + struct.pack("<I", 392) + bytes(396)
+    record = b"\x0c" + struct.pack("<Q", len(record)) + record
+    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + record * 3)
+    with pytest.raises(InputError, match="its metadata have over 1,000 bytes"):
+        read_messages(tmp_path / "a.mcap")
+
+
 def test_aliases_in_the_description_of_a_bag_do_not_multiply(tmp_path):
     import yaml
 

@@ -226,6 +226,7 @@ class McapReader:
         self._path, self._size = path, path.stat().st_size
         self.notes: dict[str, dict[str, str]] = {}
         self.whole = False
+        self._noted = 0
         self._spare = SPARE
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, records.Channel] = {}
@@ -287,14 +288,15 @@ class McapReader:
         """Go through the records outside of chunks."""
         at = len(MAGIC)
         while at + _HEAD.size <= self._size:
-            opcode, length = _HEAD.unpack(self._at(at, _HEAD.size))
+            head = self._at(at, ROOM)
+            opcode, length = _HEAD.unpack_from(head)
             body = at + _HEAD.size
             if body + length > self._size:
                 return
             if opcode == Opcode.CHUNK:
                 self._chunks.append((body, length))
             elif opcode == Opcode.MESSAGE and length >= ROOM - _HEAD.size:
-                channel, _, received = struct.unpack("<HIq", self._at(body, 14))
+                channel, _, received = struct.unpack_from("<HIq", head, _HEAD.size)
                 numbers = channel, received, at + ROOM, length - (ROOM - _HEAD.size)
                 self._loose.extend(numbers)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
@@ -313,6 +315,9 @@ class McapReader:
             channel = records.Channel.read(stream)
             self._channels[channel.id] = channel
         else:
+            self._noted += len(content)
+            if self._noted > (most := BUDGETS["JSON"].file):
+                raise InputError(f"its metadata have over {most:,} bytes; write it again")
             note = records.Metadata.read(stream)
             self.notes[note.name] = note.metadata
 
