@@ -84,20 +84,20 @@ class UnknownNameError(InputError, KeyError):
     __str__ = InputError.__str__  # KeyError would show the text in quotes
 
 
-def hint(name: str, known: Iterable[str]) -> str:
-    """The end of a refusal: the nearest known name, or all of them."""
+def hint(name: object, known: Iterable[str]) -> str:
+    """The end of a refusal: the nearest known name, or all of them. A name from a file may be no text."""
     known = sorted(known)
-    near = difflib.get_close_matches(name, known, n=1)
+    near = difflib.get_close_matches(name, known, n=1) if isinstance(name, str) else ()
     return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
 
 
-def near(name: str, known: Iterable[str]) -> str:
+def near(name: object, known: Iterable[str]) -> str:
     """An addition to a text with the nearest known name: " (did you mean 'left'?)", or ""."""
-    match = difflib.get_close_matches(name, sorted(known), n=1)
+    match = difflib.get_close_matches(name, sorted(known), n=1) if isinstance(name, str) else ()
     return f" (did you mean {match[0]!r}?)" if match else ""
 
 
-def find(kind: str, name: str, table: Mapping[str, T]) -> T:
+def find(kind: str, name: object, table: Mapping[str, T]) -> T:
     """The entry called `name`.
 
     Args:
@@ -108,6 +108,6 @@ def find(kind: str, name: str, table: Mapping[str, T]) -> T:
     Raises:
         UnknownNameError: No such entry; the text names the nearest one.
     """
-    if name in table:
+    if isinstance(name, str) and name in table:
         return table[name]
     raise UnknownNameError(f"no {kind} {name!r}; {hint(name, table)}")

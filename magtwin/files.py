@@ -146,8 +146,21 @@ def check_zip(path: Path, archive: zipfile.ZipFile, kind: str, noun: str) -> Non
             )
 
 
+_GIT_S = 5.0
+"""Time limit of git [s]; it takes 0.01 s."""
+
+
 def git_revision(folder: str | os.PathLike[str]) -> str:
-    """The commit of the Git checkout that contains a folder, or "" if there is none, or no git."""
+    """The commit of the Git checkout that contains a folder.
+
+    Returns:
+        The commit, or "" if there is no checkout, no git, or no answer: a checkout of a stranger can name a
+        pipe, for which git waits.
+    """
+    place = Path(folder).absolute()
+    settings = [parent / ".git" / "config" for parent in (place, *place.parents)]
+    if any(os.path.lexists(path) and not path.is_file() for path in settings):
+        return ""
     command = [
         "git",
         "-c",
@@ -161,8 +174,16 @@ def git_revision(folder: str | os.PathLike[str]) -> str:
     ]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
-    except OSError:
+        done = subprocess.run(
+            command,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            check=False,
+            env=environment,
+            timeout=_GIT_S,
+        )
+    except (OSError, subprocess.TimeoutExpired, UnicodeDecodeError):
         return ""
     return done.stdout.strip() if done.returncode == 0 else ""
 

@@ -2,7 +2,9 @@
 
 import pickle
 
-from magtwin.errors import InputError, UnknownNameError
+import pytest
+
+from magtwin.errors import InputError, UnknownNameError, find, hint, near
 
 FLAGS = {"force": "--force", "magnetometer": "--magnetometer"}
 
@@ -45,3 +47,10 @@ def test_a_value_of_several_lines_is_quoted_in_one():
 def test_a_parameter_survives_pickling_and_is_none_by_default():
     assert pickle.loads(pickle.dumps(InputError("give `force=True`", parameter="force"))).parameter == "force"
     assert UnknownNameError("no path").parameter is None
+
+
+def test_a_name_of_a_file_that_is_no_text_is_unknown():
+    with pytest.raises(UnknownNameError, match="no path 5; known: a, b"):
+        find("path", 5, {"a": 1, "b": 2})
+    assert hint(True, ["a"]) == "known: a"
+    assert near(5, ["a"]) == ""

@@ -40,6 +40,10 @@ CAUSES: Mapping[str, str] = {
 """Metadata that determine a run's columns, and the cause if they differ, likeliest first."""
 
 
+_MORE = 10
+"""How many times its readings a run may have by its rate and its length."""
+
+
 @dataclass(frozen=True)
 class Difference:
     """Difference of a column between a run and its reproduction."""
@@ -158,6 +162,10 @@ def made_again(
         speed = float(metadata.get("speed_m_s", 0.2))
     except (KeyError, ValueError, OverflowError) as error:
         raise InputError(f"the metadata of the run are incomplete: {error}") from error
+    if run.rows > 1 and rate * float(run["t"][-1] - run["t"][0]) > _MORE * run.rows:
+        raise InputError(
+            f"rate_hz of the metadata is {rate:g}; the run's {run.rows:,} readings have another rate"
+        )
     moved_by: Any = engine or metadata.get("engine", "kinematic")
     options: dict[str, Any] = {"seed": seed, "speed": speed, "duration_s": asked, "rate_hz": rate}
     options |= {"lidar": metadata.get("lidar", "schedule"), "outside": metadata.get("outside", "nan")}

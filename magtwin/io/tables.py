@@ -24,7 +24,7 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from magtwin.budget import check_count, check_decoded, check_size, decoded_limit
+from magtwin.budget import BUDGETS, check_count, check_decoded, check_size, decoded_limit
 from magtwin.errors import InputError, find
 from magtwin.files import check_zip, existing
 from magtwin.io.recorder import Sink
@@ -49,6 +49,9 @@ _ABOUT = "magtwin"
 
 NUMBER = 8
 """Bytes of a number in memory."""
+
+_CSV_ABOUT = 100_000
+"""Most lines of a CSV that begin with #; a run has one for each column, and three others."""
 
 _CSV_LINE = 1 << 20
 """Longest line of a CSV [bytes]; a header of ten thousand columns is shorter."""
@@ -162,8 +165,9 @@ def load_parquet(path: Path, load: Callable[[Path], Any] = pq.read_table) -> Any
     """A Parquet file, loaded by a function of pyarrow.
 
     Raises:
-        InputError: It does not begin and end like Parquet, or is damaged.
+        InputError: It is no regular file, does not begin and end like Parquet, or is damaged.
     """
+    path = existing(path, "Parquet file")
     _check_file(path, "a Parquet file")
     with open(path, "rb") as file:
         head = file.read(4)
@@ -365,6 +369,7 @@ def _on_the_floor(table: pa.Table) -> pa.Table:
 def _csv_head(file: io.BufferedReader, path: Path) -> tuple[list[str], list[str], int]:
     """The lines of a CSV that begin with #, its column names, and the number of these lines."""
     about: list[str] = []
+    held = 0
     for count, line in enumerate(iter(lambda: file.readline(_CSV_LINE), b""), 1):
         try:
             text = line.decode("utf-8-sig" if count == 1 else "utf-8").rstrip("\r\n")
@@ -373,6 +378,11 @@ def _csv_head(file: io.BufferedReader, path: Path) -> tuple[list[str], list[str]
         if len(line) == _CSV_LINE or "\0" in text:
             raise InputError(f"{path}: line {count} is not a line of a CSV file")
         if text.startswith("#"):
+            held += len(line)
+            if len(about) == _CSV_ABOUT or held > BUDGETS["text"].file:
+                raise InputError(
+                    f"{path}: {len(about):,} lines of comments; remove those that are not needed"
+                )
             about.append(text)
         elif text.strip():
             other = next((sign for sign in (";", "\t") if sign in text and "," not in text), None)

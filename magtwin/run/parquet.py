@@ -5,13 +5,17 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from magtwin.budget import check_count, check_decoded, check_size
 from magtwin.errors import InputError
 
-_BATCH, _BATCH_BYTES = 1000, 1 << 26
-"""Most rows of texts, and about as many bytes, that are measured at once."""
+_BATCH = 1 << 20
+"""Most rows of texts that are measured at once."""
+
+_FIXED = "FIXED_LEN_BYTE_ARRAY"
+"""Texts of equal length, whose length is in the metadata."""
 
 _ROW_GROUPS, _COLUMNS, _ABOUT = 4, 1, 3
 _COUNT, _PACKED, _DATA, _DICTIONARY = 5, 7, 9, 11
@@ -31,23 +35,39 @@ def check_parquet(path: Path) -> None:
         about = file.metadata
         check_count(path, "Parquet", about.num_columns, "columns")
         columns = [about.schema.column(i) for i in range(about.num_columns)]
-        largest = _largest_page(path, size)
+        _check_pages(path, size)
         lists = [i for i, column in enumerate(columns) if column.max_repetition_level]
         values = 8 * about.num_rows * (len(columns) - len(lists))
         if lists:
             counts = _counts(path)
             values += 8 * sum(count for group in counts for i, count in enumerate(group) if i in lists)
         check_decoded(path, size, values)
-        texts = [column.path for column in columns if column.physical_type.endswith("BYTE_ARRAY")]
-        at_once = max(1, min(_BATCH, _BATCH_BYTES // largest))  # a text of a dictionary can be in every row
-        for batch in file.iter_batches(at_once, columns=texts) if texts else ():
+        fixed = {i: column.length for i, column in enumerate(columns) if column.physical_type == _FIXED}
+        if fixed:
+            values += sum(fixed.get(i, 0) * count for group in _counts(path) for i, count in enumerate(group))
+            check_decoded(path, size, values)
+    texts = [column.path for column in columns if column.physical_type == "BYTE_ARRAY"]
+    # As dictionaries, since a large text of a dictionary can be in every row.
+    with pq.ParquetFile(path, read_dictionary=texts) as file:
+        for batch in file.iter_batches(_BATCH, columns=texts) if texts else ():
             values += sum(_nbytes(column) for column in batch.columns)
             check_decoded(path, size, values)
 
 
 def _nbytes(column: pa.Array) -> int:
     """Bytes of a column, each of its texts whole."""
-    return int((column.dictionary_decode() if pa.types.is_dictionary(column.type) else column).nbytes)
+    if pa.types.is_dictionary(column.type):
+        return _nbytes(column.indices) + int(
+            pc.sum(_length(column.dictionary).take(column.indices)).as_py() or 0
+        )
+    if pa.types.is_nested(column.type):
+        return sum(map(_nbytes, column.flatten() if pa.types.is_struct(column.type) else [column.flatten()]))
+    return int(column.nbytes)
+
+
+def _length(texts: pa.Array) -> pa.Array:
+    """Bytes of each text."""
+    return pc.binary_length(texts).cast(pa.int64())
 
 
 def _counts(path: Path) -> list[list[int]]:
@@ -59,13 +79,13 @@ def _counts(path: Path) -> list[list[int]]:
     return [[column[_COUNT] for column in group] for group in _chunks(path)]
 
 
-def _largest_page(path: Path, size: int) -> int:
-    """Bytes of the largest page of a file of `size` bytes, decompressed.
+def _check_pages(path: Path, size: int) -> None:
+    """Refuse pages that would be too large, decompressed, in a file of `size` bytes.
 
     Raises:
         InputError: The pages, decompressed, are over the budget, or the metadata are damaged.
     """
-    total, largest, packed = 0, 1, 0
+    total, packed = 0, 0
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         for column in (column for group in _chunks(path) for column in group):
             at = min(filter(None, (column[_DATA], column[_DICTIONARY])), default=0)
@@ -81,9 +101,8 @@ def _largest_page(path: Path, size: int) -> int:
                     raise _damaged(path) from error
                 if min(length, step) < 0:
                     raise _damaged(path)
-                total, largest, at = total + length, max(largest, length), at + step
+                total, at = total + length, at + step
             check_decoded(path, size, total)
-    return largest
 
 
 def _chunks(path: Path) -> list[list[dict[int, Any]]]:

@@ -23,7 +23,7 @@ from magtwin.io.bags import BagWriter, RawBagWriter, read_bag, write_bag
 from magtwin.io.bags import mcap as ours
 from magtwin.io.bags.bag import Bag
 from magtwin.io.bags.cdr import encode
-from magtwin.io.bags.db3 import RosbagsReader
+from magtwin.io.bags.db3 import Db3Reader
 from magtwin.io.bags.mcap import McapReader
 from magtwin.io.bags.topics import MAGNITUDE, SCAN, Qos
 from magtwin.io.bags.types import layout
@@ -44,7 +44,7 @@ def message(kind, size, t_ns=0):
 
 def by_magtwin(file):
     """By topic the times and bytes of messages that our reader finds."""
-    reader = (McapReader if file.suffix == ".mcap" else RosbagsReader)(file)
+    reader = (McapReader if file.suffix == ".mcap" else Db3Reader)(file)
     names = {heard.id: heard.topic for heard in reader.topics}
     found = defaultdict(list)
     for number, messages in reader.messages(names).items():

@@ -23,8 +23,9 @@ from rosbags.typesys import Stores, get_typestore
 import magtwin
 from magtwin.errors import InputError
 from magtwin.io.bags import BagWriter, read_bag, read_bag_readings, write_bag
+from magtwin.io.bags.bag import Bag
 from magtwin.io.bags.cdr import encode
-from magtwin.io.bags.db3 import RosbagsReader
+from magtwin.io.bags.db3 import Db3Reader
 from magtwin.io.bags.topics import TOPICS
 from magtwin.io.bags.types import layout
 from magtwin.io.recorder import partial_of
@@ -587,7 +588,7 @@ def test_an_sqlite_page_that_is_used_twice_is_refused_before_it_is_read(table, t
         database.executescript("".join(f"CREATE TABLE t{k}(a);" for k in range(20)))
         roots = dict(database.execute("SELECT name, rootpage FROM sqlite_master")) | {"sqlite_master": 1}
     database.close()
-    with closing(RosbagsReader(path)) as reader:
+    with closing(Db3Reader(path)) as reader:
         assert len(reader.messages([0])[0]) == 200
     content = bytearray(path.read_bytes())
     head = 512 * (roots[table] - 1) + (100 if table == "sqlite_master" else 0)
@@ -599,6 +600,25 @@ def test_an_sqlite_page_that_is_used_twice_is_refused_before_it_is_read(table, t
     path.write_bytes(content)
     with pytest.raises(InputError, match="its tables use a page twice"):
         read_bag(path)
+
+
+@pytest.mark.parametrize("name", ["%2e%2e%2fother.db3", "%6fther.db3#.db3", "other.db3?.db3"])
+def test_the_name_of_an_sqlite_bag_is_no_uri(name, tmp_path):
+    folder = tmp_path / "50 % #1?"
+    folder.mkdir()
+    for path, count in ((folder / name, 3), (folder / "other.db3", 5), (tmp_path / "other.db3", 5)):
+        sqlite_bag(path, messages=count).close()
+    with Bag(folder / name) as bag:
+        assert len(bag.messages(["/m"])["/m"]) == 3
+
+
+def test_the_quality_of_service_of_an_sqlite_bag_is_not_parsed(tmp_path):
+    with sqlite_bag(tmp_path / "run.db3") as database:
+        database.execute("ALTER TABLE topics ADD offered_qos_profiles")
+        database.execute("UPDATE topics SET offered_qos_profiles = ?", ("[" * 1_000_000,))
+    database.close()
+    with Bag(tmp_path / "run.db3") as bag:
+        assert len(bag.messages(["/m"])["/m"]) == 1
 
 
 def test_an_sqlite_bag_of_too_many_topics_or_of_texts_for_messages_is_refused(tmp_path):

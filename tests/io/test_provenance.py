@@ -1,6 +1,7 @@
 """What a run says of how it came about, and that it can be made once more from that."""
 
 import json
+import os
 import shutil
 import subprocess
 from dataclasses import replace
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd
 
+from magtwin import files
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.files import git_revision, sha256
@@ -109,6 +111,18 @@ def test_the_commit_is_that_of_the_checkout_or_worktree(tmp_path, monkeypatch):
     assert git_revision(inside) == git("rev-parse", "HEAD")
     monkeypatch.setenv("PATH", "")
     assert git_revision(inside) == ""  # no git
+
+
+@pytest.mark.parametrize("pipe", ["config", "include"])
+def test_git_does_not_wait_for_a_pipe(pipe, tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "_GIT_S", 0.3)
+    for name in ("refs", "objects"):
+        (tmp_path / ".git" / name).mkdir(parents=True)
+    (tmp_path / ".git" / "HEAD").write_text("ref: refs/heads/x\n")
+    os.mkfifo(tmp_path / ".git" / ("config" if pipe == "config" else "pipe"))
+    if pipe == "include":
+        (tmp_path / ".git" / "config").write_text("[include]\n\tpath = pipe\n")
+    assert git_revision(tmp_path) == ""
 
 
 def test_a_run_of_every_kind_comes_out_again_to_the_bit(twin, tmp_path):
@@ -264,6 +278,8 @@ def test_zeros_of_other_sign_and_nan_beside_a_number_differ_and_nan_beside_nan_d
         ("seed", float("inf"), "metadata of the run are incomplete"),
         ("session_seed", float("inf"), "no valid session"),
         ("controller", 5, "no controller '5'"),
+        ("magnetometer", 5, "must be a known kind"),
+        ("rate_hz", 1e7, r"rate_hz of the metadata is 1e\+07"),
     ],
 )
 def test_metadata_of_other_kinds_are_refused(run, key, value, message):

@@ -825,3 +825,10 @@ def test_a_machine_without_graphics_is_refused_with_what_to_install(written, tmp
     ):
         screenshot(written, tmp_path / "run.png")
     assert not list(tmp_path.iterdir())
+
+
+def test_metadata_in_the_viewer_are_text_and_no_markdown():
+    page = recording.metadata_page({"scene": "![x](http://a.example/t.png) <b> \u202e\x1b a\\|b\n| c"})
+    (text,) = page.text.as_arrow_array().to_pylist()
+    cell = text.splitlines()[2]
+    assert cell == r"| scene | \!\[x\](http://a.example/t.png) \<b\> \\u202e\\x1b a\\\|b \| c |"

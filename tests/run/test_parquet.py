@@ -5,8 +5,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from magtwin import budget
 from magtwin.errors import InputError
-from magtwin.run.parquet import _counts, _largest_page, check_parquet
+from magtwin.run.parquet import _check_pages, _counts, check_parquet
 
 
 @pytest.fixture
@@ -46,23 +47,47 @@ def test_damaged_metadata_are_refused(path):
     assert refused > 5
 
 
-def test_the_largest_page_is_that_of_the_longest_column(tmp_path):
+def test_pages_that_decompress_to_too_much_are_refused(tmp_path, monkeypatch):
     path = tmp_path / "a.parquet"
-    table = pa.table({"a": pa.array(np.arange(3.0)), "b": ["x" * 5000, "y", "z"]})
+    table = pa.table({"a": pa.array(np.arange(3.0)), "b": ["x" * 50_000, "y", "z"]})
     pq.write_table(table, path, use_dictionary=["b"])
-    assert _largest_page(path, path.stat().st_size) == 4 * 3 + 5002
-    pq.write_table(table.slice(0, 0), path)
-    assert _largest_page(path, path.stat().st_size) == 1
+    _check_pages(path, path.stat().st_size)
+    monkeypatch.setattr(budget, "SPARE", 20_000)
+    with pytest.raises(InputError, match="that decode to 50,"):
+        _check_pages(path, path.stat().st_size)
+
+
+@pytest.mark.parametrize("kind", ["text", "list", "struct", "fixed"])
+def test_a_long_text_of_a_dictionary_counts_as_often_as_it_is_used(kind, tmp_path, monkeypatch):
+    monkeypatch.setattr(budget, "SPARE", 10_000_000)
+    path, length = tmp_path / "a.parquet", 100_000
+    of = pa.binary(length) if kind == "fixed" else pa.string()
+    words = ["x" * length, "y" * length] if kind == "fixed" else ["x" * length, "a"]
+
+    def write(used):
+        column = pa.array(words, of).take(pa.array(np.where(np.arange(20_000) < used, 0, 1)[: 20 * used]))
+        if kind == "list":
+            column = pa.ListArray.from_arrays(np.arange(len(column) + 1, dtype=np.int32), column)
+        elif kind == "struct":
+            column = pa.StructArray.from_arrays([column], ["s"])
+        pq.write_table(pa.table({"c": column}), path, dictionary_pagesize_limit=1 << 20, compression="zstd")
+
+    write(3)
+    if kind != "fixed":
+        check_parquet(path)
+    write(200)
+    with pytest.raises(InputError, match="that decode to"):
+        check_parquet(path)
 
 
 def test_a_long_text_that_all_rows_share_is_refused(tmp_path):
     path = tmp_path / "a.parquet"
     texts = pa.DictionaryArray.from_arrays(np.zeros(2000, np.int32), ["x" * 1_000_000])
     pq.write_table(pa.table({"s": texts}), path, compression="zstd")
-    with pytest.raises(InputError, match="bytes that decode to 1"):
+    with pytest.raises(InputError, match="bytes that decode to 2"):
         check_parquet(path)
 
 
 def test_parts_of_columns_that_overlap_are_refused(path):
     with pytest.raises(InputError, match="damaged Parquet"):
-        _largest_page(path, path.stat().st_size // 2)
+        _check_pages(path, path.stat().st_size // 2)

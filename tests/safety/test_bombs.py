@@ -6,6 +6,7 @@ import pickle
 import resource
 import sqlite3
 import struct
+import tracemalloc
 import zipfile
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -96,6 +97,10 @@ def db3(path, more="", *, data="data BLOB", topics=1, message=b""):
 
 
 ENDLESS = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT x AS schema_version FROM c"
+VIRTUAL = (
+    "PRAGMA writable_schema = ON; INSERT INTO sqlite_master "
+    "VALUES ('table', 'schema', 'schema', 0, 'CREATE  VIRTUAL TABLE schema USING dbstat');"
+)
 COMPUTED = "data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL"
 
 
@@ -225,10 +230,16 @@ BOMBS = {
     "commas.csv": (commas, read_run, "that decode to 112.0 MB"),
     "columns.csv": (lambda p: p.write_text("t" + ",a" * 20_000 + "\n"), read_run, "over 10,000 columns"),
     "facts.csv": (lambda p: p.write_text("# facts " + "[" * 99_999 + "\nt\n0\n"), read_run, "metadata"),
+    "comments.csv": (
+        lambda p: p.write_text("#a\n" * 200_000 + "t\n0\n"),
+        read_run,
+        "100,000 lines of comments",
+    ),
     "column.csv": (lambda p: p.write_text("# column t " + "[" * 99_999 + "\nt\n0\n"), read_run, "not JSON"),
     "images.mcap": (mcap, read_messages, "that decode to"),
     "endless.db3": (lambda p: db3(p, f"CREATE VIEW schema AS {ENDLESS}"), read_run, "schema is computed"),
     "computed.db3": (lambda p: db3(p, data=COMPUTED), read_messages, "messages has a computed column"),
+    "virtual.db3": (lambda p: db3(p, VIRTUAL), read_run, "schema is computed"),
     "topics.db3": (lambda p: db3(p, topics=9000), read_run, "9000 topics have 1 numbers"),
     "file": (lambda p: bag(p, "FILE"), read_messages, "that decode to"),
     "message": (lambda p: bag(p, "MESSAGE"), read_messages, "that decode to"),
@@ -326,6 +337,34 @@ def test_a_bomb_is_refused_before_it_takes_memory(name, tmp_path, small):
         read(tmp_path / name)
     assert "\n" not in str(refusal.value)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before < MOST
+
+
+def test_mcap_messages_outside_of_chunks_take_little_memory(tmp_path):
+    from mcap.writer import Writer
+
+    with open(tmp_path / "a.mcap", "wb") as file:
+        writer = Writer(file, use_chunking=False)
+        writer.start("ros2")
+        schema = writer.register_schema("std_msgs/msg/Empty", "ros2msg", b"")
+        channel = writer.register_channel("/a", "cdr", schema)
+        for k in range(20_000):
+            writer.add_message(channel, k, b"\0\1\0\0" + bytes([k % 256]), k)
+        writer.finish()
+    tracemalloc.start()
+    messages = read_messages(tmp_path / "a.mcap")["/a"]
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert messages.buffer[messages.start + 4].tolist() == [k % 256 for k in range(20_000)]
+    assert peak < 4 * (tmp_path / "a.mcap").stat().st_size + 2_000_000
+
+
+def test_metadata_of_an_mcap_file_are_limited_together(tmp_path, monkeypatch):
+    monkeypatch.setitem(budget.BUDGETS, "JSON", budget.Budget(file=1000))
+    record = struct.pack("<II", 0, 400) + struct.pack("<I", 392) + bytes(396)
+    record = b"\x0c" + struct.pack("<Q", len(record)) + record
+    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + record * 3)
+    with pytest.raises(InputError, match="its metadata have over 1,000 bytes"):
+        read_messages(tmp_path / "a.mcap")
 
 
 def test_aliases_in_the_description_of_a_bag_do_not_multiply(tmp_path):

@@ -116,3 +116,12 @@ def test_a_stage_that_names_a_pipe_as_a_layer_is_refused(tmp_path):
     (tmp_path / "stage.usda").write_text('#usda 1.0\n(subLayers = [@./below.usda@])\ndef "World" {}\n')
     with pytest.raises(InputError, match=r"names .*below\.usda, which is no regular file"):
         open_stage(tmp_path / "stage.usda")
+
+
+def test_a_part_of_a_run_that_is_a_pipe_is_refused(tmp_path):
+    from magtwin.io.tables import load_parquet, read_parquet
+
+    os.mkfifo(tmp_path / "part-000000.parquet")
+    for read, path in ((read_parquet, tmp_path), (load_parquet, tmp_path / "part-000000.parquet")):
+        with pytest.raises(InputError, match="a pipe, not a Parquet file"):
+            read(path)

@@ -16,7 +16,7 @@ from magtwin.field.units import GREATEST_MEAN_NT, LEAST_MEAN_NT, NT_PER, Unit, c
 from magtwin.files import existing, existing_file, read_text, yaml_loader
 from magtwin.io.bags.cdr import Messages, decode
 from magtwin.io.bags.compression import Room
-from magtwin.io.bags.db3 import RosbagsReader, custom_data
+from magtwin.io.bags.db3 import Db3Reader, custom_data
 from magtwin.io.bags.mcap import McapReader
 from magtwin.io.bags.topics import Topic
 from magtwin.io.bags.types import layout
@@ -57,7 +57,7 @@ class Bag:
     def __init__(self, path: Path, *, recover: bool = False) -> None:
         self.path = existing(path, "bag")
         self.kinds: dict[str, str] = {}
-        self._readers: list[McapReader | RosbagsReader] = []
+        self._readers: list[McapReader | Db3Reader] = []
         with _one_line(self.path), ExitStack() as opened:
             self.files, self._custom, self._packed = _files(self.path)
             files = [existing_file(file, "storage file of a bag", "bag") for file in self.files]
@@ -65,7 +65,7 @@ class Bag:
                 folder, room = Path(opened.enter_context(TemporaryDirectory())), Room(self.path, files)
                 files = [room.file(file, folder) for file in files]
             for file in files:
-                reader = (McapReader if file.suffix == ".mcap" else RosbagsReader)(file)
+                reader = (McapReader if file.suffix == ".mcap" else Db3Reader)(file)
                 opened.callback(reader.close)
                 self._readers.append(reader)
                 for topic in reader.topics:

@@ -1,16 +1,16 @@
-"""db3: bags in sqlite3, through rosbags."""
+"""db3: bags in sqlite3. rosbags writes them; they are read here, on the connection that was checked."""
 
 import shutil
 import sqlite3
+from array import array
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin, Writer
 
 from magtwin.budget import BUDGETS, check_decoded
 from magtwin.errors import InputError
@@ -23,6 +23,9 @@ _HEAD = 100
 
 _ROWS = 10_000
 """Most topics and definitions of a bag."""
+
+_PLAIN = "CREATE TABLE ", "CREATE INDEX ", "CREATE UNIQUE INDEX ", "CREATE TRIGGER "
+"""How sqlite begins the text of all but views and virtual tables."""
 
 
 class Db3Writer:
@@ -52,7 +55,7 @@ class Db3Writer:
     def write(self, batches: Sequence[Batch]) -> None:
         """Write messages in the order of their times."""
         rows = [iter(batch.rows) for batch in batches]
-        for t, k in zip(*(array.tolist() for array in in_time(batches)), strict=True):
+        for t, k in zip(*(column.tolist() for column in in_time(batches)), strict=True):
             data = next(rows[k])[ROOM:].tobytes()
             self._writer.write(self._connections[batches[k].connection.id], t, data)
 
@@ -70,8 +73,10 @@ class Db3Writer:
         self._writer.abort()
 
 
-class RosbagsReader:
-    """A .db3 file, read by rosbags.
+class Db3Reader:
+    """A .db3 file: its topics, its metadata, and its messages on demand.
+
+    The quality of service of its topics is not read, as its YAML can be large.
 
     Attributes:
         topics: Its topics.
@@ -84,43 +89,43 @@ class RosbagsReader:
         self._path, self._size = path, path.stat().st_size
         pages = _Pages(path)
         pages.check([1])  # the list of tables, before sqlite reads it
-        with closing(
-            sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
-        ) as database:
-            longest = database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, BUDGETS["text"].file)
+        self._database = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
+        try:
+            longest = self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, BUDGETS["text"].file)
             roots = "SELECT CAST(rootpage AS INTEGER) FROM sqlite_master WHERE rootpage > 0"
-            pages.check([root for (root,) in database.execute(roots)])
-            _check_tables(database)
-            _check_rows(database)
-            self.notes = _custom_data(database)
-            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, longest)
-            _check_messages(database, path)
-        self._reader = Reader(path)
-        self._reader.open()
-        self.topics = [
-            StoredTopic(c.id, c.topic, c.msgtype, getattr(c.ext, "serialization_format", ""))
-            for c in self._reader.connections
-        ]
+            pages.check([root for (root,) in self._database.execute(roots)])
+            _check_tables(self._database)
+            _check_rows(self._database)
+            self.notes = _custom_data(self._database)
+            self.topics = _topics(self._database)
+            self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, longest)
+            _check_messages(self._database, path)
+        except BaseException:
+            self.close()
+            raise
 
     def close(self) -> None:
         """Close the bag."""
-        self._reader.close()
+        self._database.close()
 
     def messages(self, ids: Collection[int]) -> dict[int, Messages]:
         """The messages of some topics in the order of receipt."""
-        found: dict[int, tuple[list[int], list[bytes]]] = {number: ([], []) for number in ids}
-        connections, held = [c for c in self._reader.connections if c.id in found], 0
-        for connection, received, data in self._reader.messages(connections) if connections else ():
-            times, contents = found[connection.id]
+        found = {number: (array("q"), array("q"), bytearray()) for number in ids}
+        query = (
+            f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({', '.join('?' * len(ids))})"
+        )
+        held = 0
+        for number, received, data in self._database.execute(query, list(ids)):
+            times, sizes, contents = found[number]
             held += len(data)  # rows of a damaged file can share their pages
             check_decoded(self._path, self._size, held)
             times.append(received)
-            contents.append(data)
+            sizes.append(len(data))
+            contents += data
         joined = {}
-        for number, (times, contents) in found.items():
-            size = np.array([len(content) for content in contents], np.int64)
-            buffer = np.frombuffer(b"".join(contents), np.uint8)
-            moments = np.array(times, np.int64)
+        for number, (times, sizes, contents) in found.items():
+            size, moments = np.array(sizes, np.int64), np.array(times, np.int64)
+            buffer = np.frombuffer(contents, np.uint8)
             joined[number] = Messages(moments, buffer, np.cumsum(size) - size, size).in_order()
         return joined
 
@@ -167,15 +172,15 @@ def _check_tables(database: sqlite3.Connection) -> None:
         InputError: There is a view, a virtual table or a computed column; or topics share a number, so that
             joining them with their messages multiplies both.
     """
-    contents = database.execute("SELECT name, type, sql FROM sqlite_master").fetchall()
-    for name, kind, sql in contents:
-        if kind == "view" or (kind == "table" and str(sql).upper().startswith("CREATE VIRTUAL")):
+    contents = database.execute("SELECT name, sql FROM sqlite_master").fetchall()
+    for name, sql in contents:
+        if sql is not None and not str(sql).startswith(_PLAIN):
             raise InputError(f"{name} is computed; a bag has plain tables only")
         columns = database.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,)).fetchall()
-        if kind == "table" and any(hidden for (hidden,) in columns):
+        if any(hidden for (hidden,) in columns):
             raise InputError(f"table {name} has a computed column; a bag has plain tables only")
-    if "topics" not in {name for name, _, _ in contents}:
-        return  # rosbags refuses it
+    if not {"messages", "topics"} <= _tables(database):
+        raise InputError("missing tables: a bag has messages and topics")
     topics, numbers = database.execute("SELECT count(id), count(DISTINCT id) FROM topics").fetchone()
     if topics != numbers:
         raise InputError(f"{topics} topics have {numbers} numbers; each needs its own")
@@ -200,18 +205,25 @@ def _check_rows(database: sqlite3.Connection) -> None:
 
 
 def _check_messages(database: sqlite3.Connection, path: Path) -> None:
-    """Refuse messages that are too large together, which sqlite would sort on the disk.
+    """Refuse messages that are too large together.
 
     Raises:
         InputError: They are.
     """
-    if "messages" not in _tables(database):
-        return  # rosbags refuses it
     sizes = "total(CASE typeof(data) WHEN 'blob' THEN length(data) END), total(typeof(data) <> 'blob')"
     size, others = database.execute(f"SELECT {sizes} FROM messages").fetchone()
     if others:
         raise InputError(f"{others:.0f} of its messages are not bytes; write it again")
     check_decoded(path, path.stat().st_size, int(size))
+
+
+def _topics(database: sqlite3.Connection) -> list[StoredTopic]:
+    """Its topics."""
+    columns = (
+        "CAST(id AS INTEGER), CAST(name AS TEXT), CAST(type AS TEXT), CAST(serialization_format AS TEXT)"
+    )
+    rows = database.execute(f"SELECT {columns} FROM topics WHERE id IS NOT NULL ORDER BY id")
+    return [StoredTopic(row[0], *(text or "" for text in row[1:])) for row in rows]
 
 
 def _tables(database: sqlite3.Connection) -> set[str]:

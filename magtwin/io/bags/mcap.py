@@ -9,6 +9,7 @@ one message at a time and is ten times as slow.
 
 import struct
 import zlib
+from array import array
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
@@ -225,11 +226,12 @@ class McapReader:
         self._path, self._size = path, path.stat().st_size
         self.notes: dict[str, dict[str, str]] = {}
         self.whole = False
+        self._noted = 0
         self._spare = SPARE
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, records.Channel] = {}
         self._chunks: list[tuple[int, int]] = []
-        self._loose: list[tuple[int, int, int, int]] = []
+        self._loose = array("q")  # channel, time of receipt, place and size of messages outside of chunks
         try:
             if self._file.read(len(MAGIC)) != MAGIC:
                 raise InputError("it does not begin like MCAP")
@@ -254,10 +256,13 @@ class McapReader:
         self._spare = SPARE
         parts: list[tuple[Bytes, Any]] = []
         held = 0
-        for channel, received, place, size in self._loose:
-            if channel in ids:
-                raw = np.frombuffer(self._at(place, size), np.uint8)
-                parts.append((raw, np.array([(channel, received, 0, size)])))
+        loose = np.array(self._loose, np.int64).reshape(-1, 4)
+        if len(loose := loose[np.isin(loose[:, 0], list(ids))]):
+            raw = bytearray()
+            for place, size in loose[:, 2:].tolist():
+                raw += self._at(place, size)
+            loose[:, 2] = np.cumsum(loose[:, 3]) - loose[:, 3]
+            parts.append((np.frombuffer(raw, np.uint8), loose))
         for chunk in self._chunks:
             content = self._content(*chunk)
             found = self._walk(content, ids)
@@ -283,15 +288,17 @@ class McapReader:
         """Go through the records outside of chunks."""
         at = len(MAGIC)
         while at + _HEAD.size <= self._size:
-            opcode, length = _HEAD.unpack(self._at(at, _HEAD.size))
+            head = self._at(at, ROOM)
+            opcode, length = _HEAD.unpack_from(head)
             body = at + _HEAD.size
             if body + length > self._size:
                 return
             if opcode == Opcode.CHUNK:
                 self._chunks.append((body, length))
             elif opcode == Opcode.MESSAGE and length >= ROOM - _HEAD.size:
-                channel, _, received = struct.unpack("<HIQ", self._at(body, 14))
-                self._loose.append((channel, received, at + ROOM, length - (ROOM - _HEAD.size)))
+                channel, _, received = struct.unpack_from("<HIq", head, _HEAD.size)
+                numbers = channel, received, at + ROOM, length - (ROOM - _HEAD.size)
+                self._loose.extend(numbers)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
                 self._learn(opcode, self._at(body, length))
             elif opcode == Opcode.FOOTER:
@@ -308,6 +315,9 @@ class McapReader:
             channel = records.Channel.read(stream)
             self._channels[channel.id] = channel
         else:
+            self._noted += len(content)
+            if self._noted > (most := BUDGETS["JSON"].file):
+                raise InputError(f"its metadata have over {most:,} bytes; write it again")
             note = records.Metadata.read(stream)
             self.notes[note.name] = note.metadata
 
@@ -346,9 +356,9 @@ class McapReader:
             content = pa.Codec(codec).decompress(raw, size) if codec else raw
         except (pa.ArrowException, OSError, ValueError) as error:
             raise InputError(f"a damaged chunk ({str(error).splitlines()[0]})") from error
-        array = np.frombuffer(content, np.uint8)
-        if len(array) != size or (
-            chunk.uncompressed_crc and zlib.crc32(array.data) != chunk.uncompressed_crc
+        whole = np.frombuffer(content, np.uint8)
+        if len(whole) != size or (
+            chunk.uncompressed_crc and zlib.crc32(whole.data) != chunk.uncompressed_crc
         ):
             raise InputError("a damaged chunk (its checksum differs)")
-        return array
+        return whole

@@ -30,6 +30,7 @@ from magtwin.path import Path
 from magtwin.run import mapped
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
+from magtwin.summary import in_markdown
 from magtwin.twin import Twin
 
 APPLICATION = "magtwin"
@@ -307,6 +308,6 @@ def _crc(values: NDArray[Any]) -> int:
 def metadata_page(metadata: Mapping[str, Any], rows: int | None = None) -> rr.TextDocument:
     """The metadata of a run as a page with a table."""
     values = {**({} if rows is None else {"readings": f"{rows:,}"}), **metadata}
-    cells = [[" ".join(str(text).replace("|", r"\|").split()) for text in pair] for pair in values.items()]
+    cells = [[in_markdown(" ".join(str(text).split())) for text in pair] for pair in values.items()]
     lines = ["| metadata | value |", "|---|---|", *(f"| {key} | {value} |" for key, value in cells)]
     return rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)

@@ -41,6 +41,9 @@ RANDOM_S = 60.0
 HIGHEST_HZ = 10_000.0
 """Highest rate of a sensor beside the magnetometer [Hz]."""
 
+HIGHEST_READINGS_HZ = 100_000.0
+"""Highest rate of a magnetometer [Hz]."""
+
 LATEST_S = 3_600.0
 """Largest offset of a magnetometer's clock [s]."""
 
@@ -340,7 +343,10 @@ def _check_numbers(robot: RobotSpec) -> None:
 
 
 def _check_readings(duration_s: float, rate_hz: float) -> None:
-    """Refuse a run whose columns no memory can hold."""
+    """Refuse a run whose columns no memory can hold, or a rate of no magnetometer."""
+    if rate_hz > HIGHEST_READINGS_HZ:
+        most = f"at most {HIGHEST_READINGS_HZ:,.0f} Hz for a magnetometer"
+        raise InputError(f"rate_hz must be {most}, got {rate_hz:g}", parameter="rate_hz")
     if not math.isfinite(duration_s):
         raise InputError(
             f"duration_s must be above 0 s and finite, got {duration_s!r}", parameter="duration_s"
