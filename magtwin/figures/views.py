@@ -41,7 +41,9 @@ def view(files: Sequence[Source], *, scene: Source | None = None, offsets_s: Seq
     Raises:
         InputError: A file cannot be read, or there is no viewer.
     """
-    paths = [Path(file) for file in files]
+    from magtwin.twin import shipped_or
+
+    paths = [shipped_or(file) for file in files]
     if not paths:
         raise InputError("name a run or a stage to view")
     if offsets_s and (len(offsets_s) != len(paths) or len(paths) < 2):
@@ -86,8 +88,10 @@ def picture(
     """
     from magtwin.figures.pictures import check_png, picture_of_stage
     from magtwin.figures.scenery import View, picture_of_run
+    from magtwin.twin import shipped_or
 
-    file, out = existing(file, "run, stage or recording"), check_free(check_png(out), force=force)
+    file = existing(shipped_or(file), "run, stage or recording")
+    out = check_free(check_png(out), force=force)
     if file.suffix == ".rrd" and camera is None and scene is None:
         from magtwin.io.rerun.viewer import screenshot
 
@@ -150,9 +154,12 @@ def report_runs(
         progress: Called with the number of runs done, the number in all and the current step.
 
     Raises:
-        InputError: A run cannot be read, or the page cannot be written.
+        InputError: A run or `scene` cannot be read, or the page cannot be written.
     """
+    from magtwin.twin import scene_file
+
     out = check_free(out, force=force)
+    scene = None if scene is None else scene_file(scene)
     files = [file for source in runs for file in runs_in(Path(source))]
     names = [file.name for file in files]
     named = []
@@ -163,6 +170,8 @@ def report_runs(
             field = map_of(run, scene, near=file)
         except InputError as error:
             note = f"Its map is not shown: {error}."
+            if scene is not None:
+                warnings.warn(f"{file}: its map is not shown: {error}", MismatchWarning, stacklevel=2)
         name = file.name if names.count(file.name) == 1 else str(file)
         named.append(NamedRun(name, run, field, planned_of(run, near=file), note))
     pictured = out.suffix == ".html" and len(named) <= MOST_PICTURED

@@ -12,6 +12,7 @@ from magtwin.files import existing
 from magtwin.io.formats import FORMATS, read_run
 from magtwin.kinds import kind_of
 from magtwin.report import Figure, Report
+from magtwin.twin import shipped_or
 
 STAGES = (".usd", ".usda", ".usdc", ".usdz")
 NETWORKS = (".safetensors", ".pth", ".onnx")
@@ -27,7 +28,7 @@ def info_of(path: str | os.PathLike[str]) -> Report:
     Raises:
         InputError: The file is missing, of an unknown kind, or damaged.
     """
-    file = existing(path, "file")
+    file = existing(shipped_or(path), "file")
     if file.is_dir():
         return map_metadata(read_survey(file)[0]) if any(file.glob("*_map.csv")) else info_of_run(file)
     if file.suffix in NETWORKS:

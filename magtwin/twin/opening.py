@@ -148,10 +148,19 @@ def scene_file(scene: str | FilePath) -> FilePath:
         return inside
     if file.suffix or file.exists() or len(file.parts) > 1:
         return expected(file, "scene")
-    stages = {
-        stage.stem: stage for stage in shipped("scenes").glob("*/*.usda") if stage.stem == stage.parent.name
-    }
-    return find("scene", str(scene), stages)
+    return find("scene", str(scene), _shipped_stages())
+
+
+def shipped_or(file: str | FilePath) -> FilePath:
+    """The stage of a shipped scene's name such as "lab", if there is no file of that name; else the path."""
+    path = FilePath(file)
+    return path if path.exists() else _shipped_stages().get(str(file), path)
+
+
+def _shipped_stages() -> dict[str, FilePath]:
+    """Stages that ship with magtwin, by name."""
+    stages = shipped("scenes").glob("*/*.usda")
+    return {stage.stem: stage for stage in stages if stage.stem == stage.parent.name}
 
 
 def opened(
@@ -365,7 +374,7 @@ def scene_of(
         InputError: The metadata name none, or it is missing.
     """
     if scene is not None:
-        return expected(scene, "scene")
+        return scene_file(scene)
     if "scene_file" not in run.metadata:
         raise InputError("the run does not name its scene; name it with `scene`", parameter="scene")
     place = locate(str(run.metadata["scene_file"]), near)

@@ -19,7 +19,11 @@ LAYERS = (".usdc", ".usd")
 PICTURES = (".png", ".svg")
 
 MapFile = Annotated[
-    Path, Parameter(help="Map layer or stage (.usd, .usda, .usdc), or a folder of survey CSVs.")
+    Path,
+    Parameter(
+        help="Map layer or stage (.usd, .usda, .usdc), a folder of survey CSVs, or a shipped scene's name: "
+        "lab."
+    ),
 ]
 Kernel = Annotated[
     Literal["matern", "poisson"] | None,

@@ -16,13 +16,14 @@ from magtwin.field.survey.folder import node_map
 from magtwin.field.survey.folder import read_survey as read_folder
 from magtwin.field.survey.readings import TAKEN, Readings
 from magtwin.field.survey.stuck import mask_stuck
-from magtwin.files import sha256
+from magtwin.files import existing, sha256
 from magtwin.io.surveys.about import About
 from magtwin.io.surveys.columns import Columns
 from magtwin.io.surveys.readings import is_pattern, read_readings, save_readings
 from magtwin.kinds import expected
 from magtwin.outputs import check_free, output, transaction
 from magtwin.report import Report
+from magtwin.twin import scene_file
 
 Method = Literal["auto", "trilinear", "cubic", "gp", "harmonic"]
 Split = Literal["checkerboard", "heading", "run", "block"]
@@ -46,7 +47,7 @@ def open_map(file: Source, date: str | None = None) -> AnomalyMap:
     """The map of a layer or stage, or of a folder of survey CSVs.
 
     Args:
-        file: Layer, stage, or folder with one CSV per heading.
+        file: As for `map_file`.
         date: Date between the epochs of a layer, YYYY-MM-DD. None: the epoch that it selects.
 
     Raises:
@@ -54,11 +55,30 @@ def open_map(file: Source, date: str | None = None) -> AnomalyMap:
     """
     from magtwin.usd.maps.layer import load_map
 
-    if not Path(file).is_dir():
+    file = map_file(file)
+    if not file.is_dir():
         return load_map(file, date)
     if date is not None:
         raise InputError(f"{file}: a folder of CSVs has no dates; leave out `date`", parameter="date")
     return read_folder(expected(file, "map"))[0]
+
+
+def map_file(source: Source) -> Path:
+    """The file of a map: a layer, a stage, a folder of CSVs or of a scene, or the stage of a shipped scene.
+
+    Raises:
+        InputError: There is no such file or scene.
+    """
+    path = Path(source)
+    if path.is_file() or (path.is_dir() and not (path / f"{path.resolve().name}.usda").is_file()):
+        return path
+    if path.suffix or (len(path.parts) > 1 and not path.exists()):
+        return existing(path, "map")
+    try:
+        return scene_file(path)
+    except InputError as error:
+        text = f"{source}: no map layer, stage, folder of CSVs or shipped scene: {error}"
+        raise InputError(text) from error
 
 
 def read_survey(
