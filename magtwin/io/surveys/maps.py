@@ -39,9 +39,6 @@ LEAST_READINGS = 8
 USUAL_READINGS = 100
 """Number of good readings below which the report doubts the map."""
 
-USUAL_SPAN_M = 300.0
-"""Extent of a survey above which the report asks for the unit of its positions [m]."""
-
 
 def open_map(file: Source, date: str | None = None) -> AnomalyMap:
     """The map of a layer or stage, or of a folder of survey CSVs.
@@ -345,8 +342,6 @@ def _doubts(readings: Readings, source: Source) -> list[str]:
         )
     if readings.grid is None and count < USUAL_READINGS:
         doubts.append(f"only {count} good readings: the map is valid only next to them")
-    if (span := float(np.ptp(readings.p_xy, axis=0).max())) > USUAL_SPAN_M:
-        doubts.append(f"the readings span {span:,.0f} m: are their positions in metres?")
     if line := changes_line(readings):
         doubts.append(line)
     mean = np.exp(1j * yaw).mean()

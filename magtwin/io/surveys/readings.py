@@ -13,11 +13,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.errors import InputError
+from magtwin.delimited import DEGREES, LENGTHS, label_of
+from magtwin.errors import InputError, hint
 from magtwin.field.grid import FARTHEST_M, Grid
 from magtwin.field.survey.folder import read_grid
 from magtwin.field.survey.readings import SHAPES, TAKEN, Readings
-from magtwin.field.units import check_unit, nt_per, unit_by_size
+from magtwin.field.units import NT_PER, check_unit, nt_per, unit_by_size
 from magtwin.files import existing, sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
 from magtwin.io.surveys.columns import FIELDS, HEADINGS, NO_HEADING, TIMES, VECTORS, Columns
@@ -39,6 +40,9 @@ PARQUET = (".parquet", ".pq")
 
 RUNS = (".csv", ".npz", ".rrd")
 """Suffixes of runs in other formats of magtwin's own."""
+
+USUAL_SPAN_M = 50.0
+"""Extent above which the report asks for the unit of positions whose columns name none [m]."""
 
 LARGEST_TURN = 2 * np.pi + 0.01
 """Headings beyond this are refused unless their unit is given [rad]."""
@@ -96,9 +100,13 @@ def read_readings(
     columns = Columns() if columns is None else columns
     if not sources:
         raise InputError("no source of readings given")
-    parts = []
+    parts, given, twice = [], dict[str, Source](), list[str]()
     for source in _each(sources):
         path = _first(source)
+        same = given.setdefault(_identity(source), source)
+        if same is not source:
+            twice.append(f"{source} and {same} as one, since their bytes are equal")
+            continue
         if path.is_dir() or path.suffix in BAGS:
             _only_unit(path, columns)
         if path.suffix in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
@@ -112,6 +120,8 @@ def read_readings(
         else:
             parts.append(_of_file(str(source), path, columns))
     readings = parts[0] if len(parts) == 1 else _together(parts)
+    if twice:
+        readings = readings.with_(source="; ".join([readings.source, *(TAKEN + text for text in twice)]))
     return readings.with_(**{key: value for key, value in about.items() if value not in (None, "")})
 
 
@@ -252,6 +262,12 @@ def _first(source: Source) -> Path:
     return expected(Path(str(source).split("+")[0]), "source of readings")
 
 
+def _identity(source: Source) -> str:
+    """The checksum of a file; the place of a folder, or of joined files."""
+    path = Path(source)
+    return sha256(path) if path.is_file() else str(path.resolve())
+
+
 def _only_unit(path: Path, columns: Columns) -> None:
     """Refuse options for columns of a source whose columns are known."""
     if replace(columns, unit=None, scale=None) != Columns():
@@ -309,10 +325,12 @@ def _read_table(path: Path) -> Table:
 def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
     """The readings in a table."""
     columns, taken = _complete(table, columns)
-    p = np.column_stack([table.numbers(columns.x), table.numbers(columns.y)])
+    p = np.column_stack([_lengths(table, columns.x), _lengths(table, columns.y)])
     turn = _turn(table, columns)
     vector, b = _field(table, columns)
     t = table.numbers(columns.time) if columns.time else None
+    if t is not None and label_of(columns.time)[1] == "ms":
+        t = t / 1000
     some = [p, b[:, None]] + [v.reshape(len(p), -1) for v in (turn, vector, t) if v is not None]
     known: NDArray[np.bool_] = np.all(np.isfinite(np.hstack(some)), axis=1)
     if not known.any():
@@ -324,6 +342,12 @@ def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
         row = int(away[0])
         where = table.column(columns.x).where(row)
         raise InputError(f"{where}: x and y are metres, within {FARTHEST_M:g} of the origin, got {p[row]}")
+    if not (label_of(columns.x)[1] or label_of(columns.y)[1]):
+        span = float(np.ptp(p[known], axis=0).max())
+        if span > USUAL_SPAN_M:
+            taken.append(
+                f"x and y in metres, over {span:,.0f} m: if these are cm, write x [cm],y [cm] in the header"
+            )
     if turn is not None and turn.ndim == 2:
         length = np.linalg.norm(turn, axis=1)
         off = np.flatnonzero(known & (np.abs(length - 1) > 0.01))
@@ -378,8 +402,12 @@ def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
 
 def _complete(table: Table, columns: Columns) -> tuple[Columns, list[str]]:
     """Columns and unit, with missing ones found by name and size; and what was found so."""
-    taken = list[str]()
-    lower = {label.strip().lower(): label for label in reversed(table.names)}  # the first of equal names
+    taken = list(table.notes)
+    lower = {label_of(label)[0]: label for label in reversed(table.names)}  # the first of equal names
+    lower |= {label.strip().lower(): label for label in reversed(table.names)}
+    for axis in ("x", "y"):
+        if getattr(columns, axis) == axis and axis not in table.names and axis in lower:
+            columns = replace(columns, **{axis: lower[axis]})
     if not (columns.heading or columns.quaternion):
         label = next((name for name in HEADINGS if name in table.names), "")
         columns = replace(columns, heading=label or next((lower[n] for n in HEADINGS if n in lower), ""))
@@ -400,13 +428,32 @@ def _complete(table: Table, columns: Columns) -> tuple[Columns, list[str]]:
                 f"{table.path}: no column of the field was found by its name ({known}); name the magnitude "
                 "with --field NAME, or the components with --vector BX,BY,BZ"
             )
+    units = {label_of(name)[1] for name in (columns.x, columns.y)} - {"", "m"}
+    if units:
+        taken.append(f"{columns.x} and {columns.y} by the units in their names")
+    angle = label_of(columns.heading)[1]
+    if columns.heading_unit is None and angle in (*DEGREES, "rad"):
+        columns = replace(columns, heading_unit="deg" if angle in DEGREES else "rad")
+        taken.append(f"{columns.heading} in {columns.heading_unit}, by its name (--heading-unit)")
     if columns.unit is None and columns.scale is None:
+        named = label_of(columns.field or columns.several("vector")[0])[1].replace("\N{MICRO SIGN}", "u")
+        named = named.replace("\N{GREEK SMALL LETTER MU}", "u")
+        if unit := {name.lower(): name for name in NT_PER}.get(named):
+            return replace(columns, unit=unit), taken  # type: ignore[arg-type]
         _, b = _field(table, replace(columns, unit="nT"))
         unit = unit_by_size(b)
         if unit not in (None, "nT"):
             columns = replace(columns, unit=unit)  # type: ignore[arg-type]
             taken.append(f"{columns.field or columns.vector} in {unit}, by its size (--unit)")
     return columns, taken
+
+
+def _lengths(table: Table, name: str) -> Array:
+    """A column of lengths [m], in the unit of its name."""
+    unit = label_of(name)[1] or "m"
+    if unit not in LENGTHS:
+        raise InputError(f"{table.path}: {name!r} is no length; {hint(unit, LENGTHS)}")
+    return LENGTHS[unit] * table.numbers(name)
 
 
 def _check_axes(vector_nt: Array, yaw: Array, table: Table, columns: Columns) -> None:
