@@ -344,7 +344,7 @@ def error_budget(
 
 def map_of_scene(scene: File) -> Path:
     """File of the map of a scene."""
-    return Path(read_scene(scene_file(scene), check_network=False).map_layer)
+    return Path(read_scene(scene_file(Path(scene)), check_network=False).map_layer)
 
 
 def short_names(files: Sequence[Path]) -> list[str]:

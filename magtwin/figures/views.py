@@ -53,7 +53,7 @@ def view(files: Sequence[Source], *, scene: Source | None = None, offsets_s: Seq
         )
     if len(paths) > 1:
         _view_together(paths, scene, offsets_s or [0.0] * len(paths))
-    elif paths[0].suffix in STAGES and not paths[0].is_dir():
+    elif paths[0].suffix.lower() in STAGES and not paths[0].is_dir():
         _view_stage(paths[0])
     else:
         _view_run(paths[0], scene)
@@ -92,11 +92,11 @@ def picture(
 
     file = existing(shipped_or(file), "run, stage or recording")
     out = check_free(check_png(out), force=force)
-    if file.suffix == ".rrd" and camera is None and scene is None:
+    if file.suffix.lower() == ".rrd" and camera is None and scene is None:
         from magtwin.io.rerun.viewer import screenshot
 
         return screenshot(file, out, time_s=time_s, size=size, force=force)
-    if file.suffix in STAGES and time_s is None and scene is None:
+    if file.suffix.lower() in STAGES and time_s is None and scene is None:
         if camera == "chase":
             raise InputError(f"{file}: a stage has no run to follow; take another camera", parameter="camera")
         seen = None if camera is None else View.of(camera).camera()
@@ -174,9 +174,9 @@ def report_runs(
                 warnings.warn(f"{file}: its map is not shown: {error}", MismatchWarning, stacklevel=2)
         name = file.name if names.count(file.name) == 1 else str(file)
         named.append(NamedRun(name, run, field, planned_of(run, near=file), note))
-    pictured = out.suffix == ".html" and len(named) <= MOST_PICTURED
+    pictured = out.suffix.lower() == ".html" and len(named) <= MOST_PICTURED
     page = page_of_runs(named, pictures=pictured, advance=lambda done: progress(done, len(named), "drawing"))
-    if out.suffix == ".html" and not pictured:
+    if out.suffix.lower() == ".html" and not pictured:
         page = replace(page, lead=f"{page.lead} Pages of more than {MOST_PICTURED} runs have no pictures.")
     write_page(page, out, force=force)
 
@@ -205,7 +205,7 @@ def compare_files(
     name_a, name_b = names_of(a, b)
     named = NamedRun(name_a, read_run(a)), NamedRun(name_b, read_run(b))
     comparison = compare(named[0].run, named[1].run, align=align)
-    if out is not None and Path(out).suffix in (".png", ".svg"):
+    if out is not None and Path(out).suffix.lower() in (".png", ".svg"):
         save(draw_comparison(*named, comparison), out, force=force)
     elif out is not None:
         write_page(page_of_comparison(*named, comparison), out, force=force)
@@ -242,7 +242,7 @@ def _view_run(file: Path, scene: Source | None) -> None:
     from magtwin.io.rerun.viewer import show
 
     existing(file, "run")
-    if file.suffix == ".rrd" and scene is None:
+    if file.suffix.lower() == ".rrd" and scene is None:
         show(file)
     else:
         run = read_run(file)
@@ -272,7 +272,7 @@ def _view_stage(file: Path) -> None:
         result = subprocess.run([usdview, str(file)], check=False)
         if result.returncode:
             raise InputError(f"{file}: usdview ended with status {result.returncode}")
-    elif file.suffix != ".usdz" and is_animation(file):
+    elif file.suffix.lower() != ".usdz" and is_animation(file):
         _view_run(file, file)
     else:
         from magtwin.figures.pictures import show_stage

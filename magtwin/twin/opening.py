@@ -141,7 +141,7 @@ def scene_file(scene: str | FilePath) -> FilePath:
         InputError: The file is missing, there is no scene of that name, or it is a TOML.
     """
     file = FilePath(scene)
-    if file.suffix == ".toml" and kind_of(file) in (None, TOML, SCENE_TOML):
+    if file.suffix.lower() == ".toml" and kind_of(file) in (None, TOML, SCENE_TOML):
         raise InputError(f"{scene}: describes a scene; author it first: magtwin scene {scene} --out FOLDER")
     inside = file / f"{file.resolve().name}.usda"
     if inside.is_file():

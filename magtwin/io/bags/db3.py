@@ -70,6 +70,14 @@ class Db3Writer:
         self._writer.abort()
 
 
+class _Reader(Reader):
+    """A reader of a .db3 file with its suffix in any case; rosbags knows it in lower case only."""
+
+    def __init__(self, path: Path) -> None:
+        self.STORAGE_PLUGINS = {path.suffix: Reader.STORAGE_PLUGINS[".db3"]}
+        super().__init__(path)
+
+
 class RosbagsReader:
     """A .db3 file, read by rosbags.
 
@@ -95,7 +103,7 @@ class RosbagsReader:
             self.notes = _custom_data(database)
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, longest)
             _check_messages(database, path)
-        self._reader = Reader(path)
+        self._reader = _Reader(path)
         self._reader.open()
         self.topics = [
             StoredTopic(c.id, c.topic, c.msgtype, getattr(c.ext, "serialization_format", ""))

@@ -128,14 +128,15 @@ def import_survey(
 
     out, columns, about = check_free(out, force=force), reading.get("columns") or Columns(), about or About()
     name = about.name or out.stem
-    if out.suffix != ".parquet" and len(sources) == 1 and _is_survey_folder(Path(sources[0]), columns):
+    table = out.suffix.lower() == ".parquet"
+    if not table and len(sources) == 1 and _is_survey_folder(Path(sources[0]), columns):
         known = {**asdict(about), "name": name, "unit": columns.unit or "nT", "scale": columns.scale}
         field, report = read_folder(sources[0], **known, keep_stuck=reading.get("keep_stuck", False))
         save_map(field, out, force=force)
         return report
     readings, found = read_survey(sources, about=about, **reading)
     readings = readings.with_(name=name)
-    if out.suffix == ".parquet":
+    if table:
         save_readings(readings, out, force=force)
         return _joined(readings.report(), found)
     field = node_map(readings)
@@ -286,7 +287,7 @@ def survey_scene(
         raise InputError(f"`seed` must be a whole number from 0 up, got {seed}", parameter="seed")
     if not 0 <= heading_error_deg <= 90:
         raise InputError(f"heading_error_deg must be from 0 to 90 deg, got {heading_error_deg!r}")
-    if adopt and out.suffix == ".parquet":
+    if adopt and out.suffix.lower() == ".parquet":
         raise InputError(f"{out}: a scene reads a map layer (.usdc), not readings", parameter="adopt")
     opened = open_scene(scene_file, lab=lab, check_network=False)
     if adopt:
@@ -309,7 +310,7 @@ def survey_scene(
         "blocked": blocked_by(twin, opened.obstacles),
         "jobs": jobs,
     }
-    if out.suffix == ".parquet":
+    if out.suffix.lower() == ".parquet":
         surveyed = replace(survey_readings(twin, **options), name=name or out.stem)
         save_readings(surveyed, out, force=force)
         return surveyed.report()

@@ -107,9 +107,9 @@ def read_readings(
         if same is not source:
             twice.append(f"{source} and {same} as one, since their bytes are equal")
             continue
-        if path.is_dir() or path.suffix in BAGS:
+        if path.is_dir() or path.suffix.lower() in BAGS:
             _only_unit(path, columns)
-        if path.suffix in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
+        if path.suffix.lower() in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
             from magtwin.io.bags import read_bag_readings
 
             topics = {"pose_topic": pose_topic, "field_topic": field_topic}
@@ -249,7 +249,7 @@ def _each(sources: Sequence[Source]) -> Iterator[Source]:
                 raise InputError(f"no file or folder matches {str(source)!r}; check the pattern")
             yield from matches
         elif path.is_dir() and not (path / "metadata.yaml").is_file():
-            yield from sorted(file for file in path.iterdir() if file.suffix in PARQUET) or [path]
+            yield from sorted(file for file in path.iterdir() if file.suffix.lower() in PARQUET) or [path]
         else:
             yield source
 
@@ -275,12 +275,12 @@ def _only_unit(path: Path, columns: Columns) -> None:
 
 
 def _of_file(source: str, path: Path, columns: Columns) -> Readings:
-    if path.suffix in (".usd", ".usda", ".usdc"):
+    if path.suffix.lower() in (".usd", ".usda", ".usdc"):
         raise InputError(
             f"{path}: a stage or a map, not readings; give the survey of the map, or survey a scene "
             " (magtwin map survey)"
         )
-    if path.suffix in PARQUET and path == Path(source):
+    if path.suffix.lower() in PARQUET and path == Path(source):
         metadata = _metadata(path)
         if _SURVEY in metadata or FACTS in metadata:
             _only_unit(path, columns)
@@ -289,7 +289,7 @@ def _of_file(source: str, path: Path, columns: Columns) -> Readings:
             if _SURVEY in metadata:
                 return load_readings(path)
             return readings_of_run(read_parquet(path), name=path.stem, source=_sum(path))
-    if path == Path(source) and path.suffix in RUNS and kind_of(path) is RUN:
+    if path == Path(source) and path.suffix.lower() in RUNS and kind_of(path) is RUN:
         _only_unit(path, columns)
         if columns.scale is not None:
             raise InputError(f"{path}: its field is in nT already; leave out --scale")
@@ -305,8 +305,8 @@ def _of_file(source: str, path: Path, columns: Columns) -> Readings:
 
 def _run_of(path: Path) -> Run:
     """The run in a file of magtwin's own."""
-    if path.suffix != ".rrd":
-        return read_csv_run(path) if path.suffix == ".csv" else read_npz(path)
+    if path.suffix.lower() != ".rrd":
+        return read_csv_run(path) if path.suffix.lower() == ".csv" else read_npz(path)
     from magtwin.io.rerun.file import read_run  # imports rerun
 
     return read_run(path)
@@ -319,7 +319,7 @@ def _beside(first: Path, word: str) -> Path:
 
 
 def _read_table(path: Path) -> Table:
-    return read_parquet_table(path) if path.suffix in PARQUET else read_csv(path)
+    return read_parquet_table(path) if path.suffix.lower() in PARQUET else read_csv(path)
 
 
 def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
@@ -405,9 +405,10 @@ def _complete(table: Table, columns: Columns) -> tuple[Columns, list[str]]:
     taken = list(table.notes)
     lower = {label_of(label)[0]: label for label in reversed(table.names)}  # the first of equal names
     lower |= {label.strip().lower(): label for label in reversed(table.names)}
-    for axis in ("x", "y"):
-        if getattr(columns, axis) == axis and axis not in table.names and axis in lower:
-            columns = replace(columns, **{axis: lower[axis]})
+    if columns.x == "x" and "x" not in table.names:
+        columns = replace(columns, x=lower.get("x", "x"))
+    if columns.y == "y" and "y" not in table.names:
+        columns = replace(columns, y=lower.get("y", "y"))
     if not (columns.heading or columns.quaternion):
         label = next((name for name in HEADINGS if name in table.names), "")
         columns = replace(columns, heading=label or next((lower[n] for n in HEADINGS if n in lower), ""))
