@@ -1,8 +1,10 @@
 """The application: configuration, options that every command has, warnings, errors and exit status."""
 
+import difflib
 import errno
 import functools
 import inspect
+import os
 import re
 import signal
 import sys
@@ -12,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from cyclopts import App, Parameter
+from cyclopts import App, ArgumentCollection, Parameter
 from cyclopts.config import Env, Toml
 from cyclopts.exceptions import CycloptsError
 
@@ -20,16 +22,50 @@ from magtwin.cli.options import Json, Quiet
 from magtwin.cli.progress import watched
 from magtwin.cli.renamed import renamed
 from magtwin.cli.terminal import Done, output_mode, print_error
-from magtwin.errors import CalibrationWarning, InputError, MismatchWarning
+from magtwin.errors import CalibrationWarning, InputError, MismatchWarning, RepairWarning
 from magtwin.folders import allow
 from magtwin.version import __version__
+
+
+class _Environment(Env):
+    """Options in the environment; warns of a variable that names no option of the command."""
+
+    def __call__(self, app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
+        """Add the options in the environment to those of the command line."""
+        super().__call__(app, commands, arguments)
+        prefix = f"{self.prefix}{'_'.join(commands)}_".upper().replace("-", "_")
+        known = {_in_capitals(name): name for argument in arguments for name in argument.names}
+        for name in sorted(os.environ) if commands else ():
+            option = name.removeprefix(prefix)
+            if option != name and not _of_subcommand(commands, option):
+                try:
+                    arguments.match(option, transform=_in_capitals, delimiter="_")
+                except ValueError:
+                    words, near = " ".join(commands), difflib.get_close_matches(option, known, n=1)
+                    said = f"; did you mean {prefix}{near[0]}?" if near else ""
+                    text = f"{name}: magtwin {words} has no such option, it is ignored{said}"
+                    warnings.warn(text, RepairWarning, stacklevel=2)
+
+
+def _in_capitals(option: str) -> str:
+    """An option's name as it is in the environment."""
+    return option.upper().replace("-", "_").replace(".", "_").lstrip("_")
+
+
+def _of_subcommand(commands: tuple[str, ...], option: str) -> bool:
+    """Whether the rest of a variable's name begins with a command of this command: REPORT_OUT of bench."""
+    inside = app
+    for word in commands:
+        inside = inside[word]
+    return any(option.startswith(f"{_in_capitals(name)}_") for name in inside if not name.startswith("-"))
+
 
 app = App(
     name="magtwin",
     help="Author magnetic digital twins of labs and robots in USD, simulate what a robot's magnetometer "
     "reads, fit field maps and train neural magnetometers.",
     version=__version__,
-    config=[Env("MAGTWIN_", show=False), Toml("magtwin.toml", search_parents=False)],
+    config=[_Environment("MAGTWIN_", show=False), Toml("magtwin.toml", search_parents=False)],
     default_parameter=Parameter(negative_iterable="", negative_none=""),
     help_epilogue="Options can also be set in the environment (MAGTWIN_RUN_SEED=1) and in magtwin.toml. "
     "Exit status: 0 done, 1 an input was refused, 2 wrong usage. Each command also takes --debug, which "
@@ -233,7 +269,7 @@ def _warnings_in_lines() -> Iterator[None]:
     """Print each warning once, as a line on stderr."""
     printed: set[str] = set()
     with warnings.catch_warnings():
-        for own in (MismatchWarning, CalibrationWarning):
+        for own in (MismatchWarning, CalibrationWarning, RepairWarning):
             warnings.simplefilter("always", own)
 
         def line(message: Warning | str, *_: Any, **__: Any) -> None:

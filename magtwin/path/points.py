@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from magtwin.delimited import DEGREES, LENGTHS, QUOTED, Delimited, label_of, number_of, read_delimited
-from magtwin.errors import InputError, hint
+from magtwin.errors import InputError, RepairWarning, hint
 from magtwin.kinds import expected
 from magtwin.path.curves import CASES, PATHS, path_named
 from magtwin.path.polyline import SAME_M, Path, without_repeats
@@ -85,7 +85,7 @@ def read_path_csv(file: str | os.PathLike[str]) -> Path:
     if len(without_repeats(np.array(points).reshape(-1, 2))) < 2:
         raise InputError(f"{file}: only {len(points[:1])} point in it; a path needs two that differ")
     if notes:
-        warnings.warn(f"{file}: read {'; '.join(notes)}", stacklevel=2)
+        warnings.warn(f"{file}: read {'; '.join(notes)}", RepairWarning, stacklevel=2)
     return path_of_points(points, file.name, file.as_posix())
 
 

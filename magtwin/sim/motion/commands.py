@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.delimited import QUOTED, number_of, read_delimited
-from magtwin.errors import InputError
+from magtwin.errors import InputError, RepairWarning
 from magtwin.kinds import expected
 from magtwin.outputs import output
 from magtwin.spec.drive import DriveSpec
@@ -92,7 +92,7 @@ def read_commands(file: str | os.PathLike[str]) -> Commands:
             )
         rows.append((t, v, w))
     if notes := [*text.notes, *(["t, v and w by their names"] if columns != [0, 1, 2] else [])]:
-        warnings.warn(f"{file}: read {'; '.join(notes)}", stacklevel=2)
+        warnings.warn(f"{file}: read {'; '.join(notes)}", RepairWarning, stacklevel=2)
     return Commands(file.name, np.array(rows), file.as_posix())
 
 

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pxr import Gf, Usd, UsdGeom
 
 from magtwin.cli import main
-from magtwin.errors import InputError
+from magtwin.errors import InputError, RepairWarning
 from magtwin.files import shipped
 from magtwin.folders import allow
 from magtwin.io.tables import read_parquet
@@ -124,7 +124,7 @@ def test_commands_are_read_as_they_were_written(tmp_path):
 
 def test_commands_of_a_spreadsheet_are_read_with_a_note(tmp_path):
     (tmp_path / "c.csv").write_text(";w;v;t\n0;0,5;0,1;0,0\n1;-0,5;0,2;1,5\n", encoding="utf-8")
-    with pytest.warns(UserWarning, match="read numbers with decimal commas; t, v and w by their names"):
+    with pytest.warns(RepairWarning, match="read numbers with decimal commas; t, v and w by their names"):
         commands = read_commands(tmp_path / "c.csv")
     assert commands.rows.tolist() == [[0.0, 0.1, 0.5], [1.5, 0.2, -0.5]]
 
