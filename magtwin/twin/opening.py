@@ -154,7 +154,8 @@ def scene_file(scene: str | FilePath) -> FilePath:
 def shipped_or(file: str | FilePath) -> FilePath:
     """The stage of a shipped scene's name such as "lab", if there is no file of that name; else the path."""
     path = FilePath(file)
-    return path if path.exists() else _shipped_stages().get(str(file), path)
+    stage = _shipped_stages().get(str(file))
+    return path if stage is None or path.exists() else stage
 
 
 def _shipped_stages() -> dict[str, FilePath]:
