@@ -74,6 +74,10 @@ class MismatchWarning(UserWarning):
     """A network is used where it was not trained, or a map where the lab is no longer as it was."""
 
 
+class RepairWarning(UserWarning):
+    """An input was repaired, or an option is not followed to the letter; the text says how."""
+
+
 class CalibrationWarning(UserWarning):
     """A drive is poorly suited to calibrate a model."""
 

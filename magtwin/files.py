@@ -194,7 +194,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     Raises:
         InputError: The file is missing, too large, nests too deep, or is not TOML; the text has the line.
     """
-    return parse_toml(read_text(path, "TOML file", "TOML"), path)
+    return parse_toml(read_text(path, "TOML file", "TOML", "utf-8-sig"), path)
 
 
 def parse_toml(text: str, where: object) -> dict[str, Any]:
@@ -333,7 +333,7 @@ class _Where:
     def _line(self, key: str) -> int | None:
         """Line of a key, or of the table if it has none; None if the file cannot be read."""
         try:
-            lines = self.path.read_text(encoding="utf-8").splitlines()
+            lines = self.path.read_text(encoding="utf-8-sig").splitlines()
         except OSError:
             return None
         here, counts, header = self._place(), dict[_Place, int](), 0

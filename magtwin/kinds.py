@@ -6,6 +6,7 @@ of a fault of the parser. Kinds of USD files are told apart in `magtwin.usd`.
 
 import os
 import re
+from codecs import BOM_UTF8
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -207,7 +208,7 @@ def _kind_of_csv(path: Path) -> Kind:
     lines = [line.strip() for line in _head(path).decode("utf-8", "replace").splitlines()]
     if lines and lines[0].startswith("# magtwin run"):
         return RUN
-    words = next((line.lstrip("\ufeff") for line in lines if line and not line.startswith("#")), "")
+    words = next((line for line in lines if line and not line.startswith("#")), "")
     names = [word.strip().strip('"').lower() for word in words.split(",")]
     return PATH if names == ["x", "y"] else COMMANDS if names == ["t", "v", "w"] else TABLE
 
@@ -227,7 +228,7 @@ def _kind_of_json(path: Path) -> Kind:
 
 def _head(path: Path) -> bytes:
     with path.open("rb") as file:
-        return file.read(HEAD)
+        return file.read(HEAD).removeprefix(BOM_UTF8)
 
 
 _BY_SUFFIX: dict[str, Callable[[Path], Kind | None]] = {

@@ -17,7 +17,7 @@ from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files import existing, sha256
 from magtwin.io.formats import read_run
-from magtwin.io.surveys.maps import open_map
+from magtwin.io.surveys.maps import map_file, open_map
 from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import MANIFEST, Dataset, open_dataset
 from magtwin.learn.data.dataset import build_dataset as build
@@ -43,7 +43,7 @@ from magtwin.learn.models.predictor import Predictor, load_predictor
 from magtwin.outputs import check_free
 from magtwin.run.run import Run
 from magtwin.spec.scene import Scene
-from magtwin.twin import Twin, check_scene, in_session_of, open_twin
+from magtwin.twin import Twin, check_scene, in_session_of, open_twin, scene_file
 from magtwin.usd.scene import read_scene
 
 File = str | os.PathLike[str]
@@ -96,7 +96,7 @@ def build_dataset(
     if not isinstance(anomaly_map, AnomalyMap):
         from magtwin.usd.layers import layer_sha256
 
-        path = Path(anomaly_map)
+        path = map_file(anomaly_map)
         anomaly_map, checksum = open_map(path), layer_sha256(path) if path.is_file() else ""
     return build(
         sources,
@@ -265,7 +265,7 @@ def calibrate(
         model, parent = load_predictor(path), {"parent": path.name, "parent_sha256": sha256(path)}
     if not isinstance(run, Run):
         name, run = Path(run).name, read_run(Path(run), **reading)
-    field = anomaly_map if isinstance(anomaly_map, AnomalyMap) else open_map(existing(anomaly_map, "map"))
+    field = anomaly_map if isinstance(anomaly_map, AnomalyMap) else open_map(anomaly_map)
     calibrated = calibrate_model(
         model,
         run,
@@ -344,7 +344,7 @@ def error_budget(
 
 def map_of_scene(scene: File) -> Path:
     """File of the map of a scene."""
-    return Path(read_scene(existing(scene, "scene"), check_network=False).map_layer)
+    return Path(read_scene(scene_file(Path(scene)), check_network=False).map_layer)
 
 
 def short_names(files: Sequence[Path]) -> list[str]:
@@ -382,7 +382,7 @@ def _named_maps(maps: Sequence[AnomalyMap | File]) -> list[NamedMap]:
         if isinstance(each, AnomalyMap):
             named.append(named_map(each.name, each))
         else:
-            path = existing(each, "map")
+            path = map_file(each)
             checksum = [layer_sha256(path)] if path.is_file() else []
             named.append(named_map(next(files), open_map(path), *checksum))
     if not named:

@@ -19,7 +19,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.files import existing, sha256
 from magtwin.frames import wrap_angle, yaw_from_quat
 from magtwin.io.formats import read_run
-from magtwin.io.surveys.maps import open_map
+from magtwin.io.surveys.maps import map_file, open_map
 from magtwin.localization.bounds import Bounds, bounds
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.odometry import Odometry
@@ -40,7 +40,7 @@ from magtwin.outputs import output
 from magtwin.own_field import with_own_field
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run, numbers_in
-from magtwin.twin import Twin, scene_file
+from magtwin.twin import Twin
 
 RATE_HZ = 5.0
 """Default rate of readings that a localizer gets [Hz]."""
@@ -304,7 +304,7 @@ def live_problem(
     """
     belief: FieldBelief | None = twin.field
     if isinstance(anomaly_map, str | os.PathLike):
-        belief = None if str(anomaly_map) == "none" else open_map(map_file(anomaly_map))
+        belief = None if str(anomaly_map) == "none" else open_map(anomaly_map)
     elif anomaly_map is not None:
         belief = anomaly_map
     x, y = (side / 2 for side in twin.scene.lab.floor_m)
@@ -483,24 +483,6 @@ def extent_of(run: Run, belief: FieldBelief | None) -> tuple[float, float, float
     p = run["p_world_base" if "p_world_base" in run else "odom_p"][:, :2]
     (x0, y0), (x1, y1) = np.nanmin(p, axis=0) - 1.0, np.nanmax(p, axis=0) + 1.0
     return float(x0), float(x1), float(y0), float(y1)
-
-
-def map_file(source: Source) -> Path:
-    """The file of a map: a layer, a stage, a folder of CSVs, or the stage of a shipped scene's name.
-
-    Raises:
-        InputError: There is no such file or scene.
-    """
-    path = Path(source)
-    if path.is_dir() and not (path / f"{path.resolve().name}.usda").is_file():
-        return path
-    if path.is_file():
-        return path
-    try:
-        return Path(scene_file(path))
-    except InputError as error:
-        text = f"{source}: no map layer, stage, folder of CSVs or shipped scene: {error}"
-        raise InputError(text) from error
 
 
 def check_map(run: Run, anomaly_map: AnomalyMap, file: Path) -> None:

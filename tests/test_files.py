@@ -9,6 +9,7 @@ import pytest
 
 from magtwin.errors import InputError
 from magtwin.files import existing, from_table, read_toml, refused_at, sha256, shipped
+from magtwin.kinds import SCENE_TOML, kind_of
 from magtwin.outputs import check_free, output
 
 
@@ -78,6 +79,16 @@ def test_a_table_becomes_the_dataclass_with_nested_tables_and_paths_from_its_fol
 def test_a_wrong_table_is_refused_with_file_line_and_what_was_seen(tmp_path, text, message):
     with pytest.raises(InputError, match=message):
         read_cart(tmp_path, text)
+
+
+def test_a_toml_with_a_byte_order_mark_is_read_and_its_lines_are_named(tmp_path):
+    file = tmp_path / "cart.toml"
+    file.write_text('lap = 2\nname = "a"\n', encoding="utf-8-sig")
+    assert read_toml(file) == {"lap": 2, "name": "a"}
+    with pytest.raises(InputError, match=r"cart\.toml:1: unknown key 'lap'"):
+        from_table(Cart, read_toml(file), file)
+    file.write_text('[lab]\nname = "a"\n', encoding="utf-8-sig")
+    assert kind_of(file) is SCENE_TOML
 
 
 def test_a_missing_file_is_refused_by_the_near_name(tmp_path):

@@ -13,36 +13,23 @@ from pathlib import Path
 from typing import Any
 
 from cyclopts import App, Parameter
-from cyclopts.config import Env, Toml
 from cyclopts.exceptions import CycloptsError
 
 from magtwin.cli.options import Json, Quiet
 from magtwin.cli.progress import watched
 from magtwin.cli.renamed import renamed
+from magtwin.cli.settings import Environment, Settings
 from magtwin.cli.terminal import Done, output_mode, print_error
-from magtwin.errors import CalibrationWarning, InputError, MismatchWarning
+from magtwin.errors import CalibrationWarning, InputError, MismatchWarning, RepairWarning
 from magtwin.folders import allow
 from magtwin.version import __version__
-
-
-class Settings(Toml):
-    """Options in magtwin.toml of the working folder, read as any TOML of a user."""
-
-    def _load_config(self, path: Path) -> dict[str, Any]:
-        from magtwin.files import read_toml
-
-        try:
-            return read_toml(path)
-        except InputError as error:
-            raise CycloptsError(msg=str(error)) from error
-
 
 app = App(
     name="magtwin",
     help="Author magnetic digital twins of labs and robots in USD, simulate what a robot's magnetometer "
     "reads, fit field maps and train neural magnetometers.",
     version=__version__,
-    config=[Env("MAGTWIN_", show=False), Settings("magtwin.toml")],
+    config=[Environment("MAGTWIN_", show=False), Settings("magtwin.toml")],
     default_parameter=Parameter(negative_iterable="", negative_none=""),
     help_epilogue="Options can also be set in the environment (MAGTWIN_RUN_SEED=1) and in magtwin.toml. "
     "Exit status: 0 done, 1 an input was refused, 2 wrong usage. Each command also takes --debug, which "
@@ -255,7 +242,7 @@ def _warnings_in_lines() -> Iterator[None]:
     """Print each warning once, as a line on stderr."""
     printed: set[str] = set()
     with warnings.catch_warnings():
-        for own in (MismatchWarning, CalibrationWarning):
+        for own in (MismatchWarning, CalibrationWarning, RepairWarning):
             warnings.simplefilter("always", own)
 
         def line(message: Warning | str, *_: Any, **__: Any) -> None:

@@ -166,7 +166,11 @@ UsdFps = Annotated[
     Parameter(name="--usd-fps", help="Frames per second in USD. 0: one per reading. Default: 30."),
 ]
 RunScene = Annotated[
-    Path | None, Parameter(help="Scene of the run. Default: the one that the run's metadata names.")
+    Path | None,
+    Parameter(
+        help="Scene of the run: its stage, or a shipped scene's name, lab. Default: the one that the run's "
+        "metadata names."
+    ),
 ]
 OURS_THEIRS = "OURS:=THEIRS, such as /robot/enu/pose:=/vrpn/pose"
 Remap = Annotated[

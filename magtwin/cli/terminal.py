@@ -162,7 +162,7 @@ class _Escaped:
 
 def check_suffix(path: Path, suffixes: tuple[str, ...], what: str) -> None:
     """Refuse an output whose name has another suffix."""
-    if path.suffix not in suffixes:
+    if path.suffix.lower() not in suffixes:
         raise InputError(f"{path}: {what} ends in {' or '.join(suffixes)}")
 
 

@@ -68,7 +68,7 @@ def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> P
     files = {Path(layer.realPath).resolve(): layer for layer in layers}
     others = [Path(asset).resolve() for asset in assets]
     for name in lost:
-        if Path(name).suffix != ".mdl" or "/" in name:  # a material of Omniverse, such as OmniPBR.mdl
+        if Path(name).suffix.lower() != ".mdl" or "/" in name:  # a material of Omniverse, such as OmniPBR.mdl
             raise InputError(
                 f"{_namer(layers, name)}: names {name}, which does not exist; add the file or remove the name"
             )
@@ -125,12 +125,12 @@ _ASSETS = (Sdf.ValueTypeNames.Asset, Sdf.ValueTypeNames.AssetArray)
 
 def _check_carried(file: Path, layers: Iterable[Sdf.Layer], within: Path | None) -> None:
     """Refuse a file that must not be exported."""
-    if "[" in file.as_posix() or file.suffix == ".usdz":
+    if "[" in file.as_posix() or file.suffix.lower() == ".usdz":
         text = "a part of a package; unpack that with `magtwin export FILE.usdz --out DIR`, and name a "
         text += "layer in it"
     elif within is not None and not file.is_relative_to(within.resolve()):
         text = "outside its package; a package must contain all of its files"
-    elif file.suffix not in SUFFIXES and not kind_of(file):
+    elif file.suffix.lower() not in SUFFIXES and not kind_of(file):
         text = "which is no layer, texture, network or path, so it is not exported; remove the name"
     else:
         return

@@ -45,7 +45,7 @@ def export_world(
     Raises:
         InputError: The scene cannot be read, or `out` is not a .sdf file or exists.
     """
-    if Path(out).suffix != ".sdf":
+    if Path(out).suffix.lower() != ".sdf":
         raise InputError(f"{out}: a world of Gazebo is a .sdf file", parameter="out")
     opened = open_scene(scene_file)
     scene = opened.scene

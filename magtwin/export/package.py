@@ -135,7 +135,7 @@ def export_scene(
             written.
     """
     scene_file, out = Path(scene_file), Path(out)
-    if (kind := KINDS.get(out.suffix)) is None:
+    if (kind := KINDS.get(out.suffix.lower())) is None:
         raise InputError(f"{out}: an export is a folder (no suffix), or ends in .usdz, .usd, .usdc or .glb")
     name: str = profile or ("omniverse" if kind in ("folder", "package") else "viewer")
     find("profile", name, PROFILES)
@@ -190,7 +190,7 @@ def _renamed(copy: Path, scene_file: Path) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        there = scene_file if scene_file.suffix == ".usdz" else scene_file.parent
+        there = scene_file if scene_file.suffix.lower() == ".usdz" else scene_file.parent
         text = str(error)
         for folder in (copy.with_name("package"), copy):
             for path in (folder.resolve(), folder):
@@ -217,7 +217,7 @@ class _Work:
         """Copy the stage and all that it names into the folder."""
         self.progress("Gathering files")
         self.folder.mkdir()
-        if self.source.suffix == ".usdz":
+        if self.source.suffix.lower() == ".usdz":
             package = self.folder.with_name("package")
             package.mkdir()
             root = unpack(self.source, package)
@@ -371,7 +371,7 @@ class _Work:
                     f"{self.source}: {self._relative(file)} cannot be part of a layer; "
                     "give a folder or a .usdz"
                 )
-        if out.suffix == ".usd":
+        if out.suffix.lower() == ".usd":
             self.root = self.root.rename(self.root.with_suffix(".usd"))
         shutil.move(self.root, out)
 

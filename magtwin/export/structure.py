@@ -27,7 +27,7 @@ def structure(asset: Path) -> None:
     named = sorted(layer.GetCompositionAssetDependencies())
     if f"./{PAYLOADS}/base.usda" in named:
         return
-    if not layer.defaultPrim or len(named) > 1 or folder.exists() or asset.suffix != ".usda":
+    if not layer.defaultPrim or len(named) > 1 or folder.exists() or asset.suffix.lower() != ".usda":
         raise InputError(
             f"{asset}: is not a robot in one text layer and one layer of meshes, as Isaac Sim's structure "
             "needs; convert its URDF with `magtwin robot`"

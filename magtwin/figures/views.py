@@ -41,7 +41,9 @@ def view(files: Sequence[Source], *, scene: Source | None = None, offsets_s: Seq
     Raises:
         InputError: A file cannot be read, or there is no viewer.
     """
-    paths = [Path(file) for file in files]
+    from magtwin.twin import shipped_or
+
+    paths = [shipped_or(file) for file in files]
     if not paths:
         raise InputError("name a run or a stage to view")
     if offsets_s and (len(offsets_s) != len(paths) or len(paths) < 2):
@@ -51,7 +53,7 @@ def view(files: Sequence[Source], *, scene: Source | None = None, offsets_s: Seq
         )
     if len(paths) > 1:
         _view_together(paths, scene, offsets_s or [0.0] * len(paths))
-    elif paths[0].suffix in STAGES and not paths[0].is_dir():
+    elif paths[0].suffix.lower() in STAGES and not paths[0].is_dir():
         _view_stage(paths[0])
     else:
         _view_run(paths[0], scene)
@@ -86,13 +88,15 @@ def picture(
     """
     from magtwin.figures.pictures import check_png, picture_of_stage
     from magtwin.figures.scenery import View, picture_of_run
+    from magtwin.twin import shipped_or
 
-    file, out = existing(file, "run, stage or recording"), check_free(check_png(out), force=force)
-    if file.suffix == ".rrd" and camera is None and scene is None:
+    file = existing(shipped_or(file), "run, stage or recording")
+    out = check_free(check_png(out), force=force)
+    if file.suffix.lower() == ".rrd" and camera is None and scene is None:
         from magtwin.io.rerun.viewer import screenshot
 
         return screenshot(file, out, time_s=time_s, size=size, force=force)
-    if file.suffix in STAGES and time_s is None and scene is None:
+    if file.suffix.lower() in STAGES and time_s is None and scene is None:
         if camera == "chase":
             raise InputError(f"{file}: a stage has no run to follow; take another camera", parameter="camera")
         seen = None if camera is None else View.of(camera).camera()
@@ -150,9 +154,12 @@ def report_runs(
         progress: Called with the number of runs done, the number in all and the current step.
 
     Raises:
-        InputError: A run cannot be read, or the page cannot be written.
+        InputError: A run or `scene` cannot be read, or the page cannot be written.
     """
+    from magtwin.twin import scene_file
+
     out = check_free(out, force=force)
+    scene = None if scene is None else scene_file(scene)
     files = [file for source in runs for file in runs_in(Path(source))]
     names = [file.name for file in files]
     named = []
@@ -163,11 +170,13 @@ def report_runs(
             field = map_of(run, scene, near=file)
         except InputError as error:
             note = f"Its map is not shown: {error}."
+            if scene is not None:
+                warnings.warn(f"{file}: its map is not shown: {error}", MismatchWarning, stacklevel=2)
         name = file.name if names.count(file.name) == 1 else str(file)
         named.append(NamedRun(name, run, field, planned_of(run, near=file), note))
-    pictured = out.suffix == ".html" and len(named) <= MOST_PICTURED
+    pictured = out.suffix.lower() == ".html" and len(named) <= MOST_PICTURED
     page = page_of_runs(named, pictures=pictured, advance=lambda done: progress(done, len(named), "drawing"))
-    if out.suffix == ".html" and not pictured:
+    if out.suffix.lower() == ".html" and not pictured:
         page = replace(page, lead=f"{page.lead} Pages of more than {MOST_PICTURED} runs have no pictures.")
     write_page(page, out, force=force)
 
@@ -196,7 +205,7 @@ def compare_files(
     name_a, name_b = names_of(a, b)
     named = NamedRun(name_a, read_run(a)), NamedRun(name_b, read_run(b))
     comparison = compare(named[0].run, named[1].run, align=align)
-    if out is not None and Path(out).suffix in (".png", ".svg"):
+    if out is not None and Path(out).suffix.lower() in (".png", ".svg"):
         save(draw_comparison(*named, comparison), out, force=force)
     elif out is not None:
         write_page(page_of_comparison(*named, comparison), out, force=force)
@@ -233,7 +242,7 @@ def _view_run(file: Path, scene: Source | None) -> None:
     from magtwin.io.rerun.viewer import show
 
     existing(file, "run")
-    if file.suffix == ".rrd" and scene is None:
+    if file.suffix.lower() == ".rrd" and scene is None:
         show(file)
     else:
         run = read_run(file)
@@ -263,7 +272,7 @@ def _view_stage(file: Path) -> None:
         result = subprocess.run([usdview, str(file)], check=False)
         if result.returncode:
             raise InputError(f"{file}: usdview ended with status {result.returncode}")
-    elif file.suffix != ".usdz" and is_animation(file):
+    elif file.suffix.lower() != ".usdz" and is_animation(file):
         _view_run(file, file)
     else:
         from magtwin.figures.pictures import show_stage

@@ -17,6 +17,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from magtwin.errors import InputError, hint
@@ -154,16 +155,22 @@ def write_run(
 
 
 def format_of(path: Path) -> Format:
-    """The format of a file by its suffix; a bag if it has none.
+    """The format of a file by its suffix, in any case; a bag if it has none.
 
     Raises:
         InputError: The suffix is unknown.
     """
     if not path.suffix:
         return BAG
-    if path.suffix not in FORMATS:
+    suffix = path.suffix if path.suffix in FORMATS else path.suffix.lower()
+    if suffix == ".usdz":
+        raise InputError(
+            f"{path}: a package; give the run that was put into it, or unpack it (magtwin export "
+            f"{quote(str(path))} --out FOLDER) and give the layer of the run, ..._run.usdc"
+        )
+    if suffix not in FORMATS:
         raise InputError(f"{path}: unknown format of a run; {hint(path.suffix, dict.fromkeys(FORMATS))}")
-    return FORMATS[path.suffix]
+    return FORMATS[suffix]
 
 
 def _function(function: Function | str) -> Function:

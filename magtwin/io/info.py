@@ -12,6 +12,7 @@ from magtwin.files import existing
 from magtwin.io.formats import FORMATS, read_run
 from magtwin.kinds import kind_of
 from magtwin.report import Figure, Report
+from magtwin.twin import shipped_or
 
 STAGES = (".usd", ".usda", ".usdc", ".usdz")
 NETWORKS = (".safetensors", ".pth", ".onnx")
@@ -27,17 +28,17 @@ def info_of(path: str | os.PathLike[str]) -> Report:
     Raises:
         InputError: The file is missing, of an unknown kind, or damaged.
     """
-    file = existing(path, "file")
+    file = existing(shipped_or(Path(path)), "file")
     if file.is_dir():
         return map_metadata(read_survey(file)[0]) if any(file.glob("*_map.csv")) else info_of_run(file)
-    if file.suffix in NETWORKS:
+    if file.suffix.lower() in NETWORKS:
         from magtwin.learn.inference.onnx import report_onnx
         from magtwin.learn.models.predictor import load_predictor
 
-        return report_onnx(file) if file.suffix == ".onnx" else load_predictor(file).report(str(file))
-    if file.suffix in STAGES:
+        return report_onnx(file) if file.suffix.lower() == ".onnx" else load_predictor(file).report(str(file))
+    if file.suffix.lower() in STAGES:
         return _info_of_usd(file)
-    if file.suffix in FORMATS:
+    if file.suffix.lower() in FORMATS:
         return info_of_run(file)
     if kind := kind_of(file):
         raise InputError(f"{file}: is {kind.noun}; {kind.remedy.format(file=file)}")
@@ -63,13 +64,13 @@ def _info_of_usd(file: Path) -> Report:
     from magtwin.usd.info import info_of_stage
     from magtwin.usd.maps.layer import is_map_layer, load_epochs
 
-    if file.suffix != ".usdz" and is_animation(file):
+    if file.suffix.lower() != ".usdz" and is_animation(file):
         run = info_of_run(file)
         try:
             return _with_figures(run, info_of_stage(file).figures)
         except InputError as error:  # the scene is missing, the run is complete
             return replace(run, metadata={**run.metadata, "stage": str(error)})
-    if file.suffix == ".usdz" or not is_map_layer(file):
+    if file.suffix.lower() == ".usdz" or not is_map_layer(file):
         return info_of_stage(file)
     epochs = load_epochs(file)
     card = map_metadata(epochs[-1], epochs)

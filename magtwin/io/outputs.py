@@ -169,7 +169,7 @@ class Outputs:
         for file in files:
             if not format_of(file).write:
                 raise InputError(f"{file}: {format_of(file).name} is read, not written; name another format")
-        tables = tuple(_scans_of(file) for file in files if scans and file.suffix == ".parquet")
+        tables = tuple(_scans_of(file) for file in files if scans and file.suffix.lower() == ".parquet")
         made = cls(folders[0] if folders else None, files, tables, **options)
         targets = made.targets
         if len({target.resolve() for target in targets}) < len(targets):
@@ -190,7 +190,7 @@ class Outputs:
     def of_robot(self, robot: str) -> "Outputs":
         """Outputs of one robot of several: run.NAME.rrd in place of run.rrd."""
         files = tuple(_with_name(file, robot) for file in self.files)
-        tables = tuple(_scans_of(file) for file in files if self.scans and file.suffix == ".parquet")
+        tables = tuple(_scans_of(file) for file in files if self.scans and file.suffix.lower() == ".parquet")
         return replace(self, files=files, scans=tables, robot=robot)
 
     @contextmanager
@@ -200,7 +200,7 @@ class Outputs:
             stack.enter_context(transaction())
             places: dict[Path, Path] = {}
             for target in self.targets:
-                if target.suffix in USD:  # names its scene by a relative path: written in place, last
+                if target.suffix.lower() in USD:  # names its scene by a relative path: written in place, last
                     places[target] = check_free(target, force=self.force)
                 else:
                     places[target] = stack.enter_context(output(target, force=self.force))
@@ -243,7 +243,7 @@ class Outputs:
     def check_live(self) -> None:
         """Refuse partial files of an earlier run that was shown live."""
         for target in self._runs():
-            if target.suffix in (".rrd", ".mcap", ".db3"):
+            if target.suffix.lower() in (".rrd", ".mcap", ".db3"):
                 check_free(partial_of(target), force=self.force)
 
     def sinks(self, driven: Driven) -> list[Sink]:
@@ -255,11 +255,11 @@ class Outputs:
         shown: dict[str, Any] = {"planned": driven.planned, "scans": driven.scans, "force": self.force}
         sinks: dict[str, Any] = {}
         for target in self._runs():
-            if target.suffix == ".rrd" and ".rrd" not in sinks:
+            if target.suffix.lower() == ".rrd" and ".rrd" not in sinks:
                 sinks[".rrd"] = RrdWriter(target, driven.twin, expected=driven.run, **shown)
-            elif target.suffix == ".parquet" and ".parquet" not in sinks:
+            elif target.suffix.lower() == ".parquet" and ".parquet" not in sinks:
                 sinks[".parquet"] = ParquetParts(target, force=self.force)
-            elif target.suffix == ".mcap":
+            elif target.suffix.lower() == ".mcap":
                 options = {"units": self.out_unit or "T", "scans": driven.scans, "force": self.force}
                 sinks[str(target)] = BagWriter(target, driven.twin, **options)  # type: ignore[arg-type]
         return list(sinks.values())
@@ -267,12 +267,12 @@ class Outputs:
     def write(self, driven: Driven, *, recorded: bool = False) -> None:
         """Write the run to every target, each format once; `recorded` formats are there already."""
         written: dict[str, Path] = {}
-        for target in sorted(self._runs(), key=lambda file: file.suffix in USD):
-            if target.suffix in written:
-                shutil.copyfile(written[target.suffix], target)
+        for target in sorted(self._runs(), key=lambda file: file.suffix.lower() in USD):
+            if target.suffix.lower() in written:
+                shutil.copyfile(written[target.suffix.lower()], target)
                 continue
-            written[target.suffix] = target
-            if recorded and target.suffix in GROWING:
+            written[target.suffix.lower()] = target
+            if recorded and target.suffix.lower() in GROWING:
                 continue
             takes, options = format_of(target).takes, dict[str, Any]()
             if self.out_unit is not None and "units" in takes:

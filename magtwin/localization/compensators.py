@@ -211,7 +211,7 @@ class TollesLawson(Linear):
 
 def is_weights(compensator: str) -> bool:
     """Whether a compensator is given by a file of weights, not by name."""
-    return Path(compensator).suffix in WEIGHTS
+    return Path(compensator).suffix.lower() in WEIGHTS
 
 
 def compensated(run: Run, fitted: Compensator) -> Run:

@@ -57,7 +57,7 @@ class OccupancyGrid(Summarized):
             InputError: The suffix is not .yaml, or a file exists and `force` is False.
         """
         file = FilePath(path)
-        if file.suffix != ".yaml":
+        if file.suffix.lower() != ".yaml":
             raise InputError(f"{file}: the map of map_server is a .yaml file", parameter="out")
         picture = file.with_suffix(".pgm")
         for each in (file, picture):

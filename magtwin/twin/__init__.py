@@ -4,7 +4,16 @@
 """
 
 from magtwin.twin.authoring import author_scene, new_scene, scene_from_toml
-from magtwin.twin.opening import check_scene, led_by, locate, open_twin, scene_file, scene_of, twin_of
+from magtwin.twin.opening import (
+    check_scene,
+    led_by,
+    locate,
+    open_twin,
+    scene_file,
+    scene_of,
+    shipped_or,
+    twin_of,
+)
 from magtwin.twin.robot_scene import scene_with_robot
 from magtwin.twin.simulation import engine_named, path_metadata, scan, simulate, simulate_robots
 from magtwin.twin.sweeps import MIXTURE, sweep
@@ -44,6 +53,7 @@ __all__ = [
     "scene_from_toml",
     "scene_of",
     "scene_with_robot",
+    "shipped_or",
     "simulate",
     "simulate_robots",
     "sweep",

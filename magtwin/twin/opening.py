@@ -141,17 +141,27 @@ def scene_file(scene: str | FilePath) -> FilePath:
         InputError: The file is missing, there is no scene of that name, or it is a TOML.
     """
     file = FilePath(scene)
-    if file.suffix == ".toml" and kind_of(file) in (None, TOML, SCENE_TOML):
+    if file.suffix.lower() == ".toml" and kind_of(file) in (None, TOML, SCENE_TOML):
         raise InputError(f"{scene}: describes a scene; author it first: magtwin scene {scene} --out FOLDER")
     inside = file / f"{file.resolve().name}.usda"
     if inside.is_file():
         return inside
     if file.suffix or file.exists() or len(file.parts) > 1:
         return expected(file, "scene")
-    stages = {
-        stage.stem: stage for stage in shipped("scenes").glob("*/*.usda") if stage.stem == stage.parent.name
-    }
-    return find("scene", str(scene), stages)
+    return find("scene", str(scene), _shipped_stages())
+
+
+def shipped_or(file: str | FilePath) -> FilePath:
+    """The stage of a shipped scene's name such as "lab", if there is no file of that name; else the path."""
+    path = FilePath(file)
+    stage = _shipped_stages().get(str(file))
+    return path if stage is None or path.exists() else stage
+
+
+def _shipped_stages() -> dict[str, FilePath]:
+    """Stages that ship with magtwin, by name."""
+    stages = shipped("scenes").glob("*/*.usda")
+    return {stage.stem: stage for stage in stages if stage.stem == stage.parent.name}
 
 
 def opened(
@@ -365,7 +375,7 @@ def scene_of(
         InputError: The metadata name none, or it is missing.
     """
     if scene is not None:
-        return expected(scene, "scene")
+        return scene_file(scene)
     if "scene_file" not in run.metadata:
         raise InputError("the run does not name its scene; name it with `scene`", parameter="scene")
     place = locate(str(run.metadata["scene_file"]), near)

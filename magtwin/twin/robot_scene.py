@@ -65,7 +65,7 @@ def scene_with_robot(
         authoring._WORKSHOPS.append(tempfile.TemporaryDirectory(prefix="magtwin-"))
         workshop = authoring._WORKSHOPS[-1].name
     asset, stem = file, file.name.lstrip(".").split(".")[0] or "robot"
-    if file.suffix in (".urdf", ".xacro", ".xml"):
+    if file.suffix.lower() in (".urdf", ".xacro", ".xml"):
         options = Options(
             profile="diff-drive",
             controllers=None if controllers is None else existing(FilePath(controllers), "controllers"),

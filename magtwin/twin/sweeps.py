@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, RepairWarning
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.path import Path
 from magtwin.run.run import Run
@@ -247,6 +248,9 @@ def _twins(
     if not isinstance(sessions, int | np.integer) or isinstance(sessions, bool) or sessions < 1:
         raise InputError(f'sessions must be a whole number from 1 up, or "survey", got {sessions!r}')
     most = min(int(sessions), count)
+    if most < sessions:
+        text = f"{sessions} sessions of {count} run{'s' if count > 1 else ''}: only {most} can be driven"
+        warnings.warn(text, RepairWarning, stacklevel=3)
     numbered = [in_session(twin, k, seed=seed) for k in range(most)]
     return [numbered[k * most // count] for k in range(count)]
 

@@ -133,7 +133,7 @@ def write_animation(
             run has no clock or no pose, or a column that USD cannot hold; or the scene has no robot.
     """
     path = Path(path)
-    if path.suffix not in SUFFIXES:
+    if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: a USD file ends in {', '.join(SUFFIXES)}")
     if fps is not None and not 0 < fps <= MOST_FPS:
         raise InputError(f"fps must be above 0 and at most {MOST_FPS:g}, got {fps!r}")

@@ -52,7 +52,7 @@ def new_stage(
         InputError: The suffix is not USD's, or the file exists and `force` was not given.
     """
     path = Path(path)
-    if path.suffix not in SUFFIXES:
+    if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: a USD file ends in {', '.join(SUFFIXES)}")
     with output(path, force=force) as aside:
         stage = Usd.Stage.CreateNew(str(aside))
@@ -145,13 +145,13 @@ def check_stage(path: str | os.PathLike[str], *, composed: bool = True, own: boo
     path = existing(path, "USD file")
     if path.is_dir():
         raise InputError(f"{path}: a folder; give a USD file in it")
-    if path.suffix not in USD_SUFFIXES:
+    if path.suffix.lower() not in USD_SUFFIXES:
         if kind := kind_of(path):
             raise refused(path, kind, "USD file")
         raise InputError(f"{path}: no USD file; its name must end in {', '.join(USD_SUFFIXES)}")
     if not path.stat().st_size:
         raise InputError(f"{path}: is empty (0 bytes); make or copy it again")
-    binary = _is_crate(path) or path.suffix == ".usdz"
+    binary = _is_crate(path) or path.suffix.lower() == ".usdz"
     existing_file(path, "USD file", "USD" if binary else "USD text")
     if not binary:
         _check_nesting(path)
@@ -257,7 +257,7 @@ def check_not_part(stage: Usd.Stage, out: str | os.PathLike[str]) -> None:
 def export_like(layer: Sdf.Layer, path: Path, out: Path) -> None:
     """Write a layer to another file, as text or crate as the file `path` is."""
     kind = "usdc" if _is_crate(path) else "usda"
-    layer.Export(str(out), args={"format": kind} if path.suffix == ".usd" else {})
+    layer.Export(str(out), args={"format": kind} if path.suffix.lower() == ".usd" else {})
 
 
 def layer_files(path: str | os.PathLike[str]) -> list[Path]:
@@ -311,7 +311,7 @@ def _content_sha256(file: Path, above: tuple[Path, ...], known: dict[Path, str])
 
 def _new_sha256(file: Path, above: tuple[Path, ...], known: dict[Path, str]) -> str:
     """As `_content_sha256`, of a file that is not known."""
-    if file.suffix not in SUFFIXES:
+    if file.suffix.lower() not in SUFFIXES:
         return sha256(file)
     existing_file(file, "USD file", "USD")
     with translated(file, "cannot be opened as USD"):

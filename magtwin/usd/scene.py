@@ -5,6 +5,7 @@ import os
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -137,10 +138,10 @@ def open_scene(
             made with. The text names the prim.
     """
     path = Path(path)
-    if path.suffix == ".usdz":
+    if path.suffix.lower() == ".usdz":
         raise InputError(
-            f"{path}: files inside a package cannot be read; unpack it with `magtwin export {path.name} "
-            "--out DIR` and give the layer in DIR"
+            f"{path}: files inside a package cannot be read; unpack it with `magtwin export "
+            f"{quote(str(path))} --out DIR` and give the layer in DIR"
         )
     stage = open_stage(path)
     where = lab_on(stage, lab)

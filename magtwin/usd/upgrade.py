@@ -3,6 +3,7 @@
 import os
 from contextlib import ExitStack
 from pathlib import Path
+from shlex import quote
 
 from pxr import Sdf, Tf, UsdUtils
 
@@ -32,10 +33,10 @@ def upgrade(path: str | os.PathLike[str]) -> list[Path]:
             a later version. Nothing is written unless every layer can be upgraded.
     """
     path = expected(path, "USD file")
-    if path.suffix == ".usdz":
+    if path.suffix.lower() == ".usdz":
         raise InputError(
-            f"{path}: files inside a package cannot be rewritten; `magtwin export {path.name} --out DIR` "
-            "unpacks and upgrades it"
+            f"{path}: files inside a package cannot be rewritten; `magtwin export {quote(str(path))} "
+            "--out DIR` unpacks and upgrades it"
         )
     check_stage(path)
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal

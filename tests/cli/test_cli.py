@@ -1,6 +1,7 @@
 """The command line: what it writes, and how it refuses."""
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 
 from magtwin.cli import main
+from magtwin.cli.maps.map import headings_rad
+from magtwin.errors import RepairWarning
 
 HEAVY = ("torch", "pxr", "rerun", "scipy", "numba", "pyarrow", "pyvista", "matplotlib")
 
@@ -305,6 +308,24 @@ def test_a_map_that_the_scene_reads_is_not_replaced_by_a_survey_of_it(lab_scene,
     words = ("--spacing-m", "2", "--readings", "1", "--out", layer, "--force")
     assert "is a part of the scene" in refused(capsys, "map", "survey", lab_scene, *words)
     assert layer.read_bytes() == before
+
+
+def test_a_variable_that_names_no_option_of_its_command_is_reported(tmp_path, monkeypatch, capsys, lab_scene):
+    for name, value in {"RUN_SED": "1", "MAP_FIT_SEED": "1", "ALLOW_GB": "1", "RUN_OUT": "c.parquet"}.items():
+        monkeypatch.setenv(f"MAGTWIN_{name}", value)
+    monkeypatch.chdir(tmp_path)
+    main(["run", str(lab_scene), "--duration-s", "1"])
+    lines = [line for line in capsys.readouterr().err.splitlines() if "MAGTWIN" in line]
+    said = "magtwin: warning: MAGTWIN_RUN_SED: magtwin run has no such option, it is ignored; did you mean "
+    assert lines == [f"{said}MAGTWIN_RUN_SEED?"]
+    monkeypatch.setenv("MAGTWIN_BENCH_REPORT_OUT", "x.html")
+    refused(capsys, "bench", tmp_path / "none.toml", "--out", "b")
+    assert "MAGTWIN" not in capsys.readouterr().err
+
+
+def test_headings_that_are_given_twice_are_reported():
+    with pytest.warns(RepairWarning, match="--headings-deg 0,360,90: 2 headings, as some are equal"):
+        assert headings_rad("0,360,90") == pytest.approx([0, math.pi / 2])
 
 
 def test_info_tells_of_stages_runs_and_networks(lab_scene, tmp_path, capsys):

@@ -284,7 +284,7 @@ def test_a_map_in_many_headings_is_drawn_in_four_unless_asked(tmp_path):
 def test_a_picture_of_another_kind_is_refused_before_anything_is_read(tmp_path, capsys):
     said = refused(capsys, "map", "plot", tmp_path / "gone.usdc", "--out", tmp_path / "a.jpg")
     assert "a picture ends in .png or .svg" in said
-    assert "no such USD file" in refused(
+    assert "no such map" in refused(
         capsys, "map", "plot", tmp_path / "gone.usdc", "--out", tmp_path / "a.png"
     )
 

@@ -67,6 +67,11 @@ def test_a_random_driver_is_dealt_like_a_path(lab_scene, tmp_path):
     assert all(run[name].tobytes() == own[name].tobytes() for name in own)
 
 
+def test_more_sessions_than_runs_are_reported(lab_scene, tmp_path, capsys):
+    main(["sweep", str(lab_scene), "--out", str(tmp_path / "s"), "--count", "1", "--sessions", "5", *SHORT])
+    assert "warning: 5 sessions of 1 run: only 1 can be driven" in capsys.readouterr().err
+
+
 def test_sessions_differ_and_their_runs_share_what_a_session_has(lab_scene, tmp_path):
     options = ["--count", "4", "--sessions", "2", "--keep", "battery_fraction", "b_measured_nt", *SHORT]
     for name in ("a", "b"):

@@ -13,6 +13,7 @@ from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.io.bags import BagWriter
 from magtwin.io.formats import FORMATS, Format, read_run, write_run
+from magtwin.io.outputs import Outputs
 from magtwin.io.tables import ParquetParts
 from magtwin.run.run import Column, Run
 from magtwin.twin import Twin, open_twin, simulate
@@ -52,6 +53,25 @@ def written(run, twin, tmp_path_factory):
     for name, options in BAGS.items():
         write_run(run, folder / name, twin, **options)
     return folder
+
+
+@pytest.mark.parametrize("name", [*EXACT, *(name for name in BAGS if "." in name)])
+def test_suffixes_are_read_and_written_in_any_case(written, run, twin, tmp_path, name):
+    write_run(run, tmp_path / name.upper(), twin)
+    assert [file.name for file in tmp_path.iterdir()] == [name.upper()]
+    assert list(read_run(tmp_path / name.upper())) == list(read_run(written / name))
+
+
+def test_outputs_of_a_run_are_written_in_any_case(tmp_path):
+    outputs = Outputs.of([tmp_path / "a.PARQUET", tmp_path / "b.Rrd"], scans=True)
+    assert [file.name for file in outputs.scans] == ["a.scans.parquet"]
+
+
+def test_a_package_in_place_of_a_run_is_refused_with_what_it_is(tmp_path):
+    package = tmp_path / "my lab.usdz"
+    package.write_bytes(b"PK")
+    with pytest.raises(InputError, match=r"my lab\.usdz: a package; .*\(magtwin export '/.*lab\.usdz' --out"):
+        read_run(package)
 
 
 def assert_carried(run, again):

@@ -49,6 +49,74 @@ def test_a_table_becomes_readings_with_file_and_checksum_as_their_source(tmp_pat
     assert readings.grid is None
 
 
+def taken(readings):
+    """What was repaired or deduced, by the source of readings."""
+    return [part.removeprefix("taken ") for part in readings.source.split("; ") if part.startswith("taken ")]
+
+
+@pytest.mark.parametrize(
+    ("text", "notes"),
+    [
+        (
+            "x [cm],y (mm),heading [deg],field [uT]\n0,0,0,41\n100,0,90,41.5\n",
+            ["x [cm] and y (mm) by the units in their names", "heading [deg] in deg, by its name"],
+        ),
+        (
+            "X_m;Y_m;YAW_deg;B\n0,0;0,0;0,0;41000,5\n1,0;0,0;90,0;41500,5\n",
+            ["numbers with decimal", "YAW_deg"],
+        ),
+        (",y,x,theta,b_nt\n0,0,0,0,41000\n1,0,1,1.5707963267948966,41500\n", []),
+    ],
+)
+def test_columns_are_read_by_the_names_and_units_of_their_header(tmp_path, text, notes):
+    readings = read_readings(file(tmp_path, text))
+    assert_allclose(readings.p_xy, [[0, 0], [1, 0]])
+    assert_allclose(readings.yaw, [0, np.pi / 2])
+    assert_allclose(readings.b_nt, [41_000, 41_500], atol=0.6)
+    for note in notes:
+        assert any(note in said for said in taken(readings))
+    assert bool(notes) == bool(taken(readings))
+
+
+def test_a_unit_of_x_that_is_no_length_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"a\.csv: 'x \[px\]' is no length"):
+        read_readings(file(tmp_path, "x [px],y,yaw,b\n0,0,0,41000\n"))
+
+
+def test_a_survey_that_spans_far_is_read_in_metres_with_a_note(tmp_path):
+    text = "{},y,yaw,b\n-150,0,0,41000\n150,0,0,41000\n"
+    (note,) = taken(read_readings(file(tmp_path, text.format("x"))))
+    assert note == "x and y in metres, over 300 m: if these are cm, write x [cm],y [cm] in the header"
+    assert not taken(read_readings(file(tmp_path, text.format("x [m]"), "b.csv")))
+
+
+def test_cells_that_spreadsheets_write_for_nothing_are_missing(tmp_path):
+    rows = [f"{word},0,0.5,41000\n" for word in ("#N/A", "N/A", "NULL", "-", "#DIV/0!", "", "nan")]
+    readings = read_readings(file(tmp_path, ROWS + "".join(rows)))
+    assert len(readings) == 3
+    assert "(7 of 10 rows without a value left out)" in readings.source
+
+
+def test_a_last_number_that_was_cut_short_is_left_out(tmp_path):
+    rows = [f"{k},0,0.5,{45_000 + k}.25" for k in range(10)]
+    whole = read_readings(file(tmp_path, "x,y,heading,field\n" + "\n".join(rows)))  # no end, but sound
+    assert len(whole) == 10
+    cut = read_readings(file(tmp_path, "x,y,heading,field\n" + "\n".join(rows)[:-6], "b.csv"))
+    assert len(cut) == 9
+    assert "(1 of 10 rows without a value left out)" in cut.source
+    assert taken(cut) == [
+        "line 11 as cut short and left out: it has no end, and its 45 is far below all other values"
+    ]
+
+
+def test_a_survey_given_twice_counts_once(tmp_path):
+    a, b = file(tmp_path, ROWS), file(tmp_path, ROWS, "b.csv")
+    other = file(tmp_path, ROWS.replace("41500", "41600"), "c.csv")
+    readings = read_readings(a, b, other)
+    assert readings.runs == ("a", "c")
+    assert taken(readings) == [f"{b} and {a} as one, since their bytes are equal"]
+
+
 @pytest.mark.parametrize(("unit", "factor"), [("nT", 1), ("uT", 1e3), ("T", 1e9), ("mG", 1e2), ("G", 1e5)])
 def test_units_are_turned_into_nt(tmp_path, unit, factor):
     path = file(tmp_path, f"x,y,yaw,b\n0,0,0,{41_000 / factor!r}\n")
@@ -182,7 +250,7 @@ def test_a_column_tells_runs_apart(tmp_path):
 
 
 def test_several_files_are_several_runs(tmp_path):
-    a, b = file(tmp_path, ROWS), file(tmp_path, ROWS, "b.csv")
+    a, b = file(tmp_path, ROWS), file(tmp_path, ROWS + "\n", "b.csv")
     readings = read_readings(a, b)
     assert readings.runs == ("a", "b")
     assert_array_equal(readings.run, [0, 0, 0, 1, 1, 1])

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import re
 
 import numpy as np
 import pytest
@@ -191,15 +192,21 @@ def test_a_csv_is_read_with_or_without_a_header(tmp_path, text):
     ("text", "says"),
     [
         ("", r"p\.csv: is empty"),
-        ("x,y\n", r"p\.csv: no points in it"),
-        ("1,2\n", r"p\.csv: only one point in it"),
-        ("1,2\n1,2\n", r"p\.csv: only one point in it"),
-        ("0,0\n1,2,3\n", r"p\.csv:2: a point is two numbers, x,y in metres; got '1,2,3'"),
-        ("0,0\n\n1\n", r"p\.csv:3: a point is two numbers"),
-        ("0,0\n1,two\n", r"p\.csv:2: not a number in '1,two'"),
-        ("x,y\nm,m\n0,0\n", r"p\.csv:2: not a number in 'm,m'"),
-        ("0,0\n1,nan\n", r"p\.csv:2: a point must be finite"),
-        ("0,0\n1,inf\n", r"p\.csv:2: a point must be finite"),
+        ("x,y\n", r"p\.csv: no rows below the header"),
+        ("1,2\n", r"p\.csv: only 1 point in it"),
+        ("1,2\n1,2\n", r"p\.csv: only 1 point in it"),
+        ("0,0\n1,2,3\n", r"p\.csv:2: 2 values expected, got 3"),
+        ("0,0,0\n1,2,3\n", r"p\.csv:1: a point is two numbers, x,y in metres; got '0,0,0'"),
+        ("0,0\n\n1\n", r"p\.csv:3: 2 values expected, got 1"),
+        ("0,0\n1,two\n", r"p\.csv:2: not two finite numbers in '1,two'"),
+        ("x,y\nm,m\n0,0\n", r"p\.csv:2: not two finite numbers in 'm,m'"),
+        ("0,0\n1,nan\n", r"p\.csv: only 1 point in it"),
+        ("0,0\n1,inf\n", r"p\.csv:2: not two finite numbers in '1,inf'"),
+        ("lat,lon\n48,11\n49,12\n", r"p\.csv: 'lat,lon' are latitude and longitude; give x,y in metres"),
+        ("x [deg],y [deg]\n48,11\n49,12\n", "are latitude and longitude"),
+        ("x [px],y [px]\n48,11\n49,12\n", r"'x \[px\]' is no length; known: cm, "),
+        ("a,b,c\n1,2,3\n4,5,6\n", r"no columns x and y in 'a,b,c'"),
+        ("0.5;1,234\n1;2\n", "not two finite numbers"),
     ],
 )
 def test_a_csv_that_is_no_path_is_refused_with_file_and_line(tmp_path, text, says):
@@ -207,6 +214,31 @@ def test_a_csv_that_is_no_path_is_refused_with_file_and_line(tmp_path, text, say
     file.write_text(text)
     with pytest.raises(InputError, match=says):
         read_path_csv(file)
+
+
+@pytest.mark.parametrize(
+    ("text", "note"),
+    [
+        ("y,x\n0,0\n2,1\n", "x and y by their names: y comes first"),
+        ("x [cm],y [cm]\n0,0\n100,200\n", r"x \[cm\] and y \[cm\] by the units in their names"),
+        ("X (mm),y_m\n0,0\n1000,2\n", r"X \(mm\) and y_m by the units in their names"),
+        ("\ufeffx;y\n0,0;0,0\n1,0;2,0\n", "numbers with decimal commas"),
+        ("0,0 0,0\n1,0 2,0\n", "numbers with decimal commas"),
+        ("sep=;\nx;y\n0;0\n1;2\n", ""),
+        ("x\ty\n0\t0\n1\t2\n", ""),
+        (",x,y\n0,0,0\n1,1,2\n", ""),
+        ("t,x,y\n0,0,0\n1,1,2\n", "x and y, and left out t"),
+        ("x,y\n0,0\n#N/A,1\n-,NULL\n1,2\n", "2 of 4 points without a value left out"),
+        ("a,b\n0,0\n1,2\n", "columns 'a,b' as x,y in metres"),
+    ],
+)
+def test_a_csv_of_a_spreadsheet_is_read_with_a_note(tmp_path, text, note, recwarn):
+    file = tmp_path / "p.csv"
+    file.write_text(text, encoding="utf-8")
+    assert_allclose(read_path_csv(file).p_xy, [[0, 0], [1, 2]])
+    assert bool(recwarn) == bool(note)
+    if note:
+        assert re.search(rf"p\.csv: read {note}", str(recwarn.pop().message))
 
 
 def test_a_csv_that_is_not_text_or_not_there_is_refused(tmp_path):

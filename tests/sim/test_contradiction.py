@@ -80,6 +80,6 @@ def test_another_map_keeps_earth_sources_and_furniture_or_is_refused(lab, field,
 def test_a_survey_in_place_of_a_map_is_refused_with_the_command_that_fits_it(tmp_path):
     (tmp_path / "drive.csv").write_text("x,y,yaw,field\n0,0,0,41000\n")
     with pytest.raises(
-        InputError, match=r"drive\.csv: .*not a map; .*magtwin map fit drive\.csv --out drive\.usdc"
+        InputError, match=r"drive\.csv: .*not a map; .*magtwin map fit .*drive\.csv --out drive\.usdc"
     ):
         magtwin.scene_from_toml(shipped("scenes", "lab.toml"), map_layer=tmp_path / "drive.csv")

@@ -50,9 +50,10 @@ def map_info(file: MapFile, *, date: Date = None) -> Done:
     """Print a map's metadata: field, uncertainty, method, sources, licence, frame, height and dates."""
     from magtwin.field.maps.epochs import at_date
     from magtwin.field.maps.statistics import map_metadata
-    from magtwin.io.surveys.maps import open_map
+    from magtwin.io.surveys.maps import map_file, open_map
     from magtwin.usd.maps.layer import load_epochs
 
+    file = map_file(file)
     if file.is_dir():
         return Done(map_metadata(open_map(file, date)))
     epochs = load_epochs(file)
@@ -66,7 +67,7 @@ def map_diff(before: Path, after: Path, *, out: Path | None = None, force: Force
     Parameters
     ----------
     before
-        The earlier map: a layer or stage, or a folder of survey CSVs.
+        The earlier map: a layer or stage, a folder of survey CSVs, or a shipped scene's name: lab.
     after
         The later map.
     out
@@ -148,10 +149,11 @@ def map_epochs(*files: Sources, out: Path, force: Force = False) -> Done:
         Map layer to write (.usdc), with a variant of the variant set `epoch` for each date.
     """
     from magtwin.field.maps.epochs import drift, in_order
+    from magtwin.io.surveys.maps import map_file
     from magtwin.usd.maps.layer import load_epochs, save_map_series
 
     check_output(out, LAYERS, "a map layer", force=force)
-    maps = in_order([epoch for file in files for epoch in load_epochs(file)])
+    maps = in_order([epoch for file in files for epoch in load_epochs(map_file(file))])
     save_map_series(maps, out, force=force)
     return Done(drift(maps), out)
 

@@ -1,5 +1,6 @@
 """The `magtwin map` group, and options that its commands share."""
 
+import warnings
 from math import radians
 from pathlib import Path
 from typing import Annotated, Literal
@@ -7,7 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.errors import InputError
+from magtwin.errors import InputError, RepairWarning
 
 map_app = App(name="map", help="Import, fit, validate, compare and draw anomaly maps.")
 app.command(map_app)
@@ -19,7 +20,11 @@ LAYERS = (".usdc", ".usd")
 PICTURES = (".png", ".svg")
 
 MapFile = Annotated[
-    Path, Parameter(help="Map layer or stage (.usd, .usda, .usdc), or a folder of survey CSVs.")
+    Path,
+    Parameter(
+        help="Map layer or stage (.usd, .usda, .usdc), a folder of survey CSVs, or a shipped scene's name: "
+        "lab."
+    ),
 ]
 Kernel = Annotated[
     Literal["matern", "poisson"] | None,
@@ -45,15 +50,21 @@ Sources = Annotated[Path, Parameter(required=True)]
 
 
 def headings_rad(text: str) -> list[float]:
-    """Headings such as 0,90,180,270 [deg] in radians, each once, ascending."""
+    """Headings such as 0,90,180,270 [deg] in radians, each once, ascending; warns of repeated ones."""
     try:
-        degrees = sorted({float(word) % 360 for word in text.split(",")})
+        given = [float(word) % 360 for word in text.split(",")]
     except ValueError:
-        degrees = []
+        given = []
+    degrees = sorted(set(given))
     if not degrees or any(h != h for h in degrees):
         raise InputError(
             f"--headings-deg: headings are degrees with commas between, such as 0,90,180,270; got {text!r}"
         )
     if len(degrees) > MOST_HEADINGS:
         raise InputError(f"--headings-deg names {len(degrees):,} headings; take {MOST_HEADINGS} at most")
+    if len(degrees) < len(given):
+        count = f"{len(degrees)} heading{'s' if len(degrees) > 1 else ''}"
+        warnings.warn(
+            f"--headings-deg {text}: {count}, as some are equal (360 is 0)", RepairWarning, stacklevel=2
+        )
     return [radians(h) for h in degrees]

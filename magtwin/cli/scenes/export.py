@@ -47,7 +47,7 @@ def export(
 
     check_free(out, force=force)
     stage = scene_file(scene)
-    if target == "gazebo" or (target is None and out.suffix == ".sdf"):
+    if target == "gazebo" or (target is None and out.suffix.lower() == ".sdf"):
         from magtwin.export.gazebo import export_world
 
         if run is not None:

@@ -84,13 +84,13 @@ def robot(
     given = dict(locals())
     from magtwin.outputs import output, transaction
 
-    if out.suffix == ".urdf":
+    if out.suffix.lower() == ".urdf":
         from magtwin.author.from_urdf import write_urdf
 
         own = ("urdf", "out", "thumbnail", "force")
         if any(value is not None for name, value in given.items() if name not in own):
             raise InputError("a stage is written as a URDF without other options than --force; drop them")
-        if urdf.suffix in (".urdf", ".xacro"):
+        if urdf.suffix.lower() in (".urdf", ".xacro"):
             raise InputError(f"{urdf}: is no stage; a URDF is written from .usd, .usda, .usdc or .usdz")
         return Done(write_urdf(urdf, out, force=force), out)
     from magtwin.author.from_urdf import DriveRule, from_urdf

@@ -25,7 +25,7 @@ def new(out: Path, *, force: Force = False) -> Done:
         File to write: .toml for a room, whose scene gets the file's name; .py for a localizer.
     """
     check_output(out, (".toml", ".py"), "a room or a localizer", force=force)
-    if out.suffix == ".py":
+    if out.suffix.lower() == ".py":
         from magtwin.localizing import new_localizer
 
         new_localizer(out, force=force)

@@ -50,6 +50,7 @@ def validate(
     from magtwin.export.validation.validate import validate as check
     from magtwin.learn.data.features import FEATURES
     from magtwin.outputs import output
+    from magtwin.twin import shipped_or
 
     check_output(out, (".json",), "a report", force=force)
     fixes = SAFE if fix else ()
@@ -60,7 +61,7 @@ def validate(
 
         return check(file, against or AGAINST, inputs=FEATURES, fix=fixes, progress=report)
 
-    found = [validated(file) for file in files]
+    found = [validated(shipped_or(file)) for file in files]
     tables = [findings.table() for findings in found]
     if out is not None:
         with output(out, force=force) as aside:

@@ -278,7 +278,7 @@ def network_inputs(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"has the inputs {', '.join(unknown)}, which are not known", where)
         if len(set(spec.inputs)) < len(spec.inputs):
             yield Wrong("has an input twice", where)
-        if spec.network is None or spec.network.suffix != ".safetensors" or not spec.inputs:
+        if spec.network is None or spec.network.suffix.lower() != ".safetensors" or not spec.inputs:
             continue
         try:
             own = json.loads(weights_metadata(spec.network)["features"])

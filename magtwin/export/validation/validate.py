@@ -59,18 +59,18 @@ def validate(
     if file.is_dir():
         raise InputError(f"{file}: a folder; give the root layer in it")
     expected(file, "USD file")
-    if file.suffix not in SUFFIXES:
+    if file.suffix.lower() not in SUFFIXES:
         raise InputError(f"{file}: no USD file; {hint(file.suffix, SUFFIXES)}")
     names = {name: name for name in AGAINST}
     wanted = [name for name in AGAINST if name in {find("validator", given, names) for given in against}]
-    if fix and file.suffix == ".usdz":
+    if fix and file.suffix.lower() == ".usdz":
         raise InputError(
             f"{file}: a package cannot be fixed; `magtwin export` it to a folder, fix that, and pack it again"
         )
     check_stage(file)
     say = progress or (lambda name: None)
     with tempfile.TemporaryDirectory() as folder:
-        home = Path(folder) if file.suffix == ".usdz" else None
+        home = Path(folder) if file.suffix.lower() == ".usdz" else None
         root = None if home is None else unpack(file, home)
         seen = Inspection(())
         if fix or set(wanted) - {"nvidia"}:

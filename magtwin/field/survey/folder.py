@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.delimited import is_cut_short
 from magtwin.errors import InputError
 from magtwin.field.grid import Grid
 from magtwin.field.maps.curvature import interpolation_error_nt2
@@ -307,6 +308,12 @@ def _read_layer(path: Path, heading_deg: float, unit: str, scale: float | None) 
     lines = [row for row in numbered if not row[1].startswith("#")]
     if not lines:
         raise InputError(f"{path}: no rows below the header; expected one a node")
+    last = [line.rpartition(",")[2].strip() for _, line in lines]
+    if not text.endswith("\n") and is_cut_short(last):
+        raise InputError(
+            f"{path}:{lines[-1][0]}: cut short: the line has no end, and its {last[-1]} is far below all "
+            "other values; copy the file again"
+        )
     x, y, theta, field = np.array([_row(path, number, line) for number, line in lines]).T
     field = nt_per(unit, scale) * field
     beyond = max(metadata.get(MASKED, []), default=0)

@@ -65,7 +65,7 @@ class Bag:
                 folder, room = Path(opened.enter_context(TemporaryDirectory())), Room(self.path, files)
                 files = [room.file(file, folder) for file in files]
             for file in files:
-                reader = (McapReader if file.suffix == ".mcap" else Db3Reader)(file)
+                reader = (McapReader if file.suffix.lower() == ".mcap" else Db3Reader)(file)
                 opened.callback(reader.close)
                 self._readers.append(reader)
                 for topic in reader.topics:
@@ -268,10 +268,10 @@ def _files(path: Path) -> tuple[list[Path], dict[str, str], str]:
     """The storage files of a bag, its custom data, and what rosbag2 compressed: "file", "message" or ""."""
     suffixes = (".mcap", ".db3")
     if path.is_file():
-        if path.suffix not in suffixes:
+        if path.suffix.lower() not in suffixes:
             raise InputError(f"{path}: no bag: a folder with metadata.yaml is one, or a .mcap or .db3 file")
         return [path], {}, ""
-    found = sorted(p for p in path.iterdir() if p.suffix in suffixes and p.is_file())
+    found = sorted(p for p in path.iterdir() if p.suffix.lower() in suffixes and p.is_file())
     description = path / "metadata.yaml"
     if not description.is_file():
         if not found:
@@ -288,7 +288,7 @@ def _files(path: Path) -> tuple[list[Path], dict[str, str], str]:
     if packed and about.get("compression_format") != "zstd":
         raise InputError(f"compressed by {str(about.get('compression_format'))!r}; only zstd is read")
     for name in names:
-        if Path(name if packed != "file" else Path(name).stem).suffix not in suffixes:
+        if Path(name if packed != "file" else Path(name).stem).suffix.lower() not in suffixes:
             raise InputError(f"{name} is neither a .mcap nor a .db3 file")
     return [path / name for name in names], custom_data(about), packed
 

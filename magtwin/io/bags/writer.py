@@ -97,7 +97,7 @@ class _Bag:
     def __init__(self, path: Path, storage: Storage = "mcap") -> None:
         self.connections: dict[str, Connection] = {}
         self.custom: dict[str, str] = {}
-        self._folder = None if storage == "sqlite3" or path.suffix == ".mcap" else path
+        self._folder = None if storage == "sqlite3" or path.suffix.lower() == ".mcap" else path
         if self._folder is not None:
             path.mkdir()
             path = path / f"{path.name.removesuffix(PARTIAL)}_0.mcap"
@@ -372,10 +372,10 @@ def storage_of(path: Path, storage: str | None) -> Storage:
     """
     if storage is not None and storage not in STORAGES:
         raise InputError(f"no storage {storage!r} of bags; {hint(storage, STORAGES)}")
-    named = next((name for name, suffix in STORAGES.items() if path.suffix == suffix), None)
+    named = next((name for name, suffix in STORAGES.items() if path.suffix.lower() == suffix), None)
     if named and storage and named != storage:
         raise InputError(f"{path}: ends as a file of {named}; drop storage {storage!r}, or name a folder")
-    if path.suffix and not named and path.suffix != PARTIAL:
+    if path.suffix and not named and path.suffix.lower() != PARTIAL:
         raise InputError(f"{path}: a bag is a folder, without a suffix, or a file that ends in .mcap or .db3")
     return named or storage or "mcap"  # type: ignore[return-value]
 

@@ -16,13 +16,14 @@ from magtwin.field.survey.folder import node_map
 from magtwin.field.survey.folder import read_survey as read_folder
 from magtwin.field.survey.readings import TAKEN, Readings
 from magtwin.field.survey.stuck import mask_stuck
-from magtwin.files import sha256
+from magtwin.files import existing, sha256
 from magtwin.io.surveys.about import About
 from magtwin.io.surveys.columns import Columns
 from magtwin.io.surveys.readings import is_pattern, read_readings, save_readings
 from magtwin.kinds import expected
 from magtwin.outputs import check_free, output, transaction
 from magtwin.report import Report
+from magtwin.twin import scene_file
 
 Method = Literal["auto", "trilinear", "cubic", "gp", "harmonic"]
 Split = Literal["checkerboard", "heading", "run", "block"]
@@ -38,15 +39,12 @@ LEAST_READINGS = 8
 USUAL_READINGS = 100
 """Number of good readings below which the report doubts the map."""
 
-USUAL_SPAN_M = 300.0
-"""Extent of a survey above which the report asks for the unit of its positions [m]."""
-
 
 def open_map(file: Source, date: str | None = None) -> AnomalyMap:
     """The map of a layer or stage, or of a folder of survey CSVs.
 
     Args:
-        file: Layer, stage, or folder with one CSV per heading.
+        file: As for `map_file`.
         date: Date between the epochs of a layer, YYYY-MM-DD. None: the epoch that it selects.
 
     Raises:
@@ -54,11 +52,30 @@ def open_map(file: Source, date: str | None = None) -> AnomalyMap:
     """
     from magtwin.usd.maps.layer import load_map
 
-    if not Path(file).is_dir():
+    file = map_file(file)
+    if not file.is_dir():
         return load_map(file, date)
     if date is not None:
         raise InputError(f"{file}: a folder of CSVs has no dates; leave out `date`", parameter="date")
     return read_folder(expected(file, "map"))[0]
+
+
+def map_file(source: Source) -> Path:
+    """The file of a map: a layer, a stage, a folder of CSVs or of a scene, or the stage of a shipped scene.
+
+    Raises:
+        InputError: There is no such file or scene.
+    """
+    path = Path(source)
+    if path.is_file() or (path.is_dir() and not (path / f"{path.resolve().name}.usda").is_file()):
+        return path
+    if path.suffix or (len(path.parts) > 1 and not path.exists()):
+        return existing(path, "map")
+    try:
+        return scene_file(path)
+    except InputError as error:
+        text = f"{source}: no map layer, stage, folder of CSVs or shipped scene: {error}"
+        raise InputError(text) from error
 
 
 def read_survey(
@@ -111,14 +128,15 @@ def import_survey(
 
     out, columns, about = check_free(out, force=force), reading.get("columns") or Columns(), about or About()
     name = about.name or out.stem
-    if out.suffix != ".parquet" and len(sources) == 1 and _is_survey_folder(Path(sources[0]), columns):
+    table = out.suffix.lower() == ".parquet"
+    if not table and len(sources) == 1 and _is_survey_folder(Path(sources[0]), columns):
         known = {**asdict(about), "name": name, "unit": columns.unit or "nT", "scale": columns.scale}
         field, report = read_folder(sources[0], **known, keep_stuck=reading.get("keep_stuck", False))
         save_map(field, out, force=force)
         return report
     readings, found = read_survey(sources, about=about, **reading)
     readings = readings.with_(name=name)
-    if out.suffix == ".parquet":
+    if table:
         save_readings(readings, out, force=force)
         return _joined(readings.report(), found)
     field = node_map(readings)
@@ -269,7 +287,7 @@ def survey_scene(
         raise InputError(f"`seed` must be a whole number from 0 up, got {seed}", parameter="seed")
     if not 0 <= heading_error_deg <= 90:
         raise InputError(f"heading_error_deg must be from 0 to 90 deg, got {heading_error_deg!r}")
-    if adopt and out.suffix == ".parquet":
+    if adopt and out.suffix.lower() == ".parquet":
         raise InputError(f"{out}: a scene reads a map layer (.usdc), not readings", parameter="adopt")
     opened = open_scene(scene_file, lab=lab, check_network=False)
     if adopt:
@@ -294,7 +312,7 @@ def survey_scene(
         "blocked": blocked_by(twin, opened.obstacles),
         "jobs": jobs,
     }
-    if out.suffix == ".parquet":
+    if out.suffix.lower() == ".parquet":
         surveyed = replace(survey_readings(twin, **options), name=name or out.stem)
         save_readings(surveyed, out, force=force)
         return surveyed.report()
@@ -327,8 +345,6 @@ def _doubts(readings: Readings, source: Source) -> list[str]:
         )
     if readings.grid is None and count < USUAL_READINGS:
         doubts.append(f"only {count} good readings: the map is valid only next to them")
-    if (span := float(np.ptp(readings.p_xy, axis=0).max())) > USUAL_SPAN_M:
-        doubts.append(f"the readings span {span:,.0f} m: are their positions in metres?")
     if line := changes_line(readings):
         doubts.append(line)
     mean = np.exp(1j * yaw).mean()

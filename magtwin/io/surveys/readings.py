@@ -13,11 +13,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.errors import InputError
+from magtwin.delimited import DEGREES, LENGTHS, label_of
+from magtwin.errors import InputError, hint
 from magtwin.field.grid import FARTHEST_M, Grid
 from magtwin.field.survey.folder import read_grid
 from magtwin.field.survey.readings import SHAPES, TAKEN, Readings
-from magtwin.field.units import check_unit, nt_per, unit_by_size
+from magtwin.field.units import NT_PER, check_unit, nt_per, unit_by_size
 from magtwin.files import existing, sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
 from magtwin.io.surveys.columns import FIELDS, HEADINGS, NO_HEADING, TIMES, VECTORS, Columns
@@ -39,6 +40,9 @@ PARQUET = (".parquet", ".pq")
 
 RUNS = (".csv", ".npz", ".rrd")
 """Suffixes of runs in other formats of magtwin's own."""
+
+USUAL_SPAN_M = 50.0
+"""Extent above which the report asks for the unit of positions whose columns name none [m]."""
 
 LARGEST_TURN = 2 * np.pi + 0.01
 """Headings beyond this are refused unless their unit is given [rad]."""
@@ -96,12 +100,16 @@ def read_readings(
     columns = Columns() if columns is None else columns
     if not sources:
         raise InputError("no source of readings given")
-    parts = []
+    parts, given, twice = [], dict[str, Source](), list[str]()
     for source in _each(sources):
         path = _first(source)
-        if path.is_dir() or path.suffix in BAGS:
+        same = given.setdefault(_identity(source), source)
+        if same is not source:
+            twice.append(f"{source} and {same} as one, since their bytes are equal")
+            continue
+        if path.is_dir() or path.suffix.lower() in BAGS:
             _only_unit(path, columns)
-        if path.suffix in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
+        if path.suffix.lower() in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
             from magtwin.io.bags import read_bag_readings
 
             topics = {"pose_topic": pose_topic, "field_topic": field_topic}
@@ -112,6 +120,8 @@ def read_readings(
         else:
             parts.append(_of_file(str(source), path, columns))
     readings = parts[0] if len(parts) == 1 else _together(parts)
+    if twice:
+        readings = readings.with_(source="; ".join([readings.source, *(TAKEN + text for text in twice)]))
     return readings.with_(**{key: value for key, value in about.items() if value not in (None, "")})
 
 
@@ -239,7 +249,7 @@ def _each(sources: Sequence[Source]) -> Iterator[Source]:
                 raise InputError(f"no file or folder matches {str(source)!r}; check the pattern")
             yield from matches
         elif path.is_dir() and not (path / "metadata.yaml").is_file():
-            yield from sorted(file for file in path.iterdir() if file.suffix in PARQUET) or [path]
+            yield from sorted(file for file in path.iterdir() if file.suffix.lower() in PARQUET) or [path]
         else:
             yield source
 
@@ -252,6 +262,12 @@ def _first(source: Source) -> Path:
     return expected(Path(str(source).split("+")[0]), "source of readings")
 
 
+def _identity(source: Source) -> str:
+    """The checksum of a file; the place of a folder, or of joined files."""
+    path = Path(source)
+    return sha256(path) if path.is_file() else str(path.resolve())
+
+
 def _only_unit(path: Path, columns: Columns) -> None:
     """Refuse options for columns of a source whose columns are known."""
     if replace(columns, unit=None, scale=None) != Columns():
@@ -259,12 +275,12 @@ def _only_unit(path: Path, columns: Columns) -> None:
 
 
 def _of_file(source: str, path: Path, columns: Columns) -> Readings:
-    if path.suffix in (".usd", ".usda", ".usdc"):
+    if path.suffix.lower() in (".usd", ".usda", ".usdc"):
         raise InputError(
             f"{path}: a stage or a map, not readings; give the survey of the map, or survey a scene "
             " (magtwin map survey)"
         )
-    if path.suffix in PARQUET and path == Path(source):
+    if path.suffix.lower() in PARQUET and path == Path(source):
         metadata = _metadata(path)
         if _SURVEY in metadata or FACTS in metadata:
             _only_unit(path, columns)
@@ -273,7 +289,7 @@ def _of_file(source: str, path: Path, columns: Columns) -> Readings:
             if _SURVEY in metadata:
                 return load_readings(path)
             return readings_of_run(read_parquet(path), name=path.stem, source=_sum(path))
-    if path == Path(source) and path.suffix in RUNS and kind_of(path) is RUN:
+    if path == Path(source) and path.suffix.lower() in RUNS and kind_of(path) is RUN:
         _only_unit(path, columns)
         if columns.scale is not None:
             raise InputError(f"{path}: its field is in nT already; leave out --scale")
@@ -289,8 +305,8 @@ def _of_file(source: str, path: Path, columns: Columns) -> Readings:
 
 def _run_of(path: Path) -> Run:
     """The run in a file of magtwin's own."""
-    if path.suffix != ".rrd":
-        return read_csv_run(path) if path.suffix == ".csv" else read_npz(path)
+    if path.suffix.lower() != ".rrd":
+        return read_csv_run(path) if path.suffix.lower() == ".csv" else read_npz(path)
     from magtwin.io.rerun.file import read_run  # imports rerun
 
     return read_run(path)
@@ -303,16 +319,18 @@ def _beside(first: Path, word: str) -> Path:
 
 
 def _read_table(path: Path) -> Table:
-    return read_parquet_table(path) if path.suffix in PARQUET else read_csv(path)
+    return read_parquet_table(path) if path.suffix.lower() in PARQUET else read_csv(path)
 
 
 def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
     """The readings in a table."""
     columns, taken = _complete(table, columns)
-    p = np.column_stack([table.numbers(columns.x), table.numbers(columns.y)])
+    p = np.column_stack([_lengths(table, columns.x), _lengths(table, columns.y)])
     turn = _turn(table, columns)
     vector, b = _field(table, columns)
     t = table.numbers(columns.time) if columns.time else None
+    if t is not None and label_of(columns.time)[1] == "ms":
+        t = t / 1000
     some = [p, b[:, None]] + [v.reshape(len(p), -1) for v in (turn, vector, t) if v is not None]
     known: NDArray[np.bool_] = np.all(np.isfinite(np.hstack(some)), axis=1)
     if not known.any():
@@ -324,6 +342,12 @@ def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
         row = int(away[0])
         where = table.column(columns.x).where(row)
         raise InputError(f"{where}: x and y are metres, within {FARTHEST_M:g} of the origin, got {p[row]}")
+    if not (label_of(columns.x)[1] or label_of(columns.y)[1]):
+        span = float(np.ptp(p[known], axis=0).max())
+        if span > USUAL_SPAN_M:
+            taken.append(
+                f"x and y in metres, over {span:,.0f} m: if these are cm, write x [cm],y [cm] in the header"
+            )
     if turn is not None and turn.ndim == 2:
         length = np.linalg.norm(turn, axis=1)
         off = np.flatnonzero(known & (np.abs(length - 1) > 0.01))
@@ -378,8 +402,13 @@ def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
 
 def _complete(table: Table, columns: Columns) -> tuple[Columns, list[str]]:
     """Columns and unit, with missing ones found by name and size; and what was found so."""
-    taken = list[str]()
-    lower = {label.strip().lower(): label for label in reversed(table.names)}  # the first of equal names
+    taken = list(table.notes)
+    lower = {label_of(label)[0]: label for label in reversed(table.names)}  # the first of equal names
+    lower |= {label.strip().lower(): label for label in reversed(table.names)}
+    if columns.x == "x" and "x" not in table.names:
+        columns = replace(columns, x=lower.get("x", "x"))
+    if columns.y == "y" and "y" not in table.names:
+        columns = replace(columns, y=lower.get("y", "y"))
     if not (columns.heading or columns.quaternion):
         label = next((name for name in HEADINGS if name in table.names), "")
         columns = replace(columns, heading=label or next((lower[n] for n in HEADINGS if n in lower), ""))
@@ -400,13 +429,32 @@ def _complete(table: Table, columns: Columns) -> tuple[Columns, list[str]]:
                 f"{table.path}: no column of the field was found by its name ({known}); name the magnitude "
                 "with --field NAME, or the components with --vector BX,BY,BZ"
             )
+    units = {label_of(name)[1] for name in (columns.x, columns.y)} - {"", "m"}
+    if units:
+        taken.append(f"{columns.x} and {columns.y} by the units in their names")
+    angle = label_of(columns.heading)[1]
+    if columns.heading_unit is None and angle in (*DEGREES, "rad"):
+        columns = replace(columns, heading_unit="deg" if angle in DEGREES else "rad")
+        taken.append(f"{columns.heading} in {columns.heading_unit}, by its name (--heading-unit)")
     if columns.unit is None and columns.scale is None:
+        named = label_of(columns.field or columns.several("vector")[0])[1].replace("\N{MICRO SIGN}", "u")
+        named = named.replace("\N{GREEK SMALL LETTER MU}", "u")
+        if unit := {name.lower(): name for name in NT_PER}.get(named):
+            return replace(columns, unit=unit), taken  # type: ignore[arg-type]
         _, b = _field(table, replace(columns, unit="nT"))
         unit = unit_by_size(b)
         if unit not in (None, "nT"):
             columns = replace(columns, unit=unit)  # type: ignore[arg-type]
             taken.append(f"{columns.field or columns.vector} in {unit}, by its size (--unit)")
     return columns, taken
+
+
+def _lengths(table: Table, name: str) -> Array:
+    """A column of lengths [m], in the unit of its name."""
+    unit = label_of(name)[1] or "m"
+    if unit not in LENGTHS:
+        raise InputError(f"{table.path}: {name!r} is no length; {hint(unit, LENGTHS)}")
+    return LENGTHS[unit] * table.numbers(name)
 
 
 def _check_axes(vector_nt: Array, yaw: Array, table: Table, columns: Columns) -> None:

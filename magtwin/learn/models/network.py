@@ -234,7 +234,7 @@ def convert(
         InputError: Not such a checkpoint, or `out` exists.
     """
     checkpoint = expected(checkpoint, "weights file")
-    if checkpoint.suffix == ".safetensors":
+    if checkpoint.suffix.lower() == ".safetensors":
         raise InputError(f"{checkpoint}: is a .safetensors already; magtwin info {checkpoint} describes it")
     net = net_of_checkpoint(checkpoint)
     if licence:

@@ -121,7 +121,7 @@ def is_checkpoint(path: str | os.PathLike[str]) -> bool:
         raise InputError(f"{path}: a folder; give a weights file, .safetensors or .pth")
     expected(path, "weights file")
     with path.open("rb") as file:
-        return file.read(4) == _ZIP or path.suffix in (".pth", ".pt")
+        return file.read(4) == _ZIP or path.suffix.lower() in (".pth", ".pt")
 
 
 def write_weights(

@@ -2,13 +2,14 @@
 
 import math
 import os
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.errors import InputError
-from magtwin.files import existing_file
+from magtwin.delimited import QUOTED, number_of, read_delimited
+from magtwin.errors import InputError, RepairWarning
 from magtwin.kinds import expected
 from magtwin.outputs import output
 from magtwin.spec.drive import DriveSpec
@@ -59,43 +60,39 @@ class Commands(Summarized):
 
 
 def read_commands(file: str | os.PathLike[str]) -> Commands:
-    """Commands from a CSV of `t,v,w` in s, m/s and rad/s, a command a line, with or without a header.
+    """Commands from a text file of t,v,w in s, m/s and rad/s, a command a line, with or without a header.
+
+    A header that names t, v and w puts them in another order, beside other columns. Warns of what was
+    repaired.
 
     Raises:
         InputError: The file is missing or empty, a line is not three finite numbers, or times do not ascend
             from 0 s; the text has the number of the line.
     """
-    file = existing_file(expected(file, "file of commands"), "file of commands", "text")
-    try:
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: not a text file of t,v,w ({error})") from error
+    noun = "file of commands"
+    text = read_delimited(expected(file, noun), noun, "text", "t,v,w, a command a line").named()
+    file, names = text.path, [name.lower() for name in text.names]
+    named = sorted(set(names) & set(HEADER.split(","))) == sorted(HEADER.split(","))
+    columns = [names.index(name) for name in HEADER.split(",")] if named else [0, 1, 2]
+    if text.width != 3 and not named:
+        shown = repr(",".join(text.rows[0])[:QUOTED])
+        raise InputError(
+            f"{file}:{text.lines[0]}: a command is three numbers, t,v,w in s, m/s and rad/s; got {shown}"
+        )
     rows: list[tuple[float, float, float]] = []
-    headers = 0
-    for number, line in enumerate(lines, 1):
-        cells = [cell.strip() for cell in line.split(",")]
-        if cells == [""]:
-            continue
-        where = f"{file}:{number}"
-        if len(cells) != 3:
-            raise InputError(f"{where}: a command is three numbers, t,v,w in s, m/s and rad/s; got {line!r}")
-        try:
-            t, v, w = (float(cell) for cell in cells)
-        except ValueError:
-            if rows or headers:
-                raise InputError(f"{where}: not a number in {line!r}; a line is t,v,w") from None
-            headers += 1
-            continue
+    for number, row in zip(text.lines, text.rows, strict=True):
+        where, (t, v, w) = f"{file}:{number}", (number_of(row[column]) for column in columns)
         if not (math.isfinite(t) and math.isfinite(v) and math.isfinite(w)):
-            raise InputError(f"{where}: a command must be finite, got {line!r}")
+            shown = repr(",".join(row)[:QUOTED])
+            raise InputError(f"{where}: a command is three finite numbers, t,v,w; got {shown}")
         if t < 0 or (rows and t <= rows[-1][0]):
             after = f"after {rows[-1][0]:g} s" if rows else "as the first"
             raise InputError(
                 f"{where}: times must ascend from 0 s, got t = {t:g} s {after}; put the lines in order"
             )
         rows.append((t, v, w))
-    if not rows:
-        raise InputError(f"{file}: no commands in it; a line is t,v,w")
+    if notes := [*text.notes, *(["t, v and w by their names"] if columns != [0, 1, 2] else [])]:
+        warnings.warn(f"{file}: read {'; '.join(notes)}", RepairWarning, stacklevel=2)
     return Commands(file.name, np.array(rows), file.as_posix())
 
 

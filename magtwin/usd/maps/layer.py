@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -108,11 +109,11 @@ def save_map_series(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], *,
 
 def _refuse_tables(path: str | os.PathLike[str]) -> None:
     """Refuse a table of readings or a recording in place of a map."""
-    if Path(path).suffix in (".csv", ".txt", ".parquet", ".pq", ".mcap", ".db3"):
+    if Path(path).suffix.lower() in (".csv", ".txt", ".parquet", ".pq", ".mcap", ".db3"):
         fitted = Path(path).with_suffix(".usdc").name
         raise InputError(
             f"{path}: a table of readings or a recording, not a map; fit a map to it first: "
-            f"magtwin map fit {Path(path).name} --out {fitted}"
+            f"magtwin map fit {quote(str(path))} --out {fitted}"
         )
 
 
@@ -293,7 +294,7 @@ def _read_recorded(prim: Usd.Prim, name: str, shape: tuple[int, ...]) -> NDArray
 
 def _save(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], force: bool) -> None:
     """Write maps of one grid, earliest first: a single one, or several as epochs with the last selected."""
-    if Path(path).suffix not in (".usdc", ".usd"):
+    if Path(path).suffix.lower() not in (".usdc", ".usd"):
         raise InputError(f"{path}: a map layer ends in .usdc or .usd")
     latest = maps[-1]
     samples = [_epoch_values(m) for m in maps]

@@ -193,7 +193,7 @@ def write_tiled(
     force: bool,
 ) -> None:
     """Write a map tile by tile; `field` tells what is no array."""
-    if Path(path).suffix not in (".usdc", ".usd"):
+    if Path(path).suffix.lower() not in (".usdc", ".usd"):
         raise InputError(f"{path}: a map layer ends in .usdc or .usd")
     grid, count = tiling.grid, len(tiling)
     every, j, i = nodes_shown(grid)

@@ -229,6 +229,10 @@ REFUSALS = {
         (ROW2, ROW2 + "0.5,0.0,1.57,41201\n"),
         r"90_map\.csv:4: node \(0\.5, 0\) has a value already, on line 3",
     ),
+    "cut short": (
+        {"90_map.csv": HEADER + "".join(f"{k},0,1.57,4100{k}.5\n" for k in range(9)) + "9,0,1.57,41"},
+        r"90_map\.csv:11: cut short: the line has no end, and its 41 is far below all other values",
+    ),
     "another grid": (
         ("0.5,", "0.6,"),
         r"90_map\.csv: its grid differs from 0_map\.csv's: x has 0\.\.0\.6 m in 2 nodes, there 0\.\.0\.5 m",

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pxr import Gf, Usd, UsdGeom
 
 from magtwin.cli import main
-from magtwin.errors import InputError
+from magtwin.errors import InputError, RepairWarning
 from magtwin.files import shipped
 from magtwin.folders import allow
 from magtwin.io.tables import read_parquet
@@ -122,15 +122,22 @@ def test_commands_are_read_as_they_were_written(tmp_path):
     assert_array_equal(read_commands(tmp_path / "mine.csv").rows, rows)
 
 
+def test_commands_of_a_spreadsheet_are_read_with_a_note(tmp_path):
+    (tmp_path / "c.csv").write_text(";w;v;t\n0;0,5;0,1;0,0\n1;-0,5;0,2;1,5\n", encoding="utf-8")
+    with pytest.warns(RepairWarning, match="read numbers with decimal commas; t, v and w by their names"):
+        commands = read_commands(tmp_path / "c.csv")
+    assert commands.rows.tolist() == [[0.0, 0.1, 0.5], [1.5, 0.2, -0.5]]
+
+
 @pytest.mark.parametrize(
     ("text", "what"),
     [
         ("t,v,w\n0,0.1,0\n0.5,0.1,0\n0.4,0.1,0\n", ":4: times must ascend"),
-        ("0,nan,0\n", ":1: a command must be finite"),
+        ("0,nan,0\n", ":1: a command is three finite numbers"),
         ("0,0.1\n", ":1: a command is three numbers"),
-        ("t,v,w\nx,y,z\n", ":2: not a number"),
+        ("t,v,w\nx,y,z\n", ":2: a command is three finite numbers, t,v,w; got 'x,y,z'"),
         ("-1,0.1,0\n", ":1: times must ascend"),
-        ("t,v,w\n", "no commands"),
+        ("t,v,w\n", "no rows below the header"),
     ],
 )
 def test_commands_that_make_no_sense_are_refused_with_their_line(tmp_path, text, what):

@@ -1,0 +1,65 @@
+"""The name of a shipped scene stands for its stage and its map, and a missing scene is refused."""
+
+import pytest
+
+from magtwin import load_run
+from magtwin.cli import main
+from magtwin.errors import InputError
+from magtwin.figures.views import film, report_runs
+from magtwin.io.convert import convert_run
+from magtwin.io.provenance import repeat_of
+from magtwin.io.surveys.maps import map_file, open_map
+from magtwin.learning import build_dataset, map_of_scene
+from magtwin.twin import open_twin, scene_of, simulate
+
+
+@pytest.fixture(scope="module")
+def run(lab_scene, tmp_path_factory):
+    file = tmp_path_factory.mktemp("run") / "run.parquet"
+    simulate(open_twin(lab_scene, magnetometer="physical"), "figure8", duration_s=2.0, seed=0).save(file)
+    return file
+
+
+@pytest.fixture
+def elsewhere(tmp_path, monkeypatch):
+    """A working folder without a scene in it."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("scene", ["nope.usda", "nope"])
+def test_a_missing_scene_that_was_named_is_refused(run, elsewhere, scene):
+    for shown in (
+        lambda: report_runs([run], "z.html", scene=scene),
+        lambda: film(run, "z.gif", scene=scene),
+        lambda: convert_run(run, "z.rrd", scene=scene),
+        lambda: repeat_of(run, scene),
+    ):
+        with pytest.raises(InputError, match=r"nope\.usda: no such scene|no scene 'nope'; known: lab"):
+            shown()
+    assert not list(elsewhere.iterdir())
+
+
+def test_a_scene_whose_map_is_not_that_of_the_run_is_reported(run, elsewhere):
+    load_run(run).with_metadata(map_sha256="0" * 64).save("other.parquet")
+    with pytest.warns(UserWarning, match="its map is not shown: .*is not the map of the run"):
+        report_runs(["other.parquet"], "z.md", scene="lab")
+
+
+def test_the_name_of_a_shipped_scene_is_its_stage_and_its_map(run, elsewhere, capsys):
+    stage = map_file("lab")
+    assert stage.name == "lab.usda"
+    assert scene_of(load_run(run), "lab") == stage
+    assert map_of_scene("lab").name == "lab.usdc"
+    assert open_map("lab").name == open_map(stage).name
+    assert build_dataset(run, out="set", anomaly_map="lab").report().figures
+    for command in (["map", "info"], ["map", "diff", "lab"], ["info"]):
+        main([*command, "lab"])
+    assert "lab" in capsys.readouterr().out
+
+
+def test_a_file_goes_before_the_name_of_a_shipped_scene(elsewhere):
+    (elsewhere / "lab").write_text("mine")
+    assert map_file("lab") == (elsewhere / "lab").relative_to(elsewhere)
+    with pytest.raises(InputError, match=r"labb: no map layer, .*did you mean 'lab'"):
+        map_file("labb")
