@@ -90,7 +90,7 @@ class Description:
         Backslashes, too many or too few slashes after a scheme, and names relative to the package are
         repaired.
         """
-        element = next((e for e in self.xml.iter() if e.get("filename") == filename), None)
+        element = self.source.elements.get(("", filename))
         usual = _SCHEME.sub(r"\1://", filename.replace("\\", "/"))
         if usual != filename:
             self.repair("file-name", f"{what} {filename!r} is read as {usual!r}", element)
@@ -106,7 +106,7 @@ class Description:
 
     def mesh_element(self, filename: str) -> Element | None:
         """The first `<mesh>` of a file."""
-        return next((e for e in self.xml.iter("mesh") if e.get("filename") == filename), None)
+        return self.source.elements.get(("mesh", filename))
 
     def note(self, text: str, *, lost: bool = False, file: Path | None = None) -> None:
         """Add a note for the user, once.
@@ -136,7 +136,7 @@ class Description:
 
     def _find(self, kind: str, name: str) -> Element | None:
         """The `<link>` or `<joint>` called `name`."""
-        return next((e for e in self.xml.findall(kind) if e.get("name") == name), None)
+        return self.source.elements.get((f"robot/{kind}", name))
 
     def _take_notes(self) -> None:
         """Take over the notes on packages, which grow as files are searched."""
