@@ -1,5 +1,7 @@
 """Descriptions whose counts would take time with their square, or memory beyond their budget."""
 
+from pathlib import Path
+
 import pytest
 
 from magtwin import budget
@@ -8,6 +10,9 @@ from magtwin.errors import InputError
 from magtwin.urdf.description.description import read_description
 from magtwin.urdf.physics.mechanism import read_mechanism
 from magtwin.urdf.physics.merge import place_links, riders
+from magtwin.urdf.source import xacro
+from magtwin.urdf.source.expression import GLOBALS, evaluate
+from magtwin.urdf.source.source import read_source
 
 
 def robot(tmp_path, *parts):
@@ -68,3 +73,95 @@ def test_a_chain_of_frames_rides_on_the_first_body(tmp_path):
     groups = riders(place_links(read_mechanism(read_description(path))))
     assert list(groups) == ["body", "arm"]
     assert [name for name, _ in groups["body"]] == ["body", *(f"l{i}" for i in range(99)), "l99"]
+
+
+# --- xacro ----------------------------------------------------------------------------------------
+
+HEAD = '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+ROOT = '<link name="base_link"/></robot>'
+MANY = 200
+UNUSED = f'<xacro:if value="0">{"<a/>" * MANY}</xacro:if>'
+DEEP = "".join(f" for a{i} in [1]" for i in range(60))
+WEARING = {
+    "bodies of macros": f'<xacro:macro name="m">{UNUSED}</xacro:macro>' + "<xacro:m/>" * MANY,
+    "bodies of comments": f'<xacro:macro name="m">{"<!---->" * MANY * 4}</xacro:macro>' + "<xacro:m/>" * MANY,
+    "bodies of blocks": f'<xacro:property name="b">{UNUSED}</xacro:property>'
+    + '<xacro:insert_block name="b"/>' * MANY,
+    "texts": f'<xacro:macro name="m">{"a" * 50_000}</xacro:macro>' + "<xacro:m/>" * MANY,
+    "siblings": "<a/>" * 5 * MANY + "<xacro:if value='0'/>" * 5 * MANY,
+    "parameters": f'<xacro:macro name="m" params="{" ".join(f"p{i}:=1" for i in range(20 * MANY))}"/>',
+    "names outside of macros": '<xacro:macro name="m0"><a x="${len([p for i in range(999)])}"/></xacro:macro>'
+    + "".join(f'<xacro:macro name="m{i}"><xacro:m{i - 1}/></xacro:macro>' for i in range(1, 60))
+    + '<xacro:property name="p" value="1"/>'
+    + "<xacro:m59/>" * 3,
+    "long expressions": f'<a x="${{1 if 1 else [{"1," * 900}]}}"/>' * MANY,
+    "includes": '<xacro:include filename="other.xacro"/>' * MANY,
+    "settings": """<a x="${len(xacro.load_yaml('settings.yaml'))}"/>""" * 5,
+    "names of files": '<xacro:include filename="none.xacro" optional="true"/>' * MANY,
+    "patterns": '<xacro:include filename="**/*/*/*/none"/>',
+}
+
+
+@pytest.mark.parametrize("work", WEARING)
+def test_a_xacro_pays_for_all_its_work(work, tmp_path, monkeypatch):
+    path = tmp_path / "r.xacro"
+    path.write_text(HEAD + WEARING[work] + ROOT)
+    (tmp_path / "other.xacro").write_text(f"<robot><!--{'a' * 3_000}--></robot>")
+    (tmp_path / "settings.yaml").write_text("a: 1\n" * 2_000)
+    for i in range(2):
+        (tmp_path / f"{i}").symlink_to(tmp_path)
+        (tmp_path / f"f{i}").mkdir()
+    monkeypatch.setattr(xacro, "UNITS", 200_000)
+    if work == "patterns":
+        monkeypatch.setattr(xacro, "UNITS", 3_000)
+    with pytest.raises(InputError, match=r"r\.xacro:1: expands without end"):
+        read_source(path)
+
+
+def test_a_comprehension_in_sixty_others_is_not_slower_for_the_names_outside():
+    assert evaluate(f"len([pi{DEEP} for x in range(500)])", GLOBALS, xacro.Budget(200_000)) == 500
+    nested = "[x + y for x in [1] for y in [x + 1] for x in [y, y + 1]]"
+    assert evaluate(nested, {}, xacro.Budget(999)) == [4, 5]
+
+
+REFUSED = {
+    "<a x=\"${xacro.tokenize('a b', '')}\"/>": "tokenize: sep is empty",
+    r"""<a x="${'\ud800'}"/>""": "half of a character",
+    """<a x="${'%c' % 0xdfff}"/>""": "half of a character",
+    '<xacro:include filename="*/../../*/*.none"/>': r"has '\.\.' after a wildcard; leave it out",
+    """<xacro:macro name="m" params="a:=bbbbbbbbbbbbbbbbbbbbbbbbbbbbb'"/><xacro:m/>""": "Undefined par",
+}
+
+
+@pytest.mark.parametrize("content", REFUSED)
+def test_what_a_xacro_cannot_mean_is_refused_with_its_line(content, tmp_path):
+    path = tmp_path / "r.xacro"
+    path.write_text(HEAD + content + ROOT)
+    with pytest.raises(InputError, match=r"r\.xacro:1: .*" + REFUSED[content]):
+        read_source(path)
+
+
+def test_parameters_of_macros_are_read_as_the_library_reads_them():
+    library = pytest.importorskip("xacro")
+    ours = xacro._Expansion.__new__(xacro._Expansion)
+    ours._budget = xacro.Budget(100_000)
+    for text in (
+        "a b",
+        "a:=1 b",
+        "a=^ *b",
+        "a:=^|${x + 1} b:='c d'",
+        "  a:='' b",
+        'a := "x y"z **c',
+        "a:= b",
+    ):
+        assert ours._parameter(text) == library.parse_macro_arg(text), text
+
+
+def test_patterns_of_includes_match_files_in_folders_and_skip_hidden_ones(tmp_path):
+    for name in ("b/one.xacro", "a/two.xacro", "a/.hidden.xacro", ".c/three.xacro"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(f'<robot><link name="{Path(name).stem}"/></robot>')
+    path = tmp_path / "r.xacro"
+    path.write_text(HEAD + '<xacro:include filename="[ab]/./*.xacro"/>' + ROOT)
+    names = [element.get("name") for element in read_source(path).xml]
+    assert names == ["two", "one", "base_link"]
