@@ -1,6 +1,8 @@
 """Descriptions whose counts would take time with their square, or memory beyond their budget."""
 
+import tracemalloc
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -8,10 +10,13 @@ from magtwin import budget
 from magtwin.budget import Budget
 from magtwin.errors import InputError
 from magtwin.urdf.description.description import read_description
+from magtwin.urdf.meshes.mesh import read_mesh
 from magtwin.urdf.physics.mechanism import read_mechanism
 from magtwin.urdf.physics.merge import place_links, riders
-from magtwin.urdf.source import xacro
+from magtwin.urdf.source import markup, xacro
 from magtwin.urdf.source.expression import GLOBALS, evaluate
+from magtwin.urdf.source.markup import plain_text
+from magtwin.urdf.source.settings import read_settings
 from magtwin.urdf.source.source import read_source
 
 
@@ -165,3 +170,94 @@ def test_patterns_of_includes_match_files_in_folders_and_skip_hidden_ones(tmp_pa
     path.write_text(HEAD + '<xacro:include filename="[ab]/./*.xacro"/>' + ROOT)
     names = [element.get("name") for element in read_source(path).xml]
     assert names == ["two", "one", "base_link"]
+
+
+# --- memory ---------------------------------------------------------------------------------------
+
+
+def test_text_of_many_lines_takes_no_object_for_each(tmp_path):
+    path = robot(tmp_path, link("base_link"), "<x>" + "\u0100\n" * 300_000, "</x>")
+    tracemalloc.start()
+    try:
+        element = read_source(path).xml[1]
+        line = plain_text(element)
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert most < 20 * path.stat().st_size  # 76 bytes an object, for 3 bytes of the file
+    assert len(line) == len("<x></x>") + 2 * 300_000
+    assert line[:6] == "<x>\u0100 \u0100"
+
+
+@pytest.mark.parametrize("block", [1, 2, 3, 100])
+def test_an_element_is_put_on_one_line_in_blocks_of_any_size(block, monkeypatch):
+    monkeypatch.setattr(markup, "BLOCK", block)
+    monkeypatch.setattr(markup, "LONG", 0)
+    element = ElementTree.fromstring("<a>  one\n\n two <b/>three\t four<b c='  5 '/>  </a>")
+    assert plain_text(element) == " ".join(ElementTree.tostring(element, encoding="unicode").split())
+
+
+def test_a_material_that_nothing_wears_takes_no_room_and_groups_are_counted(tmp_path, monkeypatch):
+    path = tmp_path / "m.obj"
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+    path.write_text(corners + "usemtl a\n" * 100_000 + "f 1 2 3\n")
+    assert len(read_mesh(path).faces) == 1
+    path.write_text(corners + "usemtl a\nf 1 2 3\n" * 12)
+    assert len(read_mesh(path).faces) == 12
+    monkeypatch.setitem(budget.BUDGETS, "mesh", Budget(count=10))
+    with pytest.raises(InputError, match="shows over 10 nodes"):
+        read_mesh(path)
+
+
+# --- YAML -----------------------------------------------------------------------------------------
+
+FAULTS = {
+    "a: !!bool foo": "'foo' is no bool",
+    'a: !!int ""': "'' is no int",
+    'a: !!int "_"': "'_' is no int",
+    'a: !!float ""': "'' is no float",
+    "a: !!timestamp foo": "'foo' is no timestamp",
+    "? !!timestamp foo\n: b": "'foo' is no timestamp",
+    "a: 2001-02-30": "'2001-02-30' is no timestamp: day is out of range",
+    "a: !!int '1:30'": "'1:30' is no int: not decimal",
+    f"a: 0x{'f' * 400}": "is no int: not decimal, or too long",
+    "a: !!int [1]": "expected a scalar node",
+    'a: "\\U00110000"': "chr",
+    "- &a {a: 1, b: 2}\n" + "- {<<: *a}\n" * 6_000: "a table of over 10000 entries",
+}
+
+
+@pytest.mark.parametrize("text", FAULTS)
+def test_a_fault_of_a_yaml_is_refused_in_one_line_by_all_that_read_it(text, tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"a\.yaml:\d+: not YAML: .*" + FAULTS[text]):
+        list(read_settings(path))
+    source = tmp_path / "r.xacro"
+    source.write_text(HEAD + """<a x="${xacro.load_yaml('a.yaml')}"/>""" + ROOT)
+    with pytest.raises(InputError, match=r"r\.xacro:1: load_yaml: .*a\.yaml is not YAML: .*" + FAULTS[text]):
+        read_source(source)
+
+
+def test_numbers_to_base_sixty_are_texts(tmp_path):
+    long = ":".join(["59"] * 10_000)
+    path = tmp_path / "a.yaml"
+    path.write_text(f"a: 1:30\nb: 1:30.5\nc: {long}\nd: -1.5e+3\ne: 0x1f\nf: 12:30:45\ng: .inf\nh: 1_000\n")
+    (table,) = read_settings(path)
+    assert table == {"a": "1:30", "b": "1:30.5", "c": long, "d": -1500, "e": 31} | {
+        "f": "12:30:45",
+        "g": float("inf"),
+        "h": 1000,
+    }
+
+
+def test_aliases_of_tables_do_not_multiply(tmp_path):
+    path = tmp_path / "a.yaml"
+    names = [f"k{i}" for i in range(200)]
+    tables = [
+        f"{a}: &{a} {{{', '.join(f'{name}: {value}' for name in names)}}}"
+        for a, value in (("a", 1), ("b", "*a"), ("c", "*b"))
+    ]
+    path.write_text("\n".join([*tables, "d: *c"]))
+    with pytest.raises(InputError, match=r"a\.yaml: has over 1,000,000 values, with those of its aliases"):
+        list(read_settings(path))
