@@ -9,8 +9,10 @@ import pytest
 from magtwin import budget
 from magtwin.budget import Budget
 from magtwin.errors import InputError
+from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.description.description import read_description
 from magtwin.urdf.meshes.mesh import read_mesh
+from magtwin.urdf.physics import articulation
 from magtwin.urdf.physics.mechanism import read_mechanism
 from magtwin.urdf.physics.merge import place_links, riders
 from magtwin.urdf.source import markup, xacro
@@ -44,6 +46,19 @@ def test_a_robot_of_too_many_links_or_joints_is_refused_at_once(tmp_path, monkey
         read_description(robot(tmp_path, *links, link("x")))
     with pytest.raises(InputError, match=r"robot\.urdf:1: over 3 joints; split the file"):
         read_description(robot(tmp_path, *links, *joints, *joints))
+    with pytest.raises(InputError, match=r"robot\.urdf:1: over 3 visuals; split the file"):
+        read_description(robot(tmp_path, link("l", "<visual/>" * 4)))
+
+
+def test_colliders_in_one_place_are_compared_up_to_a_count(tmp_path, monkeypatch):
+    ball = '<collision><geometry><sphere radius="1"/></geometry></collision>'
+    links = [link(f"l{i}", ball) for i in range(6)]
+    joints = [joint(f"j{i}", "l0", f"l{i + 1}", "floating") for i in range(5)]
+    monkeypatch.setattr(articulation, "COMPARED", 15)
+    convert_urdf(robot(tmp_path, *links, *joints), tmp_path / "r.usda")
+    monkeypatch.setattr(articulation, "COMPARED", 14)
+    with pytest.raises(InputError, match="link 'l4': over 14 pairs of colliders are in one place"):
+        convert_urdf(robot(tmp_path, *links, *joints), tmp_path / "r.usda", force=True)
 
 
 def test_joints_of_one_name_are_numbered_in_their_order(tmp_path):

@@ -26,8 +26,9 @@ def check_names(source: Source, repair: Callable[[str, str, Element], None]) -> 
             the line.
     """
     xml, where = source.xml, source.where
-    check_count(where(xml), "URDF", sum(1 for part in xml if part.tag == "link"), "links")
-    check_count(where(xml), "URDF", sum(1 for part in xml if part.tag == "joint"), "joints")
+    for path in ("link", "joint", "link/visual", "link/collision"):
+        count = sum(1 for _ in xml.iterfind(path))
+        check_count(where(xml), "URDF", count, f"{path.rpartition('/')[2]}s")
     if not xml.get("name"):
         xml.set("name", source.path.name.partition(".")[0])
         repair("name-missing", f"<robot> has no name: {xml.get('name')!r}, as its file", xml)
