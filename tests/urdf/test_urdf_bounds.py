@@ -9,6 +9,7 @@ import pytest
 from magtwin import budget
 from magtwin.budget import Budget
 from magtwin.errors import InputError
+from magtwin.urdf import repairs
 from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.description.description import read_description
 from magtwin.urdf.meshes.mesh import read_mesh
@@ -77,6 +78,16 @@ def test_links_of_one_name_follow_the_joints_that_hold_them(tmp_path):
     links = [link("l0"), link("l"), link("l", "<visual/>"), link("l", "<collision/>")]
     description = read_description(robot(tmp_path, *links, *(joint(f"j{i}", "l0", "l") for i in range(3))))
     assert {j.name: child for child, j in description.joints.items()} == {"j0": "l", "j1": "l_2", "j2": "l_3"}
+
+
+def test_near_names_are_looked_for_a_limited_number_of_times(tmp_path, monkeypatch):
+    monkeypatch.setattr(repairs, "SUGGESTED", 1)
+    links = [link(f"l{i}") for i in range(3)]
+    follow = '<mimic joint="j"/>'
+    joints = [joint(f"j{i}", "l0", f"l{i + 1}", "continuous", follow) for i in range(2)]
+    texts = [entry.text for entry in read_description(robot(tmp_path, *links, *joints)).repairs.entries]
+    assert "no joint 'j' (did you mean 'j1'?)" in texts[0] or "no joint 'j' (did you mean 'j0'?)" in texts[0]
+    assert "no joint 'j': the mimic is left out" in texts[1]
 
 
 def test_a_chain_of_frames_rides_on_the_first_body(tmp_path):

@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from xml.etree import ElementTree
@@ -69,6 +70,11 @@ class Description:
 
     repairs: Repairs = field(default_factory=Repairs)
     """Every repair, loss and guess of a conversion."""
+
+    @cached_property
+    def joint_names(self) -> frozenset[str]:
+        """Names of all joints."""
+        return frozenset(joint.name for joint in self.joints.values())
 
     @property
     def path(self) -> Path:
@@ -285,7 +291,8 @@ def _without_bad_mimics(description: Description, joints: Sequence[Joint]) -> di
         while chain[-1] in leads and chain[-1] != joint.name:
             chain.append(leads[chain[-1]])
         if leader not in named:
-            problem = f"no joint {leader!r} ({hint(leader, named)})"
+            advice = description.repairs.suggestion(leader, named, hint)
+            problem = f"no joint {leader!r}" + (f" ({advice})" if advice else "")
         elif chain[-1] == joint.name:
             problem = f"itself: {' -> '.join(chain)}"
         elif joint.type not in (*MOVING, "fixed"):

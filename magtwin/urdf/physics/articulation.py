@@ -24,7 +24,7 @@ OVERLAP_M = 0.001
 NEAR = 1e-7
 """Distance between two hulls, relative to their size, that counts as none."""
 
-COMPARED, POINTS = 50_000, 10_000
+COMPARED, POINTS = 20_000, 10_000
 """Most pairs of hulls that are compared; this many points count as one more pair."""
 
 ITERATIONS = 200

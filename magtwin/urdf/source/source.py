@@ -117,8 +117,8 @@ class Source:
                 "or name its folder by --package NAME=FOLDER"
             )
         if not path.is_file():
-            siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-            advice = near(path.name, siblings)
+            siblings = (p.name for p in path.parent.iterdir()) if path.parent.is_dir() else ()
+            advice = self.repairs.suggestion(path.name, siblings, near)
             absent = MissingFileError(f"{start} is missing{advice}; looked for {path}")
             absent.near = advice
             raise absent
