@@ -42,6 +42,7 @@ BUDGETS: dict[str, Budget] = {
     "JSON": Budget(file=32 * MB),  # 3 bytes of it, an empty object, become 72
     "YAML": Budget(file=1 * MB, count=10_000),
     "XML": Budget(file=256 * MB, depth=200, count=2_000_000),
+    "URDF": Budget(count=2_000),  # links, joints, visuals and colliders each
     "npz": Budget(count=10_000),
     "Parquet": Budget(count=10_000),
     "CSV": Budget(file=8 * GB, count=10_000),

@@ -224,19 +224,56 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
 
 @functools.cache
 def yaml_loader() -> type:
-    """Loader of PyYAML for safe types. Refuses tables that grow exponentially by merging each other."""
+    """Loader of PyYAML for safe types. A fault of a file is a `yaml.YAMLError` with its line.
+
+    Tables that grow exponentially by merging each other are refused. Numbers to base 60 (`1:30`) are texts,
+    as in YAML 1.2: to read them takes time with the square of their length.
+    """
     import yaml
 
+    faults = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+    numbers = {f"tag:yaml.org,2002:{kind}" for kind in ("int", "float")}
+
     class Loader(yaml.SafeLoader):
+        merged = 0
+        """Entries so far of all tables that merge others."""
+
+        def get_single_data(self) -> Any:
+            try:
+                return super().get_single_data()
+            except faults as error:  # such as a character beyond U+10FFFF
+                raise yaml.MarkedYAMLError(problem=str(error), problem_mark=self.get_mark()) from error
+
+        def resolve(self, kind: type[yaml.Node], value: str | None, implicit: Any) -> str:
+            tag: str = super().resolve(kind, value, implicit)
+            return "tag:yaml.org,2002:str" if tag in numbers and ":" in (value or "") else tag
+
         def flatten_mapping(self, node: yaml.MappingNode) -> None:
+            own = len(node.value)
             super().flatten_mapping(node)
-            if len(node.value) > (most := BUDGETS["YAML"].count):
+            self.merged += len(node.value) if len(node.value) > own else 0
+            if max(self.merged, len(node.value)) > (most := BUDGETS["YAML"].count):
                 raise yaml.constructor.ConstructorError(
                     None, None, f"a table of over {most} entries", node.start_mark
                 )
 
+        def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+            try:
+                if node.tag in numbers and (":" in node.value or len(node.value) > LONGEST_NUMBER):
+                    raise ValueError("not decimal, or too long")
+                return super().construct_object(node, deep)
+            except faults as error:
+                value = f"{node.value!r:.60}" if isinstance(node.value, str) else f"a {node.id}"
+                reason = f": {error}" if isinstance(error, ValueError) else ""
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"{value} is no {node.tag.rpartition(':')[2]}{reason}", node.start_mark
+                ) from error
+
     return Loader
 
+
+LONGEST_NUMBER = 300
+"""Most characters of a number in YAML; longer ones are beyond 1e300."""
 
 _TOML_WORDS = re.compile(
     r'''"""(?:[^"\\]|\\.|"(?!""))*+"{0,5}|"(?:[^"\\\n]|\\.)*+"?'''

@@ -241,14 +241,12 @@ class _Author:
         stage.SetDefaultPrim(robot)
         Usd.ModelAPI(robot).SetKind("component")
         bodies, colliders = dict[str, Usd.Prim](), dict[str, list[Usd.Prim]]()
-        for name in description.links:
-            if places[name][0] != name:
-                continue
+        for name, carried_links in riders(places).items():
             body = _define(stage, robot.GetPath().AppendChild(names[name]), name, poses[name])
             bodies[name] = body
             ledger.bodies[name] = "body", body.GetPath()
             parts = []
-            for part, pose in riders(places, name):
+            for part, pose in carried_links:
                 link, surface = description.links[part], surfaces.get(part, Surface())
                 rider = Rider(link, pose)
                 for i, visual in enumerate(carried(link.visuals, pose, part, name)):

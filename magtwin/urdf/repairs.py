@@ -4,10 +4,13 @@ Each fault of a description has a kind in `FAULTS` with one documented repair. T
 one `Repairs`, and `check` decides what `Options.strict` refuses.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from magtwin.errors import InputError, find
+
+SUGGESTED = 100
+"""Most unknown names of a description for which a near one is looked for."""
 
 NOTE, LOSS = "note", "loss"
 """Kinds of entries that are no fault of their own: a guess, which strict accepts, and anything left out."""
@@ -107,6 +110,17 @@ class Repairs:
 
     supplies: dict[str, None] = field(default_factory=dict)
     """Options of the command line that would supply what is missing, such as `--package arm=FOLDER`."""
+
+    suggested: int = 0
+    """Names so far for which a near one was looked for."""
+
+    def suggestion(self, name: str, known: Iterable[str], advise: Callable[[str, Iterable[str]], str]) -> str:
+        """Advice on an unknown name, by `errors.near` or `errors.hint`, for the first `SUGGESTED`; then "".
+
+        To compare each of many unknown names with each of many known ones would take too long.
+        """
+        self.suggested += 1
+        return advise(name, known) if self.suggested <= SUGGESTED else ""
 
     def add(self, kind: str, text: str, place: tuple[str, int] = ("", 0)) -> None:
         """Add an entry, once.

@@ -106,7 +106,8 @@ def define_sensors(tags: Tags, robot: Usd.Prim, prim_of: Callable[[str], Usd.Pri
             name, kind = sensor.get("name") or "sensor", (sensor.get("type") or "").lower()
             start = f"sensor {name!r} of link {link!r}"
             if link not in description.links:
-                text = f"{start}, which is no link{near(link, description.links)}: kept as text"
+                advice = description.repairs.suggestion(link, description.links, near)
+                text = f"{start}, which is no link{advice}: kept as text"
                 description.repair("name-unknown", text, sensor)
                 continue
             if kind not in KINDS:

@@ -468,4 +468,4 @@ def test_a_file_above_the_limit_of_its_format_is_refused_unread(kind, tmp_path, 
 
 
 def test_every_format_of_the_table_has_a_reader_that_asks_for_it():
-    assert LARGE.keys() | {"image"} == budget.BUDGETS.keys()
+    assert LARGE.keys() | {"image", "URDF"} == budget.BUDGETS.keys()

@@ -205,7 +205,7 @@ COSTLY = {
 @pytest.mark.parametrize("text", COSTLY)
 def test_an_expression_pays_for_what_it_looks_at_and_copies(text):
     with pytest.raises(ExpressionError, match=COSTLY[text]):
-        evaluate(text, GLOBALS, Budget(400_000))
+        evaluate(text, GLOBALS, Budget(600_000))
 
 
 SLIPS = {

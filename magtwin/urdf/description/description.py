@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from xml.etree import ElementTree
@@ -70,6 +71,11 @@ class Description:
     repairs: Repairs = field(default_factory=Repairs)
     """Every repair, loss and guess of a conversion."""
 
+    @cached_property
+    def joint_names(self) -> frozenset[str]:
+        """Names of all joints."""
+        return frozenset(joint.name for joint in self.joints.values())
+
     @property
     def path(self) -> Path:
         """The file."""
@@ -90,7 +96,7 @@ class Description:
         Backslashes, too many or too few slashes after a scheme, and names relative to the package are
         repaired.
         """
-        element = next((e for e in self.xml.iter() if e.get("filename") == filename), None)
+        element = self.source.elements.get(("", filename))
         usual = _SCHEME.sub(r"\1://", filename.replace("\\", "/"))
         if usual != filename:
             self.repair("file-name", f"{what} {filename!r} is read as {usual!r}", element)
@@ -106,7 +112,7 @@ class Description:
 
     def mesh_element(self, filename: str) -> Element | None:
         """The first `<mesh>` of a file."""
-        return next((e for e in self.xml.iter("mesh") if e.get("filename") == filename), None)
+        return self.source.elements.get(("mesh", filename))
 
     def note(self, text: str, *, lost: bool = False, file: Path | None = None) -> None:
         """Add a note for the user, once.
@@ -136,7 +142,7 @@ class Description:
 
     def _find(self, kind: str, name: str) -> Element | None:
         """The `<link>` or `<joint>` called `name`."""
-        return next((e for e in self.xml.findall(kind) if e.get("name") == name), None)
+        return self.source.elements.get((f"robot/{kind}", name))
 
     def _take_notes(self) -> None:
         """Take over the notes on packages, which grow as files are searched."""
@@ -285,7 +291,8 @@ def _without_bad_mimics(description: Description, joints: Sequence[Joint]) -> di
         while chain[-1] in leads and chain[-1] != joint.name:
             chain.append(leads[chain[-1]])
         if leader not in named:
-            problem = f"no joint {leader!r} ({hint(leader, named)})"
+            advice = description.repairs.suggestion(leader, named, hint)
+            problem = f"no joint {leader!r}" + (f" ({advice})" if advice else "")
         elif chain[-1] == joint.name:
             problem = f"itself: {' -> '.join(chain)}"
         elif joint.type not in (*MOVING, "fixed"):

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from xml.etree import ElementTree
 
+from magtwin.budget import check_count
 from magtwin.errors import InputError
 from magtwin.urdf.source.markup import plain_text
 from magtwin.urdf.source.source import Source
@@ -25,18 +26,19 @@ def check_names(source: Source, repair: Callable[[str, str, Element], None]) -> 
             the line.
     """
     xml, where = source.xml, source.where
+    for path in ("link", "joint", "link/visual", "link/collision"):
+        count = sum(1 for _ in xml.iterfind(path))
+        check_count(where(xml), "URDF", count, f"{path.rpartition('/')[2]}s")
     if not xml.get("name"):
         xml.set("name", source.path.name.partition(".")[0])
         repair("name-missing", f"<robot> has no name: {xml.get('name')!r}, as its file", xml)
     for kind in ("link", "joint"):
-        seen: dict[str, Element] = {}
+        names = _Names(source, kind, repair)
         for element in xml.findall(kind):
-            name = element.get("name")
-            if not name:
+            if not element.get("name"):
                 raise InputError(f"{where(element)}: a <{kind}> has no name")
-            kept = element if name not in seen else _renamed(source, kind, element, seen[name], repair)
-            if kept is not None:
-                seen[kept.attrib["name"]] = kept
+            names.keep(element)
+        xml[:] = [part for part in xml if part not in names.removed]
     if not xml.findall("link"):
         raise InputError(f"{where(xml)}: the robot has no <link>")
     for joint in xml.findall("joint"):
@@ -46,25 +48,47 @@ def check_names(source: Source, repair: Callable[[str, str, Element], None]) -> 
                 raise InputError(f"{where(joint)}: joint {joint.get('name')!r} has no <{end} link=>")
 
 
-def _renamed(
-    source: Source, kind: str, element: Element, first: Element, repair: Callable[[str, str, Element], None]
-) -> Element | None:
-    """A second element of one name under a free name; None if it is removed."""
-    xml, name = source.xml, element.attrib["name"]
-    file, line = source.places[first]
-    at = f"line {line}" if file == source.places[element][0] else f"{file.name}:{line}"
-    start = f"{kind} {name!r} exists twice, first on {at}"
-    if plain_text(element) == plain_text(first):
-        xml.remove(element)
-        repair("name-twice", f"{start}: the second is equal and left out", element)
-        return None
-    taken = {other.get("name") for other in xml.findall(kind)}
-    free = next(f"{name}_{n}" for n in range(2, len(taken) + 3) if f"{name}_{n}" not in taken)
-    if kind == "link":
-        ends = [end for end in xml.findall("joint/child") if end.get("link") == name]
-        if len(ends) < 2:
-            raise InputError(f"{source.where(element)}: {start}; rename one")
-        ends[1].set("link", free)
-    element.set("name", free)
-    repair("name-twice", f"{start}: the second is called {free!r}", element)
-    return element
+class _Names:
+    """The names of all links, or of all joints."""
+
+    def __init__(self, source: Source, kind: str, repair: Callable[[str, str, Element], None]) -> None:
+        self.removed: set[Element] = set()
+        """Elements that are equal to one before."""
+        self._source, self._kind, self._repair = source, kind, repair
+        self._taken = {element.get("name") for element in source.xml.findall(kind)}
+        self._first: dict[str, Element] = {}
+        self._texts: dict[str, str] = {}  # of the first elements of names that are used twice
+        self._next: dict[str, int] = {}  # number to try next for each name
+        self._ends: dict[str | None, list[Element]] = {}  # <child> of the joints that hold each link
+        for end in source.xml.iterfind("joint/child"):
+            self._ends.setdefault(end.get("link"), []).append(end)
+
+    def keep(self, element: Element) -> None:
+        """Keep an element under its name if it is the first of it, else under a free one, or remove it."""
+        name = element.attrib["name"]
+        first = self._first.setdefault(name, element)
+        if first is element:
+            return
+        source, kind = self._source, self._kind
+        file, line = source.places[first]
+        at = f"line {line}" if file == source.places[element][0] else f"{file.name}:{line}"
+        start = f"{kind} {name!r} exists twice, first on {at}"
+        if name not in self._texts:
+            self._texts[name] = plain_text(first)
+        if plain_text(element) == self._texts[name]:
+            self.removed.add(element)
+            self._repair("name-twice", f"{start}: the second is equal and left out", element)
+            return
+        number = self._next.get(name, 2)
+        while f"{name}_{number}" in self._taken:
+            number += 1
+        free, self._next[name] = f"{name}_{number}", number + 1
+        if kind == "link":
+            ends = self._ends.get(name, [])
+            if len(ends) < 2:
+                raise InputError(f"{source.where(element)}: {start}; rename one")
+            ends.pop(1).set("link", free)
+        element.set("name", free)
+        self._taken.add(free)
+        self._first[free] = element
+        self._repair("name-twice", f"{start}: the second is called {free!r}", element)

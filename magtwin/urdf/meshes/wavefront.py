@@ -24,6 +24,9 @@ from magtwin.usd.geometry import linear_from_srgb
 TEXT = 64
 """Bytes that a text takes beside its characters."""
 
+GROUP = 600
+"""Bytes that a group of polygons takes beside them."""
+
 HELD = 1 << 24
 """Bytes of texts after which they are counted against the file's budget."""
 
@@ -80,7 +83,11 @@ def read_wavefront(reading: Reading) -> list[Piece]:
                 group.words += words
                 group.counts.append(len(words))
                 group.lines.append(number)
+        elif kind == "usemtl" and not group.counts:
+            group.material = rest
         elif kind == "usemtl":
+            reading.visit()
+            held += GROUP
             group = _Group(rest)
             groups.append(group)
         elif kind == "mtllib":

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
+from magtwin.errors import InputError
 from magtwin.usd.geometry import read_vertices
 
 NEWTON_API, PHYSX_API = "NewtonArticulationRootAPI", "PhysxArticulationAPI"
@@ -22,6 +23,9 @@ OVERLAP_M = 0.001
 
 NEAR = 1e-7
 """Distance between two hulls, relative to their size, that counts as none."""
+
+COMPARED, POINTS = 20_000, 10_000
+"""Most pairs of hulls that are compared; this many points count as one more pair."""
 
 ITERATIONS = 200
 """Most steps of `_overlap`; hulls that take more are too near to tell."""
@@ -59,12 +63,27 @@ def filter_overlaps(
 
     Returns:
         The pairs of link names.
+
+    Raises:
+        InputError: Too many colliders are in one place to compare them all.
     """
+    left = COMPARED
     jointed = {frozenset(_ends(joint)) for joint in joints}
     pairs = []
     for (first, second), near in _near(_hulls(bodies, colliders)).items():
         ends = bodies[first].GetPath(), bodies[second].GetPath()
-        if frozenset(ends) in jointed or not any(_overlap(a, b) for a, b in near):
+        if frozenset(ends) in jointed:
+            continue
+        for a, b in near:
+            left -= 1 + (len(a) + len(b)) // POINTS
+            if left < 0:
+                raise InputError(
+                    f"link {first!r}: over {COMPARED:,} pairs of colliders are in one place; give its joints "
+                    "origins, or merge colliders"
+                )
+            if _overlap(a, b):
+                break
+        else:
             continue
         UsdPhysics.FilteredPairsAPI.Apply(bodies[first]).CreateFilteredPairsRel().AddTarget(ends[1])
         pairs.append((first, second))

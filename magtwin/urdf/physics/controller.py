@@ -186,7 +186,7 @@ class _Settings:
 
     def _joints(self, keys: Iterable[str]) -> list[str]:
         """The joints that the first of the keys that is there names: a name, or a list of names."""
-        known = [joint.name for joint in self._tags.description.joints.values()]
+        known = self._tags.description.joint_names
         key = next(key for key in keys if key in self._table)
         value = self._table[key]
         names = [value] if isinstance(value, str) and value else value

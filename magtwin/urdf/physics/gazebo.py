@@ -61,7 +61,8 @@ def read_surfaces(tags: Tags) -> dict[str, Surface]:
     for block in tags.blocks("gazebo"):
         link = block.get("reference", "")
         if link and link not in known:
-            text = f"<gazebo> is about {link!r}, which is no link or joint{near(link, known)}: kept as text"
+            advice = description.repairs.suggestion(link, known, near)
+            text = f"<gazebo> is about {link!r}, which is no link or joint{advice}: kept as text"
             description.repair("name-unknown", text, block)
         if link not in description.links:
             continue

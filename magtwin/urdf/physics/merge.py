@@ -1,13 +1,14 @@
 """Merge: the body that each link is or rides on; welded links can become part of the body above."""
 
-from collections.abc import Iterable, Iterator
+from collections import deque
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.urdf.description.description import origin_of
-from magtwin.urdf.description.model import Shape
+from magtwin.urdf.description.model import Joint, Shape
 from magtwin.urdf.physics.link import is_marker
 from magtwin.urdf.physics.mechanism import Mechanism
 
@@ -60,12 +61,15 @@ def place_links(mechanism: Mechanism, *, merge: bool = False, filled: bool = Fal
     return {name: places[name] for name in description.links}
 
 
-def riders(places: dict[str, Place], body: str) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """The links that are part of a body or ride on it, itself first, with their poses in it."""
-    yield body, np.eye(4)
-    for name, (carrier, pose) in places.items():
-        if carrier == body != name:
-            yield name, pose
+def riders(places: Mapping[str, Place]) -> dict[str, list[Place]]:
+    """Of each body, the links that are part of it or ride on it, itself first, with their poses in it."""
+    groups: dict[str, list[Place]] = {
+        name: [(name, np.eye(4))] for name, (body, _) in places.items() if body == name
+    }
+    for name, (body, pose) in places.items():
+        if body != name and body in groups:
+            groups[body].append((name, pose))
+    return groups
 
 
 def carried(shapes: Iterable[Shape], pose: NDArray, link: str, body: str) -> list[Shape]:
@@ -88,34 +92,50 @@ def _taken_over(mechanism: Mechanism) -> dict[str, str]:
     Of several links that are welded to a link without mass, one without shapes is preferred.
     """
     description = mechanism.description
-    welded = [(child, j.parent) for child, j in description.joints.items() if j.name in mechanism.welded]
+    welded = _welded_below(mechanism)
     taken: dict[str, str] = {}
     for name, link in description.links.items():
         if link.inertial is not None or is_marker(link):
             continue
-        massive = [c for c, parent in welded if parent == name and description.links[c].inertial is not None]
+        massive = [c for c in welded.get(name, ()) if description.links[c].inertial is not None]
         massive.sort(key=lambda c: bool(description.links[c].visuals or description.links[c].collisions))
         if massive:
             taken[massive[0]] = name
     return taken
 
 
+def _welded_below(mechanism: Mechanism) -> dict[str, list[str]]:
+    """The links that are welded to each link, by the link above them."""
+    below: dict[str, list[str]] = {}
+    for child, joint in mechanism.description.joints.items():
+        if joint.name in mechanism.welded:
+            below.setdefault(joint.parent, []).append(child)
+    return below
+
+
 def _base(mechanism: Mechanism) -> tuple[str, list[str]]:
     """The robot's first body, or the world; and the links above it, which are only frames."""
-    description = mechanism.description
-    above, pending = {description.root: [description.root]}, [description.root]
+    description, below = mechanism.description, _welded_below(mechanism)
+    joints, reached = description.joints, {description.root: None}
+    pending = deque(reached)
     while pending:
-        link = pending.pop(0)
+        link = pending.popleft()
         if not is_marker(description.links[link]):
-            return link, above[link][:-1]
-        for child, joint in description.joints.items():
-            if joint.parent == link and joint.name in mechanism.welded:
-                above[child] = [*above[link], child]
-                pending.append(child)
-    joints = description.joints
-    moving = [child for child, joint in joints.items() if joint.parent in above and child not in above]
+            return link, _above(link, joints)
+        reached |= dict.fromkeys(below.get(link, ()))
+        pending += below.get(link, ())
+    moving = [child for child, joint in joints.items() if joint.parent in reached and child not in reached]
     if not moving:
         return description.root, []
     if len(moving) == 1 and joints[moving[0]].type == "floating":
-        return moving[0], above[joints[moving[0]].parent]
-    return WORLD, list(above)
+        return moving[0], _above(moving[0], joints)
+    return WORLD, list(reached)
+
+
+def _above(link: str, joints: Mapping[str, Joint]) -> list[str]:
+    """The links from the root down to a link, which is left out."""
+    way: list[str] = []
+    while link in joints:
+        link = joints[link].parent
+        way.append(link)
+    return way[::-1]

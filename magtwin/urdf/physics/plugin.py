@@ -107,7 +107,7 @@ def known_joint(tags: Tags, name: str, element: Element) -> str:
     Raises:
         IncompleteDriveError: None has.
     """
-    names = [joint.name for joint in tags.description.joints.values()]
+    names = tags.description.joint_names
     if name not in names:
         raise IncompleteDriveError(f"<{element.tag}>: no joint {name!r}; {hint(name, names)}", element)
     return name

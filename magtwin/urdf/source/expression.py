@@ -10,8 +10,8 @@ import ast
 import math
 import operator
 import re
-from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping
+from types import MappingProxyType
 from typing import Any
 
 from magtwin.errors import hint
@@ -24,6 +24,10 @@ LARGEST = 65_536
 
 BITS = 4_096
 """Most bits of an integer."""
+
+
+NODE, SCOPE = 2, 4
+"""Cost of each step, and of each turn of a comprehension or call of a lambda."""
 
 
 class ExpressionError(ValueError):
@@ -137,6 +141,9 @@ _WIDE = re.compile(r"%[^%a-zA-Z)]*(\*|\d{3})")
 _WIDE_KEYED = re.compile(_WIDE.pattern.replace("%", "[%)]", 1))
 """The same in a text with keys, `%(key)`, which end with a parenthesis."""
 
+_SURROGATE = re.compile("[\ud800-\udfff]")
+"""Halves of characters in UTF-16, which no file can hold."""
+
 NARROW = 420
 """Most characters of a number of type float in a format of two digits, 1e308 as "%.99f"."""
 
@@ -155,6 +162,7 @@ def evaluate(text: str, names: Mapping[str, Any], budget: Budget) -> Any:
     text = text.strip()
     if len(text) > LONGEST:
         raise ExpressionError(f"an expression of {len(text)} characters is too long (over {LONGEST})")
+    budget.spend(len(text))  # to parse it
     try:
         return _Interpreter(names, budget).value(ast.parse(text, mode="eval").body)
     except ExpressionError as error:
@@ -178,13 +186,15 @@ def check_size(value: Any, budget: Budget, *, plain: bool = False) -> Any:
         plain: Whether to refuse functions and other objects that have no text form.
 
     Raises:
-        ExpressionError: The value is too large, or not plain.
+        ExpressionError: The value is too large, not plain, or has half of a character.
     """
     pending, size = [value], 0
     while pending:
         entry = pending.pop()
         if isinstance(entry, str | bytes):
             size += len(entry)
+            if isinstance(entry, str) and not entry.isascii() and _SURROGATE.search(entry):
+                raise ExpressionError("half of a character (U+D800 to U+DFFF)")
         elif isinstance(entry, int):
             size += entry.bit_length() // 64  # a number of the usual size costs nothing
             if entry.bit_length() > BITS:
@@ -203,11 +213,15 @@ def check_size(value: Any, budget: Budget, *, plain: bool = False) -> Any:
 class _Interpreter:
     """Evaluates the tree of an expression; refuses every node that it does not list."""
 
-    def __init__(self, names: Mapping[str, Any], budget: Budget) -> None:
+    def __init__(
+        self, names: Mapping[str, Any], budget: Budget, inner: Mapping[str, Any] = MappingProxyType({})
+    ) -> None:
         self._names, self._budget = names, budget
+        self._inner = inner  # names of lambdas and comprehensions, which hide the others
+        self._depth: int = getattr(names, "depth", 0)  # of the macros whose properties are looked through
 
     def value(self, node: ast.expr) -> Any:
-        self._budget.spend()
+        self._budget.spend(NODE)
         match node:
             case ast.Constant() if isinstance(node.value, str | int | float | None):
                 return check_size(node.value, self._budget)
@@ -268,10 +282,14 @@ class _Interpreter:
         raise ExpressionError(f"{type(getattr(node, 'op', node)).__name__} is not allowed")
 
     def _name(self, name: str) -> Any:
+        if name in self._inner:
+            return self._inner[name]
+        self._budget.spend(self._depth)
         try:
             return self._names[name]
         except KeyError:
-            known = [key for key in self._names if isinstance(key, str) and not key.startswith("*")]
+            keys = (*self._inner, *self._names)
+            known = [key for key in keys if isinstance(key, str) and not key.startswith("*")]
             near = hint(name, known) if known else ""
             advice = f"; {near}" if near.startswith("did") else ""
             raise ExpressionError(f"no property {name!r}{advice}") from None
@@ -350,7 +368,8 @@ class _Interpreter:
         _check_length(len(text) + text.count("%") * (largest + NARROW))
 
     def _inside(self, names: dict[str, Any]) -> "_Interpreter":
-        return _Interpreter(ChainMap(names, self._names), self._budget)  # type: ignore[arg-type]
+        self._budget.spend(SCOPE + len(self._inner) // SCOPE)
+        return _Interpreter(self._names, self._budget, {**self._inner, **names})
 
     def _scopes(self, generators: list[ast.comprehension]) -> "Iterator[_Interpreter]":
         """An interpreter for each iteration of a comprehension."""
@@ -359,7 +378,6 @@ class _Interpreter:
             return
         first, *others = generators
         for value in _entries(self.value(first.iter)):
-            self._budget.spend()
             scope = self._inside(_bind(first.target, value))
             if all(scope.value(condition) for condition in first.ifs):
                 yield from scope._scopes(others)

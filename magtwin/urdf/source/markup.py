@@ -1,5 +1,6 @@
 """Markup: XML with the line of each element, without external references or entities."""
 
+import io
 import re
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,6 +15,13 @@ from magtwin.files import read_bytes
 
 _LONGEST_TAG = re.compile(rb"<[^<>]{%d}" % (1 << 20))
 """An element of over a million characters of attributes, which expat holds all at once."""
+
+
+BLOCK = 1 << 16
+"""Characters of a text that are worked on at once."""
+
+LONG = 1 << 18
+"""Characters of an element's text from which its attributes are not sorted."""
 
 
 class UnsafeError(InputError):
@@ -52,6 +60,7 @@ def parse_markup(text: bytes, path: Path) -> Markup:
     if _LONGEST_TAG.search(text):
         raise UnsafeError(f"{path}: not XML: an element of over a million characters")
     parser = expat.ParserCreate()
+    parser.buffer_text, parser.buffer_size = True, BLOCK  # else each line becomes a text of its own
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal depth, count
@@ -97,11 +106,20 @@ def parse_markup(text: bytes, path: Path) -> Markup:
 
 
 def plain_text(element: ElementTree.Element) -> str:
-    """An element as text on one line, with sorted attributes."""
+    """An element as text on one line, with sorted attributes unless it is `LONG`."""
     text = ElementTree.tostring(element, encoding="unicode").strip()
-    with suppress(ElementTree.ParseError):  # a prefix without a namespace
-        text = ElementTree.canonicalize(text, strip_text=True)
-    return " ".join(text.split())
+    text = text.encode("utf-8", "backslashreplace").decode("utf-8")
+    if len(text) < LONG:
+        with suppress(ElementTree.ParseError):  # a prefix without a namespace
+            text = ElementTree.canonicalize(text, strip_text=True)
+    line, apart = io.StringIO(), False
+    for start in range(0, len(text), BLOCK):
+        block = text[start : start + BLOCK]
+        words = block.split()
+        if words:
+            line.write(" " * (start > 0 and (apart or block[0].isspace())) + " ".join(words))
+        apart = block[-1].isspace() or (apart and not words)
+    return line.getvalue()
 
 
 def _undecodable(text: bytes, line: int) -> str:

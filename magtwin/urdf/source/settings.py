@@ -1,6 +1,7 @@
 """Settings: YAML files beside a description, read as plain data of limited size."""
 
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,9 @@ from magtwin.files import read_text, yaml_loader
 
 ENTRIES = BUDGETS["YAML"].count
 """Most tables of a file."""
+
+VALUES = 100 * ENTRIES
+"""Most values of all tables, each with those of the tables below it."""
 
 
 def read_settings(path: Path) -> Iterator[dict[str, Any]]:
@@ -29,13 +33,18 @@ def read_settings(path: Path) -> Iterator[dict[str, Any]]:
         said = str(error).partition(";")[0].partition("\n")[0]
         reason = getattr(error, "problem", None) or said or "cannot be read"
         raise InputError(f"{path}{line}: not YAML: {reason}") from error
+    left = VALUES
     for _ in range(ENTRIES):  # aliases of aliases could go on without end
         if not pending:
             return
         node = pending.pop()
         if isinstance(node, dict):
+            table = dict(islice(_dotted(node, "", 0), left + 1))
+            left -= len(table)
+            if left < 0:
+                raise InputError(f"{path}: has over {VALUES:,} values, with those of its aliases")
             pending += node.values()
-            yield dict(_dotted(node, "", 0))
+            yield table
 
 
 def _dotted(table: dict[Any, Any], prefix: str, depth: int) -> Iterator[tuple[str, Any]]:

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from xml.etree import ElementTree
@@ -32,6 +33,24 @@ class Source:
 
     repairs: Repairs = field(default_factory=Repairs)
     """Receives every repair and note of the conversion; those of the expansion so far."""
+
+    @cached_property
+    def elements(self) -> Mapping[tuple[str, str], ElementTree.Element]:
+        """The first element of each kind and name, from when every link and joint has its own name.
+
+        Keys are `robot/TAG` and name of elements directly below `<robot>`; tag and filename of those that
+        name a file, and "" and filename of the first of any tag.
+        """
+        first: dict[tuple[str, str], ElementTree.Element] = {}
+        for element in self.xml:
+            if "name" in element.attrib:
+                first.setdefault((f"robot/{element.tag}", element.attrib["name"]), element)
+        for element in self.xml.iter():
+            filename = element.get("filename")
+            if filename is not None:
+                first.setdefault((element.tag, filename), element)
+                first.setdefault(("", filename), element)
+        return first
 
     def where(self, element: ElementTree.Element | None) -> str:
         """File and line of an element, as `file:line`; the file alone if it has none."""
@@ -98,8 +117,8 @@ class Source:
                 "or name its folder by --package NAME=FOLDER"
             )
         if not path.is_file():
-            siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-            advice = near(path.name, siblings)
+            siblings = (p.name for p in path.parent.iterdir()) if path.parent.is_dir() else ()
+            advice = self.repairs.suggestion(path.name, siblings, near)
             absent = MissingFileError(f"{start} is missing{advice}; looked for {path}")
             absent.near = advice
             raise absent

@@ -6,15 +6,16 @@ description and from packages only, and environment variables are not read: `$(e
 arguments instead. The library still handles macros, scopes, blocks, conditions and lazy properties.
 """
 
-import glob
 import importlib.util
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from fnmatch import fnmatch
 from pathlib import Path
 from types import ModuleType
 from typing import Any
-from xml.dom import minidom
+from xml.dom import DOMException, minidom
 from xml.etree import ElementTree
 from xml.parsers.expat import ExpatError
 
@@ -25,8 +26,15 @@ from magtwin.urdf.source.expression import GLOBALS, LARGEST, Budget, ExpressionE
 from magtwin.urdf.source.markup import UnsafeError, parse_markup
 from magtwin.urdf.source.package import MissingFileError, Packages
 
-UNITS, ELEMENT = 20_000_000, 100
-"""Budget of an expansion, and the cost of each element."""
+UNITS, ELEMENT, FILE = 20_000_000, 100, 1_000
+"""Budget of an expansion, the cost of each element, and that of each file or package that is looked for.
+A unit is about half a microsecond."""
+
+COPY, TEXT, PER_YAML = 40, 4, 20
+"""Cost of each element that is copied; of each text; and of each byte of YAML, which is read slowly."""
+
+SIBLINGS = 16
+"""Children of an element that are looked through for one unit."""
 
 PLACE = "magtwin.place"
 """Key of a node's user data: its file and line."""
@@ -45,6 +53,14 @@ _PIECES = re.compile(
     r"(?P<escaped>\$\$+[{(])|\$\{(?P<expression>[^}]*)\}|\$\((?P<command>[^)]*)\)|(?P<text>[^$]+|\$[^{($]+|\$$)"
 )
 """Tokens of a text, as xacro defines them."""
+
+_WILD = re.compile(r"[*?\[]")
+
+_PARAMETER = re.compile(
+    r"^\s*([^\s:=]+?)\s*:?=\s*(\^\|?)?"
+    r"""(\$\{.*?\}|\$\(.*?\)|(?:'[^'\n]*+'|"[^"\n]*+"|[^\s'"]++)++|)(?:\s+|$)(.*)"""
+)
+"""A parameter of a macro with its default, as in the library, whose pattern takes exponential time."""
 
 Place = tuple[Path, int]
 
@@ -96,6 +112,7 @@ class _Expansion:
         self._optional = self._including = False
         self._asked: set[str] = set()
         self._budget = Budget(UNITS)
+        self._placed = _Placed(self._budget)
         self._at: Place = (path, 1)
         self._library = _library()
         library = self._library
@@ -105,7 +122,10 @@ class _Expansion:
             "eval_text": self._text,
             "parse": self._parse,
             "get_include_files": self._included,
+            "parse_macro_arg": self._parameter,
             "print_location": lambda: None,
+            "replace_node": self._replaced(library.replace_node),
+            "resolve_macro": self._resolved(library.resolve_macro),
         }
         for name in ("check_attrs", "eval_all", "handle_macro_call", "reqd_attrs"):
             ours[name] = self._followed(getattr(library, name))
@@ -159,7 +179,10 @@ class _Expansion:
             raise self._refused(" ".join(str(error.args[0] or error).split())) from error
         except InputError:
             raise
-        except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        except (
+            *(ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError),
+            DOMException,
+        ) as error:
             raise self._refused(f"cannot be expanded: {error}") from error
         return document
 
@@ -239,8 +262,41 @@ class _Expansion:
 
         return follow
 
+    def _replaced(self, replace: Callable[..., Any]) -> Callable[..., Any]:
+        """The library's replacement of a node by others; pays for the siblings among which it looks."""
+
+        def replaced(node: minidom.Element, by: Any, content_only: bool = False) -> None:
+            new = by if isinstance(by, list) else [] if by is None else [by]
+            count = sum(len(one.childNodes) for one in new) if content_only else len(new)
+            siblings = 0 if node.parentNode is None else len(node.parentNode.childNodes)
+            self._budget.spend((2 + count) * (siblings + count) // SIBLINGS)
+            replace(node, by, content_only)
+
+        return replaced
+
+    def _resolved(self, resolve: Callable[..., Any]) -> Callable[..., Any]:
+        """The library's look-up of a macro; pays to compare its parameters with those of the call."""
+
+        def resolved(*arguments: Any) -> Any:
+            match = resolve(*arguments)
+            self._budget.spend(len(match[2].params or ()) ** 2 // SIBLINGS)
+            return match
+
+        return resolved
+
+    def _parameter(self, text: str) -> tuple[str, tuple[str | None, str | None] | None, str]:
+        """The first parameter of a macro, the argument that it forwards and its default, and the others."""
+        self._budget.spend(1 + len(text) // SIBLINGS)
+        match = _PARAMETER.match(text)
+        if match is not None:
+            name, forward, default, rest = match.groups()
+            return name, (name if forward else None, default or None), rest
+        name, *others = text.split(None, 1)
+        return name, None, others[0] if others else ""
+
     def _text(self, text: str, symbols: Mapping[str, Any]) -> Any:
         """The value of a text: that of a single expression, or all parts joined to a string."""
+        self._budget.spend(TEXT + len(text) // SIBLINGS)
         values: list[Any] = []
         end = 0
         for piece in _PIECES.finditer(text):
@@ -270,6 +326,7 @@ class _Expansion:
 
     def _command(self, text: str) -> str:
         """The value of `$(...)`."""
+        self._budget.spend(TEXT)
         command, _, rest = text.strip().partition(" ")
         words = rest.split()
         if command == "eval":
@@ -286,6 +343,7 @@ class _Expansion:
         raise ExpressionError(f"$({text}) is not known; known: arg, dirname, env, eval, find, optenv")
 
     def _find(self, name: str) -> str:
+        self._budget.spend(FILE)
         try:
             return str(self._packages.find(name))
         except MissingFileError as error:
@@ -335,10 +393,7 @@ class _Expansion:
                 self._skipped[text] = self._place()
             return
         wanted = self._library.abs_filename_spec(text)
-        files = [wanted]
-        if pattern := re.search(r"[*?\[]", wanted):
-            self._check_inside(os.path.dirname(wanted[: pattern.start()]), "include")  # noqa: PTH120
-            files = sorted(glob.glob(wanted))  # noqa: PTH207 - the pattern may be absolute
+        files = self._matching(wanted) if _WILD.search(wanted) else [wanted]
         if not files:
             self._note(f"include {filename!r} matches no file")
         for file in files:
@@ -354,7 +409,43 @@ class _Expansion:
                 file = str(other)
             yield file
 
+    def _matching(self, pattern: str) -> list[str]:
+        """Files and folders that a pattern names, sorted. Each entry that is looked at is paid for.
+
+        Raises:
+            ExpressionError: Its folder lies outside; or it climbs by `..` after a wildcard, from where it
+                could list everything.
+        """
+        match = _WILD.search(pattern)
+        assert match is not None
+        start = os.path.dirname(pattern[: match.start()])  # noqa: PTH120
+        self._check_inside(start, "include")
+        places, names = [start], pattern[len(start) :].split("/")
+        if ".." in names:
+            raise ExpressionError(f"include {pattern!r} has '..' after a wildcard; leave it out")
+        for name in names:
+            if name not in ("", "."):
+                places = [path for place in places for path in self._below(place, name)]
+        return sorted(places)
+
+    def _below(self, folder: str, name: str) -> list[str]:
+        """The entries of a folder that a name with or without wildcards names; none if it lies outside."""
+        self._budget.spend(ELEMENT)
+        path = Path(folder)
+        if not _WILD.search(name):
+            return [os.path.join(folder, name)] if os.path.lexists(path / name) else []  # noqa: PTH118
+        if not self._packages.holds(path):
+            return []
+        found = []
+        with suppress(OSError), os.scandir(path) as entries:
+            for entry in entries:
+                self._budget.spend(ELEMENT // 10)
+                if fnmatch(entry.name, name) and (name[0] == "." or entry.name[0] != "."):
+                    found.append(entry.path)
+        return found
+
     def _check_inside(self, file: str, what: str) -> Path:
+        self._budget.spend(FILE)
         path = Path(os.path.normpath(file))
         if not self._packages.holds(path):
             raise ExpressionError(
@@ -375,8 +466,10 @@ class _Expansion:
             raise self._library.XacroException(
                 f"include {str(path)!r} cannot be read: {reason}", exc=error
             ) from error
+        self._budget.spend(FILE + len(content))
         markup = parse_markup(content, path)
-        self._budget.spend(ELEMENT * len(markup.lines))
+        attributes = sum(len(element.attrib) for element in markup.lines)
+        self._budget.spend(ELEMENT * (len(markup.lines) + attributes // 4))
         try:
             document = minidom.parseString(content)
         except ExpatError as error:
@@ -386,7 +479,7 @@ class _Expansion:
             ) from error
         elements = document.getElementsByTagName("*")
         for element, line in zip(elements, markup.lines.values(), strict=True):
-            element.setUserData(PLACE, (path, line), _KEEP)
+            element.setUserData(PLACE, (path, line), self._placed)
         return document
 
     def _yaml(self, filename: str) -> Any:
@@ -409,7 +502,7 @@ class _Expansion:
             UnitLoader.add_constructor(tag, number(factor))
         try:
             content = read_bytes(path, "YAML file", "YAML")
-            self._budget.spend(len(content))
+            self._budget.spend(PER_YAML * len(content))
             return check_size(yaml.load(content, UnitLoader), self._budget)
         except OSError as error:
             raise ExpressionError(f"load_yaml: {path} cannot be read ({error.strerror})") from error
@@ -451,6 +544,7 @@ class _Supplied(Mapping[str, Any]):
 
     def __init__(self, symbols: Mapping[str, Any], expansion: _Expansion) -> None:
         self._symbols, self._expansion = symbols, expansion
+        self.depth = getattr(symbols, "depth", 0)
 
     def __getitem__(self, name: str) -> Any:
         try:
@@ -465,15 +559,16 @@ class _Supplied(Mapping[str, Any]):
         return len(self._symbols)
 
 
-class _Keep:
-    """Copies the place of a node to its copies (DOM level 3, UserDataHandler)."""
+class _Placed:
+    """Copies the place of an element to its copies, and pays for them (DOM level 3, UserDataHandler)."""
+
+    def __init__(self, budget: Budget) -> None:
+        self._budget = budget
 
     def handle(self, operation: int, key: str, data: Any, src: Any, dst: Any) -> None:
+        self._budget.spend(COPY * (1 + len(src.attributes) // 4 + len(src.childNodes) // 4))
         if dst is not None:
             dst.setUserData(key, data, self)
-
-
-_KEEP = _Keep()
 
 
 def _library() -> ModuleType:
@@ -496,7 +591,9 @@ def _fatal(*words: Any) -> None:
 
 def _tokenize(text: str, sep: str = ",; ", skip_empty: bool = True) -> list[str]:
     """Words of a text, split at any of the characters `sep`."""
-    words = re.split(f"[{re.escape(sep)}]", text)
+    if not sep:
+        raise ExpressionError("tokenize: sep is empty; give the characters between the words")
+    words = text.translate(dict.fromkeys(map(ord, sep), sep[0])).split(sep[0])
     return [word for word in words if word or not skip_empty]
 
 
