@@ -54,6 +54,9 @@ _WRITTEN = re.compile(
 _PROBE = 1 << 16
 """Bytes that are written to see whether a disk is full."""
 
+_ENDS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""Signals that end a command: Ctrl-C, the request to end, and the end of the terminal."""
+
 _asides: set[Path] = set()
 """Hidden folders of this process."""
 
@@ -479,12 +482,12 @@ def _sync_entry(folder: Path) -> None:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Delay Ctrl-C and the request to end to the end of the block."""
+    """Delay the signals `_ENDS` to the end of the block."""
     if threading.current_thread() is not threading.main_thread():  # Python interrupts the main thread only
         yield
         return
     came: list[int] = []
-    before = {sign: signal.getsignal(sign) for sign in (signal.SIGINT, signal.SIGTERM)}
+    before = {sign: signal.getsignal(sign) for sign in _ENDS}
     before = {sign: handler for sign, handler in before.items() if handler is not None}
     for sign in before:
         signal.signal(sign, lambda number, frame: came.append(number))

@@ -3,6 +3,7 @@
 import errno
 import functools
 import inspect
+import os
 import re
 import signal
 import sys
@@ -63,9 +64,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the `magtwin` command; `arguments` default to those of the command line."""
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments
-    signal.signal(
-        signal.SIGTERM, lambda *_: sys.exit(143)
-    )  # an exception, so that partial outputs are removed
+    _end_by_exceptions()
     _running.clear()
     try:
         arguments, folders = _allowed([a for a in arguments if a != "--debug"])
@@ -102,6 +101,20 @@ def main(arguments: list[str] | None = None) -> None:
         if text := _no_room(error):
             _fail(text)
         _fail(f"a fault in magtwin, {type(error).__name__}: {error}; please report it, with --debug")
+
+
+def _end_by_exceptions() -> None:
+    """Turn signals that end the process into exceptions, so that partial outputs are removed."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    if os.name == "nt" or signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # nohup
+        return
+
+    def hang_up(*_: object) -> None:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the kernel and the shell both send it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # the terminal is gone: each line would be an error
+        sys.exit(129)
+
+    signal.signal(signal.SIGHUP, hang_up)
 
 
 def _allowed(arguments: list[str]) -> tuple[list[str], list[str]]:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 
@@ -318,20 +319,22 @@ def test_of_several_outputs_all_are_written_or_none(lab_scene, tmp_path, capsys)
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_run_that_is_told_to_end_leaves_nothing(lab_scene, tmp_path):
-    import signal
+@pytest.mark.parametrize(("sign", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_run_that_is_told_to_end_leaves_nothing(lab_scene, tmp_path, sign, status):
     import time
 
     command = [sys.executable, "-c", "from magtwin.cli import main; main()", "run", str(lab_scene)]
     process = subprocess.Popen(
-        [*command, "--duration-s", "20000", "--out", str(tmp_path / "run")], stderr=subprocess.DEVNULL
+        [*command, "--duration-s", "20000", "--out", str(tmp_path / "run")],
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),  # nohup ignores it
     )
     deadline = time.monotonic() + 30
     while not list(tmp_path.iterdir()) and time.monotonic() < deadline:
         time.sleep(0.02)
     assert list(tmp_path.iterdir())
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(60) == 143
+    process.send_signal(sign)
+    assert process.wait(60) == status
     assert not list(tmp_path.iterdir())
 
 
