@@ -71,18 +71,55 @@ _pending: ContextVar["_Pending | None"] = ContextVar("pending", default=None)
 
 
 def check_free(path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """`path` if it does not exist yet, or if `force` is True.
+    """`path` if an output can be made there: it does not exist yet, or `force` is True.
 
     Raises:
-        InputError: It exists and `force` is False.
+        InputError: It exists and `force` is False. Or it cannot be replaced, or be the name of an output.
     """
     path = Path(path)
+    kept = _foreign(path) if path.is_dir() else ""
+    if kept and not _wrong(path):
+        text = "which would be removed with it; move it away, remove the folder, or give another name"
+        raise InputError(f"{path}: {'holds' if force else 'exists already, with'} {kept}, {text}")
+    return _free(path, force=force)
+
+
+def _free(path: Path, *, force: bool) -> Path:
+    """As `check_free`, but for files in an existing folder, which the new one may have too."""
+    if wrong := _wrong(path):
+        raise InputError(f"{path if str(path).strip() else repr(str(path))}: {wrong}")
     _sweep((Path.cwd() / path).parent)
     if path.exists() and not force:
         raise InputError(
             f"{path}: exists already; give `force=True` to replace it, or another name", parameter="force"
         )
     return path
+
+
+def _wrong(path: Path) -> str:
+    """Why there can be no output of this name, and what to do; "" if there can."""
+    real = Path(os.path.realpath(path))
+    for folder, what in ((Path.cwd(), "working"), (Path("~").expanduser(), "home")):
+        if real in (folder, *folder.parents):
+            return f"is the {what} folder or contains it; give a folder inside it"
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        return "a device or pipe, which cannot be replaced; give a file"
+    if not path.name.strip():
+        return "a blank name; give another"
+    if _WRITTEN.fullmatch(path.name.lower()):
+        return f"a suffix without a name; give one, such as run{path.name}"
+    if any("\udc80" <= letter <= "\udcff" for letter in path.name):
+        return "its name is not UTF-8, and file formats store names as UTF-8; give another"
+    above = next(folder for folder in path.parents if folder.exists())
+    if not above.is_dir():
+        return f"cannot be written, as {above} is no folder; give another name"
+    return ""
+
+
+def _foreign(folder: Path) -> str:
+    """A file in a folder that no output has; "" if there is none. Exports have scripts."""
+    files = (file for file in sorted(folder.iterdir()) if file.suffix != ".py" and not file.is_dir())
+    return next((file.name for file in files if not _WRITTEN.fullmatch(file.suffix.lower())), "")
 
 
 @contextmanager
@@ -100,12 +137,8 @@ def output(path: str | os.PathLike[str], *, force: bool = False, at_once: bool =
     Raises:
         InputError: It exists and `force` is False, its folder cannot be written, or the disk is full.
     """
-    path = check_free(path, force=force)
+    path = _free(Path(path), force=force)
     place = Path.cwd() / path  # absolute, since the working folder can be renamed
-    if Path(os.path.realpath(place)) in (Path.cwd(), *Path.cwd().parents):
-        raise InputError(f"{path}: is the working folder or contains it; give a folder inside it")
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        raise InputError(f"{path}: a device or pipe, which cannot be replaced; give a file")
     inner = any(folder in place.parents for folder in _asides)  # a part of another output
     try:
         place.parent.mkdir(parents=True, exist_ok=True)

@@ -194,7 +194,7 @@ def live_viewer(
 
 @contextmanager
 def _own_folder() -> Iterator[dict[str, str]]:
-    """The environment of a viewer whose temporary files are removed after the block; it leaves some behind."""
+    """The environment of a viewer, which leaves temporary files behind; they are removed after the block."""
     with tempfile.TemporaryDirectory(prefix="magtwin-viewer-", ignore_cleanup_errors=True) as folder:
         yield {**os.environ, **dict.fromkeys(("TMPDIR", "TMP", "TEMP"), folder)}
 
