@@ -29,7 +29,7 @@ try:
 except ImportError:  # Windows, where nothing is swept
     fcntl = None  # type: ignore[assignment]
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors of a disk that is full or read-only."""
 
 _OURS = ".magtwin-"
@@ -235,7 +235,7 @@ def transaction() -> Iterator[None]:
         yield
         _commit(pending.asides)
     except OSError as error:
-        if error.errno not in _FULL:
+        if error.errno not in FULL:
             raise
         raise InputError(f"the outputs cannot be written ({os.strerror(error.errno)})") from error
     finally:
@@ -477,7 +477,7 @@ def exchanged(one: Path, other: Path) -> bool:
 def why_full(folder: Path, error: Exception | None = None) -> str:
     """In which way the disk of a folder is full, or was when an error was raised; "" if it is not."""
     number = error.errno if isinstance(error, OSError) else None
-    reasons = [os.strerror(full) for full in _FULL if full == number or os.strerror(full) in str(error)]
+    reasons = [os.strerror(full) for full in FULL if full == number or os.strerror(full) in str(error)]
     if reasons:
         return reasons[0]
     try:
@@ -486,7 +486,7 @@ def why_full(folder: Path, error: Exception | None = None) -> str:
                 pass
             os.fsync(file.fileno())
     except OSError as probe:
-        return os.strerror(probe.errno) if probe.errno in _FULL else ""
+        return os.strerror(probe.errno) if probe.errno in FULL else ""
     return ""
 
 

@@ -136,6 +136,20 @@ def test_nothing_is_overwritten_unasked(tmp_path):
     assert check_free(tmp_path / "a.txt", force=True) == tmp_path / "a.txt"
 
 
+def test_a_link_to_nothing_is_called_so(tmp_path):
+    (tmp_path / "run.parquet").symlink_to("gone.parquet")
+    with pytest.raises(InputError, match=r"no such run: a link to 'gone\.parquet', which does not exist"):
+        existing(tmp_path / "run.parquet", "run")
+
+
+def test_only_a_near_name_is_suggested(tmp_path):
+    (tmp_path / "run.parquet").touch()
+    with pytest.raises(InputError, match=r"rum\.parquet: no such run; did you mean 'run\.parquet'\?"):
+        existing(tmp_path / "rum.parquet", "run")
+    with pytest.raises(InputError, match=r"no such run$"):
+        existing(tmp_path / "mine.parquet", "run")
+
+
 def test_an_output_below_a_file_is_refused(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match=r"cannot be written, as .*file is no folder"):

@@ -23,6 +23,7 @@ from magtwin.cli.renamed import renamed
 from magtwin.cli.terminal import Done, output_mode, print_error
 from magtwin.errors import CalibrationWarning, InputError, MismatchWarning
 from magtwin.folders import allow
+from magtwin.outputs import FULL
 from magtwin.version import __version__
 
 app = App(
@@ -76,6 +77,7 @@ def main(arguments: list[str] | None = None) -> None:
                 result_action="return_value",
                 **_help_options(arguments),
             )
+            sys.stdout.flush()  # a fault is reported here
     except CycloptsError as error:
         _fail(renamed(error, arguments) or _dashed(arguments) or str(error), status=2)
     except KeyboardInterrupt:
@@ -97,7 +99,8 @@ def main(arguments: list[str] | None = None) -> None:
         if isinstance(error, FileNotFoundError) and _folder_gone():
             _fail("the working folder was removed; change to another one")
         if isinstance(error, OSError):
-            _fail(f"{error} ({type(error).__name__})")
+            full = "" if error.errno not in FULL or error.filename else _stdout_full()
+            _fail(full or f"{error} ({type(error).__name__})")
         if text := _no_room(error):
             _fail(text)
         _fail(f"a fault in magtwin, {type(error).__name__}: {error}; please report it, with --debug")
@@ -148,6 +151,16 @@ def _folder_gone() -> bool:
     except FileNotFoundError:
         return True
     return False
+
+
+def _stdout_full() -> str:
+    """The refusal of a stdout on a full disk, of which Python does not speak; "" if it can be written."""
+    try:
+        print(flush=True)  # noqa: T201
+    except OSError as error:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - else Python tries once more, at its end
+        return f"stdout cannot be written ({error.strerror}); make room there, or send it elsewhere"
+    return ""
 
 
 def _no_room(error: Exception) -> str:

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -317,6 +318,20 @@ def test_of_several_outputs_all_are_written_or_none(lab_scene, tmp_path, capsys)
     assert "cannot be written" in refused(capsys, *arguments, "--out", tmp_path / "file" / "a.rrd")
     assert "two outputs have one name" in refused(capsys, *arguments, "--out", tmp_path / "a.parquet")
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has /dev/full")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_stdout_that_is_full_is_named(unbuffered):
+    command = [sys.executable, "-c", "from magtwin.cli import main; main()", "--version"]
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            command, check=False, stdout=full, stderr=subprocess.PIPE, text=True, env=environment
+        )
+    assert done.returncode == 1
+    assert done.stderr.startswith("magtwin: stdout cannot be written (No space left on device);")
+    assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(("sign", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])

@@ -242,6 +242,14 @@ LONG, BYTES = "n" * 300, os.fsdecode(b"b\xff\xfe")
             ["convert", "run.npz", "path.csv"],
             "path.csv: exists already; give --force to replace it, or another name",
         ),
+        (
+            ["run", "lab", "--out", "new.json"],
+            "new.json: a released package is read, not written; give one of",
+        ),
+        (
+            ["convert", "run.npz", "new.json"],
+            "new.json: a released package is read, not written; give one of",
+        ),
         (["robot", "robot.urdf", "--out", "set"], "set: exists already; give --force"),
         (["run", "lab", "--duration-s", "nan", "--out", "new"], "--duration-s must be above 0 s and finite"),
         (
