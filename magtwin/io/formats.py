@@ -136,6 +136,7 @@ def write_run(
     """
     path = Path(path)
     format_ = format_to_write(path)
+    assert format_.write is not None
     if unknown := sorted(options.keys() - format_.takes):
         raise InputError(f"{path}: {format_.name} has no option {unknown[0]!r}; drop it")
     check_clock(run, "the run to write")
