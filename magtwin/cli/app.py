@@ -23,7 +23,6 @@ from magtwin.cli.renamed import renamed
 from magtwin.cli.terminal import Done, output_mode, print_error
 from magtwin.errors import CalibrationWarning, InputError, MismatchWarning
 from magtwin.folders import allow
-from magtwin.outputs import FULL
 from magtwin.version import __version__
 
 app = App(
@@ -99,6 +98,8 @@ def main(arguments: list[str] | None = None) -> None:
         if isinstance(error, FileNotFoundError) and _folder_gone():
             _fail("the working folder was removed; change to another one")
         if isinstance(error, OSError):
+            from magtwin.outputs import FULL
+
             full = "" if error.errno not in FULL or error.filename else _stdout_full()
             _fail(full or f"{error} ({type(error).__name__})")
         if text := _no_room(error):

@@ -344,10 +344,13 @@ def check_asked(speed: float, duration_s: float | None, rate_hz: float | None) -
     if not 0 < speed <= FASTEST:
         text = f"speed must be above 0 m/s and at most the drive's v_max, got {speed!r}"
         raise InputError(text, parameter="speed")
-    for name, value, unit in (("duration_s", duration_s, "s"), ("rate_hz", rate_hz, "Hz")):
+    for value, what, unit in (
+        (duration_s, "duration_s", "s"),
+        (rate_hz, "rate_hz of the magnetometer", "Hz"),
+    ):
         if value is not None and not 0 < value < math.inf:
-            text = f"{name} must be above 0 {unit} and finite, got {value!r}"
-            raise InputError(text, parameter=name)
+            text = f"{what} must be above 0 {unit} and finite, got {value!r}"
+            raise InputError(text, parameter=what.partition(" ")[0])
 
 
 def _check_readings(duration_s: float, rate_hz: float) -> None:
