@@ -12,6 +12,9 @@ T = TypeVar("T")
 LONGEST = 1500
 """Most characters of a refusal; what it quotes from a file may have no end."""
 
+NEAR, NEAR_SHORT, SHORT = 0.7, 0.6, 4
+"""Least similarity of a suggested name (1: equal): of a long one, and of one of at most so many letters."""
+
 _PARAMETER = re.compile(r"`(?:magtwin\.)?([a-z_][a-z0-9_]*)(?:=([^`]*)|\(([^`]*)\))?`")
 """A parameter in the text of a refusal: `force=True`, `map_layer`, `magtwin.allow('folder')`."""
 
@@ -91,14 +94,22 @@ class UnknownNameError(InputError, KeyError):
 def hint(name: object, known: Iterable[str]) -> str:
     """The end of a refusal: the nearest known name, or all of them. A name from a file may be no text."""
     known = sorted(known)
-    near = difflib.get_close_matches(name, known, n=1) if isinstance(name, str) else ()
-    return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
+    match = _nearest(name, known)
+    return f"did you mean {match!r}?" if match else f"known: {', '.join(known)}"
 
 
 def near(name: object, known: Iterable[str]) -> str:
     """An addition to a text with the nearest known name: " (did you mean 'left'?)", or ""."""
-    match = difflib.get_close_matches(name, sorted(known), n=1) if isinstance(name, str) else ()
-    return f" (did you mean {match[0]!r}?)" if match else ""
+    match = _nearest(name, sorted(known))
+    return f" (did you mean {match!r}?)" if match else ""
+
+
+def _nearest(name: object, known: list[str]) -> str:
+    """The nearest known name, "" if all are far."""
+    if not isinstance(name, str):
+        return ""
+    cutoff = NEAR_SHORT if len(name) <= SHORT else NEAR
+    return next(iter(difflib.get_close_matches(name, known, n=1, cutoff=cutoff)), "")
 
 
 def find(kind: str, name: object, table: Mapping[str, T]) -> T:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from magtwin.budget import BUDGETS, check_count, check_decoded, check_depth, check_size
-from magtwin.errors import InputError, hint
+from magtwin.errors import NEAR, InputError, hint
 
 T = TypeVar("T")
 
@@ -36,6 +36,9 @@ def shipped(*parts: str) -> Path:
         raise InputError(f"{path}: missing; reinstall magtwin")
     return path
 
+
+NEAR_STEM = 0.5
+"""Least similarity of a suggested file without its suffix, beside `NEAR` with it."""
 
 _SPECIAL = (
     (stat.S_ISFIFO, "a pipe"),
@@ -59,10 +62,11 @@ def existing(path: str | os.PathLike[str], what: str) -> Path:
     except (FileNotFoundError, NotADirectoryError):
         if not path.parent.is_dir():
             raise InputError(f"{path}: no such {what}; there is no folder {str(path.parent)!r}") from None
-        near = difflib.get_close_matches(path.name, [p.name for p in path.parent.iterdir()], n=1)
-        raise InputError(
-            f"{path}: no such {what}" + (f"; did you mean {near[0]!r}?" if near else "")
-        ) from None
+        if path.is_symlink():
+            text = f"a link to {str(path.readlink())!r}, which does not exist; restore that, or give another"
+            raise InputError(f"{path}: no such {what}: {text}") from None
+        near = _near_file(path)
+        raise InputError(f"{path}: no such {what}" + (f"; did you mean {near!r}?" if near else "")) from None
     except ValueError as error:  # a null character
         raise InputError(f"{str(path)!r}: no name of a {what}: {error}") from error
     except OSError as error:
@@ -72,6 +76,13 @@ def existing(path: str | os.PathLike[str], what: str) -> Path:
         if is_kind(mode):
             raise InputError(f"{path}: {kind}, not a {what}; copy what it gives into a file")
     return path
+
+
+def _near_file(path: Path) -> str:
+    """The most similar name beside a file, "" if there is none: both with their suffixes and without."""
+    names = difflib.get_close_matches(path.name, [p.name for p in path.parent.iterdir()], cutoff=NEAR)
+    stems = (difflib.SequenceMatcher(None, path.stem, Path(name).stem) for name in names)
+    return next((name for name, both in zip(names, stems, strict=True) if both.ratio() >= NEAR_STEM), "")
 
 
 def existing_file(path: str | os.PathLike[str], what: str, kind: str) -> Path:

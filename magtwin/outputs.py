@@ -30,7 +30,7 @@ try:
 except ImportError:  # Windows, where nothing is swept
     fcntl = None  # type: ignore[assignment]
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors of a disk that is full or read-only."""
 
 _OURS = ".magtwin-"
@@ -55,6 +55,9 @@ _WRITTEN = re.compile(
 _PROBE = 1 << 16
 """Bytes that are written to see whether a disk is full."""
 
+_ENDS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""Signals that end a command: Ctrl-C, the request to end, and the end of the terminal."""
+
 _asides: set[Path] = set()
 """Hidden folders of this process."""
 
@@ -68,18 +71,25 @@ _pending: ContextVar["_Pending | None"] = ContextVar("pending", default=None)
 """What waits for the end of the transaction; None outside of one."""
 
 
-def check_free(path: str | os.PathLike[str], *, force: bool = False, in_place: bool = False) -> Path:
-    """`path` if it does not exist yet, or if `force` is True and the command does not read it.
-
-    Args:
-        path: The file or folder to make.
-        force: Whether an existing one is replaced.
-        in_place: Whether it is a changed version of a file that the command reads.
+def check_free(path: str | os.PathLike[str], *, force: bool = False) -> Path:
+    """`path` if an output can be made there: it does not exist yet, or `force` is True.
 
     Raises:
-        InputError: It exists and `force` is False, or it is an input of the command.
+        InputError: It exists and `force` is False, or it is an input of the command. Or it cannot be
+            replaced, or be the name of an output.
     """
     path = Path(path)
+    kept = _foreign(path) if path.is_dir() else ""
+    if kept and not _wrong(path):
+        text = "which would be removed with it; move it away, remove the folder, or give another name"
+        raise InputError(f"{path}: {'holds' if force else 'exists already, with'} {kept}, {text}")
+    return _free(path, force=force)
+
+
+def _free(path: Path, *, force: bool, in_place: bool = False) -> Path:
+    """As `check_free`, but for files in an existing folder, which the new one may have too."""
+    if wrong := _wrong(path):
+        raise InputError(f"{path if str(path).strip() else repr(str(path))}: {wrong}")
     _sweep((Path.cwd() / path).parent)
     if path.exists() and not force:
         raise InputError(
@@ -88,6 +98,33 @@ def check_free(path: str | os.PathLike[str], *, force: bool = False, in_place: b
     if not in_place and Path(os.path.realpath(path)) in _inputs.get():
         raise InputError(f"{path}: is read by this command and would be replaced; give another name")
     return path
+
+
+def _wrong(path: Path) -> str:
+    """Why there can be no output of this name, and what to do; "" if there can."""
+    real = Path(os.path.realpath(path))
+    home = Path(os.path.expanduser("~"))  # noqa: PTH111 - Path.expanduser raises where there is no home
+    for folder, what in ((Path.cwd(), "working"), (home, "home")):
+        if real in (folder, *folder.parents):
+            return f"is the {what} folder or contains it; give a folder inside it"
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        return "a device or pipe, which cannot be replaced; give a file"
+    if not path.name.strip():
+        return "a blank name; give another"
+    if _WRITTEN.fullmatch(path.name.lower()):
+        return f"a suffix without a name; give one, such as run{path.name}"
+    if any("\udc80" <= letter <= "\udcff" for letter in path.name):
+        return "its name is not UTF-8, and file formats store names as UTF-8; give another"
+    above = next(folder for folder in path.parents if folder.exists())
+    if not above.is_dir():
+        return f"cannot be written, as {above} is no folder; give another name"
+    return ""
+
+
+def _foreign(folder: Path) -> str:
+    """A file in a folder that no output has; "" if there is none. Exports have scripts."""
+    files = (file for file in sorted(folder.iterdir()) if file.suffix != ".py" and not file.is_dir())
+    return next((file.name for file in files if not _WRITTEN.fullmatch(file.suffix.lower())), "")
 
 
 @contextmanager
@@ -103,17 +140,13 @@ def output(
         path: The file or folder to make. Its parents are created.
         force: Whether to replace an existing file or folder.
         at_once: Whether it appears at the end of the block even in a transaction.
-        in_place: As for `check_free`.
+        in_place: Whether it is a changed version of a file that the command reads.
 
     Raises:
         InputError: As for `check_free`, or its folder cannot be written, or the disk is full.
     """
-    path = check_free(path, force=force, in_place=in_place)
+    path = _free(Path(path), force=force, in_place=in_place)
     place = Path.cwd() / path  # absolute, since the working folder can be renamed
-    if Path(os.path.realpath(place)) in (Path.cwd(), *Path.cwd().parents):
-        raise InputError(f"{path}: is the working folder or contains it; give a folder inside it")
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        raise InputError(f"{path}: a device or pipe, which cannot be replaced; give a file")
     inner = any(folder in place.parents for folder in _asides)  # a part of another output
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -224,7 +257,7 @@ def transaction() -> Iterator[None]:
         yield
         _commit(pending.asides)
     except OSError as error:
-        if error.errno not in _FULL:
+        if error.errno not in FULL:
             raise
         raise InputError(f"the outputs cannot be written ({os.strerror(error.errno)})") from error
     finally:
@@ -473,7 +506,7 @@ def exchanged(one: Path, other: Path) -> bool:
 def why_full(folder: Path, error: Exception | None = None) -> str:
     """In which way the disk of a folder is full, or was when an error was raised; "" if it is not."""
     number = error.errno if isinstance(error, OSError) else None
-    reasons = [os.strerror(full) for full in _FULL if full == number or os.strerror(full) in str(error)]
+    reasons = [os.strerror(full) for full in FULL if full == number or os.strerror(full) in str(error)]
     if reasons:
         return reasons[0]
     try:
@@ -482,7 +515,7 @@ def why_full(folder: Path, error: Exception | None = None) -> str:
                 pass
             os.fsync(file.fileno())
     except OSError as probe:
-        return os.strerror(probe.errno) if probe.errno in _FULL else ""
+        return os.strerror(probe.errno) if probe.errno in FULL else ""
     return ""
 
 
@@ -511,12 +544,12 @@ def _sync_entry(folder: Path) -> None:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Delay Ctrl-C and the request to end to the end of the block."""
+    """Delay the signals `_ENDS` to the end of the block."""
     if threading.current_thread() is not threading.main_thread():  # Python interrupts the main thread only
         yield
         return
     came: list[int] = []
-    before = {sign: signal.getsignal(sign) for sign in (signal.SIGINT, signal.SIGTERM)}
+    before = {sign: signal.getsignal(sign) for sign in _ENDS}
     before = {sign: handler for sign, handler in before.items() if handler is not None}
     for sign in before:
         signal.signal(sign, lambda number, frame: came.append(number))

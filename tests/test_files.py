@@ -147,10 +147,60 @@ def test_nothing_is_overwritten_unasked(tmp_path):
     assert check_free(tmp_path / "a.txt", force=True) == tmp_path / "a.txt"
 
 
+def test_a_link_to_nothing_is_called_so(tmp_path):
+    (tmp_path / "run.parquet").symlink_to("gone.parquet")
+    with pytest.raises(InputError, match=r"no such run: a link to 'gone\.parquet', which does not exist"):
+        existing(tmp_path / "run.parquet", "run")
+
+
+def test_only_a_near_name_is_suggested(tmp_path):
+    (tmp_path / "run.parquet").touch()
+    with pytest.raises(InputError, match=r"rum\.parquet: no such run; did you mean 'run\.parquet'\?"):
+        existing(tmp_path / "rum.parquet", "run")
+    with pytest.raises(InputError, match=r"no such run$"):
+        existing(tmp_path / "mine.parquet", "run")
+
+
 def test_an_output_below_a_file_is_refused(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="cannot be written"):
-        write_and_fail(tmp_path / "file" / "a.txt")
+    with pytest.raises(InputError, match=r"cannot be written, as .*file is no folder"):
+        check_free(tmp_path / "file" / "a.txt")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("", "is the working folder or contains it"),
+        ("..", "is the working folder or contains it"),
+        ("/", "is the working folder or contains it"),
+        ("home", "is the home folder or contains it"),
+        ("/dev/null", "a device or pipe"),
+        (" ", "' ': a blank name"),
+        (".csv", r"a suffix without a name; give one, such as run\.csv"),
+        ("a/.parquet", "a suffix without a name"),
+        ("bad\udcff.parquet", "its name is not UTF-8"),
+    ],
+)
+@pytest.mark.parametrize("force", [False, True])
+def test_what_no_output_can_be_called_is_refused_at_once(tmp_path, monkeypatch, name, text, force):
+    (tmp_path / "home").mkdir()
+    (tmp_path / "work").mkdir()
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path / "work")
+    with pytest.raises(InputError, match=text):
+        check_free(tmp_path / name if name == "home" else name, force=force)
+
+
+@pytest.mark.parametrize(
+    ("force", "text"), [(False, "exists already, with notes.txt"), (True, "holds notes.txt")]
+)
+def test_a_folder_with_files_of_the_user_is_refused_before_the_work(tmp_path, force, text):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "notes.txt").touch()
+    with pytest.raises(InputError, match=f"run: {text}, which would be removed with it"):
+        check_free(tmp_path / "run", force=force)
+    (tmp_path / "run" / "notes.txt").rename(tmp_path / "run" / "magnetometer.py")  # as exports have
+    assert check_free(tmp_path / "run", force=True) == tmp_path / "run"
 
 
 def test_sha256_is_that_of_fips_180_abc(tmp_path):

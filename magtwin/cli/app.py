@@ -3,6 +3,7 @@
 import errno
 import functools
 import inspect
+import os
 import re
 import signal
 import sys
@@ -63,9 +64,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the `magtwin` command; `arguments` default to those of the command line."""
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments
-    signal.signal(
-        signal.SIGTERM, lambda *_: sys.exit(143)
-    )  # an exception, so that partial outputs are removed
+    _end_by_exceptions()
     _running.clear()
     try:
         arguments, folders = _allowed([a for a in arguments if a != "--debug"])
@@ -77,6 +76,7 @@ def main(arguments: list[str] | None = None) -> None:
                 result_action="return_value",
                 **_help_options(arguments),
             )
+            sys.stdout.flush()  # a fault is reported here
     except CycloptsError as error:
         _fail(renamed(error, arguments) or _dashed(arguments) or _with_file(error), status=2)
     except KeyboardInterrupt:
@@ -98,7 +98,10 @@ def main(arguments: list[str] | None = None) -> None:
         if isinstance(error, FileNotFoundError) and _folder_gone():
             _fail("the working folder was removed; change to another one")
         if isinstance(error, OSError):
-            _fail(f"{error} ({type(error).__name__})")
+            from magtwin.outputs import FULL
+
+            full = "" if error.errno not in FULL or error.filename else _stdout_full()
+            _fail(full or f"{error} ({type(error).__name__})")
         if text := _no_room(error):
             _fail(text)
         _fail(f"a fault in magtwin, {type(error).__name__}: {error}; please report it, with --debug")
@@ -108,6 +111,20 @@ def _with_file(error: CycloptsError) -> str:
     """The text of an error, with the file that a wrong value is in."""
     text, file = str(error), getattr(getattr(error, "token", None), "source", "")
     return f"{file}: {text}" if Path(file).is_absolute() and file not in text else text
+
+
+def _end_by_exceptions() -> None:
+    """Turn signals that end the process into exceptions, so that partial outputs are removed."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    if os.name == "nt" or signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # nohup
+        return
+
+    def hang_up(*_: object) -> None:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the kernel and the shell both send it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # the terminal is gone: each line would be an error
+        sys.exit(129)
+
+    signal.signal(signal.SIGHUP, hang_up)
 
 
 def _allowed(arguments: list[str]) -> tuple[list[str], list[str]]:
@@ -141,6 +158,16 @@ def _folder_gone() -> bool:
     except FileNotFoundError:
         return True
     return False
+
+
+def _stdout_full() -> str:
+    """The refusal of a stdout on a full disk, of which Python does not speak; "" if it can be written."""
+    try:
+        print(flush=True)  # noqa: T201
+    except OSError as error:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - else Python tries once more, at its end
+        return f"stdout cannot be written ({error.strerror}); make room there, or send it elsewhere"
+    return ""
 
 
 def _no_room(error: Exception) -> str:

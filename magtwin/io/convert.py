@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.files import existing
-from magtwin.io.formats import format_of, read_run, write_run
+from magtwin.io.formats import format_to_write, read_run, write_run
 from magtwin.outputs import check_free
 from magtwin.run.run import Run
 from magtwin.twin import Twin, lab_and_epoch, led_by, open_twin, scene_of
@@ -49,25 +49,32 @@ def convert_run(
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if usd_fps == 0:
         options["fps"] = None
-    takes = format_of(out).takes
+    takes = format_to_write(out).takes
     if scene is not None and not takes & {"twin", "scene_file"}:
         raise InputError(f"{out}: a table shows no scene; drop `scene`", parameter="scene")
     if out.resolve() == source.resolve():
         raise InputError(f"{out}: is the run itself; name another file")
+    if out.resolve() in source.resolve().parents:
+        raise InputError(f"{out}: holds the run, which would be removed with it; give another name")
     reading = {"topics": topics, "unit": unit}
     run = read_run(source, **{name: value for name, value in reading.items() if value is not None})
-    twin = twin_to_show(run, source, scene) if takes & {"twin", "scene_file"} else None
+    shown = "planned" in takes or "scene_file" in takes
+    lacks = "shown without a scene" if shown else "written without /tf_static and the robot's description"
+    twin = twin_to_show(run, source, scene, lacks=lacks) if takes & {"twin", "scene_file"} else None
     write_run(run, out, twin, force=force, **options)
     return run
 
 
-def twin_to_show(run: Run, file: Path, scene: str | Path | None = None) -> Twin | None:
+def twin_to_show(
+    run: Run, file: Path, scene: str | Path | None = None, *, lacks: str = "shown without a scene"
+) -> Twin | None:
     """The scene to show a run in. Warns, and returns None, if the run's own scene cannot be opened.
 
     Args:
         run: The run.
         file: File of the run; its folder is searched for the scene.
         scene: Scene to use in place of the one of the metadata. `file`: the scene that the run plays over.
+        lacks: What the warning says is missing.
 
     Raises:
         InputError: Another `scene` was given and cannot be opened.
@@ -80,7 +87,7 @@ def twin_to_show(run: Run, file: Path, scene: str | Path | None = None) -> Twin 
     except InputError as error:
         if scene not in (None, file):
             raise
-        warnings.warn(f"shown without a scene: {error}", MismatchWarning, stacklevel=2)
+        warnings.warn(f"{lacks}: {error}", MismatchWarning, stacklevel=2)
         return None
     then = run.metadata.get("scene_sha256")
     if then is not None and then != twin.metadata.get("scene_sha256") and scene != file:

@@ -136,10 +136,8 @@ def write_run(
             file exists and `force` is not set, or it cannot be written.
     """
     path = Path(path)
-    format_ = format_of(path)
-    if not format_.write:
-        kinds = ", ".join(suffix for suffix, other in FORMATS.items() if other.write)
-        raise InputError(f"{path}: a {format_.name} is only read; write {kinds}")
+    format_ = format_to_write(path)
+    assert format_.write is not None
     if unknown := sorted(options.keys() - format_.takes):
         raise InputError(f"{path}: {format_.name} has no option {unknown[0]!r}; drop it")
     check_clock(run, "the run to write")
@@ -171,6 +169,21 @@ def format_of(path: Path) -> Format:
     if suffix not in FORMATS:
         raise InputError(f"{path}: unknown format of a run; {hint(path.suffix, dict.fromkeys(FORMATS))}")
     return FORMATS[suffix]
+
+
+def format_to_write(path: Path) -> Format:
+    """The format of a file to write, by its suffix; a bag if it has none.
+
+    Raises:
+        InputError: The suffix is unknown, or its format is only read.
+    """
+    written = [suffix for suffix, other in FORMATS.items() if other.write]
+    if path.suffix and path.suffix not in FORMATS:
+        raise InputError(f"{path}: unknown format of a run; {hint(path.suffix, written)}")
+    format_ = format_of(path)
+    if not format_.write:
+        raise InputError(f"{path}: a {format_.name} is read, not written; give one of {', '.join(written)}")
+    return format_
 
 
 def _function(function: Function | str) -> Function:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from magtwin.errors import InputError
 from magtwin.io.bags.stream import scans_at
-from magtwin.io.formats import format_of, read_run, write_run
+from magtwin.io.formats import format_of, format_to_write, read_run, write_run
 from magtwin.io.recorder import Recorder, Sink, in_step, partial_of
 from magtwin.outputs import at_once, check_free, output, transaction
 from magtwin.path import CASES, PATHS
@@ -167,8 +167,7 @@ class Outputs:
                 f"{folders[1]}: a second folder; a run fills one folder, and any number of files"
             )
         for file in files:
-            if not format_of(file).write:
-                raise InputError(f"{file}: {format_of(file).name} is read, not written; name another format")
+            format_to_write(file)
         tables = tuple(_scans_of(file) for file in files if scans and file.suffix.lower() == ".parquet")
         made = cls(folders[0] if folders else None, files, tables, **options)
         targets = made.targets

@@ -74,6 +74,11 @@ def _class_of(name: str) -> Any:
     if ":" not in name:
         return LOCALIZERS[name]
     module, _, attribute = name.partition(":")
+    if module.startswith(".") or module.endswith(".py") or {"/", "\\"} & set(module):
+        raise InputError(
+            f"localizer {name!r}: give MODULE:CLASS, without folders and .py, such as filters:Mine for the "
+            "class Mine in filters.py of the working folder"
+        )
     if (here := str(Path.cwd())) not in sys.path:
         sys.path.append(here)  # last, so that a file here hides no installed module
     try:

@@ -24,6 +24,7 @@ STEP_M = 0.03  # Spacing of the raster of the free floor [m]; larger on large fl
 MOST_CELLS = 400_000  # Most cells of that raster
 # Sizes to try, as fractions of the size that fits the empty floor
 SHRINK = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)
+LEAST_SCALE = 0.1  # Below this scale, a path that is too large is taken for one in another unit
 SHIFTS = 13  # Positions to try along each axis for each size
 
 
@@ -131,6 +132,8 @@ def _what_fits(path: Path, floor_m: tuple[float, float], footprint_radius_m: flo
     if scale >= 1:
         x, y = np.clip(0.0, high - room / 2, low + room / 2) * -1.0 + 0.0
         return f"moved by ({x:.2f}, {y:.2f}) m it fits the floor: give `fit=True`, or move its points"
+    if scale < LEAST_SCALE:
+        return "points are in metres: convert them if they are in mm or another unit, or give a shorter path"
     return f"scaled by {math.floor(scale * 100) / 100:g} it fits the floor: give `fit=True`, or enlarge it"
 
 

@@ -75,8 +75,12 @@ FAULTS: Mapping[str, tuple[str, str]] = {
         "that file is included",
     ),
     "include-skipped": ("missing include of a xacro", "skipped; none of its macros is called"),
+    "declaration-late": ("blank lines before <?xml", "ignored"),
 }
 """Faults by kind: the fault, and its repair."""
+
+DECLARATION_LATE = "blank lines before the XML declaration <?xml: ignored; delete them"
+"""Text of a repair."""
 
 
 @dataclass(frozen=True)

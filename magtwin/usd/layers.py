@@ -105,7 +105,8 @@ def open_stage(path: str | os.PathLike[str], *, own: bool = False) -> Usd.Stage:
         errors = stage.GetCompositionErrors()
     if errors:
         said = _one_line(_text(errors[0])).removesuffix("; skipping.")
-        raise InputError(f"{path}: {said}")
+        link = f"; it is a link, beside which USD looks: give {path.resolve()}" if path.is_symlink() else ""
+        raise InputError(f"{path}: {said}{link}")
     upgrade_stage(stage, str(path))
     return stage
 

@@ -447,7 +447,7 @@ def test_a_network_brings_its_inputs_and_its_checksum(own_parts):
     [
         ("name =", "nmae =", r"scene\.toml:2: unknown key 'nmae'; did you mean 'name'"),
         ("asset =", "aset =", r"scene\.toml:6: \[robot\] unknown key 'aset'; did you mean 'asset'"),
-        ("bot.usda", "gone.usda", r"gone\.usda: no such robot asset; did you mean 'bot\.usda'"),
+        ("bot.usda", "bott.usda", r"bott\.usda: no such robot asset; did you mean 'bot\.usda'"),
         ("map.usdc", "mapp.usdc", r"mapp\.usdc: no such map layer; did you mean 'map\.usdc'"),
         ('map = "map.usdc"', "", r"scene\.toml: names no map; add map = "),
         ("[robot]", "[lab]\nfloor_m = [6]\n[robot]", r"scene\.toml:6: \[lab\] floor_m must be a list of 2"),

@@ -3,8 +3,10 @@
 import json
 import math
 import os
+import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -375,20 +377,36 @@ def test_of_several_outputs_all_are_written_or_none(lab_scene, tmp_path, capsys)
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_run_that_is_told_to_end_leaves_nothing(lab_scene, tmp_path):
-    import signal
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has /dev/full")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_stdout_that_is_full_is_named(unbuffered):
+    command = [sys.executable, "-c", "from magtwin.cli import main; main()", "--version"]
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            command, check=False, stdout=full, stderr=subprocess.PIPE, text=True, env=environment
+        )
+    assert done.returncode == 1
+    assert done.stderr.startswith("magtwin: stdout cannot be written (No space left on device);")
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(("sign", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_run_that_is_told_to_end_leaves_nothing(lab_scene, tmp_path, sign, status):
     import time
 
     command = [sys.executable, "-c", "from magtwin.cli import main; main()", "run", str(lab_scene)]
     process = subprocess.Popen(
-        [*command, "--duration-s", "20000", "--out", str(tmp_path / "run")], stderr=subprocess.DEVNULL
+        [*command, "--duration-s", "20000", "--out", str(tmp_path / "run")],
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),  # nohup ignores it
     )
     deadline = time.monotonic() + 30
     while not list(tmp_path.iterdir()) and time.monotonic() < deadline:
         time.sleep(0.02)
     assert list(tmp_path.iterdir())
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(60) == 143
+    process.send_signal(sign)
+    assert process.wait(60) == status
     assert not list(tmp_path.iterdir())
 
 

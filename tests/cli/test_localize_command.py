@@ -158,6 +158,8 @@ def test_a_network_predicts_the_own_field_at_the_poses_of_a_first_pass(here: Pat
     [
         (["--method", "odometri"], "no localizer 'odometri'; did you mean 'odometry'?"),
         (["--method", "my_filter:MyLocaliser"], "did you mean 'MyLocalizer'?"),
+        (["--method", "../filters:Thing"], "give MODULE:CLASS, without folders and .py"),
+        (["--method", "filters.py:Thing"], "give MODULE:CLASS, without folders and .py"),
         (["--method", "nowhere:Thing"], "'nowhere:Thing' cannot be imported: ModuleNotFoundError"),
         (["--method", "odometry", "--option", "speed=3"], "has no option 'speed'; it has none"),
         (["--method", "my_filter:MyLocalizer", "--option", "particls=3"], "did you mean 'particles'?"),

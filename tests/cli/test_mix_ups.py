@@ -242,7 +242,21 @@ LONG, BYTES = "n" * 300, os.fsdecode(b"b\xff\xfe")
             ["convert", "run.npz", "path.csv"],
             "path.csv: exists already; give --force to replace it, or another name",
         ),
+        (
+            ["run", "lab", "--out", "new.json"],
+            "new.json: a released package is read, not written; give one of",
+        ),
+        (
+            ["convert", "run.npz", "new.json"],
+            "new.json: a released package is read, not written; give one of",
+        ),
         (["robot", "robot.urdf", "--out", "set"], "set: exists already; give --force"),
+        (["run", "lab", "--duration-s", "nan", "--out", "new"], "--duration-s must be above 0 s and finite"),
+        (
+            ["run", "lab", "--speed", "1e9", "--out", "new"],
+            "--speed must be above 0 m/s and at most the drive's",
+        ),
+        (["sweep", "lab", "--speed", "0", "--out", "new"], "--speed must be above 0 m/s"),
         (["sweep", "lab", "--count", "1e12", "--out", "new"], "a whole number is wanted, got '1e12'"),
         (
             ["sweep", "lab", "--count", "1000000000000", "--out", "new"],

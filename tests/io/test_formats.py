@@ -247,7 +247,7 @@ def test_convert_takes_frames_a_second_units_and_the_scene(run, written, lab_sce
         ("run.parquet", "new.mcap", ["--usd-fps", "5"], "rosbag2 has no option 'fps'"),
         ("run.parquet", "new.usd", ["--usd-fps", "-5"], "fps must be above 0"),
         ("run.parquet", "run.parquet", ["--force"], "is the run itself"),
-        ("none.csv", "new.parquet", [], "none.csv: no such run; did you mean"),
+        ("runn.csv", "new.parquet", [], "runn.csv: no such run; did you mean 'run.csv'?"),
     ],
 )
 def test_what_convert_cannot_do_is_refused_in_one_line(source, out, options, message, written, capsys):
@@ -300,6 +300,24 @@ def test_view_shows_a_run_of_any_format(name, run, written, shown, capsys):
     assert "has changed" not in error
     assert ("shown without a scene" in error) == ("give --allow" in error) == (name == "run.usdc")
     assert np.array_equal(shown[0]["run"]["b_total_nt"], run["b_total_nt"])
+
+
+def test_a_conversion_without_its_scene_warns_of_what_the_format_lacks(run, tmp_path, monkeypatch, capsys):
+    write_run(run.with_metadata(scene_file="gone/lab.usda"), tmp_path / "apart" / "run.parquet")
+    monkeypatch.chdir(tmp_path)
+    for name, lacks in (
+        ("a.mcap", "written without /tf_static and the robot's description: "),
+        ("a.db3", "written without /tf_static and the robot's description: "),
+        ("a.rrd", "shown without a scene: "),
+    ):
+        main(["convert", "apart/run.parquet", name])
+        assert f"warning: {lacks}" in capsys.readouterr().err
+    main(["convert", "apart/run.parquet", "a.csv"])
+    assert "warning" not in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["convert", "apart/run.parquet", "apart", "--force"])
+    error = [line for line in capsys.readouterr().err.splitlines() if line.startswith("magtwin")]
+    assert error == ["magtwin: apart: holds the run, which would be removed with it; give another name"]
 
 
 def test_view_shows_several_runs_in_one_recording(run, written, shown, tmp_path):

@@ -100,7 +100,7 @@ def test_scattered_readings_make_no_nodes_and_the_way_on_is_told(tmp_path, capsy
         (("a.csv", "--vector", "a,b"), "vector takes 3 columns"),
         (("a.csv", "--unit", "uT"), "give --unit nT"),
         (("m.usdc",), "m.usdc: is a USD file, not a source of readings"),
-        (("b.csv",), "b.csv: no such source of readings; did you mean 'a.csv'"),
+        (("b.csv",), "b.csv: no such source of readings"),
         (("a.csv+b.csv",), "b.csv: no such file of readings"),
         (("a.csv", "--out", "a.txt"), "ends in .usdc or .usd or .parquet"),
     ],

@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path as FilePath
 
@@ -785,7 +786,9 @@ def test_a_picture_that_is_interrupted_leaves_no_viewer_and_no_file(written, tmp
         return found
 
     command = [sys.executable, "-m", "magtwin", "picture", str(written), "--out", str(tmp_path / "run.png")]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    (temporary := tmp_path / "temporary").mkdir()
+    environment = {**os.environ, "TMPDIR": str(temporary)}
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env=environment)
     try:
         end = time.monotonic() + 60
         while not (found := viewers(process.pid)) and time.monotonic() < end:
@@ -798,6 +801,7 @@ def test_a_picture_that_is_interrupted_leaves_no_viewer_and_no_file(written, tmp
         process.wait()
     assert not found[0].exists()
     assert [path.name for path in tmp_path.iterdir() if "run.png" in path.name] == []
+    assert list(temporary.iterdir()) == []
 
 
 @pytest.mark.usefixtures("drawable")
@@ -820,6 +824,7 @@ def test_a_machine_without_graphics_is_refused_with_what_to_install(written, tmp
     for name in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES", "__EGL_VENDOR_LIBRARY_FILENAMES"):
         monkeypatch.setenv(name, str(tmp_path / "none"))
     monkeypatch.setenv("WGPU_BACKEND", "vulkan")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # where the viewer keeps its files too
     with pytest.raises(
         InputError, match=r"cannot draw here: .*; .*apt install mesa-vulkan-drivers libvulkan1"
     ):

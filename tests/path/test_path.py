@@ -245,7 +245,7 @@ def test_a_csv_that_is_not_text_or_not_there_is_refused(tmp_path):
     (tmp_path / "p.csv").write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(InputError, match=r"p\.csv: not a text file"):
         read_path_csv(tmp_path / "p.csv")
-    with pytest.raises(InputError, match=r"q\.csv: no such path file; did you mean 'p\.csv'"):
+    with pytest.raises(InputError, match=r"q\.csv: no such path file$"):
         read_path_csv(tmp_path / "q.csv")
     with pytest.raises(InputError, match=r"cannot be read \(a folder\); expected a path file"):
         read_path_csv(tmp_path)

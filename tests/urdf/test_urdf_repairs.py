@@ -293,6 +293,7 @@ FAULTY = {
     "include-skipped": [
         (f'{GOOD}\n<xacro:include filename="$(find absent)/eye.xacro"/>', 3, "eye.xacro' is missing: skipped")
     ],
+    "declaration-late": [(GOOD, 3, "blank lines before"), (f"{GOOD}<!-- xacro -->", 3, "blank lines before")],
 }
 """Descriptions with one fault: the text, its line (0 if it has none), and a part of the report's text."""
 
@@ -302,7 +303,8 @@ CASES = [(kind, number) for kind, cases in FAULTY.items() for number in range(le
 def write(tmp_path, kind, number):
     text, line, told = FAULTY[kind][number]
     head = HEAD.replace(' name="arm"', "") if kind == "name-missing" else HEAD
-    xacro = kind in ("package-missing", "include-renamed", "include-skipped")
+    head = f"\n \n<?xml version='1.0'?>\n{head}" if kind == "declaration-late" else head
+    xacro = kind in ("package-missing", "include-renamed", "include-skipped") or "<!-- xacro" in text
     folder = tmp_path / "arms"
     folder.mkdir()
     (folder / "package.xml").write_text("<package><name>arms</name></package>")

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 from pxr import Usd
 
-from magtwin.errors import UnknownNameError
+from magtwin.errors import InputError, UnknownNameError
 from magtwin.files import shipped
 from magtwin.usd.lab.obstacles import read_obstacles
-from magtwin.usd.layers import stage_sha256
+from magtwin.usd.layers import open_stage, stage_sha256
 from magtwin.usd.maps.layer import load_map
 from magtwin.usd.scene import open_scene, read_scene
 
@@ -30,3 +30,14 @@ def test_parts_of_an_opened_scene_are_those_read_one_by_one(monkeypatch):
         opened.alone("nobody")
     monkeypatch.undo()
     assert opened.sha256 == stage_sha256(LAB)
+
+
+def test_a_stage_opened_by_a_link_that_hides_its_layers_is_refused_with_the_stage(tmp_path):
+    (tmp_path / "lab").mkdir()
+    (tmp_path / "lab" / "cup.usda").write_text('#usda 1.0\ndef "Cup" {}\n')
+    stage = tmp_path / "lab" / "lab.usda"
+    stage.write_text('#usda 1.0\ndef "World" (references = @./cup.usda@</Cup>) {}\n')
+    (link := tmp_path / "link.usda").symlink_to("lab/lab.usda")
+    open_stage(stage)
+    with pytest.raises(InputError, match=rf"it is a link, beside which USD looks: give {stage}$"):
+        open_stage(link)

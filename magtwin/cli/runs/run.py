@@ -159,6 +159,7 @@ def run(
         Simulated seconds per second of the live display. Default: 1.
     """
     from magtwin.io.outputs import Outputs, drive
+    from magtwin.sim.runs.simulate import check_asked
     from magtwin.twin import scene_file
     from magtwin.usd.scene import robots_in
 
@@ -188,6 +189,7 @@ def run(
     ):
         if given:
             raise InputError(f"{option} {fault}, and {what} is none; drop one")
+    check_asked(speed, duration_s, sensing.rate_hz)
     if engine == "newton":
         from magtwin.sim.engines.newton import check_installed
 

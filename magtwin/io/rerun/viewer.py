@@ -45,6 +45,9 @@ START_S = 60.0
 NOTHING_S = 10.0
 """Time that a loaded file may show nothing [s]."""
 
+VULKAN = "without a graphics card it needs Vulkan in software: apt install mesa-vulkan-drivers libvulkan1"
+"""What to do where the viewer cannot draw."""
+
 TITLE_BAR = 36
 """Height of the viewer's empty title bar [pixels]."""
 
@@ -65,7 +68,8 @@ def show(rrd: str | os.PathLike[str], *, source: str | os.PathLike[str] | None =
     rrd = existing(rrd, "recording")
     command = [_binary(), "--bind", LOCALHOST, "--port", "auto", str(rrd)]
     options: dict[str, Any] = {"stderr": subprocess.PIPE, "text": True, "preexec_fn": ends_with_parent()}
-    result = subprocess.run(command, check=False, **options)
+    with _own_folder() as environment:
+        result = subprocess.run(command, check=False, env=environment, **options)
     if result.returncode:
         advice = "view the .rrd of this run, which a browser shows too"
         if source is None:
@@ -113,7 +117,7 @@ def screenshot(
             views = _draw(client, path.resolve(), rrd, aside, time_s)
         except (ConnectionError, RuntimeError) as error:
             text = f"the Rerun viewer ended before the picture was drawn ({error})"
-            raise InputError(f"{rrd}: {text}") from error
+            raise InputError(f"{rrd}: {text}; {VULKAN}; with one, try a smaller `size`") from error
     lines = [f"{v.name}: {r.severity}: {r.summary} {r.details or ''}" for v in views for r in v.reports]
     return [line.strip() for line in lines]
 
@@ -174,17 +178,25 @@ def live_viewer(
     window = ["--headless", "--window-size", f"{size[0]}x{size[1]}"] if headless else []
     command = [_binary(), "--bind", LOCALHOST, "--port", str(port), "--hide-welcome-screen", *window]
     process = None
-    with tempfile.TemporaryFile("w+") as log:
+    with _own_folder() as environment, tempfile.TemporaryFile("w+") as log:
+        options: dict[str, Any] = {"start_new_session": True, "preexec_fn": ends_with_parent()}
+        options |= {"stdout": log, "stderr": log, "env": environment}
         try:
             with _interrupt_later() as interrupts:
-                options: dict[str, Any] = {"start_new_session": True, "preexec_fn": ends_with_parent()}
-                process = subprocess.Popen(command, stdout=log, stderr=log, **options)
+                process = subprocess.Popen(command, **options)
                 client = _connected(process, port, log, interrupts)
             assert client is not None  # else the interrupt was raised
             yield f"rerun+http://{LOCALHOST}:{port}/proxy", client
         finally:
             if process is not None:
                 _end(process)
+
+
+@contextmanager
+def _own_folder() -> Iterator[dict[str, str]]:
+    """The environment of a viewer, which leaves temporary files behind; they are removed after the block."""
+    with tempfile.TemporaryDirectory(prefix="magtwin-viewer-", ignore_cleanup_errors=True) as folder:
+        yield {**os.environ, **dict.fromkeys(("TMPDIR", "TMP", "TEMP"), folder)}
 
 
 @contextmanager
@@ -218,10 +230,7 @@ def _connected(
     def draws() -> bool:
         if process.poll() is not None:
             log.seek(0)
-            raise InputError(
-                f"the Rerun viewer cannot draw here: {_reason(log.read())}; without a graphics card "
-                "it needs Vulkan in software: apt install mesa-vulkan-drivers libvulkan1"
-            )
+            raise InputError(f"the Rerun viewer cannot draw here: {_reason(log.read())}; {VULKAN}")
         try:
             clients.append(ViewerClient.connect(f"rerun+http://{LOCALHOST}:{port}/proxy"))
             clients[-1].get_state()

@@ -424,7 +424,8 @@ def _complete(table: Table, columns: Columns) -> tuple[Columns, list[str]]:
                 taken.append(f"{columns.vector} as the field in the robot's axes, forward, left, up (--axes)")
         else:
             named = ", ".join(label for label in table.names if not label.isdigit())
-            known = f"columns: {named}" if named else f"{len(table.columns)} columns without a header"
+            count = len(table.columns)
+            known = f"columns: {named}" if named else f"no header: name columns by number, 1 to {count}"
             raise InputError(
                 f"{table.path}: no column of the field was found by its name ({known}); name the magnitude "
                 "with --field NAME, or the components with --vector BX,BY,BZ"

@@ -44,6 +44,9 @@ AGREES_NT = 1e-3  # Largest difference between onnxruntime and torch [nT], besid
 ROUNDING = 1e-6  # Relative rounding of a float32 sum of products
 PROBE = 512  # Rows on which that is checked before a file is written
 
+NO_TELEMETRY = "ORT_DISABLE_TELEMETRY"
+"""Variable that keeps onnxruntime from writing telemetry into TMPDIR and the user's cache."""
+
 EXTRA = "onnx and onnxruntime are not both installed: pip install 'magtwin[onnx]'"
 
 
@@ -291,6 +294,7 @@ def _known(values: NDArray[np.float64]) -> list[float | None]:
 
 def _difference_nt(predictor: Predictor, data: bytes, weights: str | os.PathLike[str]) -> float:
     """Largest difference between onnxruntime and the predictor [nT], on rows around the training rows."""
+    os.environ.setdefault(NO_TELEMETRY, "1")  # before the import, which writes its files
     try:
         import onnxruntime
     except ImportError:

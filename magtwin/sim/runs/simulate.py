@@ -342,6 +342,20 @@ def _check_numbers(robot: RobotSpec) -> None:
             raise InputError(f"robot {robot.name!r}: {text}")
 
 
+def check_asked(speed: float, duration_s: float | None, rate_hz: float | None) -> None:
+    """Refuse values that no robot allows. It needs no scene, so it comes before one is opened."""
+    if not 0 < speed <= FASTEST:
+        text = f"speed must be above 0 m/s and at most the drive's v_max, got {speed!r}"
+        raise InputError(text, parameter="speed")
+    for value, what, unit in (
+        (duration_s, "duration_s", "s"),
+        (rate_hz, "rate_hz of the magnetometer", "Hz"),
+    ):
+        if value is not None and not 0 < value < math.inf:
+            text = f"{what} must be above 0 {unit} and finite, got {value!r}"
+            raise InputError(text, parameter=what.partition(" ")[0])
+
+
 def _check_readings(duration_s: float, rate_hz: float) -> None:
     """Refuse a run whose columns no memory can hold, or a rate of no magnetometer."""
     if rate_hz > HIGHEST_READINGS_HZ:

@@ -21,9 +21,9 @@ from xml.parsers.expat import ExpatError
 
 from magtwin.errors import InputError, hint
 from magtwin.files import read_bytes, yaml_loader
-from magtwin.urdf.repairs import NOTE, Repairs
+from magtwin.urdf.repairs import DECLARATION_LATE, NOTE, Repairs
 from magtwin.urdf.source.expression import GLOBALS, LARGEST, Budget, ExpressionError, check_size, evaluate
-from magtwin.urdf.source.markup import UnsafeError, parse_markup
+from magtwin.urdf.source.markup import UnsafeError, in_order, parse_markup
 from magtwin.urdf.source.package import MissingFileError, Packages
 
 UNITS, ELEMENT, FILE = 20_000_000, 100, 1_000
@@ -470,8 +470,11 @@ class _Expansion:
         markup = parse_markup(content, path)
         attributes = sum(len(element.attrib) for element in markup.lines)
         self._budget.spend(ELEMENT * (len(markup.lines) + attributes // 4))
+        if markup.late:
+            file = Path(os.path.relpath(path, self._path.parent)).as_posix()
+            self._repairs.add("declaration-late", DECLARATION_LATE, (file, markup.late))
         try:
-            document = minidom.parseString(content)
+            document = minidom.parseString(in_order(content))
         except ExpatError as error:
             reason = f"{error}".partition(":")[0]
             raise InputError(

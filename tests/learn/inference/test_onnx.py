@@ -1,4 +1,5 @@
 import json
+import os
 import sys
 
 import numpy as np
@@ -129,6 +130,15 @@ def test_without_its_packages_it_says_how_to_get_them(weights, exported, tmp_pat
             with pytest.raises(InputError, match=r"pip install 'magtwin\[onnx\]'"):
                 export_onnx(weights, tmp_path / "n.onnx")
     assert not list(tmp_path.iterdir())
+
+
+def test_onnxruntime_writes_no_telemetry_unless_the_user_wants_it(weights, tmp_path, monkeypatch):
+    monkeypatch.delenv("ORT_DISABLE_TELEMETRY", raising=False)
+    export_onnx(weights, tmp_path / "n.onnx")
+    assert os.environ["ORT_DISABLE_TELEMETRY"] == "1"
+    monkeypatch.setenv("ORT_DISABLE_TELEMETRY", "0")
+    export_onnx(weights, tmp_path / "n.onnx", force=True)
+    assert os.environ["ORT_DISABLE_TELEMETRY"] == "0"
 
 
 def test_a_runtime_that_gives_something_else_writes_nothing(weights, tmp_path, monkeypatch):
