@@ -219,10 +219,9 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
         from magtwin.outputs import reading
 
         _running[:] = [command]
-        read = [value for name, value in options.items() if name not in ("out", "report")]
-        values = [
-            v for value in (*args, *read) for v in (value if isinstance(value, list | tuple) else [value])
-        ]
+        given = signature.bind_partial(*args, **options).arguments
+        read = [value for name, value in given.items() if name not in ("out", "report")]
+        values = [v for value in read for v in (value if isinstance(value, list | tuple) else [value])]
         with output_mode(as_json=json, quiet=quiet), reading(values):
             done = function(*args, **options)
             if isinstance(done, Done):

@@ -44,7 +44,12 @@ def convert_run(
     Raises:
         InputError: The source cannot be read, an option does not fit the formats, or the output exists.
     """
-    source, out = existing(source, "run"), check_free(out, force=force)
+    source, out = existing(source, "run"), Path(out)
+    if out.resolve() == source.resolve():
+        raise InputError(f"{out}: is the run itself; name another file")
+    if out.resolve() in source.resolve().parents:
+        raise InputError(f"{out}: holds the run, which would be removed with it; give another name")
+    check_free(out, force=force)
     given = {"storage": storage, "units": out_unit, "fps": usd_fps}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if usd_fps == 0:
@@ -52,10 +57,6 @@ def convert_run(
     takes = format_to_write(out).takes
     if scene is not None and not takes & {"twin", "scene_file"}:
         raise InputError(f"{out}: a table shows no scene; drop `scene`", parameter="scene")
-    if out.resolve() == source.resolve():
-        raise InputError(f"{out}: is the run itself; name another file")
-    if out.resolve() in source.resolve().parents:
-        raise InputError(f"{out}: holds the run, which would be removed with it; give another name")
     reading = {"topics": topics, "unit": unit}
     run = read_run(source, **{name: value for name, value in reading.items() if value is not None})
     shown = "planned" in takes or "scene_file" in takes

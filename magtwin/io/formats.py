@@ -178,7 +178,7 @@ def format_to_write(path: Path) -> Format:
         InputError: The suffix is unknown, or its format is only read.
     """
     written = [suffix for suffix, other in FORMATS.items() if other.write]
-    if path.suffix and path.suffix not in FORMATS:
+    if path.suffix and not {path.suffix, path.suffix.lower()} & {*FORMATS, ".usdz"}:
         raise InputError(f"{path}: unknown format of a run; {hint(path.suffix, written)}")
     format_ = format_of(path)
     if not format_.write:

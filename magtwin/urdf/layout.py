@@ -99,15 +99,14 @@ def check_payloads(out: Path, *, force: bool) -> Path:
         InputError: It exists and `force` is not set, or it does not belong to this asset.
     """
     folder = out.parent / PAYLOADS
-    check_free(folder, force=force)
-    if folder.exists():
+    if folder.exists() and force:
         base = folder / FILES["base"]
         layer = open_layer(base) if base.is_file() else None
         owner = conversion_data(layer, base).get("interface", "") if layer else ""
         if owner != out.name:
             whose = f"is of {owner}" if owner else "was not made by a conversion"
             raise InputError(f"{folder}: {whose}; give each robot its own folder")
-    return folder
+    return check_free(folder, force=force)
 
 
 def write_layers(flat: Sdf.Layer, out: Path, folder: Path, final: Path) -> None:

@@ -129,6 +129,6 @@ def test_bytes_that_are_no_text_and_writing_one_are_refused(tmp_path):
     with pytest.raises(InputError, match="not a text file"):
         read_run(tmp_path / "a.json")
     run = read_run(recorded(tmp_path, text([frame(0)])))
-    with pytest.raises(InputError, match="a released package is only read"):
+    with pytest.raises(InputError, match="a released package is read, not written"):
         write_run(run, tmp_path / "b.json")
     assert not (tmp_path / "b.json").exists()

@@ -126,7 +126,7 @@ def test_what_does_not_fit_is_refused(runs, whole, tmp_path):
 
 
 def test_a_run_that_cannot_be_made_leaves_nothing(warm, lab_scene, tmp_path, monkeypatch):
-    broken = runs_of(lab_scene, 2)
+    broken = runs_of(lab_scene, 2, sessions=2)
     monkeypatch.setattr(broken, "_finish", chunk_work.Refusing())
     with pytest.raises(InputError, match="the robot is out of the map"):
         save_runs(broken, tmp_path / "runs", jobs=2)

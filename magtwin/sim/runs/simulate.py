@@ -358,9 +358,6 @@ def check_asked(speed: float, duration_s: float | None, rate_hz: float | None) -
 
 def _check_readings(duration_s: float, rate_hz: float) -> None:
     """Refuse a run whose columns no memory can hold, or a rate of no magnetometer."""
-    if rate_hz > HIGHEST_READINGS_HZ:
-        most = f"at most {HIGHEST_READINGS_HZ:,.0f} Hz for a magnetometer"
-        raise InputError(f"rate_hz must be {most}, got {rate_hz:g}", parameter="rate_hz")
     if not math.isfinite(duration_s):
         raise InputError(
             f"duration_s must be above 0 s and finite, got {duration_s!r}", parameter="duration_s"
@@ -371,3 +368,6 @@ def _check_readings(duration_s: float, rate_hz: float) -> None:
             f"{MOST_READINGS:,}; lower `rate_hz` to {MOST_READINGS / duration_s:.4g} Hz, or `duration_s` "
             f"to {MOST_READINGS / rate_hz:.4g} s"
         )
+    if rate_hz > HIGHEST_READINGS_HZ:
+        most = f"at most {HIGHEST_READINGS_HZ:,.0f} Hz for a magnetometer"
+        raise InputError(f"rate_hz must be {most}, got {rate_hz:g}", parameter="rate_hz")
