@@ -126,7 +126,11 @@ class _Trimmed(io.TextIOBase):
 
 def stdout_console() -> Any:
     """A console on stdout: as wide as the terminal, or as its text if stdout is no terminal."""
-    from rich.console import Console
+    from rich.console import Console as RichConsole
+
+    class Console(RichConsole):
+        def on_broken_pipe(self) -> None:
+            raise  # the program ends as after any other output
 
     if _mode.json or _mode.quiet:
         console = Console(file=io.StringIO(), highlight=False)

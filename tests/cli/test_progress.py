@@ -256,6 +256,16 @@ def test_piped_reports_are_not_broken_and_have_no_spaces_at_the_end(long_run):
     assert any(re.match(r"  b_total_nt  nT  .*$", line) for line in out.stdout.splitlines())
 
 
+@pytest.mark.parametrize("words", [("run", "--help"), ("info", "lab")])
+def test_output_that_nobody_reads_to_its_end_gives_status_141_and_no_text(words):
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-c", "from magtwin.start import main; main()", *words]
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
 def test_columns_says_how_wide_piped_reports_are(long_run, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "50")
     main(["info", str(long_run)])
