@@ -34,7 +34,7 @@ class Environment(Env):
         if not commands:
             return
         prefix = f"{self.prefix}{_in_capitals('_'.join(commands))}_"
-        known = {_in_capitals(name): name for argument in arguments for name in argument.names}
+        known = {_in_capitals(name) for argument in arguments for name in argument.names}
         inner = tuple(f"{_in_capitals(name)}_" for name in app if not name.startswith("-"))
         for name in sorted(os.environ):
             option = name.removeprefix(prefix)
