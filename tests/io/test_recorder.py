@@ -15,7 +15,7 @@ from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.io.bags import BagWriter
 from magtwin.io.formats import read_run
-from magtwin.io.recorder import FLUSH_S, Recorder, in_step, partial_of
+from magtwin.io.recorder import FLUSH_S, TICK_S, Recorder, in_step, partial_of
 from magtwin.io.rerun.file import read_run as read_rrd
 from magtwin.io.rerun.live import LiveViewer, RrdWriter
 from magtwin.io.rerun.viewer import live_viewer
@@ -181,19 +181,40 @@ def test_files_are_given_rows_at_least_once_a_second():
     assert len(taken) >= 4
 
 
-def test_a_run_in_step_with_the_clock_takes_its_time_and_ends_when_told():
+class Clock:
+    """Stands for the clock and for the event on which `in_step` waits; it is set at `end`."""
+
+    def __init__(self, end=np.inf):
+        self.now, self.end = 100.0, 100.0 + end
+
+    def monotonic(self):
+        return self.now
+
+    def wait(self, seconds):
+        self.now += seconds
+
+    def is_set(self):
+        return self.now >= self.end
+
+
+@pytest.mark.parametrize("pace", [0.5, 4.0])
+def test_a_run_in_step_with_the_clock_takes_its_time_and_ends_when_told(pace, monkeypatch):
     run = Run({"t": 5 + np.arange(0, 1.0, 0.01)})
-    begun = time.monotonic()
-    blocks = list(in_step(run, 4.0))
-    took = time.monotonic() - begun
-    assert 0.22 < took < 1.0
-    assert np.array_equal(np.concatenate([block["t"] for block in blocks]), run["t"])
-    stop = threading.Event()
-    threading.Timer(0.2, stop.set).start()
-    begun = time.monotonic()
-    part = sum(block.rows for block in in_step(run, 0.5, stop=stop))
-    assert part < 50
-    assert time.monotonic() - begun < 1.0
+
+    def driven(clock):
+        monkeypatch.setattr("magtwin.io.recorder.time.monotonic", clock.monotonic)
+        return np.concatenate([block["t"] for block in in_step(run, pace, stop=clock)])
+
+    whole = Clock()
+    assert np.array_equal(driven(whole), run["t"])
+    assert 0.99 / pace <= whole.now - 100.0 <= 0.99 / pace + 2 * TICK_S
+    part = driven(Clock(end=0.2 / pace))
+    assert np.array_equal(part, run["t"][: part.size])
+    assert part.size == pytest.approx(20, abs=2 + 100 * TICK_S * pace)
+
+
+def test_a_run_that_is_not_in_step_is_one_block():
+    run = Run({"t": 5 + np.arange(0, 1.0, 0.01)})
     assert [block.rows for block in in_step(run, np.inf)] == [run.rows]
     with pytest.raises(InputError, match="pace must be above 0"):
         next(in_step(run, 0.0))
