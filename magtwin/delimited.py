@@ -1,7 +1,7 @@
 """Delimited text: rows of words in a file of another program, such as a spreadsheet or a script.
 
-Separator and header are found from the text. `notes` has what was repaired: decimal commas, and a last number
-that was cut short.
+Separator and header are found from the text. `notes` has what was repaired: lines above the header, decimal
+commas, and a last number that was cut short.
 """
 
 import csv
@@ -25,6 +25,9 @@ QUOTED = 60
 
 LOOKED = 50
 """Lines from which the separator is found."""
+
+MOST_ABOVE = 20
+"""Most lines above the header, such as the name and the date of a recording."""
 
 LEAST_ROWS = 8
 """Rows from which a last number can be told to be cut short."""
@@ -93,9 +96,9 @@ def read_delimited(path: str | os.PathLike[str], noun: str, kind: str, wanted: s
 
     The header is the first line if any of its words is not a number, else the last comment line above the
     rows with as many words as they have. Other lines that begin with `#`, such as `# KEY: VALUE`, empty
-    lines, and a first line `sep=;` are skipped. A decimal comma is read unless commas separate the words or
-    other numbers have decimal points. If the last line has no end, and its last number is far below all
-    others of its column, that number is missing.
+    lines, a first line `sep=;`, and lines of prose above the header are skipped. A decimal comma is read
+    unless commas separate the words or other numbers have decimal points. If the last line has no end, and
+    its last number is far below all others of its column, that number is missing.
 
     Args:
         path: The file.
@@ -125,8 +128,11 @@ def read_delimited(path: str | os.PathLike[str], noun: str, kind: str, wanted: s
     lines = [(number, line) for number, line in lines if not _is_comment(line)]
     if not lines:
         raise InputError(f"{path}: empty; expected {wanted}")
-    between = told[1] if told and told[1] != " " else _separator([line for _, line in lines[:LOOKED]])
-    rows, notes = _words(path, lines, between), list[str]()
+    begun = [line for _, line in lines[:LOOKED]]
+    between, prose = (told[1], 0) if told and told[1] != " " else _separator(begun)
+    notes = [f"line {lines[prose][0]} as the header, and the lines above it as prose"] if prose else []
+    lines = lines[prose:]
+    rows = _words(path, lines, between)
     if between != ",":
         rows, some = _with_points(rows)
         notes += ["numbers with decimal commas"] if some else []
@@ -212,18 +218,32 @@ def _lines(path: Path, noun: str) -> Iterator[tuple[int, str]]:
             raise InputError(f"{path}: not a text file ({error}); a {noun} is CSV in UTF-8") from error
 
 
-def _separator(lines: Sequence[str]) -> str | None:
-    """What stands between the words of lines: the mark that each has as often; None for blanks."""
+def _separator(lines: Sequence[str]) -> tuple[str | None, int]:
+    """What stands between the words of lines, and the number of lines of prose above the header.
+
+    It is the mark that each line has as often, from the header on; None for blanks.
+    """
     words = lines[-1].split()
     numbers = all(_COMMA.fullmatch(word) or math.isfinite(number_of(word)) for word in words)
     if len(words) > 1 and numbers and any(map(_COMMA.fullmatch, words)):
-        return None
+        return None, 0
     bare = [re.sub(r'"[^"]*"', "", line) for line in lines]
-    for mark in ";\t,":
-        counts = {line.count(mark) for line in bare}
-        if len(counts) == 1 and 0 not in counts:
-            return mark
-    return next((mark for mark in ",;\t" if mark in lines[0]), None)
+    found = {mark: above for mark in ";\t," if (above := _above(bare, mark)) is not None}
+    if 0 in found.values():
+        return next(mark for mark, above in found.items() if not above), 0
+    for mark, above in found.items():
+        prose, header = lines[:above], lines[above].split(mark)
+        if all(_is_header(line.split(mark)) for line in prose) and not any(map(_NUMBER.fullmatch, header)):
+            return mark, above
+    return next((mark for mark in ",;\t" if mark in lines[0]), None), 0
+
+
+def _above(lines: Sequence[str], mark: str) -> int | None:
+    """Number of lines above those that have a mark as often as the last has; None if these are no table."""
+    counts = [line.count(mark) for line in lines]
+    above = counts.index(counts[-1])
+    same = counts[-1] > 0 and set(counts[above:]) == {counts[-1]}
+    return above if same and (above == 0 or above <= min(MOST_ABOVE, len(lines) - 2)) else None
 
 
 def _words(path: Path, lines: list[tuple[int, str]], between: str | None) -> list[list[str]]:

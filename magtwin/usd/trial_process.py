@@ -202,6 +202,10 @@ def _limit(kind: int, most: int) -> None:
     resource.setrlimit(kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
 
 
+BLOCKS = tuple(getattr(Sdf, name) for name in ("ValueBlock", "AnimationBlock") if hasattr(Sdf, name))
+"""What stands for no value."""
+
+
 def copy_of(layer: Any) -> Any:
     """A copy of a layer, which decodes every value and all metadata, however large."""
     copy = Sdf.Layer.CreateAnonymous(".usda")
@@ -210,12 +214,18 @@ def copy_of(layer: Any) -> Any:
 
 
 def try_values(layer: Any) -> None:
-    """Convert every value of a layer to Python."""
+    """Convert every value of a layer to Python; refuse one that is not of its attribute's type."""
 
     def read(path: Any) -> None:
-        if path.IsPropertyPath():
-            spec = layer.GetObjectAtPath(path)
-            spec.GetInfo("default"), spec.GetInfo("timeSamples")
+        if not path.IsPropertyPath():
+            return
+        spec = layer.GetObjectAtPath(path)
+        values = [spec.GetInfo("default"), *(spec.GetInfo("timeSamples") or {}).values()]
+        if not isinstance(spec, Sdf.AttributeSpec) or (of_type := spec.typeName.defaultValue) is None:
+            return
+        kinds = (type(of_type), type(None), *BLOCKS)
+        if wrong := [value for value in values if not isinstance(value, kinds)]:
+            raise ValueError(f"<{path}> is {spec.typeName}, but holds {type(wrong[0]).__name__}")
 
     layer.Traverse("/", read)
 

@@ -147,3 +147,64 @@ def test_the_header_may_stand_above_remarks(tmp_path):
     file = tmp_path / "a.csv"
     file.write_text('# x,y,field\n# said "so" by, a friend\n# units: ["m", "m", "nT"]\n1,2,3\n4,5,6\n')
     assert read_csv(file).names == ["x", "y", "field"]
+
+
+@pytest.mark.parametrize(
+    "above",
+    ["Test started 2019-03-04 12:01:02.5\n", "Magnetometer 7\nby hand, at noon\n\n", "a;b\n" * 20],
+    ids=["a line", "more", "most"],
+)
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+def test_prose_above_the_header_is_left_out_and_noted(tmp_path, above, mark):
+    if mark in above:
+        pytest.skip("prose with as many marks as the table")
+    table = read_csv(written(tmp_path, above + "x,y,b\n1,2,3\n4,5,6\n".replace(",", mark)))
+    assert table.names == ["x", "y", "b"]
+    assert_array_equal(table.numbers("y"), [2, 5])
+    line = above.count("\n") + 1
+    assert table.notes == (f"line {line} as the header, and the lines above it as prose",)
+
+
+@pytest.mark.parametrize(
+    ("text", "refused"),
+    [
+        ("7,8\nx,y,b\n1,2,3\n4,5,6\n", "2: 2 values expected, got 3"),
+        ("x,y\n1,2,3\n4,5,6\n", "2: 2 values expected, got 3"),
+        ("x,y\n1,two,3\n4,five,6\n", "2: 2 values expected, got 3"),
+    ],
+    ids=["numbers above", "a short header", "a short header above texts"],
+)
+def test_only_prose_above_a_header_is_left_out(tmp_path, text, refused):
+    with pytest.raises(InputError, match=refused):
+        read_csv(written(tmp_path, text))
+
+
+def test_times_may_be_dates(tmp_path):
+    texts = [
+        "2026-01-13T19:52:50.5+00:00",
+        "2026-01-13 20:52:51+01:00",
+        "",
+        "2026-01-13T19:52:52",
+        "20260113T195253Z",
+    ]
+    table = read_csv(written(tmp_path, "t,x\n" + "".join(f"{t},1\n" for t in texts)))
+    assert_array_equal(table.times("t") - 1768333970.0, [0.5, 1, np.nan, 2, 3])
+    assert_array_equal(read_csv(written(tmp_path, "t_ms,time_ms,x (ms)\n1,2,3000\n")).times("x (ms)"), [3])
+
+
+@pytest.mark.parametrize("cell", ["noon", "2026-13-01T00:00:00", "7", "9999-12-31T23:59:60"])
+def test_a_cell_that_is_no_date_among_dates_is_refused_with_its_line(tmp_path, cell):
+    table = read_csv(written(tmp_path, f"t,x\n2026-01-13T19:52:50Z,1\n{cell},2\n"))
+    with pytest.raises(InputError, match=rf"a\.csv:3: t must be a date and time, got '{cell}'"):
+        table.times("t")
+
+
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+def test_timestamps_of_parquet_are_seconds(tmp_path, unit):
+    cells = pa.array([1_768_333_970, None, 1_768_333_972], pa.timestamp("s", "UTC")).cast(
+        pa.timestamp(unit, "UTC")
+    )
+    pq.write_table(pa.table({"t": cells}), tmp_path / "a.parquet")
+    assert_array_equal(
+        read_parquet_table(tmp_path / "a.parquet").times("t"), [1768333970, np.nan, 1768333972]
+    )

@@ -350,9 +350,9 @@ def _doubts(readings: Readings, source: Source) -> list[str]:
     mean = np.exp(1j * yaw).mean()
     if np.abs(mean) >= ONE_HEADING:
         doubts.append(
-            f"one heading only, {np.degrees(np.angle(mean)):.0f} deg: the robot's own field cannot be "
-            "separated from the room's, and a simulated robot adds its own again; survey in several "
-            "headings, or carry the sensor by hand"
+            f"one heading only, {np.degrees(np.angle(mean)):.0f} deg: unless the sensor was carried by hand, "
+            "the robot's own field cannot be separated from the room's, and a simulated robot adds its own "
+            "again; survey in several headings"
         )
     return doubts
 

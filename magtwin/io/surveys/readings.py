@@ -324,13 +324,19 @@ def _read_table(path: Path) -> Table:
 
 def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
     """The readings in a table."""
+    asked = bool(columns.time)
     columns, taken = _complete(table, columns)
     p = np.column_stack([_lengths(table, columns.x), _lengths(table, columns.y)])
     turn = _turn(table, columns)
     vector, b = _field(table, columns)
-    t = table.numbers(columns.time) if columns.time else None
-    if t is not None and label_of(columns.time)[1] == "ms":
-        t = t / 1000
+    t = None
+    if columns.time:
+        try:
+            t = table.times(columns.time)
+        except InputError as error:
+            if asked:
+                raise
+            taken.append(f"no times: {error}")
     some = [p, b[:, None]] + [v.reshape(len(p), -1) for v in (turn, vector, t) if v is not None]
     known: NDArray[np.bool_] = np.all(np.isfinite(np.hstack(some)), axis=1)
     if not known.any():

@@ -1,8 +1,10 @@
 """Table: columns of numbers from CSV or Parquet, with file and line of every cell for error messages."""
 
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +12,17 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from magtwin.delimited import QUOTED, number_of, read_delimited
+from magtwin.delimited import MISSING, QUOTED, label_of, number_of, read_delimited
 from magtwin.errors import InputError, hint
 from magtwin.files import existing
 from magtwin.io.tables import load_parquet
 
 Array = NDArray[np.float64]
+
+_TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+"""Ticks per second of a timestamp of Arrow, by its unit."""
+
+_DATE = re.compile(r"\d{4}-\d\d-\d\d", re.ASCII)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +112,32 @@ class Table:
             raise InputError(f"{column.where(row)}: {name} must be a finite number, got {shown}{advice}")
         return values
 
+    def times(self, name: str) -> Array:
+        """The times of a column [s], shape (N,); nan for cells that are empty or nan.
+
+        They are numbers, in ms if the name says so, or dates and times as in ISO 8601, which become seconds
+        since 1970; one without a zone is in UTC.
+
+        Raises:
+            InputError: There is no such column, or a cell is neither; with file and line.
+        """
+        column = self.column(name)
+        is_text = not isinstance(column.cells, np.ndarray) or column.cells.dtype.kind == "O"
+        texts = self.texts(name) if is_text else []
+        if not any(map(_DATE.match, texts)):
+            return self.numbers(name) / (1000 if label_of(name)[1] == "ms" else 1)
+        seconds = np.full(self.rows, np.nan)
+        for row, text in enumerate(texts):
+            if text.lower() in MISSING:
+                continue
+            try:
+                moment = datetime.fromisoformat(text)
+                seconds[row] = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+            except (ValueError, OverflowError):
+                where = column.where(row)
+                raise InputError(f"{where}: {name} must be a date and time, got {text[:QUOTED]!r}") from None
+        return seconds
+
     def texts(self, name: str) -> list[str]:
         """The cells of a column as stripped texts."""
         return [str(cell).strip() for cell in self.column(name).cells]
@@ -132,7 +165,7 @@ def read_csv(path: str | os.PathLike[str]) -> Table:
 
 
 def read_parquet_table(path: str | os.PathLike[str]) -> Table:
-    """Read the columns of numbers and texts of a Parquet file.
+    """Read the columns of numbers, texts and timestamps of a Parquet file; timestamps are seconds since 1970.
 
     Raises:
         InputError: The file is missing, is not Parquet, is truncated, or has no rows.
@@ -147,6 +180,9 @@ def read_parquet_table(path: str | os.PathLike[str]) -> Table:
         if pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind):
             plain = values.cast(pa.float64(), safe=False) if values.null_count else values
             columns.append(Column(field.name, plain.to_numpy(), path, None))
+        elif pa.types.is_timestamp(kind):
+            since = values.cast(pa.int64()).cast(pa.float64(), safe=False)
+            columns.append(Column(field.name, since.to_numpy() / _TICKS[kind.unit], path, None))
         elif pa.types.is_string(kind) or pa.types.is_large_string(kind):
             columns.append(Column(field.name, np.array(values.to_pylist(), object), path, None))
     if not columns or not table.num_rows:
