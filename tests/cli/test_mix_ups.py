@@ -36,6 +36,7 @@ def files(tmp_path_factory):
         "mesh.stl": "solid a\nendsolid a\n",
         "world.sdf": "<sdf version='1.9'/>",
         "data.zip": "PK",
+        "drive.bag": "#ROSBAG V2.0\n",
     }.items():
         (folder / name).write_text(text)
     for name in ("picture.png", "net.safetensors", "net.pth", "net.onnx"):
@@ -86,6 +87,7 @@ TAKES = {
     "mesh.stl": "magtwin robot",
     "world.sdf": "give the URDF or the stage",
     "data.zip": "unpack it",
+    "drive.bag": "rosbags-convert --src drive.bag",
 }
 """What the refusal of each file names."""
 
@@ -98,6 +100,7 @@ RARE = {
     "mesh.stl",
     "world.sdf",
     "data.zip",
+    "drive.bag",
 }
 """Files that are tried with a few commands only: what they are decides, not the command."""
 
