@@ -196,6 +196,7 @@ def test_each_kind_is_recognised_and_taken_by_a_reader(files):
     made = {known[name] for name in TAKES} - taken
     assert {kind.noun for kind in made} == {
         "a Python file",
+        "a bag of ROS 1",
         "a page",
         "a picture or film",
         "a network as ONNX, which runs without magtwin",
