@@ -216,9 +216,9 @@ def _is_copy(copy: Path, file: Path) -> bool:
 
 
 @contextmanager
-def reading(values: Iterable[object]) -> Iterator[None]:
-    """Let no output of the block remove the files among `values`, such as the arguments of a command."""
-    named = {os.path.realpath(v) for v in values if isinstance(v, str | Path) and _is_there(v)}
+def reading(files: Iterable[Path]) -> Iterator[None]:
+    """Let no output of the block remove these files and folders; those that do not exist are ignored."""
+    named = {os.path.realpath(file) for file in files if _is_there(file)}
     token = _inputs.set(tuple(map(Path, sorted(named))))
     try:
         yield
@@ -232,9 +232,9 @@ def not_read(value: str | Path) -> None:
     _inputs.set(tuple(file for file in _inputs.get() if file != real))
 
 
-def _is_there(name: str | Path) -> bool:
+def _is_there(file: Path) -> bool:
     try:
-        return Path(name).exists()
+        return file.exists()
     except (OSError, ValueError):  # a text that is too long for a name
         return False
 

@@ -253,7 +253,7 @@ def write(folder, texts, *, force=False):
 def test_a_folder_that_holds_an_input_is_not_replaced_unless_the_output_has_a_copy(tmp_path):
     (tmp_path / "room" / "b").mkdir(parents=True)
     (tmp_path / "room" / "b" / "in.csv").write_text("old")
-    with reading(["", "x\0", "n" * 5000, tmp_path / "room" / "b" / "in.csv"]):
+    with reading([*map(Path, ("", "x\0", "n" * 5000)), tmp_path / "room" / "b" / "in.csv"]):
         for others in ({}, {"b/in.csv": "new"}):
             with pytest.raises(InputError, match=r"holds b/in\.csv, which is read and would be removed"):
                 write(tmp_path / "room", others, force=True)

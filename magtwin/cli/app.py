@@ -220,9 +220,7 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
 
         _running[:] = [command]
         given = signature.bind_partial(*args, **options).arguments
-        read = [value for name, value in given.items() if name not in ("out", "report")]
-        values = [v for value in read for v in (value if isinstance(value, list | tuple) else [value])]
-        with output_mode(as_json=json, quiet=quiet), reading(values):
+        with output_mode(as_json=json, quiet=quiet), reading(_files(given)):
             done = function(*args, **options)
             if isinstance(done, Done):
                 done.show()
@@ -238,6 +236,24 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
     wrapped.shares_options = True  # type: ignore[attr-defined]
     wrapped.__annotations__ = {**function.__annotations__, **added}
     return wrapped
+
+
+_WRITTEN = ("out", "report", "rrd")
+"""Parameters that name outputs."""
+
+_FOLDERS = ("data", "earth", "map", "spec", "suite")
+"""Parameters of text that may name a folder in one word. In others a word is a choice, as in --path sine."""
+
+
+def _files(given: dict[str, Any]) -> list[Path]:
+    """Files and folders among the values of a command's parameters that it may read."""
+    found = []
+    for name, value in given.items():
+        for each in value if isinstance(value, list | tuple) else [value]:
+            is_name = isinstance(each, str) and (name in _FOLDERS or Path(each).name != each or "." in each)
+            if name not in _WRITTEN and (is_name or isinstance(each, Path)):
+                found.append(Path(each))
+    return found
 
 
 def _flags() -> dict[str, str]:
