@@ -130,8 +130,35 @@ def test_commands_of_a_spreadsheet_are_read_with_a_note(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("text", "note"),
+    [
+        ("t [ms],v [mm/s],w [deg/s]\n0,100,0\n500,200,90\n", "by the units in their names"),
+        ("t_ms,v_mps,yaw_rate_dps\n0,.1,0\n500,.2,90\n", "t_ms, v_mps, yaw_rate_dps as t, v and w"),
+        ("angular.z,linear.x,linear.y,time\n0,.1,0,0\n%r,.2,0,.5\n" % (np.pi / 2), "left out linear.y"),
+        ("t,v,w [\u00b0/s]\n1.7e9,.1,0\n1700000000.5,.2,90\n", "times as counted from the first line"),
+        (
+            "%%time,v,w\n1700000000000000000,.1,0\n1700000000500000000,.2,%r\n" % (np.pi / 2),
+            "1e-09 s, by its size",
+        ),
+    ],
+)
+def test_commands_are_read_by_their_names_and_units_and_from_any_clock(tmp_path, text, note):
+    (tmp_path / "c.csv").write_text(text, encoding="utf-8")
+    with pytest.warns(RepairWarning, match=note):
+        commands = read_commands(tmp_path / "c.csv")
+    assert_allclose(commands.rows, [[0, 0.1, 0], [0.5, 0.2, np.pi / 2]])
+
+
+@pytest.mark.parametrize(
     ("text", "what"),
     [
+        (
+            "t,left,right\n0,1,1\n",
+            "no column of v in 't,left,right'; wheel speeds .* are not read; name time",
+        ),
+        ("t,v,steering\n0,1,1\n", "no column of w in 't,v,steering'"),
+        ("t,v [knots],w\n0,1,1\n", r"'v \[knots\]' is in no unit of v; known: m/s, mm/s, cm/s, km/h"),
+        ("t,v,w,w\n0,1,1,1\n", "several columns of w"),
         ("t,v,w\n0,0.1,0\n0.5,0.1,0\n0.4,0.1,0\n", ":4: times must ascend"),
         ("0,nan,0\n", ":1: a command is three finite numbers"),
         ("0,0.1\n", ":1: a command is three numbers"),
