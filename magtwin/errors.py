@@ -15,6 +15,9 @@ LONGEST = 1500
 NEAR, NEAR_SHORT, SHORT = 0.7, 0.6, 4
 """Least similarity of a suggested name (1: equal): of a long one, and of one of at most so many letters."""
 
+TERMINATED = 143
+"""Exit status of a command that SIGTERM ended."""
+
 _PARAMETER = re.compile(r"`(?:magtwin\.)?([a-z_][a-z0-9_]*)(?:=([^`]*)|\(([^`]*)\))?`")
 """A parameter in the text of a refusal: `force=True`, `map_layer`, `magtwin.allow('folder')`."""
 
@@ -71,6 +74,11 @@ class InputError(ValueError):
         text = _FIRST.sub(lambda match: flags.get(match[1], match[1]), text)
         named = flags.get(self.parameter or "")
         return f"{named}: {text}" if named and named not in text else text
+
+
+def is_termination(error: BaseException) -> bool:
+    """Whether an error ends the command itself, and is not a `sys.exit` of code that the user gave."""
+    return isinstance(error, SystemExit) and error.code == TERMINATED
 
 
 class MismatchWarning(UserWarning):

@@ -408,22 +408,32 @@ def truth_of(run: Run) -> Array | None:
     A pose is nan where motion capture had lost the robot.
     """
     if _has_true_pose(run):
-        return np.column_stack([run["p_world_base"][:, :2], run["yaw"]])
-    if "mocap_p" in run and "mocap_q_xyzw" in run and np.isfinite(run["mocap_p"]).any():
+        pose = np.column_stack([run["p_world_base"][:, :2], run["yaw"]])
+        captured = _is_captured(run)
+    elif "mocap_p" in run and "mocap_q_xyzw" in run and np.isfinite(run["mocap_p"]).any():
         pose = np.column_stack([run["mocap_p"][:, :2], yaw_from_quat(run["mocap_q_xyzw"])])
-        if "flag_pose_lost" in run:
-            pose[run["flag_pose_lost"]] = np.nan
-        return pose
-    return None
+        captured = True
+    else:
+        return None
+    if captured and "flag_pose_lost" in run:
+        pose[run["flag_pose_lost"]] = np.nan
+    return pose
 
 
 def truth_name(run: Run) -> str:
-    """What `truth_of` gives: "true pose", or "pose of motion capture (mocap_p)"."""
-    return "true pose" if _has_true_pose(run) else "pose of motion capture (mocap_p)"
+    """What `truth_of` gives: "true pose", or "pose of motion capture" with its column or topic."""
+    if not _has_true_pose(run):
+        return "pose of motion capture (mocap_p)"
+    return f"pose of {run.metadata['truth']}" if _is_captured(run) else "true pose"
 
 
 def _has_true_pose(run: Run) -> bool:
     return "p_world_base" in run and "yaw" in run and bool(np.isfinite(run["p_world_base"]).any())
+
+
+def _is_captured(run: Run) -> bool:
+    """Whether the true pose of a recorded run is that of motion capture, as its metadata say."""
+    return str(run.metadata.get("truth", "")).startswith("motion capture")
 
 
 def prior_of(run: Run, text: str = "tracking", *, seed: int = 0) -> Prior:

@@ -21,7 +21,7 @@ from magtwin.cli.progress import watched
 from magtwin.cli.renamed import renamed
 from magtwin.cli.settings import Environment, Settings
 from magtwin.cli.terminal import Done, output_mode, print_error
-from magtwin.errors import CalibrationWarning, InputError, MismatchWarning, RepairWarning
+from magtwin.errors import TERMINATED, CalibrationWarning, InputError, MismatchWarning, RepairWarning
 from magtwin.folders import allow
 from magtwin.version import __version__
 
@@ -115,7 +115,7 @@ def _with_file(error: CycloptsError) -> str:
 
 def _end_by_exceptions() -> None:
     """Turn signals that end the process into exceptions, so that partial outputs are removed."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     if os.name == "nt" or signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # nohup
         return
 

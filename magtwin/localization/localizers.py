@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from magtwin.errors import InputError, hint
+from magtwin.errors import InputError, hint, is_termination
 from magtwin.extend import Registry
 from magtwin.localization.problem import Localizer, Smoother
 
@@ -63,7 +63,9 @@ def load_localizer(name: str, options: Mapping[str, Any] | None = None) -> Local
         algorithm = made(**options)
     except InputError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
+        if is_termination(error):
+            raise
         raise InputError(f"localizer {name!r} cannot be made: {type(error).__name__}: {error}") from error
     if not isinstance(algorithm, Localizer | Smoother):
         raise InputError(f"localizer {name!r} must have the methods reset and step, or run")
@@ -90,6 +92,8 @@ def _class_of(name: str) -> Any:
             made = getattr(made, part)
     except InputError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
+        if is_termination(error):
+            raise
         raise InputError(f"localizer {name!r} cannot be imported: {type(error).__name__}: {error}") from error
     return made

@@ -3,6 +3,7 @@
 import contextlib
 import math
 import time
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, RepairWarning, is_termination
 from magtwin.localization.problem import Array, Estimate, Localizer, Problem, Smoother
 from magtwin.localization.readings import onboard, readings_of
 from magtwin.run.run import Column, Run
@@ -29,6 +30,9 @@ EST_COLUMNS = {
     "est_lost": Column("bool", "", "the localizer does not trust its pose", interpolation="hold"),
 }
 """Columns that localization adds to a run."""
+
+LARGEST_YAW = 8 * math.pi
+"""Greater headings are reported, as they may be in degrees [rad]."""
 
 _UPPER = np.triu_indices(3)
 
@@ -117,7 +121,9 @@ def track(
             begin = time.process_time()
             try:
                 estimates.append(step(reading))
-            except Exception as error:  # whatever the algorithm under test does wrong
+            except (Exception, SystemExit) as error:  # whatever the algorithm under test does wrong
+                if is_termination(error):
+                    raise
                 raise LocalizerError(
                     f"{name}.step raised {type(error).__name__} at t = {reading.t:g} s: {error}"
                 ) from error
@@ -127,6 +133,15 @@ def track(
             if progress is not None:
                 progress(k + 1, run.rows)
     checked = checked_estimates(name, estimates, run["t"])
+    if (far := np.abs(checked[0][:, 2]) > LARGEST_YAW).any():
+        k = int(np.argmax(far))
+        warnings.warn(
+            f"{name} returned yaw {checked[0][k, 2]:g} rad at t = {run['t'][k]:g} s, more than "
+            f"{LARGEST_YAW / (2 * math.pi):g} turns: whole turns are left out; if this is in degrees, return "
+            "radians",
+            RepairWarning,
+            stacklevel=2,
+        )
     return Track(run["t"], *checked, spent / run.rows, tuple(clouds))
 
 
@@ -135,7 +150,9 @@ def _called(what: str, work: Callable[[], Any]) -> Any:
         return work()
     except InputError as error:  # it says itself what is wrong
         raise LocalizerError(f"{what.partition('.')[0]}: {error}") from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:
+        if is_termination(error):
+            raise
         raise LocalizerError(f"{what} raised {type(error).__name__}: {error}") from error
 
 
@@ -184,11 +201,21 @@ def checked_estimates(
     if known.any():
         some = covariance[known]
         scale = np.abs(some).max(axis=(1, 2), keepdims=True) + 1e-300
-        bad = ~np.isfinite(some).all(axis=(1, 2)) | (
-            np.abs(some - some.transpose(0, 2, 1)) > 1e-6 * scale
-        ).any(axis=(1, 2))
-        if not bad.any():
-            bad = np.linalg.eigvalsh(some)[:, 0] < -1e-9 * scale[:, 0, 0]
+        with np.errstate(invalid="ignore"):
+            apart = np.abs(some - some.transpose(0, 2, 1))
+        for bad, fault in (
+            (~np.isfinite(some).all(axis=(1, 2)), "finite"),
+            ((apart > 1e-6 * scale).any(axis=(1, 2)), "symmetric"),
+        ):
+            if bad.any():
+                k = int(np.argmax(bad))
+                i, j = np.unravel_index(np.argmax(apart[k]), (3, 3))
+                pair = f": [{i}, {j}] is {some[k, i, j]:g} and [{j}, {i}] is {some[k, j, i]:g}"
+                raise LocalizerError(
+                    f"{name} returned a covariance that is not {fault} at t = {t[known][k]:g} s"
+                    f"{pair if fault == 'symmetric' else ''}"
+                )
+        bad = np.linalg.eigvalsh(some)[:, 0] < -1e-9 * scale[:, 0, 0]
         if bad.any():
             when = t[known][np.argmax(bad)]
             raise LocalizerError(

@@ -120,6 +120,9 @@ def test_motion_capture_with_gaps_is_what_errors_count_against(here: Path) -> No
     said = result.report().metadata["errors"]
     assert said == f"differences from the pose of motion capture (mocap_p), known at {known.sum()} of them"
     assert exact.report().metadata["errors"] == "differences from the true pose"
+    recorded = whole.with_columns(flag_pose_lost=lost).with_metadata(truth="motion capture, /vrpn/pose")
+    said = localization(recorded, "lab", method="ekf", prior="tracking").report().metadata["errors"]
+    assert said == f"differences from the pose of motion capture, /vrpn/pose, known at {known.sum()} of them"
     away = captured.with_columns(flag_pose_lost=whole["t"] < 5)
     assert localization(away, "lab", method="odometry", prior="0,0,0.8").bounds is None
     with pytest.raises(InputError, match="no true pose at its first reading"):

@@ -9,7 +9,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from magtwin.errors import InputError
-from magtwin.io.bags import read_bag_readings
+from magtwin.io.bags import read_bag, read_bag_readings
 from magtwin.io.surveys.readings import read_readings
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -22,12 +22,12 @@ def make(kind, **parts):
     return STORE.types[kind](**parts)
 
 
-def header(t):
+def header(t, frame="map"):
     ns = round(t * 1e9)
     return make(
         "std_msgs/msg/Header",
         stamp=make("builtin_interfaces/msg/Time", sec=ns // 10**9, nanosec=ns % 10**9),
-        frame_id="map",
+        frame_id=frame,
     )
 
 
@@ -49,7 +49,7 @@ def odometry(t, *where):
     zero = make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
     return make(
         "nav_msgs/msg/Odometry",
-        header=header(t),
+        header=header(t, "odom"),
         child_frame_id="base_link",
         pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose(*where), covariance=covariance),
         twist=make(
@@ -234,6 +234,61 @@ def test_a_pose_that_does_not_drift_is_taken_before_odometry(tmp_path):
     two = write_bag(tmp_path / "b", {"/odom": drive(odometry), "/odom2": drive(odometry), "/mag": fields})
     with pytest.raises(InputError, match="2 topics of a pose, /odom, /odom2; choose with --pose-topic"):
         read_bag_readings(two)
+
+
+def transforms(t, *places):
+    """A TFMessage of parent, child, x, y and yaw of each transform."""
+    made = [
+        make(
+            "geometry_msgs/msg/TransformStamped",
+            header=header(t, parent),
+            child_frame_id=child,
+            transform=make(
+                "geometry_msgs/msg/Transform",
+                translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=0.0),
+                rotation=pose(0, 0, yaw).orientation,
+            ),
+        )
+        for parent, child, x, y, yaw in places
+    ]
+    return (t, make("tf2_msgs/msg/TFMessage", transforms=made))
+
+
+@pytest.mark.parametrize("moved", [True, False])
+def test_odometry_that_transforms_correct_is_reported(tmp_path, moved):
+    wheel = ("base_link", "wheel", 9.0, 0.0, 0.0)
+    said = [
+        transforms(START, ("map", "odom", 0.0, 0.0, 0.0)),
+        transforms(START + 1, wheel, ("map", "/odom", 3.0 * moved, 4.0 * moved, -0.5 * moved)),
+    ]
+    fields = at_middle(np.full(40, 41_000.0))
+    bag = write_bag(tmp_path / "a", {"/odom": drive(odometry), "/mag": fields, "/tf": said})
+    source = read_bag_readings(bag).source
+    text = (
+        "; taken poses of /odom in 'odom', though /tf moves it against 'map' by up to 5 m and 28.6 deg, which"
+    )
+    assert (text in source) == moved
+    assert ("taken" in source) == moved
+
+
+def test_poses_without_an_orientation_are_refused_as_such(tmp_path):
+    poses, fields = drive(), at_middle(np.full(40, 41_000.0))
+    for k, (_, message) in enumerate(poses):
+        message.pose.orientation.w = message.pose.orientation.z = 0.0
+        if k == 2:
+            some = write_bag(tmp_path / "some", {"/pose": poses, "/mag": fields})
+    assert (
+        "; taken 3 of 41 poses as missing, whose quaternion is not of length 1"
+        in read_bag_readings(some).source
+    )
+    bag = write_bag(tmp_path / "all", {"/pose": poses, "/mag": fields})
+    text = (
+        r"41 of 41 poses of /pose cannot be used, the first at 1700000000\.000 s: its quaternion is 0,0,0,0"
+    )
+    with pytest.raises(InputError, match=text):
+        read_bag_readings(bag)
+    with pytest.raises(InputError, match="its quaternion is 0,0,0,0"):
+        read_bag(bag, topics={"/robot/enu/pose": "/pose", "/robot/qtfm/magnitude": "/mag"})
 
 
 def test_a_bag_without_a_field_or_without_a_pose_is_refused_with_its_topics(tmp_path):

@@ -1,12 +1,14 @@
 """What a localizer gets leads to no true pose, no true field and no later reading."""
 
 import gc
+import sys
 import types
 
 import numpy as np
 import pytest
 
 import magtwin as mt
+from magtwin.errors import RepairWarning
 from magtwin.localization.problem import Estimate, Problem
 from magtwin.localization.readings import NEEDED, ONBOARD, onboard, readings_of
 from magtwin.localization.track import LocalizerError, track
@@ -118,12 +120,28 @@ class Wrong:
         (lambda r: Estimate(r.t, 0, 0, 0, lost=np.ones(2)), "lost that is not true or false"),
         (lambda r: Estimate(r.t, 0, 0, 0, np.eye(2)), r"a covariance of shape \(2, 2\)"),
         (lambda r: Estimate(r.t, 0, 0, 0, -np.eye(3)), "not positive semidefinite"),
-        (lambda r: Estimate(r.t, 0, 0, 0, np.arange(9.0).reshape(3, 3)), "not positive semidefinite"),
+        (
+            lambda r: Estimate(r.t, 0, 0, 0, np.arange(9.0).reshape(3, 3)),
+            r"not symmetric .*: \[0, 2\] is 2 and \[2, 0\]",
+        ),
+        (lambda r: Estimate(r.t, 0, 0, 0, np.diag([1, 1, np.inf])), "a covariance that is not finite"),
+        (lambda r: sys.exit(3), "raised SystemExit at t = 0 s: 3"),
     ],
 )
 def test_a_wrong_estimate_is_refused_with_its_time(run, estimate, text):
     with pytest.raises(LocalizerError, match=text):
         track(Wrong(estimate), Problem(belief=None, extent=(-3, 3, -2, 2)), run)
+
+
+def test_a_heading_of_many_turns_is_reported(run):
+    degrees = Wrong(lambda r: Estimate(r.t, 0, 0, 270))
+    with pytest.warns(RepairWarning, match="yaw 270 rad at t = 0 s, more than 4 turns: .* return radians"):
+        track(degrees, Problem(belief=None, extent=(-3, 3, -2, 2)), run)
+
+
+def test_a_command_that_sigterm_ends_is_no_fault_of_the_localizer(run):
+    with pytest.raises(SystemExit):
+        track(Wrong(lambda r: sys.exit(143)), Problem(belief=None, extent=(-3, 3, -2, 2)), run)
 
 
 def test_a_refusal_of_a_localizer_says_what_is_wrong_and_not_where_it_was_raised(run):

@@ -37,6 +37,9 @@ GAP = 5.0
 LEAST_GAP_S = 0.1
 """Poses closer than this are always interpolated between [s]."""
 
+UNIT_WITHIN = 0.01
+"""Largest error of the length of a quaternion."""
+
 
 class Bag:
     """An open bag: all of its storage files as one.
@@ -223,9 +226,7 @@ def poses_at(t: Array, pose_t: Array, pose: Array) -> tuple[Array, Array, NDArra
     Returns:
         Positions (N, 3), orientations xyzw (N, 4), and whether each time lies between two poses (N,).
     """
-    sound = np.isfinite(pose).all(axis=1)
-    length = np.linalg.norm(pose[:, 3:], axis=1)
-    sound &= np.abs(length - 1) < 0.01
+    sound = sound_poses(pose)
     pose_t, pose = pose_t[sound], pose[sound]
     if len(pose_t) < 2:
         return np.zeros((len(t), 3)), np.zeros((len(t), 4)), np.zeros(len(t), bool)
@@ -238,6 +239,29 @@ def poses_at(t: Array, pose_t: Array, pose: Array) -> tuple[Array, Array, NDArra
     share = np.clip(part, 0, 1)
     q = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
     return linear(pose[:, :3], low, share), quaternion(q, low, share), inside
+
+
+def sound_poses(pose: Array) -> NDArray[np.bool_]:
+    """Whether each pose is finite and its quaternion of length 1, shape (M, 7) -> (M,)."""
+    return np.isfinite(pose).all(axis=1) & (np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1) < UNIT_WITHIN)
+
+
+def check_poses(pose_t: Array, pose: Array, where: str, topic: str) -> None:
+    """Refuse poses of which less than two are sound; arguments as for `poses_at` and `field_nt`.
+
+    Raises:
+        InputError: So it is; the text says what is wrong with the first.
+    """
+    bad = ~sound_poses(pose)
+    if len(pose) < 2 or np.count_nonzero(~bad) >= 2:
+        return
+    first = int(np.argmax(bad))
+    length = float(np.linalg.norm(pose[first, 3:]))
+    fault = "its quaternion is 0,0,0,0" if length == 0 else f"the length of its quaternion is {length:.3g}"
+    raise InputError(
+        f"{where}: {np.count_nonzero(bad)} of {len(pose)} poses of {topic} cannot be used, the first at "
+        f"{pose_t[first]:.3f} s: {fault}; record the orientation too, or choose another topic of poses"
+    )
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from magtwin.errors import InputError, find
 from magtwin.field.units import NT_PER, Unit
 from magtwin.files import sha256
 from magtwin.frames import canonical, quat_conjugate, rotate, yaw_from_quat
-from magtwin.io.bags.bag import Bag, Signal, field_nt, poses_at, unit_of
+from magtwin.io.bags.bag import Bag, Signal, check_poses, field_nt, poses_at, unit_of
 from magtwin.io.bags.cdr import NS, Index, decode
 from magtwin.io.bags.sender import Sender
 from magtwin.io.bags.topics import (
@@ -270,6 +270,7 @@ def _columns(
     if signal.topic is POSE:
         once = np.flatnonzero(np.diff(when, prepend=-np.inf) > 0)
         pose = np.concatenate([values["mocap_p"], values["mocap_q_xyzw"]], axis=1)
+        check_poses(when[once], pose[once], str(path), signal.name)
         p, q, inside = poses_at(t, when[once], pose[once])
         columns["p_world_base"] = np.where(inside[:, None], p, columns["mocap_p"])
         columns["q_world_base_xyzw"] = np.where(inside[:, None], q, columns["mocap_q_xyzw"])

@@ -1,21 +1,34 @@
 """Survey: field readings at known poses, from a bag."""
 
+import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, hint
-from magtwin.field.survey.readings import Readings
+from magtwin.field.survey.readings import TAKEN, Readings
 from magtwin.field.units import Unit
 from magtwin.files import sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
-from magtwin.io.bags.bag import Bag, Signal, field_nt, poses_at
-from magtwin.io.bags.topics import MAGNITUDE, ODOMETRY, POSE, Topic
+from magtwin.io.bags.bag import Bag, Signal, check_poses, field_nt, poses_at, sound_poses
+from magtwin.io.bags.cdr import Leaf, Messages, decode
+from magtwin.io.bags.topics import MAGNITUDE, ODOMETRY, POSE, TF, Topic
+from magtwin.io.bags.types import layout
 
 Array = NDArray[np.float64]
+
+MOVED_M, MOVED_DEG = 0.001, 0.1
+"""Correction of odometry above which it is reported [m], [deg]."""
+
+MOST_TRANSFORMS = 256
+"""Messages of more transforms are not read."""
+
+_TRANSFORM = ("header.frame_id", "child_frame_id", "transform.translation", "transform.rotation")
 
 
 def read_bag_readings(
@@ -30,8 +43,8 @@ def read_bag_readings(
 
     Positions are interpolated linearly between poses, orientations by slerp (Shoemake 1985, section 3.3).
     Messages of the field before the first pose, after the last one, in a gap of the poses, or without a
-    number are left out. Stamps are those of the headers. If a topic has no stamps, times of receipt are used
-    for both topics.
+    number are left out. Corrections of odometry by transforms are not applied; `source` reports them. Stamps
+    are those of the headers. If a topic has no stamps, times of receipt are used for both topics.
 
     Args:
         path: Folder of a rosbag2, or its storage file (.db3, .mcap).
@@ -59,12 +72,16 @@ def read_bag_readings(
                 raise InputError(f"{path}: topic {name} has no message")
         poses = bag.signal(pose_name, POSE, messages[pose_name])
         fields = bag.signal(field_name, MAGNITUDE, messages[field_name])
+        taken = [_correction(bag, pose_name, messages[pose_name])]
         files = [path] if path.is_file() else sorted(path.iterdir())
         sums = "; ".join(f"{f.name} sha256:{sha256(f)}" for f in files if f.is_file())
     by_header = poses.stamps is not None and fields.stamps is not None
     clock = "header" if by_header else "receipt"
     pose_t, pose = _in_order(poses, by_header, poses.columns().values())
     t, b = _in_order(fields, by_header, fields.columns().values())
+    check_poses(pose_t, pose, str(path), poses.name)
+    if bad := np.count_nonzero(~sound_poses(pose)):
+        taken.append(f"{bad} of {len(pose)} poses as missing, whose quaternion is not of length 1")
     p, q, inside = poses_at(t, pose_t, pose)
     known = np.isfinite(b).all(axis=1) & inside
     if not known.any():
@@ -93,8 +110,49 @@ def read_bag_readings(
         t=t - t[0],
         runs=(path.stem,),
         name=path.stem,
-        source=f"{sums} ({about}{left if not known.all() else ''})",
+        source=f"{sums} ({about}{left if not known.all() else ''})"
+        + "".join(f"; {TAKEN}{text}" for text in taken if text),
     )
+
+
+def _correction(bag: Bag, name: str, messages: Messages) -> str:
+    """What transforms of the bag do to the frame of its odometry, which is not applied; "" if nothing."""
+    tf = [topic for topic, kind in bag.kinds.items() if kind == TF.kind]
+    if bag.kinds[name] != ODOMETRY.kind or not tf:
+        return ""
+    frame = decode(layout(ODOMETRY.kind), messages, ["header.frame_id"])["header.frame_id"][0].strip("/")
+    far, turn = dict[str, float](), dict[str, float]()
+    with (
+        suppress(InputError),
+        np.errstate(over="ignore", invalid="ignore"),
+    ):  # a damaged one hinders no survey
+        for parents, children, p, q in chain(*map(_transforms, bag.messages(tf).values())):
+            rows = [row for row, child in enumerate(children) if child.strip("/") == frame != ""]
+            size, yaw = np.hypot(*p[rows, :2].T), np.abs(yaw_from_quat(q[rows]))
+            for row, metres, angle in zip(rows, size.tolist(), yaw.tolist(), strict=True):
+                parent = parents[row].strip("/")
+                far[parent] = max(far.get(parent, 0.0), metres)
+                turn[parent] = max(turn.get(parent, 0.0), angle)
+    for parent in far:
+        if far[parent] > MOVED_M or turn[parent] > math.radians(MOVED_DEG):
+            return (
+                f"poses of {name} in {frame!r:.40}, though {', '.join(tf)} moves it against {parent!r:.40} "
+                f"by up to {far[parent]:.3g} m and {math.degrees(turn[parent]):.3g} deg, which is not "
+                "applied: give the topic of a corrected pose (--pose-topic)"
+            )
+    return ""
+
+
+def _transforms(messages: Messages) -> Iterator[tuple[list[str], list[str], Array, Array]]:
+    """Parents, children, translations and rotations (xyzw) of transforms of TFMessages."""
+    counts = decode([Leaf("transforms", "u4")], messages, ["transforms"])["transforms"]
+    for count in np.unique(counts[counts <= MOST_TRANSFORMS]).tolist():
+        rows = np.flatnonzero(counts == count)
+        some = Messages(messages.received[rows], messages.buffer, messages.start[rows], messages.size[rows])
+        names = [[f"transforms.{k}.{leaf}" for leaf in _TRANSFORM] for k in range(count)]
+        fields = decode(layout(TF.kind, {"transforms": count}), some, chain(*names))
+        for parent, child, p, q in names:
+            yield fields[parent], fields[child], fields[p], fields[q]
 
 
 def _choose(bag: Bag, kind: str, name: str | None, topic: Topic) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, is_termination
 from magtwin.field.units import NT_PER
 from magtwin.frames import quat_from_yaw, yaw_from_quat
 from magtwin.io.bags.bag import unit_of
@@ -273,7 +273,9 @@ class LocalizerNode:
         reading = self._reading(t, b_nt, odometry[0], stamp_ns)
         try:
             estimate = algorithm.step(reading)
-        except Exception as error:  # whatever the method does wrong
+        except (Exception, SystemExit) as error:  # whatever the method does wrong
+            if is_termination(error):
+                raise
             raise LocalizerError(
                 f"{self._method}.step raised {type(error).__name__} at t = {t:g} s: {error}"
             ) from error
@@ -339,7 +341,9 @@ class LocalizerNode:
         algorithm = self._make()
         try:
             algorithm.reset(Problem(**told))
-        except Exception as error:
+        except (Exception, SystemExit) as error:
+            if is_termination(error):
+                raise
             raise LocalizerError(f"{self._method}.reset raised {type(error).__name__}: {error}") from error
         self._algorithm = algorithm
         self._tick0, self._done, self._stamp_ns, self._yaw = stamp_ns / NS, 0, -1, None
