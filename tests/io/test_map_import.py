@@ -1,6 +1,7 @@
 """`magtwin map import`, `fit` and `check`: any survey in, what is broken in it said and masked."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from test_stuck import gridded
 from magtwin.author.earth import earth_of
 from magtwin.cli import main
 from magtwin.field.sources.earth import earth_field_nt
-from magtwin.io.surveys.maps import open_map
+from magtwin.field.survey.folder import node_map
+from magtwin.io.surveys.maps import _contradictions, _masked, open_map
 from magtwin.io.surveys.readings import load_readings, save_readings
 from magtwin.usd.maps.layer import load_map
 from magtwin.usd.scene import read_scene
@@ -294,6 +296,29 @@ def test_a_fit_of_one_heading_and_of_few_readings_says_that_they_are_doubtful(tm
         in said
     )
     assert "field in uT, by its size (--unit)" in said
+
+
+def test_vectors_and_headings_that_contradict_each_other_are_a_doubt(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    yaw, b = rng.uniform(-3, 3, 40), 20 * np.exp(1j * rng.uniform(-3, 3, 40))
+    rows = "".join(
+        f"{k},0,{a},{c.real},{c.imag},{-40 - k / 9}\n" for k, (a, c) in enumerate(zip(yaw, b, strict=True))
+    )
+    (tmp_path / "hall.csv").write_text("x,y,heading,bx,by,bz\n" + rows)
+    run("map", "import", tmp_path / "hall.csv", "--out", tmp_path / "a.parquet", "--json")
+    (doubt,) = json.loads(capsys.readouterr().out)["metadata"]["doubts"]
+    assert doubt.startswith("vectors keep no direction in world axes (")
+    (fitted,) = _contradictions(load_readings(tmp_path / "a.parquet"))
+    assert fitted == doubt
+
+
+def test_a_map_with_hardly_a_node_is_a_doubt():
+    field = node_map(gridded(0))
+    valid = np.zeros(field.valid.shape, bool)
+    assert not _masked(field)
+    valid[0, 0, :5] = True
+    (doubt,) = _masked(replace(field, valid=valid))
+    assert doubt.startswith(f"{valid.size - 5} of {valid.size} nodes are masked")
 
 
 @pytest.mark.parametrize("method", ["harmonic", "gp", "trilinear"])

@@ -90,6 +90,13 @@ def test_a_survey_that_spans_far_is_read_in_metres_with_a_note(tmp_path):
     assert not taken(read_readings(file(tmp_path, text.format("x [m]"), "b.csv")))
 
 
+def test_a_survey_of_millimetres_away_from_the_origin_may_be_in_degrees(tmp_path):
+    (note,) = taken(
+        read_readings(file(tmp_path, "x,y,yaw,b\n-82.35,29.65,0,41000\n-82.35004,29.65,0,41000\n"))
+    )
+    assert note == "x and y in metres, over 0.04 mm only: if these are degrees, convert them to metres"
+
+
 def test_cells_that_spreadsheets_write_for_nothing_are_missing(tmp_path):
     rows = [f"{word},0,0.5,41000\n" for word in ("#N/A", "N/A", "NULL", "-", "#DIV/0!", "", "nan")]
     readings = read_readings(file(tmp_path, ROWS + "".join(rows)))
@@ -170,6 +177,76 @@ def test_components_are_found_by_their_usual_names_where_there_is_no_magnitude(t
     assert both.b_body_nt is None, "a magnitude that is there is what is read"
 
 
+@pytest.mark.parametrize(
+    ("header", "nt"),
+    [
+        ("Magnetic field x (\N{MICRO SIGN}T),Magnetic field y (\N{MICRO SIGN}T),Magnetic field z (uT)", 1e3),
+        ("MAGNETIC FIELD X (\N{GREEK SMALL LETTER MU}T),MAGNETIC FIELD Y (uT),MAGNETIC FIELD Z (uT)", 1e3),
+        ("/magnetic_field/x,/magnetic_field/y,/magnetic_field/z", 1e3),
+        ("mag_x_ut,mag_y_ut,mag_z_ut", 1e3),
+        ("X_uT,Y_uT,Z_uT", 1e3),
+        ("b_x_nT,b_y_nT,b_z_nT", 1),
+        ("Bx [microtesla],By [microtesla],Bz [microtesla]", 1e3),
+        ("Bx (milligauss),By (milligauss),Bz (milligauss)", 1e2),
+        ("Bx (gauss),By (gauss),Bz (gauss)", 1e5),
+    ],
+)
+def test_components_are_found_by_the_names_and_units_of_phone_apps(tmp_path, header, nt):
+    values = ",".join(repr(v / nt) for v in WORLD.tolist())
+    text = f"Time (s),x (m),y (m),yaw,{header}\n0,1,2,0.5,{values}\n"
+    readings = read_readings(file(tmp_path, text))
+    assert_allclose(readings.b_body_nt, [WORLD])
+    assert_array_equal(readings.p_xy, [[1, 2]])
+
+
+@pytest.mark.parametrize("name", ["Absolute field (\N{MICRO SIGN}T)", "BT", "field_ut", "B_abs [microtesla]"])
+def test_a_magnitude_is_found_by_the_names_of_phone_apps(tmp_path, name):
+    assert_allclose(read_readings(file(tmp_path, f"x,y,yaw,{name}\n0,0,0,41\n")).b_nt, [41_000])
+
+
+@pytest.mark.parametrize("names", ["p_world_base_x,p_world_base_y", "pos_x,pos_y"])
+def test_positions_are_found_by_other_usual_names_and_told(tmp_path, names):
+    readings = read_readings(file(tmp_path, f"t,{names},yaw,b_total_nt\n0,1,2,0.5,41000\n"))
+    assert_array_equal(readings.p_xy, [[1, 2]])
+    assert taken(readings) == [f"{names.replace(',', ' and ')} as x and y (--x, --y)"]
+
+
+def test_a_unit_in_a_header_holds_for_a_column_that_is_named_by_its_number(tmp_path):
+    path = file(tmp_path, "x [cm],y [cm],yaw [deg],b [uT]\n100,200,90,41\n")
+    readings = read_readings(path, columns=Columns(x="1", y="2", heading="3", field="4"))
+    assert_array_equal(readings.p_xy, [[1, 2]])
+    assert_allclose((readings.yaw[0], readings.b_nt[0]), (np.pi / 2, 41_000))
+
+
+@pytest.mark.parametrize(
+    ("name", "ticks", "note"),
+    [
+        ("t_ms", 1e3, None),
+        ("time_ns", 1e9, None),
+        ("timestamp_us", 1e6, None),
+        ("Time since start in ms", 1e3, None),
+        ("seconds_elapsed", 1, None),
+        ("timestamp", 1, None),
+        ("timestamp", 1e3, "timestamp in ms since 1970, by its size"),
+        ("timestamp", 1e6, "timestamp in us since 1970, by its size"),
+        ("timestamp", 1e9, "timestamp in ns since 1970, by its size"),
+    ],
+)
+@pytest.mark.parametrize("given", [False, True])
+def test_times_are_read_in_the_unit_of_their_name_or_size(tmp_path, name, ticks, note, given):
+    rows = "".join(f"{(1763800000 + k) * int(ticks)},0,0,0,41000\n" for k in range(3))
+    path = file(tmp_path, f"{name},x,y,yaw,field\n{rows}")
+    readings = read_readings(path, columns=Columns(time=name if given else ""))
+    assert_allclose(readings.t - 1763800000, [0, 1, 2], atol=1e-6)
+    assert taken(readings) == [note] * bool(note)
+
+
+def test_a_note_on_times_is_whole(tmp_path):
+    readings = read_readings(file(tmp_path, "time,x,y,yaw,field\n08:26,0,0,0,41000\n"))
+    assert readings.t is None
+    assert taken(readings)[0].endswith("such as 2025-11-22T08:26:40, got '08:26'")
+
+
 @pytest.mark.parametrize(("said", "fits"), [(None, "world"), ("body", "world"), ("world", "body")])
 def test_vectors_in_other_axes_than_those_that_were_said_are_refused(tmp_path, said, fits):
     yaw = np.linspace(0, 6, 20)
@@ -179,6 +256,39 @@ def test_vectors_in_other_axes_than_those_that_were_said_are_refused(tmp_path, s
     with pytest.raises(InputError, match=rf"a\.csv: bx,by,bz .* one direction .*give --axes {fits}"):
         read_readings(path, columns=Columns(axes=said))
     assert len(read_readings(path, columns=Columns(axes=fits))) == 20
+
+
+@pytest.mark.parametrize("axes", ["body", "world"])
+def test_vectors_that_are_mirrored_by_the_headings_are_refused_with_the_remedies(tmp_path, axes):
+    yaw = np.linspace(0, 4.7, 20)
+    b = 20.0 * np.exp(1j * (1.2 - yaw))
+    rows = "".join(
+        f"0,0,{90 - a:.3f},{c.real:.4f},{c.imag:.4f},-40\n" for a, c in zip(np.degrees(yaw), b, strict=True)
+    )
+    path = file(tmp_path, "x,y,heading,bx,by,bz\n" + rows)
+    told = "one direction .100 % of them. if headings turn the other way.*forward, right, down: .*{}.*signs"
+    with pytest.raises(InputError, match=told.format("give --heading-unit compass")):
+        read_readings(path, columns=Columns(axes=axes, heading_unit="deg"))
+    assert_allclose(read_readings(path, columns=Columns(heading_unit="compass")).yaw, yaw, atol=1e-4)
+    rows = "".join(f"0,0,{a:.4f},{c.real:.4f},{-c.imag:.4f},40\n" for a, c in zip(yaw, b, strict=True))
+    with pytest.raises(InputError, match=told.format("give --heading-unit compass")):
+        read_readings(file(tmp_path, "x,y,yaw,bx,by,bz\n" + rows, "frd.csv"))
+
+
+def test_compass_headings_count_clockwise_from_y(tmp_path):
+    path = file(tmp_path, "x,y,heading,field\n0,0,0,41000\n1,0,90,41500\n")
+    with pytest.raises(
+        InputError, match=r"--heading-unit deg \(counter-clockwise .*compass \(clockwise from no"
+    ):
+        read_readings(path)
+    assert_allclose(read_readings(path, columns=Columns(heading_unit="compass")).yaw, [np.pi / 2, 0])
+
+
+def test_a_quaternion_is_taken_by_the_letters_of_its_names(tmp_path):
+    path = file(tmp_path, "x,y,qw,qx,qy,qz,field\n0,0,0.8,0,0,0.6,41000\n")
+    readings = read_readings(path, columns=Columns(quaternion="qw,qx,qy,qz"))
+    assert_allclose(readings.yaw, [2 * np.arctan2(0.6, 0.8)])
+    assert taken(readings) == ["qw,qx,qy,qz as qx,qy,qz,qw, by their names (--quaternion)"]
 
 
 def test_headings_in_degrees_are_refused_until_said_so_and_turns_that_count_are_taken(tmp_path):
@@ -229,6 +339,11 @@ def test_magnitudes_of_a_sensor_carried_by_hand_need_no_heading(tmp_path):
     readings = read_readings(file(tmp_path, "x,y,field\n0,0,41\n1,0,42\n"), columns=Columns(heading="none"))
     assert_array_equal(readings.yaw, [0, 0])
     assert_array_equal(readings.b_nt, [41_000, 42_000])
+    vectors = file(tmp_path, "x,y,bx,by,bz\n0,0,12,20,-38\n", "c.csv")
+    readings = read_readings(vectors, columns=Columns(heading="none"))
+    assert_allclose(readings.b_nt, np.linalg.norm(WORLD))
+    assert readings.b_body_nt is None
+    assert "the magnitude of bx,by,bz, since a sensor carried by hand has no heading" in taken(readings)
     named = file(tmp_path, "x,y,field,none\n0,0,41,1.5\n", "b.csv")  # a column of that name is read
     assert_array_equal(read_readings(named, columns=Columns(heading="none")).yaw, [1.5])
 
@@ -432,8 +547,44 @@ REFUSALS = {
     ),
     "body vector without heading": (
         "x,y,bx,by,bz\n0,0,12000,20000,1\n",
-        {"vector": "bx,by,bz", "heading": "none"},
-        r"a\.csv: no heading.* vectors in world axes need none",
+        {},
+        r"a\.csv: no heading.* carried by hand, give --heading none; vectors in world axes need none",
+    ),
+    "x and field at once": (
+        "t,x,y,z,yaw\n0,12,20,-38,0\n",
+        {"vector": "x,y,z"},
+        r"a\.csv: column 'x' cannot be position and field at once; name other columns with --x",
+    ),
+    "by number": ("7,8,0,41\n", {"x": "1", "y": "2", "heading": "3", "field": "1"}, "column '1' cannot be"),
+    "one component twice": (
+        "x,y,yaw,bx,by\n0,0,0,12,20\n",
+        {"vector": "bx,by,bx"},
+        r"a\.csv: column 'bx' cannot be field twice",
+    ),
+    "components as positions": (
+        "x,y,z,b,px,py,yaw\n12,20,-38,44.59,0,0,0\n",
+        {},
+        r"a\.csv: x, y and z are the components of b, no positions; name those with --x and --y",
+    ),
+    "units of components": (
+        "x,y,yaw,bx [uT],by [nT],bz [uT]\n0,0,0,12,20000,-38\n",
+        {},
+        r"a\.csv: the units of bx \[uT\],by \[nT\],bz \[uT\] differ",
+    ),
+    "places on Earth": (
+        "lat,lon,mag\n29.65,-82.35,46000\n",
+        {},
+        r"a\.csv: 'lat' and 'lon' are latitude and longitude; give x,y in metres in the axes of the lab",
+    ),
+    "places on Earth, named": (
+        "gps_Latitude,gps_Longitude,b,yaw\n29.65,-82.35,46000,0\n",
+        {"x": "gps_Longitude", "y": "gps_Latitude"},
+        r"a\.csv: 'gps_Longitude' and 'gps_Latitude' are latitude and longitude",
+    ),
+    "a time that is none": (
+        "time,x,y,yaw,b\n08:26:40,0,0,0,46000\n",
+        {"time": "time"},
+        r"a\.csv:2: time must be .* such as 2025-11-22T08:26:40; got '08:26:40'",
     ),
     "nought": ("x,y,yaw,field\n0,0,0,41000\n0,0,0,0\n", {}, r"a\.csv:3: a magnitude is above 0, got 0 nT"),
     "negative": ("x,y,yaw,field\n0,0,0,-41000\n", {}, r"a\.csv:2: a magnitude is above 0, got -41000 nT"),

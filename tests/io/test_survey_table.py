@@ -192,6 +192,38 @@ def test_times_may_be_dates(tmp_path):
     assert_array_equal(read_csv(written(tmp_path, "t_ms,time_ms,x (ms)\n1,2,3000\n")).times("x (ms)"), [3])
 
 
+@pytest.mark.parametrize(
+    ("dates", "wanted"),
+    [
+        (["22-Nov-2025 08:26:40", "22-nov-2025 08:26:40.25"], [0, 0.25]),
+        (["2025/11/22 08:26:40", "2025/11/22 08:26:41"], [0, 1]),
+        (["22.11.2025 08:26:40", "22.11.2025 08:27"], [0, 20]),
+        (["11/22/2025 8:26:40 AM", "11/22/2025 8:26:40 pm"], [0, 12 * 3600]),
+    ],
+)
+def test_dates_in_other_orders_are_read_where_they_are_clear(tmp_path, dates, wanted):
+    table = read_csv(written(tmp_path, "t,x\n" + "".join(f"{date},1\n" for date in dates)))
+    assert_array_equal(table.times("t") - 1763800000.0, wanted)
+
+
+@pytest.mark.parametrize("date", ["05.11.2025 08:26:40", "5/11/2025 08:26"])
+def test_a_date_whose_day_may_be_its_month_is_refused(tmp_path, date):
+    table = read_csv(written(tmp_path, f"t,x\n{date},1\n"))
+    with pytest.raises(
+        InputError, match=r"a\.csv:2: t .*cannot be told apart; write dates such as 2025-11-22T"
+    ):
+        table.times("t")
+
+
+@pytest.mark.parametrize("date", ["22-Dez-2025", "31.02.2025 08:00", "22.11.25", "11/22/2025 13:00 PM"])
+def test_a_date_that_cannot_be_is_refused_with_one_that_is_read(tmp_path, date):
+    table = read_csv(written(tmp_path, f"t,x\n{date},1\n2025-11-22T08:26:40,1\n"))
+    with pytest.raises(
+        InputError, match=r"a\.csv:2: t must be a date and time, .*2025-11-22T08:26:40 is read"
+    ):
+        table.times("t")
+
+
 @pytest.mark.parametrize("cell", ["noon", "2026-13-01T00:00:00", "7", "9999-12-31T23:59:60"])
 def test_a_cell_that_is_no_date_among_dates_is_refused_with_its_line(tmp_path, cell):
     table = read_csv(written(tmp_path, f"t,x\n2026-01-13T19:52:50Z,1\n{cell},2\n"))

@@ -17,7 +17,7 @@ from magtwin.field.maps.curvature import interpolation_error_nt2
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.header import ERROR, MASKED, header_lines, read_header
 from magtwin.field.survey.node_errors import node_errors
-from magtwin.field.survey.readings import Readings
+from magtwin.field.survey.readings import TAKEN, Readings, taken_of
 from magtwin.field.units import check_unit, nt_per
 from magtwin.files import existing, existing_file, sha256
 from magtwin.frames import wrap_angle
@@ -36,14 +36,23 @@ GRAIN_M = 1e-6  # Coordinates closer than this are equal
 METHOD = "survey, one reading a node and heading, the robot at rest"
 QUOTED = 60  # Characters of a file that an error quotes
 
+LARGEST_TURN = 2 * np.pi + 0.01
+"""Headings beyond this are no radians, unless they count turns [rad]."""
+
+USUAL_SPAN_M = 50.0
+"""Extent above which the report asks for the unit of positions whose columns name none [m]."""
+
+FAR_DEG = 20.0
+"""Median difference of recorded headings from those of their nodes at which they contradict each other."""
+
 
 def read_grid(folder: str | os.PathLike[str], **options: Any) -> Readings:
     """Read a survey folder, such as `0_map.csv`, `90_map.csv`, `180_map.csv`, `270_map.csv`.
 
     Each file begins with the line `# x,y,theta,scalar_mag` and has one row per node, in any order: x and y in
-    world [m], the recorded heading [rad], the total field [nT]. The file's name gives the nominal heading.
-    Further comment lines, as `write_survey` writes them, supply metadata that the options do not, and the
-    rows that are not field.
+    world [m], the recorded heading [rad], the total field [nT]. The file's name gives the nominal heading
+    [deg], by which recorded headings in degrees are told. Further comment lines, as `write_survey` writes
+    them, supply metadata that the options do not, and the rows that are not field.
 
     Args:
         folder: Folder of the files. Other files in it are ignored.
@@ -83,7 +92,29 @@ def _opened(
         files[heading] = path
     _check_headings(folder, sorted(files), headings_deg)
     layers = [_read_layer(files[heading], heading, unit, scale) for heading in sorted(files)]
-    return layers, _readings(layers, folder, name, about)
+    layers, notes = _in_radians(layers)
+    readings = _readings(layers, folder, name, about)
+    if (span := float(np.ptp(readings.p_xy, axis=0).max())) > USUAL_SPAN_M:
+        notes.append(f"x and y in metres, over {span:,.0f} m: if these are cm, write them in metres")
+    return layers, readings.with_(source="; ".join([readings.source, *(TAKEN + note for note in notes)]))
+
+
+def heading_doubts(readings: Readings) -> list[str]:
+    """The headings of a gridded survey whose recorded headings are far from those of their nodes."""
+    if readings.grid is None or readings.node is None:
+        return []
+    nominal = np.asarray(readings.grid.headings_rad)
+    away = np.degrees(np.abs(wrap_angle(readings.yaw - nominal[readings.node[:, 0]])))
+    layers = ((h, away[readings.node[:, 0] == h]) for h in range(len(nominal)))
+    median = {h: float(np.median(some)) for h, some in layers if len(some)}
+    far = [h for h, angle in median.items() if angle > FAR_DEG]
+    if not far:
+        return []
+    worst = max(far, key=lambda h: median[h])
+    return [
+        f"{len(far)} of {len(median)} headings are recorded otherwise than their files are named: that of "
+        f"{_degrees(nominal[worst])} deg by {median[worst]:.0f} deg (median); the map takes the names"
+    ]
 
 
 def node_map(readings: Readings) -> AnomalyMap:
@@ -211,7 +242,7 @@ def read_survey(
         variance = np.broadcast_to(sd[:, None, None], field.grid.shape) if np.isfinite(sd).all() else None
         about: dict[str, Any] = {"method": method, "parameters": parameters}
         field = replace(field, variance_nt2=variance, between_nt2=None, recorded_yaw=None, **about)
-        return field, _report(layers, field, folder, Report(""))
+        return field, _report(layers, readings, field, folder, Report(""))
     masked, findings = mask_stuck(readings)
     if not (keep_stuck or masked.good.any()):
         raise InputError(
@@ -219,7 +250,7 @@ def read_survey(
             "survey it again, or import them as they are with `keep_stuck=True`"
         )
     field = replace(node_map(readings if keep_stuck else masked), parameters=parameters)
-    return field, _report(layers, field, folder, findings)
+    return field, _report(layers, readings, field, folder, findings)
 
 
 def _common(layers: "list[_Layer]", key: str) -> Any:
@@ -326,6 +357,28 @@ def _read_layer(path: Path, heading_deg: float, unit: str, scale: float | None) 
     return layer
 
 
+def _in_radians(layers: list[_Layer]) -> tuple[list[_Layer], list[str]]:
+    """Layers whose recorded headings are in radians, and a note if they were in degrees."""
+    theta = np.concatenate([layer.theta for layer in layers])
+    nominal = np.concatenate([np.full(len(s.theta), np.radians(s.heading_deg)) for s in layers])
+    if np.abs(theta).max() <= LARGEST_TURN or _is_near(theta, nominal):
+        return layers, []
+    if _is_near(np.radians(theta), nominal):
+        note = "theta in deg, by its size and the names of the files"
+        return [replace(layer, theta=np.radians(layer.theta)) for layer in layers], [note]
+    layer = next(s for s in layers if np.abs(s.theta).max() > LARGEST_TURN)
+    row = int(np.argmax(np.abs(layer.theta) > LARGEST_TURN))
+    raise InputError(
+        f"{layer.path}:{layer.lines[row]}: theta {layer.theta[row]:g} is beyond a full turn in radians, and "
+        f"in degrees far from the {layer.heading_deg:g} of the file's name; write it in radians"
+    )
+
+
+def _is_near(theta: Array, nominal: Array) -> bool:
+    """Whether recorded headings are those of their files [rad]."""
+    return bool(np.degrees(np.median(np.abs(wrap_angle(theta - nominal)))) < FAR_DEG)
+
+
 def _row(path: Path, number: int, line: str) -> list[float]:
     words, where = line.split(","), f"{path}:{number}"
     if len(words) != len(COLUMNS):
@@ -387,7 +440,11 @@ def _readings(layers: list[_Layer], folder: Path, name: str | None, about: dict[
 
 
 def _report(
-    layers: list[_Layer], field: AnomalyMap, folder: str | os.PathLike[str], findings: Report
+    layers: list[_Layer],
+    readings: Readings,
+    field: AnomalyMap,
+    folder: str | os.PathLike[str],
+    findings: Report,
 ) -> Report:
     """Statistics of the survey, and how well its headings were kept."""
     deviation = [np.degrees(np.abs(wrap_angle(s.theta - np.radians(s.heading_deg)))) for s in layers]
@@ -404,7 +461,9 @@ def _report(
         Figure("repeated readings", repeated, note="equal to the one before in the row to the last digit"),
         *findings.figures,
     )
-    metadata = {"files": {s.path.name: s.sha256 for s in layers}, **findings.metadata}
+    metadata: dict[str, Any] = {"files": {s.path.name: s.sha256 for s in layers}, **findings.metadata}
+    metadata |= {"taken": taken} if (taken := taken_of(readings)) else {}
+    metadata |= {"doubts": doubts} if (doubts := heading_doubts(readings)) else {}
     return Report(f"survey {folder}", figures, metadata)
 
 

@@ -161,6 +161,11 @@ TAKEN = "taken "  # Start of a part of `source` that lists what was deduced from
 TEXTS = ("name", "source", "licence", "created", "frame", "datum")  # Metadata that are texts
 
 
+def taken_of(readings: Readings) -> list[str]:
+    """What was repaired or deduced, by the source of readings."""
+    return [part.removeprefix(TAKEN) for part in readings.source.split("; ") if part.startswith(TAKEN)]
+
+
 def checked_earth_nt(earth_nt: ArrayLike) -> tuple[float, float, float]:
     """The Earth's field in world axes [nT]; InputError unless it is three finite numbers, not all 0."""
     field = np.asarray(earth_nt, float)

@@ -12,14 +12,21 @@ import numpy as np
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.changes import changes_line
-from magtwin.field.survey.folder import node_map
+from magtwin.field.survey.folder import heading_doubts, node_map
 from magtwin.field.survey.folder import read_survey as read_folder
-from magtwin.field.survey.readings import TAKEN, Readings
+from magtwin.field.survey.readings import Readings, taken_of
 from magtwin.field.survey.stuck import mask_stuck
 from magtwin.files import existing, sha256
 from magtwin.io.surveys.about import About
 from magtwin.io.surveys.columns import Columns
-from magtwin.io.surveys.readings import is_pattern, read_readings, save_readings
+from magtwin.io.surveys.readings import (
+    ALIGNED,
+    TURNED,
+    is_pattern,
+    kept_direction,
+    read_readings,
+    save_readings,
+)
 from magtwin.kinds import expected
 from magtwin.outputs import check_free, output, transaction
 from magtwin.report import Report
@@ -38,6 +45,9 @@ LEAST_READINGS = 8
 
 USUAL_READINGS = 100
 """Number of good readings below which the report doubts the map."""
+
+MOST_MASKED = 0.9
+"""Share of masked nodes above which the report doubts the map."""
 
 
 def open_map(file: Source, date: str | None = None) -> AnomalyMap:
@@ -95,7 +105,7 @@ def read_survey(
     known = {} if about is None else {**asdict(about), "name": None}  # errors name the file
     readings = read_readings(*sources, **reading, **known)
     masked, report = mask_stuck(readings)
-    if taken := [part.removeprefix(TAKEN) for part in readings.source.split("; ") if part.startswith(TAKEN)]:
+    if taken := taken_of(readings):
         report = replace(report, metadata={**report.metadata, "taken": taken})
     if not (keep_stuck or masked.good.any()):
         raise InputError(
@@ -135,7 +145,7 @@ def import_survey(
         save_map(field, out, force=force)
         return report
     readings, found = read_survey(sources, about=about, **reading)
-    readings = readings.with_(name=name)
+    readings, found = readings.with_(name=name), _with_doubts(found, _contradictions(readings))
     if table:
         save_readings(readings, out, force=force)
         return _joined(readings.report(), found)
@@ -186,12 +196,12 @@ def fit_survey(
     out, about = check_free(out, force=force), about or About()
     options = _method_options([method], kernel, earth).get(method, {})
     readings, report = read_survey(sources, about=about, **reading)
-    if doubts := [*_doubts(readings, sources[0]), *_shared(readings, method)]:
-        report = replace(report, metadata={**report.metadata, "doubts": doubts})
+    doubts = [*_doubts(readings, sources[0]), *_shared(readings, method)]
     model = fit(readings, method, progress=progress, **options)
     named = readings.with_(name=about.name or out.stem)
     field = raster(model, named, spacing_m=spacing_m, headings_rad=headings_rad, progress=progress)
     save_map(field, out, force=force)
+    report = _with_doubts(report, [*doubts, *_masked(field)])
     return _joined(field.report(), choice_report(field.parameters), grid_report(field), report)
 
 
@@ -347,6 +357,7 @@ def _doubts(readings: Readings, source: Source) -> list[str]:
         doubts.append(f"only {count} good readings: the map is valid only next to them")
     if line := changes_line(readings):
         doubts.append(line)
+    doubts += _contradictions(readings)
     mean = np.exp(1j * yaw).mean()
     if np.abs(mean) >= ONE_HEADING:
         doubts.append(
@@ -355,6 +366,36 @@ def _doubts(readings: Readings, source: Source) -> list[str]:
             "again; survey in several headings"
         )
     return doubts
+
+
+def _contradictions(readings: Readings) -> list[str]:
+    """What a survey's headings contradict: its vectors, and the names of its files."""
+    doubts, good = heading_doubts(readings), readings.good
+    if readings.b_body_nt is not None and np.count_nonzero(good) >= LEAST_READINGS:
+        spin = np.exp(1j * readings.yaw[good])
+        kept = kept_direction(readings.b_body_nt[good, :2] @ np.array([1, 1j]) * spin)
+        if kept < ALIGNED and np.abs(spin.mean()) <= TURNED:
+            doubts.append(
+                f"vectors keep no direction in world axes ({100 * kept:.0f} %): headings and vectors "
+                "contradict each other, or the robot's own field is as strong as the Earth's"
+            )
+    return doubts
+
+
+def _masked(field: AnomalyMap) -> list[str]:
+    """The doubt about a map that has hardly a node."""
+    count, size = int(np.count_nonzero(~field.valid)), field.valid.size
+    if count <= MOST_MASKED * size:
+        return []
+    return [
+        f"{count:,} of {size:,} nodes are masked: they are far from the readings, or the fit's standard "
+        "deviation there is over half that of the readings; check headings and vectors, or take another "
+        "--method"
+    ]
+
+
+def _with_doubts(report: Report, doubts: list[str]) -> Report:
+    return replace(report, metadata={**report.metadata, "doubts": doubts}) if doubts else report
 
 
 def _shared(readings: Readings, method: str) -> list[str]:

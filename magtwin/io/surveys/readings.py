@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, replace
 from glob import has_magic
 from pathlib import Path
@@ -13,20 +13,33 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.delimited import DEGREES, LENGTHS, label_of
+from magtwin.delimited import DEGREES, LENGTHS
 from magtwin.errors import InputError, hint
 from magtwin.field.grid import FARTHEST_M, Grid
-from magtwin.field.survey.folder import read_grid
+from magtwin.field.survey.folder import LARGEST_TURN, USUAL_SPAN_M, read_grid
 from magtwin.field.survey.readings import SHAPES, TAKEN, Readings
-from magtwin.field.units import NT_PER, check_unit, nt_per, unit_by_size
+from magtwin.field.units import check_unit, nt_per, unit_by_size
 from magtwin.files import existing, sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
-from magtwin.io.surveys.columns import FIELDS, HEADINGS, NO_HEADING, TIMES, VECTORS, Columns
+from magtwin.io.surveys.columns import (
+    ANGLE_UNITS,
+    FIELD_UNITS,
+    FIELDS,
+    HEADINGS,
+    NO_HEADING,
+    POSITIONS,
+    TIME_UNITS,
+    TIMES,
+    VECTORS,
+    Columns,
+    named,
+)
 from magtwin.io.surveys.table import Table, read_csv, read_parquet_table
 from magtwin.io.tables import load_parquet, read_npz, read_parquet
 from magtwin.io.tables import read_csv as read_csv_run
 from magtwin.kinds import RUN, expected, kind_of
 from magtwin.outputs import output
+from magtwin.path.points import ANGLES
 from magtwin.run.arrow import FACTS
 from magtwin.run.run import Run
 
@@ -41,20 +54,26 @@ PARQUET = (".parquet", ".pq")
 RUNS = (".csv", ".npz", ".rrd")
 """Suffixes of runs in other formats of magtwin's own."""
 
-USUAL_SPAN_M = 50.0
-"""Extent above which the report asks for the unit of positions whose columns name none [m]."""
+LEAST_SPAN_M = 0.01
+"""Extent below which the report asks whether positions are in degrees [m]."""
 
-LARGEST_TURN = 2 * np.pi + 0.01
-"""Headings beyond this are refused unless their unit is given [rad]."""
+EPOCHS = ((1e17, 1e9, "ns"), (1e14, 1e6, "us"), (1e11, 1e3, "ms"))
+"""Least median of times since 1970, ticks per second and unit; below them are seconds."""
 
 APART = 2.0
 """Largest median ratio between vectors and magnitudes of the same table."""
+
+SAME_LENGTH = 0.01
+"""Largest median difference of x, y, z from the magnitude by which they are its components."""
 
 TURNED = 0.7
 """Length of the mean unit vector of the headings above which a survey hardly turned."""
 
 ALIGNED = 0.8
 """Ratio of the mean level field to its size above which it keeps one direction."""
+
+CLEARLY = 0.3
+"""Difference of these ratios from which headings or vectors are mirrored. Hard iron does not look so."""
 
 _SURVEY = b"magtwin_readings"
 _PARTS = {"p_xy": ("x", "y"), "b_body_nt": ("x", "y", "z"), "node": ("heading", "row", "column")}
@@ -329,10 +348,17 @@ def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
     p = np.column_stack([_lengths(table, columns.x), _lengths(table, columns.y)])
     turn = _turn(table, columns)
     vector, b = _field(table, columns)
+    if turn is None and columns.heading == NO_HEADING and vector is not None and columns.axes != "world":
+        vector = None
+        taken.append(
+            f"the magnitude of {columns.vector}, since a sensor carried by hand has no heading"
+            if not columns.field
+            else f"{columns.field} without {columns.vector}, since a sensor carried by hand has no heading"
+        )
     t = None
     if columns.time:
         try:
-            t = table.times(columns.time)
+            t = _times(table, columns.time, taken)
         except InputError as error:
             if asked:
                 raise
@@ -348,11 +374,16 @@ def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
         row = int(away[0])
         where = table.column(columns.x).where(row)
         raise InputError(f"{where}: x and y are metres, within {FARTHEST_M:g} of the origin, got {p[row]}")
-    if not (label_of(columns.x)[1] or label_of(columns.y)[1]):
+    if not any(named(_label(table, name), LENGTHS)[1] for name in (columns.x, columns.y)):
         span = float(np.ptp(p[known], axis=0).max())
         if span > USUAL_SPAN_M:
             taken.append(
                 f"x and y in metres, over {span:,.0f} m: if these are cm, write x [cm],y [cm] in the header"
+            )
+        elif 0 < span < LEAST_SPAN_M and np.abs(p[known]).max() > 1:
+            taken.append(
+                f"x and y in metres, over {1e3 * span:.3g} mm only: if these are degrees, convert them to "
+                "metres"
             )
     if turn is not None and turn.ndim == 2:
         length = np.linalg.norm(turn, axis=1)
@@ -363,9 +394,9 @@ def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
         turn = turn / length[:, None]
     elif turn is None:
         if columns.heading != NO_HEADING if vector is None else columns.axes != "world":
-            none = "vectors in world axes need none (--axes world)"
-            if vector is None:
-                none = "if the sensor was carried by hand, give --heading none"
+            none = "if the sensor was carried by hand, give --heading none"
+            if vector is not None:
+                none += "; vectors in world axes need none (--axes world)"
             raise InputError(
                 f"{table.path}: no heading: no column is called {', '.join(HEADINGS)}; name it with "
                 f"--heading or --quaternion; {none}"
@@ -391,8 +422,9 @@ def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
                 f"{table.path}: {columns.vector} is {ratio:.3g} times as long as {columns.field} (median); "
                 "give both in one unit, and the components of the whole field"
             )
-        _check_axes(vector[known], yaw[known], table, columns)
+        _check_axes(vector[known], turn[known], table, columns)
     run, runs = _runs(table, columns, paths[0].stem, known)
+    notes = [f"; {TAKEN}{note.replace('; ', ', ')}" for note in taken]  # "; " separates them
     return Readings(
         p_xy=p[known],
         yaw=yaw[known],
@@ -402,86 +434,237 @@ def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
         run=run,
         runs=runs,
         name=paths[0].stem,
-        source="; ".join([*map(_sum, paths)]) + _left_out(known) + "".join(f"; {TAKEN}{t}" for t in taken),
+        source="; ".join(map(_sum, paths)) + _left_out(known) + "".join(notes),
     )
 
 
 def _complete(table: Table, columns: Columns) -> tuple[Columns, list[str]]:
     """Columns and unit, with missing ones found by name and size; and what was found so."""
     taken = list(table.notes)
-    lower = {label_of(label)[0]: label for label in reversed(table.names)}  # the first of equal names
-    lower |= {label.strip().lower(): label for label in reversed(table.names)}
-    if columns.x == "x" and "x" not in table.names:
-        columns = replace(columns, x=lower.get("x", "x"))
-    if columns.y == "y" and "y" not in table.names:
-        columns = replace(columns, y=lower.get("y", "y"))
+    columns = _placed(table, columns, taken)
     if not (columns.heading or columns.quaternion):
-        label = next((name for name in HEADINGS if name in table.names), "")
-        columns = replace(columns, heading=label or next((lower[n] for n in HEADINGS if n in lower), ""))
-    if not columns.time and (label := next((lower[name] for name in TIMES if name in lower), "")):
-        columns = replace(columns, time=label)
+        columns = replace(columns, heading=_found(table, HEADINGS, ANGLE_UNITS))
+    if columns.quaternion:
+        columns = _in_order(table, columns, taken)
+    if not columns.time:
+        columns = replace(columns, time=_found(table, TIMES, TIME_UNITS))
     if not columns.field and not columns.vector:
-        three = next((names for names in VECTORS if set(names) <= lower.keys()), ())
-        if label := next((lower[name] for name in FIELDS if name in lower), ""):
+        if label := _found(table, FIELDS, FIELD_UNITS):
             columns = replace(columns, field=label)
-        elif three:
-            columns = replace(columns, vector=",".join(lower[name] for name in three))
-            if columns.axes is None:
+        elif three := _components(table):
+            columns = replace(columns, vector=",".join(three))
+            if columns.axes is None and columns.heading != NO_HEADING:
                 taken.append(f"{columns.vector} as the field in the robot's axes, forward, left, up (--axes)")
         else:
-            named = ", ".join(label for label in table.names if not label.isdigit())
+            labels = ", ".join(label for label in table.names if not label.isdigit())
             count = len(table.columns)
-            known = f"columns: {named}" if named else f"no header: name columns by number, 1 to {count}"
+            seen = f"columns: {labels}" if labels else f"no header: name columns by number, 1 to {count}"
             raise InputError(
-                f"{table.path}: no column of the field was found by its name ({known}); name the magnitude "
+                f"{table.path}: no column of the field was found by its name ({seen}); name the magnitude "
                 "with --field NAME, or the components with --vector BX,BY,BZ"
             )
-    units = {label_of(name)[1] for name in (columns.x, columns.y)} - {"", "m"}
-    if units:
+    _check_roles(table, columns)
+    lengths = {named(_label(table, name), LENGTHS)[1] for name in (columns.x, columns.y)} - {"", "m"}
+    if lengths:
         taken.append(f"{columns.x} and {columns.y} by the units in their names")
-    angle = label_of(columns.heading)[1]
-    if columns.heading_unit is None and angle in (*DEGREES, "rad"):
+    has_heading = columns.heading not in ("", NO_HEADING)
+    angle = _unit(table, columns.heading, ANGLE_UNITS) if has_heading else ""
+    if columns.heading_unit is None and angle in ANGLE_UNITS:
         columns = replace(columns, heading_unit="deg" if angle in DEGREES else "rad")
         taken.append(f"{columns.heading} in {columns.heading_unit}, by its name (--heading-unit)")
     if columns.unit is None and columns.scale is None:
-        named = label_of(columns.field or columns.several("vector")[0])[1].replace("\N{MICRO SIGN}", "u")
-        named = named.replace("\N{GREEK SMALL LETTER MU}", "u")
-        if unit := {name.lower(): name for name in NT_PER}.get(named):
-            return replace(columns, unit=unit), taken  # type: ignore[arg-type]
+        parts = [columns.field] if columns.field else columns.several("vector")
+        known = (FIELD_UNITS.get(_unit(table, part, FIELD_UNITS)) for part in parts)
+        units = {unit for unit in known if unit}
+        if len(units) > 1:
+            raise InputError(f"{table.path}: the units of {columns.vector} differ; give all in one unit")
+        if units:
+            return replace(columns, unit=units.pop()), taken
         _, b = _field(table, replace(columns, unit="nT"))
         unit = unit_by_size(b)
         if unit not in (None, "nT"):
-            columns = replace(columns, unit=unit)  # type: ignore[arg-type]
+            columns = replace(columns, unit=unit)
             taken.append(f"{columns.field or columns.vector} in {unit}, by its size (--unit)")
     return columns, taken
 
 
+def _label(table: Table, name: str) -> str:
+    """The header of a column, which may be named by its number."""
+    return table.column(name).name or name
+
+
+def _unit(table: Table, name: str, units: Collection[str]) -> str:
+    """The unit in the header of a column, in lower case; "" if there is none."""
+    return named(_label(table, name), units)[1]
+
+
+def _found(table: Table, names: Sequence[str], units: Collection[str]) -> str:
+    """The first column with one of the names, whose unit is not of another kind; "" if there is none."""
+    others = {*LENGTHS, *ANGLE_UNITS, *FIELD_UNITS, *TIME_UNITS}.difference(units)
+    exact, whole, bare = {label: label for label in table.names}, dict[str, str](), dict[str, str]()
+    for label in table.names:
+        for labels, behind in ((whole, ()), (bare, units)):
+            name, unit = named(label, behind)
+            if unit not in others:
+                labels.setdefault(name, label)
+    return next((labels[name] for name in names for labels in (exact, whole, bare) if name in labels), "")
+
+
+def _components(table: Table) -> list[str]:
+    """The columns of a vector, found by name; [] if there are none."""
+    for names in VECTORS:
+        if all(three := [_found(table, (name,), FIELD_UNITS) for name in names]):
+            return three
+    plain = [_found(table, (name,), FIELD_UNITS) for name in "xyz"]
+    return plain if all(name and _unit(table, name, FIELD_UNITS) in FIELD_UNITS for name in plain) else []
+
+
+def _placed(table: Table, columns: Columns, taken: list[str]) -> Columns:
+    """Columns with those of x and y found by name; refuses latitude and longitude."""
+    used = {columns.field, *columns.several("vector")}
+    if (columns.x, columns.y) == ("x", "y"):
+        for names in POSITIONS:
+            x, y = (_found(table, (name,), LENGTHS) for name in names)
+            if x and y and not used & {x, y}:
+                columns = replace(columns, x=x, y=y)
+                if names != POSITIONS[0]:
+                    taken.append(f"{x} and {y} as x and y (--x, --y)")
+                break
+        else:
+            on_earth = [label for label in table.names if _is_on_earth(label)]
+            if len(on_earth) > 1 and not _found(table, ("x", "y"), LENGTHS):
+                raise _no_metres(table, on_earth[:2])
+    for axis in ("x", "y"):
+        if getattr(columns, axis) == axis:
+            columns = replace(columns, **{axis: _found(table, (axis,), LENGTHS) or axis})  # type: ignore[arg-type]
+    labels = [_label(table, columns.x), _label(table, columns.y)]
+    if any(map(_is_on_earth, labels)):
+        raise _no_metres(table, labels)
+    return columns
+
+
+def _is_on_earth(label: str) -> bool:
+    """Whether a header is that of a latitude or longitude."""
+    name, unit = named(label, ANGLE_UNITS)
+    last = name.rpartition("_")[2]
+    return name in ANGLES or (last in ANGLES and last != "long") or (name in ("x", "y") and unit in DEGREES)
+
+
+def _no_metres(table: Table, labels: Sequence[str]) -> InputError:
+    shown = " and ".join(repr(label) for label in labels)
+    return InputError(
+        f"{table.path}: {shown} are latitude and longitude; give x,y in metres in the axes of the lab"
+    )
+
+
+def _in_order(table: Table, columns: Columns, taken: list[str]) -> Columns:
+    """Columns whose quaternion is xyzw, if its names end in these letters."""
+    given = columns.several("quaternion")
+    by_letter = {named(_label(table, name), ())[0][-1:]: name for name in given}
+    if set(by_letter) != set("xyzw") or list(by_letter) == list("xyzw"):
+        return columns
+    ordered = ",".join(by_letter[letter] for letter in "xyzw")
+    taken.append(f"{columns.quaternion} as {ordered}, by their names (--quaternion)")
+    return replace(columns, quaternion=ordered)
+
+
+def _check_roles(table: Table, columns: Columns) -> None:
+    """Refuse a column of two roles, and x and y that are components of the field."""
+    roles = [("position", columns.x), ("position", columns.y)]
+    roles += [("time", columns.time)] if table.names.count(columns.time) < 2 else []
+    roles += [("heading", columns.heading)] if columns.heading != NO_HEADING else []
+    roles += [("orientation", name) for name in columns.several("quaternion")]
+    roles += [("field", name) for name in (columns.field, *columns.several("vector"))]
+    seen = dict[int, str]()
+    for role, name in roles:
+        if not name:
+            continue
+        column = table.column(name)
+        if other := seen.get(id(column)):
+            both = f"{role} twice" if other == role else f"{other} and {role} at once"
+            raise InputError(
+                f"{table.path}: column {column.name or name!r} cannot be {both}; name other columns with "
+                "--x, --y, --heading, --quaternion, --field, --vector or --time"
+            )
+        seen[id(column)] = role
+    z = _found(table, ("z",), FIELD_UNITS)
+    places = [named(_label(table, name), ())[0] for name in (columns.x, columns.y)]
+    if not (columns.field and z) or sorted(places) != ["x", "y"]:
+        return
+    try:
+        length = np.linalg.norm([table.numbers(name) for name in (columns.x, columns.y, z)], axis=0)
+    except InputError:
+        return  # texts
+    b = table.numbers(columns.field)
+    known = np.isfinite(length) & (b > 0)
+    if known.any() and np.median(np.abs(length[known] / b[known] - 1)) < SAME_LENGTH:
+        raise InputError(
+            f"{table.path}: {columns.x}, {columns.y} and {z} are the components of {columns.field}, no "
+            "positions; name those with --x and --y"
+        )
+
+
+def _times(table: Table, name: str, taken: list[str]) -> Array:
+    """The times of a column [s]; ones without a unit that are far too large for seconds are of another."""
+    t = table.times(name)
+    usual = float(np.median(np.abs(t[np.isfinite(t)]))) if np.isfinite(t).any() else 0.0
+    if _unit(table, name, TIME_UNITS) not in TIME_UNITS:
+        for least, ticks, unit in EPOCHS:
+            if usual >= least:
+                taken.append(f"{_label(table, name)} in {unit} since 1970, by its size")
+                return t / ticks
+    return t
+
+
 def _lengths(table: Table, name: str) -> Array:
     """A column of lengths [m], in the unit of its name."""
-    unit = label_of(name)[1] or "m"
+    unit = _unit(table, name, LENGTHS) or "m"
     if unit not in LENGTHS:
         raise InputError(f"{table.path}: {name!r} is no length; {hint(unit, LENGTHS)}")
     return LENGTHS[unit] * table.numbers(name)
 
 
-def _check_axes(vector_nt: Array, yaw: Array, table: Table, columns: Columns) -> None:
-    """Refuse vectors whose level part keeps its direction in the other axes than those that were said."""
-    if np.hypot(np.cos(yaw).mean(), np.sin(yaw).mean()) > TURNED:
+def _check_axes(vector_nt: Array, turn: Array, table: Table, columns: Columns) -> None:
+    """Refuse vectors whose level part keeps one direction in other axes or headings than those given.
+
+    With the level part v as a complex number and the heading h, a field that keeps its direction in world
+    axes has a constant v exp(ih) for vectors in body axes, v for vectors in world axes, and v exp(-ih) for
+    headings that turn the other way, and for vectors that are forward, right, down.
+    """
+    yaw = turn if turn.ndim == 1 else yaw_from_quat(turn)
+    spin = np.exp(1j * yaw)
+    if abs(spin.mean()) > TURNED:
         return  # one heading: nothing tells the axes apart
-    level = vector_nt[:, 0] + 1j * vector_nt[:, 1]
-    size = np.abs(level).mean()
-    if not size > 0:
-        return
-    as_world, as_body = abs(level.mean()) / size, abs((level * np.exp(1j * yaw)).mean()) / size
+    body = levelled(vector_nt, turn, "body")[:, :2] @ np.array([1, 1j])
+    kept = {"body": kept_direction(body * spin), "mirrored": kept_direction(body / spin)}
+    kept["world"] = kept_direction(vector_nt[:, :2] @ np.array([1, 1j]))
     said = columns.axes or "body"
-    here, there = (as_body, as_world) if said == "body" else (as_world, as_body)
-    if there > ALIGNED and here < ALIGNED / 2:
-        other = "world" if said == "body" else "body"
+    best = max((axes for axes in kept if axes != said), key=lambda axes: kept[axes])
+    least = kept[best] - CLEARLY if best == "mirrored" else ALIGNED / 2
+    if kept[best] <= ALIGNED or kept[said] >= least:
+        return
+    they = f"{table.path}: {columns.vector} are taken to be in {said} axes, but they keep one direction"
+    if best != "mirrored":
         raise InputError(
-            f"{table.path}: {columns.vector} are taken to be in {said} axes, but they keep one direction "
-            f"({100 * there:.0f} % of them) in {other} axes, as the Earth's field does: give --axes {other}, "
-            "or correct the headings or the order of the components"
+            f"{they} ({100 * kept[best]:.0f} % of them) in {best} axes, as the Earth's field does: give "
+            f"--axes {best}, or correct the headings or the order of the components"
         )
+    turned = "give --heading-unit compass for headings clockwise from north"
+    if columns.quaternion:
+        turned = "change the signs of x, y and z of a quaternion that turns world to body"
+    elif columns.heading_unit == "compass":
+        turned = "give --heading-unit deg for headings counter-clockwise from +x"
+    body_axes = "give --axes body, and " if said == "world" else ""
+    raise InputError(
+        f"{they} ({100 * kept[best]:.0f} % of them) if headings turn the other way, or if they are forward, "
+        f"right, down: {body_axes}{turned}, or change the signs of the second and third component in the file"
+    )
+
+
+def kept_direction(level: NDArray[np.complex128]) -> float:
+    """Length of the mean of level vectors by the mean of their lengths; 1 if all have one direction."""
+    size = float(np.abs(level).mean())
+    return float(abs(level.mean())) / size if size > 0 else 1.0
 
 
 def levelled(vector_nt: Array, turn: Array, axes: str) -> Array:
@@ -505,12 +688,15 @@ def _turn(table: Table, columns: Columns) -> Array | None:
     name, heading = columns.heading, table.numbers(columns.heading)
     if columns.heading_unit == "deg":
         return np.radians(heading)
+    if columns.heading_unit == "compass":
+        return np.radians(90.0 - heading)
     beyond = np.flatnonzero(np.abs(heading) > LARGEST_TURN)
     if columns.heading_unit is None and len(beyond):
         where = table.column(name).where(int(beyond[0]))
         raise InputError(
             f"{where}: heading {heading[beyond[0]]:g} is beyond a full turn in radians; "
-            "give --heading-unit deg, or rad if it counts turns"
+            "give --heading-unit deg (counter-clockwise from +x), compass (clockwise from north) or, if it "
+            "counts turns, rad"
         )
     return heading
 

@@ -12,9 +12,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from magtwin.delimited import MISSING, QUOTED, label_of, number_of, read_delimited
+from magtwin.delimited import MISSING, QUOTED, number_of, read_delimited
 from magtwin.errors import InputError, hint
 from magtwin.files import existing
+from magtwin.io.surveys.columns import TIME_UNITS, named
 from magtwin.io.tables import load_parquet
 
 Array = NDArray[np.float64]
@@ -22,7 +23,17 @@ Array = NDArray[np.float64]
 _TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 """Ticks per second of a timestamp of Arrow, by its unit."""
 
-_DATE = re.compile(r"\d{4}-\d\d-\d\d", re.ASCII)
+_ISO = re.compile(r"\d{4}-\d\d-\d\d", re.ASCII)
+_DATE = re.compile(
+    r"(\d{1,4})([-/.])(\d{1,2}|[A-Za-z]{3})\2(\d{1,4})"
+    r"(?:[ T]+(\d{1,2}):(\d\d)(?::(\d\d)(?:[.,](\d{1,6})\d*)?)? *([AaPp][Mm])?)?",
+    re.ASCII,
+)
+"""A date in another order than that of ISO 8601, and perhaps a time."""
+
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_READ = "2025-11-22T08:26:40"
+"""A date as an error message shows it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,27 +126,37 @@ class Table:
     def times(self, name: str) -> Array:
         """The times of a column [s], shape (N,); nan for cells that are empty or nan.
 
-        They are numbers, in ms if the name says so, or dates and times as in ISO 8601, which become seconds
-        since 1970; one without a zone is in UTC.
+        They are numbers, in the unit of the name or in seconds; or dates and times, which become seconds
+        since 1970: as in ISO 8601, as `2025/11/22 08:26:40` or `22-Nov-2025 08:26:40`, or with day and month
+        in the order that the column proves by a number above 12. One without a zone is in UTC.
 
         Raises:
-            InputError: There is no such column, or a cell is neither; with file and line.
+            InputError: There is no such column, a cell is neither, or day and month cannot be told apart;
+                with file and line.
         """
         column = self.column(name)
         is_text = not isinstance(column.cells, np.ndarray) or column.cells.dtype.kind == "O"
         texts = self.texts(name) if is_text else []
-        if not any(map(_DATE.match, texts)):
-            return self.numbers(name) / (1000 if label_of(name)[1] == "ms" else 1)
+        if not any(_ISO.match(text) or _DATE.fullmatch(text) for text in texts):
+            for row, text in enumerate(texts):
+                if np.isinf(number_of(text)):
+                    wanted = f"a number of seconds, or a date and time such as {_READ}"
+                    raise InputError(f"{column.where(row)}: {name} must be {wanted}; got {text[:QUOTED]!r}")
+            return self.numbers(name) * TIME_UNITS.get(named(column.name, TIME_UNITS)[1], 1.0)
+        is_day_first = _is_day_first(texts)
         seconds = np.full(self.rows, np.nan)
         for row, text in enumerate(texts):
             if text.lower() in MISSING:
                 continue
             try:
-                moment = datetime.fromisoformat(text)
+                moment = _moment(text, is_day_first)
                 seconds[row] = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
-            except (ValueError, OverflowError):
-                where = column.where(row)
-                raise InputError(f"{where}: {name} must be a date and time, got {text[:QUOTED]!r}") from None
+            except (ValueError, OverflowError) as error:
+                advice = (
+                    str(error) if isinstance(error, _UnclearDateError) else f"one such as {_READ} is read"
+                )
+                text = f"{name} must be a date and time, got {text[:QUOTED]!r}; {advice}"
+                raise InputError(f"{column.where(row)}: {text}") from None
         return seconds
 
     def texts(self, name: str) -> list[str]:
@@ -154,6 +175,50 @@ class Table:
                 "files joined side by side need one row per reading each"
             )
         return Table(self.columns + other.columns, self.notes + other.notes)
+
+
+class _UnclearDateError(ValueError):
+    """A date whose day may be its month."""
+
+
+def _is_day_first(texts: Sequence[str]) -> bool | None:
+    """Whether the days of dates such as 22.11.2025 come before the months; None if no number is above 12."""
+    for text in texts:
+        match = _DATE.fullmatch(text)
+        if match and len(match[1]) < 3 and match[3].isdigit() and max(int(match[1]), int(match[3])) > 12:
+            return int(match[1]) > 12
+    return None
+
+
+def _moment(text: str, is_day_first: bool | None) -> datetime:
+    """The moment of a date.
+
+    Raises:
+        ValueError: It is none; or, as an `_UnclearDateError`, day and month cannot be told apart.
+    """
+    match = _DATE.fullmatch(text)
+    if match is None or _ISO.match(text):
+        return datetime.fromisoformat(text)
+    first, _, middle, last, *clock = match.groups()
+    if not middle.isdigit():
+        day, month, year = first, str(_MONTHS.index(middle.lower()) + 1), last
+    elif len(first) == 4:
+        year, month, day = first, middle, last
+    elif is_day_first is None and first != middle:
+        raise _UnclearDateError(f"day and month cannot be told apart; write dates such as {_READ}")
+    else:
+        day, month = (first, middle) if is_day_first else (middle, first)
+        year = last
+    if len(year) != 4:
+        raise ValueError("a year has four digits")
+    hour, minute, second = (int(word or 0) for word in clock[:3])
+    if clock[4]:
+        if not 1 <= hour <= 12:
+            raise ValueError("an hour before noon or after it is 1 to 12")
+        hour = hour % 12 + 12 * (clock[4].lower() == "pm")
+    return datetime(
+        int(year), int(month), int(day), hour, minute, second, int((clock[3] or "").ljust(6, "0")[:6])
+    )
 
 
 def read_csv(path: str | os.PathLike[str]) -> Table:

@@ -1,3 +1,4 @@
+import math
 import re
 
 import numpy as np
@@ -7,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from magtwin.errors import InputError
 from magtwin.field.survey import folder as survey
 from magtwin.field.survey.folder import node_map, read_grid, read_survey
-from magtwin.field.survey.readings import Readings
+from magtwin.field.survey.readings import Readings, taken_of
 from magtwin.files import sha256
 
 HEADER = "# x,y,theta,scalar_mag \n"
@@ -301,3 +302,41 @@ def test_the_real_survey_is_known_to_its_headings_places_and_noise(real_data):
     sd = np.sqrt(field.variance_nt2[field.valid])
     assert 40 < np.median(sd) < 100
     assert np.sqrt(np.mean(sd**2)) == pytest.approx(85, abs=10)
+
+
+def in_degrees(text):
+    """A file of a survey with its headings in degrees."""
+    rows = (line.split(",") for line in text.splitlines()[1:])
+    return HEADER + "".join(f"{x},{y},{math.degrees(float(theta))!r},{b}\n" for x, y, theta, b in rows)
+
+
+def test_headings_in_degrees_are_told_by_the_names_of_the_files(tmp_path):
+    plain = read_grid(write_survey(tmp_path / "plain"))
+    texts = {f"h{h}": in_degrees(layer_text(h)) for h in (0, 90, 180, 270)}
+    readings = read_grid(write_survey(tmp_path / "degrees", **texts))
+    assert_allclose(readings.yaw, plain.yaw)
+    assert taken_of(readings) == ["theta in deg, by its size and the names of the files"]
+    assert not taken_of(plain)
+    wrong = in_degrees(layer_text(143))
+    with pytest.raises(
+        InputError, match=r"0_map\.csv:2: theta 143 is beyond a full turn in radians, and in deg"
+    ):
+        read_grid(write_survey(tmp_path / "wrong", **dict.fromkeys(texts, wrong)))
+    turns = layer_text(90 + 720)
+    assert_allclose(read_grid(write_survey(tmp_path / "turns", h90=turns)).yaw[4:8], np.radians(810))
+
+
+def test_headings_far_from_the_names_of_the_files_are_a_doubt(tmp_path):
+    swapped = {f"h{h}": layer_text((90 - h) % 360) for h in (0, 90, 180, 270)}
+    report = read_survey(write_survey(tmp_path, **swapped))[1]
+    (doubt,) = report.metadata["doubts"]
+    assert doubt.startswith("4 of 4 headings are recorded otherwise than their files are named")
+    assert "doubts" not in read_survey(write_survey(tmp_path))[1].metadata
+
+
+def test_a_gridded_survey_that_spans_far_has_a_note(tmp_path):
+    texts = {f"h{h}": layer_text(h).replace("0.5,", "150,") for h in (0, 90, 180, 270)}
+    report = read_survey(write_survey(tmp_path, **texts))[1]
+    assert report.metadata["taken"] == [
+        "x and y in metres, over 150 m: if these are cm, write them in metres"
+    ]
