@@ -81,7 +81,7 @@ def test_every_kind_of_file_that_is_read_is_fuzzed():
         ".pt",
         ".jpeg",
         ".usd",
-        *(".sdf", ".world", ".pgm", ".yml"),
+        *(".bag", ".sdf", ".world", ".pgm", ".yml"),
         *(".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".7z", ".rar"),
     }  # never read, or by another name
     fuzzed = {Path(chosen.file).suffix for chosen in FORMATS.values()}
