@@ -157,8 +157,8 @@ class Table:
 
 
 def read_csv(path: str | os.PathLike[str]) -> Table:
-    """Read a text file of readings; as `magtwin.delimited.read_delimited`."""
-    text = read_delimited(path, "file of readings", "readings", "one row of numbers per reading")
+    """Read a text file of readings; as `magtwin.delimited.read_delimited`, with units below the header."""
+    text = read_delimited(path, "file of readings", "readings", "one row of numbers per reading", units=True)
     names = text.names or ("",) * text.width
     pairs = zip(names, zip(*text.rows, strict=True), strict=True)
     return Table(tuple(Column(name, list(cells), text.path, text.lines) for name, cells in pairs), text.notes)
