@@ -331,6 +331,14 @@ def test_marks_between_thousands_are_read_if_all_numbers_of_a_column_fit(tmp_pat
     assert table.notes == ("numbers of b with marks between thousands",)
 
 
+def test_a_column_is_found_by_its_name_without_a_unit(tmp_path):
+    table = read_csv(written(tmp_path, "East (cm),b [uT],b [nT],b\n1,2,3,4\n"))
+    assert_array_equal(table.numbers("East"), [1])
+    assert_array_equal(table.numbers("b"), [4])
+    with pytest.raises(InputError, match=r"no column 'c'"):
+        read_csv(written(tmp_path, "c [uT],c [nT]\n1,2\n")).numbers("c")
+
+
 def test_long_words_take_no_long_time(tmp_path):
     start, digits = time.process_time(), "1" * 60_000
     table = read_csv(written(tmp_path, f"Line {digits} x,b\n1,2\n3,{digits}x"))

@@ -325,7 +325,7 @@ def _read_table(path: Path) -> Table:
 def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
     """The readings in a table."""
     asked = bool(columns.time)
-    columns, taken = _complete(table, columns)
+    columns, taken = _complete(table, table.with_labels(columns))
     p = np.column_stack([_lengths(table, columns.x), _lengths(table, columns.y)])
     turn = _turn(table, columns)
     vector, b = _field(table, columns)

@@ -3,7 +3,8 @@
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from magtwin.delimited import MISSING, QUOTED, label_of, number_of, read_delimited
+from magtwin.delimited import MISSING, QUOTED, bare, label_of, number_of, read_delimited
 from magtwin.errors import InputError, hint
 from magtwin.files import existing
+from magtwin.io.surveys.columns import Columns
 from magtwin.io.tables import load_parquet
 
 Array = NDArray[np.float64]
@@ -72,7 +74,7 @@ class Table:
         return self.columns[0].path
 
     def column(self, name: str) -> Column:
-        """A column by its name, or by its number from 1.
+        """A column by its name, by its number from 1, or by its name without the unit in brackets.
 
         Raises:
             InputError: There is no such column (the message has the nearest name), or two have that name.
@@ -85,9 +87,28 @@ class Table:
             return matches[0]
         if name.isascii() and name.isdigit() and 1 <= int(name) <= len(self.columns):
             return self.columns[int(name) - 1]
+        without = [column for column in self.columns if name and bare(column.name) == name]
+        if len(without) == 1:
+            return without[0]
         named = [column.name[:QUOTED] for column in self.columns if column.name]
         known = hint(name, named) if named else f"no header: name columns by number, 1 to {len(self.columns)}"
         raise InputError(f"{self.path}: no column {name!r}; {known}")
+
+    def with_labels(self, columns: Columns) -> Columns:
+        """Columns by their names in the file, which hold their units, where a number or a part names them."""
+
+        def label(name: str) -> str:
+            with suppress(InputError):
+                found = self.column(name).name
+                return found if found and self.names.count(found) == 1 else name
+            return name
+
+        one = ("x", "y", "heading", "field", "time", "run_column")
+        labels = {key: label(getattr(columns, key)) for key in one if getattr(columns, key)}
+        for key in ("quaternion", "vector"):
+            found = list(map(label, columns.several(key)))
+            labels[key] = getattr(columns, key) if any("," in name for name in found) else ",".join(found)
+        return replace(columns, **labels)  # type: ignore[arg-type]
 
     def numbers(self, name: str) -> Array:
         """The numbers of a column, shape (N,); nan for cells that are empty or nan.
