@@ -1,7 +1,7 @@
 """Delimited text: rows of words in a file of another program, such as a spreadsheet or a script.
 
-Separator and header are found from the text. `notes` has what was repaired: lines above the header, decimal
-commas, and a last number that was cut short.
+Separator and header are found from the text. `notes` has what was repaired: lines above the header, headers
+that are repeated, decimal commas, marks between thousands, and a last line that was cut short.
 """
 
 import csv
@@ -35,10 +35,12 @@ LEAST_ROWS = 8
 LOST = 5.0
 """Factor below all others from which a number is cut short; a lost digit makes it a tenth."""
 
-MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "#na", "#nv", "#n/a"}
-"""Words for a missing value, in lower case. Spreadsheets also write errors for them, such as #DIV/0!."""
+MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "*", "#na", "#nv", "#n/a"}
+"""Words for a missing value, in lower case; `*` is that of Geosoft. Spreadsheets also write errors for them,
+such as #DIV/0!."""
 
 LENGTHS = {"m": 1.0, "metre": 1.0, "meter": 1.0, "cm": 0.01, "mm": 0.001, "km": 1e3, "ft": 0.3048}
+LENGTHS |= {"metres": 1.0, "meters": 1.0}
 """Metres per unit of length, by the unit in a header."""
 
 PLACED = ("x", "y", "heading", "yaw", "theta")
@@ -47,15 +49,39 @@ PLACED = ("x", "y", "heading", "yaw", "theta")
 DEGREES = ("deg", "degree", "degrees", "\N{DEGREE SIGN}", "\N{MASCULINE ORDINAL INDICATOR}")
 """Names of the degree in a header."""
 
+UNITS = frozenset(
+    {*LENGTHS, *DEGREES, "rad", "radian", "radians", "s", "sec", "second", "seconds", "ms", "us", "ns", "min"}
+    | {"nt", "ut", "mt", "t", "mg", "g", "gauss", "tesla", "nanotesla", "microtesla", "m/s", "rad/s", "deg/s"}
+)
+"""Units, in lower case, that tell a row of units below the header."""
+
 _NUMBER = re.compile(r"\s*[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
 _COMMA = re.compile(r"\s*[+-]?(\d{1,3}(\.\d{3})+|\d*),\d+([eE][+-]?\d+)?\s*", re.ASCII)
 """A number with a decimal comma, and perhaps with points between its thousands."""
+
+_THOUSANDS = re.compile(
+    r"\s*[+-]?[1-9]\d{0,2}(?P<mark>[,'\u2019 \u00a0\u202f])\d{3}((?P=mark)\d{3})*(?P<rest>[.,]\d*)?\s*",
+    re.ASCII,
+)
+"""A number with marks between its thousands: English commas, Swiss apostrophes or French blanks."""
+
+_BELOW_1000 = re.compile(r"\s*[+-]?\d{1,3}([.,]\d*)?\s*", re.ASCII)
+_BEGUN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d*)?([eE][+-]?)?", re.ASCII)
+"""The begin of a number."""
+
+_SLASH = re.compile(r"\s*/([^\w,;]|\w+\s|$)")
+"""A comment line of Geosoft's XYZ, and no word that begins with a slash, such as a topic of ROS."""
+
+_TRACK = re.compile(r"\s*(line|tie)\s+(?=\S*\d)\S+\s*", re.IGNORECASE)
+"""A line of Geosoft's XYZ that begins a survey line."""
 
 _REMARK = re.compile(r"\s*#\s*\w+:\s")
 """A comment line `# KEY: VALUE`, as in maps written as CSV."""
 
 _ERROR = re.compile(r"\s*#(n/?a|nv|value!|div/0!|ref!|num!|name\?|null!)\s*", re.IGNORECASE)
-_BRACKETS = re.compile(r"\s*(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]\s*")
+_BRACKETS = re.compile(r"[\[\]()]")
+_Lines = list[tuple[int, str]]
+"""Number and text of lines."""
 
 
 @dataclass(frozen=True)
@@ -91,20 +117,27 @@ class Delimited:
         return replace(self, names=names, rows=[[row[k] for k in keep] for row in self.rows])
 
 
-def read_delimited(path: str | os.PathLike[str], noun: str, kind: str, wanted: str) -> Delimited:
+def read_delimited(
+    path: str | os.PathLike[str], noun: str, kind: str, wanted: str, *, units: bool = False
+) -> Delimited:
     """Read a text file of rows whose words are separated by commas, semicolons, tabs or blanks.
 
     The header is the first line if any of its words is not a number, else the last comment line above the
-    rows with as many words as they have. Other lines that begin with `#`, such as `# KEY: VALUE`, empty
-    lines, a first line `sep=;`, and lines of prose above the header are skipped. A decimal comma is read
-    unless commas separate the words or other numbers have decimal points. If the last line has no end, and
-    its last number is far below all others of its column, that number is missing.
+    rows with as many words as they have. These are skipped: other lines that begin with `#`, such as
+    `# KEY: VALUE`; those that begin with `/` if the first line does; empty lines; a first line `sep=;`; lines
+    of prose above the header and one below the rows; headers that are repeated; and the lines `Line 10` and
+    `Tie 3` of Geosoft. A decimal comma is read unless commas separate the words or other numbers have decimal
+    points. Marks between thousands are read if all numbers of the column fit. If the last line has no end, it
+    is left out if it has fewer words than others; its last number is missing if it is far below all others of
+    its column.
 
     Args:
         path: The file.
         noun: What it is, for error messages.
         kind: Format in `magtwin.budget.BUDGETS`.
         wanted: What a row holds, for error messages ("one row of numbers per reading").
+        units: Add the units in a row below the header to the names, as in `x [cm]`. By default, such a row is
+            one of the rows.
 
     Raises:
         InputError: The file is missing, not text, or empty, or its lines are too long or of different widths.
@@ -114,32 +147,25 @@ def read_delimited(path: str | os.PathLike[str], noun: str, kind: str, wanted: s
         raise InputError(f"{path}: cannot be read (a folder); expected a {noun}")
     check_size(path, kind)
     lines = list(_lines(path, noun))
-    ended = not lines or lines[-1][1].endswith("\n")
-    lines = [(number, line.rstrip("\n")) for number, line in lines]
-    between = None
-    told = re.fullmatch(r'"?sep=(.)"?', lines[0][1].strip(" \r"), re.IGNORECASE) if lines else None
-    if told:
-        lines.pop(0)
-    above: list[tuple[int, str]] = []
-    while lines and _is_comment(lines[0][1]):
-        number, line = lines.pop(0)
-        if not _REMARK.match(line):
-            above.append((number, line.lstrip().lstrip("#")))
-    lines = [(number, line) for number, line in lines if not _is_comment(line)]
+    told = re.fullmatch(r'"?sep=(.)"?', lines[0][1].strip(" \r\n"), re.IGNORECASE) if lines else None
+    above, lines, notes = _without_comments(lines[1:] if told else lines)
     if not lines:
         raise InputError(f"{path}: empty; expected {wanted}")
-    begun = [line for _, line in lines[:LOOKED]]
-    between, prose = (told[1], 0) if told and told[1] != " " else _separator(begun)
-    notes = [f"line {lines[prose][0]} as the header, and the lines above it as prose"] if prose else []
+    ended = lines[-1][1].endswith("\n")
+    lines = [(number, line.rstrip("\n")) for number, line in lines]
+    between, prose = (told[1], 0) if told and told[1] != " " else _separator(lines)
+    if not ended and between and lines[-1][1].count('"') % 2:
+        lines[-1] = (lines[-1][0], lines[-1][1] + '"')
     lines = lines[prose:]
     rows = _words(path, lines, between)
-    if between != ",":
-        rows, some = _with_points(rows)
-        notes += ["numbers with decimal commas"] if some else []
+    first = _header(rows)
+    if prose or first:
+        notes.append(f"line {lines[first][0]} as the header, and the lines above it as prose")
+    rows, numbers = rows[first:], [number for number, _ in lines[first:]]
     names: list[str] = []
     if _is_header(rows[0]):
-        names = [word.strip() for word in rows.pop(0)]
-        lines.pop(0)
+        names = [word.strip() for word in rows[0]]
+        rows, numbers = rows[1:], numbers[1:]
     else:
         for comment in above:
             with suppress(InputError):  # prose with unpaired quotes
@@ -148,16 +174,38 @@ def read_delimited(path: str | os.PathLike[str], noun: str, kind: str, wanted: s
     if not rows:
         raise InputError(f"{path}: no rows below the header; expected {wanted}")
     width = len(names) or len(rows[0])
-    for (number, _), row in zip(lines, rows, strict=True):
+    if why := _last(rows, width, ended, between is None):
+        notes.append(f"line {numbers[-1]} {why}")
+        rows, numbers = rows[:-1], numbers[:-1]
+    headers = [names]
+    if units and names and _is_units(rows[:2], width):
+        notes.append(f"line {numbers[0]} as the units of the columns")
+        headers.append([word.strip() for word in rows[0]])
+        names = [_with_unit(name, word) for name, word in zip(names, rows[0], strict=True)]
+        rows, numbers = rows[1:], numbers[1:]
+    repeated = {k for k, row in enumerate(rows) if names and any(_is_same(row, header) for header in headers)}
+    if 0 < len(repeated) < len(rows):
+        notes.append(f"lines that repeat the header left out: {len(repeated)}")
+        numbers = [number for k, number in enumerate(numbers) if k not in repeated]
+        rows = [row for k, row in enumerate(rows) if k not in repeated]
+    for number, row in zip(numbers, rows, strict=True):
         if len(row) != width:
             raise InputError(f"{path}:{number}: {width} values expected, got {len(row)}")
-    numbers = [number for number, _ in lines]
-    if not ended and is_cut_short([row[-1] for row in rows]):
-        notes.append(
-            f"line {numbers[-1]} as cut short and left out: it has no end, and its {rows[-1][-1].strip()} is "
-            "far below all other values"
-        )
-        rows[-1][-1] = ""
+    if columns := _without_thousands(rows):
+        named = ", ".join(names[k] if names else str(k + 1) for k in columns)
+        notes.append(f"numbers of {named[:QUOTED]} with marks between thousands")
+    if between != ",":
+        rows, some = _with_points(rows)
+        notes += ["numbers with decimal commas"] if some else []
+    if not ended and numbers[-1] == lines[-1][0]:
+        last = rows[-1][-1].strip()
+        begun = len(rows) > 1 and _is_text(last) and _BEGUN.fullmatch(last) and _is_number(rows[-2][-1])
+        if begun or is_cut_short([row[-1] for row in rows]):
+            why = "begins a number" if begun else "is far below all other values"
+            notes.append(
+                f"line {numbers[-1]} as cut short and left out: it has no end, and its {last[:QUOTED]} {why}"
+            )
+            rows[-1][-1] = ""
     return Delimited(path, tuple(names), rows, numbers, tuple(notes))
 
 
@@ -185,20 +233,117 @@ def label_of(text: str) -> tuple[str, str]:
     The unit is "" if there is none. It is read after a low line only for the names in `PLACED`.
     """
     text = text.strip().lower()
-    if match := _BRACKETS.fullmatch(text):
-        return match[1], match[2]
+    if (name := bare(text)) != text:
+        return name, text[len(name) :].strip()[1:-1].strip()
     name, _, unit = text.rpartition("_")
     return (name, unit) if name in PLACED and unit in (*LENGTHS, *DEGREES, "rad") else (text, "")
 
 
+def bare(label: str) -> str:
+    """The name of a column without its unit in brackets."""
+    label = label.strip()
+    at = max(label.rfind("["), label.rfind("("))
+    has_unit = at >= 0 and label.endswith(("]", ")")) and len(_BRACKETS.findall(label, at)) == 2
+    return label[:at].rstrip() if has_unit else label
+
+
+def _is_number(word: str) -> bool:
+    """Whether a word is a number, perhaps with a decimal comma or marks between thousands."""
+    return math.isfinite(number_of(word)) or bool(_COMMA.fullmatch(word) or _THOUSANDS.fullmatch(word))
+
+
+def _is_text(word: str) -> bool:
+    """Whether a word is neither a number nor missing."""
+    return math.isinf(number_of(word)) and not _is_number(word)
+
+
 def _is_header(words: list[str]) -> bool:
-    """Whether a word of the first row is not a number, nor one with a comma."""
-    return any(math.isinf(number_of(word)) for word in words) and not any(map(_COMMA.fullmatch, words))
+    """Whether a word of the first row is not a number, and none is one with a comma."""
+    return any(map(_is_text, words)) and not any(
+        _COMMA.fullmatch(w) or _THOUSANDS.fullmatch(w) for w in words
+    )
 
 
-def _is_comment(line: str) -> bool:
-    """Whether a line begins with `#`, and not with the error of a spreadsheet."""
-    return line.lstrip().startswith("#") and not _ERROR.fullmatch(re.split(r"[,;\t]", line, maxsplit=1)[0])
+def _header(rows: list[list[str]]) -> int:
+    """Index of the header, below prose that a spreadsheet has filled to the width of the table.
+
+    It is the last row of distinct texts, one for each column, above the first row that is mostly numbers;
+    rather one that names a column of poses.
+    """
+    head = rows[: MOST_ABOVE + 3]  # with a row of units and one of numbers
+    full = next((k for k, row in enumerate(head) if 2 * sum(map(_is_number, row)) > len(row)), 0)
+    likely = [k for k, row in enumerate(head[:full]) if _is_names(row, head[full])]
+    placed = [k for k in likely if any(label_of(word)[0] in PLACED for word in head[k])]
+    found = (placed or likely or [0])[-1]
+    prose = all(any(map(_is_text, row)) or not any(map(str.strip, row)) for row in head[:found])
+    return found if prose and found <= MOST_ABOVE else 0
+
+
+def _is_names(row: list[str], below: list[str]) -> bool:
+    """Whether a row has a text of its own in each column of a row of numbers, and is not one of units."""
+    if len(row) != len(below) or 2 * sum(map(_is_unit, row)) > len(row):
+        return False
+    texts = [word.strip() for word, number in zip(row, below, strict=True) if word.strip() or number.strip()]
+    return all(map(_is_text, texts)) and len(set(texts)) == len(texts)
+
+
+def _last(rows: list[list[str]], width: int, ended: bool, blanks: bool) -> str:
+    """Why the last row is left out: it was cut short, or is prose such as `END OF FILE`; "" if it is not."""
+    if len(rows) < 2 or len(rows[-2]) != width:
+        return ""
+    row, words = rows[-1], [word for word in rows[-1] if word.strip()]
+    if not ended and len(row) < width:
+        return f"as cut short and left out: it has no end, and {len(row)} of {width} values"
+    alone = width > 1 and (blanks or len(words) == 1) and all(map(_is_text, words))
+    below = len(row) != width or _is_number(rows[-2][0])
+    return f"as prose and left out: {' '.join(words)[:QUOTED]!r}" if alone and below else ""
+
+
+def _is_unit(word: str) -> bool:
+    unit = _BRACKETS.sub("", word).strip().lower()
+    return unit.replace("\N{MICRO SIGN}", "u").replace("\N{GREEK SMALL LETTER MU}", "u") in UNITS
+
+
+def _is_units(rows: list[list[str]], width: int) -> bool:
+    """Whether the first of two rows is one of units: it has no number, and a unit above a number."""
+    if [len(row) for row in rows] != [width, width] or any(map(_is_number, rows[0])):
+        return False
+    return any(_is_unit(word) and _is_number(below) for word, below in zip(rows[0], rows[1], strict=True))
+
+
+def _with_unit(name: str, word: str) -> str:
+    """The name of a column with its unit, unless it has one or the word is missing."""
+    unit = _BRACKETS.sub("", word).strip()
+    return f"{name} [{unit}]" if name and _is_text(unit) and not label_of(name)[1] else name
+
+
+def _is_same(row: list[str], header: list[str]) -> bool:
+    return row[0].strip() == header[0] and [word.strip() for word in row] == header
+
+
+def _is_comment(line: str, slashed: bool = False) -> bool:
+    """Whether a line begins with `#` and not with the error of a spreadsheet, or with `/` in such a file."""
+    begun = line.lstrip()
+    if begun.startswith("/"):
+        return slashed and bool(_SLASH.match(line))
+    return begun.startswith("#") and not _ERROR.fullmatch(re.split(r"[,;\t]", line, maxsplit=1)[0])
+
+
+def _without_comments(lines: _Lines) -> tuple[_Lines, _Lines, list[str]]:
+    """Comments above the rows that may be a header, the other lines, and what was left out."""
+    slashed = bool(lines) and bool(_SLASH.match(lines[0][1]))
+    others = [(number, line) for number, line in lines if not _is_comment(line, slashed)]
+    first = others[0][0] if others else math.inf
+    above = [
+        (number, text.lstrip(text[0]))
+        for number, text in ((number, line.strip()) for number, line in lines if number < first)
+        if re.search(r"\w", text) and not _REMARK.match(text)
+    ]
+    tracks = [line.strip() for _, line in others if _TRACK.fullmatch(line)]
+    if not tracks:
+        return above, others, []
+    note = f"lines such as {tracks[0][:QUOTED]!r} left out: {len(tracks)}"
+    return above, [(number, line) for number, line in others if not _TRACK.fullmatch(line)], [note]
 
 
 def _lines(path: Path, noun: str) -> Iterator[tuple[int, str]]:
@@ -218,11 +363,19 @@ def _lines(path: Path, noun: str) -> Iterator[tuple[int, str]]:
             raise InputError(f"{path}: not a text file ({error}); a {noun} is CSV in UTF-8") from error
 
 
-def _separator(lines: Sequence[str]) -> tuple[str | None, int]:
+def _separator(lines: _Lines) -> tuple[str | None, int]:
     """What stands between the words of lines, and the number of lines of prose above the header.
 
-    It is the mark that each line has as often, from the header on; None for blanks.
+    It is the mark that each line has as often, from the header on; None for blanks. The last line of a short
+    file may differ.
     """
+    begun = [line for _, line in lines[:LOOKED]]
+    found = _mark(begun) or (_mark(begun[:-1]) if 2 < len(lines) <= LOOKED else None)
+    return found or (next((mark for mark in ",;\t" if mark in begun[0]), None), 0)
+
+
+def _mark(lines: Sequence[str]) -> tuple[str | None, int] | None:
+    """Separator and lines of prose; None if the lines have no mark as often."""
     words = lines[-1].split()
     numbers = all(_COMMA.fullmatch(word) or math.isfinite(number_of(word)) for word in words)
     if len(words) > 1 and numbers and any(map(_COMMA.fullmatch, words)):
@@ -235,7 +388,7 @@ def _separator(lines: Sequence[str]) -> tuple[str | None, int]:
         prose, header = lines[:above], lines[above].split(mark)
         if all(_is_header(line.split(mark)) for line in prose) and not any(map(_NUMBER.fullmatch, header)):
             return mark, above
-    return next((mark for mark in ",;\t" if mark in lines[0]), None), 0
+    return None
 
 
 def _above(lines: Sequence[str], mark: str) -> int | None:
@@ -246,7 +399,7 @@ def _above(lines: Sequence[str], mark: str) -> int | None:
     return above if same and (above == 0 or above <= min(MOST_ABOVE, len(lines) - 2)) else None
 
 
-def _words(path: Path, lines: list[tuple[int, str]], between: str | None) -> list[list[str]]:
+def _words(path: Path, lines: _Lines, between: str | None) -> list[list[str]]:
     if between is None:
         return [line.split() for _, line in lines]
     rows = []
@@ -256,6 +409,36 @@ def _words(path: Path, lines: list[tuple[int, str]], between: str | None) -> lis
         except csv.Error as error:
             raise InputError(f"{path}:{number}: not CSV: {error}, in {line[:QUOTED]!r}") from None
     return rows
+
+
+def _without_thousands(rows: list[list[str]]) -> list[int]:
+    """Take the marks between thousands out of the columns all of whose numbers fit; returns these columns.
+
+    A comma may be a decimal one. It is between thousands if a number has a point after it, or two of them.
+    """
+    found = {
+        k: match["mark"]
+        for row in rows
+        for k, word in enumerate(row)
+        if len(word) > 4 and (match := _THOUSANDS.fullmatch(word))
+    }
+    columns = []
+    for k, mark in found.items():
+        words = [row[k] for row in rows]
+        matches = [_THOUSANDS.fullmatch(word) for word in words]
+        fits = all(
+            match["mark"] == mark
+            if match
+            else math.isnan(number_of(word)) or (mark not in word.strip() and _BELOW_1000.fullmatch(word))
+            for word, match in zip(words, matches, strict=True)
+        )
+        ends = {match["rest"][0] for match in matches if match and match["rest"]}
+        sure = mark != "," or "." in ends or any(word.count(mark) > 1 for word in words)
+        if fits and sure and mark not in ends:
+            columns.append(k)
+            for row in rows:
+                row[k] = row[k].strip().replace(mark, "")
+    return columns
 
 
 def _with_points(rows: list[list[str]]) -> tuple[list[list[str]], bool]:

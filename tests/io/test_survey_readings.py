@@ -78,6 +78,20 @@ def test_columns_are_read_by_the_names_and_units_of_their_header(tmp_path, text,
     assert bool(notes) == bool(taken(readings))
 
 
+@pytest.mark.parametrize(
+    "header", ["east,north,cap,mag_1\ncm,mm,deg,uT", "east [cm],north (mm),cap [deg],mag_1 [uT]"]
+)
+@pytest.mark.parametrize("names", [("east", "north", "cap", "mag_1"), ("1", "2", "3", "4")])
+def test_units_count_for_columns_that_an_option_names_without_them(tmp_path, header, names):
+    path = file(tmp_path, f"{header}\n0,0,0,41\n100,0,90,41.5\n")
+    readings = read_readings(
+        path, columns=Columns(**dict(zip(("x", "y", "heading", "field"), names, strict=True)))
+    )
+    assert_allclose(readings.p_xy, [[0, 0], [1, 0]])
+    assert_allclose(readings.yaw, [0, np.pi / 2])
+    assert_allclose(readings.b_nt, [41_000, 41_500])
+
+
 def test_a_unit_of_x_that_is_no_length_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"a\.csv: 'x \[px\]' is no length"):
         read_readings(file(tmp_path, "x [px],y,yaw,b\n0,0,0,41000\n"))

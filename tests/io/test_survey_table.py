@@ -1,3 +1,5 @@
+import time
+
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -82,6 +84,7 @@ def test_a_cell_that_is_no_finite_number_is_refused_with_its_line(tmp_path, cell
         ("\n # only a remark\n", r"a\.csv: empty"),
         ("x,y\n", r"a\.csv: no rows below the header"),
         ("x,y\n1,2\n3\n", r"a\.csv:3: 2 values expected, got 1"),
+        ("sep=,\nx,y\nm,m,m\n3,4,5\n", r"a\.csv:3: 2 values expected, got 3"),
         ('x,y\n1,"2\n', r"a\.csv:2: not CSV"),
         (b"x,y\n1,\xff\xfe\n", r"a\.csv: not a text file"),
         (b"\x89PNG\r\n\x1a\n\x00\x00", r"a\.csv: not a text file"),
@@ -240,3 +243,137 @@ def test_timestamps_of_parquet_are_seconds(tmp_path, unit):
     assert_array_equal(
         read_parquet_table(tmp_path / "a.parquet").times("t"), [1768333970, np.nan, 1768333972]
     )
+
+
+ROWS = "".join(f"{k}.5,1,{50 + k}.25\n" for k in range(9))
+
+
+@pytest.mark.parametrize(
+    ("last", "why"),
+    [
+        ("9.5,1", "and 2 of 3 values"),
+        ("9.5", "and 1 of 3 values"),
+        ('9.5,"1', "and 2 of 3 values"),
+        ("9.5,1,6", "and its 6 is far below all other values"),
+        ("9.5,1,6.3e-", "and its 6.3e- begins a number"),
+    ],
+)
+def test_a_last_line_that_was_cut_short_is_left_out_and_noted(tmp_path, last, why):
+    table = read_csv(written(tmp_path, "t,x,b\n" + ROWS + last))
+    assert table.notes == (f"line 11 as cut short and left out: it has no end, {why}",)
+    b = table.numbers("b")
+    assert_array_equal(b[np.isfinite(b)], 50.25 + np.arange(9))
+
+
+@pytest.mark.parametrize(
+    "text", ["x y b\n" + ROWS.replace(",", " "), "x,y,b\n" + ROWS, "x,y,b\n1,2,3\n4,5,6\n"]
+)
+@pytest.mark.parametrize("end", ["END OF FILE", "END OF FILE\n"])
+def test_prose_below_the_rows_is_left_out_and_noted(tmp_path, text, end):
+    table = read_csv(written(tmp_path, text + end))
+    assert table.rows == text.count("\n") - 1
+    (note,) = table.notes
+    assert "left out" in note
+    with pytest.raises(InputError, match=r"values expected|must be a finite number, got 'END'"):
+        read_csv(written(tmp_path, text + "END OF FILE\n" + text.partition("\n")[2])).numbers("x")
+
+
+def test_headers_that_are_repeated_are_left_out_and_counted(tmp_path):
+    log = "t, x\ns,cm\n1,2\n"
+    table = read_csv(written(tmp_path, log + log + log))
+    assert table.notes == ("line 2 as the units of the columns", "lines that repeat the header left out: 4")
+    assert_array_equal(table.numbers("x [cm]"), [2, 2, 2])
+    assert table.columns[0].where(2).endswith("a.csv:9")
+
+
+@pytest.mark.parametrize("row", ["s,cm,,uT", "[s],[cm],-,[µT]"])
+def test_a_row_of_units_is_joined_to_the_names(tmp_path, row):
+    table = read_csv(written(tmp_path, f"t,x,y_cm,b\n{row}\n1,2,3,4\n"))
+    assert table.names == ["t [s]", "x [cm]", "y_cm", f"b [{row.rpartition(',')[2].strip('[]')}]"]
+    assert_array_equal(table.numbers("4"), [4])
+
+
+@pytest.mark.parametrize("row", ["m,nan,nan", "T,,", "s,m,7"])
+def test_a_row_of_texts_or_numbers_is_not_one_of_units(tmp_path, row):
+    assert read_csv(written(tmp_path, f"run,x,y\n{row}\nm,5,6\n")).names == ["run", "x", "y"]
+
+
+@pytest.mark.parametrize(
+    "above",
+    ["Device,S,SM-1,Android,14\nDate,2025-11-22,,,\n,,,,\n", "Rate,10,,,\n" * 20, "Device,of,a,friend,Bob\n"],
+)
+def test_prose_that_was_filled_to_the_width_of_the_table_is_left_out(tmp_path, above):
+    table = read_csv(written(tmp_path, above + "t,x,y,yaw,b\ns,m,m,rad,uT\n1,2,3,4,5\n6,7,8,9,10\n"))
+    assert [name[0] for name in table.names] == ["t", "x", "y", "y", "b"]
+    line = above.count("\n") + 1
+    assert table.notes[0] == f"line {line} as the header, and the lines above it as prose"
+
+
+@pytest.mark.parametrize(
+    ("rows", "wrong"),
+    [
+        ("a,,,\na,1,2,3\n", None),
+        ("a,nan,-,NULL\nb,1,2,3\n", None),
+        ("a,b,c,1\nd,e,f,2\ng,1,2,3\n", "'b'"),
+        ("a,b,c,d\ng,1,2,3\n", "'b'"),
+    ],
+    ids=["missing", "missing by words", "texts", "only texts"],
+)
+def test_rows_with_texts_are_not_taken_for_a_header(tmp_path, rows, wrong):
+    table = read_csv(written(tmp_path, "run,x,y,b\n" + rows))
+    assert table.names == ["run", "x", "y", "b"]
+    if wrong:
+        with pytest.raises(InputError, match=rf"a\.csv:2: x must be a finite number, got {wrong}"):
+            table.numbers("x")
+
+
+def test_the_xyz_of_geosoft_is_read(tmp_path):
+    rule, row = "/ -----\n", " 1.0 2.0 *\n"
+    head = f"{rule}/ DATABASE [.\\lab.gdb]\n{rule}/\n/  X  Y  Mag_TMI\n/=== === ===\n/\n"
+    text = f"{head}Line   10\n{row}Tie T2\n{row}/ x\n"
+    table = read_csv(written(tmp_path, text, "a.xyz"))
+    assert table.names == ["X", "Y", "Mag_TMI"]
+    assert_array_equal(table.numbers("Y"), [2, 2])
+    assert np.isnan(table.numbers("Mag_TMI")).all()
+    assert table.notes == ("lines such as 'Line   10' left out: 2",)
+    topics = read_csv(written(tmp_path, "/odom/x,/odom/y\n1,2\n"))
+    assert topics.names == ["/odom/x", "/odom/y"]
+
+
+@pytest.mark.parametrize(
+    ("cells", "values"),
+    [
+        (['"45,529.4"', "999.5", ""], [45529.4, 999.5, np.nan]),
+        (['"1,234,567"', '"-2,000"', "7"], [1234567, -2000, 7]),
+        (["45'529.4", "1'000", "0.5"], [45529.4, 1000, 0.5]),
+        (["45\u202f529.4", "1\u202f000", "nan"], [45529.4, 1000, np.nan]),
+        (['"45,529"', '"45,530"', '"45,531"'], "45,529"),
+        (['"45,529.4"', '"0,584"', "1"], "45,529.4"),
+        (['"45,529.4"', "45529.5", "1"], "45,529.4"),
+        (["45'529", "45.5291e3", "1"], "45'529"),
+    ],
+)
+def test_marks_between_thousands_are_read_if_all_numbers_of_a_column_fit(tmp_path, cells, values):
+    table = read_csv(written(tmp_path, "x,b\n" + "".join(f"0.5,{cell}\n" for cell in cells)))
+    if isinstance(values, str):
+        with pytest.raises(InputError, match=rf"a\.csv:2: b must be a finite number, got ['\"]{values}"):
+            table.numbers("b")
+        return
+    assert_array_equal(table.numbers("b"), values)
+    assert table.notes == ("numbers of b with marks between thousands",)
+
+
+def test_a_column_is_found_by_its_name_without_a_unit(tmp_path):
+    table = read_csv(written(tmp_path, "East (cm),b [uT],b [nT],b\n1,2,3,4\n"))
+    assert_array_equal(table.numbers("East"), [1])
+    assert_array_equal(table.numbers("b"), [4])
+    with pytest.raises(InputError, match=r"no column 'c'"):
+        read_csv(written(tmp_path, "c [uT],c [nT]\n1,2\n")).numbers("c")
+
+
+def test_long_words_take_no_long_time(tmp_path):
+    start, digits = time.process_time(), "1" * 60_000
+    table = read_csv(written(tmp_path, f"Line {digits} x,b\n1,2\n3,{digits}x"))
+    with pytest.raises(InputError, match=r"a\.csv:3: b must be a finite number"):
+        table.numbers("b")
+    assert time.process_time() - start < 5

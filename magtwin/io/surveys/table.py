@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from magtwin.delimited import MISSING, QUOTED, number_of, read_delimited
+from magtwin.delimited import MISSING, QUOTED, bare, number_of, read_delimited
 from magtwin.errors import InputError, hint
 from magtwin.files import existing
 from magtwin.io.surveys.columns import TIME_UNITS, named
@@ -83,7 +83,7 @@ class Table:
         return self.columns[0].path
 
     def column(self, name: str) -> Column:
-        """A column by its name, or by its number from 1.
+        """A column by its name, by its number from 1, or by its name without the unit in brackets.
 
         Raises:
             InputError: There is no such column (the message has the nearest name), or two have that name.
@@ -96,8 +96,11 @@ class Table:
             return matches[0]
         if name.isascii() and name.isdigit() and 1 <= int(name) <= len(self.columns):
             return self.columns[int(name) - 1]
-        named = [column.name[:QUOTED] for column in self.columns if column.name]
-        known = hint(name, named) if named else f"no header: name columns by number, 1 to {len(self.columns)}"
+        without = [column for column in self.columns if name and bare(column.name) == name]
+        if len(without) == 1:
+            return without[0]
+        names = [column.name[:QUOTED] for column in self.columns if column.name]
+        known = hint(name, names) if names else f"no header: name columns by number, 1 to {len(self.columns)}"
         raise InputError(f"{self.path}: no column {name!r}; {known}")
 
     def numbers(self, name: str) -> Array:
@@ -222,8 +225,8 @@ def _moment(text: str, is_day_first: bool | None) -> datetime:
 
 
 def read_csv(path: str | os.PathLike[str]) -> Table:
-    """Read a text file of readings; as `magtwin.delimited.read_delimited`."""
-    text = read_delimited(path, "file of readings", "readings", "one row of numbers per reading")
+    """Read a text file of readings; as `magtwin.delimited.read_delimited`, with units below the header."""
+    text = read_delimited(path, "file of readings", "readings", "one row of numbers per reading", units=True)
     names = text.names or ("",) * text.width
     pairs = zip(names, zip(*text.rows, strict=True), strict=True)
     return Table(tuple(Column(name, list(cells), text.path, text.lines) for name, cells in pairs), text.notes)
