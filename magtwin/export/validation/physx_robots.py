@@ -14,7 +14,7 @@ from magtwin.usd.attributes import targets
 from magtwin.usd.geometry import BASE_LINK
 from magtwin.usd.lab.obstacles import read_obstacles
 from magtwin.usd.schema import NOUNS, attribute_name
-from magtwin.usd.sensors import JOINT_FIELDS, WHEELS_FIELDS, read_drive
+from magtwin.usd.sensors import JOINT_FIELDS, WHEELS_FIELDS, joints_of, read_drive
 
 ROBOT_API = "IsaacRobotAPI"
 """Isaac Sim's applied schema of a robot."""
@@ -162,11 +162,11 @@ def _drive(robot: Usd.Prim) -> tuple[DriveSpec, tuple[str, ...]] | None:
         joints = [joint for name in wheels for joint in targets(robot, name)]
         return read_drive(robot), tuple(str(joint.GetPath()) for joint in joints)
     drive, _ = drive_of(robot, DriveSpec())
-    paths = {p.GetDisplayName() or p.GetName(): str(p.GetPath()) for p in Usd.PrimRange(robot)}
     names = drive.left_wheel_joint, drive.right_wheel_joint
     if not set(names) <= {wheel.joint for wheel in wheels_of(robot)}:
         return None
-    return drive, (paths[names[0]], paths[names[1]])
+    joints = joints_of(robot)
+    return drive, tuple(str(joints[name].GetPath()) for name in names)
 
 
 def _base(robot: Usd.Prim) -> Usd.Prim:
