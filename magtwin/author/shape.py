@@ -6,7 +6,9 @@ from dataclasses import dataclass, replace
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.spec.drive import DriveSpec
+from magtwin.urdf.physics.mobile_base import backward
 from magtwin.usd.attributes import read_pose, write_pose
+from magtwin.usd.geometry import ACROSS, axis_of
 from magtwin.usd.sensors import joints_of
 
 ALIKE_M = 0.01
@@ -35,6 +37,9 @@ class Wheel:
     z: float
     """Centre in the robot's axes [m]."""
     radius_m: float
+
+    sense: int = 1
+    """-1 if it rolls backward as the joint's angle grows."""
 
     @property
     def lowest_m(self) -> float:
@@ -70,6 +75,7 @@ def drive_of(robot: Usd.Prim, given: DriveSpec) -> tuple[DriveSpec, list[str]]:
     if not set(names) <= set(wheels):
         return drive, notes
     pair = wheels[names[0]], wheels[names[1]]
+    notes += backward([joints[w.joint].GetDisplayName() or w.joint for w in pair if w.sense < 0])
     seen = {"wheel_separation_m": pair[0].y - pair[1].y, "wheel_radius_m": sum(w.radius_m for w in pair) / 2}
     for name, value in seen.items():
         default = getattr(_DEFAULTS, name)
@@ -109,8 +115,23 @@ def wheels_of(robot: Usd.Prim) -> list[Wheel]:
         if box is None or box.IsEmpty():
             continue
         (x, y, z), size = box.GetMidpoint(), box.GetSize()
-        found.append(Wheel(prim.GetName(), x, y, z, max(size[0], size[2]) / 2))
+        found.append(Wheel(prim.GetName(), x, y, z, max(size[0], size[2]) / 2, sense_of(prim, robot)))
     return found
+
+
+def sense_of(joint: Usd.Prim, frame: Usd.Prim) -> int:
+    """-1 if the axis of a wheel points right, so that it rolls backward as its joint's angle grows, else 1.
+
+    Args:
+        joint: The wheel's joint.
+        frame: Robot or base, with x ahead and y to the left.
+    """
+    bodies, axis = UsdPhysics.Joint(joint).GetBody1Rel().GetTargets(), axis_of(UsdPhysics.Joint(joint))
+    body = joint.GetStage().GetPrimAtPath(bodies[0]) if bodies else None
+    if not body or axis is None:
+        return 1
+    to_base, _ = UsdGeom.XformCache().ComputeRelativeTransform(body, frame)
+    return -1 if to_base.TransformDir(Gf.Vec3d(*axis))[1] < -ACROSS else 1
 
 
 def _range(joint: UsdPhysics.RevoluteJoint) -> float:

@@ -15,6 +15,7 @@ from magtwin.usd.geometry import BASE_LINK
 from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.schema import only_prim_with, place
 from magtwin.usd.sensors import (
+    joints_of,
     read_battery,
     read_drive,
     read_footprint,
@@ -106,6 +107,20 @@ def urdf_of(asset: str | os.PathLike[str]) -> Path | None:
     if source.suffix != ".urdf" or not source.is_file() or sha256(source) != metadata.get("sourceSha256"):
         return None
     return source
+
+
+@translates
+def description_names(asset: str | os.PathLike[str]) -> tuple[dict[str, str], dict[str, str]]:
+    """Names of an asset's links and of its joints in its description, by their names in USD.
+
+    Raises:
+        InputError: The file is missing or is not USD.
+    """
+    stage = open_stage(existing(asset, "robot asset"))
+    robot = stage.GetDefaultPrim() or stage.GetPseudoRoot()
+    joints = set(joints_of(robot).values())
+    links = {prim for prim in Usd.PrimRange(robot) if prim.GetDisplayName()} - joints
+    return tuple({p.GetName(): str(p.GetDisplayName() or p.GetName()) for p in ps} for ps in (links, joints))
 
 
 @translates

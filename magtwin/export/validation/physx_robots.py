@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from pxr import Usd, UsdGeom, UsdPhysics
 
-from magtwin.author.shape import drive_of, footprint_of, wheels_of
+from magtwin.author.shape import drive_of, footprint_of, sense_of, wheels_of
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.usd.attributes import targets
@@ -42,6 +42,9 @@ class DrivenRobot:
 
     sides: tuple[int, ...]
     """Side of each: 0 for left, 1 for right."""
+
+    senses: tuple[int, ...]
+    """-1 for each wheel that rolls backward as its joint's angle grows, else 1."""
 
     turns: bool
     """Whether it turns on the spot without scrubbing: two wheels that are not steered."""
@@ -90,6 +93,7 @@ def read_driven(stage: Usd.Stage) -> list[DrivenRobot]:
                 base=str(base.GetPath()),
                 joints=joints,
                 sides=tuple(spec.sides.values()),
+                senses=tuple(sense_of(stage.GetPrimAtPath(joint), base) for joint in joints),
                 turns=len(joints) == 2 and not spec.turning_radius_m,
                 start=find_room(obstacles, places[prim], footprint_of(prim) or 0.0, others),
                 height_m=height,
