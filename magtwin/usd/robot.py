@@ -1,6 +1,7 @@
 """Robots on a stage, read back: in their own asset, or in a scene that refers to it."""
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -119,8 +120,11 @@ def description_names(asset: str | os.PathLike[str]) -> tuple[dict[str, str], di
     stage = open_stage(existing(asset, "robot asset"))
     robot = stage.GetDefaultPrim() or stage.GetPseudoRoot()
     joints = set(joints_of(robot).values())
-    links = {prim for prim in Usd.PrimRange(robot) if prim.GetDisplayName()} - joints
-    return tuple({p.GetName(): str(p.GetDisplayName() or p.GetName()) for p in ps} for ps in (links, joints))
+
+    def named(prims: Iterable[Usd.Prim]) -> dict[str, str]:
+        return {str(prim.GetName()): str(prim.GetDisplayName() or prim.GetName()) for prim in prims}
+
+    return named({prim for prim in Usd.PrimRange(robot) if prim.GetDisplayName()} - joints), named(joints)
 
 
 @translates

@@ -169,8 +169,8 @@ def _drive(robot: Usd.Prim) -> tuple[DriveSpec, tuple[str, ...]] | None:
     names = drive.left_wheel_joint, drive.right_wheel_joint
     if not set(names) <= {wheel.joint for wheel in wheels_of(robot)}:
         return None
-    joints = joints_of(robot)
-    return drive, tuple(str(joints[name].GetPath()) for name in names)
+    prims = joints_of(robot)
+    return drive, tuple(str(prims[name].GetPath()) for name in names)
 
 
 def _base(robot: Usd.Prim) -> Usd.Prim:

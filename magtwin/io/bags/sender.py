@@ -189,7 +189,9 @@ def sender_for(twin: "Twin | None", unit: Unit, rate_hz: Any = None) -> Sender:
     description = read_description(robot.asset)
     below = _footprint(description) if f"/{FOOTPRINT}" not in frames else ()
     mounts = {"magnetometer": robot.magnetometer, "imu": robot.imu, "lidar": robot.lidar}
-    called = {n: replace(mount, link=links.get(mount.link, mount.link)) for n, mount in mounts.items()}
+    called: dict[str, Any] = {
+        n: replace(mount, link=links.get(mount.link, mount.link)) for n, mount in mounts.items()
+    }
     return sender_of(
         replace(robot, **called),
         unit=unit,
