@@ -98,7 +98,12 @@ ACCEPTED: dict[str, tuple[Kind, ...]] = {
 
 _REMEDIES = {
     ("robot description", STAGE): "magtwin robot {file} --out F.urdf writes the URDF of a stage",
-    ("TOML of a scene", STAGE): "magtwin run {file} drives in a scene that is authored already",
+    (
+        "TOML of a scene",
+        STAGE,
+    ): "magtwin run {file} drives in it if magtwin scene made it; for another room, magtwin new room.toml "
+    "writes a TOML; its furniture may be meshes (glTF, OBJ, STL), and your stage may reference the finished "
+    "room (docs/scenes.md)",
     ("TOML of a scene", URDF): "magtwin scene --urdf {file} --out FOLDER puts it into a room",
     (
         "source of readings",

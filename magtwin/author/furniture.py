@@ -28,6 +28,9 @@ SATURATION_A_M = 2.2e6
 DRAWN_A_M = (500.0, 5000.0)
 """Range of the default magnetization of a steel part [A/m]: usual for desks, chairs and cabinets."""
 
+HUGE_M = 30.0
+"""Size of a mesh above which it is likely to be in millimetres [m]."""
+
 WALL_M = 0.002
 """Thickness of the steel of a box, cylinder or mesh, since most are hollow [m]."""
 
@@ -174,10 +177,13 @@ def check_stands(piece: FurnitureSpec, lab: LabSpec) -> None:
     beyond = float(np.max(np.abs(world[:, :2]) - half))
     if beyond > 1e-6:
         x, y = piece.p_world[:2]
+        size, hint = np.ptp(world, axis=0), ""
+        if any(part.faces for part in piece.parts) and size.max() > HUGE_M:
+            hint = f"; it is {size[0]:.3g} x {size[1]:.3g} m: is its file in mm? then scale = 0.001"
         raise InputError(
             f"p_world of {piece.name!r} is ({x:g}, {y:g}): it reaches {beyond:.2f} m beyond the slab, "
             f"which is {2 * half[0]:g} x {2 * half[1]:g} m about the origin; move it, or enlarge floor_m or "
-            "apron_m of [lab]"
+            f"apron_m of [lab]{hint}"
         )
 
 

@@ -212,6 +212,12 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
             define(stage, path, replace(given or spec, link=path.GetParentPath().name))
     if settings.magnetometer is not None or not prims_with(robot, "magnetometer"):
         magnetometer = settings.magnetometer or MagnetometerSpec()
+        if settings.magnetometer is None and magnetometer.link not in links:
+            raise InputError(
+                f"[magnetometer] link: the URDF has no link {magnetometer.link!r} and no magnetometer among "
+                "its sensors; place one with --magnetometer LINK:X,Y,Z of magtwin scene --urdf, or with link "
+                f"and p_link_sensor of [robot.magnetometer]; links: {', '.join(links)}"
+            )
         path = _mount(links, "magnetometer", magnetometer)
         notes += _replace_sensors(robot, "magnetometer", path)
         define_magnetometer(stage, path, replace(magnetometer, link=path.GetParentPath().name))

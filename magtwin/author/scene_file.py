@@ -188,6 +188,8 @@ def scene_from_toml(
         where = f"{path}: [robot]" if alone else f"{path}: [[robot]] {robot_table.name!r}"
         made = _robot(robot_table, keys, where, workshop, named=not alone)
         made = _with_network(made, robot_table, network, where, inputs_of)
+        if layer is None and (given.survey is None or given.survey.height_m is None):
+            check_above_floor(made, where)
         drives = _path(robot_table.path, Path(path).parent, where)
         start, of_robot = robot_table.start, True
         if start is None:
@@ -230,6 +232,21 @@ def scene_from_toml(
             raise InputError(f"{path}: cannot be surveyed: {error}") from error
         scene = replace(scene, map_layer=surveyed, map_sha256=layer_sha256(surveyed))
     return scene
+
+
+def check_above_floor(robot: RobotSpec, where: str) -> None:
+    """Refuse a robot whose magnetometer is below the floor, where it cannot survey.
+
+    Raises:
+        InputError: It is; begins with `where`.
+    """
+    height = robot.base_height_m + robot.p_base_magnetometer[2]
+    if height < 0:
+        raise InputError(
+            f"{where}: the magnetometer of {robot.name!r}, on link {robot.magnetometer.link!r}, is "
+            f"{-height:.4g} m below the floor on which the wheels stand; mount it higher (z of "
+            "--magnetometer LINK:X,Y,Z, or of p_link_sensor)"
+        )
 
 
 def _scaled(table: Mapping[str, Any], scale: float) -> dict[str, Any]:

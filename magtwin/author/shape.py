@@ -6,7 +6,10 @@ from dataclasses import dataclass, replace
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.spec.drive import DriveSpec
+from magtwin.urdf.physics.mobile_base import backward
 from magtwin.usd.attributes import read_pose, write_pose
+from magtwin.usd.geometry import ACROSS, axis_of
+from magtwin.usd.sensors import joints_of
 
 ALIKE_M = 0.01
 """Largest deviation of two wheels of an axle from mirror images [m]."""
@@ -28,11 +31,15 @@ class Wheel:
     """A body on a joint without limits."""
 
     joint: str
+    """Name of the joint in USD."""
     x: float
     y: float
     z: float
     """Centre in the robot's axes [m]."""
     radius_m: float
+
+    sense: int = 1
+    """-1 if it rolls backward as the joint's angle grows."""
 
     @property
     def lowest_m(self) -> float:
@@ -48,21 +55,28 @@ def drive_of(robot: Usd.Prim, given: DriveSpec) -> tuple[DriveSpec, list[str]]:
 
     Args:
         robot: The robot's prim, converted.
-        given: The drive of the settings.
+        given: The drive of the settings; its joints have the names of the description or of USD.
+
+    Returns:
+        The drive, with the joints' names in USD, and the notes.
     """
-    wheels = {wheel.joint: wheel for wheel in wheels_of(robot)}
-    names = given.left_wheel_joint, given.right_wheel_joint
-    notes = list[str]()
+    wheels, joints = {wheel.joint: wheel for wheel in wheels_of(robot)}, joints_of(robot)
+    left, right = (
+        joints[n].GetName() if n in joints else n for n in (given.left_wheel_joint, given.right_wheel_joint)
+    )
+    names, notes = (left, right), list[str]()
     if names == (_DEFAULTS.left_wheel_joint, _DEFAULTS.right_wheel_joint) and not set(names) <= set(wheels):
         axles = _axles(list(wheels.values()))
         if len(axles) == 1:
             names = axles[0][0].joint, axles[0][1].joint
-            notes.append(f"wheel joints not given: {names[0]!r} is the left one, {names[1]!r} the right one")
+            left, right = (joints[n].GetDisplayName() or n for n in names)
+            notes.append(f"wheel joints not given: {left!r} is the left one, {right!r} the right one")
     drive = replace(given, left_wheel_joint=names[0], right_wheel_joint=names[1])
     if not set(names) <= set(wheels):
         return drive, notes
-    left, right = wheels[names[0]], wheels[names[1]]
-    seen = {"wheel_separation_m": left.y - right.y, "wheel_radius_m": (left.radius_m + right.radius_m) / 2}
+    pair = wheels[names[0]], wheels[names[1]]
+    notes += backward([joints[w.joint].GetDisplayName() or w.joint for w in pair if w.sense < 0])
+    seen = {"wheel_separation_m": pair[0].y - pair[1].y, "wheel_radius_m": sum(w.radius_m for w in pair) / 2}
     for name, value in seen.items():
         default = getattr(_DEFAULTS, name)
         if value > 0 and getattr(given, name) == default and abs(value / default - 1) > OFF:
@@ -101,9 +115,23 @@ def wheels_of(robot: Usd.Prim) -> list[Wheel]:
         if box is None or box.IsEmpty():
             continue
         (x, y, z), size = box.GetMidpoint(), box.GetSize()
-        name = prim.GetDisplayName() or prim.GetName()
-        found.append(Wheel(name, x, y, z, max(size[0], size[2]) / 2))
+        found.append(Wheel(prim.GetName(), x, y, z, max(size[0], size[2]) / 2, sense_of(prim, robot)))
     return found
+
+
+def sense_of(joint: Usd.Prim, frame: Usd.Prim) -> int:
+    """-1 if the axis of a wheel points right, so that it rolls backward as its joint's angle grows, else 1.
+
+    Args:
+        joint: The wheel's joint.
+        frame: Robot or base, with x ahead and y to the left.
+    """
+    bodies, axis = UsdPhysics.Joint(joint).GetBody1Rel().GetTargets(), axis_of(UsdPhysics.Joint(joint))
+    body = joint.GetStage().GetPrimAtPath(bodies[0]) if bodies else None
+    if not body or axis is None:
+        return 1
+    to_base, _ = UsdGeom.XformCache().ComputeRelativeTransform(body, frame)
+    return -1 if to_base.TransformDir(Gf.Vec3d(*axis))[1] < -ACROSS else 1
 
 
 def _range(joint: UsdPhysics.RevoluteJoint) -> float:

@@ -32,6 +32,7 @@ from magtwin.usd.geometry import (
 )
 from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.solids import corner_normals
+from magtwin.usd.units import upright
 
 Array = NDArray[np.float64]
 
@@ -211,6 +212,7 @@ def _draw(
         else s.vertices.astype(float)
         for s in shapes
     ]
+    worlds = [upright(stage, vertices) for vertices in worlds]
     everything, scale = np.vstack(worlds), read_colour_scale(stage)
     subject = [is_subject(shape, scale) for shape in shapes]
     around = everything

@@ -235,10 +235,10 @@ class Scenery:
         for name, link in self._links.items():
             T_base_link = _matrix(link.p_base_link, link.q_base_link_xyzw)
             side = self._sides.get(link.joint)
-            if side is not None and link.axis_link is not None:
+            if side is not None and link.rolling_axis is not None:
                 half = self._wheels[k, side] / 2
                 T_base_link = T_base_link @ _matrix(
-                    (0, 0, 0), (*np.multiply(link.axis_link, np.sin(half)), np.cos(half))
+                    (0, 0, 0), (*np.multiply(link.rolling_axis, np.sin(half)), np.cos(half))
                 )
             poses[name] = base @ T_base_link
         return poses

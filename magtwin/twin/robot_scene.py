@@ -55,6 +55,8 @@ def scene_with_robot(
             `scene_from_toml`.
     """
     from magtwin.author.robot import RobotSettings, build_robot
+    from magtwin.author.scene_file import check_above_floor
+    from magtwin.urdf.lint import HUGE_M
     from magtwin.urdf.options import Options
     from magtwin.usd.robot import load_robot
 
@@ -82,9 +84,14 @@ def scene_with_robot(
             f"{file}: an asset has its magnetometer and drive already; give its URDF instead",
             parameter="robot",
         )
-    scale = 1.0
+    scale, made = 1.0, load_robot(asset)
+    if made.footprint_radius_m > HUGE_M / 2:
+        raise InputError(
+            f"{file}: the robot is {2 * made.footprint_radius_m:.4g} m wide, too large for a room; are its "
+            'meshes in mm? then <mesh scale="0.001 0.001 0.001" .../>'
+        )
+    check_above_floor(made, str(file))
     if spec is None:
-        made = load_robot(asset)
         sizes = made.footprint_radius_m / ROOM_RADIUS_M, made.drive.turning_radius_m / ROOM_TURN_M
         scale = max(1.0, *sizes)
         spec, name = shipped("scenes", "starter.toml"), name or stem

@@ -31,6 +31,9 @@ LIGHT = 10.0
 MASS_OFF = 0.05
 """Relative error of the total mass against the data sheet that is doubtful."""
 
+HUGE_M = 30.0
+"""Size of a robot above which it is doubtful [m]."""
+
 SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"))
 
 
@@ -49,6 +52,7 @@ def lint(
         for name, link in description.links.items()
     }
     return (
+        *_size(description, shapes),
         *_masses(description),
         *_frames_outside(description, shapes),
         *_swapped_sides(description),
@@ -56,6 +60,18 @@ def lint(
         *_inertias(description, shapes),
         *_densities(description, vertices, mass),
     )
+
+
+def _size(description: Description, shapes: dict[str, list[Array]]) -> Iterator[str]:
+    """A robot that is too large, as one whose meshes are in millimetres."""
+    poses = description.poses()
+    placed = [_transformed(poses[name], points) for name, boxes in shapes.items() for points in boxes]
+    size = np.ptp(np.vstack(placed), axis=0) if placed else np.zeros(3)
+    if size.max() > HUGE_M:
+        yield (
+            f"the robot is {' x '.join(f'{side:.4g}' for side in size)} m large; are its meshes in mm? then "
+            '<mesh scale="0.001 0.001 0.001" .../>'
+        )
 
 
 def _masses(description: Description) -> Iterator[str]:

@@ -98,7 +98,7 @@ class _Stand:
     q_root_base_xyzw: Quat = (0.0, 0.0, 0.0, 1.0)
     wheels: tuple[tuple[int, Sdf.Path, Vec3, Quat, Vec3], ...] = ()
     """Driven wheels: side (0 for left, 1 for right), prim, position [m] and orientation in its parent, and
-    axis in its own frame."""
+    axis in its own frame, about which it turns by a positive angle as it rolls forward."""
     sensors: Mapping[str, Sdf.Path] = field(
         default_factory=lambda: {"magnetometer": _BARE.AppendChild("magnetometer"), "robot": _BARE}
     )
@@ -324,11 +324,11 @@ def _stand(stage: Usd.Stage, default: Usd.Prim, name: str) -> _Stand:
 
 def _wheel(side: int, joint: Usd.Prim, stage: Usd.Stage) -> tuple[int, Sdf.Path, Vec3, Quat, Vec3]:
     body = target(joint, "physics:body1")
-    links = read_links(stage).values()
-    axis = next((link.axis_link for link in links if link.joint == joint.GetName()), None)
-    if axis is None:
+    links = read_links(stage)  # by path where another body has the name
+    link = links.get(str(body.GetPath()), links.get(body.GetName()))
+    if link is None or link.rolling_axis is None:
         raise InputError(f"{place(joint)}: is no revolute joint between two bodies, as a wheel needs")
-    return side, body.GetPath(), *read_pose(body), axis
+    return side, body.GetPath(), *read_pose(body), link.rolling_axis
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 
 from magtwin.budget import CORNERS, SHAPES
 from magtwin.errors import InputError
-from magtwin.frames import IDENTITY_XYZW, canonical
+from magtwin.frames import IDENTITY_XYZW, canonical, rotate
 from magtwin.spec.base import ZERO3, Quat, Vec3
 from magtwin.usd.attributes import read_axis
 from magtwin.usd.layers import open_stage, translates
@@ -27,6 +27,9 @@ SHOWN = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
 
 FARTHEST_M = 1e9
 """Farthest that a vertex of a face may lie from the origin [m]."""
+
+ACROSS = 1e-6
+"""Least component of a wheel's axis along -y of its base at which the axis points right."""
 
 BASE_LINK = "base_link"
 """Name of the link whose frame is the robot's, as in REP-105."""
@@ -102,6 +105,21 @@ class Link:
 
     base: str = ""
     """Name of the base of its robot; its own name if it has no joint."""
+
+    @property
+    def sense(self) -> int:
+        """-1 if a wheel rolls backward as its joint's angle grows, since its axis points right; else 1."""
+        if self.axis_link is None:
+            return 1
+        return -1 if rotate(self.q_base_link_xyzw, self.axis_link)[1] < -ACROSS else 1
+
+    @property
+    def rolling_axis(self) -> Vec3 | None:
+        """Axis in the link's frame about which a wheel that rolls forward turns by a positive angle."""
+        if self.axis_link is None or self.sense > 0:
+            return self.axis_link
+        x, y, z = (0.0 - v for v in self.axis_link)
+        return x, y, z
 
 
 @dataclass(frozen=True)
@@ -222,7 +240,7 @@ def read_links(stage: Usd.Stage | str | os.PathLike[str]) -> dict[str, Link]:
             name=name,
             p_base_link=p,
             q_base_link_xyzw=q,
-            axis_link=None if joint is None else _axis(joint),
+            axis_link=None if joint is None else axis_of(joint),
             joint="" if joint is None else joint.GetPrim().GetName(),
             p_world_link=p_world,
             q_world_link_xyzw=q_world,
@@ -364,8 +382,8 @@ def _roots(bodies: dict, above: dict) -> dict:
     return roots
 
 
-def _axis(joint: UsdPhysics.Joint) -> Vec3 | None:
-    """The axis of a revolute joint in the frame of its second body."""
+def axis_of(joint: UsdPhysics.Joint) -> Vec3 | None:
+    """The axis of a revolute joint in the frame of its second body; None for another joint."""
     revolute = UsdPhysics.RevoluteJoint(joint.GetPrim())
     if not revolute:
         return None

@@ -12,6 +12,7 @@ from magtwin.usd.maps.epochs import epochs_of
 from magtwin.usd.placement import AT_ORIGIN, labs_on, pose_of
 from magtwin.usd.scene import open_scene
 from magtwin.usd.schema import prims_with
+from magtwin.usd.units import metres_per_unit
 
 _PREFIX = "Magtwin"
 _MANY = ("MagtwinMagneticSourceAPI", "MagtwinFurnitureAPI", "MagtwinMapTileAPI")
@@ -31,17 +32,18 @@ def info_of_stage(path: Path) -> Report:
     purposes = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render]
     box = UsdGeom.BBoxCache(Usd.TimeCode.Default(), purposes).ComputeWorldBound(stage.GetPseudoRoot())
     bounds = box.ComputeAlignedRange()
-    size = None if bounds.IsEmpty() else " x ".join(f"{s:.3f}" for s in bounds.GetSize())
+    metres, kilograms = metres_per_unit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
+    size = None if bounds.IsEmpty() else " x ".join(f"{s * metres:.3f}" for s in bounds.GetSize())
     figures = [
         Figure("default prim", str(stage.GetDefaultPrim().GetPath()) if stage.GetDefaultPrim() else "none"),
-        Figure("metres per unit", UsdGeom.GetStageMetersPerUnit(stage)),
+        Figure("metres per unit", metres),
         Figure("up axis", str(UsdGeom.GetStageUpAxis(stage))),
         Figure("layers", len(stage.GetUsedLayers())),
         Figure("prims", len(prims)),
         Figure("size", "no shapes" if size is None else size, "" if size is None else "m"),
         Figure("rigid bodies", len(bodies)),
         Figure("joints", sum(joints.values()), note=", ".join(f"{n} {t}" for t, n in sorted(joints.items()))),
-        Figure("mass", float(mass), "kg"),
+        Figure("mass", float(mass) * kilograms, "kg"),
     ]
     applied = [
         (schema, prim) for prim in prims for schema in prim.GetAppliedSchemas() if schema.startswith(_PREFIX)

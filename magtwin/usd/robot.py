@@ -1,6 +1,7 @@
 """Robots on a stage, read back: in their own asset, or in a scene that refers to it."""
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from magtwin.usd.geometry import BASE_LINK
 from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.schema import only_prim_with, place
 from magtwin.usd.sensors import (
+    joints_of,
     read_battery,
     read_drive,
     read_footprint,
@@ -106,6 +108,23 @@ def urdf_of(asset: str | os.PathLike[str]) -> Path | None:
     if source.suffix != ".urdf" or not source.is_file() or sha256(source) != metadata.get("sourceSha256"):
         return None
     return source
+
+
+@translates
+def description_names(asset: str | os.PathLike[str]) -> tuple[dict[str, str], dict[str, str]]:
+    """Names of an asset's links and of its joints in its description, by their names in USD.
+
+    Raises:
+        InputError: The file is missing or is not USD.
+    """
+    stage = open_stage(existing(asset, "robot asset"))
+    robot = stage.GetDefaultPrim() or stage.GetPseudoRoot()
+    joints = set(joints_of(robot).values())
+
+    def named(prims: Iterable[Usd.Prim]) -> dict[str, str]:
+        return {str(prim.GetName()): str(prim.GetDisplayName() or prim.GetName()) for prim in prims}
+
+    return named({prim for prim in Usd.PrimRange(robot) if prim.GetDisplayName()} - joints), named(joints)
 
 
 @translates

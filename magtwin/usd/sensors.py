@@ -212,8 +212,7 @@ def define_drive(prim: Usd.Prim, spec: DriveSpec) -> Usd.Prim:
         InputError: There is no joint of that name.
     """
     write_spec(apply_api(prim, "drive"), "drive", spec, skip={*JOINT_FIELDS, *WHEELS_FIELDS})
-    prims = [p for p in Usd.PrimRange(prim) if p.IsA(UsdPhysics.Joint)]
-    joints = {p.GetDisplayName() or p.GetName(): p for p in prims} | {p.GetName(): p for p in prims}
+    joints = joints_of(prim)
     for field in (*JOINT_FIELDS, *WHEELS_FIELDS):
         names = (getattr(spec, field),) if field in JOINT_FIELDS else getattr(spec, field)
         for name in names:
@@ -225,8 +224,14 @@ def define_drive(prim: Usd.Prim, spec: DriveSpec) -> Usd.Prim:
     return prim
 
 
+def joints_of(robot: Usd.Prim) -> dict[str, Usd.Prim]:
+    """The joints of a robot by their names in USD, and in its description where USD does not allow those."""
+    prims = [prim for prim in Usd.PrimRange(robot) if prim.IsA(UsdPhysics.Joint)]
+    return {p.GetDisplayName() or p.GetName(): p for p in prims} | {p.GetName(): p for p in prims}
+
+
 def read_drive(prim: Usd.Prim) -> DriveSpec:
-    """The spec of an authored drive.
+    """The spec of an authored drive, with the joints' names in USD.
 
     Raises:
         InputError: The prim has no drive, a value is out of range, or a wheel's joint is missing.

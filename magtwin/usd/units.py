@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 from pxr import Pcp, Sdf, Usd, UsdGeom
 
 from magtwin.errors import InputError
@@ -11,6 +12,10 @@ from magtwin.usd.schema import place
 
 SAME = 1e-3
 """Largest relative difference of a scale from the one that is needed."""
+
+
+LONGEST_M = 1e9
+"""Longest unit of a stage [m]; the shortest is its inverse."""
 
 
 def check_units(stage: Usd.Stage) -> None:
@@ -62,6 +67,28 @@ def mixed_units(stage: Usd.Stage) -> Iterator[str]:
                 f"{place(prim)}: brings in {layer.realPath} of {_said(there)}, in {_said(here)}, and USD "
                 f"converts neither; give it scale {there[0] / here[0]:g}{turn}, or convert that file"
             )
+
+
+def metres_per_unit(stage: Usd.Stage) -> float:
+    """Length of a unit of a stage [m].
+
+    Raises:
+        InputError: It is no length.
+    """
+    metres = UsdGeom.GetStageMetersPerUnit(stage)
+    if not 1 / LONGEST_M <= metres <= LONGEST_M:
+        raise InputError(
+            f"{stage.GetRootLayer().identifier}: metersPerUnit is {metres:g}, which is no length of a unit; "
+            "write 1 for metres or 0.01 for centimetres"
+        )
+    return metres
+
+
+def upright(stage: Usd.Stage, points: NDArray) -> NDArray:
+    """Points in world of a stage, shape (N, 3), in metres with Z up; errors as for `metres_per_unit`."""
+    if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
+        points = np.column_stack([points[:, 0], -points[:, 2], points[:, 1]])
+    return np.asarray(points * metres_per_unit(stage))
 
 
 def _nodes(node: Pcp.NodeRef) -> Iterator[Pcp.NodeRef]:

@@ -12,6 +12,7 @@ from magtwin.errors import InputError
 from magtwin.files import shipped
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.sensors import MagnetometerSpec
+from magtwin.urdf.options import Options
 
 CART = DATA / "robots" / "cart.urdf"
 
@@ -118,6 +119,19 @@ def test_settings_name_links_and_joints_as_the_urdf_does_though_usd_calls_them_o
     assert made.spec.drive.left_wheel_joint == "left_wheel"
     assert made.spec.drive.right_wheel_joint == "右"
     assert made.spec.magnetometer.link == "mast_top"
+
+
+@pytest.mark.parametrize(("name", "profile"), [("left-wheel", "general"), ("left.wheel 1", "diff-drive")])
+def test_a_robot_stands_on_wheels_whose_joints_have_names_that_usd_does_not_allow(tmp_path, name, profile):
+    text = CART.read_text().replace('"left"', f'"{name}"').replace(' 0.08"', ' -0.05"')
+    (tmp_path / "cart.urdf").write_text(text.replace("chassis", "base_link"))
+    settings = RobotSettings(
+        magnetometer=MagnetometerSpec(link="mast"), conversion=Options(profile=profile, single_file=True)
+    )
+    made = from_urdf(tmp_path / "cart.urdf", tmp_path / "cart", settings=settings)
+    assert made.spec.base_height_m == pytest.approx(0.13, abs=1e-4)
+    assert made.spec.drive.wheel_separation_m == pytest.approx(0.34, abs=1e-4)
+    assert profile == "diff-drive" or any(f"{name!r} is the left one" in note for note in made.report.notes)
 
 
 def test_a_description_in_a_hidden_file_makes_an_asset_that_is_seen(tmp_path):

@@ -180,13 +180,20 @@ def test_a_mesh_file_in_mm_stands_on_the_floor_amid_its_place(toml, tmp_path, ma
     assert read_scene(author_scene(scene, tmp_path / "s")).furniture == scene.furniture
 
 
-def test_a_piece_that_was_taken_in_mm_is_refused_with_the_scale(toml, tmp_path):
-    (tmp_path / "wedge.stl").write_text(TETRAHEDRON.replace("400", "4000"))
+@pytest.mark.parametrize(
+    ("side", "message"),
+    [
+        ("4000", r"would be 4,000 m large; if it is in mm, give scale = 0\.001"),
+        ("400", r"reaches .*; it is 400 x 400 m: is its file in mm\? then scale = 0\.001"),
+    ],
+)
+def test_a_piece_that_was_taken_in_mm_is_refused_with_the_scale(toml, tmp_path, side, message):
+    (tmp_path / "wedge.stl").write_text(TETRAHEDRON.replace("400", side))
     toml.write_text(
         ROOM + '[[furniture]]\nname = "wedge"\nkind = "mesh"\nfile = "wedge.stl"\nmaterial = "wood"\n'
         "p_world = [0.5, 1.0, 0.0]\n"
     )
-    with pytest.raises(InputError, match=r"would be 4,000 m large; if it is in mm, give scale = 0\.001"):
+    with pytest.raises(InputError, match=message):
         scene_from_toml(toml)
 
 

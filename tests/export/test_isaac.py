@@ -195,7 +195,9 @@ def test_frames_of_messages_are_those_that_a_bag_of_the_robot_names(authored):
     odometry = graph.GetChild("publish_odometry")
     assert odometry.GetAttribute("inputs:odomFrameId").Get() == who.odom_frame
     assert odometry.GetAttribute("inputs:chassisFrameId").Get() == who.base_frame
-    assert graph.GetChild("wheels").GetAttribute("inputs:jointNames").Get() == list(who.wheel_joints)
+    assert graph.GetChild("wheels").GetAttribute("inputs:jointNames").Get() == [
+        joint.name for joint in who.wheel_joints
+    ]
 
 
 def test_the_drive_of_the_robot_limits_its_wheels(authored):

@@ -11,6 +11,7 @@ from magtwin.errors import InputError
 from magtwin.figures.pictures import BACKGROUND, BAR_SHARE, VEIL, Camera, picture_of_stage, view_distance
 from magtwin.files import shipped
 from magtwin.usd.geometry import srgb_from_linear
+from magtwin.usd.info import info_of_stage
 
 SIZE = (240, 160)
 BEHIND = np.array([int(BACKGROUND[i : i + 2], 16) for i in (1, 3, 5)])
@@ -68,6 +69,25 @@ def test_colours_arrive_and_y_is_on_the_right_to_who_looks_at_the_front(stage, t
     blue = (image[..., 2] > 80) & (image[..., 0] < 60)
     assert min(red.sum(), blue.sum()) > 1000
     assert np.flatnonzero(red.any(axis=0)).max() < np.flatnonzero(blue.any(axis=0)).min()
+
+
+def test_a_stage_in_centimetres_with_y_up_is_drawn_upright_as_the_same_one_in_metres(stage, tmp_path):
+    for name, up, unit in (("tall", "Z", 1.0), ("same", "Y", 0.01)):
+        UsdGeom.SetStageUpAxis(stage, up)
+        UsdGeom.SetStageMetersPerUnit(stage, unit)
+        stage.RemovePrim("/tall")
+        cube(stage, "/tall", (1, 0, 0))
+        size = (0.5, 1.0, 2.0) if up == "Z" else (50.0, 200.0, 100.0)
+        UsdGeom.XformCommonAPI(stage.GetPrimAtPath("/tall")).SetScale(size)
+        image = draw(stage, tmp_path, camera=Camera(distance_m=8.0))
+        if name == "tall":
+            want = image
+    assert np.abs(image - want).max() <= 1
+    figures = {figure.name: figure.value for figure in info_of_stage(tmp_path / "stage.usda").figures}
+    assert figures["size"] == "0.500 x 2.000 x 1.000"
+    UsdGeom.SetStageMetersPerUnit(stage, float("inf"))
+    with pytest.raises(InputError, match="metersPerUnit is inf, which is no length"):
+        draw(stage, tmp_path)
 
 
 def heat_map(stage, values):

@@ -41,3 +41,13 @@ def test_a_stage_opened_by_a_link_that_hides_its_layers_is_refused_with_the_stag
     open_stage(stage)
     with pytest.raises(InputError, match=rf"it is a link, beside which USD looks: give {stage}$"):
         open_stage(link)
+
+
+def test_a_stage_of_another_program_is_refused_with_how_a_room_is_made(tmp_path):
+    (tmp_path / "room.usda").write_text(
+        '#usda 1.0\n(\n    metersPerUnit = 1\n    upAxis = "Z"\n)\ndef Cube "Box" {}\n'
+    )
+    with pytest.raises(
+        InputError, match=r"found none; it is a stage without a scene .*magtwin new room\.toml"
+    ):
+        open_scene(tmp_path / "room.usda")

@@ -10,6 +10,7 @@ import sys
 
 import numpy as np
 import onnxruntime
+from pxr import Gf, UsdGeom
 
 DT, STEPS, SPEED, ACCELERATION = 0.02, 4, 0.2, 0.9  # s between readings, physics steps in it, m/s, m/s2
 
@@ -35,6 +36,7 @@ class Lap:
         names = [f"magtwin:drive:{side}WheelJoint" for side in ("left", "right")]
         self.joints = [self.robot.GetRelationship(name).GetTargets()[0] for name in names]
         self.base = self.robot.GetRelationship("isaac:physics:robotLinks").GetTargets()[0]  # it comes first
+        self.senses = np.array([self.sense(stage.GetPrimAtPath(joint)) for joint in self.joints])
         u = np.linspace(0, 2 * np.pi, 4001)
         path = np.column_stack([2.4 * np.sin(u), 1.2 * np.sin(2 * u)])
         self.way = np.append(
@@ -51,6 +53,15 @@ class Lap:
         key = f"magtwin:{noun}:"
         prim = next(p for p in self.stage.Traverse() if any(n.startswith(key) for n in p.GetPropertyNames()))
         return prim, {a.GetName().removeprefix(key): a.Get() for a in prim.GetAttributes()}
+
+    def sense(self, joint):
+        """-1 if a wheel rolls backward as its joint's angle grows, since its axis points right; else 1."""
+        axis = Gf.Vec3d(*(float(letter == joint.GetAttribute("physics:axis").Get()) for letter in "XYZ"))
+        axis = Gf.Rotation(joint.GetAttribute("physics:localRot1").Get()).TransformDir(axis)
+        wheel = self.stage.GetPrimAtPath(joint.GetRelationship("physics:body1").GetTargets()[0])
+        base = self.stage.GetPrimAtPath(self.base)
+        to_base, _ = UsdGeom.XformCache().ComputeRelativeTransform(wheel, base)
+        return -1.0 if to_base.TransformDir(axis)[1] < 0 else 1.0
 
     def nodes(self):
         """The values of a map in tiles [nT], in single precision: all of them, in memory."""
@@ -105,7 +116,7 @@ class Lap:
         return known
 
     def step(self, x, y, q, vx, vy, w):
-        """Take a reading at a pose (q is xyzw) with a velocity in world; returns rates for both wheels.
+        """Take a reading at a pose (q is xyzw) with a velocity in world; returns rates of both joints.
 
         The rates are None at the end of the lap.
         """
@@ -130,7 +141,7 @@ class Lap:
         forward = self.wanted * math.cos(heading - yaw) + 2 * ahead  # Kanayama and others (1990)
         self.command = forward, self.wanted * (bend + 8 * aside + 4 * math.sin(heading - yaw))
         apart = self.command[1] * drive["wheelSeparationM"] / 2
-        return np.array([forward - apart, forward + apart]) / drive["wheelRadiusM"]
+        return self.senses * np.array([forward - apart, forward + apart]) / drive["wheelRadiusM"]
 
     def lag(self, rates, asked):
         """Rates of the wheels after a step, by the lag of the motors."""

@@ -91,7 +91,7 @@ def physx(file: Path, driven: Mapping[str, Any]) -> Check:
     findings: list[Finding] = []
     with on_ground(file, driven) as stage:
         for robot in robots:
-            job = {key: robot[key] for key in ("base", "joints", "sides", "start")}
+            job = {key: robot[key] for key in ("base", "joints", "sides", "senses", "start")}
             try:
                 with open_world(python, stage, job) as world:
                     findings += [f(world, robot) for f in (_stands, _drives, _turns)]

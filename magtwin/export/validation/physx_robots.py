@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from pxr import Usd, UsdGeom, UsdPhysics
 
-from magtwin.author.shape import drive_of, footprint_of, wheels_of
+from magtwin.author.shape import drive_of, footprint_of, sense_of, wheels_of
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.usd.attributes import targets
 from magtwin.usd.geometry import BASE_LINK
 from magtwin.usd.lab.obstacles import read_obstacles
 from magtwin.usd.schema import NOUNS, attribute_name
-from magtwin.usd.sensors import JOINT_FIELDS, WHEELS_FIELDS, read_drive
+from magtwin.usd.sensors import JOINT_FIELDS, WHEELS_FIELDS, joints_of, read_drive
 
 ROBOT_API = "IsaacRobotAPI"
 """Isaac Sim's applied schema of a robot."""
@@ -42,6 +42,9 @@ class DrivenRobot:
 
     sides: tuple[int, ...]
     """Side of each: 0 for left, 1 for right."""
+
+    senses: tuple[int, ...]
+    """-1 for each wheel that rolls backward as its joint's angle grows, else 1."""
 
     turns: bool
     """Whether it turns on the spot without scrubbing: two wheels that are not steered."""
@@ -90,6 +93,7 @@ def read_driven(stage: Usd.Stage) -> list[DrivenRobot]:
                 base=str(base.GetPath()),
                 joints=joints,
                 sides=tuple(spec.sides.values()),
+                senses=tuple(sense_of(stage.GetPrimAtPath(joint), base) for joint in joints),
                 turns=len(joints) == 2 and not spec.turning_radius_m,
                 start=find_room(obstacles, places[prim], footprint_of(prim) or 0.0, others),
                 height_m=height,
@@ -162,11 +166,11 @@ def _drive(robot: Usd.Prim) -> tuple[DriveSpec, tuple[str, ...]] | None:
         joints = [joint for name in wheels for joint in targets(robot, name)]
         return read_drive(robot), tuple(str(joint.GetPath()) for joint in joints)
     drive, _ = drive_of(robot, DriveSpec())
-    paths = {p.GetDisplayName() or p.GetName(): str(p.GetPath()) for p in Usd.PrimRange(robot)}
     names = drive.left_wheel_joint, drive.right_wheel_joint
     if not set(names) <= {wheel.joint for wheel in wheels_of(robot)}:
         return None
-    return drive, (paths[names[0]], paths[names[1]])
+    prims = joints_of(robot)
+    return drive, tuple(str(prims[name].GetPath()) for name in names)
 
 
 def _base(robot: Usd.Prim) -> Usd.Prim:

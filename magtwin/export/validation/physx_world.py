@@ -2,8 +2,9 @@
 
     python physx_world.py
 
-In: a line of JSON, `{"stage", "base", "joints": [left, right, ...], "sides": [0, 1, ...], "start":
-[x, y, yaw] or null, "step_s"}`, where paths name prims and a side is 0 (left) or 1 (right); default: 0 and 1.
+In: a line of JSON, `{"stage", "base", "joints": [left, right, ...], "sides": [0, 1, ...], "senses":
+[1, -1, ...], "start": [x, y, yaw] or null, "step_s"}`. Paths name prims. A side is 0 (left) or 1 (right);
+default: 0 and 1. A sense is -1 for a wheel that rolls backward as its joint's angle grows; default: 1.
 Then a line per answer: a list with the rates of both sides [rad/s], a pair per physics step, or `[x, y, yaw]`
 to place the robot there at rest. Out: a line after the robot has settled and one after each line in: x, y,
 yaw, v, w, the angles of the first two wheels, height of the base [m], and z of its up axis.
@@ -76,6 +77,7 @@ class World:
         self._physx, self._stage = open_stage(job["stage"])
         self._step_s, self._base, self._joints = job["step_s"], job["base"], job["joints"]
         self._sides = job.get("sides", (0, 1))
+        self._senses = job.get("senses", [1] * len(self._joints))
         self._rates = [math.nan, math.nan]
         self._raw, self._angles = [0.0, 0.0], [0.0, 0.0]
         for kind, path in ((LINK, self._base), *((JOINT, joint) for joint in self._joints)):
@@ -109,9 +111,9 @@ class World:
     def step(self, rates: list[list[float]]) -> None:
         """Physics steps, each with its wheel rates [rad/s]."""
         for pair in rates:
-            for joint, side in zip(self._joints, self._sides, strict=True):
+            for joint, side, sense in zip(self._joints, self._sides, self._senses, strict=True):
                 if pair[side] != self._rates[side]:
-                    self._write(JOINT, joint, "jointVelocityTarget", [math.degrees(pair[side])])
+                    self._write(JOINT, joint, "jointVelocityTarget", [math.degrees(sense * pair[side])])
             self._rates = list(pair)
             self._physx.step_sync(self._step_s)
 
@@ -124,7 +126,10 @@ class World:
         yaw = math.atan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k))
         ahead = v[0] * math.cos(yaw) + v[1] * math.sin(yaw)
         both = self._joints[:2]
-        raw = [math.radians(self._read(JOINT, joint, "jointPosition")[0]) for joint in both]
+        raw = [
+            sense * math.radians(self._read(JOINT, joint, "jointPosition")[0])
+            for joint, sense in zip(both, self._senses, strict=False)
+        ]
         turned = [(a - b + math.tau) % (2 * math.tau) - math.tau for a, b in zip(raw, self._raw, strict=True)]
         self._raw, self._angles = raw, [a + b for a, b in zip(self._angles, turned, strict=True)]
         return [*p[:2], yaw, ahead, turning[2], *self._angles, p[2], 1 - 2 * (i * i + j * j)]

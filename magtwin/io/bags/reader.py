@@ -282,7 +282,7 @@ def _columns(
 
 def _wheels(signal: Signal, when: Array, t: Array) -> dict[str, NDArray[Any]]:
     """The angles of the wheels, if the joints have the names of a TurtleBot's."""
-    sides = Sender().wheel_joints
+    sides = [joint.name for joint in Sender().wheel_joints]
     joints = signal.fields["name"]
     rows = np.array([row for row, names in enumerate(joints) if set(sides) <= set(names)], np.intp)
     if not len(rows):

@@ -32,7 +32,18 @@ class FixedFrame:
     p: Vec3 = ZERO3
     q_xyzw: Quat = IDENTITY_XYZW
     axis: Vec3 = (0.0, 0.0, 1.0)
-    """Axis of rotation, for a wheel."""
+    """Axis about which a wheel that rolls forward turns by a positive angle."""
+
+
+@dataclass(frozen=True)
+class WheelJoint:
+    """The joint of a driven wheel."""
+
+    name: str
+    side: int
+    """0 for left, 1 for right."""
+    sense: int = 1
+    """-1 if the wheel rolls backward as the joint's angle grows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +59,11 @@ class Sender:
     imu_frame: str = "imu_link"
     magnetometer_frame: str = "magnetometer_link"
     lidar_frame: str = "rplidar_link"
-    wheel_joints: tuple[str, str] = ("left_wheel_joint", "right_wheel_joint")
+    wheel_joints: tuple[WheelJoint, ...] = (
+        WheelJoint("left_wheel_joint", 0),
+        WheelJoint("right_wheel_joint", 1),
+    )
+    """Joints of all driven wheels, with their names in the description."""
 
     transforms: Transforms = "all"
     """Transforms of the drive on /tf. With "all", map to odom puts base_link at its true pose."""
@@ -83,8 +98,8 @@ class Sender:
     links: tuple[FixedFrame, ...] = ()
     """Links fixed in base_link, and sensors mounted at an angle on their links."""
 
-    wheels: tuple[FixedFrame, FixedFrame] | None = None
-    """The left and the right wheel at rest."""
+    wheels: tuple[FixedFrame, ...] = ()
+    """The wheels of `wheel_joints` at rest; empty if they are not known."""
 
     description: str = ""
     """The robot's URDF; "" if unknown."""
@@ -97,7 +112,7 @@ def sender_of(robot: RobotSpec, *, unit: Unit = "T", rate_hz: float | None = Non
         robot: Its sensors and drive.
         unit: Unit of magnetic fields in messages.
         rate_hz: Rate of the magnetometer [Hz]. Default: the robot's.
-        rest: `links`, `wheels` and `description` of the sender.
+        rest: `links`, `wheels`, `wheel_joints` and `description` of the sender.
     """
     mounts = {"magnetometer": robot.magnetometer, "imu": robot.imu, "lidar": robot.lidar}
     frames, tilted = {}, []
@@ -111,7 +126,6 @@ def sender_of(robot: RobotSpec, *, unit: Unit = "T", rate_hz: float | None = Non
         imu_frame=frames["imu"],
         magnetometer_frame=frames["magnetometer"],
         lidar_frame=frames["lidar"],
-        wheel_joints=(robot.drive.left_wheel_joint, robot.drive.right_wheel_joint),
         unit=unit,
         odometry_std=(*robot.drive.odometry_v_noise_std, *robot.drive.odometry_w_noise_std),
         orientation_std=robot.imu.orientation_noise_std,
@@ -122,7 +136,11 @@ def sender_of(robot: RobotSpec, *, unit: Unit = "T", rate_hz: float | None = Non
         vector_std_nt=robot.magnetometer.vector_noise_density_nt * float(np.sqrt(rate / 2)),
         scan_rate_hz=robot.lidar.scan_rate_hz,
         range_m=(robot.lidar.range_min_m, robot.lidar.range_max_m),
-        **{**rest, "links": (*rest.get("links", ()), *tilted)},
+        **{
+            "wheel_joints": tuple(WheelJoint(name, side) for name, side in robot.drive.sides.items()),
+            **rest,
+            "links": (*rest.get("links", ()), *tilted),
+        },
     )
 
 
@@ -136,7 +154,7 @@ def prefixed(sender: Sender, prefix: str) -> Sender:
         return replace(frame, parent=prefix + frame.parent, name=prefix + frame.name)
 
     names = ("odom_frame", "base_frame", "truth_frame", "imu_frame", "magnetometer_frame", "lidar_frame")
-    wheels = None if sender.wheels is None else (moved(sender.wheels[0]), moved(sender.wheels[1]))
+    wheels = tuple(map(moved, sender.wheels))
     frames: dict[str, Any] = {name: prefix + getattr(sender, name) for name in names}
     return replace(sender, links=tuple(map(moved, sender.links)), wheels=wheels, **frames)
 
@@ -153,24 +171,34 @@ def sender_for(twin: "Twin | None", unit: Unit, rate_hz: Any = None) -> Sender:
         return Sender(unit=unit)
     from magtwin.author.robot import read_description
     from magtwin.usd.geometry import BASE_LINK, read_links
+    from magtwin.usd.robot import description_names
 
     robot = twin.scene.robot
-    joints = (robot.drive.left_wheel_joint, robot.drive.right_wheel_joint)
+    links, names = description_names(robot.asset)
+    sides, senses = robot.drive.sides, dict[str, int]()
     frames: dict[str, FixedFrame] = {}  # by joint; links that do not turn by name
     for link in read_links(robot.asset).values():
         if link.name != BASE_LINK:
-            axis = link.axis_link or (0.0, 0.0, 1.0)
-            frame = FixedFrame(BASE_LINK, link.name, link.p_base_link, link.q_base_link_xyzw, axis)
-            frames[link.joint if link.joint in joints else f"/{link.name}"] = frame
-    wheels = tuple(frames.pop(joint) for joint in joints if joint in frames)
+            axis = link.rolling_axis or (0.0, 0.0, 1.0)
+            name = links.get(link.name, link.name)
+            frame = FixedFrame(BASE_LINK, name, link.p_base_link, link.q_base_link_xyzw, axis)
+            frames[link.joint if link.joint in sides else f"/{name}"] = frame
+            senses[link.joint] = link.sense
+    wheels = tuple(frames.pop(joint) for joint in sides if joint in frames)
+    joints = (WheelJoint(names.get(n, n), side, senses.get(n, 1)) for n, side in sides.items())
     description = read_description(robot.asset)
     below = _footprint(description) if f"/{FOOTPRINT}" not in frames else ()
+    mounts = {"magnetometer": robot.magnetometer, "imu": robot.imu, "lidar": robot.lidar}
+    called: dict[str, Any] = {
+        n: replace(mount, link=links.get(mount.link, mount.link)) for n, mount in mounts.items()
+    }
     return sender_of(
-        robot,
+        replace(robot, **called),
         unit=unit,
         rate_hz=float(rate_hz) if isinstance(rate_hz, int | float) and rate_hz > 0 else None,
         links=(*frames.values(), *below),
-        wheels=wheels if len(wheels) == 2 else None,
+        wheels=wheels if len(wheels) == len(sides) else (),
+        wheel_joints=tuple(joints),
         description=description,
     )
 

@@ -175,7 +175,10 @@ def _command(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
 
 
 def _joints(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
-    return {**_header(stamp, ""), "name": sender.wheel_joints, "position": c["wheel_angle"]}
+    """Angles of the wheels' joints, all of which robot_state_publisher needs to place the links."""
+    joints = sender.wheel_joints
+    angle = c["wheel_angle"][:, [joint.side for joint in joints]] * [float(joint.sense) for joint in joints]
+    return {**_header(stamp, ""), "name": tuple(joint.name for joint in joints), "position": angle}
 
 
 def _transform_fields(stamp: NDArray[np.int64], transforms: list[tuple[str, str, Any, Any]]) -> Fields:
@@ -208,9 +211,9 @@ def _transforms(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
         chain.append((sender.map_frame, sender.truth_frame, p_base, q_base))
     if sender.transforms != "none":
         chain.append((sender.odom_frame, sender.base_frame, p_odom, q_odom))
-    if sender.wheels is not None and "wheel_angle" in c:
-        for wheel, angle in zip(sender.wheels, c["wheel_angle"].T, strict=True):
-            half = angle[:, None] / 2
+    if sender.wheels and "wheel_angle" in c:
+        for wheel, joint in zip(sender.wheels, sender.wheel_joints, strict=True):
+            half = c["wheel_angle"][:, joint.side, None] / 2
             turn = np.concatenate([np.sin(half) * np.array(wheel.axis), np.cos(half)], axis=1)
             p = np.broadcast_to(np.array(wheel.p), (len(stamp), 3))
             chain.append((wheel.parent, wheel.name, p, quat_multiply(wheel.q_xyzw, turn)))

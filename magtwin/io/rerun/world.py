@@ -263,8 +263,8 @@ class Robot:
                 entity, p, q = f"{root}/{_entity(name)}", link.p_base_link, link.q_base_link_xyzw
             if carried:
                 rec.log(entity, mesh_of(carried), static=True)
-            if link.joint in sides and link.axis_link is not None:
-                self._wheels.append((entity, sides[link.joint], p, q, link.axis_link))
+            if link.joint in sides and link.rolling_axis is not None:
+                self._wheels.append((entity, sides[link.joint], p, q, link.rolling_axis))
             else:
                 rec.log(entity, _transform(p, q), static=True)
         if self.name:

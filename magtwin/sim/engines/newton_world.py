@@ -79,6 +79,8 @@ class World:
             for _ in range(round(SETTLE_S / 2 / job["step_s"])):
                 mujoco.mj_step(self._model, self._data)
         mujoco.mj_forward(self._model, self._data)
+        left = self._data.xmat[base].reshape(3, 3)[:, 1]  # a joint whose axis points right turns backward
+        self._senses = [math.copysign(1.0, left @ self._data.xaxis[joint]) for joint in self._wheels]
         self._zero = self._angles()
 
     def _narrow(self) -> None:
@@ -91,7 +93,9 @@ class World:
     def step(self, rates: list[list[float]]) -> None:
         """Physics steps, each with its wheel rates [rad/s]."""
         for pair in rates:
-            self._data.ctrl[self._ctrl] = [pair[side] for side in self._sides]
+            self._data.ctrl[self._ctrl] = [
+                pair[side] * sense for side, sense in zip(self._sides, self._senses, strict=True)
+            ]
             mujoco.mj_step(self._model, self._data)
 
     def seen(self) -> list[float]:
@@ -103,7 +107,10 @@ class World:
         vx, vy, _, wx, wy, wz = self._data.qvel[self._qd : self._qd + 6].tolist()
         w = turn[2, 0] * wx + turn[2, 1] * wy + turn[2, 2] * wz  # MuJoCo gives it in the body's axes
         v = vx * math.cos(yaw) + vy * math.sin(yaw)
-        left, right = (a - b for a, b in zip(self._angles()[:2], self._zero[:2], strict=True))
+        left, right = (
+            (a - b) * sense
+            for a, b, sense in zip(self._angles()[:2], self._zero[:2], self._senses[:2], strict=True)
+        )
         return [x, y, yaw, v, float(w), left, right, z, float(turn[2, 2])]
 
     def _angles(self) -> list[float]:

@@ -112,6 +112,9 @@ def drive_spec(base: MobileBase, mechanism: Mechanism, radius_of: Callable[[str]
             "turn the joint of the base by 90 degrees"
         )
     left, right = _sides(base, places)
+    wrong = {name for name, axis in zip(base.wheels, axes, strict=True) if axis[1] < 0}
+    for note in backward([name for name in (*left, *right) if name in wrong]):
+        description.note(note)
     given: dict[str, Any] = dict(base.figures)
 
     def guess(name: str, value: float | None, how: str) -> None:
@@ -178,6 +181,17 @@ def drive_spec(base: MobileBase, mechanism: Mechanism, radius_of: Callable[[str]
         )
     except InputError as error:
         raise InputError(f"{base.source}: {error}") from error
+
+
+def backward(joints: list[str]) -> list[str]:
+    """A note on wheel joints whose axes point right, so that a positive angle rolls them backward."""
+    if not joints:
+        return []
+    return [
+        f"drive: the axis of {', '.join(map(repr, joints))} points right, so that a positive rate rolls it "
+        "backward. magtwin allows for that; Isaac Sim's graph and ROS 2's diff_drive_controller do not: "
+        "negate the <axis>"
+    ]
 
 
 def _sides(base: MobileBase, places: Mapping[str, NDArray]) -> tuple[list[str], list[str]]:

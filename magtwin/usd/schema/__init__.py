@@ -164,6 +164,12 @@ def _advice(root: Usd.Prim, noun: str) -> str:
         )
     if noun == "anomalyMap":
         return "; give a map layer (magtwin map fit) or a scene (magtwin scene)"
+    if noun in ("lab", "robot"):
+        return (
+            "; it is a stage without a scene of magtwin, which makes rooms from a TOML: magtwin new "
+            "room.toml, magtwin scene room.toml; this stage may then reference that room (docs/scenes.md, "
+            "A lab in another place)"
+        )
     return ""
 
 
