@@ -14,7 +14,8 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.changes import changes_line
 from magtwin.field.survey.folder import node_map
 from magtwin.field.survey.folder import read_survey as read_folder
-from magtwin.field.survey.readings import TAKEN, Readings
+from magtwin.field.survey.hold import without_repeats
+from magtwin.field.survey.readings import TAKEN, Readings, masked_words
 from magtwin.field.survey.stuck import mask_stuck
 from magtwin.files import existing, sha256
 from magtwin.io.surveys.about import About
@@ -83,10 +84,12 @@ def read_survey(
 ) -> tuple[Readings, Report]:
     """Readings of a survey of any form, with stuck readings masked, and the report on them.
 
+    Of values that a logger faster than the sensor repeated, one reading each is kept.
+
     Args:
         sources: As for `magtwin.io.surveys.readings.read_readings`.
         about: Metadata that the files lack.
-        keep_stuck: Whether stuck readings stay in.
+        keep_stuck: Whether stuck and repeated readings stay in.
         reading: `columns`, `pose_topic` and `field_topic` of `read_readings`.
 
     Raises:
@@ -94,6 +97,8 @@ def read_survey(
     """
     known = {} if about is None else {**asdict(about), "name": None}  # errors name the file
     readings = read_readings(*sources, **reading, **known)
+    if not keep_stuck:
+        readings = without_repeats(readings)
     masked, report = mask_stuck(readings)
     if taken := [part.removeprefix(TAKEN) for part in readings.source.split("; ") if part.startswith(TAKEN)]:
         report = replace(report, metadata={**report.metadata, "taken": taken})
@@ -186,7 +191,8 @@ def fit_survey(
     out, about = check_free(out, force=force), about or About()
     options = _method_options([method], kernel, earth).get(method, {})
     readings, report = read_survey(sources, about=about, **reading)
-    if doubts := [*_doubts(readings, sources[0]), *_shared(readings, method)]:
+    found = report.metadata.get("doubts", [])
+    if doubts := [*found, *_doubts(readings, sources[0]), *_shared(readings, method)]:
         report = replace(report, metadata={**report.metadata, "doubts": doubts})
     model = fit(readings, method, progress=progress, **options)
     named = readings.with_(name=about.name or out.stem)
@@ -340,8 +346,8 @@ def _doubts(readings: Readings, source: Source) -> list[str]:
     count, yaw, doubts = int(readings.good.sum()), readings.yaw[readings.good], list[str]()
     if readings.grid is None and count < LEAST_READINGS:
         raise InputError(
-            f"{source}: {count} of {len(readings)} readings are good; a map needs {LEAST_READINGS} at least, "
-            "and some hundred to be of use"
+            f"{source}: {count} of {len(readings)} readings are good{masked_words(readings)}; a map needs "
+            f"{LEAST_READINGS} at least, and some hundred to be of use"
         )
     if readings.grid is None and count < USUAL_READINGS:
         doubts.append(f"only {count} good readings: the map is valid only next to them")
