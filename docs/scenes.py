@@ -108,8 +108,8 @@ the path and, if necessary, shrinks it.
 
 ## A lab in another place
 
-A stage of your own cannot be driven in as it is, since its field is not known. Make a lab from a TOML, and reference it
-in your stage.
+A stage of your own cannot be driven in as it is, since its field is not known. Make a lab from a TOML, and
+reference it in your stage.
 
 The lab, its map, sources, robots and floor are relative to the lab's root, the prim `/World` of the stage
 that magtwin writes. Move and turn this prim, or reference the stage into another one, as often as you like:

@@ -139,6 +139,24 @@ def test_a_survey_whose_sensor_was_stuck_throughout_is_refused_unless_it_is_to_b
     assert load_map(tmp_path / "a.usdc").valid.all()
 
 
+def test_repeats_of_a_fast_logger_are_counted_and_a_fit_that_lacks_readings_names_the_masked(
+    tmp_path, capsys
+):
+    b = np.repeat(np.random.default_rng(0).normal(45_000, 500, 30), 2)
+    rows = [f"{k / 10},{k % 7 / 5},0,{k / 10},{v:.1f}" for k, v in enumerate(b)]
+    (tmp_path / "a.csv").write_text("\n".join(["x,y,yaw,t,field", *rows]))
+    run("map", "import", tmp_path / "a.csv", "--out", tmp_path / "a.parquet", "--json")
+    report = json.loads(capsys.readouterr().out)
+    assert "one reading of each value, 30 of 60" in report["metadata"]["taken"][-1]
+    assert len(load_readings(tmp_path / "a.parquet")) == 30
+    run("map", "import", tmp_path / "a.csv", "--out", tmp_path / "b.parquet", "--keep-stuck")
+    assert len(load_readings(tmp_path / "b.parquet")) == 60
+    few = load_readings(tmp_path / "b.parquet").with_(good=np.arange(60) < 5)
+    save_readings(few, tmp_path / "few.parquet")
+    line = refused(capsys, "map", "fit", tmp_path / "few.parquet", "--out", tmp_path / "c.usdc")
+    assert "5 of 60 readings are good, 55 are masked as stuck (--keep-stuck keeps them)" in line
+
+
 def test_a_fit_and_a_check_run_from_readings_with_latched_ones_out(tmp_path, capsys):
     def latch(b, rng):
         b[:, 3:6, 4:8] = np.round(31_000 + 15 * rng.standard_normal((4, 3, 1)), 2)

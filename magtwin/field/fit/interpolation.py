@@ -19,7 +19,7 @@ from magtwin.field.maps.curvature import interpolation_error_nt2
 from magtwin.field.maps.trilinear import spread
 from magtwin.field.survey.bins import Bins, bin_readings, spacing_m
 from magtwin.field.survey.node_errors import node_errors
-from magtwin.field.survey.readings import Readings
+from magtwin.field.survey.readings import Readings, masked_words
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -76,8 +76,7 @@ def check_readings(readings: Readings) -> None:
     good = readings.good
     count, of = int(np.count_nonzero(good)), f"of {len(readings)} in {readings.name or 'the survey'}"
     if count < LEAST:
-        masked = "; all others are stuck" if count < len(readings) else ""
-        raise InputError(f"{count} good readings {of}{masked}; a map needs {LEAST} at least")
+        raise InputError(f"{count} good readings {of}{masked_words(readings)}; a map needs {LEAST} at least")
     p, b = readings.p_xy[good], readings.b_nt[good]
     if np.ptp(b) == 0:
         raise InputError(

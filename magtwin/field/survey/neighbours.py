@@ -36,8 +36,10 @@ class LocalFit:
     count: int  # Neighbours per reading
 
     @classmethod
-    def to(cls, readings: Readings, rows: NDArray[np.intp]) -> "LocalFit":
-        """Learn the prior from some of the readings, `LEAST` or more.
+    def to(cls, readings: Readings, rows: NDArray[np.intp], turned: NDArray[np.intp]) -> "LocalFit":
+        """Learn the prior from the readings `rows`, `LEAST` or more, and the trend from `turned`.
+
+        A trend holds only at headings that it was fitted to, so `turned` must have all that are predicted.
 
         The parameters maximise the leave-one-out predictive probability under Student's t (Rasmussen &
         Williams 2006, eq. 5.11).
@@ -45,7 +47,8 @@ class LocalFit:
         from scipy.optimize import minimize
 
         p, yaw, b = readings.p_xy[rows], readings.yaw[rows], readings.b_nt[rows]
-        residual = b - _waves(yaw) @ _trend(yaw, b)
+        trend = _trend(readings.yaw[turned], readings.b_nt[turned])
+        residual = b - _waves(yaw) @ trend
         spread = deviation(residual) or 1.0
         extent = float(np.linalg.norm(np.ptp(p, axis=0))) or 1.0
         headings = 1 if readings.grid is None else len(readings.grid.headings_rad)
@@ -65,7 +68,7 @@ class LocalFit:
         best = minimize(
             unlikeliness, start, method="Nelder-Mead", options={"xatol": 0.05, "fatol": 2e-3, "maxfev": 120}
         )
-        whole = readings.b_nt - _waves(readings.yaw) @ _trend(yaw, b)
+        whole = readings.b_nt - _waves(readings.yaw) @ trend
         return cls(readings.p_xy, readings.yaw, whole, best.x, count)
 
     def left_out(self, rows: NDArray[np.intp], pool: NDArray[np.intp]) -> tuple[Array, Array]:

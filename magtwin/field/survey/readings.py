@@ -157,6 +157,12 @@ class Readings(Summarized):
         )
 
 
+def masked_words(readings: Readings) -> str:
+    """For a refusal: how many readings are masked, and how to keep them; "" if none are."""
+    masked = len(readings) - int(np.count_nonzero(readings.good))
+    return f", {masked} are masked as stuck (`keep_stuck=True` keeps them)" if masked else ""
+
+
 TAKEN = "taken "  # Start of a part of `source` that lists what was deduced from names or sizes
 TEXTS = ("name", "source", "licence", "created", "frame", "datum")  # Metadata that are texts
 

@@ -4,15 +4,17 @@ Three tests, each with its rate of false alarms:
 
 - **Frozen.** A frozen sensor repeats the same number to the last digit while the robot moves. A field seldom
   does: over a distance d it stays within the sensor's resolution q by chance with probability q f / d, where
-  f is the density at 0 of the field's slopes nearby; distances of `REACH_M` count as independent. One in a
-  hundred of the stretches found is false, and one sound survey in a hundred shows any (Benjamini & Hochberg
-  1995, at `FALSE_FROZEN`).
+  f is the density at 0 of the field's slopes nearby; distances of `REACH_M` or more count as independent. All
+  components of a vector repeat, so the least chance of one counts. On a drive the chance is at least that by
+  the share of repeats beside the stretch, since rounding may not show in the digits. One in a hundred of the
+  stretches found is false, and one sound survey in a hundred shows any (Benjamini & Hochberg 1995, at
+  `FALSE_FROZEN`).
 - **Stuck.** A sensor that lost lock reads about one level at any place and heading. If frozen stretches
   agree on a level, every node (every stretch of a drive) near that level is tested: are its readings more
   likely to be the level, or the field that its neighbours in place and heading predict? It is masked at odds
   of 19 to 1 for stuck, prior included (`SURE`), so fewer than five in a hundred masked readings are field;
   the report gives the expected number. A stretch of a drive that stays within the sensor's noise is also
-  masked if its neighbours refute it, at `FALSE_FLAT` per survey.
+  masked if its neighbours refute it, at `FALSE_FLAT` per survey. Wrong poses refute sound stretches as well.
 - **Outlying.** A reading that differs from its neighbours' prediction by more than chance allows once per
   survey is listed with its size, but kept: it may be iron.
 
@@ -26,11 +28,11 @@ Chance is Student's t with 4 degrees of freedom about a Gaussian process on the 
 import itertools
 from dataclasses import dataclass
 from math import lgamma
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.field.survey.hold import DIGITS, in_order, repeats
 from magtwin.field.survey.neighbours import FREEDOM, LEAST, LocalFit, deviation
 from magtwin.field.survey.readings import Readings
 from magtwin.frames import wrap_angle
@@ -49,11 +51,15 @@ BESIDE = 48
 # Range about the level in which stuck readings are searched, in standard deviations of the level
 WIDTH = 12.0
 CELL_M = 0.05  # Length of a drive whose readings are averaged for the fit
+COARSE = 3.0  # Resolutions by which the field usually changes in a trial; with less, the sensor is too coarse
 LEAST_SLOPES = 8  # With fewer slopes the roughness is unknown, and no stretch is called frozen
 FLAT_M = 0.25  # Least length of a flat stretch of a drive
 MOST_TOGETHER = 12  # Most readings of one place that are tested jointly; more are thinned evenly
+MOST_OTHERS = 48  # Most other stretches whose misfit is compared with that of a flat one
+UPPER = 0.9  # Quantile of their misfits
 ROUNDS = 4  # Rounds in which level, spread and share of stuck readings converge
 SPREAD_ROWS = 51  # Readings of a drive from which the usual size of a jump is estimated
+MANY = 1 / 3  # Share of stuck readings above which the report doubts them
 NAMED = 20  # Most outliers listed in the report, the largest first
 
 
@@ -113,10 +119,16 @@ class Findings:
                     readings.runs[r] or f"run {r}": f"{int(masked[readings.run == r].sum())} readings"
                     for r in np.unique(readings.run[masked])
                 }
+        if masked.sum() > MANY * max(1, readings.good.sum()):
+            metadata["doubts"] = [
+                f"{masked.sum()} of {readings.good.sum()} readings are masked as stuck: a sound sensor with "
+                "wrong poses looks the same; check them, or keep the readings (--keep-stuck)"
+            ]
         outliers = np.flatnonzero(self.outlier)
         figures.append(Figure("outliers", len(outliers), note="left in"))
         if not self.judged:
-            metadata["note"] = f"fewer than {LEAST} good readings: only repeats were looked for"
+            where = "good readings" if readings.node is not None else f"good readings {CELL_M:g} m apart"
+            metadata["note"] = f"fewer than {LEAST} {where}: only repeats were looked for"
         if len(outliers):
             first = outliers[np.argsort(-np.abs(self.outlier[outliers]), kind="stable")][:NAMED]
             metadata["outliers"] = [_place_and_size(readings, row, self.outlier[row]) for row in first]
@@ -136,21 +148,24 @@ def find_stuck(readings: Readings) -> Findings:
     cells, cell = _cells(readings)
     near_level = np.zeros(count, bool) if level is None else np.abs(b - level) <= WIDTH * spread
     flats = _flats(readings, sound & ~near_level) if readings.grid is None else []
-    suspect = readings.good & (frozen | near_level)
+    suspect = frozen | near_level | ~readings.good
+    known = np.flatnonzero(np.bincount(cell, suspect, len(cells)) == 0)
     for rows in flats:
         suspect[rows] = True
-    pool = np.flatnonzero(np.bincount(cell, suspect | ~readings.good, len(cells)) == 0)
+    pool = np.flatnonzero(np.bincount(cell, suspect, len(cells)) == 0)
+    if len(pool) < LEAST:  # a coarse sensor is flat everywhere
+        pool, flats = known, []
     if len(pool) < LEAST or np.ptp(cells.b_nt[pool]) == 0:
         return Findings(frozen, stuck, doubt, outlier, level, spread, judged=False)
-    fit = LocalFit.to(cells, pool)
-    for rows in _refuted(flats, cell, fit, pool):
+    fit = LocalFit.to(cells, pool, known)
+    for rows in _refuted(flats, cell, fit, pool, known):
         stuck[rows] = True
         doubt[rows] = FALSE_FLAT / len(flats)
     if level is not None:
         places = _places(readings, near_level & readings.good)
         held = [np.unique(cell[rows]) for rows in places]
-        known = np.array([bool(frozen[rows].any()) for rows in places])
-        sure, level, spread = _odds(cells, held, known, fit, pool, level, spread)
+        repeated = np.array([bool(frozen[rows].any()) for rows in places])
+        sure, level, spread = _odds(cells, held, repeated, fit, pool, level, spread)
         for rows, probability in zip(places, sure, strict=True):
             if probability >= SURE:
                 stuck[rows] = True
@@ -162,15 +177,12 @@ def find_stuck(readings: Readings) -> Findings:
 
 def _sequences(readings: Readings) -> list[Rows]:
     """Good rows in orders in which neighbours follow each other: rows and columns of nodes, or runs."""
-    good = np.flatnonzero(readings.good)
     if readings.node is None:
-        clock = np.zeros(len(readings)) if readings.t is None else readings.t
-        keys: list[tuple[NDArray[Any], ...]] = [(clock, readings.run)]
-    else:
-        h, j, i = readings.node.T
-        keys = [(i, j, h), (j, i, h)]
+        return in_order(readings)
+    good = np.flatnonzero(readings.good)
+    h, j, i = readings.node.T
     sequences = []
-    for inner, *outer in keys:
+    for inner, *outer in ((i, j, h), (j, i, h)):
         order = good[np.lexsort((inner[good], *(o[good] for o in outer)))]
         new = np.any([np.diff(o[order]) != 0 for o in outer], axis=0)
         sequences += np.split(order, np.flatnonzero(new) + 1)
@@ -186,32 +198,38 @@ def _moved(readings: Readings, rows: Rows) -> Array:
 
 def _frozen(readings: Readings) -> list[Rows]:
     """Rows of each stretch that repeats to the last digit for longer than chance allows."""
-    b = readings.b_nt
-    gaps = np.diff(np.unique(b[readings.good]))
+    # Of a vector each component has its digits; the magnitude of rounded ones has many
+    channels = readings.b_nt[None] if readings.b_body_nt is None else readings.b_body_nt.T
     sequences = _sequences(readings)
-    if not gaps.size:  # one number everywhere
+    if not np.ptp(channels[:, readings.good], axis=1).any():  # one number everywhere
         still = len(sequences) == 0 or np.ptp(readings.p_xy[readings.good], axis=0).max() == 0
         return [] if still or readings.good.sum() <= LEAST_SLOPES else [np.flatnonzero(readings.good)]
-    resolution = float(gaps.min())
-    place, slope = _slopes(readings, sequences)
+    known = [(_resolution_nt(b[readings.good]), *_slopes(readings, b, sequences)) for b in channels]
     candidates = []
     for rows in sequences:
-        same = np.diff(b[rows]) == 0
-        if readings.b_body_nt is not None:
-            same &= np.all(np.diff(readings.b_body_nt[rows], axis=0) == 0, axis=1)
+        same = repeats(readings, rows)
+        again = None if readings.node is not None else _repeated(same)
         for part in _stretches(same):
             held = rows[part.start : part.stop + 1]
             p = readings.p_xy[held]
             way = float(np.linalg.norm(np.ptp(p, axis=0)) + REACH_M * np.ptp(np.unwrap(readings.yaw[held])))
-            if way == 0 or len(slope) < LEAST_SLOPES:
-                continue
-            near = np.argsort(np.linalg.norm(place - p.mean(axis=0), axis=1), kind="stable")[:BESIDE]
-            usual = float(np.quantile(slope[near], 0.25))
-            trials = max(1, min(len(held) - 1, int(way / REACH_M)))
-            if usual * way / trials < 3 * resolution:
-                continue  # the sensor is too coarse for this place to tell
-            chance = resolution * 0.25 / (2 * usual) * trials / way  # a quarter of slopes lie within +-usual
-            candidates.append((trials * np.log(min(1.0, chance)), held))
+            most = max(1, min(len(held) - 1, int(way / REACH_M)))
+            by_field = 0.0  # all components repeat, so the least chance of one counts
+            for resolution, place, slope in known:
+                if way == 0 or len(slope) < LEAST_SLOPES:
+                    continue
+                near = np.argsort(np.linalg.norm(place - p.mean(axis=0), axis=1), kind="stable")[:BESIDE]
+                usual = float(np.quantile(slope[near], 0.25))
+                trials = most
+                if len(known) > 1 and resolution:  # three components seldom are flat over more than that
+                    trials = min(most, int(usual * way / (COARSE * resolution)))
+                if trials == 0 or usual * way / trials < COARSE * resolution:
+                    continue  # the sensor is too coarse for this place to tell
+                # A quarter of slopes lie within +-usual
+                chance = resolution * 0.25 / (2 * usual) * trials / way
+                by_field = min(by_field, trials * np.log(min(1.0, chance)))
+            by_rounding = -np.inf if again is None else (len(held) - 1) * np.log(again[part.start])
+            candidates.append((max(by_field, by_rounding), held))
     candidates.sort(key=lambda candidate: candidate[0])
     tests = sum(len(rows) - 1 for rows in sequences)
     allowed = np.log(FALSE_FROZEN / max(tests, 1) * np.arange(1, len(candidates) + 1))
@@ -219,7 +237,29 @@ def _frozen(readings: Readings) -> list[Rows]:
     return [held for _, held in candidates[: passed[-1] + 1]] if passed else []
 
 
-def _slopes(readings: Readings, sequences: list[Rows]) -> tuple[Array, Array]:
+def _resolution_nt(values: Array) -> float:
+    """Least difference between two values [nT]; 0 if all are equal."""
+    gaps = np.diff(np.unique(np.round(values, DIGITS)))
+    return float(gaps.min()) if gaps.size else 0.0
+
+
+def _repeated(same: Flags) -> Array:
+    """Chance at each row of a drive that the next one repeats its value, shape (len(same) + 1,).
+
+    It is the share of repeated values among the `BESIDE` others that are nearest in time, with one more for
+    what they miss (Laplace's rule). Rounded vectors repeat magnitudes, which have many digits all the same.
+    """
+    starts = np.flatnonzero(np.append(True, ~same))
+    size = np.diff(np.append(starts, len(same) + 1))
+    before = np.append(0, np.cumsum(size > 1))
+    first = np.clip(np.arange(len(size)) - BESIDE // 2, 0, max(0, len(size) - BESIDE - 1))
+    last = np.minimum(first + BESIDE + 1, len(size))
+    others = last - first - 1
+    share = (before[last] - before[first] - (size > 1) + 1) / (others + 1)
+    return np.asarray(np.repeat(share, size))
+
+
+def _slopes(readings: Readings, b: Array, sequences: list[Rows]) -> tuple[Array, Array]:
     """Places (N, 2) and sizes [nT/m] of the field's slopes along the way, over at least `REACH_M`."""
     places, slopes = [], []
     for rows in sequences:
@@ -229,7 +269,7 @@ def _slopes(readings: Readings, sequences: list[Rows]) -> tuple[Array, Array]:
             _, first = np.unique((way / REACH_M).astype(np.intp), return_index=True)
             rows = rows[first]
             moved = _moved(readings, rows)
-        change = np.abs(np.diff(readings.b_nt[rows]))
+        change = np.abs(np.diff(b[rows]))
         kept = (moved > 0) & (change > 0)
         places.append((readings.p_xy[rows][1:] + readings.p_xy[rows][:-1])[kept] / 2)
         slopes.append(change[kept] / moved[kept])
@@ -302,18 +342,35 @@ def _flats(readings: Readings, sound: NDArray[np.bool_]) -> list[Rows]:
     return flats
 
 
-def _refuted(flats: list[Rows], cell: Rows, fit: LocalFit, pool: Rows) -> list[Rows]:
-    """Flat stretches that their neighbours refute."""
-    from scipy.special import fdtrc
+def _refuted(flats: list[Rows], cell: Rows, fit: LocalFit, pool: Rows, known: Rows) -> list[Rows]:
+    """Flat stretches that their neighbours refute.
+
+    Stretches that are left out as a whole fit worse than single readings where the field is rougher than its
+    prior. So the misfit of a flat stretch is divided by that of other stretches of its length (the quantile
+    `UPPER` over its expectation), if these fit worse than expected.
+    """
+    from scipy.special import fdtrc, fdtri
+
+    def misfit(cells: Rows, pool: Rows) -> float:
+        held = _thinned(cells)
+        residual, covariance = fit.together(held, pool)
+        return float(residual @ np.linalg.solve(covariance, residual) / len(held))
 
     refuted = []
     for rows in flats:
-        held = _thinned(np.unique(cell[rows])[1:-1])
-        if not len(held):
+        inner = np.unique(cell[rows])[1:-1]
+        if not len(inner):
             continue
-        residual, covariance = fit.together(held, pool)
-        size = residual @ np.linalg.solve(covariance, residual) / len(held)
-        if fdtrc(len(held), FREEDOM, size) <= FALSE_FLAT / len(flats):
+        count, limit = min(len(inner), MOST_TOGETHER), FALSE_FLAT / len(flats)
+        size = misfit(inner, pool)
+        if fdtrc(count, FREEDOM, size) > limit:
+            continue
+        rest = known[(known < inner[0]) | (known > inner[-1])]
+        firsts = np.unique(np.linspace(0, max(0, len(rest) - len(inner)), MOST_OTHERS).astype(np.intp))
+        others = [rest[first : first + len(inner)] for first in firsts]
+        usual = [misfit(other, np.setdiff1d(pool, other)) for other in others]
+        rough = np.quantile(usual, UPPER) / fdtri(count, FREEDOM, UPPER)
+        if fdtrc(count, FREEDOM, size / max(1.0, rough)) <= limit:
             refuted.append(rows)
     return refuted
 

@@ -14,7 +14,8 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.changes import changes_line
 from magtwin.field.survey.folder import heading_doubts, node_map
 from magtwin.field.survey.folder import read_survey as read_folder
-from magtwin.field.survey.readings import Readings, taken_of
+from magtwin.field.survey.hold import without_repeats
+from magtwin.field.survey.readings import Readings, masked_words, taken_of
 from magtwin.field.survey.stuck import mask_stuck
 from magtwin.files import existing, sha256
 from magtwin.io.surveys.about import About
@@ -93,10 +94,12 @@ def read_survey(
 ) -> tuple[Readings, Report]:
     """Readings of a survey of any form, with stuck readings masked, and the report on them.
 
+    Of values that a logger faster than the sensor repeated, one reading each is kept.
+
     Args:
         sources: As for `magtwin.io.surveys.readings.read_readings`.
         about: Metadata that the files lack.
-        keep_stuck: Whether stuck readings stay in.
+        keep_stuck: Whether stuck and repeated readings stay in.
         reading: `columns`, `pose_topic` and `field_topic` of `read_readings`.
 
     Raises:
@@ -104,7 +107,11 @@ def read_survey(
     """
     known = {} if about is None else {**asdict(about), "name": None}  # errors name the file
     readings = read_readings(*sources, **reading, **known)
+    if not keep_stuck:
+        readings = without_repeats(readings)
     masked, report = mask_stuck(readings)
+    if keep_stuck:
+        report.metadata.pop("doubts", None)
     if taken := taken_of(readings):
         report = replace(report, metadata={**report.metadata, "taken": taken})
     if not (keep_stuck or masked.good.any()):
@@ -350,8 +357,8 @@ def _doubts(readings: Readings, source: Source) -> list[str]:
     count, yaw, doubts = int(readings.good.sum()), readings.yaw[readings.good], list[str]()
     if readings.grid is None and count < LEAST_READINGS:
         raise InputError(
-            f"{source}: {count} of {len(readings)} readings are good; a map needs {LEAST_READINGS} at least, "
-            "and some hundred to be of use"
+            f"{source}: {count} of {len(readings)} readings are good{masked_words(readings)}; a map needs "
+            f"{LEAST_READINGS} at least, and some hundred to be of use"
         )
     if readings.grid is None and count < USUAL_READINGS:
         doubts.append(f"only {count} good readings: the map is valid only next to them")
@@ -395,6 +402,7 @@ def _masked(field: AnomalyMap) -> list[str]:
 
 
 def _with_doubts(report: Report, doubts: list[str]) -> Report:
+    doubts = [*report.metadata.get("doubts", []), *doubts]
     return replace(report, metadata={**report.metadata, "doubts": doubts}) if doubts else report
 
 

@@ -36,6 +36,6 @@ def read_survey(
     readings, _ = read_with_report(list(sources), columns=chosen, **options)
     masked = len(readings) - int(readings.good.sum())
     if masked:
-        text = f"{sources[0]}: {masked} of {len(readings)} readings are from a stuck sensor and are masked"
-        warnings.warn(text, stacklevel=2)
+        text = f"{masked} of {len(readings)} readings are masked as stuck (keep_stuck=True keeps them)"
+        warnings.warn(f"{sources[0]}: {text}", stacklevel=2)
     return readings

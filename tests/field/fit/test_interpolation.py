@@ -176,7 +176,10 @@ def test_bins_are_means_of_what_lies_together():
 @pytest.mark.parametrize(
     ("rows", "said"),
     [
-        ({"good": np.arange(12) < 3}, "3 good readings of 12 in made; all others are stuck"),
+        (
+            {"good": np.arange(12) < 3},
+            "3 good readings of 12 in made, 9 are masked as stuck",
+        ),
         ({"good": np.zeros(12, bool)}, "0 good readings"),
         ({"b_nt": np.full(12, 42_000.0)}, "are 42000 nT: a stuck sensor"),
         ({"p_xy": np.column_stack([np.arange(12.0), 2 * np.arange(12.0)])}, "lie on one line"),

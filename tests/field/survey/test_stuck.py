@@ -235,3 +235,46 @@ def test_rows_in_no_order_are_judged_as_those_of_a_drive_are():
     assert found.judged
     assert not (found.frozen | found.stuck).any()
     assert np.argmax(np.abs(found.outlier)) == 7
+
+
+def wander(seed, quantum_nt=0.01):
+    """A drive of a minute at 0.2 m/s and 10 Hz that turns all the time, with vectors rounded to a quantum."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(600) / 10
+    p = np.column_stack(
+        [2 * np.sin(0.11 * t + rng.uniform(0, 6)), 1.5 * np.sin(0.17 * t + rng.uniform(0, 6))]
+    )
+    yaw = np.arctan2(np.gradient(p[:, 1]), np.gradient(p[:, 0]))
+    at = np.column_stack([rng.uniform(-1.5, 1.5, (4, 2)), np.full(4, -0.3)])
+    b = np.array([500, 24_000, -40_000]) + dipole_field_nt(
+        np.column_stack([p, np.full(600, 0.5)]), at, rng.normal(0, 5, (4, 3))
+    )
+    c, s = np.cos(yaw), np.sin(yaw)
+    body = np.column_stack([c * b[:, 0] + s * b[:, 1], c * b[:, 1] - s * b[:, 0], b[:, 2]])
+    body = np.rint((body + 20 * rng.standard_normal(body.shape)) / quantum_nt) * quantum_nt
+    return Readings(p_xy=p, yaw=yaw, b_body_nt=body, t=t)
+
+
+@pytest.mark.parametrize(("seed", "quantum_nt"), [(8, 60.0), (14, 100.0), (4, 150.0)])
+def test_a_sound_drive_that_turns_has_none_though_its_vectors_are_rounded(seed, quantum_nt):
+    found = find_stuck(wander(seed, quantum_nt))
+    assert found.judged
+    assert not (found.frozen | found.stuck).any()
+
+
+def test_a_coarse_sensor_whose_stretches_all_look_flat_is_compared_with_its_neighbours():
+    readings = wander(1)
+    b = 500 * np.rint(readings.b_nt / 500)
+    _, report = mask_stuck(Readings(p_xy=readings.p_xy, yaw=readings.yaw, b_nt=b))
+    assert "note" not in report.metadata
+
+
+def test_the_report_doubts_a_survey_of_which_much_is_masked():
+    def stick(b, rng):
+        b[1_000:3_000] = b[1_000]
+        return b
+
+    _, report = mask_stuck(drive(change=stick))
+    assert "2000 of 4000 readings are masked as stuck" in report.metadata["doubts"][0]
+    assert "--keep-stuck" in report.metadata["doubts"][0]
+    assert "doubts" not in mask_stuck(drive())[1].metadata
