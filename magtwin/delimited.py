@@ -39,8 +39,13 @@ MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "*", "#na", "#nv",
 """Words for a missing value, in lower case; `*` is that of Geosoft. Spreadsheets also write errors for them,
 such as #DIV/0!."""
 
-LENGTHS = {"m": 1.0, "metre": 1.0, "meter": 1.0, "cm": 0.01, "mm": 0.001, "km": 1e3, "ft": 0.3048}
-LENGTHS |= {"metres": 1.0, "meters": 1.0}
+LENGTHS = {
+    **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0),
+    "cm": 0.01,
+    "mm": 0.001,
+    "km": 1e3,
+    "ft": 0.3048,
+}
 """Metres per unit of length, by the unit in a header."""
 
 PLACED = ("x", "y", "heading", "yaw", "theta")

@@ -36,9 +36,7 @@ OTHERS = frozenset(
 )
 """Words of columns that are no position."""
 
-UNITS = frozenset(
-    {*LENGTHS, *DEGREES, "rad", "in", "inch", "inches", "px", "pixel", "pixels", "meters", "metres"}
-)
+UNITS = frozenset({*LENGTHS, *DEGREES, "rad", "in", "inch", "inches", "px", "pixel", "pixels"})
 """Words that are a unit at the end of a name."""
 
 TUM = "t x y z qx qy qz qw"
