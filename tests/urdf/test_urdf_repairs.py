@@ -143,6 +143,7 @@ FAULTY = {
     ],
     "number-range": [
         (look('<geometry><sphere radius="-0.1"/></geometry>'), 2, "used without its sign"),
+        (look(f'<origin quat_xyzw="0 0 1 1"/>{BALL}'), 2, "has length 1.414 in '0 0 1 1': scaled to 1"),
         (moving("revolute", '<limit lower="0" upper="1"/><dynamics damping="-1"/>'), 5, "raised to it"),
         (look(f'{BALL}<material name="m"><color rgba="255 0 0 1"/></material>'), 2, "reduced to it"),
         (f'{GOOD}\n<gazebo reference="base"><mu1>-1</mu1></gazebo>', 3, "mu1 -1 is below 0: raised to it"),
@@ -162,7 +163,25 @@ FAULTY = {
         (look(f'{BALL}<material name="m"><color rgba="red"/></material>'), 2, "rgba of <color> must be"),
         (f'{GOOD}\n<gazebo reference="base"><selfCollide>maybe</selfCollide></gazebo>', 3, "true or false"),
     ],
-    "tag-unknown": [(BASE.format(TENSOR, "<colision/>"), 2, "did you mean 'collision'?")],
+    "element-unknown": [
+        (
+            BASE.format(TENSOR, "<colision/>"),
+            2,
+            "<colision> in <link> is unknown (did you mean 'collision'?)",
+        ),
+        (look('<geometry><cylindre radius="1"/></geometry>'), 2, "(did you mean 'cylinder'?)"),
+        (f"{GOOD}\n<transmision/>", 3, "<transmision> in <robot> is unknown (did you mean 'transmission'?)"),
+    ],
+    "attribute-unknown": [
+        (
+            moving("revolute", '<limit lower="-1" upper="1" efort="1"/>'),
+            5,
+            "efort='1' of <limit> is unknown (d",
+        ),
+        (look(f'<origin ypr="0 0 1"/>{BALL}'), 2, "link 'base': ypr='0 0 1' of <origin> is unknown: kept"),
+        (f'{GOOD}\n<material name="m" colour="red"><color rgba="1 0 0 1"/></material>', 3, "colour='red'"),
+    ],
+    "turn-twice": [(look(f'<origin rpy="0 0 1" quat_xyzw="0 0 0 1"/>{BALL}'), 2, "quat_xyzw is used")],
     "tag-twice": [
         (
             look('<geometry><sphere radius="1"/><box size="1 1 1"/></geometry>'),
@@ -193,7 +212,7 @@ FAULTY = {
     "shape-missing": [
         (look("<origin/>"), 2, "a <visual> without <geometry>"),
         (look("<geometry/>", "collision"), 2, "a <geometry> without a shape"),
-        (look('<geometry><cylindre radius="1"/></geometry>'), 2, "did you mean 'cylinder'?"),
+        (look('<geometry><cylindre radius="1"/></geometry>'), 2, "a <geometry> without a shape"),
         (look("<geometry><mesh/></geometry>"), 2, "a <mesh> without filename="),
         (look("<geometry><sphere/></geometry>"), 2, "a <sphere> without radius="),
     ],

@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.errors import InputError, hint
+from magtwin.errors import InputError, hint, near
 from magtwin.urdf.description.grammar import check_grammar
 from magtwin.urdf.description.model import (
     Inertial,
@@ -29,6 +29,7 @@ from magtwin.urdf.description.model import (
     read_material,
 )
 from magtwin.urdf.description.names import check_names
+from magtwin.urdf.description.vocabulary import PARTS, VERSIONS, unused
 from magtwin.urdf.repairs import LOSS, NOTE, Repairs
 from magtwin.urdf.source.source import Source, read_source
 
@@ -179,10 +180,9 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
     check_names(source, description.repair)
     description = replace(description, name=source.xml.attrib["name"])
     clean = [
-        check_grammar(part, description.where, description.repair)
-        for part in source.xml
-        if part.tag in ("link", "joint", "material")
+        check_grammar(part, description.where, description.repair) for part in source.xml if part.tag in PARTS
     ]
+    _report_unknown(description)
     links = [read_link(e) for e in clean if e.tag == "link"]
     for link in links:
         for role, shapes in (("visual", link.visuals), ("collision", link.collisions)):
@@ -224,6 +224,23 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
         links=MappingProxyType({name: description.links[name] for name in order}),
         joints=MappingProxyType({name: held[name] for name in order if name in held}),
     )
+
+
+def _report_unknown(description: Description) -> None:
+    """Report elements and attributes that no grammar has, and an unknown version of URDF."""
+    version = description.xml.get("version", VERSIONS[0])
+    if version not in VERSIONS:
+        description.note(f"version {version!r} of URDF is unknown: it is read as {VERSIONS[-1]}")
+    for one in unused(description.xml):
+        if one.known:
+            continue
+        holder, part = one.way[-1], one.way[1] if len(one.way) > 1 else one.way[0]
+        what = f"<{one.name}>" if one.element is not None else f"{one.name[1:]}={holder.get(one.name[1:])!r}"
+        advice = description.repairs.suggestion(one.name.lstrip("@"), one.alternatives, near)
+        of = "in" if one.element is not None else "of"
+        text = f"{part.tag} {part.get('name')!r}: {what} {of} <{holder.tag}> is unknown{advice}: kept as text"
+        kind = "attribute-unknown" if one.element is None else "element-unknown"
+        description.repair(kind, text, holder if one.element is None else one.element)
 
 
 def _materials(description: Description, elements: Sequence[Element]) -> dict[str | None, Material]:
