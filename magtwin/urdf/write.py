@@ -214,6 +214,8 @@ class _Writer:
             for prim in Usd.PrimRange(self.robot)
             if prim.IsA(UsdPhysics.Joint) and UsdPhysics.Joint(prim).GetJointEnabledAttr().Get() is not False
         ]
+        if any(self._end(prim, UsdPhysics.Joint(prim).GetBody0Rel()) is None for prim in prims):
+            self._take_world()
         self.joint_names = {prim.GetPath(): free_name(_name(prim), taken) for prim in prims}
         joints = [self._joint(prim, self.joint_names[prim.GetPath()]) for prim in prims]
         if circle := _circle({joint.name: joint.mimic[0] for joint in joints if joint.mimic is not None}):
@@ -243,6 +245,13 @@ class _Writer:
             else:
                 hold("fixed", above, link, link)
         return joints
+
+    def _take_world(self) -> None:
+        """Let a site called `world` at the robot's prim be the link that holds the base, and no frame."""
+        for path, link in self.links.items():
+            if link.name == WORLD and not link.body and _is_identity(link.T):
+                self.world = self.links.pop(path).name
+                return
 
     def _joint(self, prim: Usd.Prim, name: str) -> _Joint:
         joint, kind = UsdPhysics.Joint(prim), KINDS.get(prim.GetTypeName())

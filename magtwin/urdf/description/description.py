@@ -37,6 +37,9 @@ Element = ElementTree.Element
 
 _SCHEME = re.compile(r"^(package|model):/*")
 
+_NAMELESS = re.compile(r"^(package|model):///")
+"""A path without a package, such as `package:///meshes/arm.stl`."""
+
 JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "planar", "floating")
 """Types of joints that can be converted."""
 
@@ -95,10 +98,15 @@ class Description:
         """The file that a `filename=` refers to, see `Source.find_file`.
 
         Backslashes, too many or too few slashes after a scheme, and names relative to the package are
-        repaired.
+        repaired. A path that names no package, with three slashes, may lead to a file beside the description.
         """
         element = self.source.elements.get(("", filename))
-        usual = _SCHEME.sub(r"\1://", filename.replace("\\", "/"))
+        name = filename.replace("\\", "/")
+        usual = _SCHEME.sub(r"\1://", name)
+        rest = usual.partition("://")[2]
+        is_beside = "/" not in rest or os.path.isfile(self.path.parent / rest)  # noqa: PTH113, which may raise
+        if _NAMELESS.match(name) and is_beside:
+            usual = rest
         if usual != filename:
             self.repair("file-name", f"{what} {filename!r} is read as {usual!r}", element)
         try:
