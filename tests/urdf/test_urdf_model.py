@@ -52,7 +52,9 @@ def same(mine, theirs):
         assert mine is None
         assert theirs is None
     elif hasattr(mine, "__dataclass_fields__"):
-        for name in mine.__dataclass_fields__:
+        for name in mine.__dataclass_fields__.keys() - {
+            "own_body"
+        }:  # `dont_collapse`, which yourdfpy ignores
             same(getattr(mine, name), getattr(theirs, name))
     else:
         kind = float if isinstance(mine, float) else None  # of damping and friction yourdfpy has the text

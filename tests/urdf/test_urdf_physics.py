@@ -205,7 +205,7 @@ def test_a_link_without_inertial_is_part_of_a_body_or_has_the_mass_that_engines_
 
 
 def capsule_moments(r, length):
-    """Inertia of a capsule of 1000 kg/m3: its ends' centres of mass are length / 2 + 3/8 r from the middle."""
+    """Mass and moments of a capsule of 1000 kg/m3; the centre of half a ball is 3/8 r from its face."""
     tube, ball = 1000 * np.pi * r**2 * length, 4000 / 3 * np.pi * r**3
     ends = ball * (0.4 * r**2 + length**2 / 4 + 3 / 8 * length * r)
     across = tube * (r**2 / 4 + length**2 / 12) + ends

@@ -11,6 +11,7 @@ from test_urdf import BALL, INERTIAL
 from magtwin.errors import InputError
 from magtwin.urdf.convert import convert_with_report
 from magtwin.urdf.description.description import origin_of, read_description
+from magtwin.urdf.description.kinematics import link_poses
 from magtwin.urdf.description.tag import KEPT
 from magtwin.urdf.description.vocabulary import GRAMMAR, unused
 from magtwin.urdf.options import Options
@@ -158,6 +159,7 @@ def test_a_quaternion_turns_a_link_and_comes_back_as_the_same_turn(tmp_path):
     stage, _ = convert(tmp_path, arm('type="fixed"', origin=f'<origin xyz="0 0 1" {QUARTER}/>'), strict=True)
     T = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath("/arm/tip"))).T
     assert_allclose(T[:3], [[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 1]], atol=1e-12)
+    assert_allclose(link_poses(tmp_path / "robot.urdf")["tip"], T, atol=1e-12)
     write_urdf(tmp_path / "usd" / "robot.usda", tmp_path / "back.urdf")
     back = read_description(tmp_path / "back.urdf").joints["tip"].origin
     assert_allclose(back, T, atol=1e-12)

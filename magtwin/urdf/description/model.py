@@ -4,6 +4,7 @@ They are read here and not by yourdfpy, whose import takes longer than a whole c
 every link and joint with yourdfpy's.
 """
 
+import math
 from dataclasses import dataclass, field
 from xml.etree import ElementTree
 
@@ -271,6 +272,20 @@ def read_origin(element: Element | None) -> Array | None:
             [0.0, 0.0, 0.0, 1.0],
         ]
     )
+
+
+def rpy_of(R: Array) -> tuple[float, float, float]:
+    """Roll, pitch and yaw of a rotation, R = Rz Ry Rx.
+
+    Each angle is removed before the next is read, so that errors near a pitch of 90 deg cancel.
+    """
+    yaw = math.atan2(R[1, 0], R[0, 0]) if math.hypot(R[0, 0], R[1, 0]) > 1e-12 else 0.0
+    c, s = math.cos(yaw), math.sin(yaw)
+    R = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ R
+    pitch = math.atan2(-R[2, 0], R[0, 0])
+    c, s = math.cos(pitch), math.sin(pitch)
+    R = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]) @ R
+    return math.atan2(R[2, 1], R[1, 1]), pitch, yaw
 
 
 def _number(element: Element, name: str) -> float | None:
