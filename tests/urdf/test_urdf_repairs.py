@@ -506,6 +506,19 @@ def test_a_folder_of_meshes_beside_a_folder_urdf_is_read_and_nothing_else_there(
         convert_with_report(path, tmp_path / "b.usda")
 
 
+@pytest.mark.parametrize("name", ["box.stl", "meshes/box.stl"])
+def test_a_path_that_names_no_package_leads_to_the_file_beside_the_description(tmp_path, name):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    trimesh.creation.box([0.1, 0.2, 0.3]).export(tmp_path / name)
+    path = tmp_path / "arm.urdf"
+    mesh = f'<geometry><mesh filename="package:///{name}"/></geometry>'
+    path.write_text(f"{HEAD}\n{look(mesh)}\n</robot>")
+    report = convert_with_report(path, tmp_path / "usd" / "arm.usda")
+    assert_allclose(np.subtract(*report.box_out[::-1]), [0.1, 0.2, 0.3], rtol=1e-6)
+    (entry,) = [entry for row in report.repairs for entry in row.entries]
+    assert entry.text == f"mesh 'package:///{name}' is read as {name!r}"
+
+
 def test_a_placeholder_has_the_inertia_of_its_link_or_the_box_of_its_other_shapes(tmp_path):
     size, mass = np.array([0.1, 0.2, 0.4]), 3.0
     a, b, c = size**2
