@@ -234,8 +234,13 @@ class _Author:
             driven = base.wheels
             surfaces = grip(mechanism, driven, surfaces)
             commands = not_on(driven, commands)
-        options = replace(self.options, drives=(*self.options.drives, *commands))
-        places = place_links(mechanism, merge=options.merge_fixed, filled=options.density is not None)
+        places = place_links(
+            mechanism, merge=self.options.merge_fixed, filled=self.options.density is not None
+        )
+        fixed = self.options.fix_base or (
+            base is None and self.options.profile == "general" and mechanism.in_world(_base(places))
+        )
+        options = replace(self.options, drives=(*self.options.drives, *commands), fix_base=fixed)
         poses = mechanism.poses()
         robot = _define(stage, Sdf.Path.absoluteRootPath.AppendChild(names[""]), description.name)
         stage.SetDefaultPrim(robot)
@@ -336,6 +341,8 @@ class _Author:
         if options.fix_base and places[description.root][0] != WORLD and base != WORLD:
             pose, ends = mechanism.poses()[base], (paths[WORLD], paths[base])
             made[""] = define_fixed_joint(stage, scope.AppendChild(names[""]), ends, pose)
+            if not self.options.fix_base:
+                description.note(f"link 'world' is the world: the base {base!r} is fixed to it")
         elif description.root == "world" and base != WORLD:
             description.note(f"link 'world' is not the world: the base {base!r} floats; --fix-base holds it")
         for child, joint in description.joints.items():

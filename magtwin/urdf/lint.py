@@ -75,7 +75,7 @@ def _size(description: Description, shapes: dict[str, list[Array]]) -> Iterator[
 
 
 def _masses(description: Description) -> Iterator[str]:
-    """Frames with a mass but no shape, and bodies without mass or inertia."""
+    """Frames with a mass but no shape."""
     dummies: dict[float, list[str]] = {}
     for name, link in description.links.items():
         fixed = name in description.joints and description.joints[name].type == "fixed"
@@ -86,13 +86,6 @@ def _masses(description: Description) -> Iterator[str]:
             f"frames with a mass of {mass:g} kg and no shape, {len(names) * mass:g} kg in all "
             f"({len(names)}): {', '.join(names)}"
         )
-    links = description.links.values()
-    bare = [link.name for link in links if (link.visuals or link.collisions) and link.inertial is None]
-    if bare:
-        yield f"no <inertial>, though there is a shape: {', '.join(bare)}"
-    partial = [link.name for link in links if link.inertial is not None and link.inertial.inertia is None]
-    if partial:
-        yield f"no <inertia> in <inertial>: {', '.join(partial)}"
 
 
 def _frames_outside(description: Description, shapes: dict[str, list[Array]]) -> Iterator[str]:

@@ -26,7 +26,7 @@ LOOKS = "Looks"
 
 
 def define_look(robot: Usd.Prim, look: Paint, meshes: MeshLayer) -> UsdShade.Material:
-    """The material of a look, shared by all prims that look so, whatever its name.
+    """The material of a look, shared by all prims that look so and name it so.
 
     Args:
         robot: Root prim; looks are in a scope below it.
@@ -62,22 +62,17 @@ def define_look(robot: Usd.Prim, look: Paint, meshes: MeshLayer) -> UsdShade.Mat
         if look.see_through:
             maps.insert(1, ("opacity", replace(own, channel="a")))
     files = [meshes.textures.add(each.image) for _, each in maps]
-    shown = (
-        tuple(inputs),
-        tuple(files),
-        tuple((n, replace(m, image=NO_IMAGE)) for n, m in maps),
-        look.by_vertex,
-    )
+    values = tuple((n, replace(m, image=NO_IMAGE)) for n, m in maps)
+    shown = look.name, tuple(inputs), tuple(files), values, look.by_vertex
+    if shown in meshes.looks:
+        return UsdShade.Material(stage.GetPrimAtPath(meshes.looks[shown]))
     hexed = "".join(f"{round(c * 255):02x}" for c in look.rgba)
     stem, number = Tf.MakeValidIdentifier(look.name) if look.name else f"colour_{hexed}", 1
-    same = meshes.same_look(shown, look.name)
-    if same is not None:
-        return UsdShade.Material(stage.GetPrimAtPath(same))
     path = scope.AppendChild(stem)
     while stage.GetPrimAtPath(path):
         path = scope.AppendChild(f"{stem}_{hexed}" if number == 1 else f"{stem}_{hexed}_{number}")
         number += 1  # two looks have the same name
-    meshes.looks[shown] = path, look.name
+    meshes.looks[shown] = path
     material = UsdShade.Material.Define(stage, path)
     surface = UsdShade.Shader.Define(stage, path.AppendChild("surface"))
     surface.CreateIdAttr("UsdPreviewSurface")

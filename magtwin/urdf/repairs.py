@@ -15,6 +15,9 @@ SUGGESTED = 100
 NOTE, LOSS = "note", "loss"
 """Kinds of entries that are no fault of their own: a guess, which strict accepts, and anything left out."""
 
+UNKNOWN = ("element-unknown", "attribute-unknown")
+"""Kinds of faults that a summary shows with their text, since it has the near name."""
+
 FAULTS: Mapping[str, tuple[str, str]] = {
     "inertia-impossible": (
         "inertia that no body has",
@@ -47,7 +50,9 @@ FAULTS: Mapping[str, tuple[str, str]] = {
     "number-range": ("number out of its range", "nearest allowed number"),
     "number-count": ("too many or too few numbers", "the reading that is evident"),
     "number-unreadable": ("something that is no number, where a default exists", "the default"),
-    "tag-unknown": ("unknown tag", "left out"),
+    "element-unknown": ("unknown element", "kept as text"),
+    "attribute-unknown": ("unknown attribute", "kept as text"),
+    "turn-twice": ("<origin> with rpy and quat_xyzw", "quat_xyzw is used"),
     "tag-twice": ("second tag of one kind", "left out"),
     "tag-misplaced": ("<texture>, <material> or <color> in the wrong place", "moved to where it belongs"),
     "tag-empty": ("<texture>, <material> or <color> without content", "left out"),

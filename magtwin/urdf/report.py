@@ -16,7 +16,7 @@ from magtwin.urdf.description.model import Shape
 from magtwin.urdf.meshes.mesh import bounds
 from magtwin.urdf.meshes.mesh_layer import MeshLayer
 from magtwin.urdf.physics.mass import engine_masses
-from magtwin.urdf.repairs import FAULTS, Repair
+from magtwin.urdf.repairs import FAULTS, UNKNOWN, Repair
 from magtwin.usd.geometry import read_vertices
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -148,7 +148,7 @@ class ConversionReport:
     lint: tuple[str, ...]
     """Doubtful values in the description, one line each."""
     unknown_tags: Mapping[str, int] = field(default_factory=dict)
-    """Number of occurrences of each tag that is kept as text."""
+    """Number of occurrences of each tag, and attribute as `@name`, that is known and kept as text."""
 
     @property
     def _faults(self) -> frozenset[str]:
@@ -185,7 +185,7 @@ class ConversionReport:
         faults = self._faults
         guesses = [note for note in self.notes if note not in faults]
         figures += [
-            Figure("unknown tags", sum(self.unknown_tags.values()), note="kept as text"),
+            Figure("tags and attributes without a use", sum(self.unknown_tags.values()), note="kept as text"),
             Figure("guesses", len(guesses)),
             Figure("doubts about the description", len(self.lint)),
         ]
@@ -194,7 +194,18 @@ class ConversionReport:
             "sha256": self.source_sha256,
             "to supply what is missing": self.supply,
         }
-        lists = {"losses": _first(self.losses), "guesses": _first(guesses), "doubts": _first(self.lint)}
+        unknown = [
+            f"{entry.place}: {entry.text}"
+            for line in self.repairs
+            for entry in line.entries
+            if line.kind in UNKNOWN
+        ]
+        lists = {
+            "unknown": _first(unknown),
+            "losses": _first(self.losses),
+            "guesses": _first(guesses),
+            "doubts": _first(self.lint),
+        }
         metadata |= {name: lines for name, lines in lists.items() if lines}
         return Report(f"{self.robot}: {self.source} -> {self.stage}", tuple(figures), metadata)
 
@@ -213,7 +224,7 @@ class Ledger:
     """Prims of each geometry, by link, role and index."""
 
     unknown_tags: dict[str, int] = field(default_factory=dict)
-    """Number of occurrences of each tag without a meaning here."""
+    """Number of occurrences of each known tag or attribute without a meaning here."""
 
 
 def make_report(

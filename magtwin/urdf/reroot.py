@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from magtwin.errors import InputError
-from magtwin.frames import matrix_from_quat, quat_from_rpy
+from magtwin.urdf.description.model import read_origin
 from magtwin.urdf.source.markup import parse_markup
 from magtwin.urdf.write import write_origin
 
@@ -45,14 +45,12 @@ def reroot(text: str, base: str, path: Path) -> str:
     for joint, parent, child in chain:
         parent.attrib, child.attrib = child.attrib, parent.attrib
         origin = joint.find("origin")
-        if origin is None:
-            continue
-        T = np.eye(4)
         try:
-            xyz, rpy = (np.array(origin.get(name, "0 0 0").split(), float) for name in ("xyz", "rpy"))
-            T[:3, :3], T[:3, 3] = matrix_from_quat(quat_from_rpy(rpy)), xyz
+            T = read_origin(origin)
         except ValueError as error:
             raise InputError(f"{path}: joint {joint.get('name')!r} has an invalid origin: {error}") from error
+        if origin is None or T is None:
+            continue
         joint.remove(origin)
         write_origin(joint, np.linalg.inv(T).astype(np.float64))
     return ElementTree.tostring(tree, encoding="unicode", xml_declaration=False)

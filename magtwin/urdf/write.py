@@ -24,6 +24,7 @@ from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat
 from magtwin.outputs import check_free, output, transaction
 from magtwin.report import Figure, Report
+from magtwin.urdf.description.model import rpy_of
 from magtwin.urdf.meshes.mesh_layer import MESH, free_name, primitive_of
 from magtwin.urdf.physics.joint import AXIS
 from magtwin.urdf.physics.link import SITE_API
@@ -214,6 +215,8 @@ class _Writer:
             for prim in Usd.PrimRange(self.robot)
             if prim.IsA(UsdPhysics.Joint) and UsdPhysics.Joint(prim).GetJointEnabledAttr().Get() is not False
         ]
+        if any(self._end(prim, UsdPhysics.Joint(prim).GetBody0Rel()) is None for prim in prims):
+            self._take_world()
         self.joint_names = {prim.GetPath(): free_name(_name(prim), taken) for prim in prims}
         joints = [self._joint(prim, self.joint_names[prim.GetPath()]) for prim in prims]
         if circle := _circle({joint.name: joint.mimic[0] for joint in joints if joint.mimic is not None}):
@@ -243,6 +246,13 @@ class _Writer:
             else:
                 hold("fixed", above, link, link)
         return joints
+
+    def _take_world(self) -> None:
+        """Let a site called `world` at the robot's prim be the link that holds the base, and no frame."""
+        for path, link in self.links.items():
+            if link.name == WORLD and not link.body and _is_identity(link.T):
+                self.world = self.links.pop(path).name
+                return
 
     def _joint(self, prim: Usd.Prim, name: str) -> _Joint:
         joint, kind = UsdPhysics.Joint(prim), KINDS.get(prim.GetTypeName())
@@ -549,24 +559,10 @@ def _text(values: Iterable[float]) -> str:
     return " ".join(repr(round(float(v), 15) + 0.0).removesuffix(".0") for v in values)
 
 
-def _rpy(R: Array) -> tuple[float, float, float]:
-    """Roll, pitch and yaw of a rotation, R = Rz Ry Rx.
-
-    Each angle is removed before the next is read, so that errors near a pitch of 90 deg cancel.
-    """
-    yaw = math.atan2(R[1, 0], R[0, 0]) if math.hypot(R[0, 0], R[1, 0]) > 1e-12 else 0.0
-    c, s = math.cos(yaw), math.sin(yaw)
-    R = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ R
-    pitch = math.atan2(-R[2, 0], R[0, 0])
-    c, s = math.cos(pitch), math.sin(pitch)
-    R = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]) @ R
-    return math.atan2(R[2, 1], R[1, 1]), pitch, yaw
-
-
 def write_origin(element: Element, T: Array) -> None:
     """Add an `<origin>` with pose T, shape (4, 4), unless it is the identity."""
     if not _is_identity(T):
-        Sub(element, "origin", xyz=_text(T[:3, 3]), rpy=_text(_rpy(T[:3, :3])))
+        Sub(element, "origin", xyz=_text(T[:3, 3]), rpy=_text(rpy_of(T[:3, :3])))
 
 
 def _write_inertial(element: Element, prim: Usd.Prim) -> None:

@@ -183,6 +183,26 @@ def test_rules_that_cannot_run_are_named_with_the_reason_and_are_not_counted(isa
     assert note.text.endswith("the stage has no robot in a separate asset")
 
 
+GRIPPER = """<robot name="grip"><link name="palm">{0}</link><link name="left">{0}</link>
+<link name="right">{0}</link><joint name="lead" type="prismatic"><parent link="palm"/><child link="left"/>
+<axis xyz="0 1 0"/><limit lower="0" upper="0.015" effort="5" velocity="1"/></joint>
+<joint name="follow" type="prismatic"><parent link="palm"/><child link="right"/><axis xyz="0 1 0"/>
+<limit lower="-0.015" upper="0" effort="5" velocity="1"/><mimic joint="lead" multiplier="-1"/></joint></robot>
+""".format('<inertial><mass value="1"/></inertial>')
+
+
+def test_limits_of_a_follower_that_isaac_sims_rule_compares_with_the_wrong_sign_are_no_error(
+    isaac_rules, tmp_path
+):
+    (tmp_path / "grip.urdf").write_text(GRIPPER)
+    asset = convert_urdf(tmp_path / "grip.urdf", tmp_path / "grip" / "grip.usda")
+    check = isaac(asset, {"/grip": asset})
+    assert errors(check) == []
+    (note,) = [f.text for f in check.findings if f.rule == "not-run" and "MimicAPICheck" in f.text]
+    assert "its comparison of limits does not apply: its sign is wrong" in note
+    assert check.scope.startswith("23 of 24 rules")  # what else the rule checks, it checks
+
+
 def test_the_makers_description_of_the_turtlebot_4_converts_without_an_error(
     isaac_rules, real_data, tmp_path
 ):

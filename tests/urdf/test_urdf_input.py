@@ -345,12 +345,12 @@ def test_small_errors_are_repaired_and_noted():
     assert faults == [
         ("number-range", "link 'base_link': rgba of <color> is above 1 in '255 0 0': reduced to it", 5),
         ("number-count", "link 'base_link': rgba of <color> has 3 numbers in '255 0 0': completed by 1", 5),
+        ("tag-twice", "link 'base_link': a second <inertial> in <link> is left out", 12),
         (
-            "tag-unknown",
-            "link 'base_link': <colision> is unknown in <link> (did you mean 'collision'?) and left out",
+            "element-unknown",
+            "link 'base_link': <colision> in <link> is unknown (did you mean 'collision'?): kept as text",
             10,
         ),
-        ("tag-twice", "link 'base_link': a second <inertial> in <link> is left out", 12),
         ("shape-empty", "link 'base_link': a visual box of size 0 is left out", 2),
     ]
 

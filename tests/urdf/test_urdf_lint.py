@@ -18,10 +18,6 @@ def doubts(name, **options):
 
 DOUBTS = {
     "dummies": ["frames with a mass of 0.01 kg and no shape, 0.02 kg in all (2): camera, imu"],
-    "weightless": [
-        "no <inertial>, though there is a shape: base_link",
-        "no <inertia> in <inertial>: hand",
-    ],
     "frame_outside": ["link 'button' at (0, 0.5, 0) m lies 0.4 m outside of the body"],
     "sides_swapped": [
         "link 'bump_left' is at y = -0.15 m and 'bump_right' at 0.15 m: swapped? left is +y (REP-103)"

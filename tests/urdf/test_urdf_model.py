@@ -52,7 +52,9 @@ def same(mine, theirs):
         assert mine is None
         assert theirs is None
     elif hasattr(mine, "__dataclass_fields__"):
-        for name in mine.__dataclass_fields__:
+        for name in mine.__dataclass_fields__.keys() - {
+            "own_body"
+        }:  # `dont_collapse`, which yourdfpy ignores
             same(getattr(mine, name), getattr(theirs, name))
     else:
         kind = float if isinstance(mine, float) else None  # of damping and friction yourdfpy has the text
@@ -112,7 +114,7 @@ def compare(description):
 
 def test_every_input_of_the_tests_is_read_as_yourdfpy_reads_it():
     counts = np.sum([compare(description) for description in readable().values()], axis=0)
-    assert counts.tolist() == [39, 35, 17]
+    assert counts.tolist() == [37, 31, 16]
 
 
 @pytest.mark.parametrize(

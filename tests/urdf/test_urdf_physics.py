@@ -11,10 +11,12 @@ from validators import assert_valid
 from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.urdf import convert_urdf, read_notes
+from magtwin.urdf.description.description import read_description
 from magtwin.urdf.options import DriveRule, Options
 from magtwin.urdf.physics import inertia as solids
 from magtwin.urdf.physics.inertia import MassProperties, combined
 from magtwin.urdf.physics.mass import engine_masses
+from magtwin.urdf.write import write_urdf
 from magtwin.usd.sensors import read_drive
 
 LIMIT = '<limit effort="3" velocity="2" lower="-1" upper="0.5"/>'
@@ -181,17 +183,61 @@ def test_a_massless_base_takes_the_mass_of_the_inertial_link_welded_to_it(tmp_pa
     assert "link 'base' has no <inertial>: it takes that of 'mass'" in notes
 
 
-@pytest.mark.parametrize("shape", ["collision", "visual"])
-def test_a_link_without_inertial_adds_no_mass_in_an_engine(tmp_path, shape):
+@pytest.mark.parametrize(
+    ("shape", "mass", "told"),
+    [
+        ("collision", 4000 / 3 * np.pi * 0.1**3, "4.19 kg, its colliders at 1000 kg/m3"),
+        ("visual", 0.001, "0.001 kg, so that engines add none"),
+    ],
+)
+def test_a_link_without_inertial_is_part_of_a_body_or_has_the_mass_that_engines_compute(
+    tmp_path, shape, mass, told
+):
     shapes = f"<{shape}>{BALL}</{shape}>"
     stage, robot, notes = convert(arm(tmp_path, "fixed|", shapes))
     assert "link 'hand' has no <inertial>: it is part of the body of 'base_link'" in notes
     assert not robot.GetPrimAtPath("base_link/hand").HasAPI(UsdPhysics.RigidBodyAPI)
     fixed = sum(engine_masses(stage).values())
     stage, robot, notes = convert(arm(tmp_path, "continuous|", shapes))
-    assert "link 'hand' has no <inertial>: 0.001 kg, so that engines add none" in notes
-    assert_allclose(sum(engine_masses(stage).values()), fixed + 0.001, rtol=1e-6)
-    assert_allclose(mass_of(robot.GetPrimAtPath("hand"))[0], 0.001, rtol=1e-6)
+    assert f"link 'hand' has no <inertial>: {told}" in notes
+    assert_allclose(sum(engine_masses(stage).values()), fixed + mass, rtol=1e-6)
+    assert_allclose(mass_of(robot.GetPrimAtPath("hand"))[0], mass, rtol=1e-6)
+
+
+def capsule_moments(r, length):
+    """Mass and moments of a capsule of 1000 kg/m3; the centre of half a ball is 3/8 r from its face."""
+    tube, ball = 1000 * np.pi * r**2 * length, 4000 / 3 * np.pi * r**3
+    ends = ball * (0.4 * r**2 + length**2 / 4 + 3 / 8 * length * r)
+    across = tube * (r**2 / 4 + length**2 / 12) + ends
+    return tube + ball, [across, across, tube * r**2 / 2 + ball * 0.4 * r**2]
+
+
+LONG = 1000 * np.pi * 0.05**2 * 0.3
+
+
+@pytest.mark.parametrize(
+    ("kind", "shape", "mass", "moments"),
+    [
+        ("Cube", '<box size="0.2 0.2 0.1"/>', 4, [4 / 12 * 0.05, 4 / 12 * 0.05, 4 / 12 * 0.08]),
+        (
+            "Cylinder",
+            '<cylinder radius="0.05" length="0.3"/>',
+            LONG,
+            [LONG * (0.0025 / 4 + 0.09 / 12)] * 2 + [LONG * 0.0025 / 2],
+        ),
+        ("Capsule", '<capsule radius="0.1" length="0.4"/>', *capsule_moments(0.1, 0.4)),
+    ],
+)
+def test_a_body_without_inertial_has_mass_and_inertia_of_its_collider_at_1000_kg_per_m3(
+    tmp_path, kind, shape, mass, moments
+):
+    collision = f"<collision><geometry>{shape}</geometry></collision>"
+    stage, _, _ = convert(urdf(tmp_path, f'<link name="base">{collision}</link>'))
+    body = stage.GetPrimAtPath("/arm/base")
+    assert [p.GetTypeName() for p in body.GetChild("collisions").GetChildren()] == [kind]
+    api = UsdPhysics.MassAPI(body)
+    assert_allclose(api.GetMassAttr().Get(), mass, rtol=1e-6)  # single precision
+    assert_allclose(api.GetDiagonalInertiaAttr().Get(), moments, rtol=1e-6)
 
 
 ZEROS = '<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/>'
@@ -432,18 +478,6 @@ def test_a_mimic_is_authored_for_newton_and_for_physx_and_its_own_drive_has_no_g
     assert_allclose(hand.ExtractRotation().GetAngle(), np.degrees(0.1), atol=1e-6)  # where it rests
 
 
-def test_the_limits_of_a_follower_overlap_those_of_its_leader_times_the_gearing(tmp_path):
-    """Isaac Sim's MimicAPICheck, which the fingers of Panda and HSR failed: they close at 0."""
-    closed = '<limit lower="0" upper="0.7" effort="3" velocity="2"/>'
-    path = follower(tmp_path, '<mimic joint="lead"/>', lead=closed)
-    path.write_text(path.read_text().replace(LIMIT, closed))
-    _stage, robot, _ = convert(path)
-    joint = prim(robot, "f")
-    low, high = (joint.GetAttribute(f"physics:{end}Limit").Get() for end in ("lower", "upper"))
-    assert -0.001 < low < 0
-    assert_allclose(high, np.degrees(0.7), rtol=1e-6)
-
-
 def test_a_slide_that_follows_a_turn_gears_in_metres_per_degree(tmp_path):
     path = follower(tmp_path, '<mimic joint="lead" multiplier="0.05"/>', kind="prismatic")
     _stage, robot, _ = convert(path)
@@ -579,14 +613,34 @@ def test_a_rule_without_effect_is_refused(rule, message):
         DriveRule.parse("x:velocity")
 
 
-def test_a_root_called_world_does_not_fix_the_base_by_default(tmp_path):
+def test_a_base_that_is_fixed_to_a_root_called_world_is_fixed_at_its_place(tmp_path):
     body = """<link name="world"/><link name="base">{BODY}</link>
-    <joint name="j" type="fixed"><parent link="world"/><child link="base"/></joint>"""
-    path = urdf(tmp_path, body, "desk")
-    assert any("the base 'base' floats" in note for note in convert(path)[2])
-    stage, _, notes = convert(path, fix_base=True)
-    assert [p for p in stage.Traverse() if p.IsA(UsdPhysics.FixedJoint)]
-    assert not any("floats" in note for note in notes)
+    <joint name="j" type="TYPE"><parent link="world"/><child link="base"/><origin xyz="0 0 0.5"/></joint>"""
+    path = urdf(tmp_path, body.replace("TYPE", "fixed"), "desk")
+    stage, robot, notes = convert(path)
+    (fixed,) = [UsdPhysics.FixedJoint(p) for p in stage.Traverse() if p.IsA(UsdPhysics.FixedJoint)]
+    assert fixed.GetBody0Rel().GetTargets() == [robot.GetPath()]
+    assert fixed.GetBody1Rel().GetTargets() == [robot.GetPrimAtPath("base").GetPath()]
+    assert_allclose(fixed.GetLocalPos0Attr().Get(), [0, 0, 0.5])
+    assert "link 'world' is the world: the base 'base' is fixed to it" in notes
+    write_urdf(tmp_path / "desk.usda", tmp_path / "back.urdf")
+    back = read_description(tmp_path / "back.urdf")
+    (joint,) = back.joints.values()
+    assert (joint.type, joint.parent, joint.child) == ("fixed", "world", "base")
+    assert_allclose(joint.origin[:3, 3], [0, 0, 0.5], atol=1e-12)
+    stage, _, notes = convert(urdf(tmp_path, body.replace("TYPE", "floating"), "desk"))
+    assert not [p for p in stage.Traverse() if p.IsA(UsdPhysics.FixedJoint)]
+    assert any("the base 'base' floats" in note for note in notes)
+
+
+def test_a_base_that_drives_floats_below_a_root_called_world(tmp_path):
+    path = rover(tmp_path)
+    hold = '<link name="world"/><joint name="j" type="fixed"><parent link="world"/><child link="base_link"/>'
+    path.write_text(path.read_text().replace("</robot>", f"{hold}</joint></robot>"))
+    stage, robot, notes = convert(path, profile="diff-drive")
+    joints = [UsdPhysics.Joint(p) for p in stage.Traverse() if p.IsA(UsdPhysics.Joint)]
+    assert not any(robot.GetPath() in joint.GetBody0Rel().GetTargets() for joint in joints)
+    assert any("the base 'base_link' floats" in note for note in notes)
 
 
 # --- the profile of bases with two driven wheels --------------------------------------------------

@@ -143,6 +143,7 @@ FAULTY = {
     ],
     "number-range": [
         (look('<geometry><sphere radius="-0.1"/></geometry>'), 2, "used without its sign"),
+        (look(f'<origin quat_xyzw="0 0 1 1"/>{BALL}'), 2, "has length 1.414 in '0 0 1 1': scaled to 1"),
         (moving("revolute", '<limit lower="0" upper="1"/><dynamics damping="-1"/>'), 5, "raised to it"),
         (look(f'{BALL}<material name="m"><color rgba="255 0 0 1"/></material>'), 2, "reduced to it"),
         (f'{GOOD}\n<gazebo reference="base"><mu1>-1</mu1></gazebo>', 3, "mu1 -1 is below 0: raised to it"),
@@ -162,7 +163,25 @@ FAULTY = {
         (look(f'{BALL}<material name="m"><color rgba="red"/></material>'), 2, "rgba of <color> must be"),
         (f'{GOOD}\n<gazebo reference="base"><selfCollide>maybe</selfCollide></gazebo>', 3, "true or false"),
     ],
-    "tag-unknown": [(BASE.format(TENSOR, "<colision/>"), 2, "did you mean 'collision'?")],
+    "element-unknown": [
+        (
+            BASE.format(TENSOR, "<colision/>"),
+            2,
+            "<colision> in <link> is unknown (did you mean 'collision'?)",
+        ),
+        (look('<geometry><cylindre radius="1"/></geometry>'), 2, "(did you mean 'cylinder'?)"),
+        (f"{GOOD}\n<transmision/>", 3, "<transmision> in <robot> is unknown (did you mean 'transmission'?)"),
+    ],
+    "attribute-unknown": [
+        (
+            moving("revolute", '<limit lower="-1" upper="1" efort="1"/>'),
+            5,
+            "efort='1' of <limit> is unknown (d",
+        ),
+        (look(f'<origin ypr="0 0 1"/>{BALL}'), 2, "link 'base': ypr='0 0 1' of <origin> is unknown: kept"),
+        (f'{GOOD}\n<material name="m" colour="red"><color rgba="1 0 0 1"/></material>', 3, "colour='red'"),
+    ],
+    "turn-twice": [(look(f'<origin rpy="0 0 1" quat_xyzw="0 0 0 1"/>{BALL}'), 2, "quat_xyzw is used")],
     "tag-twice": [
         (
             look('<geometry><sphere radius="1"/><box size="1 1 1"/></geometry>'),
@@ -193,7 +212,7 @@ FAULTY = {
     "shape-missing": [
         (look("<origin/>"), 2, "a <visual> without <geometry>"),
         (look("<geometry/>", "collision"), 2, "a <geometry> without a shape"),
-        (look('<geometry><cylindre radius="1"/></geometry>'), 2, "did you mean 'cylinder'?"),
+        (look('<geometry><cylindre radius="1"/></geometry>'), 2, "a <geometry> without a shape"),
         (look("<geometry><mesh/></geometry>"), 2, "a <mesh> without filename="),
         (look("<geometry><sphere/></geometry>"), 2, "a <sphere> without radius="),
     ],
@@ -485,6 +504,19 @@ def test_a_folder_of_meshes_beside_a_folder_urdf_is_read_and_nothing_else_there(
     path.write_text(path.read_text().replace("../meshes", "../secret"))
     with pytest.raises(InputError, match="lies outside"):
         convert_with_report(path, tmp_path / "b.usda")
+
+
+@pytest.mark.parametrize("name", ["box.stl", "meshes/box.stl"])
+def test_a_path_that_names_no_package_leads_to_the_file_beside_the_description(tmp_path, name):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    trimesh.creation.box([0.1, 0.2, 0.3]).export(tmp_path / name)
+    path = tmp_path / "arm.urdf"
+    mesh = f'<geometry><mesh filename="package:///{name}"/></geometry>'
+    path.write_text(f"{HEAD}\n{look(mesh)}\n</robot>")
+    report = convert_with_report(path, tmp_path / "usd" / "arm.usda")
+    assert_allclose(np.subtract(*report.box_out[::-1]), [0.1, 0.2, 0.3], rtol=1e-6)
+    (entry,) = [entry for row in report.repairs for entry in row.entries]
+    assert entry.text == f"mesh 'package:///{name}' is read as {name!r}"
 
 
 def test_a_placeholder_has_the_inertia_of_its_link_or_the_box_of_its_other_shapes(tmp_path):

@@ -137,6 +137,57 @@ def test_every_kind_of_joint_comes_back_with_its_figures(tmp_path):
     assert_same_kinematics(urdf, before, after, back, 1e-12)
 
 
+FOLLOWERS = {
+    "a finger that mirrors the other": ("prismatic", (0, 0.015), "prismatic", (-0.015, 0), -1, 0),
+    "fingers that close at 0": ("prismatic", (-0.015, 0), "prismatic", (-0.015, 0), 1, 0),
+    "a finger that opens alike": ("prismatic", (0, 0.04), "prismatic", (0, 0.04), 1, 0),
+    "fingers that close beyond 0": ("prismatic", (0.015, 0.03), "prismatic", (-0.03, -0.015), -1, 0),
+    "a turn the other way": ("revolute", (-0.8, 0), "revolute", (0, 0.8), -1, 0),
+    "a ratio with an offset": ("revolute", (-1, 0.5), "revolute", (-0.9, 2.1), -2, 0.1),
+    "a narrower range": ("revolute", (-1, 1), "revolute", (-0.5, -0.2), 0.5, -0.3),
+    "a slide by a turn": ("revolute", (0, 1.57), "prismatic", (-0.08, 0), -0.05, 0),
+    "a turn by a slide": ("prismatic", (0, 0.05), "revolute", (-1.2, 0.1), -20.5, 0.02),
+}
+"""Type and range of a leader, and of its follower with multiplier and offset [rad or m]."""
+
+
+@pytest.mark.parametrize("case", FOLLOWERS)
+def test_limits_and_mimic_of_a_follower_are_authored_as_described_and_come_back(tmp_path, case):
+    lead, led, kind, own, multiplier, offset = FOLLOWERS[case]
+    text = f'<robot name="pair"><link name="a">{BODY}</link>'
+    mimic = f'<mimic joint="lead" multiplier="{multiplier}" offset="{offset}"/>'
+    for name, child, type_, range_, more in (("lead", "b", lead, led, ""), ("f", "c", kind, own, mimic)):
+        limit = f'<limit lower="{range_[0]}" upper="{range_[1]}" effort="5" velocity="1"/>'
+        text += f"""<link name="{child}">{INERTIAL}</link><joint name="{name}" type="{type_}">
+        <parent link="a"/><child link="{child}"/><axis xyz="0 1 0"/>{limit}{more}</joint>"""
+    path = tmp_path / "pair.urdf"
+    path.write_text(f"{text}</robot>")
+    before, after, back = there_and_back(path, tmp_path)
+    stage = Usd.Stage.Open(str(tmp_path / "usd" / "robot.usda"))
+    prim = stage.GetPrimAtPath("/pair/joints/f")
+    ends = [prim.GetAttribute(f"physics:{end}Limit").Get() for end in ("lower", "upper")]
+    assert_allclose(ends, np.array(own) * (1 if kind == "prismatic" else 180 / np.pi), rtol=1e-6)
+    for one, two in zip(before.joints.values(), after.joints.values(), strict=True):
+        assert vars(two.limit) == vars(one.limit)
+    assert vars(after.joints["c"].mimic) == {"joint": "lead", "multiplier": multiplier, "offset": offset}
+    assert_same_kinematics(path, before, after, back, 1e-12)
+
+
+def test_a_chain_of_mimics_comes_back_as_mimics_of_its_first_joint(tmp_path):
+    path = tmp_path / "every.urdf"
+    chain = (
+        '<limit lower="-1" upper="1" effort="1" velocity="1"/><mimic joint="j4" multiplier="-3" offset="1"/>'
+    )
+    link = f'<link name="last">{INERTIAL}</link><joint name="j8" type="revolute"><parent link="tip"/>'
+    text = f'{link}<child link="last"/><axis xyz="1 0 0"/>{chain}</joint></robot>'
+    path.write_text(EVERY.replace("</robot>", text))
+    before, after, _ = there_and_back(path, tmp_path)
+    mimic = after.joints["last"].mimic
+    assert_allclose([mimic.multiplier, mimic.offset], [-3 * -1.5, -3 * 0.02 + 1], rtol=1e-6)
+    assert mimic.joint == "j3"
+    assert vars(after.joints["last"].limit) == vars(before.joints["last"].limit)
+
+
 def test_merged_links_come_back_as_frames_on_the_body_that_they_became(tmp_path):
     urdf = shipped("robots", "turtlebot4", "turtlebot4.urdf")
     before, after, back = there_and_back(urdf, tmp_path, merge_fixed=True)

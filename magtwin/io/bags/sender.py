@@ -215,6 +215,6 @@ def _footprint(description: str) -> tuple[FixedFrame, ...]:
             origin = joint.find("origin")
             text = {} if origin is None else origin.attrib
             xyz, rpy = (np.array(text.get(name, "0 0 0").split(), float) for name in ("xyz", "rpy"))
-            q = quat_from_rpy(rpy).tolist()
-            return (FixedFrame("base_link", FOOTPRINT, tuple(xyz.tolist()), tuple(q)),)
+            q = np.array(text["quat_xyzw"].split(), float) if "quat_xyzw" in text else quat_from_rpy(rpy)
+            return (FixedFrame("base_link", FOOTPRINT, tuple(xyz.tolist()), tuple(q.tolist())),)
     return ()

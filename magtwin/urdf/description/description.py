@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.errors import InputError, hint
+from magtwin.errors import InputError, hint, near
 from magtwin.urdf.description.grammar import check_grammar
 from magtwin.urdf.description.model import (
     Inertial,
@@ -29,12 +29,16 @@ from magtwin.urdf.description.model import (
     read_material,
 )
 from magtwin.urdf.description.names import check_names
+from magtwin.urdf.description.vocabulary import PARTS, VERSIONS, unused
 from magtwin.urdf.repairs import LOSS, NOTE, Repairs
 from magtwin.urdf.source.source import Source, read_source
 
 Element = ElementTree.Element
 
 _SCHEME = re.compile(r"^(package|model):/*")
+
+_NAMELESS = re.compile(r"^(package|model):///")
+"""A path without a package, such as `package:///meshes/arm.stl`."""
 
 JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "planar", "floating")
 """Types of joints that can be converted."""
@@ -94,10 +98,15 @@ class Description:
         """The file that a `filename=` refers to, see `Source.find_file`.
 
         Backslashes, too many or too few slashes after a scheme, and names relative to the package are
-        repaired.
+        repaired. A path that names no package, with three slashes, may lead to a file beside the description.
         """
         element = self.source.elements.get(("", filename))
-        usual = _SCHEME.sub(r"\1://", filename.replace("\\", "/"))
+        name = filename.replace("\\", "/")
+        usual = _SCHEME.sub(r"\1://", name)
+        rest = usual.partition("://")[2]
+        is_beside = "/" not in rest or os.path.isfile(self.path.parent / rest)  # noqa: PTH113, which may raise
+        if _NAMELESS.match(name) and is_beside:
+            usual = rest
         if usual != filename:
             self.repair("file-name", f"{what} {filename!r} is read as {usual!r}", element)
         try:
@@ -179,10 +188,9 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
     check_names(source, description.repair)
     description = replace(description, name=source.xml.attrib["name"])
     clean = [
-        check_grammar(part, description.where, description.repair)
-        for part in source.xml
-        if part.tag in ("link", "joint", "material")
+        check_grammar(part, description.where, description.repair) for part in source.xml if part.tag in PARTS
     ]
+    _report_unknown(description)
     links = [read_link(e) for e in clean if e.tag == "link"]
     for link in links:
         for role, shapes in (("visual", link.visuals), ("collision", link.collisions)):
@@ -224,6 +232,23 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
         links=MappingProxyType({name: description.links[name] for name in order}),
         joints=MappingProxyType({name: held[name] for name in order if name in held}),
     )
+
+
+def _report_unknown(description: Description) -> None:
+    """Report elements and attributes that no grammar has, and an unknown version of URDF."""
+    version = description.xml.get("version", VERSIONS[0])
+    if version not in VERSIONS:
+        description.note(f"version {version!r} of URDF is unknown: it is read as {VERSIONS[-1]}")
+    for one in unused(description.xml):
+        if one.known:
+            continue
+        holder, part = one.way[-1], one.way[1] if len(one.way) > 1 else one.way[0]
+        what = f"<{one.name}>" if one.element is not None else f"{one.name[1:]}={holder.get(one.name[1:])!r}"
+        advice = description.repairs.suggestion(one.name.lstrip("@"), one.alternatives, near)
+        of = "in" if one.element is not None else "of"
+        text = f"{part.tag} {part.get('name')!r}: {what} {of} <{holder.tag}> is unknown{advice}: kept as text"
+        kind = "attribute-unknown" if one.element is None else "element-unknown"
+        description.repair(kind, text, holder if one.element is None else one.element)
 
 
 def _materials(description: Description, elements: Sequence[Element]) -> dict[str | None, Material]:

@@ -1,14 +1,12 @@
-"""Grammar: the elements and attributes of a URDF's links and joints, and their allowed values.
-
-Follows the URDF XML specification (wiki.ros.org/urdf/XML), with the capsule of urdfdom 4.
-"""
+"""Grammar: the values of a URDF's links and joints, checked and repaired by the table in `vocabulary`."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from xml.etree import ElementTree
 
-from magtwin.errors import InputError, hint, near
+from magtwin.errors import InputError
+from magtwin.urdf.description.vocabulary import GRAMMAR, Number
 from magtwin.urdf.repairs import NOTE
 
 Element = ElementTree.Element
@@ -22,94 +20,14 @@ class _ShapeError(Exception):
     """A visual or collision has no shape that can be made; the text gives the reason."""
 
 
-@dataclass(frozen=True)
-class Number:
-    """Constraints on an attribute's numbers."""
-
-    counts: tuple[int, ...] = (1,)
-    """Allowed counts."""
-
-    required: bool = False
-
-    least: float = -math.inf
-    """Smaller numbers are raised to it."""
-
-    most: float = math.inf
-    """Larger numbers are reduced to it."""
-
-    vital: bool = False
-    """Whether an unreadable number is refused; others count as not given, as they have a default."""
-
-    signed: bool = True
-    """Whether the sign matters; without it, the absolute value is used."""
-
-    endless: bool = False
-    """Whether numbers may be infinite."""
-
-    rest: str = ""
-    """Value that completes the smallest count to the largest."""
-
-
 TURN = 2 * math.pi
 """Range from which a revolute joint without effort and velocity counts as a wheel [rad]."""
 
+UNIT = 1e-3
+"""Deviation of a quaternion's length from 1 from which it is reported."""
+
 LARGEST = 1e30
 """Larger numbers count as infinite: USD stores single precision, and volumes are cubes."""
-
-XYZ = Number(counts=(3,), vital=True)
-SIZE = Number(required=True, vital=True, signed=False)
-AMOUNT = Number(least=0.0)
-
-NUMBERS: Mapping[str, Mapping[str, Number]] = {
-    "origin": {"xyz": XYZ, "rpy": XYZ},
-    "mass": {"value": Number()},
-    "inertia": {name: Number() for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz", "iyx", "izx", "izy")},
-    "box": {"size": Number(counts=(3,), required=True, vital=True, signed=False)},
-    "cylinder": {"radius": SIZE, "length": SIZE},
-    "capsule": {"radius": SIZE, "length": SIZE},
-    "sphere": {"radius": SIZE},
-    "mesh": {"scale": Number(counts=(1, 3), vital=True)},
-    "color": {"rgba": Number(counts=(3, 4), least=0.0, most=1.0, rest="1")},
-    "axis": {"xyz": XYZ},
-    "limit": {
-        "lower": Number(endless=True),
-        "upper": Number(endless=True),
-        "effort": Number(endless=True),
-        "velocity": Number(endless=True),
-    },
-    "dynamics": {"damping": AMOUNT, "friction": AMOUNT},
-    "mimic": {"multiplier": Number(), "offset": Number()},
-    "calibration": {"rising": Number(), "falling": Number()},
-    "safety_controller": {
-        name: Number() for name in ("soft_lower_limit", "soft_upper_limit", "k_position", "k_velocity")
-    },
-}
-"""Numeric attributes by element."""
-
-SHAPES = ("box", "capsule", "cylinder", "mesh", "sphere")
-
-CHILDREN: Mapping[str, tuple[str, ...]] = {
-    "link": ("inertial", "visual", "collision"),
-    "inertial": ("origin", "mass", "inertia"),
-    "visual": ("origin", "geometry", "material"),
-    "collision": ("origin", "geometry"),
-    "geometry": SHAPES,
-    "material": ("color", "texture"),
-    "joint": (
-        *("origin", "parent", "child", "axis", "calibration", "dynamics", "limit", "mimic"),
-        "safety_controller",
-    ),
-}
-"""Allowed children by element."""
-
-MANY = frozenset({"visual", "collision"})
-"""Elements that may occur several times."""
-
-NAMED: Mapping[str, str] = {"mesh": "filename", "texture": "filename", "mimic": "joint", "color": "rgba"}
-"""Attribute without which an element is empty."""
-
-LOOKS = ("color", "texture")
-"""Contents of a material."""
 
 MIRRORED = {"iyx": "ixy", "izx": "ixz", "izy": "iyz"}
 """Products of inertia below the diagonal, which URDF does not have, by those above it."""
@@ -149,8 +67,8 @@ class _Checker:
     def cleaned(self, element: Element) -> Element | None:
         """An element as the grammar has it; None if it is left out."""
         attributes = self._attributes(element)
-        wanted = NAMED.get(element.tag)
-        if wanted is not None and not attributes.get(wanted):
+        wanted = GRAMMAR[element.tag].needed
+        if wanted and not attributes.get(wanted):
             if element.tag == "mesh":
                 raise _ShapeError("a <mesh> without filename=")
             kind = "mimic-leader" if element.tag == "mimic" else "tag-empty"
@@ -158,19 +76,19 @@ class _Checker:
                 self.repair(kind, f"a <{element.tag}> without {wanted}= is left out", element)
             return None
         clean = Element(element.tag, attributes)
-        astray = self._misplaced(element)
         for child in element:
-            if child not in astray and self._is_known(child, element, clean):
+            if self._is_known(child, element, clean):
                 self._append(clean, child)
         if element.tag == "geometry" and len(clean) != 1:
             raise _ShapeError("a <geometry> without a shape")
-        if element.tag in MANY and clean.find("geometry") is None:
+        if GRAMMAR[element.tag].many and clean.find("geometry") is None:
             raise _ShapeError(f"a <{element.tag}> without <geometry>")
         if element.tag == "visual":
-            self._rehouse(clean, astray + [e for e in element.iterfind("geometry/*") if e.tag in _LOOKING])
-        for tag, finish in (("link", self._finish_link), ("joint", self._finish_joint)):
-            if element.tag == tag:
-                finish(clean, element)
+            parts = (element, *element.findall("geometry"))
+            self._rehouse(clean, [e for p in parts for e in p if GRAMMAR[p.tag].fate(e.tag) == "moved"])
+        finish = {"link": self._finish_link, "joint": self._finish_joint, "origin": self._finish_origin}
+        if element.tag in finish:
+            finish[element.tag](clean, element)
         return clean
 
     def _append(self, clean: Element, child: Element) -> None:
@@ -178,7 +96,7 @@ class _Checker:
         try:
             made = self.cleaned(child)
         except _ShapeError as error:
-            if child.tag not in MANY:
+            if not GRAMMAR[child.tag].many:
                 raise
             self.repair("shape-missing", f"{error}: the {child.tag} is left out", child)
             return
@@ -186,28 +104,16 @@ class _Checker:
             clean.append(made)
 
     def _is_known(self, child: Element, parent: Element, clean: Element) -> bool:
-        """Whether a child is part of the grammar and the first of its kind."""
-        known = CHILDREN.get(parent.tag, ())
-        if child.tag not in known:
-            if parent.tag == "geometry" and child.tag in _LOOKING:
-                return False  # misplaced, see `_rehouse`
-            if parent.tag == "geometry":
-                raise _ShapeError(f"a geometry {child.tag!r} ({hint(child.tag, SHAPES)})")
-            text = f"<{child.tag}> is unknown in <{parent.tag}>{near(child.tag, known)} and left out"
-            self.repair("tag-unknown", text, child)
+        """Whether a child is used here and the first of its kind; `vocabulary.unused` finds all others."""
+        if GRAMMAR[parent.tag].fate(child.tag) != "used":
             return False
         first = clean.find(child.tag)
         if parent.tag == "geometry" and len(clean):
             first = clean[0]
-        if first is not None and child.tag not in MANY:
+        if first is not None and not GRAMMAR[child.tag].many:
             self.repair("tag-twice", f"a second <{child.tag}> in <{parent.tag}> is left out", child)
             return False
         return True
-
-    def _misplaced(self, element: Element) -> list[Element]:
-        """Children of a visual or link that belong into the visual's material."""
-        tags = {"visual": LOOKS, "link": ("material",)}.get(element.tag, ())
-        return [child for child in element if child.tag in tags]
 
     def _rehouse(self, visual: Element, astray: list[Element]) -> None:
         """Move misplaced looks into the material of their visual."""
@@ -253,11 +159,8 @@ class _Checker:
                 tensor.set(above, repr((one + other) / 2))
                 text = f"{above} {other:g} and {below} {one:g} of <inertia> differ: their mean"
                 self.repair("inertia-asymmetric", text, given)
-        if any(
-            name not in tensor.attrib
-            for name in given.attrib
-            if name in NUMBERS["inertia"] and name not in MIRRORED
-        ):
+        moments = GRAMMAR["inertia"].numbers.keys() - MIRRORED.keys()
+        if moments & given.attrib.keys() - tensor.attrib.keys():
             inertial.remove(tensor)
             self.repair("inertia-unreadable", "an <inertia> that cannot be read counts as none", given)
         elif not any(map(float, tensor.attrib.values())):
@@ -276,6 +179,20 @@ class _Checker:
         given = source.find("mass")
         what = "no mass" if value is None else f"a mass of {float(value):g}"
         self.repair("mass-invalid", f"{what} counts as none", source if given is None else given)
+
+    def _finish_origin(self, clean: Element, origin: Element) -> None:
+        """Leave out roll, pitch and yaw beside a quaternion, and note one whose length is not 1."""
+        if "quat_xyzw" not in clean.attrib:
+            return
+        given = clean.attrib["quat_xyzw"]
+        length = math.hypot(*map(float, given.split()))
+        if length == 0:
+            raise InputError(f"{self.where(origin)}: {self.label}: quat_xyzw of <origin> has length 0")
+        if abs(length - 1) > UNIT:
+            text = f"quat_xyzw of <origin> has length {length:.4g} in {given!r}: scaled to 1"
+            self.repair("number-range", text, origin)
+        if clean.attrib.pop("rpy", None) is not None:
+            self.repair("turn-twice", "<origin> has rpy and quat_xyzw: quat_xyzw is used", origin)
 
     def _finish_joint(self, clean: Element, joint: Element) -> None:
         """Complete limits; see `repairs.FAULTS`."""
@@ -339,10 +256,9 @@ class _Checker:
 
     def _attributes(self, element: Element) -> dict[str, str]:
         """Attributes of an element, with numbers checked."""
-        numbers = NUMBERS.get(element.tag, {})
-        made = {name: value for name, value in element.items() if name not in numbers and ":" not in name}
-        made.pop("xmlns", None)
-        for name, kind in numbers.items():
+        entry = GRAMMAR[element.tag]
+        made = {name: element.attrib[name] for name in entry.words.split() if name in element.attrib}
+        for name, kind in entry.numbers.items():
             given = element.get(name)
             if given is not None and given.strip():
                 words = self._numbers(given, kind, element, name)
@@ -391,9 +307,6 @@ class _Checker:
         if len(words) == 1 and most == 3 and (values == [0.0] or not kind.signed):
             return words * least
         return None
-
-
-_LOOKING = ("material", *LOOKS)
 
 
 def _value(word: str, *, endless: bool) -> float | None:

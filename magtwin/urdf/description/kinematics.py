@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, find
-from magtwin.urdf.description.description import MOVING, Description, read_description
+from magtwin.urdf.description.description import MOVING, Description, origin_of, read_description
 from magtwin.urdf.description.grammar import check_grammar
+from magtwin.urdf.description.model import rpy_of
 from magtwin.urdf.source.source import read_source
 
 
@@ -43,14 +44,17 @@ def link_poses(
     description = read_description(read_source(urdf, packages=packages, arguments=arguments))
     values = _values(description, positions)
     bare = ElementTree.Element("robot", name=description.name)
-    names = {joint.name for joint in description.joints.values()}
+    joints = {joint.name: joint for joint in description.joints.values()}
     for part in description.xml:
         if part.tag == "link":
             ElementTree.SubElement(bare, "link", name=part.attrib["name"])
-        elif part.tag == "joint" and part.get("name") in names:
+        elif part.tag == "joint" and part.get("name") in joints:
             bare.append(check_grammar(part, description.where, description.repair))
             for mimic in bare[-1].findall("mimic"):  # yourdfpy does not support a mimic of a mimic
                 bare[-1].remove(mimic)
+            for origin in bare[-1].findall("origin[@quat_xyzw]"):  # nor a quaternion
+                R = origin_of(joints[part.attrib["name"]])[:3, :3]
+                origin.set("rpy", " ".join(map(repr, rpy_of(R))))
     model = yourdfpy.URDF.load(io.BytesIO(ElementTree.tostring(bare)), load_meshes=False)
     for joint in description.joints.values():
         if joint.type == "prismatic":  # yourdfpy does not normalise the axis

@@ -4,11 +4,14 @@ They are read here and not by yourdfpy, whose import takes longer than a whole c
 every link and joint with yourdfpy's.
 """
 
+import math
 from dataclasses import dataclass, field
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
+
+from magtwin.frames import matrix_from_quat
 
 Element = ElementTree.Element
 Array = NDArray[np.float64]
@@ -165,6 +168,9 @@ class Joint:
     dynamics: Dynamics | None
     mimic: Mimic | None
 
+    own_body: bool = False
+    """Whether `dont_collapse` asks for a body of its own, although the joint is fixed."""
+
 
 def read_link(element: Element) -> Link:
     """The link of a checked `<link>`."""
@@ -186,7 +192,7 @@ def read_joint(element: Element) -> Joint:
         type=element.get("type", ""),
         parent=parent.attrib["link"],
         child=child.attrib["link"],
-        origin=_origin(element.find("origin")),
+        origin=read_origin(element.find("origin")),
         axis=np.array([1.0, 0.0, 0.0]) if axis is None else _numbers(axis, "xyz", "1 0 0"),
         limit=None if limits is None else Limit(*limits),
         dynamics=None if dynamics_values is None else Dynamics(*dynamics_values),
@@ -195,6 +201,7 @@ def read_joint(element: Element) -> Joint:
         else Mimic(
             mimic.attrib["joint"], float(mimic.get("multiplier", 1.0)), float(mimic.get("offset", 0.0))
         ),
+        own_body=element.get("dont_collapse", "").lower() in ("true", "1"),
     )
 
 
@@ -214,7 +221,7 @@ def _shape(element: Element) -> Shape:
     return Shape(
         geometry=_geometry(geometry[0]),
         name=element.get("name"),
-        origin=_origin(element.find("origin")),
+        origin=read_origin(element.find("origin")),
         material=None if material is None else read_material(material),
     )
 
@@ -238,15 +245,25 @@ def _inertial(element: Element | None) -> Inertial | None:
         xx, yy, zz = (float(inertia.get(name, 1.0)) for name in ("ixx", "iyy", "izz"))
         xy, xz, yz = (float(inertia.get(name, 0.0)) for name in ("ixy", "ixz", "iyz"))
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return Inertial(_origin(element.find("origin")), None if mass is None else _number(mass, "value"), tensor)
+    return Inertial(
+        read_origin(element.find("origin")), None if mass is None else _number(mass, "value"), tensor
+    )
 
 
-def _origin(element: Element | None) -> Array | None:
-    """Pose of an `<origin>`, shape (4, 4): R = Rz(yaw) Ry(pitch) Rx(roll)."""
+def read_origin(element: Element | None) -> Array | None:
+    """Pose of an `<origin>`, shape (4, 4): R = Rz(yaw) Ry(pitch) Rx(roll), or that of a quaternion.
+
+    Raises:
+        ValueError: It was not checked, and something in it is no number.
+    """
     if element is None:
         return None
-    (sr, sp, sy), (cr, cp, cy) = (turn(_numbers(element, "rpy", "0 0 0")) for turn in (np.sin, np.cos))
     x, y, z = _numbers(element, "xyz", "0 0 0")
+    if "quat_xyzw" in element.attrib:
+        T, q = np.eye(4), _numbers(element, "quat_xyzw")
+        T[:3, :3], T[:3, 3] = matrix_from_quat(q / np.linalg.norm(q)), (x, y, z)
+        return T
+    (sr, sp, sy), (cr, cp, cy) = (turn(_numbers(element, "rpy", "0 0 0")) for turn in (np.sin, np.cos))
     return np.array(
         [
             [cp * cy, sp * (sr * cy) - cr * sy, sp * (cr * cy) + sr * sy, x],
@@ -255,6 +272,20 @@ def _origin(element: Element | None) -> Array | None:
             [0.0, 0.0, 0.0, 1.0],
         ]
     )
+
+
+def rpy_of(R: Array) -> tuple[float, float, float]:
+    """Roll, pitch and yaw of a rotation, R = Rz Ry Rx.
+
+    Each angle is removed before the next is read, so that errors near a pitch of 90 deg cancel.
+    """
+    yaw = math.atan2(R[1, 0], R[0, 0]) if math.hypot(R[0, 0], R[1, 0]) > 1e-12 else 0.0
+    c, s = math.cos(yaw), math.sin(yaw)
+    R = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ R
+    pitch = math.atan2(-R[2, 0], R[0, 0])
+    c, s = math.cos(pitch), math.sin(pitch)
+    R = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]) @ R
+    return math.atan2(R[2, 1], R[1, 1]), pitch, yaw
 
 
 def _number(element: Element, name: str) -> float | None:

@@ -9,7 +9,7 @@ import numpy as np
 from pxr import Usd, Vt
 
 from magtwin.urdf.description.description import Description
-from magtwin.urdf.description.grammar import CHILDREN
+from magtwin.urdf.description.vocabulary import Unused, unused
 from magtwin.urdf.source.markup import plain_text
 
 Element = ElementTree.Element
@@ -17,8 +17,8 @@ Element = ElementTree.Element
 KEPT = "magtwin:unconverted"
 """Key of a prim's customData: unused tags, each as text."""
 
-BEYOND = ("calibration", "safety_controller")
-"""Elements of URDF's grammar that do not describe the body; they are read as tags."""
+READ = frozenset(("name", "reference", "type", "filename", "value", "relative_to", "frame", "degrees"))
+"""Attributes that are used where the tag that has them is read."""
 
 
 class Tags:
@@ -120,47 +120,53 @@ class Tags:
         return word in ("true", "1")
 
     def keep(self, prim_of: Callable[[str], Usd.Prim]) -> dict[str, int]:
-        """Keep unmarked elements as text on the prims to which they refer.
+        """Keep what is not used as text on the prims to which it refers.
 
         Args:
             prim_of: Returns the prim of a link or joint by its name, and the robot's for other names.
 
         Returns:
-            Number of unmarked elements by path, such as `gazebo/sensor/visualize`.
+            Number of unmarked elements and attributes by path, such as `gazebo/sensor/visualize` or
+            `limit/@jerk`, without those that are reported as unknown.
         """
         texts: dict[str, list[str]] = {}
         counts: Counter[str] = Counter()
-        for name, element in self._foreign():
-            for way, left in self._unread(element):
-                counts["/".join((*(e.tag for e in way), left.tag))] += 1
-                inside = "/".join(_label(e) for e in way)
-                texts.setdefault(name, []).append(
-                    f"{inside}: {plain_text(left)}" if inside else plain_text(left)
-                )
-        for name, kept in texts.items():
-            prim = prim_of(name)
+        for owner, depth, left in self._left():
+            way = left.way[depth:]
+            counts["/".join((*(e.tag for e in way), left.name))] += left.known
+            value = f"{left.name[1:]}={left.way[-1].get(left.name[1:])!r}"
+            text = value if left.element is None else plain_text(left.element)
+            inside = "/".join(_label(e) for e in way)
+            texts.setdefault(owner, []).append(f"{inside}: {text}" if inside else text)
+        for owner, kept in texts.items():
+            prim = prim_of(owner)
             there = prim.GetCustomDataByKey(KEPT) or ()
             prim.SetCustomDataByKey(KEPT, Vt.StringArray([*there, *kept]))
-        return dict(sorted(counts.items()))
+        return {name: count for name, count in sorted(counts.items()) if count}
 
-    def _foreign(self) -> Iterator[tuple[str, Element]]:
-        """Elements outside URDF's grammar, with the name of the link or joint to which they refer."""
-        for element in self.description.xml:
-            if element.tag not in ("link", "joint", "material"):
-                yield element.get("reference", ""), element
-            elif element.tag != "material":
-                known = [tag for tag in CHILDREN[element.tag] if tag not in BEYOND]
-                for child in element:
-                    if child.tag not in known:
-                        yield element.get("name", ""), child
+    def _left(self) -> Iterator[tuple[str, int, Unused]]:
+        """What is not used; the name of its link or joint, and the depth of the elements inside that."""
+        for one in unused(self.description.xml):
+            if len(one.way) > 1:
+                part = one.way[1]
+                yield ("", 1, one) if part.tag == "material" else (part.get("name", ""), 2, one)
+            elif one.element is None:
+                yield "", 1, one
+            else:
+                owner = one.element.get("reference", "")
+                yield from ((owner, 1, left) for left in self._unread(one.element, one))
 
-    def _unread(self, element: Element, *way: Element) -> Iterator[tuple[tuple[Element, ...], Element]]:
-        """The outermost unmarked elements, with their parents."""
+    def _unread(self, element: Element, section: Unused, *way: Element) -> Iterator[Unused]:
+        """The outermost unmarked elements of a section, and the attributes that no marked one uses."""
+        above = (*section.way, *way)
         if element not in self._read:
-            yield way, element
+            yield Unused(above, element.tag, element, section.known)
             return
+        for name in element.attrib:
+            if name not in READ:
+                yield Unused((*above, element), f"@{name}", None, section.known)
         for child in element:
-            yield from self._unread(child, *way, element)
+            yield from self._unread(child, section, *way, element)
 
 
 def _text_of(element: Element) -> str:

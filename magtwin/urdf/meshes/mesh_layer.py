@@ -72,8 +72,8 @@ class MeshLayer:
         self.textures = Textures(textures)
         self.images = Images()
         """Images of its meshes and of the URDF's materials."""
-        self.looks: dict[tuple[Any, ...], tuple[Sdf.Path, str]] = {}
-        """Path and name of each material on the robot's stage by its values, see `material`."""
+        self.looks: dict[tuple[Any, ...], Sdf.Path] = {}
+        """Path of each material on the robot's stage by its name and values, see `material`."""
         self._description, self.options = description, options
         self._stage = Usd.Stage.CreateInMemory()
         describe_stage(self._stage, f"{description.name}: triangles of its meshes.")
@@ -92,15 +92,6 @@ class MeshLayer:
 
     def __len__(self) -> int:
         return len(self._visuals) + len(self._colliders) + len(self._primitives)
-
-    def same_look(self, shown: tuple[Any, ...], name: str) -> Sdf.Path | None:
-        """Path of the look with these values, or None; a name that is lost is noted."""
-        path, first = self.looks.get(shown, (None, name))
-        if name and name != first:
-            self._description.note(
-                f"material {name!r} looks like {first or path.name!r}: the two are one in USD"
-            )
-        return path
 
     def visual(self, mesh: Geometry) -> Entry:
         """The prim of a URDF `<mesh>` as a visual.

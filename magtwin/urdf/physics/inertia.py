@@ -23,7 +23,7 @@ SAME = 1e-8
 """Points of a mesh that are nearer to each other than about this are one [m]."""
 
 WATER = 1000.0
-"""Density of a body whose size is unknown [kg/m3]."""
+"""Density of a body whose size or mass is unknown [kg/m3]; engines assume it too."""
 
 
 @dataclass(frozen=True)

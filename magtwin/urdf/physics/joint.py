@@ -42,11 +42,6 @@ LOCKED = (1.0, -1.0)
 WHEEL_SPEED = 30.0
 """Default maximum speed of a driven wheel [rad/s]: about 1 m/s at the rim of a small wheel."""
 
-LIMITS = ("physics:lowerLimit", "physics:upperLimit")
-
-LIMIT_MARGIN = 1e-4
-"""Overlap of the limits of a follower with those of its leader, see `_widen` [deg or m]."""
-
 MIMIC_FREQUENCY = 100.0
 """Natural frequency of PhysX's mimic [1/s]; without effect at a damping ratio of 0 (hard coupling)."""
 
@@ -149,21 +144,6 @@ def define_mimic(prim: Usd.Prim, leader: Usd.Prim, joint: Joint, lead: Joint, me
     _write(prim, f"{space}:offset", -mimic.offset * unit)
     _write(prim, f"{space}:naturalFrequency", MIMIC_FREQUENCY)
     _write(prim, f"{space}:dampingRatio", 0.0)
-    _widen(prim, leader, -mimic.multiplier * unit / lead_unit)
-
-
-def _widen(prim: Usd.Prim, leader: Usd.Prim, gearing: float) -> None:
-    """Widen the limits of a follower to overlap those of its leader times the gearing.
-
-    Isaac Sim's rule MimicAPICheck wants that, with the opposite sign of PhysX's gearing, so that the fingers
-    of a gripper that closes at 0 fail it. The coupling keeps the follower within its leader's limits anyway.
-    """
-    low, high = sorted(leader.GetAttribute(name).Get() * gearing for name in LIMITS)
-    least, most = (prim.GetAttribute(name) for name in LIMITS)
-    if not least.Get() < high:
-        least.Set(high - LIMIT_MARGIN)
-    if not most.Get() > low:
-        most.Set(low + LIMIT_MARGIN)
 
 
 def _define(

@@ -11,6 +11,7 @@ from magtwin.frames import wxyz_from_xyzw
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Link
 from magtwin.urdf.physics.inertia import (
+    WATER,
     MassProperties,
     ball_of,
     combined,
@@ -20,8 +21,7 @@ from magtwin.urdf.physics.inertia import (
 )
 
 MASSLESS_KG = 0.001
-"""Mass of a body whose links have none [kg]. Without an explicit mass, engines fill the colliders with
-1000 kg/m3, and give a body without colliders 1 kg."""
+"""Mass of a body without colliders whose links have none [kg]. Engines would give it 1 kg."""
 
 THICKER = 5e-7
 """The largest moment of a body with turned axes is below the sum of the others by at least this part."""
@@ -61,7 +61,7 @@ def define_body(
         parts: The body's own link, and links merged into it.
         description: Receives notes of repairs and guesses.
         density: Density of links without mass [kg/m3]. None leaves them without; a body of such links gets
-            `MASSLESS_KG`.
+            the mass of its colliders at `WATER`, as engines compute it, or else `MASSLESS_KG`.
     """
     prim.AddAppliedSchema(LINK_API)
     UsdPhysics.RigidBodyAPI.Apply(prim).CreateRigidBodyEnabledAttr(True)
@@ -69,7 +69,8 @@ def define_body(
     properties = [_mass_properties(part, prim, description, density) for part in parts]
     known = [each for each in properties if each is not None]
     if not known:
-        known = [_massless(parts[0], prim, description)]
+        filled = (_from_shapes(part, prim, description, WATER) for part in parts if part.colliders)
+        known = [each for each in filled if each is not None] or [_massless(parts[0], prim, description)]
     whole = known[0] if len(known) == 1 else combined(known)
     mass = UsdPhysics.MassAPI.Apply(prim)
     mass.CreateMassAttr(whole.mass)
@@ -130,7 +131,7 @@ def _massless(part: Rider, body: Usd.Prim, description: Description) -> MassProp
     """Mass properties of a body whose links have no mass: `MASSLESS_KG`, spread over its shapes."""
     kg = MASSLESS_KG
     description.note(f"link {part.link.name!r} has no <inertial>: {kg:g} kg, so that engines add none")
-    solid = read_solid(part.colliders, body) or read_solid(part.visuals, body) or ball_of(kg)
+    solid = read_solid(part.visuals, body) or ball_of(kg)
     return MassProperties(kg, solid.centre, kg / solid.mass * solid.inertia)
 
 

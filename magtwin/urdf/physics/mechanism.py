@@ -69,6 +69,13 @@ class Mechanism:
             if load.slope < 0.5 and (name in moving or load.beside > BESIDE)
         }
 
+    def in_world(self, link: str) -> bool:
+        """Whether a link is fixed to the root `world`, which is the world to Gazebo, MoveIt and Drake."""
+        joints, at = self.description.joints, link
+        while at in joints and joints[at].name in self.welded:
+            at = joints[at].parent
+        return at == self.description.root == "world" != link
+
     def poses(self) -> dict[str, NDArray[np.float64]]:
         """T_root_link of each link at rest, shape (4, 4)."""
         poses = {self.description.root: np.eye(4)}

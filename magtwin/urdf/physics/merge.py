@@ -32,7 +32,8 @@ def place_links(mechanism: Mechanism, *, merge: bool = False, filled: bool = Fal
 
     Args:
         mechanism: Joints of the description, which receives notes.
-        merge: Whether links with mass or shape that cannot move also ride on the body above.
+        merge: Whether links with mass or shape that cannot move also ride on the body above, except those
+            whose joint has `dont_collapse`.
         filled: Whether links without mass get one from a density, so that they stay bodies.
     """
     description = mechanism.description
@@ -49,8 +50,8 @@ def place_links(mechanism: Mechanism, *, merge: bool = False, filled: bool = Fal
         joint = description.joints[name]
         body, pose = places[joint.parent]
         massless = link.inertial is None and not filled
-        rides = is_marker(link) or (body != WORLD and (merge or massless or name in taken))
-        if joint.name in mechanism.welded and rides:
+        joins = body != WORLD and not joint.own_body and (merge or massless or name in taken)
+        if joint.name in mechanism.welded and (joins or is_marker(link)):
             places[name] = (body, pose @ mechanism.pose(joint))
             if massless and not merge and not is_marker(link):
                 description.note(f"link {name!r} has no <inertial>: it is part of the body of {body!r}")

@@ -1,0 +1,199 @@
+"""Each element and attribute of a URDF is used, moved, kept as text or reported as unknown."""
+
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from pxr import Usd, UsdGeom, UsdPhysics
+from test_urdf import BALL, INERTIAL
+
+from magtwin.errors import InputError
+from magtwin.urdf.convert import convert_with_report
+from magtwin.urdf.description.description import origin_of, read_description
+from magtwin.urdf.description.kinematics import link_poses
+from magtwin.urdf.description.tag import KEPT
+from magtwin.urdf.description.vocabulary import GRAMMAR, unused
+from magtwin.urdf.options import Options
+from magtwin.urdf.write import write_urdf
+
+SOLID = """<inertial><origin xyz="1 2 3" rpy="0 0 0"/><mass value="2"/><inertia ixx="1" iyy="1" izz="1"
+ixy="0.1" iyx="0.1" ixz="0.1" izx="0.1" iyz="0.1" izy="0.1"/></inertial>"""
+SHAPES = "".join(
+    f'<{role} name="n">\n<origin quat_xyzw="0 0 0 1"/><geometry><{shape}/></geometry>{look}</{role}>'
+    for role, look in (("visual", '<material name="m"/>'), ("collision", ""))
+    for shape in (
+        'box size="1 1 1"',
+        'capsule radius="1" length="1"',
+        'cylinder radius="1" length="1"',
+        'sphere radius="1"',
+        'mesh filename="a.stl" scale="1 1 1"',
+    )
+)
+FULL = f"""<robot name="full" version="1.1">
+<material name="m"><color rgba="1 0 0 1"/><texture filename="a.png"/></material>
+<link name="a">{SOLID}{SHAPES}</link><link name="b"/><link name="c">{INERTIAL}</link>
+<link name="d">{INERTIAL}</link>
+<joint name="j" type="revolute"><parent link="a"/><child link="b"/><origin xyz="1 1 1" rpy="1 1 1"/>
+<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/>
+<dynamics damping="1" friction="1"/></joint>
+<joint name="k" type="prismatic"><parent link="a"/><child link="c"/><limit lower="-1" upper="1"/>
+<mimic joint="j" multiplier="1" offset="1"/></joint>
+<joint name="fix" type="fixed" dont_collapse="false"><parent link="a"/><child link="d"/></joint></robot>"""
+"""Every element and attribute that the grammar uses."""
+
+OTHER = {"type": "continuous", "dont_collapse": "true", "version": "7", "parent": "c", "child": "e"}
+"""Another value of attributes that are no names and no numbers, or whose names must exist."""
+
+
+def read(tmp_path, text):
+    """Everything that a description holds, or the text of its refusal."""
+    path = tmp_path / "robot.urdf"
+    path.write_text(text)
+    try:
+        d = read_description(path)
+    except InputError as error:
+        return str(error)
+    return repr([d.name, d.links, d.joints, d.materials, d.repairs.notes])
+
+
+def test_a_description_that_uses_the_whole_grammar_leaves_nothing_over():
+    robot = ElementTree.fromstring(FULL)
+    assert not list(unused(robot))
+    used = {(e.tag, f"@{name}") for e in robot.iter() for name in e.attrib}
+    used |= {(e.tag, child.tag) for e in robot.iter() for child in e}
+    table = {
+        (tag, name) for tag, entry in GRAMMAR.items() for name, fate in entry.fates.items() if fate == "used"
+    }
+    assert used == table
+
+
+@pytest.mark.parametrize(
+    ("tag", "name"),
+    [
+        (tag, name[1:])
+        for tag, e in GRAMMAR.items()
+        for name, f in e.fates.items()
+        if f == "used" and name[0] == "@"
+    ],
+)
+def test_every_attribute_that_the_grammar_uses_changes_what_is_read(tmp_path, tag, name):
+    robot = ElementTree.fromstring(FULL)
+    before = read(tmp_path, ElementTree.tostring(robot, encoding="unicode"))
+    element = next(e for e in robot.iter(tag) if name in e.attrib)
+    value = element.attrib[name]
+    numbers = GRAMMAR[tag].numbers
+    changed = " ".join(repr(float(w) * 0.5 + 0.25) for w in value.split()) if name in numbers else f"{value}x"
+    element.set(name, OTHER.get(name, changed))
+    assert read(tmp_path, ElementTree.tostring(robot, encoding="unicode")) != before
+
+
+def convert(tmp_path, text, **options):
+    path = tmp_path / "robot.urdf"
+    path.write_text(text)
+    out = tmp_path / "usd" / "robot.usda"
+    report = convert_with_report(path, out, options=Options(single_file=True, **options), force=True)
+    stage = Usd.Stage.Open(str(out))
+    stage.Reload()
+    return stage, report
+
+
+def arm(joint, links="", origin="", head='name="arm"'):
+    return f"""<robot {head}>
+<link name="base">{INERTIAL}{links}</link>
+<link name="tip">{INERTIAL}</link>
+<joint name="j" {joint}><parent link="base"/><child link="tip"/>{origin}</joint></robot>"""
+
+
+LIMIT = '<limit lower="-1" upper="1" effort="1" velocity="1" {}/>'
+
+
+def test_known_attributes_without_a_counterpart_are_kept_as_text_and_are_no_fault(tmp_path):
+    limit = LIMIT.format('acceleration="3" jerk="4" drake:x="5"')
+    collision = f'<collision group="g">{BALL}<material name="m"/></collision>'
+    text = arm('type="revolute"', collision, limit, 'name="arm" version="1.2" xmlns:drake="d"')
+    stage, report = convert(tmp_path, text, strict=True)
+    kept = stage.GetPrimAtPath("/arm/joints/j").GetCustomDataByKey(KEPT)
+    assert list(kept) == ["limit: acceleration='3'", "limit: jerk='4'", "limit: drake:x='5'"]
+    kept = stage.GetPrimAtPath("/arm/base").GetCustomDataByKey(KEPT)
+    assert list(kept) == ["collision: group='g'", 'collision: <material name="m"></material>']
+    names = (
+        "collision/@group",
+        "collision/material",
+        *(f"limit/@{n}" for n in ("acceleration", "drake:x", "jerk")),
+    )
+    assert report.unknown_tags == dict.fromkeys(names, 1)
+
+
+def test_an_unknown_attribute_is_kept_as_text_and_counted_as_a_fault_alone(tmp_path):
+    stage, report = convert(
+        tmp_path, arm('type="revolute" in_model_type="x"', origin=LIMIT.format('uper="2"'))
+    )
+    kept = stage.GetPrimAtPath("/arm/joints/j").GetCustomDataByKey(KEPT)
+    assert list(kept) == ["in_model_type='x'", "limit: uper='2'"]
+    assert report.unknown_tags == {}
+    assert [(line.kind, line.count) for line in report.repairs] == [("attribute-unknown", 2)]
+    shown = report.summary().metadata["unknown"]
+    assert (
+        shown[1]
+        == "robot.urdf:4: joint 'j': uper='2' of <limit> is unknown (did you mean 'upper'?): kept as text"
+    )
+    with pytest.raises(InputError, match=r"did you mean 'upper'\?\): kept as text"):
+        convert(tmp_path, arm('type="revolute"', origin=LIMIT.format('uper="2"')), strict=True)
+
+
+def test_attributes_of_a_section_that_no_reader_uses_are_kept_as_text(tmp_path):
+    sensor = '<sensor name="s" type="imu" version="9"><update_rate>5</update_rate></sensor>'
+    text = arm('type="fixed"').replace("</robot>", f'<gazebo reference="base">{sensor}</gazebo></robot>')
+    stage, report = convert(tmp_path, text, strict=True)
+    assert list(stage.GetPrimAtPath("/arm/base").GetCustomDataByKey(KEPT)) == [
+        "gazebo/sensor(s): version='9'"
+    ]
+    assert report.unknown_tags == {"gazebo/sensor/@version": 1}
+
+
+QUARTER = 'quat_xyzw="0 0 0.70710678 0.70710678"'
+
+
+def test_a_quaternion_turns_a_link_and_comes_back_as_the_same_turn(tmp_path):
+    stage, _ = convert(tmp_path, arm('type="fixed"', origin=f'<origin xyz="0 0 1" {QUARTER}/>'), strict=True)
+    T = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath("/arm/tip"))).T
+    assert_allclose(T[:3], [[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 1]], atol=1e-12)
+    assert_allclose(link_poses(tmp_path / "robot.urdf")["tip"], T, atol=1e-12)
+    write_urdf(tmp_path / "usd" / "robot.usda", tmp_path / "back.urdf")
+    back = read_description(tmp_path / "back.urdf").joints["tip"].origin
+    assert_allclose(back, T, atol=1e-12)
+
+
+def test_a_quaternion_of_any_length_is_the_turn_of_its_roll_pitch_and_yaw_everywhere(tmp_path):
+    turned = 'quat_xyzw="0.4 0.4 0.4 -0.4"', 'rpy="0 -1.5707963267948966 -1.5707963267948966"'
+    descriptions = []
+    for turn in turned:
+        origin = f'<origin xyz="1 2 3" {turn}/>'
+        text = FULL.replace('<origin quat_xyzw="0 0 0 1"/>', origin).replace(
+            '<origin xyz="1 2 3" rpy="0 0 0"/>', origin
+        )
+        (tmp_path / "full.urdf").write_text(text)
+        descriptions.append(read_description(tmp_path / "full.urdf"))
+    one, two = (d.links["a"] for d in descriptions)
+    parts = [(link.inertial, *link.visuals, *link.collisions) for link in (one, two)]
+    assert len(parts[0]) == 11
+    for mine, peer in zip(*parts, strict=True):
+        assert_allclose(origin_of(mine), origin_of(peer), atol=1e-12)
+    assert {e.kind for e in descriptions[0].repairs.entries} >= {"number-range"}
+    with pytest.raises(InputError, match=r"robot.urdf:4: joint 'j': quat_xyzw of <origin> has length 0"):
+        convert(tmp_path, arm('type="fixed"', origin='<origin quat_xyzw="0 0 0 0"/>'))
+
+
+def test_a_version_of_urdf_that_is_not_known_is_noted(tmp_path):
+    _, report = convert(tmp_path, arm('type="fixed"', head='name="arm" version="2.0"'))
+    assert "version '2.0' of URDF is unknown: it is read as 1.2" in report.notes
+
+
+@pytest.mark.parametrize(("word", "bodies"), [("true", {"base", "tip"}), ("false", {"base"})])
+def test_dont_collapse_keeps_a_body_when_fixed_joints_are_merged(tmp_path, word, bodies):
+    stage, report = convert(
+        tmp_path, arm(f'type="fixed" dont_collapse="{word}"'), merge_fixed=True, strict=True
+    )
+    assert {p.GetName() for p in stage.Traverse() if p.HasAPI(UsdPhysics.RigidBodyAPI)} == bodies
+    assert report.mass_out_kg == report.mass_in_kg
