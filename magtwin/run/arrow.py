@@ -41,7 +41,16 @@ def table_of(run: Run) -> pa.Table:
         for name, (column, part, values) in flat.items()
     ]
     schema = pa.schema(fields, metadata={FACTS: metadata_to_json(run)})
-    return pa.Table.from_arrays([pa.array(values) for _, _, values in flat.values()], schema=schema)
+    return pa.Table.from_arrays([_array(values) for _, _, values in flat.values()], schema=schema)
+
+
+def _array(values: NDArray[Any]) -> pa.Array:
+    """A column of numbers or bools; `pa.array` would import pandas."""
+    if values.dtype == bool:
+        values, kind, count = np.packbits(values, bitorder="little"), pa.bool_(), len(values)
+    else:
+        kind, count = pa.from_numpy_dtype(values.dtype), len(values)
+    return pa.Array.from_buffers(kind, count, [None, pa.py_buffer(np.ascontiguousarray(values))])
 
 
 def run_of(table: pa.Table, path: Path, first: int | None = None) -> Run:
