@@ -160,7 +160,12 @@ def _read_long(path: Path, files: Sequence[Path], columns: Mapping[str, str] | N
     return run
 
 
-def load_parquet(path: Path, load: Callable[[Path], Any] = pq.read_table) -> Any:
+def _whole(path: Path) -> pa.Table:
+    with pq.ParquetFile(path) as file:  # `read_table` would import pandas
+        return file.read()
+
+
+def load_parquet(path: Path, load: Callable[[Path], Any] = _whole) -> Any:
     """A Parquet file, loaded by a function of pyarrow.
 
     Raises:

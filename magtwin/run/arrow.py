@@ -178,4 +178,11 @@ def _numpy(column: pa.ChunkedArray, name: str, path: Path, first: int) -> NDArra
     if column.null_count:
         row = first + column.is_null().to_numpy().argmax()
         raise InputError(f"{path}: column {name!r}, row {row}: no value; write nan for unknown values")
-    return column.to_numpy()
+    kept = [_flags(chunk) if kind == pa.bool_() else np.from_dlpack(chunk) for chunk in column.chunks]
+    return np.concatenate(kept) if kept else np.empty(0, kind.to_pandas_dtype())
+
+
+def _flags(chunk: pa.Array) -> NDArray[np.bool_]:
+    """The bools of an array; `to_numpy` would import pandas."""
+    bits = np.frombuffer(chunk.buffers()[1], np.uint8)
+    return np.unpackbits(bits, bitorder="little")[chunk.offset : chunk.offset + len(chunk)].astype(bool)
