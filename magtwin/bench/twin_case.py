@@ -21,6 +21,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import quat_from_yaw, wrap_angle, yaw_from_quat
 from magtwin.localization.problem import Problem, SensorModel
 from magtwin.run.run import Run
+from magtwin.sim.sensors.noise import decaying
 
 if TYPE_CHECKING:
     from magtwin.twin import Twin
@@ -231,14 +232,12 @@ def _readings(
 
 def fogm(t: Array, sensor: SensorModel, rng: np.random.Generator) -> Array:
     """A first-order Gauss-Markov process at times t [s]: the drift of a sensor [nT], shape (N,)."""
-    from scipy.signal import lfilter
-
     z = rng.standard_normal(len(t))
     if len(t) < 2:
         return sensor.drift_nt * z
     keep = math.exp(-float(np.median(np.diff(t))) / sensor.drift_s)
     z[1:] *= math.sqrt(1 - keep**2)
-    return sensor.drift_nt * np.asarray(lfilter([1.0], [1.0, -keep], z))
+    return sensor.drift_nt * decaying(z, keep)
 
 
 def _belief(

@@ -10,7 +10,6 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from magtwin.errors import InputError
-from magtwin.io.bags.stream import scans_at
 from magtwin.io.formats import format_of, format_to_write, read_run, write_run
 from magtwin.io.recorder import Recorder, Sink, in_step, partial_of
 from magtwin.outputs import at_once, check_free, output, transaction
@@ -336,7 +335,7 @@ def record_live(
     if recorder.rows < run.rows:
         run = run.take(slice(recorder.rows))
         if scans is not None:
-            scans = scans_at(scans, scans.t <= run["t"][-1])
+            scans = scans.take(scans.t <= run["t"][-1])
     return replace(driven, run=run, scans=scans)
 
 

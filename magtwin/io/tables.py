@@ -20,7 +20,6 @@ from typing import IO, Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
@@ -161,7 +160,12 @@ def _read_long(path: Path, files: Sequence[Path], columns: Mapping[str, str] | N
     return run
 
 
-def load_parquet(path: Path, load: Callable[[Path], Any] = pq.read_table) -> Any:
+def _whole(path: Path) -> pa.Table:
+    with pq.ParquetFile(path) as file:  # `read_table` would import pandas
+        return file.read()
+
+
+def load_parquet(path: Path, load: Callable[[Path], Any] = _whole) -> Any:
     """A Parquet file, loaded by a function of pyarrow.
 
     Raises:
@@ -277,11 +281,13 @@ def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
         if not name.isprintable() or set(name) & set('",# '):
             raise InputError(f"column {name!r} cannot stand in a CSV file; use letters, digits and _")
     lines.append(",".join(table.column_names))
+    from pyarrow import csv  # slow to import
+
     with output(path, force=force) as aside, open(aside, "wb") as file:
         file.write(("\n".join(lines) + "\n").encode())
         for block in blocks(run):
-            bare = pa.csv.WriteOptions(include_header=False, quoting_style="none")
-            pa.csv.write_csv(table_of(block), file, bare)
+            bare = csv.WriteOptions(include_header=False, quoting_style="none")
+            csv.write_csv(table_of(block), file, bare)
 
 
 def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None = None) -> Run:
@@ -325,15 +331,17 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
             raise InputError(f"{path}: column {name!r} has no such type: {error}") from error
     if cut and said:
         raise InputError(f"{path}: CSV cut short: its last line has no end; write it again, or copy it again")
+    from pyarrow import csv  # slow to import
+
     try:
-        reading = pa.csv.ReadOptions(column_names=names, skip_rows=skipped)
-        conversion = pa.csv.ConvertOptions(
+        reading = csv.ReadOptions(column_names=names, skip_rows=skipped)
+        conversion = csv.ConvertOptions(
             column_types=types,
             null_values=[""],
             true_values=["true", "True", "TRUE", "1", "1.0"],
             false_values=["false", "False", "FALSE", "0", "0.0"],
         )
-        table = pa.csv.read_csv(path, reading, pa.csv.ParseOptions(), conversion)
+        table = csv.read_csv(path, reading, csv.ParseOptions(), conversion)
     except (pa.ArrowException, OSError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: not a CSV file of a run: {_short(reason)}") from error

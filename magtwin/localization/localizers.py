@@ -25,7 +25,6 @@ LOCALIZERS: Registry[Any] = Registry(
         "rbpf-iron": "magtwin.localization.particles:RaoBlackwellIron",
         "rbpf-network": "magtwin.localization.particles:RaoBlackwellNetwork",
         "ros": "magtwin.ros.localization.ros_node:RosNode",
-        "sequence": "magtwin.localization.sequence:Sequence",
         "slam-smoother": "magtwin.localization.slam.slam_smoother:SlamSmoother",
         "smoother": "magtwin.localization.smoother:MapSmoother",
     },

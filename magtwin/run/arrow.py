@@ -41,7 +41,16 @@ def table_of(run: Run) -> pa.Table:
         for name, (column, part, values) in flat.items()
     ]
     schema = pa.schema(fields, metadata={FACTS: metadata_to_json(run)})
-    return pa.Table.from_arrays([pa.array(values) for _, _, values in flat.values()], schema=schema)
+    return pa.Table.from_arrays([_array(values) for _, _, values in flat.values()], schema=schema)
+
+
+def _array(values: NDArray[Any]) -> pa.Array:
+    """A column of numbers or bools; `pa.array` would import pandas."""
+    if values.dtype == bool:
+        values, kind, count = np.packbits(values, bitorder="little"), pa.bool_(), len(values)
+    else:
+        kind, count = pa.from_numpy_dtype(values.dtype), len(values)
+    return pa.Array.from_buffers(kind, count, [None, pa.py_buffer(np.ascontiguousarray(values))])
 
 
 def run_of(table: pa.Table, path: Path, first: int | None = None) -> Run:
@@ -169,4 +178,11 @@ def _numpy(column: pa.ChunkedArray, name: str, path: Path, first: int) -> NDArra
     if column.null_count:
         row = first + column.is_null().to_numpy().argmax()
         raise InputError(f"{path}: column {name!r}, row {row}: no value; write nan for unknown values")
-    return column.to_numpy()
+    kept = [_flags(chunk) if kind == pa.bool_() else np.from_dlpack(chunk) for chunk in column.chunks]
+    return np.concatenate(kept) if kept else np.empty(0, kind.to_pandas_dtype())
+
+
+def _flags(chunk: pa.Array) -> NDArray[np.bool_]:
+    """The bools of an array; `to_numpy` would import pandas."""
+    bits = np.frombuffer(chunk.buffers()[1], np.uint8)
+    return np.unpackbits(bits, bitorder="little")[chunk.offset : chunk.offset + len(chunk)].astype(bool)

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from magtwin.errors import InputError
 from magtwin.frames import wrap_angle, yaw_from_quat
@@ -347,6 +346,8 @@ def _best_lag(a: Array, b: Array, size_m: float) -> int:
 
     sum |a_i - b_(i-k)|^2 = sum |a_i|^2 + sum |b_j|^2 - 2 sum a_i . b_(i-k), the last by FFT.
     """
+    from scipy import signal  # takes half a second
+
     centre = a.mean(axis=0)  # avoids cancellation
     a, b = a - centre, b - centre
     lags = np.arange(-(len(b) - 1), len(a))

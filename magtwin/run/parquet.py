@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from magtwin.budget import check_count, check_decoded, check_size
@@ -57,17 +56,13 @@ def check_parquet(path: Path) -> None:
 def _nbytes(column: pa.Array) -> int:
     """Bytes of a column, each of its texts whole."""
     if pa.types.is_dictionary(column.type):
-        return _nbytes(column.indices) + int(
-            pc.sum(_length(column.dictionary).take(column.indices)).as_py() or 0
-        )
+        from pyarrow import compute  # slow to import
+
+        lengths = compute.binary_length(column.dictionary).cast(pa.int64())
+        return _nbytes(column.indices) + int(compute.sum(lengths.take(column.indices)).as_py() or 0)
     if pa.types.is_nested(column.type):
         return sum(map(_nbytes, column.flatten() if pa.types.is_struct(column.type) else [column.flatten()]))
     return int(column.nbytes)
-
-
-def _length(texts: pa.Array) -> pa.Array:
-    """Bytes of each text."""
-    return pc.binary_length(texts).cast(pa.int64())
 
 
 def _counts(path: Path) -> list[list[int]]:

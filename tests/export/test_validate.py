@@ -20,10 +20,8 @@ from magtwin.errors import InputError
 from magtwin.export.package import export_scene
 from magtwin.export.usdz import pack
 from magtwin.export.validation.findings import Check, Finding, Findings, check_from
-from magtwin.export.validation.fix import SAFE, mend
 from magtwin.export.validation.rule import RULES, Subject
 from magtwin.export.validation.rules import climbs, is_absolute, robot_assets
-from magtwin.export.validation.validate import SAFE as NAMES
 from magtwin.export.validation.validate import validate
 from magtwin.learn.data.features import FEATURES
 
@@ -289,12 +287,10 @@ def test_a_value_of_another_kind_breaks_the_rule_that_reads_it_and_ends_nothing(
     assert "a value is not of its type" in found[rule][0].text
 
 
-def test_the_docs_list_every_rule_and_every_mend_with_its_sentence():
+def test_the_docs_list_every_rule_with_its_sentence():
     text = (DOCS / "validate.md").read_text()
     for rule in EVERY.values():
         assert f"| `{rule.name}` | {rule.sentence} | {rule.advice} |" in text
-    for name, fix in SAFE.items():
-        assert f"| `{name}` | {fix.__doc__} |" in text
 
 
 def test_a_robots_asset_is_found_for_the_profiles_that_are_for_it(lab, tmp_path):
@@ -416,7 +412,6 @@ def test_core_is_every_validator_of_usds(lab):
     bare = beside(lab, "bare", HEAD.replace('defaultPrim = "World"', 'defaultPrim = "Wrld"'))
     (check,) = validate(bare, ["core"]).checks
     assert "MissingDefaultPrim" in {finding.rule for finding in check.findings}
-    assert mend(beside(lab, "none", UNSAID), ["default-prim"]) == ["none.usda: its default prim is World"]
 
 
 @pytest.mark.physics
@@ -519,77 +514,3 @@ def test_a_validator_that_there_is_not_is_refused_by_the_near_one(tmp_path):
     (tmp_path / "a.usda").write_text(HEAD)
     with pytest.raises(InputError, match="no validator 'isac'; did you mean 'isaac'"):
         validate(tmp_path / "a.usda", ["isac"])
-
-
-# --- mending --------------------------------------------------------------------------------------
-
-UNSAID = '#usda 1.0\n(\n    subLayers = [@./lab.usda@]\n)\nover "World"\n{\n}\n'
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "rule"),
-    [
-        ("units", UNSAID, "units"),
-        ("relative-paths", HEAD + over("", "asset a = @HERE/map/lab.usdc@"), "absolute-paths"),
-        ("relative-paths", HEAD + over("", "asset a = @/home/else/lab/map/lab.usdc@"), "absolute-paths"),
-    ],
-)
-def test_a_mend_mends_what_the_rule_found_and_is_done_once(lab, name, text, rule):
-    file = beside(lab, f"mend_{name.replace('-', '_')}", text.replace("HERE", lab.parent.as_posix()))
-    assert broken(file, rule)
-    assert mend(file, [name])
-    assert not broken(file, rule)
-    before = file.read_bytes()
-    assert mend(file, [name]) == []
-    assert file.read_bytes() == before
-
-
-@pytest.mark.parametrize("name", ["extents", "material-bindings"])
-def test_a_mend_of_shapes_is_what_the_validators_asked_for(lab, name):
-    text = HEAD + 'def Cube "C" {\nrel material:binding = </World/Lab/Looks/wall>\n}\n'
-    file = beside(lab, f"shape_{name.replace('-', '_')}", text)
-    assert mend(file, [name])
-    stage = Usd.Stage.Open(str(file))  # held in a name: a prim does not keep its stage alive
-    prim = stage.GetPrimAtPath("/C")
-    if name == "extents":
-        assert np.array_equal(prim.GetAttribute("extent").Get(), [(-1, -1, -1), (1, 1, 1)])
-    else:
-        assert "MaterialBindingAPI" in prim.GetAppliedSchemas()
-
-
-def test_the_units_of_a_strangers_stage_are_not_guessed(tmp_path):
-    file = tmp_path / "a.usda"
-    file.write_text('#usda 1.0\ndef Xform "A" {}\n')
-    assert mend(file, ["units"]) == []
-
-
-def test_a_layer_outside_of_the_folder_is_left_alone(lab, tmp_path):
-    (tmp_path / "in").mkdir()
-    outside = tmp_path / "else.usda"
-    outside.write_text('#usda 1.0\n(defaultPrim = "A")\ndef Cube "A" {}\n')
-    file = tmp_path / "in" / "a.usda"
-    file.write_text('#usda 1.0\n(\n    defaultPrim = "A"\n    subLayers = [@../else.usda@]\n)\n')
-    before = outside.read_bytes()
-    assert mend(file, list(SAFE)) == []
-    assert outside.read_bytes() == before
-
-
-def test_the_command_reports_what_it_mends_and_leaves_checksums(lab, capfd, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "300")
-    assert tuple(SAFE) == NAMES
-    text = UNSAID.replace('over "World"\n{\n}\n', "") + over(
-        "AnomalyMap", f'string magtwin:anomalyMap:checksum = "{"0" * 64}"'
-    )
-    file = beside(lab, "command", text)
-    with pytest.raises(SystemExit):
-        main(["validate", str(file), "--against", "magtwin", "--fix"])
-    printed = capfd.readouterr().out
-    assert "mended command.usda: its default prim is World" in printed
-    assert "map-checksum" in printed
-    assert not broken(file, "units")
-
-
-def test_a_package_is_not_mended(tmp_path, lab):
-    (tmp_path / "a.usdz").write_bytes(b"PK\x05\x06" + bytes(18))
-    with pytest.raises(InputError, match="a package cannot be fixed"):
-        validate(tmp_path / "a.usdz", fix=["units"])

@@ -239,7 +239,6 @@ COMMANDS = (
     "picture S --out o.png",
     "export S --out o",
     "validate S",
-    "validate S --fix default-prim",
     "upgrade S",
     "map survey S --out o.parquet",
     "map upward S --height-m 1 --out o.usdc",

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Flag, Force
+from magtwin.cli.options import Force
 from magtwin.cli.terminal import Done, announce, check_output, print_error, printable, stdout_console
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ SEVERITIES: tuple["Severity", ...] = ("error", "warning", "note")
 def validate(
     *files: Annotated[Path, Parameter(required=True)],
     against: Annotated[list[Validator] | None, Parameter(consume_multiple=True)] = None,
-    fix: Flag = False,
     out: Path | None = None,
     force: Force = False,
 ) -> Done:
@@ -39,27 +38,24 @@ def validate(
         Stages (.usd, .usda, .usdc or .usdz).
     against
         Validators to use, one or several: core nvidia simready isaac newton physx magtwin. Default: all.
-    fix
-        Repair first what is safe: default prim, missing units, absolute paths, extents, bindings.
     out
         Report to write (.json), with all findings.
     """
     from json import dumps
 
-    from magtwin.export.validation.validate import AGAINST, SAFE
+    from magtwin.export.validation.validate import AGAINST
     from magtwin.export.validation.validate import validate as check
     from magtwin.learn.data.features import FEATURES
     from magtwin.outputs import output
     from magtwin.twin import shipped_or
 
     check_output(out, (".json",), "a report", force=force)
-    fixes = SAFE if fix else ()
 
     def validated(file: Path) -> "Findings":
         def report(validator: str) -> None:
             announce(f"{file.name}: {validator}")
 
-        return check(file, against or AGAINST, inputs=FEATURES, fix=fixes, progress=report)
+        return check(file, against or AGAINST, inputs=FEATURES, progress=report)
 
     found = [validated(shipped_or(file)) for file in files]
     tables = [findings.table() for findings in found]
@@ -82,8 +78,6 @@ def _print(found: "list[Findings]") -> None:
     console = stdout_console()
     for findings in found:
         console.print(Text(printable(str(findings.file)), style="bold"))
-        for line in findings.mended:
-            console.print(Padding(Text(f"mended {printable(line)}"), (0, 0, 0, 2), expand=False))
         table = Table(box=None, pad_edge=False)
         for column in ("validator", "result"):
             table.add_column(column, no_wrap=True)

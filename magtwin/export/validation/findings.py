@@ -64,9 +64,6 @@ class Findings:
 
     checks: tuple[Check, ...]
 
-    mended: tuple[str, ...] = ()
-    """Repairs before the check, one line each."""
-
     def count(self, severity: Severity) -> int:
         """Number of findings of that severity."""
         return sum(check.count(severity) for check in self.checks)
@@ -83,7 +80,6 @@ class Findings:
             "clean": self.clean,
             "errors": self.count("error"),
             "warnings": self.count("warning"),
-            "mended": list(self.mended),
             "checks": [{"result": check.result, **asdict(check)} for check in self.checks],
         }
 

@@ -38,8 +38,6 @@ class Inspection:
     driven: dict[str, Any] = field(default_factory=dict)
     """What `physx_robots.driven_table` found; empty if "physx" was not asked for."""
 
-    mended: tuple[str, ...] = ()
-
 
 def inspect(
     file: Path,
@@ -48,9 +46,8 @@ def inspect(
     root: Path | None = None,
     home: Path | None = None,
     inputs: Collection[str] | None = None,
-    fix: Collection[str] = (),
 ) -> Inspection:
-    """Fix and check a stage in another process.
+    """Check a stage in another process.
 
     Args:
         file: The file that the user named.
@@ -58,11 +55,9 @@ def inspect(
         root: Root layer of an unpacked .usdz. Default: the file itself.
         home: Folder of the unpacked .usdz.
         inputs: Names of the inputs that a network may have.
-        fix: Names of fixes to apply first.
 
     Raises:
-        InputError: The file crashes its reader, is no stage, names files outside its folder, or cannot be
-            fixed.
+        InputError: The file crashes its reader, is no stage, or names files outside its folder.
     """
     from magtwin.usd.layers import check_stage
 
@@ -75,7 +70,6 @@ def inspect(
             "home": None if home is None else str(home),
             "against": sorted(against),
             "inputs": None if inputs is None else sorted(inputs),
-            "fix": list(fix),
             "answer": str(answer),
         }
         job_file = Path(folder, "job.json")
@@ -103,7 +97,6 @@ def inspect(
         {prim: None if asset is None else Path(asset) for prim, asset in result["robots"].items()},
         result["bodies"],
         result["driven"],
-        tuple(result["mended"]),
     )
 
 
@@ -120,7 +113,6 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
     from pxr import Tf, Usd, UsdPhysics, UsdUtils
 
     from magtwin.export.attached import detach
-    from magtwin.export.validation.fix import mend
 
     importlib.import_module("magtwin.export.validation.isaac_rules")  # fills RULES
     from magtwin.export.validation.physx_robots import driven_table
@@ -139,7 +131,6 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
                 detach(root)
             except InputError as error:
                 lost.append(Finding("attached", str(error), advice="export the package anew"))
-        mended = mend(root, job["fix"]) if job["fix"] else []
         stage = Usd.Stage.Open(str(root))
         if stage is None:
             raise InputError(f"{file}: cannot be opened as USD; it is damaged, cut short, or not USD")
@@ -169,7 +160,6 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
         "robots": {prim: None if asset is None else str(asset) for prim, asset in assets.items()},
         "bodies": bodies,
         "driven": driven,
-        "mended": mended,
     }
 
 

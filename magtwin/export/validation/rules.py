@@ -59,7 +59,7 @@ OFF_M = 1e-3
 """Largest distance between a mesh and what it shows [m]."""
 
 
-@rule("magtwin", "make the path relative to the layer; --fix does this if the file exists")
+@rule("magtwin", "make the path relative to the layer")
 def absolute_paths(subject: Subject) -> Iterator[Wrong]:
     """No layer names a file by an absolute path."""
     for layer in subject.layers:
@@ -84,7 +84,7 @@ def climbing_paths(subject: Subject) -> Iterator[Wrong]:
 @rule("magtwin", "convert it to metres with Z up in the program that made it")
 def units(subject: Subject) -> Iterator[Wrong]:
     """The stage is authored in metres and kilograms with Z up, and what it brings in is scaled to that."""
-    root, advice = subject.stage.GetRootLayer(), "--fix says so where magtwin made the stage"
+    root, advice = subject.stage.GetRootLayer(), "author it; stages of magtwin are in metres with Z up"
     for name, default in (("metersPerUnit", "centimetres"), ("upAxis", "Y up")):
         if not subject.stage.HasAuthoredMetadata(name):
             yield Wrong(f"does not say {name}, and counts as {default}", advice=advice)

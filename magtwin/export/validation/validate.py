@@ -26,16 +26,12 @@ AGAINST = ("core", "nvidia", "simready", "isaac", "newton", "physx", "magtwin")
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 
-SAFE = ("default-prim", "units", "relative-paths", "extents", "material-bindings")
-"""Names of the fixes in `magtwin.export.validation.fix`."""
-
 
 def validate(
     file: str | os.PathLike[str],
     against: Collection[str] = AGAINST,
     *,
     inputs: Collection[str] | None = None,
-    fix: Collection[str] = (),
     progress: Callable[[str], Any] | None = None,
 ) -> Findings:
     """Check a stage with validators.
@@ -46,12 +42,11 @@ def validate(
         file: A .usd, .usda, .usdc or .usdz.
         against: Some of `AGAINST`.
         inputs: Names of the inputs that a network may have. None allows any.
-        fix: Fixes to apply first, some of `SAFE`.
         progress: Function that is called with the name of each validator.
 
     Raises:
         InputError: The file is missing, not USD or damaged; a package has an entry outside its folder; the
-            stage names files outside its folder; or a name is not in `AGAINST` or `SAFE`.
+            stage names files outside its folder; or a name is not in `AGAINST`.
     """
     from magtwin.usd.layers import check_stage
 
@@ -63,19 +58,15 @@ def validate(
         raise InputError(f"{file}: no USD file; {hint(file.suffix, SUFFIXES)}")
     names = {name: name for name in AGAINST}
     wanted = [name for name in AGAINST if name in {find("validator", given, names) for given in against}]
-    if fix and file.suffix.lower() == ".usdz":
-        raise InputError(
-            f"{file}: a package cannot be fixed; `magtwin export` it to a folder, fix that, and pack it again"
-        )
     check_stage(file)
     say = progress or (lambda name: None)
     with tempfile.TemporaryDirectory() as folder:
         home = Path(folder) if file.suffix.lower() == ".usdz" else None
         root = None if home is None else unpack(file, home)
         seen = Inspection(())
-        if fix or set(wanted) - {"nvidia"}:
+        if set(wanted) - {"nvidia"}:
             say("core, isaac and magtwin")
-            seen = inspect(file, wanted, root=root, home=home, inputs=inputs, fix=fix)
+            seen = inspect(file, wanted, root=root, home=home, inputs=inputs)
         checks: dict[str, list[Check]] = {}
         for check in seen.checks:
             checks.setdefault(check.validator.split()[0], []).append(check)
@@ -89,4 +80,4 @@ def validate(
             if name in wanted:
                 say(name)
                 checks[name] = look()
-    return Findings(file, tuple(check for name in wanted for check in checks[name]), seen.mended)
+    return Findings(file, tuple(check for name in wanted for check in checks[name]))

@@ -1,6 +1,5 @@
 """Stream: the messages that a robot sends as a run goes on."""
 
-import dataclasses
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -124,7 +123,7 @@ class Stream:
         if self._scans is None:
             return
         k = int(np.searchsorted(self._scans.arrival, until_s, side="right"))
-        arrived, self._scans = scans_at(self._scans, slice(k)), scans_at(self._scans, slice(k, None))
+        arrived, self._scans = self._scans.take(slice(k)), self._scans.take(slice(k, None))
         moments, came = (np.rint(t * NS).astype(np.int64) for t in (arrived.t, arrived.arrival))
         fields = SCAN.write({"ranges_m": arrived.ranges_m}, moments, self._sender)
         yield SCAN, came, fields
@@ -198,11 +197,6 @@ def shifted(fields: Mapping[str, Any], by_ns: int) -> dict[str, Any]:
     """Fields of messages with all stamps later by a time [ns]."""
     stamped = ("stamp", "clock")
     return {n: value + by_ns if n.rpartition(".")[2] in stamped else value for n, value in fields.items()}
-
-
-def scans_at(scans: "Scans", rows: Any) -> "Scans":
-    """Some scans, by a slice or a mask."""
-    return type(scans)(*(getattr(scans, f.name)[rows] for f in dataclasses.fields(scans)))
 
 
 def _finite(run: Columns, names: Iterable[str]) -> NDArray[np.bool_]:

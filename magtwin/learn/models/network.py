@@ -69,6 +69,7 @@ class FieldNet(Summarized, torch.nn.Module):
         dropout: float = 0.3,
         residual_sd_nt: float = math.nan,
         metadata: Mapping[str, MetadataValue] | None = None,
+        device: str | None = None,
     ) -> None:
         """Make a network with random weights and identity scalers.
 
@@ -78,6 +79,7 @@ class FieldNet(Summarized, torch.nn.Module):
             dropout: Share of units dropped in training.
             residual_sd_nt: Root mean square error on held-out runs [nT]; nan if unknown.
             metadata: Provenance: training data, source, licence.
+            device: Where the layers are; "meta" takes no memory.
         """
         super().__init__()
         self.features = feature_names(features)
@@ -90,7 +92,9 @@ class FieldNet(Summarized, torch.nn.Module):
                 f"got {tuple(hidden)} and {dropout}"
             )
         widths = [len(self.features), *hidden, 1]
-        self.layers = torch.nn.ModuleList(torch.nn.Linear(a, b) for a, b in itertools.pairwise(widths))
+        self.layers = torch.nn.ModuleList(
+            torch.nn.Linear(a, b, device=device) for a, b in itertools.pairwise(widths)
+        )
         ones = torch.ones(len(self.features), dtype=torch.float64)
         start = (0 * ones, ones, math.nan * ones, math.nan * ones, 0 * ones[0], ones[0].clone())
         for name, value in zip(_SCALERS, start, strict=True):
@@ -277,14 +281,14 @@ def net_of(weights: Weights) -> FieldNet:
                 f"{path}: tensor 'layers.{i}.weight' is {say(weight)}; a layer's have shape (out, in)"
             )
     try:
-        with torch.device("meta"):  # no memory before the shapes are checked
-            net = FieldNet(
-                weights.features,
-                [len(weight) for weight in held[:-1]],
-                dropout=dropout,
-                residual_sd_nt=weights.residual_sd_nt,
-                metadata=weights.about["facts"],
-            )
+        net = FieldNet(
+            weights.features,
+            [len(weight) for weight in held[:-1]],
+            dropout=dropout,
+            residual_sd_nt=weights.residual_sd_nt,
+            metadata=weights.about["facts"],
+            device="meta",  # no memory before the shapes are checked
+        )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     state = weights.fit(net.state_dict())

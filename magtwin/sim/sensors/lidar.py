@@ -1,7 +1,7 @@
 """LiDAR: its schedule, and the scans of a planar one."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
@@ -98,6 +98,10 @@ class Scans(Summarized):
 
     ranges_m: NDArray[np.float32]
     """Ranges along `ray_angles` [m], shape (S, rays); see `scan`."""
+
+    def take(self, rows: slice | NDArray[np.bool_]) -> "Scans":
+        """Some scans, by a slice or a mask."""
+        return Scans(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def points_world(self) -> list[Array]:
         """Points that each scan hit, in world [m], each of shape (H, 3)."""

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.signal import lfilter
 
 from magtwin.sim.sensors.noise import gauss_markov
 from magtwin.sim.sensors.stateful import Stateful
@@ -58,7 +57,7 @@ class Magnetometer(Stateful):
         self._was_lost, self._stuck = False, math.nan
         self._past: Array | None = None
         self._last_known = math.nan
-        self._low_pass: Array | None = None
+        self._low_pass: float | None = None
         self._lost, self._dropped = np.zeros(0, bool), np.zeros(0, bool)
 
     def axes(self, b_vector_nt: ArrayLike, *, steep: ArrayLike = False) -> Array:
@@ -192,10 +191,13 @@ class Magnetometer(Stateful):
         tau = self._rate / (2 * math.pi * self._spec.bandwidth_hz)
         decay, share = math.exp(-1 / tau), -math.expm1(-1 / tau) * tau
         if self._low_pass is None:
-            self._low_pass = np.array([share * b[0]])
-        taps = [1 - share, share - decay], [1.0, -decay]
-        filtered, self._low_pass = lfilter(*taps, b, zi=self._low_pass)
-        return np.asarray(filtered)
+            self._low_pass = share * float(b[0])
+        filtered, carried = np.empty(len(b)), self._low_pass
+        for k, reading in enumerate(b.tolist()):
+            filtered[k] = out = (1 - share) * reading + carried
+            carried = (share - decay) * reading + decay * out
+        self._low_pass = carried
+        return filtered
 
 
 def vector_gain(spec: MagnetometerSpec) -> Array:

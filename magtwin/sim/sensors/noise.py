@@ -4,15 +4,18 @@ Each function takes the state after the last piece and returns the state for the
 series do not depend on how it is cut into pieces.
 """
 
+import itertools
 import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.signal import lfilter
 
 from magtwin.sim.sensors.stateful import Stateful
 
 Array = NDArray[np.float64]
+
+FEW = 8
+"""Columns up to which a recursion runs over each of them by itself."""
 
 
 def gauss_markov(white: ArrayLike, start: ArrayLike, time_s: float, rate_hz: float) -> tuple[Array, Array]:
@@ -32,8 +35,21 @@ def gauss_markov(white: ArrayLike, start: ArrayLike, time_s: float, rate_hz: flo
     """
     decay = correlation(time_s, rate_hz)
     driven = math.sqrt(1.0 - decay * decay) * np.asarray(white, float)
-    series = lfilter([1.0], [1.0, -decay], np.concatenate([np.asarray(start, float)[None], driven]), axis=0)
+    series = decaying(np.concatenate([np.asarray(start, float)[None], driven]), decay)
     return series[:-1], series[-1]
+
+
+def decaying(driven: Array, decay: float) -> Array:
+    """y_0 = u_0 and y_k = u_k + decay y_{k-1} along the first axis, shape (K, ...); overwrites `driven`."""
+    columns = driven.reshape(len(driven), -1)
+    if columns.shape[1] <= FEW:  # Python's floats are faster than numpy's short rows, and give the same bits
+        for k in range(columns.shape[1]):
+            terms = itertools.accumulate(columns[:, k].tolist(), lambda y, u: u + decay * y)
+            columns[:, k] = np.fromiter(terms, float, len(columns))
+    else:
+        for k in range(1, len(columns)):
+            columns[k] += decay * columns[k - 1]
+    return columns.reshape(driven.shape)
 
 
 def correlation(time_s: float, rate_hz: float) -> float:

@@ -1,0 +1,143 @@
+"""Check that the house stays small: what public functions reach by imports, the lines of each room, long functions.
+
+    python .ci/house.py
+
+`REACH`, `ROOMS` and `TESTS` are bounds. Lower one when you can. Raise one only in a commit that says why.
+"""
+
+import ast
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+REACH = {
+    "read_survey": ("magtwin.io.surveys.survey", 52_700),
+    "fit_map": ("magtwin.field.fit.fit", 5_200),
+    "simulate": ("magtwin.twin.simulation", 42_700),
+    "open_twin": ("magtwin.twin.opening", 42_700),
+    "localize": ("magtwin.localizing", 55_100),
+    "from_urdf": ("magtwin.author.from_urdf", 18_800),
+    "ros magnetometer": ("magtwin.ros.magnetometer", 48_200),
+}
+"""Module of a public function, and the most lines of magtwin that it reaches.
+
+Counted are imports at any depth, those inside functions and the packages' own files too; not those for type checkers,
+and not modules that a table names as text, since these are loaded for one format or method only.
+"""
+
+ROOMS = {
+    "magtwin": 4_650,
+    "author": 1_650,
+    "bench": 3_900,
+    "cli": 5_150,
+    "export": 4_950,
+    "fetch": 150,
+    "field": 9_650,
+    "figures": 3_900,
+    "io": 10_000,
+    "learn": 10_250,
+    "localization": 6_650,
+    "parallel": 920,
+    "path": 1_130,
+    "ros": 4_900,
+    "run": 1_850,
+    "sim": 9_150,
+    "spec": 1_720,
+    "twin": 1_750,
+    "urdf": 11_500,
+    "usd": 7_250,
+}
+"""Most lines of each room; "magtwin" are the files beside the rooms."""
+
+TESTS = 61_000
+"""Most lines of tests."""
+
+LONG = 80
+"""Most lines of a function, its docstring left out."""
+
+KERNELS = ("loops", "inversion", "kernels")
+"""Words in the names of modules of compiled loops, which may be longer."""
+
+
+def modules() -> dict[str, Path]:
+    """Files of the package by the name of their module."""
+    names = {}
+    for path in sorted((ROOT / "magtwin").rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        names[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return names
+
+
+def imported(tree: ast.AST) -> set[str]:
+    """Names that a module imports at any depth, but for type checkers."""
+    names: set[str] = set()
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            node = ast.Module(node.orelse, [])
+        elif isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names |= {f"{node.module}.{alias.name}" for alias in node.names} | {str(node.module)}
+        names |= imported(node)
+    return names
+
+
+def reached(start: str, imports: dict[str, set[str]]) -> set[str]:
+    """Modules that are loaded with a module, itself and the packages around each of them included."""
+    seen: set[str] = set()
+    waiting = [start]
+    while waiting:
+        name = waiting.pop()
+        if name in imports and name not in seen:
+            seen.add(name)
+            waiting += [name.rpartition(".")[0], *imports[name]]
+    return seen
+
+
+def long_functions(name: str, tree: ast.AST) -> list[str]:
+    """Functions of a module that are too long."""
+    if any(word in name for word in KERNELS):
+        return []
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef):
+            body = node.body[1:] if ast.get_docstring(node) and len(node.body) > 1 else node.body
+            lines = body[-1].end_lineno - body[0].lineno + 1
+            if lines > LONG:
+                found.append(f"{name}.{node.name} has {lines} lines, at most {LONG}")
+    return found
+
+
+def main() -> int:
+    """Print the figures, and what is beyond its bound; 1 if anything is."""
+    files = modules()
+    texts = {name: path.read_text(encoding="utf-8") for name, path in files.items()}
+    trees = {name: ast.parse(text) for name, text in texts.items()}
+    lines = {name: text.count("\n") for name, text in texts.items()}
+    imports = {name: imported(tree) for name, tree in trees.items()}
+    wrong = [said for name, tree in trees.items() for said in long_functions(name, tree)]
+
+    def compare(what: str, count: int, most: int) -> None:
+        print(f"{count:7,} of {most:7,}  {what}")
+        if count > most:
+            wrong.append(f"{what}: {count:,} lines, at most {most:,}; delete first, or raise the bound and say why")
+
+    for function, (start, most) in REACH.items():
+        compare(f"reached by {function}", sum(lines[name] for name in reached(start, imports)), most)
+    rooms = dict.fromkeys(ROOMS, 0)
+    for name, count in lines.items():
+        parts = files[name].relative_to(ROOT).parts
+        room = parts[1] if len(parts) > 2 else "magtwin"
+        rooms[room] = rooms.get(room, 0) + count
+    for room, count in rooms.items():
+        compare(f"in {room}", count, ROOMS.get(room, 0))
+    tests = sum(path.read_text(encoding="utf-8").count("\n") for path in (ROOT / "tests").rglob("*.py"))
+    compare("in tests", tests, TESTS)
+    print(f"{sum(lines.values()):7,}             in the package")
+    print("\n".join(wrong), file=sys.stderr)
+    return int(bool(wrong))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
