@@ -280,13 +280,34 @@ def test_a_message_that_came_twice_is_one_reading(tmp_path):
     assert run.rows == 20
 
 
+def test_messages_that_overtook_each_other_are_sorted_and_told(tmp_path):
+    said = poses()
+    said[40], said[41] = [(said[k][0], said[81 - k][1]) for k in (40, 41)]
+    run = read_bag(record(tmp_path / "bag", {MAG: readings(), POSE: said}))
+    straight = read_bag(record(tmp_path / "straight", {MAG: readings(), POSE: poses()}))
+    for name in straight:
+        assert_array_equal(run[name], straight[name])
+    assert "1 messages of /robot/enu/pose by their stamps, behind which they came" in run.metadata["taken"]
+
+
+@pytest.mark.parametrize(("row", "stamp_ns"), [(0, 0), (100, 0), (100, START - 60 * 10**9)])
+def test_one_stamp_that_is_wrong_is_one_reading_less_and_told(tmp_path, row, stamp_ns):
+    said = readings()
+    said[row] = said[row][0], magnetic(stamp_ns, 41_000)
+    run = read_bag(record(tmp_path / "bag", {MAG: said}))
+    assert run.rows == 199
+    assert run["t"][-1] < 4
+    text = f"1 of 200 messages of {MAG} as missing, whose stamps are wrong"
+    assert text in run.metadata["taken"]
+
+
 def backwards(said):
     return [(t, magnetic(START + (1000 - k) * MS, 41_000)) for k, (t, _) in enumerate(said)]
 
 
 def test_what_cannot_be_a_run_is_refused_with_what_is_there(tmp_path):
     far = [(r, posed(s + 10**15, 0, 0)) for s, r in at(20)]
-    late = [(r + MS, posed(s - 60 * MS * (k == 1), 0, 0)) for k, (s, r) in enumerate(at(20))]
+    late = [(r, posed(s - 1100 * MS * (k in (40, 60)), 0, 0)) for k, (s, r) in enumerate(at(20))]
     cases = {
         "no topic /robot/qtfm/magnitude; did you mean '/robot/qtfm/magnetude'.; topics in it: "
         r"/robot/qtfm/magnetude \(sensor_msgs": ({"/robot/qtfm/magnetude": readings()}, None),
@@ -301,8 +322,8 @@ def test_what_cannot_be_a_run_is_refused_with_what_is_there(tmp_path):
             {MAG: backwards(readings())},
             None,
         ),
-        r"stamps of /robot/enu/pose run backwards: .* in message 3 of 81": (
-            {MAG: readings(), POSE: [*poses()[:1], *late]},
+        r"stamps of /robot/enu/pose run backwards: .* in message 41 of 80": (
+            {MAG: readings(), POSE: late},
             None,
         ),
         r"/robot/enu/pose spans 1000000.000\.\.1000003.950 s since .* are they of one clock": (
