@@ -1,15 +1,19 @@
 """Frames of a recording: vectors and poses of parts of a robot become those of base_link by /tf_static."""
 
+import warnings
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from magtwin.errors import RepairWarning
+from magtwin.errors import MismatchWarning, RepairWarning
 from magtwin.io.bags import RawBagWriter, read_bag, read_bag_readings
 from magtwin.io.bags.frames import StaticFrames, kind_of
 from magtwin.io.bags.topics import Qos
+from magtwin.localizing import check_lever_arm
 from magtwin.ros.bus import to_bytes
+from magtwin.run.run import Run
 
 START, NS = 1_700_000_000, 10**9
 GRAVITY = np.array([0.0, 0.0, 9.80665])
@@ -240,3 +244,15 @@ def test_a_ring_of_transforms_or_a_damaged_one_ends_no_reader():
     mount = known.mount("/mag_link")
     assert mount is not None
     assert_array_equal(mount.q_xyzw, one)
+
+
+def test_a_lever_arm_other_than_that_of_tf_static_is_warned_of():
+    run = Run({"t": np.arange(3.0)}, {"tf_sensor_m": "0.1, -0.05, 0.2"})
+    with pytest.warns(
+        MismatchWarning, match=r"lever arm is 0.000, 0.000 m; give --sensor lever_arm_m=\[0.100,-0.050\]"
+    ):
+        check_lever_arm(run, (0.0, 0.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_lever_arm(run, (0.11, -0.05))
+        check_lever_arm(Run({"t": np.arange(3.0)}), (0.11, -0.05))
