@@ -496,8 +496,8 @@ def check_lever_arm(run: Run, lever_arm_m: tuple[float, float]) -> None:
     if math.dist((x, y), lever_arm_m) > APART_M:
         told = ", ".join(f"{part:.3f}" for part in lever_arm_m)
         warnings.warn(
-            f"/tf_static of the recording has the magnetometer at x, y = {x:.3f}, {y:.3f} m in base_link, and "
-            f"the lever arm is {told} m; give --sensor lever_arm_m=[{x:.3f},{y:.3f}], unless the map was "
+            f"/tf_static of the recording has the magnetometer at x, y = {x:.3f}, {y:.3f} m in base_link, "
+            f"and the lever arm is {told} m; give --sensor lever_arm_m=[{x:.3f},{y:.3f}], unless the map was "
             "surveyed by the poses of this robot",
             MismatchWarning,
             stacklevel=3,

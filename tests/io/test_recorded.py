@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, RepairWarning
 from magtwin.io.bags import read_bag
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -239,6 +239,14 @@ def test_the_unit_is_told_by_size_and_said(tmp_path, scale, unit):
     assert read_bag(bag, unit=unit).metadata["field_unit_told"] == "given"
     with pytest.raises(InputError, match=f"in {unit} it would be"):
         read_bag(bag, unit="G")
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(3.7e-9, None), (3.7e-9, "T"), (0.2e-9, "T")])
+def test_a_field_with_the_robots_iron_is_read_with_a_warning(tmp_path, factor, unit):
+    bag = record(tmp_path / "bag", {MAG: readings(factor)})
+    with pytest.warns(RepairWarning, match="nT in T, not that of the Earth's field: iron near the sensor"):
+        run = read_bag(bag, unit=unit)
+    assert_allclose(run["b_measured_nt"], factor * 1e9 * (41_000 + np.arange(200)), rtol=1e-12)
 
 
 def test_a_vector_field_gives_its_magnitude_and_itself(tmp_path):

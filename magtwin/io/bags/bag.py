@@ -49,6 +49,9 @@ LATE_S = 1.0
 WRONG = 0.01
 """Share of messages with wrong stamps up to which they are left out."""
 
+IRON = 2.0
+"""Factor by which iron near the sensor may change the mean of the field."""
+
 UNSET_NS = 10**7 * NS
 """Median of stamps from which a stamp of 0 was not set, and is not the beginning of a simulation [ns]."""
 
@@ -283,6 +286,9 @@ def field_nt(
 ) -> Field:
     """The field of messages in nT.
 
+    A mean that is up to twice too large or too small for the Earth's field is taken with a warning: it may be
+    that of iron near the sensor.
+
     Args:
         b: Magnitudes, shape (N,), or vectors, shape (N, 3). Vectors whose y and z are all 0 are magnitudes in
             x, as APRILab's robot publishes them.
@@ -302,17 +308,32 @@ def field_nt(
     if scale is None:
         unit = unit or unit_of(float(finite.mean()), where, topic)
     factor = NT_PER[unit] if unit else float(scale or 1.0)
-    check_unit(factor * finite, where, topic, unit or "nT", scale=scale)
+    mean = factor * float(finite.mean())
+    if unit and not _is_earths(mean) and _is_earths(mean, IRON):
+        text = f"{where}: the mean of {topic} is {mean:,.0f} nT in {unit}, not that of the Earth's field"
+        text += ": iron near the sensor, or another unit (--unit, --scale)"
+        warnings.warn(text, RepairWarning, stacklevel=3)
+    else:
+        check_unit(factor * finite, where, topic, unit or "nT", scale=scale)
     label = unit or f"units of {scale:g} nT"
     return Field(factor * size, None if vector is None else factor * vector, label)
 
 
 def unit_of(mean: float, where: str, topic: str) -> Unit:
-    """The unit in which a mean magnitude is the Earth's field; the ranges of the units do not overlap."""
-    for unit, factor in NT_PER.items():
-        if LEAST_MEAN_NT <= mean * factor < GREATEST_MEAN_NT:
-            return unit  # type: ignore[return-value]
+    """The unit in which a mean magnitude is the Earth's field, or at least the Earth's with that of iron.
+
+    The ranges of the units do not overlap.
+    """
+    for apart in (1.0, IRON):
+        for unit, factor in NT_PER.items():
+            if _is_earths(mean * factor, apart):
+                return unit  # type: ignore[return-value]
     raise InputError(f"{where}: the mean of {topic} is {mean:.6g}; in no unit is that the Earth's field")
+
+
+def _is_earths(mean_nt: float, apart: float = 1.0) -> bool:
+    """Whether a mean may be that of the Earth's field, or up to a factor of it [nT]."""
+    return LEAST_MEAN_NT / apart <= mean_nt < GREATEST_MEAN_NT * apart
 
 
 @contextmanager
