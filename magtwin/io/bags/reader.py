@@ -68,8 +68,8 @@ def read_bag(
     stamps goes by time of receipt, less the median delay of the magnetometer's messages. p_world_base,
     q_world_base_xyzw and yaw are motion capture, interpolated between poses; without it, odometry if /tf
     moves it in the map. Vectors and poses of parts of the robot become those of base_link by /tf_static.
-    Gravity is subtracted from accelerations that contain it. The metadata name the topics, the unit, how it was
-    found, and what was done to frames and stamps (`taken`).
+    Gravity is subtracted from accelerations that contain it. The metadata name the topics, the unit, how it
+    was found, and what was done to frames and stamps (`taken`).
 
     Args:
         path: Folder of a rosbag2, or its storage file (.mcap, .db3).
