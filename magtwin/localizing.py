@@ -53,6 +53,9 @@ ROBOT_NOISE = SensorModel(white_nt=100.0, drift_nt=250.0, drift_s=2.5, offset_nt
 In six simulated drives the difference of the readings from the map had a mean of 190 to 520 nT, 290 to 500 nT
 along the heading, and the rest 180 to 280 nT with a correlation of 0.4 to 0.6 after 2 s."""
 
+APART_M = 0.02
+"""Distance of two places of the magnetometer that is warned of [m]."""
+
 GAP_S = 1.0
 """Longest gap in the true poses over which they are interpolated for the bounds [s]."""
 
@@ -254,6 +257,7 @@ def localization(
         if rate_hz is not None:
             calibration = thinned(calibration, rate_hz)
     lever_arm = lever_arm_of(run) if sensor is None else sensor.lever_arm_m
+    check_lever_arm(run, lever_arm)
     if anomaly_map is not None:
         check_on_map(run, anomaly_map, lever_arm)
     problem = Problem(
@@ -484,6 +488,20 @@ def lever_arm_of(run: Run) -> tuple[float, float]:
     """Place of the magnetometer in base_link from the metadata of a run; (0, 0) if it is not there."""
     x, y, _ = numbers_in(run.metadata, "sensor_m", 3) or (0.0, 0.0, 0.0)
     return x, y
+
+
+def check_lever_arm(run: Run, lever_arm_m: tuple[float, float]) -> None:
+    """Warn if /tf_static of a recording has the magnetometer at another place than the method is told."""
+    x, y, _ = numbers_in(run.metadata, "tf_sensor_m", 3) or (*lever_arm_m, 0.0)
+    if math.dist((x, y), lever_arm_m) > APART_M:
+        told = ", ".join(f"{part:.3f}" for part in lever_arm_m)
+        warnings.warn(
+            f"/tf_static of the recording has the magnetometer at x, y = {x:.3f}, {y:.3f} m in base_link, "
+            f"and the lever arm is {told} m; give --sensor lever_arm_m=[{x:.3f},{y:.3f}], unless the map was "
+            "surveyed by the poses of this robot",
+            MismatchWarning,
+            stacklevel=3,
+        )
 
 
 def extent_of(run: Run, belief: FieldBelief | None) -> tuple[float, float, float, float]:

@@ -402,7 +402,7 @@ def record(
     out
         Folder to make, or a file (.mcap).
     topic
-        Topic to record, such as odom or /map. May be repeated. Default: all of the robot's.
+        Topic to record beside those of the robot, such as /scan_2. May be repeated.
     """
     from magtwin.io.bags import RawBagWriter
     from magtwin.ros.record import Recorder

@@ -16,7 +16,7 @@ from magtwin.path import Path
 from magtwin.ros.bus import Bus
 from magtwin.ros.commands import Commands, CommandType
 from magtwin.ros.diagnostics import Reporter, Status
-from magtwin.ros.inputs import Input, Stamps
+from magtwin.ros.inputs import Input, LiveFrames, Stamps
 from magtwin.sim.motion.controllers import Guide, guide_along
 from magtwin.sim.motion.follow import CONTROL_RATE_HZ
 from magtwin.sim.motion.loop import RELEASE
@@ -145,10 +145,9 @@ class Follower:
         self._now_ns = 0
         self._guide = self._guided(path)
         topic, self._p, self._q = find("source", source, SOURCES)
-        self._pose = Input(bus, topic, max_age_s=MAX_AGE_S, stamps=stamps, say=say)
-        self._twist = self._pose
-        if topic is not ODOMETRY:
-            self._twist = Input(bus, ODOMETRY, max_age_s=MAX_AGE_S, stamps=stamps, say=say)
+        told: Any = {"frames": LiveFrames(bus), "max_age_s": MAX_AGE_S, "stamps": stamps, "say": say}
+        self._pose = Input(bus, topic, **told)
+        self._twist = self._pose if topic is ODOMETRY else Input(bus, ODOMETRY, **told)
         self._commands = Commands(bus, commands)
         self._reporter = Reporter(bus)
         self._state, self._stand_s = "", STAND_S

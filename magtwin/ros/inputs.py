@@ -1,19 +1,22 @@
 """Inputs of a node, joined by stamp: of each topic the newest message that is not in the future."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.frames import quat_conjugate, rotate
+from magtwin.frames import quat_conjugate, quat_multiply, rotate
 from magtwin.io.bags.cdr import NS
-from magtwin.io.bags.topics import SENSOR_DATA, Topic
+from magtwin.io.bags.frames import LEAVES, Mount, Role, StaticFrames, in_base, mount_of, role_of
+from magtwin.io.bags.topics import LATCHED, SENSOR_DATA, TF_STATIC, Topic
 from magtwin.io.bags.types import layout
 from magtwin.ros.bus import Bus, Message, Subscription
 from magtwin.ros.diagnostics import Level, Status, status_of
+from magtwin.spec.base import Quat
 
 Columns = dict[str, NDArray[Any]]
 
@@ -48,6 +51,56 @@ SETTLE = 50
 """Number of accelerations after which it is decided whether they contain gravity."""
 
 
+STATICS = 100
+"""Queue of /tf_static, which has a latched message of each of its publishers."""
+
+
+class LiveFrames:
+    """The frames of a robot, by /tf_static."""
+
+    def __init__(self, bus: Bus, axes: Mapping[str, Quat] | None = None) -> None:
+        """Listen.
+
+        Args:
+            bus: The node.
+            axes: Axes in base_link of the columns, by the noun of their role. Default: those of base_link.
+        """
+        self._known, self._axes = StaticFrames(), dict(axes or {})
+        self._mounts: dict[tuple[str, ...], tuple[Mount | None, str]] = {}
+        if bus.knows(TF_STATIC.kind):
+            bus.subscribe(TF_STATIC.name, TF_STATIC.kind, self._hear, replace(LATCHED, depth=STATICS))
+
+    def in_base(self, role: Role, frames: tuple[str, str], columns: Columns) -> tuple[Columns, str]:
+        """Columns of a message in these frames as those of base_link; and what is wrong with the frames."""
+        key = (role.noun, *frames)
+        if key not in self._mounts:
+            self._mounts[key] = mount_of(role, frames, self._known)
+        mount, fault = self._mounts[key]
+        if mount is not None:
+            wanted = self._axes.get(role.noun)
+            q = mount.q_xyzw if wanted is None else quat_multiply(quat_conjugate(wanted), mount.q_xyzw)
+            columns = in_base(role, columns, mount._replace(q_xyzw=q))
+        return columns, fault
+
+    def place(self, frame: str) -> Mount | None:
+        """Where a frame is on the robot; None if that is not known."""
+        return self._known.mount(frame)
+
+    def _hear(self, message: Message) -> None:
+        parts = ("header.frame_id", "child_frame_id", "transform.translation", "transform.rotation")
+        try:
+            for k in range(message.read(["transforms"])["transforms"]):
+                self._known.add(*message.read([f"transforms.{k}.{part}" for part in parts]).values())
+        except InputError:
+            return  # damaged
+        self._mounts.clear()
+
+
+def frames_in(kind: str) -> list[str]:
+    """Leaves of a message type with its frames."""
+    return [leaf.name for leaf in layout(kind) if leaf.name in LEAVES]
+
+
 class Input:
     """A topic, subscribed to when it is first published, in any of its readable types."""
 
@@ -56,6 +109,7 @@ class Input:
         bus: Bus,
         topic: Topic,
         *,
+        frames: LiveFrames,
         max_age_s: float,
         wanted: frozenset[str] | None = None,
         stamps: Stamps = "header",
@@ -66,12 +120,14 @@ class Input:
         Args:
             bus: The node.
             topic: Its name, and the columns of its messages.
+            frames: Frames of the robot; its columns become those of base_link.
             max_age_s: Age at which its newest message is stale [s].
             wanted: Columns that must be valid. Default: all.
             stamps: Time of its messages.
             say: Called with messages for the user.
         """
         self.topic, self.max_age_s, self._bus, self._wanted = topic, max_age_s, bus, wanted
+        self._frames, self._fault, self._told = frames, "", ""
         self.name = bus.resolve(topic.name)
         """Its name on the network."""
         self._kind = ""
@@ -150,7 +206,7 @@ class Input:
 
     def missing(self, now_ns: int) -> str:
         """Message if nothing is fresh."""
-        return f"no fresh {self.name}{self._other_clock(now_ns)}"
+        return f"no fresh {self.name}{f': {self._fault}' if self._fault else self._other_clock(now_ns)}"
 
     def _other_clock(self, now_ns: int) -> str:
         """Hint at stamps of another clock; "" if there are none."""
@@ -168,6 +224,9 @@ class Input:
         span = (now_ns - self._reported_ns) / NS
         rate = (self.heard - self._heard_before) / span if 0 < span < 60 else 0.0
         self._heard_before, self._reported_ns = self.heard, now_ns
+        if self._fault and self._fault != self._told:
+            self._say(f"{self.name}: {self._fault}")
+        self._told = self._fault
         senders = self._subscription.publishers() if self._subscription else 0
         stale = ""
         if self._subscription is None:
@@ -181,6 +240,7 @@ class Input:
         expected = bool(stale and self.silence and not self._trouble)
         problems = (
             (bool(self._trouble and self._subscription), self._trouble),
+            (bool(self._fault), self._fault),
             (senders > 1, f"{senders} publishers; the newest message counts"),
             (bool(self.broken), f"{self.broken} messages could not be used"),
             (bool(self.jumps), f"stamps jumped back {self.jumps} times"),
@@ -240,12 +300,20 @@ class Input:
 
     def _read(self, message: Message) -> tuple[int, Columns]:
         stamped = layout(message.kind)[0].name == "header.stamp"
-        wanted = (*self.topic.leaves(message.kind), *(("header.stamp",) if stamped else ()))
+        role = role_of(self.topic.reads[message.kind])
+        framed = frames_in(message.kind) if role else []
+        wanted = (*self.topic.leaves(message.kind), *framed, *(("header.stamp",) if stamped else ()))
         fields = message.read(wanted)
+        header, child = (str(fields.pop(leaf, "")) for leaf in LEAVES)
         stamp = int(fields.pop("header.stamp")) if stamped else self._bus.now_ns()
         if self._stamps == "arrival":
             stamp = self._bus.now_ns()
         columns = self.topic.read(message.kind, {name: np.asarray(v)[None] for name, v in fields.items()})
+        if role:
+            columns, self._fault = self._frames.in_base(role, (header, child), columns)
+            if self._fault and role.position:
+                self._fault += ": publish that transform, or the pose of base_link"
+                raise InputError(self._fault)
         if self._gravity is not None:
             columns = self._gravity.without(columns)
         return stamp, columns

@@ -34,7 +34,7 @@ from magtwin.io.bags.topics import (
 from magtwin.ros.bus import Bus, Timer, to_bytes
 from magtwin.ros.bus.names import checked_prefix
 from magtwin.ros.diagnostics import Level, Reporter, status_of
-from magtwin.ros.inputs import Columns, Input, Scanning
+from magtwin.ros.inputs import Columns, Input, LiveFrames, Scanning
 from magtwin.ros.online import Measured, Online
 from magtwin.ros.parameters import Parameter
 from magtwin.twin import Twin
@@ -135,10 +135,12 @@ class Magnetometer:
             )
         chosen = [topic for topic in INPUTS if topic is POSE or needed & set(topic.needs)]
         read = needed | ({"imu_q_xyzw"} if "imu_a" in needed else frozenset())  # to subtract gravity
+        self._frames = LiveFrames(bus, {"IMU": twin.scene.robot.q_base_imu_xyzw})
         self.inputs = {
             topic.name: Input(
                 bus,
                 topic,
+                frames=self._frames,
                 max_age_s=settings["max_age_s"],
                 wanted=read | _ALWAYS,
                 stamps=settings["stamps"],
@@ -197,6 +199,7 @@ class Magnetometer:
             self._twin.magnetometer.net,
             self._twin.field,
             self._settings,
+            frames=self._frames,
             poses=poses,
             measured=measured,
             seconds=self._seconds,

@@ -16,11 +16,12 @@ from magtwin.field.maps.map import AnomalyMap, Outside
 from magtwin.field.units import GREATEST_MEAN_NT, LEAST_MEAN_NT, NT_PER
 from magtwin.frames import yaw_from_quat
 from magtwin.io.bags.cdr import NS
+from magtwin.io.bags.frames import role_of
 from magtwin.io.bags.topics import MAGNITUDE, POSE, Qos
 from magtwin.io.bags.types import layout
 from magtwin.ros.bus import Bus, Handler, Message, Subscription, is_name
 from magtwin.ros.diagnostics import Level, Status, status_of
-from magtwin.ros.inputs import AHEAD_S, JUMP_S, MOST_KEPT, OTHER_S
+from magtwin.ros.inputs import AHEAD_S, JUMP_S, MOST_KEPT, OTHER_S, LiveFrames, frames_in
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.reader import Reading, Signals
@@ -50,6 +51,7 @@ class Online:
         field: AnomalyMap,
         settings: Mapping[str, Any],
         *,
+        frames: LiveFrames,
         poses: str,
         measured: str,
         seconds: Callable[[int], float],
@@ -63,6 +65,7 @@ class Online:
             model: A mixed model.
             field: The map that it was trained on.
             settings: Current values of the node's parameters.
+            frames: Frames of the robot.
             poses: Topic of the poses.
             measured: Topic of the measured field.
             seconds: Time of the model [s] by that of the node [ns].
@@ -76,7 +79,7 @@ class Online:
         from magtwin.learn.inference.calibrate import mixed_of_kind
 
         self._bus, self._model, self._field, self._settings = bus, mixed_of_kind(model), field, settings
-        self._seconds, self._signals, self._say = seconds, signals, say
+        self._seconds, self._signals, self._say, self._frames = seconds, signals, say, frames
         self._alignment = alignment_of(model.metadata, "the model")
         self._late_ns = round(self._alignment.latency_s * NS)
         self.poses = _Source(bus, "online", poses, tuple(POSE.reads), self._pose_heard)
@@ -136,6 +139,15 @@ class Online:
                 )
             self._unused[f"were in frame {frame!r}"] += 1
             return
+        role = role_of(POSE.needs)
+        assert role is not None
+        pose = {name: fields[key][None] for name, key in zip(POSE.needs, ("p", "q_xyzw"), strict=True)}
+        pose, fault = self._frames.in_base(role, (frame, str(fields.get("child_frame_id", ""))), pose)
+        if fault:
+            self._unused[f"were refused, {fault}"] += 1
+            return
+        p, q = (pose[name][0] for name in POSE.needs)
+        fields |= {"p": p, "q_xyzw": q}
         stamp = int(fields["header.stamp"])
         self._newest_s = (now - stamp) / NS
         if why := self._use(stamp, fields):
@@ -143,7 +155,7 @@ class Online:
 
     def _fields(self, message: Message) -> dict[str, Any] | None:
         """Fields of a pose; None if they are damaged, not finite or no rotation."""
-        wanted = ["header.stamp", "header.frame_id", *POSE.leaves(message.kind)]
+        wanted = ["header.stamp", *frames_in(message.kind), *POSE.leaves(message.kind)]
         known = {leaf.name for leaf in layout(message.kind)}
         try:
             fields = message.read([*wanted, *(["pose.covariance"] if "pose.covariance" in known else [])])

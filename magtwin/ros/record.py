@@ -58,14 +58,16 @@ class Recorder:
         Args:
             bus: The node; its clock gives times of receipt.
             writer: The bag.
-            topics: Names of topics to record. Default: all of the robot's.
+            topics: Names of topics to record beside those of the robot, without which a bag is no drive.
             sim_time: Whether the clock is /clock, which may jump back.
             say: Called with messages for the user.
         """
         self._bus, self._writer, self._say, self._sim_time = bus, writer, say, sim_time
         known = {topic.name: topic for topic in RECORDED}
-        self._named = tuple(dict.fromkeys(topics))
-        self._waited = {name: known.get(name) for name in self._named or known}
+        usual = {bus.resolve(name): name for name in known}
+        self._named = {name: usual.get(bus.resolve(name), name) for name in topics}
+        """Name in the bag of each topic asked for by name."""
+        self._waited = {name: known.get(name) for name in (*known, *self._named.values())}
         self._refused: dict[str, str] = {}
         self._latched: dict[str, bytes | None] = {}
         self._looked, self._flushed = 0.0, time.monotonic()
@@ -93,9 +95,9 @@ class Recorder:
     def missing(self) -> dict[str, str]:
         """The topics asked for by name of which nothing was recorded, each with the reason."""
         counts = self._writer.counts
-        silent = {name: "no message came" for name in self._named if name not in self._waited}
-        reasons = dict.fromkeys(self._named, "nobody publishes it") | silent | self._refused
-        return {name: reasons[name] for name in self._named if not counts.get(name)}
+        reasons = dict.fromkeys(self._waited, "nobody publishes it") | self._refused
+        lost = {name: kept for name, kept in self._named.items() if not counts.get(kept)}
+        return {name: reasons.get(kept, "no message came") for name, kept in lost.items()}
 
     def _look(self) -> None:
         """Subscribe to new topics."""
@@ -200,7 +202,7 @@ class Player:
 
     def run(self, until: Callable[[], bool] = lambda: False, *, speed: float = 1.0) -> int:
         """Publish it at `speed` times real time, after `SETTLE_S`; returns the number of messages."""
-        first = float(self._run["t"][0])
+        first = float(self._run["t"][0]) + self._stream.later_s
         begin = max(time.monotonic(), self._begun + SETTLE_S)
         count = 0
         # at a pace other than 1, stamps run at that pace from the wall time of the beginning

@@ -21,12 +21,12 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 import magtwin
-from magtwin.errors import InputError
+from magtwin.errors import InputError, RepairWarning
 from magtwin.io.bags import BagWriter, read_bag, read_bag_readings, write_bag
 from magtwin.io.bags.bag import Bag
 from magtwin.io.bags.cdr import encode
 from magtwin.io.bags.db3 import Db3Reader
-from magtwin.io.bags.topics import TOPICS
+from magtwin.io.bags.topics import MAGNITUDE, TOPICS
 from magtwin.io.bags.types import layout
 from magtwin.io.recorder import partial_of
 from magtwin.run.run import COLUMNS, Column, Run
@@ -383,6 +383,35 @@ def test_a_run_without_rows_comes_back_without(made, tmp_path):
     assert_same(read_bag(tmp_path / "run.mcap"), none)
 
 
+@pytest.mark.parametrize("block", [1, 3, 7])
+def test_rows_of_the_same_nanosecond_come_back_each_with_its_own_values(tmp_path, block):
+    t = np.array([0.0, 1e-10, 2e-10, 3e-10, 1e-9, 0.1, np.nextafter(0.1, 1)])
+    q = np.tile([0.0, 0.0, 0.0, 1.0], (7, 1))
+    run = Run(
+        {"t": t, "b_measured_nt": 41_000.0 + np.arange(7), "mocap_p": np.eye(7)[:, :3], "mocap_q_xyzw": q}
+    )
+    with BagWriter(tmp_path / "run.mcap", units="nT") as writer:
+        for first in range(0, 7, block):
+            writer.append(run.take(slice(first, first + block)))
+    back = read_bag(tmp_path / "run.mcap")
+    for name in run:
+        assert_array_equal(back[name], run[name])
+    with Bag(tmp_path / "run.mcap") as bag:
+        stamps = bag.messages([MAGNITUDE.name])[MAGNITUDE.name].received
+    assert stamps.tolist() == [0, 1, 2, 3, 4, 10**8, 10**8 + 1]
+
+
+def test_times_before_0_come_back_and_the_later_stamps_are_told(made, tmp_path):
+    run = made[0].with_columns(t=made[0]["t"] - 1.25)
+    with pytest.warns(
+        RepairWarning, match=r"t begins at -1\.\d+ s, and stamps of ROS at 0: they are t \+ 2 s"
+    ):
+        write_bag(run, tmp_path / "run.mcap", units="nT")
+    back = read_bag(tmp_path / "run.mcap")
+    for name in ("t", "b_measured_nt", "mocap_p", "odom_p"):
+        assert_array_equal(back[name], run[name])
+
+
 def test_what_no_bag_can_hold_is_refused_and_what_was_there_stays(made, tmp_path):
     run, target = made[0], tmp_path / "run.mcap"
     target.write_bytes(b"earlier")
@@ -391,7 +420,7 @@ def test_what_no_bag_can_hold_is_refused_and_what_was_there_stays(made, tmp_path
     refused = {
         "exists already": (run, {}),
         "the run to write: ": (run.with_columns(t=t), {"force": True}),
-        "begin at 0": (run.with_columns(t=run["t"] - 1), {"force": True}),
+        "subtract the first time from t": (run.with_columns(t=run["t"] + 2.0**31), {"force": True}),
         "column 'name' cannot stand in a bag": (
             run.with_columns(name=np.full(run.rows, "a")),
             {"force": True},

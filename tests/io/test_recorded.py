@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, RepairWarning
 from magtwin.io.bags import read_bag
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -241,6 +241,14 @@ def test_the_unit_is_told_by_size_and_said(tmp_path, scale, unit):
         read_bag(bag, unit="G")
 
 
+@pytest.mark.parametrize(("factor", "unit"), [(3.7e-9, None), (3.7e-9, "T"), (0.2e-9, "T")])
+def test_a_field_with_the_robots_iron_is_read_with_a_warning(tmp_path, factor, unit):
+    bag = record(tmp_path / "bag", {MAG: readings(factor)})
+    with pytest.warns(RepairWarning, match="nT in T, not that of the Earth's field: iron near the sensor"):
+        run = read_bag(bag, unit=unit)
+    assert_allclose(run["b_measured_nt"], factor * 1e9 * (41_000 + np.arange(200)), rtol=1e-12)
+
+
 def test_a_vector_field_gives_its_magnitude_and_itself(tmp_path):
     b = np.array([12_000.0, 20_000.0, -38_000.0])
     bag = record(tmp_path / "bag", {MAG: [(r, magnetic(s, *(b * 1e-9))) for s, r in at(50)]})
@@ -280,13 +288,34 @@ def test_a_message_that_came_twice_is_one_reading(tmp_path):
     assert run.rows == 20
 
 
+def test_messages_that_overtook_each_other_are_sorted_and_told(tmp_path):
+    said = poses()
+    said[40], said[41] = [(said[k][0], said[81 - k][1]) for k in (40, 41)]
+    run = read_bag(record(tmp_path / "bag", {MAG: readings(), POSE: said}))
+    straight = read_bag(record(tmp_path / "straight", {MAG: readings(), POSE: poses()}))
+    for name in straight:
+        assert_array_equal(run[name], straight[name])
+    assert "1 messages of /robot/enu/pose by their stamps, behind which they came" in run.metadata["taken"]
+
+
+@pytest.mark.parametrize(("row", "stamp_ns"), [(0, 0), (100, 0), (100, START - 60 * 10**9)])
+def test_one_stamp_that_is_wrong_is_one_reading_less_and_told(tmp_path, row, stamp_ns):
+    said = readings()
+    said[row] = said[row][0], magnetic(stamp_ns, 41_000)
+    run = read_bag(record(tmp_path / "bag", {MAG: said}))
+    assert run.rows == 199
+    assert run["t"][-1] < 4
+    text = f"1 of 200 messages of {MAG} as missing, whose stamps are wrong"
+    assert text in run.metadata["taken"]
+
+
 def backwards(said):
     return [(t, magnetic(START + (1000 - k) * MS, 41_000)) for k, (t, _) in enumerate(said)]
 
 
 def test_what_cannot_be_a_run_is_refused_with_what_is_there(tmp_path):
     far = [(r, posed(s + 10**15, 0, 0)) for s, r in at(20)]
-    late = [(r + MS, posed(s - 60 * MS * (k == 1), 0, 0)) for k, (s, r) in enumerate(at(20))]
+    late = [(r, posed(s - 1100 * MS * (k in (40, 60)), 0, 0)) for k, (s, r) in enumerate(at(20))]
     cases = {
         "no topic /robot/qtfm/magnitude; did you mean '/robot/qtfm/magnetude'.; topics in it: "
         r"/robot/qtfm/magnetude \(sensor_msgs": ({"/robot/qtfm/magnetude": readings()}, None),
@@ -301,8 +330,8 @@ def test_what_cannot_be_a_run_is_refused_with_what_is_there(tmp_path):
             {MAG: backwards(readings())},
             None,
         ),
-        r"stamps of /robot/enu/pose run backwards: .* in message 3 of 81": (
-            {MAG: readings(), POSE: [*poses()[:1], *late]},
+        r"stamps of /robot/enu/pose run backwards: .* in message 41 of 80": (
+            {MAG: readings(), POSE: late},
             None,
         ),
         r"/robot/enu/pose spans 1000000.000\.\.1000003.950 s since .* are they of one clock": (

@@ -63,7 +63,7 @@ def odometry(t, *where):
 def magnetic(t, x, y=0.0, z=0.0):
     return make(
         "sensor_msgs/msg/MagneticField",
-        header=header(t),
+        header=header(t, "mag_link"),
         magnetic_field=make("geometry_msgs/msg/Vector3", x=float(x), y=float(y), z=float(z)),
         magnetic_field_covariance=np.zeros(9),
     )
@@ -255,7 +255,7 @@ def transforms(t, *places):
 
 
 @pytest.mark.parametrize("moved", [True, False])
-def test_odometry_that_transforms_correct_is_reported(tmp_path, moved):
+def test_odometry_is_moved_into_the_map_by_transforms_unless_its_topic_is_named(tmp_path, moved):
     wheel = ("base_link", "wheel", 9.0, 0.0, 0.0)
     said = [
         transforms(START, ("map", "odom", 0.0, 0.0, 0.0)),
@@ -263,12 +263,17 @@ def test_odometry_that_transforms_correct_is_reported(tmp_path, moved):
     ]
     fields = at_middle(np.full(40, 41_000.0))
     bag = write_bag(tmp_path / "a", {"/odom": drive(odometry), "/mag": fields, "/tf": said})
-    source = read_bag_readings(bag).source
-    text = (
-        "; taken poses of /odom in 'odom', though /tf moves it against 'map' by up to 5 m and 28.6 deg, which"
-    )
-    assert (text in source) == moved
-    assert ("taken" in source) == moved
+    readings, named = read_bag_readings(bag), read_bag_readings(bag, pose_topic="/odom")
+    text = "; taken poses of /odom from 'odom' to 'map', by /tf (by up to 5 m and 28.6 deg)"
+    assert (text in readings.source) == moved
+    assert (f"{text}, which is not applied, as --pose-topic names it" in named.source) == moved
+    p_odom = np.column_stack([0.02 * MIDDLE, -0.01 * MIDDLE])
+    assert_allclose(named.p_xy, p_odom, atol=1e-7)
+    later = readings.t >= 1.0  # the last transform holds on
+    c, s = np.cos(-0.5 * moved), np.sin(-0.5 * moved)
+    expected = np.array([3.0, 4.0]) * moved + p_odom @ [[c, s], [-s, c]]
+    assert_allclose(readings.p_xy[later], expected[later], atol=1e-7)
+    assert_allclose(np.exp(1j * (readings.yaw - named.yaw))[later], np.exp(-0.5j * moved), atol=1e-6)
 
 
 def test_poses_without_an_orientation_are_refused_as_such(tmp_path):

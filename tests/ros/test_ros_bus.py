@@ -2,7 +2,9 @@
 
 import json
 import os
+import socket
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +19,7 @@ from magtwin.io.bags.topics import LATCHED, ODOMETRY, POSE, SENSOR_DATA, TOPICS,
 from magtwin.io.bags.types import definition_of, layout, store_of, typestore
 from magtwin.ros.bus import Bus, Message, names_of, open_bus, to_bytes
 from magtwin.ros.bus.clock import Clock
-from magtwin.ros.bus.names import range_of
+from magtwin.ros.bus.names import Range, range_of
 
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 
@@ -167,6 +169,23 @@ def test_a_node_is_found_on_this_machine_alone_unless_the_environment_or_an_opti
     assert range_of() == wanted
     assert range_of("subnet") == "subnet"
     assert range_of("localhost") == "localhost"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux lists the sockets of a process")
+@pytest.mark.parametrize(("reach", "device"), [("localhost", b"lo\0"), ("subnet", b"")])
+def test_sockets_of_a_node_hear_this_machine_alone_unless_discovery_opens_them(
+    domain: int, reach: Range, device: bytes
+) -> None:
+    from magtwin.ros.bus.dds import sockets_of
+
+    bus = open_bus("one", backend="cyclonedds", domain=domain, discovery=reach)
+    sockets = sockets_of(domain)
+    devices = [held.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16) for held in sockets]
+    for held in sockets:
+        held.close()
+    bus.close()
+    assert len(devices) >= 2  # of discovery and of data
+    assert set(devices) == {device}
 
 
 @pytest.mark.parametrize("value", ["OFF", "world"])

@@ -16,7 +16,7 @@ from magtwin.learn.data.features import SETS
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.ros.bus import Bus, Message, Publisher, Subscription, names_of, open_bus, to_bytes
 from magtwin.ros.diagnostics import KIND, Status
-from magtwin.ros.inputs import GRAVITY, Gravity, Input
+from magtwin.ros.inputs import GRAVITY, Gravity, Input, LiveFrames
 from magtwin.ros.magnetometer import PARAMETERS, Magnetometer
 from magtwin.ros.parameters import settings
 from magtwin.run.run import Run
@@ -324,8 +324,8 @@ def test_a_skewed_clock_is_explained_once_and_does_not_matter_by_arrival(
     world: World, stamp_s: float, sent_s: float, line: str
 ) -> None:
     bus, lines = world.bus("node"), list[str]()
-    one = Input(bus, BATTERY, max_age_s=0.5, say=lines.append)
-    two = Input(bus, BATTERY, max_age_s=0.5, stamps="arrival", say=lines.append)
+    one = Input(bus, BATTERY, frames=LiveFrames(bus), max_age_s=0.5, say=lines.append)
+    two = Input(bus, BATTERY, frames=LiveFrames(bus), max_age_s=0.5, stamps="arrival", say=lines.append)
     for source in (one, two):
         source._kind = BATTERY.kind
         source._subscription = Subscription(source.name, lambda: 1)
@@ -346,7 +346,7 @@ def test_a_skewed_clock_is_explained_once_and_does_not_matter_by_arrival(
 
 def test_what_no_column_is_read_of_may_be_no_number(world: World) -> None:
     for wanted in (frozenset({"battery_v"}), frozenset({"battery_v", "battery_a"})):
-        one = Input(world.robot, BATTERY, max_age_s=1.0, wanted=wanted)
+        one = Input(world.robot, BATTERY, frames=LiveFrames(world.robot), max_age_s=1.0, wanted=wanted)
         fields = {"header.stamp": np.int64(5), "voltage": 15.0, "current": np.nan}
         one._kind = BATTERY.kind
         one._hear(Message(BATTERY.kind, to_bytes(BATTERY.kind, fields), 0, 0))
@@ -397,7 +397,7 @@ def test_two_who_send_one_topic_are_told_of(world: World) -> None:
 def test_an_input_that_comes_back_in_another_type_is_told_of(world: World) -> None:
     topic = replace(BATTERY, name="/robot/pack")
     bus, first, again = (world.bus(name) for name in ("node", "first", "again"))
-    one = Input(bus, topic, max_age_s=1.0)
+    one = Input(bus, topic, frames=LiveFrames(bus), max_age_s=1.0)
     first.publisher(topic.name, topic.kind, topic.qos)
     spin(lambda: one.look() or one._subscription, bus)
     world.buses.remove(first)

@@ -189,6 +189,23 @@ def test_a_replay_by_the_wall_has_stamps_and_clock_of_now(
     assert to_bytes(CLOCK.kind, {"clock": 0}) != heard[CLOCK.name][0].data
 
 
+def test_topics_that_are_named_are_recorded_beside_those_of_the_drive(
+    nodes: Callable[..., Bus], tmp_path: Path
+) -> None:
+    robot, ear = nodes("robot"), nodes("recorder")
+    kinds = {ODOMETRY.name: ODOMETRY.kind, MAGNITUDE.name: MAGNITUDE.kind, "/notes": "std_msgs/msg/String"}
+    publishers = [robot.publisher(name, kind, Qos()) for name, kind in kinds.items()]
+    writer = RawBagWriter(tmp_path / "bag.mcap")
+    recorder = Recorder(ear, writer, ["/notes", "odom"])
+    recorder.run(lambda: all(p.subscribers() for p in publishers), duration_s=20)
+    for publisher in publishers:
+        publisher.publish(to_bytes(publisher.kind, {}))
+    recorder.run(lambda: sum(writer.counts.values()) == 3, duration_s=20)
+    assert recorder.missing() == {}
+    writer.close()
+    assert writer.counts == dict.fromkeys(kinds, 1)
+
+
 def test_a_latched_topic_of_another_node_is_recorded_although_it_was_sent_before(
     nodes: Callable[..., Bus], tmp_path: Path
 ) -> None:

@@ -1,8 +1,10 @@
 """Bag: the reading layer of all bags: storage files, topics, types, stamps, and the unit of the field."""
 
 import json
+import warnings
 from collections.abc import Collection, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, Self
@@ -11,19 +13,29 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from magtwin.errors import InputError, hint
+from magtwin.errors import InputError, RepairWarning, hint
 from magtwin.field.units import GREATEST_MEAN_NT, LEAST_MEAN_NT, NT_PER, Unit, check_unit
 from magtwin.files import existing, existing_file, read_text, yaml_loader
-from magtwin.io.bags.cdr import Messages, decode
+from magtwin.io.bags.cdr import NS, Index, Messages, decode
 from magtwin.io.bags.compression import Room
 from magtwin.io.bags.db3 import Db3Reader, custom_data
+from magtwin.io.bags.frames import (
+    Frames,
+    StaticFrames,
+    Transform,
+    frames_of,
+    in_base,
+    kind_of,
+    mount_of,
+    role_of,
+    transforms,
+)
 from magtwin.io.bags.mcap import McapReader
-from magtwin.io.bags.topics import Topic
+from magtwin.io.bags.topics import TF, TF_STATIC, Topic
 from magtwin.io.bags.types import layout
 from magtwin.io.bags.writer import CUSTOM, NOTE
 from magtwin.io.recorder import PARTIAL, partial_of
 from magtwin.run.arrow import check_metadata
-from magtwin.run.resample import linear, quaternion
 from magtwin.run.run import Metadata
 
 Array = NDArray[np.float64]
@@ -31,14 +43,17 @@ Array = NDArray[np.float64]
 LONGEST_LINE = 2000
 """Most characters of an error message."""
 
-GAP = 5.0
-"""Poses further apart than this multiple of their median interval are not interpolated between."""
+LATE_S = 1.0
+"""Stamps further behind an earlier one than this are wrong, or those of another clock [s]."""
 
-LEAST_GAP_S = 0.1
-"""Poses closer than this are always interpolated between [s]."""
+WRONG = 0.01
+"""Share of messages with wrong stamps up to which they are left out."""
 
-UNIT_WITHIN = 0.01
-"""Largest error of the length of a quaternion."""
+IRON = 2.0
+"""Factor by which iron near the sensor may change the mean of the field."""
+
+UNSET_NS = 10**7 * NS
+"""Median of stamps from which a stamp of 0 was not set, and is not the beginning of a simulation [ns]."""
 
 
 class Bag:
@@ -125,10 +140,55 @@ class Bag:
         except InputError as error:
             raise InputError(f"{self.path}: topic {name}: {error}") from error
         stamps = fields.pop("header.stamp", None) if stamped else None
-        # A single stamp of 0 is the first moment of a simulation; several mean that there are no stamps.
-        if stamps is not None and np.count_nonzero(stamps == 0) > 1:
+        # A single stamp of 0 is the first moment of a simulation; many mean that there are no stamps.
+        if stamps is not None and np.count_nonzero(stamps == 0) > max(1, WRONG * len(stamps)):
             stamps = None
-        return Signal(name, topic, kind, messages.received, fields, stamps)
+        return Signal(name, topic, kind, messages, fields, stamps)
+
+    @cached_property
+    def static(self) -> StaticFrames:
+        """The transforms of /tf_static, also of one in a namespace."""
+        known = StaticFrames()
+        for each in self.transforms(TF_STATIC.name):
+            for parent, child, p, q in zip(each.parents, each.children, each.p, each.q_xyzw, strict=True):
+                known.add(parent, child, p, q)
+        return known
+
+    def transforms(self, *ends: str) -> list[Transform]:
+        """The transforms of topics by the ends of their names; a damaged topic has none."""
+        found: list[Transform] = []
+        names = [name for name, kind in self.kinds.items() if kind == TF.kind and name.endswith(ends)]
+        for messages in self.messages(names).values():
+            with suppress(InputError), np.errstate(over="ignore", invalid="ignore"):
+                found += transforms(messages)
+        return found
+
+    def in_base(
+        self, signal: "Signal", columns: dict[str, NDArray[Any]]
+    ) -> tuple[dict[str, NDArray[Any]], str]:
+        """Columns of a signal as those of base_link, and what was done to them, in a line.
+
+        Warns if its frame cannot be that of such a signal.
+        """
+        role, frames = role_of(columns), self.frames(signal)
+        if role is None:
+            return columns, ""
+        mount, fault = mount_of(role, frames, self.static)
+        about = f"{role.noun} of {signal.name}"
+        if fault:
+            text = f"{self.path}: {about}: {fault}; it is read as that of base_link"
+            warnings.warn(text, RepairWarning, stacklevel=4)
+        if mount is not None:
+            return in_base(role, columns, mount), f"{about} from {mount}, by {TF_STATIC.name}"
+        unknown = not role.position and frames[0] and kind_of(frames[0]) != "base"
+        return columns, f"{about} in the axes of {frames[0]!r:.40} as in those of base_link" * bool(unknown)
+
+    def frames(self, signal: "Signal") -> Frames:
+        """The frames of a signal."""
+        try:
+            return frames_of(signal.messages, signal.kind)
+        except InputError as error:
+            raise InputError(f"{self.path}: topic {signal.name}: {error}") from error
 
     def missing(self, name: str) -> InputError:
         """The refusal of a topic that is not in the bag."""
@@ -151,18 +211,61 @@ class Signal(NamedTuple):
     kind: str
     """Message type."""
 
-    received: NDArray[np.int64]
-    """Times of receipt [ns], shape (M,)."""
-
+    messages: Messages
     fields: dict[str, Any]
     """Values by leaf name."""
 
     stamps: NDArray[np.int64] | None
     """Stamps of the headers [ns], shape (M,). None: the messages have none."""
 
+    @property
+    def received(self) -> Index:
+        """Times of receipt [ns], shape (M,)."""
+        return self.messages.received
+
     def columns(self) -> dict[str, NDArray[Any]]:
         """The columns that the topic gives, one row a message."""
         return self.topic.read(self.kind, self.fields)
+
+    def in_order(self, ns: Index, where: Path) -> tuple["Signal", Index, str]:
+        """The messages in the order of their times, these times [ns], and what was repaired for that.
+
+        Messages that overtook each other are sorted. The few whose stamp was not set, or lies more than
+        `LATE_S` before an earlier one, are left out.
+
+        Args:
+            ns: Times of the messages [ns], shape (M,).
+            where: The bag, for refusals.
+
+        Raises:
+            InputError: The times run backwards: most of them, or again and again by more than `LATE_S`.
+        """
+        behind = np.maximum.accumulate(ns) - ns
+        unset = (ns == 0) if len(ns) and np.median(ns) > UNSET_NS else np.zeros(len(ns), bool)
+        late, wrong = behind > 0, (behind > LATE_S * NS) | unset
+        if not (late | wrong).any():
+            return self, ns, ""
+        left, overtaken = np.count_nonzero(wrong), np.count_nonzero(late & ~wrong)
+        if 2 * np.count_nonzero(late) > len(ns) or left > max(1, WRONG * len(ns)):
+            k = int(np.argmax(late))
+            raise InputError(
+                f"{where}: stamps of {self.name} run backwards: {ns[k] / NS:.6f} s after "
+                f"{ns[k - 1] / NS:.6f} s, in message {k + 1} of {len(ns)}"
+            )
+        kept = np.flatnonzero(~wrong)
+        rows = kept[np.argsort(ns[kept], kind="stable")]
+        notes = [f"{overtaken} messages of {self.name} by their stamps, behind which they came"] * bool(
+            overtaken
+        )
+        notes += [f"{left} of {len(ns)} messages of {self.name} as missing, whose stamps are wrong"] * bool(
+            left
+        )
+        fields = {
+            n: v[rows] if isinstance(v, np.ndarray) else [v[r] for r in rows] for n, v in self.fields.items()
+        }
+        stamps = None if self.stamps is None else self.stamps[rows]
+        signal = self._replace(messages=self.messages.take(rows), fields=fields, stamps=stamps)
+        return signal, ns[rows], ", ".join(notes)
 
 
 class Field(NamedTuple):
@@ -183,6 +286,9 @@ def field_nt(
 ) -> Field:
     """The field of messages in nT.
 
+    A mean that is up to twice too large or too small for the Earth's field is taken with a warning: it may be
+    that of iron near the sensor.
+
     Args:
         b: Magnitudes, shape (N,), or vectors, shape (N, 3). Vectors whose y and z are all 0 are magnitudes in
             x, as APRILab's robot publishes them.
@@ -202,66 +308,32 @@ def field_nt(
     if scale is None:
         unit = unit or unit_of(float(finite.mean()), where, topic)
     factor = NT_PER[unit] if unit else float(scale or 1.0)
-    check_unit(factor * finite, where, topic, unit or "nT", scale=scale)
+    mean = factor * float(finite.mean())
+    if unit and not _is_earths(mean) and _is_earths(mean, IRON):
+        text = f"{where}: the mean of {topic} is {mean:,.0f} nT in {unit}, not that of the Earth's field"
+        text += ": iron near the sensor, or another unit (--unit, --scale)"
+        warnings.warn(text, RepairWarning, stacklevel=3)
+    else:
+        check_unit(factor * finite, where, topic, unit or "nT", scale=scale)
     label = unit or f"units of {scale:g} nT"
     return Field(factor * size, None if vector is None else factor * vector, label)
 
 
 def unit_of(mean: float, where: str, topic: str) -> Unit:
-    """The unit in which a mean magnitude is the Earth's field; the ranges of the units do not overlap."""
-    for unit, factor in NT_PER.items():
-        if LEAST_MEAN_NT <= mean * factor < GREATEST_MEAN_NT:
-            return unit  # type: ignore[return-value]
+    """The unit in which a mean magnitude is the Earth's field, or at least the Earth's with that of iron.
+
+    The ranges of the units do not overlap.
+    """
+    for apart in (1.0, IRON):
+        for unit, factor in NT_PER.items():
+            if _is_earths(mean * factor, apart):
+                return unit  # type: ignore[return-value]
     raise InputError(f"{where}: the mean of {topic} is {mean:.6g}; in no unit is that the Earth's field")
 
 
-def poses_at(t: Array, pose_t: Array, pose: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Interpolate poses; positions linearly, orientations by slerp.
-
-    Args:
-        t: Times [s], shape (N,).
-        pose_t: Times of the poses, ascending [s], shape (M,).
-        pose: Positions and orientations xyzw, shape (M, 7).
-
-    Returns:
-        Positions (N, 3), orientations xyzw (N, 4), and whether each time lies between two poses (N,).
-    """
-    sound = sound_poses(pose)
-    pose_t, pose = pose_t[sound], pose[sound]
-    if len(pose_t) < 2:
-        return np.zeros((len(t), 3)), np.zeros((len(t), 4)), np.zeros(len(t), bool)
-    steps = np.diff(pose_t)
-    widest = max(GAP * float(np.median(steps)), LEAST_GAP_S)
-    low = np.clip(np.searchsorted(pose_t, t, side="right") - 1, 0, len(steps) - 1)
-    part = (t - pose_t[low]) / steps[low]
-    bridged = (steps[low] <= widest) | (part == 0) | (part == 1)
-    inside = (part >= 0) & (part <= 1) & bridged
-    share = np.clip(part, 0, 1)
-    q = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
-    return linear(pose[:, :3], low, share), quaternion(q, low, share), inside
-
-
-def sound_poses(pose: Array) -> NDArray[np.bool_]:
-    """Whether each pose is finite and its quaternion of length 1, shape (M, 7) -> (M,)."""
-    return np.isfinite(pose).all(axis=1) & (np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1) < UNIT_WITHIN)
-
-
-def check_poses(pose_t: Array, pose: Array, where: str, topic: str) -> None:
-    """Refuse poses of which less than two are sound; arguments as for `poses_at` and `field_nt`.
-
-    Raises:
-        InputError: So it is; the text says what is wrong with the first.
-    """
-    bad = ~sound_poses(pose)
-    if len(pose) < 2 or np.count_nonzero(~bad) >= 2:
-        return
-    first = int(np.argmax(bad))
-    length = float(np.linalg.norm(pose[first, 3:]))
-    fault = "its quaternion is 0,0,0,0" if length == 0 else f"the length of its quaternion is {length:.3g}"
-    raise InputError(
-        f"{where}: {np.count_nonzero(bad)} of {len(pose)} poses of {topic} cannot be used, the first at "
-        f"{pose_t[first]:.3f} s: {fault}; record the orientation too, or choose another topic of poses"
-    )
+def _is_earths(mean_nt: float, apart: float = 1.0) -> bool:
+    """Whether a mean may be that of the Earth's field, or up to a factor of it [nT]."""
+    return LEAST_MEAN_NT / apart <= mean_nt < GREATEST_MEAN_NT * apart
 
 
 @contextmanager

@@ -72,8 +72,11 @@ class Messages:
         """The messages sorted by time of receipt."""
         if np.all(self.received[1:] >= self.received[:-1]):
             return self
-        order = np.argsort(self.received, kind="stable")
-        return Messages(self.received[order], self.buffer, self.start[order], self.size[order])
+        return self.take(np.argsort(self.received, kind="stable"))
+
+    def take(self, rows: NDArray[np.intp]) -> "Messages":
+        """Some of the messages, by index."""
+        return Messages(self.received[rows], self.buffer, self.start[rows], self.size[rows])
 
 
 def encode(leaves: Sequence[Leaf], fields: Mapping[str, Any], rows: int, *, room: int = 0) -> Bytes:

@@ -13,8 +13,9 @@ from magtwin.errors import InputError, find
 from magtwin.field.units import NT_PER, Unit
 from magtwin.files import sha256
 from magtwin.frames import canonical, quat_conjugate, rotate, yaw_from_quat
-from magtwin.io.bags.bag import Bag, Signal, check_poses, field_nt, poses_at, unit_of
+from magtwin.io.bags.bag import Bag, Signal, field_nt, unit_of
 from magtwin.io.bags.cdr import NS, Index, decode
+from magtwin.io.bags.poses import check_poses, corrected, poses_at
 from magtwin.io.bags.sender import Sender
 from magtwin.io.bags.topics import (
     BATTERY,
@@ -65,8 +66,10 @@ def read_bag(
     topics are in `magtwin.io.bags.topics.TOPICS`; all but the magnetometer's may be missing. Slower signals
     are held causally by the stamps of their headers, and are nan before their first message. A topic without
     stamps goes by time of receipt, less the median delay of the magnetometer's messages. p_world_base,
-    q_world_base_xyzw and yaw are motion capture, interpolated between poses. Gravity is subtracted from
-    accelerations that contain it. The metadata name the topics, the unit, and how the unit was found.
+    q_world_base_xyzw and yaw are motion capture, interpolated between poses; without it, odometry if /tf
+    moves it in the map. Vectors and poses of parts of the robot become those of base_link by /tf_static.
+    Gravity is subtracted from accelerations that contain it. The metadata name the topics, the unit, how it
+    was found, and what was done to frames and stamps (`taken`).
 
     Args:
         path: Folder of a rosbag2, or its storage file (.mcap, .db3).
@@ -188,28 +191,39 @@ def _recorded(bag: Bag, names: Mapping[str, str], unit: Unit | None) -> Run:
     by_header = clock.stamps is not None
     ns = clock.received if clock.stamps is None else clock.stamps
     delay = int(np.median(clock.received - ns)) if len(ns) else 0
-    _check_order(path, clock.name, ns / NS)
+    clock, ns, repaired = clock.in_order(ns, path)
     first = np.flatnonzero(np.diff(ns, prepend=ns[0] - 1) > 0)  # a repeated message counts once
-    start = int(ns[0])
+    start, taken = int(ns[0]), [repaired]
     t = (ns[first] - start) / NS
     field = field_nt(clock.columns()["magnetic_field"], str(path), clock.name, unit=unit)
     columns: dict[str, NDArray[Any]] = {"t": t, "b_measured_nt": field.b_nt[first]}
-    if field.vector_nt is not None:
-        columns["b_vector_measured_nt"] = field.vector_nt[first]
     metadata: dict[str, Any] = {"bag": path.name, "bag_sha256": " ".join(sha256(file) for file in bag.files)}
     metadata |= {"clock": clock.name, "stamps": "header" if by_header else "receipt", "start_ns": str(start)}
     metadata |= {"field_unit": field.label, "field_unit_told": "given" if unit else "by its size"}
+    if field.vector_nt is not None:
+        turned, placed = bag.in_base(clock, {"magnetic_field": field.vector_nt})
+        columns["b_vector_measured_nt"] = turned["magnetic_field"][first]
+        taken.append(placed)
+    if mount := bag.static.mount(bag.frames(clock)[0]):
+        metadata["tf_sensor_m"] = ", ".join(f"{part:.6g}" for part in mount.p)
+    moved = corrected(bag, signals[ODOMETRY]) if ODOMETRY in signals and POSE not in signals else None
+    if moved:
+        signals[POSE] = moved[0]._replace(topic=POSE)
     for signal in signals.values():
-        taken = signal.received - delay if signal.stamps is None or not by_header else signal.stamps
-        when = (taken - start) / NS
-        _check_order(path, signal.name, when)
+        ns = signal.received - delay if signal.stamps is None or not by_header else signal.stamps
+        signal, ns, repaired = signal.in_order(ns, path)
+        when = (ns - start) / NS
         if when[-1] < t[0] or when[0] > t[-1]:
             raise InputError(
                 f"{path}: {signal.name} spans {when[0]:.3f}..{when[-1]:.3f} s since the first reading of "
                 f"{clock.name}, which ends at {t[-1]:.3f} s; are they of one clock?"
             )
-        columns |= _columns(signal, when, t, metadata, path)
-    metadata["topics"] = " ".join(sorted(signal.name for signal in (clock, *signals.values())))
+        read, placed = _columns(bag, signal, when, t, metadata)
+        columns |= read
+        taken += [repaired, placed]
+    metadata |= {"truth": moved[1]} if moved else {}
+    metadata["topics"] = " ".join(sorted({signal.name for signal in (clock, *signals.values())}))
+    metadata |= {"taken": "; ".join(filter(None, taken))} if any(taken) else {}
     return Run({name: columns[name] for name in COLUMNS if name in columns}, metadata)
 
 
@@ -238,23 +252,23 @@ def _signals(bag: Bag, names: Mapping[str, str]) -> dict[Topic, Signal]:
 
 
 def _columns(
-    signal: Signal, when: Array, t: Array, metadata: dict[str, Any], path: Path
-) -> dict[str, NDArray[Any]]:
-    """The columns of a slower signal, held causally at the times of readings [s]."""
+    bag: Bag, signal: Signal, when: Array, t: Array, metadata: dict[str, Any]
+) -> tuple[dict[str, NDArray[Any]], str]:
+    """The columns of a slower signal, held causally at the times of readings [s], and what was done."""
     at = np.searchsorted(when, t, side="right") - 1
     known = at >= 0
     if signal.topic is SCAN:
         since = np.where(known, t - when[np.maximum(at, 0)], np.inf)
-        return {"lidar_on": since < SCAN_S}
+        return {"lidar_on": since < SCAN_S}, ""
     if signal.topic is JOINTS:
-        return _wheels(signal, when, t)
-    values = signal.columns()
+        return _wheels(signal, when, t), ""
+    values, placed = bag.in_base(signal, signal.columns())
     if signal.topic is VECTOR:
         size = np.linalg.norm(values["magnetic_field"], axis=1)
         size = size[np.isfinite(size)]
         if not len(size):
-            return {}
-        unit = unit_of(float(size.mean()), str(path), signal.name)  # may differ from the clock's
+            return {}, ""
+        unit = unit_of(float(size.mean()), str(bag.path), signal.name)  # may differ from the clock's
         metadata["vector_unit"] = unit
         values = {"b_vector_measured_nt": values["magnetic_field"] * NT_PER[unit]}
     for name in values.keys() & {"mocap_q_xyzw", "imu_q_xyzw"}:
@@ -270,14 +284,14 @@ def _columns(
     if signal.topic is POSE:
         once = np.flatnonzero(np.diff(when, prepend=-np.inf) > 0)
         pose = np.concatenate([values["mocap_p"], values["mocap_q_xyzw"]], axis=1)
-        check_poses(when[once], pose[once], str(path), signal.name)
+        check_poses(when[once], pose[once], str(bag.path), signal.name)
         p, q, inside = poses_at(t, when[once], pose[once])
         columns["p_world_base"] = np.where(inside[:, None], p, columns["mocap_p"])
         columns["q_world_base_xyzw"] = np.where(inside[:, None], q, columns["mocap_q_xyzw"])
         columns["yaw"] = yaw_from_quat(columns["q_world_base_xyzw"])
         columns["flag_pose_lost"] = ~inside
         metadata["truth"] = f"motion capture, {signal.name}"
-    return columns
+    return columns, placed
 
 
 def _wheels(signal: Signal, when: Array, t: Array) -> dict[str, NDArray[Any]]:

@@ -1,10 +1,6 @@
 """Survey: field readings at known poses, from a bag."""
 
-import math
 import os
-from collections.abc import Iterable, Iterator
-from contextlib import suppress
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -15,20 +11,11 @@ from magtwin.field.survey.readings import TAKEN, Readings
 from magtwin.field.units import Unit
 from magtwin.files import sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
-from magtwin.io.bags.bag import Bag, Signal, check_poses, field_nt, poses_at, sound_poses
-from magtwin.io.bags.cdr import Leaf, Messages, decode
-from magtwin.io.bags.topics import MAGNITUDE, ODOMETRY, POSE, TF, Topic
-from magtwin.io.bags.types import layout
+from magtwin.io.bags.bag import Bag, Signal, field_nt
+from magtwin.io.bags.poses import check_poses, corrected, poses_at, sound_poses
+from magtwin.io.bags.topics import MAGNITUDE, ODOMETRY, POSE, Topic
 
 Array = NDArray[np.float64]
-
-MOVED_M, MOVED_DEG = 0.001, 0.1
-"""Correction of odometry above which it is reported [m], [deg]."""
-
-MOST_TRANSFORMS = 256
-"""Messages of more transforms are not read."""
-
-_TRANSFORM = ("header.frame_id", "child_frame_id", "transform.translation", "transform.rotation")
 
 
 def read_bag_readings(
@@ -43,8 +30,9 @@ def read_bag_readings(
 
     Positions are interpolated linearly between poses, orientations by slerp (Shoemake 1985, section 3.3).
     Messages of the field before the first pose, after the last one, in a gap of the poses, or without a
-    number are left out. Corrections of odometry by transforms are not applied; `source` reports them. Stamps
-    are those of the headers. If a topic has no stamps, times of receipt are used for both topics.
+    number are left out. Odometry, unless `pose_topic` names it, is corrected by /tf from map to odom. Poses
+    of a part of the robot and vectors of a sensor become those of base_link by /tf_static. `source` has both.
+    Stamps are those of the headers. If a topic has no stamps, times of receipt are used for both topics.
 
     Args:
         path: Folder of a rosbag2, or its storage file (.db3, .mcap).
@@ -55,12 +43,12 @@ def read_bag_readings(
 
     Returns:
         Readings in the order of their stamps. A MagneticField with y = z = 0 is a magnitude in x, as
-        APRILab's robot publishes it. Otherwise it is a vector in the robot's axes, which the pose
-        rotates level.
+        APRILab's robot publishes it. Otherwise it is a vector, which the pose rotates level.
 
     Raises:
         InputError: There is no bag, or it is damaged; a topic is missing, or there are several to choose
-            from; no message of the field lies between poses; no unit makes it the Earth's field.
+            from; no message of the field lies between poses; no unit makes it the Earth's field; stamps run
+            backwards.
     """
     path = Path(path)
     with Bag(path) as bag:
@@ -72,25 +60,25 @@ def read_bag_readings(
                 raise InputError(f"{path}: topic {name} has no message")
         poses = bag.signal(pose_name, POSE, messages[pose_name])
         fields = bag.signal(field_name, MAGNITUDE, messages[field_name])
-        taken = [_correction(bag, pose_name, messages[pose_name])]
+        by_header = poses.stamps is not None and fields.stamps is not None
+        pose_t, pose, taken = _poses(bag, poses, by_header, told=pose_topic is not None)
         files = [path] if path.is_file() else sorted(path.iterdir())
         sums = "; ".join(f"{f.name} sha256:{sha256(f)}" for f in files if f.is_file())
-    by_header = poses.stamps is not None and fields.stamps is not None
     clock = "header" if by_header else "receipt"
-    pose_t, pose = _in_order(poses, by_header, poses.columns().values())
-    t, b = _in_order(fields, by_header, fields.columns().values())
+    fields, once, t, late = _in_order(fields, path, by_header)
+    b = fields.columns()["magnetic_field"][once]
     check_poses(pose_t, pose, str(path), poses.name)
     if bad := np.count_nonzero(~sound_poses(pose)):
         taken.append(f"{bad} of {len(pose)} poses as missing, whose quaternion is not of length 1")
     p, q, inside = poses_at(t, pose_t, pose)
-    known = np.isfinite(b).all(axis=1) & inside
+    known = np.isfinite(b if b.ndim == 1 else b.sum(axis=1)) & inside
     if not known.any():
         raise InputError(
             f"{path}: no field lies between poses: by the stamps of {clock} poses span {_span(pose_t)}, the "
             f"field {_span(t)}; are they of one clock?"
         )
     t, b, p, q = t[known], b[known], p[known], q[known]
-    field = field_nt(b if b.shape[1] == 3 else b[:, 0], str(path), fields.name, unit=unit, scale=scale)
+    field = field_nt(b, str(path), fields.name, unit=unit, scale=scale)
     zero = np.flatnonzero(field.b_nt == 0)
     if len(zero):
         raise InputError(
@@ -98,7 +86,9 @@ def read_bag_readings(
         )
     level = None
     if field.vector_nt is not None:
-        level = rotate(quat_conjugate(quat_from_yaw(yaw_from_quat(q))), rotate(q, field.vector_nt))
+        columns, placed = bag.in_base(fields, {"magnetic_field": field.vector_nt})
+        taken.append(placed)
+        level = rotate(quat_conjugate(quat_from_yaw(yaw_from_quat(q))), rotate(q, columns["magnetic_field"]))
     left = f", {np.count_nonzero(~known)} of {len(known)} fields not between poses or not a number left out"
     how = "given" if unit or scale is not None else "told by its size"
     about = f"poses {poses.name}, field {fields.name} in {field.label}, {how}; stamps of {clock}"
@@ -111,48 +101,8 @@ def read_bag_readings(
         runs=(path.stem,),
         name=path.stem,
         source=f"{sums} ({about}{left if not known.all() else ''})"
-        + "".join(f"; {TAKEN}{text}" for text in taken if text),
+        + "".join(f"; {TAKEN}{text}" for text in (late, *taken) if text),
     )
-
-
-def _correction(bag: Bag, name: str, messages: Messages) -> str:
-    """What transforms of the bag do to the frame of its odometry, which is not applied; "" if nothing."""
-    tf = [topic for topic, kind in bag.kinds.items() if kind == TF.kind]
-    if bag.kinds[name] != ODOMETRY.kind or not tf:
-        return ""
-    frame = decode(layout(ODOMETRY.kind), messages, ["header.frame_id"])["header.frame_id"][0].strip("/")
-    far, turn = dict[str, float](), dict[str, float]()
-    with (
-        suppress(InputError),
-        np.errstate(over="ignore", invalid="ignore"),
-    ):  # a damaged one hinders no survey
-        for parents, children, p, q in chain(*map(_transforms, bag.messages(tf).values())):
-            rows = [row for row, child in enumerate(children) if child.strip("/") == frame != ""]
-            size, yaw = np.hypot(*p[rows, :2].T), np.abs(yaw_from_quat(q[rows]))
-            for row, metres, angle in zip(rows, size.tolist(), yaw.tolist(), strict=True):
-                parent = parents[row].strip("/")
-                far[parent] = max(far.get(parent, 0.0), metres)
-                turn[parent] = max(turn.get(parent, 0.0), angle)
-    for parent in far:
-        if far[parent] > MOVED_M or turn[parent] > math.radians(MOVED_DEG):
-            return (
-                f"poses of {name} in {frame!r:.40}, though {', '.join(tf)} moves it against {parent!r:.40} "
-                f"by up to {far[parent]:.3g} m and {math.degrees(turn[parent]):.3g} deg, which is not "
-                "applied: give the topic of a corrected pose (--pose-topic)"
-            )
-    return ""
-
-
-def _transforms(messages: Messages) -> Iterator[tuple[list[str], list[str], Array, Array]]:
-    """Parents, children, translations and rotations (xyzw) of transforms of TFMessages."""
-    counts = decode([Leaf("transforms", "u4")], messages, ["transforms"])["transforms"]
-    for count in np.unique(counts[counts <= MOST_TRANSFORMS]).tolist():
-        rows = np.flatnonzero(counts == count)
-        some = Messages(messages.received[rows], messages.buffer, messages.start[rows], messages.size[rows])
-        names = [[f"transforms.{k}.{leaf}" for leaf in _TRANSFORM] for k in range(count)]
-        fields = decode(layout(TF.kind, {"transforms": count}), some, chain(*names))
-        for parent, child, p, q in names:
-            yield fields[parent], fields[child], fields[p], fields[q]
 
 
 def _choose(bag: Bag, kind: str, name: str | None, topic: Topic) -> str:
@@ -175,12 +125,27 @@ def _choose(bag: Bag, kind: str, name: str | None, topic: Topic) -> str:
     return fixed[0]
 
 
-def _in_order(signal: Signal, by_header: bool, columns: Iterable[Array]) -> tuple[Array, Array]:
-    """Times [s], ascending, each once, and the columns side by side."""
-    stamps = signal.stamps if by_header and signal.stamps is not None else signal.received
-    ns, first = np.unique(stamps, return_index=True)
-    parts = [column if column.ndim == 2 else column[:, None] for column in columns]
-    return ns / 1e9, np.concatenate(parts, axis=1)[first]
+def _poses(bag: Bag, poses: Signal, by_header: bool, *, told: bool) -> tuple[Array, Array, list[str]]:
+    """Times of poses [s], ascending, and poses of base_link, xyz and xyzw; and what was done to them.
+
+    `told` keeps odometry as it is, since its topic was named.
+    """
+    poses, once, t, late = _in_order(poses, bag.path, by_header)
+    taken = [late]
+    if poses.kind == ODOMETRY.kind and (moved := corrected(bag, poses)):
+        poses = poses if told else moved[0]
+        taken.append(moved[1] + ", which is not applied, as --pose-topic names it" * told)
+    columns, placed = bag.in_base(poses, poses.columns())
+    pose = np.concatenate([columns["mocap_p"], columns["mocap_q_xyzw"]], axis=1)
+    return t, pose[once], [*taken, placed]
+
+
+def _in_order(signal: Signal, path: Path, by_header: bool) -> tuple[Signal, NDArray[np.intp], Array, str]:
+    """The messages by their times, the first one of each time, these times [s], and what was repaired."""
+    ns = signal.stamps if by_header and signal.stamps is not None else signal.received
+    signal, ns, repaired = signal.in_order(ns, path)
+    times, once = np.unique(ns, return_index=True)
+    return signal, once, times / 1e9, repaired
 
 
 def _span(t: Array) -> str:

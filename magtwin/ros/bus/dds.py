@@ -6,11 +6,15 @@ policies, and messages are plain CDR. Such a node sends and receives like any ot
 """
 
 import os
+import socket
+import sys
 import time
+import warnings
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from cyclonedds.builtin import BuiltinTopicDcpsSubscription
@@ -29,7 +33,7 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic as DdsTopic
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, RepairWarning
 from magtwin.io.bags.cdr import NS
 from magtwin.io.bags.topics import CLOCK, Qos
 from magtwin.io.bags.types import typestore
@@ -60,6 +64,9 @@ _HERE = (
 )
 _ANYWHERE = "<Discovery><ParticipantIndex>auto</ParticipantIndex></Discovery>"
 
+PORTS, PORTS_EACH = 7400, 250
+"""First port of domain 0, and ports of each domain (OMG DDSI-RTPS 2.5, section 9.6.2.1)."""
+
 _DOMAINS: dict[int, Domain] = {}
 """Configured domains; they must be configured before the first participant and outlive it."""
 
@@ -74,6 +81,42 @@ def qos_of(qos: Qos, kind: str) -> DdsQos:
         Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),
         user_data(kind),
     )
+
+
+def sockets_of(domain: int) -> list[socket.socket]:
+    """The sockets of this process that receive in a domain from every interface, as duplicates."""
+    found = []
+    ports = range(PORTS + PORTS_EACH * domain, PORTS + PORTS_EACH * (domain + 1))
+    for entry in list(Path("/proc/self/fd").iterdir()):
+        with suppress(OSError):  # closed by now
+            if not str(entry.readlink()).startswith("socket:"):
+                continue
+            held = socket.socket(fileno=os.dup(int(entry.name)))
+            udp = (held.family, held.type) == (socket.AF_INET, socket.SOCK_DGRAM)
+            address, port = held.getsockname() if udp else ("", 0)
+            if address == "0.0.0.0" and port in ports:
+                found.append(held)
+            else:
+                held.close()
+    return found
+
+
+def _to_loopback(domain: int) -> None:
+    """Let the sockets of a domain receive from this machine alone.
+
+    cyclonedds binds them to every interface, whatever interfaces it is configured for.
+    """
+    if sys.platform != "linux":
+        return
+    for held in sockets_of(domain):
+        with held:
+            if held.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16):
+                continue
+            try:
+                held.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo\0")
+            except OSError as error:  # Linux before 5.7 leaves this to root
+                text = f"other machines can send to port {held.getsockname()[1]} of this node ({error})"
+                warnings.warn(f"{text}: close it in the firewall", RepairWarning, stacklevel=3)
 
 
 class DdsBus(Bus):
@@ -91,6 +134,8 @@ class DdsBus(Bus):
                 xml = f'<CycloneDDS><Domain Id="any">{where}{_COMMON}</Domain></CycloneDDS>'
                 _DOMAINS[domain] = Domain(domain, xml)
             self._participant = DomainParticipant(domain, qos=DdsQos(Policy.Userdata(b"enclave=/;")))
+            if reach == "localhost" and domain in _DOMAINS:
+                _to_loopback(domain)
         except DDSException as error:
             raise InputError(
                 f"cyclonedds cannot join domain {domain} ({error}); is CYCLONEDDS_URI right, the network up, "

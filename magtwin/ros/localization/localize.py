@@ -38,7 +38,7 @@ from magtwin.localization.track import LocalizerError, checked_estimates
 from magtwin.ros.bus import Bus, Message, Subscription, to_bytes
 from magtwin.ros.bus.names import checked_prefix
 from magtwin.ros.diagnostics import Level, Reporter, status_of
-from magtwin.ros.inputs import JUMP_S, Input, Scanning
+from magtwin.ros.inputs import JUMP_S, Input, LiveFrames, Scanning
 from magtwin.ros.localization.poses import (
     CLOUD,
     CLOUD_KIND,
@@ -99,6 +99,9 @@ LOOK_S = 0.5
 PATH_S = 1.0
 """Time between messages of the estimated path [s]."""
 
+APART_M = 0.02
+"""Distance of places of the magnetometer that is reported [m]."""
+
 HELD_S = 30.0
 """Age up to which slow topics, such as the battery's, are passed on [s]."""
 
@@ -140,7 +143,10 @@ class LocalizerNode:
         sender = sender_of(twin.scene.robot, unit="T", rate_hz=settings["rate_hz"])
         self._sender = prefixed(sender, checked_prefix(frame_prefix))
         age = settings["max_age_s"]
-        told: Any = {"stamps": settings["stamps"], "say": say}
+        robot = twin.scene.robot
+        axes = {"IMU": robot.q_base_imu_xyzw, "field": robot.q_base_magnetometer_xyzw}
+        self._frames, self._placed = LiveFrames(bus, axes), False
+        told: Any = {"frames": self._frames, "stamps": settings["stamps"], "say": say}
         self.inputs = {ODOMETRY.name: Input(bus, ODOMETRY, max_age_s=age, **told)}
         self.inputs |= {topic.name: Input(bus, topic, max_age_s=HELD_S, **told) for topic in OTHERS}
         for topic in OTHERS:
@@ -213,9 +219,10 @@ class LocalizerNode:
         """A reading of the magnetometer; the method gets it if it is the last one before a tick."""
         arrived = time.monotonic()
         leaf = MAGNITUDE.leaves(message.kind)[0]
-        stamped = message.kind.startswith("sensor_msgs") and self._settings["stamps"] == "header"
+        headed = message.kind.startswith("sensor_msgs")
+        stamped = headed and self._settings["stamps"] == "header"
         try:
-            read = message.read([leaf, *(("header.stamp",) if stamped else ())])
+            read = message.read([leaf, *(("header.stamp", "header.frame_id") if headed else ())])
         except InputError:
             self._broken += 1
             return
@@ -227,10 +234,23 @@ class LocalizerNode:
         if self._heard_ns >= 0:
             self._period_s = (stamp - self._heard_ns) / NS
         self._heard_ns = stamp
+        self._check_place(str(read.get("header.frame_id", "")))
         if self._algorithm is not None and not self._due(stamp):
             return
         size = float(np.linalg.norm(np.atleast_1d(read[leaf])))
         self._step(stamp, _in_nt(size), arrived)
+
+    def _check_place(self, frame: str) -> None:
+        """Report once a magnetometer that /tf_static has at another place than the method is told."""
+        if self._placed or (mount := self._frames.place(frame)) is None:
+            return
+        self._placed = True
+        (x, y), (told_x, told_y) = mount.p[:2].tolist(), self._problem.sensor.lever_arm_m
+        if math.hypot(x - told_x, y - told_y) > APART_M:
+            self._say(
+                f"/tf_static has {frame!r} at x, y = {x:.3f}, {y:.3f} m in {mount.base}, the method is told "
+                f"{told_x:.3f}, {told_y:.3f} m: correct the robot's description, or the scene's robot"
+            )
 
     def _due(self, stamp_ns: int) -> bool:
         """Whether the next reading will be after the tick."""
