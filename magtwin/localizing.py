@@ -363,7 +363,7 @@ def report_of(result: Localization) -> Report:
     """Errors of a localization beside their bound and dead reckoning, and a verdict."""
     run, scores, dead = result.run, result.scores, result.dead_reckoning
     belief = result.problem.belief
-    read = np.count_nonzero(field_known(run))
+    read = int(np.count_nonzero(field_known(run)))
     rate = max(read - 1, 0) / max(run.duration_s, 1e-9)
     metadata: dict[str, Any] = {
         "map": "none (SLAM)" if belief is None else getattr(belief, "name", "") or type(belief).__name__,
