@@ -24,13 +24,13 @@ def cell(standing: Standing | None) -> str:
     text = f"{100 * standing.rmse_m.value:.1f}"
     if standing.diverged.value > 0.05:
         return f"{text}, diverges in {100 * standing.diverged.value:.0f} %"
-    return f"{text} ({standing.ratio:.2f}, {standing.anees:.2f})"
+    return f"{text} ({standing.ratio:.2f}, {standing.anees.value:.2f})"
 
 
 def main() -> None:
     """Read the results and replace the block of the page."""
     made = read_results(*sys.argv[1:])
-    every = standings(made.rows, made.times)
+    every = standings(made.rows, made.times, made.compensated)
     by = {(s.localizer, s.scenario): s for s in every}
     scenarios = list(dict.fromkeys(s.scenario for s in every))
     lines = [f"| | {' | '.join(scenarios)} | us a step |", "|---" * (len(scenarios) + 2) + "|"]
@@ -44,8 +44,8 @@ def main() -> None:
     lead = (
         f"{count} runs of each scenario, {about['seeds']} seeds, each in another session; magtwin "
         f"{about['magtwin']}, suite {about['name']} version {about['version']}. RMSE of the position [cm]; "
-        "in brackets divided by the bound, and the ANEES per state. The time of a step is that of the first "
-        "scenario."
+        "in brackets divided by the bound, and the median ANEES per state. The time of a step is that of the "
+        "first scenario."
     )
     block = "\n".join(["## Leaderboard", "", lead, "", *lines, ""])
     text = PAGE.read_text(encoding="utf-8")

@@ -40,6 +40,7 @@ from magtwin.outputs import output
 from magtwin.own_field import with_own_field
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run, numbers_in
+from magtwin.run.thinning import field_known, newest
 from magtwin.twin import Twin
 
 RATE_HZ = 5.0
@@ -62,6 +63,15 @@ GAP_S = 1.0
 LEAST_ON_MAP = 0.5
 """Share of the readings that must be on the map."""
 
+FEW = 0.5
+"""Share of the intervals with a reading below which the verdict gives the share."""
+
+NO_READING = (
+    "Dead reckoning: no row of the run holds a reading of the field (b_measured_nt is nan, or the "
+    "magnetometer had lost lock), so the field was not used."
+)
+"""Verdict on a run without a reading."""
+
 Source = str | os.PathLike[str]
 
 
@@ -80,6 +90,14 @@ class Localization:
 
     method: str
     """Name of the method."""
+
+    intervals: int
+    """Number of intervals between readings, at the rate that the method should get them."""
+
+    @property
+    def read_share(self) -> float:
+        """Share of these intervals that have a reading of the field."""
+        return float(np.count_nonzero(field_known(self.run))) / self.intervals
 
     @cached_property
     def truth(self) -> Array | None:
@@ -121,8 +139,7 @@ class Localization:
                 return None
             parts = (*truth[self.known, :2].T, np.unwrap(truth[self.known, 2]))
             truth = np.column_stack([np.interp(t, seen, part) for part in parts])
-        used = np.isfinite(self.run["b_measured_nt"])
-        return bounds(self.problem, truth, t, used=used)
+        return bounds(self.problem, truth, t, used=field_known(self.run))
 
     @cached_property
     def scores(self) -> Scores | None:
@@ -250,8 +267,9 @@ def localization(
         raise InputError(f"`rate_hz` must be above 0 Hz, got {rate_hz!r}", parameter="rate_hz")
     if seed < 0:
         raise InputError(f"seed must be a whole number from 0 up, got {seed!r}", parameter="seed")
+    intervals = run.rows
     if rate_hz is not None and run.rows > 1 and 1.01 * rate_hz < (run.rows - 1) / run.duration_s:
-        run = thinned(run, rate_hz)
+        intervals, run = len(_ticks(run["t"], rate_hz)), thinned(run, rate_hz)
     if calibration is not None:
         calibration = calibration if isinstance(calibration, Run) else read_run(existing(calibration, "run"))
         if rate_hz is not None:
@@ -281,7 +299,8 @@ def localization(
     made = track(algorithm, problem, run, keep_particles=keep_particles, progress=progress)
     name = method if isinstance(method, str) else type(method).__name__
     estimated = run.with_columns(**made.columns()).with_specs(**EST_COLUMNS)
-    return Localization(estimated.with_metadata(localizer=name, localizer_seed=seed), problem, made, name)
+    estimated = estimated.with_metadata(localizer=name, localizer_seed=seed)
+    return Localization(estimated, problem, made, name, intervals)
 
 
 def live_problem(
@@ -348,24 +367,33 @@ def report_of(result: Localization) -> Report:
     """Errors of a localization beside their bound and dead reckoning, and a verdict."""
     run, scores, dead = result.run, result.scores, result.dead_reckoning
     belief = result.problem.belief
-    rate = (run.rows - 1) / max(run.duration_s, 1e-9)
+    read = int(np.count_nonzero(field_known(run)))
+    rate = max(read - 1, 0) / max(run.duration_s, 1e-9)
     metadata: dict[str, Any] = {
         "map": "none (SLAM)" if belief is None else getattr(belief, "name", "") or type(belief).__name__,
-        "readings": f"{run.rows:,} in {run.duration_s:.1f} s, {rate:.3g} a second",
+        "readings": f"{read:,} in {run.duration_s:.1f} s, {rate:.3g} a second",
     }
     if result.scores is not None:
         gaps = "" if result.known.all() else f", known at {result.known.sum():,} of them"
         metadata["errors"] = f"differences from the {truth_name(run)}{gaps}"
     title = f"{result.method} on {', '.join(_origin(run)) or 'a recorded run'}"
+    share = result.read_share
+    figures = []
+    if share < 1:
+        note = "share of the intervals; odometry alone carries the pose through the others"
+        figures.append(Figure("with a reading", share, note=note))
     if scores is None or dead is None or result.truth is None:
-        lost = Figure("flagged lost", float(result.track.lost.mean()), note="share of the readings")
-        return Report(title, (lost,), metadata, "No verdict: the run has no true pose to compare with.")
+        if share:
+            lost = float(result.track.lost.mean())
+            figures.append(Figure("flagged lost", lost, note="share of the readings"))
+        none = "No verdict: the run has no true pose to compare with."
+        return Report(title, tuple(figures), metadata, none if share else NO_READING)
     ratio = scores.ratio.get("correlated", math.nan)
-    close = f"{ratio:.2f} of the bound" if math.isfinite(ratio) else ""
+    close = f"{ratio:.2f} of the bound" if share and math.isfinite(ratio) else ""
     off = np.hypot(*(dead.pose - result.truth)[result.scored_rows, :2].T)
     dead_m = float(np.sqrt(np.mean(off**2)))
     expected = f"{scores.anees_low:.2f} to {scores.anees_high:.2f} if the covariance is right"
-    figures = [
+    figures += [
         Figure("position error, RMSE", scores.rmse_m, "m", note=close),
         Figure("position error, median", scores.median_m, "m"),
         Figure("position error, 95 %", scores.p95_m, "m"),
@@ -373,6 +401,8 @@ def report_of(result: Localization) -> Report:
         Figure("heading error, RMSE", math.degrees(scores.heading_rad), "deg"),
         Figure("dead reckoning, RMSE", dead_m, "m", note=_dead_start(result)),
     ]
+    if not share:
+        return Report(title, tuple(figures), metadata, NO_READING)
     if scores.bound_m:
         figures += [
             Figure("bound", scores.bound_m["correlated"], "m", note="map error alike at nearby places"),
@@ -387,7 +417,8 @@ def report_of(result: Localization) -> Report:
         Figure("flagged lost", scores.lost_share, note="share of the readings"),
         Figure("time a step", scores.step_us, "us"),
     ]
-    return Report(title, tuple(figures), metadata, verdict_of(scores, dead_m, _dead_start(result)))
+    few = f" Only {share:.0%} of the intervals have a reading of the field." if share < FEW else ""
+    return Report(title, tuple(figures), metadata, verdict_of(scores, dead_m, _dead_start(result)) + few)
 
 
 def _origin(run: Run) -> list[str]:
@@ -400,10 +431,16 @@ def _dead_start(result: Localization) -> str:
 
 
 def thinned(run: Run, rate_hz: float) -> Run:
-    """The latest row of a run at each tick of a slower clock, which starts at its first row."""
-    t = run["t"]
-    ticks = t[0] + np.arange(int((t[-1] - t[0]) * rate_hz + 1e-9) + 1) / rate_hz
-    return run.take(np.unique(np.searchsorted(t, ticks + 1e-9, side="right") - 1))
+    """The newest reading between ticks of a slower clock, which starts at the first row of a run.
+
+    If there is no reading of the field between two ticks, the latest row is taken.
+    """
+    ends = np.unique(np.searchsorted(run["t"], _ticks(run["t"], rate_hz) + 1e-9, side="right") - 1)
+    return run.take(newest(ends, field_known(run)))
+
+
+def _ticks(t: Array, rate_hz: float) -> Array:
+    return np.asarray(t[0] + np.arange(int((t[-1] - t[0]) * rate_hz + 1e-9) + 1) / rate_hz)
 
 
 def truth_of(run: Run) -> Array | None:

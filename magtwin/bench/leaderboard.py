@@ -1,7 +1,7 @@
 """Leaderboard: what the rows of a benchmark say of each localizer on each scenario, with intervals."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,8 +16,14 @@ Columns = Mapping[str, NDArray[Any]]
 """Rows of results, as arrays of equal length by name."""
 
 CONSISTENT = (0.8, 1.3)
-"""ANEES per state that counts as consistent."""
+"""Median ANEES per state that counts as consistent."""
 
+BOUNDS_OF = {
+    (False, False): "bound_correlated_m",
+    (True, False): "bound_smoothed_m",
+    (False, True): "bound_oracle_m",
+}
+"""Column of the bound that holds for a method, by whether it smooths and whether it has a compensator."""
 
 SHOWN = 0.05
 """p-value below which a difference counts as shown."""
@@ -44,10 +50,13 @@ class Standing:
     """Root mean square of the heading error."""
 
     bound_m: float
-    """Root mean square of the bound with the map's error as correlated; of the smoothed one for smoothers."""
+    """Root mean square of the bound in `BOUNDS_OF` over the same runs; nan if no bound holds."""
 
-    anees: float
-    """Mean over runs of the normalised squared error per state."""
+    anees: Interval
+    """Median over runs of the ANEES per state, with the quartiles: one lost run would carry a mean."""
+
+    anees_inside: float
+    """Share of runs whose ANEES lies in its own central 95 % interval (`Scores.anees_low`, `anees_high`)."""
 
     coverage: float
     """Mean over runs of the share of true positions within the 90 % ellipse."""
@@ -80,19 +89,23 @@ class Standing:
         if self.diverged.value > 0.01 and self.failed < self.runs:
             parts.append(f"diverges in {100 * self.diverged.value:.0f} % of runs")
         low, high = CONSISTENT
-        if self.anees > high:
-            parts.append(f"too sure of itself: errors are {math.sqrt(self.anees):.1f} times its sd")
-        elif self.anees < low:
-            parts.append(f"too cautious: errors are {math.sqrt(self.anees):.2f} of its sd")
+        ratio = math.sqrt(self.anees.value)
+        if self.anees.value > high:
+            parts.append(f"too sure of itself: errors are {ratio:.1f} times its sd (median run)")
+        elif self.anees.value < low:
+            parts.append(f"too cautious: errors are {ratio:.2f} of its sd (median run)")
         return "; ".join(parts)
 
 
-def standings(rows: Columns, times: Columns | None = None) -> list[Standing]:
+def standings(
+    rows: Columns, times: Columns | None = None, compensated: Collection[str] = ()
+) -> list[Standing]:
     """The standing of every localizer on every scenario, in the order of the rows.
 
     Args:
         rows: Rows of results.
         times: Processor times of the same runs.
+        compensated: Localizers with a compensator: they know more than the bound of the others assumes.
     """
     made = []
     for scenario in dict.fromkeys(rows["scenario"].tolist()):
@@ -103,11 +116,12 @@ def standings(rows: Columns, times: Columns | None = None) -> list[Standing]:
             if times is not None:
                 spent = times["step_us"][(times["scenario"] == scenario) & (times["localizer"] == localizer)]
                 cost = float(np.nanmedian(spent)) if np.isfinite(spent).any() else math.nan
-            made.append(_standing(scenario, localizer, {k: v[mine] for k, v in rows.items()}, cost))
+            own = {k: v[mine] for k, v in rows.items()}
+            made.append(_standing(scenario, localizer, own, cost, localizer in compensated))
     return made
 
 
-def _standing(scenario: str, localizer: str, rows: Columns, step_us: float) -> Standing:
+def _standing(scenario: str, localizer: str, rows: Columns, step_us: float, compensated: bool) -> Standing:
     good = (rows["status"] == "ok") & np.isfinite(rows["rmse_m"])
     count = len(good)
     errors, sessions = rows["rmse_m"][good], rows["session"][good]
@@ -115,6 +129,9 @@ def _standing(scenario: str, localizer: str, rows: Columns, step_us: float) -> S
     unknown_start = bool(rows["global_start"].any())
     kidnaps = int(rows["kidnapped"].sum())
     converged = int(np.count_nonzero(good & (rows["converged_s"] <= WITHIN_S)))
+    bound = BOUNDS_OF.get((bool(rows["smoother"].any()), compensated))
+    anees, known = rows["anees"][good], ~np.isnan(rows["anees"][good])
+    inside = (rows["anees_low"][good] <= anees) & (anees <= rows["anees_high"][good])
     return Standing(
         scenario=scenario,
         localizer=localizer,
@@ -124,8 +141,9 @@ def _standing(scenario: str, localizer: str, rows: Columns, step_us: float) -> S
         median_m=float(np.median(errors)) if len(errors) else math.nan,
         p95_m=float(np.percentile(errors, 95)) if len(errors) else math.nan,
         heading_rad=_rms(rows["heading_rad"][good]),
-        bound_m=_rms(rows["bound_smoothed_m" if rows["smoother"].any() else "bound_correlated_m"][good]),
-        anees=_mean(rows["anees"][good]),
+        bound_m=math.nan if bound is None else _rms(rows[bound][good]),
+        anees=_quartiles(anees),
+        anees_inside=_mean(inside[known]),
         coverage=_mean(rows["coverage"][good]),
         diverged=rate(diverged, count),
         converged=rate(converged, count) if unknown_start else None,
@@ -225,3 +243,9 @@ def _rms(values: NDArray[Any]) -> float:
 def _mean(values: NDArray[Any]) -> float:
     known = values[np.isfinite(values)]
     return float(known.mean()) if len(known) else math.nan
+
+
+def _quartiles(values: NDArray[Any]) -> Interval:
+    """Median and quartiles of the finite values."""
+    known = values[np.isfinite(values)]
+    return Interval(*np.percentile(known, (50, 25, 75)).tolist()) if len(known) else Interval(*[math.nan] * 3)

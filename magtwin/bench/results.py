@@ -80,6 +80,11 @@ class Results(Summarized):
         )
 
     @property
+    def compensated(self) -> list[str]:
+        """Localizers of the suite with a compensator."""
+        return [each.name for each in self.suite.localizer if each.compensator != "none"]
+
+    @property
     def table(self) -> pa.Table:
         """The rows as a table of pyarrow."""
         return pa.table({name: pa.array(values) for name, values in self.rows.items()})

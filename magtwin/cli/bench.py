@@ -87,7 +87,7 @@ def bench(
             force=force,
             progress=advance,
         )
-    return Done(made.report(standings(made.rows, made.times)), out)
+    return Done(made.report(standings(made.rows, made.times, made.compensated)), out)
 
 
 @bench_app.command

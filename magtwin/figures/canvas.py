@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.outputs import output
+from magtwin.run.thinning import newest
 from magtwin.summary import printable_lines
 
 Array = NDArray[np.float64]
@@ -172,7 +173,7 @@ def coloured_line(
         colours: Name of the colour scale.
         width: Width of the line [points].
     """
-    rows = evenly(len(points), SEGMENTS + 1)
+    rows = newest(evenly(len(points), SEGMENTS + 1), np.isfinite(values))
     points, values = points[rows], values[rows]
     line = LineCollection(
         list(np.stack([points[:-1], points[1:]], axis=1)),

@@ -249,8 +249,8 @@ def _title(result: Localization) -> str:
     belief = result.problem.belief
     on = "without a map" if belief is None else f"on map {getattr(belief, 'name', '') or 'belief'}"
     head = f"{short_name(result.method, 40)} {on}, {seed}; run {where or 'recorded'}, {run.duration_s:.0f} s"
-    lines = [head] if result.truth is None else [head, *textwrap.wrap(result.report().verdict, TITLE_WIDTH)]
-    return "\n".join(lines)
+    judged = result.truth is not None or not result.read_share
+    return "\n".join([head, *(textwrap.wrap(result.report().verdict, TITLE_WIDTH) if judged else ())])
 
 
 def save_localization(result: Localization, out: str | os.PathLike[str], *, force: bool = False) -> Path:

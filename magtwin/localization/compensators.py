@@ -13,6 +13,7 @@ from magtwin.frames import yaw_from_quat
 from magtwin.localization.problem import Array, Compensator, FieldBelief, Reading
 from magtwin.localization.readings import readings_of
 from magtwin.run.run import Column, Run, numbers_in
+from magtwin.run.thinning import field_known
 
 COMPENSATORS: Registry[Any] = Registry(
     "compensator",
@@ -108,7 +109,7 @@ class Linear:
         for name in ("p_world_base", "yaw", *self.needs):
             if name not in run:
                 raise InputError(f"the calibration drive has no column {name!r}, which the compensator needs")
-        misfit = run["b_measured_nt"] - _field_along(run, field)
+        misfit = np.where(field_known(run), run["b_measured_nt"], np.nan) - _field_along(run, field)
         rows, last = [], None
         for reading in readings_of(run):
             rows.append(self.features(reading, last))

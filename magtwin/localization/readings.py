@@ -9,6 +9,7 @@ from magtwin.errors import InputError
 from magtwin.frames import yaw_from_quat
 from magtwin.localization.problem import Reading
 from magtwin.run.run import Run
+from magtwin.run.thinning import field_known
 
 ONBOARD = (
     "t",
@@ -39,6 +40,8 @@ NEEDED = ("t", "b_measured_nt", "odom_p", "odom_q_xyzw")
 def onboard(run: Run) -> Run:
     """A copy of the on-board columns of a run, without its other columns and its metadata.
 
+    `b_measured_nt` is nan where the magnetometer had lost lock.
+
     Raises:
         InputError: A column that localization needs is missing, or the clock does not ascend.
     """
@@ -54,6 +57,7 @@ def onboard(run: Run) -> Run:
         )
         raise InputError(f"the odometry of row {row} is not finite; cut the run with `magtwin convert`")
     kept = {name: np.array(run[name]) for name in ONBOARD if name in run}
+    kept["b_measured_nt"][~field_known(run)] = np.nan
     return Run(kept, specs={name: run.spec(name) for name in kept})
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, RepairWarning, is_termination
+from magtwin.frames import yaw_from_quat
 from magtwin.localization.problem import Array, Estimate, Localizer, Problem, Smoother
 from magtwin.localization.readings import onboard, readings_of
 from magtwin.run.run import Column, Run
@@ -32,7 +33,7 @@ EST_COLUMNS = {
 """Columns that localization adds to a run."""
 
 LARGEST_YAW = 8 * math.pi
-"""Greater headings are reported, as they may be in degrees [rad]."""
+"""Headings up to this are not checked for degrees [rad]."""
 
 _UPPER = np.triu_indices(3)
 
@@ -133,16 +134,22 @@ def track(
             if progress is not None:
                 progress(k + 1, run.rows)
     checked = checked_estimates(name, estimates, run["t"])
-    if (far := np.abs(checked[0][:, 2]) > LARGEST_YAW).any():
+    yaw, turned = checked[0][:, 2], yaw_from_quat(run["odom_q_xyzw"])
+    far = np.abs(yaw) > LARGEST_YAW
+    if far.any() and _alike(np.radians(yaw), turned) >= _alike(yaw, turned) - 1e-9:
         k = int(np.argmax(far))
         warnings.warn(
-            f"{name} returned yaw {checked[0][k, 2]:g} rad at t = {run['t'][k]:g} s, more than "
-            f"{LARGEST_YAW / (2 * math.pi):g} turns: whole turns are left out; if this is in degrees, return "
-            "radians",
+            f"{name} returned yaw {yaw[k]:g} rad at t = {run['t'][k]:g} s, and as radians its headings "
+            "follow the odometry no better than as degrees: if they are degrees, return radians",
             RepairWarning,
             stacklevel=2,
         )
     return Track(run["t"], *checked, spent / run.rows, tuple(clouds))
+
+
+def _alike(yaw: Array, other: Array) -> float:
+    """Agreement of two headings up to a constant and whole turns: 1 if they turn alike, near 0 if not."""
+    return float(np.abs(np.exp(1j * (yaw - other)).mean()))
 
 
 def _called(what: str, work: Callable[[], Any]) -> Any:

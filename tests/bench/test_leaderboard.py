@@ -34,12 +34,15 @@ def rows_of(localizer, rmse, *, anees=1.0, failed=0, diverged=0, scenario="track
         "rmse_m": np.where(bad, np.nan, rmse * (1 + 0.1 * rng.standard_normal(n))),
         "heading_rad": np.where(bad, np.nan, 0.02),
         "anees": np.where(bad, np.nan, anees),
+        "anees_low": np.where(bad, np.nan, 0.7),
+        "anees_high": np.where(bad, np.nan, 1.4),
         "coverage": np.where(bad, np.nan, 0.9),
         "diverged": (np.arange(n) >= failed) & (np.arange(n) < failed + diverged),
         "converged_s": np.where(np.arange(n) < 36, 10.0, np.nan),
         "lost_share": np.zeros(n),
         "bound_correlated_m": np.full(n, 0.05),
         "bound_smoothed_m": np.full(n, 0.03),
+        "bound_oracle_m": np.full(n, 0.02),
     }
 
 
@@ -85,6 +88,24 @@ def test_a_smoother_is_measured_by_its_own_bound():
     rows = rows_of("f", 0.1)
     rows["smoother"][:] = True
     assert standings(rows)[0].bound_m == pytest.approx(0.03)
+
+
+def test_a_localizer_with_a_compensator_is_measured_by_the_bound_of_a_known_own_field():
+    rows = rows_of("f", 0.1)
+    assert standings(rows, compensated=["f"])[0].bound_m == pytest.approx(0.02)
+    rows["smoother"][:] = True
+    assert np.isnan(standings(rows, compensated=["f"])[0].bound_m)
+
+
+def test_one_lost_run_does_not_carry_the_anees():
+    rows = rows_of("f", 0.1)
+    rows["anees"] = np.linspace(0.9, 1.1, RUNS)
+    rows["anees"][7] = 1e5
+    (standing,) = standings(rows)
+    assert standing.anees.value == pytest.approx(1.0, abs=0.01)
+    assert (standing.anees.low, standing.anees.high) == pytest.approx((0.95, 1.05), abs=0.01)
+    assert standing.anees_inside == (RUNS - 1) / RUNS
+    assert standing.verdict() == ""
 
 
 def test_paired_differences_find_a_small_change_that_intervals_hide():

@@ -1,6 +1,7 @@
 """What a localizer gets leads to no true pose, no true field and no later reading."""
 
 import gc
+import math
 import sys
 import types
 
@@ -9,10 +10,12 @@ import pytest
 
 import magtwin as mt
 from magtwin.errors import RepairWarning
+from magtwin.frames import quat_from_yaw
+from magtwin.localization.odometry import Odometry
 from magtwin.localization.problem import Estimate, Problem
 from magtwin.localization.readings import NEEDED, ONBOARD, onboard, readings_of
 from magtwin.localization.track import LocalizerError, track
-from magtwin.run.run import COLUMNS
+from magtwin.run.run import COLUMNS, Run
 
 TRUE = (
     "p_world_base",
@@ -30,6 +33,14 @@ TRUE = (
 @pytest.fixture(scope="module")
 def run():
     return mt.simulate("lab", "figure8", seed=2, duration_s=10, rate_hz=5, magnetometer="physical")
+
+
+@pytest.fixture(scope="module")
+def turning():
+    """Readings of a robot that turns seven times in one direction."""
+    t = np.arange(600) / 5
+    p = np.zeros((600, 3))
+    return Run({"t": t, "b_measured_nt": 4e4 + t, "odom_p": p, "odom_q_xyzw": quat_from_yaw(44 * t / t[-1])})
 
 
 def reachable(*starts):
@@ -133,10 +144,25 @@ def test_a_wrong_estimate_is_refused_with_its_time(run, estimate, text):
         track(Wrong(estimate), Problem(belief=None, extent=(-3, 3, -2, 2)), run)
 
 
-def test_a_heading_of_many_turns_is_reported(run):
-    degrees = Wrong(lambda r: Estimate(r.t, 0, 0, 270))
-    with pytest.warns(RepairWarning, match="yaw 270 rad at t = 0 s, more than 4 turns: .* return radians"):
-        track(degrees, Problem(belief=None, extent=(-3, 3, -2, 2)), run)
+@pytest.mark.parametrize(
+    "heading",
+    [lambda yaw: 270, math.degrees, lambda yaw: math.degrees(yaw) % 360, lambda yaw: 90 + math.degrees(yaw)],
+)
+def test_headings_in_degrees_are_reported(turning, heading):
+    degrees = Wrong(lambda r: Estimate(r.t, 0, 0, heading(r.odometry[2])))
+    with pytest.warns(RepairWarning, match=r"Wrong returned yaw .* if they are degrees, return radians"):
+        track(degrees, Problem(belief=None, extent=(-3, 3, -2, 2)), turning)
+
+
+@pytest.mark.parametrize("heading", [lambda yaw: yaw, lambda yaw: math.remainder(yaw, 2 * math.pi)])
+def test_headings_of_many_turns_are_not_taken_for_degrees(turning, heading, recwarn):
+    radians = Wrong(lambda r: Estimate(r.t, 0, 0, heading(r.odometry[2]) + 0.2 * math.sin(9 * r.t)))
+    made = track(radians, Problem(belief=None, extent=(-3, 3, -2, 2)), turning)
+    assert not recwarn
+    made_odometry = track(Odometry(), Problem(belief=None, extent=(-3, 3, -2, 2)), turning)
+    assert not recwarn
+    assert np.abs(made_odometry.pose[:, 2]).max() > 40
+    np.testing.assert_allclose(np.cos(made.pose[:, 2] - made_odometry.pose[:, 2]), 1, atol=0.05)
 
 
 def test_a_command_that_sigterm_ends_is_no_fault_of_the_localizer(run):

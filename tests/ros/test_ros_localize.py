@@ -214,14 +214,16 @@ class Hand:
         spin(lambda: self.robot.publishers(ESTIMATE), self.robot)
         self.t = 5.0
 
-    def tick(self, times: int = 1, *, field: bool = True, x: float = 0.0) -> None:
+    def tick(
+        self, times: int = 1, *, field: bool = True, x: float = 0.0, step_s: float = 0.2, b_t: float = 4.2e-5
+    ) -> None:
         for _ in range(times):
-            self.t += 0.2
+            self.t += step_s
             now = np.int64(round(self.t * NS))
             pose = {"pose.pose.position": [x, 0.0, 0.0], "pose.pose.orientation": quat_from_yaw(0.0)}
             self.senders[ODOMETRY].publish(to_bytes(ODOMETRY.kind, {"header.stamp": now, **pose}))
             if field:
-                reading = {"header.stamp": now, "magnetic_field": [4.2e-5, 0, 0]}
+                reading = {"header.stamp": now, "magnetic_field": [b_t, 0, 0]}
                 self.senders[MAGNITUDE].publish(to_bytes(MAGNITUDE.kind, reading))
             self.senders[CLOCK].publish(to_bytes(CLOCK.kind, {"clock": now}))
             spin(lambda now=now: self.bus.now_ns() == now, self.bus)
@@ -286,7 +288,22 @@ def test_while_the_magnetometer_is_silent_odometry_is_used_alone(net: Net, twin:
     _, pose, _ = poses(hand.heard)
     np.testing.assert_allclose(pose[-1, :2], [1 + 0.4 * math.cos(0.3), 0.5 + 0.4 * math.sin(0.3)], atol=1e-6)
     levels = {s.name: s for message in hand.said for s in from_message(message)}
-    assert "silent: odometry alone" in levels["localizer: estimates"].message
+    assert "gives no field: odometry alone" in levels["localizer: estimates"].message
+
+
+def test_the_newest_message_with_a_field_before_a_tick_is_the_reading(net: Net, twin: Twin) -> None:
+    hand = Hand(net, twin, "prior:=1,0.5,0.3")
+    hand.tick()
+    for _ in range(6):  # the last of four messages before each tick holds no field
+        hand.tick(3, step_s=0.05)
+        hand.tick(step_s=0.05, b_t=math.nan)
+    hand.settle()
+    t, *_ = poses(hand.heard)
+    np.testing.assert_allclose(t, [5.2, *(5.2 + 0.2 * np.arange(6) + 0.15)], atol=1e-6)
+    hand.tick(8, step_s=0.05, b_t=math.nan)  # no field at all: the last message before each tick
+    hand.settle()
+    t, *_ = poses(hand.heard)
+    np.testing.assert_allclose(t[7:], [6.6, 6.8], atol=1e-6)
 
 
 def test_a_magnetometer_that_the_robot_has_elsewhere_is_told_of_once(net: Net, twin: Twin) -> None:

@@ -13,6 +13,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import into_base, wrap_angle, yaw_from_quat
 from magtwin.report import Figure, Report
 from magtwin.run.run import Run
+from magtwin.run.thinning import newest
 from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
@@ -280,7 +281,7 @@ class _Fit:
                 self.corners[1] = np.fmax(self.corners[1], p.max(axis=0))
             step = float(np.median(np.diff(run["t"]))) if run.rows > 1 else 1.0
             every = max(1, round(1 / (step * FIT_RATE_HZ)))
-            rows = np.arange(0, run.rows, every)
+            rows = newest(np.arange(0, run.rows, every), usable(run) & np.isfinite(run["b_measured_nt"]))
             if free[2]:  # the same readings whatever the latency; else the cost favours those with fewer
                 t = run["t"]
                 rows = rows[(t[rows] >= t[0] + END_S) & (t[rows] <= t[-1] - END_S)]

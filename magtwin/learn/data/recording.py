@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
+from magtwin.learn.data.alignment import usable
 from magtwin.run.run import Run
+from magtwin.run.thinning import newest
 from magtwin.summary import Summarized
 
 Array = NDArray[np.float64]
@@ -196,12 +198,13 @@ def read(source: Source) -> Run:
 
 
 def thinned(run: Run, rate_hz: float | None) -> Run:
-    """Every k-th row, so that the rate is at most `rate_hz`."""
+    """The newest row with a field and a pose of every k rows, so that the rate is at most `rate_hz`."""
     if rate_hz is None or run.rows < 2:
         return run
     step = float(np.median(np.diff(run["t"])))
     every = max(1, int(np.ceil(min(0.99 / max(step * rate_hz, 1e-300), run.rows))))  # to 1 %, as clocks go
     if every == 1:
         return run
-    columns = {name: values[::every] for name, values in run.items()}
-    return Run(columns, {**run.metadata, "every": every}, run.specs)
+    place = run["mocap_p" if "mocap_p" in run else "p_world_base"]
+    good = usable(run) & np.isfinite(run["b_measured_nt"]) & np.isfinite(place).all(axis=1)
+    return run.take(newest(np.arange(0, run.rows, every), good)).with_metadata(every=every)

@@ -22,6 +22,7 @@ from magtwin.learn.mixed.session_effects import RATE_HZ, thinned_rows
 from magtwin.learn.models.predictor import Predictor
 from magtwin.learn.models.weights import MetadataValue
 from magtwin.run.run import Run
+from magtwin.run.thinning import newest
 
 Array = NDArray[np.float64]
 
@@ -97,11 +98,13 @@ def labelled_drive(
     for column in columns_of(model.features):
         if column not in run:
             raise InputError(f"{name} has no column {column!r}, which the model reads")
-    at = np.arange(run.rows) if rate_hz is None else thinned_rows(run["t"], rate_hz)
-    x = features(run, model.features)[at]
-    y = np.where(np.isfinite(x).all(axis=1), run["label_nt"][at], np.nan)
+    x = features(run, model.features)
+    y = np.where(np.isfinite(x).all(axis=1), run["label_nt"], np.nan)
+    at = np.arange(run.rows)
+    if rate_hz is not None:
+        at = newest(thinned_rows(run["t"], rate_hz), np.isfinite(y))
     yaw = yaw_from_quat(run["mocap_q_xyzw"]) if "mocap_q_xyzw" in run else run["yaw"]
-    return LabelledDrive(run["t"][at], x, y, yaw[at], run["b_map_gradient_nt_m"][at])
+    return LabelledDrive(run["t"][at], x[at], y[at], yaw[at], run["b_map_gradient_nt_m"][at])
 
 
 def calibrate(

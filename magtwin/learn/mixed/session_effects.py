@@ -6,6 +6,7 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtwin.learn.mixed.effects import Array, Effects, posterior, sums_of
 from magtwin.learn.models.calibration import quantile_factor
@@ -44,7 +45,7 @@ def shares(t: Array) -> float:
     return min(step / CORRELATION_S, 1.0)
 
 
-def thinned_rows(t: Array, rate_hz: float = RATE_HZ) -> Array:
+def thinned_rows(t: Array, rate_hz: float = RATE_HZ) -> NDArray[np.intp]:
     """Indices of rows at most `rate_hz` apart, from ascending times [s], shape (N,)."""
     kept, last = [], -math.inf
     for i, now in enumerate(t.tolist()):

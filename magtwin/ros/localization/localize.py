@@ -169,6 +169,7 @@ class LocalizerNode:
         self._algorithm: Localizer | None = None
         self._tick0, self._done = 0.0, 0
         self._heard_ns, self._stamp_ns, self._period_s = -1, -1, 0.0  # -1: none yet
+        self._newest = (-1, math.nan)  # stamp and field of the newest message that holds a field
         self._yaw: float | None = None
         self._cloud_ns = self._path_ns = -NS * 10**6
         self._own_tf: deque[int] = deque(maxlen=64)
@@ -216,7 +217,7 @@ class LocalizerNode:
         self._say(f"starts at x, y = {x:.2f}, {y:.2f} m, heading {math.degrees(yaw):.0f} deg")
 
     def _hear_field(self, message: Message) -> None:
-        """A reading of the magnetometer; the method gets it if it is the last one before a tick."""
+        """A reading of the magnetometer; the method gets the newest one with a field before a tick."""
         arrived = time.monotonic()
         leaf = MAGNITUDE.leaves(message.kind)[0]
         headed = message.kind.startswith("sensor_msgs")
@@ -235,10 +236,13 @@ class LocalizerNode:
             self._period_s = (stamp - self._heard_ns) / NS
         self._heard_ns = stamp
         self._check_place(str(read.get("header.frame_id", "")))
+        b_nt = _in_nt(float(np.linalg.norm(np.atleast_1d(read[leaf]))))
+        if math.isfinite(b_nt):
+            self._newest = stamp, b_nt
         if self._algorithm is not None and not self._due(stamp):
             return
-        size = float(np.linalg.norm(np.atleast_1d(read[leaf])))
-        self._step(stamp, _in_nt(size), arrived)
+        begun = self._algorithm is not None
+        self._step(*(self._newest if begun and self._newest[0] > self._stamp_ns else (stamp, b_nt)), arrived)
 
     def _check_place(self, frame: str) -> None:
         """Report once a magnetometer that /tf_static has at another place than the method is told."""
@@ -268,7 +272,6 @@ class LocalizerNode:
         ):
             return
         if quiet >= 0.99 * NS / self._settings["rate_hz"]:
-            self._blind += 1
             self._step(now, math.nan, time.monotonic())
 
     def _step(self, stamp_ns: int, b_nt: float, arrived: float) -> None:
@@ -287,8 +290,11 @@ class LocalizerNode:
         algorithm = self._algorithm
         assert algorithm is not None
         rate = self._settings["rate_hz"]
-        t = stamp_ns / NS
-        self._done = max(self._done, math.floor((t + 0.99 * self._period_s - self._tick0) * rate + 1e-6)) + 1
+        t, end = stamp_ns / NS, max(stamp_ns, self._heard_ns) / NS
+        self._done = (
+            max(self._done, math.floor((end + 0.99 * self._period_s - self._tick0) * rate + 1e-6)) + 1
+        )
+        self._blind += math.isnan(b_nt)
         self._stamp_ns = stamp_ns
         reading = self._reading(t, b_nt, odometry[0], stamp_ns)
         try:
@@ -375,6 +381,7 @@ class LocalizerNode:
         self._resets += 1
         self._say("time jumped back: the method begins anew")
         self._algorithm, self._heard_ns, self._stamp_ns, self._period_s = None, -1, -1, 0.0
+        self._newest = (-1, math.nan)
 
     def _hear_tf(self, message: Message) -> None:
         """Notice another node that publishes the transform from map to odom."""
@@ -406,7 +413,7 @@ class LocalizerNode:
         half, most = 1e3 * np.percentile(self.latencies_s or [np.nan], (50, 99))
         problems = (
             (self._is_lost, "the method does not trust its pose"),
-            (self._blind, f"{field} is silent: odometry alone"),
+            (self._blind, f"{field} gives no field: odometry alone"),
             (self._broken, f"{self._broken} messages could not be used"),
             (self._resets, f"time jumped back {self._resets} times"),
             (self._other_tf, "another node publishes the transform from map to odom too"),

@@ -162,6 +162,22 @@ def test_a_lower_rate_keeps_every_second_row(tmp_path):
     assert_array_equal(run["t"], RUNS["a"]["t"][::2])
 
 
+@pytest.mark.parametrize("lost", ["field", "lock", "pose"])
+def test_a_lower_rate_keeps_labels_where_every_second_reading_is_lost(tmp_path, lost):
+    run = RUNS["a"]
+    every_second = np.arange(run.rows) % 2 == 0
+    gaps = {
+        "field": {"b_measured_nt": np.where(every_second, np.nan, run["b_measured_nt"])},
+        "lock": {"flag_lost_lock": every_second},
+        "pose": {"flag_pose_lost": every_second},
+    }
+    found = build_dataset({"a": run.with_columns(**gaps[lost])}, FIELD, tmp_path / "d", rate_hz=5.0)
+    ((one, made),) = found.runs()
+    assert one.rows == 120
+    assert one.labelled == np.isfinite(made["label_nt"]).sum() == 119  # the first row is kept as it is
+    assert_array_equal(made["t"][1:], run["t"][1:-1:2])
+
+
 def test_a_clock_of_the_smallest_steps_is_thinned():
     run = RUNS["a"].with_columns(t=np.arange(RUNS["a"].rows) * 5e-324)
     assert thinned(run, 5.0).rows == 1

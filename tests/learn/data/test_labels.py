@@ -33,10 +33,12 @@ def a_map(cell=0.02, variance=None):
     )
 
 
-def a_run(lever=(0.0, 0.0), latency=0.0, *, seconds=60.0, swing=0.7, noise=5.0, seed=0, straight=False):
+def a_run(
+    lever=(0.0, 0.0), latency=0.0, *, seconds=60.0, swing=0.7, noise=5.0, seed=0, straight=False, rate=20
+):
     """A Lissajous drive (or a straight one at 0.2 m/s) whose sensor sits at a lever arm and answers late."""
     rng = np.random.default_rng(seed)
-    t = np.arange(round(seconds * 20)) / 20
+    t = np.arange(round(seconds * rate)) / rate
 
     def pose(t):
         if straight:
@@ -123,6 +125,13 @@ def test_lever_arm_and_latency_are_found_together_to_their_stated_spread():
     assert_allclose(got, truth, atol=0.004)
     assert (np.abs(got - truth) < 4 * sd + 0.002).all()
     assert (sd < 0.01).all()
+
+
+def test_an_alignment_is_found_where_every_second_reading_is_lost():
+    runs = [a_run((0.04, -0.03), seed=k, swing=0.5 + k, rate=40) for k in range(2)]
+    lost = np.arange(runs[0].rows) % 2 == 0
+    gaps = [run.with_columns(b_measured_nt=np.where(lost, np.nan, run["b_measured_nt"])) for run in runs]
+    assert_allclose(fit_alignment(gaps, FIELD).lever_arm_m, (0.04, -0.03), atol=0.004)
 
 
 def test_errors_shared_within_groups_make_the_spread_of_students_t():

@@ -1,0 +1,186 @@
+"""The page of a benchmark: every number that it shows, recomputed from the rows of the results."""
+
+import json
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from matplotlib.colors import to_hex
+from scipy.stats import binomtest
+
+from magtwin.bench import report
+from magtwin.bench.report import report_results
+from magtwin.bench.runner import benchmark
+
+pytest.importorskip("pandas")
+
+SUITE = """
+name = "uneven"
+seed = 2
+
+[[scenario]]
+name = "known"
+runs = 300
+sessions = 3
+duration_s = 12.0
+
+[[scenario]]
+name = "global"
+runs = 300
+duration_s = 14.0
+prior = "global"
+
+[[localizer]]
+method = "odometry"
+
+[[localizer]]
+method = "smoother"
+
+[[localizer]]
+method = "ekf"
+"""
+RUNS = {"odometry": 3, "smoother": 3, "ekf": 5}
+PLACES = ("known", "global")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Results of 3 and 5 of 300 runs, the folder of their report, and the figures in it."""
+    folder = tmp_path_factory.mktemp("uneven")
+    (folder / "uneven.toml").write_text(SUITE)
+    benchmark(folder / "uneven.toml", folder / "results", runs=3, jobs=1)
+    benchmark(folder / "uneven.toml", folder / "results", runs=5, localizers=["ekf"], jobs=1)
+    figures, picture = {}, report.picture
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            report,
+            "picture",
+            lambda figure, *a, file: (figures.update({file: figure}), picture(figure, *a, file=file))[1],
+        )
+        report_results([folder / "results"], folder / "page")
+    return folder / "results", folder / "page", figures
+
+
+@pytest.fixture(scope="module")
+def raw(made):
+    """Rows by scenario and localizer, as any reader of Parquet gives them."""
+    tables = {place: pq.ParquetDataset(made[0] / "rows" / place).read().to_pandas() for place in PLACES}
+    times = {place: pq.ParquetDataset(made[0] / "times" / place).read().to_pandas() for place in PLACES}
+    return {
+        (place, name): (tables[place].query("localizer == @name"), times[place].query("localizer == @name"))
+        for place in PLACES
+        for name in RUNS
+    }
+
+
+def tables_of(page):
+    """Rows of the tables of the Markdown page by section, table and first cell."""
+    section = title = head = ""
+    found = {}
+    for line in page.read_text().replace("\\", "").splitlines():
+        if line.startswith("## "):
+            section = line[3:]
+        elif line.startswith("### "):
+            title, head = line[4:], ""
+        elif line.startswith("| "):
+            cells = [cell.strip() for cell in line.strip("|").split("|")]
+            if not head:
+                head = cells
+            elif not set(cells[0]) <= set("-"):
+                found[section, title, cells[0]] = dict(zip(head, cells, strict=True))
+    return found
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def number(value, digits=3):
+    return "" if np.isnan(value) else f"{value:.{digits}f}"
+
+
+def test_every_number_of_the_page_is_that_of_the_raw_rows(made, raw):
+    tables = tables_of(made[1] / "bench.md")
+    for (place, name), (rows, times) in raw.items():
+        assert len(rows) == RUNS[name]
+        anees = rows.anees[np.isfinite(rows.anees)]
+        bound = rms(rows.bound_smoothed_m if name == "smoother" else rows.bound_correlated_m)
+        shown = tables[place, "Accuracy", name]
+        assert shown["runs"] == str(len(rows))
+        assert shown["RMSE [m]"].split(" (")[0] == number(rms(rows.rmse_m))
+        assert shown["median [m]"] == number(np.median(rows.rmse_m))
+        assert shown["95th percentile [m]"] == number(np.percentile(rows.rmse_m, 95))
+        assert shown["bound [m]"] == number(bound)
+        assert shown["RMSE / bound"] == number(rms(rows.rmse_m) / bound, 2)
+        assert shown["heading [deg]"] == number(np.degrees(rms(rows.heading_rad)), 1)
+        assert shown["us a step"] == number(np.median(times.step_us), 0)
+        assert tables["Leaderboard", "RMSE of the position, and its bound [m]", name][place] == (
+            f"{rms(rows.rmse_m):.3f} ({bound:.3f})"
+        )
+        shown = tables[place, "Reliability", name]
+        if len(anees):
+            middle, low, high = np.median(anees), *np.percentile(anees, (25, 75))
+            inside = np.mean((rows.anees_low < rows.anees) & (rows.anees < rows.anees_high))
+            assert shown["ANEES per state"] == f"{middle:.2f} ({low:.2f} to {high:.2f})"
+            assert shown["runs consistent"] == f"{100 * inside:.0f} %"
+            assert shown["in 90 % ellipse"] == f"{100 * rows.coverage.mean():.0f} %"
+        else:
+            assert {shown[key] for key in ("ANEES per state", "runs consistent", "in 90 % ellipse")} == {""}
+        for key, count in (
+            ("diverged [%]", int(rows.diverged.sum())),
+            ("found in 30 s [%]", int((rows.converged_s <= 30).sum()) if place == "global" else None),
+        ):
+            if count is not None:
+                ends = binomtest(count, len(rows)).proportion_ci(0.95, "exact")
+                rate = [100 * value for value in (count / len(rows), *ends)]
+                assert shown[key] == "{:.1f} ({:.1f} to {:.1f})".format(*rate)
+        assert shown["lost"] == f"{100 * rows.lost_share.mean():.0f} %"
+        assert shown["failed"] == str((rows.status != "ok").sum())
+
+
+def test_the_json_of_the_page_has_the_same_numbers_in_full(made, raw):
+    found = json.loads((made[1] / "bench.json").read_text())["standings"]
+    assert len(found) == len(raw)
+    for one in found:
+        rows, _ = raw[one["scenario"], one["localizer"]]
+        assert one["runs"] == len(rows)
+        assert one["rmse_m"]["value"] == pytest.approx(rms(rows.rmse_m))
+        if one["anees"]["value"] is not None and not np.isnan(one["anees"]["value"]):
+            quartiles = np.percentile(rows.anees, (50, 25, 75))
+            assert list(one["anees"].values()) == pytest.approx(quartiles)
+
+
+def test_the_runs_that_are_told_are_those_of_the_results(made):
+    text = (made[1] / "bench.md").read_text()
+    assert "22 runs of 3 localizers in all, 0 of which failed" in text
+    assert "5 runs of 12 s in 3 sessions" in text
+    assert text.count("Some localizers have fewer runs, 3 at least: see the column runs.") == 2
+    assert "300 runs" not in text
+
+
+def test_each_curve_has_the_bound_of_its_own_row(made, raw):
+    for place in PLACES:
+        (ax,) = made[2][f"{place}_cdf"].axes
+        lines = {to_hex(line.get_color()): [] for line in ax.lines}
+        for line in ax.lines:
+            lines[to_hex(line.get_color())].append(np.asarray(line.get_xdata(), float))
+        named = {line.get_label(): to_hex(line.get_color()) for line in ax.lines}
+        for name in RUNS:
+            rows, _ = raw[place, name]
+            errors, bound = lines[named[name]]
+            np.testing.assert_allclose(errors[1:], np.clip(np.sort(rows.rmse_m), 0.01, 5))
+            expected = rms(rows.bound_smoothed_m if name == "smoother" else rows.bound_correlated_m)
+            np.testing.assert_allclose(bound, expected)
+
+
+def test_the_bound_over_time_is_that_of_causal_methods_over_all_their_runs(made):
+    table = pq.ParquetDataset(made[0] / "tracks" / "known").read().to_pandas()
+    bound = np.stack(table.query("localizer == 'ekf'").bound_m)
+    (ax,) = made[2]["known_time"].axes
+    (line,) = (line for line in ax.lines if line.get_label() == "bound, RMS")
+    np.testing.assert_allclose(line.get_ydata(), np.sqrt(np.mean(bound**2, axis=0)), rtol=1e-6)
+
+
+def test_no_text_of_the_page_is_cut(made):
+    assert "…" not in (made[1] / "bench.html").read_text()
+    assert "…" not in (made[1] / "bench.md").read_text()

@@ -1,0 +1,128 @@
+"""Localization of recordings whose magnetometer drops readings."""
+
+import json
+
+import numpy as np
+import pytest
+
+import magtwin as mt
+from magtwin.figures.localization import draw_localization
+from magtwin.localization.odometry import Odometry
+from magtwin.localization.track import track
+from magtwin.localizing import localization, thinned
+from magtwin.run.thinning import newest
+
+WITHOUT_VERDICT = ("Consistent", "TOO CONFIDENT", "cautious", "ost.", "LOST", "better", "Better")
+
+
+@pytest.fixture(scope="module")
+def run():
+    twin = mt.in_session(mt.open_twin("lab"), 2)
+    return mt.simulate(twin, "lawnmower", seed=2, duration_s=60)
+
+
+@pytest.fixture(scope="module")
+def whole(run):
+    return localization(run, "lab")
+
+
+def dropped(run, lost):
+    return run.with_columns(b_measured_nt=np.where(lost, np.nan, run["b_measured_nt"]))
+
+
+def bursts(rows):
+    """Dropouts of 0.15 s, 40 a minute."""
+    lost = np.zeros(rows, bool)
+    for first in np.random.default_rng(1).integers(rows, size=40):
+        lost[first : first + 20] = True
+    return lost
+
+
+LOST = {
+    "every third from the first": lambda rows: np.arange(rows) % 3 == 0,
+    "every third from the second": lambda rows: np.arange(rows) % 3 == 1,
+    "two of three": lambda rows: np.arange(rows) % 3 != 1,
+    "bursts": bursts,
+    "half at random": lambda rows: np.random.default_rng(0).random(rows) < 0.5,
+}
+
+
+@pytest.mark.parametrize("lost", LOST.values(), ids=LOST)
+@pytest.mark.parametrize("flagged", [False, True])
+def test_dropouts_shorter_than_an_interval_cost_no_readings(run, whole, lost, flagged):
+    lost = lost(run.rows)
+    with_gaps = run.with_columns(flag_lost_lock=lost) if flagged else dropped(run, lost)
+    made = localization(with_gaps, "lab")
+    assert made.intervals == whole.intervals == 300
+    assert made.read_share >= 299 / 300  # the first interval is the first row alone
+    # errors of one drive by one filter, on other rows of the same readings: 25 % is their scatter
+    assert made.scores.rmse_m == pytest.approx(whole.scores.rmse_m, rel=0.25)
+    assert made.report().verdict.startswith("Better than dead reckoning: ")
+    assert made.scores.bound_m["correlated"] == pytest.approx(whole.scores.bound_m["correlated"], rel=0.02)
+    names = [figure.name for figure in made.report().figures]
+    assert ("with a reading" in names) is (made.read_share < 1)
+
+
+def test_irregular_stamps_cost_no_readings(run, whole):
+    kept = np.random.default_rng(3).random(run.rows) < 0.4
+    made = localization(dropped(run.take(kept), np.arange(kept.sum()) % 2 == 0), "lab")
+    assert made.read_share > 0.99
+    assert made.scores.rmse_m == pytest.approx(whole.scores.rmse_m, rel=0.25)
+
+
+def test_a_reading_is_the_newest_of_its_interval(run):
+    lost = LOST["half at random"](run.rows)
+    made = thinned(dropped(run, lost), 5.0)
+    interval = np.ceil((run["t"] - run["t"][0]) * 5 - 1e-9)
+    for k in (1, 7, 299):
+        assert made["t"][k] == run["t"][(interval == k) & ~lost][-1]
+    assert not np.isnan(made["b_measured_nt"][1:]).any()
+
+
+def test_without_dropouts_the_last_row_of_each_interval_is_taken(run):
+    np.testing.assert_array_equal(thinned(run, 5.0)["t"], run["t"][::27])
+
+
+def test_a_stretch_without_a_good_row_gives_its_last_row():
+    good = np.array([0, 1, 1, 0, 0, 0, 1, 0], bool)
+    assert newest(np.array([0, 3, 5, 7]), good).tolist() == [0, 2, 5, 6]
+
+
+def test_a_run_without_a_reading_is_dead_reckoning_and_is_not_judged(run):
+    made = localization(dropped(run, np.ones(run.rows, bool)), "lab")
+    report = made.report()
+    assert report.verdict.startswith("Dead reckoning: no row of the run holds a reading of the field")
+    assert not any(word in report.verdict for word in WITHOUT_VERDICT)
+    printed = json.loads(report.to_json())
+    assert printed["verdict"] == report.verdict
+    assert printed["figures"]["with a reading"]["value"] == 0
+    assert printed["metadata"]["readings"].startswith("0 in ")
+    assert not {"ANEES per state", "in the 90 % ellipse", "flagged lost", "bound"} & set(printed["figures"])
+    assert "Dead reckoning: no row" in draw_localization(made).get_suptitle()
+    error = np.sqrt(np.mean(np.sum((made.track.pose - made.truth)[:, :2] ** 2, axis=1)))
+    assert printed["figures"]["position error, RMSE"]["value"] == pytest.approx(error)
+    bare = run.select("b_measured_nt", "odom_p", "odom_q_xyzw")
+    blind = localization(dropped(bare, np.ones(run.rows, bool)), "lab", prior="0,0,0.8")
+    assert blind.report().verdict == report.verdict
+    assert "Dead reckoning: no row" in draw_localization(blind).get_suptitle()
+
+
+def test_few_readings_are_told_in_the_verdict(run):
+    made = localization(dropped(run, run["t"] > 12), "lab")
+    assert made.read_share == pytest.approx(61 / 300)
+    assert made.report().verdict.endswith("Only 20% of the intervals have a reading of the field.")
+
+
+def test_a_reading_without_lock_is_not_given_to_the_method(run):
+    class Listener(Odometry):
+        def step(self, reading):
+            heard.append(reading.b_nt)
+            return super().step(reading)
+
+    heard = []
+    some = thinned(run, 5.0)
+    lost = np.arange(some.rows) % 4 == 2
+    result = localization(some.with_columns(flag_lost_lock=lost), "lab", method="odometry")
+    track(Listener(), result.problem, result.run)
+    np.testing.assert_array_equal(np.isnan(heard), lost)
+    assert result.read_share == pytest.approx(1 - lost.mean())
