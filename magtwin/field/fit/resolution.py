@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.fit.methods import FieldModel, values_of
 from magtwin.field.grid import TURN
-from magtwin.field.survey.axes import SurveyAxes
+from magtwin.field.survey.axes import WORLD, SurveyAxes
 from magtwin.field.survey.bins import spacing_m
 from magtwin.field.survey.readings import Readings
 
@@ -42,7 +42,7 @@ class Resolution:
 def resolution(
     model: FieldModel,
     readings: Readings,
-    axes: SurveyAxes,
+    axes: SurveyAxes = WORLD,
     *,
     spacing: float | None = None,
     headings_rad: ArrayLike | None = None,
