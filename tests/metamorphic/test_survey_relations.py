@@ -5,6 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from relations import SHIFT, doubled, later, moved, permuted, room, rotation, split, turned
 
+from magtwin.errors import InputError
 from magtwin.field.fit.check import check
 from magtwin.field.fit.choice import CANDIDATES, CHOSEN, RMSE
 from magtwin.field.fit.fit import fit, raster
@@ -190,6 +191,27 @@ def test_a_bias_of_all_readings_is_a_bias_of_the_field(fitted):
 def test_the_density_of_a_survey_scales_with_it():
     survey = drive()
     assert_allclose(spacing_m(survey.with_(p_xy=10 * survey.p_xy)), 10 * spacing_m(survey), rtol=1e-9)
+
+
+@pytest.mark.parametrize("degrees", [0, 90])
+def test_a_refusal_names_the_heading_in_world(degrees):
+    survey = nodes()
+    survey = survey.with_(good=(survey.node[:, 0] != 2) | (survey.node[:, 1:].sum(axis=1) == 0))
+    given = turned(survey, degrees) if degrees else survey
+    with pytest.raises(InputError, match=f"heading {180 + degrees} deg has 1 nodes"):
+        fit(given, "trilinear")
+
+
+@pytest.mark.parametrize("method", ["gp", "harmonic"])
+def test_a_fit_that_continues_from_another_has_its_axes(fitted, method):
+    model = fitted("drive", method)
+    part = drive().take(drive().p_xy[:, 0] < 0.6)
+    assert in_own_axes(part)[1] != model.axes
+    again = fit(part, method, like=model)
+    assert again.axes == model.axes
+    p, yaw = (part[places()[0][:, 0] < 0.3] for part in places())
+    value, variance = model.predict(p, yaw)
+    assert np.median(np.abs(again.predict(p, yaw)[0] - value) / np.sqrt(variance)) < 1.0
 
 
 def test_own_axes_are_their_own():

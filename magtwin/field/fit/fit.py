@@ -57,8 +57,8 @@ def fit(
     function = _checked(method, options)
     if not hasattr(function, "own_axes"):
         return fit_as_given(in_order(distinct(readings)), method, progress=progress, **options)
-    own, axes = in_own_axes(readings)
-    given = dict(options)
+    like, given = options.get("like"), dict(options)
+    own, axes = in_own_axes(readings, None if like is None else like.axes)
     if (earth_nt := options.get("earth_nt")) is not None:
         own = own.with_(earth_nt=axes.own_vector(checked_earth_nt(earth_nt)))
         del options["earth_nt"]

@@ -104,10 +104,10 @@ class SurveyAxes:
 WORLD = SurveyAxes()
 
 
-def in_own_axes(readings: Readings) -> tuple[Readings, SurveyAxes]:
-    """A survey in its own axes and order, without exact duplicates of readings, and these axes."""
+def in_own_axes(readings: Readings, axes: SurveyAxes | None = None) -> tuple[Readings, SurveyAxes]:
+    """A survey in its own axes (or `axes`) and order, without copies of readings, and these axes."""
     kept = distinct(readings)
-    axes = SurveyAxes.of(kept)
+    axes = SurveyAxes.of(kept) if axes is None else axes
     return axes.own_readings(kept), axes
 
 
