@@ -11,6 +11,7 @@ from magtwin.errors import InputError, hint
 from magtwin.field.fit.fit import fit
 from magtwin.field.fit.interpolation import check_readings
 from magtwin.field.fit.methods import METHODS, FieldModel
+from magtwin.field.survey.axes import SurveyAxes, distinct
 from magtwin.field.survey.bins import spacing_m
 from magtwin.field.survey.readings import Readings
 from magtwin.report import Figure, Report
@@ -154,8 +155,8 @@ def parts(readings: Readings, split: str) -> tuple[Rows, str]:
         return readings.run, "one run at a time"
     if split == "block":
         side = BLOCK_SPACINGS * spacing_m(readings)
-        corner = readings.p_xy[readings.good].min(axis=0)
-        i, j = np.floor((readings.p_xy - corner) / side + 1e-9).astype(np.intp).T
+        p, _ = SurveyAxes.of(distinct(readings)).own_poses(readings.p_xy, readings.yaw)
+        i, j = np.floor((p - p[readings.good].min(axis=0)) / side + 1e-6).astype(np.intp).T
         return (i + 2 * j) % BLOCKS, f"every fifth block of {side:.3g} x {side:.3g} m, in turn"
     if readings.node is None:
         raise InputError(

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.field.fit.check import parts, predict_readings, shown
 from magtwin.field.fit.covariance import Kernel
-from magtwin.field.fit.fit import fit
+from magtwin.field.fit.fit import fit_as_given
 from magtwin.field.fit.harmonic.inversion import GAIN
 from magtwin.field.fit.harmonic.layers import DIPOLES_OF_DRIVE, LEAST_DEPTH_M
-from magtwin.field.fit.methods import FieldModel
+from magtwin.field.fit.methods import FieldModel, in_own_axes
 from magtwin.field.fit.mixture import Mixture, mixed
 from magtwin.field.survey.bins import means, spacing_m
 from magtwin.field.survey.readings import Readings
@@ -62,7 +62,7 @@ class Candidate:
         else:
             more |= SHORT.get(self.method, {})
         own = readings.with_(b_body_nt=None) if self.magnitudes else readings
-        return fit(own, self.method, progress=progress, **{**self.options, **more})
+        return fit_as_given(own, self.method, progress=progress, **{**self.options, **more})
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +110,7 @@ class Trial:
         return float(100 * np.mean(np.abs(self.off) <= Z_90 * np.sqrt(self.variance)))
 
 
+@in_own_axes
 def fit_auto(
     readings: Readings,
     *,
@@ -145,7 +146,7 @@ def fit_auto(
     tried = _candidates(readings, earth_nt, kernel)
     held = _held_out(readings)
     if not held:
-        model = fit(readings, "harmonic", progress=progress, earth_nt=earth_nt)
+        model = fit_as_given(readings, "harmonic", progress=progress, earth_nt=earth_nt)
         return _told(model, {CHOSEN: "harmonic: too few readings to leave some out"})
     steps, turn = TICKS * (len(tried) + 4 * (len(held) - 1) + 2), 0
     trials, refused = list[Trial](), list[InputError]()

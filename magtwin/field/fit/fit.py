@@ -5,7 +5,7 @@ twenty times as long. Whole headings run in parallel instead.
 """
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -15,13 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.compiled import threads
 from magtwin.errors import InputError, hint
-from magtwin.field.fit.methods import METHODS, FieldModel
+from magtwin.field.fit.methods import METHODS, FieldModel, MapMethod
 from magtwin.field.fit.resolution import resolution
 from magtwin.field.grid import TURN, Grid
 from magtwin.field.maps.curvature import interpolation_error_nt2
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.survey.axes import SurveyAxes, distinct, in_order, in_own_axes
 from magtwin.field.survey.bins import distance_m, spacing_m
-from magtwin.field.survey.readings import Readings
+from magtwin.field.survey.readings import Readings, checked_earth_nt
 from magtwin.report import Figure, Report
 
 Array = NDArray[np.float64]
@@ -40,6 +41,10 @@ def fit(
 ) -> FieldModel:
     """Fit a method to the good readings of a survey.
 
+    A reading that equals another in every number, time included, is a copy and counts once. Methods see the
+    readings in an order and built-in methods also in axes of their own (`magtwin.field.survey.axes`). So the
+    field moves and turns with the survey, and the order of its rows does not matter.
+
     Args:
         readings: A survey.
         method: Name of a map method, see `magtwin.field.fit.methods`.
@@ -49,6 +54,35 @@ def fit(
     Raises:
         InputError: There is no such method or option, or the method refuses the readings.
     """
+    function = _checked(method, options)
+    if not hasattr(function, "own_axes"):
+        return fit_as_given(in_order(distinct(readings)), method, progress=progress, **options)
+    like, given = options.get("like"), dict(options)
+    own, axes = in_own_axes(readings, None if like is None else like.axes)
+    if (earth_nt := options.get("earth_nt")) is not None:
+        own = own.with_(earth_nt=axes.own_vector(checked_earth_nt(earth_nt)))
+        del options["earth_nt"]
+    try:
+        model = fit_as_given(own, method, progress=progress, **options)
+    except InputError:
+        fit_as_given(readings, method, **given)  # names places and headings in world
+        raise
+    return model.placed(axes)  # type: ignore[attr-defined, no-any-return]
+
+
+def fit_as_given(
+    readings: Readings, method: str, *, progress: Progress | None = None, **options: Any
+) -> FieldModel:
+    """`fit` in the axes and the order of the readings."""
+    function = _checked(method, options)
+    if progress is not None and "progress" in inspect.signature(function).parameters:
+        options["progress"] = progress
+    with _one_thread():
+        return function(readings, **options)
+
+
+def _checked(method: str, options: Mapping[str, Any]) -> MapMethod:
+    """The method of a name, if it has the options."""
     function = METHODS[method]
     kinds = inspect.signature(function).parameters.values()
     known = [p.name for p in kinds if p.kind is p.KEYWORD_ONLY]
@@ -56,10 +90,7 @@ def fit(
         if name not in known:
             ends = hint(name, known) if known else "it has none"
             raise InputError(f"method {method!r} has no option {name!r}; {ends}")
-    if progress is not None and "progress" in known:
-        options["progress"] = progress
-    with _one_thread():
-        return function(readings, **options)
+    return function
 
 
 def fit_map(
@@ -137,7 +168,8 @@ def raster(
     """
     say = progress or (lambda done, total, what: None)
     say(0, 1, "resolution")
-    grid, errors = _grid(model, readings, spacing_m, headings_rad, extent)
+    own, axes = in_own_axes(readings)
+    grid, errors = _grid(model, readings, own, axes, spacing_m, headings_rad, extent)
     p, _ = grid.poses()
     values, variance = np.empty(grid.shape), np.empty(grid.shape)
     headings = grid.headings_rad
@@ -148,7 +180,7 @@ def raster(
             say(h, len(headings), "headings")
             values[h], variance[h] = predicted
     say(len(headings), len(headings), "headings")
-    valid = np.isfinite(values) & np.isfinite(variance) & _known(model, readings, p[0], variance)
+    valid = np.isfinite(values) & np.isfinite(variance) & _known(model, readings, own, p[0], variance)
     if not valid.any():
         x0, x1, y0, y1 = grid.extent
         raise InputError(
@@ -192,6 +224,8 @@ def grid_report(field: AnomalyMap) -> Report:
 def _grid(
     model: FieldModel,
     readings: Readings,
+    own_readings: Readings,
+    axes: SurveyAxes,
     spacing: float | None,
     headings_rad: ArrayLike | None,
     extent: ArrayLike | None,
@@ -211,14 +245,16 @@ def _grid(
     x0, x1, y0, y1 = (float(v) for v in np.asarray(extent, float))
     if spacing is not None:
         Grid.over(extent, spacing, (0.0,))  # refuses a wrong spacing before the errors are measured
-    if spacing is None and readings.grid is None and min(x1 - x0, y1 - y0) < spacing_m(readings) / NARROW:
+    if spacing is None and readings.grid is None and min(x1 - x0, y1 - y0) < spacing_m(own_readings) / NARROW:
         raise InputError(
             f"the readings of {readings.name!r} lie on one line, x {x0:g}..{x1:g}, y {y0:g}..{y1:g} "
             "m; a map needs an area"
         )
     with _one_thread():
         largest = max(min(x1 - x0, y1 - y0), 0.0)
-        chosen = resolution(model, readings, spacing=spacing, headings_rad=headings_rad, largest_m=largest)
+        chosen = resolution(
+            model, own_readings, axes, spacing=spacing, headings_rad=headings_rad, largest_m=largest
+        )
     errors = zip(ERRORS, (chosen.nodes_nt, chosen.turn_nt), strict=True)
     known = {name: round(error, 2) for name, error in errors if np.isfinite(error)}
     lay = Grid.filling if spacing is None else Grid.over
@@ -234,13 +270,15 @@ def _only_heading(readings: Readings) -> tuple[float, ...] | None:
     return (float(yaw[0] % TURN),) if np.ptp(yaw) == 0 else None
 
 
-def _known(model: FieldModel, readings: Readings, p_xy: Array, variance: Array) -> NDArray[np.bool_]:
+def _known(
+    model: FieldModel, readings: Readings, own: Readings, p_xy: Array, variance: Array
+) -> NDArray[np.bool_]:
     """Nodes that are near enough to readings, and certain enough."""
     from scipy.spatial import cKDTree
 
     if readings.grid is not None and model.method in ("trilinear", "cubic"):
         return np.ones(variance.shape, bool)
-    good, spacing = readings.good, spacing_m(readings)
+    good, spacing = readings.good, spacing_m(own)
     far = distance_m(cKDTree(readings.p_xy[good]), p_xy)
     doubt = np.sqrt(variance) / readings.b_nt[good].std()
     known = (far <= REACH * spacing * (1 + 1e-9)) & (doubt <= MOST_DOUBT)

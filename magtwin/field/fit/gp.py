@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError
 from magtwin.field.fit.covariance import Covariance, Kernel
 from magtwin.field.fit.interpolation import check_readings
-from magtwin.field.fit.methods import FittedModel, flat_poses
+from magtwin.field.fit.methods import FittedModel, in_own_axes
 from magtwin.field.fit.nodes import variance_at_nodes
 from magtwin.field.fit.roughness import local_mean, tail
+from magtwin.field.survey.axes import WORLD, SurveyAxes
 from magtwin.field.survey.bins import GRAIN_M, Bins, bin_readings, spacing_m
 from magtwin.field.survey.readings import Readings
 
@@ -55,6 +56,7 @@ class GpModel(FittedModel):
     missed: tuple[Any, Array]
     spacing_m: float  # Spacing of the readings [m]
     method: str = "gp"  # Name of the method
+    axes: SurveyAxes = WORLD  # Axes of `poses` and `missed`
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
         """Field [nT] and its variance [nT^2] at poses; nan if a pose is nan. See `FieldModel`.
@@ -63,13 +65,13 @@ class GpModel(FittedModel):
         residuals of positions left out, since real fields are rougher in some places, and so that 90 % of all
         readings left out lie in their 90 % intervals.
         """
-        p, angle, shape = flat_poses(p_xy, yaw)
+        p, angle, shape = self.own_poses(p_xy, yaw)
         mean, variance = self._at(p, angle)
         return mean.reshape(shape), variance.reshape(shape)
 
     def predict_values(self, p_xy: ArrayLike, yaw: ArrayLike) -> Array:
         """The field of `predict` alone [nT]."""
-        p, angle, shape = flat_poses(p_xy, yaw)
+        p, angle, shape = self.own_poses(p_xy, yaw)
         return self._at(p, angle, sure=False)[0].reshape(shape)
 
     def predict_nodes(self, p_xy: Array, yaw: float) -> tuple[Array, Array]:
@@ -78,9 +80,7 @@ class GpModel(FittedModel):
         On a fine grid the variance is computed only at nodes `COARSE` apart, and interpolated.
         """
         value = self.predict_values(p_xy, yaw)
-        one = np.array([yaw])
-        step = COARSE * self.spacing_m
-        return value, variance_at_nodes(p_xy, step, lambda p: self._at(p, np.repeat(one, len(p)))[1])
+        return value, variance_at_nodes(p_xy, COARSE * self.spacing_m, lambda p: self.predict(p, yaw)[1])
 
     def _at(self, p: Array, angle: Array, *, sure: bool = True) -> tuple[Array, Array]:
         """Field [nT] and, if `sure`, its variance [nT^2] at poses (N, 2), (N,)."""
@@ -101,6 +101,7 @@ class GpModel(FittedModel):
         return mean, variance
 
 
+@in_own_axes
 def fit_gp(
     readings: Readings,
     *,

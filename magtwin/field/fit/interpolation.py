@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.field.fit.methods import FittedModel, flat_poses
+from magtwin.field.fit.methods import FittedModel, in_own_axes
 from magtwin.field.fit.roughness import Interpolation, Roughness
 from magtwin.field.grid import TURN, Grid
 from magtwin.field.maps.curvature import interpolation_error_nt2
 from magtwin.field.maps.trilinear import spread
+from magtwin.field.survey.axes import WORLD, SurveyAxes
 from magtwin.field.survey.bins import Bins, bin_readings, spacing_m
 from magtwin.field.survey.node_errors import node_errors
 from magtwin.field.survey.readings import Readings, masked_words
@@ -32,6 +33,7 @@ LEAST = 4  # Fewest readings of a map
 CUBIC_TURN = 0.009
 
 
+@in_own_axes
 def fit_trilinear(readings: Readings, *, fill: bool = False) -> "GridInterpolation | ScatterInterpolation":
     """Linear interpolation in x, y and heading; exact at the nodes of a gridded survey.
 
@@ -57,6 +59,7 @@ def fit_trilinear(readings: Readings, *, fill: bool = False) -> "GridInterpolati
     return _fit(readings, "trilinear", fill)
 
 
+@in_own_axes
 def fit_cubic(readings: Readings, *, fill: bool = False) -> "GridInterpolation | ScatterInterpolation":
     """Cubic interpolation in x and y, periodic cubic splines in heading; smooth, and exact at nodes.
 
@@ -103,6 +106,7 @@ class GridInterpolation(FittedModel):
     # Mean squared error of interpolation in the middle of a cell and midway between headings [nT^2], shape
     # (2, H, Y, X); None: that of `roughness` and `turned_nt2`
     between_nt2: Array | None
+    axes: SurveyAxes = WORLD  # Axes of the nodes
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
         """Field [nT] and its variance [nT^2] at poses; nan off the grid and in unknown cells. See
@@ -110,7 +114,7 @@ class GridInterpolation(FittedModel):
         """
         from scipy.interpolate import RectBivariateSpline
 
-        p, angle, shape = flat_poses(p_xy, yaw)
+        p, angle, shape = self.own_poses(p_xy, yaw)
         u = (p - self.grid.origin_m) / self.grid.cell_m
         last = np.array([self.grid.columns - 1, self.grid.rows - 1])
         inside = np.all((u >= -EDGE) & (u <= last + EDGE), axis=1) & np.isfinite(angle)
@@ -164,10 +168,11 @@ class ScatterInterpolation(FittedModel):
     place_nt2: Array  # Variance of these values [nT^2], shape (M,)
     wave_nt: Array  # Coefficients of cos yaw, sin yaw, cos 2 yaw, sin 2 yaw [nT], shape (4,)
     roughness: Roughness  # Error of interpolation between the vertices
+    axes: SurveyAxes = WORLD  # Axes of the vertices and of the wave
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
         """Field [nT] and its variance [nT^2] at poses; nan outside the convex hull. See `FieldModel`."""
-        p, angle, shape = flat_poses(p_xy, yaw)
+        p, angle, shape = self.own_poses(p_xy, yaw)
         finite = np.all(np.isfinite(p), axis=1)
         at = np.where(finite[:, None], p, self.p_xy[0])
         mean = _triangles(self.method)(self.p_xy, self.b_nt, at) + _waves(angle) @ self.wave_nt
@@ -317,7 +322,7 @@ def _fit_scattered(readings: Readings, method: str) -> ScatterInterpolation:
             "readings": int(readings.good.sum()),
             "places": len(bins.p_xy),
             "bin_m": cell,
-            "wave_nt": wave.tolist(),
+            "wave_nt": [float(np.hypot(*pair)) for pair in wave.reshape(2, 2)],
             "noise_nt": round(float(np.sqrt(noise)), 3),
         },
         noise_nt2=noise,

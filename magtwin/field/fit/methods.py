@@ -10,18 +10,22 @@ An installed package announces its methods as entry points of the group `magtwin
 """
 
 import math
-from collections.abc import Mapping
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.extend import Registry
+from magtwin.field.survey.axes import WORLD, SurveyAxes
 from magtwin.field.survey.readings import Readings
 from magtwin.summary import Summarized, Summary, printable
 
 Array = NDArray[np.float64]
+Method = TypeVar("Method", bound=Callable[..., Any])
+Model = TypeVar("Model", bound="FittedModel")
 
 
 class FieldModel(Protocol):
@@ -81,12 +85,31 @@ METHODS: Registry[MapMethod] = Registry(
 map_method = METHODS.register  # Decorator that names a map method
 
 
+def in_own_axes(method: Method) -> Method:
+    """Decorate a map method that `fit` gives the survey in its own axes (`SurveyAxes`).
+
+    Its models are `FittedModel`, and `FittedModel.placed` takes them into the world.
+    """
+    method.own_axes = True  # type: ignore[attr-defined]
+    return method
+
+
 class FittedModel(Summarized):
-    """Summary of the built-in methods' models: method, parameters and noise."""
+    """A built-in method's model: axes, and a summary of method, parameters and noise."""
 
     method: Any
     parameters: Any
     noise_nt2: Any
+    axes: SurveyAxes = WORLD  # Axes in which it was fitted
+
+    def placed(self: Model, axes: SurveyAxes) -> Model:
+        """The model for poses in world, if it was fitted in `axes`."""
+        return replace(self, axes=axes)  # type: ignore[type-var, return-value]
+
+    def own_poses(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
+        """Rows of poses in the model's axes, and the shape of the poses; see `flat_poses`."""
+        p, angle, shape = flat_poses(p_xy, yaw)
+        return *self.axes.own_poses(p, angle), shape
 
     def _summary(self) -> Summary:
         figures = [f"{name} {value}" for name, value in self.parameters.items()]

@@ -1,13 +1,14 @@
 """Mixture: the weighted mean of two fits, where their errors differ."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.fit.methods import FieldModel, FittedModel, values_of
+from magtwin.field.survey.axes import SurveyAxes
 
 Array = NDArray[np.float64]
 
@@ -41,6 +42,12 @@ class Mixture(FittedModel):
             parameters |= {f"{model.method} {name}": value for name, value in model.parameters.items()}
         parameters["weights"] = [float(w) for w in weights]
         return cls(models=tuple(models), weights=tuple(weights), parameters=parameters)
+
+    def placed(self, axes: SurveyAxes) -> "Mixture":
+        """The mixture for poses in world, if its fits were made in `axes`."""
+        placed = [model.placed(axes) for model in self.models]  # type: ignore[attr-defined]
+        mixture = Mixture.of(placed, self.weights)
+        return replace(mixture, parameters={**self.parameters, **mixture.parameters})
 
     @property
     def method(self) -> str:

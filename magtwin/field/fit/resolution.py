@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.fit.methods import FieldModel, values_of
 from magtwin.field.grid import TURN
+from magtwin.field.survey.axes import WORLD, SurveyAxes
 from magtwin.field.survey.bins import spacing_m
 from magtwin.field.survey.readings import Readings
 
@@ -41,6 +42,7 @@ class Resolution:
 def resolution(
     model: FieldModel,
     readings: Readings,
+    axes: SurveyAxes = WORLD,
     *,
     spacing: float | None = None,
     headings_rad: ArrayLike | None = None,
@@ -51,19 +53,19 @@ def resolution(
     The error of linear interpolation is measured on the fitted field, at positions of the readings, and must
     be below `SHARE` of the fit's standard deviation. If no choice reaches this, the finest is used. Of a
     spacing [m] or headings [rad] that the caller gives, only the error is measured. `largest_m` is the widest
-    spacing that leaves a cell.
+    spacing that leaves a cell. `readings` are in `axes`, the model in world.
     """
-    p, yaw, part = _probes(readings)
+    p, yaw, part = _probes(readings, axes)
     value, variance = model.predict(p, yaw)
     known = np.isfinite(value) & np.isfinite(variance)
     sd = float(np.sqrt(np.median(variance[known]))) if known.any() else float("nan")
 
     def between_nodes(step: float) -> float:
-        corner = p - part[:, :2] * step
+        corner = p - step * part @ axes.turn.T
         mixed = np.zeros(len(p))
         for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
             weight = np.abs(1 - i - part[:, 0]) * np.abs(1 - j - part[:, 1])
-            mixed += weight * values_of(model, corner + step * np.array([i, j]), yaw)
+            mixed += weight * values_of(model, corner + step * axes.turn @ [i, j], yaw)
         return _rms(mixed - value)
 
     def between_headings(headings: Array) -> float:
@@ -83,7 +85,8 @@ def resolution(
     else:
         step, nodes = float(spacing), between_nodes(float(spacing))
     if headings_rad is None:
-        evenly: list[Array] = [TURN / n * np.arange(n, dtype=float) for n in HEADINGS]
+        main = axes.main_heading_rad(readings)
+        evenly = [main % (TURN / n) + TURN / n * np.arange(n, dtype=float) for n in HEADINGS]
         headings, turn = _first_good(((h, between_headings(h)) for h in evenly), sd)
     else:
         headings = np.asarray(headings_rad, float).ravel()
@@ -101,12 +104,12 @@ def _first_good(tried: Iterable[tuple[Choice, float]], sd: float) -> tuple[Choic
     return choice, error
 
 
-def _probes(readings: Readings) -> tuple[Array, Array, Array]:
-    """Positions of readings (K, 2), even headings (K,), and positions within a cell from 0 to 1 (K, 2)."""
+def _probes(readings: Readings, axes: SurveyAxes) -> tuple[Array, Array, Array]:
+    """Positions of readings in world (K, 2), even headings (K,), and positions in a cell, 0 to 1 (K, 2)."""
     rows = np.flatnonzero(readings.good)
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, PROBES).astype(np.intp))]
     even = np.mod(0.5 + np.arange(1, len(rows) + 1)[:, None] * GOLDEN, 1.0)
-    return readings.p_xy[rows], TURN * even[:, 2], even[:, :2]
+    return axes.world_xy(readings.p_xy[rows]), TURN * even[:, 2] + axes.yaw_rad, even[:, :2]
 
 
 def _rms(error: Array) -> float:

@@ -107,24 +107,27 @@ def means(good: Readings, depth_m: float) -> tuple[NDArray[np.intp], bool]:
 
     A reading of a gridded survey stands alone. Readings of a drive are averaged along the way. A long drive
     passes each place often; its readings are averaged by place and heading instead, since longer means along
-    the way would blur the field. Distances count in `depth_m`, that of the first layer of dipoles.
+    the way would blur the field. So are readings without times, whose way is unknown. Distances count in
+    `depth_m`, that of the first layer of dipoles.
     """
     if good.node is not None:
         return np.arange(len(good)), False
-    along = _along(good, CELL * depth_m, LONGEST * depth_m)
-    if along is not None:
-        return along, True
-    side = BIN * depth_m
+    side, most = CELL * depth_m, MOST_MEANS
+    if good.t is not None:
+        along = _along(good, good.t, side, LONGEST * depth_m)
+        if along is not None:
+            return along, True
+        side, most = BIN * depth_m, MOST_BINS
     while True:
         bins, cell = bin_readings(good, side, sectors=SECTORS)
-        if len(bins.count) <= MOST_BINS:
+        if len(bins.count) <= most:
             return cell, False
         side *= WIDEN
 
 
-def _along(good: Readings, way_m: float, longest_m: float) -> NDArray[np.intp] | None:
+def _along(good: Readings, t: Array, way_m: float, longest_m: float) -> NDArray[np.intp] | None:
     """Means along the way; None if they would be longer than `longest_m`."""
-    order = np.lexsort((np.arange(len(good)) if good.t is None else good.t, good.run))
+    order = np.lexsort((t, good.run))
     step = np.linalg.norm(np.diff(good.p_xy[order], axis=0), axis=1)
     step += TURN_M * np.abs(wrap_angle(np.diff(good.yaw[order])))
     other = np.diff(good.run[order]) != 0

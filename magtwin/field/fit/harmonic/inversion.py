@@ -31,6 +31,7 @@ from magtwin.field.fit.harmonic.layers import Layers, ladders, layers_below
 from magtwin.field.fit.harmonic.model import HarmonicModel
 from magtwin.field.fit.harmonic.problem import Hyperparameters, Platform, Problem
 from magtwin.field.fit.harmonic.solution import Solution
+from magtwin.field.fit.methods import in_own_axes
 from magtwin.field.survey.readings import Readings, checked_earth_nt
 
 Array = NDArray[np.float64]
@@ -47,6 +48,7 @@ STILL = 0.03
 GAIN = 3.0
 
 
+@in_own_axes
 def fit_harmonic(
     readings: Readings,
     *,

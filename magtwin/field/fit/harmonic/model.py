@@ -1,7 +1,7 @@
 """HarmonicModel: a fitted harmonic field, its predictions and their variance."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,10 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.field.fit.harmonic.forward import Forward
 from magtwin.field.fit.harmonic.layers import Layers
 from magtwin.field.fit.harmonic.problem import Hyperparameters
-from magtwin.field.fit.methods import FittedModel, flat_poses
+from magtwin.field.fit.methods import FittedModel
 from magtwin.field.fit.nodes import variance_at_nodes
 from magtwin.field.grid import TURN
 from magtwin.field.sources.harmonic import HarmonicField
+from magtwin.field.survey.axes import WORLD, SurveyAxes
 
 Array = NDArray[np.float64]
 
@@ -49,14 +50,40 @@ class HarmonicModel(FittedModel):
     turned: float
     untold: str = ""  # Why the vector field is unknown; "" if it is known
     method: str = "harmonic"  # Name of the method
+    axes: SurveyAxes = WORLD  # Axes of `forward`, `layers`, `unknowns`, `prior_sd`, `learnt`, `headings_rad`
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
         """Field magnitude as the survey's robot reads it [nT], and its variance without noise [nT^2]. See
         `FieldModel`.
         """
-        p, yaw, shape = flat_poses(p_xy, yaw)
+        p, yaw, shape = self.own_poses(p_xy, yaw)
         value, variance = self._read(p, yaw)
         return value.reshape(shape), self._corrected(variance, yaw).reshape(shape)
+
+    def placed(self, axes: SurveyAxes) -> "HarmonicModel":
+        """The model for poses in world, with its field in world, if it was fitted in `axes`."""
+        turn, field, count = np.eye(3), self.field, self.field.m_world.size
+        turn[:2, :2] = axes.turn
+        uniform = turn @ field.b_uniform_nt
+        rows = np.zeros((3, len(self.unknowns)))
+        rows[:, count : count + 3] = turn
+        return replace(
+            self,
+            axes=axes,
+            field=replace(
+                field,
+                p_world_dipole=np.column_stack(
+                    [axes.world_xy(field.p_world_dipole[:, :2]), field.p_world_dipole[:, 2]]
+                ),
+                m_world=field.m_world @ turn.T,
+                b_uniform_nt=uniform,
+            ),
+            parameters={
+                **self.parameters,
+                "uniform field [nT]": np.round(uniform, 1).tolist(),
+                "uniform field, sd [nT]": np.round(np.sqrt(self._variance(rows)), 1).tolist(),
+            },
+        )
 
     def predict_nodes(self, p_xy: Array, yaw: float) -> tuple[Array, Array]:
         """`predict` on evenly spaced nodes, several times faster.
@@ -72,9 +99,9 @@ class HarmonicModel(FittedModel):
         """
         value = self.field.magnitude_nt(p_xy, yaw, compiled=True)
         depth = np.abs(self.forward.p_world_dipole[:, 2] - self.forward.height_m).min()
-        turned = np.array([yaw])
+        turned = np.array([yaw]) - self.axes.yaw_rad
         variance = variance_at_nodes(
-            p_xy, COARSE * depth, lambda p: self._read(p, np.repeat(turned, len(p)))[1]
+            p_xy, COARSE * depth, lambda p: self._read(*self.own_poses(p, yaw)[:2])[1]
         )
         return value, self._corrected(variance, turned)
 
@@ -101,11 +128,13 @@ class HarmonicModel(FittedModel):
         if self.untold:
             return np.full(p.shape, np.nan), np.full(p.shape, np.inf)
         value = self.field.field_nt(p)
-        points, variance = p.reshape(-1, 3), np.empty(p.shape)
+        points, variance = p.reshape(-1, 3).copy(), np.empty(p.shape)
+        points[:, :2] = self.axes.own_poses(points[:, :2], 0.0)[0]
         flat = variance.reshape(-1, 3)
         for start in range(0, len(points), BLOCK):
             part = slice(start, start + BLOCK)
             rows = self.forward.vectors(points[part])
+            rows[:, :2] = np.einsum("ij,njp->nip", self.axes.turn, rows[:, :2])
             flat[part] = VECTOR_WIDTH * self._variance(rows.reshape(-1, rows.shape[-1])).reshape(-1, 3)
         return value, variance
 
