@@ -31,6 +31,7 @@ Progress = Callable[[int, int, str], Any]
 NARROW = 5.0  # Readings lie on a line if their extent is below their spacing over this
 REACH = 2.0  # Largest distance from a known node to a good reading, in spacings of the readings
 MOST_DOUBT = 0.5  # Largest standard deviation of a known node, as a share of the readings' own
+FLAT_NT = 50.0  # Least scale of that share, for fields that hardly change [nT]
 # Parameters of a map: RMS errors of linear interpolation
 ERRORS = ("error between nodes [nT]", "error between headings [nT]")
 MOST_THREADS = 4  # Headings of a raster that are computed in parallel: each holds blocks of 100 MB
@@ -280,7 +281,7 @@ def _known(
         return np.ones(variance.shape, bool)
     good, spacing = readings.good, spacing_m(own)
     far = distance_m(cKDTree(readings.p_xy[good]), p_xy)
-    doubt = np.sqrt(variance) / readings.b_nt[good].std()
+    doubt = np.sqrt(variance) / max(float(readings.b_nt[good].std()), FLAT_NT)
     known = (far <= REACH * spacing * (1 + 1e-9)) & (doubt <= MOST_DOUBT)
     if not good.all():
         none = distance_m(cKDTree(readings.p_xy[~good]), p_xy)

@@ -1,5 +1,7 @@
 """The front door of all methods, and the maps that come out of it."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -83,6 +85,14 @@ def test_a_drive_becomes_a_map_that_ends_where_the_readings_do(method):
     middle = np.broadcast_to(np.abs(p).max(axis=-1) < 0.7, field.valid.shape)
     assert field.valid[middle].all()
     assert np.sqrt(np.mean((field.values_nt[middle] - truth(p, yaw)[middle]) ** 2)) < 60
+
+
+@pytest.mark.parametrize("method", ["trilinear", "gp", "harmonic"])
+def test_a_field_without_any_change_is_mapped(method):
+    flat = dataclasses.replace(drive(300), b_nt=np.full(300, 43_000.0), b_body_nt=None)
+    field = raster(fit(flat, method), flat, spacing_m=0.5, headings_rad=[0.0, 3.0])
+    assert field.valid.any()
+    assert_allclose(field.values_nt[field.valid], 43_000, atol=5)  # a tenth of `FLAT_NT`
 
 
 def test_a_survey_of_one_heading_makes_a_map_of_one_layer():

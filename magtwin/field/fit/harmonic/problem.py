@@ -173,7 +173,7 @@ class Problem:
         # a white layer of density s per metre makes a field of variance 3 (1e2 s)^2 pi / (8 d^4) or so
         density = max(spread, 1.0) * depth**2 / 100
         return Hyperparameters(
-            noise_nt=max(spread / 50, 1e-3),
+            noise_nt=max(spread, 5.0) / 50,
             position_m=0.01,
             heading_rad=0.02 if np.any(self.rest_sd[3:]) else 0.0,
             freedom=8.0,

@@ -21,6 +21,7 @@ DRAWN = 0.005  # Weight of the layer's strength relative to that of the dipoles 
 TAILS = np.geomspace(4.0, 48.0, 13)  # Degrees of freedom of Student's t that are tried
 SETTLED = 0.2  # Gain of the log posterior below which Gauss-Newton has converged
 STEPS = 30  # Most steps until then
+LEAST_NOISE_NT = 0.1  # Below it, the prior of the uniform field leaves double precision [nT]
 FIRST_STEPS = 4  # Gauss-Newton steps before learning begins
 # Logarithms of the widths that are tried, as factors of the posterior's variances
 WIDTHS = np.linspace(-np.log(16), np.log(16), 161)
@@ -209,7 +210,7 @@ class Solution:
         half = TAILS / 2
         freedom = float(TAILS[np.argmax(half * np.log(half) - gammaln(half) + half * tail)])
         learnt = Hyperparameters(
-            noise_nt=float(figures.noise_nt * scale[0]),
+            noise_nt=max(float(figures.noise_nt * scale[0]), LEAST_NOISE_NT),
             position_m=float(figures.position_m * scale[1]),
             heading_rad=float(figures.heading_rad * scale[2]),
             freedom=freedom,
