@@ -214,4 +214,5 @@ class LiveRobot:
             known["b_sd_nt"] = np.hypot(sd, self._noise_sd_nt)
             if beyond is not None:
                 known["flag_out_of_distribution"] = beyond
-        return Run({**self._sensing.read(columns, predicted, self._model_error), **known}, self._metadata)
+        read = self._sensing.read(columns, predicted, self._model_error)
+        return Run({**read, **known}, self._metadata, self._sensing.specs)
