@@ -139,7 +139,11 @@ DRAWN = "b_model_error_nt"
 ERRORS: Mapping[str, tuple[str, tuple[str, ...], str]] = MappingProxyType(
     {
         "map": ("b_map_nt", ("b_truth_nt",), "error of the map at the sensor"),
-        "disturbance": ("b_total_nt", (UNMODELLED, "b_truth_nt"), "error of the prediction, map plus network"),
+        "disturbance": (
+            "b_total_nt",
+            (UNMODELLED, "b_truth_nt"),
+            "error of the prediction, map plus network",
+        ),
         "model error": (DRAWN, (), "error drawn for the network's prediction"),
         "noise": ("b_measured_nt", ("b_total_nt", DRAWN), "noise of the sensor"),
         "total": ("b_measured_nt", ("b_truth_nt",), "error of the reading"),

@@ -19,7 +19,7 @@ from magtwin.run.figures import prediction_nt, run_report
 from magtwin.run.resample import RULES, Interpolation, bracket, check_instants, grid
 from magtwin.run.summary import run_summary
 from magtwin.summary import Summarized, Summary
-from magtwin.verdict import Tally
+from magtwin.verdict import OWN, Tally
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -504,7 +504,8 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         tally.than = "the map plus the mean disturbance in the training data" if mean else "the map alone"
         for rows in mapped.parts(self.rows):
             level, truth, sd = (self[name][rows] for name in ("b_map_nt", "b_truth_nt", "b_sd_nt"))
-            tally.add(prediction_nt(self, rows) - truth, level + mean - truth, sd)
+            whose = str(self.metadata.get("network_intervals", OWN))
+            tally.add(prediction_nt(self, rows) - truth, level + mean - truth, sd, whose)
 
     def _derived(self, step: str, columns: Mapping[str, NDArray[Any]] | None = None) -> "Run":
         """This run after a step, which is noted in its metadata."""
