@@ -42,6 +42,7 @@ def verdict(
     naive_mae_nt: float,
     *,
     than: str = "the naive mean",
+    measure: str = "mean error",
     interval: tuple[float, float] | None = None,
     coverage: float = math.nan,
     holds: tuple[float, float] = HOLDS,
@@ -54,6 +55,7 @@ def verdict(
         mae_nt: Mean absolute error of the model [nT].
         naive_mae_nt: Mean absolute error of the naive model on the same readings [nT].
         than: Name of the naive model.
+        measure: Name of the two errors, if they are others than mean absolute ones.
         interval: Confidence interval of the ratio of the two errors. The models count as equal if it contains
             1; without an interval, if the ratio is within `EVEN` of 1.
         coverage: Share of readings within the model's 90 % intervals, 0 to 1; nan if it predicts none.
@@ -71,7 +73,7 @@ def verdict(
     least, most = ratio - EVEN, ratio + EVEN
     if interval is not None and all(map(math.isfinite, interval)):
         least, most = interval
-    sizes = f"mean error {mae_nt:,.0f} nT against {naive_mae_nt:,.0f} nT, a ratio of {ratio:.2f}"
+    sizes = f"{measure} {mae_nt:,.0f} nT against {naive_mae_nt:,.0f} nT, a ratio of {ratio:.2f}"
     if most < 1:
         text = f"Better than {than}: {sizes}."
     elif least > 1:

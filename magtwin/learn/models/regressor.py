@@ -108,7 +108,7 @@ def summary_of(net: Any, title: str, *metadata: tuple[str, str]) -> Summary:
     error = (
         "unknown"
         if math.isnan(net.residual_sd_nt)
-        else f"{net.residual_sd_nt:.4g} nT rms on held-out recordings"
+        else f"{net.residual_sd_nt:.4g} nT rms on {getattr(net, 'judged_on', 'held-out recordings')}"
     )
     trained = [
         f"{name} {net.metadata[name]}"
