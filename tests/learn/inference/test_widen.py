@@ -1,4 +1,4 @@
-"""Intervals on robots that a model was not trained on: learned, kept in its file, used on every other robot."""
+"""Intervals on robots that a model was not trained on: learned, kept in its file, used on other robots."""
 
 import json
 
