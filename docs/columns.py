@@ -43,6 +43,10 @@ ERRORS = """Each error has its own column. Where all are known:
     b_total_nt = b_map_nt + b_disturbance_nt
     b_measured_nt = b_total_nt + b_model_error_nt + b_noise_nt
     b_truth_nt = |b_vector_nt|, and = b_total_nt of a physical magnetometer
+
+A neural run with fields that its network does not know (a plant, the iron of other robots, custom
+interference) also has `b_unmodelled_nt`, their part of b_disturbance_nt. The error of the prediction is
+b_total_nt - b_unmodelled_nt - b_truth_nt.
 """
 
 

@@ -337,7 +337,7 @@ def _predictions(network: "NeuralMagnetometer") -> Predict:
     """A function from a table of robots to a network's predictions and their standard deviations."""
 
     def predictions(table: Run) -> tuple[Array, Array]:
-        (read,) = network.read([table], outside=False)
+        (read,) = network.read([table], outside=False, known=[True])
         return read.disturbance_nt, read.sd_nt
 
     return predictions

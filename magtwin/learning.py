@@ -15,7 +15,7 @@ import numpy as np
 
 from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import existing, sha256
+from magtwin.files import existing, read_text, sha256
 from magtwin.io.formats import read_run
 from magtwin.io.surveys.maps import map_file, open_map
 from magtwin.learn.data.alignment import Alignment
@@ -38,9 +38,11 @@ from magtwin.learn.evaluation.evaluation import Evaluation
 from magtwin.learn.evaluation.trials import check_apart, trials_of, unlearned, unseen
 from magtwin.learn.inference.calibrate import calibrate as calibrate_model
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
+from magtwin.learn.inference.widen import widened
 from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.predictor import Predictor, load_predictor
-from magtwin.outputs import check_free
+from magtwin.learn.training.model_card import widened_card
+from magtwin.outputs import check_free, output, transaction
 from magtwin.run.run import Run
 from magtwin.spec.scene import Scene
 from magtwin.twin import Twin, check_scene, in_session_of, open_twin, scene_file
@@ -279,6 +281,51 @@ def calibrate(
     if out is not None:
         calibrated.save(out, force=force)
     return calibrated
+
+
+def widen(
+    model: File | Predictor,
+    recordings: Mapping[str, Run] | Sequence[File] | File,
+    *,
+    anomaly_map: AnomalyMap | File,
+    out: File | None = None,
+    force: bool = False,
+) -> Predictor:
+    """Learn a model's intervals on robots that it was not trained on, from recordings of such robots.
+
+    `run`, `evaluate` and the ROS node then use these intervals on every robot but that of the training.
+    Predictions do not change; see `magtwin.learn.inference.widen`.
+
+    Args:
+        model: A model, or its weights file. If a model card is beside the file, `out` gets one too.
+        recordings: Runs by name, or files of runs, of at least 4 robots or plants.
+        anomaly_map: The map that the model was trained on: a map layer, a stage, or a folder of survey CSVs.
+        out: Weights file to write, .safetensors.
+        force: Replace existing files.
+
+    Raises:
+        InputError: A file cannot be read, the model is a mixed one, which learns this in its training, the
+            map is another, there are too few robots, or a file exists.
+    """
+    if out is not None:
+        check_free(out, force=force)
+    card, before = None, ""
+    if isinstance(model, str | os.PathLike):
+        path = existing(model, "weights file")
+        model, card, before = load_predictor(path), path.with_suffix(".md"), sha256(path)
+    sources = sources_of(recordings) if isinstance(recordings, Mapping) else sources_of_files(recordings)
+    field = anomaly_map if isinstance(anomaly_map, AnomalyMap) else open_map(anomaly_map)
+    wide = widened(model, sources, field)
+    if out is not None:
+        with transaction():
+            with output(out, force=force) as weights:
+                wide.save(weights)
+                after = sha256(weights)
+            if card is not None and card.is_file():
+                text = widened_card(read_text(card, "model card", "text"), before, after, wide)
+                with output(Path(out).with_suffix(".md"), force=force) as copied:
+                    copied.write_text(text, encoding="utf-8")
+    return wide
 
 
 @dataclass(frozen=True)

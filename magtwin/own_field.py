@@ -61,6 +61,6 @@ def _with_network(run: Run, weights: str, problem: Problem) -> Run:
         pose = track(load_localizer(PILOT), problem, run).pose
         slopes = np.asarray(problem.belief.gradient(pose[:, :2], pose[:, 2]), float)[:, :2]
         told = told.with_columns(yaw=pose[:, 2], b_map_gradient_nt_m=into_base(slopes, pose[:, 2]))
-    (made,) = network.read([told], outside=False)
-    columns = {"disturbance_nt": made.disturbance_nt, "disturbance_sd_nt": made.sd_nt}
+    (made,) = network.read([told], outside=False, known=[network.knows(run.metadata)])
+    columns = {"disturbance_nt": made.disturbance_nt, "disturbance_sd_nt": made.stated_sd_nt}
     return run.with_columns(**columns).with_specs(**DISTURBANCE_COLUMNS)

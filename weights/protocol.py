@@ -17,6 +17,7 @@ import argparse
 import shlex
 import shutil
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -46,6 +47,10 @@ TRAINING = ("sine", "lawnmower", "figure8", "continuous_cycle", "random")
 
 SESSIONS, RUNS, SECONDS, RATE_HZ = 12, 75, 60, 20
 """Training recordings: 75 min, as published. Readings at 135 Hz are too correlated to be worth the time."""
+
+PLANTS, PLANT_SESSIONS, PLANT_SECONDS, PLANT_RATE_HZ = range(101, 117), 5, 120, 8
+"""Robots with the effects of all families of plants, from which intervals on other robots are learned. The
+seeds are apart from 0, the default, which others are judged by."""
 
 TEST_SESSIONS = 12
 """Test sessions, in each of which the robot drives the paths of the paper's Table 1 once."""
@@ -178,20 +183,43 @@ def protocol(
         "--out",
         out / "hybrid_set",
     )
-    weights = [out / f"{name}.safetensors" for name in SHIPPED]
+    trained = [out / "trained" / f"{name}.safetensors" for name in SHIPPED]
     leak = out / "leak.safetensors"
     licence = ("--licence", "Apache-2.0")
     paper = (*licence, "--model", "paper", "--epochs", max(8 // shorter, 2))
     hybrid = (*licence, "--model", "hybrid", "--features", "platform", "--dropout", 0.2)
     slowly = ("--lr", 3e-4, "--epochs", max(12 // shorter, 2))
-    do("train", out / "paper_set", *paper, "--out", weights[0])
-    do("train", out / "hybrid_set", *hybrid, *slowly, "--out", weights[1])
+    do("train", out / "paper_set", *paper, "--out", trained[0])
+    do("train", out / "hybrid_set", *hybrid, *slowly, "--out", trained[1])
     do("train", out / "paper_set", *paper, "--split", "row", "--out", leak)
+    weights = widened(stage, trained, (trilinear, harmonic), out, shorter=shorter)
     given = [*weights, *([released] if released else [])]
     do(
         *("evaluate", *given, "--runs", out / "test", "--map", trilinear, harmonic),
         *("--train", out / "paper_set", "--scene", stage, "--out", out / "report"),
     )
+
+
+def widened(
+    stage: Path, weights: Sequence[Path], maps: Sequence[Path], out: Path, *, shorter: int = 1
+) -> list[Path]:
+    """Learn the intervals of trained weights on other robots; returns the new files.
+
+    Args:
+        stage: The twin.
+        weights: The weights.
+        maps: The map that each was trained on.
+        out: Folder of the new files, and of `plants`.
+        shorter: Divisor of the number of plants.
+    """
+    plants = [out / "plants" / f"all_{k}" for k in PLANTS[: max(len(PLANTS) // shorter, 4)]]
+    by_physics = ("--magnetometer", "physical", "--rate-hz", PLANT_RATE_HZ, "--duration-s", PLANT_SECONDS)
+    drives = ("--count", PLANT_SESSIONS, "--sessions", PLANT_SESSIONS, *by_physics)
+    for k, folder in zip(PLANTS, plants, strict=False):
+        do("sweep", stage, "--plant", f"all:{k}", "--out", folder, *drives, "--seed", 10 * k)
+    for file, field in zip(weights, maps, strict=True):
+        do("network", "widen", file, "--runs", *plants, "--map", field, "--out", out / file.name)
+    return [out / file.name for file in weights]
 
 
 def main() -> None:

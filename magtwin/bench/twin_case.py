@@ -34,6 +34,9 @@ STREAMS = ("odometry", "noise", "prior", "map", "kidnap", "moved", "localizer")
 SESSION = 7
 """Second word of the seed of what a session has in common."""
 
+ROBOT = ("platform_sha256", "sensor_m", "plant", "session")
+"""Metadata of a drive by which a network knows the robot of its training."""
+
 Place = tuple[str, str, str]
 """Stage of a scene, its lab and the epoch of its map, as `open_twin` takes them."""
 
@@ -93,7 +96,8 @@ def twin_case(scenario: Scenario, scene: str, seed: int, session: int, fields: P
             "odom_q_xyzw": quat_from_yaw(odometry[:, 2]),
             "b_measured_nt": b,
             **{name: drive[name][rows] for name in keep},
-        }
+        },
+        {name: drive.metadata[name] for name in ROBOT if name in drive.metadata},
     )
     problem = Problem(
         belief=_belief(scenario, place, fields, rngs["map"]),

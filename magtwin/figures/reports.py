@@ -29,7 +29,8 @@ from magtwin.figures.canvas import (
 )
 from magtwin.figures.page import Page, Section, Table
 from magtwin.figures.runs import field_name, pictures_of_run, position_name
-from magtwin.run.compare import ERRORS, Agreement, Comparison, Traversals, errors_of
+from magtwin.run.compare import ERRORS, Agreement, Comparison, Traversals, errors_of, terms_of
+from magtwin.run.figures import prediction_nt
 from magtwin.run.run import COLUMNS, Metadata, Run
 
 MOST_SPANS = 12
@@ -159,11 +160,11 @@ def _section(named: NamedRun, pictures: bool) -> Section:
     errors = errors_of(run)
     if errors:
         rows = tuple((name, ERRORS[name][2], *_measures(row), row.count) for name, row in errors.items())
-        terms = (f"{name} = {' - '.join((ERRORS[name][0], *ERRORS[name][1]))}" for name in errors)
+        terms = (f"{name} = {' - '.join(terms_of(run, name))}" for name in errors)
         note = f"Each error is the difference of columns: {'; '.join(terms)}"
         coverage = _coverage(run)
         if coverage is not None:
-            note += f". {100 * coverage:.1f} % of the total errors lie within 2 predicted standard deviations"
+            note += f". {100 * coverage:.1f} % of the predictions lie within 2 of their standard deviations"
         head = ("source", "meaning", *(f"{name} [nT]" for name in MEASURES), "readings")
         tables.append(Table("Errors by source", head, rows, note + "."))
     events = tuple(
@@ -224,7 +225,7 @@ def _coverage(run: Run) -> float | None:
     """Share of the predictions whose error lies within twice its predicted standard deviation."""
     if not {"b_sd_nt", "b_total_nt", "b_truth_nt"} <= set(run):
         return None
-    error, sd = run["b_total_nt"] - run["b_truth_nt"], run["b_sd_nt"]
+    error, sd = prediction_nt(run) - run["b_truth_nt"], run["b_sd_nt"]
     known = np.isfinite(error) & np.isfinite(sd)
     return float(np.mean(np.abs(error[known]) <= 2 * sd[known])) if known.any() else None
 

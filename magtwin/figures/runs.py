@@ -35,6 +35,7 @@ from magtwin.figures.canvas import (
 from magtwin.figures.maps import draw_cells, mean_field_ut
 from magtwin.run import mapped
 from magtwin.run.compare import FIELDS, POSITIONS
+from magtwin.run.figures import prediction_nt
 from magtwin.run.run import Run
 
 MOST_OTHER = 4
@@ -166,7 +167,7 @@ def panels_of(run: Run) -> list[Panel]:
         )
         band = None
         if _has(run, "b_sd_nt", "b_total_nt"):
-            low, high = ((run["b_total_nt"] + k * run["b_sd_nt"]) / 1000 for k in (-2, 2))
+            low, high = ((prediction_nt(run) + k * run["b_sd_nt"]) / 1000 for k in (-2, 2))
             band = low, high
         text = "field\n[µT]" if len(curves) > 1 else f"{curves[0][0]} field\n[µT]"
         panels.append(Panel("Field", text, curves, 2.0, band))

@@ -65,9 +65,7 @@ class Listed:
         self.paths |= other.paths
         self.sessions |= other.sessions
         self.driven_s += other.driven_s
-        for name in ("readings", "error_nt", "naive_nt", "within", "with_sd"):
-            setattr(self.tally, name, getattr(self.tally, name) + getattr(other.tally, name))
-        self.tally.than = other.tally.than if other.tally.readings else self.tally.than
+        self.tally.extend(other.tally)
 
     def to_json(self) -> bytes:
         """As `from_json` reads it."""

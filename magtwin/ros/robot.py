@@ -23,7 +23,7 @@ from magtwin.sim.exact import check_field
 from magtwin.sim.runs.live import LiveRobot
 from magtwin.sim.runs.sensing import LidarMode
 from magtwin.sim.sensors.clock import Samples
-from magtwin.twin import Twin, model_error_of
+from magtwin.twin import Twin, model_error_of, trained_on
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.magnetometer import NeuralMagnetometer
@@ -83,7 +83,7 @@ class SimulatedRobot:
             rng=np.random.default_rng((self._seed, 2, self._which) if self._which else self._seed),
             obstacles=twin.obstacles,
             rate_hz=self._rate,
-            network=partial(_read_rows, twin.magnetometer) if twin.magnetometer else None,
+            network=partial(_read_rows, twin.magnetometer, trained_on(twin)) if twin.magnetometer else None,
             model_error=model_error_of(twin, self._seed, which=self._which),
             lidar=self._lidar,
         )
@@ -189,10 +189,11 @@ class SimulatedRobot:
 
 
 def _read_rows(
-    magnetometer: "NeuralMagnetometer", run: Run
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_] | None]:
-    """Disturbances, their standard deviations [nT], and whether the rows are outside the training range."""
+    magnetometer: "NeuralMagnetometer", known: bool, run: Run
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_] | None, NDArray[Any]]:
+    """What `LiveRobot` takes of a network; `known`: whether it was trained on this robot."""
     if not run.rows:
-        return np.zeros(0), np.zeros(0), np.zeros(0, bool)
-    (read,) = magnetometer.read([run.select("t", *sorted(magnetometer.columns - {"t"}))])
-    return read.disturbance_nt, read.sd_nt, read.outside
+        return np.zeros(0), np.zeros(0), np.zeros(0, bool), np.zeros(0)
+    inputs = run.select("t", *sorted(magnetometer.columns - {"t"}))
+    (read,) = magnetometer.read([inputs], known=[known])
+    return read.disturbance_nt, read.sd_nt, read.outside, read.stated_sd_nt

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.frames import wrap_angle, yaw_from_quat
+from magtwin.run.figures import UNMODELLED, prediction_nt
 from magtwin.run.run import Run
 from magtwin.summary import Summarized, Summary
 
@@ -137,24 +138,37 @@ DRAWN = "b_model_error_nt"
 ERRORS: Mapping[str, tuple[str, tuple[str, ...], str]] = MappingProxyType(
     {
         "map": ("b_map_nt", ("b_truth_nt",), "error of the map at the sensor"),
-        "disturbance": ("b_total_nt", ("b_truth_nt",), "error of the prediction, map plus disturbance"),
+        "disturbance": (
+            "b_total_nt",
+            (UNMODELLED, "b_truth_nt"),
+            "error of the prediction, map plus network",
+        ),
         "model error": (DRAWN, (), "error drawn for the network's prediction"),
         "noise": ("b_measured_nt", ("b_total_nt", DRAWN), "noise of the sensor"),
         "total": ("b_measured_nt", ("b_truth_nt",), "error of the reading"),
     }
 )
-"""Errors by source: a column, the columns subtracted from it, and the meaning. Runs without
-`b_model_error_nt` have no model error."""
+"""Errors by source: a column, the columns subtracted from it, and the meaning. Runs may lack
+`b_model_error_nt` and `b_unmodelled_nt`, which are then 0."""
+
+
+def terms_of(run: Run, name: str) -> tuple[str, ...]:
+    """The column of an error of `ERRORS`, and the columns that are subtracted from it in a run."""
+    seen, others, _ = ERRORS[name]
+    return seen, *(other for other in others if other not in (DRAWN, UNMODELLED) or other in run)
 
 
 def errors_of(run: Run) -> dict[str, Agreement]:
     """The known errors of a run, by the names of `ERRORS`."""
     errors = {}
-    for name, (seen, others, _) in ERRORS.items():
-        others = tuple(other for other in others if other != DRAWN or DRAWN in run)
+    for name in ERRORS:
+        seen, *others = terms_of(run, name)
         if not {seen, *others} <= set(run) or (seen == DRAWN and not run[DRAWN].any()):
             continue
-        error = agreement(name, "nT", sum((-run[other] for other in others), run[seen]))
+        first = run[seen]
+        if name == "disturbance":
+            first, others = prediction_nt(run), [other for other in others if other != UNMODELLED]
+        error = agreement(name, "nT", sum((-run[other] for other in others), first))
         if error is not None:
             errors[name] = error
     return errors

@@ -14,6 +14,27 @@ if TYPE_CHECKING:
     from magtwin.run.run import Run
 
 
+UNMODELLED = "b_unmodelled_nt"
+"""Column of a neural run with fields that its network does not know: their part of b_disturbance_nt."""
+
+PLAIN = ("nominal", "drawn")
+"""Families of plants that add no field of their own: runs of these need no `UNMODELLED`."""
+
+
+def prediction_nt(run: "Run", rows: slice = slice(None)) -> NDArray[Any]:
+    """What the model of a run predicts, b_total_nt without `UNMODELLED` [nT], shape (N,).
+
+    The true field contains the plant too, so with it a prediction would be judged by a part of the truth. nan
+    in runs of earlier versions that read a plant and do not tell its part.
+    """
+    total = run["b_total_nt"][rows]
+    if UNMODELLED in run:
+        return np.asarray(total - run[UNMODELLED][rows])
+    plant = str(run.metadata.get("plant", "nominal")).partition(":")[0]
+    untold = run.metadata.get("magnetometer") == "neural" and plant not in PLAIN
+    return np.full(len(total), np.nan) if untold else total
+
+
 def run_report(run: "Run", title: str) -> Report:
     """Duration, distance, fields, errors and flags of a run; missing columns are skipped."""
     figures = [Figure("duration", run.duration_s, "s"), Figure("readings", run.rows)]
@@ -24,7 +45,7 @@ def run_report(run: "Run", title: str) -> Report:
             least, most, mean, sd = field
             figures.append(Figure(name, mean, "nT", sd, f"{least:.0f} to {most:.0f}"))
     if {"b_total_nt", "b_truth_nt"} <= set(run) and (error := _mean_error(run)) > 0:
-        note = "mean absolute difference of b_total_nt from b_truth_nt"
+        note = "mean absolute difference of the prediction from b_truth_nt"
         figures.append(Figure("error", error, "nT", None, note))
     for name in run:
         if name.startswith("flag_") and run[name].any():
@@ -64,10 +85,10 @@ def _statistics(values: NDArray[Any]) -> tuple[float, float, float, float] | Non
 
 
 def _mean_error(run: "Run") -> float:
-    """Mean absolute difference of b_total_nt from b_truth_nt [nT]; 0 where neither is known."""
+    """Mean absolute difference of the prediction from b_truth_nt [nT]; 0 if neither is known."""
     count, total = 0, 0.0
     for rows in mapped.parts(run.rows):
-        error = np.abs(run["b_total_nt"][rows] - run["b_truth_nt"][rows])
+        error = np.abs(prediction_nt(run, rows) - run["b_truth_nt"][rows])
         known = np.isfinite(error)
         count, total = count + int(known.sum()), total + float(error[known].sum())
     return total / count if count else 0.0

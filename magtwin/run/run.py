@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError, find
 from magtwin.report import Report
 from magtwin.run import mapped
-from magtwin.run.figures import run_report
+from magtwin.run.figures import prediction_nt, run_report
 from magtwin.run.resample import RULES, Interpolation, bracket, check_instants, grid
 from magtwin.run.summary import run_summary
 from magtwin.summary import Summarized, Summary
-from magtwin.verdict import Tally
+from magtwin.verdict import OWN, Tally
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -137,10 +137,14 @@ Errors have separate columns. Where all are known,
     b_measured_nt = b_total_nt + b_model_error_nt + b_noise_nt
     b_truth_nt = |b_vector_nt|, and = b_total_nt of a physical magnetometer
 
-So b_total_nt - b_truth_nt is the error of a neural or map-only magnetometer's model, b_truth_nt - b_map_nt is
-what the map lacks, b_noise_nt is the sensor's error, and b_vector_measured_nt - b_vector_nt that of its
-vector axes. b_model_error_nt is a random draw of a model error, with the standard deviation that the network
-predicts. Readings are thus as far from the mean as the network was from held-out recordings.
+A neural magnetometer also reads fields that its network does not know, such as a plant. Their part of
+b_disturbance_nt is the column b_unmodelled_nt, which runs without such fields lack.
+
+So b_total_nt - b_unmodelled_nt - b_truth_nt is the error of a neural or map-only magnetometer's model,
+b_truth_nt - b_map_nt is what the map lacks, b_noise_nt is the sensor's error, and
+b_vector_measured_nt - b_vector_nt that of its vector axes. b_model_error_nt is a random draw of a model
+error, with the standard deviation that the network predicts on the robot of its training. Readings are thus
+as far from the mean as the network was from held-out recordings.
 """
 
 
@@ -499,10 +503,9 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         (mean,) = numbers_in(self.metadata, "network_label_mean_nt") or (0.0,)
         tally.than = "the map plus the mean disturbance in the training data" if mean else "the map alone"
         for rows in mapped.parts(self.rows):
-            total, level, truth, sd = (
-                self[name][rows] for name in ("b_total_nt", "b_map_nt", "b_truth_nt", "b_sd_nt")
-            )
-            tally.add(total - truth, level + mean - truth, sd)
+            level, truth, sd = (self[name][rows] for name in ("b_map_nt", "b_truth_nt", "b_sd_nt"))
+            whose = str(self.metadata.get("network_intervals", OWN))
+            tally.add(prediction_nt(self, rows) - truth, level + mean - truth, sd, whose)
 
     def _derived(self, step: str, columns: Mapping[str, NDArray[Any]] | None = None) -> "Run":
         """This run after a step, which is noted in its metadata."""

@@ -26,6 +26,7 @@ from magtwin.twin.twin import (
     lab_and_epoch,
     model_error_of,
     room_of,
+    trained_on,
     with_plant,
     without_model_error,
 )
@@ -57,6 +58,7 @@ __all__ = [
     "simulate",
     "simulate_robots",
     "sweep",
+    "trained_on",
     "twin_of",
     "with_plant",
     "without_model_error",

@@ -28,8 +28,10 @@ from magtwin.twin.twin import (
     model_error_of,
     room_of,
     scene_sha256,
+    trained_on,
     with_plant,
 )
+from magtwin.verdict import OWN
 from magtwin.version import __version__
 
 if TYPE_CHECKING:
@@ -131,7 +133,7 @@ def simulate(
         speed=speed,
         duration_s=duration_s,
         rate_hz=rate_hz,
-        disturbance_nt=_predict(twin.magnetometer, reads),
+        disturbance_nt=_predict(twin, reads),
         model_error=model_error_of(twin, seed),
         outside=outside,
         lidar=lidar,
@@ -241,7 +243,7 @@ def simulate_robots(
         rate_hz=rate_hz,
         obstacles=twin.obstacles,
         controller=controller,
-        disturbances_nt={name: _predict(own.magnetometer, reads[name]) for name, own in twins.items()},
+        disturbances_nt={name: _predict(own, reads[name]) for name, own in twins.items()},
         model_errors={name: model_error_of(twins[name], seed, which=k) for k, name in enumerate(placed)},
         outside=outside,
         lidar=lidar,
@@ -345,7 +347,7 @@ def finished(
     if read is not None:
         spec = twin.scene.robot.magnetometer
         noise = spec.noise_density_nt * np.sqrt(float(run.metadata["rate_hz"]) / 2)
-        columns: dict[str, NDArray[Any]] = {"b_sd_nt": np.hypot(read.sd_nt, noise)}
+        columns: dict[str, NDArray[Any]] = {"b_sd_nt": np.hypot(read.stated_sd_nt, noise)}
         if read.outside is not None:
             columns["flag_out_of_distribution"] = read.outside
         run = run.with_columns(**{name: array for name, array in columns.items() if add or name in run})
@@ -354,6 +356,8 @@ def finished(
         metadata["asked_duration_s"] = float(duration_s)
     if twin.scene.robot.plant != PlantSpec():
         metadata["plant"] = OF_SCENE  # unless the twin's metadata name another
+    if read is not None and read.intervals != OWN:
+        metadata["network_intervals"] = read.intervals
     driven = path if isinstance(path, dict) else path_metadata(path)
     metadata |= dict(twin.session) | driven | dict(twin.metadata)
     metadata["config_sha256"] = config_sha256 or scene_sha256(twin.scene)
@@ -373,13 +377,14 @@ def check_commands(path: "Path | Commands | Run | str", network: "NeuralMagnetom
             )
 
 
-def _predict(network: "NeuralMagnetometer | None", reads: "list[Read]") -> "Predict | None":
+def _predict(twin: Twin, reads: "list[Read]") -> "Predict | None":
     """A function that predicts the disturbance of a run and appends what the network read to `reads`."""
+    network, known = twin.magnetometer, [trained_on(twin)]
     if network is None:
         return None
 
     def predict(run: Run) -> tuple[NDArray[Any], NDArray[Any]]:
-        (read,) = network.read([run])
+        (read,) = network.read([run], known=known)
         reads.append(read)
         return read.disturbance_nt, read.sd_nt
 

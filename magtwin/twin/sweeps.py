@@ -29,6 +29,7 @@ from magtwin.twin.twin import (
     model_error_of,
     room_of,
     scene_sha256,
+    trained_on,
     with_plant,
     without_model_error,
 )
@@ -194,7 +195,8 @@ class _Finish:
         predictor, known = self.predictor, self._known
         flagged = "flag_out_of_distribution" in sensed[0].wanted
         rows = [each.run for each in sensed]
-        reads = predictor.read(rows, outside=flagged) if predictor else [None] * len(rows)
+        trained = [trained_on(known[id(job.scene)][0]) for job in jobs]
+        reads = predictor.read(rows, outside=flagged, known=trained) if predictor else [None] * len(rows)
         runs = []
         for job, each, read in zip(jobs, sensed, reads, strict=True):
             own, config = known[id(job.scene)]

@@ -251,6 +251,17 @@ def model_error_of(twin: Twin, seed: int, *, which: int = 0) -> "ModelError | No
     return twin.model_error.in_session(offset_generator(twin.session, seed, which=which))
 
 
+def trained_on(twin: Twin) -> bool:
+    """Whether the network of a twin was trained on its robot, plant and kind of session."""
+    from magtwin.sim.runs.simulate import robot_metadata
+
+    network, robot = twin.magnetometer, twin.scene.robot
+    plant = {} if robot.plant == PlantSpec() else {"plant": OF_SCENE}
+    return network is not None and network.knows(
+        {**robot_metadata(robot), **plant, **twin.session, **twin.metadata}
+    )
+
+
 def without_model_error(twin: Twin) -> Twin:
     """The twin whose neural magnetometer reads exactly what its network predicts, plus sensor noise."""
     metadata = twin.metadata if twin.magnetometer is None else {**twin.metadata, "model_error": False}

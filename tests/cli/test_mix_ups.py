@@ -152,7 +152,7 @@ SLOTS = {
     "train set --config FILE --out new.safetensors": {"training.toml"},
     "network export FILE --out new.onnx": {"net.safetensors", "net.pth"},
     "network convert FILE --out new.safetensors": {"net.safetensors", "net.pth"},
-    "network widen FILE --out new.safetensors": {"net.safetensors", "net.pth"},
+    "network widen FILE --runs run.npz --map map.usdc --out new.safetensors": {"net.safetensors", "net.pth"},
     "evaluate FILE --runs run.npz --map map.usdc --out new": {"net.safetensors", "net.pth"},
     "bench FILE --out new": {"suite.toml"},
     "bench report FILE --out new": {"results"},

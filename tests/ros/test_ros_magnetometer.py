@@ -139,9 +139,9 @@ class World:
             "b_map_gradient_nt_m": into_base(slopes[:, :2], np.array([yaw])),
         }
         run = Run({name: np.array(values) for name, values in row.items()}, {})
-        (read,) = self.twin.magnetometer.read([run])
+        (read,) = self.twin.magnetometer.read([run])  # names no platform: another robot
         noise = self.twin.scene.robot.magnetometer.noise_density_nt * np.sqrt(125 / 2)
-        return float(b_map[0] + read.disturbance_nt[0]), float(np.hypot(read.sd_nt[0], noise))
+        return float(b_map[0] + read.disturbance_nt[0]), float(np.hypot(read.stated_sd_nt[0], noise))
 
     def _hear(self, message: Message) -> None:
         self.said.append({s.name.removeprefix("magnetometer: "): s for s in from_message(message)})

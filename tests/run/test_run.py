@@ -94,6 +94,41 @@ def test_the_report_counts_what_happened():
     assert json.loads(run.report("x").to_json())["figures"]["duration"] == {"value": 2.0, "unit": "s"}
 
 
+def test_the_figures_of_a_report_are_those_of_the_raw_arrays():
+    rng = np.random.default_rng(2)
+    truth = 41e3 + rng.normal(0, 300, 400)
+    total, beside = truth + rng.normal(0, 80, 400) + 120, rng.normal(200, 10, 400)
+    level, sd = truth - rng.normal(250, 90, 400), rng.uniform(60, 120, 400)
+    p = np.column_stack([np.cumsum(rng.normal(0, 0.01, (400, 2)), axis=0), np.zeros(400)])
+    columns = {
+        "t": np.arange(400) / 8,
+        "p_world_base": p,
+        "b_map_nt": level,
+        "b_total_nt": total,
+        "b_sd_nt": sd,
+    }
+    about = {"magnetometer": "neural", "plant": "hysteresis", "network_label_mean_nt": 240.0}
+    run = Run({**columns, "b_truth_nt": truth, "b_unmodelled_nt": beside}, about)
+    report = run.report()
+    figures = {figure.name: figure for figure in report.figures}
+    assert figures["duration"].value == 399 / 8
+    assert figures["readings"].value == 400
+    assert figures["distance driven"].value == pytest.approx(np.hypot(*np.diff(p[:, :2], axis=0).T).sum())
+    for name in ("b_total_nt", "b_map_nt"):
+        assert figures[name].value == pytest.approx(run[name].mean(), rel=1e-12)
+        assert figures[name].spread == pytest.approx(run[name].std(), rel=1e-9)
+        assert figures[name].note == f"{run[name].min():.0f} to {run[name].max():.0f}"
+    error, naive = np.abs(total - beside - truth), np.abs(level + 240.0 - truth)
+    assert figures["error"].value == pytest.approx(error.mean(), rel=1e-12)
+    held = np.mean(error <= 1.6448536 * sd)
+    assert f"mean error {error.mean():,.0f} nT against {naive.mean():,.0f} nT" in report.verdict
+    assert f"a ratio of {error.mean() / naive.mean():.2f}" in report.verdict
+    assert f"hold {held:.0%} of the readings" in report.verdict
+    earlier = Run({name: run[name] for name in run if name != "b_unmodelled_nt"}, about)
+    assert earlier.report().verdict == ""  # a run of an earlier version: the plant is in reading and truth
+    assert "error" not in {figure.name for figure in earlier.report().figures}
+
+
 def test_public_names_resolve_and_others_are_refused():
     for name in magtwin.__all__:
         assert getattr(magtwin, name) is not None

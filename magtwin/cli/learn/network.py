@@ -1,8 +1,9 @@
 """`magtwin network`: convert and export networks."""
 
 from pathlib import Path
+from typing import Annotated
 
-from cyclopts import App
+from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force, Licence
@@ -57,22 +58,32 @@ def net_export(weights: Path, *, out: Path, force: Force = False) -> Done:
 
 
 @net_app.command(name="widen")
-def net_widen(weights: Path, *, out: Path, force: Force = False) -> Done:
-    """Write a mixed model without a drive whose intervals hold on plants other than the nominal one.
+def net_widen(
+    weights: Path,
+    *,
+    runs: Annotated[list[Path], Parameter(consume_multiple=True)],
+    map: Path,  # noqa: A002
+    out: Path,
+    force: Force = False,
+) -> Done:
+    """Learn how wide a model's intervals are on robots that it was not trained on.
 
-    Its predictions are those for the nominal plant, with the spread of all plants that it was trained with.
+    Predictions do not change. The new intervals hold on any robot but that of the training, which keeps its
+    own.
 
     Parameters
     ----------
     weights
-        Weights of a mixed model, .safetensors (`magtwin train --model mixed`).
+        Weights of any kind but mixed, which learns this in its training.
+    runs
+        Recordings of at least 4 other robots, or of plants (`magtwin sweep --plant all:1`).
+    map
+        Map that the weights were trained on: a layer or stage, or a folder of survey CSVs.
     out
-        File to write, .safetensors.
+        File to write, .safetensors. A model card beside the weights is carried over.
     """
-    from magtwin.learn.inference.calibrate import mixed_of_kind
-    from magtwin.learn.models.predictor import load_predictor
+    from magtwin.learning import widen
 
     check_output(out, (".safetensors",), "a network", force=force)
-    model = mixed_of_kind(load_predictor(weights)).open_loop(unknown_plant=True)
-    model.save(out, force=force)
-    return Done(model.report(str(out)), out)
+    step("Reading the recordings")
+    return Done(widen(weights, runs, anomaly_map=map, out=out, force=force).report(str(out)), out)

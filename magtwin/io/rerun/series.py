@@ -19,6 +19,7 @@ from rerun.chunk import Chunk
 
 from magtwin.errors import InputError
 from magtwin.run.arrow import check_metadata, said_of, spec_said
+from magtwin.run.figures import prediction_nt
 from magtwin.run.run import COLUMNS, Run, check_numbers
 from magtwin.verdict import Z_90
 
@@ -89,11 +90,13 @@ DERIVED = (
 def derived(run: Run) -> dict[str, Array]:
     """Lines of the plots that follow from the columns; those that a run has no columns for are left out.
 
-    interval = b_total -+ 1.645 b_sd, error = b_total - b_truth, measured_error = b_measured - b_truth, and
-    error_low, error_high = -+ 1.645 b_sd, which contain 90 % of the errors if b_sd is right.
+    prediction = b_total - b_unmodelled, interval = prediction -+ 1.645 b_sd, error = prediction - b_truth,
+    measured_error = b_measured - b_truth, and error_low, error_high = -+ 1.645 b_sd, which contain 90 % of
+    the errors if b_sd is right.
     """
     made: dict[str, Array] = {}
-    total, measured = run.get("b_total_nt"), run.get("b_measured_nt")
+    total = prediction_nt(run) if "b_total_nt" in run else None
+    measured = run.get("b_measured_nt")
     truth, sd = (
         run[name] if name in run and np.isfinite(run[name]).any() else None
         for name in ("b_truth_nt", "b_sd_nt")

@@ -378,7 +378,8 @@ def compensate_run(run: Run, model: TollesLawson) -> tuple[Run, Report]:
         float(after.std()),
         float(before.std()),
         than="no compensation",
-        judged_on="the spread of measured minus map in this run",
+        measure="standard deviation",
+        judged_on="measured minus map in this run",
     )
     metadata = {"tolles_lawson": " ".join(model.terms)}
     return compensated.with_metadata(**metadata), Report("Compensation", figures, about, line)

@@ -15,13 +15,18 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import into_base
+from magtwin.learn.data.recording import plant_name
 from magtwin.run.run import Metadata
 from magtwin.spec.robot import RobotSpec
+from magtwin.verdict import SEPARATOR
 
 Array = NDArray[np.float64]
 
 ROBOT_METADATA = ("robot_name", "sensor_m", "platform_sha256", "mocap_offset_m", "mocap_latency_s")
 """Metadata of a run about its robot and its motion capture."""
+
+NOMINAL = "nominal"
+"""Name of the plant of a robot without one, in the metadata of a network."""
 
 UNKNOWN, SEVERAL = "unknown", "several"
 """Values in a data set if no recording names its robot, or if they differ."""
@@ -104,6 +109,28 @@ def mismatches(
         _frame_mismatch(metadata, name, field, residual_sd_nt),
     )
     return tuple(mismatch for mismatch in each if mismatch is not None)
+
+
+def same_robot(learned: Metadata, used: Metadata) -> bool:
+    """Whether a network is used on the robot that it was trained on, so that its own intervals hold.
+
+    The robot's platform field and sensor, its plant and the kind of its session must be those of the
+    training. Recordings of a real robot do not name these, so they count as those of another robot.
+
+    Args:
+        learned: Metadata of the network.
+        used: Metadata of a run.
+    """
+    for name in ("platform_sha256", "sensor_m"):
+        ours, its = (str(metadata.get(name, UNKNOWN)) for metadata in (learned, used))
+        if ours != its or ours in (UNKNOWN, SEVERAL):
+            return False
+    plants, sessions = (
+        str(learned.get(f"training_{name}", default)).split(SEPARATOR)
+        for name, default in (("plants", NOMINAL), ("sessions", ""))
+    )
+    surveys = used.get("session") == "survey" and "survey" not in sessions
+    return (plant_name(used) or NOMINAL) in plants and not surveys
 
 
 def label_frame(metadata: Metadata, name: str = "") -> tuple[float, float, float] | None:

@@ -102,7 +102,7 @@ def _judge(
     on: dict[tuple[int, Alignment], Run] = {}
     shape = (len(models), run.rows)
     map_nt, map_sd, total, sd = (np.full(shape, np.nan) for _ in range(4))
-    outside = np.zeros(shape, bool)
+    outside, intervals = np.zeros(shape, bool), []
     for m, model in enumerate(models):
         key = (id(model.map), model.alignment)
         try:
@@ -112,7 +112,8 @@ def _judge(
             prediction = model.model.read([here])[0]
         except InputError as error:
             raise InputError(f"{trial.name}: {model.name}: {error}") from error
-        sd[m] = prediction.sd_nt
+        sd[m] = prediction.stated_sd_nt
+        intervals.append(prediction.intervals)
         if prediction.outside is not None:
             outside[m] = prediction.outside
         map_nt[m], map_sd[m] = here["b_map_nt"], here["label_sd_nt"]
@@ -127,9 +128,8 @@ def _judge(
     row = row_of.get(path, path)
     if row in TOTALS:
         row = f"path {row}"
-    judged = Judged(
-        trial.name, session, path, row, run, p[:, :2], measured, kept, map_nt, map_sd, total, sd, outside
-    )
+    arrays = (p[:, :2], measured, kept, map_nt, map_sd, total, sd, outside)
+    judged = Judged(trial.name, session, path, row, run, *arrays, tuple(intervals))
     return judged, lost
 
 

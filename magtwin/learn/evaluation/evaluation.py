@@ -72,6 +72,9 @@ class Judged(Summarized):
     outside: NDArray[np.bool_]
     """Whether an input is outside the training ranges, shape (M, N)."""
 
+    intervals: tuple[str, ...]
+    """Which robots the intervals of each model hold for, M texts."""
+
     def errors(self) -> Errors:
         """Errors on the readings that every model is judged on."""
         kept = self.kept
@@ -137,8 +140,8 @@ class Evaluation(Summarized):
         every, sessions = self.every, {recording.session for recording in self.judged}
         naive, paths = every.scores[0].mae_nt, {recording.path for recording in self.judged}
         lines = {}
-        for candidate, score in zip(self.candidates[1:], every.scores[1:], strict=True):
-            if "sha256" not in candidate.metadata:
+        for m, (candidate, score) in enumerate(zip(self.candidates, every.scores, strict=True)):
+            if m == 0 or "sha256" not in candidate.metadata:
                 continue
             learned = [
                 None if key not in candidate.metadata else str(candidate.metadata[key]).split(SEPARATOR)
@@ -150,6 +153,7 @@ class Evaluation(Summarized):
                 than=f"the naive model, which uses the map {self.candidates[0].map.name!r}",
                 interval=score.ratio_interval,
                 coverage=score.coverage,
+                intervals=[recording.intervals[m] for recording in self.judged],
                 judged_on=recordings_text(len(self.judged), sessions, paths, *learned),
             )
         return lines

@@ -12,12 +12,15 @@ from magtwin import files
 from magtwin.errors import InputError
 from magtwin.kinds import expected
 from magtwin.learn.data.features import columns_of, features
+from magtwin.learn.data.origin import same_robot
+from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.predictor import Predictor, load_predictor
 from magtwin.learn.models.regressor import summary_of
 from magtwin.learn.models.weights import MetadataValue
 from magtwin.run.run import Run
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.summary import Summarized, Summary
+from magtwin.verdict import OF_DRIVE, ONLY_OWN, OTHERS, OWN
 
 Array = NDArray[np.float64]
 
@@ -30,10 +33,22 @@ class Read(Summarized):
     """Disturbance [nT], shape (N,)."""
 
     sd_nt: Array
-    """Standard deviation of its error [nT], shape (N,); nan if unknown."""
+    """Standard deviation of its error on the robot of its training [nT], shape (N,); nan if unknown."""
 
     outside: NDArray[np.bool_] | None
     """Whether an input left the range of the training rows, shape (N,); None if not computed."""
+
+    wide_sd_nt: Array | None = None
+    """Standard deviation on a robot that it was not trained on [nT], shape (N,). None if the run is of the
+    robot of its training, or if it learned none."""
+
+    intervals: str = OWN
+    """Which of the two `stated_sd_nt` is, in words."""
+
+    @property
+    def stated_sd_nt(self) -> Array:
+        """Standard deviation of its error on the robot of the run [nT], shape (N,)."""
+        return self.sd_nt if self.wide_sd_nt is None else self.wide_sd_nt
 
 
 class NeuralMagnetometer(Summarized):
@@ -123,14 +138,21 @@ class NeuralMagnetometer(Summarized):
         Raises:
             InputError: The run lacks a column that the network reads.
         """
-        return self.read([run], outside=False)[0].disturbance_nt
+        return self.read([run], outside=False, known=[True])[0].disturbance_nt
 
-    def read(self, runs: Sequence[Run], *, outside: bool = True) -> list[Read]:
+    def knows(self, metadata: Mapping[str, MetadataValue]) -> bool:
+        """Whether it was trained on the robot of a run, by the run's metadata; see `same_robot`."""
+        return same_robot(self.net.metadata, metadata)
+
+    def read(
+        self, runs: Sequence[Run], *, outside: bool = True, known: Sequence[bool] | None = None
+    ) -> list[Read]:
         """Disturbances, their standard deviations and rows outside the training ranges of each run.
 
         Args:
             runs: At least one. The result of a run does not depend on the other runs.
             outside: Whether to compute `Read.outside`.
+            known: Whether each run is of the robot of its training. Default: by `knows`.
 
         Raises:
             InputError: A run lacks a column that the network reads.
@@ -140,7 +162,16 @@ class NeuralMagnetometer(Summarized):
         ends = np.cumsum([run.rows for run in runs])[:-1]
         mean, sd = (np.split(values, ends) for values in self.net.predict(x))
         flags = np.split(self.net.outside(x), ends) if outside else [None] * len(runs)
-        return [Read(*values) for values in zip(mean, sd, flags, strict=True)]
+        known = [self.knows(run.metadata) for run in runs] if known is None else known
+        wide = [None if own else self.net.wide_sd_nt(part) for own, part in zip(known, parts, strict=True)]
+        texts = [self._intervals(own, sd is not None) for own, sd in zip(known, wide, strict=True)]
+        return [Read(*values) for values in zip(mean, sd, flags, wide, texts, strict=True)]
+
+    def _intervals(self, known: bool, wide: bool) -> str:
+        """Which robots the intervals of a run hold for, in words."""
+        if isinstance(self.net, Mixed) and self.net.intervals != "nominal":
+            return OF_DRIVE if self.net.intervals == "calibrated" else OTHERS
+        return OWN if known else OTHERS if wide else ONLY_OWN
 
     def _summary(self) -> Summary:
         return summary_of(self.net, f"NeuralMagnetometer {self.name}".rstrip())

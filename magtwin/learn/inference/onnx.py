@@ -1,8 +1,9 @@
 """ONNX: a predictor as one graph that runs in onnxruntime without torch and without magtwin.
 
 The input is float64 features in their units, as `magtwin.learn.data.features` makes them; the outputs are the
-disturbance and the standard deviation of its error [nT], each (rows,). Scalers are inside the graph and work
-in float64, because float32 would err by 0.1 nT; products are float32, as in torch.
+disturbance and the standard deviation of its error [nT], each (rows,). Other programs run it on robots that
+it was not trained on, so a predictor that has a `wide` spread gives that. Scalers are inside the graph and
+work in float64, because float32 would err by 0.1 nT; products are float32, as in torch.
 """
 
 import json
@@ -187,20 +188,24 @@ class _Graph:
         """Disturbance and standard deviation [nT], each (rows,)."""
         if isinstance(predictor, FieldNet):
             mean = self.net(predictor, INPUT)
+            if predictor.wide:
+                return mean, self.sd(predictor.wide, self.scaled(predictor.inputs, INPUT))
             sd = self.constant([predictor.residual_sd_nt])
             return mean, self.add("Expand", sd, self.add("Shape", mean))
         if isinstance(predictor, Linear):
-            return self.linear(predictor)
+            return self.linear(predictor, predictor.wide or predictor.spread)
         if isinstance(predictor, Mixed):
-            return self.mixed(predictor)
+            nominal = predictor.intervals == "nominal"
+            return self.mixed(predictor.open_loop(unknown_plant=True) if nominal else predictor)
         if isinstance(predictor, Hybrid):
-            mean, sd = self.linear(predictor.base)
+            known = predictor.base.spread.scaled(predictor.sd_factor)
+            mean, sd = self.linear(predictor.base, predictor.wide or known)
             if predictor.net is not None:
                 inputs = predictor.base.inputs
                 clipped = self.add("Max", INPUT, self.constant(inputs.low))
                 clipped = self.add("Min", clipped, self.constant(inputs.high))
                 mean = self.add("Add", mean, self.net(predictor.net, clipped))
-            return mean, self.add("Mul", sd, self.constant(predictor.sd_factor))
+            return mean, sd
         raise InputError(f"a predictor of the kind {predictor.kind!r} has no ONNX graph")
 
     def scaled(self, inputs: Inputs, x: str) -> str:
@@ -224,12 +229,12 @@ class _Graph:
         nan = self.add("ReduceSum", self.add("Sub", z, z), self.constant(np.array([1])), keepdims=0)
         return self.add("Add", y, nan)
 
-    def linear(self, linear: Linear) -> tuple[str, str]:
+    def linear(self, linear: Linear, spread: Spread) -> tuple[str, str]:
         """Disturbance and standard deviation of a linear model, each (rows,)."""
         z = self.scaled(linear.inputs, INPUT)
         mean = self.add("MatMul", z, self.constant(linear.coefficients_nt))
         mean = self.add("Add", mean, self.constant(linear.constant_nt))
-        return mean, self.add("Sqrt", self.variance(linear.spread, z))
+        return mean, self.sd(spread, z)
 
     def mixed(self, mixed: Mixed) -> tuple[str, str]:
         """Disturbance and standard deviation of a mixed model, each (rows,)."""
@@ -237,8 +242,6 @@ class _Graph:
         mean = self.add("MatMul", z, self.constant(effects.mean[1:]))
         mean = self.add("Add", mean, self.constant(effects.mean[0]))
         factor, share = mixed.interval_factors
-        if not share:
-            return mean, self.add("Sqrt", self.variance(mixed.spread, z))
         cross = self.add("MatMul", z, self.constant(effects.covariance[1:, 1:]))
         cross = self.add("Mul", self.add("Add", cross, self.constant(2 * effects.covariance[0, 1:])), z)
         variance = self.add("ReduceSum", cross, self.constant(np.array([1])), keepdims=0)
@@ -246,6 +249,10 @@ class _Graph:
         variance = self.add("Mul", variance, self.constant(share))
         variance = self.add("Add", variance, self.variance(mixed.noise, z))
         return mean, self.add("Mul", self.add("Sqrt", variance), self.constant(factor))
+
+    def sd(self, spread: Spread, z: str) -> str:
+        """Standard deviation of a spread at scaled inputs, (rows,)."""
+        return self.add("Sqrt", self.variance(spread, z))
 
     def variance(self, spread: Spread, z: str) -> str:
         """Variance of a spread at scaled inputs, (rows,)."""
@@ -304,7 +311,8 @@ def _difference_nt(predictor: Predictor, data: bytes, weights: str | os.PathLike
     x = inputs.mean + 2 * inputs.scale * wave
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
     exported = np.nan_to_num(session.run([MEAN, SD], {INPUT: x}))
-    expected = np.nan_to_num(predictor.predict(x))
+    (mean, sd), wide = predictor.predict(x), predictor.wide_sd_nt(x)
+    expected = np.nan_to_num((mean, sd if wide is None else wide))
     difference = np.abs(exported - expected)
     worst = float(difference.max())
     if not np.all(difference <= AGREES_NT + ROUNDING * np.abs(expected)):

@@ -28,6 +28,7 @@ from magtwin.learn.data.features import (
     turning_size,
 )
 from magtwin.learn.data.inputs import Inputs
+from magtwin.learn.models.calibration import Spread
 from magtwin.learn.models.hybrid import Hybrid
 from magtwin.learn.models.linear import Linear
 from magtwin.learn.models.network import FieldNet
@@ -59,7 +60,8 @@ class Reading(NamedTuple):
     """Predicted disturbance of the robot [nT]."""
 
     b_sd_nt: float
-    """Standard deviation of the prediction's error [nT]; nan if unknown."""
+    """Standard deviation of the prediction's error [nT]; nan if unknown. A live robot is not the one that was
+    trained on, so a predictor that has a `wide` spread gives that."""
 
     outside_training: bool
     """Whether an input left the range of the training rows."""
@@ -122,6 +124,8 @@ class Reader:
         else:
             row = self._x[None]
             mean, sd = (float(value[0]) for value in self.predictor.predict(row))
+            wide = self.predictor.wide_sd_nt(row)
+            sd = sd if wide is None else float(wide[0])
             beyond = bool(self.predictor.outside(row)[0])
         return Reading(field_nt + mean, field_nt, mean, sd, beyond)
 
@@ -268,7 +272,7 @@ def _compiled_path(predictor: Predictor, code: Any) -> PredictRow | None:
     if isinstance(predictor, FieldNet):
         return _net(predictor, code)
     if isinstance(predictor, Linear):
-        return _linear(predictor, code)
+        return _linear(predictor, code, predictor.wide or predictor.spread)
     if isinstance(predictor, Hybrid):
         return _hybrid(predictor, code)
     return None
@@ -276,7 +280,7 @@ def _compiled_path(predictor: Predictor, code: Any) -> PredictRow | None:
 
 def _net(net: FieldNet, code: Any, clip: Inputs | None = None) -> PredictRow:
     """A perceptron; its inputs are clipped to the training ranges of `clip` if given."""
-    y_mean, y_scale, sd = float(net.y_mean), float(net.y_scale), net.residual_sd_nt
+    y_mean, y_scale, known, wide = float(net.y_mean), float(net.y_scale), net.residual_sd_nt, net.wide
     ranges = _ranges(net.inputs, clip)
     widths = np.array([len(net.features), *net.hidden, 1])
     parts = [part.detach().t().reshape(-1) for layer in net.linears for part in (layer.weight, layer.bias)]
@@ -286,15 +290,16 @@ def _net(net: FieldNet, code: Any, clip: Inputs | None = None) -> PredictRow:
 
     def predict(x: Array) -> tuple[float, float, bool]:
         outside = forward(x, ranges, widths, table, z, work, out)
+        sd = math.sqrt(wide.floor_nt2 + float(wide.slopes_nt2 @ (z * z))) if wide else known
         return y_mean + y_scale * out.item(), sd, outside
 
     return predict
 
 
-def _linear(linear: Linear, code: Any) -> PredictRow:
+def _linear(linear: Linear, code: Any, spread: Spread) -> PredictRow:
     ranges, z, scaled = _ranges(linear.inputs), np.empty(len(linear.features)), code.scaled
     constant, slopes = linear.constant_nt, linear.coefficients_nt
-    floor, squares = linear.spread.floor_nt2, linear.spread.slopes_nt2
+    floor, squares = spread.floor_nt2, spread.slopes_nt2
 
     def predict(x: Array) -> tuple[float, float, bool]:
         outside = scaled(x, ranges, z)
@@ -304,12 +309,12 @@ def _linear(linear: Linear, code: Any) -> PredictRow:
 
 
 def _hybrid(hybrid: Hybrid, code: Any) -> PredictRow:
-    base, factor = _linear(hybrid.base, code), hybrid.sd_factor
+    base = _linear(hybrid.base, code, hybrid.wide or hybrid.base.spread.scaled(hybrid.sd_factor))
     net = None if hybrid.net is None else _net(hybrid.net, code, clip=hybrid.base.inputs)
 
     def predict(x: Array) -> tuple[float, float, bool]:
         mean, sd, outside = base(x)
-        return mean + net(x)[0] if net else mean, factor * sd, outside
+        return mean + net(x)[0] if net else mean, sd, outside
 
     return predict
 

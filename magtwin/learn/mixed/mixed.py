@@ -20,7 +20,7 @@ from magtwin.errors import InputError
 from magtwin.learn.data.inputs import Array, inputs_from, scaler_tensors
 from magtwin.learn.mixed.effects import Effects
 from magtwin.learn.mixed.session_effects import effects_of_drive
-from magtwin.learn.models.calibration import Spread
+from magtwin.learn.models.calibration import Spread, spread_from, spread_like
 from magtwin.learn.models.regressor import Regressor
 from magtwin.learn.models.weights import Weights
 from magtwin.report import Figure
@@ -106,6 +106,10 @@ class Mixed(Regressor):
             return mean, self.spread.sd_nt(phi[:, 1:])
         return mean, factor * np.sqrt(self.noise_nt2(phi) + share * variance)
 
+    def wide_sd_nt(self, x: ArrayLike) -> Array | None:
+        """Standard deviations on plants other than the nominal one [nT], (N,); None after a drive."""
+        return self.open_loop(unknown_plant=True).predict(x)[1] if self.intervals == "nominal" else None
+
     @property
     def interval_factors(self) -> tuple[float, float]:
         """Factor of the standard deviation, and of the variance of the effects; (1, 0) if nominal."""
@@ -157,11 +161,8 @@ class Mixed(Regressor):
                 for name, effects in (("prior", self.prior), ("session", self.session))
                 for part, value in (("mean_nt", effects.mean), ("covariance_nt2", effects.covariance))
             },
-            **{
-                f"{name}_{part}": torch.tensor(value, dtype=torch.float64)
-                for name, spread in (("spread", self.spread), ("noise", self.noise))
-                for part, value in (("floor_nt2", spread.floor_nt2), ("slopes_nt2", spread.slopes_nt2))
-            },
+            **self.spread.tensors("spread"),
+            **self.noise.tensors("noise"),
         }
 
     def settings(self) -> dict[str, Any]:
@@ -214,14 +215,11 @@ def mixed_of(weights: Weights) -> Mixed:
             for name in ("prior", "session")
             for part, shape in shapes.items()
         },
-        **{f"{name}_floor_nt2": torch.ones((), dtype=torch.float64) for name in ("spread", "noise")},
-        **{f"{name}_slopes_nt2": torch.ones(count, dtype=torch.float64) for name in ("spread", "noise")},
+        **spread_like("spread", count),
+        **spread_like("noise", count),
     }
     tensors = weights.fit(like)
     held = {name: value.numpy() for name, value in tensors.items()}
-    for name in ("spread", "noise"):
-        if held[f"{name}_floor_nt2"] <= 0 or (held[f"{name}_slopes_nt2"] < 0).any():
-            raise InputError(f"{weights.path}: a variance of its {name} is below 0")
     for name in ("prior", "session"):
         covariance = held[f"{name}_covariance_nt2"]
         if not np.allclose(covariance, covariance.T) or np.linalg.eigvalsh(covariance)[0] <= 0:
@@ -236,15 +234,12 @@ def mixed_of(weights: Weights) -> Mixed:
     def effects(name: str) -> Effects:
         return Effects(held[f"{name}_mean_nt"], held[f"{name}_covariance_nt2"])
 
-    def spread(name: str) -> Spread:
-        return Spread(float(held[f"{name}_floor_nt2"]), held[f"{name}_slopes_nt2"])
-
     return Mixed(
         inputs=inputs_from(weights.features, tensors, weights.path),
         prior=effects("prior"),
         session=effects("session"),
-        spread=spread("spread"),
-        noise=spread("noise"),
+        spread=spread_from(tensors, "spread", weights.path),
+        noise=spread_from(tensors, "noise", weights.path),
         intervals=intervals,  # type: ignore[arg-type]
         factors={name: weights.number(f"factor_{name}", above=0.0) for name in FACTORS},
         widening=weights.number("widening", above=0.0),

@@ -1,9 +1,12 @@
 """Calibration: standard deviations that hold on recordings left out of a fit."""
 
 import math
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
@@ -46,6 +49,35 @@ class Spread:
     def scaled(self, factor: float) -> "Spread":
         """The spread with standard deviations `factor` times as large."""
         return Spread(self.floor_nt2 * factor**2, self.slopes_nt2 * factor**2)
+
+    def tensors(self, name: str) -> dict[str, torch.Tensor]:
+        """It as tensors of a weights file, float64."""
+        parts = (self.floor_nt2, self.slopes_nt2)
+        return {
+            f"{name}_{part}": torch.tensor(value, dtype=torch.float64)
+            for part, value in zip(_PARTS, parts, strict=True)
+        }
+
+
+_PARTS = ("floor_nt2", "slopes_nt2")
+
+
+def spread_like(name: str, count: int) -> dict[str, torch.Tensor]:
+    """Tensors with the names, shapes and types of a spread of `count` inputs."""
+    shapes = ((), (count,))
+    return {f"{name}_{p}": torch.ones(s, dtype=torch.float64) for p, s in zip(_PARTS, shapes, strict=True)}
+
+
+def spread_from(tensors: Mapping[str, torch.Tensor], name: str, path: str | os.PathLike[str]) -> Spread:
+    """The spread among the tensors of a weights file.
+
+    Raises:
+        InputError: A variance is below 0.
+    """
+    floor, slopes = (tensors[f"{name}_{part}"].numpy() for part in _PARTS)
+    if floor <= 0 or (slopes < 0).any():
+        raise InputError(f"{path}: a variance of its {name} is below 0")
+    return Spread(float(floor), slopes)
 
 
 def fit_spread(z: Array, error_nt: Array) -> Spread:

@@ -16,7 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError
 from magtwin.learn.data.features import FEATURES
 from magtwin.learn.data.inputs import Array, Inputs, inputs_from, inputs_of, scaler_tensors
-from magtwin.learn.models.calibration import Spread, few_groups_factor, fit_spread, quantile_factor
+from magtwin.learn.models.calibration import (
+    Spread,
+    few_groups_factor,
+    fit_spread,
+    quantile_factor,
+    spread_from,
+    spread_like,
+)
 from magtwin.learn.models.regressor import Regressor
 from magtwin.learn.models.weights import Weights
 from magtwin.report import Figure
@@ -73,13 +80,11 @@ class Linear(Regressor):
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """Scaler, ranges, coefficients and spread, float64."""
-        spread = self.spread
         return {
             **self.inputs.tensors(),
             "constant_nt": torch.tensor(self.constant_nt, dtype=torch.float64),
             "coefficients_nt": torch.as_tensor(self.coefficients_nt),
-            "spread_floor_nt2": torch.tensor(spread.floor_nt2, dtype=torch.float64),
-            "spread_slopes_nt2": torch.as_tensor(spread.slopes_nt2),
+            **self.spread.tensors("spread"),
         }
 
     def settings(self) -> dict[str, Any]:
@@ -205,14 +210,11 @@ def linear_from(weights: Weights, tensors: Mapping[str, torch.Tensor]) -> Linear
     Raises:
         InputError: A scale is not above 0, a variance is below 0, or a setting is missing.
     """
-    held = {name: value.numpy() for name, value in tensors.items()}
-    if held["spread_floor_nt2"] <= 0 or (held["spread_slopes_nt2"] < 0).any():
-        raise InputError(f"{weights.path}: a variance of its spread is below 0")
     return Linear(
         inputs=inputs_from(weights.features, tensors, weights.path),
-        constant_nt=float(held["constant_nt"]),
-        coefficients_nt=held["coefficients_nt"],
-        spread=Spread(float(held["spread_floor_nt2"]), held["spread_slopes_nt2"]),
+        constant_nt=float(tensors["constant_nt"]),
+        coefficients_nt=tensors["coefficients_nt"].numpy(),
+        spread=spread_from(tensors, "spread", weights.path),
         penalty=weights.number("penalty"),
         weighted=weights.expect("weighted", bool),
     )
@@ -220,13 +222,12 @@ def linear_from(weights: Weights, tensors: Mapping[str, torch.Tensor]) -> Linear
 
 def like(count: int) -> dict[str, torch.Tensor]:
     """Tensors with the names, shapes and types of a linear model of `count` features."""
-    ones, one = torch.ones(count, dtype=torch.float64), torch.ones((), dtype=torch.float64)
-    wide = ("coefficients_nt", "spread_slopes_nt2")
-    return (
-        scaler_tensors(count)
-        | dict.fromkeys(wide, ones)
-        | dict.fromkeys(("constant_nt", "spread_floor_nt2"), one)
-    )
+    return {
+        **scaler_tensors(count),
+        "coefficients_nt": torch.ones(count, dtype=torch.float64),
+        "constant_nt": torch.ones((), dtype=torch.float64),
+        **spread_like("spread", count),
+    }
 
 
 @dataclass(frozen=True)

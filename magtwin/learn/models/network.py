@@ -15,9 +15,10 @@ from magtwin.files import sha256
 from magtwin.kinds import expected
 from magtwin.learn.data.features import FULL, feature_names
 from magtwin.learn.data.inputs import Inputs, inputs_of
+from magtwin.learn.models.calibration import Spread
 from magtwin.learn.models.checkpoint import read_checkpoint
 from magtwin.learn.models.perceptron import outputs
-from magtwin.learn.models.regressor import summary_of
+from magtwin.learn.models.regressor import summary_of, wide_figures, wide_sd_nt
 from magtwin.learn.models.weights import (
     MetadataValue,
     Weights,
@@ -86,6 +87,7 @@ class FieldNet(Summarized, torch.nn.Module):
         self.dropout = dropout
         self.residual_sd_nt = residual_sd_nt
         self.metadata: dict[str, MetadataValue] = dict(metadata or {})
+        self.wide: Spread | None = None
         if not hidden or not all(width > 0 for width in hidden) or not 0 <= dropout < 1:
             raise InputError(
                 f"a network needs hidden layers above 0 wide and dropout in 0..1, "
@@ -153,6 +155,10 @@ class FieldNet(Summarized, torch.nn.Module):
         y = outputs(layers, inputs, inputs.checked(x))[:, 0]
         return float(self.y_mean) + float(self.y_scale) * y, np.full(len(y), self.residual_sd_nt)
 
+    def wide_sd_nt(self, x: ArrayLike) -> Array | None:
+        """As `Regressor.wide_sd_nt`."""
+        return wide_sd_nt(self.wide, self.inputs, x)
+
     def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
         """Whether an input of a row left the range of the training rows; see `Inputs.outside`."""
         return self.inputs.outside(x)
@@ -185,6 +191,7 @@ class FieldNet(Summarized, torch.nn.Module):
             metadata=self.metadata,
             hidden=self.hidden,
             dropout=self.dropout,
+            wide=self.wide,
             force=force,
         )
 
@@ -199,7 +206,7 @@ class FieldNet(Summarized, torch.nn.Module):
         ]
         if not math.isnan(self.residual_sd_nt):
             figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note="on held-out runs"))
-        return Report(title, tuple(figures), shown(self.metadata))
+        return Report(title, (*figures, *wide_figures(self.wide)), shown(self.metadata))
 
     def _summary(self) -> Summary:
         return summary_of(self, "FieldNet")
@@ -216,7 +223,9 @@ def load_net(path: str | os.PathLike[str]) -> FieldNet:
     weights = read_weights(path)
     if weights.kind != "mlp":
         raise InputError(f"{path}: holds a {weights.kind}, no multilayer perceptron; give one of those")
-    return net_of(weights)
+    net = net_of(weights)
+    net.wide = weights.wide
+    return net
 
 
 def convert(

@@ -28,7 +28,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.extend import Registry
+from magtwin.learn.data.inputs import Inputs
 from magtwin.learn.data.recording import Recording, Rows
+from magtwin.learn.models.calibration import Spread
 from magtwin.learn.models.descent import Epoch
 from magtwin.learn.models.network import net_of_checkpoint
 from magtwin.learn.models.weights import MetadataValue, Weights, is_checkpoint, read_weights
@@ -46,9 +48,16 @@ class Predictor(Protocol):
     residual_sd_nt: float
     """Root mean square error on held-out recordings [nT]; nan if unknown."""
 
+    wide: Spread | None
+    """Spread of errors on robots that it was not trained on; None if it was never learned."""
+
     @property
     def features(self) -> tuple[str, ...]:
         """Names of the inputs, in order."""
+
+    @property
+    def inputs(self) -> Inputs:
+        """Scaler and training ranges of the inputs."""
 
     @property
     def kind(self) -> str:
@@ -64,6 +73,12 @@ class Predictor(Protocol):
 
     def predict(self, x: ArrayLike) -> tuple[Array, Array]:
         """Disturbances and standard deviations of their errors [nT], each (N,), from features (N, F)."""
+
+    def wide_sd_nt(self, x: ArrayLike) -> Array | None:
+        """Standard deviations on robots that it was not trained on [nT], (N,), from features (N, F), or None.
+
+        None if it learned none, or predicts for the session of a drive.
+        """
 
     def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
         """Whether an input of a row left the range of the training rows, shape (N,)."""
@@ -219,4 +234,7 @@ def load_predictor(path: str | os.PathLike[str]) -> Predictor:
         kind = PREDICTORS[weights.kind]
     except InputError as error:
         raise InputError(f"{path}: {error}; update magtwin, or install the package of this kind") from error
-    return kind.load(weights)
+    predictor = kind.load(weights)
+    if weights.wide is not None:
+        predictor.wide = weights.wide
+    return predictor

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.learn.data.inputs import Inputs
+from magtwin.learn.models.calibration import Spread
 from magtwin.learn.models.weights import MetadataValue, shown, write_weights
 from magtwin.report import Figure, Report
 from magtwin.summary import Summarized, Summary, listed
@@ -24,6 +25,9 @@ class Regressor(Summarized, ABC):
     residual_sd_nt: float = math.nan
     metadata: dict[str, MetadataValue] = field(default_factory=dict)
 
+    wide: Spread | None = None
+    """Spread of errors on robots that it was not trained on; None if it was never learned."""
+
     kind: ClassVar[str]
 
     @property
@@ -34,6 +38,13 @@ class Regressor(Summarized, ABC):
     def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
         """Whether an input of a row left the range of the training rows; see `Inputs.outside`."""
         return self.inputs.outside(x)
+
+    def wide_sd_nt(self, x: ArrayLike) -> NDArray[np.float64] | None:
+        """Standard deviations on robots that it was not trained on [nT], (N,), from features (N, F), or None.
+
+        None if it learned none, or predicts for the session of a drive.
+        """
+        return wide_sd_nt(self.wide, self.inputs, x)
 
     @abstractmethod
     def tensors(self) -> dict[str, torch.Tensor]:
@@ -60,6 +71,7 @@ class Regressor(Summarized, ABC):
             features=self.features,
             residual_sd_nt=self.residual_sd_nt,
             metadata=self.metadata,
+            wide=self.wide,
             force=force,
             **self.settings(),
         )
@@ -71,7 +83,7 @@ class Regressor(Summarized, ABC):
 
     def report(self, title: str) -> Report:
         """Its kind, its parts, and its error on held-out recordings if known."""
-        figures = [Figure("kind", self.kind), *self.figures()]
+        figures = [Figure("kind", self.kind), *self.figures(), *wide_figures(self.wide)]
         if not math.isnan(self.residual_sd_nt):
             figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note=f"on {self.judged_on}"))
         return Report(title, tuple(figures), shown(self.metadata))
@@ -80,12 +92,23 @@ class Regressor(Summarized, ABC):
         return summary_of(self, type(self).__name__)
 
 
+def wide_sd_nt(wide: Spread | None, inputs: Inputs, x: ArrayLike) -> NDArray[np.float64] | None:
+    """Standard deviations by a spread on other robots [nT], (N,), from features (N, F); None without one."""
+    return None if wide is None else wide.sd_nt(inputs.scaled(inputs.checked(x)))
+
+
+def wide_figures(wide: Spread | None) -> list[Figure]:
+    """A spread on other robots, for a report."""
+    note = "of training rows, on robots that it was not trained on"
+    return [Figure("sd, other robots", wide.mean_nt, "nT", note=note)] if wide else []
+
+
 def summary_of(net: Any, title: str, *metadata: tuple[str, str]) -> Summary:
     """Kind, layers, inputs, error and provenance of a predictor."""
     error = (
         "unknown"
         if math.isnan(net.residual_sd_nt)
-        else f"{net.residual_sd_nt:.4g} nT rms on held-out recordings"
+        else f"{net.residual_sd_nt:.4g} nT rms on {getattr(net, 'judged_on', 'held-out recordings')}"
     )
     trained = [
         f"{name} {net.metadata[name]}"

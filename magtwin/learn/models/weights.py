@@ -17,6 +17,7 @@ from magtwin.errors import InputError
 from magtwin.files import existing, existing_file
 from magtwin.kinds import expected, kind_of
 from magtwin.learn.data.features import FEATURES, feature_names
+from magtwin.learn.models.calibration import Spread, spread_from, spread_like
 from magtwin.outputs import output
 
 MetadataValue = str | int | float | bool
@@ -25,6 +26,9 @@ VERSIONS = {"mlp": 1}
 """Version of the file by kind of predictor, `VERSION` for all others; other versions are refused."""
 
 VERSION = 2
+
+WIDE = "wide"
+"""Name of the spread on other robots, among the tensors of a file of any kind."""
 
 _ZIP = b"PK\x03\x04"
 _TYPES = {"features": list, "units": list, "residual_sd_nt": float | None, "facts": dict}
@@ -42,6 +46,10 @@ class Weights:
     """Features, units, provenance, `residual_sd_nt`, and the settings of the kind."""
 
     tensors: Mapping[str, torch.Tensor]
+    """Its tensors, but for those of `wide`."""
+
+    wide: Spread | None = None
+    """Spread of errors on robots that it was not trained on; None if it was never learned."""
 
     @property
     def features(self) -> tuple[str, ...]:
@@ -132,6 +140,7 @@ def write_weights(
     features: Sequence[str],
     residual_sd_nt: float,
     metadata: Mapping[str, MetadataValue],
+    wide: Spread | None = None,
     force: bool = False,
     **about: Any,
 ) -> None:
@@ -144,6 +153,7 @@ def write_weights(
         features: Names of the inputs, in order.
         residual_sd_nt: Root mean square error on held-out recordings [nT]; nan if unknown.
         metadata: Provenance.
+        wide: Spread of errors on robots that it was not trained on; None if it was never learned.
         force: Replace an existing file.
         about: Settings of the kind, as JSON.
 
@@ -162,6 +172,7 @@ def write_weights(
     }
     if kind != "mlp":
         header["kind"] = kind
+    tensors = {**tensors, **(wide.tensors(WIDE) if wide else {})}
     whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     # One key, because safetensors writes several in random order.
     metadata_text = {"magtwin": json.dumps(header, sort_keys=True, allow_nan=False)}
@@ -186,7 +197,12 @@ def read_weights(path: str | os.PathLike[str]) -> Weights:
     except (SafetensorError, OSError, ValueError) as error:
         raise InputError(f"{path}: damaged safetensors ({error}); get the file again") from error
     about = _about(path, metadata)
-    return Weights(path, about.get("kind", "mlp"), about, tensors)
+    weights = Weights(path, about.get("kind", "mlp"), about, tensors)
+    like = spread_like(WIDE, len(weights.features))
+    own = {name: tensors.pop(name) for name in like if name in tensors}
+    if not own:
+        return weights
+    return replace(weights, wide=spread_from(weights.with_tensors(own).fit(like), WIDE, path))
 
 
 def _about(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:

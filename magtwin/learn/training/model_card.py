@@ -4,7 +4,7 @@ import math
 import textwrap
 
 from magtwin.learn.data.split import PARTS
-from magtwin.learn.models.predictor import PREDICTORS
+from magtwin.learn.models.predictor import PREDICTORS, Predictor
 from magtwin.learn.training.result import TrainingResult
 
 MOST_NAMES = 40  # Most paths, and most test recordings, that a card lists
@@ -47,6 +47,25 @@ def model_card(result: TrainingResult, name: str, checksum: str) -> str:
         _reproduce(result, name),
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def widened_card(card: str, before: str, after: str, predictor: Predictor) -> str:
+    """The card of a model that `magtwin network widen` made of another.
+
+    Args:
+        card: The card of the other.
+        before: SHA-256 of its weights file.
+        after: SHA-256 of the new one.
+        predictor: The new model.
+    """
+    robots, readings = (predictor.metadata[f"wide_{name}"] for name in ("robots", "readings"))
+    sd = 0.0 if predictor.wide is None else predictor.wide.mean_nt
+    text = (
+        f"On robots other than that of its training the standard deviation is {sd:.0f} nT (root mean square "
+        f"of training rows). `magtwin network widen` learned it from {readings:,} readings of {robots} "
+        "robots."
+    )
+    return f"{card.replace(before, after)}\n## On other robots\n\n{_wrapped(text)}\n"
 
 
 def _data(result: TrainingResult) -> str:

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 from magtwin.errors import InputError
 from magtwin.files import sha256
 from magtwin.learn.data.dataset import MANIFEST, Dataset, open_dataset
-from magtwin.learn.data.origin import ROBOT_METADATA
+from magtwin.learn.data.origin import NOMINAL, ROBOT_METADATA
 from magtwin.learn.data.residuals import HeldOut, held_out_errors, residuals
 from magtwin.learn.data.split import PARTS, Part, Split
 from magtwin.learn.data.split import split as split_recordings
@@ -209,6 +209,9 @@ def _fit(
     learned, tested = ([recordings[name] for name in split.names(part)] for part in ("train", "test"))
     sessions = dict.fromkeys(recording.session for recording in learned)
     driven = dict.fromkeys(recording.path for recording in learned)
+    plants = dict.fromkeys(recording.plant or NOMINAL for recording in learned)
+    if config.kind != "mixed" and set(plants) != {NOMINAL}:  # the mean of a mixed model is that of NOMINAL
+        predictor.metadata["training_plants"] = SEPARATOR.join(plants)
     predictor.metadata.update(
         training_sessions=SEPARATOR.join(sessions), training_paths=SEPARATOR.join(driven)
     )

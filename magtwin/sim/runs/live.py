@@ -28,9 +28,10 @@ from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
-Network = Callable[[Run], tuple[NDArray[Any], NDArray[Any], "NDArray[np.bool_] | None"]]
-"""From rows of a run to the disturbance of each, the standard deviation of its error [nT], and whether it is
-outside of the training range. Rows come in the order of time, each once."""
+Network = Callable[[Run], tuple[NDArray[Any], NDArray[Any], "NDArray[np.bool_] | None", NDArray[Any]]]
+"""From rows of a run to the disturbance of each, the standard deviation of its error [nT] that model errors
+are drawn with, whether it is outside of the training range, and the standard deviation for `b_sd_nt` [nT].
+Rows come in the order of time, each once."""
 
 KEPT = 256
 """Control steps that are kept: 5 s, more than any sensor needs."""
@@ -209,9 +210,10 @@ class LiveRobot:
         if self._network is None:
             predicted = None
         else:
-            mean, sd, beyond = self._network(Run(columns, self._metadata))
+            mean, sd, beyond, stated_sd = self._network(Run(columns, self._metadata))
             predicted = mean, sd
-            known["b_sd_nt"] = np.hypot(sd, self._noise_sd_nt)
+            known["b_sd_nt"] = np.hypot(stated_sd, self._noise_sd_nt)
             if beyond is not None:
                 known["flag_out_of_distribution"] = beyond
-        return Run({**self._sensing.read(columns, predicted, self._model_error), **known}, self._metadata)
+        read = self._sensing.read(columns, predicted, self._model_error)
+        return Run({**read, **known}, self._metadata, self._sensing.specs)

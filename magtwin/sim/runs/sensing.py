@@ -17,6 +17,7 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import into_base, quat_from_yaw, wrap_angle
 from magtwin.run import mapped
+from magtwin.run.figures import UNMODELLED
 from magtwin.run.run import COLUMNS, Column
 from magtwin.sim.exact import ExactField
 from magtwin.sim.extensions import INTERFERENCE, Interference, SensorFactory, start_sensors
@@ -61,6 +62,7 @@ _MADE_TOGETHER = {
     "mocap": frozenset(("mocap_p", "mocap_q_xyzw", "flag_pose_lost")),
     "battery": frozenset(("battery_v", "battery_a", "battery_fraction")),
 }
+_UNMODELLED = Column("nT", "", "part of b_disturbance_nt that no network predicts, such as the plant's")
 _EXACT = frozenset(("b_vector_nt", "b_truth_nt", "b_vector_measured_nt"))
 _READ = frozenset(
     ("b_measured_nt", "b_model_error_nt", "b_noise_nt", "b_vector_measured_nt", "flag_lost_lock")
@@ -142,6 +144,7 @@ class Sensing:
                 f"scene {scene.name!r} has a constant map and no Earth field, so {what} has nothing to add "
                 "to; give the scene an Earth field"
             )
+        self._unmodelled = network and added
         self._reads = bool(self.wanted & _READ)
         self._reads_axes = network and "b_vector_measured_nt" in needed
         self._vector = bool(
@@ -176,8 +179,9 @@ class Sensing:
 
     @property
     def specs(self) -> dict[str, Column]:
-        """What the columns of custom sensors hold."""
-        return {name: column for one in self._custom for name, column in one.columns.items()}
+        """What columns beside those of `COLUMNS` hold: those of custom sensors, and `UNMODELLED`."""
+        custom = {name: column for one in self._custom for name, column in one.columns.items()}
+        return custom | ({UNMODELLED: _UNMODELLED} if self._unmodelled else {})
 
     @property
     def metadata(self) -> dict[str, str]:
@@ -253,6 +257,7 @@ class Sensing:
                 error = model_error.error_nt(sd, self._error_process.next(rows))
                 error = rounded(error, spec.resolution_nt)
             disturbance = disturbance + self._beside_nt
+            columns[UNMODELLED] = np.zeros(rows) + self._beside_nt
         columns["b_disturbance_nt"] = disturbance
         columns["b_total_nt"] = columns["b_map_nt"] + disturbance
         columns["b_model_error_nt"] = error

@@ -490,6 +490,50 @@ def test_the_preset_magnav_gives_its_arrays(penalty, tmp_path):
     assert np.std(default - compensated) > 0.01
 
 
+def test_the_presets_own_penalty_leaves_the_noise_and_that_of_magnavs_test_far_more():
+    b, readings = figure_of_merit_flight(10.0)
+    left = {
+        ridge: float(np.std(fit.compensate(readings, b, 10.0)))
+        for ridge in (None, 1e-3)
+        for fit in [fit_tolles_lawson(readings, b, 10.0, ridge=ridge, preset="magnav")]
+    }
+    page = (DOCS / "compensate.md").read_text()
+    (line,) = re.findall(
+        r"the default leaves ([\d.]+) nT of (\d+) nT.*?`ridge=1e-3` leaves\s+(\d+) nT", page, re.DOTALL
+    )
+    assert [float(word) for word in line] == [round(left[None], 1), round(readings.std()), round(left[1e-3])]
+    assert left[None] < 0.6  # the noise of a reading is 0.5 nT
+    assert "ridge=1e-3, preset" not in page
+
+
+def test_the_figures_of_both_reports_are_those_of_the_raw_arrays(calibration):
+    run = calibration("figure8", seed=1)
+    model = fit_run(run, band_hz=None, ridge=1e-6)
+    vector, field = (
+        run["b_vector_measured_nt"],
+        run["b_measured_nt"] - run["b_map_nt"],
+    )
+    fine = np.isfinite(field) & np.isfinite(vector).all(axis=1)
+    assert fine[np.argmax(fine) :].all()  # so that the longest stretch is all of it
+    b, y = vector[fine], field[fine]
+    matrix, names = design_matrix(b, 1 / float(np.median(np.diff(run["t"]))))
+    modelled = matrix @ np.array(model.coefficients)
+    left = y - y.mean() - (modelled - modelled.mean())
+    fitted = {figure.name: figure.value for figure in model.report("fit").figures}
+    assert fitted["coefficients"] == len(names) == len(model.coefficients)
+    assert fitted["ridge"] == 1e-6
+    assert_allclose(fitted["residual"], left.std(), rtol=1e-9)
+    compensated, report = compensate_run(run, model)
+    applied = {figure.name: figure.value for figure in report.figures}
+    assert applied["readings"] == fine.sum()
+    assert_allclose(applied["before"], y.std(), rtol=1e-12)
+    assert_allclose(applied["after"], left.std(), rtol=1e-9)
+    assert_allclose(applied["variance removed"], 1 - left.var() / y.var(), rtol=1e-9)
+    assert_allclose((compensated["b_measured_nt"] - run["b_map_nt"])[fine] - y.mean(), left, atol=1e-6)
+    assert f"standard deviation {left.std():,.0f} nT against {y.std():,.0f} nT" in report.verdict
+    assert f"a ratio of {left.std() / y.std():.2f}" in report.verdict
+
+
 def test_the_preset_magnav_drops_the_terms_along_z_and_takes_a_bias():
     b, readings = figure_of_merit_flight(10.0)
     _, names = design_matrix(b, 10.0, ("induced5", "eddy8", "bias"), preset="magnav")

@@ -9,6 +9,7 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import build_dataset
+from magtwin.learn.data.features import features as features_of
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.recording import Source
 from magtwin.learn.data.split import split
@@ -209,6 +210,40 @@ def test_weights_trained_on_rows_of_every_recording_are_refused(data, weights):
     leaky = replace(one, metadata={**one.metadata, "config": 'split = "row"\nseed = 3\n'})
     with pytest.raises(InputError, match="trained on rows of every recording"):
         unseen(data, [leaky])
+
+
+def test_the_figures_of_a_report_are_those_of_the_raw_arrays(data, weights):
+    runs = {"one": a_run(7, path="figure8"), "other": a_run(9, path="sine")}
+    candidate = candidate_of(weights[0], [HILLS])
+    made = judged([FLAT, candidate], *(trial(name, run) for name, run in runs.items()))
+    every = next(case for case in made.summary()["cases"] if case["name"] == "all")
+    errors, sds, naive_errors = [], [], []
+    for run in runs.values():
+        here = labelled(run, HILLS.field, candidate.alignment)
+        mean, sd = candidate.model.net.predict(features_of(here, candidate.model.features))
+        kept = np.isfinite(here["label_nt"])
+        errors.append((mean - here["label_nt"])[kept])
+        sds.append(sd[kept])
+        naive_errors.append((300.0 - labelled(run, HILLS.field)["label_nt"])[kept])
+    error, sd, plain = (np.concatenate(parts) for parts in (errors, sds, naive_errors))
+    shown, naive_shown = every["models"][candidate.name], every["models"][NAIVE]
+    assert every["rows"] == len(error)
+    assert naive_shown["mae_nt"] == pytest.approx(np.abs(plain).mean(), rel=1e-9)
+    wanted = {
+        "mae_nt": np.abs(error).mean(),
+        "ratio": np.abs(error).mean() / np.abs(plain).mean(),
+        "rmse_nt": np.sqrt(np.mean(error**2)),
+        "bias_nt": error.mean(),
+        "coverage": np.mean(np.abs(error) <= 1.6448536 * sd),
+    }
+    for name, value in wanted.items():
+        assert shown[name] == pytest.approx(value, rel=1e-9), name
+    (line,) = made.verdicts().values()
+    sizes = (
+        f"{wanted['mae_nt']:,.0f} nT against {np.abs(plain).mean():,.0f} nT, a ratio of {wanted['ratio']:.2f}"
+    )
+    assert sizes in line
+    assert f"hold {wanted['coverage']:.0%} of the readings" in line
 
 
 def test_the_exact_field_judges_where_it_is_asked_for():

@@ -11,12 +11,14 @@ from magtwin.cli import main
 from magtwin.errors import CalibrationWarning, InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files import sha256
+from magtwin.learn.data.features import features
 from magtwin.learn.inference.calibrate import labelled_drive
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.inference.online import OnlineMagnetometer, read_online
 from magtwin.learn.models.linear import fit_linear
 from magtwin.learn.models.predictor import load_predictor
 from magtwin.run.run import Run
+from magtwin.verdict import OF_DRIVE, OTHERS, OWN
 
 NAMES = "yaw_sin,yaw_cos,odom_v_x"
 X, Y = np.meshgrid(np.linspace(-3, 3, 13), np.linspace(-3, 3, 13))
@@ -155,6 +157,44 @@ def test_the_date_of_a_bag_is_recorded_and_the_error_of_a_single_block_is_unknow
     assert np.isnan(load_predictor(tmp_path / "a.safetensors").residual_sd_nt)
 
 
+def test_the_figures_of_its_report_are_those_of_the_raw_arrays(model):
+    run = a_run(31, "hysteresis")
+    now = mt.calibrate(model, run, anomaly_map=FIELD)
+    drive = labelled_drive(model, run, FIELD)
+    phi = np.column_stack([np.ones(len(drive.y)), (drive.x - model.inputs.mean) / model.inputs.scale])
+    noise = model.noise.floor_nt2 + (phi[:, 1:] ** 2) @ model.noise.slopes_nt2
+    share = np.median(np.diff(drive.t)) / 2.5  # of an independent reading: errors are correlated over 2.5 s
+    inverse = np.linalg.inv(model.prior.covariance)
+
+    def posterior(at):
+        weighted = phi[at].T * (share / noise[at])
+        spread = np.linalg.inv(inverse + weighted @ phi[at])
+        return spread @ (inverse @ model.prior.mean + weighted @ drive.y[at]), spread
+
+    mean, spread = posterior(np.ones(len(drive.y), bool))
+    block = ((drive.t - drive.t[0]) // 10).astype(int)
+    error, sd = np.empty(len(drive.y)), np.empty(len(drive.y))
+    for k in np.unique(block):
+        m, v = posterior(block != k)
+        at = block == k
+        error[at] = phi[at] @ m - drive.y[at]
+        sd[at] = np.sqrt(noise[at] + np.einsum("ni,ij,nj->n", phi[at], v, phi[at]))
+    figures = {figure.name: figure for figure in now.report("now").figures}
+    assert figures["constant of the session"].value == pytest.approx(mean[0], rel=1e-6)
+    assert figures["constant of the session"].spread == pytest.approx(np.sqrt(spread[0, 0]), rel=1e-6)
+    assert figures["residual sd"].value == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-6)
+    ratio = np.sort(np.abs(error) / sd) / 1.6448536
+    assert figures["interval factor of the drive"].value == pytest.approx(
+        np.clip(ratio[int(np.ceil(0.9 * len(ratio))) - 1], 0.7, 4.0), rel=0.05
+    )  # blocks weigh alike, which are of equal length but for a reading
+    before = phi @ model.prior.mean - drive.y
+    assert now.metadata["calibration_residual_before_nt"] == pytest.approx(
+        np.sqrt(np.mean(before**2)), rel=1e-9
+    )
+    assert now.metadata["calibration_readings"] == len(drive.y)
+    assert now.metadata["calibration_duration_s"] == drive.t[-1] - drive.t[0]
+
+
 def test_a_poor_drive_is_warned_of(model):
     for run, options, text in (
         (a_run(3, seconds=20.0), {}, "it lasts 20 s, and 30 s are needed"),
@@ -266,7 +306,7 @@ def test_training_needs_sessions_and_a_nominal_plant(tmp_path):
             mt.train(data, model="mixed", features=NAMES)
 
 
-def test_the_commands_calibrate_and_widen(weights, tmp_path, capsys):
+def test_the_commands_calibrate_and_refuse_to_widen_what_is_wide(weights, tmp_path, capsys):
     a_run(7, "hysteresis", seconds=20.0).save(tmp_path / "drive.parquet")
     mt.save_map(FIELD, tmp_path / "map.usdc")
     words = [
@@ -282,5 +322,22 @@ def test_the_commands_calibrate_and_widen(weights, tmp_path, capsys):
     assert "it lasts 20 s" in err
     assert json.loads(out)
     assert load_predictor(tmp_path / "now.safetensors").intervals == "calibrated"
-    main(["network", "widen", str(weights), "--out", str(tmp_path / "wide.safetensors"), "--quiet"])
-    assert load_predictor(tmp_path / "wide.safetensors").intervals == "unknown"
+    words[1:1] = ["--runs"]
+    with pytest.raises(SystemExit):
+        main(["network", "widen", *map(str, words[:-1]), str(tmp_path / "wide.safetensors")])
+    assert "a mixed model learned how robots differ in its training" in capsys.readouterr().err
+
+
+def test_an_uncalibrated_model_is_wide_on_every_robot_but_its_own_and_a_calibrated_one_as_its_drive(model):
+    run = a_run(900, "hysteresis", seconds=120.0)
+    now = mt.calibrate(model, run, anomaly_map=FIELD, duration_s=60.0)
+    for net, wanted in ((model, model.open_loop(unknown_plant=True)), (now, now)):
+        read = NeuralMagnetometer(net).read([run])[0]
+        x = features(run, net.features)
+        assert_array_equal(read.stated_sd_nt, wanted.predict(x)[1])
+        assert_array_equal(read.sd_nt, net.predict(x)[1])
+    assert NeuralMagnetometer(model).read([run])[0].intervals == OTHERS
+    assert NeuralMagnetometer(now).read([run])[0].intervals == OF_DRIVE
+    (own,) = NeuralMagnetometer(model).read([run], known=[True])
+    assert own.intervals == OWN
+    assert_array_equal(own.stated_sd_nt, own.sd_nt)

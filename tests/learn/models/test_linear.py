@@ -118,6 +118,26 @@ def test_a_label_that_never_varies_is_refused():
         fit_linear(x, np.full(len(x), 7.0), of, features=NAMES)
 
 
+def test_the_figures_of_its_report_are_those_of_the_raw_rows(fitted):
+    x, y, _ = rows()
+    model = fitted.model
+    figures = {figure.name: figure for figure in model.report("linear").figures}
+    slopes = np.array([figures[name].value for name in NAMES])
+    assert figures["constant"].value == pytest.approx(
+        y.mean(), rel=1e-12
+    )  # the labels' mean, at the inputs' means
+    predicted = figures["constant"].value + (x - x.mean(axis=0)) @ slopes
+    assert_allclose(model.predict(x)[0], predicted, rtol=1e-12)
+    z = (x - x.mean(axis=0)) / x.std(axis=0)
+    penalty = figures["ridge penalty"].value * len(x) * np.eye(3)
+    peer = np.linalg.solve(z.T @ z + penalty, z.T @ (y - y.mean()))
+    assert_allclose(slopes, peer / x.std(axis=0), rtol=1e-9)
+    for name, size in zip(NAMES, peer, strict=True):
+        assert figures[name].note == f"{size:+.3g} nT a standard deviation"
+    at_means = model.predict(x.mean(axis=0)[None])[1][0]
+    assert figures["sd at the means"].value == pytest.approx(at_means, rel=1e-12)
+
+
 def test_the_report_gives_coefficients_in_the_units_of_the_features(fitted):
     figures = {figure.name: figure for figure in fitted.model.report("m").figures}
     assert figures["odom_v_x"].unit == "nT per m/s"

@@ -38,10 +38,10 @@ def twin(request: pytest.FixtureRequest, lab_scene: Path) -> Twin:
 def live_of(twin: Twin) -> LiveRobot:
     net = twin.magnetometer
 
-    def network(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    def network(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray]:
         assert net is not None
         (read,) = net.read([run])
-        return read.disturbance_nt, read.sd_nt, read.outside
+        return read.disturbance_nt, read.sd_nt, read.outside, read.stated_sd_nt
 
     return LiveRobot(
         twin.scene,
