@@ -69,7 +69,7 @@ def run(
         try:
             return subprocess.run(command, check=False, timeout=limit_s, env=env, **(wanted | options))
         except subprocess.TimeoutExpired:
-            return subprocess.CompletedProcess(command, LATE, "", f"took longer than {limit_s:.3g} s")
+            return subprocess.CompletedProcess(command, LATE, "", f"took longer than {limit_s:.0f} s")
 
 
 def answer_of(

@@ -157,7 +157,7 @@ def check_zip(path: Path, archive: zipfile.ZipFile, kind: str, noun: str) -> Non
             )
 
 
-_GIT_S = 5.0
+_GIT_S = 60.0
 """Time limit of git [s]; it takes 0.01 s."""
 
 

@@ -92,10 +92,13 @@ class _Trial:
                 break
             if late.is_set() or child.wait() == _CUT_SHORT:
                 self.stop()
-                took = f"{patience:.0f} s" if late.is_set() else f"{PROCESSOR_S:g} s of the processor"
+                if late.is_set():
+                    raise InputError(
+                        f"{path}: USD does not open it in {patience:.0f} s; try again, or copy it"
+                    )
                 raise InputError(
-                    f"{path}: USD does not open it in {took}: damaged, or its references multiply each "
-                    "other; copy or write it again"
+                    f"{path}: USD does not open it in {PROCESSOR_S:g} s of the processor: damaged, or its "
+                    "references multiply each other; copy or write it again"
                 )
             self.stop()
             if attempt:  # alone in a fresh process

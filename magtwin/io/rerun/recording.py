@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -38,6 +39,9 @@ APPLICATION = "magtwin"
 
 PATIENCE_S = 60.0
 """Time that Rerun may take to write its data [s]."""
+
+NEVER = timedelta(days=1)
+"""Time after which Rerun writes what it has, however little."""
 
 END = b"RRF2FOOT"
 """Bytes at the end of a complete file."""
@@ -113,7 +117,11 @@ def stream(
     strict = rr.strict_mode()
     if not _stuck.is_set():  # the threads of recordings that nothing uses any more end when Rerun is asked
         await_rerun(rerun_bindings.flush_and_cleanup_orphaned_recordings, folder)
-    rec = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False)
+    # What is written together must not depend on the speed of the machine; a viewer gets it as it comes.
+    batches = None if file is None else rr.ChunkBatcherConfig(flush_tick=NEVER)
+    rec = rr.RecordingStream(
+        APPLICATION, recording_id=recording_id, send_properties=False, batcher_config=batches
+    )
     if not rr.is_enabled(rec):
         raise InputError(f"{final}: Rerun is switched off by the environment variable RERUN; unset it")
     rr.set_strict_mode(True)

@@ -43,7 +43,7 @@ LEAST_SIZE, MOST_SIZE = 200, 8000
 PATIENCE_S = 600.0
 """Time that a viewer that lives may take for a step, on a busy machine without a graphics card [s]."""
 
-FRAMES = 60
+FRAMES = 20
 """Frames after which a loaded file has shown something, and after which the viewer's notices are gone."""
 
 CANNOT_DRAW = re.compile(r"render context|adapter|graphics|wgpu|surface", re.IGNORECASE)
@@ -184,7 +184,7 @@ def live_viewer(
         try:
             with _interrupt_later() as interrupts:
                 process = subprocess.Popen(command, **options)
-                client = _connected(process, port, log, interrupts)
+                client = _connected(process, port, log, interrupts, draws=headless)
             assert client is not None  # else the interrupt was raised
             yield f"rerun+http://{LOCALHOST}:{port}/proxy", client
         except (ConnectionError, RuntimeError) as error:
@@ -216,25 +216,27 @@ def _interrupt_later() -> Iterator[list[int]]:
 
 
 def _connected(
-    process: "subprocess.Popen[bytes]", port: int, log: IO[str], interrupts: list[int]
+    process: "subprocess.Popen[bytes]", port: int, log: IO[str], interrupts: list[int], *, draws: bool
 ) -> ViewerClient | None:
-    """A client of a started viewer, once it draws. It listens before it knows whether it can draw.
+    """A client of a started viewer, once it answers, or has drawn. It answers before it tries to draw.
 
     None if the user interrupted.
     """
     clients: list[ViewerClient] = []
 
-    def draws() -> bool:
+    def ready() -> bool:
         if process.poll() is not None:
             raise _ending(process, log)
         try:
             clients.append(ViewerClient.connect(f"rerun+http://{LOCALHOST}:{port}/proxy"))
             clients[-1].get_state()
+            if draws:
+                clients[-1].take_screenshot(max_size=64)
         except (ConnectionError, RuntimeError):
             return False
         return True
 
-    _wait_until(lambda: bool(interrupts) or draws(), "the Rerun viewer did not start")
+    _wait_until(lambda: bool(interrupts) or ready(), "the Rerun viewer did not start")
     return None if interrupts else clients[-1]
 
 
