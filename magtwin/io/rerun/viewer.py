@@ -253,7 +253,7 @@ def _ending(process: "subprocess.Popen[bytes]", log: IO[str]) -> InputError:
     log.seek(0)
     reason = _reason(log.read())
     if process.returncode == -signal.SIGKILL:
-        reason = "it was killed, as where memory runs out; try a smaller `size`"
+        reason = "it was killed from outside; if memory ran out, give a smaller `size`"
     if CANNOT_DRAW.search(reason):
         return InputError(f"the Rerun viewer cannot draw here: {reason}; {VULKAN}")
     return InputError(f"the Rerun viewer ended: {reason}")
