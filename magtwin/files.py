@@ -8,7 +8,6 @@ import hashlib
 import os
 import re
 import stat
-import subprocess
 import tomllib
 import types
 import typing
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from magtwin.budget import BUDGETS, check_count, check_decoded, check_depth, check_size
+from magtwin.children import run
 from magtwin.errors import NEAR, InputError, hint
 
 T = TypeVar("T")
@@ -157,7 +157,7 @@ def check_zip(path: Path, archive: zipfile.ZipFile, kind: str, noun: str) -> Non
             )
 
 
-_GIT_S = 5.0
+_GIT_S = 60.0
 """Time limit of git [s]; it takes 0.01 s."""
 
 
@@ -183,18 +183,9 @@ def git_revision(folder: str | os.PathLike[str]) -> str:
         "-q",
         "HEAD",
     ]
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     try:
-        done = subprocess.run(
-            command,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            check=False,
-            env=environment,
-            timeout=_GIT_S,
-        )
-    except (OSError, subprocess.TimeoutExpired, UnicodeDecodeError):
+        done = run(command, limit_s=_GIT_S, changes={n: None for n in os.environ if n.startswith("GIT_")})
+    except OSError:
         return ""
     return done.stdout.strip() if done.returncode == 0 else ""
 

@@ -4,6 +4,9 @@ An output is written in a hidden folder beside its place, is brought to the disk
 writing process keeps the hidden folder locked. One whose lock is free was left by a
 process that was killed: the next process that writes there removes it, after it has completed or undone what
 the other had begun to rename.
+
+A link at the place of an output is itself replaced: what it leads to stays as it is, so that no link in a
+stranger's folder leads a write elsewhere. Only a file that is rewritten in its place is found through a link.
 """
 
 import ctypes
@@ -79,7 +82,7 @@ def check_free(path: str | os.PathLike[str], *, force: bool = False) -> Path:
             replaced, or be the name of an output.
     """
     path = Path(path)
-    kept = _foreign(path) if path.is_dir() else ""
+    kept = _foreign(path) if path.is_dir() and not path.is_symlink() else ""
     if kept and not _wrong(path):
         text = "which would be removed with it; move it away, remove the folder, or give another name"
         raise InputError(f"{path}: {'holds' if force else 'exists already, with'} {kept}, {text}")
@@ -91,9 +94,11 @@ def _free(path: Path, *, force: bool, in_place: bool = False) -> Path:
     if wrong := _wrong(path):
         raise InputError(f"{path if str(path).strip() else repr(str(path))}: {wrong}")
     _sweep((Path.cwd() / path).parent)
-    if path.exists() and not force:
+    if os.path.lexists(path) and not force:
+        link = " as a link" if path.is_symlink() else ""
         raise InputError(
-            f"{path}: exists already; give `force=True` to replace it, or another name", parameter="force"
+            f"{path}: exists already{link}; give `force=True` to replace it, or another name",
+            parameter="force",
         )
     if not in_place and Path(os.path.realpath(path)) in _inputs.get():
         raise InputError(f"{path}: is read by this command and would be replaced; give another name")
@@ -147,6 +152,7 @@ def output(
     """
     path = _free(Path(path), force=force, in_place=in_place)
     place = Path.cwd() / path  # absolute, since the working folder can be renamed
+    place = Path(os.path.realpath(place)) if in_place else place
     inner = any(folder in place.parents for folder in _asides)  # a part of another output
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -189,7 +195,7 @@ def _check_replaceable(folder: Path, new: Path) -> None:
         InputError: It holds an input, and the new folder no copy of it; or a file of another suffix, and the
             new folder none of its name.
     """
-    if not folder.is_dir():
+    if not folder.is_dir() or folder.is_symlink():
         return
     real = Path(os.path.realpath(folder))
     for file in _inputs.get():
@@ -345,18 +351,18 @@ class _Aside:
                 self.old.rename(self.place)
                 raise
             return
-        if keep and self.place.exists():
+        if keep and os.path.lexists(self.place):
             try:
-                os.link(self.place, self.old)
+                os.link(self.place, self.old, follow_symlinks=False)
             except OSError:  # a file system without hard links
-                shutil.copy2(self.place, self.old)
+                shutil.copy2(self.place, self.old, follow_symlinks=False)
         self.new.replace(self.place)
 
     def undo(self) -> None:
         """Take a `swap` back."""
-        if self.new.exists() and exchanged(self.new, self.place):
+        if os.path.lexists(self.new) and exchanged(self.new, self.place):
             return
-        if self.old.is_file():
+        if (self.old.is_file() or self.old.is_symlink()) and not self.place.is_dir():
             self.old.replace(self.place)
             return
         self.place.rename(self.new)
@@ -396,7 +402,7 @@ def _commit(asides: list[_Aside]) -> None:
         done: list[_Aside] = []
         try:
             for aside in asides:
-                if not aside.force and aside.place.exists():
+                if not aside.force and os.path.lexists(aside.place):
                     raise InputError(
                         f"{aside.place}: another process has made it in the meantime; give another name"
                     )

@@ -285,6 +285,65 @@ def test_what_another_process_made_in_the_meantime_is_not_replaced(tmp_path):
 @pytest.mark.parametrize("name", ["loop", "loop/x"])
 def test_a_link_to_itself_is_replaced_or_refused(name, tmp_path):
     (tmp_path / "loop").symlink_to("loop")
-    with suppress(InputError), output(tmp_path / name) as aside:
+    with suppress(InputError), output(tmp_path / name, force=True) as aside:
         aside.write_text("new")
     assert content(tmp_path) in ({"loop": "new"}, {})
+
+
+@pytest.mark.parametrize("target", ["a.txt", "missing", "../other/a.txt"])
+def test_a_link_is_replaced_itself_and_only_by_force(target, tmp_path):
+    for folder in ("here", "other"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "a.txt").write_text("old")
+    link = tmp_path / "here" / "link.txt"
+    link.symlink_to(target)
+    with pytest.raises(InputError, match="exists already as a link"), output(link) as aside:
+        aside.write_text("new")
+    assert link.readlink() == Path(target)
+    with output(link, force=True) as aside:
+        aside.write_text("new")
+    assert not link.is_symlink()
+    assert content(tmp_path) == {"here/a.txt": "old", "here/link.txt": "new", "other/a.txt": "old"}
+
+
+def test_a_link_to_a_folder_is_replaced_itself_whatever_the_folder_holds(tmp_path):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "thesis.tex").write_text("mine")
+    (tmp_path / "out").symlink_to("data")
+    check_free(tmp_path / "out", force=True)
+    write(tmp_path / "out", {"x.txt": "new"}, force=True)
+    assert not (tmp_path / "out").is_symlink()
+    assert content(tmp_path) == {"data/thesis.tex": "mine", "out/x.txt": "new"}
+
+
+def test_a_link_to_the_folder_of_an_output_is_followed(tmp_path):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "out").symlink_to("data")
+    write(tmp_path / "out" / "run", {"x.txt": "new"})
+    assert (tmp_path / "out").is_symlink()
+    assert (tmp_path / "data" / "run" / "x.txt").read_text() == "new"
+
+
+def test_a_file_that_is_rewritten_in_its_place_is_found_through_a_link(tmp_path):
+    (tmp_path / "real.txt").write_text("old")
+    (tmp_path / "link.txt").symlink_to("real.txt")
+    with output(tmp_path / "link.txt", force=True, in_place=True) as aside:
+        aside.write_text("new")
+    assert (tmp_path / "link.txt").is_symlink()
+    assert (tmp_path / "real.txt").read_text() == "new"
+
+
+def test_links_are_put_back_if_a_later_output_of_the_command_fails(tmp_path, monkeypatch):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "a.txt").write_text("old")
+    links = {"file": Path("a.txt"), "folder": Path("data"), "missing": Path("nowhere")}
+    for name, target in links.items():
+        (tmp_path / name).symlink_to(target)
+    with suppress(InputError), transaction():
+        for name in ("file", "missing"):
+            with output(tmp_path / name, force=True) as aside:
+                aside.write_text("new")
+        write(tmp_path / "folder", {"x.txt": "new"}, force=True)
+        write(tmp_path / "last", {"x.txt": "mine", "../../last/x.txt": "theirs"})
+    assert content(tmp_path)["last/x.txt"] == "theirs", "the command did not fail"
+    assert {name: (tmp_path / name).readlink() for name in links} == links

@@ -259,7 +259,7 @@ def _replace_sensors(robot: Usd.Prim, noun: str, path: Sdf.Path) -> list[str]:
             stage.RemovePrim(prim.GetPath())
             continue
         notes.append(f"{where} is not simulated here: the settings name another")
-        prim.RemoveAPI(NOUNS[noun])
+        prim.RemoveAppliedSchema(NOUNS[noun])
         for attribute in prim.GetAuthoredPropertiesInNamespace(f"magtwin:{noun}"):
             prim.RemoveProperty(attribute.GetName())
     return notes

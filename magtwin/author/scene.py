@@ -32,7 +32,7 @@ from magtwin.usd.maps.heat_map import MAP
 from magtwin.usd.maps.layer import load_map
 from magtwin.usd.robot import load_robot, urdf_of
 from magtwin.usd.scene import check_map
-from magtwin.usd.schema import only_prim_with
+from magtwin.usd.schema import author, author_targets, only_prim_with
 from magtwin.usd.sensors import (
     MAP_CHECKSUM,
     MAP_RELATIONSHIP,
@@ -281,9 +281,9 @@ def _define_robot(stage: Usd.Stage, placed: PlacedRobot, map_sha256: str) -> Non
         define(stage, only_prim_with(prim, part).GetPath(), getattr(robot, part))
     magnetometer = only_prim_with(prim, "magnetometer")
     map_prim = only_prim_with(stage.GetPrimAtPath(WORLD), "anomalyMap")
-    magnetometer.GetRelationship(MAP_RELATIONSHIP).SetTargets([map_prim.GetPath()])
+    author_targets(magnetometer, MAP_RELATIONSHIP, [map_prim.GetPath()])
     if map_sha256:
-        magnetometer.GetAttribute(MAP_CHECKSUM).Set(map_sha256)
+        author(magnetometer.GetAttribute(MAP_CHECKSUM), map_sha256)
 
 
 def _settle(layer: Sdf.Layer, aside: Path, final: Path) -> None:

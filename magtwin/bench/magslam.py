@@ -10,7 +10,6 @@ magtwin ships neither; give the folder that holds them.
 import io
 import math
 import os
-import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from magtwin.budget import check_decoded, decoded_limit
+from magtwin.children import run
 from magtwin.errors import InputError
 from magtwin.files import existing_file
 from magtwin.localization.problem import OdometryModel, Prior, Problem, SensorModel
@@ -287,7 +287,7 @@ def _matlab(path: Path, shapes: Mapping[str, tuple[int, int]]) -> dict[str, Arra
 def _numbers(path: Path, names: tuple[str, ...], size: int, changed_ns: int) -> dict[str, Array]:
     """Arrays of numbers of a MATLAB file that had this size, and was changed at this time."""
     command = [sys.executable, "-P", "-c", _LOAD, str(path), str(decoded_limit(size)), *names]
-    done = subprocess.run(command, capture_output=True, check=False)
+    done = run(command, text=False, errors=None)
     if done.returncode:
         lines = done.stderr.decode(errors="replace").split("\n")
         reason = next((line.strip() for line in reversed(lines) if line.strip()), "the reader crashes on it")

@@ -19,7 +19,7 @@ from magtwin.errors import InputError
 from magtwin.usd.geometry import Shape, read_shapes
 from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.maps.tiled_layer import is_tiled
-from magtwin.usd.schema import NOUNS, attribute_name, prims_with
+from magtwin.usd.schema import attribute_name, has_api, prims_with, value_of
 from magtwin.version import __version__
 
 CREASE = np.deg2rad(40.0)
@@ -187,14 +187,14 @@ class _Scene:
                 value = _json_value(attribute.Get())
                 if value not in (None, []):
                     extras[attribute.GetName()] = value
-        if prim.HasAPI(NOUNS["anomalyMap"]) and not is_tiled(prim):
-            values = np.array(prim.GetAttribute(attribute_name("anomalyMap", "values")).Get(), "<f4")
-            valid = np.array(prim.GetAttribute(attribute_name("anomalyMap", "valid")).Get(), "u1")
+        if has_api(prim, "anomalyMap") and not is_tiled(prim):
+            values = np.array(value_of(prim.GetAttribute(attribute_name("anomalyMap", "values"))), "<f4")
+            valid = np.array(value_of(prim.GetAttribute(attribute_name("anomalyMap", "valid"))), "u1")
             valid &= np.isfinite(values)
             numbers = {"values": np.where(valid, values, 0).astype("<f4"), "valid": valid}
             for name, array in numbers.items():
                 extras[attribute_name("anomalyMap", name)] = {"accessor": self._accessor(array)}
-        for child in prim.GetChildren() if prim.HasAPI(NOUNS["anomalyMap"]) else ():
+        for child in prim.GetChildren() if has_api(prim, "anomalyMap") else ():
             scale = child.GetCustomDataByKey("magtwin") or {}
             if "colourMap" in scale:
                 extras["colours"] = {key: _json_value(value) for key, value in scale.items()}

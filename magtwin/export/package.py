@@ -38,7 +38,7 @@ from magtwin.usd.maps.tiled_layer import check_tiles
 from magtwin.usd.placement import labs_on
 from magtwin.usd.scene import read_scene
 from magtwin.usd.schema import FOLDER as SCHEMA
-from magtwin.usd.schema import attribute_name, place, prims_with
+from magtwin.usd.schema import attribute_name, place, prims_with, value_of
 from magtwin.usd.schema.names import OLDER
 from magtwin.usd.schema.versions import TEXT
 from magtwin.usd.trial import check_named
@@ -265,7 +265,7 @@ class _Work:
             read_map(prim)
             check_tiles(prim)
             self.map = self.map or str(prim.GetPath())
-            licence = prim.GetAttribute(attribute_name("anomalyMap", "licence")).Get()
+            licence = value_of(prim.GetAttribute(attribute_name("anomalyMap", "licence")))
             values = prim.GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack()[0].layer
             self.licences[self._relative(Path(values.realPath))] = licence or UNKNOWN
         magnetometers = prims_with(world, "magnetometer")

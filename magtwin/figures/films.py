@@ -6,13 +6,14 @@ import re
 import subprocess
 import tempfile
 from collections.abc import Callable, Generator, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.children import end, environment
 from magtwin.errors import InputError
 from magtwin.figures.scenery import Scenery, View
 from magtwin.outputs import check_free, output
@@ -154,16 +155,13 @@ def _ffmpeg(
     exact = "-map_metadata -1 -fflags +bitexact -flags:v +bitexact"
     options = f"-nostdin -v error -y {source} {video} {exact}".split()
     command = [imageio_ffmpeg.get_ffmpeg_exe(), *options, str(aside)]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log)
+    streams: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": log}
+    process = subprocess.Popen(command, env=environment(os.devnull), **streams)
     try:
         yield process
     finally:
-        if process.poll() is None:
-            process.kill()
-            process.wait()
-        if process.stdin is not None:
-            with suppress(OSError):
-                process.stdin.close()
+        process.kill()
+        end(process)
 
 
 def _last_line(log: IO[bytes]) -> str:

@@ -1,7 +1,6 @@
 """Views of files: show, draw or film a run or a stage; a page about runs; two runs compared."""
 
 import shutil
-import subprocess
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
@@ -9,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+from magtwin.children import run
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.figures.canvas import save
 from magtwin.figures.page import write_page
@@ -269,7 +269,7 @@ def _view_stage(file: Path) -> None:
 
     existing(file, "stage")
     if usdview := shutil.which("usdview"):
-        result = subprocess.run([usdview, str(file)], check=False)
+        result = run([usdview, str(file)], capture_output=False)
         if result.returncode:
             raise InputError(f"{file}: usdview ended with status {result.returncode}")
     elif file.suffix.lower() != ".usdz" and is_animation(file):

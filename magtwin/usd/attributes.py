@@ -14,7 +14,7 @@ from magtwin.errors import InputError
 from magtwin.frames import wxyz_from_xyzw, xyzw_from_wxyz
 from magtwin.spec.base import Quat, Vec3
 from magtwin.usd.layers import relative_asset
-from magtwin.usd.schema import attribute_name, place, require_api
+from magtwin.usd.schema import attribute_name, author, place, require_api, type_of, value_of
 from magtwin.usd.trial import check_named
 
 S = TypeVar("S")
@@ -32,7 +32,7 @@ def write_spec(prim: Usd.Prim, noun: str, spec: Any, *, skip: Any = ()) -> Usd.P
         value = getattr(spec, field.name)
         missing = value not in (None, "", ()) and not attribute.HasAuthoredValue()
         if missing or _value(attribute) != (value.resolve() if isinstance(value, Path) else value):
-            attribute.Set(_usd_value(attribute, value))
+            author(attribute, _usd_value(attribute, value))
     return prim
 
 
@@ -160,7 +160,7 @@ def check_prim_name(name: str, what: str) -> str:
 
 def _usd_value(attribute: Usd.Attribute, value: Any) -> Any:
     """A field's value as the attribute's type."""
-    kind = attribute.GetTypeName()
+    kind = type_of(attribute)
     if kind == Sdf.ValueTypeNames.Asset:
         layer = attribute.GetStage().GetEditTarget().GetLayer()
         return Sdf.AssetPath(relative_asset(layer, value) if value is not None else "")
@@ -185,7 +185,7 @@ def plain_value(attribute: Usd.Attribute) -> Any:
 
 def _value(attribute: Usd.Attribute) -> Any:
     """As `plain_value`, of a stage that is being written."""
-    value, kind = attribute.Get(), attribute.GetTypeName()
+    value, kind = value_of(attribute), type_of(attribute)
     if not isinstance(value, kind.type.pythonClass or type(kind.defaultValue)):
         raise InputError(
             f"{place(attribute.GetPrim())}: {attribute.GetName()} must be a {kind}, "

@@ -46,7 +46,10 @@ def info_of_stage(path: Path) -> Report:
         Figure("mass", float(mass) * kilograms, "kg"),
     ]
     applied = [
-        (schema, prim) for prim in prims for schema in prim.GetAppliedSchemas() if schema.startswith(_PREFIX)
+        (schema, prim)
+        for prim in prims
+        for schema in prim.GetPrimTypeInfo().GetAppliedAPISchemas()
+        if schema.startswith(_PREFIX)
     ]
     places: dict[str, list[str]] = {}
     for schema, prim in applied:

@@ -15,7 +15,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 from magtwin.errors import InputError
-from magtwin.usd.schema import NOUNS, only_prim_with, place, prims_with
+from magtwin.usd.schema import has_api, only_prim_with, place, prims_with
 from magtwin.usd.sensors import MAP_RELATIONSHIP
 
 SAME = 1e-6
@@ -206,12 +206,12 @@ def _root_of(prim: Usd.Prim, maps: list[Sdf.Path]) -> Usd.Prim:
 
 def _open_instances(stage: Usd.Stage) -> None:
     """Make instances that hold a lab, a map or a robot ordinary prims, in the session layer."""
-    wanted = [NOUNS[noun] for noun in ("lab", "anomalyMap", "robot", "magnetometer")]
+    wanted = ("lab", "anomalyMap", "robot", "magnetometer")
     while stage.GetPrototypes():
         inside = (
             prim
             for prim in stage.Traverse(Usd.TraverseInstanceProxies())
-            if prim.IsInstanceProxy() and any(prim.HasAPI(api) for api in wanted)
+            if prim.IsInstanceProxy() and any(has_api(prim, noun) for noun in wanted)
         )
         prim = next(inside, None)
         if prim is None:

@@ -44,7 +44,15 @@ from magtwin.usd.placement import (
     take_to_origin,
 )
 from magtwin.usd.robot import read_robot
-from magtwin.usd.schema import NOUNS, attribute_name, only_prim_with, place, prims_with, require_api
+from magtwin.usd.schema import (
+    attribute_name,
+    author,
+    has_api,
+    only_prim_with,
+    place,
+    prims_with,
+    require_api,
+)
 from magtwin.usd.sensors import MAP_CHECKSUM, MAP_RELATIONSHIP, read_path
 from magtwin.usd.trial import folders_of
 from magtwin.usd.units import check_units
@@ -296,7 +304,7 @@ def _turned(earth: EarthFieldSpec, matrix: Gf.Matrix4d) -> EarthFieldSpec:
 
 
 def _all_with(stage: Usd.Stage, noun: str) -> list[Usd.Prim]:
-    return [p for p in stage.Traverse(Usd.TraverseInstanceProxies()) if p.HasAPI(NOUNS[noun])]
+    return [p for p in stage.Traverse(Usd.TraverseInstanceProxies()) if has_api(p, noun)]
 
 
 def map_of(magnetometer: Usd.Prim) -> Usd.Prim:
@@ -390,7 +398,7 @@ def use_map(
     checksum = layer_sha256(written)
     with Usd.EditContext(stage, stage.GetRootLayer()):
         for prim in prims_with(stage.GetPseudoRoot(), "magnetometer"):
-            prim.GetAttribute(MAP_CHECKSUM).Set(checksum)
+            author(prim.GetAttribute(MAP_CHECKSUM), checksum)
     for prim in prims_with(stage.GetPseudoRoot(), "anomalyMap"):
         for layer in stage.GetLayerStack(includeSessionLayers=False):
             over = layer.GetPrimAtPath(prim.GetPath())

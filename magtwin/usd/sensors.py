@@ -18,7 +18,16 @@ from magtwin.spec.magnetics import PlatformFieldSpec
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec, MountSpec
 from magtwin.usd.attributes import read_pose, read_spec, target, targets, write_pose, write_spec
-from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, require_api
+from magtwin.usd.schema import (
+    apply_api,
+    attribute_name,
+    author,
+    author_targets,
+    has_api,
+    place,
+    require_api,
+    value_of,
+)
 
 S = TypeVar("S")
 
@@ -184,13 +193,13 @@ def define_footprint(prim: Usd.Prim, footprint_radius_m: float) -> Usd.Prim:
     """Mark an Xform as the root of a robot with this footprint radius [m]."""
     attribute = apply_api(prim, "robot").GetAttribute(FOOTPRINT)
     if not attribute.HasAuthoredValue() or attribute.Get() != footprint_radius_m:
-        attribute.Set(footprint_radius_m)
+        author(attribute, footprint_radius_m)
     return prim
 
 
 def read_footprint(prim: Usd.Prim) -> float:
     """Footprint radius of the robot rooted at `prim` [m]."""
-    return float(require_api(prim, "robot").GetAttribute(FOOTPRINT).Get())
+    return float(value_of(require_api(prim, "robot").GetAttribute(FOOTPRINT)))
 
 
 def define_path(prim: Usd.Prim, path: str | Path) -> Usd.Prim:
@@ -218,9 +227,9 @@ def define_drive(prim: Usd.Prim, spec: DriveSpec) -> Usd.Prim:
         for name in names:
             if name not in joints:
                 raise InputError(f"{place(prim)}: no joint {name!r} for {field}; {hint(name, joints)}")
-        relationship = prim.GetRelationship(attribute_name("drive", field))
-        if relationship.GetTargets() != [joints[name].GetPath() for name in names]:
-            relationship.SetTargets([joints[name].GetPath() for name in names])
+        relationship, paths = attribute_name("drive", field), [joints[name].GetPath() for name in names]
+        if prim.GetRelationship(relationship).GetTargets() != paths:
+            author_targets(prim, relationship, paths)
     return prim
 
 
@@ -255,14 +264,14 @@ def read_platform(prim: Usd.Prim) -> PlatformFieldSpec:
 
 def define_plant(prim: Usd.Prim, spec: PlantSpec) -> Usd.Prim:
     """Apply the field beyond the linear platform field to a robot's root prim, unless there is none."""
-    if spec == PlantSpec() and not prim.HasAPI(NOUNS["plant"]):
+    if spec == PlantSpec() and not has_api(prim, "plant"):
         return prim
     return write_spec(apply_api(prim, "plant"), "plant", spec)
 
 
 def read_plant(prim: Usd.Prim) -> PlantSpec:
     """The plant of the robot rooted at `prim`, or one without effect."""
-    if not prim.HasAPI(NOUNS["plant"]):
+    if not has_api(prim, "plant"):
         return PlantSpec()
     return read_spec(PlantSpec, prim, "plant")
 
@@ -274,7 +283,7 @@ def define_mocap(prim: Usd.Prim, spec: MocapSpec) -> Usd.Prim:
 
 def read_mocap(prim: Usd.Prim) -> MocapSpec:
     """Settings of motion capture of the robot rooted at `prim`, or the default."""
-    if not prim.HasAPI(NOUNS["mocap"]):
+    if not has_api(prim, "mocap"):
         return MocapSpec()
     return read_spec(MocapSpec, prim, "mocap")
 

@@ -8,7 +8,6 @@ magtwin are not tried.
 """
 
 import atexit
-import contextlib
 import json
 import os
 import signal
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from magtwin.budget import BUDGETS, SPARE, allowed
+from magtwin.children import end, environment, limited
 from magtwin.errors import InputError
 from magtwin.files import shipped
 from magtwin.folders import allowed_folders
@@ -81,25 +81,24 @@ class _Trial:
             child = self._started()
             assert child.stdin is not None
             assert child.stdout is not None
-            late = threading.Event()
-            timer = threading.Timer(patience, _too_late, (child, late))
-            timer.start()
-            try:
-                child.stdin.write(json.dumps(job) + "\n")
-                child.stdin.flush()
-                answer = child.stdout.readline()
-            except BrokenPipeError:
-                answer = ""
-            finally:
-                timer.cancel()
+            with limited(child, patience) as late:
+                try:
+                    child.stdin.write(json.dumps(job) + "\n")
+                    child.stdin.flush()
+                    answer = child.stdout.readline()
+                except BrokenPipeError:
+                    answer = ""
             if answer:
                 break
             if late.is_set() or child.wait() == _CUT_SHORT:
                 self.stop()
-                took = f"{patience:.0f} s" if late.is_set() else f"{PROCESSOR_S:g} s of the processor"
+                if late.is_set():
+                    raise InputError(
+                        f"{path}: USD does not open it in {patience:.0f} s; try again, or copy it"
+                    )
                 raise InputError(
-                    f"{path}: USD does not open it in {took}: damaged, or its references multiply each "
-                    "other; copy or write it again"
+                    f"{path}: USD does not open it in {PROCESSOR_S:g} s of the processor: damaged, or its "
+                    "references multiply each other; copy or write it again"
                 )
             self.stop()
             if attempt:  # alone in a fresh process
@@ -121,6 +120,7 @@ class _Trial:
         if self._child is None or self._child.poll() is not None:
             # None of Python's settings of this process: they may print, or import from the working folder.
             options: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+            options["env"] = environment(os.devnull)  # it writes nothing
             self._child = subprocess.Popen([sys.executable, "-P", str(PROGRAM)], **options)
         return self._child
 
@@ -129,17 +129,7 @@ class _Trial:
         child, self._child = self._child, None
         if child is not None and self._owner == os.getpid():
             child.kill()
-            for pipe in (child.stdin, child.stdout):
-                if pipe is not None:
-                    with contextlib.suppress(OSError):
-                        pipe.close()
-            child.wait()
-
-
-def _too_late(child: "subprocess.Popen[str]", late: threading.Event) -> None:
-    """End a child that takes too long."""
-    late.set()
-    child.kill()
+            end(child)
 
 
 def _working_folder() -> str:

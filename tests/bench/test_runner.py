@@ -7,7 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
+from functools import partial
 from pathlib import Path
 
 import bad_localizers
@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from waiting import PATIENCE_S, wait_until
 
 from magtwin.bench import runner
 from magtwin.bench.results import begin_results, check_about, read_results
@@ -215,6 +216,11 @@ def test_localizers_that_fail_in_any_way_have_rows_and_the_suite_goes_on(warm, t
         assert reason in rows[f"bad_localizers:{name}"][1]
 
 
+def _went_on(out, before, program):
+    """Whether a program has written files of rows since, or has ended."""
+    return set(out.glob("rows/*/*.parquet")) != before or program.poll() is not None
+
+
 def test_an_interruption_leaves_whole_files_and_a_repeat_goes_on(suite, whole, tmp_path):
     out = tmp_path / "results"
     environment = {
@@ -224,12 +230,10 @@ def test_an_interruption_leaves_whole_files_and_a_repeat_goes_on(suite, whole, t
     command = [sys.executable, "-m", "magtwin", "bench", str(suite), "--out", str(out), "--jobs", "2"]
     for end in (signal.SIGINT, signal.SIGKILL):
         program = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
-        before, patience = len(list(out.glob("rows/*/*.parquet"))), time.monotonic() + 60
-        while len(list(out.glob("rows/*/*.parquet"))) == before and program.poll() is None:
-            assert time.monotonic() < patience
-            time.sleep(0.005)
+        before = set(out.glob("rows/*/*.parquet"))
+        wait_until(partial(_went_on, out, before, program))
         program.send_signal(end)
-        said = program.communicate(timeout=20)[1].decode()
+        said = program.communicate(timeout=PATIENCE_S)[1].decode()
         if end == signal.SIGINT:
             assert program.returncode == 130
             assert "magtwin: interrupted; finished work is kept, and the same command continues" in said

@@ -11,6 +11,7 @@ import time
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from waiting import PATIENCE_S, wait_until
 
 from magtwin.cli import main
 from magtwin.errors import InputError
@@ -105,8 +106,8 @@ def test_a_drive_at_a_terminal_is_recorded_and_leaves_the_terminal_as_it_was(tmp
     assert not termios.tcgetattr(theirs)[3] & termios.ICANON  # keys come one by one
     for key in (b"w", b"w", b"\x1b[D", end):
         os.write(ours, key)
-        time.sleep(0.3)
-    _, error = process.communicate(timeout=60)
+        time.sleep(1.0)  # the loop reads one key after the other also on a busy machine
+    _, error = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, error
     assert termios.tcgetattr(theirs) == before
     os.close(ours)
@@ -137,15 +138,19 @@ def test_a_folder_is_no_gamepad(tmp_path, lab_scene, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+def _drawn(client):
+    """Let a viewer draw; whether it shows something."""
+    client.take_screenshot(max_size=64)
+    return any(r.timelines for r in client.get_state().recordings)
+
+
 def test_a_viewer_that_listens_shows_the_drive_while_it_goes_on(lab_scene):
     twin = open_twin(lab_scene, network="none")
     try:
         with live_viewer(headless=True) as (address, client), streamed(twin, address) as show:
             for k in range(20):
                 show(k / 50, (k / 100, 0.0, 0.0))
-            end = time.monotonic() + 60
-            while time.monotonic() < end and not any(r.timelines for r in client.get_state().recordings):
-                client.take_screenshot(max_size=64)
+            wait_until(lambda: _drawn(client))
             state = client.get_state()
             assert [timeline.name for r in state.recordings for timeline in r.timelines if r.timelines]
             assert [report for seen in state.views for report in seen.reports] == []

@@ -8,11 +8,11 @@ import re
 import subprocess
 import sys
 import threading
-import time
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from waiting import wait_until
 
 import magtwin
 from magtwin.cli import main
@@ -203,10 +203,7 @@ def test_nothing_is_printed_while_a_viewer_is_shown(watch, clock, stream):
 def test_a_thread_prints_what_a_library_without_a_hook_takes_long_for(capsys):
     with watched():
         step("Waiting for a library")
-        begin, said = time.monotonic(), ""
-        while not said and time.monotonic() - begin < 20:
-            time.sleep(0.02)
-            said = capsys.readouterr().err
+        said = wait_until(lambda: capsys.readouterr().err)
     assert re.fullmatch(r"  Waiting for a library: \d+ s so far\n", said)
     assert not [t for t in threading.enumerate() if t.name == "magtwin-progress"]
 

@@ -276,7 +276,7 @@ def test_a_browser_lays_a_page_out_within_its_window_on_a_phone_as_on_a_desk(pag
     )
     command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files"]
     command += [f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", outer.as_uri()]
-    out = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
+    out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     said = re.search(r"<title>([\d ,]+)</title>", out)[1].split(",")
     for (width, _), frame in zip(windows, said, strict=True):
         wide, window, broken, least, cut, filled = map(int, frame.split())

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -16,6 +15,7 @@ import rerun as rr
 import rerun_cli
 from PIL import Image
 from rerun.chunk import RrdReader
+from waiting import PATIENCE_S, wait_until
 
 from magtwin.cli import main
 from magtwin.errors import InputError
@@ -352,9 +352,7 @@ def test_the_arrow_is_at_a_sensor_whose_link_has_no_shape_and_a_map_without_fiel
 def rerun(*arguments):
     """Rerun's own command line."""
     program = FilePath(rerun_cli.__file__).with_name("rerun")
-    return subprocess.run(
-        [program, *map(str, arguments)], capture_output=True, text=True, timeout=60, check=False
-    )
+    return subprocess.run([program, *map(str, arguments)], capture_output=True, text=True, check=False)
 
 
 def test_two_recordings_of_one_run_are_the_same_recording(parts, tmp_path):
@@ -634,7 +632,7 @@ except InputError as error:
     write_rrd(run, tmp_path / "size.rrd")
     just = (tmp_path / "size.rrd").stat().st_size - 1000  # so that only its end does not fit
     command = [sys.executable, "-c", script, str(just)]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     lines = done.stdout.splitlines()
     assert len(lines) == 4
     assert all(
@@ -672,7 +670,7 @@ for limit in (0, 100, 3000, 5000, 7000, 20_000, 40_000):
         print(error)
 """
     command = [sys.executable, "-c", script]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     lines = done.stdout.splitlines()
     assert len(lines) == 7
     assert all(line.startswith("run.rrd: cannot be written (") for line in lines)
@@ -790,12 +788,10 @@ def test_a_picture_that_is_interrupted_leaves_no_viewer_and_no_file(written, tmp
     environment = {**os.environ, "TMPDIR": str(temporary)}
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env=environment)
     try:
-        end = time.monotonic() + 60
-        while not (found := viewers(process.pid)) and time.monotonic() < end:
-            time.sleep(0.05)
+        found = wait_until(lambda: viewers(process.pid))
         assert len(found) == 1
         process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 130
+        assert process.wait(PATIENCE_S) == 130
     finally:
         process.kill()
         process.wait()

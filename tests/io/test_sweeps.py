@@ -5,10 +5,10 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import chunk_work
 import pytest
+from waiting import PATIENCE_S, wait_until
 
 from magtwin.cli import main
 from magtwin.errors import InputError
@@ -176,12 +176,9 @@ def test_an_interrupted_command_is_continued(lab_scene, tmp_path):
         [sys.executable, "-m", "magtwin", *command, "--jobs", "1"],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
     )
-    patience = time.monotonic() + 120
-    while not list(parts.glob("part-*.json")) and program.poll() is None:
-        assert time.monotonic() < patience
-        time.sleep(0.002)
+    wait_until(lambda: list(parts.glob("part-*.json")) or program.poll() is not None)
     program.send_signal(signal.SIGINT)
-    assert program.wait(20) == 130
+    assert program.wait(PATIENCE_S) == 130
     assert not out.exists()
     done = {path.name: path.stat().st_mtime_ns for path in parts.iterdir() if path.suffix == ".parquet"}
     assert not [path for path in parts.iterdir() if path.name.startswith(".")]

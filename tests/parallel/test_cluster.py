@@ -12,6 +12,7 @@ from pathlib import Path
 import chunk_work
 import pytest
 from dask_cluster import Cluster
+from waiting import PATIENCE_S, wait_until
 
 import magtwin
 from magtwin.errors import InputError
@@ -88,7 +89,7 @@ def test_a_killed_dask_worker_loses_no_chunk(cluster, tmp_path):
                 extra.send_signal(signal.SIGKILL)
             outcomes.append(outcome)
     assert sorted(o.result() for o in outcomes) == list(range(12))
-    extra.wait(5)
+    extra.wait(PATIENCE_S)
     cluster.processes.remove(extra)
 
 
@@ -105,10 +106,7 @@ def test_an_interruption_stops_what_the_cluster_does(cluster, tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         interrupted()
-    end = time.monotonic() + 5
-    while magtwin_workers(cluster) and time.monotonic() < end:
-        time.sleep(0.1)
-    assert not magtwin_workers(cluster)
+    wait_until(lambda: not magtwin_workers(cluster))
     assert len(list(tmp_path.iterdir())) == 2  # nothing else has begun
 
 

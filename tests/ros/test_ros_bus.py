@@ -423,7 +423,7 @@ from magtwin.ros.bus import open_bus
 node, heard = open_bus("peer", backend="rclpy"), set()
 for kind in ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"):
     node.subscribe("cmd_vel", kind, lambda m: heard.add(m.kind), Qos())
-last = time.monotonic() + 20
+last = time.monotonic() + 120
 while time.monotonic() < last:
     node.spin_once(0.05)
     names = node._node.get_node_names_and_namespaces()

@@ -64,7 +64,7 @@ def tick():
 
 node.create_timer(0.1, tick)
 begin = time.monotonic()
-while (len(due) < 20 or len(heard) < 14) and time.monotonic() < begin + 25:
+while (len(due) < 20 or len(heard) < 14) and time.monotonic() < begin + 120:
     rclpy.spin_once(node, timeout_sec=0.1)
 field, odom = heard["qtfm/magnitude"][-1], heard["odom"][-1]
 print(json.dumps({
@@ -110,7 +110,7 @@ def test_a_stranger_in_rclpy_sees_the_robot_obeys_its_clock_and_drives_it(
     simulated.start()
     try:
         env = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": reach}
-        ended = subprocess.run([python, "-c", STRANGER], env=env, capture_output=True, text=True, timeout=60)
+        ended = subprocess.run([python, "-c", STRANGER], env=env, capture_output=True, text=True)
     finally:
         over.set()
         simulated.join()
@@ -254,7 +254,7 @@ def test_the_magnetometers_parameters_are_told_with_their_ranges_and_set_while_i
     monkeypatch.setenv("ROS_DOMAIN_ID", str(next(DOMAINS)))
     libraries = str(Path(np.__file__).parents[1])
     command = [python, "-c", ASKED, str(BUILD.parent), libraries]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=90)
+    ended = subprocess.run(command, capture_output=True, text=True)
     assert ended.returncode == 0, ended.stderr
     seen = json.loads(ended.stdout.splitlines()[-1])
     assert (seen["doc"], seen["range"]) == ("rate of readings [Hz]", [1.0, 1000.0])

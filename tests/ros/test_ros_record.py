@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from nodes import spin
+from nodes import SLOWEST_S, spin
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
@@ -72,7 +72,7 @@ def test_every_type_of_common_interfaces_is_recorded_and_read_by_mcap_and_rosbag
     publishers = {kind: robot.publisher(f"/{kind}", kind, Qos()) for kind in kinds}
     writer = RawBagWriter(tmp_path / "all.mcap")
     recorder = Recorder(ear, writer, [f"/{kind}" for kind in kinds])
-    last = time.monotonic() + 60
+    last = time.monotonic() + SLOWEST_S
     recorder.run(lambda: all(p.subscribers() for p in publishers.values()) or time.monotonic() > last)
     for kind, publisher in publishers.items():
         publisher.publish(sent[kind])

@@ -7,15 +7,14 @@
 
 import importlib
 import json
-import subprocess
 import sys
-import tempfile
 import warnings
 from collections.abc import Collection
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from magtwin.children import LATE, answer_of
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.export.validation.findings import Check, Finding, check_from
 
@@ -62,31 +61,22 @@ def inspect(
     from magtwin.usd.layers import check_stage
 
     check_stage(root or file)
-    with tempfile.TemporaryDirectory() as folder:
-        answer = Path(folder, "answer.json")
-        job = {
-            "file": str(file),
-            "root": str(root or file),
-            "home": None if home is None else str(home),
-            "against": sorted(against),
-            "inputs": None if inputs is None else sorted(inputs),
-            "answer": str(answer),
-        }
-        job_file = Path(folder, "job.json")
-        job_file.write_text(json.dumps(job), encoding="utf-8")
-        command = [sys.executable, "-P", "-m", "magtwin.export.validation.inspection", str(job_file)]
-        try:
-            patience = PATIENCE_S + file.stat().st_size / 1e6
-            options: Any = {"capture_output": True, "text": True, "errors": "replace"}
-            done = subprocess.run(command, check=False, timeout=patience, **options)
-        except subprocess.TimeoutExpired as error:
-            raise InputError(f"{file}: damaged: USD does not finish reading it; copy it again") from error
-        if not answer.is_file():
-            if done.returncode < 0:
-                raise InputError(f"{file}: damaged: USD crashes on it; copy it, or write it again")
-            last = (done.stderr.strip().splitlines() or ["no output"])[-1]
-            raise RuntimeError(f"the inspection of {file} ended with {done.returncode}: {last}")
-        result = json.loads(answer.read_text(encoding="utf-8"))
+    job = {
+        "file": str(file),
+        "root": str(root or file),
+        "home": None if home is None else str(home),
+        "against": sorted(against),
+        "inputs": None if inputs is None else sorted(inputs),
+    }
+    patience = PATIENCE_S + file.stat().st_size / 1e6
+    result, done = answer_of("magtwin.export.validation.inspection", job, patience)
+    if done.returncode == LATE:
+        raise InputError(f"{file}: USD does not finish reading it in {patience:.0f} s; copy it again")
+    if result is None:
+        if done.returncode < 0:
+            raise InputError(f"{file}: damaged: USD crashes on it; copy it, or write it again")
+        last = (done.stderr.strip().splitlines() or ["no output"])[-1]
+        raise RuntimeError(f"the inspection of {file} ended with {done.returncode}: {last}")
     if result.get("refused"):
         raise InputError(as_named(result["refused"], home, file))
     for check in result["checks"]:

@@ -7,17 +7,14 @@ with their SHA-256 first.
 """
 
 import hashlib
-import json
 import os
 import re
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
+from magtwin.children import LATE, answer_of
 from magtwin.errors import InputError
 from magtwin.export.validation.findings import Check, Finding
 from magtwin.export.validation.inspection import as_named
@@ -79,7 +76,7 @@ def isaac(
         return Check("isaac", not_run=str(error))
     assets = {asset: prim for prim, asset in reversed(list(robots.items())) if asset is not None}
     with tempfile.TemporaryDirectory() as folder:
-        rules, answer = Path(folder, "rules"), Path(folder, "answer.json")
+        rules = Path(folder, "rules")
         for name, content in files.items():
             (rules / name).parent.mkdir(parents=True, exist_ok=True)
             (rules / name).write_bytes(content)
@@ -88,22 +85,13 @@ def isaac(
             "stage": str(file),
             "robots": [[str(asset), prim] for asset, prim in assets.items()],
             "packed": home is not None,
-            "answer": str(answer),
         }
-        job_file = Path(folder, "job.json")
-        job_file.write_text(json.dumps(job), encoding="utf-8")
-        command = [sys.executable, "-P", "-B", "-m", "magtwin.export.validation.isaac_run", str(job_file)]
         patience = PATIENCE_S + file.stat().st_size / 1e6
-        options: Any = {"capture_output": True, "text": True, "errors": "replace", "timeout": patience}
-        try:
-            done = subprocess.run(command, check=False, **options)
+        result, done = answer_of("magtwin.export.validation.isaac_run", job, patience, "-B")
+        if result is None:
             last = (done.stderr.strip().splitlines() or ["no output"])[-1]
-            ended = f"ended with status {done.returncode}: {last[:200]}"
-        except subprocess.TimeoutExpired:
-            ended = f"took longer than {patience:.0f} s"
-        if not answer.is_file():
+            ended = last if done.returncode == LATE else f"ended with status {done.returncode}: {last[:200]}"
             return Check("isaac", (Finding("unfinished", f"Isaac Sim's rules {ended}"),))
-        result = json.loads(answer.read_text(encoding="utf-8"))
     findings = []
     for finding in (Finding(**each) for each in result["findings"]):
         text = as_named(finding.text, home, package or file)

@@ -6,7 +6,6 @@ for it, and `MAGTWIN_PHYSX` is the path of its Python.
 
 import math
 import os
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -14,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from magtwin.children import run
 from magtwin.errors import InputError
 from magtwin.export.validation.findings import Check, Finding
 from magtwin.export.validation.physx_robots import AHEAD_M
@@ -26,6 +26,9 @@ GET_PHYSX = (
     "ovphysx is not installed; pip install 'magtwin[physx]', or set "
     f"{PHYSX} to the path of a Python that has it; `make physx` installs one in build/physx"
 )
+
+OTHER_PYTHON = {"PYTHONPATH": None}
+"""What differs in the environment of a Python that need not be this one."""
 
 LIMIT_S = 300.0
 """Time limit for one robot [s]."""
@@ -111,9 +114,8 @@ def find_python() -> tuple[str, str]:
         "v('newton-usd-schemas'), v('physx-usd-schemas'), v('ovstage'); print(v('ovphysx'))"
     )
     try:
-        options: Any = {"capture_output": True, "text": True, "env": _environment(), "timeout": 60}
-        done = subprocess.run([python, "-c", code], check=False, **options)
-    except (OSError, subprocess.TimeoutExpired):
+        done = run([python, "-c", code], limit_s=LIMIT_S, changes=OTHER_PYTHON)
+    except OSError:
         return "", ""
     return (python, done.stdout.strip()) if done.returncode == 0 else ("", "")
 
@@ -122,7 +124,7 @@ def open_world(python: str, stage: Path, job: Mapping[str, Any]) -> WorldProcess
     """A process with a stage in PhysX; `physx_world` describes the job."""
     script = str(Path(__file__).with_name("physx_world.py"))
     whole = {**job, "stage": str(stage.resolve()), "step_s": job.get("step_s", STEP_S)}
-    return WorldProcess([python, script], whole, "PhysX", environment=_environment(), limit_s=LIMIT_S)
+    return WorldProcess([python, script], whole, "PhysX", changes=OTHER_PYTHON, limit_s=LIMIT_S)
 
 
 @contextmanager
@@ -203,8 +205,3 @@ def _steps(seconds: float, left: float, right: float) -> list[list[float]]:
 def _finding(rule: str, text: str, robot: Mapping[str, Any], good: bool) -> Finding:
     where = robot["prim"]
     return Finding(rule, text, where, "" if good else ADVICE, "note" if good else "error")
-
-
-def _environment() -> dict[str, str]:
-    """The environment without PYTHONPATH, which is that of another Python."""
-    return {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}

@@ -13,7 +13,7 @@ from magtwin.spec.obstacles import Obstacles
 from magtwin.usd.attributes import targets
 from magtwin.usd.geometry import BASE_LINK
 from magtwin.usd.lab.obstacles import read_obstacles
-from magtwin.usd.schema import NOUNS, attribute_name
+from magtwin.usd.schema import attribute_name, has_api
 from magtwin.usd.sensors import JOINT_FIELDS, WHEELS_FIELDS, joints_of, read_drive
 
 ROBOT_API = "IsaacRobotAPI"
@@ -75,7 +75,7 @@ def read_driven(stage: Usd.Stage) -> list[DrivenRobot]:
     found = []
     drives = {}
     for prim in stage.Traverse():
-        if ROBOT_API in prim.GetPrimTypeInfo().GetAppliedAPISchemas() or prim.HasAPI(NOUNS["drive"]):
+        if ROBOT_API in prim.GetPrimTypeInfo().GetAppliedAPISchemas() or has_api(prim, "drive"):
             drive = _drive(prim)
             if drive is not None:
                 drives[prim] = drive
@@ -161,7 +161,7 @@ def driven_table(stage: Usd.Stage) -> dict[str, Any]:
 
 def _drive(robot: Usd.Prim) -> tuple[DriveSpec, tuple[str, ...]] | None:
     """The drive of a robot and the paths of its wheels' joints; None if it does not have two wheels."""
-    if robot.HasAPI(NOUNS["drive"]):
+    if has_api(robot, "drive"):
         wheels = [attribute_name("drive", field) for field in (*JOINT_FIELDS, *WHEELS_FIELDS)]
         joints = [joint for name in wheels for joint in targets(robot, name)]
         return read_drive(robot), tuple(str(joint.GetPath()) for joint in joints)

@@ -32,7 +32,7 @@ from magtwin.usd.maps.tiled_layer import tile_faults
 from magtwin.usd.placement import UPRIGHT, labs_on, pose_of
 from magtwin.usd.robot import read_robot
 from magtwin.usd.scene import earth_in, open_scene
-from magtwin.usd.schema import NOUNS, attribute_name, prims_with
+from magtwin.usd.schema import NOUNS, attribute_name, declared, has_api, prims_with, value_of
 from magtwin.usd.schema.names import OLDER
 from magtwin.usd.schema.versions import TEXT, is_upgraded, older_properties
 from magtwin.usd.sensors import (
@@ -123,10 +123,11 @@ def schema_names(subject: Subject) -> Iterator[Wrong]:
                 yield Wrong(f"has the schema {api}, which there is not", str(prim.GetPath()))
         for prop in prim.GetAuthoredPropertiesInNamespace("magtwin"):
             name = prop.GetName()
-            if prop.IsCustom() or prim.GetPrimDefinition().GetPropertyDefinition(name):
+            if prop.IsCustom() or declared(prop):
                 continue  # what is custom is nobody's schema, such as the readings of a run
-            noun = NOUNS.get(name.split(":")[1], "")
-            why = f"which {noun} has not" if noun and prim.HasAPI(noun) else "and has no schema of it"
+            noun = name.split(":")[1]
+            has = noun in NOUNS and has_api(prim, noun)
+            why = f"which {NOUNS[noun]} has not" if has else "and has no schema of it"
             yield Wrong(f"has {name}, {why}", str(prim.GetPath()))
 
 
@@ -179,7 +180,7 @@ def map_grid(subject: Subject) -> Iterator[Wrong]:
             yield Wrong("has no coloured floor to show it", str(prim.GetPath()), severity="warning")
             continue
         names = ("shape", "origin", "cell_size", "headings")
-        got = [prim.GetAttribute(attribute_name("anomalyMap", name)).Get() for name in names]
+        got = [value_of(prim.GetAttribute(attribute_name("anomalyMap", name))) for name in names]
         shape, origin, cell, headings = (np.array(value, float).ravel() for value in got)
         if (shape.size, origin.size, cell.size) != (3, 2, 2):
             continue  # map-complete tells
@@ -203,7 +204,7 @@ def map_file(subject: Subject) -> Iterator[Wrong]:
         said = str(plain_value(prim.GetAttribute(MAP_CHECKSUM)) or "").lower()
         ends = prim.GetRelationship(MAP_RELATIONSHIP).GetTargets()
         end = subject.stage.GetPrimAtPath(ends[0]) if len(ends) == 1 else None
-        if not said or not end or not end.HasAPI(NOUNS["anomalyMap"]):
+        if not said or not end or not has_api(end, "anomalyMap"):
             continue
         stack = end.GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack()
         layer = stack[0].layer if stack else subject.stage.GetRootLayer()
@@ -222,7 +223,7 @@ def magnetometer_map(subject: Subject) -> Iterator[Wrong]:
         first = None
         for prim in prims_with(stage.GetPseudoRoot(), "magnetometer"):
             end = target(prim, MAP_RELATIONSHIP)
-            if not end.HasAPI(NOUNS["anomalyMap"]):
+            if not has_api(end, "anomalyMap"):
                 yield Wrong(f"reads <{end.GetPath()}>, which is no map", str(prim.GetPath()))
             first = first or end
             if end != first:

@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from magtwin.children import LATE, caches, run
 from magtwin.export.validation.findings import Check, Finding, Severity
 
 PATIENCE_S = 600.0
@@ -171,19 +172,15 @@ def _programs() -> str:
 
 
 def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    """Run a program without PYTHONPATH, and capture its output."""
-    clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    try:
-        options: Any = {"capture_output": True, "text": True, "errors": "replace", "env": clean}
-        return subprocess.run(command, check=False, timeout=PATIENCE_S, **options)
-    except subprocess.TimeoutExpired:
-        return subprocess.CompletedProcess(command, 1, "", f"took longer than {PATIENCE_S:g} s")
+    """Run a program without PYTHONPATH, and capture its output. The kernels that Newton compiles are kept."""
+    return run(command, limit_s=PATIENCE_S, changes={"PYTHONPATH": None, "XDG_CACHE_HOME": caches()})
 
 
 def _unfinished(program: str, result: subprocess.CompletedProcess[str]) -> Finding:
     """The finding for a program that ended without a report."""
     lines = (result.stderr.strip() or result.stdout.strip() or "no output").splitlines()
-    text = f"{program} ended with status {result.returncode} and without a report: {lines[-1][:200]}"
+    ended = f"ended with status {result.returncode} and without a report: "
+    text = f"{program} {'' if result.returncode == LATE else ended}{lines[-1][:200]}"
     return Finding("unfinished", text, "", "the stage or the program may be damaged")
 
 

@@ -13,12 +13,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+import rerun_bindings
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
@@ -38,11 +40,17 @@ APPLICATION = "magtwin"
 PATIENCE_S = 60.0
 """Time that Rerun may take to write its data [s]."""
 
+NEVER = timedelta(days=1)
+"""Time after which Rerun writes what it has, however little."""
+
 END = b"RRF2FOOT"
 """Bytes at the end of a complete file."""
 
 ROOM = 1 << 20
 """Upper bound of the bytes of a layout, the metadata and the column names."""
+
+_stuck = threading.Event()
+"""Set once Rerun waits for ever, for a thread that a full disk has ended."""
 
 POSED = frozenset(("p_world_base", "q_world_base_xyzw"))
 """Columns that place a robot."""
@@ -107,13 +115,19 @@ def stream(
         check_room(file, room, final)
     folder = None if file is None else file.parent
     strict = rr.strict_mode()
-    rec = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False)
+    if not _stuck.is_set():  # the threads of recordings that nothing uses any more end when Rerun is asked
+        await_rerun(rerun_bindings.flush_and_cleanup_orphaned_recordings, folder)
+    # What is written together must not depend on the speed of the machine; a viewer gets it as it comes.
+    batches = None if file is None else rr.ChunkBatcherConfig(flush_tick=NEVER)
+    rec = rr.RecordingStream(
+        APPLICATION, recording_id=recording_id, send_properties=False, batcher_config=batches
+    )
     if not rr.is_enabled(rec):
         raise InputError(f"{final}: Rerun is switched off by the environment variable RERUN; unset it")
     rr.set_strict_mode(True)
     try:
         sink: Any = rr.GrpcSink(address) if file is None else rr.FileSink(str(file))
-        await_rerun(lambda: rec.set_sinks(sink, default_blueprint=views), folder)
+        await_rerun(lambda: _open(rec, sink, views), folder)
         rec.send_recording_name(name)
         yield rec
         flush(rec, folder)
@@ -128,6 +142,17 @@ def stream(
             written.seek(-min(64, file.stat().st_size), 2)
             if END not in written.read():
                 raise unwritten(final, "its end is missing")
+
+
+def _open(rec: rr.RecordingStream, sink: Any, views: rrb.Blueprint) -> None:
+    """As `rec.set_sinks(sink, default_blueprint=views)`, which keeps the threads of the layout for ever."""
+    options = {"make_default": False, "make_thread_default": False, "default_enabled": True}
+    shown = rr.RecordingStream._from_native(rerun_bindings.new_blueprint(APPLICATION, **options))
+    shown.set_time("blueprint", sequence=0)
+    views._log_to_stream(shown)
+    held = shown.memory_recording().storage
+    rerun_bindings.set_sinks([sink], default_blueprint=held, recording=rec.to_native())
+    shown.disconnect()
 
 
 def flush(rec: rr.RecordingStream, folder: FilePath | None) -> None:
@@ -168,6 +193,7 @@ def await_rerun(work: Callable[[], object], folder: FilePath | None) -> None:
         if full := why_full(folder):
             break
     atexit.unregister(rr.rerun_shutdown)  # it would wait too
+    _stuck.set()
     raise RuntimeError(full or "Rerun does not end")
 
 

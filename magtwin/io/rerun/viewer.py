@@ -21,6 +21,7 @@ import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import Timeline, View, ViewerClient
 
 from magtwin.budget import BUDGETS, check_decoded, check_size
+from magtwin.children import LATE, own_home, run
 from magtwin.errors import InputError
 from magtwin.files import existing
 from magtwin.io.rerun.series import TIMELINE
@@ -39,20 +40,23 @@ HEADER, ARROW = 12, 2
 LEAST_SIZE, MOST_SIZE = 200, 8000
 """Least and greatest side of a picture: room for the views, and the limit of a texture [pixels]."""
 
-START_S = 60.0
-"""Time that the viewer may take to start, on a busy machine without a graphics card [s]."""
+PATIENCE_S = 600.0
+"""Time that a viewer that lives may take for a step, on a busy machine without a graphics card [s]."""
 
-NOTHING_S = 10.0
-"""Time that a loaded file may show nothing [s]."""
+FRAMES = 20
+"""Frames after which a loaded file has shown something, and after which the viewer's notices are gone."""
+
+CANNOT_DRAW = re.compile(r"render context|adapter|graphics|wgpu|surface", re.IGNORECASE)
+"""Words of a viewer that ended because it cannot draw."""
 
 VULKAN = "without a graphics card it needs Vulkan in software: apt install mesa-vulkan-drivers libvulkan1"
-"""What to do where the viewer cannot draw."""
+"""What to do then."""
 
 TITLE_BAR = 36
 """Height of the viewer's empty title bar [pixels]."""
 
-TOASTS_S = 6.0
-"""Time until the viewer's own notices have disappeared [s]."""
+TOASTS_S, NOTHING_S = 6.0, 10.0
+"""Time until the viewer's own notices have disappeared, and until a loaded file shows something [s]."""
 
 
 def show(rrd: str | os.PathLike[str], *, source: str | os.PathLike[str] | None = None) -> None:
@@ -67,9 +71,8 @@ def show(rrd: str | os.PathLike[str], *, source: str | os.PathLike[str] | None =
     """
     rrd = existing(rrd, "recording")
     command = [_binary(), "--bind", LOCALHOST, "--port", "auto", str(rrd)]
-    options: dict[str, Any] = {"stderr": subprocess.PIPE, "text": True, "preexec_fn": ends_with_parent()}
-    with _own_folder() as environment:
-        result = subprocess.run(command, check=False, env=environment, **options)
+    options: dict[str, Any] = {"capture_output": False, "stderr": subprocess.PIPE}
+    result = run(command, preexec_fn=ends_with_parent(), **options)
     if result.returncode:
         advice = "view the .rrd of this run, which a browser shows too"
         if source is None:
@@ -113,11 +116,7 @@ def screenshot(
     check_decodes(path, rrd)
     window = (size[0], size[1] + TITLE_BAR)
     with output(png, force=force) as aside, live_viewer(headless=True, size=window) as (_, client):
-        try:
-            views = _draw(client, path.resolve(), rrd, aside, time_s)
-        except (ConnectionError, RuntimeError) as error:
-            text = f"the Rerun viewer ended before the picture was drawn ({error})"
-            raise InputError(f"{rrd}: {text}; {VULKAN}; with one, try a smaller `size`") from error
+        views = _draw(client, path.resolve(), rrd, aside, time_s)
     lines = [f"{v.name}: {r.severity}: {r.summary} {r.details or ''}" for v in views for r in v.reports]
     return [line.strip() for line in lines]
 
@@ -130,8 +129,11 @@ def _draw(
 
     client.open(str(path))
     _wait_until(lambda: not client.get_state().loading, f"{source}: the viewer did not load it")
-    nothing = f"{source}: holds nothing that the viewer shows; if the recording was cut short, write it again"
-    _wait_until(lambda: _timelines(client) != [], nothing, NOTHING_S)
+    _show_frames(client, NOTHING_S, lambda: _timelines(client) != [])
+    if not _timelines(client):
+        raise InputError(
+            f"{source}: holds nothing that the viewer shows; if the recording was cut short, write it again"
+        )
     if time_s is not None:
         timelines = _timelines(client)
         line = next((timeline for timeline in timelines if timeline.name == TIMELINE), None)
@@ -147,9 +149,7 @@ def _draw(
             )
         client.set_time(TIMELINE, duration=time_s, play_state="paused")
     client.run_command("ui.toggle_top_panel")
-    end = time.monotonic() + TOASTS_S
-    while time.monotonic() < end:  # its clock advances only while it draws
-        client.take_screenshot(max_size=64)
+    _show_frames(client, TOASTS_S)
     client.save_screenshot(str(png))
     picture = imread(png)[TITLE_BAR:]
     imsave(png, picture, metadata={"Software": "magtwin"}, pil_kwargs={"optimize": True})
@@ -178,25 +178,22 @@ def live_viewer(
     window = ["--headless", "--window-size", f"{size[0]}x{size[1]}"] if headless else []
     command = [_binary(), "--bind", LOCALHOST, "--port", str(port), "--hide-welcome-screen", *window]
     process = None
-    with _own_folder() as environment, tempfile.TemporaryFile("w+") as log:
+    with own_home() as environment, tempfile.TemporaryFile("w+") as log:
         options: dict[str, Any] = {"start_new_session": True, "preexec_fn": ends_with_parent()}
         options |= {"stdout": log, "stderr": log, "env": environment}
         try:
             with _interrupt_later() as interrupts:
                 process = subprocess.Popen(command, **options)
-                client = _connected(process, port, log, interrupts)
+                client = _connected(process, port, log, interrupts, draws=headless)
             assert client is not None  # else the interrupt was raised
             yield f"rerun+http://{LOCALHOST}:{port}/proxy", client
+        except (ConnectionError, RuntimeError) as error:
+            if process is not None and _ended(process):
+                raise _ending(process, log) from error
+            raise
         finally:
             if process is not None:
                 _end(process)
-
-
-@contextmanager
-def _own_folder() -> Iterator[dict[str, str]]:
-    """The environment of a viewer, which leaves temporary files behind; they are removed after the block."""
-    with tempfile.TemporaryDirectory(prefix="magtwin-viewer-", ignore_cleanup_errors=True) as folder:
-        yield {**os.environ, **dict.fromkeys(("TMPDIR", "TMP", "TEMP"), folder)}
 
 
 @contextmanager
@@ -219,27 +216,47 @@ def _interrupt_later() -> Iterator[list[int]]:
 
 
 def _connected(
-    process: "subprocess.Popen[bytes]", port: int, log: IO[str], interrupts: list[int]
+    process: "subprocess.Popen[bytes]", port: int, log: IO[str], interrupts: list[int], *, draws: bool
 ) -> ViewerClient | None:
-    """A client of a started viewer, once it draws. It listens before it knows whether it can draw.
+    """A client of a started viewer, once it answers, or has drawn. It answers before it tries to draw.
 
     None if the user interrupted.
     """
     clients: list[ViewerClient] = []
 
-    def draws() -> bool:
+    def ready() -> bool:
         if process.poll() is not None:
-            log.seek(0)
-            raise InputError(f"the Rerun viewer cannot draw here: {_reason(log.read())}; {VULKAN}")
+            raise _ending(process, log)
         try:
             clients.append(ViewerClient.connect(f"rerun+http://{LOCALHOST}:{port}/proxy"))
             clients[-1].get_state()
+            if draws:
+                clients[-1].take_screenshot(max_size=64)
         except (ConnectionError, RuntimeError):
             return False
         return True
 
-    _wait_until(lambda: bool(interrupts) or draws(), "the Rerun viewer did not start")
+    _wait_until(lambda: bool(interrupts) or ready(), "the Rerun viewer did not start")
     return None if interrupts else clients[-1]
+
+
+def _ended(process: "subprocess.Popen[bytes]") -> bool:
+    """Whether a viewer that no longer answers has ended in an error; it needs time to write why."""
+    try:
+        return process.wait(PATIENCE_S / 10) != 0
+    except subprocess.TimeoutExpired:
+        return False
+
+
+def _ending(process: "subprocess.Popen[bytes]", log: IO[str]) -> InputError:
+    """The error for a viewer that has ended, with the reason in its log."""
+    log.seek(0)
+    reason = _reason(log.read())
+    if process.returncode == -signal.SIGKILL:
+        reason = "it was killed from outside; if memory ran out, give a smaller `size`"
+    if CANNOT_DRAW.search(reason):
+        return InputError(f"the Rerun viewer cannot draw here: {reason}; {VULKAN}")
+    return InputError(f"the Rerun viewer ended: {reason}")
 
 
 def check_decodes(rrd: Path, source: str | os.PathLike[str]) -> None:
@@ -260,10 +277,9 @@ def check_decodes(rrd: Path, source: str | os.PathLike[str]) -> None:
         _check_decoded(rrd, file, source)
     command = [_binary(), "rrd", "verify", str(rrd)]
     patience = BUDGETS["rrd"].seconds + rrd.stat().st_size / 1e6
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=patience)
-    except subprocess.TimeoutExpired:
-        raise InputError(f"{source}: Rerun does not decode it in {patience:.0f} s; write it again") from None
+    done = run(command, limit_s=patience)
+    if done.returncode == LATE:
+        raise InputError(f"{source}: Rerun does not decode it in {patience:.0f} s; write it again")
     lines = [line for line in done.stderr.splitlines() if "Missing RRD footer" not in line and line.strip()]
     endless = done.returncode == 1 and [line.rpartition(" with ")[2] for line in lines] == ["1 errors"]
     if done.returncode and not endless:
@@ -307,13 +323,21 @@ def _timelines(client: ViewerClient) -> list[Timeline]:
     return [line for recording in client.get_state().recordings for line in recording.timelines]
 
 
-def _wait_until(done: Callable[[], bool], refusal: str, limit_s: float = START_S) -> None:
-    """Wait for a condition; raise an error after a time limit."""
-    end = time.monotonic() + limit_s
+def _wait_until(done: Callable[[], bool], refusal: str) -> None:
+    """Wait for a condition of a viewer that lives; raise an error after a long time."""
+    last = time.monotonic() + PATIENCE_S
     while not done():
-        if time.monotonic() > end:
-            raise InputError(f"{refusal} (waited {limit_s:g} s)")
+        if time.monotonic() > last:
+            raise InputError(f"{refusal} (waited {PATIENCE_S:g} s)")
         time.sleep(0.1)
+
+
+def _show_frames(client: ViewerClient, least_s: float, done: Callable[[], bool] = lambda: False) -> None:
+    """Let the viewer draw until `done`, or for a time and `FRAMES`; its clock advances while it draws."""
+    first, frames = time.monotonic(), 0
+    while not done() and (frames < FRAMES or time.monotonic() < first + least_s):
+        client.take_screenshot(max_size=64)
+        frames += 1
 
 
 def _reason(log: str) -> str:

@@ -155,8 +155,7 @@ class Newton:
         path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
         command = [sys.executable, "-m", "magtwin.sim.engines.newton_world"]
         files = {PLACED: self.placed} if self.placed else {}
-        environment = {**os.environ, "PYTHONPATH": path}
-        return WorldProcess(command, job, "Newton", environment=environment, files=files)
+        return WorldProcess(command, job, "Newton", changes={"PYTHONPATH": path}, files=files)
 
 
 def check_installed() -> None:

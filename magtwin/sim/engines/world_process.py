@@ -1,16 +1,14 @@
 """World process: a stage in a physics engine in another process, asked line by line."""
 
 import json
-import os
 import subprocess
-import tempfile
-import threading
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path as FilePath
 from types import MappingProxyType
 from typing import Any
 
+from magtwin.children import caches, end, limited, own_home
 from magtwin.errors import InputError
 
 
@@ -26,7 +24,7 @@ class WorldProcess:
         job: Mapping[str, Any],
         engine: str,
         *,
-        environment: Mapping[str, str] | None = None,
+        changes: Mapping[str, str | None] = MappingProxyType({}),
         limit_s: float | None = None,
         files: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
@@ -36,19 +34,22 @@ class WorldProcess:
             command: The program and its arguments.
             job: Its first line, with the key `stage`.
             engine: Name of the engine, for messages.
-            environment: Its environment. Default: that of this process.
+            changes: What differs in its environment, as for `magtwin.children.environment`.
             limit_s: Time after which the process is killed [s]. None for no limit.
             files: Texts of files in the folder that it runs in, by name.
         """
         self._command, self._job, self._engine = list(command), dict(job), engine
-        self._environment, self._limit_s = environment, limit_s
-        self._files, self._late = files, False
+        self._changes, self._limit_s, self._files = changes, limit_s, files
 
     def __enter__(self) -> "WorldProcess":
-        self._folder = tempfile.TemporaryDirectory()  # engines write logs there
+        self._held = ExitStack()
+        changes = {"XDG_CACHE_HOME": caches(), **self._changes}  # engines compile kernels for a minute
+        environment = self._held.enter_context(own_home(changes))
+        folder = environment["HOME"]  # engines write logs there
         for name, text in self._files.items():
-            FilePath(self._folder.name, name).write_text(text, encoding="utf-8")
-        self._log = open(FilePath(self._folder.name, "log"), "w+", encoding="utf-8", errors="replace")
+            FilePath(folder, name).write_text(text, encoding="utf-8")
+        self._log = open(FilePath(folder, "log"), "w+", encoding="utf-8", errors="replace")
+        self._held.enter_context(self._log)
         self._process = subprocess.Popen(
             self._command,
             stdin=subprocess.PIPE,
@@ -56,30 +57,16 @@ class WorldProcess:
             stderr=self._log,
             text=True,
             bufsize=1,
-            cwd=self._folder.name,
-            env=dict(os.environ if self._environment is None else self._environment),
+            cwd=folder,
+            env=environment,
         )
-        self._timer = threading.Timer(self._limit_s or 0.0, self._stop)
-        if self._limit_s is not None:
-            self._timer.daemon = True
-            self._timer.start()
+        self._late = self._held.enter_context(limited(self._process, self._limit_s))
         self._send(self._job)
         return self
 
     def __exit__(self, *_: object) -> None:
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._timer.cancel()
-        with suppress(OSError):
-            self._process.stdin.close()
-        try:
-            self._process.wait(5)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._process.stdout.close()
-        self._log.close()
-        self._folder.cleanup()
+        end(self._process, patience_s=5)
+        self._held.close()
 
     def seen(self) -> list[float]:
         """The next answer.
@@ -90,7 +77,7 @@ class WorldProcess:
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
-            if self._late:
+            if self._late.is_set():
                 raise InputError(f"{self._job['stage']}: {self._engine} took longer than {self._limit_s:g} s")
             self._log.seek(0)
             lines = [text for text in self._log.read().splitlines() if text.strip()]
@@ -103,11 +90,6 @@ class WorldProcess:
         """Send a line, and return its answer."""
         self._send(message)
         return self.seen()
-
-    def _stop(self) -> None:
-        """Kill the process, which has taken too long."""
-        self._late = True
-        self._process.kill()
 
     def _send(self, message: object) -> None:
         assert self._process.stdin is not None

@@ -9,7 +9,7 @@ from magtwin.field.sources.earth import earth_field_nt
 from magtwin.spec.base import ZERO3
 from magtwin.spec.magnetics import EarthFieldSpec
 from magtwin.usd.attributes import read_spec, write_spec
-from magtwin.usd.schema import apply_api, attribute_name, place
+from magtwin.usd.schema import apply_api, attribute_name, author, place, value_of
 
 DERIVED_FROM = attribute_name("earth", "derived_from")
 DIGITS = 1
@@ -22,7 +22,7 @@ AGREES_NT = 1.0
 def define_earth(stage: Usd.Stage, path: str | Sdf.Path, spec: EarthFieldSpec) -> Usd.Prim:
     """Author the Earth's field as an Xform; returns its prim."""
     prim = write_spec(apply_api(UsdGeom.Xform.Define(stage, path).GetPrim(), "earth"), "earth", spec)
-    prim.GetAttribute(DERIVED_FROM).Set("" if spec.measured else _inputs(spec))
+    author(prim.GetAttribute(DERIVED_FROM), "" if spec.measured else _inputs(spec))
     return prim
 
 
@@ -33,7 +33,7 @@ def read_earth(prim: Usd.Prim) -> EarthFieldSpec:
         InputError: The prim is no Earth's field, or a value is out of range.
     """
     spec = read_spec(EarthFieldSpec, prim, "earth")
-    if spec.measured or prim.GetAttribute(DERIVED_FROM).Get() == _inputs(spec):
+    if spec.measured or value_of(prim.GetAttribute(DERIVED_FROM)) == _inputs(spec):
         return spec
     try:
         return derived(spec)

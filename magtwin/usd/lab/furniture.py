@@ -22,7 +22,7 @@ from magtwin.usd.lab.sources import (
 )
 from magtwin.usd.layers import WORLD
 from magtwin.usd.placement import labs_on
-from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, prims_with
+from magtwin.usd.schema import apply_api, attribute_name, author, has_api, place, prims_with
 from magtwin.usd.solids import define_triangles
 
 FURNITURE = WORLD.AppendChild("Furniture")
@@ -48,10 +48,10 @@ def define_furniture(stage: Usd.Stage, furniture: tuple[FurnitureSpec, ...]) -> 
         Usd.ModelAPI(piece).SetKind(Kind.Tokens.component)
         turn = None if spec.q_world_xyzw == IDENTITY_XYZW else spec.q_world_xyzw
         write_pose(piece, spec.p_world, turn)
-        apply_api(piece, "furniture").GetAttribute(KIND).Set(spec.kind)
+        author(apply_api(piece, "furniture").GetAttribute(KIND), spec.kind)
         if spec.kind in GENERIC:
-            piece.GetAttribute(MATERIAL).Set(spec.material)
-            piece.GetAttribute(SIZE).Set(spec.size_m)
+            author(piece.GetAttribute(MATERIAL), spec.material)
+            author(piece.GetAttribute(SIZE), spec.size_m)
         parts = spec.parts
         define_looks(stage, path.AppendChild(LOOKS), dict.fromkeys(part.look for part in parts))
         steel = {source.name.removeprefix(f"{spec.name}_"): source for source in spec.sources(in_world=False)}
@@ -98,7 +98,7 @@ def read_magnets(stage: Usd.Stage) -> tuple[tuple[SourceSpec, ...], tuple[Furnit
     prims = source_prims(stage)
     pieces, taken = [], set()
     for root in stage.Traverse(Usd.TraverseInstanceProxies()):
-        if root.HasAPI(NOUNS["furniture"]) and (piece := _whole(root, prims)):
+        if has_api(root, "furniture") and (piece := _whole(root, prims)):
             pieces.append(piece)
             taken |= {prim.GetPath() for prim in prims if prim.GetPath().HasPrefix(root.GetPath())}
     sources: list[SourceSpec] = []

@@ -14,7 +14,7 @@ from magtwin.spec.magnetics import SourceSpec
 from magtwin.usd.attributes import check_prim_name, plain_value, read_axis, read_number, write_pose
 from magtwin.usd.lab.looks import define_looks, define_visual, hide, visual_path, wear
 from magtwin.usd.layers import WORLD
-from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, require_api
+from magtwin.usd.schema import apply_api, attribute_name, author, has_api, place, require_api
 from magtwin.usd.solids import define_triangles, mesh_solid
 
 SOURCES = WORLD.AppendChild("Sources")
@@ -78,7 +78,7 @@ def define_source(
             )
     apply_api(prim, "source")
     for name, value in figures.items():
-        prim.GetAttribute(attribute_name("source", name)).Set(value)
+        author(prim.GetAttribute(attribute_name("source", name)), value)
     return prim
 
 
@@ -131,7 +131,7 @@ def _turn(spec: SourceSpec) -> Quat | None:
 
 def source_prims(stage: Usd.Stage) -> list[Usd.Prim]:
     """Every active prim that is a source, also invisible ones and those inside instances."""
-    return [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if prim.HasAPI(NOUNS["source"])]
+    return [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if has_api(prim, "source")]
 
 
 def read_source(prim: Usd.Prim, *, name: str | None = None, local: bool = False) -> SourceSpec:

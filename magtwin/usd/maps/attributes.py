@@ -14,7 +14,7 @@ from magtwin.field.grid import Grid
 from magtwin.field.maps.made_from import MadeFrom
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.harmonic import SHAPES as HARMONIC
-from magtwin.usd.schema import NOUNS, attribute_name, place
+from magtwin.usd.schema import attribute_name, author, has_api, place, type_of, value_of
 
 MOST_CHARACTERS = 60
 """Characters of an attribute that an error quotes."""
@@ -38,7 +38,7 @@ TILED_CHECKSUM_VERSION = 3
 def get(prim: Usd.Prim, name: str) -> Any:
     """Value of one of the map's attributes, of the schema's type."""
     attribute = prim.GetAttribute(attribute_name("anomalyMap", name))
-    return check_type(attribute, attribute.Get())
+    return check_type(attribute, value_of(attribute))
 
 
 def check_type(attribute: Usd.Attribute, value: Any) -> Any:
@@ -47,7 +47,7 @@ def check_type(attribute: Usd.Attribute, value: Any) -> Any:
     Raises:
         InputError: It is not; names the prim.
     """
-    kind = attribute.GetTypeName()
+    kind = type_of(attribute)
     if not isinstance(value, type(kind.defaultValue)):
         raise InputError(f"{place(attribute.GetPrim())}: {attribute.GetName()} must be a {kind}")
     return value
@@ -99,7 +99,7 @@ def read_made_from(prim: Usd.Prim) -> MadeFrom | None:
 
 def write_made_from(prim: Usd.Prim, made_from: MadeFrom) -> None:
     """Author what a map was made from on its prim, in the stage's edit target."""
-    prim.GetAttribute(MADE_FROM).Set(_spelled(made_from))
+    author(prim.GetAttribute(MADE_FROM), _spelled(made_from))
 
 
 def _spelled(made_from: MadeFrom | None) -> str:
@@ -108,7 +108,7 @@ def _spelled(made_from: MadeFrom | None) -> str:
 
 def read_harmonic(prim: Usd.Prim) -> dict[str, NDArray] | None:
     """The arrays of the harmonic field in the schema's order; None if there is none."""
-    if not prim.HasAPI(NOUNS["harmonic"]):
+    if not has_api(prim, "harmonic"):
         return None
     arrays = {}
     for name, shape in HARMONIC.items():
@@ -128,7 +128,7 @@ def set_values(prim: Usd.Prim, values: Mapping[str, Any]) -> None:
     """Author attributes by name, but those without a value."""
     for name, value in values.items():
         if value is not None:
-            prim.GetAttribute(name).Set(value)
+            author(prim.GetAttribute(name), value)
 
 
 def shared_values(field: AnomalyMap, grid: Grid, version: int) -> dict[str, Any]:

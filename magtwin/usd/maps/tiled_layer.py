@@ -37,7 +37,7 @@ from magtwin.usd.maps.attributes import (
 )
 from magtwin.usd.maps.heat_map import MAP, Floor, define_colours, define_heat_map, nodes_shown
 from magtwin.usd.maps.tiles import LayerTiles, tile_path, write_tiles
-from magtwin.usd.schema import apply_api, attribute_name, place
+from magtwin.usd.schema import apply_api, attribute_name, place, value_of
 
 
 def save_tiled_map(
@@ -174,7 +174,7 @@ def _planes(prim: Usd.Prim) -> int:
     """Number of variances per node of a map in tiles, as its first tile has them."""
     tile = prim.GetStage().GetPrimAtPath(prim.GetPath().AppendPath("Tiles/tile_0_0"))
     values, variance = (
-        tile.GetAttribute(attribute_name("mapTile", name)).Get() if tile else None
+        value_of(tile.GetAttribute(attribute_name("mapTile", name))) if tile else None
         for name in ("values", "variance")
     )
     ratio = len(variance) / len(values) if values and variance is not None else -1

@@ -11,7 +11,7 @@ from pxr import Sdf, Usd, Vt
 from magtwin.errors import InputError
 from magtwin.field.maps.tiles import Tile, Tiling
 from magtwin.usd.layers import check_stage
-from magtwin.usd.schema import NOUNS, attribute_name, place
+from magtwin.usd.schema import NOUNS, attribute_name, place, value_of
 
 TILES = "Tiles"
 """Name of the prim of the tiles, below that of the map."""
@@ -51,7 +51,7 @@ class LayerTiles:
             raise InputError(f"{self.place(tile)}: the map's tile is missing; make the map anew")
         arrays = {}
         for name, attribute in ARRAYS.items():
-            value = prim.GetAttribute(attribute).Get()
+            value = value_of(prim.GetAttribute(attribute))
             kind = Vt.BoolArray if name == "valid" else Vt.FloatArray
             if not isinstance(value, kind):
                 raise InputError(f"{place(prim)}: {attribute} must be a {kind.__name__}; make the map anew")

@@ -1,15 +1,19 @@
 """The `magtwin` schema library: registered with USD, checked, and applied to prims.
 
 The library is codeless: `schema.usda` is its source, `generate.py` makes `generatedSchema.usda` and
-`plugInfo.json` from it. USD reads schema plugins once, when its schema registry is first used, and is
-silent about those that come later; `register` therefore asks the registry whether it knows each one.
+`plugInfo.json` from it. USD reads schema plugins once, when its schema registry is first used. A program may
+open a stage before it imports magtwin, so nothing here asks that registry: applied schemas are read from a
+prim's metadata, types and fallbacks from `schema.usda`.
 """
 
+import functools
 import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from pxr import Plug, Usd
+from pxr import Plug, Sdf, Usd
 
 from magtwin.errors import InputError, find
 from magtwin.outputs import output
@@ -20,12 +24,19 @@ __all__ = [
     "NOUNS",
     "apply_api",
     "attribute_name",
+    "author",
+    "author_targets",
+    "declarations",
+    "declared",
+    "has_api",
     "only_prim_with",
     "place",
     "prims_with",
     "publish",
     "register",
     "require_api",
+    "type_of",
+    "value_of",
 ]
 
 FOLDER = Path(__file__).resolve().parent
@@ -58,9 +69,10 @@ NOUNS = {
 def register() -> None:
     """Register the schemas with USD; a second call does nothing.
 
+    If a stage was opened before, other programs in this process do not see the schemas; magtwin does.
+
     Raises:
-        InputError: USD's schema registry was used before, so it cannot add schemas; or it has another version
-            of the library.
+        InputError: USD has another version of the library.
     """
     Plug.Registry().RegisterPlugins(str(FOLDER))
     plugin = Plug.Registry().GetPluginWithName("magtwin")
@@ -70,14 +82,50 @@ def register() -> None:
             f"USD loads version {version} of magtwin's schemas from {plugin.resourcePath}, this magtwin "
             f"needs {wanted}; let PXR_PLUGINPATH_NAME name {FOLDER} instead"
         )
-    registry = Usd.SchemaRegistry()
-    unknown = [api for api in NOUNS.values() if not registry.FindAppliedAPIPrimDefinition(api)]
-    if unknown:
-        raise InputError(
-            f"the USD schemas {', '.join(unknown)} are registered too late: USD reads schemas at the first "
-            "use of a stage; import magtwin.usd before opening one, or add "
-            f"{FOLDER} to PXR_PLUGINPATH_NAME"
-        )
+
+
+@functools.cache
+def _source() -> Sdf.Layer:
+    """The layer of `schema.usda`."""
+    return Sdf.Layer.FindOrOpen(str(FOLDER / "schema.usda"))
+
+
+@functools.cache
+def declarations() -> dict[str, Sdf.PropertySpec]:
+    """Every attribute and relationship of the schemas, by name."""
+    return {item.name: item for schema in _source().rootPrims for item in schema.properties}
+
+
+def declared(item: Usd.Property) -> Sdf.PropertySpec | None:
+    """The declaration of a prim's property; None if it is not the schemas', or the prim lacks its schema."""
+    spec = declarations().get(item.GetName())
+    return spec if spec and spec.owner.name in _applied(item.GetPrim()) else None
+
+
+def value_of(attribute: Usd.Attribute) -> Any:
+    """Value of an attribute, or the schema's fallback; None if there is neither."""
+    value = attribute.Get()
+    if value is None and (spec := declared(attribute)):
+        return spec.default
+    return value
+
+
+def type_of(attribute: Usd.Attribute) -> Sdf.ValueTypeName:
+    """Type of an attribute: that of the schema, whatever a layer has."""
+    spec = declared(attribute)
+    return spec.typeName if spec else attribute.GetTypeName()
+
+
+def author(attribute: Usd.Attribute, value: Any) -> None:
+    """Set an attribute of a schema that its prim has, in the stage's edit target."""
+    if not attribute and (spec := declared(attribute)):
+        attribute.GetPrim().CreateAttribute(spec.name, spec.typeName, False, spec.variability)
+    attribute.Set(value)
+
+
+def author_targets(prim: Usd.Prim, name: str, paths: Sequence[Sdf.Path]) -> None:
+    """Set the targets of a relationship of the schemas, in the stage's edit target."""
+    (prim.GetRelationship(name) or prim.CreateRelationship(name, custom=False)).SetTargets(list(paths))
 
 
 def publish(folder: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -108,22 +156,28 @@ def apply_api(prim: Usd.Prim, noun: str) -> Usd.Prim:
     Raises:
         InputError: The schema is not for a prim of that type.
     """
-    api = find("schema", noun, NOUNS)
-    if prim.HasAPI(api):
+    if has_api(prim, noun):
         return prim
-    allowed = prim.CanApplyAPI(api)
-    if not allowed:
+    kinds = _source().GetPrimAtPath(NOUNS[noun]).customData["apiSchemaCanOnlyApplyTo"]
+    if not any(map(prim.IsA, kinds)):
+        *others, last = kinds
+        words = f"an {', '.join(others)} or {last}" if others else f"an {last}"
         raise InputError(
-            f"{place(prim)}: {api} goes on {_kinds(api)} only, not on a {prim.GetTypeName() or 'def'}"
+            f"{place(prim)}: {NOUNS[noun]} goes on {words} only, not on a {prim.GetTypeName() or 'def'}"
         )
-    prim.ApplyAPI(api)
+    prim.AddAppliedSchema(NOUNS[noun])
     return prim
 
 
-def _kinds(api: str) -> str:
-    """The types of prim of a schema, in words."""
-    *others, last = Usd.SchemaRegistry().GetAPISchemaCanOnlyApplyToTypeNames(api)
-    return f"an {', '.join(others)} or {last}" if others else f"an {last}"
+def has_api(prim: Usd.Prim, noun: str) -> bool:
+    """Whether the schema of `noun` is applied to `prim`."""
+    return find("schema", noun, NOUNS) in _applied(prim)
+
+
+def _applied(prim: Usd.Prim) -> list[str]:
+    """The applied schemas of a prim, by its metadata."""
+    names: list[str] = prim.GetPrimTypeInfo().GetAppliedAPISchemas()
+    return names
 
 
 def require_api(prim: Usd.Prim, noun: str) -> Usd.Prim:
@@ -132,16 +186,15 @@ def require_api(prim: Usd.Prim, noun: str) -> Usd.Prim:
     Raises:
         InputError: It lacks the schema.
     """
-    api = find("schema", noun, NOUNS)
-    if not prim.HasAPI(api):
-        raise InputError(f"{place(prim)}: has no {api}, so it is no {noun} of magtwin")
+    if not has_api(prim, noun):
+        raise InputError(f"{place(prim)}: has no {NOUNS[noun]}, so it is no {noun} of magtwin")
     return prim
 
 
 def prims_with(root: Usd.Prim, noun: str) -> list[Usd.Prim]:
     """The prims at and below `root` with the schema of `noun`, in order of the stage."""
     api = find("schema", noun, NOUNS)
-    return [prim for prim in Usd.PrimRange(root) if prim.HasAPI(api)]
+    return [prim for prim in Usd.PrimRange(root) if api in _applied(prim)]
 
 
 def _advice(root: Usd.Prim, noun: str) -> str:

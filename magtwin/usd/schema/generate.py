@@ -41,10 +41,12 @@ text, list or file; `none` is no value.
 
 ## The schemas in other programs
 
-`import magtwin.usd` registers the schemas with USD. Other programs find them by `PXR_PLUGINPATH_NAME`, which
-USD reads when a program starts. It names a folder with `plugInfo.json` and `generatedSchema.usda`:
-`magtwin schema` prints the one of this installation, and `magtwin schema --out DIR` makes a copy for another
-machine. `magtwin export` puts a copy in the folder `plugin/magtwin` of each export.
+`import magtwin.usd` registers the schemas with USD. magtwin reads and writes them also where a stage was
+opened before; bare pxr knows them only if the import comes first, as USD reads schemas once. Other programs
+find them by `PXR_PLUGINPATH_NAME`, which USD reads when a program starts. It names a folder with
+`plugInfo.json` and `generatedSchema.usda`: `magtwin schema` prints the one of this installation, and
+`magtwin schema --out DIR` makes a copy for another machine. `magtwin export` puts a copy in the folder
+`plugin/magtwin` of each export.
 
 OpenUSD's usdview:
 

@@ -12,7 +12,7 @@ from typing import Any
 from pxr import Sdf, Usd
 
 from magtwin.errors import InputError, MismatchWarning
-from magtwin.usd.schema import NOUNS
+from magtwin.usd.schema import declarations
 from magtwin.usd.schema.names import OLDER, REMOVED, RENAMED, VERSION
 
 KEY = "magtwinSchemaVersion"
@@ -106,19 +106,12 @@ def _rename(layer: Sdf.Layer, older: list[Sdf.Path]) -> None:
             spec.name = RENAMED[path.name]
         else:
             spec.owner.RemoveProperty(spec)
-    ours = _attributes()
 
     def settle(path: Sdf.Path) -> None:
-        if path.IsPropertyPath() and path.name in ours:
+        if path.IsPropertyPath() and path.name in declarations():
             layer.GetPropertyAtPath(path).SetInfo("variability", Sdf.VariabilityUniform)
 
     layer.Traverse(Sdf.Path.absoluteRootPath, settle)
-
-
-def _attributes() -> set[str]:
-    """Names of every attribute of the schema; relationships are uniform as they are."""
-    definitions = map(Usd.SchemaRegistry().FindAppliedAPIPrimDefinition, NOUNS.values())
-    return {n for d in definitions for n in d.GetPropertyNames() if d.GetAttributeDefinition(n)}
 
 
 def is_upgraded(layer: Sdf.Layer) -> bool:
