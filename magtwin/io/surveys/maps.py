@@ -409,6 +409,7 @@ def _with_doubts(report: Report, doubts: list[str]) -> Report:
 def _shared(readings: Readings, method: str) -> list[str]:
     """What a fit takes for granted about the runs of a survey, and what its intervals leave out."""
     from magtwin.field.fit.fit import offset_sd_nt
+    from magtwin.field.fit.passes import by_pass
 
     doubts = list[str]()
     if readings.grid is not None:
@@ -418,6 +419,11 @@ def _shared(readings: Readings, method: str) -> list[str]:
             f"{len(readings.runs)} runs are fitted with one platform: if the robot's hard iron changed "
             "between them, as between sessions, the map takes the difference for field; fit each session "
             "alone, or use --method gp, in which runs may disagree"
+        )
+    if readings.t is not None and np.ptp(by_pass(readings).run) == 0:
+        doubts.append(
+            "the drive never comes back to a place, so the noise between passes is unknown and the standard "
+            "deviations are too small; cross your own path often"
         )
     if offset := offset_sd_nt(readings):
         doubts.append(

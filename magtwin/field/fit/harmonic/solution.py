@@ -268,7 +268,7 @@ class Solution:
 
         Each place counts once. Consecutive readings of a drive share errors from motors, battery and LiDAR,
         so whole passes are left out, and predicted where another pass is near. The noise grows by what a pass
-        shares; passes are few, so that they never narrow an interval.
+        shares. Passes are few, so the intervals of a drive are never narrowed.
         """
         root, problem = np.sqrt(precision).ravel(), self.problem
         places, (passes, near) = problem.places(), problem.met()
@@ -281,8 +281,8 @@ class Solution:
         noise, freedom = self.variance.ravel(), self.figures.freedom
         square, field = (off / root) ** 2, field / root**2
         best = np.inf, 1.0, 1.0
-        widths, noises = (WIDTHS[WIDTHS >= 0], NOISES) if passes else (WIDTHS, NOISES[:1])
-        for factor in noises:
+        widths = WIDTHS if problem.passes is None else WIDTHS[WIDTHS >= 0]
+        for factor in NOISES if passes else NOISES[:1]:
             scale = widened(field, factor * noise, np.exp(widths)[:, None]) + factor * noise
             surprise = (freedom + 1) / 2 * np.log1p(square / (freedom * scale)) + np.log(scale) / 2
             loss = surprise @ share + (widths / WIDTH_SD) ** 2 / 2
