@@ -15,6 +15,7 @@ from magtwin.field.maps.epochs import at_date
 from magtwin.field.maps.map import OFFSET
 from magtwin.field.maps.statistics import map_metadata
 from magtwin.field.survey.readings import Readings
+from magtwin.io.surveys.maps import _shared
 from magtwin.localization.problem import Problem, SensorModel
 from magtwin.verdict import Z_90
 
@@ -131,3 +132,11 @@ def test_an_offset_that_is_none_is_not_used(wrong):
     field = replace(raster(fitted("gp"), loops(), spacing_m=0.2), parameters={OFFSET: wrong})
     assert field.offset_sd_nt == 0
     assert field.relative() is field
+
+
+def test_a_fit_doubts_one_drive_and_one_that_never_comes_back():
+    one, several = loops(), loops().with_(run=np.arange(1500) // 750, runs=("a", "b"))
+    assert [doubt.split(":")[0] for doubt in _shared(one, "auto")] == ["one drive"]
+    assert [doubt.split(":")[0] for doubt in _shared(several, "gp")] == ["readings of drives"]
+    assert "never comes back" in _shared(one.take(np.arange(200)), "auto")[0]
+    assert _shared(survey(), "auto") == _shared(one.with_(t=None), "auto") == []

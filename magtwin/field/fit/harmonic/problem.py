@@ -153,13 +153,15 @@ class Problem:
         """
         from scipy.spatial import cKDTree
 
+        none = list[NDArray[np.intp]](), np.zeros(0, bool)
+        if self.passes is None or np.ptp(self.passes) == 0:
+            return none
         side, near = abs(self.layers.depths[0]) / DEPTH_SPACINGS, np.zeros(len(self.p_xy), bool)
-        names = [] if self.passes is None else np.unique(self.passes)
-        for name in names if len(names) > 1 else []:
+        for name in np.unique(self.passes):
             own = self.passes == name
             near[own] = cKDTree(self.p_xy[~own]).query(self.p_xy[own])[0] <= side
-        if self.passes is None or not near.any():
-            return [], np.zeros(0, bool)
+        if not near.any():
+            return none
         return self._grouped(self.passes), np.repeat(near, self.read_nt.shape[1])
 
     def _grouped(self, group: NDArray[np.intp]) -> list[NDArray[np.intp]]:
