@@ -6,7 +6,7 @@ pose, the true field or a later reading. Poses are x, y [m] and yaw [rad] of bas
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -149,7 +149,8 @@ class Problem:
     """What a localizer is told before the first reading. It holds no truth."""
 
     belief: FieldBelief | None
-    """Map of the field. None: simultaneous localization and mapping."""
+    """Map of the field. None: simultaneous localization and mapping. The `offset_sd_nt` of a map becomes part
+    of the sensor's `offset_nt`."""
 
     extent: Extent
     """The floor on which the robot drives."""
@@ -176,6 +177,10 @@ class Problem:
     """Seed of the algorithm's random numbers."""
 
     def __post_init__(self) -> None:
+        if offset := getattr(self.belief, "offset_sd_nt", 0.0):  # once, as an error of the offset
+            sensor = replace(self.sensor, offset_nt=math.hypot(self.sensor.offset_nt, offset))
+            object.__setattr__(self, "sensor", sensor)
+            object.__setattr__(self, "belief", self.belief.relative())  # type: ignore[union-attr]
         for name in ("map_length_m", "rate_hz"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"`{name}` must be above 0, got {getattr(self, name)}", parameter=name)

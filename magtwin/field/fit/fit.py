@@ -19,7 +19,8 @@ from magtwin.field.fit.methods import METHODS, FieldModel, MapMethod
 from magtwin.field.fit.resolution import resolution
 from magtwin.field.grid import TURN, Grid
 from magtwin.field.maps.curvature import interpolation_error_nt2
-from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.map import OFFSET, AnomalyMap
+from magtwin.field.maps.statistics import offset_figures
 from magtwin.field.survey.axes import SurveyAxes, distinct, in_order, in_own_axes
 from magtwin.field.survey.bins import distance_m, spacing_m
 from magtwin.field.survey.readings import Readings, checked_earth_nt
@@ -34,6 +35,9 @@ MOST_DOUBT = 0.5  # Largest standard deviation of a known node, as a share of th
 FLAT_NT = 50.0  # Least scale of that share, for fields that hardly change [nT]
 # Parameters of a map: RMS errors of linear interpolation
 ERRORS = ("error between nodes [nT]", "error between headings [nT]")
+# Standard deviation of what a robot adds alike throughout a drive [nT]: a constant of 500 and, by heading,
+# 400, as in drives of the shipped robot (`ROBOT_NOISE` of `magtwin.localizing`)
+OFFSET_SD_NT = 640.0
 MOST_THREADS = 4  # Headings of a raster that are computed in parallel: each holds blocks of 100 MB
 
 
@@ -160,6 +164,8 @@ def raster(
         extent: Least x, greatest x, least y, greatest y [m]. Default: that of the readings.
         progress: Called as progress(done, total, what), once per heading.
 
+    The variance of a map of one drive has that of an offset, see `offset_sd_nt`.
+
     Returns:
         The map with values, variance, method, parameters, the survey's metadata and, if the model has one,
         the harmonic field. The parameters include the errors of interpolation between its nodes and headings.
@@ -181,6 +187,7 @@ def raster(
             say(h, len(headings), "headings")
             values[h], variance[h] = predicted
     say(len(headings), len(headings), "headings")
+    offset = offset_sd_nt(readings)
     valid = np.isfinite(values) & np.isfinite(variance) & _known(model, readings, own, p[0], variance)
     if not valid.any():
         x0, x1, y0, y1 = grid.extent
@@ -193,16 +200,26 @@ def raster(
     return AnomalyMap(
         values_nt=values,
         valid=valid,
-        variance_nt2=variance,
+        variance_nt2=variance + offset**2,
         between_nt2=interpolation_error_nt2(values, valid, headings, variance if read else None),
         origin_m=grid.origin_m,
         cell_m=grid.cell_m,
         headings_rad=np.asarray(grid.headings_rad),
         method=model.method,
-        parameters={**model.parameters, **errors},
+        parameters={**model.parameters, **errors, **({OFFSET: offset} if offset else {})},
         **readings.about,
         harmonic=getattr(model, "field", None),
     )
+
+
+def offset_sd_nt(readings: Readings) -> float:
+    """Standard deviation of an error that is alike all over a map of the readings [nT].
+
+    A robot that drives adds the fields of its motors, battery and LiDAR. What is alike throughout its only
+    drive cannot be told from the field of the room, and no reading of the drive disagrees with it.
+    """
+    drive = readings.grid is None and readings.t is not None
+    return OFFSET_SD_NT if drive and np.ptp(readings.run[readings.good]) == 0 else 0.0
 
 
 def grid_report(field: AnomalyMap) -> Report:
@@ -219,6 +236,7 @@ def grid_report(field: AnomalyMap) -> Report:
     if field.variance_nt2 is not None and field.valid.any():
         sd = float(np.sqrt(np.median(field.variance_nt2[field.valid])))
         figures.append(Figure("standard deviation", round(sd, 1), "nT", note="median over the nodes"))
+    figures += offset_figures(field)
     return Report("grid", tuple(figures), {})
 
 

@@ -12,6 +12,7 @@ from magtwin.field.fit.covariance import Covariance, Kernel
 from magtwin.field.fit.interpolation import check_readings
 from magtwin.field.fit.methods import FittedModel, in_own_axes
 from magtwin.field.fit.nodes import variance_at_nodes
+from magtwin.field.fit.passes import by_pass
 from magtwin.field.fit.roughness import local_mean, tail
 from magtwin.field.survey.axes import WORLD, SurveyAxes
 from magtwin.field.survey.bins import GRAIN_M, Bins, bin_readings, spacing_m
@@ -134,7 +135,7 @@ def fit_gp(
     say = progress or (lambda done, total, what: None)
     total = len(STARTS) + 3
     say(0, total, "averaging")
-    bins, within = _data(readings)
+    bins, within = _data(by_pass(readings))
     mean = float(bins.b_nt.mean())
     poses, b = (bins.p_xy, bins.yaw), bins.b_nt - mean
     several = readings.grid is None and len(np.unique(bins.run)) > 1

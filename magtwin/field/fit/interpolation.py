@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.fit.methods import FittedModel, in_own_axes
+from magtwin.field.fit.passes import by_pass
 from magtwin.field.fit.roughness import Interpolation, Roughness
 from magtwin.field.grid import TURN, Grid
 from magtwin.field.maps.curvature import interpolation_error_nt2
@@ -337,13 +338,13 @@ def _fit_scattered(readings: Readings, method: str) -> ScatterInterpolation:
 def _binned(readings: Readings, still: Array, cell_m: float) -> tuple[Bins, float, Array]:
     """Bins of the position's part; variance of a reading, and of the mean of each bin [nT^2].
 
-    Readings of one run in a bin have variance w about their mean, and the runs' means vary by r more. If no
-    two runs met, r is unknown, and a bin is no more certain than a reading.
+    Readings of one pass in a bin have variance w about their mean, and the passes' means vary by r more. If
+    no two passes met, r is unknown, and a bin is no more certain than a reading.
     """
     bins, index = bin_readings(readings, cell_m)
     rows = np.flatnonzero(readings.good)
     mean = np.bincount(index, still[rows]) / bins.count
-    apart, own = bin_readings(readings, cell_m, by_run=True)
+    apart, own = bin_readings(by_pass(readings), cell_m, by_run=True)
     means = np.bincount(own, still[rows]) / apart.count
     freedom = len(rows) - len(means)
     within = float(np.sum((still[rows] - means[own]) ** 2) / freedom) if freedom else 0.0

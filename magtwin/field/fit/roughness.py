@@ -116,5 +116,16 @@ def tail(tree: Any, squares: Array, each: Array, place: NDArray[np.intp]) -> flo
     single residuals at the positions `place`, both of shape (E,).
     """
     variance = local_mean(tree, squares, np.asarray(tree.data), skip=1)
-    ratio = each / np.maximum(variance[place], np.finfo(float).tiny)
-    return float(np.quantile(ratio, 0.9)) / Z_90**2
+    return tail_of(each / np.maximum(variance[place], np.finfo(float).tiny))
+
+
+def tail_of(ratio: Array, weights: Array | None = None) -> float:
+    """Factor on variances with which their 90 % intervals hold 90 % of the residuals, (R,).
+
+    `ratio` are the squares of the residuals over the variances, `weights` how much each counts.
+    """
+    if weights is None:
+        return float(np.quantile(ratio, 0.9)) / Z_90**2
+    order = np.argsort(ratio)
+    share = np.cumsum(weights[order])
+    return float(ratio[order][np.searchsorted(share, 0.9 * share[-1])]) / Z_90**2

@@ -10,7 +10,7 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.field.days import day_number, parse_day
-from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.map import OFFSET, AnomalyMap
 from magtwin.report import Figure, Report
 
 # What all epochs of a map share, besides the number of nodes
@@ -99,6 +99,10 @@ def at_date(maps: Sequence[AnomalyMap], date: str | datetime.date) -> AnomalyMap
         variance = (1 - w) ** 2 * before.variance_nt2 + w**2 * after.variance_nt2
         if before.between_nt2 is not None and after.between_nt2 is not None:
             error = (1 - w) * before.between_nt2 + w * after.between_nt2  # alike on both days
+    parameters = before.parameters
+    if before.parameters != after.parameters:
+        offset = float(np.hypot((1 - w) * before.offset_sd_nt, w * after.offset_sd_nt))
+        parameters = {OFFSET: offset} if offset else {}
     between = f"linear in time between {before.created} and {after.created}"
     return replace(
         after,
@@ -110,7 +114,7 @@ def at_date(maps: Sequence[AnomalyMap], date: str | datetime.date) -> AnomalyMap
         source=_joined(before.source, after.source),
         licence=_joined(before.licence, after.licence),
         created=day.isoformat(),
-        parameters={} if before.parameters != after.parameters else before.parameters,
+        parameters=parameters,
         harmonic=None,
         recorded_yaw=None,
     )

@@ -3,7 +3,7 @@
 import importlib
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 
 TEXTS = ("name", "method", "source", "licence", "created", "frame", "datum")  # Metadata that are texts
 CONSTANT_NT = 1e-3  # Range of values up to which a map is constant [nT]
+OFFSET = "offset sd [nT]"  # Parameter of a map: see `AnomalyMap.offset_sd_nt`
 
 Outside = Literal["nan", "clamp", "raise"]
 
@@ -306,6 +307,24 @@ class AnomalyMap(Summarized):
         if len(self.headings_rad) >= 3 and everywhere.any():
             figures.append(amplitude(self.values_nt[:, everywhere].mean(axis=1), self.headings_rad))
         return Report(f"map {self.name}", tuple(figures), {"method": self.method, "licence": self.licence})
+
+    @property
+    def offset_sd_nt(self) -> float:
+        """Standard deviation of an error that is alike all over the map [nT]; part of every variance."""
+        known = self.parameters.get(OFFSET)
+        return float(known) if isinstance(known, int | float) and 0 < known < np.inf else 0.0
+
+    def relative(self) -> "AnomalyMap":
+        """The map up to a constant: its variance without that of the offset, for users that estimate one."""
+        if not self.offset_sd_nt or not self.has_variance:
+            return self
+        whole = self.whole()
+        assert whole.variance_nt2 is not None
+        return replace(
+            whole,
+            variance_nt2=np.maximum(whole.variance_nt2 - np.square(self.offset_sd_nt), 0.0),
+            parameters={name: value for name, value in whole.parameters.items() if name != OFFSET},
+        )
 
     @property
     def has_variance(self) -> bool:

@@ -81,6 +81,7 @@ def map_metadata(field: AnomalyMap, epochs: Sequence[AnomalyMap] = ()) -> Report
         if isinstance(field, TiledMap) and field.sums.every > 1:
             note += f" at every {field.sums.every}th node along x and y"
         figures.append(Figure("standard deviation", float(middle), "nT", note=note))
+    figures += offset_figures(field)
     if field.height_m is None:
         figures.append(Figure("height", "unknown"))
     else:
@@ -99,6 +100,14 @@ def map_metadata(field: AnomalyMap, epochs: Sequence[AnomalyMap] = ()) -> Report
     if len(epochs) > 1:
         metadata["epochs"] = {m.created: m.source or "source unknown" for m in epochs}
     return Report(f"map {field.name}", tuple(figures), metadata)
+
+
+def offset_figures(field: AnomalyMap) -> list[Figure]:
+    """The offset that a map of one drive leaves open; none for other maps."""
+    if not field.offset_sd_nt:
+        return []
+    note = "part of it: one drive cannot tell what its robot adds alike throughout from the room's field"
+    return [Figure("offset sd", field.offset_sd_nt, "nT", note=note)]
 
 
 def source_files(source: str) -> dict[str, str]:

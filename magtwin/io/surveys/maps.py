@@ -408,6 +408,9 @@ def _with_doubts(report: Report, doubts: list[str]) -> Report:
 
 def _shared(readings: Readings, method: str) -> list[str]:
     """What a fit takes for granted about the runs of a survey, and what its intervals leave out."""
+    from magtwin.field.fit.fit import offset_sd_nt
+    from magtwin.field.fit.passes import by_pass
+
     doubts = list[str]()
     if readings.grid is not None:
         return doubts
@@ -417,11 +420,21 @@ def _shared(readings: Readings, method: str) -> list[str]:
             "between them, as between sessions, the map takes the difference for field; fit each session "
             "alone, or use --method gp, in which runs may disagree"
         )
-    if readings.t is not None and method == "harmonic":
+    if readings.t is not None and np.ptp(by_pass(readings).run) == 0:
         doubts.append(
-            "readings of a drive: the standard deviations are too small for the field at rest; in the "
-            "default lab 90 % intervals held 59 % of it without the fields of motors, battery and LiDAR, and "
-            "26 % with them; survey at rest, node by node, for intervals that hold"
+            "the drive never comes back to a place, so the noise between passes is unknown and the standard "
+            "deviations are too small; cross your own path often"
+        )
+    if offset := offset_sd_nt(readings):
+        doubts.append(
+            "one drive: what its robot adds alike throughout (motors, battery, LiDAR) cannot be told from "
+            f"the room's field; the standard deviations hold {offset:g} nT for it (offset sd), which "
+            "localization takes for an unknown bias; survey at rest, node by node, for a smaller one"
+        )
+    elif readings.t is not None:
+        doubts.append(
+            "readings of drives: the standard deviations do not hold what the robot adds alike in all runs "
+            "(motors, battery, LiDAR); survey at rest, node by node, for intervals that hold"
         )
     return doubts
 

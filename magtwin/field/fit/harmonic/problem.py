@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from magtwin.field.fit.harmonic.forward import SOFT, Forward, Reading
 from magtwin.field.fit.harmonic.layers import DEPTH_SPACINGS, Layers
+from magtwin.field.fit.passes import by_pass
 from magtwin.field.survey.bins import means
 from magtwin.field.survey.readings import Readings
 
@@ -20,8 +21,6 @@ BEGINNINGS, BEGUN_DIP = 4, np.radians(60.0)
 EARTH_SD_NT = 1000.0  # Prior standard deviation of the uniform field about the Earth's, per component [nT]
 # Prior standard deviations of the platform's unknowns, about 0
 HARD_IRON_SD_NT, SOFT_IRON_SD, LEVER_SD_M = 3000.0, 0.03, 0.05
-# Length of a drive that is left out together, in the first layer's depth: over half a minute at 0.2 m/s
-STRETCH = 24.0
 # Length of the headings' mean vector from which they count as one: a spread of at most 8 deg
 ONE_HEADING = 0.99
 
@@ -78,7 +77,7 @@ class Problem:
     yaw: Array
     read_nt: Array  # (N, C)
     cell: NDArray[np.intp]  # of each good reading
-    follow: bool  # whether rows follow each other as a drive's do
+    passes: NDArray[np.intp] | None  # pass of each row of a drive, (N,); None if rows are not parts of one
     mean: Array  # of the unknowns' priors
     rest_sd: Array  # standard deviations of the priors of all unknowns but the moments
     begins: list[Array]  # uniform fields to begin with
@@ -97,6 +96,7 @@ class Problem:
         read = good.b_nt[:, None] if good.b_body_nt is None else good.b_body_nt
         cell, follow = means(good, min(map(abs, layers.depths)))
         size = np.bincount(cell)
+        passes = by_pass(good).run[np.unique(cell, return_index=True)[1]] if follow else None
 
         def mean(values: Array) -> Array:
             return np.asarray(np.bincount(cell, values) / size)
@@ -132,7 +132,7 @@ class Problem:
             )
             rest[3:14] = 0.0
         untold = UNTOLD if platform is None and good.b_body_nt is None else ""
-        return cls(forward, layers, p, yaw, read, cell, follow, prior, rest, begins, untold)
+        return cls(forward, layers, p, yaw, read, cell, passes, prior, rest, begins, untold)
 
     @property
     def vectors(self) -> bool:
@@ -146,13 +146,23 @@ class Problem:
         _, place = np.unique(square, axis=0, return_inverse=True)
         return self._grouped(place.ravel())
 
-    def stretches(self) -> list[NDArray[np.intp]]:
-        """Rows of reading components of each stretch of a drive; empty for other surveys."""
-        if not self.follow:
-            return []
-        step = np.linalg.norm(np.diff(self.p_xy, axis=0), axis=1)
-        way = np.concatenate([[0.0], np.cumsum(step)])
-        return self._grouped(np.floor(way / (STRETCH * abs(self.layers.depths[0]))).astype(np.intp))
+    def met(self) -> tuple[list[NDArray[np.intp]], NDArray[np.bool_]]:
+        """Rows of reading components of each pass, and the rows within a spacing of another pass, (R,).
+
+        Both are empty if no two passes meet, or the readings are not of a drive.
+        """
+        from scipy.spatial import cKDTree
+
+        none = list[NDArray[np.intp]](), np.zeros(0, bool)
+        if self.passes is None or np.ptp(self.passes) == 0:
+            return none
+        side, near = abs(self.layers.depths[0]) / DEPTH_SPACINGS, np.zeros(len(self.p_xy), bool)
+        for name in np.unique(self.passes):
+            own = self.passes == name
+            near[own] = cKDTree(self.p_xy[~own]).query(self.p_xy[own])[0] <= side
+        if not near.any():
+            return none
+        return self._grouped(self.passes), np.repeat(near, self.read_nt.shape[1])
 
     def _grouped(self, group: NDArray[np.intp]) -> list[NDArray[np.intp]]:
         """Rows of reading components, by the groups (N,) of their readings."""

@@ -12,6 +12,7 @@ from magtwin.field.fit.harmonic.layers import Layers
 from magtwin.field.fit.harmonic.model import HarmonicModel, between, surveyed, widened
 from magtwin.field.fit.harmonic.posterior import Posterior
 from magtwin.field.fit.harmonic.problem import Hyperparameters, Problem
+from magtwin.field.fit.roughness import tail_of
 from magtwin.field.survey.readings import Readings
 from magtwin.verdict import Z_90
 
@@ -267,24 +268,33 @@ class Solution:
         """Likeliest factors of the noise's and of the field's variance, from readings left out in turn.
 
         Each place counts once. Consecutive readings of a drive share errors from motors, battery and LiDAR,
-        so whole stretches are left out, and the noise grows by what they share.
+        so whole passes are left out, and predicted where another pass is near. The noise grows by what a pass
+        shares. Passes are few, so the intervals of a drive are never narrowed.
         """
         root, problem = np.sqrt(precision).ravel(), self.problem
-        places, stretches = problem.places(), problem.stretches()
-        off, field = posterior.left_out(self._target(posterior, precision), stretches or places)
+        places, (passes, near) = problem.places(), problem.met()
+        off, field = posterior.left_out(self._target(posterior, precision), passes or places)
         share = np.empty(len(root))
         for rows in places:
             share[rows] = 1 / len(rows)
+        if passes:
+            share *= near
         noise, freedom = self.variance.ravel(), self.figures.freedom
         square, field = (off / root) ** 2, field / root**2
         best = np.inf, 1.0, 1.0
-        for factor in NOISES if stretches else NOISES[:1]:
-            scale = widened(field, factor * noise, np.exp(WIDTHS)[:, None]) + factor * noise
+        widths = WIDTHS if problem.passes is None else WIDTHS[WIDTHS >= 0]
+        for factor in NOISES if passes else NOISES[:1]:
+            scale = widened(field, factor * noise, np.exp(widths)[:, None]) + factor * noise
             surprise = (freedom + 1) / 2 * np.log1p(square / (freedom * scale)) + np.log(scale) / 2
-            loss = surprise @ share + (WIDTHS / WIDTH_SD) ** 2 / 2
+            loss = surprise @ share + (widths / WIDTH_SD) ** 2 / 2
             k = int(np.argmin(loss))
-            best = min(best, (float(loss[k]), float(factor), float(np.exp(WIDTHS[k]))))
-        return best[1], best[2]
+            best = min(best, (float(loss[k]), float(factor), float(np.exp(widths[k]))))
+        _, louder, width = best
+        if not passes:
+            return louder, width
+        variance = widened(field, louder * noise, width) + louder * noise * freedom / (freedom - 2)
+        wider = max(tail_of(square[near] / variance[near], share[near]), 1.0)
+        return louder * wider, width * wider
 
     def _turned(self, posterior: Posterior, precision: Array) -> tuple[Array, float]:
         """See `HarmonicModel.headings_rad` and `HarmonicModel.turned`."""
