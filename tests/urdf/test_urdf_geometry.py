@@ -702,6 +702,21 @@ def test_what_nodes_show_counts_as_often_as_they_show_it_although_it_has_no_face
         read_mesh(path)
 
 
+def test_the_groups_of_a_collada_geometry_are_counted_before_they_are_decoded(tmp_path, monkeypatch):
+    monkeypatch.setitem(BUDGETS, "mesh", Budget(count=500))
+    path = dae(tmp_path / "m.dae", "<node>{mesh}</node>")
+    path.write_text(
+        re.sub(
+            "<triangles.*</triangles>",
+            "<triangles><p>x</p></triangles>" * 501,
+            path.read_text(),
+            flags=re.DOTALL,
+        )
+    )
+    with pytest.raises(InputError, match=r"m\.dae:\d+: shows over 500 nodes; export it again"):
+        read_mesh(path)
+
+
 HALF = float(np.sqrt(0.5))
 
 TREE = [

@@ -172,8 +172,10 @@ class _Collada:
                 self._reading.note(f"<{kind}> of geometry {name!r} are left out")
         shown = [p for p in mesh if p.tag in POLYGONS and p.find("p") is not None]
         mesh[:] = [*mesh.findall("source"), *mesh.findall("vertices"), *shown]
+        self._reading.visit(len(shown), self._line(geometry))  # before they are decoded
+        of_vertices = len(mesh.findall("vertices/input"))
         for primitive in shown:
-            if len(primitive.findall("input")) + len(mesh.findall("vertices/input")) > MOST_INPUTS:
+            if len(primitive.findall("input")) + of_vertices > MOST_INPUTS:
                 raise self._refused(primitive, f"<{primitive.tag}> has over {MOST_INPUTS} inputs")
             if primitive.tag == "triangles":  # pycollada reads the first <p>
                 first, *others = primitive.findall("p")
