@@ -3,6 +3,7 @@
 Encoding: https://protobuf.dev/programming-guides/encoding
 """
 
+import mmap
 from collections.abc import Iterator
 
 NUMBER, EIGHT, BYTES, FOUR = 0, 1, 2, 5
@@ -20,18 +21,22 @@ def fields(message: bytes) -> Iterator[tuple[int, int, int, int]]:
     at = 0
     while at < len(message):
         begin = at
-        tag, at = _number(message, at)
+        tag, at = varint(message, at)
         kind, value = tag & 7, 0
         if kind in (NUMBER, BYTES):
-            value, at = _number(message, at)
+            value, at = varint(message, at)
         elif kind not in (EIGHT, FOUR):
             raise ValueError(f"a field of kind {kind}")
         at += {NUMBER: 0, EIGHT: 8, BYTES: value, FOUR: 4}[kind]
         yield tag >> 3, value, begin, at
 
 
-def _number(message: bytes, at: int) -> tuple[int, int]:
-    """A number of variable length, and where it ends."""
+def varint(message: bytes | mmap.mmap, at: int) -> tuple[int, int]:
+    """A number of variable length, in groups of 7 bits, the lowest first; and where it ends.
+
+    Raises:
+        ValueError: It has no end.
+    """
     value = 0
     for shift in range(0, 70, 7):
         if at >= len(message):

@@ -9,6 +9,7 @@ import pyarrow.parquet as pq
 
 from magtwin.budget import check_count, check_decoded, check_size
 from magtwin.errors import InputError
+from magtwin.protobuf import varint
 
 _BATCH = 1 << 20
 """Most rows of texts that are measured at once."""
@@ -147,7 +148,7 @@ def _value(data: bytes | mmap.mmap, at: int, kind: int, depth: int) -> tuple[Any
     if kind == 7:
         return None, at + 8
     if kind == 8:
-        length, at = _varint(data, at)
+        length, at = varint(data, at)
         return None, at + length
     if depth > 16:
         raise ValueError("lists without end")
@@ -157,7 +158,7 @@ def _value(data: bytes | mmap.mmap, at: int, kind: int, depth: int) -> tuple[Any
         raise ValueError(f"unknown kind {kind}")
     count, kind, at = data[at] >> 4, data[at] & 15, at + 1
     if count == 15:
-        count, at = _varint(data, at)
+        count, at = varint(data, at)
     values = []
     for _ in range(count):  # each takes a byte at least
         value, at = _value(data, at, kind, depth + 1)
@@ -167,16 +168,5 @@ def _value(data: bytes | mmap.mmap, at: int, kind: int, depth: int) -> tuple[Any
 
 def _integer(data: bytes | mmap.mmap, at: int) -> tuple[int, int]:
     """A signed number, in zigzag code."""
-    value, at = _varint(data, at)
+    value, at = varint(data, at)
     return (value >> 1) ^ -(value & 1), at
-
-
-def _varint(data: bytes | mmap.mmap, at: int) -> tuple[int, int]:
-    """An unsigned number in groups of 7 bits, the lowest first."""
-    value = 0
-    for shift in range(0, 70, 7):
-        value |= (data[at] & 127) << shift
-        at += 1
-        if not data[at - 1] & 128:
-            return value, at
-    raise ValueError("a number without end")

@@ -261,9 +261,6 @@ def test_a_ball_is_shaded_smooth_and_a_box_sharp():
     assert_allclose(corner_normals(box.vertices, box.faces), corners, atol=1e-6)
 
 
-# --- COLLADA --------------------------------------------------------------------------------------
-
-
 # --- refusals -------------------------------------------------------------------------------------
 
 

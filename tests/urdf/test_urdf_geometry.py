@@ -388,36 +388,131 @@ def test_a_collada_file_whose_author_has_an_accent_in_latin_1_is_read(tmp_path):
     assert len(read_mesh(path).faces) == 4
 
 
-def test_collada_polygons_strips_and_fans_are_read_as_pycollada_reads_lists_of_polygons(tmp_path):
-    import collada
+PRIMITIVES = {
+    "triangles": ("<p>0 2 1</p><p>0 1 3</p>", [[0, 2, 1], [0, 1, 3]]),
+    "polylist": ("<vcount>4 3</vcount><p>0 1 3 2 0 2 1</p>", [[0, 1, 3], [0, 3, 2], [0, 2, 1]]),
+    "polygons": ("<p>0 1 3 2</p><p>0 2 1</p>", [[0, 1, 3], [0, 3, 2], [0, 2, 1]]),
+    "tristrips": ("<p>0 1 3 2</p>", [[0, 1, 3], [3, 1, 2]]),
+    "trifans": ("<p>0 1 3 2</p>", [[0, 1, 3], [0, 3, 2]]),
+}
 
+
+@pytest.mark.parametrize("tag", PRIMITIVES)
+def test_all_kinds_of_collada_faces_are_cut_into_triangles(tmp_path, tag):
+    body, want = PRIMITIVES[tag]
     path = dae(tmp_path / "n.dae", "<node>{mesh}</node>")
-    index = " ".join(map(str, FACES.ravel()))
-    before = '<triangles count="4" material="s">'
-    text = (
-        path.read_text()
-        .replace(before, '<polylist count="2" material="s">')
-        .replace("</triangles>", "</polylist>")
+    text = re.sub("<p>.*</p>", f"{body}<!-- of Blender -->", path.read_text())
+    text = text.replace('<triangles count="4"', f'<{tag} count="{len(want)}"').replace(
+        "</triangles", f"</{tag}"
     )
-    path.write_text(text.replace(f"<p>{index}</p>", "<vcount>4 3</vcount><p>0 1 3 2 0 2 1</p>"))
-    peer = collada.Collada(str(path)).geometries[0].primitives[0].triangleset()
-    mine = read_mesh(path)
-    assert_allclose(mine.points[mine.faces], peer.vertex[peer.vertex_index])
-    for tag, want in (("tristrips", [[0, 1, 3], [1, 2, 3]]), ("trifans", [[0, 1, 3], [0, 3, 2]])):
-        path.write_text(text.replace(f"<p>{index}</p>", "<p>0 1 3 2</p>").replace("polylist", tag))
-        mine = read_mesh(path)
-        assert_allclose(mine.points[mine.faces], POINTS[want])
+    path.write_text(text.replace("</mesh>", "<lines><p>0 1</p></lines></mesh>"))
+    mesh = read_mesh(path)
+    assert_allclose(mesh.points[mesh.faces], POINTS[want])
+    assert mesh.notes == (("n.dae: <lines> of geometry 'g' are left out", False),)
+
+
+def source(name, parts, values):
+    """A COLLADA source with a name for each part of its rows."""
+    names = "".join(f'<param name="{part}"/>' for part in parts)
+    count = len(values) // len(parts)
+    return (
+        f'<source id="{name}"><float_array>{" ".join(map(str, values))}</float_array><technique_common>'
+        f'<accessor count="{count}" stride="{len(parts)}">{names}</accessor></technique_common></source>'
+    )
+
+
+CORNERS = (
+    source("n", "XYZ", [0, 0, 2, 0, 3, 0, "nan", "nan", "nan"])
+    + source("w", "STP", [0.25, 0.5, 9, 0.75, 1, 9])
+    + source("k", "RGBA", [1, 0, 0, 0, 0, 0.5, 1, 0])
+    + "<vertices"
+)
+
+
+def test_each_collada_corner_has_its_own_normal_colour_and_bound_texture_coordinates(tmp_path):
+    picture(tmp_path / "i.png")
+    path = dae(
+        tmp_path / "n.dae",
+        "<node>{mesh}</node>",
+        images='<image id="i"><init_from>i.png</init_from></image>',
+        diffuse='<texture texture="i" texcoord="UV"/>',
+    )
+    text = re.sub("<p>.*</p>", "<p>0 1 1  1 1 0  2 0 1  0 2 0  2 2 0  3 2 0</p>", path.read_text())
+    inputs = 'offset="0" set="0"/><input semantic="TEXCOORD" source="#w" offset="2" set="1"/><input semantic='
+    inputs += '"NORMAL" source="#n" offset="1"/><input semantic="COLOR" source="#k" offset="2"/><p>'
+    text = text.replace('offset="0"/><p>', inputs).replace("<vertices", CORNERS)
+    bind = '<bind_vertex_input semantic="UV" input_semantic="TEXCOORD" input_set="1"/></instance_material>'
+    path.write_text(text.replace('target="#m"/>', f'target="#m">{bind}'))
+    mesh = read_mesh(path)
+    assert_allclose(mesh.points[mesh.faces], POINTS[[[0, 1, 2], [0, 2, 3]]])
+    nan = np.full(3, np.nan)
+    assert_allclose(mesh.normals, [[[0, 1, 0], [0, 1, 0], [0, 0, 1]], [nan, nan, nan]])
+    assert_allclose(mesh.shaded()[1], [[1, 0, 0]] * 3)  # computed, where the file has nan
+    assert_allclose(mesh.uvs[0], [[0.75, 1], [0.25, 0.5], [0.75, 1]])
+    path.write_text(path.read_text().replace(' material="s"', ""))
+    blue, red = [0, 0.21404, 1], [1, 0, 0]
+    assert_allclose(read_mesh(path).colours, [[blue, red, blue], [red, red, red]], atol=1e-5)
+
+
+def test_a_collada_id_may_be_that_of_another_kind_or_of_a_source_in_another_geometry(tmp_path):
+    """As in a public gripper, whose geometries all name their sources alike."""
+    path = dae(tmp_path / "n.dae", '<node id="scene">{mesh}</node>')
+    text = path.read_text()
+    first, last = text.index("<geometry"), text.index("</library_geometries>")
+    twin = text[first:last].replace('id="g"', 'id="h"').replace(" 3.0\n", " 6.0\n")
+    assert twin.count("6.0") == 1
+    text = text[:last] + twin + text[last:]
+    path.write_text(text.replace("<instance_geometry", '<instance_geometry url="#h"/><instance_geometry'))
+    mesh = read_mesh(path)
+    assert_allclose(mesh.points[mesh.faces[:4]], (POINTS * [1, 1, 2])[FACES])
+    assert_allclose(mesh.points[mesh.faces[4:]], POINTS[FACES])
+
+
+def test_a_skin_is_left_out_and_noted(tmp_path):
+    path = dae(tmp_path / "n.dae", '<node><instance_controller url="#c"/>{mesh}</node>')
+    controller = (
+        '<library_controllers><controller id="c"><skin source="#g"/></controller></library_controllers>'
+    )
+    path.write_text(path.read_text().replace("<library_images>", f"{controller}<library_images>"))
+    mesh = read_mesh(path)
+    assert len(mesh.faces) == 4
+    assert mesh.notes == (("n.dae: skin '#c' is left out; apply its bones and export again", True),)
 
 
 DAE_REFUSED = {
     "entities": ("<COLLADA", '<!DOCTYPE x [<!ENTITY a "b">]><COLLADA', r"n\.dae:2: has a DOCTYPE"),
-    "points": (
+    "nan": (" 3.0\n", " nan\n", r"has vertices that are not finite numbers; export it again"),
+    "offset": (
         'count="4" stride="3"',
-        'count="5" stride="3"',
-        r"12 numbers are too few for 5 rows of 3; export",
+        'count="3" offset="3" stride="3"',
+        r"n\.dae:\d+: an <accessor> whose values have an offset or no names; export it again",
     ),
-    "index": ("<p>0 2 1", "<p>0 2 x", r"its indices are not whole numbers in rows of 1; export it again"),
-    "vertex": ("<p>0 2 1", "<p>0 2 9", r"n\.dae:\d+: a face names vertex 9 of 4; export it again"),
+    "index": (
+        "<p>0 2 1",
+        "<p>0 2 x",
+        r"n\.dae:\d+: geometry 'g' cannot be read \(Corrupted index in .*\); export",
+    ),
+    "row": (
+        "<p>0 2 1",
+        "<p>0 2",
+        r"n\.dae:\d+: geometry 'g' cannot be read \(cannot reshape .*\); export it again",
+    ),
+    "vertex": (
+        "<p>0 2 1",
+        "<p>0 2 9",
+        r"n\.dae:\d+: geometry 'g' cannot be read \(.*9.* go beyond .*\); export",
+    ),
+    "negative": ("<p>0 2 1", "<p>0 2 -1", r"n\.dae:\d+: an index is -1; export it again"),
+    "source": (
+        'source="#u"',
+        'source="#gone"',
+        r"geometry 'g' cannot be read \(Source input id \"#gone\" not found",
+    ),
+    "inputs": (
+        "<p>",
+        "<input/>" * 70 + "<p>",
+        r"n\.dae:\d+: <triangles> has over 64 inputs; export it again",
+    ),
     "matrix": (
         "<node>",
         "<node><matrix>1 2</matrix>",
@@ -441,8 +536,18 @@ DAE_REFUSED = {
 def test_a_malformed_collada_file_is_refused_with_its_line(tmp_path, case):
     old, new, message = DAE_REFUSED[case]
     path = dae(tmp_path / "n.dae", "<node>{mesh}</node>")
-    path.write_text(path.read_text().replace(old, new))
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
     with pytest.raises(InputError, match=message):
+        read_mesh(path)
+
+
+def test_a_collada_polylist_needs_its_corners(tmp_path):
+    path = dae(tmp_path / "n.dae", "<node>{mesh}</node>")
+    text = path.read_text().replace("triangles", "polylist").replace("<p>", "<vcount>4 4 3</vcount><p>")
+    path.write_text(text)
+    with pytest.raises(InputError, match="its polygons have 11 corners, its indices are 12; export it again"):
         read_mesh(path)
 
 
@@ -587,13 +692,29 @@ def test_what_nodes_show_counts_as_often_as_they_show_it_although_it_has_no_face
         text = dae(path, "<node>{mesh}</node>" * 30).read_text()
         empty = '<triangles count="0"><input semantic="VERTEX" source="#v" offset="0"/><p/></triangles>'
         path.write_text(re.sub("<triangles.*</triangles>", empty * 30, text, flags=re.DOTALL))
-    if kind == "lines" and suffix == "dae":  # they are left out before they are counted
-        path.write_text(path.read_text().replace("<triangles", "<lines").replace("</triangles", "</lines"))
-        with pytest.raises(InputError, match="holds no triangle"):
-            read_mesh(path)
-    else:
-        with pytest.raises(InputError, match="shows over 500 nodes; export it again"):
-            read_mesh(path)
+        if kind == "lines":
+            path.write_text(
+                path.read_text().replace("<triangles", "<lines").replace("</triangles", "</lines")
+            )
+    # those of COLLADA are left out before they are counted
+    match = "holds no triangle" if suffix == "dae" else "shows over 500 nodes; export it again"
+    with pytest.raises(InputError, match=match):
+        read_mesh(path)
+
+
+def test_the_groups_of_a_collada_geometry_are_counted_before_they_are_decoded(tmp_path, monkeypatch):
+    monkeypatch.setitem(BUDGETS, "mesh", Budget(count=500))
+    path = dae(tmp_path / "m.dae", "<node>{mesh}</node>")
+    path.write_text(
+        re.sub(
+            "<triangles.*</triangles>",
+            "<triangles><p>x</p></triangles>" * 501,
+            path.read_text(),
+            flags=re.DOTALL,
+        )
+    )
+    with pytest.raises(InputError, match=r"m\.dae:\d+: shows over 500 nodes; export it again"):
+        read_mesh(path)
 
 
 HALF = float(np.sqrt(0.5))

@@ -21,7 +21,7 @@ from magtwin.errors import InputError
 from magtwin.files import read_bytes
 from magtwin.frames import matrix_from_quat
 from magtwin.urdf.meshes.piece import Map, Paint, Piece, normal_map
-from magtwin.urdf.meshes.polygon import strips
+from magtwin.urdf.meshes.polygon import strip
 from magtwin.urdf.meshes.reading import Reading
 from magtwin.urdf.meshes.texture import Image, image_of, read_image
 from magtwin.urdf.source.markup import UnsafeError
@@ -328,5 +328,5 @@ def _triangles(order: NDArray, mode: int) -> NDArray:
     """Vertices of the triangles of a list, strip or fan of vertices, shape (F, 3)."""
     if mode == TRIANGLES:
         return order[: len(order) // 3 * 3].reshape(-1, 3)
-    triangles = strips(np.array([len(order)]), fans=mode == FAN)
+    triangles = strip(len(order), fan=mode == FAN)
     return order[np.roll(triangles, -1, axis=1) if mode == FAN else triangles]  # its order of a fan's corners

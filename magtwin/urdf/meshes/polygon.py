@@ -58,12 +58,7 @@ def cut_polygons(
     return triangles
 
 
-def strips(counts: NDArray, *, fans: bool = False) -> NDArray[np.int64]:
-    """Triangles of strips or fans with so many corners each, as indices of corners, shape (F, 3)."""
-    made, start = [np.empty((0, 3), np.int64)], 0
-    for count in counts:
-        i = np.arange(max(count - 2, 0))
-        rows = (np.zeros_like(i), i + 1, i + 2) if fans else (i, i + 1 + i % 2, i + 2 - i % 2)
-        made.append(start + np.column_stack(rows))
-        start += count
-    return np.concatenate(made)
+def strip(count: int, *, fan: bool = False) -> NDArray[np.int64]:
+    """Triangles of a strip or fan with so many corners, as indices of corners, shape (F, 3)."""
+    i = np.arange(max(count - 2, 0))
+    return np.column_stack((np.zeros_like(i), i + 1, i + 2) if fan else (i, i + 1 + i % 2, i + 2 - i % 2))
