@@ -192,10 +192,10 @@ def test_a_recording_and_the_table_that_is_made_of_it_give_the_same_readings(tmp
 BASE = {"/mag": readings(), "/pose": poses()}
 TIES = {
     r"2 field topics, /a/mag \(sensor_msgs/msg/MagneticField, 50 Hz\), /mag \(.*, 50 Hz\); "
-    f"choose with --remap {MAG}:=TOPIC$": ({**BASE, "/a/mag": readings()}, False),
+    f"choose with --remap {MAG}:=TOPIC of magtwin convert$": ({**BASE, "/a/mag": readings()}, False),
     r"2 field topics, .*; choose with --field-topic TOPIC$": ({**BASE, "/a/mag": readings()}, True),
     r"2 pose topics, /pose \(.*, 20 Hz\), /slam \(geometry_msgs/msg/PoseWithCovarianceStamped, 5 Hz\); "
-    f"choose with --remap {POSE}:=TOPIC$": (
+    f"choose with --remap {POSE}:=TOPIC of magtwin convert$": (
         {**BASE, "/slam": poses("geometry_msgs/msg/PoseWithCovarianceStamped", 5)},
         False,
     ),
@@ -245,7 +245,7 @@ def test_a_minor_role_of_several_topics_or_of_another_clock_is_left_out_with_a_w
     assert not {"imu_w", "battery_v"} & set(run)
     imus, battery = (str(warning.message) for warning in told)
     assert "2 IMU topics, /imu/data (sensor_msgs/msg/Imu, 30 Hz), /imu/raw" in imus
-    assert imus.endswith(f"choose with --remap {IMU}:=TOPIC; none is read")
+    assert imus.endswith(f"choose with --remap {IMU}:=TOPIC of magtwin convert; none is read")
     assert "battery topic left out: /battery spans 1000000.000..1000003.000 s since" in battery
 
 

@@ -157,17 +157,19 @@ class _Recording:
         signal = self._signal(source)
         moved = corrected(self.bag, signal) if signal.kind == ODOMETRY.kind else None
         truth = f"topic {signal.name}"
-        if source is POSE and moved:
-            self.taken.append(f"poses of {moved[1]}, which is not applied, as their topic was named")
+        if source is POSE:
+            if moved:
+                self.taken.append(f"poses of {moved[1]}, which is not applied, as their topic was named")
+            if signal.name == self.topics.get(ODOMETRY):
+                text = "is both the odometry and the true pose, so the odometry seems to have no errors"
+                self._warn(f"{signal.name} {text}")
         elif moved:
             signal, truth = moved[0], f"topic {moved[1]}"
             self.taken.append(f"poses of {moved[1]}")
-        elif source is ODOMETRY and not self.survey:
-            return
-        elif source is ODOMETRY:
+        elif self.survey:
             self.taken.append(f"poses of {signal.name}, which is odometry and drifts")
-        elif signal.name == self.topics.get(ODOMETRY):
-            self._warn(f"{signal.name} is both the odometry and the true pose, so its errors are unknown")
+        else:
+            return
         signal, when = self._timed(signal)
         values, placed = self.bag.in_base(signal, signal._replace(topic=POSE).columns())
         first = np.flatnonzero(np.diff(when, prepend=-np.inf) > 0)
@@ -244,7 +246,7 @@ class _Recording:
             rate = f"{(len(messages) - 1) / span:.3g} Hz"
             listed.append(f"{name} ({self.bag.kinds[name]}, {rate if len(messages) > 1 else '1 message'})")
         option = f"--{'field' if topic is MAGNITUDE else 'pose'}-topic TOPIC"
-        option = option if self.survey else f"--remap {topic.name}:=TOPIC"
+        option = option if self.survey else f"--remap {topic.name}:=TOPIC of magtwin convert"
         text = f"{len(several)} {ROLES[topic].noun} topics, {', '.join(listed)}; choose with {option}"
         if topic in VITAL:
             raise InputError(f"{self.bag.path}: {text}")
