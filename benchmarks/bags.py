@@ -1,6 +1,6 @@
 """A run of 600 s as a bag and back, against rosbags on the same messages, in one process.
 
-81,000 readings of the shipped lab's robot with all of its topics, some 500,000 messages, in both storages.
+81,000 readings of the shipped lab's robot with all of its topics, some 500,000 messages, in MCAP.
 The peer writes the same messages with rosbags' Writer, given as bytes already, and reads and decodes them
 again. For scale: numpy's savez of the same columns. Seconds by the clock and of all processors, medians over
 repetitions of ours, one of the peer.
@@ -37,8 +37,8 @@ def seconds(work: Callable[[], object], repetitions: int) -> tuple[float, float]
     return statistics.median(wall), statistics.median(cpu)
 
 
-def rosbags_write(folder: Path, storage: str, messages: list) -> None:
-    with Writer(folder, version=8, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+def rosbags_write(folder: Path, messages: list) -> None:
+    with Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
         known = {
             (topic, kind): writer.add_connection(topic, kind, typestore=STORE)
             for topic, kind in dict.fromkeys((topic, kind) for topic, kind, _, _ in messages)
@@ -65,33 +65,19 @@ def main() -> None:
         folder = Path(temporary)
         saved = seconds(lambda: np.savez(folder / "run.npz", **run.columns), options.repetitions)
         print(f"{run.rows} rows; numpy's savez {saved[0]:.2f} s, {saved[1]:.2f} s of all processors")
-        for storage in ("mcap", "sqlite3"):
-            bag = folder / storage
-
-            def write(bag: Path = bag, storage: str = storage) -> None:
-                write_bag(run, bag, twin, storage=storage, scans=scans, force=True)  # type: ignore[arg-type]
-
-            def read(bag: Path = bag) -> None:
-                read_bag(bag)
-
-            ours = seconds(write, options.repetitions), seconds(read, options.repetitions)
-            with Reader(bag) as reader:
-                messages = [(c.topic, c.msgtype, t, bytes(data)) for c, t, data in reader.messages()]
-
-            def peer_writes(bag: Path = bag, storage: str = storage, messages: list = messages) -> None:
-                rosbags_write(bag.with_name(f"peer_{storage}"), storage, messages)
-
-            def peer_reads(bag: Path = bag) -> None:
-                rosbags_read(bag)
-
-            peer = seconds(peer_writes, 1), seconds(peer_reads, 1)
-            for what, mine, theirs in zip(("write", "read"), ours, peer, strict=True):
-                ratio = theirs[1] / mine[1]
-                print(
-                    f"{storage:8} {what:5} {len(messages)} messages: ours {mine[0]:.2f} s "
-                    f"({mine[1]:.2f} s of all processors), rosbags {theirs[0]:.2f} s ({theirs[1]:.2f} s), "
-                    f"{ratio:.1f} times as much"
-                )
+        bag, peer_bag = folder / "run", folder / "peer"
+        ours = (
+            seconds(lambda: write_bag(run, bag, twin, scans=scans, force=True), options.repetitions),
+            seconds(lambda: read_bag(bag), options.repetitions),
+        )
+        with Reader(bag) as reader:
+            messages = [(c.topic, c.msgtype, t, bytes(data)) for c, t, data in reader.messages()]
+        peer = seconds(lambda: rosbags_write(peer_bag, messages), 1), seconds(lambda: rosbags_read(bag), 1)
+        for what, mine, theirs in zip(("write", "read"), ours, peer, strict=True):
+            print(
+                f"{what:5} {len(messages)} messages: ours {mine[0]:.2f} s ({mine[1]:.2f} s of all CPUs), "
+                f"rosbags {theirs[0]:.2f} s ({theirs[1]:.2f} s), {theirs[1] / mine[1]:.1f} times as much"
+            )
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from magtwin.twin import open_twin, scene_from_toml, simulate
 from magtwin.usd.animation import sample
 
 DURATION_S = 600.0
-NAMES = ("run.parquet", "run.npz", "run.csv", "run.rrd", "run.mcap", "run.db3", "run.usdc")
+NAMES = ("run.parquet", "run.npz", "run.csv", "run.rrd", "run.mcap", "run.usdc")
 WANTED_S, WANTED_RATIO = 5.0, 5.0
 
 

@@ -474,7 +474,7 @@ def _has_true_pose(run: Run) -> bool:
 
 def _is_captured(run: Run) -> bool:
     """Whether the true pose of a recorded run is that of motion capture, as its metadata say."""
-    return str(run.metadata.get("truth", "")).startswith("motion capture")
+    return str(run.metadata.get("truth", "")).startswith(("motion capture", "topic "))
 
 
 def prior_of(run: Run, text: str = "tracking", *, seed: int = 0) -> Prior:

@@ -179,6 +179,10 @@ Remap = Annotated[
         help="Name of a topic in the bag, as OURS:=THEIRS: /robot/enu/pose:=/vrpn/pose. May be repeated."
     ),
 ]
+Scale = Annotated[
+    float | None,
+    Parameter(help="Factor from the values of the field in the input to nT, in place of a unit."),
+]
 Licence = Annotated[str, Parameter(help="Licence, an SPDX identifier such as MIT.")]
 Gamepad = Annotated[
     Path | None,
@@ -203,3 +207,23 @@ class Sensing:
 
 SensingOptions = Annotated[Sensing, Parameter(name="*")]
 SENSING = Sensing()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """How a robot's own bag is read; options of the commands that read one and write another file."""
+
+    remap: Remap = None
+    unit: Unit = None
+    scale: Scale = None
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of `magtwin.io.formats.read_run`, as far as they were given."""
+        topics = pairs("remap", self.remap, OURS_THEIRS) or None
+        given = {"topics": topics, "unit": self.unit, "scale": self.scale}
+        return {name: value for name, value in given.items() if value is not None}
+
+
+RecordedOptions = Annotated[Recorded, Parameter(name="*")]
+RECORDED = Recorded()

@@ -18,12 +18,10 @@ def convert_run(
     out: str | os.PathLike[str],
     *,
     scene: str | Path | None = None,
-    storage: Literal["mcap", "sqlite3"] | None = None,
     out_unit: Literal["T", "nT"] | None = None,
     usd_fps: float | None = None,
-    topics: dict[str, str] | None = None,
-    unit: str | None = None,
     force: bool = False,
+    **reading: Any,
 ) -> Run:
     """Convert a run to the format of the output's name.
 
@@ -31,12 +29,10 @@ def convert_run(
         source: A run in any format; also the parts of one that did not end.
         out: File to make; a name without a suffix is the folder of a rosbag2.
         scene: Stage for formats that show it. None: the one of the metadata.
-        storage: Storage of a bag. None: mcap.
         out_unit: Unit of the field in a bag. None: T.
         usd_fps: Frames per second in USD; 0 for one per reading. None: 30.
-        topics: Names of topics in a foreign bag, by ours.
-        unit: Unit of the field in a foreign bag. None: found from its size.
         force: Whether an existing output is replaced.
+        reading: Options of `magtwin.io.formats.read_run`: topics, unit and scale of a robot's bag.
 
     Returns:
         The run.
@@ -50,15 +46,14 @@ def convert_run(
     if out.resolve() in source.resolve().parents:
         raise InputError(f"{out}: holds the run, which would be removed with it; give another name")
     check_free(out, force=force)
-    given = {"storage": storage, "units": out_unit, "fps": usd_fps}
+    given = {"units": out_unit, "fps": usd_fps}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if usd_fps == 0:
         options["fps"] = None
     takes = format_to_write(out).takes
     if scene is not None and not takes & {"twin", "scene_file"}:
         raise InputError(f"{out}: a table shows no scene; drop `scene`", parameter="scene")
-    reading = {"topics": topics, "unit": unit}
-    run = read_run(source, **{name: value for name, value in reading.items() if value is not None})
+    run = read_run(source, **reading)
     shown = "planned" in takes or "scene_file" in takes
     lacks = "shown without a scene" if shown else "written without /tf_static and the robot's description"
     twin = twin_to_show(run, source, scene, lacks=lacks) if takes & {"twin", "scene_file"} else None

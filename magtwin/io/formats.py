@@ -49,6 +49,9 @@ class Format:
     reads: frozenset[str] = frozenset()
     """Options of the reader."""
 
+    instead: str = ""
+    """What to write, if the format is only read. Default: one of the others."""
+
     takes: frozenset[str] = frozenset()
     """Arguments of the writer: of `twin`, `planned`, `scans` and `scene_file`, which other formats are not
     given, and options, which other formats refuse."""
@@ -68,8 +71,14 @@ BAG = Format(
     name="rosbag2",
     read="magtwin.io.bags.reader:read_bag",
     write="magtwin.io.bags.writer:write_bag",
-    reads=frozenset(("topics", "unit")),
-    takes=frozenset(("twin", "scans", "storage", "units")),
+    reads=frozenset(("topics", "unit", "scale")),
+    takes=frozenset(("twin", "scans", "units")),
+)
+DB3 = Format(
+    name="rosbag2 in SQLite",
+    read=BAG.read,
+    reads=BAG.reads,
+    instead=".mcap, the default of ROS 2; ros2 bag convert makes a .db3 of it",
 )
 USD = Format(
     name="USD",
@@ -79,7 +88,7 @@ USD = Format(
 )
 
 _SUFFIXES = {".parquet": "PARQUET", ".csv": "CSV", ".npz": "NPZ", ".rrd": "RERUN", ".json": "RELEASE"}
-_SUFFIXES |= {".mcap": "BAG", ".db3": "BAG", ".usd": "USD", ".usda": "USD", ".usdc": "USD"}
+_SUFFIXES |= {".mcap": "BAG", ".db3": "DB3", ".usd": "USD", ".usda": "USD", ".usdc": "USD"}
 
 FORMATS: Registry[Format] = Registry(
     "run format", "formats", {suffix: f"{__name__}:{name}" for suffix, name in _SUFFIXES.items()}
@@ -93,8 +102,8 @@ def read_run(path: str | os.PathLike[str], **options: Any) -> Run:
     Args:
         path: A file with a suffix of `FORMATS`, or a folder: a bag, the parts of an unfinished Parquet
             file, or the output of `magtwin run --out`.
-        options: Options of single formats: `topics` and `unit` of a robot's bag, `columns` of a table that
-            another program wrote.
+        options: Options of single formats: `topics`, `unit` and `scale` of a robot's bag, `columns` of a
+            table that another program wrote.
 
     Raises:
         InputError: The file is missing, of unknown format, damaged, or holds no run; or its format has no
@@ -129,7 +138,7 @@ def write_run(
         planned: The path that was to be driven, for formats that show it.
         scans: The LiDAR's scans, for formats that hold them.
         force: Replace an existing file.
-        options: Options of single formats: `storage` and `units` of bags, `fps` of USD.
+        options: Options of single formats: `units` of bags, `fps` of USD.
 
     Raises:
         InputError: The suffix is unknown, the format has no such option, the run's clock does not ascend, the
@@ -182,7 +191,8 @@ def format_to_write(path: Path) -> Format:
         raise InputError(f"{path}: unknown format of a run; {hint(path.suffix, written)}")
     format_ = format_of(path)
     if not format_.write:
-        raise InputError(f"{path}: a {format_.name} is read, not written; give one of {', '.join(written)}")
+        instead = format_.instead or f"one of {', '.join(written)}"
+        raise InputError(f"{path}: a {format_.name} is read, not written; give {instead}")
     return format_
 
 

@@ -4,6 +4,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from magtwin.errors import InputError, hint
 from magtwin.field.maps.statistics import map_metadata
@@ -18,19 +19,26 @@ STAGES = (".usd", ".usda", ".usdc", ".usdz")
 NETWORKS = (".safetensors", ".pth", ".onnx")
 
 
-def info_of(path: str | os.PathLike[str]) -> Report:
+def info_of(path: str | os.PathLike[str], **reading: Any) -> Report:
     """A report on the content and origin of a file.
 
     Args:
         path: A run in any format of `magtwin.io.formats`, a stage or a map, a folder of survey CSVs, or a
             network.
+        reading: Options of `magtwin.io.formats.read_run`, for a run.
 
     Raises:
         InputError: The file is missing, of an unknown kind, or damaged.
     """
     file = existing(shipped_or(Path(path)), "file")
     if file.is_dir():
-        return map_metadata(read_survey(file)[0]) if any(file.glob("*_map.csv")) else info_of_run(file)
+        return (
+            map_metadata(read_survey(file)[0])
+            if any(file.glob("*_map.csv"))
+            else info_of_run(file, **reading)
+        )
+    if reading and file.suffix.lower() in (*NETWORKS, *STAGES):
+        raise InputError(f"{file}: no recording; drop the option {next(iter(reading))!r}")
     if file.suffix.lower() in NETWORKS:
         from magtwin.learn.inference.onnx import report_onnx
         from magtwin.learn.models.predictor import load_predictor
@@ -39,16 +47,16 @@ def info_of(path: str | os.PathLike[str]) -> Report:
     if file.suffix.lower() in STAGES:
         return _info_of_usd(file)
     if file.suffix.lower() in FORMATS:
-        return info_of_run(file)
+        return info_of_run(file, **reading)
     if kind := kind_of(file):
         raise InputError(f"{file}: is {kind.noun}; {kind.remedy.format(file=file)}")
     known = hint(file.suffix, {*FORMATS, *STAGES, *NETWORKS})
     raise InputError(f"{file}: unknown kind of file {file.suffix!r}; {known}")
 
 
-def info_of_run(file: Path) -> Report:
+def info_of_run(file: Path, **reading: Any) -> Report:
     """Rows, duration, what was driven and read, sources, and each column with its unit and frame."""
-    run = read_run(file)
+    run = read_run(file, **reading)
     report = run.report(str(file))
     columns = {}
     for name, values in run.items():

@@ -241,7 +241,7 @@ class Outputs:
     def check_live(self) -> None:
         """Refuse partial files of an earlier run that was shown live."""
         for target in self._runs():
-            if target.suffix.lower() in (".rrd", ".mcap", ".db3"):
+            if target.suffix.lower() in (".rrd", ".mcap"):
                 check_free(partial_of(target), force=self.force)
 
     def sinks(self, driven: Driven) -> list[Sink]:

@@ -28,7 +28,6 @@ from magtwin.io.bags.topics import (
     ODOMETRY,
     POSE,
     SCAN,
-    TOTAL_FIELD,
     Topic,
 )
 from magtwin.ros.bus import Bus, Timer, to_bytes
@@ -37,6 +36,7 @@ from magtwin.ros.diagnostics import Level, Reporter, status_of
 from magtwin.ros.inputs import Columns, Input, LiveFrames, Scanning
 from magtwin.ros.online import Measured, Online
 from magtwin.ros.parameters import Parameter
+from magtwin.ros.topics import TOTAL_FIELD
 from magtwin.twin import Twin
 
 if TYPE_CHECKING:

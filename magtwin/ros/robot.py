@@ -13,10 +13,10 @@ from magtwin.errors import InputError
 from magtwin.io.bags.cdr import NS
 from magtwin.io.bags.sender import Sender
 from magtwin.io.bags.stream import Sent, Stream
-from magtwin.io.bags.topics import COMMAND, IMU, MAGNITUDE, SCAN, TOTAL_FIELD, VECTOR, Topic
+from magtwin.io.bags.topics import COMMAND, IMU, MAGNITUDE, SCAN, VECTOR, Topic
 from magtwin.ros.bus import Bus, Message
 from magtwin.ros.bus.names import within
-from magtwin.ros.topics import PATH, READ, READINGS, SAMPLED, TICKS
+from magtwin.ros.topics import PATH, READ, READINGS, SAMPLED, TICKS, TOTAL_FIELD
 from magtwin.ros.views import Truth
 from magtwin.run.run import Run
 from magtwin.sim.exact import check_field

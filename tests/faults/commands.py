@@ -173,15 +173,14 @@ COMMANDS = (
     ),
     Command(
         "run",
-        "run lab --duration-s 2 --out r --out r.parquet --out r.npz --out r.csv --out r.mcap --out r.db3 "
-        "--out r.rrd --out r.usdc --out r.usda",
+        "run lab --duration-s 2 --out r --out r.parquet --out r.npz --out r.csv --out r.mcap --out r.rrd "
+        "--out r.usdc --out r.usda",
     ),
     Command("convert parquet", "convert IN/run.parquet out.parquet", RUN),
     Command("convert npz", "convert IN/run.parquet out.npz", RUN),
     Command("convert csv", "convert IN/run.parquet out.csv", RUN),
     Command("convert mcap", "convert IN/run.parquet out.mcap", RUN),
     Command("convert bag", "convert IN/run.parquet bag", RUN),
-    Command("convert db3", "convert IN/run.parquet bag --storage sqlite3", RUN),
     Command("convert rrd", "convert IN/run.parquet out.rrd", RUN),
     Command("convert usd", "convert IN/run.parquet out.usda", RUN),
     Command("reproduce", "reproduce IN/run.parquet --out again.parquet", RUN),

@@ -277,6 +277,16 @@ def _saved_run(file: Path) -> None:
     _run().save(file)
 
 
+def _db3(file: Path) -> None:
+    sys.path.append(str(Path(__file__).resolve().parents[1]))
+    from recordings import as_db3
+
+    whole = file.with_name("whole.mcap")
+    _saved_run(whole)
+    as_db3(whole, file)
+    whole.unlink()
+
+
 def _plain_bag(file: Path) -> None:
     """A bag without compression and checksums, whose messages a change reaches."""
     from mcap.reader import make_reader
@@ -595,7 +605,7 @@ def _read_run(file: Path) -> None:
 
 
 def _read_survey_bag(file: Path) -> None:
-    call("io.surveys.readings:read_readings", file)
+    call("io.surveys.readings:read_readings", file, field_topic="/robot/qtfm/magnitude")
 
 
 def _read_recorded(file: Path) -> None:
@@ -738,7 +748,8 @@ _NETWORK = _reads("learn.models.predictor:load_predictor", "io.info:info_of")
 _READINGS = _reads("io.surveys.readings:read_readings")
 
 FORMATS: Mapping[str, Format] = {
-    **{kind: Format(f"x.{kind}", _saved_run, _read_run) for kind in ("npz", "parquet", "csv", "mcap", "db3")},
+    **{kind: Format(f"x.{kind}", _saved_run, _read_run) for kind in ("npz", "parquet", "csv", "mcap")},
+    "db3": Format("x.db3", _db3, _read_run),
     "rrd": Format("x.rrd", _saved_run, _read_run, slow=True),
     "bag": Format("plain.mcap", _plain_bag, _read_run),
     "bag-folder": Format("metadata.yaml", _bag_folder, lambda file: _read_run(file.parent)),

@@ -5,33 +5,28 @@ import warnings
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from recordings import UPRIGHT, inertial, magnetic, moved, pose, record
 from scipy.spatial.transform import Rotation
 
 from magtwin.errors import MismatchWarning, RepairWarning
-from magtwin.io.bags import RawBagWriter, read_bag, read_bag_readings
+from magtwin.io.bags import read_bag
 from magtwin.io.bags.frames import StaticFrames, kind_of
-from magtwin.io.bags.topics import Qos
+from magtwin.io.surveys.readings import read_readings
 from magtwin.localizing import check_lever_arm
-from magtwin.ros.bus import to_bytes
 from magtwin.run.run import Run
 
-START, NS = 1_700_000_000, 10**9
 GRAVITY = np.array([0.0, 0.0, 9.80665])
 FIELD = np.array([12_000.0, 20_000.0, -38_000.0])
 RATE, AHEAD = np.array([0.0, 0.0, 0.2]), np.array([0.0, 0.04, 0.0])
 T = np.arange(200) / 50
-TOPICS = {"/robot/qtfm/magnitude": "/mag", "/robot/imu": "/imu", "/robot/enu/pose": "/pose"}
 MOUNTS = {
-    "upright": Rotation.identity(),
+    "upright": UPRIGHT,
     "upside down": Rotation.from_euler("x", np.pi),
     "turned": Rotation.from_euler("zyx", (0.7, 0.3, -0.4)),
 }
 ARM = np.array([0.1, -0.05, 0.2])
-CENTRE = (np.zeros(3), MOUNTS["upright"])
-
-
-def stamped(t, frame):
-    return {"header.stamp": np.int64(START * NS + round(t * NS)), "header.frame_id": frame}
+CENTRE = (np.zeros(3), UPRIGHT)
+ODOMETRY, PLACED = "nav_msgs/msg/Odometry", {"/robot/enu/pose": "/pose"}
 
 
 def true_pose(t):
@@ -40,68 +35,35 @@ def true_pose(t):
 
 
 def static(*transforms):
-    """One TFMessage of transforms: parent, child, place and rotation."""
-    fields = {"transforms": len(transforms)}
-    for k, (parent, child, p, rotation) in enumerate(transforms):
-        each = stamped(0, parent) | {"child_frame_id": child, "transform.translation": p}
-        each |= {"transform.rotation": rotation.as_quat()}
-        fields |= {f"transforms.{k}.{name}": value for name, value in each.items()}
-    return [(0.0, "tf2_msgs/msg/TFMessage", fields)]
+    return {"/tf_static": [(0.0, *moved(0.0, *transforms))]}
 
 
-def record(path, topics):
-    """A bag of messages: by topic a list of time [s], type and fields."""
-    writer = RawBagWriter(path)
-    for topic, said in topics.items():
-        for t, kind, fields in said:
-            writer.add(topic, kind, Qos())
-            writer.write(topic, START * NS + round(t * NS), to_bytes(kind, fields))
-    writer.close()
-    return path
-
-
-def drive(mount=MOUNTS["upright"], frame="sensor_link", child="base_link", part=CENTRE):
+def drive(mount=UPRIGHT, frame="sensor_link", child="base_link", part=CENTRE, oriented=True):
     """A field and an IMU in the axes of a mount, and poses of a part of the robot."""
     field, imu, poses = [], [], []
-    to_sensor = mount.inv()
+    back, (v, w) = mount.inv(), ((0.3, 0, 0), (0, 0, 0.5))
+    v, w = part[1].inv().apply([v + np.cross(w, part[0]), w])
     for t in T:
         p, q = true_pose(t)
-        field.append(
-            (
-                t,
-                "sensor_msgs/msg/MagneticField",
-                {**stamped(t, frame), "magnetic_field": to_sensor.apply(FIELD) * 1e-9},
-            )
-        )
-        imu.append(
-            (
-                t,
-                "sensor_msgs/msg/Imu",
-                {
-                    **stamped(t, frame),
-                    "orientation": (q * mount).as_quat(),
-                    "angular_velocity": to_sensor.apply(RATE),
-                    "linear_acceleration": to_sensor.apply(GRAVITY + AHEAD),
-                },
-            )
-        )
-        there, turned = p + q.apply(part[0]), q * part[1]
-        pose = {
-            "pose.pose.position": there,
-            "pose.pose.orientation": turned.as_quat(),
-            "child_frame_id": child,
-        }
-        poses.append((t, "nav_msgs/msg/Odometry", {**stamped(t, "map"), **pose}))
+        field.append((t, *magnetic(t, *(back.apply(FIELD) * 1e-9), frame=frame)))
+        seen = q * mount if oriented else q
+        imu.append((t, *inertial(t, seen, back.apply(RATE), back.apply(GRAVITY + AHEAD), frame)))
+        there = (p + q.apply(part[0]), q * part[1])
+        poses.append((t, *pose(t, *there, ODOMETRY, child=child, v=v, w=w)))
     return {"/mag": field, "/imu": imu, "/pose": poses}
+
+
+def both(bag):
+    """The recording as a run and as readings."""
+    return read_bag(bag, topics=PLACED), read_readings(bag, pose_topic="/pose")
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_vectors_of_a_mounted_sensor_are_those_of_base_link(tmp_path, mount):
     frames = static(
-        ("base_link", "plate", ARM, MOUNTS[mount]), ("plate", "sensor_link", np.zeros(3), MOUNTS["upright"])
+        ("base_link", "plate", ARM, MOUNTS[mount]), ("plate", "sensor_link", np.zeros(3), UPRIGHT)
     )
-    bag = record(tmp_path / "a.mcap", {**drive(MOUNTS[mount]), "/tf_static": frames})
-    run, readings = read_bag(bag, topics=TOPICS), read_bag_readings(bag)
+    run, readings = both(record(tmp_path / "a.mcap", drive(MOUNTS[mount]) | frames))
     assert_allclose(run["b_vector_measured_nt"], np.tile(FIELD, (200, 1)), atol=1e-6)
     assert_allclose(readings.b_body_nt, np.tile(FIELD, (200, 1)), atol=1e-6)
     assert_allclose(run["imu_w"], np.tile(RATE, (200, 1)), atol=1e-12)
@@ -118,101 +80,58 @@ def test_vectors_of_a_mounted_sensor_are_those_of_base_link(tmp_path, mount):
 
 def test_an_orientation_that_gravity_shows_to_be_that_of_the_base_is_kept(tmp_path):
     mount = MOUNTS["upside down"]
-    topics = drive(mount) | {"/tf_static": static(("base_link", "sensor_link", ARM, mount))}
-    for t, _, fields in topics["/imu"]:
-        fields["orientation"] = true_pose(t)[1].as_quat()
-    run = read_bag(record(tmp_path / "a.mcap", topics), topics=TOPICS)
+    topics = drive(mount, oriented=False) | static(("base_link", "sensor_link", ARM, mount))
+    run, _ = both(record(tmp_path / "a.mcap", topics))
     assert_allclose(run["imu_a"], np.tile([0, 0.04, 0], (200, 1)), atol=1e-12)
     assert_allclose(np.abs(np.sum(run["imu_q_xyzw"] * run["q_world_base_xyzw"], axis=1)), 1, atol=1e-9)
 
 
-def test_without_a_transform_a_sensor_is_taken_as_upright_and_that_is_said(tmp_path):
-    bag = record(tmp_path / "a.mcap", drive())
+def test_without_a_transform_a_sensor_is_taken_as_upright_and_that_is_told(tmp_path):
+    run, readings = both(record(tmp_path / "a.mcap", drive()))
     text = "field of /mag in the axes of 'sensor_link' as in those of base_link"
-    assert text in read_bag(bag, topics=TOPICS).metadata["taken"]
-    assert f"taken {text}" in read_bag_readings(bag).source
-    silent = record(tmp_path / "b.mcap", drive(frame=""))
-    assert "taken" not in read_bag(silent, topics=TOPICS).metadata
-    assert "taken" not in read_bag_readings(silent).source
+    assert text in run.metadata["taken"]
+    assert f"taken {text}" in readings.source
+    run, readings = both(record(tmp_path / "b.mcap", drive(frame="")))
+    assert run.metadata["taken"] == "field /mag, IMU /imu by their types"
+    assert readings.source.endswith("; taken field /mag by its type")
 
 
 @pytest.mark.parametrize("frame", ["map", "/odom", "ann/world"])
 def test_a_vector_in_a_frame_that_stands_still_is_warned_of(tmp_path, frame):
     bag = record(tmp_path / "a.mcap", drive(frame=frame))
     with pytest.warns(RepairWarning, match=f"field of /mag: '{frame.strip('/')}' is no frame of a sensor"):
-        read_bag_readings(bag)
+        read_readings(bag, pose_topic="/pose")
 
 
 @pytest.mark.parametrize("root", ["base_link", "base_footprint"])
-def test_the_pose_of_a_camera_becomes_that_of_the_base(tmp_path, root):
+def test_pose_and_velocity_of_a_camera_become_those_of_the_base(tmp_path, root):
     part = (ARM, MOUNTS["turned"])
-    frames = static((root, "camera_link", *part))
-    bag = record(tmp_path / "a.mcap", {**drive(child="camera_link", part=part), "/tf_static": frames})
-    run, readings = read_bag(bag, topics=TOPICS), read_bag_readings(bag)
-    straight = read_bag(record(tmp_path / "b.mcap", drive()), topics=TOPICS)
+    topics = drive(child="camera_link", part=part) | static((root, "camera_link", *part))
+    bag = record(tmp_path / "a.mcap", topics)
+    run, readings = both(bag)
+    straight, _ = both(record(tmp_path / "b.mcap", drive()))
     assert_allclose(run["p_world_base"], straight["p_world_base"], atol=1e-12)
     assert_allclose(run["yaw"], straight["yaw"], atol=1e-12)
     assert_allclose(readings.p_xy, straight["p_world_base"][:, :2], atol=1e-12)
     assert f"taken pose of /pose from 'camera_link' to '{root}'" in readings.source
-
-
-def test_the_velocity_of_a_camera_becomes_that_of_the_base(tmp_path):
-    mount, w, v = MOUNTS["turned"], np.array([0.0, 0.0, 0.5]), np.array([0.3, 0.0, 0.0])
-    topics = drive(child="camera_link", part=(ARM, mount))
-    for _, _, fields in topics["/pose"]:
-        fields["twist.twist.linear"] = mount.inv().apply(v + np.cross(w, ARM))
-        fields["twist.twist.angular"] = mount.inv().apply(w)
-    topics["/tf_static"] = static(("base_link", "camera_link", ARM, mount))
-    bag = record(tmp_path / "a.mcap", topics)
-    run = read_bag(
-        bag,
-        topics={"/robot/qtfm/magnitude": "/mag", "/robot/odom": "/pose"},
-    )
-    assert_allclose(run["odom_v"], np.tile(v, (200, 1)), atol=1e-12)
-    assert_allclose(run["odom_w"], np.tile(w, (200, 1)), atol=1e-12)
-    assert_allclose(run["odom_p"][:, 0], np.cos(0.2 * T), atol=1e-12)
+    odometry = read_bag(bag)
+    assert_allclose(odometry["odom_p"], straight["p_world_base"], atol=1e-12)
+    assert_allclose(odometry["odom_v"], np.tile([0.3, 0, 0], (200, 1)), atol=1e-12)
+    assert_allclose(odometry["odom_w"], np.tile([0, 0, 0.5], (200, 1)), atol=1e-12)
 
 
 def test_the_pose_of_a_camera_whose_place_is_unknown_is_warned_of(tmp_path):
     bag = record(tmp_path / "a.mcap", drive(child="camera_link"))
     with pytest.warns(RepairWarning, match="it is the pose of 'camera_link', and no /tf_static has the way"):
-        read_bag_readings(bag)
+        read_readings(bag, pose_topic="/pose")
 
 
 @pytest.mark.parametrize(
     "child", ["", "base_link", "base_footprint", "ann/base_link", "tb3_base_footprint", "turtlebot"]
 )
 def test_names_of_robots_in_use_pass_without_a_warning(tmp_path, child):
-    frames = static(("base_footprint", "base_link", [0, 0, 0.01], MOUNTS["upright"]))
-    readings = read_bag_readings(
-        record(tmp_path / "a.mcap", {**drive(child=child, frame=""), "/tf_static": frames})
-    )
-    assert "taken" not in readings.source
-
-
-def test_without_a_pose_odometry_and_transforms_from_the_map_give_it(tmp_path):
-    topics, moved = drive(frame=""), []
-    topics["/odom"] = topics.pop("/pose")
-    for t, _, fields in topics["/odom"]:
-        back = -0.01 * t
-        fields["header.frame_id"] = "odom"
-        fields["pose.pose.position"] = fields["pose.pose.position"] - [back, 0, 0]
-        each = {"header.stamp": fields["header.stamp"], "header.frame_id": "map", "child_frame_id": "odom"}
-        each |= {"transform.translation": [back, 0.0, 0.0], "transform.rotation": [0.0, 0.0, 0.0, 1.0]}
-        moved.append(
-            (
-                t,
-                "tf2_msgs/msg/TFMessage",
-                {"transforms": 1} | {f"transforms.0.{k}": v for k, v in each.items()},
-            )
-        )
-    bag = record(tmp_path / "a.mcap", {**topics, "/tf": moved})
-    run = read_bag(bag, topics={"/robot/qtfm/magnitude": "/mag", "/robot/odom": "/odom"})
-    assert_allclose(run["p_world_base"][:, 0], np.cos(0.2 * T), atol=1e-12)
-    assert_allclose(run["odom_p"][:, 0], np.cos(0.2 * T) + 0.01 * T, atol=1e-12)
-    assert (
-        run.metadata["truth"] == "poses of /odom from 'odom' to 'map', by /tf (by up to 0.0398 m and 0 deg)"
-    )
+    topics = drive(child=child, frame="") | static(("base_footprint", "base_link", [0, 0, 0.01], UPRIGHT))
+    assert " of /pose" not in both(record(tmp_path / "a.mcap", topics))[1].source
 
 
 @pytest.mark.parametrize(

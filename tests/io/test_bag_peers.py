@@ -14,6 +14,7 @@ from mcap.records import Channel, Chunk, Message, MessageIndex, Schema, Statisti
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as PeerWriter
+from recordings import as_db3
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -222,11 +223,11 @@ def made(lab_scene, tmp_path_factory):
     twin = magtwin.open_twin(lab_scene)
     run = magtwin.simulate(twin, "figure8", seed=3, duration_s=20.0, lidar="on")
     write_bag(run, folder / "whole.mcap", twin, scans=scan(twin, run))
-    write_bag(run, folder / "whole.db3", twin, scans=scan(twin, run))
+    as_db3(folder / "whole.mcap", folder / "whole.db3")
     with BagWriter(folder / "blocks.mcap", twin, scans=scan(twin, run)) as writer:
         for first in range(0, run.rows, 500):
             writer.append(run.take(slice(first, first + 500)))
-    with Reader(folder / "whole.db3") as reader:
+    with Reader(folder / "whole.mcap") as reader:
         said = [(c.topic, c.msgtype, t, bytes(data)) for c, t, data in reader.messages()]
     raw = RawBagWriter(folder / "raw.mcap")
     for k, (topic, kind, t, data) in enumerate(said):

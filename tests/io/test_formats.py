@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from recordings import as_db3
 from test_cli import refused
 from test_run import assert_same, every_column
 from test_tables import few_bytes
@@ -19,7 +20,9 @@ from magtwin.run.run import Column, Run
 from magtwin.twin import Twin, open_twin, simulate
 
 EXACT = ("run.parquet", "run.csv", "run.npz", "run.rrd", "run.usd", "run.usda", "run.usdc")
-BAGS = {"run.mcap": {}, "run.db3": {}, "mcap": {"storage": "mcap"}, "sqlite3": {"storage": "sqlite3"}}
+BAGS = ("run.mcap", "bag")
+READ = (*EXACT, *BAGS, "run.db3")
+"""Formats that are read; .db3 is written by rosbags."""
 
 WITHIN = {
     "battery_v": {"rtol": 1e-7},
@@ -48,14 +51,13 @@ def run(twin) -> Run:
 def written(run, twin, tmp_path_factory):
     """A folder with the run in every format."""
     folder = tmp_path_factory.mktemp("formats")
-    for name in EXACT:
+    for name in (*EXACT, *BAGS):
         write_run(run, folder / name, twin)
-    for name, options in BAGS.items():
-        write_run(run, folder / name, twin, **options)
+    as_db3(folder / "run.mcap", folder / "run.db3")
     return folder
 
 
-@pytest.mark.parametrize("name", [*EXACT, *(name for name in BAGS if "." in name)])
+@pytest.mark.parametrize("name", [*EXACT, "run.mcap"])
 def test_suffixes_are_read_and_written_in_any_case(written, run, twin, tmp_path, name):
     write_run(run, tmp_path / name.upper(), twin)
     assert [file.name for file in tmp_path.iterdir()] == [name.upper()]
@@ -96,13 +98,13 @@ def test_columns_of_a_users_own_keep_unit_frame_parts_and_rule(name, tmp_path):
     run = run.with_columns(valve=np.arange(5) > 2, est_q_xyzw=np.tile([0, 0, 0, 1.0], (5, 1)))
     coil = Column("A", "magnetometer", "currents", 3, ("a", "b", "c"))
     run = run.with_specs(head_k=Column("K", "", "temperature", interpolation="hold"), coil=coil)
-    write_run(run, tmp_path / name, **BAGS.get(name, {}))
+    write_run(run, tmp_path / name)
     again = read_run(tmp_path / name)
     assert_same(run, again)
     assert {key: again.spec(key) for key in again} == {key: run.spec(key) for key in run}
 
 
-@pytest.mark.parametrize("name", BAGS)
+@pytest.mark.parametrize("name", [*BAGS, "run.db3"])
 def test_a_run_comes_back_from_a_bag_as_its_messages_carry_it(name, run, written):
     again = read_run(written / name)
     assert_carried(run, again)
@@ -123,7 +125,7 @@ def test_a_run_goes_through_all_formats_one_after_the_other_and_is_itself(run, t
     assert_carried(run, again)
 
 
-@pytest.mark.parametrize("name", [*EXACT, "run.mcap", "run.db3", "bag"])
+@pytest.mark.parametrize("name", [*EXACT, *BAGS])
 def test_a_run_alone_is_written_too_where_no_scene_is_known(name, run, tmp_path):
     write_run(run, tmp_path / name)
     again = read_run(tmp_path / name)
@@ -139,7 +141,7 @@ def test_folders_are_read_by_what_is_in_them(run, written, tmp_path):
     write_run(run, tmp_path / "out" / "run.parquet")
     (tmp_path / "out" / "run.png").touch()
     assert_same(read_run(tmp_path / "out"), run)
-    assert len(read_run(written / "sqlite3")) == len(run)
+    assert len(read_run(written / "bag")) == len(run)
     (tmp_path / "none").mkdir()
     with pytest.raises(InputError, match="a folder without a run; name a file"):
         read_run(tmp_path / "none")
@@ -185,7 +187,7 @@ def test_a_csv_cut_short_at_the_end_of_a_line_is_refused_by_its_count_of_rows(wr
     assert read_run(tmp_path / "run.csv").rows == read_run(written / "run.csv").rows - 7
 
 
-@pytest.mark.parametrize("name", [*EXACT, "run.mcap", "run.db3"])
+@pytest.mark.parametrize("name", [*EXACT, *BAGS])
 def test_every_format_refuses_a_run_whose_time_goes_backwards(name, tmp_path):
     back = every_column().take(slice(None, None, -1))
     with pytest.raises(InputError, match=r"t must ascend|backwards"):
@@ -193,11 +195,11 @@ def test_every_format_refuses_a_run_whose_time_goes_backwards(name, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", [*EXACT, "run.mcap", "run.db3", "bag"])
+@pytest.mark.parametrize("name", [*EXACT, *BAGS])
 def test_a_full_disk_is_refused_by_every_format_and_what_was_there_stays(name, run, twin, written, tmp_path):
     write_run(run.take(slice(0, 20)), tmp_path / name)
     before = read_run(tmp_path / name)
-    whole = written / ("mcap" if name == "bag" else name)
+    whole = written / name
     room = max(file.stat().st_size for file in (whole.iterdir() if whole.is_dir() else [whole])) // 2
     with few_bytes(room), pytest.raises(InputError, match=r"cannot be written|full|too large"):
         write_run(run, tmp_path / name, twin, force=True)
@@ -209,12 +211,10 @@ def test_convert_writes_any_format_from_any_other(run, written, tmp_path, capsys
     chain = ["run.rrd", "bag", "run.usdc", "run.npz", "run.mcap", "run.csv", "run.parquet"]
     source = written / "run.parquet"
     for name in chain:
-        options = ["--storage", "sqlite3"] if name == "bag" else []
-        main(["convert", str(source), str(tmp_path / name), *options])
+        main(["convert", str(source), str(tmp_path / name)])
         source = tmp_path / name
     assert f"Wrote {source}: {run.rows} rows, {len(run)} columns" in capsys.readouterr().out
     assert_carried(run, read_run(source))
-    assert list((tmp_path / "bag").glob("*.db3"))
 
 
 def test_convert_takes_frames_a_second_units_and_the_scene(run, written, lab_scene, tmp_path, capsys):
@@ -245,6 +245,12 @@ def test_convert_takes_frames_a_second_units_and_the_scene(run, written, lab_sce
         ("run.parquet", "new.csv", ["--scene", "x.usda"], "a table shows no scene; drop --scene"),
         ("run.parquet", "new.rrd", ["--scene", "x.usda"], "x.usda: no such scene"),
         ("run.parquet", "new.mcap", ["--usd-fps", "5"], "rosbag2 has no option 'fps'"),
+        (
+            "run.parquet",
+            "new.db3",
+            [],
+            "rosbag2 in SQLite is read, not written; give .mcap, the default of ROS 2;",
+        ),
         ("run.parquet", "new.usd", ["--usd-fps", "-5"], "fps must be above 0"),
         ("run.parquet", "run.parquet", ["--force"], "is the run itself"),
         ("runn.csv", "new.parquet", [], "runn.csv: no such run; did you mean 'run.csv'?"),
@@ -256,7 +262,7 @@ def test_what_convert_cannot_do_is_refused_in_one_line(source, out, options, mes
     assert sorted(p.name for p in written.iterdir()) == before
 
 
-@pytest.mark.parametrize("name", [*EXACT, *BAGS])
+@pytest.mark.parametrize("name", READ)
 def test_info_of_every_format_tells_rows_columns_units_and_what_the_run_came_from(name, run, written, capsys):
     main(["info", str(written / name), "--json"])
     told = json.loads(capsys.readouterr().out)
@@ -293,7 +299,7 @@ def shown(monkeypatch):
     return seen
 
 
-@pytest.mark.parametrize("name", ["run.csv", "run.usdc", "sqlite3", "run.rrd"])
+@pytest.mark.parametrize("name", ["run.csv", "run.usdc", "run.db3", "run.rrd"])
 def test_view_shows_a_run_of_any_format(name, run, written, shown, capsys):
     main(["view", str(written / name)])
     error = capsys.readouterr().err
@@ -307,7 +313,6 @@ def test_a_conversion_without_its_scene_warns_of_what_the_format_lacks(run, tmp_
     monkeypatch.chdir(tmp_path)
     for name, lacks in (
         ("a.mcap", "written without /tf_static and the robot's description: "),
-        ("a.db3", "written without /tf_static and the robot's description: "),
         ("a.rrd", "shown without a scene: "),
     ):
         main(["convert", "apart/run.parquet", name])
@@ -334,7 +339,7 @@ def test_view_without_a_display_refuses_a_stage_and_names_the_picture(lab_scene,
     assert "no display to show it on; magtwin picture draws it" in refused(capsys, "view", lab_scene)
 
 
-@pytest.mark.parametrize("suffix", [".mcap", ".db3", ".parquet"])
+@pytest.mark.parametrize("suffix", [".mcap", ".parquet"])
 def test_a_run_saves_itself_as_one_file_in_the_format_of_its_suffix(tmp_path, suffix):
     run = Run({"t": [0.0, 0.5], "b_measured_nt": [41_000.0, 41_001.0]}, {"seed": 3})
     run.save(tmp_path / f"run{suffix}", **({} if suffix == ".parquet" else {"units": "nT"}))

@@ -1,198 +1,114 @@
-"""A robot's own recording as a Run; rosbags writes the bags."""
+"""A robot's own recording as a Run, and as the readings of a survey."""
+
+import warnings
 
 import numpy as np
 import pytest
+import yaml
 from numpy.testing import assert_allclose, assert_array_equal
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from recordings import START, UPRIGHT, as_db3, inertial, magnetic, moved, pose, record, stamped
+from scipy.spatial.transform import Rotation
+from test_cli import refused
 
+from magtwin.cli import main
 from magtwin.errors import InputError, RepairWarning
 from magtwin.io.bags import read_bag
+from magtwin.io.formats import read_run
+from magtwin.io.surveys.columns import Columns
+from magtwin.io.surveys.readings import read_readings
 
-STORE = get_typestore(Stores.ROS2_HUMBLE)
-START = 1_700_000_000_000_000_000
-MS = 1_000_000
 MAG, POSE, ODOM, IMU = "/robot/qtfm/magnitude", "/robot/enu/pose", "/robot/odom", "/robot/imu"
 BATTERY, CMD, JOINTS, SCAN = "/robot/battery_state", "/robot/cmd_vel", "/robot/joint_states", "/robot/scan"
+POSES = ("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped")
+ODOMETRY, VECTOR3 = "nav_msgs/msg/Odometry", "geometry_msgs/msg/Vector3Stamped"
+WORLD = np.array([12_000.0, 20_000.0, -38_000.0])
+UP = (0, 0, 9.80665)
+LATE = 0.003
+"""Time that messages take to be received [s]."""
 
 
-def make(kind, **parts):
-    return STORE.types[kind](**parts)
+def turned(yaw):
+    return Rotation.from_euler("z", yaw)
 
 
-def header(ns, frame="map"):
-    stamp = make("builtin_interfaces/msg/Time", sec=ns // 10**9, nanosec=ns % 10**9)
-    return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+def at(rate_hz, seconds=4.0, offset=0.0):
+    return offset + np.arange(int(seconds * rate_hz)) / rate_hz
 
 
-def vector(x=0.0, y=0.0, z=0.0, kind="Vector3"):
-    return make(f"geometry_msgs/msg/{kind}", x=float(x), y=float(y), z=float(z))
+def said(times, message, late=LATE):
+    """Messages of a topic: `message` of the number and the time of each."""
+    return [(t + late, *message(k, t)) for k, t in enumerate(times)]
 
 
-def quaternion(yaw):
-    return make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=np.sin(yaw / 2), w=np.cos(yaw / 2))
+def readings(scale=1.0, count=200):
+    return said(at(50)[:count], lambda k, t: magnetic(t, scale * (41_000 + k)))
 
 
-def pose_of(x, yaw):
-    return make("geometry_msgs/msg/Pose", position=vector(x, kind="Point"), orientation=quaternion(yaw))
-
-
-def twist(v, w):
-    return make("geometry_msgs/msg/Twist", linear=vector(v), angular=vector(z=w))
-
-
-def covered(kind, what, value, size):
-    return make(kind, **{what: value, "covariance": np.zeros(size)})
-
-
-def magnetic(ns, *b):
-    return make(
-        "sensor_msgs/msg/MagneticField",
-        header=header(ns, "qtfm"),
-        magnetic_field=vector(*b),
-        magnetic_field_covariance=np.zeros(9),
+def vectors(scale=1.0, kind="sensor_msgs/msg/MagneticField", rate_hz=50):
+    return said(
+        at(rate_hz), lambda k, t: magnetic(t, *(scale * turned(0.3 * t).inv().apply(WORLD)), kind=kind)
     )
 
 
-def posed(ns, x, yaw, kind="PoseStamped"):
-    if kind == "PoseStamped":
-        return make("geometry_msgs/msg/PoseStamped", header=header(ns), pose=pose_of(x, yaw))
-    pose = covered("geometry_msgs/msg/PoseWithCovariance", "pose", pose_of(x, yaw), 36)
-    if kind == "PoseWithCovarianceStamped":
-        return make("geometry_msgs/msg/PoseWithCovarianceStamped", header=header(ns), pose=pose)
-    return odometry(ns, x, yaw, 0.0, 0.0)
+def poses(kind="geometry_msgs/msg/PoseStamped", rate_hz=20, frame="map", x=0.0):
+    return said(at(rate_hz), lambda k, t: pose(t, (x + 0.2 * t, 0, 0), turned(0.3 * t), kind, frame=frame))
 
 
-def odometry(ns, x, yaw, v, w):
-    return make(
-        "nav_msgs/msg/Odometry",
-        header=header(ns, "odom"),
-        child_frame_id="base_link",
-        pose=covered("geometry_msgs/msg/PoseWithCovariance", "pose", pose_of(x, yaw), 36),
-        twist=covered("geometry_msgs/msg/TwistWithCovariance", "twist", twist(v, w), 36),
+def odometry(rate_hz=25):
+    return poses(ODOMETRY, rate_hz, "odom", 1.0)
+
+
+def imu(q=UPRIGHT, frame="imu_link"):
+    return said(at(30), lambda k, t: inertial(t, q, (0, 0, 0.5), UP, frame))
+
+
+def twists(rate_hz=10):
+    kind = "geometry_msgs/msg/Twist"
+    return said(
+        at(rate_hz), lambda k, t: (kind, {"linear": [0.1 * (k // 10), 0, 0], "angular": [0, 0, 0.2]}), 0.008
     )
-
-
-def inertial(ns, yaw, a):
-    zero = np.zeros(9)
-    return make(
-        "sensor_msgs/msg/Imu",
-        header=header(ns, "imu_link"),
-        orientation=quaternion(yaw),
-        orientation_covariance=zero,
-        angular_velocity=vector(z=0.5),
-        angular_velocity_covariance=zero,
-        linear_acceleration=vector(*a),
-        linear_acceleration_covariance=zero,
-    )
-
-
-def battery(ns, volts):
-    names = ("temperature", "charge", "capacity", "design_capacity")
-    flags = ("power_supply_status", "power_supply_health", "power_supply_technology")
-    cells = np.full(4, volts / 4, np.float32)
-    return make(
-        "sensor_msgs/msg/BatteryState",
-        header=header(ns, ""),
-        voltage=volts,
-        current=-1.25,
-        percentage=0.75,
-        **dict.fromkeys(names, 0.0),
-        **dict.fromkeys(flags, 0),
-        present=True,
-        cell_voltage=cells,
-        cell_temperature=cells[:0],
-        location="bay",
-        serial_number="a-1",
-    )
-
-
-def joints(ns, names, position):
-    none = np.zeros(0)
-    position = np.array(position, float)
-    return make(
-        "sensor_msgs/msg/JointState",
-        header=header(ns, ""),
-        name=names,
-        position=position,
-        velocity=none,
-        effort=none,
-    )
-
-
-def scanned(ns, rays):
-    numbers = (
-        "angle_min",
-        "angle_max",
-        "angle_increment",
-        "time_increment",
-        "scan_time",
-        "range_min",
-        "range_max",
-    )
-    return make(
-        "sensor_msgs/msg/LaserScan",
-        header=header(ns, "rplidar_link"),
-        **dict.fromkeys(numbers, 0.0),
-        ranges=np.ones(rays, np.float32),
-        intensities=np.zeros(0, np.float32),
-    )
-
-
-def record(path, topics, storage="mcap"):
-    """A bag of messages: by topic a list of (time of receipt [ns], message)."""
-    rows = [(t, topic, message) for topic, said in topics.items() for t, message in said]
-    with Writer(path, version=8, storage_plugin=StoragePlugin[storage.upper()]) as writer:
-        connections = {
-            topic: writer.add_connection(
-                topic, said[0][1].__msgtype__ if said else "std_msgs/msg/Float64", typestore=STORE
-            )
-            for topic, said in topics.items()
-        }
-        for t, topic, message in sorted(rows, key=lambda row: row[0]):
-            writer.write(connections[topic], t, STORE.serialize_cdr(message, message.__msgtype__))
-    return path
-
-
-def at(rate_hz, seconds=4.0, late_ms=3, offset_ms=0):
-    """Stamps and times of receipt [ns]."""
-    stamps = START + offset_ms * MS + (np.arange(int(seconds * rate_hz)) * 10**9 // rate_hz)
-    return [(int(s), int(s) + late_ms * MS) for s in stamps]
-
-
-def x_at(ns):
-    return 0.2 * (ns - START) / 1e9
-
-
-def readings(scale=1.0, count=None):
-    said = [(r, magnetic(s, scale * (41_000 + k))) for k, (s, r) in enumerate(at(50))]
-    return said[:count]
-
-
-def poses(kind="PoseStamped", **options):
-    return [(r, posed(s, x_at(s), 0.3, kind)) for s, r in at(20, **options)]
 
 
 def drive():
+    """A drive on the topics of magtwin, each at a rate of its own."""
+    names, angles = ("arm", "right_wheel_joint", "left_wheel_joint"), (9.0, 2.0, 1.0)
+    charge = {"current": -1.25, "percentage": 0.75, "present": 1}
     return {
         MAG: readings(),
-        POSE: poses(),
-        ODOM: [(r, odometry(s, x_at(s) + 1, 0.1, 0.2, 0.5)) for s, r in at(25, offset_ms=1)],
-        IMU: [(r, inertial(s, -0.3, (0.1, 0.2, 9.8))) for s, r in at(30, offset_ms=500)],
-        BATTERY: [(r, battery(s, 15.5 + 0.1 * k)) for k, (s, r) in enumerate(at(1))],
-        CMD: [(r, twist(0.1 * (k // 10), 0.2)) for k, (s, r) in enumerate(at(10, late_ms=8))],
-        JOINTS: [
-            (r, joints(s, ["arm", "right_wheel_joint", "left_wheel_joint"][k % 2 :], [9, 2, 1][k % 2 :]))
-            for k, (s, r) in enumerate(at(10))
-        ],
-        SCAN: [(r, scanned(s, 5 + k)) for k, (s, r) in enumerate(at(10, seconds=2.0))],
-        "/rosout": [(START, make("std_msgs/msg/String", data="hello"))],
+        POSE: said(at(20), lambda k, t: pose(t, (0.2 * t, 0, 0), turned(0.3))),
+        ODOM: said(
+            at(25, offset=0.001),
+            lambda k, t: pose(
+                t, (1 + 0.2 * t, 0, 0), turned(0.1), ODOMETRY, frame="odom", v=(0.2, 0, 0), w=(0, 0, 0.5)
+            ),
+        ),
+        IMU: said(at(30, offset=0.5), lambda k, t: inertial(t, turned(-0.3), (0, 0, 0.5), (0.1, 0.2, 9.8))),
+        BATTERY: said(
+            at(1),
+            lambda k, t: (
+                "sensor_msgs/msg/BatteryState",
+                {**stamped(t), "voltage": 15.5 + 0.1 * k, **charge},
+            ),
+        ),
+        CMD: twists(),
+        JOINTS: said(
+            at(10),
+            lambda k, t: (
+                "sensor_msgs/msg/JointState",
+                {**stamped(t), "name": names[k % 2 :], "position": np.array(angles[k % 2 :])},
+            ),
+        ),
+        SCAN: said(
+            at(10, 2.0), lambda k, t: ("sensor_msgs/msg/LaserScan", {**stamped(t), "ranges": np.ones(5 + k)})
+        ),
+        "/rosout": [(0.0, "std_msgs/msg/String", {"data": "hello"})],
     }
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_a_drive_becomes_a_run_on_the_magnetometers_clock(tmp_path, storage):
-    run = read_bag(record(tmp_path / "bag", drive(), storage))
+    bag = record(tmp_path / "run.mcap", drive())
+    run = read_bag(bag if storage == "mcap" else as_db3(bag, tmp_path / "bag"))
     t = np.arange(200) / 50
     assert_allclose(run["t"], t, atol=1e-9)
     assert_array_equal(run["b_measured_nt"], 41_000.0 + np.arange(200))
@@ -214,25 +130,161 @@ def test_a_drive_becomes_a_run_on_the_magnetometers_clock(tmp_path, storage):
     assert_allclose(run["v_cmd"][1:], 0.1 * (came[1:] // 10))
     assert_array_equal(run["wheel_angle"], np.tile([1.0, 2.0], (200, 1)))
     assert_array_equal(run["lidar_on"], t < 1.9 + 0.5 - 1e-9)
-    assert run.metadata["field_unit"] == "nT"
-    assert run.metadata["stamps"] == "header"
-    assert run.metadata["start_ns"] == str(START)
-    assert run.metadata["imu_gravity"] == "removed"
-    assert POSE in run.metadata["topics"]
+    known = {"field_unit": "nT", "stamps": "header", "imu_gravity": "removed", "truth": f"topic {POSE}"}
+    known |= {"start_ns": str(START * 10**9), "topics": " ".join(sorted(drive().keys() - {"/rosout"}))}
+    assert known.items() <= run.metadata.items()
 
 
-@pytest.mark.parametrize("kind", ["PoseStamped", "PoseWithCovarianceStamped", "Odometry"])
-def test_poses_may_be_of_several_types_under_a_name_of_their_own(tmp_path, kind):
-    bag = record(tmp_path / "bag", {MAG: readings(), "/vrpn/robot/pose": poses(kind)})
-    run = read_bag(bag, topics={POSE: "/vrpn/robot/pose"})
-    inside = run["t"] <= 3.95
+# by what the field is published in: options of the reader
+FIELDS = {
+    "T": ({"/imu/mag": vectors(1e-9)}, {}),
+    "uT": ({"/imu/mag": vectors(1e-3)}, {}),
+    "nT": ({"/imu/mag": vectors()}, {}),
+    "mG": ({"/imu/mag": vectors(1e-2)}, {}),
+    "G": ({"/imu/mag": vectors(1e-5)}, {}),
+    "units of 42942 nT": ({"/imu/mag": vectors(1 / 42_942)}, {"scale": 42_942.0}),
+    "T, by its name": ({"/compass": vectors(1e-9, VECTOR3), "/wind": vectors(3.0, VECTOR3)}, {}),
+}
+
+
+@pytest.mark.parametrize("unit", FIELDS)
+@pytest.mark.parametrize("kind", POSES)
+def test_roles_are_found_by_type_and_units_by_size_in_a_run_and_in_readings(tmp_path, unit, kind):
+    topics = {
+        "/vicon/pose": poses(f"geometry_msgs/msg/{kind}"),
+        "/odometry/filtered": odometry(),
+        "/imu/data": imu(),
+    }
+    topics |= {"/cmd_vel": twists(), "/wheel/speed": twists(), "/clicked": poses()[:1], **FIELDS[unit][0]}
+    bag, options = record(tmp_path / "a.mcap", topics), FIELDS[unit][1]
+    run, survey = read_bag(bag, **options), read_readings(bag, columns=Columns(**options))
+    b = np.array([turned(0.3 * t).inv().apply(WORLD) for t in run["t"]])
+    assert_allclose(run["b_vector_measured_nt"], b, rtol=1e-9)
+    inside = ~run["flag_pose_lost"]
     assert_allclose(run["p_world_base"][inside, 0], 0.2 * run["t"][inside], atol=1e-9)
-    assert list(read_bag(bag)) == ["t", "b_measured_nt"]
+    assert {"odom_p", "imu_w", "v_cmd"} <= set(run)
+    assert run.metadata["field_unit"] == unit.split(",")[0]
+    assert "field /" in run.metadata["taken"]
+    assert (
+        "pose /vicon/pose, odometry /odometry/filtered, IMU /imu/data, command /cmd_vel by their types"
+        in run.metadata["taken"]
+    )
+    assert len(survey) == inside.sum() == 198
+    assert_array_equal(survey.p_xy, run["p_world_base"][inside, :2])
+    assert_allclose(survey.b_body_nt, b[inside], rtol=1e-9)
+    assert f"field of {run.metadata['clock']} in {run.metadata['field_unit']}, " in survey.source
+
+
+def test_a_recording_and_the_table_that_is_made_of_it_give_the_same_readings(tmp_path, capsys):
+    gap = [row for row in poses() if not 1.0 < row[0] < 2.0]
+    bag = record(tmp_path / "a.mcap", {"/imu/mag": vectors(1 / 42_942), "/vicon/pose": gap})
+    main(["convert", str(bag), str(tmp_path / "a.parquet"), "--scale", "42942"])
+    main(["info", str(bag), "--scale", "42942"])
+    assert "200" in capsys.readouterr().out
+    direct, made = read_readings(bag, columns=Columns(scale=42_942.0)), read_readings(tmp_path / "a.parquet")
+    assert len(direct) == len(made) == 146
+    for name in ("p_xy", "yaw", "b_nt", "b_body_nt", "t"):
+        assert_array_equal(getattr(direct, name), getattr(made, name))
+    assert "no recording; drop the option 'scale'" in refused(capsys, "info", "lab", "--scale", "2")
+    assert "no option 'scale'; drop it" in refused(capsys, "info", tmp_path / "a.parquet", "--scale", "2")
+
+
+BASE = {"/mag": readings(), "/pose": poses()}
+TIES = {
+    r"2 field topics, /a/mag \(sensor_msgs/msg/MagneticField, 50 Hz\), /mag \(.*, 50 Hz\); "
+    f"choose with --remap {MAG}:=TOPIC of magtwin convert$": ({**BASE, "/a/mag": readings()}, False),
+    r"2 field topics, .*; choose with --field-topic TOPIC$": ({**BASE, "/a/mag": readings()}, True),
+    r"2 pose topics, /pose \(.*, 20 Hz\), /slam \(geometry_msgs/msg/PoseWithCovarianceStamped, 5 Hz\); "
+    f"choose with --remap {POSE}:=TOPIC of magtwin convert$": (
+        {**BASE, "/slam": poses("geometry_msgs/msg/PoseWithCovarianceStamped", 5)},
+        False,
+    ),
+    r"2 odometry topics, /odom .*, /odom2 .*; choose with --remap": (
+        {**BASE, "/odom": odometry(), "/odom2": odometry()},
+        False,
+    ),
+    r"2 odometry topics, .*; choose with --pose-topic TOPIC$": (
+        {"/mag": readings(), "/odom": odometry(), "/odom2": odometry()},
+        True,
+    ),
+}
+
+
+@pytest.mark.parametrize("text", TIES)
+def test_a_role_of_several_topics_is_refused_with_their_rates_and_the_option(tmp_path, text):
+    bag = record(tmp_path / "a.mcap", TIES[text][0])
+    with pytest.raises(InputError, match=text):
+        read_readings(bag) if TIES[text][1] else read_bag(bag)
+
+
+def test_a_name_that_is_given_or_that_magtwin_gives_decides_between_topics(tmp_path):
+    topics = {
+        MAG: readings(),
+        "/mag": readings(2.0),
+        POSE: poses(),
+        "/slam": poses(x=9.0),
+        "/odom": odometry(),
+    }
+    bag = record(tmp_path / "a.mcap", topics | {ODOM: odometry(), "/imu": imu()})
+    run = read_bag(bag)
+    assert run["b_measured_nt"][0] == 41_000
+    assert run.metadata["truth"] == f"topic {POSE}"
+    assert run.metadata["topics"] == f"/imu {POSE} {ODOM} {MAG}"
+    other = read_bag(bag, topics={POSE: "/slam", MAG: "/mag"})
+    assert (other["p_world_base"][0, 0], other["b_measured_nt"][0]) == (9.0, 82_000)
+    survey = read_readings(bag, pose_topic="/slam", field_topic="/mag")
+    assert (survey.p_xy[0, 0], survey.b_nt[0]) == (9.0, 82_000)
+
+
+def test_a_minor_role_of_several_topics_or_of_another_clock_is_left_out_with_a_warning(tmp_path):
+    far = said(at(1, offset=1e6), lambda k, t: ("sensor_msgs/msg/BatteryState", stamped(t)))
+    bag = record(tmp_path / "a.mcap", {**BASE, "/imu/data": imu(), "/imu/raw": imu(), "/battery": far})
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        run = read_bag(bag)
+    assert not {"imu_w", "battery_v"} & set(run)
+    imus, battery = (str(warning.message) for warning in told)
+    assert "2 IMU topics, /imu/data (sensor_msgs/msg/Imu, 30 Hz), /imu/raw" in imus
+    assert imus.endswith(f"choose with --remap {IMU}:=TOPIC of magtwin convert; none is read")
+    assert "battery topic left out: /battery spans 1000000.000..1000003.000 s since" in battery
+
+
+def test_odometry_is_the_truth_only_if_something_moves_it_or_it_is_named_and_that_is_told(tmp_path):
+    bag = record(tmp_path / "a.mcap", {"/mag": readings(), ODOM: odometry()})
+    assert "p_world_base" not in read_bag(bag)
+    survey = read_readings(bag)
+    assert_allclose(survey.p_xy[:, 0], 1 + 0.2 * survey.t, atol=1e-9)
+    assert f"taken poses of {ODOM}, which is odometry and drifts" in survey.source
+    with pytest.warns(RepairWarning, match=f"{ODOM} is both the odometry and the true pose"):
+        run = read_bag(bag, topics={POSE: ODOM})
+    assert {"p_world_base", "odom_p"} <= set(run)
+
+
+@pytest.mark.parametrize("by", [1, 0])
+def test_odometry_is_moved_into_the_map_by_transforms_unless_its_topic_is_named(tmp_path, by):
+    steps = [(0.0, *moved(0.0, ("map", "odom", (0, 0, 0), UPRIGHT)))]
+    there = ("map", "/odom", (3.0 * by, 4.0 * by, 0), turned(-0.5 * by))
+    steps.append((1.0, *moved(1.0, ("base_link", "wheel", (9, 0, 0), UPRIGHT), there)))
+    bag = record(tmp_path / "a.mcap", {"/odom": odometry(), "/mag": readings(), "/tf": steps})
+    survey, named = read_readings(bag), read_readings(bag, pose_topic="/odom")
+    text = "; taken poses of /odom from 'odom' to 'map', by /tf (by up to 5 m and 28.6 deg)"
+    assert (text in survey.source) == by
+    assert (f"{text}, which is not applied, as their topic was named" in named.source) == by
+    p = np.column_stack([1 + 0.2 * named.t, 0 * named.t])
+    assert_allclose(named.p_xy, p, atol=1e-9)
+    later = survey.t >= 1.0  # the last transform holds on
+    c, s = np.cos(-0.5 * by), np.sin(-0.5 * by)
+    assert_allclose(survey.p_xy[later], (np.array([3.0, 4.0]) * by + p @ [[c, s], [-s, c]])[later], atol=1e-7)
+    assert_allclose(np.exp(1j * (survey.yaw - named.yaw))[later], np.exp(-0.5j * by), atol=1e-6)
+    if by:
+        run = read_bag(bag)
+        assert run.metadata["truth"] == f"topic {text.removeprefix('; taken poses of ')}"
+        assert_allclose(run["odom_p"][:, 0], 1 + 0.2 * np.floor(run["t"] * 25 + 1e-6) / 25, atol=1e-9)
 
 
 @pytest.mark.parametrize(("scale", "unit"), [(1, "nT"), (1e-3, "uT"), (1e-9, "T")])
-def test_the_unit_is_told_by_size_and_said(tmp_path, scale, unit):
-    bag = record(tmp_path / "bag", {MAG: readings(scale)})
+def test_the_unit_is_told_by_size_or_given(tmp_path, scale, unit):
+    bag = record(tmp_path / "a.mcap", {MAG: readings(scale)})
     run = read_bag(bag)
     assert_allclose(run["b_measured_nt"], 41_000 + np.arange(200), rtol=1e-12)
     assert (run.metadata["field_unit"], run.metadata["field_unit_told"]) == (unit, "by its size")
@@ -243,173 +295,228 @@ def test_the_unit_is_told_by_size_and_said(tmp_path, scale, unit):
 
 @pytest.mark.parametrize(("factor", "unit"), [(3.7e-9, None), (3.7e-9, "T"), (0.2e-9, "T")])
 def test_a_field_with_the_robots_iron_is_read_with_a_warning(tmp_path, factor, unit):
-    bag = record(tmp_path / "bag", {MAG: readings(factor)})
+    bag = record(tmp_path / "a.mcap", {MAG: readings(factor)})
     with pytest.warns(RepairWarning, match="nT in T, not that of the Earth's field: iron near the sensor"):
         run = read_bag(bag, unit=unit)
     assert_allclose(run["b_measured_nt"], factor * 1e9 * (41_000 + np.arange(200)), rtol=1e-12)
 
 
-def test_a_vector_field_gives_its_magnitude_and_itself(tmp_path):
-    b = np.array([12_000.0, 20_000.0, -38_000.0])
-    bag = record(tmp_path / "bag", {MAG: [(r, magnetic(s, *(b * 1e-9))) for s, r in at(50)]})
-    run = read_bag(bag)
-    assert_allclose(run["b_vector_measured_nt"], np.tile(b, (200, 1)))
-    assert_allclose(run["b_measured_nt"], np.linalg.norm(b))
-
-
 def test_a_vector_beside_the_magnitude_has_a_unit_of_its_own(tmp_path):
-    b = np.array([12_000.0, 20_000.0, -38_000.0])
-    field = [(r, magnetic(s, *(b * 1e-9))) for s, r in at(50)]
-    run = read_bag(record(tmp_path / "bag", {MAG: readings(), "/robot/qtfm/field": field}))
-    assert_allclose(run["b_vector_measured_nt"], np.tile(b, (200, 1)))
+    run = read_bag(record(tmp_path / "a.mcap", {MAG: readings(), "/robot/qtfm/field": vectors(1e-9)}))
+    assert_allclose(run["b_vector_measured_nt"][0], WORLD)
+    assert_array_equal(run["b_measured_nt"], 41_000 + np.arange(200))
     assert (run.metadata["field_unit"], run.metadata["vector_unit"]) == ("nT", "T")
 
 
 def test_plain_numbers_are_taken_as_received(tmp_path):
-    said = [(r, make("std_msgs/msg/Float64", data=41_000.0)) for _, r in at(50)]
-    run = read_bag(record(tmp_path / "bag", {"/mag": said, POSE: poses()}), topics={MAG: "/mag"})
-    assert run.metadata["stamps"] == "receipt"
+    plain = said(at(50), lambda k, t: ("std_msgs/msg/Float64", {"data": 41_000.0}))
+    bag = record(tmp_path / "a.mcap", {"/mag": plain, "/temperature": plain, POSE: poses()})
+    run = read_bag(bag)
+    assert (run.metadata["stamps"], run.metadata["clock"]) == ("receipt", "/mag")
     assert_allclose(run["mocap_p"][:, 0], 0.2 * np.floor(run["t"] * 20 + 1e-6) / 20, atol=1e-9)
 
 
 def test_a_simulation_that_begins_at_0_has_stamps(tmp_path):
-    said = [(START + k * 20 * MS, magnetic(k * 20 * MS, 41_000)) for k in range(100)]
-    pose = [(START + k * 50 * MS, posed(k * 50 * MS, k, 0.0)) for k in range(40)]
-    command = [(START + 70 * MS, twist(0.3, 0.0))]
-    run = read_bag(record(tmp_path / "bag", {MAG: said, POSE: pose, CMD: command}))
+    def early(said):
+        return [
+            (t, kind, {**fields, "header.stamp": fields["header.stamp"] - START * 10**9})
+            for t, kind, fields in said
+        ]
+
+    topics = {MAG: early(readings()), POSE: early(poses()), CMD: twists()[:1]}
+    run = read_bag(record(tmp_path / "a.mcap", topics))
     assert run.metadata["stamps"] == "header"
-    assert_allclose(run["mocap_p"][:, 0], np.floor(run["t"] * 20 + 1e-6), atol=1e-9)
-    assert_array_equal(np.isfinite(run["v_cmd"]), run["t"] >= 0.07)  # though it was received years later
+    assert_allclose(run["mocap_p"][:, 0], 0.2 * np.floor(run["t"] * 20 + 1e-6) / 20, atol=1e-9)
+    assert_array_equal(np.isfinite(run["v_cmd"]), run["t"] >= 0.005)  # though it was received years later
 
 
 def test_a_message_that_came_twice_is_one_reading(tmp_path):
-    said = readings(count=20)
-    run = read_bag(record(tmp_path / "bag", {MAG: [*said, *said[5:6]][:6] + said[5:]}))
-    assert run.rows == 20
+    one = readings(count=20)
+    assert read_bag(record(tmp_path / "a.mcap", {MAG: one[:6] + one[5:]})).rows == 20
 
 
-def test_messages_that_overtook_each_other_are_sorted_and_told(tmp_path):
-    said = poses()
-    said[40], said[41] = [(said[k][0], said[81 - k][1]) for k in (40, 41)]
-    run = read_bag(record(tmp_path / "bag", {MAG: readings(), POSE: said}))
-    straight = read_bag(record(tmp_path / "straight", {MAG: readings(), POSE: poses()}))
-    for name in straight:
-        assert_array_equal(run[name], straight[name])
-    assert "1 messages of /robot/enu/pose by their stamps, behind which they came" in run.metadata["taken"]
+def swapped(rows, k):
+    """Messages of which two were received in each other's place."""
+    first, second = rows[k], rows[k + 1]
+    return [*rows[:k], (first[0], *second[1:]), (second[0], *first[1:]), *rows[k + 2 :]]
 
 
-@pytest.mark.parametrize(("row", "stamp_ns"), [(0, 0), (100, 0), (100, START - 60 * 10**9)])
-def test_one_stamp_that_is_wrong_is_one_reading_less_and_told(tmp_path, row, stamp_ns):
-    said = readings()
-    said[row] = said[row][0], magnetic(stamp_ns, 41_000)
-    run = read_bag(record(tmp_path / "bag", {MAG: said}))
-    assert run.rows == 199
-    assert run["t"][-1] < 4
-    text = f"1 of 200 messages of {MAG} as missing, whose stamps are wrong"
-    assert text in run.metadata["taken"]
+def changed(rows, changes):
+    """Messages of which some are others."""
+    return [(row[0], *changes[k]) if k in changes else row for k, row in enumerate(rows)]
 
 
-def backwards(said):
-    return [(t, magnetic(START + (1000 - k) * MS, 41_000)) for k, (t, _) in enumerate(said)]
+REPAIRED = {
+    "1 messages of /pose by their stamps, behind which they came": (
+        {"/pose": swapped(poses(), 40)},
+        200,
+        198,
+    ),
+    "1 messages of /mag by their stamps, behind which they came": (
+        {"/mag": swapped(readings(), 90)},
+        200,
+        198,
+    ),
+    "1 of 200 messages of /mag as missing, whose stamps are wrong": (
+        {"/mag": changed(readings(), {100: magnetic(None, 41_000)})},
+        199,
+        197,
+    ),
+    "2 of 200 messages of /mag as missing, which are 0": (
+        {"/mag": changed(readings(), {7: magnetic(0.14, 0.0), 9: magnetic(0.18, 0.0)})},
+        200,
+        196,
+    ),
+    "1 of 80 poses as missing, whose quaternion is not of length 1": (
+        {"/pose": changed(poses(), {40: ("geometry_msgs/msg/PoseStamped", stamped(2.0, "map"))})},
+        200,
+        198,
+    ),
+}
 
 
-def test_what_cannot_be_a_run_is_refused_with_what_is_there(tmp_path):
-    far = [(r, posed(s + 10**15, 0, 0)) for s, r in at(20)]
-    late = [(r, posed(s - 1100 * MS * (k in (40, 60)), 0, 0)) for k, (s, r) in enumerate(at(20))]
-    cases = {
-        "no topic /robot/qtfm/magnitude; did you mean '/robot/qtfm/magnetude'.; topics in it: "
-        r"/robot/qtfm/magnetude \(sensor_msgs": ({"/robot/qtfm/magnetude": readings()}, None),
-        r"no topic /robot/qtfm/magnitude; topics in it: none": ({}, None),
-        r"no topic /vrpn; topics in it: /robot/qtfm/magnitude": ({MAG: readings()}, {POSE: "/vrpn"}),
-        "^no topic '/robot/pose'; did you mean '/robot/enu/pose'": ({MAG: readings()}, {"/robot/pose": "/a"}),
-        r"/robot/enu/pose is a sensor_msgs/msg/MagneticField; it must be geometry_msgs/msg/PoseStamped or": (
-            {MAG: readings(), POSE: readings()},
-            None,
-        ),
-        r"stamps of /robot/qtfm/magnitude run backwards: .* in message 2 of 200": (
-            {MAG: backwards(readings())},
-            None,
-        ),
-        r"stamps of /robot/enu/pose run backwards: .* in message 41 of 80": (
-            {MAG: readings(), POSE: late},
-            None,
-        ),
-        r"/robot/enu/pose spans 1000000.000\.\.1000003.950 s since .* are they of one clock": (
-            {MAG: readings(), POSE: far},
-            None,
-        ),
-        r"no message of /robot/qtfm/magnitude holds a number": (
-            {MAG: [(r, magnetic(s, np.nan)) for s, r in at(50)]},
-            None,
-        ),
-        r"in no unit is that the Earth's field": ({MAG: readings(1e-4)}, None),
-    }
-    for k, (text, (topics, names)) in enumerate(cases.items()):
-        bag = record(tmp_path / f"bag{k}", topics)
-        with pytest.raises(InputError, match=text) as refusal:
-            read_bag(bag, topics=names)
-        assert str(bag) in str(refusal.value) or "no topic '" in text
-        assert "\n" not in str(refusal.value)
+@pytest.mark.parametrize("text", REPAIRED)
+def test_a_few_faulty_messages_are_repaired_or_left_out_and_told_in_a_run_and_in_readings(tmp_path, text):
+    topics, rows, known = REPAIRED[text]
+    bag = record(tmp_path / "a.mcap", {**BASE, **topics})
+    run, survey = read_bag(bag), read_readings(bag)
+    assert (run.rows, len(survey)) == (rows, known)
+    assert text in run.metadata["taken"].split("; ")
+    assert f"taken {text}" in survey.source.split("; ")
+    assert_allclose(survey.p_xy[:, 0], 0.2 * survey.t, atol=1e-9)
 
 
-def test_convert_makes_a_table_of_a_robots_own_bag(tmp_path, capsys):
-    from magtwin.cli import main
-    from magtwin.io.formats import read_run
+def test_an_imu_without_orientation_is_taken_as_upright(tmp_path):
+    run = read_bag(record(tmp_path / "a.mcap", {**BASE, "/imu": imu(np.zeros(4))}))
+    assert np.isnan(run["imu_q_xyzw"]).all()
+    assert_allclose(run["imu_a"], 0, atol=1e-12)
+    assert "120 of 120 orientations of /imu as missing" in run.metadata["taken"]
 
-    bag, out = record(tmp_path / "bag", {MAG: readings(), "/vrpn/pose": poses()}), tmp_path / "run.parquet"
+
+def test_readings_lie_between_poses_and_are_level(tmp_path):
+    roll = Rotation.from_euler("x", 0.2)
+    tilted = said(at(20), lambda k, t: pose(t, (0.2 * t, 0, 0), turned(0.3 * t) * roll))
+    field = said(at(50), lambda k, t: magnetic(t, *((turned(0.3 * t) * roll).inv().apply(WORLD) * 1e-9)))
+    field[7] = (field[7][0], *magnetic(at(50)[7], np.nan))
+    gap = [row for row in tilted if not 1.0 < row[0] < 2.0]
+    survey = read_readings(record(tmp_path / "a.mcap", {"/mag": field, "/pose": gap}))
+    assert len(survey) == 145
+    assert "(55 of 200 rows without a value left out)" in survey.source
+    assert_allclose(survey.p_xy[:, 0], 0.2 * survey.t, atol=1e-9)
+    level = np.array([turned(0.3 * t).inv().apply(WORLD) for t in survey.t])
+    assert_allclose(survey.b_body_nt, level, rtol=1e-6)
+
+
+LATER = [(t, *pose(t - 1.1 * (k in (40, 60)), (0, 0, 0), UPRIGHT)) for k, t in enumerate(at(20))]
+REFUSED = {
+    r"no field topic \(sensor_msgs/msg/MagneticField, .*\); topics in it: /robot/field/depth \(": (
+        {"/robot/field/depth": poses()},
+        {},
+    ),
+    r"no field topic .*; topics in it: /rosout \(std_msgs": ({}, {}),
+    r"no topic /vrpn; topics in it: /robot/qtfm/magnitude": ({MAG: readings()}, {POSE: "/vrpn"}),
+    r"no topic /pos; did you mean '/pose'": (BASE, {POSE: "/pos"}),
+    "^no topic '/robot/pose'; did you mean '/robot/enu/pose'": (BASE, {"/robot/pose": "/a"}),
+    r"/robot/enu/pose is a sensor_msgs/msg/MagneticField; it must be geometry_msgs/msg/PoseStamped or": (
+        {MAG: readings(), POSE: readings()},
+        {},
+    ),
+    r"stamps of /robot/qtfm/magnitude run backwards: .* in message 2 of 50": (
+        {MAG: [(t, *magnetic(1.0 - 0.001 * k, 41_000)) for k, t in enumerate(at(50, 1.0))]},
+        {},
+    ),
+    r"stamps of /pose run backwards: .* in message 41 of 80": ({"/mag": readings(), "/pose": LATER}, {}),
+    r"/pose spans 1000000.000\.\.1000003.950 s since .* are they of one clock": (
+        {
+            "/mag": readings(),
+            "/pose": said(at(20, offset=1e6), lambda k, t: pose(t, (0, 0, 0), UPRIGHT), -1e6),
+        },
+        {},
+    ),
+    r"no message of /mag holds a number": ({"/mag": said(at(50), lambda k, t: magnetic(t, np.nan))}, {}),
+    r"the mean of /mag is 4.10995; in no unit is that the Earth's field": ({"/mag": readings(1e-4)}, {}),
+    r"topic /pose has no message": ({"/mag": readings(), "/pose": []}, {POSE: "/pose"}),
+    r"80 of 80 poses of /pose cannot be used, the first at 0\.000 s: its quaternion is 0,0,0,0": (
+        {
+            "/mag": readings(),
+            "/pose": said(at(20), lambda k, t: ("geometry_msgs/msg/PoseStamped", stamped(t))),
+        },
+        {},
+    ),
+}
+
+
+@pytest.mark.parametrize("text", REFUSED)
+def test_what_cannot_be_a_run_is_refused_with_what_is_there(tmp_path, text):
+    topics, names = REFUSED[text]
+    bag = record(tmp_path / "bag", {"/rosout": drive()["/rosout"], **topics})
+    with pytest.raises(InputError, match=text) as refusal:
+        read_bag(bag, topics=names)
+    assert str(bag) in str(refusal.value) or "no topic '" in text
+    assert "\n" not in str(refusal.value)
+
+
+def test_convert_takes_the_names_of_topics(tmp_path, capsys):
+    bag = record(tmp_path / "bag", {MAG: readings(), "/vrpn/pose": poses(), "/slam": poses()})
+    out = tmp_path / "run.parquet"
     main(["convert", str(bag), str(out), "--remap", f"{POSE}:=/vrpn/pose", "--unit", "nT"])
     assert "p_world_base" in read_run(out)
     for topic, text in {
         "/vrpn/pose": "/robot/enu/pose:=/vrpn/pose, each once, got '/vrpn/pose'",
         f"{POSE}=/vrnp/pose": "no topic /vrnp/pose; did you mean '/vrpn/pose'",
     }.items():
-        with pytest.raises(SystemExit, match="1"):
-            main(["convert", str(bag), str(out), "--force", "--remap", topic])
-        assert text in capsys.readouterr().err
+        assert text in refused(capsys, "convert", bag, out, "--force", "--remap", topic)
     with pytest.raises(InputError, match=r"Parquet has no option .unit.; drop it"):
         read_run(out, unit="T")
 
 
 def test_a_bag_in_two_files_is_one(tmp_path):
     """As `ros2 bag record --max-bag-duration` makes them."""
-    import yaml
-
-    whole = drive()
-    half = START + 2 * 10**9
-    for k, keep in enumerate((lambda t: t < half, lambda t: t >= half)):
-        part = {
-            topic: [m for m in said if keep(m[0])] for topic, said in whole.items() if topic in (MAG, POSE)
-        }
-        record(tmp_path / f"part_{k}", part, "sqlite3")
+    for k in range(2):
+        half = {topic: [row for row in rows if (row[0] >= 2) == k] for topic, rows in BASE.items()}
+        as_db3(record(tmp_path / f"{k}.mcap", half), tmp_path / f"part_{k}")
     bag = tmp_path / "part_0"
     (tmp_path / "part_1" / "part_1.db3").rename(bag / "part_1.db3")
     told = yaml.safe_load((bag / "metadata.yaml").read_text())
     told["rosbag2_bagfile_information"]["relative_file_paths"].append("part_1.db3")
     (bag / "metadata.yaml").write_text(yaml.safe_dump(told))
-    (tmp_path / "one").mkdir()
-    one = read_bag(record(tmp_path / "one" / "bag", {MAG: whole[MAG], POSE: whole[POSE]}))
-    two = read_bag(bag)
+    one, two = read_bag(record(tmp_path / "one.mcap", BASE)), read_bag(bag)
     for name in one:
         assert_array_equal(one[name], two[name])
 
 
-def test_metadata_that_points_outside_its_folder_reaches_nothing_and_runs_nothing(tmp_path, monkeypatch):
+def test_metadata_that_is_none_or_points_outside_its_folder_reaches_nothing_and_runs_nothing(
+    tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     bag = record(tmp_path / "bag", {MAG: readings()})
-    (bag / "bag.mcap").rename(tmp_path / "bag.mcap")
+    (bag / "bag_0.mcap").rename(tmp_path / "bag_0.mcap")
     text = (bag / "metadata.yaml").read_text()
-    (bag / "metadata.yaml").write_text(text.replace("bag.mcap", "../bag.mcap"))
-    with pytest.raises(InputError, match=r"storage file bag\.mcap is missing"):
+    (bag / "metadata.yaml").write_text(text.replace("bag_0.mcap", "../bag_0.mcap"))
+    with pytest.raises(InputError, match=r"storage file bag_0\.mcap is missing"):
         read_bag(bag)
-    for bad in (
+    texts = [
         "",
         "{",
         "rosbag2_bagfile_information: 1\n",
         "!!python/object/apply:os.system ['touch x']\n",
         "[" * 500,
-    ):
+    ]
+    for bad in [*texts, "rosbag2_bagfile_information:\n  version: 99\n"]:
         (bag / "metadata.yaml").write_text(bad)
         with pytest.raises(InputError, match="bag: damaged bag, or none") as refusal:
             read_bag(bag)
         assert "\n" not in str(refusal.value)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["bag", "bag.mcap"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["bag", "bag_0.mcap"]
+
+
+@pytest.mark.parametrize("storage", ["mcap", "db3"])
+@pytest.mark.parametrize("keep", [0.0, 0.01, 0.5, 0.8])
+def test_a_bag_that_was_cut_short_is_refused_in_one_line(tmp_path, storage, keep):
+    file = record(tmp_path / "a.mcap", BASE)
+    file = file if storage == "mcap" else as_db3(file, tmp_path / "a.db3")
+    content = file.read_bytes()
+    file.write_bytes(content[: int(keep * len(content))])
+    with pytest.raises(InputError, match=r"a\.\w+: (damaged bag, or none|cut short)") as refusal:
+        read_bag(file)
+    assert "\n" not in str(refusal.value)

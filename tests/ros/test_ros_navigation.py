@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from magtwin.frames import quat_from_yaw, rotate, wrap_angle, yaw_from_quat
 from magtwin.io.bags.sender import Transforms
-from magtwin.io.bags.topics import COMMAND, LATCHED, ODOMETRY, TF, TF_STATIC, TRUTH, Qos
+from magtwin.io.bags.topics import COMMAND, LATCHED, ODOMETRY, TF, TF_STATIC, Qos
 from magtwin.io.bags.types import typestore
 from magtwin.localizing import live_problem
 from magtwin.path.occupancy import occupancy_of
@@ -20,7 +20,7 @@ from magtwin.ros.localization.poses import ESTIMATE, POSE_KIND, read_pose
 from magtwin.ros.localization.poses import PATH as ESTIMATED_PATH
 from magtwin.ros.parameters import settings
 from magtwin.ros.simulate import Simulator
-from magtwin.ros.topics import FIELD, FIELD_GRID, OCCUPANCY, PATH, READINGS
+from magtwin.ros.topics import FIELD, FIELD_GRID, OCCUPANCY, PATH, READINGS, TRUTH
 from magtwin.ros.views import MOST_POSES, Trail, path_bytes
 from magtwin.twin import Twin, open_twin, room_of
 

@@ -96,10 +96,10 @@ def db3(path, more="", *, data="data BLOB", topics=1, message=b""):
         database.commit()
 
 
-ENDLESS = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT x AS schema_version FROM c"
+ENDLESS = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT x AS id FROM c"
 VIRTUAL = (
     "PRAGMA writable_schema = ON; INSERT INTO sqlite_master "
-    "VALUES ('table', 'schema', 'schema', 0, 'CREATE  VIRTUAL TABLE schema USING dbstat');"
+    "VALUES ('table', 'metadata', 'metadata', 0, 'CREATE  VIRTUAL TABLE metadata USING dbstat');"
 )
 COMPUTED = "data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL"
 
@@ -237,10 +237,10 @@ BOMBS = {
     ),
     "column.csv": (lambda p: p.write_text("# column t " + "[" * 99_999 + "\nt\n0\n"), read_run, "not JSON"),
     "images.mcap": (mcap, read_messages, "that decode to"),
-    "endless.db3": (lambda p: db3(p, f"CREATE VIEW schema AS {ENDLESS}"), read_run, "schema is computed"),
-    "computed.db3": (lambda p: db3(p, data=COMPUTED), read_messages, "messages has a computed column"),
-    "virtual.db3": (lambda p: db3(p, VIRTUAL), read_run, "schema is computed"),
-    "topics.db3": (lambda p: db3(p, topics=9000), read_run, "9000 topics have 1 numbers"),
+    "endless.db3": (lambda p: db3(p, f"CREATE VIEW metadata AS {ENDLESS}"), read_run, "metadata is computed"),
+    "computed.db3": (lambda p: db3(p, data=COMPUTED), read_messages, "messages is computed"),
+    "virtual.db3": (lambda p: db3(p, VIRTUAL), read_run, "metadata is computed"),
+    "topics.db3": (lambda p: db3(p, topics=10_001), read_run, "it has over 10,000 topics"),
     "file": (lambda p: bag(p, "FILE"), read_messages, "that decode to"),
     "message": (lambda p: bag(p, "MESSAGE"), read_messages, "that decode to"),
     "merges": (lambda p: bag(p, "MESSAGE", MERGES), read_messages, "a table of over 10000 entries"),

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import OURS_THEIRS, Force, Jobs, Remap, Unit, pairs
+from magtwin.cli.options import RECORDED, Force, Jobs, RecordedOptions, pairs
 from magtwin.cli.terminal import Done, progress, step
 from magtwin.errors import InputError
 
@@ -28,8 +28,7 @@ def build(
     session_by: By = "metadata",
     path_by: By = "metadata",
     rate_hz: float | None = None,
-    remap: Remap = None,
-    unit: Unit = None,
+    recorded: RecordedOptions = RECORDED,
     column: Annotated[list[str] | None, Parameter(negative="")] = None,
     jobs: Jobs = None,
     force: Force = False,
@@ -72,11 +71,10 @@ def build(
     if given and alignment == "fit":
         raise InputError("--alignment fit finds both; drop it, or --lever-arm-m and --latency-s")
     known: Any = Alignment(lever_arm_m or (0.0, 0.0), latency_s or 0.0) if given else None
-    reading: dict[str, Any] = {"topics": pairs("remap", remap, OURS_THEIRS), "unit": unit}
     columns = pairs("column", column, "NAME=THEIRS, such as yaw=heading")
     if len(set(columns.values())) < len(columns):
         raise InputError(f"--column names one column twice, got {' '.join(column or ())}")
-    reading["columns"] = columns
+    reading = recorded.options | ({"columns": columns} if columns else {})
     with progress("Labelling", "recordings") as advance:
         made = build_dataset(
             run,
@@ -89,7 +87,7 @@ def build(
             jobs=jobs,
             force=force,
             progress=advance,
-            **{name: value for name, value in reading.items() if value},
+            **reading,
         )
     return Done(made.report(), out)
 

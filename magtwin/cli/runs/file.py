@@ -6,12 +6,12 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import OURS_THEIRS, Force, OutUnit, Remap, RunScene, Unit, UsdFps, pairs
+from magtwin.cli.options import RECORDED, Force, OutUnit, RecordedOptions, RunScene, UsdFps
 from magtwin.cli.terminal import Done, progress, silence, step
 
 
 @app.command
-def info(file: Path) -> Done:
+def info(file: Path, *, recorded: RecordedOptions = RECORDED) -> Done:
     """Print what a run, a stage, a map or a network holds, and its origin.
 
     Parameters
@@ -24,7 +24,7 @@ def info(file: Path) -> Done:
     from magtwin.io.info import info_of
 
     step(f"Reading {file.name}")
-    return Done(info_of(file))
+    return Done(info_of(file, **recorded.options))
 
 
 @app.command
@@ -58,11 +58,9 @@ def convert(
     out: Path,
     *,
     scene: RunScene = None,
-    storage: Literal["mcap", "sqlite3"] | None = None,
     out_unit: OutUnit = None,
     usd_fps: UsdFps = None,
-    remap: Remap = None,
-    unit: Unit = None,
+    recorded: RecordedOptions = RECORDED,
     force: Force = False,
 ) -> Done:
     """Convert a run to another format, or import a ROS bag.
@@ -74,8 +72,6 @@ def convert(
     out
         File to make: .parquet, .csv, .npz, .rrd, .mcap, .usd, .usda or .usdc. A name without a suffix is the
         folder of a rosbag2.
-    storage
-        Storage of a bag. Default: mcap.
     """
     from magtwin.io.convert import convert_run
 
@@ -84,12 +80,10 @@ def convert(
         run,
         out,
         scene=scene,
-        storage=storage,
         out_unit=out_unit,
         usd_fps=usd_fps,
-        topics=pairs("remap", remap, OURS_THEIRS) or None,
-        unit=unit,
         force=force,
+        **recorded.options,
     )
     rows = f"{result.rows:,} rows, {len(result)} columns, {result.duration_s:g} s"
     data = {"rows": result.rows, "columns": len(result), "duration_s": result.duration_s}

@@ -144,12 +144,12 @@ def run(
         Duration of the run [s]. If it is longer than one pass along the path, the robot drives further laps.
         Default: once along the path.
     out
-        Output; may be repeated. A file gets the format of its suffix: .rrd, .parquet, .mcap, .db3, .csv,
-        .npz, .usd, .usda or .usdc. A name without a suffix is a folder with run.rrd, run.parquet and run.png.
+        Output; may be repeated. A file gets the format of its suffix: .rrd, .parquet, .mcap, .csv, .npz,
+        .usd, .usda or .usdc. A name without a suffix is a folder with run.rrd, run.parquet and run.png.
         Default: the folder run.
     scans
-        Cast the LiDAR's rays while it spins. Files .rrd, .mcap and .db3 contain the scans. For .parquet, .csv
-        and .npz, the scans go into a second file such as run.scans.parquet.
+        Cast the LiDAR's rays while it spins. Files .rrd and .mcap contain the scans. For .parquet, .csv and
+        .npz, the scans go into a second file such as run.scans.parquet.
     live
         Show the run in a Rerun viewer while it goes on. Until it ends, the names of growing files contain
         "partial" or "parts". Ctrl-C ends it and keeps what was driven.

@@ -1,4 +1,4 @@
-"""Bags: rosbag2 in MCAP and sqlite3, read and written without ROS.
+"""Bags: rosbag2, read and written without ROS.
 
 Messages are decoded with the type definitions of rosbags, never with those that a bag contains.
 """
@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from magtwin.io.bags.reader import read_bag as read_bag
-    from magtwin.io.bags.survey import read_bag_readings as read_bag_readings
     from magtwin.io.bags.writer import BagWriter as BagWriter
     from magtwin.io.bags.writer import RawBagWriter as RawBagWriter
     from magtwin.io.bags.writer import write_bag as write_bag
 
-_MODULES = {"read_bag": "reader", "read_bag_readings": "survey"}
+_MODULES = {"read_bag": "reader"}
 _MODULES |= dict.fromkeys(("BagWriter", "RawBagWriter", "write_bag"), "writer")
 
-__all__ = ["BagWriter", "RawBagWriter", "read_bag", "read_bag_readings", "write_bag"]
+__all__ = ["BagWriter", "RawBagWriter", "read_bag", "write_bag"]
 
 
 def __getattr__(name: str) -> Any:

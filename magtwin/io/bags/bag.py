@@ -1,4 +1,4 @@
-"""Bag: the reading layer of all bags: storage files, topics, types, stamps, and the unit of the field."""
+"""Bag: the reading layer of all bags: storage files, topics, types, stamps and frames."""
 
 import json
 import warnings
@@ -14,7 +14,6 @@ import yaml
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, RepairWarning, hint
-from magtwin.field.units import GREATEST_MEAN_NT, LEAST_MEAN_NT, NT_PER, Unit, check_unit
 from magtwin.files import existing, existing_file, read_text, yaml_loader
 from magtwin.io.bags.cdr import NS, Index, Messages, decode
 from magtwin.io.bags.compression import Room
@@ -49,9 +48,6 @@ LATE_S = 1.0
 WRONG = 0.01
 """Share of messages with wrong stamps up to which they are left out."""
 
-IRON = 2.0
-"""Factor by which iron near the sensor may change the mean of the field."""
-
 UNSET_NS = 10**7 * NS
 """Median of stamps from which a stamp of 0 was not set, and is not the beginning of a simulation [ns]."""
 
@@ -60,8 +56,8 @@ class Bag:
     """An open bag: all of its storage files as one.
 
     Args:
-        path: Folder of a rosbag2, or a storage file (.mcap, .db3).
-        recover: Read a truncated file up to its last whole chunk. Always done if the name is partial.
+        path: Folder of a rosbag2, or a storage file (.mcap, .db3). A truncated file is read up to its last
+            whole chunk if its name is partial.
 
     Attributes:
         path: As given.
@@ -72,7 +68,7 @@ class Bag:
         InputError: There is no bag, or it is damaged or truncated.
     """
 
-    def __init__(self, path: Path, *, recover: bool = False) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = existing(path, "bag")
         self.kinds: dict[str, str] = {}
         self._readers: list[McapReader | Db3Reader] = []
@@ -94,7 +90,7 @@ class Bag:
                     self._custom |= {CUSTOM + key: value for key, value in reader.notes.get(NOTE, {}).items()}
                 else:
                     self._custom |= reader.notes
-            if not (all(reader.whole for reader in self._readers) or recover or PARTIAL in self.path.name):
+            if not (all(reader.whole for reader in self._readers) or PARTIAL in self.path.name):
                 raise InputError(
                     f"{self.path}: cut short: its end is missing; copy it again, or rename it such as "
                     f"{partial_of(self.path).name} to read the whole part"
@@ -198,7 +194,8 @@ class Bag:
 
     def listed(self) -> str:
         """The topics with their types."""
-        return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(self.kinds.items())) or "none"
+        none = "of unknown type, as its schema is missing"
+        return ", ".join(f"{topic} ({kind or none})" for topic, kind in sorted(self.kinds.items())) or "none"
 
 
 class Signal(NamedTuple):
@@ -266,74 +263,6 @@ class Signal(NamedTuple):
         stamps = None if self.stamps is None else self.stamps[rows]
         signal = self._replace(messages=self.messages.take(rows), fields=fields, stamps=stamps)
         return signal, ns[rows], ", ".join(notes)
-
-
-class Field(NamedTuple):
-    """A magnetic field in nT."""
-
-    b_nt: Array
-    """Magnitude [nT], shape (N,)."""
-
-    vector_nt: Array | None
-    """Vector [nT], shape (N, 3). None: the messages hold a magnitude."""
-
-    label: str
-    """Unit of the messages."""
-
-
-def field_nt(
-    b: Array, where: str, topic: str, *, unit: Unit | None = None, scale: float | None = None
-) -> Field:
-    """The field of messages in nT.
-
-    A mean that is up to twice too large or too small for the Earth's field is taken with a warning: it may be
-    that of iron near the sensor.
-
-    Args:
-        b: Magnitudes, shape (N,), or vectors, shape (N, 3). Vectors whose y and z are all 0 are magnitudes in
-            x, as APRILab's robot publishes them.
-        where: The file, for refusals.
-        topic: The topic, for refusals.
-        unit: Their unit. Default: the unit that makes their mean the Earth's field.
-        scale: Factor to nT, in place of a unit.
-
-    Raises:
-        InputError: The mean cannot be the Earth's field, or no message holds a number.
-    """
-    vector = b if b.ndim == 2 and np.any(b[:, 1:] != 0) else None
-    size = np.abs(b if b.ndim == 1 else b[:, 0]) if vector is None else np.linalg.norm(b, axis=1)
-    finite = size[np.isfinite(size)]
-    if not len(finite):
-        raise InputError(f"{where}: no message of {topic} holds a number")
-    if scale is None:
-        unit = unit or unit_of(float(finite.mean()), where, topic)
-    factor = NT_PER[unit] if unit else float(scale or 1.0)
-    mean = factor * float(finite.mean())
-    if unit and not _is_earths(mean) and _is_earths(mean, IRON):
-        text = f"{where}: the mean of {topic} is {mean:,.0f} nT in {unit}, not that of the Earth's field"
-        text += ": iron near the sensor, or another unit (--unit, --scale)"
-        warnings.warn(text, RepairWarning, stacklevel=3)
-    else:
-        check_unit(factor * finite, where, topic, unit or "nT", scale=scale)
-    label = unit or f"units of {scale:g} nT"
-    return Field(factor * size, None if vector is None else factor * vector, label)
-
-
-def unit_of(mean: float, where: str, topic: str) -> Unit:
-    """The unit in which a mean magnitude is the Earth's field, or at least the Earth's with that of iron.
-
-    The ranges of the units do not overlap.
-    """
-    for apart in (1.0, IRON):
-        for unit, factor in NT_PER.items():
-            if _is_earths(mean * factor, apart):
-                return unit  # type: ignore[return-value]
-    raise InputError(f"{where}: the mean of {topic} is {mean:.6g}; in no unit is that the Earth's field")
-
-
-def _is_earths(mean_nt: float, apart: float = 1.0) -> bool:
-    """Whether a mean may be that of the Earth's field, or up to a factor of it [nT]."""
-    return LEAST_MEAN_NT / apart <= mean_nt < GREATEST_MEAN_NT * apart
 
 
 @contextmanager

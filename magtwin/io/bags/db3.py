@@ -1,76 +1,29 @@
-"""db3: bags in sqlite3. rosbags writes them; they are read here, on the connection that was checked."""
+"""db3: bags in sqlite3, the older storage of rosbag2. They are read, not written."""
 
-import shutil
 import sqlite3
 from array import array
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
-from rosbags.rosbag2 import StoragePlugin, Writer
 
 from magtwin.budget import BUDGETS, check_decoded
 from magtwin.errors import InputError
 from magtwin.files import yaml_loader
 from magtwin.io.bags.cdr import Messages
-from magtwin.io.bags.storage import ROOM, VERSION, Batch, Connection, StoredTopic, in_time
+from magtwin.io.bags.storage import StoredTopic
 
-_HEAD = 100
-"""Bytes of the header of an sqlite file, which its first page begins with."""
+_STEPS, _STEP = 1_000_000, 10_000
+"""Steps of sqlite's machine that any file may take, and those between two counts."""
+
+_STEPS_PER_BYTE = 5
+"""Further steps for each byte of a file. A message takes about 20 and has 20 bytes or more, but pages of a
+damaged file can lead to each other again and again."""
 
 _ROWS = 10_000
-"""Most topics and definitions of a bag."""
-
-_PLAIN = "CREATE TABLE ", "CREATE INDEX ", "CREATE UNIQUE INDEX ", "CREATE TRIGGER "
-"""How sqlite begins the text of all but views and virtual tables."""
-
-
-class Db3Writer:
-    """A sqlite3 bag, which is complete once it is closed.
-
-    Args:
-        path: The folder of a bag to make, or its storage file, which ends in .db3.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._folder = path.with_suffix("") if path.suffix else path
-        self._writer = Writer(self._folder, version=VERSION, storage_plugin=StoragePlugin.SQLITE3)
-        self._writer.open()
-        self._connections: dict[int, Any] = {}
-
-    def add(self, connection: Connection) -> None:
-        """Register a topic."""
-        self._connections[connection.id] = self._writer.add_connection(
-            connection.topic,
-            connection.kind,
-            msgdef=connection.definition,
-            rihs01=connection.digest,
-            offered_qos_profiles=[connection.rosbags_qos],
-        )
-
-    def write(self, batches: Sequence[Batch]) -> None:
-        """Write messages in the order of their times."""
-        rows = [iter(batch.rows) for batch in batches]
-        for t, k in zip(*(column.tolist() for column in in_time(batches)), strict=True):
-            data = next(rows[k])[ROOM:].tobytes()
-            self._writer.write(self._connections[batches[k].connection.id], t, data)
-
-    def close(self, custom: Mapping[str, str]) -> None:
-        """Complete the bag; `custom` is its custom data."""
-        for key, value in custom.items():
-            self._writer.set_custom_data(key, value)
-        self._writer.close()
-        if self._folder != self._path:
-            next(self._folder.glob("*.db3")).rename(self._path)
-            shutil.rmtree(self._folder)
-
-    def abort(self) -> None:
-        """Give up; nothing can be read."""
-        self._writer.abort()
+"""Most topics of a bag."""
 
 
 class Db3Reader:
@@ -86,20 +39,15 @@ class Db3Reader:
     whole = True
 
     def __init__(self, path: Path) -> None:
-        self._path, self._size = path, path.stat().st_size
-        pages = _Pages(path)
-        pages.check([1])  # the list of tables, before sqlite reads it
+        self._path, self._size, self._steps = path, path.stat().st_size, 0
         self._database = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
         try:
+            self._database.set_progress_handler(self._spent, _STEP)
             longest = self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, BUDGETS["text"].file)
-            roots = "SELECT CAST(rootpage AS INTEGER) FROM sqlite_master WHERE rootpage > 0"
-            pages.check([root for (root,) in self._database.execute(roots)])
-            _check_tables(self._database)
-            _check_rows(self._database)
-            self.notes = _custom_data(self._database)
+            tables = _tables(self._database)
+            self.notes = _custom_data(self._database) if "metadata" in tables else {}
             self.topics = _topics(self._database)
             self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, longest)
-            _check_messages(self._database, path)
         except BaseException:
             self.close()
             raise
@@ -114,7 +62,7 @@ class Db3Reader:
         query = (
             f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({', '.join('?' * len(ids))})"
         )
-        held = 0
+        held = self._steps = 0
         for number, received, data in self._database.execute(query, list(ids)):
             times, sizes, contents = found[number]
             held += len(data)  # rows of a damaged file can share their pages
@@ -129,92 +77,29 @@ class Db3Reader:
             joined[number] = Messages(moments, buffer, np.cumsum(size) - size, size).in_order()
         return joined
 
-
-class _Pages:
-    """The pages of an sqlite file, which are trees. sqlite follows a page as often as others point to it."""
-
-    def __init__(self, path: Path) -> None:
-        content = np.memmap(path, np.uint8, "r") if path.stat().st_size else np.empty(0, np.uint8)
-        size = int.from_bytes(content[16:18].tobytes())
-        size = 1 << 16 if size == 1 else max(size, 512)  # sqlite refuses a smaller one
-        count = len(content) // size
-        self._pages = content[: count * size].reshape(count, size)
-        self._used = np.zeros(count + 1, bool)
-
-    def check(self, roots: Sequence[int]) -> None:
-        """Refuse trees that use a page twice, or one of an earlier tree.
-
-        Raises:
-            InputError: They do.
-        """
-        level = np.array(roots, np.int64)
-        while len(level := level[(level > 0) & (level < len(self._used))]):  # sqlite refuses others
-            if len(np.unique(level)) < len(level) or self._used[level].any():
-                raise InputError("its tables use a page twice; get the file again")
-            self._used[level] = True
-            kinds = self._pages[level - 1, np.where(level == 1, _HEAD, 0)]
-            inner = level[(kinds == 2) | (kinds == 5)]
-            level = np.concatenate([np.empty(0, np.int64), *map(self._below, inner.tolist())])
-
-    def _below(self, number: int) -> NDArray[np.int64]:
-        """The pages to which an inner page points."""
-        page, head = self._pages[number - 1], _HEAD if number == 1 else 0
-        count = int.from_bytes(page[head + 3 : head + 5].tobytes())
-        cells = np.frombuffer(page[head + 12 : head + 12 + 2 * count].tobytes(), ">u2") & (len(page) - 1)
-        at = np.append(cells[cells <= len(page) - 4], head + 8).astype(np.int64)
-        return page[at[:, None] + np.arange(4)].view(">u4")[:, 0].astype(np.int64)
+    def _spent(self) -> bool:
+        """Whether sqlite has to give up."""
+        self._steps += _STEP
+        return self._steps > _STEPS + _STEPS_PER_BYTE * self._size
 
 
-def _check_tables(database: sqlite3.Connection) -> None:
-    """Refuse contents that are computed, as a few bytes can make rows without end.
+def _tables(database: sqlite3.Connection) -> set[str]:
+    """Names of its tables, in lower case, as sqlite ignores the case.
 
     Raises:
-        InputError: There is a view, a virtual table or a computed column; or topics share a number, so that
-            joining them with their messages multiplies both.
+        InputError: A table is missing; or contents are computed, as a few bytes can make rows without end.
     """
-    contents = database.execute("SELECT name, sql FROM sqlite_master").fetchall()
-    for name, sql in contents:
-        if sql is not None and not str(sql).startswith(_PLAIN):
-            raise InputError(f"{name} is computed; a bag has plain tables only")
-        columns = database.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,)).fetchall()
-        if any(hidden for (hidden,) in columns):
-            raise InputError(f"table {name} has a computed column; a bag has plain tables only")
-    if not {"messages", "topics"} <= _tables(database):
+    tables = set()
+    for name, sql in database.execute("SELECT CAST(name AS BLOB), sql FROM sqlite_master"):
+        name = (name or b"").decode(errors="replace").lower()
+        if name in ("messages", "topics", "metadata"):
+            hidden = database.execute("SELECT count(*) FROM pragma_table_xinfo(?) WHERE hidden", (name,))
+            if not str(sql).startswith("CREATE TABLE ") or hidden.fetchone() != (0,):
+                raise InputError(f"{name} is computed; a bag has plain tables only")
+            tables.add(name)
+    if not {"messages", "topics"} <= tables:
         raise InputError("missing tables: a bag has messages and topics")
-    topics, numbers = database.execute("SELECT count(id), count(DISTINCT id) FROM topics").fetchone()
-    if topics != numbers:
-        raise InputError(f"{topics} topics have {numbers} numbers; each needs its own")
-
-
-def _check_rows(database: sqlite3.Connection) -> None:
-    """Refuse topics that are too many or too large together, as rows of a damaged file can share their pages.
-
-    Raises:
-        InputError: They are.
-    """
-    rows, held = 0, 0
-    database.text_factory = bytes
-    for table in sorted({"schema", "metadata", "topics", "message_definitions"} & _tables(database)):
-        for row in database.execute(f"SELECT * FROM {table}"):
-            rows, held = rows + 1, held + sum(len(value) for value in row if isinstance(value, bytes))
-            if rows > _ROWS or held > BUDGETS["text"].file:
-                raise InputError(
-                    f"its topics have {rows:,} rows of {held:,} bytes; write it again with fewer"
-                )
-    database.text_factory = str
-
-
-def _check_messages(database: sqlite3.Connection, path: Path) -> None:
-    """Refuse messages that are too large together.
-
-    Raises:
-        InputError: They are.
-    """
-    sizes = "total(CASE typeof(data) WHEN 'blob' THEN length(data) END), total(typeof(data) <> 'blob')"
-    size, others = database.execute(f"SELECT {sizes} FROM messages").fetchone()
-    if others:
-        raise InputError(f"{others:.0f} of its messages are not bytes; write it again")
-    check_decoded(path, path.stat().st_size, int(size))
+    return tables
 
 
 def _topics(database: sqlite3.Connection) -> list[StoredTopic]:
@@ -222,20 +107,17 @@ def _topics(database: sqlite3.Connection) -> list[StoredTopic]:
     columns = (
         "CAST(id AS INTEGER), CAST(name AS TEXT), CAST(type AS TEXT), CAST(serialization_format AS TEXT)"
     )
-    rows = database.execute(f"SELECT {columns} FROM topics WHERE id IS NOT NULL ORDER BY id")
-    return [StoredTopic(row[0], *(text or "" for text in row[1:])) for row in rows]
-
-
-def _tables(database: sqlite3.Connection) -> set[str]:
-    """Names of its tables, of which sqlite ignores the case."""
-    names = database.execute("SELECT CAST(name AS BLOB) FROM sqlite_master")
-    return {name.decode(errors="replace").lower() for (name,) in names if name is not None}
+    topics, held = [], 0
+    for number, *texts in database.execute(f"SELECT {columns} FROM topics WHERE id IS NOT NULL"):
+        topics.append(StoredTopic(number, *(text or "" for text in texts)))
+        held += sum(map(len, topics[-1][1:]))  # rows of a damaged file can share their pages
+        if len(topics) > _ROWS or held > BUDGETS["text"].file:
+            raise InputError(f"it has over {_ROWS:,} topics, or they are too long; write it again with fewer")
+    return sorted(topics)
 
 
 def _custom_data(database: sqlite3.Connection) -> dict[str, str]:
     """The custom data that a .db3 file holds beside its messages; empty if it holds none."""
-    if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'metadata'").fetchone():
-        return {}
     row = database.execute("SELECT metadata FROM metadata ORDER BY id DESC LIMIT 1").fetchone()
     if row and len(row[0]) > BUDGETS["YAML"].file:
         raise InputError(f"its metadata have {len(row[0]):,} bytes; write it again")

@@ -56,7 +56,7 @@ def corrected(bag: Bag, odometry: Signal) -> tuple[Signal, str] | None:
     p_odom, q_odom = (odometry.fields[leaf] for leaf in leaves)
     moved = dict(zip(leaves, (p + rotate(q, p_odom), quat_multiply(q, q_odom)), strict=True))
     by = f"by up to {far:.3g} m and {np.degrees(turn):.3g} deg"
-    text = f"poses of {odometry.name} from {frame!r:.40} to {parent!r:.40}, by {TF.name} ({by})"
+    text = f"{odometry.name} from {frame!r:.40} to {parent!r:.40}, by {TF.name} ({by})"
     return odometry._replace(fields={**odometry.fields, **moved}), text
 
 

@@ -1,9 +1,9 @@
-"""Storage: what the two storages of a rosbag2, MCAP and sqlite3, have in common."""
+"""Storage: topics and messages as a storage file of a rosbag2 holds them, and its metadata.yaml."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -12,12 +12,7 @@ from numpy.typing import NDArray
 from magtwin.io.bags.cdr import Bytes, Index
 from magtwin.io.bags.topics import Qos
 
-Storage = Literal["mcap", "sqlite3"]
-
-STORAGES: Mapping[str, str] = {"mcap": ".mcap", "sqlite3": ".db3"}
-"""Suffix of a storage's files."""
-
-VERSION: Literal[8] = 8
+VERSION = 8
 """Version of metadata.yaml: the newest one that ROS 2 Humble reads."""
 
 ROOM = 31
@@ -42,22 +37,16 @@ class Connection:
     qos: Qos
 
     @cached_property
-    def rosbags_qos(self) -> Any:
-        """The quality of service as a `rosbags.interfaces.Qos`, with infinite durations."""
+    def offered_qos(self) -> str:
+        """The quality of service as YAML, as rosbag2 stores it, with infinite durations."""
         from rosbags import interfaces as ros
+        from rosbags.rosbag2.metadata import dump_qos_v8
 
         infinite, qos = ros.QosTime(9223372036, 854775807), self.qos
         reliability = ros.QosReliability.RELIABLE if qos.reliable else ros.QosReliability.BEST_EFFORT
         durability = ros.QosDurability.TRANSIENT_LOCAL if qos.latched else ros.QosDurability.VOLATILE
         kept = (ros.QosHistory.KEEP_LAST, qos.depth, reliability, durability)
-        return ros.Qos(*kept, infinite, infinite, ros.QosLiveliness.AUTOMATIC, infinite, False)
-
-    @cached_property
-    def offered_qos(self) -> str:
-        """The quality of service as YAML, as rosbag2 stores it."""
-        from rosbags.rosbag2.metadata import dump_qos_v8
-
-        return dump_qos_v8([self.rosbags_qos])
+        return dump_qos_v8([ros.Qos(*kept, infinite, infinite, ros.QosLiveliness.AUTOMATIC, infinite, False)])
 
 
 class Batch(NamedTuple):

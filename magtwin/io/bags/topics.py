@@ -220,16 +220,6 @@ def _transforms(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
     return _transform_fields(stamp, chain)
 
 
-def _truth(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
-    return {
-        "child_frame_id": sender.truth_frame,
-        "pose.pose.position": c["p_world_base"],
-        "pose.pose.orientation": c["q_world_base_xyzw"],
-        "twist.twist.linear": c["v_base"],
-        "twist.twist.angular": c["w_base"],
-    }
-
-
 def _static(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
     links = [(link.parent, link.name, np.array(link.p), np.array(link.q_xyzw)) for link in sender.links]
     return _transform_fields(stamp, links)
@@ -311,6 +301,7 @@ MAGNITUDE = Topic(
     more=_magnitude,
     reads={
         _FIELD: {"magnetic_field": "magnetic_field"},
+        "geometry_msgs/msg/Vector3Stamped": {"magnetic_field": "vector"},
         "std_msgs/msg/Float64": {"magnetic_field": "data"},
         "std_msgs/msg/Float32": {"magnetic_field": "data"},
     },
@@ -323,7 +314,10 @@ VECTOR = Topic(
     sent="each",
     frame="magnetometer_frame",
     more=_field,
-    reads={_FIELD: {"magnetic_field": "magnetic_field"}},
+    reads={
+        _FIELD: {"magnetic_field": "magnetic_field"},
+        "geometry_msgs/msg/Vector3Stamped": {"magnetic_field": "vector"},
+    },
 )
 COMMAND = Topic(
     name="/robot/cmd_vel",
@@ -386,15 +380,6 @@ READING = Topic(
     more=lambda c, stamp, sender: {"data": c["data"]},
 )
 
-TOTAL_FIELD = Topic(
-    name="/robot/qtfm/total_field_nt",
-    kind="std_msgs/msg/Float64",
-    needs=("b_measured_nt",),
-    sent="each",
-    more=lambda c, stamp, sender: {"data": c["b_measured_nt"]},
-)
-"""The magnitude in nT, whatever the unit of the other topics; live robots only. In bags, use MAGNITUDE."""
-
 TOPICS: Mapping[str, Topic] = MappingProxyType(
     {
         topic.name: topic
@@ -406,14 +391,3 @@ TOPICS: Mapping[str, Topic] = MappingProxyType(
 )
 """Topics by name. /magtwin/reading holds the columns that no ROS message carries, in the order that
 /magtwin/columns gives."""
-
-TRUTH = Topic(
-    name="/robot/ground_truth",
-    kind="nav_msgs/msg/Odometry",
-    needs=("p_world_base", "q_world_base_xyzw", "v_base", "w_base"),
-    sent="ticks",
-    every_s=1 / 62,
-    frame="map_frame",
-    more=_truth,
-)
-"""The true pose of base_link in the map, with its velocities in base_link; live robots only."""

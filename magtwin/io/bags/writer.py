@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import sqlite3
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -12,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from magtwin.errors import InputError, hint
+from magtwin.errors import InputError
 from magtwin.io.bags.cdr import encode
-from magtwin.io.bags.db3 import Db3Writer
 from magtwin.io.bags.mcap import McapWriter
 from magtwin.io.bags.sender import Unit, sender_for
-from magtwin.io.bags.storage import ROOM, STORAGES, Batch, Connection, Storage, bag_metadata, to_yaml
+from magtwin.io.bags.storage import ROOM, Batch, Connection, bag_metadata, to_yaml
 from magtwin.io.bags.stream import Sent, Stream
 from magtwin.io.bags.topics import Qos
 from magtwin.io.bags.types import definition_of, layout
@@ -50,7 +48,6 @@ def write_bag(
     path: str | os.PathLike[str],
     twin: "Twin | None" = None,
     *,
-    storage: Storage | None = None,
     units: Unit = "T",
     scans: "Scans | None" = None,
     force: bool = False,
@@ -62,9 +59,8 @@ def write_bag(
 
     Args:
         run: The run; its t ascends from 0 or later.
-        path: The folder to make, or a single storage file, which ends in .mcap or .db3.
+        path: The folder to make, or a single file, which ends in .mcap.
         twin: The twin of the run: gives frames, covariances, /tf_static and the robot's description.
-        storage: "mcap", compressed, or "sqlite3". Default: by the suffix of the path, else MCAP.
         units: Unit of magnetic fields: "T", as in ROS, or "nT", as APRILab's robot publishes them.
         scans: The LiDAR's scans.
         force: Replace an existing bag.
@@ -74,11 +70,11 @@ def write_bag(
             does not ascend, or a column cannot stand in a bag.
     """
     path = Path(path)
-    kind = storage_of(path, storage)
+    check_suffix(path)
     check_free(path, force=force)
     sender = sender_for(twin, units, run.metadata.get("rate_hz"))
     with output(path, force=force) as aside, one_line(path):
-        bag = _Bag(aside, kind)
+        bag = _Bag(aside)
         try:
             stream = Stream(run, sender, scans)
             bag.begin(run, stream)
@@ -94,17 +90,15 @@ def write_bag(
 class _Bag:
     """A bag at exactly the given path; an MCAP bag is a file, or a folder with metadata.yaml."""
 
-    def __init__(self, path: Path, storage: Storage = "mcap") -> None:
+    def __init__(self, path: Path) -> None:
         self.connections: dict[str, Connection] = {}
         self.custom: dict[str, str] = {}
-        self._folder = None if storage == "sqlite3" or path.suffix.lower() == ".mcap" else path
+        self._folder = None if path.suffix.lower() == ".mcap" else path
         if self._folder is not None:
             path.mkdir()
             path = path / f"{path.name.removesuffix(PARTIAL)}_0.mcap"
         self._file = path
-        self.store: Any = (
-            Db3Writer(path) if storage == "sqlite3" else McapWriter(path, f"magtwin {__version__}")
-        )
+        self.store = McapWriter(path, f"magtwin {__version__}")
 
     def begin(self, run: Run, stream: Stream) -> None:
         """Register the metadata and the topics of a run."""
@@ -132,11 +126,11 @@ class _Bag:
         entries = {name: json.dumps(value) for name, value in json.loads(metadata_to_json(run)).items()}
         custom = {CUSTOM + name: value for name, value in entries.items()}
         changed, self.custom = custom != self.custom, custom
-        if isinstance(self.store, McapWriter) and (changed or not self.store.counts):
+        if changed or not self.store.counts:
             self.store.note(NOTE, entries)
 
     def flush(self) -> None:
-        """Make everything in an MCAP bag outlive this process."""
+        """Make everything outlive this process."""
         self.store.flush()
         if self._folder is not None:
             aside = self._folder / "metadata.yaml.new"
@@ -147,16 +141,13 @@ class _Bag:
 
     def close(self) -> None:
         """Complete the bag."""
-        if isinstance(self.store, Db3Writer):
-            self.store.close(self.custom)
-            return
         self.store.note("rosbag2", {"serialized_metadata": to_yaml(self._metadata())})
         self.flush()
         self.store.close()
 
     def abort(self) -> None:
         """Leave the bag as it is."""
-        with suppress(OSError, sqlite3.Error):
+        with suppress(OSError):
             self.store.abort()
 
     def _metadata(self, file: str = INSIDE) -> dict[str, Any]:
@@ -173,11 +164,7 @@ class _GrowingBag:
 
     def __init__(self, path: str | os.PathLike[str], *, force: bool) -> None:
         self._path, self._force = Path(path), force
-        if storage_of(self._path, None) != "mcap":
-            raise InputError(
-                f"{self._path}: a bag that grows is MCAP; name it {self._path.with_suffix('.mcap').name}, "
-                "and make a .db3 file of it afterwards with magtwin convert"
-            )
+        check_suffix(self._path)
         check_free(self._path, force=force)
         self.partial = partial_of(self._path)
         """Path until it ends."""
@@ -206,14 +193,14 @@ class BagWriter(_GrowingBag, Sink):
     """A bag that is written block by block while a run goes on.
 
     Args:
-        path: As for `write_bag`, as are the other arguments; a growing bag is MCAP.
+        path: As for `write_bag`, as are the other arguments.
         twin: The twin of the run.
         units: Unit of magnetic fields.
         scans: The LiDAR's scans of the whole run; each is written when it has arrived.
         force: Replace an existing bag, and the rest of an earlier recording.
 
     Raises:
-        InputError: As for `write_bag`; or the path ends in .db3, or an earlier recording left its part there.
+        InputError: As for `write_bag`; or an earlier recording left its part there.
     """
 
     def __init__(
@@ -272,7 +259,7 @@ class RawBagWriter(_GrowingBag):
         force: Replace an existing bag, and the rest of an earlier recording.
 
     Raises:
-        InputError: The path exists and `force` is not set, ends in .db3, or cannot be written.
+        InputError: The path exists and `force` is not set, or cannot be written.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -364,20 +351,17 @@ class RawBagWriter(_GrowingBag):
                 self.partial.unlink()
 
 
-def storage_of(path: Path, storage: str | None) -> Storage:
-    """The storage of a bag to be written to a path.
+def check_suffix(path: Path) -> None:
+    """Refuse a path that is no bag's to be written.
 
     Raises:
-        InputError: The storage is unknown, or does not fit the suffix.
+        InputError: So it is.
     """
-    if storage is not None and storage not in STORAGES:
-        raise InputError(f"no storage {storage!r} of bags; {hint(storage, STORAGES)}")
-    named = next((name for name, suffix in STORAGES.items() if path.suffix.lower() == suffix), None)
-    if named and storage and named != storage:
-        raise InputError(f"{path}: ends as a file of {named}; drop storage {storage!r}, or name a folder")
-    if path.suffix and not named and path.suffix.lower() != PARTIAL:
-        raise InputError(f"{path}: a bag is a folder, without a suffix, or a file that ends in .mcap or .db3")
-    return named or storage or "mcap"  # type: ignore[return-value]
+    if path.suffix.lower() not in ("", ".mcap", PARTIAL):
+        raise InputError(
+            f"{path}: a bag is a folder, without a suffix, or a file that ends in .mcap; ros2 bag convert "
+            "makes a .db3 of either"
+        )
 
 
 @contextmanager
@@ -385,8 +369,8 @@ def one_line(path: Path) -> Iterator[None]:
     """Turn faults of the disk into one line."""
     try:
         yield
-    except (OSError, sqlite3.Error) as error:
-        reason = why_full(path.parent, error) or getattr(error, "strerror", None) or str(error)
+    except OSError as error:
+        reason = why_full(path.parent, error) or error.strerror or str(error)
         raise InputError(f"{path}: cannot be written ({reason})") from error
 
 

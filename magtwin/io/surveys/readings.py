@@ -129,10 +129,13 @@ def read_readings(
         if path.is_dir() or path.suffix.lower() in BAGS:
             _only_unit(path, columns)
         if path.suffix.lower() in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
-            from magtwin.io.bags import read_bag_readings
+            from magtwin.io.bags import read_bag
+            from magtwin.io.bags.topics import MAGNITUDE, POSE
 
-            topics = {"pose_topic": pose_topic, "field_topic": field_topic}
-            parts.append(read_bag_readings(path, unit=columns.unit, scale=columns.scale, **topics))
+            topics = {POSE.name: pose_topic, MAGNITUDE.name: field_topic}
+            named = {ours: theirs for ours, theirs in topics.items() if theirs}
+            run = read_bag(path, topics=named, unit=columns.unit, scale=columns.scale, survey=True)
+            parts.append(readings_of_run(run, name=path.stem, source=_sum(path)))
         elif path.is_dir():
             unit = columns.unit or "nT"
             parts.append(read_grid(path, headings_deg=headings_deg, unit=unit, scale=columns.scale))
@@ -147,7 +150,8 @@ def read_readings(
 def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
     """The readings of a Run: its measured field at the true pose of base_link.
 
-    Rows whose field is nan (outside the map) are left out; rows with lost lock are not good.
+    Rows whose field is nan (outside the map) are left out; rows with lost lock are not good. Of a robot's
+    recording, rows between whose poses there is a gap are left out too, and vectors are read.
 
     Args:
         run: A run with p_world_base, yaw and b_measured_nt, or b_total_nt.
@@ -165,15 +169,24 @@ def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
     b, p, yaw, t = run[field], run["p_world_base"], run["yaw"], run["t"]
     known = np.isfinite(b) & np.isfinite(p).all(axis=1) & np.isfinite(yaw) & np.isfinite(t)
     lost = run["flag_lost_lock"] if "flag_lost_lock" in run else np.zeros(len(b), bool)
+    body, about = None, ""
+    if "bag" in run.metadata:
+        known &= ~run["flag_pose_lost"]
+        about = _recorded(run)
+        if "b_vector_measured_nt" in run:
+            vector = levelled(run["b_vector_measured_nt"], run["q_world_base_xyzw"], "body")
+            known &= np.isfinite(vector).all(axis=1)
+            body = vector[known]
     return Readings(
         p_xy=p[known, :2],
         yaw=yaw[known],
         b_nt=b[known],
+        b_body_nt=body,
         t=t[known],
         good=~lost[known],
         runs=(name,),
         name=name,
-        source=source + _left_out(known),
+        source=source + _left_out(known) + about,
     )
 
 
@@ -748,8 +761,19 @@ def _metadata(path: Path) -> dict[bytes, bytes]:
     return dict(load_parquet(path, pq.read_schema).metadata or {})
 
 
+def _recorded(run: Run) -> str:
+    """How a robot's recording was read, for the source of its readings."""
+    said = run.metadata
+    about = f" (poses of {said['truth']}, field of {said['clock']} in {said['field_unit']}"
+    about += f", {said['field_unit_told']}, stamps of {said['stamps']})"
+    taken = said.get("taken")
+    return about + "".join(f"; {TAKEN}{note}" for note in str(taken).split("; ")) * bool(taken)
+
+
 def _sum(path: Path) -> str:
-    return f"{path.name} sha256:{sha256(path)}"
+    """Names and checksums of a file, or of the files of a folder."""
+    files = [path] if path.is_file() else sorted(file for file in path.iterdir() if file.is_file())
+    return "; ".join(f"{file.name} sha256:{sha256(file)}" for file in files)
 
 
 def _left_out(known: NDArray[np.bool_]) -> str:

@@ -17,7 +17,6 @@ import numpy as np
 from magtwin.errors import InputError, is_termination
 from magtwin.field.units import NT_PER
 from magtwin.frames import quat_from_yaw, yaw_from_quat
-from magtwin.io.bags.bag import unit_of
 from magtwin.io.bags.cdr import NS
 from magtwin.io.bags.sender import prefixed, sender_of
 from magtwin.io.bags.topics import (
@@ -32,6 +31,7 @@ from magtwin.io.bags.topics import (
     Qos,
     Topic,
 )
+from magtwin.io.bags.unit import unit_of
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import Array, Localizer, Prior, Problem, Reading
 from magtwin.localization.track import LocalizerError, checked_estimates

@@ -73,7 +73,7 @@ def run(twin):
     return drive(twin)
 
 
-@pytest.mark.parametrize("suffix", [".parquet", ".csv", ".npz", ".mcap", ".db3", ".rrd"])
+@pytest.mark.parametrize("suffix", [".parquet", ".csv", ".npz", ".mcap", ".rrd"])
 def test_a_long_run_is_written_as_one_that_is_written_at_once(run, twin, tmp_path, monkeypatch, suffix):
     once, long = tmp_path / f"once{suffix}", tmp_path / f"long{suffix}"
     write_run(run, once, twin)
