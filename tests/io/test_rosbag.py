@@ -146,13 +146,13 @@ def test_the_unit_is_told_by_size_or_by_option(tmp_path, factor, unit):
     assert_allclose(read_bag_readings(bag).b_nt, 41_000)
     assert_allclose(read_bag_readings(bag, unit=unit).b_nt, 41_000)
     other = "nT" if unit != "nT" else "T"
-    with pytest.raises(InputError, match=f"the mean of /mag .* in {unit} .* give --unit {unit}"):
+    with pytest.raises(InputError, match=f"the median of /mag .* in {unit} .* give --unit {unit}"):
         read_bag_readings(bag, unit=other)
 
 
 def test_a_field_that_no_unit_makes_the_earths_is_refused(tmp_path):
     topics = {"/pose": drive(), "/mag": at_middle(np.full(40, 3.0))}
-    with pytest.raises(InputError, match="the mean of /mag is 3; in no unit is that the Earth's field"):
+    with pytest.raises(InputError, match="the median of /mag is 3; in no unit is that the Earth's field"):
         read_bag_readings(write_bag(tmp_path / "bag", topics))
 
 

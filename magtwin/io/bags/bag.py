@@ -188,7 +188,7 @@ def field_nt(
             x, as APRILab's robot publishes them.
         where: The file, for refusals.
         topic: The topic, for refusals.
-        unit: Their unit. Default: the unit that makes their mean the Earth's field.
+        unit: Their unit. Default: the unit that makes their median the Earth's field.
         scale: Factor to nT, in place of a unit.
 
     Raises:
@@ -199,20 +199,21 @@ def field_nt(
     finite = size[np.isfinite(size)]
     if not len(finite):
         raise InputError(f"{where}: no message of {topic} holds a number")
+    told = unit is not None or scale is not None
     if scale is None:
-        unit = unit or unit_of(float(finite.mean()), where, topic)
+        unit = unit or unit_of(float(np.median(finite)), where, topic)
     factor = NT_PER[unit] if unit else float(scale or 1.0)
-    check_unit(factor * finite, where, topic, unit or "nT", scale=scale)
+    check_unit(factor * finite, where, topic, unit or "nT", scale=scale, told=told)
     label = unit or f"units of {scale:g} nT"
     return Field(factor * size, None if vector is None else factor * vector, label)
 
 
-def unit_of(mean: float, where: str, topic: str) -> Unit:
-    """The unit in which a mean magnitude is the Earth's field; the ranges of the units do not overlap."""
+def unit_of(usual: float, where: str, topic: str) -> Unit:
+    """The unit in which a median magnitude is the Earth's field; the ranges of the units do not overlap."""
     for unit, factor in NT_PER.items():
-        if LEAST_MEAN_NT <= mean * factor < GREATEST_MEAN_NT:
+        if LEAST_MEAN_NT <= usual * factor < GREATEST_MEAN_NT:
             return unit  # type: ignore[return-value]
-    raise InputError(f"{where}: the mean of {topic} is {mean:.6g}; in no unit is that the Earth's field")
+    raise InputError(f"{where}: the median of {topic} is {usual:.6g}; in no unit is that the Earth's field")
 
 
 def poses_at(t: Array, pose_t: Array, pose: Array) -> tuple[Array, Array, NDArray[np.bool_]]:

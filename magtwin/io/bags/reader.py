@@ -254,7 +254,7 @@ def _columns(
         size = size[np.isfinite(size)]
         if not len(size):
             return {}
-        unit = unit_of(float(size.mean()), str(path), signal.name)  # may differ from the clock's
+        unit = unit_of(float(np.median(size)), str(path), signal.name)  # may differ from the clock's
         metadata["vector_unit"] = unit
         values = {"b_vector_measured_nt": values["magnetic_field"] * NT_PER[unit]}
     for name in values.keys() & {"mocap_q_xyzw", "imu_q_xyzw"}:
