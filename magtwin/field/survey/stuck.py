@@ -3,18 +3,19 @@
 Three tests, each with its rate of false alarms:
 
 - **Frozen.** A frozen sensor repeats the same number to the last digit while the robot moves. A field seldom
-  does: over a distance d it stays within the sensor's resolution q by chance with probability q f / d, where
-  f is the density at 0 of the field's slopes nearby; distances of `REACH_M` or more count as independent. All
-  components of a vector repeat, so the least chance of one counts. On a drive the chance is at least that by
-  the share of repeats beside the stretch, since rounding may not show in the digits. One in a hundred of the
-  stretches found is false, and one sound survey in a hundred shows any (Benjamini & Hochberg 1995, at
-  `FALSE_FROZEN`).
+  does: over a distance d it stays within the sensor's step q (`steps_nt`) by chance with probability q f / d,
+  where f is the density at 0 of the field's slopes nearby; distances of `REACH_M` or more count as
+  independent. One in a hundred of the stretches found is false, and one sound survey in a hundred shows any
+  (Benjamini & Hochberg 1995, at `FALSE_FROZEN`). A coarse sensor often repeats itself. It is frozen where it
+  did so for long and then jumps by far more than its step (`_released`).
 - **Stuck.** A sensor that lost lock reads about one level at any place and heading. If frozen stretches
   agree on a level, every node (every stretch of a drive) near that level is tested: are its readings more
   likely to be the level, or the field that its neighbours in place and heading predict? It is masked at odds
-  of 19 to 1 for stuck, prior included (`SURE`), so fewer than five in a hundred masked readings are field;
-  the report gives the expected number. A stretch of a drive that stays within the sensor's noise is also
+  of 19 to 1 for stuck, prior included (`SURE`), so fewer than five in a hundred masked readings are field. A
+  stretch of a drive that stays within the sensor's noise is also
   masked if its neighbours refute it, at `FALSE_FLAT` per survey. Wrong poses refute sound stretches as well.
+  The report gives the number of readings masked falsely: at most the frozen ones that their neighbours
+  predict as well, and the expected number of others.
 - **Outlying.** A reading that differs from its neighbours' prediction by more than chance allows once per
   survey is listed with its size, but kept: it may be iron.
 
@@ -52,7 +53,8 @@ BESIDE = 48
 WIDTH = 12.0
 CELL_M = 0.05  # Length of a drive whose readings are averaged for the fit
 COARSE = 3.0  # Steps by which the field usually changes in a trial; with less, the sensor is too coarse
-NORMAL = np.sqrt(2 * np.pi) / 0.6745  # Median of |x| over the density of x at 0, for normal x
+MOST_CHANGES = 0.75  # Quantile of changes that stands for them; steel makes a few far larger
+NORMAL = np.sqrt(2 * np.pi) / 1.1503  # Step by that quantile and the share of repeats, if changes are normal
 LEAST_SLOPES = 8  # With fewer slopes the roughness is unknown, and no stretch is called frozen
 FLAT_M = 0.25  # Least length of a flat stretch of a drive
 MOST_TOGETHER = 12  # Most readings of one place that are tested jointly; more are thinned evenly
@@ -72,7 +74,7 @@ def mask_stuck(readings: Readings) -> tuple[Readings, Report]:
 
     Returns:
         The readings with frozen and stuck ones no longer good; and the report: counts, the level, nodes stuck
-        at every heading, the expected number masked falsely, outliers with place and size.
+        at every heading, the number masked falsely, outliers with place and size.
     """
     findings = find_stuck(readings)
     good = readings.good & ~findings.frozen & ~findings.stuck
@@ -85,7 +87,8 @@ class Findings:
 
     frozen: Flags  # Repeats to the last digit, shape (N,)
     stuck: Flags  # At the level of a sensor that lost lock, shape (N,); may also be frozen
-    doubt: Array  # Probability that a stuck reading is field, shape (N,); 0 if it is not stuck
+    # Probability that a masked reading is field, shape (N,); 1 if it is frozen at what its neighbours predict
+    doubt: Array
     outlier: Array  # Difference from the neighbours' prediction [nT], shape (N,); 0 if it is not unusual
     level_nt: float | None  # Level of the stuck sensor; None if no stretches agree on one
     spread_nt: float  # Standard deviation of stuck readings about the level [nT]
@@ -103,8 +106,9 @@ class Findings:
             level, spread = round(self.level_nt, 1), round(self.spread_nt, 1)
             figures.append(Figure("stuck level", level, "nT", spread=spread))
         if masked.any():
-            doubt = round(float(self.doubt[masked].sum()), 2)
-            figures.append(Figure("masked falsely", doubt, "readings", note="expected number of them"))
+            if self.judged:
+                doubt, note = round(float(self.doubt[masked].sum()), 2), "at most; others nearby predict them"
+                figures.append(Figure("masked falsely", doubt, "readings", note=note))
             if readings.grid is not None and readings.node is not None:
                 at = np.zeros(readings.grid.shape, bool)
                 at[tuple(readings.node[masked].T)] = True
@@ -262,9 +266,9 @@ def steps_nt(readings: Readings, sequences: list[Rows]) -> list[float]:
 
     It is the least difference of two values, or what explains the share of readings that repeat the one
     before. If changes have the density f at 0, a step q repeats q f of them; f is that of normal changes with
-    the median of those seen. So the magnitudes of rounded vectors, which have many digits, show their step
-    too. A stuck sensor repeats fewer than one group of values in `BESIDE`. Nodes are of one sensor, and each
-    drive is of its own.
+    the quantile `MOST_CHANGES` of those seen. So the magnitudes of rounded vectors show their step too,
+    though they have many digits. A stuck sensor repeats fewer than one group of values in `BESIDE`. Nodes are
+    of one sensor, and each drive is of its own.
     """
     steps = []
     for part in [[rows] for rows in sequences] if readings.node is None else [sequences]:
@@ -276,7 +280,7 @@ def steps_nt(readings: Readings, sequences: list[Rows]) -> list[float]:
         same = np.abs(change) < 10.0**-DIGITS
         begun = np.count_nonzero(same[1:] & ~same[:-1])
         share = begun / max(1, len(change) - np.count_nonzero(same)) - 1 / BESIDE
-        usual = float(np.median(size)) if size.size else 0.0
+        usual = float(np.quantile(size, MOST_CHANGES)) if size.size else 0.0
         steps.append(max(least, min(1.0, NORMAL * max(0.0, share)) * usual))
     return steps if readings.node is None else steps * len(sequences)
 
