@@ -53,6 +53,7 @@ BESIDE = 48
 WIDTH = 12.0
 CELL_M = 0.05  # Length of a drive whose readings are averaged for the fit
 COARSE = 3.0  # Steps by which the field usually changes in a trial; with less, the sensor is too coarse
+STUCK_DRIVE, STUCK_NODES = 0.002, 0.02  # Groups of equal values that may be stuck, as a share of all
 MOST_CHANGES = 0.75  # Quantile of changes that stands for them; steel makes a few far larger
 NORMAL = np.sqrt(2 * np.pi) / 1.1503  # Step by that quantile and the share of repeats, if changes are normal
 LEAST_SLOPES = 8  # With fewer slopes the roughness is unknown, and no stretch is called frozen
@@ -164,7 +165,8 @@ def find_stuck(readings: Readings) -> Findings:
         pool, flats = known, []
     if len(pool) < LEAST or np.ptp(cells.b_nt[pool]) == 0:
         return Findings(frozen, stuck, doubt, outlier, level, spread, judged=False)
-    fit = LocalFit.to(cells, pool, known)
+    steps = steps_nt(readings, _sequences(readings))
+    fit = LocalFit.to(cells, pool, known, max(steps) / float(np.sqrt(12)))
     for rows in _refuted(flats, cell, fit, pool, known):
         stuck[rows] = True
         doubt[rows] = FALSE_FLAT / len(flats)
@@ -209,7 +211,8 @@ def _moved(readings: Readings, rows: Rows) -> Array:
 
 def _frozen(readings: Readings) -> list[Rows]:
     """Rows of each stretch that repeats to the last digit for longer than chance allows."""
-    b, sequences, candidates = readings.b_nt, _sequences(readings), []
+    b, sequences = readings.b_nt, _sequences(readings)
+    candidates = list[tuple[float, Rows]]()
     channels = b[:, None] if readings.b_body_nt is None else readings.b_body_nt
     if not np.ptp(channels[readings.good], axis=0).any():  # one number everywhere
         still = len(sequences) == 0 or np.ptp(readings.p_xy[readings.good], axis=0).max() == 0
@@ -225,10 +228,10 @@ def _frozen(readings: Readings) -> list[Rows]:
                 continue
             trials = max(1, min(len(held) - 1, int(way / REACH_M)))
             near = np.argsort(np.linalg.norm(place - p.mean(axis=0), axis=1), kind="stable")[:BESIDE]
-            # A quarter of slopes lie within +-usual
+            # A quarter of changes lie within +-change
             change = float(np.quantile(slope[near], 0.25)) * way / trials
             if change >= COARSE * step:  # else the sensor is too coarse for this place to tell
-                candidates.append((trials * np.log(step * 0.25 / (2 * change)), held))
+                candidates.append((trials * float(np.log(step * 0.25 / (2 * change))), held))
     candidates.sort(key=lambda candidate: candidate[0])
     tests = sum(len(rows) - 1 for rows in sequences)
     allowed = np.log(FALSE_FROZEN / max(tests, 1) * np.arange(1, len(candidates) + 1))
@@ -252,11 +255,11 @@ def _released(readings: Readings, drive: Rows) -> list[Rows]:
             way = float(np.linalg.norm(np.ptp(readings.p_xy[held], axis=0)))
             runs.append((held, way, abs(readings.b_nt[after[0]] - readings.b_nt[held[0]])))
     count = np.array([len(held) for held, *_ in runs])
-    way, jump = np.array([run[1:] for run in runs]).reshape(-1, 2).T
-    others, found = np.sort(jump[way < FLAT_M]), list[Rows]()
-    for k in np.flatnonzero((way >= FLAT_M) & (count > 1)):
+    ways, jump = np.array([run[1:] for run in runs]).reshape(-1, 2).T
+    others, found = np.sort(jump[ways < FLAT_M]), list[Rows]()
+    for k in np.flatnonzero((ways >= FLAT_M) & (count > 1)):
         share = (1 + len(others) - np.searchsorted(others, jump[k])) / (1 + len(others))
-        if share * np.count_nonzero((count >= count[k]) & (way >= way[k])) <= FALSE_FROZEN:
+        if share * np.count_nonzero((count >= count[k]) & (ways >= ways[k])) <= FALSE_FROZEN:
             found.append(runs[k][0])
     return found
 
@@ -267,10 +270,10 @@ def steps_nt(readings: Readings, sequences: list[Rows]) -> list[float]:
     It is the least difference of two values, or what explains the share of readings that repeat the one
     before. If changes have the density f at 0, a step q repeats q f of them; f is that of normal changes with
     the quantile `MOST_CHANGES` of those seen. So the magnitudes of rounded vectors show their step too,
-    though they have many digits. A stuck sensor repeats fewer than one group of values in `BESIDE`. Nodes are
-    of one sensor, and each drive is of its own.
+    though they have many digits. A share of repeats that is no larger than `STUCK_DRIVE` or `STUCK_NODES` may
+    be that of a stuck sensor. Nodes are of one sensor, and each drive is of its own.
     """
-    steps = []
+    steps = list[float]()
     for part in [[rows] for rows in sequences] if readings.node is None else [sequences]:
         b = np.round(readings.b_nt[np.concatenate(part)], DIGITS) if part else np.zeros(0)
         gaps = np.diff(np.unique(b))
@@ -278,8 +281,9 @@ def steps_nt(readings: Readings, sequences: list[Rows]) -> list[float]:
         change = np.concatenate([np.diff(readings.b_nt[rows], prepend=np.nan) for rows in part] or [b])
         size = np.abs(change[np.abs(change) >= 10.0**-DIGITS])
         same = np.abs(change) < 10.0**-DIGITS
-        begun = np.count_nonzero(same[1:] & ~same[:-1])
-        share = begun / max(1, len(change) - np.count_nonzero(same)) - 1 / BESIDE
+        groups = max(1, len(change) - int(np.count_nonzero(same)))
+        share = float(np.count_nonzero(same[1:] & ~same[:-1])) / groups
+        share -= STUCK_DRIVE if readings.node is None else STUCK_NODES
         usual = float(np.quantile(size, MOST_CHANGES)) if size.size else 0.0
         steps.append(max(least, min(1.0, NORMAL * max(0.0, share)) * usual))
     return steps if readings.node is None else steps * len(sequences)
