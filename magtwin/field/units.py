@@ -11,12 +11,13 @@ if TYPE_CHECKING:
 
 Unit = Literal["nT", "uT", "T", "mG", "G"]
 
-# Bounds of a survey's mean [nT]. The Earth's field is 22,000 to 67,000 nT; a building bends it.
+# Bounds of a survey's median [nT]. The Earth's field is 22,000 to 67,000 nT; a building bends it.
 LEAST_MEAN_NT, GREATEST_MEAN_NT = 10_000.0, 100_000.0
 # Range of the median of readings from which their unit is deduced [nT]: the Earth's field and some steel
 INDOORS_NT = 18_000.0, 75_000.0
 USUAL_NT = 50_000.0  # Magnitude that a suggested scale would give [nT]
 NT_PER: dict[str, float] = {"nT": 1.0, "uT": 1e3, "T": 1e9, "mG": 1e2, "G": 1e5}  # nT per unit
+BESIDE_STEEL = 10.0  # Factor by which they are wider for a unit that was told
 MIXED = 0.01  # Share of readings in another unit from which they count as mixed units, not as outliers
 
 
@@ -37,59 +38,93 @@ def check_unit(
     unit: str = "nT",
     row: Callable[[int], str] | None = None,
     scale: float | None = None,
-) -> None:
-    """Refuse readings whose mean cannot be the Earth's field, and readings in two units.
+    *,
+    told: bool = False,
+    p_xy: "NDArray[np.float64] | None" = None,
+) -> str:
+    """Refuse readings whose median cannot be the Earth's field, and readings in two units.
 
     Args:
-        b_nt: Field magnitudes [nT], shape (N,).
+        b_nt: Field magnitudes [nT], shape (N,), in the order of the file.
         where: File, for the error.
         column: Column, for the error.
         unit: Unit that the file was read in.
         row: Gives the place of a reading from its index. Default: the file.
         scale: Factor from the file's values to nT, in place of a unit.
+        told: Whether the header or the user gave the unit. Then the median may be ten times beyond the
+            bounds, as beside steel.
+        p_xy: Positions [m], shape (N, 2), to look for rows in another unit. None: all rows are in one.
+
+    Returns:
+        A warning about a median that the Earth's field does not have; "" if it has.
 
     Raises:
-        InputError: The mean is outside 10,000..100,000 nT (the text names the unit that would fit), or more
-            than 1 % of the readings are off by the factor of another unit.
+        InputError: The median is outside 10,000..100,000 nT (the text names the unit that would fit), or more
+            than 1 % of the readings are in another unit.
     """
     import numpy as np
 
-    usual = float(np.sort(b_nt)[len(b_nt) // 2])
-    for other, factor in NT_PER.items():
-        ratio = b_nt / usual * factor / NT_PER[unit]
-        odd = np.flatnonzero((np.abs(np.log10(np.maximum(ratio, 1e-12))) < 0.3) & (other != unit))
-        if LEAST_MEAN_NT <= usual <= GREATEST_MEAN_NT and len(odd) > max(1, MIXED * len(b_nt)):
-            first = int(odd[0])
-            raise InputError(
-                f"{row(first) if row else where}: {column} is {b_nt[first]:.6g} nT, where most readings are "
-                f"about {usual:,.0f} nT; it and {len(odd) - 1} more would fit in {other}: give all rows in "
-                "one unit"
-            )
-    mean = float(b_nt.mean())
-    if LEAST_MEAN_NT <= mean <= GREATEST_MEAN_NT:
-        return
+    usual = float(np.median(b_nt))
+    if p_xy is not None:
+        _check_one_unit(b_nt, p_xy, unit, f"{column} is", row or (lambda k: where))
+    if LEAST_MEAN_NT <= usual <= GREATEST_MEAN_NT:
+        return ""
+    text = f"the median of {column} is {usual:.6g} nT"
+    bounds = f"outside {LEAST_MEAN_NT:,.0f}..{GREATEST_MEAN_NT:,.0f} nT"
+    kept = told and LEAST_MEAN_NT / BESIDE_STEEL <= usual <= GREATEST_MEAN_NT * BESIDE_STEEL
     if scale is not None:
-        raise InputError(
-            f"{where}: the mean of {column} is {mean:.6g} nT with scale {scale:g}, outside "
-            f"{LEAST_MEAN_NT:,.0f}..{GREATEST_MEAN_NT:,.0f} nT; --scale {_four(scale * USUAL_NT / mean)} "
-            f"would make it {USUAL_NT:,.0f} nT"
+        advice = f"--scale {_four(scale * USUAL_NT / usual)} would make it {USUAL_NT:,.0f} nT"
+        text = f"{text} with scale {scale:g}, {bounds}; {advice}"
+    else:
+        number = usual / NT_PER[unit]
+        could = {other: number * factor for other, factor in NT_PER.items()}
+        could = {o: value for o, value in could.items() if LEAST_MEAN_NT <= value <= GREATEST_MEAN_NT}
+        advice = " or ".join(
+            f"in {other} it would be {value:,.0f} nT: give --unit {other}" for other, value in could.items()
         )
-    number = mean / NT_PER[unit]
-    could = {other: number * factor for other, factor in NT_PER.items()}
-    could = {other: value for other, value in could.items() if LEAST_MEAN_NT <= value <= GREATEST_MEAN_NT}
-    advice = " or ".join(
-        f"in {other} it would be {value:,.0f} nT: give --unit {other}" for other, value in could.items()
-    )
-    if not any(INDOORS_NT[0] <= value <= INDOORS_NT[1] for value in could.values()):
-        no_unit = "no usual unit makes it the Earth's field"
-        advice = (
-            f"{advice or no_unit}; for a normalised sensor give --scale, the factor to nT "
-            f"({_four(USUAL_NT / number)} would make it {USUAL_NT:,.0f} nT)"
-        )
-    raise InputError(
-        f"{where}: the mean of {column} is {mean:.6g} nT, outside {LEAST_MEAN_NT:,.0f}.."
-        f"{GREATEST_MEAN_NT:,.0f} nT; {advice}"
-    )
+        if not kept and not any(INDOORS_NT[0] <= value <= INDOORS_NT[1] for value in could.values()):
+            no_unit = "no usual unit makes it the Earth's field"
+            advice = (
+                f"{advice or no_unit}; for a normalised sensor give --scale, the factor to nT "
+                f"({_four(USUAL_NT / number)} would make it {USUAL_NT:,.0f} nT)"
+            )
+        text = "; ".join(part for part in (f"{text}, {bounds}", advice) if part)
+    if kept:
+        return text
+    raise InputError(f"{where}: {text}")
+
+
+def _check_one_unit(
+    b_nt: "NDArray[np.float64]",
+    p_xy: "NDArray[np.float64]",
+    unit: str,
+    what: str,
+    row: Callable[[int], str],
+) -> None:
+    """Refuse rows in another unit: they jump by its ratio in the file, and from the rows nearest in place.
+
+    Beside steel, a field rises by degrees along the path and does neither.
+    """
+    import numpy as np
+    from scipy.spatial import cKDTree
+
+    usual = float(np.median(b_nt))
+    for other, factor in NT_PER.items():
+        ratio = factor / NT_PER[unit]
+        odd = np.abs(np.log10(b_nt / usual * ratio)) < 0.3
+        if other == unit or not MIXED * len(b_nt) < np.count_nonzero(odd) < len(b_nt) or odd.sum() < 2:
+            continue
+        edge = np.flatnonzero(np.diff(odd))
+        near = np.flatnonzero(~odd)[cKDTree(p_xy[~odd]).query(p_xy[odd])[1]]
+        jump = np.abs(np.log10(b_nt[edge + 1] / b_nt[edge]))
+        in_file = np.median(np.abs(jump - abs(np.log10(ratio)))) < 0.3
+        if in_file and np.median(np.abs(np.log10(b_nt[odd] * ratio / b_nt[near]))) < 0.15:
+            first = int(np.argmax(odd))
+            raise InputError(
+                f"{row(first)}: {what} {b_nt[first]:.6g} nT, where most readings are about {usual:,.0f} nT; "
+                f"it and {odd.sum() - 1} more would fit in {other}: give all rows "
+                f"in one unit, or --unit {unit} if they are field"
+            )
 
 
 def unit_by_size(b: "NDArray[np.float64]") -> Unit | None:

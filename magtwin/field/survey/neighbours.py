@@ -34,9 +34,16 @@ class LocalFit:
     # Logarithms of the reach [m], the sd of the three terms [nT] and the noise's sd [nT], shape (5,)
     log_figures: Array
     count: int  # Neighbours per reading
+    rounding_nt: float = 0.0  # Least sd of the noise: that of the sensor's step [nT]
 
     @classmethod
-    def to(cls, readings: Readings, rows: NDArray[np.intp], turned: NDArray[np.intp]) -> "LocalFit":
+    def to(
+        cls,
+        readings: Readings,
+        rows: NDArray[np.intp],
+        turned: NDArray[np.intp],
+        rounding_nt: float,
+    ) -> "LocalFit":
         """Learn the prior from the readings `rows`, `LEAST` or more, and the trend from `turned`.
 
         A trend holds only at headings that it was fitted to, so `turned` must have all that are predicted.
@@ -61,7 +68,7 @@ class LocalFit:
         def unlikeliness(figures: Array) -> float:
             if np.abs(figures - start).max() > WIDEST:
                 return np.inf
-            mean, variance = cls(p, yaw, residual, figures, count)._given(near, tried)
+            mean, variance = cls(p, yaw, residual, figures, count, rounding_nt)._given(near, tried)
             z2 = (residual[tried] - mean) ** 2 / variance
             return float(np.mean(np.log(variance) / 2 + (FREEDOM + 1) / 2 * np.log1p(z2 / FREEDOM)))
 
@@ -69,7 +76,12 @@ class LocalFit:
             unlikeliness, start, method="Nelder-Mead", options={"xatol": 0.05, "fatol": 2e-3, "maxfev": 120}
         )
         whole = readings.b_nt - _waves(readings.yaw) @ trend
-        return cls(readings.p_xy, readings.yaw, whole, best.x, count)
+        return cls(readings.p_xy, readings.yaw, whole, best.x, count, rounding_nt)
+
+    @property
+    def _noise(self) -> float:
+        """Variance of the noise [nT^2]."""
+        return float(np.exp(2 * self.log_figures[4])) + self.rounding_nt**2
 
     def left_out(self, rows: NDArray[np.intp], pool: NDArray[np.intp]) -> tuple[Array, Array]:
         """Residuals of `rows` from the prediction by their neighbours in `pool`, without themselves.
@@ -88,7 +100,7 @@ class LocalFit:
         """
         far = np.linalg.norm(self.p_xy[pool] - self.p_xy[rows].mean(axis=0), axis=1)
         near = pool[np.argsort(far, kind="stable")[: self.count + len(rows)]]
-        noise = np.exp(2 * self.log_figures[4])
+        noise = self._noise
         solved = np.linalg.solve(
             self._covariance(near, near) + noise * np.eye(len(near)), self._covariance(near, rows)
         )
@@ -121,7 +133,7 @@ class LocalFit:
 
     def _given(self, near: NDArray[np.intp], rows: NDArray[np.intp]) -> tuple[Array, Array]:
         """Mean and variance, with noise, of each of `rows` given the readings `near` it."""
-        noise = np.exp(2 * self.log_figures[4])
+        noise = self._noise
         mean, variance = np.empty(len(rows)), np.empty(len(rows))
         for start in range(0, len(rows), BLOCK):
             part = slice(start, start + BLOCK)

@@ -3,18 +3,19 @@
 Three tests, each with its rate of false alarms:
 
 - **Frozen.** A frozen sensor repeats the same number to the last digit while the robot moves. A field seldom
-  does: over a distance d it stays within the sensor's resolution q by chance with probability q f / d, where
-  f is the density at 0 of the field's slopes nearby; distances of `REACH_M` or more count as independent. All
-  components of a vector repeat, so the least chance of one counts. On a drive the chance is at least that by
-  the share of repeats beside the stretch, since rounding may not show in the digits. One in a hundred of the
-  stretches found is false, and one sound survey in a hundred shows any (Benjamini & Hochberg 1995, at
-  `FALSE_FROZEN`).
+  does: over a distance d it stays within the sensor's step q (`steps_nt`) by chance with probability q f / d,
+  where f is the density at 0 of the field's slopes nearby; distances of `REACH_M` or more count as
+  independent. One in a hundred of the stretches found is false, and one sound survey in a hundred shows any
+  (Benjamini & Hochberg 1995, at `FALSE_FROZEN`). A coarse sensor often repeats itself. It is frozen where it
+  did so for long and then jumps by far more than its step (`_released`).
 - **Stuck.** A sensor that lost lock reads about one level at any place and heading. If frozen stretches
   agree on a level, every node (every stretch of a drive) near that level is tested: are its readings more
   likely to be the level, or the field that its neighbours in place and heading predict? It is masked at odds
-  of 19 to 1 for stuck, prior included (`SURE`), so fewer than five in a hundred masked readings are field;
-  the report gives the expected number. A stretch of a drive that stays within the sensor's noise is also
+  of 19 to 1 for stuck, prior included (`SURE`), so fewer than five in a hundred masked readings are field. A
+  stretch of a drive that stays within the sensor's noise is also
   masked if its neighbours refute it, at `FALSE_FLAT` per survey. Wrong poses refute sound stretches as well.
+  The report gives the number of readings masked falsely: at most the frozen ones that their neighbours
+  predict as well, and the expected number of others.
 - **Outlying.** A reading that differs from its neighbours' prediction by more than chance allows once per
   survey is listed with its size, but kept: it may be iron.
 
@@ -51,7 +52,10 @@ BESIDE = 48
 # Range about the level in which stuck readings are searched, in standard deviations of the level
 WIDTH = 12.0
 CELL_M = 0.05  # Length of a drive whose readings are averaged for the fit
-COARSE = 3.0  # Resolutions by which the field usually changes in a trial; with less, the sensor is too coarse
+COARSE = 3.0  # Steps by which the field usually changes in a trial; with less, the sensor is too coarse
+STUCK_DRIVE, STUCK_NODES = 0.002, 0.02  # Groups of equal values that may be stuck, as a share of all
+MOST_CHANGES = 0.75  # Quantile of changes that stands for them; steel makes a few far larger
+NORMAL = np.sqrt(2 * np.pi) / 1.1503  # Step by that quantile and the share of repeats, if changes are normal
 LEAST_SLOPES = 8  # With fewer slopes the roughness is unknown, and no stretch is called frozen
 FLAT_M = 0.25  # Least length of a flat stretch of a drive
 MOST_TOGETHER = 12  # Most readings of one place that are tested jointly; more are thinned evenly
@@ -71,7 +75,7 @@ def mask_stuck(readings: Readings) -> tuple[Readings, Report]:
 
     Returns:
         The readings with frozen and stuck ones no longer good; and the report: counts, the level, nodes stuck
-        at every heading, the expected number masked falsely, outliers with place and size.
+        at every heading, the number masked falsely, outliers with place and size.
     """
     findings = find_stuck(readings)
     good = readings.good & ~findings.frozen & ~findings.stuck
@@ -84,7 +88,8 @@ class Findings:
 
     frozen: Flags  # Repeats to the last digit, shape (N,)
     stuck: Flags  # At the level of a sensor that lost lock, shape (N,); may also be frozen
-    doubt: Array  # Probability that a stuck reading is field, shape (N,); 0 if it is not stuck
+    # Probability that a masked reading is field, shape (N,); 1 if it is frozen at what its neighbours predict
+    doubt: Array
     outlier: Array  # Difference from the neighbours' prediction [nT], shape (N,); 0 if it is not unusual
     level_nt: float | None  # Level of the stuck sensor; None if no stretches agree on one
     spread_nt: float  # Standard deviation of stuck readings about the level [nT]
@@ -102,8 +107,9 @@ class Findings:
             level, spread = round(self.level_nt, 1), round(self.spread_nt, 1)
             figures.append(Figure("stuck level", level, "nT", spread=spread))
         if masked.any():
-            doubt = round(float(self.doubt[masked].sum()), 2)
-            figures.append(Figure("masked falsely", doubt, "readings", note="expected number of them"))
+            if self.judged:
+                doubt, note = round(float(self.doubt[masked].sum()), 2), "at most; others nearby predict them"
+                figures.append(Figure("masked falsely", doubt, "readings", note=note))
             if readings.grid is not None and readings.node is not None:
                 at = np.zeros(readings.grid.shape, bool)
                 at[tuple(readings.node[masked].T)] = True
@@ -137,6 +143,8 @@ class Findings:
 
 def find_stuck(readings: Readings) -> Findings:
     """Findings of `mask_stuck`, as flags of rows."""
+    from scipy.special import stdtrit
+
     count, b = len(readings), readings.b_nt
     stretches = _frozen(readings)
     frozen = np.zeros(count, bool)
@@ -157,7 +165,8 @@ def find_stuck(readings: Readings) -> Findings:
         pool, flats = known, []
     if len(pool) < LEAST or np.ptp(cells.b_nt[pool]) == 0:
         return Findings(frozen, stuck, doubt, outlier, level, spread, judged=False)
-    fit = LocalFit.to(cells, pool, known)
+    steps = steps_nt(readings, _sequences(readings))
+    fit = LocalFit.to(cells, pool, known, max(steps) / float(np.sqrt(12)))
     for rows in _refuted(flats, cell, fit, pool, known):
         stuck[rows] = True
         doubt[rows] = FALSE_FLAT / len(flats)
@@ -170,6 +179,10 @@ def find_stuck(readings: Readings) -> Findings:
             if probability >= SURE:
                 stuck[rows] = True
                 doubt[rows] = 1 - probability
+    alone = np.unique(cell[frozen & ~stuck])
+    if len(alone):
+        agrees = alone[np.abs(fit.left_out(alone, pool)[0]) <= stdtrit(FREEDOM, 0.95)]
+        doubt[frozen & ~stuck & np.isin(cell, agrees)] = 1.0
     kept = np.bincount(cell, stuck | frozen | ~readings.good, len(cells)) == 0
     outlier = _outliers(readings, cells, cell, fit, np.flatnonzero(kept))
     return Findings(frozen, stuck, doubt, outlier, level, spread, judged=True)
@@ -198,65 +211,82 @@ def _moved(readings: Readings, rows: Rows) -> Array:
 
 def _frozen(readings: Readings) -> list[Rows]:
     """Rows of each stretch that repeats to the last digit for longer than chance allows."""
-    # Of a vector each component has its digits; the magnitude of rounded ones has many
-    channels = readings.b_nt[None] if readings.b_body_nt is None else readings.b_body_nt.T
-    sequences = _sequences(readings)
-    if not np.ptp(channels[:, readings.good], axis=1).any():  # one number everywhere
+    b, sequences = readings.b_nt, _sequences(readings)
+    candidates = list[tuple[float, Rows]]()
+    channels = b[:, None] if readings.b_body_nt is None else readings.b_body_nt
+    if not np.ptp(channels[readings.good], axis=0).any():  # one number everywhere
         still = len(sequences) == 0 or np.ptp(readings.p_xy[readings.good], axis=0).max() == 0
         return [] if still or readings.good.sum() <= LEAST_SLOPES else [np.flatnonzero(readings.good)]
-    known = [(_resolution_nt(b[readings.good]), *_slopes(readings, b, sequences)) for b in channels]
-    candidates = []
-    for rows in sequences:
-        same = repeats(readings, rows)
-        again = None if readings.node is not None else _repeated(same)
-        for part in _stretches(same):
+    steps = steps_nt(readings, sequences)
+    place, slope = _slopes(readings, b, sequences)
+    for rows, step in zip(sequences, steps, strict=True):
+        for part in _stretches(repeats(readings, rows)):
             held = rows[part.start : part.stop + 1]
             p = readings.p_xy[held]
             way = float(np.linalg.norm(np.ptp(p, axis=0)) + REACH_M * np.ptp(np.unwrap(readings.yaw[held])))
-            most = max(1, min(len(held) - 1, int(way / REACH_M)))
-            by_field = 0.0  # all components repeat, so the least chance of one counts
-            for resolution, place, slope in known:
-                if way == 0 or len(slope) < LEAST_SLOPES:
-                    continue
-                near = np.argsort(np.linalg.norm(place - p.mean(axis=0), axis=1), kind="stable")[:BESIDE]
-                usual = float(np.quantile(slope[near], 0.25))
-                trials = most
-                if len(known) > 1 and resolution:  # three components seldom are flat over more than that
-                    trials = min(most, int(usual * way / (COARSE * resolution)))
-                if trials == 0 or usual * way / trials < COARSE * resolution:
-                    continue  # the sensor is too coarse for this place to tell
-                # A quarter of slopes lie within +-usual
-                chance = resolution * 0.25 / (2 * usual) * trials / way
-                by_field = min(by_field, trials * np.log(min(1.0, chance)))
-            by_rounding = -np.inf if again is None else (len(held) - 1) * np.log(again[part.start])
-            candidates.append((max(by_field, by_rounding), held))
+            if way == 0 or len(slope) < LEAST_SLOPES:
+                continue
+            trials = max(1, min(len(held) - 1, int(way / REACH_M)))
+            near = np.argsort(np.linalg.norm(place - p.mean(axis=0), axis=1), kind="stable")[:BESIDE]
+            # A quarter of changes lie within +-change
+            change = float(np.quantile(slope[near], 0.25)) * way / trials
+            if change >= COARSE * step:  # else the sensor is too coarse for this place to tell
+                candidates.append((trials * float(np.log(step * 0.25 / (2 * change))), held))
     candidates.sort(key=lambda candidate: candidate[0])
     tests = sum(len(rows) - 1 for rows in sequences)
     allowed = np.log(FALSE_FROZEN / max(tests, 1) * np.arange(1, len(candidates) + 1))
     passed = [k for k, (chance, _) in enumerate(candidates) if chance <= allowed[k]]
-    return [held for _, held in candidates[: passed[-1] + 1]] if passed else []
+    found = [held for _, held in candidates[: passed[-1] + 1]] if passed else []
+    drives = sequences if readings.node is None else []
+    return found + [rows for drive in drives for rows in _released(readings, drive)]
 
 
-def _resolution_nt(values: Array) -> float:
-    """Least difference between two values [nT]; 0 if all are equal."""
-    gaps = np.diff(np.unique(np.round(values, DIGITS)))
-    return float(gaps.min()) if gaps.size else 0.0
+def _released(readings: Readings, drive: Rows) -> list[Rows]:
+    """Repeats of `FLAT_M` or more that end in a jump which the sensor's step does not explain.
 
-
-def _repeated(same: Flags) -> Array:
-    """Chance at each row of a drive that the next one repeats its value, shape (len(same) + 1,).
-
-    It is the share of repeated values among the `BESIDE` others that are nearest in time, with one more for
-    what they miss (Laplace's rule). Rounded vectors repeat magnitudes, which have many digits all the same.
+    A sound sensor leaves a value by a step, however long it stayed there. A stuck one leaves it by as much as
+    the field changed meanwhile. The number of sound repeats that are as long, in readings and in metres, and
+    end in such a jump is that of all so long by the share of other changes that are as large.
     """
-    starts = np.flatnonzero(np.append(True, ~same))
-    size = np.diff(np.append(starts, len(same) + 1))
-    before = np.append(0, np.cumsum(size > 1))
-    first = np.clip(np.arange(len(size)) - BESIDE // 2, 0, max(0, len(size) - BESIDE - 1))
-    last = np.minimum(first + BESIDE + 1, len(size))
-    others = last - first - 1
-    share = (before[last] - before[first] - (size > 1) + 1) / (others + 1)
-    return np.asarray(np.repeat(share, size))
+    runs = list[tuple[Rows, float, float]]()  # rows, length [m] and change at the end [nT]
+    for rows in _driven(readings, drive):
+        first = np.append(0, np.flatnonzero(~repeats(readings, rows)) + 1)
+        for held, after in itertools.pairwise(np.split(rows, first[1:])):
+            way = float(np.linalg.norm(np.ptp(readings.p_xy[held], axis=0)))
+            runs.append((held, way, abs(readings.b_nt[after[0]] - readings.b_nt[held[0]])))
+    count = np.array([len(held) for held, *_ in runs])
+    ways, jump = np.array([run[1:] for run in runs]).reshape(-1, 2).T
+    others, found = np.sort(jump[ways < FLAT_M]), list[Rows]()
+    for k in np.flatnonzero((ways >= FLAT_M) & (count > 1)):
+        share = (1 + len(others) - np.searchsorted(others, jump[k])) / (1 + len(others))
+        if share * np.count_nonzero((count >= count[k]) & (ways >= ways[k])) <= FALSE_FROZEN:
+            found.append(runs[k][0])
+    return found
+
+
+def steps_nt(readings: Readings, sequences: list[Rows]) -> list[float]:
+    """Step of the sensor in each sequence [nT]: the change of the field that the readings do not show.
+
+    It is the least difference of two values, or what explains the share of readings that repeat the one
+    before. If changes have the density f at 0, a step q repeats q f of them; f is that of normal changes with
+    the quantile `MOST_CHANGES` of those seen. So the magnitudes of rounded vectors show their step too,
+    though they have many digits. A share of repeats that is no larger than `STUCK_DRIVE` or `STUCK_NODES` may
+    be that of a stuck sensor. Nodes are of one sensor, and each drive is of its own.
+    """
+    steps = list[float]()
+    for part in [[rows] for rows in sequences] if readings.node is None else [sequences]:
+        b = np.round(readings.b_nt[np.concatenate(part)], DIGITS) if part else np.zeros(0)
+        gaps = np.diff(np.unique(b))
+        least = float(gaps.min()) if gaps.size else 0.0
+        change = np.concatenate([np.diff(readings.b_nt[rows], prepend=np.nan) for rows in part] or [b])
+        size = np.abs(change[np.abs(change) >= 10.0**-DIGITS])
+        same = np.abs(change) < 10.0**-DIGITS
+        groups = max(1, len(change) - int(np.count_nonzero(same)))
+        share = float(np.count_nonzero(same[1:] & ~same[:-1])) / groups
+        share -= STUCK_DRIVE if readings.node is None else STUCK_NODES
+        usual = float(np.quantile(size, MOST_CHANGES)) if size.size else 0.0
+        steps.append(max(least, min(1.0, NORMAL * max(0.0, share)) * usual))
+    return steps if readings.node is None else steps * len(sequences)
 
 
 def _slopes(readings: Readings, b: Array, sequences: list[Rows]) -> tuple[Array, Array]:
@@ -442,14 +472,15 @@ def _outliers(readings: Readings, cells: Readings, cell: Rows, fit: LocalFit, po
         rows = np.flatnonzero(cell == pool[at])
         outlier[rows[len(rows) // 2]] = residual[at]
     if readings.node is None:
-        for sequence in _sequences(readings):
+        sequences = _sequences(readings)
+        for sequence, step in zip(sequences, steps_nt(readings, sequences), strict=True):
             for rows in _driven(readings, sequence):  # a field may jump with the pose
-                off = _spikes(readings.b_nt[rows])
+                off = _spikes(readings.b_nt[rows], step)
                 outlier[rows[off != 0]] = off[off != 0]
     return outlier
 
 
-def _spikes(b: Array) -> Array:
+def _spikes(b: Array, step: float) -> Array:
     """Difference of each spike of a drive from the mean of its two neighbours [nT]; 0 for other readings.
 
     Hampel's filter: the scale is the median difference over `SPREAD_ROWS`, since differences grow with speed
@@ -463,10 +494,8 @@ def _spikes(b: Array) -> Array:
     off = np.zeros(len(b))
     off[1:-1] = b[1:-1] - (b[:-2] + b[2:]) / 2
     size = np.abs(off)
-    gaps = np.diff(np.unique(b))
-    rounding = float(gaps.min()) * np.sqrt(1.5 / 12) if gaps.size else 0.0  # sd of it in such a difference
     scale = 1.4826 * np.maximum(median_filter(size, SPREAD_ROWS, mode="reflect"), np.median(size))
-    scale = np.maximum(scale, rounding)
+    scale = np.maximum(scale, step * np.sqrt(1.5 / 12))  # sd of rounding in such a difference
     limit = float(stdtrit(FREEDOM, 1 - 1 / (2 * len(b))))
     spike = (size > limit * scale) & (size == maximum_filter1d(size, 3)) & (size > 0)
     return np.where(spike, off, 0.0)

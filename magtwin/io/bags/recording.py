@@ -298,7 +298,7 @@ class _Recording:
         size = size[np.isfinite(size)]
         if not len(size):
             return {}
-        unit = unit_of(float(size.mean()), str(self.bag.path), signal.name)  # may differ from the clock's
+        unit = unit_of(float(np.median(size)), str(self.bag.path), signal.name)  # may differ from the clock's
         self.metadata["vector_unit"] = unit
         return self._held({"b_vector_measured_nt": b * NT_PER[unit]}, when)
 

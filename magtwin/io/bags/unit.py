@@ -12,7 +12,7 @@ from magtwin.field.units import GREATEST_MEAN_NT, LEAST_MEAN_NT, NT_PER, Unit, c
 Array = NDArray[np.float64]
 
 IRON = 2.0
-"""Factor by which iron near the sensor may change the mean of the field."""
+"""Factor by which iron near the sensor may change the median of the field."""
 
 
 class Field(NamedTuple):
@@ -36,19 +36,19 @@ def field_nt(
 ) -> Field:
     """The field of messages in nT.
 
-    A mean that is up to twice too large or too small for the Earth's field is taken with a warning: it may be
-    that of iron near the sensor.
+    A median that is up to twice too large or too small for the Earth's field is taken with a warning: it may be
+    that of iron near the sensor. Up to ten times is taken if the unit is given.
 
     Args:
         b: Magnitudes, shape (N,), or vectors, shape (N, 3). Vectors whose y and z are all 0 are magnitudes in
             x, as APRILab's robot publishes them.
         where: The file, for refusals.
         topic: The topic, for refusals.
-        unit: Their unit. Default: the unit that makes their mean the Earth's field.
+        unit: Their unit. Default: the unit that makes their median the Earth's field.
         scale: Factor to nT, in place of a unit.
 
     Raises:
-        InputError: The mean cannot be the Earth's field, or no message holds a number.
+        InputError: The median cannot be the Earth's field, or no message holds a number.
     """
     vector = b if b.ndim == 2 and np.any(b[:, 1:] != 0) else None
     size = np.abs(b if b.ndim == 1 else b[:, 0]) if vector is None else np.linalg.norm(b, axis=1)
@@ -57,33 +57,35 @@ def field_nt(
     finite = size[np.isfinite(size)]
     if not len(finite):
         raise InputError(f"{where}: no message of {topic} holds a number")
+    told = unit is not None or scale is not None
     if scale is None:
-        unit = unit or unit_of(float(finite.mean()), where, topic)
+        unit = unit or unit_of(float(np.median(finite)), where, topic)
     factor = NT_PER[unit] if unit else float(scale or 1.0)
-    mean = factor * float(finite.mean())
-    if unit and not _is_earths(mean) and _is_earths(mean, IRON):
-        text = f"{where}: the mean of {topic} is {mean:,.0f} nT in {unit}, not that of the Earth's field"
-        text += ": iron near the sensor, or another unit (--unit, --scale)"
-        warnings.warn(text, RepairWarning, stacklevel=3)
+    usual = factor * float(np.median(finite))
+    if unit and not _is_earths(usual) and _is_earths(usual, IRON):
+        doubt = f"the median of {topic} is {usual:,.0f} nT in {unit}, not that of the Earth's field"
     else:
-        check_unit(factor * finite, where, topic, unit or "nT", scale=scale)
+        doubt = check_unit(factor * finite, where, topic, unit or "nT", scale=scale, told=told)
+    if doubt:
+        text = f"{where}: {doubt}: iron near the sensor, or another unit (--unit, --scale)"
+        warnings.warn(text, RepairWarning, stacklevel=3)
     label = unit or f"units of {scale:g} nT"
     text = f"{np.count_nonzero(zero)} of {len(b)} messages of {topic} as missing, which are 0"
     return Field(factor * size, None if vector is None else factor * vector, label, text * bool(zero.any()))
 
 
-def unit_of(mean: float, where: str, topic: str) -> Unit:
-    """The unit in which a mean magnitude is the Earth's field, or at least the Earth's with that of iron.
+def unit_of(usual: float, where: str, topic: str) -> Unit:
+    """The unit in which a median magnitude is the Earth's field, or at least the Earth's with that of iron.
 
     The ranges of the units do not overlap.
     """
     for apart in (1.0, IRON):
         for unit, factor in NT_PER.items():
-            if _is_earths(mean * factor, apart):
+            if _is_earths(usual * factor, apart):
                 return unit  # type: ignore[return-value]
-    raise InputError(f"{where}: the mean of {topic} is {mean:.6g}; in no unit is that the Earth's field")
+    raise InputError(f"{where}: the median of {topic} is {usual:.6g}; in no unit is that the Earth's field")
 
 
-def _is_earths(mean_nt: float, apart: float = 1.0) -> bool:
-    """Whether a mean may be that of the Earth's field, or up to a factor of it [nT]."""
-    return LEAST_MEAN_NT / apart <= mean_nt < GREATEST_MEAN_NT * apart
+def _is_earths(usual_nt: float, apart: float = 1.0) -> bool:
+    """Whether a median may be that of the Earth's field, or up to a factor of it [nT]."""
+    return LEAST_MEAN_NT / apart <= usual_nt < GREATEST_MEAN_NT * apart

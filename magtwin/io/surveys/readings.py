@@ -356,7 +356,7 @@ def _read_table(path: Path) -> Table:
 
 def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
     """The readings in a table."""
-    asked = bool(columns.time)
+    asked, one_unit = bool(columns.time), columns.unit is not None or columns.scale is not None
     columns, taken = _complete(table, columns)
     p = np.column_stack([_lengths(table, columns.x), _lengths(table, columns.y)])
     turn = _turn(table, columns)
@@ -420,14 +420,17 @@ def _of_table(table: Table, paths: list[Path], columns: Columns) -> Readings:
     zero = np.flatnonzero(known & (b <= 0))
     if len(zero):
         raise InputError(f"{magnitude.where(int(zero[0]))}: a magnitude is above 0, got {b[zero[0]]:g} nT")
-    check_unit(
+    warning = check_unit(
         b[known],
         str(table.path),
         magnitude.name or columns.field or columns.vector,
         columns.unit or "nT",
         lambda k: magnitude.where(int(np.flatnonzero(known)[k])),
         columns.scale,
+        told=columns.unit is not None or columns.scale is not None,
+        p_xy=None if one_unit else p[known],
     )
+    taken += [warning] if warning else []
     if vector is not None:
         ratio = float(np.median(np.linalg.norm(vector[known], axis=1) / b[known]))
         if not 1 / APART <= ratio <= APART:

@@ -6,7 +6,7 @@ from magtwin.field.grid import Grid
 from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.field.survey.folder import read_grid
 from magtwin.field.survey.readings import Readings
-from magtwin.field.survey.stuck import SURE, find_stuck, mask_stuck
+from magtwin.field.survey.stuck import SURE, find_stuck, mask_stuck, steps_nt
 
 QUARTERS = tuple(np.arange(4) * np.pi / 2)
 
@@ -278,3 +278,78 @@ def test_the_report_doubts_a_survey_of_which_much_is_masked():
     assert "2000 of 4000 readings are masked as stuck" in report.metadata["doubts"][0]
     assert "--keep-stuck" in report.metadata["doubts"][0]
     assert "doubts" not in mask_stuck(drive())[1].metadata
+
+
+def phone(step_nt, rate_hz, kind, seed=0, locks=()):
+    """A walk of a minute at 0.5 m/s over 5 m x 2.1 m that stands still twice for 3 s, with a phone's steps.
+
+    `kind` is what is known: vectors in its axes, their magnitudes, these with a bias below the steps, or
+    rounded magnitudes. The sensor holds its value for 2 s at the times `locks` [s].
+    """
+    rng = np.random.default_rng(3_000 + seed)
+    x = np.arange(-2.5, 2.5, 0.5 / rate_hz)
+    p = np.concatenate([np.column_stack([x[:: (-1) ** k], np.full(len(x), 0.35 * k)]) for k in range(7)])
+    yaw = np.repeat([0.0 if k % 2 == 0 else np.pi for k in range(7)], len(x))
+    times = np.ones(len(p), int)
+    times[rng.integers(0, len(p), 2)] = 3 * rate_hz
+    p, yaw = np.repeat(p, times, axis=0), np.repeat(yaw, times)
+    at = np.column_stack([rng.uniform(-3, 3, 6), rng.uniform(-0.5, 2.5, 6), rng.uniform(-0.5, -0.2, 6)])
+    sensor = np.column_stack([p, np.full(len(p), 0.5)])
+    b = np.array([2_000, 21_000, -39_000]) + dipole_field_nt(sensor, at, rng.normal(0, 8, (6, 3)))
+    turned = np.cos(yaw)[:, None] * b[:, :2]  # headings are 0 and 180 deg
+    b = np.column_stack([turned, b[:, 2]]) + 60 * rng.standard_normal(b.shape)
+    bias = rng.uniform(-20_000, 20_000, 3) if kind == "biased" else 0
+    if kind == "rounded":
+        b = np.linalg.norm(b, axis=1)
+    b = step_nt * np.rint((b + bias) / step_nt) - bias
+    held = np.zeros(len(b), bool)
+    for start in (int(s * rate_hz) for s in locks):
+        b[start : start + 2 * rate_hz], held[start : start + 2 * rate_hz] = b[start], True
+    field = (
+        {"b_body_nt": b} if kind == "vector" else {"b_nt": b if b.ndim == 1 else np.linalg.norm(b, axis=1)}
+    )
+    return Readings(p_xy=p, yaw=yaw, t=np.arange(len(p)) / rate_hz, **field), held
+
+
+KINDS = ["vector", "magnitude", "biased", "rounded"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("step_nt", "rate_hz"), [(150, 100), (300, 45), (690, 45)])
+def test_of_a_walk_with_a_phones_steps_at_most_one_percent_is_masked(step_nt, rate_hz, kind):
+    readings, _ = phone(step_nt, rate_hz, kind)
+    assert np.count_nonzero(np.diff(readings.b_nt) == 0) > 100
+    found = find_stuck(readings)
+    assert np.count_nonzero(found.frozen | found.stuck) <= 0.01 * len(readings)
+    assert np.count_nonzero(found.outlier) <= 5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("step_nt", [10, 150, 690])
+def test_a_phone_that_holds_a_value_for_2_s_of_a_walk_through_a_gradient_is_found(step_nt, kind):
+    sound, _ = phone(step_nt, 45, kind)
+    starts = np.arange(1, 70, 3.0)
+    change = [abs(np.subtract(*sound.b_nt[[int(s * 45), int(s * 45) + 90]])) for s in starts]
+    readings, held = phone(step_nt, 45, kind, locks=starts[np.argsort(change)[-2:]])
+    found = find_stuck(readings)
+    masked = found.frozen | found.stuck
+    assert masked[held].all()
+    value = np.cumsum(np.diff(readings.b_nt, prepend=0) != 0)  # it may have begun before it was held
+    assert np.count_nonzero(masked & ~np.isin(value, value[held])) <= 0.01 * len(readings)
+
+
+@pytest.mark.parametrize("step_nt", [1, 10, 150, 690])
+def test_the_step_of_a_sensor_is_learnt_from_values_that_lie_on_it(step_nt):
+    readings, _ = phone(step_nt, 45, "rounded")
+    assert steps_nt(readings, [np.arange(len(readings))])[0] == pytest.approx(step_nt, rel=0.35)
+
+
+def test_masked_falsely_counts_repeats_that_agree_with_their_neighbours_and_no_others():
+    away = drive(change=lambda b, rng: np.where(np.arange(len(b)) // 60 == 20, b[1_200] + 3_000, b))
+    agree = drive(change=lambda b, rng: np.where(np.arange(len(b)) // 13 == 92, b[1_199], b))
+    for readings, count, least, most in ((away, 60, 0, 0), (agree, 13, 1, 13)):
+        _, report = mask_stuck(readings)
+        figures = {f.name: f for f in report.figures}
+        assert figures["stuck readings"].value == count
+        assert least <= figures["masked falsely"].value <= most
+        assert "at most" in figures["masked falsely"].note

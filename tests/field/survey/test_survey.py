@@ -246,10 +246,10 @@ REFUSALS = {
         {"90_map.csv": HEADER + "0,0,1.57,41000\n0.5,0,1.57,41000\n"},
         r"90_map\.csv: all rows have y = 0; a map needs two rows",
     ),
-    "tesla": ("scaled", 1e-9, r"mean of scalar_mag is 4\.105e-05 nT.*in T it would be 41,050 nT"),
-    "uT": ("scaled", 1e-3, r"mean of scalar_mag is 41\.05.*in uT it would be 41,050 nT"),
-    "mG": ("scaled", 1e-2, r"mean of scalar_mag is 410\.5.*in mG it would be 41,050 nT"),
-    "pT": ("scaled", 1e3, r"mean of scalar_mag is 4\.105e\+07 nT, outside .* no usual unit"),
+    "tesla": ("scaled", 1e-9, r"median of scalar_mag is 4\.105e-05 nT.*in T it would be 41,050 nT"),
+    "uT": ("scaled", 1e-3, r"median of scalar_mag is 41\.05.*in uT it would be 41,050 nT"),
+    "mG": ("scaled", 1e-2, r"median of scalar_mag is 410\.5.*in mG it would be 41,050 nT"),
+    "pT": ("scaled", 1e3, r"median of scalar_mag is 4\.105e\+07 nT, outside .* no usual unit"),
 }
 
 
