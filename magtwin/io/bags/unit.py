@@ -36,8 +36,8 @@ def field_nt(
 ) -> Field:
     """The field of messages in nT.
 
-    A median that is up to twice too large or too small for the Earth's field is taken with a warning: it may be
-    that of iron near the sensor. Up to ten times is taken if the unit is given.
+    A median up to twice too large or too small for the Earth's field is taken with a warning: it may be that
+    of iron near the sensor. Up to ten times is taken if the unit is given.
 
     Args:
         b: Magnitudes, shape (N,), or vectors, shape (N, 3). Vectors whose y and z are all 0 are magnitudes in
