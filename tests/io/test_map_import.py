@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from recordings import record
 from test_cli import refused
 from test_gp import survey
-from test_rosbag import at_middle, drive, write_bag
+from test_recorded import poses, readings
 from test_stuck import gridded
 
 from magtwin.author.earth import earth_of
@@ -81,10 +82,10 @@ def test_a_table_becomes_a_file_of_readings_by_its_column_names(tmp_path, capsys
 
 
 def test_a_bag_becomes_readings_by_the_command(tmp_path, capsys):
-    bag = write_bag(tmp_path / "bag", {"/pose": drive(), "/mag": at_middle(41_000 + np.arange(40.0))}, "mcap")
+    bag = record(tmp_path / "bag", {"/pose": poses(), "/slam": poses(), "/mag": readings()})
     run("map", "import", bag, "--out", tmp_path / "a.parquet", "--pose-topic", "/pose")
-    assert "told by its size" in "".join(capsys.readouterr().out.split("\n")).replace("  ", "")
-    assert len(load_readings(tmp_path / "a.parquet")) == 40
+    assert "in nT, by its size" in "".join(capsys.readouterr().out.split("\n")).replace("  ", "")
+    assert len(load_readings(tmp_path / "a.parquet")) == 198
 
 
 def test_scattered_readings_make_no_nodes_and_the_way_on_is_told(tmp_path, capsys):
