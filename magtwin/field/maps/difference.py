@@ -155,7 +155,6 @@ def difference(a: AnomalyMap, b: AnomalyMap) -> MapDifference:
         InputError: The maps have no node in common, or differ in frame, datum or height. If one of these is
             unknown, the report has a caution.
     """
-    a, b = a.whole(), b.whole()
     cautions = _compared(a, b)
     grid = _common(a, b)
     p, yaw = grid.poses()

@@ -336,14 +336,6 @@ class AnomalyMap(Summarized):
         values = np.where(self.valid, self.values_nt, np.nan)
         return bool(np.any(np.abs(values - values[:1]) > CONSTANT_NT))
 
-    def whole(self) -> "AnomalyMap":
-        """The map with all its arrays in memory; a map in tiles is read whole, if it is not too large."""
-        return self
-
-    def overview(self) -> "AnomalyMap":
-        """The map for pictures; of a map in tiles, every few nodes."""
-        return self
-
     @cached_property
     def _lookup(self) -> Lookup:
         return Lookup(self.values_nt, self.valid, self.origin_m, self.cell_m, self.headings_rad)
