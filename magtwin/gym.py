@@ -121,7 +121,6 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         *,
         scene: Twin | Scene | str | FilePath | None = None,
         lab: str = "",
-        epoch: str = "",
         network: str | FilePath | None = None,
         magnetometer: Kind | None = None,
         model_error: bool = True,
@@ -142,7 +141,6 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             num_envs: How many robots.
             scene: The file of a stage, a `Scene`, or a `Twin`.
             lab: As for `magtwin.open_twin`, if `scene` is a file.
-            epoch: As for `magtwin.open_twin`, if `scene` is a file.
             network: As for `magtwin.open_twin`, if `scene` is a file.
             magnetometer: As for `magtwin.open_twin`, if `scene` is a file.
             model_error: As for `magtwin.simulate`; each episode counts as a session.
@@ -167,7 +165,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             raise InputError("MagNav needs a scene: gymnasium.make('magtwin/MagNav-v0', scene='lab.usda')")
         if render_mode is not None:
             raise InputError(f"MagNav has no render_mode, got {render_mode!r}; write a Run and view that")
-        twin = opened(scene, network, magnetometer, model_error, "MagNav", lab=lab, epoch=epoch)
+        twin = opened(scene, network, magnetometer, model_error, "MagNav", lab=lab)
         twin = with_plant(twin, plant)
         check_field(twin.scene, twin.field)
         network_read = twin.magnetometer

@@ -1,9 +1,9 @@
 """Outputs: files and folders that appear whole, or not at all, whatever happens to the process or the disk.
 
 An output is written in a hidden folder beside its place, is brought to the disk, and is then renamed. The
-writing process keeps the hidden folder locked. One whose lock is free was left by a
-process that was killed: the next process that writes there removes it, after it has completed or undone what
-the other had begun to rename.
+writing process keeps the hidden folder locked. One whose lock is free was left by a process that was killed:
+the next process that writes there removes it. If a process is killed while it renames several outputs, the
+first ones are new and the others old; each is whole.
 
 A link at the place of an output is itself replaced: what it leads to stays as it is, so that no link in a
 stranger's folder leads a write elsewhere. Only a file that is rewritten in its place is found through a link.
@@ -12,12 +12,10 @@ stranger's folder leads a write elsewhere. Only a file that is rewritten in its 
 import ctypes
 import errno
 import filecmp
-import json
 import os
 import re
 import shutil
 import signal
-import stat
 import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -39,15 +37,11 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 _OURS = ".magtwin-"
 """In the name of every hidden folder."""
 
-_OLD, _FIRST, _COMMIT, _LIST = ".old", ".first", ".commit", ".list"
-"""Files in a hidden folder: what the output replaces, the first folder of its transaction, and in that folder
-the renames of a transaction that is complete, and the same while they are written down."""
+_OLD = ".old"
+"""What an output replaces, in its hidden folder."""
 
 _AT_FDCWD, _EXCHANGE = -100, 2
 """Arguments of renameat2(2): paths are relative to the working folder; the two files change places."""
-
-_LARGEST_NOTE = 1 << 24
-"""Most bytes of such a file."""
 
 _WRITTEN = re.compile(
     r"\.(bin|bmp|csv|dae|db3|exr|gif|glb|gltf|hdr|html|jpe?g|json|mcap|md|mtl|npz|obj|parquet|pgm|ply|png|rrd)"
@@ -268,7 +262,7 @@ def transaction() -> Iterator[None]:
         raise InputError(f"the outputs cannot be written ({os.strerror(error.errno)})") from error
     finally:
         _pending.reset(token)
-        for aside in reversed(pending.asides):  # the first one last: it holds the list of renames
+        for aside in pending.asides:
             aside.remove()
     for function in pending.functions:
         function()
@@ -322,12 +316,10 @@ class _Aside:
         name = place.name[:60]  # a longer one with what is added could be too long for the disk
         while True:
             folder = Path(tempfile.mkdtemp(prefix=f".{name}{_OURS}", dir=place.parent))
-            try:
-                lock = _locked(folder)
-            except FileNotFoundError:  # another process swept it before it was locked
-                continue
-            _asides.add(folder)
-            return cls(place, folder, lock, force)
+            lock = _locked(folder)
+            if folder.exists():  # no other process swept it before it was locked
+                _asides.add(folder)
+                return cls(place, folder, lock, force)
 
     @property
     def new(self) -> Path:
@@ -369,24 +361,8 @@ class _Aside:
         if self.old.exists():
             self.old.rename(self.place)
 
-    def number(self) -> int:
-        """Number of the output on the disk, which stays when it is renamed."""
-        return self.new.stat().st_ino
-
-    def complete(self, number: int) -> None:
-        """Do the `swap` that another process did not come to; `number` is that of the output."""
-        beside = self.folder.parent == self.place.parent and not self.folder.is_symlink()
-        if not beside or _OURS not in self.folder.name:
-            return  # not a list that magtwin wrote
-        if self.new.exists():
-            if self.number() == number:  # else it is what the output has replaced
-                self.swap(keep=False)
-        elif self.old.is_dir() and not self.place.exists():
-            self.old.rename(self.place)
-
     def remove(self) -> None:
         """Remove the folder."""
-        (self.folder / _COMMIT).unlink(missing_ok=True)
         shutil.rmtree(self.folder, ignore_errors=True)
         _asides.discard(self.folder)
         if self.lock >= 0:
@@ -396,9 +372,6 @@ class _Aside:
 def _commit(asides: list[_Aside]) -> None:
     """Rename outputs to their places: all, or none."""
     with _uninterrupted():
-        several = len(asides) > 1
-        if several:
-            _announce(asides)
         done: list[_Aside] = []
         try:
             for aside in asides:
@@ -406,10 +379,9 @@ def _commit(asides: list[_Aside]) -> None:
                     raise InputError(
                         f"{aside.place}: another process has made it in the meantime; give another name"
                     )
-                aside.swap(keep=several)
+                aside.swap(keep=len(asides) > 1)
                 done.append(aside)
         except BaseException:
-            (asides[0].folder / _COMMIT).unlink(missing_ok=True)
             for aside in reversed(done):
                 aside.undo()
             raise
@@ -417,86 +389,41 @@ def _commit(asides: list[_Aside]) -> None:
             _sync_entry(parent)
 
 
-def _announce(asides: list[_Aside]) -> None:
-    """Write down the renames of a transaction, so that they are completed if this process is killed."""
-    first = asides[0].folder
-    for aside in asides[1:]:
-        (aside.folder / _FIRST).write_text(str(first), encoding="utf-8")
-        _sync(aside.folder / _FIRST)
-    renames = [[str(aside.place), str(aside.folder), aside.number()] for aside in asides]
-    (first / _LIST).write_text(json.dumps(renames), encoding="utf-8")
-    _sync(first / _LIST)
-    (first / _LIST).rename(first / _COMMIT)
-    _sync_entry(first)
-
-
 def _sweep(parent: Path) -> None:
-    """Complete or undo, and remove, what killed processes left in a folder; once a process."""
+    """Remove what killed processes left in a folder; once a process."""
     if fcntl is None or parent in _swept or not parent.is_dir():
         return
     _swept.add(parent)
-    with suppress(OSError):
-        for entry in os.scandir(parent):
-            hidden = entry.name.startswith(".") and _OURS in entry.name
-            if hidden and entry.is_dir(follow_symlinks=False):
-                with suppress(OSError, ValueError, TypeError):
-                    _recover(Path(entry.path))
+    for folder in parent.glob(f".*{_OURS}*"):
+        with suppress(OSError):  # no folder, or that of a living process or of another user
+            lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                _clear(folder)
+            finally:
+                os.close(lock)
 
 
-def _recover(folder: Path) -> None:
-    """Sweep a hidden folder; raises OSError if its process lives."""
-    lock = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        names = {entry.name for entry in os.scandir(folder)}
-        head = folder
-        if _FIRST in names:
-            head = Path(_note(folder / _FIRST))
-        if (head / _COMMIT).is_file():  # a transaction that was complete: rename the rest of it
-            with suppress(ValueError, TypeError, RecursionError):  # not a list that magtwin wrote
-                for place, aside, number in json.loads(_note(head / _COMMIT)):
-                    _Aside(Path(place), Path(aside)).complete(number)
-        elif len(left := names - {_OLD, _FIRST, _LIST}) == 1:  # perhaps killed between two renames
-            own = _Aside(folder.with_name(left.pop()), folder)
-            if own.old.is_dir() and not own.place.exists():
-                own.old.rename(own.place)
-        shutil.rmtree(folder, ignore_errors=True)
-    finally:
-        os.close(lock)
-
-
-def _note(file: Path) -> str:
-    """The text of a small file in a hidden folder. The folder can come from a stranger.
-
-    Raises:
-        OSError, ValueError: It is no regular file of UTF-8, or a large one.
-    """
-    number = os.open(file, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-    with open(number, encoding="utf-8") as text:
-        about = os.fstat(number)
-        if not stat.S_ISREG(about.st_mode) or about.st_size > _LARGEST_NOTE:
-            raise ValueError(f"{file}: no note of magtwin")
-        return text.read()
+def _clear(folder: Path) -> None:
+    """Remove a hidden folder, and put back an older output that was moved out of the way for a new one."""
+    old = folder / _OLD
+    for new in folder.iterdir():
+        place = folder.with_name(new.name)
+        if new != old and old.is_dir() and not os.path.lexists(place):
+            old.rename(place)
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _locked(folder: Path) -> int:
-    """Lock a folder as long as this process lives; its file descriptor, -1 where folders have no locks.
-
-    Raises:
-        FileNotFoundError: It was removed before it was locked.
-    """
+    """Lock a folder as long as this process lives; its file descriptor, -1 where folders have no locks."""
     if fcntl is None:
         return -1
-    lock = os.open(folder, os.O_RDONLY)
     try:
+        lock = os.open(folder, os.O_RDONLY)
+    except FileNotFoundError:  # swept
+        return -1
+    with suppress(OSError):  # a file system without locks
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if not os.path.samestat(os.fstat(lock), folder.stat()):
-            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(folder))
-    except FileNotFoundError:
-        os.close(lock)
-        raise
-    except OSError:  # a file system without locks
-        pass
     return lock
 
 

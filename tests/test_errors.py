@@ -24,7 +24,7 @@ def test_a_parameter_that_begins_a_text_or_that_an_error_is_about_becomes_its_fl
         ("rate_hz of a controller must be above 0", "--rate-hz of a controller must be above 0"),
         ("rate_hz 3 is too low", "--rate-hz 3 is too low"),
         ("seed must be 0 or more", "--seed must be 0 or more"),
-        ("map has no epochs; seed must be 0", "map has no epochs; seed must be 0"),
+        ("map has no variance; seed must be 0", "map has no variance; seed must be 0"),
         ("a.csv: seed must be 0", "a.csv: seed must be 0"),
     ):
         assert InputError(text).in_flags(flags) == shown

@@ -77,9 +77,6 @@ class Scenario:
     lab: str = ""
     """Lab on a stage of several: path of its root prim. Default: the only one."""
 
-    epoch: str = ""
-    """Epoch of the scene's map, if it has several: its date, YYYY-MM-DD. Default: the one that it selects."""
-
     truth: Literal["map", "scene"] = "map"
     """Readings: drawn from the true field with the noise of `sensor`; or those of the scene's physical
     magnetometer, with the robot's own field of the session, motors and LiDAR."""

@@ -37,8 +37,8 @@ SESSION = 7
 ROBOT = ("platform_sha256", "sensor_m", "plant", "session")
 """Metadata of a drive by which a network knows the robot of its training."""
 
-Place = tuple[str, str, str]
-"""Stage of a scene, its lab and the epoch of its map, as `open_twin` takes them."""
+Place = tuple[str, str]
+"""Stage of a scene and its lab, as `open_twin` takes them."""
 
 
 def twin_case(scenario: Scenario, scene: str, seed: int, session: int, fields: Path | None = None) -> Case:
@@ -55,7 +55,7 @@ def twin_case(scenario: Scenario, scene: str, seed: int, session: int, fields: P
     Raises:
         InputError: A path or the scene is unknown, or the drive leaves no room for a kidnap.
     """
-    place = scene, scenario.lab, scenario.epoch
+    place = scene, scenario.lab
     rngs = dict(zip(STREAMS, np.random.default_rng((seed, 1)).spawn(len(STREAMS)), strict=True))
     field = _field(place, fields)
     drive = _drive(scenario, place, seed, session)
@@ -118,8 +118,8 @@ def twin_case(scenario: Scenario, scene: str, seed: int, session: int, fields: P
 def _twin(place: Place, magnetometer: str) -> "Twin":
     from magtwin.twin import open_twin
 
-    scene, lab, epoch = place
-    return open_twin(scene, lab=lab, epoch=epoch, magnetometer=magnetometer)  # type: ignore[arg-type]
+    scene, lab = place
+    return open_twin(scene, lab=lab, magnetometer=magnetometer)  # type: ignore[arg-type]
 
 
 @lru_cache(maxsize=64)

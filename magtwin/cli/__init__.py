@@ -36,7 +36,6 @@ MODULES = {
     "schema": ("scenes.schema",),
     "sweep": ("runs.sweep",),
     "train": ("learn.train",),
-    "upgrade": ("scenes.schema",),
     "validate": ("scenes.validate",),
     "view": ("runs.file",),
 }

@@ -18,7 +18,6 @@ from cyclopts.exceptions import CycloptsError
 
 from magtwin.cli.options import Json, Quiet
 from magtwin.cli.progress import watched
-from magtwin.cli.renamed import renamed
 from magtwin.cli.settings import Environment, Settings
 from magtwin.cli.terminal import Done, output_mode, print_error
 from magtwin.errors import TERMINATED, CalibrationWarning, InputError, MismatchWarning, RepairWarning
@@ -78,7 +77,7 @@ def main(arguments: list[str] | None = None) -> None:
             )
             sys.stdout.flush()  # a fault is reported here
     except CycloptsError as error:
-        _fail(renamed(error, arguments) or _dashed(arguments) or _with_file(error), status=2)
+        _fail(_dashed(arguments) or _with_file(error), status=2)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # `magtwin info ... | head`

@@ -105,12 +105,12 @@ Lab = Annotated[
         "only lab.",
     ),
 ]
-Epoch = Annotated[
-    str,
+MapLayer = Annotated[
+    Path | None,
     Parameter(
-        name="--epoch",
-        help="Epoch of the map, if it has several: its date, YYYY-MM-DD. Default: the epoch that the stage "
-        "selects.",
+        name="--map",
+        help="Map that the magnetometer reads, such as one of the same room on another day (.usdc, .usd). "
+        "Default: the scene's.",
     ),
 ]
 Network = Annotated[

@@ -12,12 +12,12 @@ from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import (
-    Epoch,
     Flag,
     Force,
     Gamepad,
     Lab,
     Lidar,
+    MapLayer,
     ModelError,
     Network,
     OutUnit,
@@ -134,7 +134,7 @@ def sim(
     *,
     where: Where = HERE,
     lab: Lab = "",
-    epoch: Epoch = "",
+    map_layer: MapLayer = None,
     pace: float = 1.0,
     duration_s: float | None = None,
     seed: Seed = 0,
@@ -181,7 +181,7 @@ def sim(
     announce(f"opening {scene}")
     kind = None if magnetometer == "none" else magnetometer
     opening: Any = {"network": network, "magnetometer": kind, "model_error": model_error}
-    twin = with_plant(open_twin(scene, lab=lab, epoch=epoch, **opening), plant)
+    twin = with_plant(open_twin(scene, lab=lab, map_layer=map_layer, **opening), plant)
     with where.bus("magtwin_sim", duration_s=duration_s, several=bool(twin.scene.others)) as bus:
         node = Simulator(
             twin,
@@ -216,7 +216,7 @@ def magnetometer(
     *settings: str,
     where: Where = HERE,
     lab: Lab = "",
-    epoch: Epoch = "",
+    map_layer: MapLayer = None,
     network: Network = None,
     online: str | None = None,
     measured: str | None = None,
@@ -252,7 +252,7 @@ def magnetometer(
     values = settings_of(PARAMETERS, settings)
     announce(f"opening {scene}")
     twin = open_twin(
-        scene, lab=lab, epoch=epoch, network=network, model_error=False
+        scene, lab=lab, map_layer=map_layer, network=network, model_error=False
     )  # it predicts for a robot that reads
     with where.bus("magtwin_magnetometer", sim_time=values["use_sim_time"], duration_s=duration_s) as bus:
         Magnetometer(

@@ -18,7 +18,6 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 from magtwin.errors import InputError
 from magtwin.usd.geometry import Shape, read_shapes
 from magtwin.usd.layers import open_stage, translates
-from magtwin.usd.maps.tiled_layer import is_tiled
 from magtwin.usd.schema import attribute_name, has_api, prims_with, value_of
 from magtwin.version import __version__
 
@@ -187,7 +186,7 @@ class _Scene:
                 value = _json_value(attribute.Get())
                 if value not in (None, []):
                     extras[attribute.GetName()] = value
-        if has_api(prim, "anomalyMap") and not is_tiled(prim):
+        if has_api(prim, "anomalyMap"):
             values = np.array(value_of(prim.GetAttribute(attribute_name("anomalyMap", "values"))), "<f4")
             valid = np.array(value_of(prim.GetAttribute(attribute_name("anomalyMap", "valid"))), "u1")
             valid &= np.isfinite(values)

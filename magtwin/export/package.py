@@ -34,16 +34,12 @@ from magtwin.urdf.simready import UNKNOWN
 from magtwin.usd.animation import write_animation
 from magtwin.usd.layers import open_stage, stage_sha256
 from magtwin.usd.maps.layer import read_map
-from magtwin.usd.maps.tiled_layer import check_tiles
 from magtwin.usd.placement import labs_on
 from magtwin.usd.scene import read_scene
 from magtwin.usd.schema import FOLDER as SCHEMA
 from magtwin.usd.schema import attribute_name, place, prims_with, value_of
-from magtwin.usd.schema.names import OLDER
-from magtwin.usd.schema.versions import TEXT
 from magtwin.usd.trial import check_named
 from magtwin.usd.units import check_units
-from magtwin.usd.upgrade import upgrade
 from magtwin.version import __version__
 
 Profile = Literal["omniverse", "isaac", "newton", "viewer"]
@@ -236,10 +232,6 @@ class _Work:
             self.root = bring_together(self.source, self.folder)
             detach(self.root)  # of a single layer, which holds its network
             self.checksum = stage_sha256(self.source)
-        if older := upgrade(self.root):
-            self.notes.append(
-                f"{len(older)} layers were of schema {OLDER}, or named such a map, and are of {TEXT} here"
-            )
         stage = open_stage(self.root)
         check_units(stage)
         if len(labs := dict.fromkeys(lab.path for lab in labs_on(stage))) > 1:
@@ -263,7 +255,6 @@ class _Work:
         self.map = ""
         for prim in prims_with(world, "anomalyMap"):
             read_map(prim)
-            check_tiles(prim)
             self.map = self.map or str(prim.GetPath())
             licence = value_of(prim.GetAttribute(attribute_name("anomalyMap", "licence")))
             values = prim.GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack()[0].layer

@@ -1,11 +1,9 @@
-"""Calendar days: dates of surveys, of epochs and of the Earth's field."""
+"""Calendar days: dates of surveys and of the Earth's field."""
 
 import datetime
 from collections.abc import Sequence
 
 from magtwin.errors import InputError
-
-ORIGIN = datetime.date(2000, 1, 1)  # Day 0 of `day_number`
 
 
 def parse_day(day: str | datetime.date, what: str = "date") -> datetime.date:
@@ -45,8 +43,3 @@ def check_texts(survey: object, names: Sequence[str]) -> None:
         if not isinstance(text, str):
             raise InputError(f"{name} of {kind} must be a text, got {text!r}")
     check_day(getattr(survey, "created", ""), f"created of {kind}")
-
-
-def day_number(day: datetime.date) -> int:
-    """Days from 2000-01-01 to `day`, UTC; negative before it."""
-    return (day - ORIGIN).days

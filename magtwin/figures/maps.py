@@ -65,7 +65,6 @@ def draw_map(field: AnomalyMap, *, what: str = "field", headings: Sequence[float
         raise InputError("headings must name one heading at least, got none")
     if headings is not None and len(headings) > MOST_ASKED:
         raise InputError(f"headings to show are {MOST_ASKED} at most, a panel each, got {len(headings)}")
-    field = field.overview()
     if what != "mask" and not field.valid.any():
         raise InputError(f"map {field.name!r} has no valid node to draw")
     layers = quantity.layers(field)

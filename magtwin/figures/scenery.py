@@ -38,7 +38,6 @@ from magtwin.outputs import output
 from magtwin.run.compare import FIELDS, HEADINGS, POSITIONS
 from magtwin.run.run import Run
 from magtwin.spec.base import Vec3
-from magtwin.twin import lab_and_epoch
 from magtwin.usd.geometry import ColourScale, Link, Shape, read_colour_scale, read_links, read_shapes
 from magtwin.usd.scene import open_scene
 
@@ -172,7 +171,7 @@ class Scenery:
         self._times, self._speed, self._view, self._size = np.asarray(times, float), speed, view, size
         self._position = _position(run)
         self._pose(run)
-        opened = open_scene(scene_file, check_network=False, **lab_and_epoch(run.metadata))
+        opened = open_scene(scene_file, check_network=False, lab=str(run.metadata.get("lab", "")))
         stage, scene = opened.stage, opened.scene
         shapes, links = read_shapes(stage), read_links(stage)
         moving = _links_of(links, [placed.robot.name for placed in scene.robots], run)

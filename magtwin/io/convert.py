@@ -10,7 +10,7 @@ from magtwin.files import existing
 from magtwin.io.formats import format_to_write, read_run, write_run
 from magtwin.outputs import check_free
 from magtwin.run.run import Run
-from magtwin.twin import Twin, lab_and_epoch, led_by, open_twin, scene_of
+from magtwin.twin import Twin, lab_and_map, led_by, open_twin, scene_of
 
 
 def convert_run(
@@ -77,7 +77,7 @@ def twin_to_show(
     """
     try:
         stage = scene_of(run, scene, near=file)
-        twin = open_twin(stage, magnetometer="map-only", **lab_and_epoch(run.metadata))  # needs no network
+        twin = open_twin(stage, magnetometer="map-only", **lab_and_map(run.metadata, file))  # no network
         if "robot" in run.metadata:
             twin = led_by(twin, str(run.metadata["robot"]))
     except InputError as error:

@@ -70,7 +70,7 @@ def info_of_run(file: Path, **reading: Any) -> Report:
 def _info_of_usd(file: Path) -> Report:
     from magtwin.usd.animation import is_animation
     from magtwin.usd.info import info_of_stage
-    from magtwin.usd.maps.layer import is_map_layer, load_epochs
+    from magtwin.usd.maps.layer import is_map_layer, load_map
 
     if file.suffix.lower() != ".usdz" and is_animation(file):
         run = info_of_run(file)
@@ -80,8 +80,7 @@ def _info_of_usd(file: Path) -> Report:
             return replace(run, metadata={**run.metadata, "stage": str(error)})
     if file.suffix.lower() == ".usdz" or not is_map_layer(file):
         return info_of_stage(file)
-    epochs = load_epochs(file)
-    card = map_metadata(epochs[-1], epochs)
+    card = map_metadata(load_map(file))
     stage = [figure for figure in info_of_stage(file).figures if figure.value != 0]
     return replace(_with_figures(card, stage), title=f"{card.title} ({file})")
 

@@ -52,7 +52,7 @@ def drive(
     commands: str | Path | None = None,
     replay: str | Path | None = None,
     lab: str = "",
-    epoch: str = "",
+    map_layer: str | Path | None = None,
     network: str | Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
     model_error: bool = True,
@@ -74,7 +74,7 @@ def drive(
         commands: CSV of commands to drive by, in place of the path.
         replay: Run to drive again, in place of the path.
         lab: As for `magtwin.open_twin`.
-        epoch: As for `magtwin.open_twin`.
+        map_layer: As for `magtwin.open_twin`.
         network: As for `magtwin.open_twin`.
         magnetometer: As for `magtwin.open_twin`.
         model_error: As for `magtwin.open_twin`.
@@ -102,7 +102,7 @@ def drive(
     twin = open_twin(
         scene_file,
         lab=lab,
-        epoch=epoch,
+        map_layer=map_layer,
         network=network,
         magnetometer=magnetometer,
         model_error=model_error,

@@ -17,7 +17,7 @@ from magtwin.report import Figure, Report
 from magtwin.run.run import COLUMNS, Run
 from magtwin.twin import (
     in_session_of,
-    lab_and_epoch,
+    lab_and_map,
     locate,
     path_metadata,
     scene_of,
@@ -197,11 +197,11 @@ def map_of(
     from magtwin.usd.maps.layer import load_map
     from magtwin.usd.scene import read_scene
 
-    where = lab_and_epoch(run.metadata)
+    where = lab_and_map(run.metadata, near)
     layer = read_scene(scene_of(run, scene, near=near), check_network=False, **where).map_layer
     if "map_sha256" in run.metadata and run.metadata["map_sha256"] != layer_sha256(layer):
         raise InputError(f"{layer}: is not the map of the run")
-    return load_map(layer, where["epoch"] or None)
+    return load_map(layer)
 
 
 def planned_of(run: Run, *, near: str | FilePath | None = None) -> NDArray[np.float64] | None:

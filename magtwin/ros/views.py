@@ -48,7 +48,7 @@ def publish_lab(twin: Twin, bus: Bus, frame: str) -> list[Publisher]:
         The publishers. Late subscribers get the messages from them.
     """
     occupancy = occupancy_of(room_of(twin))
-    shown = twin.field.overview()
+    shown = twin.field
     values, sd = _mean_and_sd(shown)
     step = max(1, math.ceil(math.sqrt(values.size / MOST_NODES)))
     values, sd = values[::step, ::step], sd[::step, ::step]

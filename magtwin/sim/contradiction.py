@@ -72,7 +72,6 @@ def contradiction_nt(scene: Scene, anomaly_map: AnomalyMap) -> Contradiction:
     Raises:
         InputError: The scene has no Earth's field, or the map no valid node where a robot can stand.
     """
-    anomaly_map = anomaly_map.overview()
     p_xy, yaw = anomaly_map.grid.poses()
     read = anomaly_map.recorded_yaw
     if read is not None:

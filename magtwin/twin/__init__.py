@@ -6,6 +6,7 @@
 from magtwin.twin.authoring import author_scene, new_scene, scene_from_toml
 from magtwin.twin.opening import (
     check_scene,
+    lab_and_map,
     led_by,
     locate,
     open_twin,
@@ -23,7 +24,6 @@ from magtwin.twin.twin import (
     Twin,
     in_session,
     in_session_of,
-    lab_and_epoch,
     model_error_of,
     room_of,
     trained_on,
@@ -41,7 +41,7 @@ __all__ = [
     "engine_named",
     "in_session",
     "in_session_of",
-    "lab_and_epoch",
+    "lab_and_map",
     "led_by",
     "locate",
     "model_error_of",

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any
 
-from magtwin.errors import InputError, find
+from magtwin.errors import find
 from magtwin.files import sha256, shipped
 from magtwin.kinds import expected
 from magtwin.outputs import check_free, output
@@ -62,13 +62,10 @@ def scene_from_toml(
     """
     from magtwin.author.scene_file import scene_from_toml as read_toml_scene
     from magtwin.sim.contradiction import check_agrees
-    from magtwin.usd.maps.layer import is_map_layer, load_map
+    from magtwin.usd.maps.layer import check_map_layer, load_map
 
-    if map_layer is not None and not is_map_layer(map_layer):
-        raise InputError(
-            f"{map_layer}: is no map layer; give the layer of a map, such as `magtwin map import` writes",
-            parameter="map_layer",
-        )
+    if map_layer is not None:
+        check_map_layer(map_layer)
     if workshop is None:
         _WORKSHOPS.append(tempfile.TemporaryDirectory(prefix="magtwin-"))
         workshop = _WORKSHOPS[-1].name

@@ -21,7 +21,6 @@ from magtwin.twin.twin import (
     Kind,
     Metadata,
     Twin,
-    lab_and_epoch,
     scene_sha256,
     without_model_error,
     without_tracking_error,
@@ -38,7 +37,7 @@ def open_twin(
     scene: Scene | str | FilePath,
     *,
     lab: str = "",
-    epoch: str = "",
+    map_layer: str | FilePath | None = None,
     network: str | FilePath | None = None,
     magnetometer: Kind | None = None,
     model_error: bool = True,
@@ -57,8 +56,8 @@ def open_twin(
             written to a temporary folder first. Colliders added to a stage by hand are not part of a
             `Scene`.
         lab: Path of the lab's root prim on a stage of several labs. Default: the only lab.
-        epoch: Date of the map's epoch, YYYY-MM-DD, if the map has several. Default: the epoch that the stage
-            selects.
+        map_layer: Map that replaces the scene's, such as one of the same room on another day. What shows the
+            stage still shows the stage's own map.
         network: Weights (.safetensors or .pth) that replace those of the scene; or "none" for a physical
             magnetometer.
         magnetometer: Kind that replaces the scene's: "physical", "neural" or "map-only".
@@ -75,13 +74,13 @@ def open_twin(
     options: Any = {"network": network, "magnetometer": magnetometer, "model_error": model_error}
     options["tracking_error"] = tracking_error
     if isinstance(scene, Scene):
-        return _open_in_memory(scene, epoch=epoch, **options)  # has one lab
+        return _open_in_memory(scene, map_layer=map_layer, **options)  # has one lab
     from magtwin.usd.layers import layer_sha256
     from magtwin.usd.scene import open_scene
 
     file = scene_file(scene)
     neural = network is None and magnetometer in (None, "neural")
-    stage = open_scene(file, lab=lab, epoch=epoch, check_network=neural)
+    stage = open_scene(file, lab=lab, map_layer=map_layer, check_network=neural)
     read = stage.scene
     read = dataclasses.replace(
         read,
@@ -98,8 +97,8 @@ def open_twin(
     metadata |= {"map": field.name, "map_sha256": layer_sha256(read.map_layer)}
     if stage.lab:
         metadata["lab"] = stage.lab
-    if stage.epoch:
-        metadata["map_epoch"] = stage.epoch
+    if map_layer is not None:
+        metadata["map_file"] = FilePath(map_layer).as_posix()
     if stage.pose is not None:
         metadata["lab_pose"] = " ".join(map(repr, (*stage.pose.p, stage.pose.yaw)))
     stale = [_stale(stage)] if stage.changes else []
@@ -174,7 +173,7 @@ def opened(
 ) -> Twin:
     """The twin, opened if it is a scene; `function` is named in the refusal of options that come too late.
 
-    `where` are the options `lab` and `epoch`.
+    `where` are further options of `open_twin`.
     """
     if not isinstance(twin, Twin):
         return open_twin(twin, network=network, magnetometer=magnetometer, model_error=model_error, **where)
@@ -333,7 +332,7 @@ def twin_of(
     network = str(metadata["network_file"]) if "network_file" in metadata else None
     twin = open_twin(
         scene,
-        **lab_and_epoch(metadata),
+        **lab_and_map(metadata, near),
         network=network if network is None else locate(network, near) or network,
         magnetometer=kind if network is None else None,
         model_error=bool(metadata.get("model_error", False)),
@@ -383,6 +382,15 @@ def scene_of(
         name = run.metadata["scene_file"]
         raise InputError(f"{name}: the scene of the run is missing; name it with `scene`", parameter="scene")
     return place
+
+
+def lab_and_map(metadata: Mapping[str, object], near: str | FilePath | None = None) -> dict[str, Any]:
+    """The options `lab` and `map_layer` of `open_twin` with which a run was made; `near` as for `twin_of`."""
+    options: dict[str, Any] = {"lab": str(metadata.get("lab", ""))}
+    if "map_file" in metadata:
+        file = str(metadata["map_file"])
+        options["map_layer"] = locate(file, near) or file
+    return options
 
 
 def locate(file: str, near: str | FilePath | None = None) -> FilePath | None:

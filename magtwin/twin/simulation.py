@@ -24,7 +24,6 @@ from magtwin.twin.twin import (
     checked_seed,
     in_session,
     in_session_of,
-    lab_and_epoch,
     model_error_of,
     room_of,
     scene_sha256,
@@ -297,7 +296,7 @@ def engine_named(
     if {"lab", "lab_pose"} & twin.metadata.keys():
         from magtwin.usd.scene import as_layer, open_alone
 
-        placed = as_layer(open_alone(twin.scene_file, robot.name, **lab_and_epoch(twin.metadata)))
+        placed = as_layer(open_alone(twin.scene_file, robot.name, lab=str(twin.metadata.get("lab", ""))))
     return Newton(twin.scene_file, robot, progress, placed=placed)
 
 

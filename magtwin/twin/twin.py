@@ -5,7 +5,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -89,7 +89,7 @@ class Twin(Summarized):
         if self.opened is not None:
             opened = self.opened.alone(name)
             return opened.shapes, opened.links
-        stage = open_alone(self.scene_file, name, **lab_and_epoch(self.metadata))
+        stage = open_alone(self.scene_file, name, lab=str(self.metadata.get("lab", "")))
         return list(read_shapes(stage)), read_links(stage)
 
     def __getstate__(self) -> dict[str, object]:
@@ -116,11 +116,6 @@ class Twin(Summarized):
                 ("file", str(self.scene_file) if self.stage is None else "none: opened from a Scene"),
             ),
         )
-
-
-def lab_and_epoch(metadata: Mapping[str, object]) -> dict[str, Any]:
-    """The options `lab` and `epoch` of `open_twin` with which a run was made, from its metadata."""
-    return {"lab": str(metadata.get("lab", "")), "epoch": str(metadata.get("map_epoch", ""))}
 
 
 def in_session(twin: Twin, session: Session | None = None, *, seed: int = 0) -> Twin:

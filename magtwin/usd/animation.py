@@ -39,7 +39,6 @@ from magtwin.usd.layers import (
     open_stage,
     translates,
 )
-from magtwin.usd.maps.epochs import EPOCH
 from magtwin.usd.placement import lab_on, labs_on, take_to_origin
 from magtwin.usd.schema import attribute_name, only_prim_with, place, prims_with
 from magtwin.usd.schema.versions import creator
@@ -143,7 +142,7 @@ def write_animation(
         raise InputError("the run has no rows, there is nothing to play")
     rate = fps or (round(1 / float(np.median(np.diff(t[: mapped.LONG + 1]))), 6) if len(t) > 1 else 1.0)
     pose = _pose_columns(run)
-    stand, maps = _Stand(), list[Sdf.Path]()
+    stand = _Stand()
     if scene_file is not None:
         stage = open_stage(scene_file)
         world = stage.GetDefaultPrim()
@@ -151,7 +150,6 @@ def write_animation(
             take_to_origin(stage, lab_on(stage, str(run.metadata.get("lab", ""))))
         check_not_part(stage, path)
         stand = _stand(stage, world, str(run.metadata.get("robot", "")))
-        maps = [prim.GetPath() for prim in prims_with(stage.GetPseudoRoot(), "anomalyMap")]
     with ExitStack() as stack:
         stack.enter_context(transaction())
         if run.rows > mapped.LONG:
@@ -178,9 +176,6 @@ def write_animation(
             for bare in (stand.world, stand.robot, stand.sensors["magnetometer"]):
                 spec = Sdf.CreatePrimInLayer(layer, bare)
                 spec.specifier, spec.typeName = Sdf.SpecifierDef, "Xform"
-        if epoch := str(run.metadata.get("map_epoch", "")):
-            for prim in maps:
-                Sdf.CreatePrimInLayer(layer, prim).variantSelections[EPOCH] = epoch
         readings, columns = _sampled(run, stand), stand.world.AppendChild(RUN)
         clips = ClipWriter(folder, layer) if run.rows > mapped.LONG else None
         _declare(layer, stand, readings, wheels="wheel_angle" in run)

@@ -8,14 +8,12 @@ from pxr import Usd, UsdGeom, UsdPhysics
 from magtwin.errors import InputError
 from magtwin.report import Figure, Report
 from magtwin.usd.layers import open_stage, translates
-from magtwin.usd.maps.epochs import epochs_of
 from magtwin.usd.placement import AT_ORIGIN, labs_on, pose_of
 from magtwin.usd.scene import open_scene
-from magtwin.usd.schema import prims_with
 from magtwin.usd.units import metres_per_unit
 
 _PREFIX = "Magtwin"
-_MANY = ("MagtwinMagneticSourceAPI", "MagtwinFurnitureAPI", "MagtwinMapTileAPI")
+_MANY = ("MagtwinMagneticSourceAPI", "MagtwinFurnitureAPI")
 """Schemas that are on many prims, so that only their number is shown."""
 
 
@@ -79,9 +77,6 @@ def _labs(path: Path, stage: Usd.Stage) -> list[Figure]:
         except InputError as error:
             figures.append(Figure("cannot be run", str(error)))
             continue
-        if opened.epoch:
-            dates = ", ".join(epochs_of(prims_with(opened.stage.GetPseudoRoot(), "anomalyMap")[0]))
-            figures.append(Figure("map epoch", opened.epoch, note=f"of {dates}; --epoch reads another"))
         if opened.map.made_from is not None:
             figures.append(Figure("map made from", str(opened.map.made_from)))
         if opened.changes:

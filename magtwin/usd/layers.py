@@ -2,7 +2,6 @@
 
 import functools
 import hashlib
-import json
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -19,7 +18,7 @@ from magtwin.errors import InputError
 from magtwin.files import existing, existing_file, sha256
 from magtwin.kinds import USD_SUFFIXES, kind_of, refused
 from magtwin.outputs import afterwards, output
-from magtwin.usd.schema.versions import creator, is_upgraded, upgrade_stage
+from magtwin.usd.schema.versions import check_schema, creator
 from magtwin.usd.trial import try_stage
 
 P = ParamSpec("P")
@@ -27,12 +26,6 @@ R = TypeVar("R")
 
 WORLD = Sdf.Path("/World")
 """Default prim of maps and scenes."""
-
-TILED_MAP, MAP_PREFIX = WORLD.AppendChild("AnomalyMap"), "magtwin:anomalyMap:"
-"""Path of the map in a map's layer, and how its attributes begin."""
-
-TILED_BYTES = 1_000_000
-"""Bytes from which on a layer can be one whose map is read by tiles."""
 
 SUFFIXES = (".usd", ".usda", ".usdc")
 
@@ -75,7 +68,7 @@ def describe_stage(stage: Usd.Stage, documentation: str) -> None:
 def open_stage(path: str | os.PathLike[str], *, own: bool = False) -> Usd.Stage:
     """Open the stage of a USD file, reloaded from disk.
 
-    Layers of an older version of the schema get its names of today in memory, with a warning.
+    Attributes of magtwin that the schema does not define cause a warning, as does a later schema.
 
     Args:
         path: The file.
@@ -90,24 +83,18 @@ def open_stage(path: str | os.PathLike[str], *, own: bool = False) -> Usd.Stage:
     path = check_stage(path, own=own)
     with translated(path, "cannot be opened as USD"):
         stage = Usd.Stage.Open(str(path))
-        layers = [layer for layer in stage.GetUsedLayers() if layer.realPath]
-        held = [layer for layer in layers if is_upgraded(layer)]  # elsewhere; a reload would undo it
-        unsaved = [layer.identifier for layer in layers if layer.dirty and layer not in held]
-        if unsaved:
+        if unsaved := [x.identifier for x in stage.GetUsedLayers() if x.realPath and x.dirty]:
             raise InputError(
                 f"{path}: {unsaved[0]} has changes in this process that are not saved; save them "
                 "(`stage.Save()`), or drop them (`layer.Reload()`)"
             )
-        if held:
-            Sdf.Layer.ReloadLayers([layer for layer in layers if layer not in held])
-        else:
-            stage.Reload()  # a layer that is still held elsewhere would be stale
+        stage.Reload()  # a layer that is still held elsewhere would be stale
         errors = stage.GetCompositionErrors()
     if errors:
         said = _one_line(_text(errors[0])).removesuffix("; skipping.")
         link = f"; it is a link, beside which USD looks: give {path.resolve()}" if path.is_symlink() else ""
         raise InputError(f"{path}: {said}{link}")
-    upgrade_stage(stage, str(path))
+    check_schema(stage, str(path))
     return stage
 
 
@@ -273,19 +260,8 @@ def layer_files(path: str | os.PathLike[str]) -> list[Path]:
 
 
 def layer_sha256(path: str | os.PathLike[str]) -> str:
-    """Checksum of a layer: of its bytes, but of a map in tiles of what its map's prim says.
-
-    That holds the map's own checksum, which covers every tile, so no tile is read.
-    """
-    path = existing_file(path, "layer", "USD")
-    if _is_crate(path) and path.stat().st_size > TILED_BYTES:
-        check_stage(path, composed=False)
-        layer = Sdf.Layer.OpenAsAnonymous(str(path))
-        prim = layer.GetPrimAtPath(TILED_MAP)
-        if prim and f"{MAP_PREFIX}tileCells" in prim.attributes:
-            said = {a.name: str(a.default) for a in prim.attributes if not a.name.endswith("tileFigures")}
-            return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
-    return sha256(path)
+    """Checksum of a layer's bytes."""
+    return sha256(existing_file(path, "layer", "USD"))
 
 
 def stage_sha256(path: str | os.PathLike[str]) -> str:

@@ -28,8 +28,7 @@ from magtwin.usd.lab.room import read_lab
 from magtwin.usd.lab.sources import read_transform
 from magtwin.usd.layers import layer_sha256, open_stage, relative_asset, save_layer, stage_sha256, translates
 from magtwin.usd.maps.attributes import MADE_FROM
-from magtwin.usd.maps.epochs import select_epoch, selected_epoch
-from magtwin.usd.maps.layer import read_map
+from magtwin.usd.maps.layer import check_map_layer, load_map, read_map
 from magtwin.usd.placement import (
     AT_ORIGIN,
     SAME,
@@ -80,9 +79,6 @@ class OpenedScene:
     pose: Pose | None = None
     """Pose of the lab in its stage; None if it is at the origin."""
 
-    epoch: str = ""
-    """Date of the map's epoch; "" if the map has no epochs."""
-
     changes: tuple[str, ...] = ()
     """What has changed on the stage since the map was made."""
 
@@ -121,13 +117,17 @@ class OpenedScene:
         scene = replace(self.scene.led_by(robot), others=())
         if not self.scene.others:
             return self
-        stage = _alone(_placed(Usd.Stage.Open(self.stage.GetRootLayer()), self.lab, self.epoch), robot)
+        stage = _alone(_placed(Usd.Stage.Open(self.stage.GetRootLayer()), self.lab), robot)
         return replace(self, stage=stage, scene=scene)
 
 
 @translates
 def open_scene(
-    path: str | os.PathLike[str], *, lab: str = "", epoch: str = "", check_network: bool = True
+    path: str | os.PathLike[str],
+    *,
+    lab: str = "",
+    map_layer: str | os.PathLike[str] | None = None,
+    check_network: bool = True,
 ) -> OpenedScene:
     """Open the stage of a scene once: its Scene and map, and its obstacles and geometry when asked for.
 
@@ -137,7 +137,7 @@ def open_scene(
         path: Root layer, as `author_scene` wrote it or as others edited it. A start's yaw is computed from a
             quaternion, so its last bits can differ from what was authored.
         lab: Path of the lab's root on a stage of several labs. Default: the only lab.
-        epoch: Date of the map's epoch, YYYY-MM-DD. Default: the epoch that the stage selects.
+        map_layer: Map that replaces the stage's.
         check_network: Whether the weights that the magnetometer names must exist.
 
     Raises:
@@ -158,26 +158,29 @@ def open_scene(
     earth, notes = earth_in(stage, where)
     take_to_origin(stage, where)
     world = stage.GetPseudoRoot()
-    _select_epoch(stage, epoch)
     prims = _robot_prims(stage)
     robots = [_read_placed(prim, check_network, notes) for prim in prims]
     magnetometers = [only_prim_with(prim, "magnetometer") for prim in prims]
     maps = [map_of(magnetometer) for magnetometer in magnetometers]
     checksums = [plain_value(m.GetAttribute(MAP_CHECKSUM)) for m in magnetometers]
-    anomaly_map = read_map(maps[0])
-    for magnetometer, own_map, checksum in zip(magnetometers, maps, checksums, strict=True):
-        if own_map != maps[0] or checksum not in ("", checksums[0]):
+    if map_layer is not None:
+        check_map_layer(map_layer)
+        anomaly_map, layer, checksum = load_map(map_layer), Path(map_layer), layer_sha256(map_layer)
+    else:
+        values = maps[0].GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack()
+        anomaly_map, layer, checksum = read_map(maps[0]), Path(values[0].layer.realPath), checksums[0]
+    for magnetometer, own_map, own_checksum in zip(magnetometers, maps, checksums, strict=True):
+        if own_map != maps[0] or own_checksum not in ("", checksums[0]):
             raise InputError(
                 f"{place(magnetometer)}: reads another map than {magnetometers[0].GetPath()}; the robots of "
                 "a scene share one"
             )
     sources, furniture = read_magnets(stage)
-    values = maps[0].GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack()
     try:
         scene = Scene(
             name=path.stem,
-            map_layer=Path(values[0].layer.realPath).resolve(),
-            map_sha256=checksums[0],
+            map_layer=layer.resolve(),
+            map_sha256=checksum,
             robot=robots[0].robot,
             lab=read_lab(only_prim_with(world, "lab")),
             earth=earth,
@@ -199,7 +202,6 @@ def open_scene(
         anomaly_map,
         lab=where.path if several else "",
         pose=None if pose == AT_ORIGIN else pose,
-        epoch=selected_epoch(maps[0]),
         changes=() if made is None else tuple(made.changes(scene)),
         notes=tuple(notes),
     )
@@ -222,19 +224,18 @@ def robots_in(path: str | os.PathLike[str], *, lab: str = "") -> dict[str, str |
 
 
 @translates
-def open_alone(path: str | os.PathLike[str], robot: str, *, lab: str = "", epoch: str = "") -> Usd.Stage:
+def open_alone(path: str | os.PathLike[str], robot: str, *, lab: str = "") -> Usd.Stage:
     """A stage in the axes of a lab, on which other labs and all robots but one are inactive.
 
     Args:
         path: Root layer of a scene.
         robot: Name of the robot that stays. If there is no such robot, all stay.
         lab: As for `open_scene`. A stage without a lab stays where it is.
-        epoch: As for `open_scene`.
 
     Raises:
-        InputError: The file is missing or not USD, or as for `open_scene`, for `lab` and `epoch`.
+        InputError: The file is missing or not USD, or as for `open_scene`, for `lab`.
     """
-    return _alone(_placed(open_stage(path), lab, epoch), robot)
+    return _alone(_placed(open_stage(path), lab), robot)
 
 
 def as_layer(stage: Usd.Stage) -> str:
@@ -250,18 +251,11 @@ def as_layer(stage: Usd.Stage) -> str:
     return str(layer.ExportToString())
 
 
-def _placed(stage: Usd.Stage, lab: str, epoch: str = "") -> Usd.Stage:
-    """The stage in the axes of a lab, if it has one, with an epoch of its map."""
+def _placed(stage: Usd.Stage, lab: str) -> Usd.Stage:
+    """The stage in the axes of a lab, if it has one."""
     if labs_on(stage):
         take_to_origin(stage, lab_on(stage, lab))
-    _select_epoch(stage, epoch)
     return stage
-
-
-def _select_epoch(stage: Usd.Stage, epoch: str) -> None:
-    """Show an epoch of the maps of a stage of one lab; "" leaves what the stage selects."""
-    for prim in prims_with(stage.GetPseudoRoot(), "anomalyMap") if epoch else ():
-        select_epoch(prim, epoch)
 
 
 def earth_in(stage: Usd.Stage, lab: Lab) -> tuple[EarthFieldSpec | None, list[str]]:

@@ -1,4 +1,4 @@
-"""`magtwin map plot`, `info`, `diff`, `continue`, `epochs`, and the card that `info` prints."""
+"""`magtwin map plot`, `info`, `diff`, `upward`, and the card that `info` prints."""
 
 import json
 from dataclasses import replace
@@ -9,11 +9,10 @@ import pytest
 
 from magtwin.cli import main
 from magtwin.field.grid import Grid
-from magtwin.field.maps.epochs import drift
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import map_metadata, source_files
 from magtwin.field.sources.harmonic import HarmonicField
-from magtwin.usd.maps.layer import load_epochs, load_map, save_map, save_map_series
+from magtwin.usd.maps.layer import load_map, save_map
 
 SHA = "0123456789abcdef" * 4
 
@@ -53,22 +52,10 @@ def a_map(harmonic=None, **more) -> AnomalyMap:
     return AnomalyMap(**{**given, **more})
 
 
-def on(day: str, rise_nt: float) -> AnomalyMap:
-    """The map of another day, its field higher by so much."""
-    field = a_map()
-    return replace(field, values_nt=field.values_nt + rise_nt, created=day)
-
-
 @pytest.fixture
 def layer(tmp_path):
     save_map(a_map(a_field()), tmp_path / "m.usdc")
     return tmp_path / "m.usdc"
-
-
-@pytest.fixture
-def series(tmp_path):
-    save_map_series([on("2026-01-01", 0), on("2026-01-11", 10), on("2026-01-21", 60)], tmp_path / "s.usdc")
-    return tmp_path / "s.usdc"
 
 
 def told(capsys, *arguments):
@@ -157,55 +144,6 @@ def test_files_of_one_name_that_differ_are_all_told():
     assert source_files(source) == {"lab.usda": SHA, "room.usda": SHA, "lab.usda (2)": other}
 
 
-def test_the_drift_is_the_slope_of_the_line_through_the_epochs():
-    maps = [on("2026-01-01", 0), on("2026-01-11", 10), on("2026-01-21", 60)]
-    figures = {f.name: f for f in drift(maps).figures}
-    assert figures["span"].value == 20
-    # rises 0, 10, 60 at -10, 0, 10 days about their mean: (600 - 0) / 200
-    assert figures["drift"].value == pytest.approx(3.0)
-    assert figures["drift"].spread == pytest.approx(0.0, abs=1e-6)
-    assert figures["greatest drift"].spread == pytest.approx(5 * np.sqrt(2) / 20)
-
-
-def test_the_greatest_drift_is_told_with_its_place():
-    late = on("2026-01-11", 0)
-    values = late.values_nt.copy()
-    values[1, 2, 3] -= 50.0
-    figure = drift([on("2026-01-01", 0), replace(late, values_nt=values)]).figures[-1]
-    assert figure.value == pytest.approx(-5.0)
-    assert figure.note == "at (-0.5, -0.5) m, heading 90 deg"
-
-
-def test_info_of_a_map_of_several_days_tells_its_drift_and_every_day(series, capsys):
-    said = told(capsys, "map", "info", series)
-    assert said["figures"]["drift"]["value"] == pytest.approx(3.0, abs=1e-3)
-    assert said["figures"]["epochs"]["note"] == "2026-01-01, 2026-01-11, 2026-01-21"
-    assert list(said["metadata"]["epochs"]) == ["2026-01-01", "2026-01-11", "2026-01-21"]
-    assert said["metadata"]["created"] == "2026-01-21"
-    between = told(capsys, "map", "info", series, "--date", "2026-01-06")
-    mean = on("2026-01-06", 5).values_nt.mean()
-    assert between["figures"]["mean"]["value"] == pytest.approx(mean, abs=0.06)
-    assert "reaches from 2026-01-01 to 2026-01-21" in refused(
-        capsys, "map", "info", series, "--date", "2025-12-31"
-    )
-
-
-def test_epochs_joins_maps_in_any_order_and_series_too(tmp_path, series, capsys):
-    later = on("2026-02-01", 70)
-    save_map(later, tmp_path / "later.usdc")
-    said = told(capsys, "map", "epochs", tmp_path / "later.usdc", series, "--out", tmp_path / "all.usdc")
-    assert said["figures"]["epochs"]["value"] == 4
-    assert load_epochs(tmp_path / "all.usdc") == (*load_epochs(series), load_map(tmp_path / "later.usdc"))
-
-
-def test_what_is_no_series_is_refused_and_nothing_is_written(tmp_path, layer, series, capsys):
-    out = tmp_path / "out.usdc"
-    assert "two at least, got 1" in refused(capsys, "map", "epochs", layer, "--out", out)
-    assert "are both of 2026-01-01" in refused(capsys, "map", "epochs", layer, layer, "--out", out)
-    assert "exists already" in refused(capsys, "map", "epochs", layer, layer, "--out", series)
-    assert not out.exists()
-
-
 def test_continue_writes_the_map_of_another_height(tmp_path, layer, capsys):
     said = told(capsys, "map", "upward", layer, "--height-m", "1.0", "--out", tmp_path / "up.usdc")
     assert said["figures"]["height"]["value"] == 1.0
@@ -249,24 +187,12 @@ def test_plot_draws_each_quantity_as_png_and_svg(tmp_path, layer, capsys, what):
         assert out.read_bytes().startswith(head)
 
 
-def test_plot_shows_the_headings_and_the_day_that_are_asked_for(tmp_path, series):
-    main(
-        [
-            "map",
-            "plot",
-            str(series),
-            "--out",
-            str(tmp_path / "a.svg"),
-            "--headings-deg",
-            "45",
-            "--date",
-            "2026-01-06",
-        ]
-    )
+def test_plot_shows_the_headings_that_are_asked_for(tmp_path, layer):
+    main(["map", "plot", str(layer), "--out", str(tmp_path / "a.svg"), "--headings-deg", "45"])
     words = " ".join(ElementTree.parse(tmp_path / "a.svg").getroot().itertext())
     assert "heading 45°" in words
     assert "heading 0°" not in words
-    assert "2026-01-06" in words
+    assert "2026-01-01" in words
 
 
 def test_a_map_in_many_headings_is_drawn_in_four_unless_asked(tmp_path):

@@ -158,7 +158,6 @@ SLOTS = {
     "bench report FILE --out new": {"results"},
     "bench compare FILE results": {"results"},
     "validate FILE --against core": {"map.usdc", "room", "cart"},
-    "upgrade FILE": {"map.usdc", "room", "cart"},
 }
 """Commands, each with the files that it may open."""
 

@@ -10,7 +10,6 @@ import pytest
 
 from magtwin.cli import MODULES, load, main
 from magtwin.cli.app import app
-from magtwin.cli.renamed import COMMANDS
 from magtwin.errors import InputError
 
 
@@ -69,34 +68,6 @@ def test_an_option_has_one_meaning():
 
 def _names(command):
     return {name for argument in command.assemble_argument_collection() for name in argument.names}
-
-
-@pytest.mark.parametrize("old", COMMANDS, ids=" ".join)
-def test_an_old_command_prints_the_new_one(old, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main([*old, "a", "--out", "b"])
-    assert stop.value.code == 2
-    text = f"magtwin: magtwin {' '.join(old)} is called magtwin {COMMANDS[old]} now\n"
-    assert capsys.readouterr().err == text
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (["run", "a", "--duration", "3"], "--duration is called --duration-s now"),
-        (["run", "a", "--parquet=b.parquet"], "--parquet is called --out FILE now"),
-        (["film", "a", "--out", "b.mp4", "--speed", "4"], "--speed is called --pace now"),
-        (["export", "lab", "--out", "b", "--profile", "isaac"], "--profile is called --target now"),
-        (["ros", "sim", "a", "--profile", "aprilab"], "--profile is called --out-unit nT now"),
-        (["ros", "follow", "sine", "--robot", "a"], "--robot is called --asset now"),
-        (["scene", "lab", "--net", "a", "--out", "b"], "--net is called --network now"),
-    ],
-)
-def test_an_old_option_prints_the_new_one(arguments, text, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(arguments)
-    assert stop.value.code == 2
-    assert capsys.readouterr().err.splitlines()[-1] == f"magtwin: {text}"
 
 
 def test_a_command_that_writes_prints_its_files_as_json_and_nothing_when_quiet(tmp_path, capfd):

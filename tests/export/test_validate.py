@@ -96,11 +96,6 @@ BROKEN = {
     "absolute-paths": (over("", "asset a = @/somewhere/else.png@"), "names /somewhere/else.png", "error"),
     "climbing-paths": (over("", "asset a = @../else.png@"), "names ../else.png, outside", "warning"),
     "units": (HEAD.replace("metersPerUnit = 1", "metersPerUnit = 0.01"), "in units of 0.01 m", "error"),
-    "schema-version": (
-        over("turtlebot4", "double magtwin:drive:vMax = 1"),
-        "has attributes of schema 0.x, not 1.0",
-        "warning",
-    ),
     "schema-names": (over("turtlebot4", "double magtwin:drive:vMx = 1"), "magtwin:drive:vMx, which", "error"),
     "targets": (over("turtlebot4", "rel magtwin:drive:leftWheelJoint = </World/x>"), "</World/x>", "error"),
     "map-complete": (

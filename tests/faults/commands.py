@@ -1,7 +1,6 @@
 """The commands that write, on small inputs."""
 
 import math
-import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -48,26 +47,6 @@ def _scene(folder: Path) -> None:
     _magtwin("scene", folder / "room.toml", "--out", folder / "room")
 
 
-def _older(folder: Path) -> None:
-    """The room with the attribute names of 0.x, in all of its layers."""
-    from pxr import Sdf
-
-    from magtwin.usd.schema.names import RENAMED
-
-    names = {name: older for older, name in RENAMED.items()}
-    shutil.copytree(folder / "room", folder / "older")
-    for file in (folder / "older").rglob("*.usd?"):
-        layer = Sdf.Layer.FindOrOpen(str(file))
-        paths: list[Sdf.Path] = []
-        layer.Traverse("/", paths.append)
-        for path in paths:
-            if path.IsPropertyPath() and path.name in names:
-                layer.GetPropertyAtPath(path).name = names[path.name]
-        data = dict(layer.customLayerData)
-        layer.customLayerData = {key: value for key, value in data.items() if key != "magtwin"}
-        layer.Save()
-
-
 def _run(folder: Path) -> None:
     _magtwin("run", "lab", "--duration-s", 3, "--seed", 3, "--out", folder / "run.parquet")
 
@@ -85,13 +64,6 @@ def _readings(folder: Path) -> None:
             "\n".join(["# x,y,theta,scalar_mag", *rows, ""]), encoding="utf-8"
         )
     _magtwin("map", "import", survey, "--height-m", 0.2, "--out", folder / "map.usdc")
-
-
-def _days(folder: Path) -> None:
-    survey = folder / "survey2"
-    shutil.copytree(folder / "survey", survey)
-    _magtwin("map", "import", survey, "--out", folder / "map2.usdc", "--created", "2026-02-01")
-    _magtwin("map", "import", folder / "survey", "--out", folder / "map1.usdc", "--created", "2026-01-01")
 
 
 def _dataset(folder: Path) -> None:
@@ -117,10 +89,8 @@ def _localized(folder: Path) -> None:
 
 INPUTS: dict[str, tuple[tuple[str, ...], Callable[[Path], None]]] = {
     "scene": ((), _scene),
-    "older": (("scene",), _older),
     "run": ((), _run),
     "readings": ((), _readings),
-    "days": (("readings",), _days),
     "dataset": ((), _dataset),
     "network": (("dataset",), _network),
     "results": ((), _localized),
@@ -156,7 +126,6 @@ COMMANDS = (
     Command("map fit", "map fit IN/survey --out map.usdc", ("readings",)),
     Command("map export", "map export IN/map.usdc --out csv", ("readings",)),
     Command("map plot", "map plot IN/map.usdc --out map.png", ("readings",)),
-    Command("map epochs", "map epochs IN/map1.usdc IN/map2.usdc --out epochs.usdc", ("days",)),
     Command("map upward", "map upward IN/map.usdc --height-m 0.3 --out up.usdc", ("readings",)),
     Command("map occupancy", "map occupancy IN/room/room.usda --out floor.yaml", ("scene",)),
     Command(
@@ -217,5 +186,4 @@ COMMANDS = (
     Command("sweep jobs", "sweep lab --count 2 --duration-s 2 --path sine --out runs --jobs 1", keeps=True),
     Command("bench", "bench IN/tiny.toml --out results --jobs 1", ("results",), keeps=True),
     Command("bench report", "bench report IN/results --out page", ("results",)),
-    Command("upgrade", "upgrade older/room.usda", ("older",), begins="older", force=False),
 )

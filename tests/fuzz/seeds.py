@@ -349,7 +349,7 @@ def _map_layer(file: Path) -> None:
         Sdf.Layer.FindOrOpen(str(file.with_suffix(".usdc"))).Export(str(file))
         file.with_suffix(".usdc").unlink()
     else:
-        call("usd.maps.layer:save_map", _map(), file, tile_cells=1 if file.stem == "tiles" else None)
+        call("usd.maps.layer:save_map", _map(), file)
 
 
 def _robot(file: Path) -> None:
@@ -642,7 +642,6 @@ def _read_map(file: Path) -> None:
     field = call("usd.maps.layer:load_map", file)
     str(field.report())
     field.lookup(np.zeros((1, 2)), np.zeros(1))
-    call("usd.maps.layer:load_epochs", file)
 
 
 def _read_robot(file: Path) -> None:
@@ -762,7 +761,6 @@ FORMATS: Mapping[str, Format] = {
     "usdz": Format("x.usdz", _package, _read_package),
     "map": Format("x.usdc", _map_layer, _read_map),
     "map-text": Format("x.usda", _map_layer, _read_map),
-    "map-tiles": Format("tiles.usdc", _map_layer, _read_map),
     "robot": Format("cart.usda", _robot, _read_robot, slow=True),
     "scene": Format("room.usda", _scene, _read_scene, slow=True),
     "scene-magnetics": Format("magnetics.usda", _scene, _read_scene, slow=True),

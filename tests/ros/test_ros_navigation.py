@@ -165,7 +165,7 @@ def test_readings_and_paths_are_where_the_robot_was(heard: Heard, twin: Twin) ->
     table = np.concatenate(tables)
     rate = twin.scene.robot.magnetometer.rate_hz
     assert len(table) == pytest.approx(rate * DURATION_S, rel=0.03)
-    b_nt = twin.field.overview()
+    b_nt = twin.field
     assert (
         np.nanmin(b_nt.values_nt) - 500 < table[:, 3].min() <= table[:, 3].max() < b_nt.values_nt.max() + 500
     )

@@ -1,9 +1,5 @@
 """A map through its layer and back, and the coloured floor that goes with it."""
 
-import datetime
-import hashlib
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,14 +15,13 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import colour_limits
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.usd.maps.heat_map import HEAT_MAP, MAP, colour_index, heading_variants, viridis
-from magtwin.usd.maps.layer import checksums, load_epochs, load_map, read_map, save_map, save_map_series
-from magtwin.usd.schema import NOUNS, attribute_name
+from magtwin.usd.maps.layer import checksums, load_map, read_map, save_map
 
 VALUES = "magtwin:anomalyMap:valuesNt"
 HEIGHT = "magtwin:anomalyMap:heightM"
 PARAMETERS = "magtwin:anomalyMap:parameters"
+DAYS = ("2026-01-01", "2026-02-01")
 GRID = [f"magtwin:anomalyMap:{name}" for name in ("shape", "originM", "cellSizeM", "headingsDeg")]
-HARMONIC = ("pWorldDipoleM", "mWorldAm2", "bUniformNt", "hardIronNt", "softIron", "pBaseSensorM")
 
 
 def a_map(shape=(4, 3, 5), **changes) -> AnomalyMap:
@@ -119,23 +114,6 @@ def test_a_harmonic_field_survives_the_layer_to_the_last_bit(tmp_path_factory, d
     assert save_and_load(field, tmp_path_factory.mktemp("map")).harmonic == field.harmonic
 
 
-def test_a_layer_from_before_frame_height_and_figures_still_loads(tmp_path):
-    save_map(a_map(), tmp_path / "m.usdc")
-    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
-    prim = layer.GetPrimAtPath(MAP)
-    for name in ("frame", "datum", "parameters"):
-        prim.RemoveProperty(prim.attributes[f"magtwin:anomalyMap:{name}"])
-    for name in ("name", "method", "source", "licence", "created", "checksum"):  # which never varied
-        attribute = prim.attributes[f"magtwin:anomalyMap:{name}"]
-        value = attribute.default
-        prim.RemoveProperty(attribute)
-        Sdf.AttributeSpec(
-            prim, attribute_name("anomalyMap", name), Sdf.ValueTypeNames.String, Sdf.VariabilityUniform
-        ).default = value
-    layer.Save()
-    assert load_map(tmp_path / "m.usdc") == a_map()
-
-
 @pytest.mark.parametrize(
     "parameters", [{"a": np.nan}, {"a": np.zeros(2)}, {"a": {1, 2}}], ids=["nan", "array", "set"]
 )
@@ -143,244 +121,6 @@ def test_figures_that_json_does_not_hold_are_refused_and_nothing_is_written(tmp_
     with pytest.raises(InputError, match="parameters of map 'small' must be finite numbers, texts"):
         save_map(a_map(parameters=parameters), tmp_path / "m.usdc")
     assert list(tmp_path.iterdir()) == []
-
-
-def epochs() -> list[AnomalyMap]:
-    """Three surveys of one floor, of which the second has a harmonic field and the third no variance."""
-    base, rng = a_map(), np.random.default_rng(5)
-    maps = []
-    for k, day in enumerate(("2025-12-31", "2026-01-10", "2026-02-01")):
-        values = base.values_nt + np.round(rng.normal(0, 50, base.values_nt.shape))
-        maps.append(
-            a_map(
-                values_nt=values.astype(np.float32).astype(float),
-                valid=rng.random(values.shape) < 0.9,
-                variance_nt2=None if k == 2 else np.full(values.shape, 4.0 + 4 * k),
-                name=f"survey {k}",
-                source=f"file {k}",
-                created=day,
-                height_m=0.35,
-                parameters={"k": k},
-                harmonic=a_field() if k == 1 else None,
-            )
-        )
-    return maps
-
-
-def test_every_epoch_comes_back_from_a_series_and_the_latest_without_a_date(tmp_path):
-    first, second, third = maps = epochs()
-    save_map_series([third, first, second], tmp_path / "m.usdc")
-    assert load_epochs(tmp_path / "m.usdc") == tuple(maps)
-    for field in maps:
-        assert load_map(tmp_path / "m.usdc", field.created) == field
-        assert load_map(tmp_path / "m.usdc", datetime.date.fromisoformat(field.created)) == field
-    assert load_map(tmp_path / "m.usdc") == third
-
-
-def test_between_two_epochs_the_field_is_linear_in_time_and_surer_than_each(tmp_path):
-    maps = epochs()
-    save_map_series(maps, tmp_path / "m.usdc")
-    field = load_map(tmp_path / "m.usdc", "2026-01-05")  # half the ten days
-    before, after = maps[:2]
-    assert_allclose(field.values_nt, (before.values_nt + after.values_nt) / 2)
-    assert_allclose(field.variance_nt2, (4.0 + 8.0) / 4)
-    assert_array_equal(field.valid, before.valid & after.valid)
-    assert field.created == "2026-01-05"
-    assert field.source == "file 0; file 1"
-    assert field.harmonic is None
-    assert load_map(tmp_path / "m.usdc", "2026-01-20").variance_nt2 is None
-
-
-def test_a_program_that_knows_usd_alone_selects_an_epoch_and_finds_no_time_codes(tmp_path):
-    maps = epochs()
-    save_map_series(maps, tmp_path / "m.usdc")
-    stage = Usd.Stage.Open(str(tmp_path / "m.usdc"))
-    prim = stage.GetPrimAtPath(MAP)
-    variants = prim.GetVariantSet("epoch")
-    assert variants.GetVariantNames() == ["2025-12-31", "2026-01-10", "2026-02-01"]
-    assert variants.GetVariantSelection() == "2026-02-01"
-    assert not stage.HasAuthoredTimeCodeRange()
-    for field in maps:
-        variants.SetVariantSelection(field.created)
-        assert_array_equal(prim.GetAttribute(VALUES).Get(), field.values_nt.ravel().astype(np.float32))
-        assert prim.GetAttribute("magtwin:anomalyMap:source").Get() == field.source
-        assert not any(a.ValueMightBeTimeVarying() for p in stage.Traverse() for a in p.GetAttributes())
-
-
-def test_a_stage_that_references_the_map_selects_its_epoch(tmp_path):
-    """In a stronger layer, at another frame rate, below another prim, twice."""
-    maps = epochs()
-    save_map_series(maps, tmp_path / "m.usdc")
-    stage = Usd.Stage.CreateNew(str(tmp_path / "scene.usda"))
-    stage.SetTimeCodesPerSecond(30.0)
-    for name, day in (("Before", "2025-12-31"), ("After", "2026-01-10")):
-        prim = stage.DefinePrim(f"/Site/{name}")
-        prim.GetReferences().AddReference("./m.usdc", MAP)
-        prim.GetVariantSets().SetSelection("epoch", day)
-    stage.Save()
-    before, after = (stage.GetPrimAtPath(f"/Site/{name}") for name in ("Before", "After"))
-    assert (read_map(before), read_map(after)) == (maps[0], maps[1])
-    stage.RemovePrim("/Site/Before")
-    stage.Save()
-    assert load_map(tmp_path / "scene.usda") == maps[1]
-    assert load_epochs(tmp_path / "scene.usda") == tuple(maps)
-
-
-@pytest.mark.parametrize(
-    ("epoch", "said"),
-    [("", "no epoch is selected; select one of 2025-12-31, "), ("2026-03-01", "the epoch '2026-03-01' is")],
-)
-def test_a_selection_that_is_no_epoch_is_refused_with_the_epochs(tmp_path, epoch, said):
-    save_map_series(epochs(), tmp_path / "m.usdc")
-    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
-    layer.GetPrimAtPath(MAP).variantSelections["epoch"] = epoch
-    layer.Save()
-    with pytest.raises(InputError, match=f"m.usdc </World/AnomalyMap>: {said}"):
-        load_map(tmp_path / "m.usdc")
-    assert load_map(tmp_path / "m.usdc", "2026-01-10") == epochs()[1]
-
-
-def test_only_the_selected_epoch_is_read(tmp_path):
-    """The bytes of another epoch's arrays may be damaged: nobody asks for them."""
-    wide = a_map((4, 60, 80), created="2026-01-01")
-    days = [wide, replace(wide, values_nt=wide.values_nt + 0.5, created="2026-02-01")]
-    save_map_series(days, tmp_path / "m.usdc")
-    data = (tmp_path / "m.usdc").read_bytes()
-    piece = days[0].values_nt.astype("<f4").ravel()[1000:1016].tobytes()
-    assert data.count(piece) == 1
-    (tmp_path / "m.usdc").write_bytes(data.replace(piece, bytes(64)))
-    assert load_map(tmp_path / "m.usdc") == days[1]
-    with pytest.raises(InputError, match="do not match its checksum"):
-        load_map(tmp_path / "m.usdc", "2026-01-01")
-
-
-def test_the_coloured_floor_shows_the_epoch_and_the_heading_that_are_selected(tmp_path):
-    maps = epochs()
-    save_map_series(maps, tmp_path / "m.usdc")
-    stage = Usd.Stage.Open(str(tmp_path / "m.usdc"))
-    prim = stage.GetPrimAtPath(HEAT_MAP)
-    legend, primvar = prim.GetCustomDataByKey("magtwin"), UsdGeom.Mesh(prim).GetDisplayColorPrimvar()
-    for field in maps:
-        stage.GetPrimAtPath(MAP).GetVariantSet("epoch").SetVariantSelection(field.created)
-        for h, heading in ((0, "0"), (2, "180")):
-            prim.GetVariantSet("heading").SetVariantSelection(heading)
-            index = colour_index(field.values_nt[h], field.valid[h], legend["least"], legend["greatest"])
-            assert_array_equal(np.array(primvar.ComputeFlattened()), viridis()[index.ravel()])
-
-
-@pytest.mark.parametrize("date", ["2025-12-30", "2026-02-02"])
-def test_a_date_outside_the_span_is_refused_with_the_span(tmp_path, date):
-    save_map_series(epochs(), tmp_path / "m.usdc")
-    with pytest.raises(InputError, match=f"{date} lies beyond .* reaches from 2025-12-31 to 2026-02-01"):
-        load_map(tmp_path / "m.usdc", date)
-
-
-def test_a_date_of_a_map_of_one_day_is_that_day_or_refused(tmp_path):
-    save_map(a_map(), tmp_path / "m.usdc")
-    assert load_map(tmp_path / "m.usdc", "2026-01-02") == a_map()
-    with pytest.raises(InputError, match="is of 2026-01-02 only"):
-        load_map(tmp_path / "m.usdc", "2026-01-03")
-    save_map(a_map(created=""), tmp_path / "m.usdc", force=True)
-    with pytest.raises(InputError, match=r"map 'small' has no day; .*--created"):
-        load_map(tmp_path / "m.usdc", "2026-01-02")
-
-
-@pytest.mark.parametrize("date", ["soon", "20260102", "2026-W01-5", "2026-02-30"])
-def test_a_date_that_is_no_day_is_refused(tmp_path, date):
-    save_map(a_map(), tmp_path / "m.usdc")
-    with pytest.raises(InputError, match=f"date must be a day YYYY-MM-DD, got '{date}'"):
-        load_map(tmp_path / "m.usdc", date)
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"created": ""}, "map 'small' has no day"),
-        ({"created": "2026-01-02"}, "are both of 2026-01-02"),
-        ({"origin_m": (0.0, 0.0)}, r"origin_m is \(-3.0, -1.75\) on 2026-01-02 and \(0.0, 0.0\)"),
-        ({"height_m": 0.5}, "height_m is None on 2026-01-02 and 0.5 on"),
-        ({"frame": "map"}, "frame is '' on 2026-01-02 and 'map' on"),
-        ({"headings_rad": [0.0, 1.0, 2.0, 3.0]}, "headings_rad is"),
-    ],
-)
-def test_maps_that_are_no_epochs_of_one_are_refused(tmp_path, change, said):
-    with pytest.raises(InputError, match=said):
-        save_map_series([a_map(), a_map(**({"created": "2026-01-03"} | change))], tmp_path / "m.usdc")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_grids_of_other_size_and_a_single_map_are_no_series(tmp_path):
-    with pytest.raises(InputError, match=r"\(4, 3, 5\) nodes on 2026-01-02 and \(4, 3, 6\)"):
-        save_map_series([a_map(), a_map((4, 3, 6), created="2026-01-03")], tmp_path / "m.usdc")
-    with pytest.raises(InputError, match="two at least, got 1"):
-        save_map_series([a_map()], tmp_path / "m.usdc")
-
-
-def of_epoch(layer: Sdf.Layer, day: str, name: str) -> Sdf.AttributeSpec:
-    return layer.GetAttributeAtPath(MAP.AppendVariantSelection("epoch", day).AppendProperty(name))
-
-
-def test_an_epoch_that_was_tampered_with_is_refused_when_it_is_asked_for(tmp_path):
-    maps = epochs()
-    save_map_series(maps, tmp_path / "m.usdc")
-    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
-    of_epoch(layer, "2026-01-10", VALUES).default = [4e4] * 60
-    layer.Save()
-    assert load_map(tmp_path / "m.usdc") == maps[2]
-    with pytest.raises(InputError, match="do not match its checksum"):
-        load_map(tmp_path / "m.usdc", "2026-01-10")
-    stage = Usd.Stage.Open(layer)
-    assert [said == taken for said, taken in checksums(stage.GetPrimAtPath(MAP))] == [True, False, True]
-
-
-@pytest.mark.parametrize(
-    ("day", "said"),
-    [
-        (
-            "2026-01-11",
-            "its epoch 2026-01-10 must be of that day, got magtwin:anomalyMap:created 2026-01-11;",
-        ),
-        ("soon", "epoch 2026-01-10: created of AnomalyMap must be a day YYYY-MM-DD, got 'soon'"),
-        ("", "epoch 2026-01-10: map 'survey 1' has no day"),
-    ],
-)
-def test_an_epoch_whose_day_is_not_that_of_its_variant_is_refused_with_its_prim(tmp_path, day, said):
-    save_map_series(epochs(), tmp_path / "m.usdc")
-    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
-    of_epoch(layer, "2026-01-10", "magtwin:anomalyMap:created").default = day
-    layer.Save()
-    with pytest.raises(InputError, match=f"m.usdc </World/AnomalyMap>: {said}"):
-        load_epochs(tmp_path / "m.usdc")
-
-
-def test_epochs_that_an_older_version_wrote_as_time_codes_are_read_with_a_warning(tmp_path):
-    """Each value of an epoch is a time sample, in days since 2000-01-01; a missing one is blocked."""
-    maps = epochs()
-    save_map(maps[2], tmp_path / "old.usdc")
-    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "old.usdc"))
-    prim = layer.GetPrimAtPath(MAP)
-    schemas = [NOUNS["anomalyMap"], NOUNS["harmonic"]]
-    prim.SetInfo("apiSchemas", Sdf.TokenListOp.Create(prependedItems=schemas))
-    for k, (field, code) in enumerate(zip(maps, (9496.0, 9506.0, 9528.0), strict=True)):
-        save_map(field, tmp_path / f"{k}.usdc")
-        single = Sdf.Layer.FindOrOpen(str(tmp_path / f"{k}.usdc"))
-        own = single.GetPrimAtPath(MAP)
-        shared = ("shape", "origin", "cellSize", "headings", "unit", "checksumVersion")
-        for spec in own.attributes:
-            if spec.name.rpartition(":")[2] not in shared:
-                if spec.name not in prim.attributes:
-                    Sdf.AttributeSpec(prim, spec.name, spec.typeName, spec.variability)
-                layer.SetTimeSample(MAP.AppendProperty(spec.name), code, spec.default)
-    layer.Save()
-    with pytest.warns(UserWarning, match=r"old.usdc .*time codes, .*: magtwin map epochs OLD.usdc --out NEW"):
-        assert load_map(tmp_path / "old.usdc") == maps[2]
-    with pytest.warns(UserWarning, match="time codes"):
-        old = load_epochs(tmp_path / "old.usdc")
-    assert old == tuple(maps)
-    with pytest.warns(UserWarning, match="time codes"):
-        assert load_map(tmp_path / "old.usdc", "2026-01-10") == maps[1]
-    save_map_series(old, tmp_path / "new.usdc")
-    assert load_epochs(tmp_path / "new.usdc") == tuple(maps)
 
 
 def test_the_coloured_floor_of_a_fine_map_stays_light_and_reaches_its_border(tmp_path):
@@ -606,14 +346,15 @@ def test_a_stage_without_a_map_is_refused(tmp_path):
 )
 def test_a_tampered_map_is_refused_by_file_and_prim(tmp_path, attribute, kind, value, said):
     save_map(a_map(height_m=0.35, harmonic=a_field()), tmp_path / "m.usdc")
-    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
+    stage = Usd.Stage.Open(str(tmp_path / "m.usdc"))
+    layer = stage.GetRootLayer()
     prim = layer.GetPrimAtPath(MAP)
     if prim.attributes[attribute].typeName != kind:
         prim.RemoveProperty(prim.attributes[attribute])
         Sdf.AttributeSpec(prim, attribute, kind)
     prim.attributes[attribute].default = value
-    if attribute in GRID and value:  # an old map; the checksum of a new one has its grid
-        with_old_checksum(prim)
+    if attribute in GRID and value:  # the checksum covers them
+        prim.attributes["magtwin:anomalyMap:checksum"].default = checksums(stage.GetPrimAtPath(MAP))[1]
     layer.Save()
     with pytest.raises(InputError, match=rf"m\.usdc </World/AnomalyMap>: .*{said}"):
         load_map(tmp_path / "m.usdc")
@@ -635,27 +376,57 @@ def test_the_checksum_covers_the_grid(tmp_path, attribute, value):
     layer.Save()
     with pytest.raises(InputError, match="do not match its checksum, which covers its grid too"):
         load_map(tmp_path / "m.usdc")
-    with_old_checksum(prim)  # which does not see it
-    layer.Save()
-    load_map(tmp_path / "m.usdc")
 
 
-def test_a_map_with_the_old_checksum_opens(tmp_path):
-    field = a_map(variance_nt2=np.ones((4, 3, 5)), harmonic=a_field())
-    save_map(field, tmp_path / "m.usdc")
-    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
-    with_old_checksum(layer.GetPrimAtPath(MAP))
-    layer.Save()
-    assert load_map(tmp_path / "m.usdc") == field
-
-
-def test_a_checksum_of_a_later_version_is_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("attribute", "kind", "value", "said"),
+    [
+        ("checksumVersion", Sdf.ValueTypeNames.Int, 3, "its checksum is of version 3, this magtwin reads 2"),
+        ("tileCells", Sdf.ValueTypeNames.Int, 64, r"is in tiles, .*; make the map anew, or save it in parts"),
+        (
+            "valuesNt",
+            Sdf.ValueTypeNames.FloatArray,
+            [],
+            "has no .*valuesNt; select the variant that has them",
+        ),
+    ],
+)
+def test_a_map_that_an_earlier_version_wrote_otherwise_is_refused_with_the_way_on(
+    tmp_path, attribute, kind, value, said
+):
     save_map(a_map(), tmp_path / "m.usdc")
     layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
-    layer.GetPrimAtPath(MAP).attributes["magtwin:anomalyMap:checksumVersion"].default = 3
+    prim, name = layer.GetPrimAtPath(MAP), f"magtwin:anomalyMap:{attribute}"
+    spec = prim.attributes.get(name) or Sdf.AttributeSpec(prim, name, kind)
+    spec.default = value
     layer.Save()
-    with pytest.raises(InputError, match="checksum is of version 3, this magtwin knows 1 to 2"):
+    with pytest.raises(InputError, match=rf"m\.usdc </World/AnomalyMap>: {said}"):
         load_map(tmp_path / "m.usdc")
+
+
+def test_a_map_with_variants_is_read_as_the_stage_selects(tmp_path):
+    """So are the epochs that an earlier magtwin wrote: USD composes them."""
+    maps = {day: a_map(created=day, values_nt=a_map().values_nt + k) for k, day in enumerate(DAYS)}
+    save_map(maps[DAYS[0]], tmp_path / "m.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "m.usdc"))
+    prim = stage.GetPrimAtPath(MAP)
+    epochs = prim.GetVariantSets().AddVariantSet("epoch")
+    for name in ("valuesNt", "checksum", "created"):
+        prim.RemoveProperty(f"magtwin:anomalyMap:{name}")
+    for day, field in maps.items():
+        save_map(field, tmp_path / f"{day}.usdc")
+        layer = Sdf.Layer.FindOrOpen(str(tmp_path / f"{day}.usdc"))
+        source = layer.GetPrimAtPath(MAP)
+        epochs.AddVariant(day)
+        epochs.SetVariantSelection(day)
+        with epochs.GetVariantEditContext():
+            for name in ("valuesNt", "checksum", "created"):
+                prim.GetAttribute(f"magtwin:anomalyMap:{name}").Set(
+                    source.attributes[f"magtwin:anomalyMap:{name}"].default
+                )
+    for day, field in maps.items():
+        epochs.SetVariantSelection(day)
+        assert read_map(prim) == field
 
 
 def test_a_map_keeps_what_it_was_made_from(tmp_path):
@@ -677,18 +448,6 @@ def test_a_damaged_record_of_what_a_map_was_made_from_is_refused(tmp_path, text)
     layer.Save()
     with pytest.raises(InputError, match=r"m\.usdc </World/AnomalyMap>: magtwin:anomalyMap:madeFrom: "):
         load_map(tmp_path / "m.usdc")
-
-
-def with_old_checksum(prim: Sdf.PrimSpec) -> None:
-    """Give a map's prim the checksum of version 1, as docs/schema.md defines it."""
-    digest = hashlib.sha256()
-    kinds = {"anomalyMap:valuesNt": "<f4", "anomalyMap:valid": "u1", "anomalyMap:varianceNt2": "<f4"}
-    kinds |= {f"harmonic:{name}": "<f8" for name in HARMONIC}
-    for name, kind in kinds.items():
-        if attribute := prim.attributes.get(f"magtwin:{name}"):
-            digest.update(np.array(attribute.default).astype(kind).tobytes())
-    prim.attributes["magtwin:anomalyMap:checksum"].default = digest.hexdigest()
-    prim.RemoveProperty(prim.attributes["magtwin:anomalyMap:checksumVersion"])
 
 
 def test_a_harmonic_field_that_lost_a_part_is_refused(tmp_path):

@@ -12,11 +12,10 @@ from pxr import Usd, Vt
 
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.field.maps.epochs import at_date
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.folder import read_survey, write_survey
 from magtwin.io.surveys.readings import read_readings
-from magtwin.usd.maps.layer import load_epochs, load_map, save_map, save_map_series
+from magtwin.usd.maps.layer import load_map, save_map
 
 
 def survey(seed=0, **given):
@@ -173,16 +172,6 @@ def test_a_map_that_is_no_survey_is_written_at_its_own_headings(tmp_path):
     attributes = ("magtwin:anomalyMap:recordedYawRad", "magtwin:anomalyMap:recordedNt")
     prim = Usd.Stage.Open(str(tmp_path / "a.usdc")).GetPrimAtPath
     assert not any(prim("/World/AnomalyMap").GetAttribute(name).HasAuthoredValue() for name in attributes)
-
-
-def test_each_day_of_a_map_keeps_its_own_readings_and_a_day_between_has_none(tmp_path):
-    days = [survey(1, created="2026-01-01"), survey(2, created="2026-01-11")]
-    save_map_series(days, tmp_path / "a.usdc")
-    epochs = load_epochs(tmp_path / "a.usdc")
-    for epoch, day in zip(epochs, days, strict=True):
-        assert np.array_equal(epoch.values_nt, day.values_nt)
-        assert np.array_equal(epoch.recorded_yaw, day.recorded_yaw)
-    assert at_date(epochs, "2026-01-06").recorded_yaw is None
 
 
 @pytest.mark.parametrize(

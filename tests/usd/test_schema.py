@@ -244,7 +244,7 @@ def test_the_footprints_fallback_is_the_default_of_the_robot():
 
 
 UNAUTHORED = {
-    "magtwin:anomalyMap:checksumVersion": (1, 1),  # the first maps have no such attribute
+    "magtwin:anomalyMap:checksumVersion": (1, 1),  # the first maps have none, and are refused
     "magtwin:earth:derivedFrom": ("", ""),  # computed anew
     "magtwin:furniture:kind": ("desk", "desk"),
     "magtwin:magnetometer:mapSha256": ("", Scene.__dataclass_fields__["map_sha256"].default),
@@ -265,8 +265,7 @@ UNAUTHORED = {
 
 EMPTY = {
     "anomalyMap": "valuesNt valid varianceNt2 recordedNt recordedYawRad shape headingsDeg checksum "
-    "parameters madeFrom heightM tileCells tileChecksums tileFigures originM cellSizeM",
-    "mapTile": "valuesNt valid varianceNt2",
+    "parameters madeFrom heightM originM cellSizeM",
 }
 """Attributes of maps: unknown if empty, or refused, as test_schema_versions.py shows."""
 

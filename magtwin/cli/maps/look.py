@@ -1,4 +1,4 @@
-"""`magtwin map plot`, `diff`, `upward`, `export`, `epochs` and `occupancy`: commands on what exists."""
+"""`magtwin map plot`, `diff`, `upward`, `export` and `occupancy`: commands on what exists."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from magtwin.cli.maps.map import LAYERS, PICTURES, Date, MapFile, Sources, headings_rad, map_app
+from magtwin.cli.maps.map import LAYERS, PICTURES, MapFile, headings_rad, map_app
 from magtwin.cli.options import Force
 from magtwin.cli.terminal import Done, check_output, print_report, step
 
@@ -18,7 +18,6 @@ def map_plot(
     out: Path,
     quantity: Literal["field", "gradient", "variance", "mask", "headings"] = "field",
     headings_deg: str | None = None,
-    date: Date = None,
     force: Force = False,
 ) -> Done:
     """Draw a map as filled contours, one panel per heading.
@@ -41,23 +40,17 @@ def map_plot(
     check_output(out, PICTURES, "a picture", force=force)
     angles = None if headings_deg is None else headings_rad(headings_deg)
     step("Drawing the map")
-    save(draw_map(open_map(file, date), what=quantity, headings=angles), out, force=force)
+    save(draw_map(open_map(file), what=quantity, headings=angles), out, force=force)
     return Done(wrote=out)
 
 
 @map_app.command(name="info")
-def map_info(file: MapFile, *, date: Date = None) -> Done:
-    """Print a map's metadata: field, uncertainty, method, sources, licence, frame, height and dates."""
-    from magtwin.field.maps.epochs import at_date
+def map_info(file: MapFile) -> Done:
+    """Print a map's metadata: field, uncertainty, method, sources, licence, frame, height and date."""
     from magtwin.field.maps.statistics import map_metadata
-    from magtwin.io.surveys.maps import map_file, open_map
-    from magtwin.usd.maps.layer import load_epochs
+    from magtwin.io.surveys.maps import open_map
 
-    file = map_file(file)
-    if file.is_dir():
-        return Done(map_metadata(open_map(file, date)))
-    epochs = load_epochs(file)
-    return Done(map_metadata(epochs[-1] if date is None else at_date(epochs, date), epochs))
+    return Done(map_metadata(open_map(file)))
 
 
 @map_app.command(name="diff")
@@ -96,7 +89,6 @@ def map_upward(
     *,
     height_m: Annotated[float, Parameter(help="Height of the sensor above the floor in the new map [m].")],
     out: Path,
-    date: Date = None,
     force: Force = False,
 ) -> Done:
     """Continue a map to another height: exactly by its harmonic field, else upward by its grid's spectrum.
@@ -113,13 +105,13 @@ def map_upward(
 
     check_output(out, LAYERS, "a map layer", force=force)
     step(f"Continuing the field to {height_m:g} m")
-    field = at_height(open_map(file, date), height_m)
+    field = at_height(open_map(file), height_m)
     save_map(field, out, force=force)
     return Done(map_metadata(field), out)
 
 
 @map_app.command(name="export")
-def map_export(file: MapFile, *, out: Path, date: Date = None, force: Force = False) -> Done:
+def map_export(file: MapFile, *, out: Path, force: Force = False) -> Done:
     """Write a map as CSVs, one per heading, that `magtwin map import` reads back.
 
     Comment lines above the rows keep the map's method, frame, height, date, licence and statistics. The rows
@@ -133,29 +125,7 @@ def map_export(file: MapFile, *, out: Path, date: Date = None, force: Force = Fa
     from magtwin.field.survey.folder import write_survey
     from magtwin.io.surveys.maps import open_map
 
-    return Done(wrote=tuple(write_survey(open_map(file, date), out, force=force)))
-
-
-@map_app.command(name="epochs")
-def map_epochs(*files: Sources, out: Path, force: Force = False) -> Done:
-    """Join maps of several dates into one layer that holds the drift of the field.
-
-    Parameters
-    ----------
-    files
-        Map layers of one grid, each with the date of its survey, in any order. One with several epochs counts
-        with all of them, so that this also converts a layer of an older version.
-    out
-        Map layer to write (.usdc), with a variant of the variant set `epoch` for each date.
-    """
-    from magtwin.field.maps.epochs import drift, in_order
-    from magtwin.io.surveys.maps import map_file
-    from magtwin.usd.maps.layer import load_epochs, save_map_series
-
-    check_output(out, LAYERS, "a map layer", force=force)
-    maps = in_order([epoch for file in files for epoch in load_epochs(map_file(file))])
-    save_map_series(maps, out, force=force)
-    return Done(drift(maps), out)
+    return Done(wrote=tuple(write_survey(open_map(file), out, force=force)))
 
 
 @map_app.command(name="occupancy")

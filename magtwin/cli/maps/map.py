@@ -42,10 +42,6 @@ Earth = Annotated[
         "surveys of a simulated lab."
     ),
 ]
-Date = Annotated[
-    str | None,
-    Parameter(help="Date between the map's epochs, YYYY-MM-DD. Default: the epoch that the file selects."),
-]
 Sources = Annotated[Path, Parameter(required=True)]
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Epoch, Force, Gamepad, Lab, ModelError, Network, Plant, Seed, Session
+from magtwin.cli.options import Force, Gamepad, Lab, MapLayer, ModelError, Network, Plant, Seed, Session
 from magtwin.cli.runs.run import save_picture
 from magtwin.cli.terminal import Done, announce, note, silence
 from magtwin.errors import InputError
@@ -28,7 +28,7 @@ def drive(
     *,
     out: Path = Path("drive"),
     lab: Lab = "",
-    epoch: Epoch = "",
+    map_layer: MapLayer = None,
     gamepad: Gamepad = None,
     network: Network = None,
     model_error: ModelError = True,
@@ -72,7 +72,7 @@ def drive(
             raise InputError(f"{gamepad}: a folder; name a gamepad in it, such as /dev/input/js0")
         raise InputError(f"{gamepad}: not a gamepad; name one, such as /dev/input/js0")
     with output(out, force=force) as folder:
-        twin = open_twin(scene, lab=lab, epoch=epoch, network=network, model_error=model_error)
+        twin = open_twin(scene, lab=lab, map_layer=map_layer, network=network, model_error=model_error)
         twin = with_plant(twin, plant)
         twin = in_session(twin, session, seed=seed)
         robot, dt = twin.scene.robot, 1.0 / CONTROL_RATE_HZ
@@ -101,7 +101,7 @@ def drive(
             scene,
             commands=folder / "commands.csv",
             lab=lab,
-            epoch=epoch,
+            map_layer=map_layer,
             network=network,
             model_error=model_error,
             seed=seed,
@@ -112,7 +112,7 @@ def drive(
         )
         Outputs(folder, picture=save_picture).write(driven)
     again = f"magtwin run {scene} --commands {out / 'commands.csv'} --seed {seed}"
-    options = {"lab": lab or None, "epoch": epoch or None, "session": session, "plant": plant}
+    options = {"lab": lab or None, "map": map_layer, "session": session, "plant": plant}
     again += "".join(f" --{name} {value}" for name, value in options.items() if value is not None)
     return Done(driven.run.report(f"Manual drive in {scene}"), out, text=f"Wrote {out}; again: {again}")
 

@@ -12,10 +12,10 @@ from cyclopts import Parameter
 from magtwin.cli.app import app
 from magtwin.cli.options import (
     SENSING,
-    Epoch,
     Flag,
     Force,
     Lab,
+    MapLayer,
     ModelError,
     OutUnit,
     Plant,
@@ -87,7 +87,7 @@ def run(
     fit: Flag = False,
     commands: Path | None = None,
     lab: Lab = "",
-    epoch: Epoch = "",
+    map_layer: MapLayer = None,
     robot: str | None = None,
     meet: Literal["refuse", "flag"] | None = None,
     engine: Literal["kinematic", "newton"] = "kinematic",
@@ -216,7 +216,7 @@ def run(
             scene,
             outputs,
             lab=lab,
-            epoch=epoch,
+            map_layer=map_layer,
             robot=robot,
             path=path,
             fit=fit,
@@ -242,7 +242,7 @@ def run(
                 scene,
                 what,
                 lab=lab,
-                epoch=epoch,
+                map_layer=map_layer,
                 fit=fit,
                 scans=scans,
                 engine=engine,
@@ -272,7 +272,7 @@ def _run_robots(
     outputs: "Outputs",
     *,
     lab: str,
-    epoch: str,
+    map_layer: Path | None,
     robot: str | None,
     path: str | None,
     fit: bool,
@@ -293,7 +293,7 @@ def _run_robots(
     opening = {
         name: options.pop(name) for name in ("network", "magnetometer", "model_error", "tracking_error")
     }
-    twin = open_twin(scene, lab=lab, epoch=epoch, **opening)
+    twin = open_twin(scene, lab=lab, map_layer=map_layer, **opening)
     ways: dict[str, Any] = {spec.robot.name: spec.path or "figure8" for spec in twin.scene.robots}
     if robot is not None and (commands or replay or path):
         ways[robot] = read_commands(commands) if commands else read_run(replay) if replay else path

@@ -7,11 +7,11 @@ from magtwin.cli.app import app
 from magtwin.cli.options import (
     SENSING,
     Dask,
-    Epoch,
     Flag,
     Force,
     Jobs,
     Lab,
+    MapLayer,
     Names,
     Plant,
     Seed,
@@ -35,7 +35,7 @@ def sweep(
     path: Names = None,
     fit: Flag = False,
     lab: Lab = "",
-    epoch: Epoch = "",
+    map_layer: MapLayer = None,
     seed: Seed = 0,
     sessions: Whole | None = None,
     session: Literal["survey"] | None = None,
@@ -115,7 +115,7 @@ def sweep(
     opening = {
         name: options.pop(name) for name in ("network", "magnetometer", "model_error", "tracking_error")
     }
-    twin = open_twin(scene, lab=lab, epoch=epoch, **opening)
+    twin = open_twin(scene, lab=lab, map_layer=map_layer, **opening)
     announce(f"Driving {count} runs")
     runs = drive_many(
         twin,

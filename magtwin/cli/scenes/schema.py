@@ -1,9 +1,6 @@
-"""`magtwin schema` and `magtwin upgrade`."""
+"""`magtwin schema`."""
 
 from pathlib import Path
-from typing import Annotated
-
-from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force
@@ -30,21 +27,3 @@ def schema(*, out: Path | None = None, force: Force = False) -> Done:
         return Done(text=str(FOLDER), data=data)
     publish(out, force=force)
     return Done(wrote=out, data=data)
-
-
-@app.command
-def upgrade(*files: Annotated[Path, Parameter(required=True)]) -> Done:
-    """Rewrite stages, robots and maps that an older magtwin wrote with the attribute names of today.
-
-    Every layer that a file names is rewritten in its place, so keep a copy. Values stay as they are.
-
-    Parameters
-    ----------
-    files
-        Stages (.usd, .usda or .usdc).
-    """
-    from magtwin.usd.upgrade import upgrade as rewrite
-
-    done = list(dict.fromkeys(written for file in files for written in rewrite(file)))
-    text = "" if done else "Nothing to do: no layer has names of an older schema"
-    return Done(wrote=tuple(done), text=text, data={})

@@ -25,12 +25,7 @@ class Lap:
         self.inputs = json.loads(self.network.get_modelmeta().custom_metadata_map["features"])
         self.robot, self.drive = self.figures("drive")
         self.grid, self.battery, self.lidar = (self.figures(n)[1] for n in ("anomalyMap", "battery", "lidar"))
-        values = (
-            self.nodes()
-            if self.grid.get("tileCells")
-            else np.where(self.grid["valid"], self.grid["valuesNt"], np.nan)
-        )
-        values = values.reshape(self.grid["shape"])
+        values = np.where(self.grid["valid"], self.grid["valuesNt"], np.nan).reshape(self.grid["shape"])
         self.values = np.append(values, values[:1], axis=0)  # once round: the last heading is the first
         self.headings = np.radians([*self.grid["headingsDeg"], self.grid["headingsDeg"][0] + 360])
         names = [f"magtwin:drive:{side}WheelJoint" for side in ("left", "right")]
@@ -62,20 +57,6 @@ class Lap:
         base = self.stage.GetPrimAtPath(self.base)
         to_base, _ = UsdGeom.XformCache().ComputeRelativeTransform(wheel, base)
         return -1.0 if to_base.TransformDir(axis)[1] < 0 else 1.0
-
-    def nodes(self):
-        """The values of a map in tiles [nT], in single precision: all of them, in memory."""
-        values, cells = np.empty(tuple(self.grid["shape"]), np.float32), self.grid["tileCells"]
-        for tile in (
-            next(p for p in self.stage.Traverse() if p.GetName() == "tile_0_0").GetParent().GetChildren()
-        ):
-            row, column = (int(n) * cells for n in tile.GetName().split("_")[1:])
-            part = values[:, row : row + cells + 1, column : column + cells + 1]
-            known, valid = (
-                np.array(tile.GetAttribute(f"magtwin:mapTile:{n}").Get()) for n in ("valuesNt", "valid")
-            )
-            part[:] = np.where(valid, known, np.float32(np.nan)).reshape(part.shape)
-        return values
 
     def field_map(self, x, y, yaw):
         """The map at a pose [nT]: linear in x, in y, and between two headings on the circle."""

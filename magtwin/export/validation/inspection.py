@@ -108,7 +108,7 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
     from magtwin.export.validation.physx_robots import driven_table
     from magtwin.export.validation.rule import RULES, TITLES, Subject
     from magtwin.export.validation.rules import robot_assets
-    from magtwin.usd.schema.versions import upgrade_stage
+    from magtwin.usd.schema.versions import check_schema
 
     file, root = Path(job["file"]), Path(job["root"])
     packed = None if job["home"] is None else Path(job["home"])
@@ -127,8 +127,8 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
         for layer in stage.GetUsedLayers():
             _read_all(layer)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MismatchWarning)  # the rule `schema-version` reports it
-            upgrade_stage(stage, str(file))
+            warnings.simplefilter("ignore", MismatchWarning)  # the rule `schema-names` reports it
+            check_schema(stage, str(file))
         if "core" in job["against"]:
             checks.append(_core(stage if packed is None else Usd.Stage.Open(str(file))))
         inputs = None if job["inputs"] is None else frozenset(job["inputs"])

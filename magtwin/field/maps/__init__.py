@@ -1,1 +1,1 @@
-"""Anomaly maps: the field by position and heading, its lookup, epochs and differences."""
+"""Anomaly maps: the field by position and heading, its lookup and differences."""

@@ -65,7 +65,6 @@ def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
     start = field.harmonic.height_m if field.harmonic is not None else field.height_m
     if abs(height_m - start) < GRAIN_M:
         return field
-    field = field.whole()
     harmonic, step = field.harmonic, height_m - start
     parameters = {**field.parameters, "continued_from_m": start}
     if harmonic is not None:

@@ -155,7 +155,7 @@ def difference(a: AnomalyMap, b: AnomalyMap) -> MapDifference:
         InputError: The maps have no node in common, or differ in frame, datum or height. If one of these is
             unknown, the report has a caution.
     """
-    a, b = a.whole().relative(), b.whole().relative()
+    a, b = a.relative(), b.relative()
     cautions = _compared(a, b)
     grid = _common(a, b)
     p, yaw = grid.poses()

@@ -5,8 +5,6 @@ All three do the same operations in the same order, so a pose gives the same byt
 among others.
 """
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,34 +32,8 @@ def warm_up() -> None:
     LOOPS.open()
 
 
-@dataclass(frozen=True, eq=False)
-class Block:
-    """A rectangle of a map's nodes laid out for lookup: all of them, or those of a tile.
-
-    Each array is flat, by heading, row and column, with the first heading repeated at the end.
-    """
-
-    values: NDArray  # Field [nT], 0 at masked nodes; single or double precision
-    holes: NDArray | None  # 1 at masked nodes, 0 at others; None if there are none
-    spreads: tuple[NDArray, ...]  # Variances [nT^2]: of the nodes, and any errors of interpolation
-    row: int  # Row of its first node in the map
-    column: int  # Column of its first node in the map
-    rows: int
-    columns: int
-
-    def node(self, h: NDArray[np.intp], j: NDArray[np.intp], i: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Index of the nodes at heading h, row j and column i of the map."""
-        return (h * self.rows + (j - self.row)) * self.columns + (i - self.column)
-
-    def corners(self, plane: NDArray, node: NDArray[np.intp]) -> list[Array]:
-        """Entries of the cells whose lowest nodes are `node`, in double precision."""
-        along_y = self.columns
-        ways = [up + way for up in (0, self.rows * along_y) for way in (0, 1, along_y, along_y + 1)]
-        return [plane.take(node + way).astype(float, copy=False) for way in ways]
-
-
-def closed(plane: NDArray) -> NDArray:
-    """Nodes (H, Y, X) as a plane of a `Block`."""
+def _closed(plane: NDArray) -> NDArray:
+    """Nodes (H, Y, X), flat, with the first heading repeated at the end."""
     return np.concatenate([plane.ravel(), plane[0].ravel()])
 
 
@@ -82,40 +54,27 @@ class Lookup:
         headings_rad: Array,
     ) -> None:
         layers, rows, columns = values_nt.shape
-        self._lay_axes(layers, rows, columns, origin_m, cell_m, headings_rad)
-        x0, y0, dx, dy, first, per_rad, *_ = self.figures
-        grids = [np.where(valid, values_nt, 0.0)]
-        if not valid.all():
-            grids.append((~valid).astype(float))
-        header = [x0, y0, dx, dy, first, EDGE, layers, rows, columns, per_rad]
-        self.table: Array = np.concatenate([header, self.knots, self.gaps, *map(closed, grids)])
-        """The map in one array, see `trilinear`."""
-
-        begin, end, *_ = trilinear.planes(self.table)
-        holes = self.table[end:] if len(grids) > 1 else None
-        self._block = Block(self.table[begin:end], holes, (), 0, 0, rows, columns)
-        self._plain = memoryview(self.table.data)  # its entries are plain floats, which Python adds up faster
-
-    def _lay_axes(
-        self,
-        layers: int,
-        rows: int,
-        columns: int,
-        origin_m: tuple[float, float],
-        cell_m: tuple[float, float],
-        headings_rad: Array,
-    ) -> None:
-        """Lay out the axes of a map of so many headings, rows and columns."""
         first = float(headings_rad[0])
         self.knots: Array = headings_rad - first
         self.gaps: Array = np.diff(np.append(headings_rad, first + TURN))
         even = np.abs(self.gaps - TURN / layers).max() < 1e-12
         per_rad = 0.0 if layers == 1 else layers / TURN if even else -1.0
         self.figures = (*origin_m, *cell_m, first, per_rad, layers, rows, columns)
+        grids = [np.where(valid, values_nt, 0.0)]
+        if not valid.all():
+            grids.append((~valid).astype(float))
+        header = [*origin_m, *cell_m, first, EDGE, layers, rows, columns, per_rad]
+        self.table: Array = np.concatenate([header, self.knots, self.gaps, *map(_closed, grids)])
+        """The map in one array, see `trilinear`."""
+
+        begin, end, *_ = trilinear.planes(self.table)
+        self._values = self.table[begin:end]
+        self._holes = self.table[end:] if len(grids) > 1 else None  # 1 at masked nodes, 0 at others
+        self._plain = memoryview(self.table.data)  # its entries are plain floats, which Python adds up faster
 
     def spreads(self, *layers: Array) -> Array:
         """Variances (H, Y, X) laid out for `lookup`: the nodes' own, and any errors of interpolation."""
-        return np.concatenate([closed(layer) for layer in layers])
+        return np.concatenate([_closed(layer) for layer in layers])
 
     def lookup(
         self, p: Array, yaw: Array, *, clamp: bool, gradient: bool, spreads: Array = NONE
@@ -147,11 +106,10 @@ class Lookup:
 
             in_threads(work, len(yaw), SHARE)
         else:
-            planes = tuple(spreads.reshape(-1, self._block.values.size)) if len(spreads) else ()
-            block = replace(self._block, spreads=planes)
+            planes = list(spreads.reshape(-1, self._values.size)) if len(spreads) else []
             for start in range(0, len(p), BLOCK):
                 part = slice(start, start + BLOCK)
-                self._by_numpy(block, p[part], yaw[part], clamp, out[part], slopes[part], sds[part])
+                self._by_numpy(p[part], yaw[part], clamp, planes, out[part], slopes[part], sds[part])
         sds[np.isnan(out[: len(sds)])] = np.nan
         return out, slopes, sds
 
@@ -193,10 +151,13 @@ class Lookup:
         return tuple(cells), tuple(weights), tuple(inside), unknown
 
     def _by_numpy(
-        self, block: Block, p: Array, yaw: Array, clamp: bool, out: Array, slopes: Array, sds: Array
+        self, p: Array, yaw: Array, clamp: bool, planes: list[Array], out: Array, slopes: Array, sds: Array
     ) -> None:
-        """Look up poses of a block in numpy; `slopes` and `sds` are empty if they are not wanted."""
-        _, _, dx, dy, first, per_rad, layers, _, _ = self.figures
+        """Look up poses in numpy; `slopes` and `sds` are empty if they are not wanted.
+
+        `planes` are the variances [nT^2]: of the nodes, and any errors of interpolation.
+        """
+        _, _, dx, dy, first, per_rad, layers, rows, columns = self.figures
         (i, j), (wx, wy), inside, unknown = self._cells(p, clamp)
         unknown |= ~np.isfinite(yaw)
         a = np.where(unknown, 0.0, yaw) - first
@@ -209,16 +170,21 @@ class Lookup:
             u = a * per_rad
             h = np.minimum(u.astype(np.intp), layers - 1)
             wh, rate = u - h, np.full(len(a), per_rad)
-        node = block.node(h, j, i)
-        values = block.corners(block.values, node)
+        node = (h * rows + j) * columns + i
+        ways = [up + way for up in (0, rows * columns) for way in (0, 1, columns, columns + 1)]
+
+        def corners(plane: Array) -> list[Array]:
+            return [plane.take(node + way) for way in ways]
+
+        values = corners(self._values)
         out[:] = blend(values, wx, wy, wh)
         holes = None
-        if block.holes is not None:
-            holes = block.corners(block.holes, node)
+        if self._holes is not None:
+            holes = corners(self._holes)
             unknown |= blend(holes, wx, wy, wh) > EDGE
         out[unknown] = np.nan
         if len(sds):
-            parts = [blend(block.corners(one, node), wx, wy, wh) for one in block.spreads]
+            parts = [blend(corners(plane), wx, wy, wh) for plane in planes]
             whole = parts[0] if len(parts) == 1 else spread(parts[0], parts[1], parts[2], wx, wy, wh)
             sds[:] = np.sqrt(whole)
         if not len(slopes):

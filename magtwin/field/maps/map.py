@@ -316,14 +316,12 @@ class AnomalyMap(Summarized):
 
     def relative(self) -> "AnomalyMap":
         """The map up to a constant: its variance without that of the offset, for users that estimate one."""
-        if not self.offset_sd_nt or not self.has_variance:
+        if not self.offset_sd_nt or self.variance_nt2 is None:
             return self
-        whole = self.whole()
-        assert whole.variance_nt2 is not None
         return replace(
-            whole,
-            variance_nt2=np.maximum(whole.variance_nt2 - np.square(self.offset_sd_nt), 0.0),
-            parameters={name: value for name, value in whole.parameters.items() if name != OFFSET},
+            self,
+            variance_nt2=np.maximum(self.variance_nt2 - np.square(self.offset_sd_nt), 0.0),
+            parameters={name: value for name, value in self.parameters.items() if name != OFFSET},
         )
 
     @property
@@ -354,14 +352,6 @@ class AnomalyMap(Summarized):
         """Whether the values depend on the heading by more than 1 pT at any node."""
         values = np.where(self.valid, self.values_nt, np.nan)
         return bool(np.any(np.abs(values - values[:1]) > CONSTANT_NT))
-
-    def whole(self) -> "AnomalyMap":
-        """The map with all its arrays in memory; a map in tiles is read whole, if it is not too large."""
-        return self
-
-    def overview(self) -> "AnomalyMap":
-        """The map for pictures; of a map in tiles, every few nodes."""
-        return self
 
     @cached_property
     def _lookup(self) -> Lookup:

@@ -2,15 +2,13 @@
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.field.maps.epochs import drift
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.maps.tiles import TiledMap
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.report import Figure, Report
 from magtwin.summary import span
@@ -52,17 +50,12 @@ _FILE = re.compile(r"(?P<name>.+?) sha256:(?P<sha256>[0-9a-f]{64})")
 _TEXTS = ("method", "frame", "datum", "created", "licence")
 
 
-def map_metadata(field: AnomalyMap, epochs: Sequence[AnomalyMap] = ()) -> Report:
+def map_metadata(field: AnomalyMap) -> Report:
     """All that is known about a map: statistics, uncertainty, method and source.
-
-    Args:
-        field: The map.
-        epochs: All epochs of the map, from `magtwin.usd.maps.layer.load_epochs`. With two or more, their
-            drift is added.
 
     Returns:
         Statistics of the map and of each heading, share of valid nodes, standard deviation, height, the
-        harmonic field and the robot of the survey, drift. The metadata: method with its parameters, frame,
+        harmonic field and the robot of the survey. The metadata: method with its parameters, frame,
         datum, day, licence, and source files with checksums. Unknown entries are "unknown".
     """
     figures = [*field.report().figures]
@@ -72,14 +65,12 @@ def map_metadata(field: AnomalyMap, epochs: Sequence[AnomalyMap] = ()) -> Report
     dx, dy = field.cell_m
     extent = f"x {x0:g}..{x1:g}, y {y0:g}..{y1:g}"
     figures.append(Figure("extent", extent, "m", note=f"cells {dx:g} x {dy:g} m"))
-    known = _variances(field)
+    known = np.empty(0) if field.variance_nt2 is None else field.variance_nt2[field.valid]
     if not known.size:
         figures.append(Figure("standard deviation", "unknown"))
     else:
         low, middle, high = np.sqrt(np.percentile(known, (0, 50, 100)))
         note = f"median; from {low:.3g} to {high:.3g} nT"
-        if isinstance(field, TiledMap) and field.sums.every > 1:
-            note += f" at every {field.sums.every}th node along x and y"
         figures.append(Figure("standard deviation", float(middle), "nT", note=note))
     figures += offset_figures(field)
     if field.height_m is None:
@@ -89,16 +80,12 @@ def map_metadata(field: AnomalyMap, epochs: Sequence[AnomalyMap] = ()) -> Report
     figures += _headings(field)
     if field.harmonic is not None:
         figures += _harmonic(field.harmonic, "sensor" if field.height_m is None else "floor")
-    if len(epochs) > 1:
-        figures += drift(epochs).figures
     metadata: dict[str, Any] = {"headings deg": ", ".join(f"{h:.6g}" for h in np.degrees(field.headings_rad))}
     metadata |= {name: getattr(field, name) or "unknown" for name in _TEXTS}
     if field.parameters:
         metadata["parameters"] = dict(field.parameters)
     files = source_files(field.source)
     metadata |= {"files": files} if files else {"source": field.source or "unknown"}
-    if len(epochs) > 1:
-        metadata["epochs"] = {m.created: m.source or "source unknown" for m in epochs}
     return Report(f"map {field.name}", tuple(figures), metadata)
 
 
@@ -130,37 +117,10 @@ def source_files(source: str) -> dict[str, str]:
     return files
 
 
-def _variances(field: AnomalyMap) -> Array:
-    """Variances of the valid nodes, of a map in tiles at every few nodes; empty if unknown."""
-    if isinstance(field, TiledMap):
-        return field.sums.variances_nt2
-    return np.empty(0) if field.variance_nt2 is None else field.variance_nt2[field.valid]
-
-
-def _rows(field: AnomalyMap) -> Iterable[Mapping[str, float]]:
-    """`statistics` of each heading; of a map in tiles without gradients and errors."""
-    if not isinstance(field, TiledMap):
-        return (statistics(field, h) for h in range(len(field.headings_rad)))
-    sums = field.sums
-    with np.errstate(invalid="ignore"):
-        rows: dict[str, Any] = {
-            "heading_deg": np.degrees(field.headings_rad),
-            "nodes": np.full(len(sums.count), sums.nodes),
-            "masked": sums.nodes - sums.count,
-            "mean_nt": sums.mean,
-            "sd_nt": np.sqrt(sums.square / sums.count),
-            "least_nt": sums.least,
-            "greatest_nt": sums.greatest,
-        }
-    return [
-        dict(zip(rows, row, strict=True)) for row in zip(*map(np.ndarray.tolist, rows.values()), strict=True)
-    ]
-
-
 def _headings(field: AnomalyMap) -> list[Figure]:
     """Mean and standard deviation of each heading, with its range and masked share."""
     figures = []
-    for row in _rows(field):
+    for row in (statistics(field, h) for h in range(len(field.headings_rad))):
         name = f"heading {row['heading_deg']:.6g}"
         if row["masked"] == row["nodes"]:
             figures.append(Figure(name, "no valid node"))

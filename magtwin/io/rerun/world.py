@@ -63,8 +63,7 @@ class Scale:
         table = (colormaps["viridis"](np.arange(256)) * 255).round().astype(np.uint8)
         known = readings_nt[np.isfinite(readings_nt)]
         known = known[:: max(1, len(known) // 10_000)]  # enough for a percentile
-        nodes = field.overview()
-        ends = [np.percentile(v, [1, 99]) for v in (nodes.values_nt[nodes.valid], known) if v.size]
+        ends = [np.percentile(v, [1, 99]) for v in (field.values_nt[field.valid], known) if v.size]
         low, high = np.floor(np.min(ends or 0) / 1000) * 1000, np.ceil(np.max(ends or 0) / 1000) * 1000
         return cls(float(low), float(max(high, low + 1000)), table)
 
@@ -132,7 +131,6 @@ def send_room(
 
 def send_map(rec: rr.RecordingStream, field: AnomalyMap, scale: Scale, heading: float) -> None:
     """The floor in the colours of the map at a heading [rad], interpolated between nodes."""
-    field = field.overview()
     x0, x1, y0, y1 = field.extent
     cell, width, height = _pixels(field)
     x = x0 + (np.arange(width) + 0.5) * (x1 - x0) / width

@@ -51,23 +51,20 @@ MOST_MASKED = 0.9
 """Share of masked nodes above which the report doubts the map."""
 
 
-def open_map(file: Source, date: str | None = None) -> AnomalyMap:
+def open_map(file: Source) -> AnomalyMap:
     """The map of a layer or stage, or of a folder of survey CSVs.
 
     Args:
         file: As for `map_file`.
-        date: Date between the epochs of a layer, YYYY-MM-DD. None: the epoch that it selects.
 
     Raises:
-        InputError: There is no map, it is damaged, or a folder is asked for a date.
+        InputError: There is no map, or it is damaged.
     """
     from magtwin.usd.maps.layer import load_map
 
     file = map_file(file)
     if not file.is_dir():
-        return load_map(file, date)
-    if date is not None:
-        raise InputError(f"{file}: a folder of CSVs has no dates; leave out `date`", parameter="date")
+        return load_map(file)
     return read_folder(expected(file, "map"))[0]
 
 

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.maps.tiles import TiledMap
 from magtwin.files import existing_file, read_text, sha256
 from magtwin.kinds import expected
 from magtwin.learn.data.alignment import Alignment, fit_alignment
@@ -545,9 +544,6 @@ def _write(run: Run, source: Source, path: Path) -> Recording:
 def values_sha256(field: AnomalyMap) -> str:
     """Checksum of a map's nodes, for maps without a file."""
     digest = hashlib.sha256(json.dumps([field.origin_m, field.cell_m, field.grid.shape]).encode())
-    if isinstance(field, TiledMap):
-        digest.update("".join(field.checksums).encode())
-        return digest.hexdigest()
     for array in (field.values_nt, field.valid, field.headings_rad):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

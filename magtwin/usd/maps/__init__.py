@@ -1,1 +1,1 @@
-"""Anomaly maps as USD layers: in memory or in tiles, with epochs and a coloured floor."""
+"""Anomaly maps as USD layers, with a coloured floor."""

@@ -1,4 +1,4 @@
-"""Attributes of a map's prim: what maps in memory and maps in tiles have in common."""
+"""Attributes of a map's prim, one by one."""
 
 import json
 import math
@@ -26,13 +26,10 @@ PLACES = ("frame", "datum")
 MADE_FROM = attribute_name("anomalyMap", "made_from")
 
 GRID = ("shape", "origin", "cellSize", "headings")
-"""Attributes of the grid, which the checksum covers from version 2 on."""
+"""Attributes of the grid, which the checksum covers."""
 
 CHECKSUM_VERSION = 2
-"""Version of the checksum of a new map. Version 1, that of an older map, is of the arrays alone."""
-
-TILED_CHECKSUM_VERSION = 3
-"""Version of the checksum of a map in tiles: over the checksums of its tiles."""
+"""Version of the checksum: 1 did not cover the grid, and 3 was of maps in tiles."""
 
 
 def get(prim: Usd.Prim, name: str) -> Any:
@@ -131,22 +128,23 @@ def set_values(prim: Usd.Prim, values: Mapping[str, Any]) -> None:
             author(prim.GetAttribute(name), value)
 
 
-def shared_values(field: AnomalyMap, grid: Grid, version: int) -> dict[str, Any]:
-    """Values of the attributes that all epochs share, by name; None if there is no value."""
-    shared = {
+def grid_values(field: AnomalyMap) -> dict[str, Any]:
+    """Values of the attributes of a map's grid and of its place, by name; None if there is no value."""
+    grid = field.grid
+    values = {
         "shape": Vt.IntArray(grid.shape),
         "origin": Gf.Vec2d(*grid.origin_m),
         "cellSize": Gf.Vec2d(*grid.cell_m),
         "headings": Vt.DoubleArray(np.rad2deg(grid.headings_rad).tolist()),
-        "checksumVersion": version,
+        "checksumVersion": CHECKSUM_VERSION,
         "height_m": field.height_m,
         **{name: getattr(field, name) for name in PLACES},
     }
-    return {attribute_name("anomalyMap", name): value for name, value in shared.items()}
+    return {attribute_name("anomalyMap", name): value for name, value in values.items()}
 
 
 def texts_of(field: AnomalyMap) -> dict[str, Any]:
-    """Values of the attributes that are texts and differ between epochs, by name."""
+    """Values of the attributes that are texts, by name."""
     parameters = dict(field.parameters or {})
     try:
         text = json.dumps(parameters, allow_nan=False, ensure_ascii=False) if parameters else ""

@@ -1,13 +1,9 @@
 """The coloured floor of a map: a mesh of bounded size, with one variant of colours per heading."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
-from magtwin.field.grid import Grid
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
 from magtwin.usd.geometry import linear_from_srgb
@@ -29,38 +25,13 @@ MOST_QUADS = 60_000
 UNIT = "nT"
 
 
-@dataclass(frozen=True, eq=False)
-class Floor:
-    """What the coloured floor shows: every few nodes of a map, at each of its epochs."""
-
-    grid: Grid
-    every: int  # Step between the nodes
-    j: NDArray[np.intp]  # Rows of the nodes
-    i: NDArray[np.intp]  # Columns of the nodes
-    shown: Sequence[tuple[NDArray, NDArray[np.bool_]]]  # Values and flags of each epoch, shape (H, J, I)
-    limits: tuple[float, float]  # Values at the ends of the colour scale [nT]
-
-    @classmethod
-    def of(cls, maps: Sequence[AnomalyMap]) -> "Floor":
-        """The floor of maps in memory of one grid, the latest last."""
-        every, j, i = nodes_shown(maps[-1].grid)
-        here = np.ix_(np.arange(len(maps[-1].headings_rad)), j, i)
-        limits = colour_limits(np.concatenate([m.values_nt[m.valid] for m in maps]))
-        return cls(maps[-1].grid, every, j, i, [(m.values_nt[here], m.valid[here]) for m in maps], limits)
-
-
-def nodes_shown(grid: Grid) -> tuple[int, NDArray[np.intp], NDArray[np.intp]]:
-    """Step between the nodes that a coloured floor shows, their rows and their columns."""
-    every = 1
+def define_heat_map(stage: Usd.Stage, field: AnomalyMap) -> None:
+    """A grid of quads with a vertex at every node, or every few, and a variant of colours per heading."""
+    grid, every = field.grid, 1
     while (len(j := _kept(grid.rows, every)) - 1) * (len(i := _kept(grid.columns, every)) - 1) > MOST_QUADS:
         every += 1
-    return every, j, i
-
-
-def define_heat_map(stage: Usd.Stage, floor: Floor) -> UsdGeom.Mesh:
-    """A grid of quads with a vertex at every node, or every few; `define_colours` colours it."""
-    grid, rows, columns = floor.grid, len(floor.j), len(floor.i)
-    x, y = np.meshgrid(grid.x_m[floor.i], grid.y_m[floor.j])
+    rows, columns = len(j), len(i)
+    x, y = np.meshgrid(grid.x_m[i], grid.y_m[j])
     points = np.stack([x, y, np.full_like(x, HEAT_MAP_HEIGHT_M)], axis=-1).reshape(-1, 3).astype(np.float32)
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     quads = np.stack([corner, corner + 1, corner + columns + 1, corner + columns], axis=-1).astype(np.int32)
@@ -74,21 +45,16 @@ def define_heat_map(stage: Usd.Stage, floor: Floor) -> UsdGeom.Mesh:
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateDoubleSidedAttr(True)
     UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(_define_material(stage))
-    low, high = floor.limits
+    low, high = colour_limits(field.values_nt[field.valid])
     scale = {"colourMap": COLOUR_MAP, "least": low, "greatest": high, "unit": UNIT}
-    mesh.GetPrim().SetCustomData({"magtwin": scale | {"everyNode": floor.every}})  # stride over the nodes
-    return mesh
-
-
-def define_colours(mesh: UsdGeom.Mesh, floor: Floor, epoch: int = -1) -> None:
-    """One variant of the floor's colours for each heading, of one epoch, in the stage's edit target."""
-    low, high = floor.limits
-    values, valid = floor.shown[epoch]
+    mesh.GetPrim().SetCustomData({"magtwin": scale | {"everyNode": every}})  # stride over the nodes
+    here = np.ix_(np.arange(len(field.headings_rad)), j, i)
+    values, valid = field.values_nt[here], field.valid[here]
     primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
         "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex
     )
     variants = mesh.GetPrim().GetVariantSets().AddVariantSet("heading")
-    names, palette = heading_variants(np.array(floor.grid.headings_rad)), viridis()
+    names, palette = heading_variants(field.headings_rad), viridis()
     for h, name in enumerate(names):
         variants.AddVariant(name)
         variants.SetVariantSelection(name)

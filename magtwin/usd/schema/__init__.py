@@ -47,7 +47,6 @@ FILES = ("plugInfo.json", "generatedSchema.usda", "schema.usda")
 
 NOUNS = {
     "anomalyMap": "MagtwinAnomalyMapAPI",
-    "mapTile": "MagtwinMapTileAPI",
     "harmonic": "MagtwinHarmonicFieldAPI",
     "magnetometer": "MagtwinMagnetometerAPI",
     "imu": "MagtwinImuAPI",

@@ -90,25 +90,10 @@ layer that magtwin writes has it in its `customLayerData`, as `magtwinSchemaVers
 
 | layer | what magtwin does |
 |---|---|
-| of this version | reads it |
-| of no version, without older names: an edit in another program | reads it |
-| with older names: of magtwin 0.2, or typed by hand | uses the names of today in memory, and warns once |
-| with an attribute under its older and its later name | refuses it |
-| of a later second number | reads it, ignores attributes that it does not know, and warns |
+| of this version, or of none: an edit in another program | reads it |
+| with a name that the schemas lack: a typing error, or an older name | ignores it, and warns once |
+| of a later second number | reads it, ignores attributes that it does not know, and warns once |
 | of a later first number | refuses it |
-
-`magtwin upgrade FILE` rewrites a stage, robot or map, with every layer that it names, to this version. Values
-stay as they are, so a run gives the same readings. A rewritten map is another file: the checksum in the
-scene's magnetometers follows, but a network or run made before names the file of before and reports another
-map or scene. `magtwin export` upgrades what it exports, and `magtwin validate` has the rule `schema-version`.
-
-### From 0.x to 1.0
-
-Attributes with another name:
-
-{table}
-These are removed: {removed}. All attributes are uniform
-since 1.0, and layers have a version.
 """
 
 
@@ -162,7 +147,7 @@ def reference() -> str:
     from pxr import Sdf
 
     layer = Sdf.Layer.FindOrOpen(str(HERE / "schema.usda"))
-    parts = [_introduction()]
+    parts = [INTRODUCTION.format(version=VERSION)]
     for schema in layer.rootPrims:
         if schema.specifier != Sdf.SpecifierClass:
             continue
@@ -175,14 +160,6 @@ def reference() -> str:
             fallback = f"`{_fallback(item)}`" if attribute and _fallback(item) else ""
             parts.append(f"| `{item.name}` | {kind} | {fallback} | {item.documentation} |\n")
     return "".join(parts)
-
-
-def _introduction() -> str:
-    """What stands above the tables, with the version and the names of version 0.x."""
-    rows = [f"| `{older}` | `{name}` |\n" for older, name in NAMES.RENAMED.items()]
-    removed = (f"`{name}`, which was always {value!r}" for name, value in NAMES.REMOVED.items())
-    table = "| 0.x | 1.0 |\n|---|---|\n" + "".join(rows)
-    return INTRODUCTION.format(version=VERSION, table=table, removed=", ".join(removed))
 
 
 def _fallback(attribute: Any) -> str:

@@ -8,9 +8,6 @@ NtSPerM, nT/(N m) is NtPerNm. A ratio, a count, a text and a file have none.
 VERSION = (1, 0)
 """Version of the schema: the first number changes with names and meanings, the second with new attributes."""
 
-OLDER = "0.x"
-"""How messages call a version before 1.0, which layers do not name."""
-
 WITH_UNIT = {
     "anomalyMap": {
         "values": "valuesNt",
@@ -20,7 +17,6 @@ WITH_UNIT = {
         "cellSize": "cellSizeM",
         "headings": "headingsDeg",
     },
-    "mapTile": {"values": "valuesNt", "variance": "varianceNt2"},
     "harmonic": {
         "pWorldDipole": "pWorldDipoleM",
         "mWorld": "mWorldAm2",
@@ -87,7 +83,7 @@ WITH_UNIT = {
 }
 """Names of noun's attributes whose field in Python leaves out the unit, or has it in another spelling.
 
-The left one is the name in camel case: that of the field, and that of the attribute before version 1.0.
+The left one is the name of the field in camel case.
 """
 
 
@@ -98,12 +94,5 @@ def attribute_name(noun: str, field: str) -> str:
     return f"magtwin:{noun}:{WITH_UNIT.get(noun, {}).get(name, name)}"
 
 
-RENAMED = {
-    f"magtwin:{noun}:{older}": f"magtwin:{noun}:{name}"
-    for noun, names in WITH_UNIT.items()
-    for older, name in names.items()
-}
-"""Attributes of version 0.x that have another name since 1.0."""
-
-REMOVED = {"magtwin:anomalyMap:unit": "nT"}
-"""Attributes of version 0.x that 1.0 does not have, and the only value that they could have."""
+BESIDE = ("axis", "file", "primitive", "run", "sensor", "unconverted")
+"""Second words of names that are none of the schema: the URDF converter, exports and runs author them."""
