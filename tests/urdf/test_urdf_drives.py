@@ -5,9 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from made import urdf
 from numpy.testing import assert_allclose
 from pxr import UsdPhysics
-from test_urdf import urdf
 from test_urdf_physics import convert, drive_of, prim
 
 from magtwin.urdf.options import DriveRule

@@ -5,9 +5,9 @@ import textwrap
 
 import numpy as np
 import pytest
+from made import BODY, INERTIAL
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics, UsdRender, UsdShade
-from test_urdf import BODY, INERTIAL
 from validators import assert_valid
 
 from magtwin.errors import InputError

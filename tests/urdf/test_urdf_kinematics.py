@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from made import urdf
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics
-from test_urdf import urdf
 
 from magtwin.author.from_urdf import link_poses
 from magtwin.errors import InputError

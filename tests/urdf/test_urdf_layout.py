@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from made import BALL, BODY, INERTIAL
 from numpy.testing import assert_allclose
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils
-from test_urdf import BALL, BODY, INERTIAL
 from validators import assert_valid
 
 from magtwin.errors import InputError

@@ -3,9 +3,9 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made import BALL, INERTIAL, arm, urdf
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
-from test_urdf import BALL, INERTIAL, arm, urdf
 from validators import assert_valid
 
 from magtwin.errors import InputError

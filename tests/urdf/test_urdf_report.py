@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from made import INERTIAL, urdf
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics
-from test_urdf import INERTIAL, urdf
 
 from magtwin.errors import InputError
 from magtwin.files import sha256

@@ -4,9 +4,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from made import BALL, INERTIAL
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics
-from test_urdf import BALL, INERTIAL
 
 from magtwin.errors import InputError
 from magtwin.urdf.convert import convert_with_report

@@ -5,9 +5,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from made import BODY, INERTIAL
 from numpy.testing import assert_allclose
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
-from test_urdf import BODY, INERTIAL
 
 from magtwin.author.from_urdf import link_poses, write_urdf
 from magtwin.cli import main
