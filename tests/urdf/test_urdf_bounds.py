@@ -238,6 +238,8 @@ def test_a_material_that_nothing_wears_takes_no_room_and_groups_are_counted(tmp_
 # --- YAML -----------------------------------------------------------------------------------------
 
 FAULTS = {
+    "a: [": "",
+    "a: !!python/object/apply:os.getcwd []": "could not determine a constructor",
     "a: !!bool foo": "'foo' is no bool",
     'a: !!int ""': "'' is no int",
     'a: !!int "_"': "'_' is no int",
