@@ -292,15 +292,13 @@ def test_merged_colliders_keep_their_own_links_friction(tmp_path):
     assert_allclose([grips["box"], grips["lid"]], [0.5, 0.05], rtol=1e-6)
 
 
-def test_merging_the_real_robot_leaves_three_bodies_of_the_same_mass_and_balance(tmp_path, real_data):
-    path = real_data / "turtlebot4" / "turtlebot4.urdf"
+def test_merging_the_real_robot_leaves_three_bodies_of_the_same_mass_and_balance(tmp_path, real_robot):
+    path, out, _ = real_robot
+    options = Options(single_file=True, merge_fixed=True)
     total = {}
-    for merge in (False, True):
-        out = convert_urdf(
-            path, tmp_path / f"{merge}.usda", options=Options(single_file=True, merge_fixed=merge)
-        )
-        stage = Usd.Stage.Open(str(out))
+    for merge, file in ((False, out), (True, convert_urdf(path, tmp_path / "merged.usda", options=options))):
         parts, cache = [], UsdGeom.XformCache()
+        stage = Usd.Stage.Open(str(file))
         for p in stage.Traverse():
             if p.HasAPI(UsdPhysics.MassAPI):
                 T = np.array(cache.GetLocalToWorldTransform(p)).T
