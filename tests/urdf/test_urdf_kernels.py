@@ -1,6 +1,5 @@
 """Numpy in place of a library that takes longer to import: it agrees with the library."""
 
-
 import numpy as np
 import trimesh
 from hypothesis import given, settings

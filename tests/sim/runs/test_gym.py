@@ -15,15 +15,9 @@ from magtwin.errors import InputError  # noqa: E402
 from magtwin.run.run import COLUMNS  # noqa: E402
 from magtwin.sim.runs.stepped import SteppedRobots  # noqa: E402
 from magtwin.sim.session import draw_session  # noqa: E402
-from magtwin.twin import Twin, open_twin  # noqa: E402
 
 NAME = "magtwin/MagNav-v0"
 AHEAD = np.array([0.2, 0.0], np.float32)
-
-
-@pytest.fixture(scope="module")
-def twin(lab_scene) -> Twin:
-    return open_twin(lab_scene, magnetometer="physical")
 
 
 @pytest.fixture(scope="module")
