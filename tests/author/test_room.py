@@ -390,12 +390,6 @@ def test_the_free_place_that_a_refusal_names_is_free(toml):
     assert scene_from_toml(toml).start[1] != 0.9
 
 
-def test_neither_map_nor_earth_is_refused_with_what_to_add(toml):
-    toml.write_text('name = "a"\n[robot]\nasset = "turtlebot4"\n')
-    with pytest.raises(InputError, match=r"names no map; add map = .*\[earth\].*\[\[furniture\]\]"):
-        scene_from_toml(toml)
-
-
 # The file to start from
 
 

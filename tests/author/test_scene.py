@@ -297,10 +297,6 @@ def test_the_magnetometer_points_to_the_map_that_it_reads(parts, tmp_path):
     assert magnetometer.GetRelationship(sensors.MAP_RELATIONSHIP).GetTargets() == [MAP]
 
 
-def test_a_scene_passes_the_gates(parts, tmp_path):
-    assert_valid(author_scene(full_scene(parts), tmp_path / "s"), tmp_path)
-
-
 # The lab
 
 
@@ -450,7 +446,7 @@ def test_a_network_brings_its_inputs_and_its_checksum(own_parts):
         ("asset =", "aset =", r"scene\.toml:6: \[robot\] unknown key 'aset'; did you mean 'asset'"),
         ("bot.usda", "bott.usda", r"bott\.usda: no such robot asset; did you mean 'bot\.usda'"),
         ("map.usdc", "mapp.usdc", r"mapp\.usdc: no such map layer; did you mean 'map\.usdc'"),
-        ('map = "map.usdc"', "", r"scene\.toml: names no map; add map = "),
+        ('map = "map.usdc"', "", r"scene\.toml: names no map; add map = .*\[earth\].*\[\[furniture\]\]"),
         ("[robot]", "[lab]\nfloor_m = [6]\n[robot]", r"scene\.toml:6: \[lab\] floor_m must be a list of 2"),
         (
             "[robot]",

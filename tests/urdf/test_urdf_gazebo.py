@@ -242,18 +242,6 @@ def test_a_sensor_without_a_counterpart_is_kept_as_text_on_its_link_and_counted(
     assert any("sensor 'gps' of link 'eye' is of type 'navsat'" in note for note in report.notes)
 
 
-def test_unknown_tags_of_a_sensor_are_counted(tmp_path):
-    text = IMU.replace("<imu>", "<topic>imu</topic><visualize>1</visualize><imu>")
-    _stage, robot, report = cart(tmp_path, on("eye", text))
-    assert report.unknown_tags == {"gazebo/sensor/topic": 1, "gazebo/sensor/visualize": 1}
-    kept = list(robot.GetPrimAtPath("base_link/eye").GetCustomDataByKey("magtwin:unconverted"))
-    assert kept[0] == "gazebo/sensor(imu): <topic>imu</topic>"
-    note = (
-        "2 tags without a meaning here are kept as text, such as gazebo/sensor/topic, gazebo/sensor/visualize"
-    )
-    assert note in report.notes
-
-
 # --- drives ---------------------------------------------------------------------------------------
 
 GZ = """<gazebo><plugin filename="gz-sim-diff-drive-system" name="gz::sim::systems::DiffDrive">

@@ -315,15 +315,6 @@ def test_xacro_has_arguments_properties_macros_blocks_conditions_includes_and_ya
     assert description.where(hand) == f"{URDF}/input_packages/arm_description/urdf/hand.xacro:3"
 
 
-def test_the_expanded_text_is_a_urdf_of_the_same_robot(tmp_path):
-    source = read_source(URDF / "input_xacro_language.xacro")
-    path = tmp_path / "arm.urdf"
-    path.write_text(ElementTree.tostring(source.xml, encoding="unicode"), encoding="utf-8")
-    again = read_source(path, packages={"arm_description": URDF / "input_packages" / "arm_description"})
-    assert same(again.xml, source.xml)
-    assert list(read_description(again).links) == list(read_description(source).links)
-
-
 @pytest.mark.parametrize("name", ["latin1", "byte_order_mark", "namespaces"])
 def test_declared_encodings_and_namespaces_are_read(name):
     description = read(URDF / f"input_{name}.urdf")
@@ -461,7 +452,6 @@ def same(ours, theirs):
 
 @pytest.mark.parametrize("kind", ["standard", "lite"])
 def test_the_real_xacro_expands_as_the_library_alone_expands_it(real_data, kind, monkeypatch):
-    from xml.etree import ElementTree
 
     import xacro
     from xacro import substitution_args
