@@ -4,14 +4,13 @@ import textwrap
 
 import numpy as np
 import pytest
-from made import BODY, INERTIAL
+from made import BODY, INERTIAL, converted
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics, UsdRender, UsdShade
 from validators import assert_valid
 
 from magtwin.errors import InputError
 from magtwin.urdf import read_notes
-from magtwin.urdf.convert import convert_with_report
 from magtwin.urdf.options import DriveRule, Options
 from magtwin.usd.schema import prims_with
 from magtwin.usd.sensors import read_drive, read_imu, read_lidar, read_magnetometer
@@ -31,10 +30,7 @@ def cart(tmp_path, tags, **choices):
     """A two-wheeled robot with tags: its stage, its prim and the report."""
     path = tmp_path / "cart.urdf"
     path.write_text(f'<robot name="cart">\n{CART}{EYE}\n{textwrap.dedent(tags)}\n</robot>\n')
-    report = convert_with_report(path, tmp_path / "cart.usda", options=Options(**choices), force=True)
-    stage = Usd.Stage.Open(str(tmp_path / "cart.usda"))
-    stage.Reload()
-    return stage, stage.GetDefaultPrim(), report
+    return converted(path, **choices)
 
 
 def on(link, sensor):

@@ -207,6 +207,11 @@ SLIPS = {
     '<l x="${xacro.fatal(1, 2)}"/>': "1 2",
     """<l x="${xacro.load_yaml('merges.yaml')}"/>""": "is not YAML: a table of over 10000 entries",
     """<l x="${xacro.load_yaml('deep.yaml')}"/>""": "deep.yaml nests too deep",
+    "<a x=\"${xacro.tokenize('a b', '')}\"/>": "tokenize: sep is empty",
+    r"""<a x="${'\ud800'}"/>""": "half of a character",
+    """<a x="${'%c' % 0xdfff}"/>""": "half of a character",
+    '<xacro:include filename="*/../../*/*.none"/>': r"has '\.\.' after a wildcard; leave it out",
+    """<xacro:macro name="m" params="a:=bbbbbbbbbbbbbbbbbbbbbbbbbbbbb'"/><xacro:m/>""": "Undefined par",
     '<l x="${xacro}"/>': "a .* is not a value",
     '<l x="$(cwd)"/>': r"\$\(cwd\) is not known; known: arg, dirname, env, eval, find, optenv",
 }
