@@ -2,7 +2,7 @@
 
 import importlib.util
 import re
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,6 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.bodies import Bodies
 from magtwin.field.sources.magnets import body_of
 from magtwin.files import shipped
-from magtwin.sim.contradiction import contradiction_nt
 from magtwin.sim.survey import field_at_rest_nt
 from magtwin.spec.furniture import (
     KINDS,
@@ -30,7 +29,6 @@ from magtwin.spec.furniture import (
 )
 from magtwin.twin import author_scene, new_scene, open_twin, scene_from_toml, simulate
 from magtwin.usd.lab.furniture import define_furniture, read_magnets
-from magtwin.usd.maps.layer import save_map
 from magtwin.usd.scene import read_scene
 
 ROOM = """
@@ -276,17 +274,6 @@ def test_a_room_of_earth_alone_is_told_to_be_the_same_everywhere(toml):
 # Map and sources
 
 
-def test_a_map_that_its_sources_made_agrees_and_one_of_another_room_is_refused(den, toml, tmp_path):
-    twin = open_twin(den)
-    assert contradiction_nt(twin.scene, twin.field).rms_nt < 1  # but for the filled nodes, noise
-    save_map(replace(twin.field, values_nt=twin.field.values_nt[:, ::-1, ::-1] + 6000), tmp_path / "o.usdc")
-    toml.write_text(ROOM.replace("seed = 3", 'map = "o.usdc"').replace("[survey]\nspacing_m = 0.5\n", ""))
-    with pytest.raises(
-        InputError, match=r"den\.toml with o\.usdc: the map differs .* nT rms .* at most [\d,]+ nT"
-    ):
-        scene_from_toml(toml)
-
-
 def test_a_moved_desk_is_noted_with_its_place(tmp_path):
     text = shipped("scenes", "lab.toml").read_text()
     root = shipped("scenes").parent
@@ -388,12 +375,6 @@ def test_the_free_place_that_a_refusal_names_is_free(toml):
     assert place is not None
     toml.write_text(ROOM.replace("seed = 3", place[0]))
     assert scene_from_toml(toml).start[1] != 0.9
-
-
-def test_neither_map_nor_earth_is_refused_with_what_to_add(toml):
-    toml.write_text('name = "a"\n[robot]\nasset = "turtlebot4"\n')
-    with pytest.raises(InputError, match=r"names no map; add map = .*\[earth\].*\[\[furniture\]\]"):
-        scene_from_toml(toml)
 
 
 # The file to start from

@@ -13,7 +13,6 @@ from magtwin.sim import extensions
 from magtwin.sim.motion.drive import Motion
 from magtwin.sim.motion.engine import ENGINES, KINEMATIC
 from magtwin.sim.runs.simulate import simulate
-from magtwin.twin import Twin, open_twin
 
 
 @extensions.sensor("test_speedometer")
@@ -41,11 +40,6 @@ class StraightOn:
     def command(self, t, x, y, yaw, v, w):
         self.done = t > 2.0
         return (0.0 if self.done else self.speed), 0.0
-
-
-@pytest.fixture(scope="module")
-def twin(lab_scene) -> Twin:
-    return open_twin(lab_scene, magnetometer="physical")
 
 
 def run_of(twin, **options):

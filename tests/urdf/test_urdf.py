@@ -1,4 +1,4 @@
-import textwrap
+"""Small descriptions and what they become on a stage; names; meshes of every format."""
 
 import numpy as np
 import pytest
@@ -6,48 +6,16 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from looking import assert_looks_alike
+from made import BALL, arm, converted, urdf
 from numpy.testing import assert_allclose
-from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
+from pxr import UsdGeom, UsdPhysics, UsdShade
 from validators import assert_valid
 
 from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, quat_from_rpy
-from magtwin.urdf import convert_urdf, read_notes
-from magtwin.urdf.description.description import read_description
-from magtwin.urdf.physics.inertia import nearest_possible, principal_axes, quaternion
+from magtwin.urdf import convert_urdf
+from magtwin.urdf.physics.inertia import nearest_possible, principal_axes
 from magtwin.usd.geometry import read_links, read_shapes
-from magtwin.usd.solids import corner_normals
-
-INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
-BALL = '<geometry><sphere radius="0.1"/></geometry>'
-BODY = f"{INERTIAL}<visual>{BALL}</visual><collision>{BALL}</collision>"
-
-
-def urdf(tmp_path, body, name="arm"):
-    """A URDF file around `body`; {INERTIAL} and {BODY} stand for usual contents of a link."""
-    text = textwrap.dedent(body).replace("{INERTIAL}", INERTIAL).replace("{BODY}", BODY)
-    path = tmp_path / f"{name}.urdf"
-    path.write_text(f'<?xml version="1.0"?>\n<robot name="{name}">\n{text}\n</robot>\n')
-    return path
-
-
-def arm(tmp_path, joint, child="{BODY}"):
-    """Two links held by a joint called j, whose inner XML is given."""
-    kind, _, inner = joint.partition("|")
-    return urdf(
-        tmp_path,
-        f"""<link name="base_link">{{BODY}}</link>
-        <link name="hand">{child}</link>
-        <joint name="j" type="{kind}"><parent link="base_link"/><child link="hand"/>{inner}</joint>""",
-    )
-
-
-def convert(path):
-    """The stage of a converted URDF, and the robot's prim."""
-    out = convert_urdf(path, path.with_suffix(".usda"), force=True)
-    stage = Usd.Stage.Open(str(out))
-    stage.Reload()
-    return stage, stage.GetDefaultPrim()
 
 
 def joint_of(stage):
@@ -55,38 +23,6 @@ def joint_of(stage):
 
 
 # --- what arrives ---------------------------------------------------------------------------------
-
-
-def test_a_continuous_joint_gets_a_velocity_drive_in_degrees_and_a_finite_force(tmp_path):
-    stage, _ = convert(arm(tmp_path, 'continuous|<axis xyz="0 0 1"/><limit effort="2" velocity="10"/>'))
-    joint = UsdPhysics.RevoluteJoint(joint_of(stage))
-    drive = UsdPhysics.DriveAPI(joint, "angular")
-    assert joint.GetAxisAttr().Get() == "Z"
-    assert (drive.GetStiffnessAttr().Get(), drive.GetMaxForceAttr().Get()) == (0, 2)
-    assert_allclose(drive.GetDampingAttr().Get(), 5 * np.pi / 180, rtol=1e-6)  # N m s per degree
-    assert not joint.GetLowerLimitAttr().HasAuthoredValue()
-    assert_allclose(joint.GetPrim().GetAttribute("newton:velocityLimit").Get(), np.degrees(10), rtol=1e-6)
-
-
-def test_a_revolute_joint_keeps_its_limits_and_friction_in_degrees(tmp_path):
-    inner = '<axis xyz="1 0 0"/><limit effort="3" velocity="2" lower="-1" upper="0.5"/>'
-    stage, _ = convert(arm(tmp_path, f'revolute|{inner}<dynamics damping="0.2" friction="0.1"/>'))
-    joint = UsdPhysics.RevoluteJoint(joint_of(stage))
-    assert_allclose(
-        [joint.GetLowerLimitAttr().Get(), joint.GetUpperLimitAttr().Get()], np.degrees([-1, 0.5]), rtol=1e-6
-    )
-    assert UsdPhysics.DriveAPI(joint, "angular").GetStiffnessAttr().Get() > 0
-    assert_allclose(joint.GetPrim().GetAttribute("newton:damping").Get(), 0.2 * np.pi / 180, rtol=1e-6)
-    assert_allclose(joint.GetPrim().GetAttribute("newton:friction").Get(), 0.1, rtol=1e-6)
-
-
-def test_a_prismatic_joint_keeps_its_limits_in_metres(tmp_path):
-    inner = '<axis xyz="0 1 0"/><limit effort="3" velocity="2" lower="0" upper="0.3"/>'
-    stage, _ = convert(arm(tmp_path, f"prismatic|{inner}"))
-    joint = UsdPhysics.PrismaticJoint(joint_of(stage))
-    assert joint.GetAxisAttr().Get() == "Y"
-    assert_allclose([joint.GetLowerLimitAttr().Get(), joint.GetUpperLimitAttr().Get()], [0, 0.3], atol=1e-7)
-    assert UsdPhysics.DriveAPI(joint, "linear").GetMaxForceAttr().Get() == 3
 
 
 @settings(max_examples=25, deadline=None)
@@ -98,7 +34,7 @@ def test_a_prismatic_joint_keeps_its_limits_in_metres(tmp_path):
 def test_both_frames_of_a_joint_meet_and_its_axis_is_the_urdfs(tmp_path_factory, axis, xyz, rpy):
     tmp_path = tmp_path_factory.mktemp("joint")
     words = [" ".join(f"{v:.9f}" for v in vector) for vector in (axis, xyz, rpy)]
-    stage, _ = convert(
+    stage, *_ = converted(
         arm(tmp_path, f'continuous|<axis xyz="{words[0]}"/><origin xyz="{words[1]}" rpy="{words[2]}"/>')
     )
     links = read_links(stage)
@@ -107,82 +43,31 @@ def test_both_frames_of_a_joint_meet_and_its_axis_is_the_urdfs(tmp_path_factory,
     turned = matrix_from_quat(links["hand"].q_base_link_xyzw)
     assert_allclose(turned, matrix_from_quat(quat_from_rpy(rpy)), atol=1e-8)
     joint = joint_of(stage)
-    first = matrix_from_quat([*joint.GetLocalRot0Attr().Get().imaginary, joint.GetLocalRot0Attr().Get().real])
-    second = matrix_from_quat(
-        [*joint.GetLocalRot1Attr().Get().imaginary, joint.GetLocalRot1Attr().Get().real]
-    )
+    ends = (joint.GetLocalRot0Attr().Get(), joint.GetLocalRot1Attr().Get())
+    first, second = (matrix_from_quat([*q.imaginary, q.real]) for q in ends)
     assert_allclose(first, turned @ second, atol=1e-6)  # single precision quaternions
     assert stage.GetPrimAtPath(joint.GetBody0Rel().GetTargets()[0]).HasAPI(UsdPhysics.ArticulationRootAPI)
 
 
 def test_the_base_floats_and_nothing_is_bolted_to_the_world(tmp_path):
-    stage, robot = convert(arm(tmp_path, "fixed|"))
-    for prim in stage.Traverse():
-        if prim.IsA(UsdPhysics.Joint):
-            joint = UsdPhysics.Joint(prim)
-            assert len(joint.GetBody0Rel().GetTargets()) == len(joint.GetBody1Rel().GetTargets()) == 1
+    stage, robot, _report = converted(arm(tmp_path, "fixed|"))
+    joint = joint_of(stage)
+    assert len(joint.GetBody0Rel().GetTargets()) == len(joint.GetBody1Rel().GetTargets()) == 1
     (root,) = [p for p in stage.Traverse() if p.HasAPI(UsdPhysics.ArticulationRootAPI)]
     assert root.HasAPI(UsdPhysics.RigidBodyAPI)
     assert root == robot.GetChildren()[0]
     assert root.GetAttribute("newton:selfCollisionEnabled").Get() is False
 
 
-def test_links_that_only_name_a_place_become_sites_on_the_body_they_ride_on(tmp_path):
-    path = urdf(
-        tmp_path,
-        """<link name="base_footprint"/><link name="base_link">{BODY}</link>
-        <link name="cam"/><link name="eye"/>
-        <joint name="a" type="fixed"><parent link="base_footprint"/><child link="base_link"/>
-          <origin xyz="0 0 0.1"/></joint>
-        <joint name="b" type="fixed"><parent link="base_link"/><child link="cam"/>
-          <origin xyz="1 0 0"/></joint>
-        <joint name="c" type="fixed"><parent link="cam"/><child link="eye"/>
-          <origin xyz="0 1 0" rpy="0 0 1.57079632679"/></joint>""",
-    )
-    _, robot = convert(path)
-    assert [c.GetName() for c in robot.GetChildren()] == ["base_link", "Looks", "joints"]
-    cache = UsdGeom.XformCache()
-    places = {
-        name: cache.GetLocalToWorldTransform(robot.GetPrimAtPath(f"base_link/{name}")).ExtractTranslation()
-        for name in ("base_footprint", "cam", "eye")
-    }
-    assert_allclose(places["base_footprint"], [0, 0, 0], atol=1e-12)
-    assert_allclose(places["cam"], [1, 0, 0.1], atol=1e-12)
-    assert_allclose(places["eye"], [1, 1, 0.1], atol=1e-12)
-    assert not list(robot.GetPrimAtPath("joints").GetChildren())
-
-
-def test_a_wheel_without_effort_is_noted_and_a_dead_suspension_is_welded(tmp_path):
-    stage, _ = convert(arm(tmp_path, 'continuous|<axis xyz="0 1 0"/>'))
-    assert UsdPhysics.DriveAPI(joint_of(stage), "angular").GetMaxForceAttr().Get() == 10
-    assert any("gives no effort" in note for note in read_notes(tmp_path / "arm.usda"))
-    inner = '<axis xyz="0 1 0"/><limit effort="0" velocity="0" lower="0" upper="0.03"/>'
-    stage, _ = convert(arm(tmp_path, f"prismatic|{inner}"))
-    assert joint_of(stage).GetPrim().IsA(UsdPhysics.FixedJoint)
-    assert any("cannot move by its own limits: welded" in note for note in read_notes(tmp_path / "arm.usda"))
-
-
-def test_colours_of_materials_arrive_linear_and_one_name_with_two_colours_stays_two(tmp_path):
-    colour = '<material name="paint"><color rgba="{} 0 0 0.5"/></material>'
-    path = urdf(
-        tmp_path,
-        f"""<link name="base_link">{{INERTIAL}}
-        <visual>{BALL}{colour.format(1.0)}</visual><visual>{BALL}{colour.format(0.5)}</visual></link>""",
-    )
-    stage, _ = convert(path)
-    one, two = read_shapes(stage)
-    assert_allclose(one.colour, [1, 0, 0, 0.5], atol=1e-6)
-    assert_allclose(two.colour, [0.21404, 0, 0, 0.5], atol=1e-4)  # ((0.5 + 0.055) / 1.055) ** 2.4
-
-
-def test_materials_of_equal_content_keep_their_names_and_one_name_is_one_material(tmp_path):
-    red = '<material name="{}"><color rgba="1 0 0 1"/></material>'
-    balls = "".join(f"<visual>{BALL}{red.format(name)}</visual>" for name in ("red", "rosso", "red"))
-    path = urdf(tmp_path, f'<link name="base_link">{{INERTIAL}}{balls}</link>')
-    stage, _ = convert(path)
+def test_a_name_with_two_looks_is_two_materials_and_colours_are_linear(tmp_path):
+    looks = (("red", 1), ("rosso", 1), ("red", 1), ("red", 0.5))
+    colour = '<material name="{}"><color rgba="{} 0 0 0.5"/></material>'
+    balls = "".join(f"<visual>{BALL}{colour.format(*look)}</visual>" for look in looks)
+    stage, *_ = converted(urdf(tmp_path, f'<link name="base_link">{{INERTIAL}}{balls}</link>'))
     named = [prim.GetName() for prim in stage.Traverse() if prim.IsA(UsdShade.Material)]
-    assert [name for name in named if name.startswith("r")] == ["red", "rosso"]
-    assert [shape.colour for shape in read_shapes(stage)] == [pytest.approx([1, 0, 0, 1])] * 3
+    assert [name.partition("_")[0] for name in named if name[0] == "r"] == ["red", "rosso", "red"]
+    seen = [shape.colour[0] for shape in read_shapes(stage)]
+    assert_allclose(seen, [1, 1, 1, 0.21404], atol=1e-4)  # ((0.5 + 0.055) / 1.055) ** 2.4
 
 
 def tetrahedron(path):
@@ -192,7 +77,7 @@ def tetrahedron(path):
 
 
 @pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "glb"])
-@pytest.mark.parametrize("scale", [(1, 1, 1), (0.5, 0.5, 0.5), (-1, 1, 1)])
+@pytest.mark.parametrize("scale", [(0.5, 0.5, 0.5), (-1, 1, 1)])
 def test_meshes_of_every_format_arrive_scaled_and_facing_outwards(tmp_path, suffix, scale):
     tetrahedron(tmp_path / f"t.{suffix}")
     words = " ".join(map(str, scale))
@@ -201,7 +86,7 @@ def test_meshes_of_every_format_arrive_scaled_and_facing_outwards(tmp_path, suff
         tmp_path,
         f"<link name='base_link'>{{INERTIAL}}<visual>{shape}</visual><collision>{shape}</collision></link>",
     )
-    stage, robot = convert(path)
+    stage, robot, _report = converted(path)
     (seen,) = read_shapes(stage)
     corners = np.array([[0, -3, 0], [1, 0, 2]] if suffix == "glb" else [[0, 0, 0], [1, 2, 3]]) * scale
     corners = np.sort(corners, axis=0)  # glTF's Y is up: (x, y, z) lies at (x, -z, y)
@@ -217,7 +102,7 @@ def test_big_arrays_stay_out_of_the_text(tmp_path):
     trimesh.creation.icosphere().export(tmp_path / "ball.stl")
     mesh = '<visual><geometry><mesh filename="ball.stl"/></geometry></visual>'
     path = urdf(tmp_path, f"<link name='base_link'>{{INERTIAL}}{mesh}</link>")
-    convert(path)
+    converted(path, single_file=False)
     assert (tmp_path / "payloads" / "geometries.usdc").read_bytes().startswith(b"PXR-USDC")
     text = [file.read_text() for file in tmp_path.rglob("*.usda")]
     assert len(text) == 8
@@ -241,48 +126,21 @@ def test_principal_axes_give_back_the_tensor_of_a_turned_box(sizes, rpy):
     assert nearest_possible(tensor) is tensor
 
 
-def test_a_diagonal_tensor_keeps_its_axes():
-    moments, q = principal_axes(np.diag([3.0, 2.0, 2.5]))
-    assert_allclose(moments, [3, 2, 2.5])
-    assert_allclose(q, [0, 0, 0, 1])
-
-
-@given(st.lists(st.floats(-3.1, 3.1), min_size=3, max_size=3))
-def test_the_quaternion_of_a_rotation_gives_it_back(rpy):
-    R = matrix_from_quat(quat_from_rpy(rpy))
-    assert_allclose(matrix_from_quat(quaternion(R)), R, atol=1e-12)
-
-
-def test_a_ball_is_shaded_smooth_and_a_box_sharp():
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    assert_allclose(corner_normals(ball.vertices, ball.faces), ball.vertices[ball.faces], atol=0.02)
-    box = trimesh.creation.box()
-    corners = np.repeat(box.face_normals[:, None], 3, axis=1)
-    assert_allclose(corner_normals(box.vertices, box.faces), corners, atol=1e-6)
-
-
 # --- refusals -------------------------------------------------------------------------------------
 
 
-def mesh_link(filename):
-    return f'<link name="b"><visual><geometry><mesh filename="{filename}"/></geometry></visual></link>'
-
-
+SHOWN = '<link name="b"><visual><geometry><{}/></geometry></visual></link>'
 REFUSED = {
-    "mesh scale": (mesh_link('t.stl" scale="1 0 1'), r"mesh 't\.stl' has scale \[1\.0, 0\.0, 1\.0\]; give"),
-    "too large": (
-        '<link name="b"><visual><geometry><sphere radius="1e200"/></geometry></visual></link>',
-        r":3: link 'b': radius of <sphere> must be a finite number, got '1e200'",
-    ),
+    'mesh filename="t.stl" scale="1 0 1"': r"mesh 't\.stl' has scale .*0\.0",
+    'sphere radius="1e200"': r":3: link 'b': radius of <sphere> .*1e200",
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_a_bad_description_is_refused_in_one_line_and_nothing_is_written(tmp_path, case):
-    body, message = REFUSED[case]
-    path = urdf(tmp_path, body)
+@pytest.mark.parametrize("shape", REFUSED)
+def test_a_shape_of_no_size_or_beyond_all_is_refused_in_one_line_and_nothing_is_written(tmp_path, shape):
+    path = urdf(tmp_path, SHOWN.format(shape))
     tetrahedron(tmp_path / "t.stl")
-    with pytest.raises(InputError, match=message) as refusal:
+    with pytest.raises(InputError, match=REFUSED[shape]) as refusal:
         convert_urdf(path, tmp_path / "out" / "arm.usda")
     assert "\n" not in str(refusal.value)
     assert not list(tmp_path.glob("out/**/*"))
@@ -299,8 +157,7 @@ NAMED = """
 
 
 def test_any_name_is_accepted_and_invalid_usd_names_become_display_names(tmp_path):
-    stage, robot = convert(urdf(tmp_path, NAMED, "my robot"))
-    notes = read_notes(tmp_path / "my robot.usda")
+    stage, robot, report = converted(urdf(tmp_path, NAMED, "my robot"))
     renamed = {
         "my_robot": "my robot",
         "a_b_2": "a-b",
@@ -313,7 +170,7 @@ def test_any_name_is_accepted_and_invalid_usd_names_become_display_names(tmp_pat
     shown = {p.GetName(): p.GetDisplayName() for p in stage.Traverse() if p.GetDisplayName()}
     assert shown == renamed
     for name, was in renamed.items():
-        assert any(note.endswith(f"{was!r} is called {name!r} in USD") for note in notes)
+        assert any(note.endswith(f"{was!r} is called {name!r} in USD") for note in report.notes)
     assert {p.GetName() for p in robot.GetChild("joints").GetChildren()} == {"右", "j_1_2", "joints", "w_1"}
     for link in ("底座", "a_b", "a_b_2", "a_b_2/visuals_2", "joints_2", "_1st_wheel"):
         assert robot.GetPrimAtPath(link), link
@@ -322,49 +179,5 @@ def test_any_name_is_accepted_and_invalid_usd_names_become_display_names(tmp_pat
     assert_valid(tmp_path / "my robot.usda", tmp_path)
 
 
-def test_an_output_that_exists_is_kept_unless_forced(tmp_path):
-    path = arm(tmp_path, "fixed|")
-    out = convert_urdf(path, tmp_path / "out.usda")
-    with pytest.raises(InputError, match=r"out\.usda: exists already; give `force=True`"):
-        convert_urdf(path, out)
-    convert_urdf(path, out, force=True)
-    with pytest.raises(InputError, match=r"out\.usdc: the robot's root layer is text; give it the suffix"):
-        convert_urdf(path, tmp_path / "out.usdc")
-
-
-# --- the real robot -------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def real_robot(real_data, tmp_path_factory):
-    path = real_data / "turtlebot4" / "turtlebot4.urdf"
-    return path, convert_urdf(path, tmp_path_factory.mktemp("real") / "turtlebot4.usda")
-
-
-def primitive_box(geometry):
-    """Lower and upper corner of a primitive about its origin, shape (2, 3)."""
-    if geometry.kind == "box":
-        half = geometry.size / 2
-    elif geometry.kind == "cylinder":
-        half = np.array([geometry.radius, geometry.radius, geometry.length / 2])
-    else:
-        half = np.full(3, geometry.radius)
-    return np.stack([-half, half])
-
-
 def test_the_real_robot_shows_meshes_with_materials_and_hides_its_colliders(real_robot):
     assert_looks_alike(real_robot[1])
-
-
-def test_the_mass_of_the_real_robot_is_its_urdfs_and_nothing_is_silent(real_robot):
-    path, out = real_robot
-    stage = Usd.Stage.Open(str(out))
-    masses = [
-        UsdPhysics.MassAPI(p).GetMassAttr().Get() for p in stage.Traverse() if p.HasAPI(UsdPhysics.MassAPI)
-    ]
-    xml = read_description(path).xml
-    assert_allclose(sum(masses), sum(float(m.get("value")) for m in xml.iter("mass")), rtol=1e-6)
-    notes = read_notes(out)
-    assert "rplidar.dae: malformed colour '0.0 0.0 0.01.0' read as '0 0 0 1'" in notes
-    assert "joint 'wheel_drop_left_joint' (prismatic) cannot move by its own limits: welded" in notes
-    assert any(s.link == "rplidar_link" and len(s.faces) > 5000 for s in read_shapes(stage))

@@ -1,18 +1,16 @@
 """What `<gazebo>`, `<ros2_control>`, `<transmission>` and `<safety_controller>` become on the stage."""
 
-import re
 import textwrap
 
 import numpy as np
 import pytest
+from made import BODY, INERTIAL, converted
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics, UsdRender, UsdShade
-from test_urdf import BODY, INERTIAL
 from validators import assert_valid
 
 from magtwin.errors import InputError
 from magtwin.urdf import read_notes
-from magtwin.urdf.convert import convert_with_report
 from magtwin.urdf.options import DriveRule, Options
 from magtwin.usd.schema import prims_with
 from magtwin.usd.sensors import read_drive, read_imu, read_lidar, read_magnetometer
@@ -32,10 +30,7 @@ def cart(tmp_path, tags, **choices):
     """A two-wheeled robot with tags: its stage, its prim and the report."""
     path = tmp_path / "cart.urdf"
     path.write_text(f'<robot name="cart">\n{CART}{EYE}\n{textwrap.dedent(tags)}\n</robot>\n')
-    report = convert_with_report(path, tmp_path / "cart.usda", options=Options(**choices), force=True)
-    stage = Usd.Stage.Open(str(tmp_path / "cart.usda"))
-    stage.Reload()
-    return stage, stage.GetDefaultPrim(), report
+    return converted(path, **choices)
 
 
 def on(link, sensor):
@@ -80,35 +75,24 @@ def test_friction_bounce_and_compliance_reach_the_collider(tmp_path):
     assert_valid(tmp_path / "cart.usda", tmp_path)
 
 
-def test_a_number_may_be_in_the_attribute_value(tmp_path):
-    _, robot, report = cart(tmp_path, on("left_wheel", '<mu1 value="0.7"/><selfCollide value="true"/>'))
+@pytest.mark.parametrize(
+    "tags", ["<mu1>0.7</mu1><selfCollide>true</selfCollide>", '<mu1 value="0.7"/><selfCollide value="1"/>']
+)
+def test_a_figure_may_be_in_the_attribute_value_and_one_link_that_collides_with_its_robot_switches_all(
+    tmp_path, tags
+):
+    _, robot, report = cart(tmp_path, on("left_wheel", tags))
     collider = robot.GetPrimAtPath("left_wheel/collisions").GetChildren()[0]
     grip = UsdShade.MaterialBindingAPI(collider).ComputeBoundMaterial("physics")[0].GetPrim()
     assert_allclose(grip.GetAttribute("physics:staticFriction").Get(), 0.7, rtol=1e-6)
-    assert robot.GetPrimAtPath("base_link").GetAttribute("newton:selfCollisionEnabled").Get() is True
+    for name in ("newton:selfCollisionEnabled", "physxArticulation:enabledSelfCollisions"):
+        assert robot.GetPrimAtPath("base_link").GetAttribute(name).Get() is True
     assert not report.unknown_tags
-
-
-def test_tags_of_an_unknown_link_are_a_fault(tmp_path):
-    _, _, report = cart(tmp_path, on("left_weel", "<mu1>1</mu1>"))
-    ((fault,),) = [row.entries for row in report.repairs]
-    text = (
-        "<gazebo> is about 'left_weel', which is no link or joint (did you mean 'left_wheel'?): kept as text"
-    )
-    assert (fault.kind, fault.text, fault.place) == ("name-unknown", text, "cart.urdf:10")
 
 
 def test_friction_that_differs_across_is_a_loss(tmp_path):
     _, _, report = cart(tmp_path, on("left_wheel", "<mu1>1</mu1><mu2>0.2</mu2>"))
     assert report.losses == ("link 'left_wheel': friction 1 is used across too, in place of mu2 0.2",)
-
-
-def test_one_link_that_collides_with_its_robot_switches_all_on(tmp_path):
-    _stage, robot, _ = cart(tmp_path, on("base_link", "<selfCollide>true</selfCollide>"))
-    assert robot.GetPrimAtPath("base_link").GetAttribute("newton:selfCollisionEnabled").Get() is True
-    assert (
-        robot.GetPrimAtPath("base_link").GetAttribute("physxArticulation:enabledSelfCollisions").Get() is True
-    )
 
 
 def test_a_link_without_gravity_floats_in_physx(tmp_path):
@@ -254,18 +238,6 @@ def test_a_sensor_without_a_counterpart_is_kept_as_text_on_its_link_and_counted(
     assert any("sensor 'gps' of link 'eye' is of type 'navsat'" in note for note in report.notes)
 
 
-def test_unknown_tags_of_a_sensor_are_counted(tmp_path):
-    text = IMU.replace("<imu>", "<topic>imu</topic><visualize>1</visualize><imu>")
-    _stage, robot, report = cart(tmp_path, on("eye", text))
-    assert report.unknown_tags == {"gazebo/sensor/topic": 1, "gazebo/sensor/visualize": 1}
-    kept = list(robot.GetPrimAtPath("base_link/eye").GetCustomDataByKey("magtwin:unconverted"))
-    assert kept[0] == "gazebo/sensor(imu): <topic>imu</topic>"
-    note = (
-        "2 tags without a meaning here are kept as text, such as gazebo/sensor/topic, gazebo/sensor/visualize"
-    )
-    assert note in report.notes
-
-
 # --- drives ---------------------------------------------------------------------------------------
 
 GZ = """<gazebo><plugin filename="gz-sim-diff-drive-system" name="gz::sim::systems::DiffDrive">
@@ -408,120 +380,31 @@ def test_a_safety_controller_is_kept_as_text_on_its_joint(tmp_path):
     assert report.unknown_tags == {"safety_controller": 1}
 
 
-# --- refusals -------------------------------------------------------------------------------------
-
-REPAIRED = {
-    "rate": (
-        "number-unreadable",
-        10,
-        on("eye", IMU.replace(">100<", ">fast<")),
-        "update_rate must be a finite number, not 'fast'",
-    ),
-    "pose": (
-        "sensor-range",
-        10,
-        on("eye", IMU.replace("0.1 0 0.2 0 0 1.5708", "1 2 3")),
-        "its pose is not x y z roll pitch yaw",
-    ),
-    "frame": (
-        "sensor-range",
-        10,
-        on("eye", IMU.replace("<pose>", '<pose relative_to="world">')),
-        "is relative to 'world'",
-    ),
-    "noise": (
-        "number-range",
-        14,
-        on("eye", IMU.replace(">0.3<", ">-0.3<")),
-        "stddev -0.3 is below 0: raised to it",
-    ),
-    "rays": (
-        "sensor-missing",
-        10,
-        on("eye", LIDAR.format(type="ray", tag="ray", samples="1e300", least=0, most=1, lines="1e12")),
-        "rays, over 2000000: kept as a frame with its type and rate",
-    ),
-    "friction": (
-        "number-unreadable",
-        10,
-        on("base_link", "<mu1>slippery</mu1>"),
-        "mu1 must be a finite number, not 'slippery'",
-    ),
-    "radius": ("number-range", 12, GZ.replace("0.041", "0"), "wheel_radius 0 is not above 0: not used"),
-    "command": (
-        "name-unknown",
-        10,
-        '<ros2_control name="c"><joint name="lefft"></joint></ros2_control>',
-        "<ros2_control> names no joint 'lefft': its interfaces are left out",
-    ),
-    "joint": (
-        "drive-incomplete",
-        11,
-        GZ.replace(">left<", ">lefft<"),
-        "no joint 'lefft'; did you mean 'left'",
-    ),
-    "no joint": (
-        "drive-incomplete",
-        10,
-        GZ.replace("<left_joint>left</left_joint>", ""),
-        "the drive plugin has no <left_joint>",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", REPAIRED)
-def test_a_bad_tag_is_repaired_with_its_line_and_strict_refuses_it(tmp_path, name):
-    kind, line, tags, text = REPAIRED[name]
-    _, robot, report = cart(tmp_path, tags)
-    faults = [entry for row in report.repairs for entry in row.entries]
-    (fault,) = [entry for entry in faults if text in entry.text]
-    assert (fault.kind, fault.place) == (kind, f"cart.urdf:{line}")
-    if kind == "drive-incomplete":
-        assert len(faults) == 1
-        assert not prims_with(robot, "drive")
-        kept = robot.GetCustomDataByKey("magtwin:unconverted")
-        assert any("gz-sim-diff-drive-system" in tag for tag in kept)
-    for path in tmp_path.glob("cart*.usda"):
-        path.unlink()
-    with pytest.raises(InputError, match=re.escape(text)) as refusal:
-        cart(tmp_path, tags, strict=True)
-    assert "\n" not in str(refusal.value)
+# --- settings that cannot be used -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("old", "new", "words"),
     [
-        ("a: [", r"control\.yaml:1: not YAML"),
-        ("!!python/object/apply:os.getcwd []", r"control\.yaml:1: not YAML"),
-        ("a: 2001-99-99", r"control\.yaml:1: not YAML: .*month must be in 1\.\.12"),
-        ("a: " + "9" * 5000, r"control\.yaml:1: not YAML: .*too long"),
-        ("a: " + "[" * 5000, r"control\.yaml: not YAML"),
+        ("0.04", "round", "wheel_radius must be a number above 0, got 'round'"),
+        ("[left]", "[lefft]", "left_wheel_names: no joint 'lefft'; did you mean 'left'"),
     ],
 )
-def test_settings_that_are_not_yaml_are_refused(tmp_path, text, message):
-    (tmp_path / "control.yaml").write_text(text)
-    with pytest.raises(InputError, match=message):
-        cart(tmp_path, CONTROL)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (YAML.replace("0.04", "round"), "control.yaml: wheel_radius must be a number above 0, got 'round'"),
-        (
-            YAML.replace("[left]", "[lefft]"),
-            "control.yaml: left_wheel_names: no joint 'lefft'; did you mean 'left'",
-        ),
-    ],
-)
-def test_bad_settings_of_a_plugin_are_left_out_and_those_of_the_user_refused(tmp_path, text, message):
-    (tmp_path / "control.yaml").write_text(text)
+def test_bad_settings_of_a_plugin_are_left_out_and_those_of_the_user_refused(tmp_path, old, new, words):
+    (tmp_path / "control.yaml").write_text(YAML.replace(old, new))
     _stage, robot, report = cart(tmp_path, CONTROL)
     (fault,) = [entry for row in report.repairs for entry in row.entries if row.kind == "drive-incomplete"]
-    assert fault.text.startswith(message)
+    assert f"control.yaml: {words}" in fault.text
     assert not prims_with(robot, "drive")
-    with pytest.raises(InputError, match=message.partition(": ")[2].partition(",")[0]):
+    with pytest.raises(InputError, match=words.partition(",")[0]):
         cart(tmp_path, "", controllers=tmp_path / "control.yaml")
+
+
+@pytest.mark.parametrize("text", ["a: [", "!!python/object/apply:os.getcwd []", "a: " + "[" * 5000])
+def test_settings_that_are_not_yaml_are_refused(tmp_path, text):
+    (tmp_path / "control.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"control\.yaml.*: not YAML"):
+        cart(tmp_path, CONTROL)
 
 
 def test_settings_that_grow_exponentially_are_ignored(tmp_path):
@@ -534,16 +417,8 @@ def test_settings_that_grow_exponentially_are_ignored(tmp_path):
 # --- the real robot -------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def turtlebot(real_data, tmp_path_factory):
-    """The real TurtleBot4 with its Gazebo tags, its root layer and its report."""
-    out = tmp_path_factory.mktemp("real") / "turtlebot4" / "turtlebot4.usda"
-    urdf = real_data / "turtlebot4" / "turtlebot4_gazebo_tags.urdf"
-    return out, convert_with_report(urdf, out, options=Options(missing_meshes="note"))
-
-
-def test_the_real_robots_sensors_all_arrive(turtlebot):
-    stage = Usd.Stage.Open(str(turtlebot[0]))
+def test_the_real_robots_sensors_all_arrive(tagged_robot):
+    stage = Usd.Stage.Open(str(tagged_robot[1]))
     robot = stage.GetDefaultPrim()
     kinds = [p.GetTypeName() for p in stage.Traverse()]
     counts = {k: kinds.count(k) for k in ("OmniLidar", "IsaacImuSensor", "Camera", "IsaacContactSensor")}
@@ -561,8 +436,8 @@ def test_the_real_robots_sensors_all_arrive(turtlebot):
     assert figures == (0.233, 0.03575, 0.46, 1.9, 0.9)
 
 
-def test_the_real_robot_passes_the_validators_and_nothing_is_silent(turtlebot, tmp_path):
-    out, report = turtlebot
+def test_the_real_robot_passes_the_validators_and_nothing_is_silent(tagged_robot, tmp_path):
+    _, out, report = tagged_robot
     assert_valid(out, tmp_path)
     assert report.unknown_tags["gazebo/sensor/visualize"] == 13
     assert any("tags without a meaning here are kept as text" in note for note in read_notes(out))
@@ -589,19 +464,3 @@ def test_settings_come_before_tags_and_leave_one_sensor_of_each_kind(tmp_path, r
     assert "lidar 'rplidar' of link 'rplidar_link': the settings replace the URDF's tags" in (report.notes)
     assert "imu 'imu' of link 'imu_link' is not simulated here: the settings name another" in report.notes
     assert_valid(out, tmp_path)
-
-
-def test_a_robot_without_settings_takes_its_sensors_and_drive_from_its_tags(tmp_path, real_data):
-    from magtwin.author.robot import RobotSettings, build_robot
-    from magtwin.spec.sensors import MagnetometerSpec
-    from magtwin.usd.robot import load_robot
-
-    settings = RobotSettings(
-        magnetometer=MagnetometerSpec(link="tower_sensor_plate"),
-        conversion=Options(missing_meshes="note"),
-    )
-    out = tmp_path / "turtlebot4" / "turtlebot4.usda"
-    build_robot(real_data / "turtlebot4" / "turtlebot4_gazebo_tags.urdf", settings, out)
-    spec = load_robot(out)
-    assert (spec.imu.link, spec.imu.rate_hz, spec.lidar.link) == ("imu_link", 62, "rplidar_link")
-    assert (spec.drive.wheel_radius_m, spec.drive.v_max) == (0.03575, 0.46)

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from made import urdf
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics
-from test_urdf import urdf
 
 from magtwin.author.from_urdf import link_poses
 from magtwin.errors import InputError
@@ -171,12 +171,12 @@ def test_links_of_a_robot_with_every_joint_of_one_axis_stand_where_yourdfpy_puts
     assert compare(path, out, np.random.default_rng(1)) == {"chain": 6, "tree": 7}[name]
 
 
-@pytest.mark.parametrize("options", [{}, {"merge_fixed": True, "fix_base": True, "profile": "diff-drive"}])
-def test_links_of_the_real_robot_stand_where_yourdfpy_puts_them(tmp_path, real_data, options):
-    path = real_data / "turtlebot4" / "turtlebot4.urdf"
-    out = convert_urdf(path, tmp_path / "tb4.usda", options=Options(single_file=True, **options))
+def test_links_of_the_real_robot_stand_where_yourdfpy_puts_them(tmp_path, real_robot):
+    path, out, _ = real_robot
+    options = Options(single_file=True, merge_fixed=True, fix_base=True, profile="diff-drive")
     dead = ("wheel_drop_left_joint", "wheel_drop_right_joint")  # neither effort nor speed: welded
-    assert compare(path, out, np.random.default_rng(2), still=dead) > 40
+    for each in (out, convert_urdf(path, tmp_path / "tb4.usda", options=options)):
+        assert compare(path, each, np.random.default_rng(2), still=dead) > 40
 
 
 def test_a_planar_joint_slides_and_turns_in_its_plane_only(tmp_path):

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from made import BALL, BODY, INERTIAL
 from numpy.testing import assert_allclose
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils
-from test_urdf import BALL, BODY, INERTIAL
 from validators import assert_valid
 
 from magtwin.errors import InputError
@@ -100,10 +100,11 @@ def test_the_layers_compose_to_the_single_file_prim_by_prim(tmp_path):
     assert_equal(one, two)
 
 
-@pytest.mark.parametrize("name", ["turtlebot4", "turtlebot4_gazebo_tags"])
-def test_the_real_robots_layers_compose_to_its_single_file(real_data, tmp_path, name):
-    urdf = real_data / "turtlebot4" / f"{name}.urdf"
-    assert_equal(*both(urdf, tmp_path, missing_meshes="note"))
+@pytest.mark.parametrize("name", ["real_robot", "tagged_robot"])
+def test_the_real_robots_layers_compose_to_its_single_file(name, request, tmp_path):
+    urdf, out, _ = request.getfixturevalue(name)
+    options = Options(single_file=True, missing_meshes="note")
+    assert_equal(composed(convert_urdf(urdf, tmp_path / "a.usda", options=options)), composed(out))
 
 
 def test_textures_come_along(tmp_path):
@@ -224,6 +225,8 @@ def test_the_layers_of_another_robot_are_never_overwritten(tmp_path):
         convert_urdf(other, out / "leg.usda")
     with pytest.raises(InputError, match=r"is of arm\.usda; give each robot its own folder"):
         convert_urdf(other, out / "leg.usda", force=True)
+    with pytest.raises(InputError, match=r"root layer is text; .*\.usda"):
+        convert_urdf(other, out / "arm.usdc", force=True)
     assert before == {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
 
 

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from made import converted
 from numpy.testing import assert_allclose
-from pxr import Usd, UsdPhysics
+from pxr import UsdPhysics
 
 from magtwin.errors import InputError
 from magtwin.urdf.convert import convert_with_report
@@ -49,13 +50,8 @@ def rover(
         )
     path = tmp_path / f"{name}.urdf"
     path.write_text(f'<robot name="rover">{"".join(parts)}{tags}</robot>')
-    out = tmp_path / f"{name}.usda"
-    options = {"profile": "diff-drive", "single_file": True, **options}
-    report = convert_with_report(path, out, options=Options(**options), force=True)
-    stage = Usd.Stage.Open(str(out))
-    stage.Reload()
-    driven = stage.GetDefaultPrim().HasAPI("MagtwinDifferentialDriveAPI")
-    return stage, read_drive(stage.GetDefaultPrim()) if driven else None, report
+    stage, robot, report = converted(path, **{"profile": "diff-drive"} | options)
+    return stage, read_drive(robot) if robot.HasAPI("MagtwinDifferentialDriveAPI") else None, report
 
 
 def plugin(file, text):

@@ -129,7 +129,7 @@ def test_every_description_of_the_real_robot_is_read_as_yourdfpy_reads_it(real_d
     assert compare(read_description(real_data / "turtlebot4" / name)) == (49, 31, 48)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     xyz=st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3),
     rpy=st.lists(st.floats(-10, 10), min_size=3, max_size=3),

@@ -3,14 +3,14 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made import BALL, INERTIAL, arm, converted, drive_of, prim, urdf
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
-from test_urdf import BALL, INERTIAL, arm, urdf
 from validators import assert_valid
 
 from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, quat_from_rpy
-from magtwin.urdf import convert_urdf, read_notes
+from magtwin.urdf import convert_urdf
 from magtwin.urdf.description.description import read_description
 from magtwin.urdf.options import DriveRule, Options
 from magtwin.urdf.physics import inertia as solids
@@ -22,20 +22,6 @@ from magtwin.usd.sensors import read_drive
 LIMIT = '<limit effort="3" velocity="2" lower="-1" upper="0.5"/>'
 
 
-def convert(path, **options):
-    """The stage of a converted URDF, the robot's prim, and the notes."""
-    out = convert_urdf(
-        path, path.with_suffix(".usda"), options=Options(single_file=True, **options), force=True
-    )
-    stage = Usd.Stage.Open(str(out))
-    stage.Reload()
-    return stage, stage.GetDefaultPrim(), read_notes(out)
-
-
-def prim(robot, name):
-    return next(p for p in Usd.PrimRange(robot) if p.GetName() == name)
-
-
 def mass_of(body):
     """Mass, centre and tensor of a body in its own axes, as an engine reads them."""
     mass = UsdPhysics.MassAPI(body)
@@ -43,12 +29,6 @@ def mass_of(body):
     R = matrix_from_quat(np.array([*q.imaginary, q.real]) / q.GetLength())
     tensor = R @ np.diag(mass.GetDiagonalInertiaAttr().Get()) @ R.T
     return mass.GetMassAttr().Get(), np.array(mass.GetCenterOfMassAttr().Get()), tensor
-
-
-def drive_of(robot, name, axis="angular"):
-    drive = UsdPhysics.DriveAPI(prim(robot, name), axis)
-    unit = 180 / np.pi if axis == "angular" else 1.0
-    return drive, drive.GetStiffnessAttr().Get() * unit, drive.GetDampingAttr().Get() * unit
 
 
 # --- solids and inertia ---------------------------------------------------------------------------
@@ -130,13 +110,13 @@ def test_links_without_inertial_get_a_mass_from_their_colliders_and_else_from_th
     expected = 500 * solids.cylinder(0.1, 0.5).inertia
     turned = np.diag(np.diag(expected)[[2, 1, 0]])  # its axis lies along x
     for child in (f"<collision>{shape}</collision>{visual}", f"<visual>{shape}</visual>"):
-        _stage, robot, notes = convert(arm(tmp_path, "fixed|", child), density=500.0)
+        _stage, robot, report = converted(arm(tmp_path, "fixed|", child), density=500.0)
         mass, centre, tensor = mass_of(robot.GetPrimAtPath("hand"))
         assert_allclose(mass, 500 * np.pi * 0.01 * 0.5, rtol=1e-6)
         assert_allclose(centre, [0, 0, 1], atol=1e-6)
         assert_allclose(tensor, turned, rtol=1e-5, atol=1e-6)
         used = "colliders" if "collision" in child else "visuals"
-        assert f"link 'hand' has no <inertial>: 7.85 kg, its {used} at 500 kg/m3" in notes
+        assert f"link 'hand' has no <inertial>: 7.85 kg, its {used} at 500 kg/m3" in report.notes
 
 
 def test_a_mesh_weighs_what_it_encloses_and_an_open_one_what_its_hull_does(tmp_path):
@@ -145,7 +125,7 @@ def test_a_mesh_weighs_what_it_encloses_and_an_open_one_what_its_hull_does(tmp_p
     for name, what in (("whole", mesh), ("open", hollow)):
         what.export(tmp_path / f"{name}.stl")
         child = f'<visual><geometry><mesh filename="{name}.stl" scale="1 1 2"/></geometry></visual>'
-        _stage, robot, _ = convert(arm(tmp_path, "fixed|", child), density=1000.0)
+        _stage, robot, _ = converted(arm(tmp_path, "fixed|", child), density=1000.0)
         assert_allclose(mass_of(robot.GetPrimAtPath("hand"))[0], 2000 * mesh.volume, rtol=1e-4)
 
 
@@ -175,12 +155,12 @@ def test_a_massless_base_takes_the_mass_of_the_inertial_link_welded_to_it(tmp_pa
             f'<joint name="{name}_joint" type="fixed"><parent link="base"/><child link="{name}"/>'
             f'<origin xyz="0 0 {z}"/></joint>'
         )
-    stage, robot, notes = convert(urdf(tmp_path, parts))
+    stage, robot, report = converted(urdf(tmp_path, parts))
     mass, centre, _ = mass_of(robot.GetPrimAtPath("base"))
     assert_allclose([mass, *centre], [46, 0, 0, 0.3], rtol=1e-6, atol=1e-7)
     assert [path.name for path in engine_masses(stage)] == ["base", "lid"]  # the lid stays a body
     assert_allclose(sum(engine_masses(stage).values()), 47, rtol=1e-6)
-    assert "link 'base' has no <inertial>: it takes that of 'mass'" in notes
+    assert "link 'base' has no <inertial>: it takes that of 'mass'" in report.notes
 
 
 @pytest.mark.parametrize(
@@ -194,50 +174,14 @@ def test_a_link_without_inertial_is_part_of_a_body_or_has_the_mass_that_engines_
     tmp_path, shape, mass, told
 ):
     shapes = f"<{shape}>{BALL}</{shape}>"
-    stage, robot, notes = convert(arm(tmp_path, "fixed|", shapes))
-    assert "link 'hand' has no <inertial>: it is part of the body of 'base_link'" in notes
+    stage, robot, report = converted(arm(tmp_path, "fixed|", shapes))
+    assert "link 'hand' has no <inertial>: it is part of the body of 'base_link'" in report.notes
     assert not robot.GetPrimAtPath("base_link/hand").HasAPI(UsdPhysics.RigidBodyAPI)
     fixed = sum(engine_masses(stage).values())
-    stage, robot, notes = convert(arm(tmp_path, "continuous|", shapes))
-    assert f"link 'hand' has no <inertial>: {told}" in notes
+    stage, robot, report = converted(arm(tmp_path, "continuous|", shapes))
+    assert f"link 'hand' has no <inertial>: {told}" in report.notes
     assert_allclose(sum(engine_masses(stage).values()), fixed + mass, rtol=1e-6)
     assert_allclose(mass_of(robot.GetPrimAtPath("hand"))[0], mass, rtol=1e-6)
-
-
-def capsule_moments(r, length):
-    """Mass and moments of a capsule of 1000 kg/m3; the centre of half a ball is 3/8 r from its face."""
-    tube, ball = 1000 * np.pi * r**2 * length, 4000 / 3 * np.pi * r**3
-    ends = ball * (0.4 * r**2 + length**2 / 4 + 3 / 8 * length * r)
-    across = tube * (r**2 / 4 + length**2 / 12) + ends
-    return tube + ball, [across, across, tube * r**2 / 2 + ball * 0.4 * r**2]
-
-
-LONG = 1000 * np.pi * 0.05**2 * 0.3
-
-
-@pytest.mark.parametrize(
-    ("kind", "shape", "mass", "moments"),
-    [
-        ("Cube", '<box size="0.2 0.2 0.1"/>', 4, [4 / 12 * 0.05, 4 / 12 * 0.05, 4 / 12 * 0.08]),
-        (
-            "Cylinder",
-            '<cylinder radius="0.05" length="0.3"/>',
-            LONG,
-            [LONG * (0.0025 / 4 + 0.09 / 12)] * 2 + [LONG * 0.0025 / 2],
-        ),
-        ("Capsule", '<capsule radius="0.1" length="0.4"/>', *capsule_moments(0.1, 0.4)),
-    ],
-)
-def test_a_body_without_inertial_has_mass_and_inertia_of_its_collider_at_1000_kg_per_m3(
-    tmp_path, kind, shape, mass, moments
-):
-    collision = f"<collision><geometry>{shape}</geometry></collision>"
-    stage, _, _ = convert(urdf(tmp_path, f'<link name="base">{collision}</link>'))
-    body = stage.GetPrimAtPath("/arm/base")
-    assert [p.GetTypeName() for p in body.GetChild("collisions").GetChildren()] == [kind]
-    api = UsdPhysics.MassAPI(body)
-    assert_allclose(api.GetMassAttr().Get(), mass, rtol=1e-6)  # single precision
-    assert_allclose(api.GetDiagonalInertiaAttr().Get(), moments, rtol=1e-6)
 
 
 ZEROS = '<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/>'
@@ -249,13 +193,13 @@ def test_masses_and_inertias_of_zero_are_ignored(tmp_path):
     <link name="eye"><inertial><mass value="0.5"/>{ZEROS}</inertial><collision>{BALL}</collision></link>
     <joint name="up" type="fixed"><parent link="foot"/><child link="base"/></joint>
     <joint name="on" type="fixed"><parent link="base"/><child link="eye"/></joint>"""
-    _, robot, notes = convert(urdf(tmp_path, text))
+    _, robot, report = converted(urdf(tmp_path, text))
     assert not robot.GetPrimAtPath("foot")  # it has neither mass nor shape: a frame on the base
     assert robot.GetPrimAtPath("base/foot")
     eye = UsdPhysics.MassAPI(robot.GetPrimAtPath("eye"))
     assert eye.GetMassAttr().Get() == 0.5
     assert_allclose(eye.GetDiagonalInertiaAttr().Get(), [0.5 * 0.4 * 0.1**2] * 3, rtol=1e-5)  # 2/5 m r^2
-    assert notes[:2] == (
+    assert report.notes[:2] == (
         "link 'foot': a mass of 0 counts as none",
         "link 'eye': an <inertia> of zeros counts as none",
     )
@@ -266,22 +210,20 @@ def test_zero_limits_do_not_weld_a_wheel(tmp_path):
     look = (
         '<visual><geometry><sphere radius="1"/></geometry><material name=""><texture filename=""/></material>'
     )
-    stage, _, notes = convert(arm(tmp_path, f"continuous|{zeros}", f"{{BODY}}{look}</visual>"))
+    stage, _, report = converted(arm(tmp_path, f"continuous|{zeros}", f"{{BODY}}{look}</visual>"))
     drive = UsdPhysics.DriveAPI(stage.GetPrimAtPath("/arm/joints/j"), "angular")
     assert drive.GetMaxForceAttr().Get() == 10
-    assert "joint 'j' gives an effort of 0: its drive may use 10 N m" in notes
-    assert "link 'hand': a <texture> without filename= is left out" in notes
+    assert "joint 'j' gives an effort of 0: its drive may use 10 N m" in report.notes
+    assert "link 'hand': a <texture> without filename= is left out" in report.notes
 
 
-def test_a_missing_limit_is_0_and_limits_of_a_continuous_joint_are_noted(tmp_path):
+def test_a_missing_limit_is_0_and_an_infinite_effort_is_kept(tmp_path):
     limit = '<limit upper="1" effort="inf" velocity="2"/>'
-    stage, _, notes = convert(arm(tmp_path, f"revolute|{limit}"))
+    stage, _, report = converted(arm(tmp_path, f"revolute|{limit}"))
     joint = UsdPhysics.RevoluteJoint(stage.GetPrimAtPath("/arm/joints/j"))
     assert (joint.GetLowerLimitAttr().Get(), joint.GetUpperLimitAttr().Get()) == (0, pytest.approx(57.29578))
     assert UsdPhysics.DriveAPI(joint, "angular").GetMaxForceAttr().Get() == np.inf
-    assert "joint 'j' gives no lower limit: 0, URDF's default" in notes
-    _, _, notes = convert(arm(tmp_path, f"continuous|{limit}"))
-    assert any("is continuous, which has no range: upper 1 of its <limit>" in n for n in notes)
+    assert "joint 'j' gives no lower limit: 0, URDF's default" in report.notes
 
 
 # --- merging --------------------------------------------------------------------------------------
@@ -312,9 +254,9 @@ def boxes(tmp_path):
 
 def test_a_merged_body_weighs_and_turns_as_its_shapes_together_and_keeps_every_frame(tmp_path):
     path = boxes(tmp_path)
-    _stage, robot, _ = convert(path)
+    _stage, robot, _ = converted(path)
     apart = {p.GetName(): UsdGeom.XformCache().GetLocalToWorldTransform(p) for p in Usd.PrimRange(robot)}
-    stage, robot, _ = convert(path, merge_fixed=True)
+    stage, robot, _ = converted(path, merge_fixed=True)
     bodies = [p.GetName() for p in stage.Traverse() if p.HasAPI(UsdPhysics.RigidBodyAPI)]
     assert bodies == ["base"]
     assert not [p for p in stage.Traverse() if p.IsA(UsdPhysics.Joint)]
@@ -342,7 +284,7 @@ def test_merged_colliders_keep_their_own_links_friction(tmp_path):
     path = boxes(tmp_path)
     tag = '<gazebo reference="lid"><mu1>0.05</mu1></gazebo></robot>'
     path.write_text(path.read_text().replace("</robot>", tag))
-    _stage, robot, _ = convert(path, merge_fixed=True)
+    _stage, robot, _ = converted(path, merge_fixed=True)
     grips = {}
     for collider in robot.GetPrimAtPath("base/collisions").GetChildren():
         grip = UsdShade.MaterialBindingAPI(collider).ComputeBoundMaterial("physics")[0]
@@ -350,15 +292,13 @@ def test_merged_colliders_keep_their_own_links_friction(tmp_path):
     assert_allclose([grips["box"], grips["lid"]], [0.5, 0.05], rtol=1e-6)
 
 
-def test_merging_the_real_robot_leaves_three_bodies_of_the_same_mass_and_balance(tmp_path, real_data):
-    path = real_data / "turtlebot4" / "turtlebot4.urdf"
+def test_merging_the_real_robot_leaves_three_bodies_of_the_same_mass_and_balance(tmp_path, real_robot):
+    path, out, _ = real_robot
+    options = Options(single_file=True, merge_fixed=True)
     total = {}
-    for merge in (False, True):
-        out = convert_urdf(
-            path, tmp_path / f"{merge}.usda", options=Options(single_file=True, merge_fixed=merge)
-        )
-        stage = Usd.Stage.Open(str(out))
+    for merge, file in ((False, out), (True, convert_urdf(path, tmp_path / "merged.usda", options=options))):
         parts, cache = [], UsdGeom.XformCache()
+        stage = Usd.Stage.Open(str(file))
         for p in stage.Traverse():
             if p.HasAPI(UsdPhysics.MassAPI):
                 T = np.array(cache.GetLocalToWorldTransform(p)).T
@@ -374,34 +314,28 @@ def test_merging_the_real_robot_leaves_three_bodies_of_the_same_mass_and_balance
 # --- bases and joints -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("fix_base", "kind"), [(True, "Manipulator"), (False, "Default")])
-def test_a_robot_without_a_drive_has_one_of_isaacs_types(tmp_path, fix_base, kind):
-    _stage, robot, _ = convert(
-        urdf(tmp_path, """<link name="base">{BODY}</link>""", "arm"), fix_base=fix_base
-    )
-    assert robot.GetAttribute("isaac:robotType").Get() == kind
-
-
 def test_a_fixed_base_is_bolted_to_the_robots_prim_where_it_stands(tmp_path):
     body = """<link name="base_footprint"/><link name="base">{BODY}</link>
     <joint name="up" type="fixed"><parent link="base_footprint"/><child link="base"/>
       <origin xyz="0 0 0.1" rpy="0 0 1"/></joint>"""
     path = urdf(tmp_path, body, "post")
-    stage, robot, _ = convert(path, fix_base=True)
+    stage, robot, _ = converted(path, fix_base=True)
     joint = UsdPhysics.Joint(prim(robot, "root_joint"))
     assert joint.GetBody0Rel().GetTargets() == [robot.GetPath()]
     assert joint.GetBody1Rel().GetTargets() == [robot.GetPath().AppendChild("base")]
+    assert robot.GetAttribute("isaac:robotType").Get() == "Manipulator"
     assert_allclose(joint.GetLocalPos0Attr().Get(), [0, 0, 0.1], atol=1e-7)
     assert_valid(path.with_suffix(".usda"), tmp_path)
-    stage, robot, _ = convert(path)
+    stage, robot, _ = converted(path)
     assert not [p for p in stage.Traverse() if p.IsA(UsdPhysics.Joint)]
+    assert robot.GetAttribute("isaac:robotType").Get() == "Default"
 
 
 def test_what_slides_on_a_root_without_mass_slides_on_the_world(tmp_path):
     body = """<link name="rail"/><link name="cart">{BODY}</link>
     <joint name="slide" type="prismatic"><parent link="rail"/><child link="cart"/><origin xyz="0 0 1"/>
       <axis xyz="1 0 0"/><limit lower="-2" upper="2" effort="9" velocity="3"/></joint>"""
-    _stage, robot, _ = convert(urdf(tmp_path, body, "cartpole"))
+    _stage, robot, _ = converted(urdf(tmp_path, body, "cartpole"))
     joint = UsdPhysics.Joint(prim(robot, "slide"))
     assert joint.GetBody0Rel().GetTargets() == [robot.GetPath()]
     assert not robot.HasAPI(UsdPhysics.RigidBodyAPI)
@@ -410,7 +344,7 @@ def test_what_slides_on_a_root_without_mass_slides_on_the_world(tmp_path):
 
 def test_speed_damping_and_friction_reach_newton_and_physx_in_their_units(tmp_path):
     path = arm(tmp_path, f'revolute|<axis xyz="0 0 1"/>{LIMIT}<dynamics damping="0.2" friction="0.1"/>')
-    _stage, robot, _ = convert(path)
+    _stage, robot, _ = converted(path)
     joint = prim(robot, "j")
     applied = joint.GetPrimTypeInfo().GetAppliedAPISchemas()
     assert {"NewtonJointAPI", "PhysxJointAPI", "PhysxJointAxisAPI:angular"} <= set(applied)
@@ -430,21 +364,21 @@ def test_speed_damping_and_friction_reach_newton_and_physx_in_their_units(tmp_pa
 
 def test_equal_limits_weld_a_joint_at_their_value(tmp_path):
     limit = '<limit lower="0.3" upper="0.3" effort="1" velocity="1"/>'
-    _stage, robot, notes = convert(arm(tmp_path, f'prismatic|<axis xyz="0 1 0"/>{limit}'))
+    _stage, robot, report = converted(arm(tmp_path, f'prismatic|<axis xyz="0 1 0"/>{limit}'))
     joint = prim(robot, "j")
     assert joint.IsA(UsdPhysics.FixedJoint)
     assert_allclose(UsdPhysics.Joint(joint).GetLocalPos0Attr().Get(), [0, 0.3, 0], atol=1e-7)
     hand = UsdGeom.XformCache().GetLocalToWorldTransform(robot.GetPrimAtPath("hand"))
     assert_allclose(hand.ExtractTranslation(), [0, 0.3, 0], atol=1e-9)
-    assert "joint 'j' (prismatic) cannot move by its own limits: welded" in notes
+    assert "joint 'j' (prismatic) cannot move by its own limits: welded" in report.notes
 
 
 def test_a_joint_whose_limits_exclude_0_is_held_at_the_nearest_limit(tmp_path):
     limit = '<limit lower="0.2" upper="0.9" effort="1" velocity="1"/>'
-    _stage, robot, notes = convert(arm(tmp_path, f'revolute|<axis xyz="0 1 0"/>{limit}'))
+    _stage, robot, report = converted(arm(tmp_path, f'revolute|<axis xyz="0 1 0"/>{limit}'))
     drive, *_ = drive_of(robot, "j")
     assert_allclose(drive.GetTargetPositionAttr().Get(), np.degrees(0.2), rtol=1e-6)
-    assert any("stands at 0, outside its limits 0.2 to 0.9" in note for note in notes)
+    assert any("stands at 0, outside its limits 0.2 to 0.9" in note for note in report.notes)
 
 
 # --- mimics ---------------------------------------------------------------------------------------
@@ -460,7 +394,7 @@ def follower(tmp_path, mimic, kind="revolute", lead=LIMIT):
 
 def test_a_mimic_is_authored_for_newton_and_for_physx_and_its_own_drive_has_no_gains(tmp_path):
     path = follower(tmp_path, '<mimic joint="lead" multiplier="-2" offset="0.1"/>')
-    _stage, robot, _ = convert(path)
+    _stage, robot, _ = converted(path)
     joint, lead = prim(robot, "f"), prim(robot, "lead").GetPath()
     assert joint.GetRelationship("newton:mimicJoint").GetTargets() == [lead]
     assert_allclose(joint.GetAttribute("newton:mimicCoef0").Get(), np.degrees(0.1), rtol=1e-6)
@@ -480,32 +414,18 @@ def test_a_mimic_is_authored_for_newton_and_for_physx_and_its_own_drive_has_no_g
 
 def test_a_slide_that_follows_a_turn_gears_in_metres_per_degree(tmp_path):
     path = follower(tmp_path, '<mimic joint="lead" multiplier="0.05"/>', kind="prismatic")
-    _stage, robot, _ = convert(path)
+    _stage, robot, _ = converted(path)
     joint = prim(robot, "f")
     assert_allclose(joint.GetAttribute("newton:mimicCoef1").Get(), 0.05, rtol=1e-6)
     gearing = joint.GetAttribute("physxMimicJoint:rotY:gearing").Get()
     assert_allclose(gearing, -0.05 * np.pi / 180, rtol=1e-6)
 
 
-def test_a_mimic_of_a_mimic_follows_the_first(tmp_path):
-    path = follower(tmp_path, '<mimic joint="lead" multiplier="2" offset="0.1"/>')
-    more = """<link name="d"><inertial><mass value="1"/></inertial></link>
-    <joint name="g" type="revolute"><parent link="a"/><child link="d"/><axis xyz="0 1 0"/>
-      <limit lower="-1" upper="1" effort="1" velocity="1"/>
-      <mimic joint="f" multiplier="3" offset="-0.2"/></joint></robot>"""
-    path.write_text(path.read_text().replace("</robot>", more))
-    _stage, robot, _ = convert(path)
-    joint = prim(robot, "g")
-    assert joint.GetRelationship("newton:mimicJoint").GetTargets() == [prim(robot, "lead").GetPath()]
-    assert joint.GetAttribute("newton:mimicCoef1").Get() == 6
-    assert_allclose(joint.GetAttribute("newton:mimicCoef0").Get(), np.degrees(3 * 0.1 - 0.2), rtol=1e-5)
-
-
 def test_what_follows_a_welded_joint_is_welded_too(tmp_path):
     dead = '<limit lower="0" upper="0" effort="1" velocity="1"/>'
-    _stage, robot, notes = convert(follower(tmp_path, '<mimic joint="lead"/>', lead=dead))
+    _stage, robot, report = converted(follower(tmp_path, '<mimic joint="lead"/>', lead=dead))
     assert prim(robot, "f").IsA(UsdPhysics.FixedJoint)
-    assert "joint 'f' follows 'lead', which cannot move: welded" in notes
+    assert "joint 'f' follows 'lead', which cannot move: welded" in report.notes
 
 
 # --- drives ---------------------------------------------------------------------------------------
@@ -517,29 +437,15 @@ def test_the_first_rule_that_fits_a_joint_drives_it(tmp_path):
         DriveRule(joints="le*", type="velocity", damping=0.7),
         DriveRule(joints="*", type="position", stiffness=40.0, damping=3.0, max_force=9.0),
     )
-    _stage, robot, _ = convert(path, drives=rules)
+    _stage, robot, _ = converted(path, drives=rules)
     drive, stiffness, damping = drive_of(robot, "lead")
     assert_allclose([stiffness, damping, drive.GetMaxForceAttr().Get()], [0, 0.7, 3], rtol=1e-6)
     assert drive.GetTargetVelocityAttr().HasAuthoredValue()
     drive, stiffness, damping = drive_of(robot, "f")
     assert_allclose([stiffness, damping, drive.GetMaxForceAttr().Get()], [40, 3, 9], rtol=1e-6)
     assert drive.GetTargetPositionAttr().HasAuthoredValue()
-    _stage, robot, _ = convert(path, drives=(DriveRule(joints="f", type="none"),))
+    _stage, robot, _ = converted(path, drives=(DriveRule(joints="f", type="none"),))
     assert drive_of(robot, "f")[1:] == (0, 0)
-
-
-def test_moments_in_single_precision_are_those_of_a_body_too(tmp_path):
-    """Isaac Sim's RigidBodyHasMassAPI: I1 + I2 = I3, but not after rounding, as in a finger of Allegro."""
-    rng = np.random.default_rng(0)
-    for small, large in rng.uniform(1e-6, 1e-4, (20, 2)):
-        tensor = f'<inertia ixx="{small}" iyy="{large}" izz="{small + large}" ixy="0" ixz="0" iyz="0"/>'
-        path = tmp_path / "plate.urdf"
-        link = f'<link name="a"><inertial><mass value="1"/>{tensor}</inertial></link>'
-        path.write_text(f'<robot name="plate">{link}</robot>')
-        _stage, robot, _ = convert(path)
-        moments = np.array(UsdPhysics.MassAPI(prim(robot, "a")).GetDiagonalInertiaAttr().Get(), float)
-        assert moments[0] + moments[1] >= moments[2]
-        assert_allclose(moments, [small, large, small + large], rtol=1e-6)
 
 
 CRANE = """<link name="a">{{BODY}}</link>
@@ -557,7 +463,7 @@ CRANE = """<link name="a">{{BODY}}</link>
 def test_a_joint_with_limits_holds_what_it_carries_at_10_hz(tmp_path, mass):
     """Torsos sank and arms fell: 100 N/m held the lift of HSR, 100 N m/rad the shoulder of Baxter."""
     path = urdf(tmp_path, CRANE.format(mass=mass, extra=""), "crane")
-    _stage, robot, _ = convert(path)
+    _stage, robot, _ = converted(path)
     square = (2 * np.pi * 10) ** 2
     drive, stiffness, damping = drive_of(robot, "lift", "linear")
     assert_allclose([stiffness, damping], [square * (mass + 3), square * (mass + 3) / 10], rtol=5e-3)
@@ -567,21 +473,12 @@ def test_a_joint_with_limits_holds_what_it_carries_at_10_hz(tmp_path, mass):
     assert drive.GetMaxForceAttr().Get() == 40
 
 
-def test_a_joint_with_limits_is_held_although_it_is_commanded_by_effort(tmp_path):
-    """The arms of Panda and PR2 fell: their transmissions are for effort, with controllers above them."""
-    tags = """<transmission name="t"><joint name="elbow"><hardwareInterface>
-    hardware_interface/EffortJointInterface</hardwareInterface></joint></transmission>"""
-    path = urdf(tmp_path, CRANE.format(mass=2, extra=tags), "crane")
-    _stage, robot, _ = convert(path)
-    assert drive_of(robot, "elbow")[1] > 100
-
-
 def test_a_rule_drives_each_free_axis_of_a_planar_joint(tmp_path):
     path = arm(tmp_path, 'planar|<axis xyz="0 0 1"/>')
-    _stage, robot, _ = convert(path)
+    _stage, robot, _ = converted(path)
     for axis in ("transX", "transY", "rotZ"):
         assert drive_of(robot, "j", axis)[1:] == (0, 0)
-    _stage, robot, _ = convert(path, drives=(DriveRule(joints="j", damping=2.0, max_force=5.0),))
+    _stage, robot, _ = converted(path, drives=(DriveRule(joints="j", damping=2.0, max_force=5.0),))
     joint = prim(robot, "j")
     applied = joint.GetPrimTypeInfo().GetAppliedAPISchemas()
     driven = {a.split(":")[1] for a in applied if a.startswith("PhysicsDriveAPI")}
@@ -592,22 +489,22 @@ def test_a_rule_drives_each_free_axis_of_a_planar_joint(tmp_path):
 
 def test_a_rule_that_fits_no_joint_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"drive rule 'laed' fits no joint .* did you mean 'lead'"):
-        convert(follower(tmp_path, ""), drives=(DriveRule(joints="laed", damping=1.0),))
+        converted(follower(tmp_path, ""), drives=(DriveRule(joints="laed", damping=1.0),))
 
 
 @pytest.mark.parametrize(
-    ("rule", "message"),
+    ("rule", "words"),
     [
-        ({"type": "velocity"}, "without damping it cannot hold a velocity; give damping="),
-        ({"type": "position", "damping": 1.0}, "without stiffness it cannot hold a position"),
+        ({"type": "velocity"}, "without damping .*; give damping="),
+        ({"type": "position", "damping": 1.0}, "without stiffness"),
         ({"type": "velocity", "damping": 1.0, "stiffness": 2.0}, "type velocity has no stiffness, got 2"),
         ({"type": "none", "damping": 1.0}, "type none has no damping, got 1"),
-        ({"damping": float("nan")}, "damping must be a number from 0 up, got nan"),
-        ({"damping": 1.0, "max_force": 0.0}, r"max_force must be above 0, got 0\.0"),
+        ({"damping": float("nan")}, "damping must .* from 0 up, got nan"),
+        ({"damping": 1.0, "max_force": 0.0}, "max_force must be above 0, got 0"),
     ],
 )
-def test_a_rule_without_effect_is_refused(rule, message):
-    with pytest.raises(InputError, match=rf"drive 'x': {message}"):
+def test_a_rule_without_effect_is_refused(rule, words):
+    with pytest.raises(InputError, match=rf"drive 'x': {words}"):
         DriveRule(joints="x", **rule)
     with pytest.raises(InputError, match="drive 'x': without damping"):
         DriveRule.parse("x:velocity")
@@ -617,30 +514,30 @@ def test_a_base_that_is_fixed_to_a_root_called_world_is_fixed_at_its_place(tmp_p
     body = """<link name="world"/><link name="base">{BODY}</link>
     <joint name="j" type="TYPE"><parent link="world"/><child link="base"/><origin xyz="0 0 0.5"/></joint>"""
     path = urdf(tmp_path, body.replace("TYPE", "fixed"), "desk")
-    stage, robot, notes = convert(path)
+    stage, robot, report = converted(path)
     (fixed,) = [UsdPhysics.FixedJoint(p) for p in stage.Traverse() if p.IsA(UsdPhysics.FixedJoint)]
     assert fixed.GetBody0Rel().GetTargets() == [robot.GetPath()]
     assert fixed.GetBody1Rel().GetTargets() == [robot.GetPrimAtPath("base").GetPath()]
     assert_allclose(fixed.GetLocalPos0Attr().Get(), [0, 0, 0.5])
-    assert "link 'world' is the world: the base 'base' is fixed to it" in notes
+    assert "link 'world' is the world: the base 'base' is fixed to it" in report.notes
     write_urdf(tmp_path / "desk.usda", tmp_path / "back.urdf")
     back = read_description(tmp_path / "back.urdf")
     (joint,) = back.joints.values()
     assert (joint.type, joint.parent, joint.child) == ("fixed", "world", "base")
     assert_allclose(joint.origin[:3, 3], [0, 0, 0.5], atol=1e-12)
-    stage, _, notes = convert(urdf(tmp_path, body.replace("TYPE", "floating"), "desk"))
+    stage, _, report = converted(urdf(tmp_path, body.replace("TYPE", "floating"), "desk"))
     assert not [p for p in stage.Traverse() if p.IsA(UsdPhysics.FixedJoint)]
-    assert any("the base 'base' floats" in note for note in notes)
+    assert any("the base 'base' floats" in note for note in report.notes)
 
 
 def test_a_base_that_drives_floats_below_a_root_called_world(tmp_path):
     path = rover(tmp_path)
     hold = '<link name="world"/><joint name="j" type="fixed"><parent link="world"/><child link="base_link"/>'
     path.write_text(path.read_text().replace("</robot>", f"{hold}</joint></robot>"))
-    stage, robot, notes = convert(path, profile="diff-drive")
+    stage, robot, report = converted(path, profile="diff-drive")
     joints = [UsdPhysics.Joint(p) for p in stage.Traverse() if p.IsA(UsdPhysics.Joint)]
     assert not any(robot.GetPath() in joint.GetBody0Rel().GetTargets() for joint in joints)
-    assert any("the base 'base_link' floats" in note for note in notes)
+    assert any("the base 'base_link' floats" in note for note in report.notes)
 
 
 # --- the profile of bases with two driven wheels --------------------------------------------------
@@ -683,7 +580,7 @@ def friction(robot, link):
 
 
 def test_diff_drive_drives_the_wheels_frees_the_casters_and_welds_the_dead_suspension(tmp_path):
-    _stage, robot, notes = convert(rover(tmp_path), profile="diff-drive")
+    _stage, robot, report = converted(rover(tmp_path), profile="diff-drive")
     kg, n, radius = 7.0, 2, 0.1
     for name in ("left", "right"):
         drive, stiffness, damping = drive_of(robot, name)
@@ -696,12 +593,12 @@ def test_diff_drive_drives_the_wheels_frees_the_casters_and_welds_the_dead_suspe
         drive, stiffness, damping = drive_of(robot, name)
         assert (stiffness, damping) == (0, 0)
         assert np.isfinite(drive.GetMaxForceAttr().Get())
-        assert f"joint {name!r} is not a driven wheel: it turns freely" in notes
+        assert f"joint {name!r} is not a driven wheel: it turns freely" in report.notes
     assert prim(robot, "spring").IsA(UsdPhysics.FixedJoint)
-    assert "joint 'spring' (prismatic) is a suspension without effort or speed: welded" in notes
+    assert "joint 'spring' (prismatic) is a suspension without effort or speed: welded" in report.notes
     found = [friction(robot, link) for link in ("left_wheel", "right_wheel", "skid", "base_link")]
     assert_allclose(found, [1, 1, 0.05, 0.5], rtol=1e-6)
-    assert "link 'skid' is a caster and gives no friction: 0.05" in notes
+    assert "link 'skid' is a caster and gives no friction: 0.05" in report.notes
 
 
 def test_all_wheels_that_a_plugin_names_are_driven_not_the_first_of_each_side(tmp_path):
@@ -716,11 +613,11 @@ def test_all_wheels_that_a_plugin_names_are_driven_not_the_first_of_each_side(tm
         tags += f"<{side}_joint>j{i}</{side}_joint>"
     plugin = f'<gazebo><plugin name="DiffDrive" filename="gz-sim-diff-drive-system">{tags}</plugin></gazebo>'
     path = urdf(tmp_path, "".join(parts) + plugin)
-    stage, _, notes = convert(path, profile="diff-drive")
+    stage, _, report = converted(path, profile="diff-drive")
     joints = [p for p in stage.Traverse() if p.IsA(UsdPhysics.RevoluteJoint)]
     assert len(joints) == 4
     assert all(UsdPhysics.DriveAPI(joint, "angular").GetDampingAttr().Get() > 0 for joint in joints)
-    assert not any("caster" in note or "freely" in note for note in notes)
+    assert not any("caster" in note or "freely" in note for note in report.notes)
     spec = read_drive(stage.GetDefaultPrim())
     assert spec.sides == {"j0": 0, "j1": 1, "j2": 0, "j3": 1}
 
@@ -729,24 +626,24 @@ def test_the_urdfs_values_of_wheels_override_the_profile(tmp_path):
     path = rover(tmp_path, wheel='<limit effort="1.5" velocity="8"/>')
     tag = '<gazebo reference="skid"><mu1>0.3</mu1></gazebo></robot>'
     path.write_text(path.read_text().replace("</robot>", tag))
-    _stage, robot, _ = convert(path, profile="diff-drive")
+    _stage, robot, _ = converted(path, profile="diff-drive")
     assert drive_of(robot, "left")[0].GetMaxForceAttr().Get() == 1.5
     assert_allclose(prim(robot, "left").GetAttribute("newton:velocityLimit").Get(), np.degrees(8), rtol=1e-6)
     assert_allclose(friction(robot, "skid"), 0.3, rtol=1e-6)
 
 
 def test_the_general_profile_keeps_a_suspension_that_is_not_quite_dead(tmp_path):
-    _stage, robot, _ = convert(rover(tmp_path))
+    _stage, robot, _ = converted(rover(tmp_path))
     assert prim(robot, "spring").IsA(UsdPhysics.PrismaticJoint)
     assert_allclose(drive_of(robot, "swivel")[2], 5, rtol=1e-6)  # as any joint that turns for ever
 
 
 def test_a_robot_without_two_wheels_is_no_diff_drive(tmp_path):
     with pytest.raises(InputError, match=r"profile diff-drive needs two wheels, .* found none"):
-        convert(arm(tmp_path, f'revolute|<axis xyz="0 1 0"/>{LIMIT}'), profile="diff-drive")
+        converted(arm(tmp_path, f'revolute|<axis xyz="0 1 0"/>{LIMIT}'), profile="diff-drive")
 
 
 def test_a_converted_rover_passes_the_validators(tmp_path):
     path = rover(tmp_path)
-    convert(path, profile="diff-drive", merge_fixed=True)
+    converted(path, profile="diff-drive", merge_fixed=True)
     assert_valid(path.with_suffix(".usda"), tmp_path)

@@ -59,37 +59,55 @@ SCAN = """<ray><scan><horizontal><samples>9</samples><min_angle>{}</min_angle><m
 EYE = """<camera><horizontal_fov>{}</horizontal_fov><image><width>{}</width><height>48</height></image>
 <clip><near>{}</near><far>{}</far></clip></camera>"""
 
+
+def held(hand):
+    return f"{GOOD}\n{hand}\n{joint('fixed')}"
+
+
+def limited(figures):
+    return moving("revolute", f"<limit {figures}/>")
+
+
+def tagged(content):
+    return f'{GOOD}\n<gazebo reference="base">{content}</gazebo>'
+
+
+def meshed(filename, role="visual"):
+    return look(f'<geometry><mesh filename="{filename}"/></geometry>', role)
+
+
+def included(filename):
+    return f'{GOOD}\n<xacro:include filename="{filename}"/>'
+
+
+def wheels(*, axis="0 0 1", more="", **names):
+    """A base with two wheels and a plugin that drives some, in line 9."""
+    tags = "".join(f"<{side}_joint>{name}</{side}_joint>" for side, name in names.items())
+    plugin = f'<gazebo><plugin name="diff_drive">{tags}{more}</plugin></gazebo>'
+    robot = f"{moving('continuous')}\n{TIP}\n{joint('continuous', name='k', child='tip')}\n{plugin}"
+    return robot.replace("0 0 1", axis)
+
+
+NOISE = """<imu><linear_acceleration><x><noise type="gaussian"><stddev>{}</stddev></noise></x>
+</linear_acceleration></imu>"""
+
 FAULTY = {
     "inertia-impossible": [
-        (
-            BASE.format(TENSOR.replace('izz="1"', 'izz="9"'), ""),
-            2,
-            "no body has principal moments of inertia",
-        ),
+        (BASE.format(TENSOR.replace('izz="1"', 'izz="9"'), ""), 2, "no body has principal moments"),
         (BASE.format(TENSOR.replace('ixx="1"', 'ixx="-1"'), ""), 2, "-1, 1, 1 kg m2: the nearest possible"),
     ],
     "inertia-missing": [
         (BASE.format(TENSOR.replace("1", "0"), ""), 2, "that of a ball of water"),
         (BASE.format("", f"<collision>{BALL}</collision>"), 2, "that of its colliders"),
     ],
-    "inertia-asymmetric": [
-        (BASE.format(TENSOR.replace("/>", ' iyx="0.1"/>'), ""), 2, "ixy 0 and iyx 0.1 of <inertia> differ")
-    ],
+    "inertia-asymmetric": [(BASE.format(TENSOR.replace("/>", ' iyx="0.1"/>'), ""), 2, "ixy 0 and iyx 0.1")],
     "inertia-unreadable": [(BASE.format(TENSOR.replace('ixx="1"', 'ixx="big"'), ""), 2, "counts as none")],
     "mass-invalid": [
-        (f"{GOOD}\n{HAND.replace(chr(34) + '2', chr(34) + '-2')}\n{joint('fixed')}", 3, "a mass of -2"),
-        (
-            f"{GOOD}\n{HAND.replace('<mass value=' + chr(34) + '2' + chr(34) + '/>', '')}\n{joint('fixed')}",
-            3,
-            "no mass counts as none",
-        ),
+        (held(HAND.replace('"2"', '"-2"')), 3, "a mass of -2"),
+        (held(HAND.replace('<mass value="2"/>', "")), 3, "no mass counts as none"),
     ],
     "mimic-leader": [
-        (
-            follower('<mimic joint="jj"/>'),
-            7,
-            "mimics no joint 'jj' (did you mean 'j'?): the mimic is left out",
-        ),
+        (follower('<mimic joint="jj"/>'), 7, "no joint 'jj' (did you mean 'j'?): the mimic is left out"),
         (follower('<mimic joint="f"/>'), 7, "mimics itself: f -> f"),
         (follower('<mimic multiplier="2"/>'), 8, "a <mimic> without joint= is left out"),
         (follower('<mimic joint="j"/>', "", "planar"), 7, "'j', which is planar"),
@@ -102,33 +120,15 @@ FAULTY = {
         (moving("revolute"), 4, "is revolute without limits"),
         (moving("prismatic", '<limit effort="1" velocity="1"/>'), 5, "is prismatic without limits"),
     ],
-    "limit-one-end": [
-        (moving("revolute", '<limit upper="1" effort="1" velocity="1"/>'), 5, "no lower limit")
-    ],
+    "limit-one-end": [(limited('upper="1" effort="1" velocity="1"'), 5, "no lower limit")],
     "limit-zeros": [
-        (
-            moving("revolute", '<limit lower="0" upper="0" effort="0" velocity="0"/>'),
-            5,
-            "range, effort and velo",
-        ),
-        (moving("revolute", '<limit lower="-180" upper="180" effort="0" velocity="0"/>'), 5, "of 360 rad"),
-        (
-            moving("revolute", '<limit lower="-1" upper="1" effort="0" velocity="0"/>'),
-            5,
-            "it moves within it",
-        ),
+        (limited('lower="0" upper="0" effort="0" velocity="0"'), 5, "range, effort and velo"),
+        (limited('lower="-180" upper="180" effort="0" velocity="0"'), 5, "of 360 rad"),
+        (limited('lower="-1" upper="1" effort="0" velocity="0"'), 5, "it moves within it"),
     ],
-    "limit-swapped": [
-        (moving("revolute", '<limit lower="1" upper="-1" effort="1" velocity="1"/>'), 5, "above its upper -1")
-    ],
+    "limit-swapped": [(limited('lower="1" upper="-1" effort="1" velocity="1"'), 5, "above its upper -1")],
     "limit-ignored": [(moving("continuous", '<limit lower="-1" upper="1"/>'), 5, "which has no range")],
-    "effort-invalid": [
-        (
-            moving("revolute", '<limit lower="0" upper="1" effort="-1" velocity="1"/>'),
-            5,
-            "effort -1 of <limit>",
-        )
-    ],
+    "effort-invalid": [(limited('lower="0" upper="1" effort="-1" velocity="1"'), 5, "effort -1 of <limit>")],
     "sensor-range": [
         (sensor("ray", SCAN.format(-3.1416, 3.1416, 0.1, 9)), 4, "become -3.1416 to 3.141585"),
         (sensor("ray", SCAN.format(1, -1, 0.1, 9)), 4, "from 1 to -1 rad become -1 to 1"),
@@ -136,17 +136,25 @@ FAULTY = {
         (sensor("camera", EYE.format(3.2, 64, 0.1, 9)), 4, "horizontal_fov of 3.2 rad is reduced"),
         (sensor("camera", EYE.format(1, "1e9", 0.1, 9)), 4, "pixels becomes 65536 x 48"),
         (sensor("imu", "<pose>1 2 3</pose>"), 4, "its pose is not x y z roll pitch yaw"),
+        (sensor("imu", '<pose relative_to="world">0 0 0 0 0 0</pose>'), 4, "is relative to 'world'"),
     ],
     "sensor-missing": [
         (sensor("camera", ""), 4, "has no <camera>: kept as a frame with its type and rate"),
         (sensor("ray", SCAN.format(-1, 1, 1, 1)), 4, "its range from 1 to 1.0 m is empty"),
+        (sensor("ray", SCAN.replace(">9<", ">1e300<").format(-1, 1, 0.1, 9)), 4, "rays, over 2000000"),
     ],
     "number-range": [
         (look('<geometry><sphere radius="-0.1"/></geometry>'), 2, "used without its sign"),
         (look(f'<origin quat_xyzw="0 0 1 1"/>{BALL}'), 2, "has length 1.414 in '0 0 1 1': scaled to 1"),
         (moving("revolute", '<limit lower="0" upper="1"/><dynamics damping="-1"/>'), 5, "raised to it"),
         (look(f'{BALL}<material name="m"><color rgba="255 0 0 1"/></material>'), 2, "reduced to it"),
-        (f'{GOOD}\n<gazebo reference="base"><mu1>-1</mu1></gazebo>', 3, "mu1 -1 is below 0: raised to it"),
+        (tagged("<mu1>-1</mu1>"), 3, "mu1 -1 is below 0: raised to it"),
+        (sensor("imu", NOISE.format("-0.3")), 4, "stddev -0.3 is below 0: raised to it"),
+        (
+            wheels(left="j", right="k", more="<wheel_radius>0</wheel_radius>"),
+            9,
+            "wheel_radius 0 is not above",
+        ),
     ],
     "number-count": [
         (look(f'<origin xyz="1 2 3 0"/>{BALL}'), 2, "has 4 numbers in '1 2 3 0': read as 1 2 3"),
@@ -155,54 +163,31 @@ FAULTY = {
         (look(f'{BALL}<material name="m"><color rgba="1 0 0"/></material>'), 2, "completed by 1"),
     ],
     "number-unreadable": [
-        (
-            moving("continuous", '<dynamics damping="soft"/>'),
-            5,
-            "damping of <dynamics> must be a finite number",
-        ),
+        (moving("continuous", '<dynamics damping="soft"/>'), 5, "damping of <dynamics> must be a finite"),
         (look(f'{BALL}<material name="m"><color rgba="red"/></material>'), 2, "rgba of <color> must be"),
-        (f'{GOOD}\n<gazebo reference="base"><selfCollide>maybe</selfCollide></gazebo>', 3, "true or false"),
+        (tagged("<selfCollide>maybe</selfCollide>"), 3, "true or false"),
+        (tagged("<mu1>slippery</mu1>"), 3, "mu1 must be a finite number, not 'slippery'"),
     ],
     "element-unknown": [
         (
             BASE.format(TENSOR, "<colision/>"),
             2,
-            "<colision> in <link> is unknown (did you mean 'collision'?)",
+            "<colision> in <link> is unknown (did you mean 'coll",
         ),
         (look('<geometry><cylindre radius="1"/></geometry>'), 2, "(did you mean 'cylinder'?)"),
         (f"{GOOD}\n<transmision/>", 3, "<transmision> in <robot> is unknown (did you mean 'transmission'?)"),
     ],
     "attribute-unknown": [
-        (
-            moving("revolute", '<limit lower="-1" upper="1" efort="1"/>'),
-            5,
-            "efort='1' of <limit> is unknown (d",
-        ),
+        (limited('lower="-1" upper="1" efort="1"'), 5, "efort='1' of <limit> is unknown (d"),
         (look(f'<origin ypr="0 0 1"/>{BALL}'), 2, "link 'base': ypr='0 0 1' of <origin> is unknown: kept"),
         (f'{GOOD}\n<material name="m" colour="red"><color rgba="1 0 0 1"/></material>', 3, "colour='red'"),
     ],
     "turn-twice": [(look(f'<origin rpy="0 0 1" quat_xyzw="0 0 0 1"/>{BALL}'), 2, "quat_xyzw is used")],
-    "tag-twice": [
-        (
-            look('<geometry><sphere radius="1"/><box size="1 1 1"/></geometry>'),
-            2,
-            "a second <box> in <geometry>",
-        )
-    ],
+    "tag-twice": [(look(BALL.replace("</", '<box size="1 1 1"/></')), 2, "a second <box> in <geometry>")],
     "tag-misplaced": [
-        (
-            look(f'<geometry><sphere radius="1"/>{RED}</geometry>'),
-            2,
-            "<material> moved into the <material> of its visual",
-        ),
+        (look(BALL.replace("</", f"{RED}</")), 2, "<material> moved into the <material> of its visual"),
         (look(f'{BALL}<color rgba="1 0 0 1"/>'), 2, "<color> moved"),
-        (
-            BASE.format(
-                TENSOR, f'<visual>{BALL}</visual><material name="m"><color rgba="1 0 0 1"/></material>'
-            ),
-            2,
-            "moved from the link to its visuals",
-        ),
+        (BASE.format(TENSOR, f"<visual>{BALL}</visual>{RED}"), 2, "moved from the link to its visuals"),
     ],
     "tag-empty": [
         (look(f'{BALL}<material name="m"><texture/></material>'), 2, "a <texture> without filename="),
@@ -218,31 +203,22 @@ FAULTY = {
     ],
     "shape-empty": [(look('<geometry><box size="0 0 0"/></geometry>'), 2, "a visual box of size 0")],
     "material-twice": [
-        (
-            f'{RED}\n<material name="m"><color rgba="{rgba}"/></material>\n{GOOD}',
-            2,
-            told,
-        )
-        for rgba, told in (("1 0 0 1", "twice, alike"), ("0 1 0 1", "twice, with two looks"))
+        (f"{RED}\n{RED}\n{GOOD}", 2, "twice, alike"),
+        (f"{RED}\n{RED.replace('1 0 0 1', '0 1 0 1')}\n{GOOD}", 2, "twice, with two looks"),
     ],
     "name-twice": [
         (f"{GOOD}\n{GOOD}", 3, "link 'base' exists twice, first on line 2: the second is equal and left out"),
         (f"{GOOD}\n{HAND}\n{TIP}\n{joint('fixed')}\n{joint('fixed', child='tip')}", 7, "is called 'j_2'"),
         (
-            "\n".join(
-                [GOOD, HAND, look(BALL).replace("base", "hand"), joint("fixed"), joint("fixed", name="k")]
-            ),
+            held(f"{HAND}\n{look(BALL).replace('base', 'hand')}") + joint("fixed", name="k"),
             4,
             "is called 'hand_2'",
         ),
     ],
     "name-unknown": [
-        (
-            f'{GOOD}\n<transmission name="t"><joint name="nobody"/></transmission>',
-            3,
-            "names no joint 'nobody'",
-        ),
-        (f"{GOOD}\n{HAND}\n{joint('fixed')}\n{joint('fixed', '', 'k', 'arm')}", 6, "leads to no link 'arm'"),
+        (f'{GOOD}\n<transmission name="t"><joint name="nobody"/></transmission>', 3, "no joint 'nobody'"),
+        (f'{GOOD}\n<ros2_control name="c"><joint name="jj"/></ros2_control>', 3, "no joint 'jj'"),
+        (f"{held(HAND)}\n{joint('fixed', '', 'k', 'arm')}", 6, "leads to no link 'arm'"),
         (f'{GOOD}\n<gazebo reference="bas"/>', 3, "'bas', which is no link or joint (did you mean 'base'?)"),
         (
             f"{moving('continuous')}\n<gazebo reference='j'>\n<sensor name='s' type='imu'/></gazebo>",
@@ -252,47 +228,23 @@ FAULTY = {
     ],
     "name-missing": [(f"{GOOD}", 1, "<robot> has no name: 'arm', as its file")],
     "mesh-missing": [
-        (look('<geometry><mesh filename="nowhere.stl"/></geometry>'), 2, "a box of 1.73 x 1.73 x 1.73 m"),
-        (look('<geometry><mesh filename="package://absent/a.stl"/></geometry>'), 2, "a box of"),
-        (look('<geometry><mesh filename="https://example.com/a.stl"/></geometry>'), 2, "a box of"),
+        (meshed("nowhere.stl"), 2, "a box of 1.73 x 1.73 x 1.73 m"),
+        (meshed("package://absent/a.stl"), 2, "a box of"),
+        (meshed("https://example.com/a.stl"), 2, "a box of"),
     ],
     "mesh-unreadable": [
-        (look('<geometry><mesh filename="broken.stl"/></geometry>'), 2, "cannot be read: a box"),
-        (look('<geometry><mesh filename="a.step"/></geometry>'), 2, "cannot be read: a box"),
+        (meshed("broken.stl"), 2, "cannot be read: a box"),
+        (meshed("a.step"), 2, "cannot be read: a box"),
     ],
-    "mesh-flat": [
-        (look('<geometry><mesh filename="flat.stl"/></geometry>', "collision"), 2, "as a plate 0.0071 m")
-    ],
+    "mesh-flat": [(meshed("flat.stl", "collision"), 2, "as a plate 0.0071 m")],
     "file-name": [
-        (
-            look('<geometry><mesh filename="parts/box.stl"/></geometry>'),
-            2,
-            "is found in the package, not beside",
-        ),
-        (look('<geometry><mesh filename="package:///arms/flat.stl"/></geometry>'), 2, "'package://arms/"),
+        (meshed("parts/box.stl"), 2, "is found in the package, not beside"),
+        (meshed("package:///arms/flat.stl"), 2, "'package://arms/"),
     ],
     "drive-incomplete": [
-        (
-            f'{moving("continuous")}\n<gazebo><plugin name="diff_drive">\n<left_joint>jj</left_joint>'
-            "<right_joint>j</right_joint></plugin></gazebo>",
-            7,
-            "<left_joint>: no joint 'jj'; did you mean 'j'",
-        ),
-        (
-            f'{moving("continuous")}\n<gazebo><plugin name="diff_drive"><left_joint>j</left_joint>'
-            "</plugin></gazebo>",
-            6,
-            "the drive plugin has no <right_joint>: the drive is kept as text",
-        ),
-        (
-            (
-                f"{moving('continuous')}\n{TIP}\n{joint('continuous', name='k', child='tip')}\n"
-                '<gazebo><plugin name="diff_drive"><left_joint>j</left_joint>'
-                "<right_joint>k</right_joint></plugin></gazebo>"
-            ).replace("0 0 1", "0 1 0"),
-            9,
-            "a drive needs wheels on the left (y > 0) and right",
-        ),
+        (wheels(left="jj", right="j"), 9, "<left_joint>: no joint 'jj'; did you mean 'j'"),
+        (wheels(left="j"), 9, "the drive plugin has no <right_joint>: the drive is kept as text"),
+        (wheels(left="j", right="k", axis="0 1 0"), 9, "needs wheels on the left (y > 0) and right"),
     ],
     "package-missing": [
         (
@@ -302,16 +254,8 @@ FAULTY = {
         )
     ],
     "macro-unknown": [(f'{GOOD}\n<xacro:lidar name="l"/>', 3, "<xacro:lidar> is no macro: left out")],
-    "include-renamed": [
-        (
-            f'{GOOD}\n<xacro:include filename="eye.xacro"/>',
-            3,
-            "'eye.xacro' is missing: eye.urdf.xacro beside it",
-        )
-    ],
-    "include-skipped": [
-        (f'{GOOD}\n<xacro:include filename="$(find absent)/eye.xacro"/>', 3, "eye.xacro' is missing: skipped")
-    ],
+    "include-renamed": [(included("eye.xacro"), 3, "'eye.xacro' is missing: eye.urdf.xacro beside it")],
+    "include-skipped": [(included("$(find absent)/eye.xacro"), 3, "eye.xacro' is missing: skipped")],
     "declaration-late": [(GOOD, 3, "blank lines before"), (f"{GOOD}<!-- xacro -->", 3, "blank lines before")],
 }
 """Descriptions with one fault: the text, its line (0 if it has none), and a part of the report's text."""

@@ -1,21 +1,19 @@
 """The report of a conversion: what it says is what stands on the stage, and strict ones refuse losses."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from made import INERTIAL, converted, urdf
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics
-from test_urdf import INERTIAL, urdf
 
 from magtwin.errors import InputError
 from magtwin.files import sha256
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.urdf.convert import convert_with_report
 from magtwin.urdf.options import Options
-from magtwin.urdf.report import GeometryLine
 
 ARM = """<link name="base_link">{BODY}</link><link name="hand">{BODY}</link><link name="tip"/>
 <joint name="j" type="revolute"><parent link="base_link"/><child link="hand"/><origin xyz="0.3 0 0"/>
@@ -24,7 +22,7 @@ ARM = """<link name="base_link">{BODY}</link><link name="hand">{BODY}</link><lin
 
 
 def convert(path, **choices):
-    return convert_with_report(path, path.with_suffix(".usda"), options=Options(**choices), force=True)
+    return converted(path, **choices)[2]
 
 
 def one_shape(tmp_path, shape, origin=""):
@@ -42,11 +40,12 @@ def one_shape(tmp_path, shape, origin=""):
 def test_every_link_joint_and_shape_has_its_line_and_its_prim(tmp_path):
     path = urdf(tmp_path, ARM)
     report = convert(path)
-    assert [(line.name, line.became) for line in report.links] == [
-        ("base_link", "body"),
-        ("hand", "body"),
-        ("tip", "frame"),
+    assert [(line.name, line.became, line.mass_in_kg, line.mass_out_kg) for line in report.links] == [
+        ("base_link", "body", 1, 1),
+        ("hand", "body", 1, 1),
+        ("tip", "frame", None, None),
     ]
+    assert (report.mass_in_kg, report.mass_out_kg) == (2, 2)
     assert [(j.name, j.type_in, j.type_out) for j in report.joints] == [
         ("j", "revolute", "PhysicsRevoluteJoint"),
         ("t", "fixed", ""),
@@ -60,12 +59,6 @@ def test_every_link_joint_and_shape_has_its_line_and_its_prim(tmp_path):
     assert all(stage.GetPrimAtPath(prim) for prim in named)
     assert not report.losses
     assert report.source_sha256 == sha256(path)
-
-
-def test_masses_are_those_of_the_description_and_of_the_stage(tmp_path):
-    report = convert(urdf(tmp_path, ARM))
-    assert (report.mass_in_kg, report.mass_out_kg) == (2, 2)
-    assert [(line.mass_in_kg, line.mass_out_kg) for line in report.links] == [(1, 1), (1, 1), (None, None)]
 
 
 def test_a_density_adds_mass_and_that_is_no_loss(tmp_path):
@@ -164,28 +157,6 @@ def test_a_changed_stage_is_detected(tmp_path, what, message):
     assert not path.with_suffix(".usda").exists()
 
 
-MISSING = """<link name="base_link">{BODY}<visual><geometry><mesh filename="{0}.stl"/></geometry></visual>
-<visual><geometry><mesh filename="{1}.stl"/></geometry></visual></link>"""
-
-
-def test_strict_names_every_fault(tmp_path):
-    path = urdf(tmp_path, MISSING.replace("{0}", "one").replace("{1}", "two"))
-    report = convert(path, missing_meshes="note")
-    assert len(report.losses) == 2
-    path.with_suffix(".usda").unlink()
-    with pytest.raises(InputError, match=r"arm\.urdf: 2 faults: .*one\.stl.*two\.stl.*; convert without"):
-        convert_with_report(
-            path,
-            tmp_path / "strict" / "arm.usda",
-            options=Options(missing_meshes="note", strict=True),
-        )
-    assert not list((tmp_path / "strict").iterdir())
-
-
-def test_a_conversion_that_loses_nothing_passes_strict(tmp_path):
-    assert not convert(urdf(tmp_path, ARM), strict=True).losses
-
-
 def test_a_follower_that_rests_beside_0_is_where_it_belongs(tmp_path):
     text = ARM.replace('<link name="tip"/>', '<link name="tip">{BODY}</link>').replace(
         'name="t" type="fixed">',
@@ -221,38 +192,20 @@ def test_the_summary_has_the_main_numbers(tmp_path):
     assert summary.title == "arm: arm.urdf -> arm.usda"
 
 
-def test_the_tolerance_of_a_box_is_of_its_size_and_kind():
-    unit = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-    off = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.001))
-
-    def line(shape, box):
-        return GeometryLine(link="a", role="visual", index=0, shape=shape, prims=(), box_in=unit, box_out=box)
-
-    assert line("box", unit).kept
-    assert not line("box", off).kept
-    assert line("sphere", off).kept
-    assert not line("box", None).kept
-    assert line("box", None).error_m == np.inf
+def test_every_shape_of_the_real_robot_arrives_in_its_box(real_robot, tagged_robot):
+    for (path, _, report), lost in ((real_robot, 0), (tagged_robot, 2)):
+        missing = [line for line in report.geometries if not line.kept]
+        assert all(line.box_in is None and line.shape in ("shell.dae", "oakd_pro.dae") for line in missing)
+        assert len(missing) == lost
+        (lidar,) = (g for g in report.geometries if g.shape == "rplidar.dae")
+        assert lidar.kept  # the mesh that a malformed colour made others drop
+        assert_allclose(report.mass_out_kg, 5.39, atol=1e-6)
+        assert max(line.error_m for line in report.geometries if line.kept) < 1e-3
+        assert path.name == report.source
 
 
-@pytest.mark.parametrize("name", ["turtlebot4", "turtlebot4_gazebo_tags"])
-def test_every_shape_of_the_real_robot_arrives_in_its_box(real_data, tmp_path, name):
-    path = real_data / "turtlebot4" / f"{name}.urdf"
-    report = convert_with_report(path, tmp_path / "tb4.usda", options=Options(missing_meshes="note"))
-    missing = [line for line in report.geometries if not line.kept]
-    assert all(line.box_in is None and line.shape in ("shell.dae", "oakd_pro.dae") for line in missing)
-    assert len(missing) == (0 if name == "turtlebot4" else 2)
-    (lidar,) = (g for g in report.geometries if g.shape == "rplidar.dae")
-    assert lidar.kept  # the mesh that a malformed colour made others drop
-    assert_allclose(report.mass_out_kg, 5.39, atol=1e-6)
-    worst = max(line.error_m for line in report.geometries if line.kept)
-    assert worst < 1e-3
-    assert Path(path).name == report.source
-
-
-def test_the_mesh_boxes_of_the_real_robot_are_those_that_trimesh_reads(real_data, tmp_path):
-    path = real_data / "turtlebot4" / "turtlebot4.urdf"
-    report = convert_with_report(path, tmp_path / "tb4.usda", options=Options(missing_meshes="note"))
+def test_the_mesh_boxes_of_the_real_robot_are_those_that_trimesh_reads(real_robot):
+    path, _, report = real_robot
     looked = 0
     for line in report.geometries:
         file = path.parent / "meshes" / line.shape

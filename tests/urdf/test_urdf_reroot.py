@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from magtwin.author.robot import read_description
-from magtwin.author.scene import author_scene
-from magtwin.author.scene_file import scene_from_toml
 from magtwin.errors import InputError
 from magtwin.files import shipped
 from magtwin.frames import matrix_from_quat, quat_from_rpy
@@ -87,8 +85,7 @@ def test_an_invalid_origin_is_refused_with_its_joint() -> None:
             reroot(robot(joint("footprint", "base_link", xyz=xyz)), "base_link", HERE)
 
 
-def test_a_scene_in_a_folder_of_its_own_keeps_its_robots_description(tmp_path: Path) -> None:
-    author_scene(scene_from_toml(shipped("scenes", "lab.toml")), tmp_path / "lab")
+def test_a_scene_in_a_folder_of_its_own_keeps_its_robots_description(lab_scene: Path) -> None:
     shown = read_description(shipped("robots", "turtlebot4", "turtlebot4.usda"))
     assert "<robot" in shown
-    assert read_description(tmp_path / "lab" / "robots" / "turtlebot4" / "turtlebot4.usda") == shown
+    assert read_description(lab_scene.parent / "robots" / "turtlebot4" / "turtlebot4.usda") == shown

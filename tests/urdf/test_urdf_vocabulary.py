@@ -4,17 +4,15 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from made import BALL, INERTIAL, converted
 from numpy.testing import assert_allclose
-from pxr import Usd, UsdGeom, UsdPhysics
-from test_urdf import BALL, INERTIAL
+from pxr import UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
-from magtwin.urdf.convert import convert_with_report
 from magtwin.urdf.description.description import origin_of, read_description
 from magtwin.urdf.description.kinematics import link_poses
 from magtwin.urdf.description.tag import KEPT
 from magtwin.urdf.description.vocabulary import GRAMMAR, unused
-from magtwin.urdf.options import Options
 from magtwin.urdf.write import write_urdf
 
 SOLID = """<inertial><origin xyz="1 2 3" rpy="0 0 0"/><mass value="2"/><inertia ixx="1" iyy="1" izz="1"
@@ -91,10 +89,7 @@ def test_every_attribute_that_the_grammar_uses_changes_what_is_read(tmp_path, ta
 def convert(tmp_path, text, **options):
     path = tmp_path / "robot.urdf"
     path.write_text(text)
-    out = tmp_path / "usd" / "robot.usda"
-    report = convert_with_report(path, out, options=Options(single_file=True, **options), force=True)
-    stage = Usd.Stage.Open(str(out))
-    stage.Reload()
+    stage, _, report = converted(path, **options)
     return stage, report
 
 
@@ -160,7 +155,7 @@ def test_a_quaternion_turns_a_link_and_comes_back_as_the_same_turn(tmp_path):
     T = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath("/arm/tip"))).T
     assert_allclose(T[:3], [[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 1]], atol=1e-12)
     assert_allclose(link_poses(tmp_path / "robot.urdf")["tip"], T, atol=1e-12)
-    write_urdf(tmp_path / "usd" / "robot.usda", tmp_path / "back.urdf")
+    write_urdf(tmp_path / "robot.usda", tmp_path / "back.urdf")
     back = read_description(tmp_path / "back.urdf").joints["tip"].origin
     assert_allclose(back, T, atol=1e-12)
 

@@ -5,9 +5,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from made import BODY, INERTIAL
 from numpy.testing import assert_allclose
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
-from test_urdf import BODY, INERTIAL
 
 from magtwin.author.from_urdf import link_poses, write_urdf
 from magtwin.cli import main
@@ -99,22 +99,18 @@ def assert_same_inertia(before, after):
         assert_allclose(I2, I1, rtol=0, atol=2e-7 * np.abs(I1).max(), err_msg=name)
 
 
-def test_our_robot_comes_back_with_equal_kinematics_and_inertia(tmp_path):
-    urdf = shipped("robots", "turtlebot4", "turtlebot4.urdf")
-    before, after, back = there_and_back(urdf, tmp_path, profile="diff-drive")
+@pytest.mark.parametrize("name", ["ours", "real"])
+def test_a_robot_comes_back_with_equal_kinematics_and_inertia(name, request, tmp_path):
+    if name == "ours":
+        urdf = shipped("robots", "turtlebot4", "turtlebot4.urdf")
+        before, after, back = there_and_back(urdf, tmp_path, profile="diff-drive")
+    else:
+        urdf, asset, _ = request.getfixturevalue("real_robot")
+        back = tmp_path / "back" / "robot.urdf"
+        write_urdf(asset, back)
+        before, after = read_description(urdf), read_description(back)
+        assert len(after.links) == 49
     assert (after.name, after.root) == (before.name, before.root)
-    assert {j.name for j in after.joints.values() if j.type in MOVING} == {
-        "left_wheel_joint",
-        "right_wheel_joint",
-    }
-    assert_same_kinematics(urdf, before, after, back, 1e-12)
-    assert_same_inertia(before, after)
-
-
-def test_the_real_robot_comes_back_with_equal_kinematics_and_inertia(real_data, tmp_path):
-    urdf = real_data / "turtlebot4" / "turtlebot4.urdf"
-    before, after, back = there_and_back(urdf, tmp_path)
-    assert len(after.links) == 49
     assert_same_kinematics(urdf, before, after, back, 1e-12)
     assert_same_inertia(before, after)
 
@@ -366,97 +362,68 @@ def small(tmp_path, **parts):
     return ElementTree.parse(tmp_path / "out" / "small.urdf").getroot()
 
 
-@pytest.mark.parametrize(
-    ("parts", "said"),
-    [
-        (
-            {"JOINT": f'string newton:mimicCoef0 = "x"; {MIMIC}', "MORE": LEADER},
-            "j>: newton:mimicCoef0 must be a",
-        ),
-        ({"JOINT": 'string newton:velocityLimit = "x"'}, "j>: newton:velocityLimit must be a number"),
-        ({"JOINT": 'string newton:damping = "x"'}, "j>: newton:damping must be a number"),
-        ({"JOINT": 'string drive:angular:physics:maxForce = "x"'}, "j>.* drive:angular:physics:maxForce"),
-        ({"JOINT": 'string physics:lowerLimit = "x"'}, "j>.* physics:lowerLimit"),
-        ({"BODY": 'string physics:mass = "x"'}, "base_link>.* physics:mass"),
-        (
-            {"BODY": 'float physics:mass = 1; string physics:diagonalInertia = "x"'},
-            "base_link>.*diagonalInertia",
-        ),
-        (
-            {"MORE": LEADER.replace("Revolute", "").replace("HERE", 'string limit:transX:physics:low = "x"')},
-            "low",
-        ),
-        (
-            {"BODY": MARKED.replace("FORM", 'string kind = "a b"')},
-            "m>: its customData magtwin:primitive is damaged",
-        ),
-        ({"BODY": MARKED.replace("FORM", 'string kind = "box"; double2 size = (1, 2)')}, "is damaged"),
-        ({"BODY": MARKED.replace("FORM", "string name = ''")}, "is damaged"),
-    ],
-)
-def test_a_value_of_another_type_is_refused_by_its_name(tmp_path, parts, said):
-    parts = {part: text.replace("HERE", "") for part, text in parts.items()}
-    with pytest.raises(InputError, match=said):
-        small(tmp_path, **parts)
+def inertial(figures):
+    return {"BODY": f"float physics:mass = 1; {figures}"}
+
+
+def marked(form):
+    return {"BODY": MARKED.replace("FORM", form)}
+
+
+def mimics(leader, more=""):
+    return {"JOINT": MIMIC.replace("k>", f"{leader}>"), "MORE": more}
+
+
+FREE = LEADER.replace("Revolute", "")
+REFUSED = [
+    # of another type
+    (
+        {"JOINT": f'string newton:mimicCoef0 = "x"; {MIMIC}', "MORE": LEADER},
+        "j>: newton:mimicCoef0 must be a",
+    ),
+    ({"JOINT": 'string newton:velocityLimit = "x"'}, "j>: newton:velocityLimit must be a number"),
+    ({"JOINT": 'string newton:damping = "x"'}, "j>: newton:damping must be a number"),
+    ({"JOINT": 'string drive:angular:physics:maxForce = "x"'}, "j>.* drive:angular:physics:maxForce"),
+    ({"JOINT": 'string physics:lowerLimit = "x"'}, "j>.* physics:lowerLimit"),
+    ({"BODY": 'string physics:mass = "x"'}, "base_link>.* physics:mass"),
+    (inertial('string physics:diagonalInertia = "x"'), "base_link>.*diagonalInertia"),
+    ({"MORE": FREE.replace("HERE", 'string limit:transX:physics:low = "x"')}, "low"),
+    (marked('string kind = "a b"'), "m>: its customData magtwin:primitive is damaged"),
+    (marked('string kind = "box"; double2 size = (1, 2)'), "is damaged"),
+    (marked("string name = ''"), "is damaged"),
+    # not finite
+    ({"JOINT": "float newton:damping = nan"}, "j>: newton:damping is nan"),
+    ({"JOINT": "float newton:friction = inf"}, 'j>: becomes <dynamics friction="inf">'),
+    ({"JOINT": "float physics:lowerLimit = nan"}, "j>: physics:lowerLimit is nan"),
+    ({"JOINT": "point3f physics:localPos0 = (0, inf, 0)"}, "j>: .*localPos0 is .0, inf, 0. .* not a frame"),
+    ({"JOINT": "quatf physics:localRot1 = (0, 0, 0, 0)"}, "j>: .*localRot1 .0, 0, 0, 0., not a frame"),
+    ({"BODY": "float physics:mass = nan"}, "base_link>: physics:mass is nan"),
+    ({"BODY": "float physics:mass = inf"}, 'base_link>: becomes <mass value="inf">'),
+    ({"BODY": "double physics:mass = 1e300"}, 'base_link>: becomes <mass value="inf">'),
+    (inertial("point3f physics:centerOfMass = (nan, 0, 0)"), "base_link>: physics:centerOfMass is .nan"),
+    (inertial("float3 physics:diagonalInertia = (1, 1, inf)"), "base_link>: becomes <inertia"),
+    (
+        {"BODY": 'double3 xformOp:translate = (nan, 0, 0); token[] xformOpOrder = ["xformOp:translate"]'},
+        "finite",
+    ),
+    ({"BODY": BALL.replace("OPACITY", "nan")}, "s>: becomes <color rgba="),
+    (marked('string kind = "sphere"; double radius = nan'), "m>: becomes <sphere radius"),
+    # a mimic needs another joint to follow
+    (mimics("k"), "j>: newton:mimicJoint must point to one prim of the stage, found /World/k"),
+    (mimics("wheel"), "j>: mimics </World/wheel>, not a joint of the robot"),
+    (mimics("k", LEADER.replace("Revolute", "Fixed")), "j>: mimics </World/k>, not a joint of the robot"),
+    (mimics("j"), "joints mimic in a circle: j -> j"),
+    (mimics("k", LEADER.replace("HERE", "rel newton:mimicJoint = </World/j>")), "circle: j -> k -> j"),
+]
+
+
+@pytest.mark.parametrize(("parts", "words"), REFUSED)
+def test_a_stage_of_impossible_values_is_refused_by_prim_and_name_and_nothing_is_written(
+    tmp_path, parts, words
+):
+    with pytest.raises(InputError, match=words):
+        small(tmp_path, **{part: text.replace("HERE", "") for part, text in parts.items()})
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("parts", "said"),
-    [
-        ({"JOINT": "float newton:damping = nan"}, "j>: newton:damping is nan"),
-        ({"JOINT": "float newton:friction = inf"}, 'j>: becomes <dynamics friction="inf">'),
-        ({"JOINT": "float physics:lowerLimit = nan"}, "j>: physics:lowerLimit is nan"),
-        (
-            {"JOINT": "point3f physics:localPos0 = (0, inf, 0)"},
-            "j>: .*localPos0 is .0, inf, 0. .* not a frame",
-        ),
-        ({"JOINT": "quatf physics:localRot1 = (0, 0, 0, 0)"}, "j>: .*localRot1 .0, 0, 0, 0., not a frame"),
-        ({"BODY": "float physics:mass = nan"}, "base_link>: physics:mass is nan"),
-        ({"BODY": "float physics:mass = inf"}, 'base_link>: becomes <mass value="inf">'),
-        ({"BODY": "double physics:mass = 1e300"}, 'base_link>: becomes <mass value="inf">'),
-        (
-            {"BODY": "float physics:mass = 1; point3f physics:centerOfMass = (nan, 0, 0)"},
-            "base_link>: physics:centerOfMass is .nan, 0, 0.",
-        ),
-        (
-            {"BODY": "float physics:mass = 1; float3 physics:diagonalInertia = (1, 1, inf)"},
-            "base_link>: becomes <inertia",
-        ),
-        (
-            {"BODY": 'double3 xformOp:translate = (nan, 0, 0); token[] xformOpOrder = ["xformOp:translate"]'},
-            "not finite",
-        ),
-        ({"BODY": BALL.replace("OPACITY", "nan")}, "s>: becomes <color rgba="),
-        (
-            {"BODY": MARKED.replace("FORM", 'string kind = "sphere"; double radius = nan')},
-            "m>: becomes <sphere radius",
-        ),
-    ],
-)
-def test_a_number_that_is_not_finite_is_refused_and_nothing_is_written(tmp_path, parts, said):
-    with pytest.raises(InputError, match=said):
-        small(tmp_path, **parts)
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("leader", "more", "said"),
-    [
-        ("k", "", "j>: newton:mimicJoint must point to one prim of the stage, found /World/k"),
-        ("wheel", "", "j>: mimics </World/wheel>, not a joint of the robot"),
-        ("k", LEADER.replace("Revolute", "Fixed"), "j>: mimics </World/k>, not a joint of the robot"),
-        ("j", "", "joints mimic in a circle: j -> j"),
-        (
-            "k",
-            LEADER.replace("HERE", "rel newton:mimicJoint = </World/j>"),
-            "joints mimic in a circle: j -> k -> j",
-        ),
-    ],
-)
-def test_a_mimic_joint_must_have_another_joint_to_follow(tmp_path, leader, more, said):
-    with pytest.raises(InputError, match=said):
-        small(tmp_path, JOINT=MIMIC.replace("k>", f"{leader}>"), MORE=more.replace("HERE", ""))
 
 
 def test_a_mimic_names_its_leader_as_the_urdf_does_even_if_prims_share_a_name(tmp_path):

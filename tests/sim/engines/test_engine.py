@@ -30,11 +30,6 @@ from magtwin.twin.twin import without_tracking_error
 DRIVE = DriveSpec()
 
 
-@pytest.fixture(scope="module")
-def twin(lab_scene):
-    return open_twin(lab_scene, network="none")
-
-
 def test_a_run_that_is_replayed_has_the_poses_of_the_run_to_the_last_bit(twin):
     path = figure8(half_length_m=0.6, half_width_m=0.3)
     first = simulate(twin, path, seed=3)

@@ -9,10 +9,10 @@ import subprocess
 import sys
 
 import pytest
+from made import urdf
 from numpy.testing import assert_allclose
 from places import TESTS
 from pxr import Usd, UsdPhysics
-from test_urdf import urdf
 
 from magtwin.urdf import convert_urdf
 from magtwin.urdf.options import Options

@@ -152,12 +152,7 @@ def test_each_robot_has_its_own_parameters(neural):
         metadata = {name: fact for name, fact in direct.metadata.items() if name != "session"}
         assert_same(run, Run(direct.columns, metadata))
     assert len({run["battery_fraction"][0] for run in runs}) == 3
-
-
-def test_robots_that_differ_in_their_session_alone_share_a_plan(neural):
-    robots = [draw_session(neural.scene.robot, np.random.default_rng(k)) for k in range(3)]
-    runs = sweep(neural, "figure8", [7, 7, 7], robots=robots, **SHORT)
-    assert len(runs._planned) == 1
+    assert len(runs._planned) == 1  # they differ in their sessions alone
 
 
 @pytest.mark.parametrize(

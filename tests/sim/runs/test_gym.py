@@ -15,15 +15,9 @@ from magtwin.errors import InputError  # noqa: E402
 from magtwin.run.run import COLUMNS  # noqa: E402
 from magtwin.sim.runs.stepped import SteppedRobots  # noqa: E402
 from magtwin.sim.session import draw_session  # noqa: E402
-from magtwin.twin import Twin, open_twin  # noqa: E402
 
 NAME = "magtwin/MagNav-v0"
 AHEAD = np.array([0.2, 0.0], np.float32)
-
-
-@pytest.fixture(scope="module")
-def twin(lab_scene) -> Twin:
-    return open_twin(lab_scene, magnetometer="physical")
 
 
 @pytest.fixture(scope="module")
@@ -119,26 +113,14 @@ def test_one_seed_is_one_episode_and_another_seed_another(twin):
     assert not np.array_equal(a[0], c[0])
 
 
-def test_robots_that_step_together_do_what_each_does_alone(twin):
-    many = vector(twin, 3, random_start=True)
-    actions = np.random.default_rng(1).uniform(-1, 1, (15, 3, 2)) * many.single_action_space.high
-    actions = actions.astype(np.float32)
-    together = drive(many, actions, seed=7)
-    for i in range(3):
-        one = gymnasium.make(NAME, scene=twin, random_start=True)
-        alone = drive(one, actions[:, i], seed=7 + i)
-        assert_allclose(together[0][:, i], alone[0], rtol=1e-6, atol=1e-6)
-        assert_allclose(together[1][:, i], alone[1], atol=1e-12)
-
-
 def test_vectors_agree_with_gymnasiums_own_through_the_ends_of_episodes(twin):
     options = {"scene": twin, "duration_s": 0.5, "random_start": True}
     ours = vector(twin, 2, duration_s=0.5, random_start=True)
     theirs = SyncVectorEnv([lambda: gymnasium.make(NAME, **options)] * 2)
     a, b = ours.reset(seed=3), theirs.reset(seed=3)
     assert_allclose(a[0], b[0], rtol=1e-6, atol=1e-6)
-    for _ in range(14):
-        actions = np.tile(AHEAD, (2, 1))
+    draw = np.random.default_rng(1).uniform(-1, 1, (14, 2, 2)) * ours.single_action_space.high
+    for actions in draw.astype(np.float32):
         a, b = ours.step(actions), theirs.step(actions)
         assert_allclose(a[0], b[0], rtol=1e-6, atol=1e-6)
         for x, y in zip(a[1:4], b[1:4], strict=True):

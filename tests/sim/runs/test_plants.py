@@ -17,7 +17,6 @@ from magtwin.sim.plant_families import PLANTS, draw_plant
 from magtwin.sim.runs.live import LiveRobot
 from magtwin.spec.plant import PlantSpec
 from magtwin.twin import (
-    Twin,
     author_scene,
     in_session,
     open_twin,
@@ -30,11 +29,6 @@ from magtwin.twin import (
 
 BRIEF = {"duration_s": 12.0, "rate_hz": 20.0, "lidar": "on"}
 EFFECTIVE = [name for name in PLANTS if name != "nominal"]
-
-
-@pytest.fixture(scope="module")
-def twin(lab_scene) -> Twin:
-    return open_twin(lab_scene, magnetometer="physical")
 
 
 @pytest.fixture(scope="module")

@@ -106,13 +106,6 @@ def test_readings_come_at_k_over_rate_for_the_whole_duration():
     assert_allclose(whole["p_world_base"][-1], [0.5, 0.2, 0.0], atol=0.002)
 
 
-def test_a_longer_duration_goes_on_along_the_path():
-    run = drive(duration_s=30.0)
-    assert run["p_world_base"][:, 0].max() == pytest.approx(0.5, abs=0.002)
-    assert run["p_world_base"][-1, 0] < 0.4  # on its way
-    assert np.abs(run["p_world_base"][:, 1] - 0.2).max() < 0.006
-
-
 def test_columns_of_the_truth_agree_with_each_other():
     run = drive(path=path_named("figure8"), rate_hz=1000.0, duration_s=20.0)
     assert_allclose(yaw_from_quat(run["q_world_base_xyzw"]), run["yaw"], atol=1e-12)
@@ -132,13 +125,6 @@ def test_the_map_is_read_at_base_links_pose():
     run = drive(path=path_named("figure8"), duration_s=20.0)
     assert_array_equal(run["b_map_nt"], MAP.lookup(run["p_world_base"][:, :2], run["yaw"]))
     assert not run["flag_outside_map"].any()
-
-
-def test_the_total_is_map_plus_disturbance_and_by_physics_the_truth():
-    run = drive(path=path_named("figure8"), duration_s=20.0)
-    assert_allclose(run["b_total_nt"], run["b_map_nt"] + run["b_disturbance_nt"], atol=1e-9)
-    assert_allclose(run["b_total_nt"], run["b_truth_nt"], atol=1e-9)
-    assert_allclose(np.linalg.norm(run["b_vector_nt"], axis=1), run["b_truth_nt"], rtol=1e-12)
 
 
 def test_without_sources_or_iron_the_truth_is_the_earths_field_seen_from_the_robot():
@@ -314,16 +300,6 @@ def test_with_a_network_the_exact_field_is_still_given_where_it_is_known():
     assert_array_equal(run["b_truth_nt"], drive(KNOWN)["b_truth_nt"])
 
 
-def test_a_reading_is_the_total_with_noise_rounded_to_the_resolution():
-    spec = MagnetometerSpec(noise_density_nt=5.0 / np.sqrt(135 / 2), resolution_nt=0.01)
-    run = drive(with_robot(KNOWN, magnetometer=spec), path_named("figure8"))
-    noise = run["b_measured_nt"] - run["b_total_nt"]
-    assert noise.std() == pytest.approx(5.0, rel=4 / np.sqrt(2 * run.rows))
-    assert noise.mean() == pytest.approx(0.0, abs=4 * 5 / np.sqrt(run.rows))
-    steps = run["b_measured_nt"] / 0.01
-    assert_allclose(steps, np.rint(steps), atol=1e-6)
-
-
 def test_every_error_has_an_address():
     spec = MagnetometerSpec(
         noise_density_nt=0.5, bandwidth_hz=20.0, heading_error_nt=3.0, vector_bias_nt=(50, 0, 0)
@@ -338,6 +314,8 @@ def test_every_error_has_an_address():
         assert_allclose(run["b_map_nt"] + run["b_disturbance_nt"], run["b_total_nt"], rtol=0, atol=1e-9)
         assert_allclose(run["b_total_nt"] + run["b_noise_nt"], run["b_measured_nt"], rtol=0, atol=1e-9)
         assert_allclose(np.linalg.norm(run["b_vector_nt"], axis=1), run["b_truth_nt"], rtol=1e-12)
+        if run.metadata["magnetometer"] == "physical":
+            assert_allclose(run["b_total_nt"], run["b_truth_nt"], rtol=0, atol=1e-9)
         assert np.abs(run["b_noise_nt"]).max() > 1
         off = (run["b_vector_measured_nt"] - run["b_vector_nt"]).mean(axis=0)
         # an axis is held for a reading on average, in which a field of 24,000 nT turns by about 1 mrad
@@ -414,11 +392,6 @@ def test_poses_off_the_map_are_flagged_whatever_they_read(outside):
     assert np.isfinite(run["b_truth_nt"]).all()
 
 
-def test_a_path_off_the_map_can_be_refused():
-    with pytest.raises(InputError, match="off the map"):
-        drive(anomaly_map=wavy_map((0.5, 3.5)), outside="raise")
-
-
 def test_masked_nodes_are_flagged():
     valid = np.ones((4, 15, 25), bool)
     valid[:, :, 12] = False  # x = 0
@@ -427,10 +400,6 @@ def test_masked_nodes_are_flagged():
     near = np.abs(run["p_world_base"][:, 0]) < 0.249
     assert run["flag_outside_map"][near].all()
     assert not run["flag_outside_map"][np.abs(run["p_world_base"][:, 0]) > 0.2501].any()
-
-
-def test_no_bump_where_the_path_keeps_clear():
-    assert not drive(path=path_named("lawnmower"))["flag_bump"].any()
 
 
 def test_a_wall_that_a_corner_swings_over_is_a_bump():
@@ -483,6 +452,7 @@ def test_a_single_reading_is_a_run_too():
             r"3600 s at 10000 Hz make 3\.6e\+07 readings, more than 20,000,000; lower `rate_hz` to 5556 Hz, "
             r"or `duration_s` to 2000 s",
         ),
+        ({"anomaly_map": wavy_map((0.5, 3.5)), "outside": "raise"}, "off the map"),
         ({"lidar": "maybe"}, 'lidar must be "schedule", "on" or "off"'),
         ({"outside": "guess"}, 'outside must be "nan", "clamp" or "raise"'),
         (

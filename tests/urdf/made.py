@@ -1,0 +1,52 @@
+"""Descriptions that the tests of this folder make, and what they become."""
+
+import textwrap
+
+import numpy as np
+from pxr import Usd, UsdPhysics
+
+from magtwin.urdf.convert import convert_with_report
+from magtwin.urdf.options import Options
+
+INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+BALL = '<geometry><sphere radius="0.1"/></geometry>'
+BODY = f"{INERTIAL}<visual>{BALL}</visual><collision>{BALL}</collision>"
+
+
+def urdf(tmp_path, body, name="arm"):
+    """A URDF file around `body`; {INERTIAL} and {BODY} stand for usual contents of a link."""
+    text = textwrap.dedent(body).replace("{INERTIAL}", INERTIAL).replace("{BODY}", BODY)
+    path = tmp_path / f"{name}.urdf"
+    path.write_text(f'<?xml version="1.0"?>\n<robot name="{name}">\n{text}\n</robot>\n')
+    return path
+
+
+def arm(tmp_path, joint, child="{BODY}"):
+    """Two links held by a joint called j, whose inner XML is given."""
+    kind, _, inner = joint.partition("|")
+    return urdf(
+        tmp_path,
+        f"""<link name="base_link">{{BODY}}</link>
+        <link name="hand">{child}</link>
+        <joint name="j" type="{kind}"><parent link="base_link"/><child link="hand"/>{inner}</joint>""",
+    )
+
+
+def converted(path, **options):
+    """The stage of a description, its robot's prim, and the report; a single file unless it is told."""
+    out = path.with_suffix(".usda")
+    report = convert_with_report(path, out, options=Options(**{"single_file": True} | options), force=True)
+    stage = Usd.Stage.Open(str(out))
+    stage.Reload()
+    return stage, stage.GetDefaultPrim(), report
+
+
+def prim(robot, name):
+    return next(p for p in Usd.PrimRange(robot) if p.GetName() == name)
+
+
+def drive_of(robot, name, axis="angular"):
+    """Drive of a joint, its stiffness and its damping, per radian or metre."""
+    drive = UsdPhysics.DriveAPI(prim(robot, name), axis)
+    unit = 180 / np.pi if axis == "angular" else 1.0
+    return drive, drive.GetStiffnessAttr().Get() * unit, drive.GetDampingAttr().Get() * unit
