@@ -2,7 +2,7 @@
 
     python benchmarks/training.py [--steps N] [--rows N] [--threads N]
 
-magtwin's is `magtwin.learn.models.fit_network.train` as `magtwin train` calls it: 600,000 x 20 float64
+magtwin's is `magtwin.learn.training.fit_network.train` as `magtwin train` calls it: 600,000 x 20 float64
 rows, 1,024 a step,
 dropout .3, Adam. The bare loop is what one writes with torch alone: the same layers in eager mode with ReLU
 and Dropout, tensors in memory, shuffled indices, mean squared error, fused Adam. The bare products are those
@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from magtwin.learn.data.features import FULL
-from magtwin.learn.models.fit_network import train
+from magtwin.learn.training.fit_network import train
 
 WANTED, GOAL = 0.95, 0.80
 LAYERS = (512, 512, 512, 512)

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-import torch
 
 import magtwin as mt
 from magtwin.extend import predictor
@@ -27,7 +26,7 @@ class Mean(Regressor):
         return tuple(np.full(len(x), value) for value in self.values)
 
     def tensors(self):
-        return {**self.inputs.tensors(), "values": torch.as_tensor(self.values)}
+        return {**self.inputs.tensors(), "values": self.values}
 
     def settings(self):
         return {}
@@ -49,10 +48,10 @@ class MeanKind:
 
     @staticmethod
     def load(weights):
-        like = {**scaler_tensors(len(weights.features)), "values": torch.ones(2, dtype=torch.float64)}
+        like = {**scaler_tensors(len(weights.features)), "values": np.ones(2)}
         tensors = weights.fit(like)
         inputs = inputs_from(weights.features, tensors, weights.path)
-        return Mean(inputs=inputs, values=tensors["values"].numpy(), residual_sd_nt=weights.residual_sd_nt)
+        return Mean(inputs=inputs, values=tensors["values"], residual_sd_nt=weights.residual_sd_nt)
 
 
 twin = mt.open_twin(mt.author_scene("lab", out="lab"), magnetometer="physical")

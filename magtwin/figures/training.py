@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from magtwin.figures.canvas import INK, MAP_INK, OTHER_INK, WIDTH_IN, label, legend_below, new_figure
 from magtwin.learn.data.correlation import PAPER, Correlations
-from magtwin.learn.models.descent import Epoch
+from magtwin.learn.models.predictor import Epoch
 from magtwin.outputs import output
 
 
@@ -22,7 +22,7 @@ def draw_learning_curve(
     """Draw the errors on the training and the validation rows over the epochs.
 
     Args:
-        history: Result of `magtwin.learn.models.fit_network.train`.
+        history: Result of `magtwin.learn.training.fit_network.train`.
         naive_rmse_nt: Error of the mean training label on the validation rows [nT], drawn as a line.
         title: Title of the picture.
     """

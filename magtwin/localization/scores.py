@@ -263,12 +263,12 @@ def anees_interval(squares: Array, states: int, level: float = 0.95) -> tuple[fl
     Returns:
         Lower and upper end; nan without finite errors.
     """
-    from scipy.stats import chi2
+    from scipy.special import gammaincinv
 
     if not len(squares) or not np.isfinite(squares).all():
         return math.nan, math.nan
     freedom = states * independent(squares)
-    low, high = chi2.ppf([(1 - level) / 2, (1 + level) / 2], freedom) / freedom
+    low, high = 2 * gammaincinv(freedom / 2, [(1 - level) / 2, (1 + level) / 2]) / freedom
     return float(low), float(high)
 
 

@@ -64,6 +64,7 @@ def test_the_disturbance_column_is_what_torch_predicts_from_the_twenty_signals(r
     import torch
 
     from magtwin.learn.models.network import load_net
+    from magtwin.learn.training.module import NetModule
 
     run, real = real_run
     odometry, imu = np.hstack([run["odom_v"], run["odom_w"]]), np.hstack([run["imu_w"], run["imu_a"]])
@@ -79,8 +80,8 @@ def test_the_disturbance_column_is_what_torch_predicts_from_the_twenty_signals(r
         ]
     )
     assert x.shape[1] == 20
-    released = load_net(real / "models" / "nn_magnetometer_model_v0.0.1.pth").double()
-    layers = [part for linear in released.linears for part in (linear, torch.nn.ReLU())]
+    released = NetModule.of(load_net(real / "models" / "nn_magnetometer_model_v0.0.1.pth")).double()
+    layers = [part for linear in released.layers for part in (linear, torch.nn.ReLU())]
     with torch.no_grad():
         z = torch.nn.Sequential(*layers[:-1])((torch.tensor(x) - released.x_mean) / released.x_scale)
         expected = (released.y_mean + released.y_scale * z.squeeze(-1)).numpy()

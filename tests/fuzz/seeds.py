@@ -528,7 +528,7 @@ def _tensors() -> Any:
 
 
 def _state(file: Path) -> None:
-    call("learn.models.state:save_state", file, _tensors(), _SETTINGS, [{"epoch": 1, "loss": 0.5}])
+    call("learn.training.state:save_state", file, _tensors(), _SETTINGS, [{"epoch": 1, "loss": 0.5}])
 
 
 def _tolles_lawson(file: Path) -> None:
@@ -813,7 +813,7 @@ FORMATS: Mapping[str, Format] = {
     "state": Format(
         "x.safetensors",
         _state,
-        lambda file: call("learn.models.state:load_state", file, _tensors(), _SETTINGS),
+        lambda file: call("learn.training.state:load_state", file, _tensors(), _SETTINGS),
     ),
     "tolles-lawson": Format("x.json", _tolles_lawson, _read_tolles_lawson),
     "dataset": Format("dataset.json", _dataset, _read_dataset),

@@ -10,7 +10,7 @@ from magtwin.errors import InputError
 from magtwin.kinds import SWEEP, kind_of
 
 if TYPE_CHECKING:
-    from magtwin.learn.models.descent import Epoch
+    from magtwin.learn.models.predictor import Epoch
 
 
 @app.command

@@ -9,7 +9,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from magtwin.io.rerun.recording import stream
-from magtwin.learn.models.descent import Epoch
+from magtwin.learn.models.predictor import Epoch
 from magtwin.outputs import output
 
 
@@ -24,7 +24,7 @@ def record_learning_curve(
     """Write the epochs of a training as a recording that opens as a plot, on a timeline of epochs.
 
     Args:
-        history: Result of `magtwin.learn.models.fit_network.train`.
+        history: Result of `magtwin.learn.training.fit_network.train`.
         out: The .rrd file to make.
         naive_rmse_nt: Error of the mean training label on the validation rows [nT], drawn as a line.
         title: Name of the recording in the viewer. Default: the file's name.

@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
@@ -38,10 +38,9 @@ class Inputs(Summarized):
     high: Array
     """Largest training inputs, shape (F,); nan if unknown."""
 
-    def tensors(self) -> dict[str, torch.Tensor]:
+    def tensors(self) -> dict[str, Array]:
         """Scaler and ranges as tensors of a weights file, by name, float64."""
-        values = (self.mean, self.scale, self.low, self.high)
-        return {name: torch.as_tensor(value) for name, value in zip(SCALERS, values, strict=True)}
+        return dict(zip(SCALERS, (self.mean, self.scale, self.low, self.high), strict=True))
 
     def grown(self, other: "Inputs") -> "Inputs":
         """The same scaler, with ranges extended by those of other rows; unknown ranges stay unknown.
@@ -110,12 +109,12 @@ def inputs_of(x: ArrayLike, features: str | Sequence[str]) -> Inputs:
     return Inputs(feature_names(features), x.mean(axis=0), scale, x.min(axis=0), x.max(axis=0))
 
 
-def scaler_tensors(count: int) -> dict[str, torch.Tensor]:
+def scaler_tensors(count: int) -> dict[str, Array]:
     """Tensors with the names, shapes and types of the scaler and ranges of `count` inputs."""
-    return dict.fromkeys(SCALERS, torch.ones(count, dtype=torch.float64))
+    return dict.fromkeys(SCALERS, np.ones(count))
 
 
-def inputs_from(features: Sequence[str], tensors: Mapping[str, torch.Tensor], path: Path) -> Inputs:
+def inputs_from(features: Sequence[str], tensors: Mapping[str, NDArray[Any]], path: Path) -> Inputs:
     """Scaler and ranges of a weights file.
 
     Args:
@@ -126,7 +125,7 @@ def inputs_from(features: Sequence[str], tensors: Mapping[str, torch.Tensor], pa
     Raises:
         InputError: A scale is not above 0.
     """
-    mean, scale, low, high = (tensors[name].numpy() for name in SCALERS)
+    mean, scale, low, high = (tensors[name] for name in SCALERS)
     if not (scale > 0).all():
         raise InputError(f"{path}: a scale of its scalers is not above 0")
     return Inputs(tuple(features), mean, scale, low, high)

@@ -157,15 +157,15 @@ class NeuralMagnetometer(Summarized):
         Raises:
             InputError: A run lacks a column that the network reads.
         """
-        parts = [features(run, self.features) for run in runs]
-        x = parts[0] if len(parts) == 1 else np.concatenate(parts)
-        ends = np.cumsum([run.rows for run in runs])[:-1]
-        mean, sd = (np.split(values, ends) for values in self.net.predict(x))
-        flags = np.split(self.net.outside(x), ends) if outside else [None] * len(runs)
         known = [self.knows(run.metadata) for run in runs] if known is None else known
-        wide = [None if own else self.net.wide_sd_nt(part) for own, part in zip(known, parts, strict=True)]
-        texts = [self._intervals(own, sd is not None) for own, sd in zip(known, wide, strict=True)]
-        return [Read(*values) for values in zip(mean, sd, flags, wide, texts, strict=True)]
+        return [self._read(run, outside, own) for run, own in zip(runs, known, strict=True)]
+
+    def _read(self, run: Run, outside: bool, known: bool) -> Read:
+        x = features(run, self.features)
+        mean, sd = self.net.predict(x)
+        wide = None if known else self.net.wide_sd_nt(x)
+        flags = self.net.outside(x) if outside else None
+        return Read(mean, sd, flags, wide, self._intervals(known, wide is not None))
 
     def _intervals(self, known: bool, wide: bool) -> str:
         """Which robots the intervals of a run hold for, in words."""

@@ -217,10 +217,10 @@ class _Graph:
         """Disturbance of a multilayer perceptron, (rows,)."""
         z = self.scaled(net.inputs, x)
         h = self.add("Cast", z, to=self._onnx.TensorProto.FLOAT)
-        for i, layer in enumerate(net.linears):
-            weight, bias = (self.constant(part.detach().numpy()) for part in (layer.weight, layer.bias))
+        for i, layer in enumerate(net.layers):
+            weight, bias = (self.constant(part) for part in layer)
             h = self.add("Gemm", h, weight, bias, transB=1)
-            h = self.add("Relu", h) if i < len(net.linears) - 1 else h
+            h = self.add("Relu", h) if i < len(net.layers) - 1 else h
         column = self.add("Gather", h, self.constant(np.array(0)), axis=1)
         y = self.add("Cast", column, to=self._onnx.TensorProto.DOUBLE)
         y = self.add("Mul", y, self.constant(float(net.y_scale)))

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from magtwin.compiled import Loops
@@ -105,7 +104,7 @@ class Reader:
         try:
             lookup.warm_up()
             self._predict_row = _compiled_path(predictor, LOOPS.open())
-        except ImportError:  # without numba: the same numbers, in numpy and torch
+        except ImportError:  # without numba: the same numbers, in numpy
             pass
 
     @property
@@ -280,11 +279,10 @@ def _compiled_path(predictor: Predictor, code: Any) -> PredictRow | None:
 
 def _net(net: FieldNet, code: Any, clip: Inputs | None = None) -> PredictRow:
     """A perceptron; its inputs are clipped to the training ranges of `clip` if given."""
-    y_mean, y_scale, known, wide = float(net.y_mean), float(net.y_scale), net.residual_sd_nt, net.wide
+    y_mean, y_scale, known, wide = net.y_mean, net.y_scale, net.residual_sd_nt, net.wide
     ranges = _ranges(net.inputs, clip)
     widths = np.array([len(net.features), *net.hidden, 1])
-    parts = [part.detach().t().reshape(-1) for layer in net.linears for part in (layer.weight, layer.bias)]
-    table = torch.cat(parts).numpy()
+    table = np.concatenate([part.T.reshape(-1) for layer in net.layers for part in layer])
     z, work, out = np.empty(widths[0]), np.empty(2 * int(widths.max()), np.float32), np.empty(1)
     forward = code.perceptron
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike
 
 from magtwin.errors import InputError
@@ -152,12 +151,12 @@ class Mixed(Regressor):
             metadata=kept,
         )
 
-    def tensors(self) -> dict[str, torch.Tensor]:
+    def tensors(self) -> dict[str, Array]:
         """Scaler, ranges, effects and spreads, float64."""
         return {
             **self.inputs.tensors(),
             **{
-                f"{name}_{part}": torch.tensor(value)  # a copy: open loop, the two are one
+                f"{name}_{part}": value
                 for name, effects in (("prior", self.prior), ("session", self.session))
                 for part, value in (("mean_nt", effects.mean), ("covariance_nt2", effects.covariance))
             },
@@ -211,15 +210,14 @@ def mixed_of(weights: Weights) -> Mixed:
     like = {
         **scaler_tensors(count),
         **{
-            f"{name}_{part}": torch.ones(shape, dtype=torch.float64)
+            f"{name}_{part}": np.ones(shape)
             for name in ("prior", "session")
             for part, shape in shapes.items()
         },
         **spread_like("spread", count),
         **spread_like("noise", count),
     }
-    tensors = weights.fit(like)
-    held = {name: value.numpy() for name, value in tensors.items()}
+    held = weights.fit(like)
     for name in ("prior", "session"):
         covariance = held[f"{name}_covariance_nt2"]
         if not np.allclose(covariance, covariance.T) or np.linalg.eigvalsh(covariance)[0] <= 0:
@@ -235,11 +233,11 @@ def mixed_of(weights: Weights) -> Mixed:
         return Effects(held[f"{name}_mean_nt"], held[f"{name}_covariance_nt2"])
 
     return Mixed(
-        inputs=inputs_from(weights.features, tensors, weights.path),
+        inputs=inputs_from(weights.features, held, weights.path),
         prior=effects("prior"),
         session=effects("session"),
-        spread=spread_from(tensors, "spread", weights.path),
-        noise=spread_from(tensors, "noise", weights.path),
+        spread=spread_from(held, "spread", weights.path),
+        noise=spread_from(held, "noise", weights.path),
         intervals=intervals,  # type: ignore[arg-type]
         factors={name: weights.number(f"factor_{name}", above=0.0) for name in FACTORS},
         widening=weights.number("widening", above=0.0),

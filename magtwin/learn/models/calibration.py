@@ -4,9 +4,9 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
@@ -50,31 +50,27 @@ class Spread:
         """The spread with standard deviations `factor` times as large."""
         return Spread(self.floor_nt2 * factor**2, self.slopes_nt2 * factor**2)
 
-    def tensors(self, name: str) -> dict[str, torch.Tensor]:
+    def tensors(self, name: str) -> dict[str, Array]:
         """It as tensors of a weights file, float64."""
         parts = (self.floor_nt2, self.slopes_nt2)
-        return {
-            f"{name}_{part}": torch.tensor(value, dtype=torch.float64)
-            for part, value in zip(_PARTS, parts, strict=True)
-        }
+        return {f"{name}_{part}": np.array(value, float) for part, value in zip(_PARTS, parts, strict=True)}
 
 
 _PARTS = ("floor_nt2", "slopes_nt2")
 
 
-def spread_like(name: str, count: int) -> dict[str, torch.Tensor]:
+def spread_like(name: str, count: int) -> dict[str, Array]:
     """Tensors with the names, shapes and types of a spread of `count` inputs."""
-    shapes = ((), (count,))
-    return {f"{name}_{p}": torch.ones(s, dtype=torch.float64) for p, s in zip(_PARTS, shapes, strict=True)}
+    return Spread(1.0, np.ones(count)).tensors(name)
 
 
-def spread_from(tensors: Mapping[str, torch.Tensor], name: str, path: str | os.PathLike[str]) -> Spread:
+def spread_from(tensors: Mapping[str, NDArray[Any]], name: str, path: str | os.PathLike[str]) -> Spread:
     """The spread among the tensors of a weights file.
 
     Raises:
         InputError: A variance is below 0.
     """
-    floor, slopes = (tensors[f"{name}_{part}"].numpy() for part in _PARTS)
+    floor, slopes = (tensors[f"{name}_{part}"] for part in _PARTS)
     if floor <= 0 or (slopes < 0).any():
         raise InputError(f"{path}: a variance of its {name} is below 0")
     return Spread(float(floor), slopes)
@@ -139,7 +135,7 @@ def few_groups_factor(error_nt: Array, groups: NDArray[np.intp]) -> float:
         error_nt: Errors [nT], shape (N,).
         groups: Recording of each row, shape (N,).
     """
-    from scipy.stats import t
+    from scipy.special import stdtrit
 
     number, counts = _numbered(groups)
     if len(counts) < 2:
@@ -147,7 +143,7 @@ def few_groups_factor(error_nt: Array, groups: NDArray[np.intp]) -> float:
     means = np.bincount(number, error_nt) / counts
     whole = float(np.mean(np.bincount(number, error_nt**2) / counts))
     between = min(1.0, float(np.mean(means**2)) / whole) if whole > 0 else 0.0
-    wide = min(float(t.ppf(0.5 + WITHIN / 2, len(counts) - 1)) / Z_90, MOST_FACTOR)
+    wide = min(float(stdtrit(len(counts) - 1, 0.5 + WITHIN / 2)) / Z_90, MOST_FACTOR)
     return math.sqrt(1 - between + between * wide**2)
 
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy._core import multiarray
+from numpy.typing import NDArray
 
 from magtwin.budget import BUDGETS, check_decoded
 from magtwin.errors import InputError
@@ -45,7 +46,7 @@ SAFE_GLOBALS: list[Any] = [
 """What a checkpoint may name beside tensors."""
 
 
-def read_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dict[str, str | int]]:
+def read_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[str, str | int]]:
     """Read a released checkpoint without executing anything in it.
 
     Args:
@@ -67,7 +68,7 @@ def read_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tenso
             tensors |= {f"{name}_mean": mean, f"{name}_scale": scale}
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    tensors |= {name: torch.full_like(tensors["x_mean"], torch.nan) for name in ("x_min", "x_max")}
+    tensors |= {name: np.full_like(tensors["x_mean"], np.nan) for name in ("x_min", "x_max")}
     scaler = vars(saved["scaler_X"])
     rows, version = scaler.get("n_samples_seen_"), scaler.get("_sklearn_version")
     known = isinstance(version, str) and re.fullmatch(r"[\w.+-]{1,40}", version)
@@ -143,12 +144,13 @@ def _is_codec(text: str) -> bool:
         return False
 
 
-def _layers(state: Any, path: Path) -> dict[str, torch.Tensor]:
+def _layers(state: Any, path: Path) -> dict[str, NDArray[Any]]:
     """Linear layers of a state dict `name.weight`, `name.bias`, numbered in the order of the file."""
     if not isinstance(state, dict) or not state:
         raise InputError("model_state_dict holds no tensors")
     numbers: dict[str, int] = {}
-    tensors, held = {}, 0
+    tensors: dict[str, NDArray[Any]] = {}
+    held = 0
     for name, tensor in state.items():
         layer, _, part = str(name).rpartition(".")
         if not isinstance(tensor, torch.Tensor) or part not in ("weight", "bias"):
@@ -157,11 +159,12 @@ def _layers(state: Any, path: Path) -> dict[str, torch.Tensor]:
             raise InputError(f"tensor {name!r} is larger than what the file stores for it")
         held += 4 * tensor.numel()  # tensors can share what is stored
         check_decoded(path, path.stat().st_size, held)
-        tensors[f"layers.{numbers.setdefault(layer, len(numbers))}.{part}"] = tensor.float().contiguous()
+        number = numbers.setdefault(layer, len(numbers))
+        tensors[f"layers.{number}.{part}"] = tensor.float().contiguous().numpy()
     return tensors
 
 
-def _scaler(name: str, saved: dict[str, Any]) -> tuple[torch.Tensor, torch.Tensor]:
+def _scaler(name: str, saved: dict[str, Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Mean and scale of a StandardScaler, each (F,), or () for one column."""
     if not isinstance(saved[name], StoredScaler):
         raise InputError(f"{name} is not a StandardScaler")
@@ -174,4 +177,4 @@ def _scaler(name: str, saved: dict[str, Any]) -> tuple[torch.Tensor, torch.Tenso
         raise InputError(f"{name} has {max(mean.size, scale.size):,} columns")
     mean = np.zeros_like(mean) if values.get("with_mean") is False else mean
     scale = np.ones_like(mean) if values.get("with_std") is False else scale
-    return torch.tensor(mean), torch.tensor(scale)
+    return mean, scale

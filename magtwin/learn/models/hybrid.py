@@ -5,16 +5,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.learn.data.inputs import Array, Inputs
 from magtwin.learn.models.linear import Linear, like, linear_from
 from magtwin.learn.models.network import FieldNet, net_of
 from magtwin.learn.models.regressor import Regressor
-from magtwin.learn.models.state import tensors_below
-from magtwin.learn.models.weights import Weights
+from magtwin.learn.models.weights import Weights, tensors_below
 from magtwin.report import Figure
 
 
@@ -59,11 +57,11 @@ class Hybrid(Regressor):
             mean += self.net.predict(np.clip(x, self.inputs.low, self.inputs.high))[0]
         return mean, sd * self.sd_factor
 
-    def tensors(self) -> dict[str, torch.Tensor]:
+    def tensors(self) -> dict[str, NDArray[Any]]:
         """Tensors of the base and of the network, prefixed."""
         tensors = {f"base.{name}": value for name, value in self.base.tensors().items()}
         if self.net is not None:
-            tensors |= {f"net.{name}": value for name, value in self.net.state_dict().items()}
+            tensors |= {f"net.{name}": value for name, value in self.net.tensors().items()}
         return tensors
 
     def settings(self) -> dict[str, Any]:

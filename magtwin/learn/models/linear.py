@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
@@ -78,12 +77,12 @@ class Linear(Regressor):
         z = self.inputs.scaled(self.inputs.checked(x))
         return self.mean_nt(z), self.spread.sd_nt(z)
 
-    def tensors(self) -> dict[str, torch.Tensor]:
+    def tensors(self) -> dict[str, Array]:
         """Scaler, ranges, coefficients and spread, float64."""
         return {
             **self.inputs.tensors(),
-            "constant_nt": torch.tensor(self.constant_nt, dtype=torch.float64),
-            "coefficients_nt": torch.as_tensor(self.coefficients_nt),
+            "constant_nt": np.array(self.constant_nt),
+            "coefficients_nt": self.coefficients_nt,
             **self.spread.tensors("spread"),
         }
 
@@ -204,7 +203,7 @@ def linear_of(weights: Weights) -> Linear:
     return model
 
 
-def linear_from(weights: Weights, tensors: Mapping[str, torch.Tensor]) -> Linear:
+def linear_from(weights: Weights, tensors: Mapping[str, NDArray[Any]]) -> Linear:
     """A linear model from tensors, with the settings of a weights file.
 
     Raises:
@@ -213,19 +212,19 @@ def linear_from(weights: Weights, tensors: Mapping[str, torch.Tensor]) -> Linear
     return Linear(
         inputs=inputs_from(weights.features, tensors, weights.path),
         constant_nt=float(tensors["constant_nt"]),
-        coefficients_nt=tensors["coefficients_nt"].numpy(),
+        coefficients_nt=tensors["coefficients_nt"],
         spread=spread_from(tensors, "spread", weights.path),
         penalty=weights.number("penalty"),
         weighted=weights.expect("weighted", bool),
     )
 
 
-def like(count: int) -> dict[str, torch.Tensor]:
+def like(count: int) -> dict[str, Array]:
     """Tensors with the names, shapes and types of a linear model of `count` features."""
     return {
         **scaler_tensors(count),
-        "coefficients_nt": torch.ones(count, dtype=torch.float64),
-        "constant_nt": torch.ones((), dtype=torch.float64),
+        "coefficients_nt": np.ones(count),
+        "constant_nt": np.array(1.0),
         **spread_like("spread", count),
     }
 

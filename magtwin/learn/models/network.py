@@ -1,148 +1,65 @@
 """FieldNet: a multilayer perceptron that predicts the disturbance, with its scalers, in one file."""
 
 import itertools
-import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.files import sha256
 from magtwin.kinds import expected
-from magtwin.learn.data.features import FULL, feature_names
-from magtwin.learn.data.inputs import Inputs, inputs_of
-from magtwin.learn.models.calibration import Spread
-from magtwin.learn.models.checkpoint import read_checkpoint
-from magtwin.learn.models.perceptron import outputs
-from magtwin.learn.models.regressor import summary_of, wide_figures, wide_sd_nt
-from magtwin.learn.models.weights import (
-    MetadataValue,
-    Weights,
-    is_checkpoint,
-    read_weights,
-    say,
-    shown,
-    write_weights,
-)
-from magtwin.report import Figure, Report
-from magtwin.summary import Summarized, Summary
-
-Array = NDArray[np.float64]
-
-_SCALERS = ("x_mean", "x_scale", "x_min", "x_max", "y_mean", "y_scale")
+from magtwin.learn.data.features import FULL
+from magtwin.learn.data.inputs import Array, inputs_from, scaler_tensors
+from magtwin.learn.models.perceptron import Layer, outputs
+from magtwin.learn.models.regressor import Regressor
+from magtwin.learn.models.weights import Weights, is_checkpoint, read_weights, say
+from magtwin.report import Figure
 
 
-class FieldNet(Summarized, torch.nn.Module):
-    """Disturbance of the field magnitude [nT] from features of a Run, (B, F) -> (B,).
+@dataclass(kw_only=True, repr=False)
+class FieldNet(Regressor):
+    """Disturbance of the field magnitude [nT] from features of a Run, (N, F) -> (N,).
 
     A multilayer perceptron between two scalers:
 
         y = y_mean + y_scale * W_L relu(... relu(W_1 z + b_1) ...) + b_L,   z = (x - x_mean) / x_scale
 
-    Inputs are scaled in float64; with the scaler in float32 weights the error rises from 0.003 to 0.1 nT. In
-    training, dropout follows every hidden layer but the last.
+    Inputs are scaled in float64; with the scaler in float32 weights the error rises from 0.003 to 0.1 nT.
     """
 
+    layers: tuple[Layer, ...]
+    """Linear layers, first to last."""
+
+    y_mean: float = 0.0
+    """Mean of the training labels [nT]."""
+
+    y_scale: float = 1.0
+    """Scale of the training labels [nT], above 0."""
+
+    dropout: float = 0.3
+    """Share of units dropped in training."""
+
     kind = "mlp"
-
-    x_mean: torch.Tensor
-    """Means of the training inputs, in the units of the features, shape (F,), float64."""
-    x_scale: torch.Tensor
-    """Scales of the training inputs, shape (F,), float64, above 0."""
-    x_min: torch.Tensor
-    """Smallest training inputs, shape (F,), float64; nan if unknown."""
-    x_max: torch.Tensor
-    """Largest training inputs, shape (F,), float64; nan if unknown."""
-    y_mean: torch.Tensor
-    """Mean of the training labels [nT], shape (), float64."""
-    y_scale: torch.Tensor
-    """Scale of the training labels [nT], shape (), float64, above 0."""
-
-    def __init__(
-        self,
-        features: str | Sequence[str] = "full",
-        hidden: Sequence[int] = (512, 512, 512, 512),
-        *,
-        dropout: float = 0.3,
-        residual_sd_nt: float = math.nan,
-        metadata: Mapping[str, MetadataValue] | None = None,
-        device: str | None = None,
-    ) -> None:
-        """Make a network with random weights and identity scalers.
-
-        Args:
-            features: Names of the inputs, in order, or the name of a set.
-            hidden: Widths of the hidden layers.
-            dropout: Share of units dropped in training.
-            residual_sd_nt: Root mean square error on held-out runs [nT]; nan if unknown.
-            metadata: Provenance: training data, source, licence.
-            device: Where the layers are; "meta" takes no memory.
-        """
-        super().__init__()
-        self.features = feature_names(features)
-        self.dropout = dropout
-        self.residual_sd_nt = residual_sd_nt
-        self.metadata: dict[str, MetadataValue] = dict(metadata or {})
-        self.wide: Spread | None = None
-        if not hidden or not all(width > 0 for width in hidden) or not 0 <= dropout < 1:
-            raise InputError(
-                f"a network needs hidden layers above 0 wide and dropout in 0..1, "
-                f"got {tuple(hidden)} and {dropout}"
-            )
-        widths = [len(self.features), *hidden, 1]
-        self.layers = torch.nn.ModuleList(
-            torch.nn.Linear(a, b, device=device) for a, b in itertools.pairwise(widths)
-        )
-        ones = torch.ones(len(self.features), dtype=torch.float64)
-        start = (0 * ones, ones, math.nan * ones, math.nan * ones, 0 * ones[0], ones[0].clone())
-        for name, value in zip(_SCALERS, start, strict=True):
-            self.register_buffer(name, value)
 
     @property
     def hidden(self) -> tuple[int, ...]:
         """Widths of the hidden layers."""
-        return tuple(layer.out_features for layer in self.linears[:-1])
-
-    @property
-    def linears(self) -> list[torch.nn.Linear]:
-        """The linear layers, first to last."""
-        return [layer for layer in self.layers if isinstance(layer, torch.nn.Linear)]
+        return tuple(len(layer.bias) for layer in self.layers[:-1])
 
     @property
     def parameters_count(self) -> int:
         """Number of weights and biases."""
-        return sum(p.numel() for p in self.parameters())
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Disturbances [nT], shape (B,), float64, from features in their units, shape (B, F)."""
-        h = ((x - self.x_mean) / self.x_scale).to(self.linears[0].weight.dtype)
-        return self.y_mean + self.y_scale * self.body(h).to(self.y_mean.dtype)
-
-    def body(
-        self, z: torch.Tensor, drop: Callable[[torch.Tensor], torch.Tensor] | None = None
-    ) -> torch.Tensor:
-        """Scaled labels, shape (B,), from scaled features, shape (B, F); `drop` replaces torch's dropout."""
-        *inner, last = self.linears
-        for i, layer in enumerate(inner):
-            z = torch.relu(layer(z))
-            if i < len(inner) - 1:
-                z = drop(z) if drop else torch.nn.functional.dropout(z, self.dropout, self.training)
-        return last(z).squeeze(-1)
+        return sum(part.size for layer in self.layers for part in layer)
 
     @property
     def layers_text(self) -> str:
         """Widths from inputs to output, as 20-512-1."""
         return "-".join(str(n) for n in (len(self.features), *self.hidden, 1))
-
-    @property
-    def inputs(self) -> Inputs:
-        """Scaler and ranges of the inputs."""
-        scalers = (self.x_mean, self.x_scale, self.x_min, self.x_max)
-        return Inputs(self.features, *(value.detach().cpu().numpy() for value in scalers))
 
     def predict(self, x: ArrayLike) -> tuple[Array, Array]:
         """Disturbances and their standard deviations [nT], each (N,), from features in their units (N, F).
@@ -150,70 +67,39 @@ class FieldNet(Summarized, torch.nn.Module):
         The standard deviation is `residual_sd_nt` for every row. A row with nan gives nan. Products are
         float32; compared with float64 the released network errs by less than 0.01 nT.
         """
-        inputs = self.inputs
-        layers = [(layer.weight.detach(), layer.bias.detach()) for layer in self.linears]
-        y = outputs(layers, inputs, inputs.checked(x))[:, 0]
-        return float(self.y_mean) + float(self.y_scale) * y, np.full(len(y), self.residual_sd_nt)
+        y = outputs(self.layers, self.inputs, self.inputs.checked(x))[:, 0]
+        return self.y_mean + self.y_scale * y, np.full(len(y), self.residual_sd_nt)
 
-    def wide_sd_nt(self, x: ArrayLike) -> Array | None:
-        """As `Regressor.wide_sd_nt`."""
-        return wide_sd_nt(self.wide, self.inputs, x)
+    def tensors(self) -> dict[str, NDArray[Any]]:
+        """Scalers and ranges, float64, and layers, float32."""
+        return {
+            **self.inputs.tensors(),
+            "y_mean": np.array(self.y_mean),
+            "y_scale": np.array(self.y_scale),
+            **{
+                f"layers.{i}.{part}": value
+                for i, layer in enumerate(self.layers)
+                for part, value in layer._asdict().items()
+            },
+        }
 
-    def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
-        """Whether an input of a row left the range of the training rows; see `Inputs.outside`."""
-        return self.inputs.outside(x)
+    def settings(self) -> dict[str, Any]:
+        """Widths of the hidden layers, and dropout."""
+        return {"hidden": self.hidden, "dropout": self.dropout}
 
-    def set_scalers(self, x: ArrayLike, y: ArrayLike) -> None:
-        """Set scalers and training ranges from training rows.
-
-        Args:
-            x: Features, shape (N, F). A constant feature gets a scale of 1.
-            y: Labels [nT], shape (N,).
-        """
-        x, y = np.asarray(x, float), np.asarray(y, float)
-        of = inputs_of(x, self.features)
-        values = (of.mean, of.scale, of.low, of.high, y.mean(), y.std())
-        for name, value in zip(_SCALERS, values, strict=True):
-            getattr(self, name).copy_(torch.as_tensor(value))
-
-    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write it to a safetensors file; the same network gives the same bytes.
-
-        Raises:
-            InputError: The file exists and `force` was not given.
-        """
-        write_weights(
-            path,
-            self.kind,
-            self.state_dict(),
-            features=self.features,
-            residual_sd_nt=self.residual_sd_nt,
-            metadata=self.metadata,
-            hidden=self.hidden,
-            dropout=self.dropout,
-            wide=self.wide,
-            force=force,
-        )
-
-    def report(self, title: str) -> Report:
-        """Layers, inputs, scales and error."""
-        figures = [
+    def figures(self) -> list[Figure]:
+        """Layers, inputs and the scale of labels."""
+        return [
             Figure("layers", self.layers_text),
             Figure("parameters", self.parameters_count),
             Figure("inputs", ", ".join(self.features)),
-            Figure("label mean", float(self.y_mean), "nT"),
-            Figure("label sd", float(self.y_scale), "nT"),
+            Figure("label mean", self.y_mean, "nT"),
+            Figure("label sd", self.y_scale, "nT"),
         ]
-        if not math.isnan(self.residual_sd_nt):
-            figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note="on held-out runs"))
-        return Report(title, (*figures, *wide_figures(self.wide)), shown(self.metadata))
-
-    def _summary(self) -> Summary:
-        return summary_of(self, "FieldNet")
 
 
 def load_net(path: str | os.PathLike[str]) -> FieldNet:
-    """Load a network, safetensors or a released `.pth`, in evaluation mode.
+    """Load a network, safetensors or a released `.pth`.
 
     Raises:
         InputError: Neither of the two, another kind, damaged, or its parts do not fit each other.
@@ -257,11 +143,13 @@ def convert(
 
 
 def net_of_checkpoint(path: str | os.PathLike[str]) -> FieldNet:
-    """The network of a released `.pth`, in evaluation mode.
+    """The network of a released `.pth`, which torch reads.
 
     Raises:
         InputError: Not such a checkpoint.
     """
+    from magtwin.learn.models.checkpoint import read_checkpoint
+
     path = Path(path)
     tensors, metadata = read_checkpoint(path)
     facts = {"source": path.name, "source_sha256": sha256(path), **metadata}
@@ -269,39 +157,59 @@ def net_of_checkpoint(path: str | os.PathLike[str]) -> FieldNet:
     return net_of(Weights(path, "mlp", about, tensors))
 
 
+def check_shape(hidden: Sequence[int], dropout: float) -> None:
+    """Refuse a network without hidden layers, or with a share of dropout that is none.
+
+    Raises:
+        InputError: It is refused.
+    """
+    if not hidden or not all(width > 0 for width in hidden) or not 0 <= dropout < 1:
+        raise InputError(
+            f"a network needs hidden layers above 0 wide and dropout in 0..1, "
+            f"got {tuple(hidden)} and {dropout}"
+        )
+
+
 def net_of(weights: Weights) -> FieldNet:
-    """The network of a weights file, in evaluation mode.
+    """The network of a weights file.
 
     Raises:
         InputError: Its parts do not fit each other.
     """
     path, tensors = weights.path, weights.tensors
     dropout = weights.expect("dropout", float)
-    layers = sum(name.startswith("layers.") and name.endswith(".weight") for name in tensors)
-    missing = [name for name in _SCALERS if name not in tensors]
-    missing += [f"layers.{i}.{p}" for i in range(max(layers, 2)) for p in ("weight", "bias")
-                if f"layers.{i}.{p}" not in tensors]  # fmt: skip
+    count = sum(name.startswith("layers.") and name.endswith(".weight") for name in tensors)
+    names = [f"layers.{i}.{part}" for i in range(max(count, 2)) for part in Layer._fields]
+    missing = [name for name in (*scaler_tensors(0), "y_mean", "y_scale", *names) if name not in tensors]
     if missing:
         raise InputError(f"{path}: tensor {missing[0]!r} is missing; train or convert the network again")
-    held = [tensors[f"layers.{i}.weight"] for i in range(layers)]
+    held = [tensors[f"layers.{i}.weight"] for i in range(count)]
     for i, weight in enumerate(held):
         if weight.ndim != 2:
             raise InputError(
                 f"{path}: tensor 'layers.{i}.weight' is {say(weight)}; a layer's have shape (out, in)"
             )
+    hidden = [len(weight) for weight in held[:-1]]
     try:
-        net = FieldNet(
-            weights.features,
-            [len(weight) for weight in held[:-1]],
-            dropout=dropout,
-            residual_sd_nt=weights.residual_sd_nt,
-            metadata=weights.about["facts"],
-            device="meta",  # no memory before the shapes are checked
-        )
+        check_shape(hidden, dropout)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    state = weights.fit(net.state_dict())
-    if not (bool((tensors["x_scale"] > 0).all()) and bool(tensors["y_scale"] > 0)):
+    widths = [len(weights.features), *hidden, 1]
+    one = np.ones((), np.float32)  # broadcast takes no memory before the shapes are checked
+    like = scaler_tensors(len(weights.features)) | {"y_mean": np.ones(()), "y_scale": np.ones(())}
+    for i, (a, b) in enumerate(itertools.pairwise(widths)):
+        like |= {f"layers.{i}.weight": np.broadcast_to(one, (b, a))}
+        like |= {f"layers.{i}.bias": np.broadcast_to(one, (b,))}
+    state = weights.fit(like)
+    inputs = inputs_from(weights.features, state, path)
+    if not state["y_scale"] > 0:
         raise InputError(f"{path}: a scale of its scalers is not above 0")
-    net.load_state_dict(state, assign=True)
-    return net.eval()
+    return FieldNet(
+        inputs=inputs,
+        layers=tuple(Layer(state[f"layers.{i}.weight"], state[f"layers.{i}.bias"]) for i in range(count)),
+        y_mean=float(state["y_mean"]),
+        y_scale=float(state["y_scale"]),
+        dropout=dropout,
+        residual_sd_nt=weights.residual_sd_nt,
+        metadata=dict(weights.about["facts"]),
+    )

@@ -1,31 +1,55 @@
-"""The layers of a perceptron in blocks of rows; a row gives the same bytes whatever rows stand beside it."""
+"""The layers of a perceptron in blocks of rows.
 
+A row's bytes depend neither on the other rows nor on their number. On some processors they depend, in the last
+digits of float32, on its place in a block: the kernels of OpenBLAS for AVX2 treat the first and the last six
+of twelve rows differently.
+"""
+
+import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 from magtwin.learn.data.inputs import Inputs
 
 Array = NDArray[np.float64]
-Layer = tuple[torch.Tensor, torch.Tensor]
-"""Weights (out, in) and biases (out,), float32."""
 
-CHUNK = 512  # Rows of a block: layers of 512 then stay in a core's cache
+BLOCK = 512
+"""Rows of a block; the last one is padded, because the rounding of a product depends on its number of rows.
+Layers of 512 then stay in a core's cache."""
 
-TILE = 16
-"""Rows of the last block are padded to a multiple of this, a multiple of the rows that matrix kernels take at
-once, so that a row's bytes do not depend on its neighbours."""
+
+class Layer(NamedTuple):
+    """A linear layer."""
+
+    weight: NDArray[np.float32]
+    """Shape (out, in)."""
+
+    bias: NDArray[np.float32]
+    """Shape (out,)."""
+
+
+@functools.cache
+def _blas() -> ThreadpoolController:
+    """The libraries that compute numpy's products."""
+    return ThreadpoolController().select(user_api="blas")
+
+
+def threads_of_products() -> int:
+    """Number of threads that numpy's products take now; 1 if that is unknown."""
+    return max((library["num_threads"] for library in _blas().info()), default=1)
 
 
 def in_threads(work: Callable[[], None], threads: int) -> None:
-    """Run `work` in several threads, each with torch products in one thread.
+    """Run `work` in several threads, each with products in one thread.
 
-    All cores then stay busy between products, which torch's own threads leave idle.
+    All cores then stay busy between products, which the threads of a product leave idle.
 
     Args:
         work: Takes items from a shared supply until none is left.
@@ -34,82 +58,60 @@ def in_threads(work: Callable[[], None], threads: int) -> None:
     Raises:
         BaseException: An exception of a thread, after all threads have ended.
     """
-    if threads <= 1:
-        work()
-        return
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with _blas().limit(limits=1):
+        if threads <= 1:
+            work()
+            return
         with ThreadPoolExecutor(threads) as pool:
             for job in [pool.submit(work) for _ in range(threads)]:
                 job.result()
-    finally:
-        torch.set_num_threads(before)
 
 
 def outputs(layers: Sequence[Layer], inputs: Inputs, x: Array) -> Array:
     """Outputs of a multilayer perceptron, shape (N, K), K the width of its last layer.
 
     One thread computes each block of rows in a fixed order, so the result does not depend on the number of
-    threads, nor a row's on the other rows. Inputs are scaled in float64, products are float32; a row with a
-    nan gives nan.
+    threads, nor a row's on the other rows. Inputs are scaled in float64, products are
+    float32; a row with a nan gives nan.
 
     Args:
         layers: First to last; ReLU stands between them.
         inputs: Scaler of the rows.
         x: Features in their units, shape (N, F), contiguous.
     """
-    y = np.empty((len(x), len(layers[-1][1])))
-    starts = itertools.count(0, CHUNK)  # next() on it is atomic
-    threads = min(torch.get_num_threads(), math.ceil(len(x) / CHUNK))
-    transposed = [(weight.t(), bias) for weight, bias in _widened(layers)]
-    in_threads(lambda: _work(transposed, inputs, x, y, starts), threads)
+    y = np.empty((len(x), len(layers[-1].bias)))
+    starts = itertools.count(0, BLOCK)  # next() on it is atomic
+    threads = min(threads_of_products(), math.ceil(len(x) / BLOCK))
+    in_threads(lambda: _work(layers, inputs, x, y, starts), threads)
     return y
 
 
-def _widened(layers: Sequence[Layer]) -> list[Layer]:
-    """Layers whose products give a row the same bytes wherever it stands in a block.
-
-    With few outputs, and inputs that are no multiple of 4, the rounding of matrix kernels depends on a row's
-    place. Such a layer gets more outputs, which are 0 and which the next layer ignores.
-    """
-    widened: list[Layer] = []
-    for weight, bias in layers:
-        if widened and (more := len(widened[-1][1]) - weight.shape[1]):
-            weight = torch.nn.functional.pad(weight, (0, more))
-        if len(bias) < TILE and weight.shape[1] % 4:
-            more = TILE - len(bias)
-            weight, bias = (
-                torch.nn.functional.pad(weight, (0, 0, 0, more)),
-                torch.cat([bias, bias.new_zeros(more)]),
-            )
-        widened.append((weight, bias))
-    return widened
-
-
 def _work(
-    layers: Sequence[Layer],
-    inputs: Inputs,
-    x: Array,
-    y: Array,
-    starts: "itertools.count[int]",
+    layers: Sequence[Layer], inputs: Inputs, x: Array, y: Array, starts: "itertools.count[int]"
 ) -> None:
-    """Compute chunks until none is left; memory is allocated once."""
-    rows = CHUNK if len(x) > CHUNK else -(-len(x) // TILE) * TILE
-    z = np.zeros((rows, x.shape[1]))
-    with torch.inference_mode():
-        blocks = [torch.empty(rows, x.shape[1])] + [torch.empty(rows, len(bias)) for _, bias in layers]
-        scaled, last = torch.from_numpy(z), blocks[-1].numpy()
+    """Compute blocks until none is left; memory is allocated once."""
+    z, first = np.zeros((BLOCK, x.shape[1])), np.empty((BLOCK, x.shape[1]), np.float32)
+    widest = max(len(layer.bias) for layer in layers)
+    memory = [np.empty(BLOCK * widest, np.float32) for _ in range(2)]  # in turn, to stay in the cache
+    blocks = [
+        memory[i % 2][: BLOCK * len(bias)].reshape(BLOCK, len(bias)) for i, (_, bias) in enumerate(layers)
+    ]
+    with np.errstate(over="ignore", invalid="ignore"):  # rows beyond float32 give inf or nan
         for start in starts:
-            block = x[start : start + CHUNK]
+            block = x[start : start + BLOCK]
             if not len(block):
                 return
             n = len(block)
             np.subtract(block, inputs.mean, out=z[:n])
             np.divide(z[:n], inputs.scale, out=z[:n])
-            blocks[0].copy_(scaled)
+            first[:] = z
+            h = first
             for i, (weight, bias) in enumerate(layers):
-                torch.addmm(bias, blocks[i], weight, out=blocks[i + 1])
+                if len(bias) > 1:
+                    h = np.matmul(h, weight.T, out=blocks[i])
+                else:  # a product with a vector would depend on how memory is aligned
+                    h = np.einsum("ij,kj->ik", h, weight, out=blocks[i])
+                h += bias
                 if i < len(layers) - 1:
-                    blocks[i + 1].relu_()
-            y[start : start + n] = last[:n, : y.shape[1]]
+                    np.maximum(h, 0, out=h)
+            y[start : start + n] = h[:n]

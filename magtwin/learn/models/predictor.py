@@ -31,7 +31,6 @@ from magtwin.extend import Registry
 from magtwin.learn.data.inputs import Inputs
 from magtwin.learn.data.recording import Recording, Rows
 from magtwin.learn.models.calibration import Spread
-from magtwin.learn.models.descent import Epoch
 from magtwin.learn.models.network import net_of_checkpoint
 from magtwin.learn.models.weights import MetadataValue, Weights, is_checkpoint, read_weights
 from magtwin.report import Report
@@ -88,6 +87,26 @@ class Predictor(Protocol):
 
     def report(self, title: str) -> Report:
         """Its kind, shape and errors."""
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """Errors of a network after one pass over the training rows."""
+
+    number: int
+    """1 is the first; 0 are the initial weights of a continued training."""
+
+    train_rmse_nt: float
+    """RMSE in training [nT], with dropout except in epoch 0."""
+
+    val_rmse_nt: float
+    """RMSE on the validation rows, without dropout [nT]."""
+
+    val_mae_nt: float
+    """Mean absolute error on the validation rows [nT]."""
+
+    best: bool
+    """Whether no earlier epoch has a smaller val_rmse_nt; the last such epoch is kept."""
 
 
 @dataclass(frozen=True)
@@ -212,9 +231,9 @@ PREDICTORS: Registry[PredictorKind] = Registry(
     "predictor kind",
     "predictors",
     {
-        "mlp": "magtwin.learn.models.kinds:Perceptrons",
-        "linear": "magtwin.learn.models.kinds:Linears",
-        "hybrid": "magtwin.learn.models.kinds:Hybrids",
+        "mlp": "magtwin.learn.training.kinds:Perceptrons",
+        "linear": "magtwin.learn.training.kinds:Linears",
+        "hybrid": "magtwin.learn.training.kinds:Hybrids",
         "mixed": "magtwin.learn.mixed.fit_mixed:Mixeds",
     },
 )

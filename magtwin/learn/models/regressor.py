@@ -1,4 +1,4 @@
-"""Regressor: base class of predictors other than networks: inputs, provenance, file and report."""
+"""Regressor: base class of predictors: inputs, provenance, file and report."""
 
 import math
 import os
@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.learn.data.inputs import Inputs
@@ -47,7 +46,7 @@ class Regressor(Summarized, ABC):
         return wide_sd_nt(self.wide, self.inputs, x)
 
     @abstractmethod
-    def tensors(self) -> dict[str, torch.Tensor]:
+    def tensors(self) -> dict[str, NDArray[Any]]:
         """Arrays to save, by name."""
 
     @abstractmethod

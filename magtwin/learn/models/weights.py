@@ -7,11 +7,12 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-import torch
+import numpy as np
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors.numpy import save
 
 from magtwin.errors import InputError
 from magtwin.files import existing, existing_file
@@ -21,6 +22,8 @@ from magtwin.learn.models.calibration import Spread, spread_from, spread_like
 from magtwin.outputs import output
 
 MetadataValue = str | int | float | bool
+Tensors = Mapping[str, NDArray[Any]]
+T = TypeVar("T")
 
 VERSIONS = {"mlp": 1}
 """Version of the file by kind of predictor, `VERSION` for all others; other versions are refused."""
@@ -45,7 +48,7 @@ class Weights:
     about: Mapping[str, Any]
     """Features, units, provenance, `residual_sd_nt`, and the settings of the kind."""
 
-    tensors: Mapping[str, torch.Tensor]
+    tensors: Tensors
     """Its tensors, but for those of `wide`."""
 
     wide: Spread | None = None
@@ -62,7 +65,7 @@ class Weights:
         sd = self.about["residual_sd_nt"]
         return math.nan if sd is None else sd
 
-    def with_tensors(self, tensors: Mapping[str, torch.Tensor]) -> "Weights":
+    def with_tensors(self, tensors: Tensors) -> "Weights":
         """The same file with some of its tensors, renamed."""
         return replace(self, tensors=tensors)
 
@@ -89,9 +92,7 @@ class Weights:
             raise InputError(f"{self.path}: {key!r} of its metadata must be {wanted}, got {str(value)[:40]}")
         return float(value)
 
-    def fit(
-        self, like: Mapping[str, torch.Tensor], *, unknown: Sequence[str] = ("x_min", "x_max")
-    ) -> dict[str, torch.Tensor]:
+    def fit(self, like: Tensors, *, unknown: Sequence[str] = ("x_min", "x_max")) -> dict[str, NDArray[Any]]:
         """The tensors, checked against others.
 
         Args:
@@ -110,7 +111,7 @@ class Weights:
                     f"{self.path}: tensor {name!r} is {say(tensor)}, the {len(self.features)} features and "
                     f"the other layers ask for {say(wanted)}"
                 )
-            if name not in unknown and not bool(torch.isfinite(tensor).all()):
+            if name not in unknown and not bool(np.isfinite(tensor).all()):
                 raise InputError(f"{self.path}: tensor {name!r} has numbers that are nan or infinite")
         if extra := sorted(set(self.tensors) - set(like)):
             noun = "FieldNet" if self.kind == "mlp" else self.kind
@@ -135,7 +136,7 @@ def is_checkpoint(path: str | os.PathLike[str]) -> bool:
 def write_weights(
     path: str | os.PathLike[str],
     kind: str,
-    tensors: Mapping[str, torch.Tensor],
+    tensors: Tensors,
     *,
     features: Sequence[str],
     residual_sd_nt: float,
@@ -173,7 +174,7 @@ def write_weights(
     if kind != "mlp":
         header["kind"] = kind
     tensors = {**tensors, **(wide.tensors(WIDE) if wide else {})}
-    whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    whole = {name: np.array(value, order="C") for name, value in tensors.items()}
     # One key, because safetensors writes several in random order.
     metadata_text = {"magtwin": json.dumps(header, sort_keys=True, allow_nan=False)}
     with output(path, force=force) as aside:
@@ -191,10 +192,10 @@ def read_weights(path: str | os.PathLike[str]) -> Weights:
         if file.read(9)[8:] != b"{":
             raise InputError(f"{path}: no weights: neither safetensors nor a PyTorch checkpoint (.pth)")
     try:
-        with safe_open(path, framework="pt") as file:
+        with safe_open(path, framework="np") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError) as error:
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: damaged safetensors ({error}); get the file again") from error
     about = _about(path, metadata)
     weights = Weights(path, about.get("kind", "mlp"), about, tensors)
@@ -243,11 +244,16 @@ def _about(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     return about
 
 
+def tensors_below(tensors: Mapping[str, T], prefix: str) -> dict[str, T]:
+    """The tensors whose names start with a prefix, by the rest of their names."""
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
+
 def shown(metadata: Mapping[str, MetadataValue]) -> dict[str, MetadataValue]:
     """Metadata to show: without the map's samples."""
     return {name: value for name, value in metadata.items() if name != "map_samples_nt"}
 
 
-def say(tensor: torch.Tensor) -> str:
+def say(tensor: NDArray[Any]) -> str:
     """Type and shape of a tensor, for error messages."""
-    return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"
+    return f"{tensor.dtype} {tuple(tensor.shape)}"

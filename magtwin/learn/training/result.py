@@ -4,8 +4,7 @@ import math
 from dataclasses import dataclass
 
 from magtwin.learn.data.split import Split
-from magtwin.learn.models.descent import Epoch
-from magtwin.learn.models.predictor import Choice, Predictor
+from magtwin.learn.models.predictor import Choice, Epoch, Predictor
 from magtwin.learn.models.weights import shown
 from magtwin.learn.training.config import TrainConfig
 from magtwin.report import Figure, Report

@@ -20,8 +20,7 @@ from magtwin.learn.data.origin import NOMINAL, ROBOT_METADATA
 from magtwin.learn.data.residuals import HeldOut, held_out_errors, residuals
 from magtwin.learn.data.split import PARTS, Part, Split
 from magtwin.learn.data.split import split as split_recordings
-from magtwin.learn.models.descent import Epoch
-from magtwin.learn.models.predictor import PREDICTORS, Fit, FitTask, Predictor, load_predictor
+from magtwin.learn.models.predictor import PREDICTORS, Epoch, Fit, FitTask, Predictor, load_predictor
 from magtwin.learn.models.weights import MetadataValue
 from magtwin.learn.training.config import TrainConfig
 from magtwin.learn.training.model_card import model_card

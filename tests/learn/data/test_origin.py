@@ -5,6 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
+from test_network import a_net
 
 from magtwin import simulate
 from magtwin.cli import main
@@ -12,7 +13,6 @@ from magtwin.errors import InputError, MismatchWarning
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files import sha256, shipped
 from magtwin.learn.data.origin import label_frame, map_metadata, mismatches, shared_metadata
-from magtwin.learn.models.network import FieldNet
 from magtwin.sim.runs.simulate import robot_metadata
 from magtwin.sim.session import draw_session
 from magtwin.spec.sensors import MocapSpec
@@ -174,7 +174,7 @@ def strange(tmp_path):
     metadata = learned(off, other) | {"map": "off", "map_sha256": sha256(tmp_path / "off.usdc")}
     metadata |= {"residual_offset_sd_nt": 50.0, "residual_time_s": 1.0}
     file = tmp_path / "strange.safetensors"
-    FieldNet("full", (4,), residual_sd_nt=100.0, metadata=metadata).save(file)
+    a_net("full", (4,), residual_sd_nt=100.0, metadata=metadata).save(file)
     return file
 
 

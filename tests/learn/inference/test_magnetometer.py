@@ -1,32 +1,46 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
-import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from test_features import a_run
 from test_network import RELEASED, a_net
+from threadpoolctl import threadpool_limits
 
 from magtwin.errors import InputError
 from magtwin.files import sha256, shipped
 from magtwin.learn.data.features import FULL, features
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
-from magtwin.learn.models.perceptron import in_threads
+from magtwin.learn.models.network import load_net
+from magtwin.learn.models.perceptron import in_threads, threads_of_products
+from magtwin.learn.models.predictor import load_predictor
 from magtwin.sim.session import session_of
 from magtwin.twin import open_twin, sweep
 
 
 def forward64(net, x):
     """Disturbances in float64 throughout, by plain numpy."""
-    h = (x - net.x_mean.numpy()) / net.x_scale.numpy()
-    for i, layer in enumerate(net.linears):
-        h = h @ layer.weight.detach().double().numpy().T + layer.bias.detach().double().numpy()
-        h = np.maximum(h, 0) if i < len(net.linears) - 1 else h
-    return float(net.y_mean) + float(net.y_scale) * h[:, 0]
+    h = net.inputs.scaled(x)
+    for i, (weight, bias) in enumerate(net.layers):
+        h = h @ weight.astype(float).T + bias
+        h = np.maximum(h, 0) if i < len(net.layers) - 1 else h
+    return net.y_mean + net.y_scale * h[:, 0]
 
 
 def inputs(net, rows, seed=0):
     """Features distributed as the training rows were."""
     rng = np.random.default_rng(seed)
-    return net.x_mean.numpy() + net.x_scale.numpy() * rng.normal(size=(rows, len(net.features)))
+    return net.inputs.mean + net.inputs.scale * rng.normal(size=(rows, len(net.features)))
+
+
+def by_torch(net, x):
+    """Disturbances by the module that trains networks."""
+    import torch
+
+    from magtwin.learn.training.module import NetModule
+
+    with torch.inference_mode():
+        return NetModule.of(net)(torch.from_numpy(x)).numpy()
 
 
 @pytest.fixture(scope="module")
@@ -43,29 +57,29 @@ def test_the_released_network_errs_by_less_than_a_hundredth_nt_against_float64(r
 
 def test_blocks_agree_with_torch_on_the_whole_array(paper):
     x = inputs(paper.net, 1500)
-    with torch.inference_mode():
-        assert_allclose(paper.net.predict(x)[0], paper.net(torch.from_numpy(x)).numpy(), atol=1e-3)
+    assert_allclose(paper.net.predict(x)[0], by_torch(paper.net, x), atol=1e-3)
 
 
-@pytest.mark.parametrize("rows", [1, 2, 15, 16, 17, 511, 512, 513, 1025])
-def test_a_rows_bytes_do_not_depend_on_how_many_rows_there_are(paper, rows):
+@pytest.mark.parametrize("shape", [(20, 512, 512, 512, 512), (14, 64, 64), (1, 3), (5, 17, 1, 8)])
+def test_a_rows_bytes_depend_neither_on_its_neighbours_nor_on_how_many_rows_there_are(shape):
+    """Features of 1 to 20 and layers of 1 to 512 take different kernels of the library of products."""
+    net = a_net(FULL[: shape[0]], shape[1:])
+    x, others = inputs(net, 1100), inputs(net, 1100, seed=1)
+    all_at_once = net.predict(x)[0]
+    for rows in (1, 2, 15, 16, 17, 511, 512, 513, 1025):
+        assert_array_equal(net.predict(x[:rows])[0], all_at_once[:rows])
+        mixed = np.vstack([others[:rows], x[rows:]])
+        assert_array_equal(net.predict(mixed)[0][rows:], all_at_once[rows:])
+    assert_array_equal(net.predict(x[512:])[0], all_at_once[512:])  # blocks of 512 rows
+
+
+def test_one_thread_and_two_give_the_same_bytes_and_the_number_of_threads_stays(paper):
     x = inputs(paper.net, 1100)
-    all_at_once = paper.net.predict(x)[0]
-    assert_array_equal(paper.net.predict(x[:rows])[0], all_at_once[:rows])
-    assert_array_equal(paper.net.predict(x[-rows:])[0], all_at_once[-rows:])
-
-
-def test_one_thread_and_two_give_the_same_bytes_and_torch_keeps_its_threads(paper):
-    x = inputs(paper.net, 1100)
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(2)
+    with threadpool_limits(2):
         two = paper.net.predict(x)[0]
-        assert torch.get_num_threads() == 2
-        torch.set_num_threads(1)
+        assert threads_of_products() == 2
+    with threadpool_limits(1):
         assert_array_equal(paper.net.predict(x)[0], two)
-    finally:
-        torch.set_num_threads(before)
 
 
 def test_nan_in_gives_nan_out_in_that_row_alone(paper):
@@ -90,15 +104,14 @@ def test_a_run_is_read_by_the_names_of_the_networks_inputs():
 
 def test_an_input_beyond_its_training_range_is_outside():
     net = a_net(["battery_fraction", "imu_w_z"])
-    net.x_min.copy_(torch.tensor([0.2, -1.0], dtype=torch.float64))
-    net.x_max.copy_(torch.tensor([1.0, 1.0]))
+    net.inputs = replace(net.inputs, low=np.array([0.2, -1.0]), high=np.array([1.0, 1.0]))
     x = [[0.2, 1.0], [1.0, -1.0], [-0.1, 0.0], [0.5, 1.01], [np.nan, 0.0]]
     assert net.outside(x).tolist() == [False, False, True, True, True]
 
 
 def test_where_the_range_is_unknown_5_scales_from_the_mean_are_outside(real_data):
     released = NeuralMagnetometer.load(real_data / RELEASED)
-    mean, scale = released.net.x_mean.numpy(), released.net.x_scale.numpy()
+    mean, scale = released.net.inputs.mean, released.net.inputs.scale
     x = np.stack([mean, mean + 4.9 * scale, mean - 5.1 * scale])
     x = np.vstack([x, np.where(np.arange(20) == 18, -0.1, mean)])  # the battery runs below empty
     assert released.net.outside(x).tolist() == [False, False, True, True]
@@ -106,8 +119,7 @@ def test_where_the_range_is_unknown_5_scales_from_the_mean_are_outside(real_data
 
 def test_rounding_of_an_input_that_never_varied_is_not_outside():
     net = a_net(["battery_v"])
-    net.x_min.fill_(15.1)
-    net.x_max.fill_(15.1)
+    net.inputs = replace(net.inputs, low=np.array([15.1]), high=np.array([15.1]))
     assert not net.outside([[np.nextafter(15.1, 16)]]).any()
 
 
@@ -139,6 +151,13 @@ def test_features_of_another_width_are_refused(paper):
         paper.net.predict(np.zeros((5, 19)))
 
 
+def test_a_row_beyond_float32_gives_no_number_and_no_warning(paper):
+    x = inputs(paper.net, 3)
+    x[1] = 1e300
+    y = paper.net.predict(x)[0]
+    assert np.isfinite(y).tolist() == [True, False, True]
+
+
 # The networks that ship
 
 
@@ -162,6 +181,19 @@ def test_the_paper_s_network_has_its_shape_and_reads_its_inputs():
     assert paper.features == FULL
 
 
+def test_the_shipped_networks_predict_in_numpy_what_they_predict_in_torch():
+    """Sums of 64 or 512 float32 products, in another order: 1e-7 of their terms times the scale of labels."""
+    paper = load_net(shipped("weights", "turtlebot4_paper.safetensors"))
+    x = inputs(paper, 3000)
+    assert_allclose(paper.predict(x)[0], by_torch(paper, x), rtol=0, atol=1e-3)
+    hybrid = load_predictor(shipped("weights", "turtlebot4_hybrid.safetensors"))
+    x = inputs(hybrid, 3000)
+    whole = hybrid.base.predict(x)[0] + by_torch(
+        hybrid.net, np.clip(x, hybrid.inputs.low, hybrid.inputs.high)
+    )
+    assert_allclose(hybrid.predict(x)[0], whole, rtol=0, atol=1e-4)
+
+
 def test_the_card_is_of_the_shipped_network(shipped_network):
     card = shipped("weights", shipped_network.name).with_suffix(".md").read_text(encoding="utf-8")
     assert f"SHA-256 `{shipped_network.sha256}`" in " ".join(card.split())
@@ -179,7 +211,7 @@ def test_the_shipped_network_does_better_than_the_mean_label_on_days_and_paths_i
 
 def test_a_battery_that_is_fuller_than_any_trained_on_is_flagged(new_days):
     paper = NeuralMagnetometer.load(shipped("weights", "turtlebot4_paper.safetensors"))
-    fullest = paper.net.x_max.numpy()[paper.features.index("battery_fraction")]
+    fullest = paper.net.inputs.high[paper.features.index("battery_fraction")]
     for run in new_days:
         flagged = paper.net.outside(features(run, paper.features))
         assert flagged[run["battery_fraction"] > fullest + 1e-6].all()
@@ -187,8 +219,8 @@ def test_a_battery_that_is_fuller_than_any_trained_on_is_flagged(new_days):
 
 
 def test_work_is_done_in_each_thread_and_the_first_failure_is_raised_after_all_ended():
-    before, done = torch.get_num_threads(), []
-    in_threads(lambda: done.append(torch.get_num_threads()), 3)
+    before, done = threads_of_products(), []
+    in_threads(lambda: done.append(threads_of_products()), 3)
     assert done == [1, 1, 1]
 
     def fails():
@@ -198,4 +230,4 @@ def test_work_is_done_in_each_thread_and_the_first_failure_is_raised_after_all_e
     with pytest.raises(ArithmeticError, match="no"):
         in_threads(fails, 2)
     assert done == [1, 1, 1, 0, 0]
-    assert torch.get_num_threads() == before
+    assert threads_of_products() == before

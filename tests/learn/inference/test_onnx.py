@@ -6,9 +6,8 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-import torch
 from numpy.testing import assert_allclose, assert_array_equal
-from test_magnetometer import inputs
+from test_magnetometer import by_torch, inputs
 from test_network import RELEASED, a_net
 from test_predictor import KINDS, a_predictor
 
@@ -48,8 +47,7 @@ def test_onnxruntime_gives_what_torch_gives(tmp_path, hidden):
     export_onnx(tmp_path / "n.safetensors", tmp_path / "n.onnx")
     for rows in (1, 300):
         x = inputs(net, rows)
-        with torch.inference_mode():
-            assert_allclose(run(tmp_path / "n.onnx", x)[0], net(torch.from_numpy(x)), atol=1e-3)
+        assert_allclose(run(tmp_path / "n.onnx", x)[0], by_torch(net, x), atol=1e-3)
 
 
 def test_the_released_network_gives_in_onnxruntime_what_it_gives_here(real_data, tmp_path):
@@ -83,8 +81,8 @@ def test_the_file_says_what_goes_in_and_from_which_weights_it_came(weights, expo
     net = load_predictor(weights)
     assert json.loads(told["features"]) == list(net.features)
     assert json.loads(told["units"]) == [FEATURES[name].unit for name in net.features]
-    assert json.loads(told["training_min"]) == net.x_min.tolist()
-    assert json.loads(told["training_max"]) == net.x_max.tolist()
+    assert json.loads(told["training_min"]) == net.inputs.low.tolist()
+    assert json.loads(told["training_max"]) == net.inputs.high.tolist()
     assert told["weights_sha256"] == sha256(weights)
     assert json.loads(told["facts"]) == {"seed": 3}
 

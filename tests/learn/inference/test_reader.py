@@ -13,6 +13,7 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.features import FEATURES, FULL, SETS, features
 from magtwin.learn.inference import reader
+from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.inference.reader import POSE, Reader
 from magtwin.learn.models.network import load_net
 from magtwin.run.run import COLUMNS
@@ -61,7 +62,7 @@ def poses(run):
 def test_one_reading_is_the_row_of_a_run(names, run, field):
     net = a_net(names, (16, 24, 8), residual_sd_nt=31.0)
     x = features(run, names)
-    net.set_scalers(x[:20], np.random.default_rng(1).normal(300, 500, 20))
+    net.inputs = inputs_of(x[:20], names)
     reader = Reader(net, field)
     mean, base = net.predict(x)[0], field.lookup(run["p_world_base"][:, :2], run["yaw"])
     outside = net.outside(x)

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from test_network import a_net
 
 import magtwin as mt
 from magtwin.cli import main
@@ -17,7 +18,6 @@ from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.inference.reader import Reader
 from magtwin.learn.models.calibration import Spread
 from magtwin.learn.models.linear import Linear
-from magtwin.learn.models.network import FieldNet
 from magtwin.learn.models.predictor import load_predictor
 from magtwin.learning import widen
 from magtwin.run.run import Run
@@ -82,7 +82,7 @@ def test_intervals_on_other_robots_hold_on_fresh_ones_and_predictions_stay(wide)
 
 
 def test_every_kind_keeps_them_in_its_file_and_a_live_robot_reads_them(wide, tmp_path):
-    net = FieldNet(("odom_v_x",), (4,), residual_sd_nt=50.0)
+    net = a_net(("odom_v_x",), (4,), residual_sd_nt=50.0)
     net.wide = wide.wide
     for name, model in (("linear", wide), ("mlp", net)):
         model.save(tmp_path / f"{name}.safetensors")

@@ -88,9 +88,9 @@ def test_the_released_scalers_are_the_published_figures(real_data):
         .002215 .271545  .021819 .980056  15.6979 .532527  .856926 .140275  .340609 .473914
     """
     mean, scale = np.array(figures.split(), float).reshape(20, 2).T
-    assert_allclose(net.x_mean, mean, rtol=2e-2)
-    assert_allclose(net.x_mean[[0, 1, 17, 18, 19]], mean[[0, 1, 17, 18, 19]], rtol=1e-5)
-    assert_allclose(net.x_scale, scale, rtol=3e-3)
+    assert_allclose(net.inputs.mean, mean, rtol=2e-2)
+    assert_allclose(net.inputs.mean[[0, 1, 17, 18, 19]], mean[[0, 1, 17, 18, 19]], rtol=1e-5)
+    assert_allclose(net.inputs.scale, scale, rtol=3e-3)
     assert_allclose([net.y_mean, net.y_scale], [366.662, 524.898], rtol=1e-6)
     assert net.metadata["training_rows"] == 591_952
     assert net.metadata["scalers_by"] == "scikit-learn 1.5.2"
@@ -100,11 +100,11 @@ def test_a_checkpoint_gives_back_what_was_saved(tmp_path):
     state = layers(20, 8, 4, 1)
     state["layer0.weight"] = state["layer0.weight"].T.contiguous().T  # stored by columns
     net = load_net(pth(tmp_path / "a.pth", saved(state)))
-    assert len(net.linears) == 3
-    for i, layer in enumerate(net.linears):
-        assert_array_equal(layer.weight.detach(), state[f"layer{i}.weight"])
-        assert_array_equal(layer.bias.detach(), state[f"layer{i}.bias"])
-    assert_array_equal(net.x_mean, np.arange(20))
+    assert len(net.layers) == 3
+    for i, layer in enumerate(net.layers):
+        assert_array_equal(layer.weight, state[f"layer{i}.weight"])
+        assert_array_equal(layer.bias, state[f"layer{i}.bias"])
+    assert_array_equal(net.inputs.mean, np.arange(20))
     assert (net.y_mean, net.y_scale, net.metadata["training_rows"]) == (300.0, 500.0, 7)
 
 

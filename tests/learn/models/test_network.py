@@ -1,29 +1,39 @@
+import itertools
 import json
 import math
 
 import numpy as np
 import pytest
-import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.numpy import load_file, save_file
 
 from magtwin.errors import InputError
-from magtwin.learn.data.features import FULL
+from magtwin.learn.data.features import FULL, feature_names
+from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.models.checkpoint import read_checkpoint
-from magtwin.learn.models.network import FieldNet, convert, load_net
+from magtwin.learn.models.network import FieldNet, check_shape, convert, load_net
+from magtwin.learn.models.perceptron import Layer
+from magtwin.learn.training.config import TrainConfig
 
 RELEASED = "aprilab/models/nn_magnetometer_model_v0.0.1.pth"
 
 
 def a_net(features=FULL, hidden=(8, 4), seed=0, **options):
     """A small network with weights, scalers and ranges that are all different."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        net = FieldNet(features, hidden, **options)
-    rng = np.random.default_rng(seed)
-    net.set_scalers(rng.normal(3, 2, (100, len(net.features))), rng.normal(300, 500, 100))
-    return net.eval()
+    rng, names = np.random.default_rng(seed), feature_names(features)
+    widths = [len(names), *hidden, 1]
+    layers = [
+        Layer(*(rng.uniform(-1, 1, shape).astype(np.float32) / a**0.5 for shape in ((b, a), b)))
+        for a, b in itertools.pairwise(widths)
+    ]
+    return FieldNet(
+        inputs=inputs_of(rng.normal(3, 2, (100, len(names))), names),
+        layers=tuple(layers),
+        y_mean=340.0,
+        y_scale=480.0,
+        **options,
+    )
 
 
 @pytest.mark.parametrize("hidden", [(512, 512, 512, 512), (512, 512, 512, 128), (3,)])
@@ -32,12 +42,12 @@ def test_the_file_alone_tells_the_architecture(tmp_path, hidden):
     net.save(tmp_path / "n.safetensors")
     again = load_net(tmp_path / "n.safetensors")
     assert again.hidden == hidden
-    for name, value in net.state_dict().items():
-        assert_array_equal(again.state_dict()[name], value)
+    for name, value in net.tensors().items():
+        assert_array_equal(again.tensors()[name], value)
 
 
 def test_the_papers_network_has_799233_parameters():
-    assert FieldNet().parameters_count == 799_233
+    assert a_net(hidden=TrainConfig().options["layers"]).parameters_count == 799_233
 
 
 def test_what_is_known_of_a_network_survives_the_file(tmp_path):
@@ -48,7 +58,6 @@ def test_what_is_known_of_a_network_survives_the_file(tmp_path):
     again = load_net(tmp_path / "n.safetensors")
     assert again.features == ("yaw_deg", "odom_v_x")
     assert (again.dropout, again.residual_sd_nt, again.metadata) == (0.1, 12.5, {"source": "here", "rows": 7})
-    assert not again.training
 
 
 def test_one_network_gives_one_file_byte_for_byte(tmp_path):
@@ -77,25 +86,12 @@ def test_scalers_make_training_rows_standard_and_leave_constant_ones_alone():
     rng = np.random.default_rng(1)
     x = rng.normal(5, 3, (1000, 2))
     x[:, 1] = 7.1
-    net = FieldNet(["yaw_deg", "battery_v"], (4,))
-    net.set_scalers(x, rng.normal(size=1000))
-    z = (x - net.x_mean.numpy()) / net.x_scale.numpy()
+    inputs = inputs_of(x, ["yaw_deg", "battery_v"])
+    z = inputs.scaled(x)
     assert_allclose(z.mean(axis=0), 0, atol=1e-12)
     assert_allclose(z[:, 0].std(), 1)
-    assert net.x_scale[1] == 1
-    assert_array_equal(net.x_max, x.max(axis=0))
-
-
-def test_forward_is_the_textbook_perceptron():
-    net = a_net()
-    x = np.random.default_rng(2).normal(3, 2, (30, 20))
-    h = (x - net.x_mean.numpy()) / net.x_scale.numpy()
-    for i, layer in enumerate(net.linears):
-        h = h @ layer.weight.detach().double().numpy().T + layer.bias.detach().double().numpy()
-        h = np.maximum(h, 0) if i < 2 else h
-    with torch.inference_mode():
-        ours = net(torch.from_numpy(x)).numpy()
-    assert_allclose(ours, float(net.y_mean) + float(net.y_scale) * h[:, 0], atol=1e-3)  # float32 products
+    assert inputs.scale[1] == 1
+    assert_array_equal(inputs.high, x.max(axis=0))
 
 
 def test_the_released_network_converts_once_and_stays_itself(real_data, tmp_path):
@@ -104,21 +100,20 @@ def test_the_released_network_converts_once_and_stays_itself(real_data, tmp_path
     net, (checkpoint, _) = load_net(out), read_checkpoint(real_data / RELEASED)
     assert net.hidden == (512, 512, 512, 128)
     assert net.features == FULL
-    for i, layer in enumerate(net.linears):
-        assert_array_equal(layer.weight.detach(), checkpoint[f"layers.{i}.weight"])
-        assert_array_equal(layer.bias.detach(), checkpoint[f"layers.{i}.bias"])
+    for i, layer in enumerate(net.layers):
+        assert_array_equal(layer.weight, checkpoint[f"layers.{i}.weight"])
+        assert_array_equal(layer.bias, checkpoint[f"layers.{i}.bias"])
     assert net.metadata == converted.metadata
     assert net.metadata["source_sha256"] == "2418abc80cb0eab578e1e8af35f53566db2efa84b1cfa5257710d15273a07cf0"
     assert math.isnan(net.residual_sd_nt)
-    assert torch.isnan(net.x_min).all()
+    assert np.isnan(net.inputs.low).all()
 
 
 def test_a_pth_loads_without_conversion(real_data, tmp_path):
     convert(real_data / RELEASED, tmp_path / "n.safetensors")
     a, b = load_net(real_data / RELEASED), load_net(tmp_path / "n.safetensors")
-    assert all(
-        torch.equal(a.state_dict()[n].nan_to_num(), b.state_dict()[n].nan_to_num()) for n in a.state_dict()
-    )
+    for name, value in a.tensors().items():
+        assert_array_equal(b.tensors()[name], value)
 
 
 def test_an_output_that_exists_is_refused_unless_forced(real_data, tmp_path):
@@ -141,13 +136,14 @@ def changed(tmp_path, *, about=None, drop=(), metadata=None, **tensors):
     with safe_open(path, framework="np") as file:
         said = json.loads(file.metadata()["magtwin"])
     held = {k: v for k, v in load_file(path).items() if k not in drop}
-    held |= {k.replace("__", "."): torch.as_tensor(v) for k, v in tensors.items()}
+    held |= {k.replace("__", "."): np.asarray(v) for k, v in tensors.items()}
     metadata = {"magtwin": json.dumps(said | (about or {}))} if metadata is None else metadata
     save_file(held, path, metadata=metadata)
     return path
 
 
-F8 = torch.float64
+def ones(*shape):
+    return np.ones(shape, np.float32)
 
 
 @pytest.mark.parametrize(
@@ -166,28 +162,28 @@ F8 = torch.float64
             "tensor 'layers.1.weight' is missing; train or convert the network again",
         ),
         (
-            {"layers__0__weight": torch.ones(8, 3)},
+            {"layers__0__weight": ones(8, 3)},
             "tensor 'layers.0.weight' is float32 (8, 3), the 2 features and the other layers ask for "
             "float32 (8, 2)",
         ),
         (
-            {"layers__1__weight": torch.ones(4, 9)},
+            {"layers__1__weight": ones(4, 9)},
             "tensor 'layers.1.weight' is float32 (4, 9), the 2 features and the other layers ask for "
             "float32 (4, 8)",
         ),
         (
-            {"x_mean": torch.zeros(2)},
+            {"x_mean": 0 * ones(2)},
             "tensor 'x_mean' is float32 (2,), the 2 features and the other layers ask for float64 (2,)",
         ),
         (
-            {"layers__2__bias": torch.tensor([math.nan])},
+            {"layers__2__bias": math.nan * ones(1)},
             "tensor 'layers.2.bias' has numbers that are nan or infinite",
         ),
         (
-            {"x_scale": torch.tensor([1.0, 0.0], dtype=F8)},
+            {"x_scale": np.array([1.0, 0.0])},
             "a scale of its scalers is not above 0",
         ),
-        ({"spare": torch.zeros(1)}, "tensor 'spare' belongs to no layer of a FieldNet"),
+        ({"spare": ones(1)}, "tensor 'spare' belongs to no layer of a FieldNet"),
         (
             {"about": {"features": ["yaw_deg", "odom_vx"]}},
             "no feature 'odom_vx'; did you mean 'odom_v_x'?",
@@ -208,11 +204,11 @@ F8 = torch.float64
         ),
         ({"about": {"facts": {"a": [1]}}}, "'a' of its metadata must be text, a number, true or false"),
         (
-            {"layers__0__weight": torch.tensor(1.0)},
+            {"layers__0__weight": ones()},
             "tensor 'layers.0.weight' is float32 (); a layer's have shape (out, in)",
         ),
         (
-            {"layers__2__weight": torch.ones(4)},
+            {"layers__2__weight": ones(4)},
             "tensor 'layers.2.weight' is float32 (4,); a layer's have shape (out, in)",
         ),
         ({"about": {"format_version": 2}}, "format version 2, this magtwin reads 1; update magtwin"),
@@ -260,4 +256,4 @@ def test_a_folder_is_refused(tmp_path):
 @pytest.mark.parametrize(("hidden", "dropout"), [((), 0.3), ((4, 0), 0.3), ((4,), 1.0)])
 def test_a_network_without_width_or_with_all_units_dropped_is_refused(hidden, dropout):
     with pytest.raises(InputError, match="a network needs hidden layers"):
-        FieldNet(FULL, hidden, dropout=dropout)
+        check_shape(hidden, dropout)

@@ -5,10 +5,9 @@ import math
 
 import numpy as np
 import pytest
-import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.numpy import load_file, save_file
 from test_features import a_run
 from test_network import RELEASED, a_net
 
@@ -191,8 +190,8 @@ def changed(tmp_path, kind, *, about=None, drop=None, **tensors):
         ("hybrid", {"drop": "base.constant_nt"}, "tensor 'constant_nt' is missing; train the hybrid again"),
         ("mixed", {"about": {"intervals": "wide"}}, "'intervals' of its metadata must be one of"),
         ("mixed", {"drop": "noise_floor_nt2"}, "tensor 'noise_floor_nt2' is missing; train the mixed again"),
-        ("mixed", {"prior_covariance_nt2": -torch.eye(3).double()}, "of its prior is not positive definite"),
-        ("hybrid", {"spare": torch.ones(1)}, "tensor 'spare' belongs to no layer of a hybrid"),
+        ("mixed", {"prior_covariance_nt2": -np.eye(3)}, "of its prior is not positive definite"),
+        ("hybrid", {"spare": np.ones(1)}, "tensor 'spare' belongs to no layer of a hybrid"),
     ],
 )
 def test_a_file_that_does_not_hold_together_is_refused(tmp_path, kind, change, text):
@@ -211,7 +210,7 @@ def test_a_registered_kind_is_loaded_like_a_built_in_one(tmp_path):
     write_weights(
         tmp_path / "c.safetensors",
         "constant",
-        {"mean": torch.zeros(1)},
+        {"mean": np.zeros(1)},
         features=("yaw_sin",),
         residual_sd_nt=1.0,
         metadata={},

@@ -5,11 +5,10 @@ import itertools
 
 import numpy as np
 import pytest
-import torch
+from test_network import a_net
 
 from magtwin import simulate, sweep
 from magtwin.errors import InputError
-from magtwin.learn.models.network import FieldNet
 from magtwin.run.run import COLUMNS, Run
 from magtwin.sim.motion import closed_loop
 from magtwin.sim.motion.commands import Commands
@@ -26,10 +25,9 @@ SHORT = {"duration_s": 1.5, "rate_hz": 135.0}
 @pytest.fixture(scope="module")
 def neural(lab_scene, tmp_path_factory) -> Twin:
     """The lab with a small network of random weights, as bits do not depend on what it has learnt."""
-    torch.manual_seed(0)
     file = tmp_path_factory.mktemp("net") / "small.safetensors"
     error = {"residual_offset_sd_nt": 60.0, "residual_time_s": 2.0}
-    FieldNet("full", (48, 48), residual_sd_nt=100.0, metadata=error).save(file)
+    a_net("full", (48, 48), residual_sd_nt=100.0, metadata=error).save(file)
     return open_twin(lab_scene, network=file)
 
 

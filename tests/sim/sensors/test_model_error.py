@@ -4,14 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
 from numpy.testing import assert_allclose, assert_array_equal
+from test_network import a_net
 
 import magtwin
 from magtwin import simulate, sweep
 from magtwin.errors import MismatchWarning
 from magtwin.io.provenance import repeat
-from magtwin.learn.models.network import FieldNet
 from magtwin.run.run import COLUMNS
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.twin import Twin, in_session, open_twin
@@ -22,9 +21,8 @@ SHORT = {"duration_s": 2.0, "rate_hz": 20.0}
 
 
 def weights(folder, **options):
-    torch.manual_seed(0)
     file = folder / "small.safetensors"
-    FieldNet("full", (8, 8), **options).save(file)
+    a_net("full", (8, 8), **options).save(file)
     return file
 
 

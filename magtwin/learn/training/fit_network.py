@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -10,9 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError, find
 from magtwin.learn.data.features import feature_names
-from magtwin.learn.models.descent import Course, Dropout, Epoch, Learner, check_device, descend
+from magtwin.learn.data.inputs import Inputs, inputs_of
 from magtwin.learn.models.network import FieldNet
-from magtwin.learn.models.state import digest
+from magtwin.learn.models.predictor import Epoch
+from magtwin.learn.training.descent import Course, Dropout, Learner, check_device, descend
+from magtwin.learn.training.module import NetModule
+from magtwin.learn.training.state import digest
 from magtwin.parallel import check_room
 
 Array = NDArray[np.float64]
@@ -75,7 +79,7 @@ def train(
         advance: Called after each step with the rows done and the rows of all epochs.
 
     Returns:
-        The network in evaluation mode, with `residual_sd_nt` the RMSE on the validation rows, and its epochs.
+        The network, with `residual_sd_nt` the RMSE on the validation rows, and its epochs.
 
     Raises:
         InputError: Rows with nan or of the wrong shape, constant labels, training diverged, no such device,
@@ -105,17 +109,17 @@ def train(
             "layers",
         )
     seed = int(rng.integers(2**62))
+    inputs = inputs_of(x, names)
     with torch.random.fork_rng(devices=[]):  # torch draws initial weights from its global generator
         torch.manual_seed(seed)
-        net = FieldNet(names, layers, dropout=dropout)
-    if init is None:
-        net.set_scalers(x, y)
-    else:
-        _continue_from(net, init, x)
-    _freeze(net, freeze, init)
+        if init is None:
+            module = NetModule(inputs, layers, dropout=dropout, y_mean=y.mean(), y_scale=y.std())
+        else:
+            module = NetModule.of(_continued(init, inputs, tuple(layers), dropout))
+    _freeze(module, freeze, init)
     settings = {
         "features": list(names),
-        "layers": list(net.hidden),
+        "layers": list(layers),
         "dropout": dropout,
         "freeze": sorted(freeze),
         "device": device,
@@ -124,10 +128,11 @@ def train(
     }
     if checkpoint is not None:
         settings["rows"] = digest(x, y, x_val, y_val, *([] if counts is None else [counts]))
-        settings["init"] = digest(*init.state_dict().values()) if init is not None else ""
+        settings["init"] = digest(*init.tensors().values()) if init is not None else ""
     history = descend(
         Learner(
-            net, x, y, counts, x_val, y_val, Dropout(dropout, torch.Generator(device).manual_seed(seed + 1))
+            *(module, x, y, counts, x_val, y_val),
+            Dropout(dropout, torch.Generator(device).manual_seed(seed + 1)),
         ),
         Course(epochs=epochs, batch=batch, lr=lr, patience=patience, seed=seed),
         settings,
@@ -137,29 +142,25 @@ def train(
         progress=progress,
         advance=advance,
     )
-    net.requires_grad_(True)
-    net.residual_sd_nt = min(epoch.val_rmse_nt for epoch in history)
-    return net, history
+    return module.net(residual_sd_nt=min(epoch.val_rmse_nt for epoch in history)), history
 
 
-def _continue_from(net: FieldNet, init: FieldNet, x: Array) -> None:
-    """Copy weights and scalers; training ranges are extended by the new rows, or stay unknown."""
-    if init.features != net.features or init.hidden != net.hidden:
+def _continued(init: FieldNet, inputs: Inputs, hidden: tuple[int, ...], dropout: float) -> FieldNet:
+    """The network to start from, its training ranges extended by the new rows, or unknown as before."""
+    if init.features != inputs.features or init.hidden != hidden:
         raise InputError(
             f"the network to continue from has inputs {', '.join(init.features)} and layers of "
-            f"{init.hidden}, this training {', '.join(net.features)} and {net.hidden}; give it the same "
+            f"{init.hidden}, this training {', '.join(inputs.features)} and {hidden}; give it the same "
             "features and layers"
         )
-    net.load_state_dict(init.state_dict())
-    net.x_min.copy_(torch.from_numpy(np.minimum(net.x_min.numpy(), x.min(axis=0))))
-    net.x_max.copy_(torch.from_numpy(np.maximum(net.x_max.numpy(), x.max(axis=0))))
+    return replace(init, inputs=init.inputs.grown(inputs), dropout=dropout)
 
 
-def _freeze(net: FieldNet, names: Sequence[str], init: FieldNet | None) -> None:
+def _freeze(module: NetModule, names: Sequence[str], init: FieldNet | None) -> None:
     """Exclude layers from the training."""
     if names and init is None:
         raise InputError("freeze keeps layers of trained weights: give init too")
-    layers = {f"layers.{i}": layer for i, layer in enumerate(net.linears)}
+    layers = {f"layers.{i}": layer for i, layer in enumerate(module.layers)}
     for name in names:
         find("layer", name, layers).requires_grad_(False)
 

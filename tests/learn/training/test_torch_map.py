@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.learn.inference.torch_map import TorchMap
+from magtwin.learn.training.torch_map import TorchMap
 
 QUARTERS = (0.0, 90.0, 180.0, 270.0)
 HEADINGS = [QUARTERS, (33.0,), (0.0, 180.0), (15.0, 100.0, 110.0, 300.0)]

@@ -12,28 +12,10 @@ import torch
 
 from magtwin.errors import InputError
 from magtwin.learn.data.inputs import Array
-from magtwin.learn.models.network import FieldNet
-from magtwin.learn.models.state import load_state, save_state, tensors_below
-
-
-@dataclass(frozen=True)
-class Epoch:
-    """Errors of a network after one pass over the training rows."""
-
-    number: int
-    """1 is the first; 0 are the initial weights of a continued training."""
-
-    train_rmse_nt: float
-    """RMSE in training [nT], with dropout except in epoch 0."""
-
-    val_rmse_nt: float
-    """RMSE on the validation rows, without dropout [nT]."""
-
-    val_mae_nt: float
-    """Mean absolute error on the validation rows [nT]."""
-
-    best: bool
-    """Whether no earlier epoch has a smaller val_rmse_nt; the last such epoch is kept."""
+from magtwin.learn.models.predictor import Epoch
+from magtwin.learn.models.weights import tensors_below
+from magtwin.learn.training.module import NetModule
+from magtwin.learn.training.state import load_state, save_state
 
 
 class Dropout:
@@ -66,7 +48,7 @@ class Learner:
 
     def __init__(
         self,
-        net: FieldNet,
+        net: NetModule,
         x: Array,
         y: Array,
         weight: Array | None,

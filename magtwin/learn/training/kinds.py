@@ -9,12 +9,10 @@ import numpy as np
 
 from magtwin.errors import InputError, find
 from magtwin.learn.models.calibration import Yardstick, transferred_factor, yardstick
-from magtwin.learn.models.descent import Epoch
-from magtwin.learn.models.fit_network import train
 from magtwin.learn.models.hybrid import Hybrid, hybrid_of
 from magtwin.learn.models.linear import FittedLinear, Linear, fit_linear, linear_of
 from magtwin.learn.models.network import FieldNet, net_of
-from magtwin.learn.models.predictor import Array, Choice, Fit, FitTask
+from magtwin.learn.models.predictor import Array, Choice, Epoch, Fit, FitTask
 
 DESCENT: Mapping[str, Any] = MappingProxyType({"epochs": 20, "batch": 1024, "lr": 1e-3, "patience": None})
 TORCH: Mapping[str, Any] = MappingProxyType({"threads": None, "device": "auto", "freeze": ()})
@@ -72,7 +70,7 @@ class Hybrids:
     def fit(task: FitTask) -> Fit:
         """Fit the base, then the network to what the base leaves."""
         learned, stops, init = task.train, task.validation, task.init
-        known = {"base", *(f"layers.{i}" for i in range(len(init.net.linears) if init and init.net else 0))}
+        known = {"base", *(f"layers.{i}" for i in range(len(init.net.layers) if init and init.net else 0))}
         for name in task.freeze:
             find("layer", name, dict.fromkeys(sorted(known)))
         if "base" in task.freeze:
@@ -108,6 +106,8 @@ class Hybrids:
 def _train(
     task: FitTask, x: Array, y: Array, x_val: Array, y_val: Array, **options: Any
 ) -> tuple[FieldNet, tuple[Epoch, ...]]:
+    from magtwin.learn.training.fit_network import train  # imports torch, which predictions do without
+
     names = ("layers", "dropout", "epochs", "batch", "lr", "patience")
     return train(
         x,

@@ -22,12 +22,7 @@ FORMAT_VERSION = 1  # Version of the file; other versions are refused
 Tensors = Mapping[str, torch.Tensor]
 
 
-def tensors_below(tensors: Tensors, prefix: str) -> dict[str, torch.Tensor]:
-    """The tensors whose names start with a prefix, by the rest of their names."""
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-
-
-def digest(*arrays: NDArray[Any] | torch.Tensor) -> str:
+def digest(*arrays: NDArray[Any]) -> str:
     """SHA-256 of arrays, to recognise the data of a checkpoint."""
     checksum = hashlib.sha256()
     for array in arrays:
