@@ -57,12 +57,13 @@ build/ros-%/.installed:
 	build/ros-$*/bin/python -m pip --disable-pip-version-check -q install --target build/ros-$*/numpy1 'numpy<2'
 	@touch $@
 
-lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies
+lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies, size
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check --no-cache .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/deptry .
+	$(BIN)/python .ci/house.py
 
 physics: $(VENV)/.dev  ## Drive converted robots in Newton (extra physics, 600 MB)
 	$(PIP) -e '.[dev,physics]'

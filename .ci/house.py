@@ -12,13 +12,13 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 
 REACH = {
-    "read_survey": ("magtwin.io.surveys.survey", 52_700),
-    "fit_map": ("magtwin.field.fit.fit", 5_200),
-    "simulate": ("magtwin.twin.simulation", 42_700),
-    "open_twin": ("magtwin.twin.opening", 42_700),
-    "localize": ("magtwin.localizing", 55_100),
-    "from_urdf": ("magtwin.author.from_urdf", 18_800),
-    "ros magnetometer": ("magtwin.ros.magnetometer", 48_200),
+    "read_survey": ("magtwin.io.surveys.survey", 53_300),
+    "fit_map": ("magtwin.field.fit.fit", 5_600),
+    "simulate": ("magtwin.twin.simulation", 42_300),
+    "open_twin": ("magtwin.twin.opening", 42_300),
+    "localize": ("magtwin.localizing", 55_900),
+    "from_urdf": ("magtwin.author.from_urdf", 18_900),
+    "ros magnetometer": ("magtwin.ros.magnetometer", 47_000),
 }
 """Module of a public function, and the most lines of magtwin that it reaches.
 
@@ -27,33 +27,33 @@ that a table names as text, since these are loaded for one format or method only
 """
 
 ROOMS = {
-    "magtwin": 4_650,
-    "author": 1_650,
-    "bench": 3_900,
-    "cli": 5_150,
-    "export": 4_950,
-    "fetch": 150,
-    "field": 9_650,
+    "magtwin": 4_800,
+    "author": 1_640,
+    "bench": 3_940,
+    "cli": 5_020,
+    "export": 4_880,
+    "fetch": 160,
+    "field": 9_280,
     "figures": 3_900,
-    "io": 10_000,
-    "learn": 10_250,
-    "localization": 6_650,
+    "io": 10_400,
+    "learn": 10_480,
+    "localization": 6_640,
     "parallel": 920,
-    "path": 1_130,
-    "ros": 4_900,
-    "run": 1_850,
-    "sim": 9_150,
+    "path": 1_140,
+    "ros": 5_060,
+    "run": 1_900,
+    "sim": 9_140,
     "spec": 1_720,
-    "twin": 1_750,
-    "urdf": 11_500,
-    "usd": 7_250,
+    "twin": 1_760,
+    "urdf": 11_560,
+    "usd": 6_400,
 }
 """Most lines of each room; "magtwin" are the files beside the rooms."""
 
-TESTS = 61_000
+TESTS = 62_200
 """Most lines of tests."""
 
-LONG = 80
+LONG = 100
 """Most lines of a function, its docstring left out."""
 
 KERNELS = ("loops", "inversion", "kernels")

@@ -4,6 +4,7 @@ import json
 import shutil
 import signal
 import struct
+import subprocess
 import zipfile
 from pathlib import Path
 
@@ -234,13 +235,13 @@ def test_a_layer_that_ends_its_reader_is_refused_in_one_line(lab, tmp_path, monk
     own = shutil.copytree(lab, tmp_path / "lab")
     seen = {}
 
-    def killed(command, **options):
-        seen["command"] = command
-        return __import__("subprocess").CompletedProcess(command, -signal.SIGSEGV, "", "")
+    def killed(module, job, limit_s, *flags):
+        seen["module"] = module
+        return None, subprocess.CompletedProcess([module], -signal.SIGSEGV, "", "")
 
-    monkeypatch.setattr("magtwin.export.validation.inspection.subprocess.run", killed)
+    monkeypatch.setattr("magtwin.export.validation.inspection.answer_of", killed)
     refuse(r"lab\.usda: damaged: USD crashes on it", own / "lab.usda", tmp_path, trusted=False)
-    assert "magtwin.export.validation.inspection" in seen["command"]
+    assert seen["module"] == "magtwin.export.validation.inspection"
 
 
 @pytest.mark.parametrize(
