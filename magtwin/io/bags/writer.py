@@ -16,10 +16,11 @@ from magtwin.errors import InputError, hint
 from magtwin.io.bags.cdr import encode
 from magtwin.io.bags.db3 import Db3Writer
 from magtwin.io.bags.mcap import McapWriter
-from magtwin.io.bags.sender import Unit, sender_for
+from magtwin.io.bags.sender import Unit
 from magtwin.io.bags.storage import ROOM, STORAGES, Batch, Connection, Storage, bag_metadata, to_yaml
 from magtwin.io.bags.stream import Sent, Stream
 from magtwin.io.bags.topics import Qos
+from magtwin.io.bags.twin_sender import sender_for
 from magtwin.io.bags.types import definition_of, layout
 from magtwin.io.recorder import PARTIAL, Sink, partial_of
 from magtwin.outputs import check_free, output, why_full

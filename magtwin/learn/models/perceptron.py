@@ -1,8 +1,8 @@
 """The layers of a perceptron in blocks of rows.
 
-A row's bytes depend neither on the other rows nor on their number. On some processors they depend, in the last
-digits of float32, on its place in a block: the kernels of OpenBLAS for AVX2 treat the first and the last six
-of twelve rows differently.
+A row's bytes depend neither on the other rows nor on their number. On some processors they depend, in the
+last digits of float32, on its place in a block: the kernels of OpenBLAS for AVX2 treat the first and the last
+six of twelve rows differently.
 """
 
 import functools

@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 
 from magtwin.learn.data.inputs import SCALERS, Inputs
@@ -47,10 +48,9 @@ class NetModule(torch.nn.Module):
         self.features, self.dropout = inputs.features, dropout
         widths = [len(inputs.features), *hidden, 1]
         self.layers = torch.nn.ModuleList(torch.nn.Linear(a, b) for a, b in itertools.pairwise(widths))
-        for name, value in inputs.tensors().items():
+        labels = {"y_mean": np.array(y_mean), "y_scale": np.array(y_scale)}
+        for name, value in (inputs.tensors() | labels).items():
             self.register_buffer(name, torch.tensor(value))
-        for name, value in (("y_mean", y_mean), ("y_scale", y_scale)):
-            self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
 
     @classmethod
     def of(cls, net: FieldNet) -> "NetModule":
@@ -66,8 +66,7 @@ class NetModule(torch.nn.Module):
         return FieldNet(
             inputs=Inputs(self.features, *(held[name] for name in SCALERS)),
             layers=tuple(
-                Layer(*(held[f"layers.{i}.{part}"] for part in Layer._fields))
-                for i in range(count)
+                Layer(*(held[f"layers.{i}.{part}"] for part in Layer._fields)) for i in range(count)
             ),
             y_mean=float(held["y_mean"]),
             y_scale=float(held["y_scale"]),

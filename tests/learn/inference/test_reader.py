@@ -12,8 +12,8 @@ from test_predictor import KINDS, a_predictor
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.features import FEATURES, FULL, SETS, features
-from magtwin.learn.inference import reader
 from magtwin.learn.data.inputs import inputs_of
+from magtwin.learn.inference import reader
 from magtwin.learn.inference.reader import POSE, Reader
 from magtwin.learn.models.network import load_net
 from magtwin.run.run import COLUMNS
