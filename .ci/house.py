@@ -18,7 +18,7 @@ REACH = {
     "open_twin": ("magtwin.twin.opening", 42_300),
     "localize": ("magtwin.localizing", 55_900),
     "from_urdf": ("magtwin.author.from_urdf", 18_900),
-    "ros magnetometer": ("magtwin.ros.magnetometer", 47_000),
+    "ros magnetometer": ("magtwin.ros.magnetometer", 15_900),
 }
 """Module of a public function, and the most lines of magtwin that it reaches.
 
@@ -35,7 +35,7 @@ ROOMS = {
     "fetch": 160,
     "field": 9_280,
     "figures": 3_900,
-    "io": 10_400,
+    "io": 10_420,
     "learn": 10_480,
     "localization": 6_640,
     "parallel": 920,
@@ -50,7 +50,7 @@ ROOMS = {
 }
 """Most lines of each room; "magtwin" are the files beside the rooms."""
 
-TESTS = 62_200
+TESTS = 62_300
 """Most lines of tests."""
 
 LONG = 100

@@ -26,7 +26,9 @@ import torch
 
 from magtwin.author.scene import author_scene
 from magtwin.files import shipped
-from magtwin.learn.models.network import FieldNet
+from magtwin.learn.data.features import FULL
+from magtwin.learn.data.inputs import inputs_of
+from magtwin.learn.training.module import NetModule
 from magtwin.path import path_named
 from magtwin.sim.motion.closed_loop import run_loops, warm_up
 from magtwin.sim.motion.drive import draw_wheel_errors
@@ -49,7 +51,7 @@ def seconds(work: Callable[[], object]) -> tuple[float, float]:
 def lab_twin(folder: Path) -> Twin:
     net = folder / "random.safetensors"
     torch.manual_seed(0)
-    FieldNet("full", HIDDEN).save(net)
+    NetModule(inputs_of(np.eye(len(FULL)), FULL), HIDDEN).net().save(net)
     scene = scene_from_toml(shipped("scenes", "lab.toml"), network=net)
     return open_twin(author_scene(scene, folder / "lab"))
 

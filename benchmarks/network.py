@@ -28,12 +28,15 @@ import numpy as np
 import torch
 from scipy.interpolate import RegularGridInterpolator
 from sklearn.preprocessing import StandardScaler
+from threadpoolctl import threadpool_limits
 
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.features import FULL
+from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.inference.reader import Reader
-from magtwin.learn.models.network import FieldNet, load_net
+from magtwin.learn.models.network import load_net
 from magtwin.learn.models.perceptron import in_threads
+from magtwin.learn.training.module import NetModule
 
 WANTED_MANY = 0.90
 WANTED_ONE, GOAL_ONE = 25, 50
@@ -46,31 +49,30 @@ ACTIVE = (0.35, 0.10, 0.06, 0.01)
 def as_sparse_as_released(hidden=(512, 512, 512, 512)):
     """A network with random weights, biases lowered until its units are as often 0 as a trained one's."""
     torch.manual_seed(0)
-    net = FieldNet("full", hidden).eval()
     rng = np.random.default_rng(0)
     x = rng.normal(size=(1000, len(FULL)))
     x[:, 0] = rng.uniform(0, 360, 1000)
-    net.set_scalers(x, rng.normal(300, 500, 1000))
+    module = NetModule(inputs_of(x, FULL), hidden, y_mean=300.0, y_scale=500.0)
     h = torch.from_numpy(rng.normal(size=(2048, len(FULL)))).float()
     with torch.inference_mode():
-        for layer, share in zip(net.linears[:-1], ACTIVE, strict=True):
+        for layer, share in zip(module.layers[:-1], ACTIVE, strict=True):
             before = h @ layer.weight.T
             layer.weight.copy_(layer.weight / before.std())
             before = h @ layer.weight.T
             layer.bias.copy_(-torch.quantile(before[::8], 1 - share, dim=0))
             h = torch.relu(before + layer.bias)
-    return net
+    return module.net()
 
 
 def inputs(net, rows):
     """Features distributed as the training rows were."""
     normal = np.random.default_rng(0).normal(size=(rows, len(net.features)))
-    return net.x_mean.numpy() + net.x_scale.numpy() * normal
+    return net.inputs.mean + net.inputs.scale * normal
 
 
 def bare_products(net, rows, threads, block=1024):
     """A function that does the network's matrix products and nothing else."""
-    weights = [layer.weight.detach().t() for layer in net.linears]
+    weights = [torch.from_numpy(layer.weight).t() for layer in net.layers]
     widths = [len(net.features), *net.hidden, 1]
 
     def work(starts):
@@ -84,6 +86,7 @@ def bare_products(net, rows, threads, block=1024):
 
     def run():
         starts = itertools.count(0, block)
+        torch.set_num_threads(1)  # in each of the threads
         in_threads(lambda: work(starts), threads)
 
     return run
@@ -97,14 +100,14 @@ def many(net, rows, rounds, threads):
         "magtwin": lambda: net.predict(x),
     }
     clock = time.process_time if threads == 1 else time.perf_counter
-    torch.set_num_threads(threads)
     seconds = {name: [] for name in ways}
-    for turn in range(rounds + 1):
-        for name, way in ways.items():
-            start = clock()
-            way()
-            if turn:  # the first is warm-up
-                seconds[name].append(clock() - start)
+    with threadpool_limits(threads, user_api="blas"):
+        for turn in range(rounds + 1):
+            for name, way in ways.items():
+                start = clock()
+                way()
+                if turn:  # the first is warm-up
+                    seconds[name].append(clock() - start)
     print(f"{rows:,} readings, {threads} thread{'s' if threads > 1 else ''}, "
           f"{'processor time' if threads == 1 else 'by the clock'}, median of {rounds}")  # fmt: skip
     for name, times in seconds.items():
@@ -121,12 +124,11 @@ class TheReleasesWay:
         headings = np.append(np.degrees(field.headings_rad), 360.0)
         values = np.concatenate([field.values_nt, field.values_nt[:1]])
         self.field = RegularGridInterpolator((headings, field.y_m, field.x_m), values)
-        self.x_scaler = self.scaler(net.x_mean.numpy(), net.x_scale.numpy())
-        self.y_scaler = self.scaler(np.array([float(net.y_mean)]), np.array([float(net.y_scale)]))
-        layers = []
-        for i, layer in enumerate(net.linears):
-            layers += [layer, torch.nn.ReLU(), torch.nn.Dropout(0.3)] if i < len(net.linears) - 1 else [layer]
-        self.net = torch.nn.Sequential(*layers).eval()
+        self.x_scaler = self.scaler(net.inputs.mean, net.inputs.scale)
+        self.y_scaler = self.scaler(np.array([net.y_mean]), np.array([net.y_scale]))
+        *hidden, last = NetModule.of(net).layers
+        layers = [part for layer in hidden for part in (layer, torch.nn.ReLU(), torch.nn.Dropout(0.3))]
+        self.net = torch.nn.Sequential(*layers, last).eval()
 
     @staticmethod
     def scaler(mean, scale):
@@ -200,11 +202,11 @@ def signals(row):
 
 def in_float64(net, x):
     """Disturbances in float64 throughout."""
-    h = (x - net.x_mean.numpy()) / net.x_scale.numpy()
-    for i, layer in enumerate(net.linears):
-        h = h @ layer.weight.detach().double().numpy().T + layer.bias.detach().double().numpy()
-        h = np.maximum(h, 0) if i < len(net.linears) - 1 else h
-    return float(net.y_mean) + float(net.y_scale) * h[:, 0]
+    h = net.inputs.scaled(x)
+    for i, (weight, bias) in enumerate(net.layers):
+        h = h @ weight.astype(float).T + bias
+        h = np.maximum(h, 0) if i < len(net.layers) - 1 else h
+    return net.y_mean + net.y_scale * h[:, 0]
 
 
 def main():
@@ -213,7 +215,7 @@ def main():
     parser.add_argument("--rows", type=int, default=16_384)
     parser.add_argument("--rounds", type=int, default=9)
     options = parser.parse_args()
-    net = load_net(options.net).eval() if options.net else as_sparse_as_released()
+    net = load_net(options.net) if options.net else as_sparse_as_released()
     threads = torch.get_num_threads()
     print(f"network {net.layers_text}")
     ratio = many(net, options.rows, options.rounds, 1)

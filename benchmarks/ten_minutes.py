@@ -26,9 +26,10 @@ from magtwin.author.scene import author_scene
 from magtwin.files import shipped
 from magtwin.io.rerun.file import write_rrd
 from magtwin.io.tables import write_parquet
-from magtwin.learn.data.features import features
-from magtwin.learn.models.network import FieldNet
+from magtwin.learn.data.features import FULL, features
+from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.models.perceptron import in_threads
+from magtwin.learn.training.module import NetModule
 from magtwin.path import path_named
 from magtwin.sim.motion.closed_loop import warm_up
 from magtwin.twin import Twin, open_twin, scene_from_toml, simulate
@@ -75,7 +76,10 @@ class Products:
                 for weight, block in zip(self.weights, blocks, strict=True):
                     x = torch.mm(x, weight, out=block[: len(x)])
 
+        before = torch.get_num_threads()
+        torch.set_num_threads(1)  # in each of the threads
         in_threads(work, threads)
+        torch.set_num_threads(before)
 
     def fastest(self, threads: int) -> tuple[int, Callable[[], None]]:
         """The chunk size that is fastest here, 0 for none, and the work in it."""
@@ -92,7 +96,7 @@ def lab_twin(folder: Path) -> Twin:
     """The lab that ships with magtwin, with a network of the paper's shape in its magnetometer."""
     net = folder / "random.safetensors"
     torch.manual_seed(0)
-    FieldNet("full", HIDDEN).save(net)
+    NetModule(inputs_of(np.eye(len(FULL)), FULL), HIDDEN).net().save(net)
     return open_twin(
         author_scene(scene_from_toml(shipped("scenes", "lab.toml"), network=net), folder / "lab")
     )

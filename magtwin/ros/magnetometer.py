@@ -37,11 +37,11 @@ from magtwin.ros.inputs import Columns, Input, LiveFrames, Scanning
 from magtwin.ros.online import Measured, Online
 from magtwin.ros.parameters import Parameter
 from magtwin.ros.topics import TOTAL_FIELD
-from magtwin.twin import Twin
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.reader import Reader, Reading
     from magtwin.learn.models.predictor import Predictor
+    from magtwin.twin import Twin
 
 PARAMETERS: Mapping[str, Parameter] = MappingProxyType(
     {
@@ -93,7 +93,7 @@ class Magnetometer:
 
     def __init__(
         self,
-        twin: Twin,
+        twin: "Twin",
         bus: Bus,
         settings: Mapping[str, Any],
         *,

@@ -12,9 +12,10 @@ import numpy as np
 from magtwin.errors import InputError
 from magtwin.io.bags import RawBagWriter
 from magtwin.io.bags.cdr import NS, encode
-from magtwin.io.bags.sender import Transforms, Unit, prefixed, sender_for
+from magtwin.io.bags.sender import Transforms, Unit, prefixed
 from magtwin.io.bags.stream import Stream, shifted
 from magtwin.io.bags.topics import Qos
+from magtwin.io.bags.twin_sender import sender_for
 from magtwin.io.bags.types import layout
 from magtwin.ros.bus import Bus, Message, Publisher
 from magtwin.ros.bus.names import checked_prefix

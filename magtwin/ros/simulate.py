@@ -9,9 +9,10 @@ from typing import Literal
 
 from magtwin.errors import InputError
 from magtwin.io.bags.cdr import NS, encode
-from magtwin.io.bags.sender import Transforms, Unit, prefixed, sender_for
+from magtwin.io.bags.sender import Transforms, Unit, prefixed
 from magtwin.io.bags.stream import Sent, shifted
 from magtwin.io.bags.topics import Qos, Topic
+from magtwin.io.bags.twin_sender import sender_for
 from magtwin.io.bags.types import layout
 from magtwin.ros.bus import Bus, Publisher
 from magtwin.ros.bus.names import checked_prefix

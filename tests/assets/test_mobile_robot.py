@@ -11,8 +11,8 @@ from magtwin import load_run
 from magtwin.author.robot import RobotSettings, build_robot
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.io.bags.sender import sender_for
 from magtwin.io.bags.topics import JOINTS
+from magtwin.io.bags.twin_sender import sender_for
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.sensors import MagnetometerSpec
 from magtwin.twin import author_scene, open_twin, scene_with_robot, simulate

@@ -11,8 +11,9 @@ from nodes import DOMAINS, spin
 from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
 from magtwin.files import shipped
-from magtwin.io.bags.sender import prefixed, sender_for
+from magtwin.io.bags.sender import prefixed
 from magtwin.io.bags.topics import CLOCK, COMMAND, LATCHED, ODOMETRY, TF, TF_STATIC, Qos
+from magtwin.io.bags.twin_sender import sender_for
 from magtwin.ros.bus import Message, names_of, open_bus, to_bytes
 from magtwin.ros.simulate import Simulator
 from magtwin.spec.scene import PlacedRobot

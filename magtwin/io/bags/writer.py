@@ -14,10 +14,11 @@ import numpy as np
 from magtwin.errors import InputError
 from magtwin.io.bags.cdr import encode
 from magtwin.io.bags.mcap import McapWriter
-from magtwin.io.bags.sender import Unit, sender_for
+from magtwin.io.bags.sender import Unit
 from magtwin.io.bags.storage import ROOM, Batch, Connection, bag_metadata, to_yaml
 from magtwin.io.bags.stream import Sent, Stream
 from magtwin.io.bags.topics import Qos
+from magtwin.io.bags.twin_sender import sender_for
 from magtwin.io.bags.types import definition_of, layout
 from magtwin.io.recorder import PARTIAL, Sink, partial_of
 from magtwin.outputs import check_free, output, why_full

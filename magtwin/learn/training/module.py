@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 
 from magtwin.learn.data.inputs import SCALERS, Inputs
@@ -47,10 +48,9 @@ class NetModule(torch.nn.Module):
         self.features, self.dropout = inputs.features, dropout
         widths = [len(inputs.features), *hidden, 1]
         self.layers = torch.nn.ModuleList(torch.nn.Linear(a, b) for a, b in itertools.pairwise(widths))
-        for name, value in inputs.tensors().items():
+        labels = {"y_mean": np.array(y_mean), "y_scale": np.array(y_scale)}
+        for name, value in (inputs.tensors() | labels).items():
             self.register_buffer(name, torch.tensor(value))
-        for name, number in (("y_mean", y_mean), ("y_scale", y_scale)):
-            self.register_buffer(name, torch.tensor(number, dtype=torch.float64))
 
     @classmethod
     def of(cls, net: FieldNet) -> "NetModule":

@@ -13,7 +13,7 @@ from test_network import RELEASED, a_net
 
 from magtwin.errors import InputError
 from magtwin.learn.data.features import SETS, features
-from magtwin.learn.data.inputs import inputs_of
+from magtwin.learn.data.inputs import inputs_from, inputs_of
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.mixed.effects import Effects
 from magtwin.learn.mixed.mixed import Mixed
@@ -22,6 +22,7 @@ from magtwin.learn.models.hybrid import Hybrid
 from magtwin.learn.models.linear import Linear
 from magtwin.learn.models.network import load_net
 from magtwin.learn.models.predictor import PREDICTORS, load_predictor
+from magtwin.learn.models.regressor import Regressor
 from magtwin.learn.models.weights import write_weights
 from magtwin.twin import open_twin, simulate, sweep
 
@@ -223,3 +224,49 @@ def test_what_wants_a_perceptron_refuses_a_hybrid(tmp_path):
     a_predictor("hybrid").save(tmp_path / "h.safetensors")
     with pytest.raises(InputError, match="holds a hybrid, no multilayer perceptron; give one of those"):
         load_net(tmp_path / "h.safetensors")
+
+
+def test_a_module_of_torch_is_a_predictor_of_ones_own(tmp_path):
+    import torch
+
+    class Curve(torch.nn.Module, Regressor):
+        kind, layers_text, parameters_count = "curve", "a curve", 2
+
+        def __init__(self, inputs, residual_sd_nt):
+            torch.nn.Module.__init__(self)
+            Regressor.__init__(self, inputs=inputs, residual_sd_nt=residual_sd_nt)
+            self.line = torch.nn.Linear(len(inputs.features), 1, dtype=torch.float64)
+
+        def predict(self, x):
+            with torch.inference_mode():
+                y = self.line(torch.tanh(torch.tensor(self.inputs.scaled(x)))).squeeze(-1).numpy()
+            return y, np.full(len(y), self.residual_sd_nt)
+
+        def tensors(self):
+            line = {name: value.detach().numpy() for name, value in self.line.state_dict().items()}
+            return self.inputs.tensors() | line
+
+        def settings(self):
+            return {}
+
+        def figures(self):
+            return []
+
+    @PREDICTORS.register("curve")
+    class Curves:
+        @staticmethod
+        def load(weights):
+            model = Curve(
+                inputs_from(weights.features, weights.tensors, weights.path), weights.residual_sd_nt
+            )
+            held = {name: weights.tensors[name] for name in ("weight", "bias")}
+            model.line.load_state_dict({name: torch.tensor(value) for name, value in held.items()})
+            return model
+
+    rng = np.random.default_rng(0)
+    model = Curve(inputs_of(rng.normal(0, 30, (100, len(NAMES))), NAMES), 12.0)
+    model.save(tmp_path / "c.safetensors")
+    run = a_run(30)
+    read = NeuralMagnetometer.load(tmp_path / "c.safetensors").disturbance_nt(run)
+    assert_array_equal(read, model.predict(features(run, NAMES))[0])
+    PREDICTORS._loaded.pop("curve")
