@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-FORMATS = ("rrd", "parquet", "mcap", "db3", "csv", "npz", "usdc")
+FORMATS = ("rrd", "parquet", "mcap", "csv", "npz", "usdc")
 
 SAVES = """
 import gc, json, os, sys

@@ -24,6 +24,7 @@ from magtwin.io.bags.bag import Bag
 from magtwin.io.formats import read_run
 from magtwin.urdf.meshes.mesh import read_mesh
 from magtwin.urdf.source.source import read_source
+from magtwin.usd import trial
 from magtwin.usd.layers import open_stage
 
 MOST = 300_000_000
@@ -323,7 +324,8 @@ def no_more_than(room):
 def small(monkeypatch):
     """Small limits, so that bombs are quick to make."""
     monkeypatch.setattr(budget, "SPARE", SPARE)
-    monkeypatch.setitem(budget.BUDGETS, "USD", budget.Budget(seconds=2.0))
+    monkeypatch.setitem(budget.BUDGETS, "USD", budget.Budget(seconds=600.0))
+    monkeypatch.setattr(trial, "PROCESSOR_S", 2.0)
     monkeypatch.setitem(budget.BUDGETS, "mesh", budget.Budget(count=500))
     monkeypatch.setitem(budget.BUDGETS, "package", budget.Budget(count=100))
 

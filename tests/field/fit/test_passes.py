@@ -11,7 +11,6 @@ from test_gp import survey, truth
 from magtwin.field.fit.fit import OFFSET_SD_NT, fit, grid_report, offset_sd_nt, raster
 from magtwin.field.fit.passes import by_pass
 from magtwin.field.maps.difference import difference
-from magtwin.field.maps.epochs import at_date
 from magtwin.field.maps.map import OFFSET
 from magtwin.field.maps.statistics import map_metadata
 from magtwin.field.survey.readings import Readings
@@ -117,14 +116,6 @@ def test_changes_between_maps_are_tested_without_their_offsets():
     field = raster(fitted("gp"), loops(), spacing_m=0.2)
     found = difference(field, field)
     assert found.sd_nt[np.isfinite(found.z)].max() < OFFSET_SD_NT
-
-
-def test_a_map_between_two_days_keeps_the_offset_of_its_variance():
-    field = raster(fitted("gp"), loops(), spacing_m=0.2)
-    first = replace(field, created="2026-01-01")
-    second = replace(field, created="2026-01-03", parameters={OFFSET: OFFSET_SD_NT})
-    between = at_date([first, second], "2026-01-02")
-    assert between.offset_sd_nt == pytest.approx(OFFSET_SD_NT / np.sqrt(2), rel=1e-12)
 
 
 @pytest.mark.parametrize("wrong", ["far", -3.0, float("nan"), float("inf"), None, [1.0]])
