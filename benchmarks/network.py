@@ -34,8 +34,8 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.features import FULL
 from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.inference.reader import Reader
-from magtwin.learn.models.network import load_net
 from magtwin.learn.models.perceptron import in_threads
+from magtwin.learn.models.predictor import load_predictor
 from magtwin.learn.training.module import NetModule
 
 WANTED_MANY = 0.90
@@ -215,7 +215,7 @@ def main():
     parser.add_argument("--rows", type=int, default=16_384)
     parser.add_argument("--rounds", type=int, default=9)
     options = parser.parse_args()
-    net = load_net(options.net) if options.net else as_sparse_as_released()
+    net = load_predictor(options.net) if options.net else as_sparse_as_released()
     threads = torch.get_num_threads()
     print(f"network {net.layers_text}")
     ratio = many(net, options.rows, options.rounds, 1)

@@ -63,7 +63,7 @@ def test_the_map_column_is_what_scipy_interpolates_and_unknown_beside_latched_no
 def test_the_disturbance_column_is_what_torch_predicts_from_the_twenty_signals(real_run):
     import torch
 
-    from magtwin.learn.models.network import load_net
+    from magtwin.learn.models.predictor import load_predictor
     from magtwin.learn.training.module import NetModule
 
     run, real = real_run
@@ -80,7 +80,7 @@ def test_the_disturbance_column_is_what_torch_predicts_from_the_twenty_signals(r
         ]
     )
     assert x.shape[1] == 20
-    released = NetModule.of(load_net(real / "models" / "nn_magnetometer_model_v0.0.1.pth")).double()
+    released = NetModule.of(load_predictor(real / "models" / "nn_magnetometer_model_v0.0.1.pth")).double()
     layers = [part for linear in released.layers for part in (linear, torch.nn.ReLU())]
     with torch.no_grad():
         z = torch.nn.Sequential(*layers[:-1])((torch.tensor(x) - released.x_mean) / released.x_scale)

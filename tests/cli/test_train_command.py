@@ -18,7 +18,6 @@ from magtwin.io.formats import read_run
 from magtwin.learn.data.dataset import build_dataset, open_dataset
 from magtwin.learn.data.features import features
 from magtwin.learn.data.split import LEAK
-from magtwin.learn.models.network import load_net
 from magtwin.learn.models.predictor import load_predictor
 from magtwin.learn.training.config import read_config
 from magtwin.learn.training.descent import _Descent
@@ -85,7 +84,7 @@ def refused(capsys, *words):
 
 
 def test_the_error_told_is_that_of_the_weights_on_what_was_held_out(data, trained):
-    net = load_net(trained)
+    net = load_predictor(trained)
     rows = open_dataset(data).rows("full", ["f", "g"])
     error = net.predict(rows.x)[0] - rows.y
     assert net.metadata["test_mae_nt"] == pytest.approx(np.abs(error).mean())
@@ -97,7 +96,7 @@ def test_the_error_told_is_that_of_the_weights_on_what_was_held_out(data, traine
 def test_the_card_tells_checksum_errors_by_path_and_how_to_repeat(trained):
     card = trained.with_suffix(".md").read_text()
     assert sha256(trained) in card
-    mae = load_net(trained).metadata["test_mae_nt"]
+    mae = load_predictor(trained).metadata["test_mae_nt"]
     assert f"| test | 2 | 400 | {mae:.1f} |" in card
     assert "| test, path eight | 1 | 200 |" in card
     assert "Test: f, g." in card
@@ -105,7 +104,7 @@ def test_the_card_tells_checksum_errors_by_path_and_how_to_repeat(trained):
 
 
 def test_the_configuration_in_the_weights_repeats_them_to_the_byte(data, trained, tmp_path):
-    (tmp_path / "c.toml").write_text(load_net(trained).metadata["config"])
+    (tmp_path / "c.toml").write_text(load_predictor(trained).metadata["config"])
     assert read_config(tmp_path / "c.toml").hold_out == ("f", "g")
     again = tmp_path / "g.safetensors"
     main(["train", str(data), "--out", str(again), "--config", str(tmp_path / "c.toml"), "--json"])
@@ -154,7 +153,7 @@ def test_a_simulation_runs_the_trained_network(trained, lab_scene, tmp_path, cap
     )
     run = read_run(out)
     assert run.metadata["network_sha256"] == sha256(trained)
-    assert run["b_sd_nt"][0] == pytest.approx(load_net(trained).residual_sd_nt)
+    assert run["b_sd_nt"][0] == pytest.approx(load_predictor(trained).residual_sd_nt)
     assert np.isfinite(run["b_disturbance_nt"]).all()
 
 
@@ -185,10 +184,12 @@ def test_fine_tuning_tells_the_error_before_and_after(data, trained, tmp_path, c
     words = ["--init", str(trained), "--freeze", "layers.0", "layers.1", "--layers", "12,12", "--epochs", "2"]
     main(["train", str(data), "--out", str(out), *words, "--hold-out", "f", "g", "--json"])
     figures = json.loads(capsys.readouterr().out)["figures"]
-    assert figures["test MAE before"]["value"] == pytest.approx(load_net(trained).metadata["test_mae_nt"])
-    net = load_net(out)
+    assert figures["test MAE before"]["value"] == pytest.approx(
+        load_predictor(trained).metadata["test_mae_nt"]
+    )
+    net = load_predictor(out)
     assert net.metadata["init_sha256"] == sha256(trained)
-    assert np.array_equal(net.layers[0].weight, load_net(trained).layers[0].weight)
+    assert np.array_equal(net.layers[0].weight, load_predictor(trained).layers[0].weight)
     card = card_of(out)
     assert (
         f"It continues from `f.safetensors` (SHA-256 `{sha256(trained)}`), layers.0, layers.1 frozen." in card
@@ -241,7 +242,7 @@ def test_a_split_by_row_carries_its_warning_everywhere(data, tmp_path, capsys):
     out = tmp_path / "f.safetensors"
     main(["train", str(data), "--out", str(out), *TINY[:2], "--epochs", "1", "--split", "row", "--json"])
     assert json.loads(capsys.readouterr().out)["metadata"]["warning"] == LEAK
-    assert load_net(out).metadata["warning"] == LEAK
+    assert load_predictor(out).metadata["warning"] == LEAK
     assert LEAK in card_of(out)
 
 

@@ -17,7 +17,7 @@ from magtwin.learn.data.features import FULL
 from magtwin.learn.data.inputs import Array, inputs_from, scaler_tensors
 from magtwin.learn.models.perceptron import Layer, outputs
 from magtwin.learn.models.regressor import Regressor
-from magtwin.learn.models.weights import Weights, is_checkpoint, read_weights, say
+from magtwin.learn.models.weights import Weights, say
 from magtwin.report import Figure
 
 
@@ -96,22 +96,6 @@ class FieldNet(Regressor):
             Figure("label mean", self.y_mean, "nT"),
             Figure("label sd", self.y_scale, "nT"),
         ]
-
-
-def load_net(path: str | os.PathLike[str]) -> FieldNet:
-    """Load a network, safetensors or a released `.pth`.
-
-    Raises:
-        InputError: Neither of the two, another kind, damaged, or its parts do not fit each other.
-    """
-    if is_checkpoint(path):
-        return net_of_checkpoint(path)
-    weights = read_weights(path)
-    if weights.kind != "mlp":
-        raise InputError(f"{path}: holds a {weights.kind}, no multilayer perceptron; give one of those")
-    net = net_of(weights)
-    net.wide = weights.wide
-    return net
 
 
 def convert(

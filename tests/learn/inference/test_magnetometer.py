@@ -11,7 +11,6 @@ from magtwin.errors import InputError
 from magtwin.files import sha256, shipped
 from magtwin.learn.data.features import FULL, features
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
-from magtwin.learn.models.network import load_net
 from magtwin.learn.models.perceptron import in_threads, threads_of_products
 from magtwin.learn.models.predictor import load_predictor
 from magtwin.sim.session import session_of
@@ -183,7 +182,7 @@ def test_the_paper_s_network_has_its_shape_and_reads_its_inputs():
 
 def test_the_shipped_networks_predict_in_numpy_what_they_predict_in_torch():
     """Sums of 64 or 512 float32 products, in another order: 1e-7 of their terms times the scale of labels."""
-    paper = load_net(shipped("weights", "turtlebot4_paper.safetensors"))
+    paper = load_predictor(shipped("weights", "turtlebot4_paper.safetensors"))
     x = inputs(paper, 3000)
     assert_allclose(paper.predict(x)[0], by_torch(paper, x), rtol=0, atol=1e-3)
     hybrid = load_predictor(shipped("weights", "turtlebot4_hybrid.safetensors"))

@@ -15,7 +15,7 @@ from magtwin.learn.data.features import FEATURES, FULL, SETS, features
 from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.inference import reader
 from magtwin.learn.inference.reader import POSE, Reader
-from magtwin.learn.models.network import load_net
+from magtwin.learn.models.predictor import load_predictor
 from magtwin.run.run import COLUMNS
 
 
@@ -97,7 +97,7 @@ def test_nan_in_gives_nan_out_of_every_kind(kind, run, field):
 
 
 def test_a_reading_of_the_released_network_errs_by_less_than_a_hundredth_nt(real_data, field):
-    net = load_net(real_data / RELEASED)
+    net = load_predictor(real_data / RELEASED)
     reader, x = Reader(net, field), inputs(net, 200)
     x[:, FULL.index("yaw_deg")] %= 360
     exact = forward64(net, x)

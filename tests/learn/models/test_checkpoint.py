@@ -17,7 +17,8 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
-from magtwin.learn.models.network import load_net, net_of_checkpoint
+from magtwin.learn.models.network import net_of_checkpoint
+from magtwin.learn.models.predictor import load_predictor
 
 RELEASED = "aprilab/models/nn_magnetometer_model_v0.0.1.pth"
 
@@ -73,13 +74,13 @@ def refusal(path):
 
 
 def test_the_released_network_has_601857_parameters_in_5_layers(real_data):
-    net = load_net(real_data / RELEASED)
+    net = load_predictor(real_data / RELEASED)
     assert net.layers_text == "20-512-512-512-128-1"
     assert net.parameters_count == 601_857
 
 
 def test_the_released_scalers_are_the_published_figures(real_data):
-    net = load_net(real_data / RELEASED)
+    net = load_predictor(real_data / RELEASED)
     # Mean and scale of each input, to the digits that were noted when the file was first looked at.
     figures = """
         180.295 101.551   .232589 .0658757  3.06e-4 2.75e-3  -2.6e-6 1.35e-4  4.3e-5 .010961
@@ -99,7 +100,7 @@ def test_the_released_scalers_are_the_published_figures(real_data):
 def test_a_checkpoint_gives_back_what_was_saved(tmp_path):
     state = layers(20, 8, 4, 1)
     state["layer0.weight"] = state["layer0.weight"].T.contiguous().T  # stored by columns
-    net = load_net(pth(tmp_path / "a.pth", saved(state)))
+    net = load_predictor(pth(tmp_path / "a.pth", saved(state)))
     assert len(net.layers) == 3
     for i, layer in enumerate(net.layers):
         assert_array_equal(layer.weight, state[f"layer{i}.weight"])

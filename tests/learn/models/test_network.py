@@ -12,8 +12,9 @@ from magtwin.errors import InputError
 from magtwin.learn.data.features import FULL, feature_names
 from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.models.checkpoint import read_checkpoint
-from magtwin.learn.models.network import FieldNet, check_shape, convert, load_net
+from magtwin.learn.models.network import FieldNet, check_shape, convert
 from magtwin.learn.models.perceptron import Layer
+from magtwin.learn.models.predictor import load_predictor
 from magtwin.learn.training.config import TrainConfig
 
 RELEASED = "aprilab/models/nn_magnetometer_model_v0.0.1.pth"
@@ -40,7 +41,7 @@ def a_net(features=FULL, hidden=(8, 4), seed=0, **options):
 def test_the_file_alone_tells_the_architecture(tmp_path, hidden):
     net = a_net(hidden=hidden)
     net.save(tmp_path / "n.safetensors")
-    again = load_net(tmp_path / "n.safetensors")
+    again = load_predictor(tmp_path / "n.safetensors")
     assert again.hidden == hidden
     for name, value in net.tensors().items():
         assert_array_equal(again.tensors()[name], value)
@@ -55,7 +56,7 @@ def test_what_is_known_of_a_network_survives_the_file(tmp_path):
         ["yaw_deg", "odom_v_x"], dropout=0.1, residual_sd_nt=12.5, metadata={"source": "here", "rows": 7}
     )
     net.save(tmp_path / "n.safetensors")
-    again = load_net(tmp_path / "n.safetensors")
+    again = load_predictor(tmp_path / "n.safetensors")
     assert again.features == ("yaw_deg", "odom_v_x")
     assert (again.dropout, again.residual_sd_nt, again.metadata) == (0.1, 12.5, {"source": "here", "rows": 7})
 
@@ -97,7 +98,7 @@ def test_scalers_make_training_rows_standard_and_leave_constant_ones_alone():
 def test_the_released_network_converts_once_and_stays_itself(real_data, tmp_path):
     out = tmp_path / "released.safetensors"
     converted = convert(real_data / RELEASED, out)
-    net, (checkpoint, _) = load_net(out), read_checkpoint(real_data / RELEASED)
+    net, (checkpoint, _) = load_predictor(out), read_checkpoint(real_data / RELEASED)
     assert net.hidden == (512, 512, 512, 128)
     assert net.features == FULL
     for i, layer in enumerate(net.layers):
@@ -111,7 +112,7 @@ def test_the_released_network_converts_once_and_stays_itself(real_data, tmp_path
 
 def test_a_pth_loads_without_conversion(real_data, tmp_path):
     convert(real_data / RELEASED, tmp_path / "n.safetensors")
-    a, b = load_net(real_data / RELEASED), load_net(tmp_path / "n.safetensors")
+    a, b = load_predictor(real_data / RELEASED), load_predictor(tmp_path / "n.safetensors")
     for name, value in a.tensors().items():
         assert_array_equal(b.tensors()[name], value)
 
@@ -123,7 +124,7 @@ def test_an_output_that_exists_is_refused_unless_forced(real_data, tmp_path):
         convert(real_data / RELEASED, out)
     assert out.read_bytes() == b"precious"
     convert(real_data / RELEASED, out, force=True)
-    assert load_net(out).hidden == (512, 512, 512, 128)
+    assert load_predictor(out).hidden == (512, 512, 512, 128)
 
 
 # Files that are refused
@@ -228,7 +229,7 @@ def ones(*shape):
 def test_a_weights_file_that_does_not_hold_together_is_refused(tmp_path, change, text):
     path = changed(tmp_path, **change)
     with pytest.raises(InputError) as refused:
-        load_net(path)
+        load_predictor(path)
     assert str(refused.value) == f"{path}: {text}"
 
 
@@ -236,7 +237,7 @@ def test_a_truncated_weights_file_is_refused(tmp_path):
     path = changed(tmp_path)
     path.write_bytes(path.read_bytes()[:-10])
     with pytest.raises(InputError, match=r"damaged safetensors \(.*\); get the file again"):
-        load_net(path)
+        load_predictor(path)
 
 
 @pytest.mark.parametrize("content", [b"", b"weights", b"\x89PNG\r\n\x1a\n" + bytes(20)])
@@ -245,12 +246,12 @@ def test_a_file_of_another_kind_is_refused(tmp_path, content):
     path.write_bytes(content)
     text = "no weights: neither safetensors nor a PyTorch checkpoint" if content else "n.bin: is empty"
     with pytest.raises(InputError, match=text):
-        load_net(path)
+        load_predictor(path)
 
 
 def test_a_folder_is_refused(tmp_path):
     with pytest.raises(InputError, match="a folder; give a weights file"):
-        load_net(tmp_path)
+        load_predictor(tmp_path)
 
 
 @pytest.mark.parametrize(("hidden", "dropout"), [((), 0.3), ((4, 0), 0.3), ((4,), 1.0)])

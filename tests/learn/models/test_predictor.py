@@ -20,7 +20,6 @@ from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.calibration import Spread
 from magtwin.learn.models.hybrid import Hybrid
 from magtwin.learn.models.linear import Linear
-from magtwin.learn.models.network import load_net
 from magtwin.learn.models.predictor import PREDICTORS, load_predictor
 from magtwin.learn.models.regressor import Regressor
 from magtwin.learn.models.weights import write_weights
@@ -218,12 +217,6 @@ def test_a_registered_kind_is_loaded_like_a_built_in_one(tmp_path):
     )
     assert load_predictor(tmp_path / "c.safetensors") == ("constant", ("yaw_sin",))
     PREDICTORS._loaded.pop("constant")
-
-
-def test_what_wants_a_perceptron_refuses_a_hybrid(tmp_path):
-    a_predictor("hybrid").save(tmp_path / "h.safetensors")
-    with pytest.raises(InputError, match="holds a hybrid, no multilayer perceptron; give one of those"):
-        load_net(tmp_path / "h.safetensors")
 
 
 def test_a_module_of_torch_is_a_predictor_of_ones_own(tmp_path):
