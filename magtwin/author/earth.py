@@ -21,7 +21,7 @@ def earth_of(text: str) -> tuple[float, float, float]:
     if len(words) in (3, 4) and not Path(text).exists():
         from magtwin.field.sources.earth import earth_field_nt
         from magtwin.field.survey.readings import checked_earth_nt
-        from magtwin.field.units import GREATEST_MEAN_NT, LEAST_MEAN_NT
+        from magtwin.field.units import LEAST_USUAL_NT, MOST_USUAL_NT
 
         try:
             x, y, z = (float(word) for word in words[:3])
@@ -30,7 +30,7 @@ def earth_of(text: str) -> tuple[float, float, float]:
         if len(words) == 4:
             return earth_field_nt(x, y, z, words[3])
         size = sum(c * c for c in checked_earth_nt((x, y, z))) ** 0.5
-        if not LEAST_MEAN_NT <= size <= GREATEST_MEAN_NT:
+        if not LEAST_USUAL_NT <= size <= MOST_USUAL_NT:
             raise InputError(
                 f"`earth={text}` is a field of {size:.6g} nT, and the Earth's is some 22,000 to 67,000; give "
                 "it in nT, or as latitude,longitude,height,date",

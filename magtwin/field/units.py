@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 Unit = Literal["nT", "uT", "T", "mG", "G"]
 
 # Bounds of a survey's median [nT]. The Earth's field is 22,000 to 67,000 nT; a building bends it.
-LEAST_MEAN_NT, GREATEST_MEAN_NT = 10_000.0, 100_000.0
+LEAST_USUAL_NT, MOST_USUAL_NT = 10_000.0, 100_000.0
 # Range of the median of readings from which their unit is deduced [nT]: the Earth's field and some steel
 INDOORS_NT = 18_000.0, 75_000.0
 USUAL_NT = 50_000.0  # Magnitude that a suggested scale would give [nT]
@@ -29,6 +29,20 @@ def _four(value: float) -> str:
 def nt_per(unit: str | None, scale: float | None) -> float:
     """Factor from a file's values to nT: `scale` if given, else that of the unit; None is nT."""
     return NT_PER[unit or "nT"] if scale is None else scale
+
+
+def check_factor(unit: str | None, scale: float | None) -> None:
+    """Refuse a unit and a scale for the same field, and a scale that is no factor.
+
+    Raises:
+        InputError: It is refused.
+    """
+    if scale is None:
+        return
+    if unit is not None:
+        raise InputError("give either the unit of the field or its scale, the factor to nT")
+    if not 0 < scale < float("inf"):
+        raise InputError(f"scale, the factor to nT, must be above 0, got {scale:g}", parameter="scale")
 
 
 def check_unit(
@@ -67,18 +81,18 @@ def check_unit(
     usual = float(np.median(b_nt))
     if p_xy is not None:
         _check_one_unit(b_nt, p_xy, unit, f"{column} is", row or (lambda k: where))
-    if LEAST_MEAN_NT <= usual <= GREATEST_MEAN_NT:
+    if LEAST_USUAL_NT <= usual <= MOST_USUAL_NT:
         return ""
     text = f"the median of {column} is {usual:.6g} nT"
-    bounds = f"outside {LEAST_MEAN_NT:,.0f}..{GREATEST_MEAN_NT:,.0f} nT"
-    kept = told and LEAST_MEAN_NT / BESIDE_STEEL <= usual <= GREATEST_MEAN_NT * BESIDE_STEEL
+    bounds = f"outside {LEAST_USUAL_NT:,.0f}..{MOST_USUAL_NT:,.0f} nT"
+    kept = told and LEAST_USUAL_NT / BESIDE_STEEL <= usual <= MOST_USUAL_NT * BESIDE_STEEL
     if scale is not None:
         advice = f"--scale {_four(scale * USUAL_NT / usual)} would make it {USUAL_NT:,.0f} nT"
         text = f"{text} with scale {scale:g}, {bounds}; {advice}"
     else:
         number = usual / NT_PER[unit]
         could = {other: number * factor for other, factor in NT_PER.items()}
-        could = {o: value for o, value in could.items() if LEAST_MEAN_NT <= value <= GREATEST_MEAN_NT}
+        could = {o: value for o, value in could.items() if LEAST_USUAL_NT <= value <= MOST_USUAL_NT}
         advice = " or ".join(
             f"in {other} it would be {value:,.0f} nT: give --unit {other}" for other, value in could.items()
         )
@@ -106,7 +120,6 @@ def _check_one_unit(
     Beside steel, a field rises by degrees along the path and does neither.
     """
     import numpy as np
-    from scipy.spatial import cKDTree
 
     usual = float(np.median(b_nt))
     for other, factor in NT_PER.items():
@@ -114,6 +127,8 @@ def _check_one_unit(
         odd = np.abs(np.log10(b_nt / usual * ratio)) < 0.3
         if other == unit or not MIXED * len(b_nt) < np.count_nonzero(odd) < len(b_nt) or odd.sum() < 2:
             continue
+        from scipy.spatial import cKDTree
+
         edge = np.flatnonzero(np.diff(odd))
         near = np.flatnonzero(~odd)[cKDTree(p_xy[~odd]).query(p_xy[odd])[1]]
         jump = np.abs(np.log10(b_nt[edge + 1] / b_nt[edge]))

@@ -13,7 +13,7 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap, Outside
-from magtwin.field.units import GREATEST_MEAN_NT, LEAST_MEAN_NT, NT_PER
+from magtwin.field.units import LEAST_USUAL_NT, MOST_USUAL_NT, NT_PER
 from magtwin.frames import yaw_from_quat
 from magtwin.io.bags.cdr import NS
 from magtwin.io.bags.frames import role_of
@@ -310,7 +310,7 @@ class Measured:
 
 
 def _is_earths(b_nt: float) -> bool:
-    return LEAST_MEAN_NT <= b_nt < GREATEST_MEAN_NT
+    return LEAST_USUAL_NT <= b_nt < MOST_USUAL_NT
 
 
 class _Source:

@@ -520,3 +520,20 @@ def test_a_bag_that_was_cut_short_is_refused_in_one_line(tmp_path, storage, keep
     with pytest.raises(InputError, match=r"a\.\w+: (damaged bag, or none|cut short)") as refusal:
         read_bag(file)
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"unit": "T", "scale": 5.0}, "give either the unit of the field or its scale"),
+        ({"scale": 0.0}, "must be above 0, got 0"),
+        ({"scale": np.nan}, "must be above 0, got nan"),
+    ],
+)
+def test_a_factor_that_is_none_or_one_of_two_is_refused_in_a_recording_and_in_a_survey(
+    tmp_path, options, text
+):
+    bag = record(tmp_path / "bag", BASE)
+    for read in (lambda: read_bag(bag, **options), lambda: Columns(**options)):
+        with pytest.raises(InputError, match=text):
+            read()

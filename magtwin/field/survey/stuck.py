@@ -146,7 +146,9 @@ def find_stuck(readings: Readings) -> Findings:
     from scipy.special import stdtrit
 
     count, b = len(readings), readings.b_nt
-    stretches = _frozen(readings)
+    sequences = _sequences(readings)
+    steps = steps_nt(readings, sequences)
+    stretches = _frozen(readings, sequences, steps)
     frozen = np.zeros(count, bool)
     for rows in stretches:
         frozen[rows] = True
@@ -165,7 +167,6 @@ def find_stuck(readings: Readings) -> Findings:
         pool, flats = known, []
     if len(pool) < LEAST or np.ptp(cells.b_nt[pool]) == 0:
         return Findings(frozen, stuck, doubt, outlier, level, spread, judged=False)
-    steps = steps_nt(readings, _sequences(readings))
     fit = LocalFit.to(cells, pool, known, max(steps) / float(np.sqrt(12)))
     for rows in _refuted(flats, cell, fit, pool, known):
         stuck[rows] = True
@@ -209,15 +210,14 @@ def _moved(readings: Readings, rows: Rows) -> Array:
     return np.asarray(np.hypot(way[:, 0], way[:, 1]) + REACH_M * np.abs(turn))
 
 
-def _frozen(readings: Readings) -> list[Rows]:
+def _frozen(readings: Readings, sequences: list[Rows], steps: list[float]) -> list[Rows]:
     """Rows of each stretch that repeats to the last digit for longer than chance allows."""
-    b, sequences = readings.b_nt, _sequences(readings)
+    b = readings.b_nt
     candidates = list[tuple[float, Rows]]()
     channels = b[:, None] if readings.b_body_nt is None else readings.b_body_nt
     if not np.ptp(channels[readings.good], axis=0).any():  # one number everywhere
         still = len(sequences) == 0 or np.ptp(readings.p_xy[readings.good], axis=0).max() == 0
         return [] if still or readings.good.sum() <= LEAST_SLOPES else [np.flatnonzero(readings.good)]
-    steps = steps_nt(readings, sequences)
     place, slope = _slopes(readings, b, sequences)
     for rows, step in zip(sequences, steps, strict=True):
         for part in _stretches(repeats(readings, rows)):

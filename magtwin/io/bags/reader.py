@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, find
-from magtwin.field.units import NT_PER, Unit
+from magtwin.field.units import NT_PER, Unit, check_factor
 from magtwin.io.bags.bag import Bag, Signal
 from magtwin.io.bags.cdr import Index, decode
 from magtwin.io.bags.recording import ROLES, read_recording, taken
@@ -58,8 +58,10 @@ def read_bag(
 
     Raises:
         InputError: There is no bag, or it is damaged or truncated; a topic is missing or of another type, or
-            there are several of a role; stamps run backwards; no unit makes the field the Earth's.
+            there are several of a role; stamps run backwards; no unit makes the field the Earth's; or the
+            scale is not above 0, or is given beside a unit.
     """
+    check_factor(unit, scale)
     for name in topics or ():
         find("topic", name, {topic.name: topic for topic in ROLES})
     with Bag(Path(path)) as bag, np.errstate(over="ignore", invalid="ignore"):

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, RepairWarning
-from magtwin.field.units import GREATEST_MEAN_NT, LEAST_MEAN_NT, NT_PER, Unit, check_unit
+from magtwin.field.units import LEAST_USUAL_NT, MOST_USUAL_NT, NT_PER, Unit, check_unit, nt_per
 
 Array = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ def field_nt(
     told = unit is not None or scale is not None
     if scale is None:
         unit = unit or unit_of(float(np.median(finite)), where, topic)
-    factor = NT_PER[unit] if unit else float(scale or 1.0)
+    factor = nt_per(unit, scale)
     usual = factor * float(np.median(finite))
     if unit and not _is_earths(usual) and _is_earths(usual, IRON):
         doubt = f"the median of {topic} is {usual:,.0f} nT in {unit}, not that of the Earth's field"
@@ -88,4 +88,4 @@ def unit_of(usual: float, where: str, topic: str) -> Unit:
 
 def _is_earths(usual_nt: float, apart: float = 1.0) -> bool:
     """Whether a median may be that of the Earth's field, or up to a factor of it [nT]."""
-    return LEAST_MEAN_NT / apart <= usual_nt < GREATEST_MEAN_NT * apart
+    return LEAST_USUAL_NT / apart <= usual_nt < MOST_USUAL_NT * apart

@@ -7,7 +7,7 @@ from typing import Literal
 
 from magtwin.delimited import DEGREES, label_of
 from magtwin.errors import InputError
-from magtwin.field.units import Unit
+from magtwin.field.units import Unit, check_factor
 
 Axes = Literal["body", "world"]
 HeadingUnit = Literal["rad", "deg", "compass"]
@@ -139,13 +139,7 @@ class Columns:
             given = getattr(self, name)
             if given and len(self.several(name)) != count:
                 raise InputError(f"{name} takes {count} columns with commas between, got {given!r}")
-        if self.scale is not None:
-            if self.unit is not None:
-                raise InputError("give either the unit of the field or its scale, the factor to nT")
-            if not (0 < self.scale < float("inf")):
-                raise InputError(
-                    f"scale, the factor to nT, must be above 0, got {self.scale:g}", parameter="scale"
-                )
+        check_factor(self.unit, self.scale)
         if self.heading and self.quaternion:
             raise InputError("give either the heading's column or the quaternion's")
 

@@ -43,7 +43,7 @@ class Regressor(Summarized, ABC):
 
         None if it learned none, or predicts for the session of a drive.
         """
-        return wide_sd_nt(self.wide, self.inputs, x)
+        return None if self.wide is None else self.wide.sd_nt(self.inputs.scaled(self.inputs.checked(x)))
 
     @abstractmethod
     def tensors(self) -> dict[str, NDArray[Any]]:
@@ -82,24 +82,16 @@ class Regressor(Summarized, ABC):
 
     def report(self, title: str) -> Report:
         """Its kind, its parts, and its error on held-out recordings if known."""
-        figures = [Figure("kind", self.kind), *self.figures(), *wide_figures(self.wide)]
+        figures = [Figure("kind", self.kind), *self.figures()]
+        if self.wide is not None:
+            note = "of training rows, on robots that it was not trained on"
+            figures.append(Figure("sd, other robots", self.wide.mean_nt, "nT", note=note))
         if not math.isnan(self.residual_sd_nt):
             figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note=f"on {self.judged_on}"))
         return Report(title, tuple(figures), shown(self.metadata))
 
     def _summary(self) -> Summary:
         return summary_of(self, type(self).__name__)
-
-
-def wide_sd_nt(wide: Spread | None, inputs: Inputs, x: ArrayLike) -> NDArray[np.float64] | None:
-    """Standard deviations by a spread on other robots [nT], (N,), from features (N, F); None without one."""
-    return None if wide is None else wide.sd_nt(inputs.scaled(inputs.checked(x)))
-
-
-def wide_figures(wide: Spread | None) -> list[Figure]:
-    """A spread on other robots, for a report."""
-    note = "of training rows, on robots that it was not trained on"
-    return [Figure("sd, other robots", wide.mean_nt, "nT", note=note)] if wide else []
 
 
 def summary_of(net: Any, title: str, *metadata: tuple[str, str]) -> Summary:

@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from test_calibrate import FIELD
 from test_network import a_net
 
 import magtwin as mt
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.field.maps.map import AnomalyMap
 from magtwin.files import sha256, shipped
 from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.data.origin import same_robot
@@ -24,14 +24,6 @@ from magtwin.run.run import Run
 from magtwin.sim.plant_families import PLANTS
 from magtwin.verdict import ONLY_OWN, OTHERS, OWN, Z_90, Tally
 
-X, Y = np.meshgrid(np.linspace(-3, 3, 13), np.linspace(-3, 3, 13))
-FIELD = AnomalyMap(
-    values_nt=(41e3 + 300 * X**2 - 400 * Y)[None],
-    origin_m=(-3.0, -3.0),
-    cell_m=(0.5, 0.5),
-    headings_rad=np.zeros(1),
-    name="trough",
-)
 HYBRID = shipped("weights", "turtlebot4_hybrid.safetensors")
 EFFECTIVE = [name for name in PLANTS if name != "nominal"]
 
