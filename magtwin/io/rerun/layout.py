@@ -87,7 +87,7 @@ DISTURBANCE_PANEL = Panel("Disturbance [nT]", (Series("b_disturbance_nt", "distu
 ERROR_PANEL = Panel(
     "Error [nT]",
     (
-        Series("error_nt", "total - truth", _ORANGE, width=3.0),
+        Series("error_nt", "prediction - truth", _ORANGE, width=3.0),
         Series("measured_error_nt", "measured - truth", _GREEN, width=1.0),
         Series("error_low_nt", "90 % interval", _DIM),
         Series("error_high_nt", "90 % interval", _DIM),
@@ -136,7 +136,7 @@ PANELS = (
 _COMPARED = (
     ("Total field [nT]", "b_total_nt", ""),
     ("Disturbance [nT]", "b_disturbance_nt", ""),
-    ("Error, total - truth [nT]", "error_nt", ""),
+    ("Error, prediction - truth [nT]", "error_nt", ""),
     ("Speed [m/s]", "v_base", "x"),
     ("Heading [rad]", "yaw", ""),
     ("Battery voltage [V]", "battery_v", ""),
