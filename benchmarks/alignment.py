@@ -13,7 +13,7 @@ import sys
 import numpy as np
 
 import magtwin
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.learn.data.alignment import fit_alignment
 
 TRUTH = np.array([55.0, -30.0, -75.2])

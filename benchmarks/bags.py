@@ -19,7 +19,7 @@ import numpy as np
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.io.bags import read_bag, write_bag
 from magtwin.twin import open_twin, scan, simulate
 

@@ -21,7 +21,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 import magtwin
 from magtwin.author.scene import author_scene
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.io.formats import read_run, write_run
 from magtwin.twin import open_twin, scene_from_toml, simulate
 from magtwin.usd.animation import sample

@@ -22,12 +22,12 @@ import numpy as np
 from magtwin.field.fit.fit import fit, raster
 from magtwin.field.maps.lookup import warm_up
 from magtwin.field.survey.stuck import mask_stuck
-from magtwin.files import shipped
+from magtwin.files.file import shipped
+from magtwin.report.verdict import Z_90
 from magtwin.sim.interference import ambient_field_nt
 from magtwin.sim.survey import blocked_by, field_at_rest_nt, survey_readings
 from magtwin.usd.lab.obstacles import read_obstacles
 from magtwin.usd.scene import read_scene
-from magtwin.verdict import Z_90
 
 FILE = shipped("scenes", "lab", "lab.usda")
 POSES = 1_500

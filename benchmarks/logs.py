@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.io.rerun.file import read_run, write_rrd
 from magtwin.run.run import Run
 from magtwin.twin import Twin, open_twin, simulate

@@ -30,16 +30,16 @@ import numpy as np
 import magtwin as mt
 from magtwin.errors import CalibrationWarning, MismatchWarning
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.learn.data.alignment import Alignment, alignment_of, fit_alignment
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.inference.online import read_online
 from magtwin.learn.mixed.mixed import Mixed
 from magtwin.path import loops, path_named
+from magtwin.report.verdict import Z_90
 from magtwin.run.run import Run
 from magtwin.twin import Twin, in_session, with_plant
-from magtwin.verdict import Z_90
 
 FAMILIES = ("hysteresis", "warm-up", "nonlinear", "moving-part", "drawn")
 JUDGED = ("nominal", *FAMILIES, "all")

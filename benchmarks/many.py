@@ -25,7 +25,7 @@ import numpy as np
 import torch
 
 from magtwin.author.scene import author_scene
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.learn.data.features import FULL
 from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.training.module import NetModule

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.io.bags.topics import COMMAND, MAGNITUDE, NAMES, POSE, READING, TF, TF_STATIC, Qos
 from magtwin.ros.bus import Message, open_bus
 from magtwin.ros.commands import command_bytes

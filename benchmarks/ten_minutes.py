@@ -23,7 +23,7 @@ import torch
 
 import magtwin
 from magtwin.author.scene import author_scene
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.io.rerun.file import write_rrd
 from magtwin.io.tables import write_parquet
 from magtwin.learn.data.features import FULL, features

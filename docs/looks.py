@@ -20,7 +20,7 @@ from PIL import Image
 
 from magtwin.export.package import export_scene
 from magtwin.figures.pictures import Camera, picture_of_stage
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 
 HERE = Path(__file__).resolve().parent
 IN_BLENDER = HERE.parent / "tests" / "in_blender.py"

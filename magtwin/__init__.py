@@ -26,23 +26,23 @@ if TYPE_CHECKING:
     from magtwin.field.maps.map import AnomalyMap as AnomalyMap
     from magtwin.field.survey.readings import Readings as Readings
     from magtwin.figures.plot import plot as plot
-    from magtwin.folders import allow as allow
+    from magtwin.files.folders import allow as allow
     from magtwin.io.formats import read_run, write_run
     from magtwin.io.provenance import repeat_of
     from magtwin.io.surveys.survey import read_survey as read_survey
     from magtwin.io.sweeps import save_runs as save_runs
     from magtwin.learn.models.predictor import load_predictor as load_predictor
     from magtwin.learn.training.train import train as train
-    from magtwin.learning import build_dataset as build_dataset
-    from magtwin.learning import calibrate as calibrate
-    from magtwin.learning import error_budget as error_budget
-    from magtwin.learning import evaluate as evaluate
-    from magtwin.localizing import localize as localize
     from magtwin.run.run import COLUMNS as COLUMNS
     from magtwin.run.run import Run as Run
     from magtwin.sim.plant_families import draw_plant as draw_plant
     from magtwin.spec.plant import PlantSpec as PlantSpec
     from magtwin.spec.scene import Scene as Scene
+    from magtwin.tasks.learning import build_dataset as build_dataset
+    from magtwin.tasks.learning import calibrate as calibrate
+    from magtwin.tasks.learning import error_budget as error_budget
+    from magtwin.tasks.learning import evaluate as evaluate
+    from magtwin.tasks.localizing import localize as localize
     from magtwin.twin import Twin as Twin
     from magtwin.twin import author_scene as author_scene
     from magtwin.twin import in_session as in_session

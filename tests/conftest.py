@@ -37,7 +37,7 @@ def isaac_rules(real_data: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def allow_neighbours(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Lets stages name files in the folders of other tests, such as the lab that is authored once."""
-    from magtwin.folders import allow
+    from magtwin.files.folders import allow
 
     with allow(tmp_path_factory.getbasetemp()):
         yield
@@ -47,7 +47,7 @@ def allow_neighbours(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]
 def lab_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Root layer of the default lab, authored once into a folder of its own; not to be changed."""
     from magtwin.author.scene import author_scene
-    from magtwin.files import shipped
+    from magtwin.files.file import shipped
     from magtwin.twin import scene_from_toml
 
     return author_scene(

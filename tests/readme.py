@@ -123,8 +123,8 @@ def near(quoted: str, line: str) -> bool:
 def check_first_run(folder: Path) -> None:
     """The lab's neural magnetometer errs by at most `MOST_NT` on each named path, and its intervals hold."""
     from magtwin.path import PATHS
+    from magtwin.report.verdict import Tally
     from magtwin.twin import open_twin, sweep
-    from magtwin.verdict import Tally
 
     twin = open_twin(folder / "lab" / "lab.usda")
     failed = False

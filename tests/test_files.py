@@ -8,9 +8,10 @@ from typing import Literal
 import pytest
 
 from magtwin.errors import InputError
-from magtwin.files import existing, from_table, read_toml, refused_at, sha256, shipped
-from magtwin.kinds import SCENE_TOML, kind_of
-from magtwin.outputs import check_free, output
+from magtwin.files.file import existing, sha256, shipped
+from magtwin.files.kinds import SCENE_TOML, kind_of
+from magtwin.files.outputs import check_free, output
+from magtwin.files.settings import from_table, read_toml, refused_at
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,7 +235,7 @@ def test_levels_after_a_text_that_ends_in_a_quote_are_counted(quote, tmp_path):
 
 
 def test_a_table_that_is_right_makes_no_refusals(tmp_path, monkeypatch):
-    monkeypatch.delattr("magtwin.files._Where.refused")
+    monkeypatch.delattr("magtwin.files.settings._Where.refused")
     cart = read_cart(tmp_path, 'name = "a"\nlaps = 2\n' + "[[wheels]]\nradius_m = 0.1\n" * 50)
     assert len(cart.wheels) == 50
 

@@ -15,7 +15,7 @@ from magtwin.bench.suite import Scenario
 from magtwin.bench.twin_case import twin_case
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.files import sha256
+from magtwin.files.file import sha256
 from magtwin.io.formats import read_run
 from magtwin.io.provenance import map_of
 from magtwin.ros.simulate import Simulator

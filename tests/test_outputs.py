@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from magtwin import outputs
 from magtwin.errors import InputError
-from magtwin.outputs import afterwards, check_free, not_read, output, reading, transaction
+from magtwin.files import outputs
+from magtwin.files.outputs import afterwards, check_free, not_read, output, reading, transaction
 
 EVENTS = (
     (os, "fsync"),

@@ -14,7 +14,7 @@ from magtwin.errors import InputError
 from magtwin.field.fit.fit import fit
 from magtwin.field.maps.difference import difference
 from magtwin.field.survey.readings import Readings
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import build_dataset
 from magtwin.learn.data.recording import Source
@@ -26,7 +26,8 @@ from magtwin.learn.models.predictor import load_predictor
 from magtwin.learn.training.config import TrainConfig
 from magtwin.learn.training.train import fit as train
 from magtwin.path import path_named
-from magtwin.report import Figure, Report
+from magtwin.report.report import Figure, Report
+from magtwin.report.summary import LINES, WIDTH, Summarized, Summary
 from magtwin.run.compare import compare
 from magtwin.run.run import Column, Run
 from magtwin.sim.motion.commands import Commands
@@ -35,7 +36,6 @@ from magtwin.spec.magnetics import SourceSpec
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import PlacedRobot
 from magtwin.spec.scene import Scene
-from magtwin.summary import LINES, WIDTH, Summarized, Summary
 from magtwin.twin import open_twin, scan, simulate, sweep
 
 HOSTILE = '<script>alert("1")</script>&amp;\x1b[31m\n\u2028name'

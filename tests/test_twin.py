@@ -8,7 +8,7 @@ import pytest
 import magtwin
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.twin import in_session, in_session_of, open_twin, simulate, sweep
 
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from magtwin.verdict import coverage, recordings_text, verdict
+from magtwin.report.verdict import coverage, recordings_text, verdict
 
 
 def test_a_verdict_says_by_how_much_and_whether_the_intervals_hold():

@@ -8,8 +8,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magtwin.kinds import expected
-from magtwin.outputs import output
+from magtwin.files.kinds import expected
+from magtwin.files.outputs import output
 from magtwin.urdf.convert import convert_with_report
 from magtwin.urdf.options import DEFAULTS, DriveRule, Options
 from magtwin.urdf.report import ConversionReport

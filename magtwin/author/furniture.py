@@ -11,7 +11,8 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.field.sources.bodies import mesh_moments
-from magtwin.files import existing, refused_at
+from magtwin.files.file import existing
+from magtwin.files.settings import refused_at
 from magtwin.frames import IDENTITY_XYZW, quat_from_yaw, rotate
 from magtwin.spec.base import ZERO3, Quat, Spec, Vec3
 from magtwin.spec.furniture import BODY, FurnitureSpec, Part

@@ -10,8 +10,9 @@ from pxr import Sdf, Usd, UsdPhysics
 
 from magtwin.author.shape import drive_of, footprint_of, stand_on_floor
 from magtwin.errors import InputError, hint
-from magtwin.files import existing_file, from_table, read_toml
-from magtwin.kinds import expected
+from magtwin.files.file import existing_file
+from magtwin.files.kinds import expected
+from magtwin.files.settings import from_table, read_toml
 from magtwin.sim.plant_families import draw_plant
 from magtwin.spec.base import Spec
 from magtwin.spec.drive import DriveSpec

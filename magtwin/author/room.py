@@ -13,7 +13,8 @@ from pxr import Usd
 
 from magtwin.author.furniture import LARGEST_M
 from magtwin.errors import InputError
-from magtwin.files import refused_at, shipped
+from magtwin.files.file import shipped
+from magtwin.files.settings import refused_at
 from magtwin.spec.furniture import FurnitureSpec
 from magtwin.spec.lab import LabSpec
 from magtwin.spec.obstacles import Obstacles

@@ -12,9 +12,9 @@ from magtwin.author.room import check_name
 from magtwin.errors import InputError
 from magtwin.field.maps.made_from import made_from
 from magtwin.field.sources.magnets import body_of
-from magtwin.files import existing
+from magtwin.files.file import existing
+from magtwin.files.outputs import output
 from magtwin.frames import quat_from_yaw
-from magtwin.outputs import output
 from magtwin.spec.furniture import FurnitureSpec
 from magtwin.spec.magnetics import SourceSpec
 from magtwin.spec.robot import PlacedRobot

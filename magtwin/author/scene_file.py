@@ -11,8 +11,9 @@ from magtwin.author.robot import RobotSettings, build_robot
 from magtwin.author.room import asset_named, check_name, check_start, lab_of, obstacles_in
 from magtwin.author.scene import check_names, check_things
 from magtwin.errors import InputError
-from magtwin.files import existing_file, from_table, read_toml, refused_at, sha256
-from magtwin.kinds import expected
+from magtwin.files.file import existing_file, sha256
+from magtwin.files.kinds import expected
+from magtwin.files.settings import from_table, read_toml, refused_at
 from magtwin.path import resolve_path
 from magtwin.path.room import Room, path_in
 from magtwin.spec.base import ZERO3, Vec3

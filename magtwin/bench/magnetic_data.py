@@ -27,7 +27,7 @@ from magtwin.field.fit.fit import fit
 from magtwin.field.grid import Grid
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.readings import Readings
-from magtwin.files import existing_file
+from magtwin.files.file import existing_file
 from magtwin.frames import quat_from_yaw
 from magtwin.localization.problem import OdometryModel, Problem, SensorModel
 from magtwin.run.run import Run

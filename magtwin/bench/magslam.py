@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from magtwin.budget import check_decoded, decoded_limit
-from magtwin.children import run
 from magtwin.errors import InputError
-from magtwin.files import existing_file
+from magtwin.files.budget import check_decoded, decoded_limit
+from magtwin.files.children import run
+from magtwin.files.file import existing_file
 from magtwin.localization.problem import OdometryModel, Prior, Problem, SensorModel
 from magtwin.run.run import Run
 

@@ -26,8 +26,8 @@ from magtwin.figures.canvas import (
 )
 from magtwin.figures.evaluations import INKS
 from magtwin.figures.page import Page, Section, Table, write_page, write_pages
-from magtwin.outputs import check_free
-from magtwin.report import Report
+from magtwin.files.outputs import check_free
+from magtwin.report.report import Report
 
 Array = NDArray[np.float64]
 

@@ -28,13 +28,13 @@ from numpy.typing import NDArray
 
 from magtwin.bench.suite import Chunk, Seeds, Suite, load_suite
 from magtwin.errors import InputError, find
-from magtwin.files import read_text
+from magtwin.files.file import read_text
+from magtwin.files.kinds import expected
+from magtwin.files.outputs import output
 from magtwin.io.tables import load_parquet
-from magtwin.kinds import expected
 from magtwin.localization.scores import Scores
-from magtwin.outputs import output
-from magtwin.report import Figure, Report
-from magtwin.summary import Summarized, Summary, listed
+from magtwin.report.report import Figure, Report
+from magtwin.report.summary import Summarized, Summary, listed
 
 if TYPE_CHECKING:
     from magtwin.bench.leaderboard import Standing

@@ -159,7 +159,7 @@ def run_localizer(
         with time_limit(limit_s):
             readings = case.readings
             if entry.compensator != "none":
-                from magtwin.own_field import with_own_field
+                from magtwin.tasks.own_field import with_own_field
 
                 readings = with_own_field(readings, entry.compensator, case.problem)
             made = track(load_localizer(entry.method, entry.options), case.problem, readings)

@@ -14,9 +14,9 @@ from magtwin.bench.results import Results, Run, runs_of
 from magtwin.bench.row import SETUP, Row, run_chunk, warm_up
 from magtwin.bench.suite import Chunk, Seeds, Suite, load_suite, suite_file
 from magtwin.errors import InputError
-from magtwin.files import sha256, shipped
+from magtwin.files.file import sha256, shipped
+from magtwin.files.outputs import output
 from magtwin.localization.compensators import is_weights
-from magtwin.outputs import output
 from magtwin.parallel import Failure, Pool, beat, checked_shard, free_memory, in_shard, open_pool, processors
 from magtwin.version import __version__
 

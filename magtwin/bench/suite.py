@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from magtwin.errors import InputError, find
-from magtwin.files import existing, from_table, read_toml, refused_at
-from magtwin.kinds import expected
+from magtwin.files.file import existing
+from magtwin.files.kinds import expected
+from magtwin.files.settings import from_table, read_toml, refused_at
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import OdometryModel, SensorModel
 from magtwin.sim.motion.drive_input import drive_input

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 from magtwin.errors import InputError
 from magtwin.field.maps.curvature import interpolation_error_nt2
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import existing_file
+from magtwin.files.file import existing_file
 
 Array = NDArray[np.float64]
 

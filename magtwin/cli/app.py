@@ -21,7 +21,7 @@ from magtwin.cli.progress import watched
 from magtwin.cli.settings import Environment, Settings
 from magtwin.cli.terminal import Done, output_mode, print_error
 from magtwin.errors import TERMINATED, CalibrationWarning, InputError, MismatchWarning, RepairWarning
-from magtwin.folders import allow
+from magtwin.files.folders import allow
 from magtwin.version import __version__
 
 app = App(
@@ -97,7 +97,7 @@ def main(arguments: list[str] | None = None) -> None:
         if isinstance(error, FileNotFoundError) and _folder_gone():
             _fail("the working folder was removed; change to another one")
         if isinstance(error, OSError):
-            from magtwin.outputs import FULL
+            from magtwin.files.outputs import FULL
 
             full = "" if error.errno not in FULL or error.filename else _stdout_full()
             _fail(full or f"{error} ({type(error).__name__})")
@@ -173,7 +173,7 @@ def _no_room(error: Exception) -> str:
     """The refusal of a full disk of temporary files, of which libraries do not speak; "" if it has room."""
     import tempfile
 
-    from magtwin.outputs import why_full
+    from magtwin.files.outputs import why_full
 
     folder = tempfile.gettempdir()
     reason = why_full(Path(folder), error)
@@ -215,7 +215,7 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
 
     @functools.wraps(function)
     def wrapped(*args: Any, json: bool = False, quiet: bool = False, **options: Any) -> None:
-        from magtwin.outputs import reading
+        from magtwin.files.outputs import reading
 
         _running[:] = [command]
         given = signature.bind_partial(*args, **options).arguments

@@ -37,7 +37,7 @@ DRIVERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vul
 @app.command
 def doctor() -> Done:
     """List what is installed, what each missing extra would add, and how to install it."""
-    from magtwin.report import Report
+    from magtwin.report.report import Report
 
     found = diagnose()
     extras = {

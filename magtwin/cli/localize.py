@@ -73,10 +73,10 @@ def localize(
         Earlier run of the same session, with true poses.
     """
     from magtwin.figures.localization import save_localization
+    from magtwin.files.outputs import check_free
     from magtwin.io.formats import read_run
     from magtwin.localization.problem import OdometryModel, SensorModel
-    from magtwin.localizing import ROBOT_NOISE, lever_arm_of, localization
-    from magtwin.outputs import check_free
+    from magtwin.tasks.localizing import ROBOT_NOISE, lever_arm_of, localization
 
     check_free(out, force=force)
     announce(f"Reading {run}")
@@ -150,9 +150,9 @@ def localize_live(
         Correlation length of the map's error that the method is told [m].
     """
     from magtwin.localization.problem import OdometryModel, SensorModel
-    from magtwin.localizing import live_problem
     from magtwin.ros.localization.localize import PARAMETERS, LocalizerNode
     from magtwin.ros.parameters import settings as settings_of
+    from magtwin.tasks.localizing import live_problem
     from magtwin.twin import open_twin
 
     values = settings_of(PARAMETERS, settings)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from threading import Event, Lock, Thread
 from typing import Any, TextIO
 
-from magtwin.summary import printable_lines
+from magtwin.report.summary import printable_lines
 
 FIRST_S = 1.5
 """Silence after which the first line is printed [s]."""

@@ -507,7 +507,7 @@ def _announce_reach(bus: "Bus") -> None:
 
 def _drive_of(asset: Path | None) -> "DriveSpec":
     """Limits of a robot's drive."""
-    from magtwin.files import shipped
+    from magtwin.files.file import shipped
     from magtwin.usd.robot import load_robot
 
     return load_robot(asset or shipped("robots", "turtlebot4", "turtlebot4.usda")).drive

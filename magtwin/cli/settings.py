@@ -17,7 +17,7 @@ class Settings(Toml):
     """Options in magtwin.toml, which is read as any TOML of a user."""
 
     def _load_config(self, path: Path) -> dict[str, Any]:
-        from magtwin.files import read_toml
+        from magtwin.files.settings import read_toml
 
         try:
             return read_toml(path)

@@ -12,7 +12,7 @@ from typing import Any, TextIO, cast
 
 from magtwin.cli.progress import announce, current, progress, silence, step
 from magtwin.errors import InputError
-from magtwin.summary import printable, printable_lines
+from magtwin.report.summary import printable, printable_lines
 
 __all__ = ["announce", "printable", "progress", "silence", "step"]  # commands import these from here too
 
@@ -172,7 +172,7 @@ def check_suffix(path: Path, suffixes: tuple[str, ...], what: str) -> None:
 
 def check_output(path: Path | None, suffixes: tuple[str, ...], what: str, *, force: bool) -> None:
     """Refuse an output whose name has another suffix, or that exists without --force."""
-    from magtwin.outputs import check_free
+    from magtwin.files.outputs import check_free
 
     if path is not None:
         check_suffix(path, suffixes, what)

@@ -15,7 +15,7 @@ from pxr import Sdf, Usd, UsdUtils, Vt
 
 from magtwin.errors import InputError
 from magtwin.export.contents import kind_of, named_files
-from magtwin.files import read_bytes, sha256
+from magtwin.files.file import read_bytes, sha256
 from magtwin.usd.layers import open_stage, relative_asset, translates
 from magtwin.usd.schema import place as prim_place
 from magtwin.usd.schema.versions import creator

@@ -12,7 +12,7 @@ from pxr import Sdf, UsdUtils
 from safetensors import SafetensorError, safe_open
 
 from magtwin.errors import InputError
-from magtwin.files import existing
+from magtwin.files.file import existing
 from magtwin.usd.layers import SUFFIXES, open_stage, translates
 from magtwin.usd.trial import check_named
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.outputs import output
+from magtwin.files.outputs import output
 from magtwin.usd.lab.obstacles import ROBOT_HEIGHT_M
 from magtwin.usd.scene import open_scene
 

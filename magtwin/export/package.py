@@ -24,12 +24,12 @@ from magtwin.export.isaac import GRAPHS, author_graph
 from magtwin.export.structure import structure
 from magtwin.export.usdz import pack, unpack
 from magtwin.export.validation.inspection import inspect
-from magtwin.files import existing, sha256
-from magtwin.folders import allow
-from magtwin.outputs import check_free, output, transaction
-from magtwin.report import Figure, Report
+from magtwin.files.file import existing, sha256
+from magtwin.files.folders import allow
+from magtwin.files.outputs import check_free, output, transaction
+from magtwin.report.report import Figure, Report
+from magtwin.report.summary import in_markdown, printable
 from magtwin.run.run import Run
-from magtwin.summary import in_markdown, printable
 from magtwin.urdf.simready import UNKNOWN
 from magtwin.usd.animation import write_animation
 from magtwin.usd.layers import open_stage, stage_sha256

@@ -9,9 +9,9 @@ import struct
 import zipfile
 from pathlib import Path, PurePosixPath
 
-from magtwin.budget import check_count
 from magtwin.errors import InputError
-from magtwin.files import existing_file
+from magtwin.files.budget import check_count
+from magtwin.files.file import existing_file
 from magtwin.usd.layers import SUFFIXES
 
 ALLOWED = (*SUFFIXES, ".png", ".jpg", ".jpeg", ".exr", ".avif", ".m4a", ".mp3", ".wav")

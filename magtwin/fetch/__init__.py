@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 from magtwin.errors import InputError, find
 from magtwin.export.validation.isaac_sim import FILES, copy_folder
-from magtwin.outputs import output
+from magtwin.files.outputs import output
 
 UNSTATED = "NOASSERTION"
 """SPDX's word for a licence that the publisher does not state."""

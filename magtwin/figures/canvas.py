@@ -21,9 +21,9 @@ from matplotlib.text import Text
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.outputs import output
+from magtwin.files.outputs import output
+from magtwin.report.summary import printable_lines
 from magtwin.run.thinning import newest
-from magtwin.summary import printable_lines
 
 Array = NDArray[np.float64]
 

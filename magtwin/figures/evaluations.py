@@ -26,12 +26,12 @@ from magtwin.figures.canvas import (
 from magtwin.figures.maps import mean_field_ut
 from magtwin.figures.page import Page, Section, Table, write_pages
 from magtwin.figures.training import draw_correlations, label_epochs
-from magtwin.files import read_text
+from magtwin.files.file import read_text
 from magtwin.learn.data.correlation import correlations
 from magtwin.learn.data.features import FEATURES, FULL, features
 from magtwin.learn.evaluation.evaluation import PAPER, Evaluation, Judged
 from magtwin.learn.evaluation.scores import COVERED, DRAWS, LEVEL
-from magtwin.verdict import Z_90
+from magtwin.report.verdict import Z_90
 
 NAME = "evaluation"
 """Name of the report's files."""

@@ -13,10 +13,10 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.children import end, environment
 from magtwin.errors import InputError
 from magtwin.figures.scenery import Scenery, View
-from magtwin.outputs import check_free, output
+from magtwin.files.children import end, environment
+from magtwin.files.outputs import check_free, output
 from magtwin.run.run import Run
 
 Image = NDArray[np.uint8]

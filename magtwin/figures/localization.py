@@ -33,11 +33,11 @@ from magtwin.figures.canvas import (
     short_name,
 )
 from magtwin.figures.maps import draw_cells, mean_field_ut
+from magtwin.files.outputs import output
 from magtwin.frames import wrap_angle
 from magtwin.io.rerun.localization import write_localization
 from magtwin.localization.tum import save_tum
-from magtwin.localizing import Localization, truth_name
-from magtwin.outputs import output
+from magtwin.tasks.localizing import Localization, truth_name
 
 ESTIMATE_INK, TRUTH_INK, DEAD_INK, BOUND_INK, LOST_INK = "#e8590c", INK, "#1971c2", "#2b8a3e", "#f3d9fa"
 BAND_INK = "#ffd8a8"
@@ -65,8 +65,8 @@ def draw_localization(result: Localization) -> Figure:
     can have with this map, see `magtwin.localization.bounds`.
 
     Args:
-        result: Result of `magtwin.localizing.localization`. Without a true pose, the errors are left out
-            and the standard deviations are drawn alone.
+        result: Result of `magtwin.tasks.localizing.localization`. Without a true pose, the errors are left
+            out and the standard deviations are drawn alone.
 
     Returns:
         A matplotlib figure.
@@ -257,7 +257,7 @@ def save_localization(result: Localization, out: str | os.PathLike[str], *, forc
     """Write the folder of a localization.
 
     Args:
-        result: Result of `magtwin.localizing.localization`.
+        result: Result of `magtwin.tasks.localizing.localization`.
         out: Folder to make, with run.parquet, localize.rrd, localize.png, estimate.tum and, if the true pose
             is known, truth.tum.
         force: Whether to replace an existing folder.

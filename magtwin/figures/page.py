@@ -19,8 +19,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from magtwin.errors import InputError
 from magtwin.figures.canvas import Picture
-from magtwin.outputs import output
-from magtwin.summary import in_markdown, printable, printable_lines
+from magtwin.files.outputs import output
+from magtwin.report.summary import in_markdown, printable, printable_lines
 from magtwin.version import __version__
 
 LONGEST_TEXT = 500

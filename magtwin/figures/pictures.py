@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.files import read_bytes
+from magtwin.files.file import read_bytes
+from magtwin.files.outputs import output
 from magtwin.frames import rotate
-from magtwin.outputs import output
 from magtwin.parallel import check_room
 from magtwin.spec.base import Vec3
 from magtwin.urdf.meshes.texture import opened_image

@@ -33,8 +33,8 @@ from magtwin.figures.pictures import (
     style_of,
     write_png,
 )
+from magtwin.files.outputs import output
 from magtwin.frames import matrix_from_quat, quat_from_yaw
-from magtwin.outputs import output
 from magtwin.run.compare import FIELDS, HEADINGS, POSITIONS
 from magtwin.run.run import Run
 from magtwin.spec.base import Vec3

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from magtwin.figures.canvas import INK, MAP_INK, OTHER_INK, WIDTH_IN, label, legend_below, new_figure
+from magtwin.files.outputs import output
 from magtwin.learn.data.correlation import PAPER, Correlations
 from magtwin.learn.models.predictor import Epoch
-from magtwin.outputs import output
 
 
 def draw_learning_curve(

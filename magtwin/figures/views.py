@@ -8,16 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from magtwin.children import run
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.figures.canvas import save
 from magtwin.figures.page import write_page
 from magtwin.figures.reports import NamedRun, draw_comparison, page_of_comparison, page_of_runs
-from magtwin.files import existing
+from magtwin.files.children import run
+from magtwin.files.file import existing
+from magtwin.files.outputs import check_free
 from magtwin.io.convert import twin_to_show
 from magtwin.io.formats import read_run
 from magtwin.io.provenance import map_of, planned_of
-from magtwin.outputs import check_free
 from magtwin.run.compare import Comparison, compare
 from magtwin.run.run import Run
 from magtwin.usd.layers import stage_sha256

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from magtwin.errors import InputError, MismatchWarning
-from magtwin.files import existing
+from magtwin.files.file import existing
+from magtwin.files.outputs import check_free
 from magtwin.io.formats import format_to_write, read_run, write_run
-from magtwin.outputs import check_free
 from magtwin.run.run import Run
 from magtwin.twin import Twin, lab_and_map, led_by, open_twin, scene_of
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from magtwin.errors import InputError, hint
 from magtwin.extend import Registry
-from magtwin.kinds import expected
+from magtwin.files.kinds import expected
 from magtwin.run.run import Run, check_clock, check_size_of_numbers
 
 if TYPE_CHECKING:

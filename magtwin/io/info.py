@@ -9,10 +9,10 @@ from typing import Any
 from magtwin.errors import InputError, hint
 from magtwin.field.maps.statistics import map_metadata
 from magtwin.field.survey.folder import read_survey
-from magtwin.files import existing
+from magtwin.files.file import existing
+from magtwin.files.kinds import kind_of
 from magtwin.io.formats import FORMATS, read_run
-from magtwin.kinds import kind_of
-from magtwin.report import Figure, Report
+from magtwin.report.report import Figure, Report
 from magtwin.twin import shipped_or
 
 STAGES = (".usd", ".usda", ".usdc", ".usdz")

@@ -10,9 +10,9 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from magtwin.errors import InputError
+from magtwin.files.outputs import at_once, check_free, output, transaction
 from magtwin.io.formats import format_of, format_to_write, read_run, write_run
 from magtwin.io.recorder import Recorder, Sink, in_step, partial_of
-from magtwin.outputs import at_once, check_free, output, transaction
 from magtwin.path import CASES, PATHS
 from magtwin.path import Path as Planned
 from magtwin.path.room import FLOOR_M

@@ -13,7 +13,7 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.io.formats import read_run, write_run
 from magtwin.path import CASES, PATHS, Path, path_named, read_path_csv
-from magtwin.report import Figure, Report
+from magtwin.report.report import Figure, Report
 from magtwin.run.run import COLUMNS, Run
 from magtwin.twin import (
     in_session_of,

@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.budget import check_size
 from magtwin.errors import InputError, hint
-from magtwin.files import existing, sha256
+from magtwin.files.budget import check_size
+from magtwin.files.file import existing, sha256
 from magtwin.frames import canonical, quat_from_yaw, wrap_angle
 from magtwin.run.run import COLUMNS, Run
 

@@ -7,9 +7,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from magtwin.errors import InputError
-from magtwin.files import existing
+from magtwin.files.file import existing
+from magtwin.files.outputs import output
 from magtwin.io.tables import load_parquet
-from magtwin.outputs import output
 from magtwin.sim.sensors.lidar import Scans
 
 _VECTORS = {"p_world_lidar": 3, "q_world_lidar_xyzw": 4}

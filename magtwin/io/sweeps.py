@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Any
 
 from magtwin.errors import InputError
-from magtwin.files import read_bytes, read_text
+from magtwin.files.file import read_bytes, read_text
+from magtwin.files.outputs import check_free, exchanged, output
 from magtwin.io.tables import parquet_of, write_parquet
-from magtwin.outputs import check_free, exchanged, output
 from magtwin.parallel import checked_shard, in_shard, open_pool
-from magtwin.report import Figure, Report
+from magtwin.report.report import Figure, Report
+from magtwin.report.verdict import HOLDS, HOLDS_ONE, Tally
 from magtwin.run.run import Run
-from magtwin.verdict import HOLDS, HOLDS_ONE, Tally
 from magtwin.version import __version__
 
 LISTING = "runs.csv"

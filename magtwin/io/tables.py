@@ -23,11 +23,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from magtwin.budget import BUDGETS, check_count, check_decoded, check_size, decoded_limit
 from magtwin.errors import InputError, find
-from magtwin.files import check_zip, existing
+from magtwin.files.budget import BUDGETS, check_count, check_decoded, check_size, decoded_limit
+from magtwin.files.file import check_zip, existing
+from magtwin.files.outputs import check_free, output
 from magtwin.io.recorder import Sink
-from magtwin.outputs import check_free, output
 from magtwin.run import mapped
 from magtwin.run.arrow import (
     FACTS,

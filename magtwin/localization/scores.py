@@ -15,7 +15,7 @@ from magtwin.errors import InputError
 from magtwin.localization.bounds import Bounds
 from magtwin.localization.problem import Array
 from magtwin.localization.track import Track
-from magtwin.verdict import EVEN
+from magtwin.report.verdict import EVEN
 
 Flags = NDArray[np.bool_]
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from magtwin.errors import InputError
+from magtwin.files.outputs import output
 from magtwin.frames import quat_from_yaw
 from magtwin.localization.problem import Array
-from magtwin.outputs import output
 from magtwin.run.run import Run
 
 HEADER = "# t [s] x y z [m] qx qy qz qw, base_link in {frame}"

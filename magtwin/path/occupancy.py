@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.outputs import check_free, output, transaction
+from magtwin.files.outputs import check_free, output, transaction
 from magtwin.path.room import Room
+from magtwin.report.summary import Summarized, Summary
 from magtwin.spec.obstacles import Obstacles
-from magtwin.summary import Summarized, Summary
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 """Values of cells, those of nav_msgs/OccupancyGrid."""

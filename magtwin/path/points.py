@@ -9,13 +9,13 @@ from pathlib import Path as FilePath
 import numpy as np
 from numpy.typing import ArrayLike
 
-from magtwin.delimited import DEGREES, LENGTHS, QUOTED, Delimited, number_of, read_delimited
 from magtwin.errors import InputError, RepairWarning, hint
-from magtwin.kinds import expected
-from magtwin.labels import split_label
+from magtwin.files.kinds import expected
 from magtwin.path.curves import CASES, PATHS, path_named
 from magtwin.path.polyline import SAME_M, Path, without_repeats
-from magtwin.summary import listed
+from magtwin.report.summary import listed
+from magtwin.tables.delimited import DEGREES, LENGTHS, QUOTED, Delimited, number_of, read_delimited
+from magtwin.tables.labels import split_label
 
 ANGLES = frozenset({"lat", "latitude", "lon", "lng", "long", "longitude"})
 """Names of columns of places on Earth."""

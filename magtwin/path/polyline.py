@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.summary import Summarized, Summary, rectangle
+from magtwin.report.summary import Summarized, Summary, rectangle
 
 Array = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.frames import wrap_angle, yaw_from_quat
+from magtwin.report.summary import Summarized, Summary
 from magtwin.run.figures import UNMODELLED, prediction_nt
 from magtwin.run.run import Run
-from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
 Align = Literal["time", "path", "none"]

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.report import Figure, Report
+from magtwin.report.report import Figure, Report
+from magtwin.report.verdict import HOLDS_ONE, Tally
 from magtwin.run import mapped
-from magtwin.verdict import HOLDS_ONE, Tally
 
 if TYPE_CHECKING:
     from magtwin.run.run import Run

@@ -7,9 +7,9 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from magtwin.budget import check_count, check_decoded, check_size
 from magtwin.errors import InputError
-from magtwin.protobuf import varint
+from magtwin.files.budget import check_count, check_decoded, check_size
+from magtwin.files.protobuf import varint
 
 _BATCH = 1 << 20
 """Most rows of texts that are measured at once."""

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError, find
-from magtwin.report import Report
+from magtwin.report.report import Report
+from magtwin.report.summary import Summarized, Summary
+from magtwin.report.verdict import OWN, Tally
 from magtwin.run import mapped
 from magtwin.run.figures import prediction_nt, run_report
 from magtwin.run.resample import RULES, Interpolation, bracket, check_instants, grid
 from magtwin.run.summary import run_summary
-from magtwin.summary import Summarized, Summary
-from magtwin.verdict import OWN, Tally
 
 if TYPE_CHECKING:
     import pandas as pd

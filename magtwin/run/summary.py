@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.summary import Summary, listed, rectangle, span
+from magtwin.report.summary import Summary, listed, rectangle, span
 
 Columns = Mapping[str, NDArray[Any]]
 

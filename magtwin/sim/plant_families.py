@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, find
-from magtwin.files import from_table
+from magtwin.files.settings import from_table
 from magtwin.spec.base import ZERO3
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import RobotSpec

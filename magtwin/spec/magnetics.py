@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from magtwin.frames import IDENTITY_XYZW
+from magtwin.report.summary import Summarized
 from magtwin.spec.base import ZERO3, ZERO9, Matrix3, Quat, Spec, Vec3
 from magtwin.spec.mesh import check_mesh
-from magtwin.summary import Summarized
 
 MODEL = "the IGRF-14"
 """Model of the Earth's field."""

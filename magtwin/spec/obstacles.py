@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.summary import Summarized, Summary, listed
+from magtwin.report.summary import Summarized, Summary, listed
 
 Array = NDArray[np.float64]
 

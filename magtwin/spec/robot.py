@@ -4,12 +4,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from magtwin.frames import IDENTITY_XYZW, quat_multiply
+from magtwin.report.summary import Summarized, Summary
 from magtwin.spec.base import LATER, ZERO3, Quat, Spec, Vec3
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.magnetics import PlatformFieldSpec
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec
-from magtwin.summary import Summarized, Summary
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

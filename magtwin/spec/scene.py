@@ -4,12 +4,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from magtwin.errors import find
+from magtwin.report.summary import Summarized, Summary, listed
 from magtwin.spec.base import ZERO3, Spec, Vec3
 from magtwin.spec.furniture import FurnitureSpec, steel_of
 from magtwin.spec.lab import LabSpec
 from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
 from magtwin.spec.robot import PlacedRobot, RobotSpec
-from magtwin.summary import Summarized, Summary, listed
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

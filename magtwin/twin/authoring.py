@@ -6,9 +6,9 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any
 
 from magtwin.errors import find
-from magtwin.files import sha256, shipped
-from magtwin.kinds import expected
-from magtwin.outputs import check_free, output
+from magtwin.files.file import sha256, shipped
+from magtwin.files.kinds import expected
+from magtwin.files.outputs import check_free, output
 from magtwin.spec.lab import SurveySpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.scene import Scene

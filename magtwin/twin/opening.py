@@ -12,8 +12,8 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any
 
 from magtwin.errors import InputError, MismatchWarning, find
-from magtwin.files import git_revision, shipped
-from magtwin.kinds import SCENE_TOML, TOML, expected, kind_of
+from magtwin.files.file import git_revision, shipped
+from magtwin.files.kinds import SCENE_TOML, TOML, expected, kind_of
 from magtwin.run.run import Run
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene

@@ -8,8 +8,8 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from magtwin.errors import InputError
-from magtwin.files import existing, shipped
-from magtwin.kinds import expected
+from magtwin.files.file import existing, shipped
+from magtwin.files.kinds import expected
 from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import MagnetometerSpec
 from magtwin.twin.authoring import scene_from_toml

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError, find
 from magtwin.path import Path
+from magtwin.report.verdict import OWN
 from magtwin.run.run import Run
 from magtwin.sim.motion.drive_input import drive_input
 from magtwin.spec.plant import PlantSpec
@@ -30,7 +31,6 @@ from magtwin.twin.twin import (
     trained_on,
     with_plant,
 )
-from magtwin.verdict import OWN
 from magtwin.version import __version__
 
 if TYPE_CHECKING:

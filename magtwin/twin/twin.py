@@ -12,13 +12,13 @@ import numpy as np
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.path.room import Room
+from magtwin.report.summary import Summarized, Summary
 from magtwin.spec.base import spelled
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import MagnetometerSpec
-from magtwin.summary import Summarized, Summary
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.magnetometer import NeuralMagnetometer

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
 
 from magtwin.errors import InputError
-from magtwin.files import sha256
-from magtwin.outputs import check_free, output, transaction
+from magtwin.files.file import sha256
+from magtwin.files.outputs import check_free, output, transaction
 from magtwin.spec.drive import DriveSpec
 from magtwin.urdf.description.description import Description, origin_of, read_description
 from magtwin.urdf.description.tag import Tags

@@ -22,7 +22,7 @@ from pathlib import Path
 from pxr import Sdf, UsdUtils
 
 from magtwin.errors import InputError
-from magtwin.outputs import check_free
+from magtwin.files.outputs import check_free
 from magtwin.urdf.material import LOOKS
 from magtwin.urdf.shape import COLLISIONS, VISUALS
 from magtwin.usd.layers import open_layer

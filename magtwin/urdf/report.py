@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
-from magtwin.report import Figure, Report
+from magtwin.report.report import Figure, Report
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Shape
 from magtwin.urdf.meshes.mesh import bounds

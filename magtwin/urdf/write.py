@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
+from magtwin.files.outputs import check_free, output, transaction
 from magtwin.frames import matrix_from_quat
-from magtwin.outputs import check_free, output, transaction
-from magtwin.report import Figure, Report
+from magtwin.report.report import Figure, Report
 from magtwin.urdf.description.model import rpy_of
 from magtwin.urdf.meshes.mesh_layer import MESH, free_name, primitive_of
 from magtwin.urdf.physics.joint import AXIS

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
 from magtwin.errors import InputError, find
+from magtwin.files.outputs import afterwards, output, transaction
 from magtwin.frames import quat_conjugate, quat_multiply, rotate
-from magtwin.outputs import afterwards, output, transaction
 from magtwin.run import mapped
 from magtwin.run.resample import grid
 from magtwin.run.run import COLUMNS, Column, Run, check_clock

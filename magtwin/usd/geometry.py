@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 
-from magtwin.budget import CORNERS, SHAPES
 from magtwin.errors import InputError
+from magtwin.files.budget import CORNERS, SHAPES
 from magtwin.frames import IDENTITY_XYZW, canonical, rotate
 from magtwin.spec.base import ZERO3, Quat, Vec3
 from magtwin.usd.attributes import read_axis

@@ -6,7 +6,7 @@ from pathlib import Path
 from pxr import Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
-from magtwin.report import Figure, Report
+from magtwin.report.report import Figure, Report
 from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.placement import AT_ORIGIN, labs_on, pose_of
 from magtwin.usd.scene import open_scene

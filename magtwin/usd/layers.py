@@ -13,11 +13,11 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
-from magtwin.budget import check_depth
 from magtwin.errors import InputError
-from magtwin.files import existing, existing_file, sha256
-from magtwin.kinds import USD_SUFFIXES, kind_of, refused
-from magtwin.outputs import afterwards, output
+from magtwin.files.budget import check_depth
+from magtwin.files.file import existing, existing_file, sha256
+from magtwin.files.kinds import USD_SUFFIXES, kind_of, refused
+from magtwin.files.outputs import afterwards, output
 from magtwin.usd.schema.versions import check_schema, creator
 from magtwin.usd.trial import try_stage
 

@@ -8,7 +8,7 @@ from typing import Any
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 from magtwin.errors import InputError
-from magtwin.files import existing, sha256
+from magtwin.files.file import existing, sha256
 from magtwin.frames import IDENTITY_XYZW, canonical, xyzw_from_wxyz
 from magtwin.spec.base import Quat, Vec3
 from magtwin.spec.robot import RobotSpec

@@ -13,8 +13,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.files.outputs import transaction
 from magtwin.frames import yaw_from_quat
-from magtwin.outputs import transaction
 from magtwin.spec.magnetics import EarthFieldSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import PlacedRobot

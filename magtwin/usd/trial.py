@@ -17,11 +17,11 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from magtwin.budget import BUDGETS, SPARE, allowed
-from magtwin.children import end, environment, limited
 from magtwin.errors import InputError
-from magtwin.files import shipped
-from magtwin.folders import allowed_folders
+from magtwin.files.budget import BUDGETS, SPARE, allowed
+from magtwin.files.children import end, environment, limited
+from magtwin.files.file import shipped
+from magtwin.files.folders import allowed_folders
 
 VALUES = 16_000_000
 """Bytes of a layer up to which its values are converted to Python; those of any layer are decoded."""
@@ -204,7 +204,7 @@ def try_stage(path: Path, *, composed: bool = True) -> None:
 
     Raises:
         InputError: USD crashes on it, does not end, or takes more memory than the budget. Or it names a file
-            that is not in its folder, in those of `magtwin.folders.allow`, or shipped with magtwin; an
+            that is not in its folder, in those of `magtwin.files.folders.allow`, or shipped with magtwin; an
             address in the network; or a pipe or device as a layer.
     """
     if not _is_shipped(path):

@@ -21,10 +21,10 @@ from magtwin.field.fit.fit import fit, raster
 from magtwin.field.maps.made_from import made_from
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.readings import Readings
-from magtwin.files import shipped
+from magtwin.files.file import shipped
+from magtwin.files.outputs import output
 from magtwin.frames import quat_from_rpy
-from magtwin.outputs import output
-from magtwin.report import Report
+from magtwin.report.report import Report
 from magtwin.sim.survey import survey_readings
 from magtwin.spec.base import ZERO3
 from magtwin.spec.furniture import FurnitureSpec, parts_of

@@ -11,7 +11,8 @@ from numpy.testing import assert_allclose
 from magtwin.author.scene_file import read_sources
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.magnets import body_of
-from magtwin.files import from_table, read_toml, shipped
+from magtwin.files.file import shipped
+from magtwin.files.settings import from_table, read_toml
 from magtwin.path import path_named
 from magtwin.sim.runs.simulate import simulate
 from magtwin.sim.survey import field_at_rest_nt

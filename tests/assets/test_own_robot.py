@@ -9,7 +9,7 @@ from pxr import Usd, UsdGeom, UsdPhysics
 from magtwin.author.from_urdf import RobotSettings, from_urdf
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.sensors import MagnetometerSpec
 from magtwin.urdf.options import Options

@@ -8,7 +8,7 @@ from validators import assert_valid
 
 from magtwin.author.robot import build_robot, read_settings
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.frames import rotate
 from magtwin.urdf import read_notes
 from magtwin.usd.geometry import read_links, read_shapes

@@ -20,7 +20,7 @@ from magtwin.author.scene_file import scene_from_toml
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.earth import earth_field_nt
-from magtwin.files import sha256, shipped
+from magtwin.files.file import sha256, shipped
 from magtwin.frames import IDENTITY_XYZW, quat_from_rpy, quat_multiply
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.lab import LabSpec

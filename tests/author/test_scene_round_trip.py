@@ -6,7 +6,7 @@ import pytest
 
 from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.spec.robot import PlacedRobot
 from magtwin.twin import scene_from_toml
 from magtwin.usd.scene import read_scene

@@ -11,7 +11,7 @@ from magtwin.bench.draws import chained, moves, noisy_odometry
 from magtwin.bench.suite import Scenario
 from magtwin.bench.twin_case import fogm, twin_case
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.io.surveys.maps import open_map
 from magtwin.localization.problem import OdometryModel, SensorModel
 

@@ -9,7 +9,6 @@ from numpy.testing import assert_allclose
 from scipy.io import loadmat, savemat
 from scipy.spatial.transform import Rotation
 
-from magtwin import budget
 from magtwin.bench.magslam import (
     SHIP_BIAS_M,
     SHIP_FUNCTIONS,
@@ -23,6 +22,7 @@ from magtwin.bench.magslam import (
 from magtwin.bench.row import make_case, run_chunk
 from magtwin.bench.suite import load_suite
 from magtwin.errors import InputError
+from magtwin.files import budget
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.track import track
 

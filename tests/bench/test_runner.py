@@ -23,7 +23,7 @@ from magtwin.bench.runner import about, benchmark
 from magtwin.bench.suite import load_suite
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.parallel import open_pool
 
 SUITE = """

@@ -138,7 +138,7 @@ def test_a_misspelt_path_is_refused_by_the_near_name(capsys, lab_scene, tmp_path
 
 
 def test_a_scene_file_with_a_misspelt_key_is_refused_by_the_near_name(tmp_path, capsys):
-    from magtwin.files import shipped
+    from magtwin.files.file import shipped
 
     text = shipped("scenes", "lab.toml").read_text().replace("[lab]", "[labb]", 1)
     assert "[labb]" in text
@@ -415,7 +415,7 @@ def test_names_are_not_markup(lab_scene, tmp_path, capsys):
 def test_a_folder_is_not_put_in_place_of_a_file_nor_a_file_of_a_folder(lab_scene, tmp_path, capsys):
     (tmp_path / "a.png").mkdir()
     (tmp_path / "a.png" / "mine").touch()
-    from magtwin.files import shipped
+    from magtwin.files.file import shipped
 
     layer = shipped("maps", "lab", "lab.usdc")
     assert "is a folder" in refused(capsys, "map", "plot", layer, "--out", tmp_path / "a.png", "--force")

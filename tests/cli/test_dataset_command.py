@@ -8,7 +8,7 @@ import pytest
 from pyarrow import csv, parquet
 
 from magtwin.cli import main
-from magtwin.files import sha256, shipped
+from magtwin.files.file import sha256, shipped
 from magtwin.io.formats import read_run, write_run
 from magtwin.learn.data.dataset import open_dataset
 from magtwin.learn.data.labels import labelled

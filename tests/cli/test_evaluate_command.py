@@ -11,7 +11,7 @@ from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.figures.evaluations import read_curve
-from magtwin.files import sha256
+from magtwin.files.file import sha256
 from magtwin.io.formats import write_run
 from magtwin.io.provenance import made_again
 from magtwin.learn.data.dataset import build_dataset

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from magtwin.cli import main
+from magtwin.report.summary import in_markdown, printable_lines
 from magtwin.run.run import Column, Run
-from magtwin.summary import in_markdown, printable_lines
 
 EVIL = "a\x1b]0;owned\x07\x1b[31mb\u202ec\x9b2Jd\x7f<script>alert(1)</script>"
 """Sets the title and the colour of a terminal, reverses the direction of text, erases the screen; HTML."""

@@ -11,13 +11,13 @@ import pytest
 import magtwin as mt
 from magtwin.cli import main
 from magtwin.errors import InputError, MismatchWarning
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.localization.problem import Prior
 from magtwin.localization.readings import onboard
 from magtwin.localization.scores import Scores, verdict_of
-from magtwin.localizing import Localization, localization, prior_of, thinned
+from magtwin.tasks.localizing import Localization, localization, prior_of, thinned
 
 
 @pytest.fixture(scope="module")

@@ -125,7 +125,7 @@ def test_info_works_on_a_stage_that_holds_a_map(lab_scene, capsys):
 
 
 def test_info_works_on_a_folder_of_csvs_and_tells_their_checksums(real_data, capsys):
-    from magtwin.files import sha256
+    from magtwin.files.file import sha256
 
     folder = real_data / "aprilab" / "maps"
     said = told(capsys, "map", "info", folder)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magtwin.cli import main
-from magtwin.files import sha256
+from magtwin.files.file import sha256
 from magtwin.io.surveys.readings import load_readings
 from magtwin.usd.maps.layer import load_map
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from magtwin.cli import main
-from magtwin.files import shipped
-from magtwin.kinds import ACCEPTED, kind_of
+from magtwin.files.file import shipped
+from magtwin.files.kinds import ACCEPTED, kind_of
 from magtwin.run.run import Run
 
 URDF = '<robot name="r"><link name="a"/></robot>'

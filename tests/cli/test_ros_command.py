@@ -8,7 +8,7 @@ import pytest
 from nodes import DOMAINS
 
 from magtwin.cli import main
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.io.bags.topics import LATCHED
 from magtwin.io.formats import write_run
 from magtwin.ros.bus import open_bus, to_bytes

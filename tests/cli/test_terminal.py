@@ -5,7 +5,7 @@ from itertools import product
 import pytest
 
 from magtwin.cli import terminal
-from magtwin.report import Figure, Report
+from magtwin.report.report import Figure, Report
 
 VALUES = (1, 12_345_678, 1.5, 3e-9, float("nan"))
 TEXTS = ("", "mass", "[bold]two words[/]", "-" * 60)

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import sha256
+from magtwin.files.file import sha256
 from magtwin.io.formats import read_run
 from magtwin.learn.data.dataset import build_dataset, open_dataset
 from magtwin.learn.data.features import features

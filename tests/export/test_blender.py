@@ -17,7 +17,7 @@ from magtwin.author.scene import author_scene
 from magtwin.author.scene_file import scene_from_toml
 from magtwin.export.package import export_scene
 from magtwin.field.survey.folder import read_survey
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.spec.lab import LabSpec
 from magtwin.urdf import convert_urdf
 from magtwin.usd.maps.layer import save_map

@@ -17,8 +17,8 @@ from magtwin.errors import InputError
 from magtwin.export.package import export_scene
 from magtwin.export.structure import structure
 from magtwin.export.usdz import pack, unpack
-from magtwin.files import sha256, shipped
-from magtwin.folders import allow
+from magtwin.files.file import sha256, shipped
+from magtwin.files.folders import allow
 from magtwin.io.tables import write_parquet
 from magtwin.run.run import Run
 

@@ -20,7 +20,7 @@ from magtwin.export.usdz import unpack
 from magtwin.export.validation.physx_drive import STEP_S, find_python, open_world
 from magtwin.export.validation.physx_robots import driven_table, find_room, read_driven
 from magtwin.export.validation.validate import validate
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.path import figure8
 from magtwin.sim.engines.newton import Newton
 from magtwin.sim.motion.follow import follow

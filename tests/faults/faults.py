@@ -322,7 +322,7 @@ class Trial:
 
     def _sweep(self) -> None:
         """What the next command does first in each folder in which it writes."""
-        from magtwin.outputs import check_free
+        from magtwin.files.outputs import check_free
 
         for folder in {(self.folder / name).parent for name in {*self.new, *self.before}}:
             check_free(folder / "next", force=True)

@@ -16,7 +16,7 @@ from magtwin.errors import InputError
 from magtwin.figures.films import LONGEST_S, film_of_run, frame_times
 from magtwin.figures.pictures import VEIL
 from magtwin.figures.scenery import WALL_M, Scenery, View, _free_share, picture_of_run
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.io.tables import write_parquet
 from magtwin.run.run import Run
 from magtwin.spec.robot import PlacedRobot

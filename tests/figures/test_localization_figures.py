@@ -12,8 +12,8 @@ from magtwin.figures.canvas import render
 from magtwin.figures.localization import draw_localization, ellipse
 from magtwin.frames import quat_from_yaw
 from magtwin.localization.problem import Prior
-from magtwin.localizing import Localization, localization
 from magtwin.run.run import Run
+from magtwin.tasks.localizing import Localization, localization
 
 
 @pytest.fixture(scope="module")

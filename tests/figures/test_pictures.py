@@ -9,7 +9,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from magtwin.errors import InputError
 from magtwin.figures.pictures import BACKGROUND, BAR_SHARE, VEIL, Camera, picture_of_stage, view_distance
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.usd.geometry import srgb_from_linear
 from magtwin.usd.info import info_of_stage
 

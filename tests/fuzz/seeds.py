@@ -502,7 +502,7 @@ def _checkpoint(file: Path) -> None:
 
 
 def _network(file: Path) -> None:
-    from magtwin.files import shipped
+    from magtwin.files.file import shipped
 
     if file.stem == "net":  # a small perceptron
         _checkpoint(file.with_suffix(".pth"))

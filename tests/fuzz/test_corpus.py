@@ -67,9 +67,9 @@ def test_faults_that_others_found_are_read_or_refused_in_one_line(real_data, hom
 
 
 def test_every_kind_of_file_that_is_read_is_fuzzed():
+    from magtwin.files.kinds import _BY_SUFFIX
     from magtwin.io.formats import FORMATS as RUNS
     from magtwin.io.info import NETWORKS
-    from magtwin.kinds import _BY_SUFFIX
     from magtwin.urdf.meshes.mesh import SUFFIXES
 
     written = {

@@ -12,8 +12,8 @@ from magtwin.errors import MismatchWarning, RepairWarning
 from magtwin.io.bags import read_bag
 from magtwin.io.bags.frames import StaticFrames, kind_of
 from magtwin.io.surveys.readings import read_readings
-from magtwin.localizing import check_lever_arm
 from magtwin.run.run import Run
+from magtwin.tasks.localizing import check_lever_arm
 
 GRAVITY = np.array([0.0, 0.0, 9.80665])
 FIELD = np.array([12_000.0, 20_000.0, -38_000.0])

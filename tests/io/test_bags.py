@@ -351,7 +351,7 @@ def test_covariances_are_those_of_the_robots_specs(heard, twin):
 
 
 def test_a_robot_with_its_urdf_beside_it_is_described(made, tmp_path):
-    from magtwin.files import shipped
+    from magtwin.files.file import shipped
 
     twin = magtwin.open_twin(shipped("scenes", "lab", "lab.usda"))
     write_bag(made[0], tmp_path / "run.mcap", twin)

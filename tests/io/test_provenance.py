@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd
 
-from magtwin import files
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.files import git_revision, sha256
+from magtwin.files import file
+from magtwin.files.file import git_revision, sha256
 from magtwin.io.provenance import differences, repeat, repeat_of
 from magtwin.io.tables import read_parquet, write_parquet
 from magtwin.path import Path
@@ -115,7 +115,7 @@ def test_the_commit_is_that_of_the_checkout_or_worktree(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("pipe", ["config", "include"])
 def test_git_does_not_wait_for_a_pipe(pipe, tmp_path, monkeypatch):
-    monkeypatch.setattr(files, "_GIT_S", 0.3)
+    monkeypatch.setattr(file, "_GIT_S", 0.3)
     for name in ("refs", "objects"):
         (tmp_path / ".git" / name).mkdir(parents=True)
     (tmp_path / ".git" / "HEAD").write_text("ref: refs/heads/x\n")

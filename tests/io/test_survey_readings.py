@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from magtwin.errors import InputError
 from magtwin.field.grid import Grid
 from magtwin.field.survey.readings import SHAPES, Readings
-from magtwin.files import sha256
+from magtwin.files.file import sha256
 from magtwin.frames import quat_from_rpy, quat_from_yaw, quat_multiply
 from magtwin.io.surveys.columns import Columns
 from magtwin.io.surveys.readings import load_readings, read_readings, readings_of_run, save_readings

@@ -6,9 +6,9 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.testing import assert_array_equal
 
-from magtwin.delimited import LONGEST_LINE
 from magtwin.errors import InputError
 from magtwin.io.surveys.table import read_csv, read_parquet_table
+from magtwin.tables.delimited import LONGEST_LINE
 
 
 def written(tmp_path, content, name="a.csv"):

@@ -9,8 +9,8 @@ import magtwin as mt
 from magtwin.figures.localization import draw_localization
 from magtwin.localization.odometry import Odometry
 from magtwin.localization.track import track
-from magtwin.localizing import localization, thinned
 from magtwin.run.thinning import newest
+from magtwin.tasks.localizing import localization, thinned
 
 WITHOUT_VERDICT = ("Consistent", "TOO CONFIDENT", "cautious", "ost.", "LOST", "better", "Better")
 

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 
 import magtwin as mt
 from magtwin.frames import yaw_from_quat
-from magtwin.localizing import localization
+from magtwin.tasks.localizing import localization
 
 
 @pytest.fixture(scope="module")

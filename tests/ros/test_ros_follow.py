@@ -11,7 +11,7 @@ import pytest
 from nodes import from_message, spin
 
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.frames import quat_from_yaw
 from magtwin.io.bags.topics import CLOCK, COMMAND, ODOMETRY, POSE, Qos
 from magtwin.path import PATHS, Path

@@ -11,13 +11,12 @@ import pytest
 from nodes import DOMAINS, from_message, spin
 
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.frames import quat_from_yaw, rotate, wrap_angle, yaw_from_quat
 from magtwin.io.bags.topics import CLOCK, COMMAND, MAGNITUDE, ODOMETRY, Qos
 from magtwin.io.bags.types import typestore
 from magtwin.localization.problem import Estimate, Prior
 from magtwin.localization.track import LocalizerError
-from magtwin.localizing import live_problem, localization, localize, new_localizer
 from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
 from magtwin.ros.commands import command_bytes
 from magtwin.ros.diagnostics import KIND
@@ -38,6 +37,7 @@ from magtwin.ros.localization.poses import (
 from magtwin.ros.parameters import settings
 from magtwin.ros.simulate import Simulator
 from magtwin.run.run import Run
+from magtwin.tasks.localizing import live_problem, localization, localize, new_localizer
 from magtwin.twin import Twin, open_twin, simulate
 
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")

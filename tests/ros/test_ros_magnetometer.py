@@ -9,7 +9,7 @@ from nodes import DOMAINS, from_message, spin
 from test_predictor import a_predictor
 
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.frames import into_base, quat_from_yaw
 from magtwin.io.bags.topics import BATTERY, CLOCK, IMU, MAGNITUDE, ODOMETRY, POSE, Qos, Topic
 from magtwin.learn.data.features import SETS

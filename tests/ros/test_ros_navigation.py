@@ -12,7 +12,6 @@ from magtwin.frames import quat_from_yaw, rotate, wrap_angle, yaw_from_quat
 from magtwin.io.bags.sender import Transforms
 from magtwin.io.bags.topics import COMMAND, LATCHED, ODOMETRY, TF, TF_STATIC, Qos
 from magtwin.io.bags.types import typestore
-from magtwin.localizing import live_problem
 from magtwin.path.occupancy import occupancy_of
 from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
 from magtwin.ros.localization.localize import PARAMETERS, LocalizerNode
@@ -22,6 +21,7 @@ from magtwin.ros.parameters import settings
 from magtwin.ros.simulate import Simulator
 from magtwin.ros.topics import FIELD, FIELD_GRID, OCCUPANCY, PATH, READINGS, TRUTH
 from magtwin.ros.views import MOST_POSES, Trail, path_bytes
+from magtwin.tasks.localizing import live_problem
 from magtwin.twin import Twin, open_twin, room_of
 
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")

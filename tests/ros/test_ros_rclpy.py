@@ -11,7 +11,7 @@ import pytest
 from nodes import DOMAINS
 from places import ROOT
 
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.io.bags.topics import MAGNITUDE
 from magtwin.ros.bus import Message, open_bus
 from magtwin.ros.simulate import Simulator
@@ -138,7 +138,7 @@ def test_a_stranger_in_rclpy_sees_the_robot_obeys_its_clock_and_drives_it(
 OURS = """
 import sys, threading, time
 sys.path[:0] = sys.argv[1:]
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.ros.bus import open_bus
 from magtwin.ros.simulate import Simulator
 from magtwin.twin import open_twin
@@ -196,7 +196,7 @@ def test_the_robot_is_simulated_on_rclpy_too_and_reset_by_its_service(
 ASKED = """
 import json, sys, threading
 sys.path[:0] = sys.argv[1:]
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.ros.bus import open_bus
 from magtwin.ros.magnetometer import PARAMETERS, Magnetometer
 from magtwin.ros.parameters import settings

@@ -14,7 +14,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.io.bags import RawBagWriter
 from magtwin.io.bags.topics import CLOCK, LATCHED, MAGNITUDE, ODOMETRY, Qos
 from magtwin.io.bags.types import definition_of

@@ -10,7 +10,7 @@ from nodes import DOMAINS, spin
 
 from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.io.bags.sender import prefixed
 from magtwin.io.bags.topics import CLOCK, COMMAND, LATCHED, ODOMETRY, TF, TF_STATIC, Qos
 from magtwin.io.bags.twin_sender import sender_for

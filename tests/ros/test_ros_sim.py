@@ -11,7 +11,7 @@ import pytest
 from nodes import SLOWEST_S, from_message, in_a_domain, spin
 
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.io.bags import RawBagWriter
 from magtwin.io.bags.bag import Bag
 from magtwin.io.bags.cdr import decode

@@ -5,8 +5,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from magtwin import budget
 from magtwin.errors import InputError
+from magtwin.files import budget
 from magtwin.run.parquet import _check_pages, _counts, check_parquet
 
 

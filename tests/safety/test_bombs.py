@@ -17,9 +17,9 @@ import pyarrow.parquet as pq
 import pytest
 from one_triangle import glb
 
-from magtwin import budget
 from magtwin.errors import InputError
-from magtwin.files import read_toml
+from magtwin.files import budget
+from magtwin.files.settings import read_toml
 from magtwin.io.bags.bag import Bag
 from magtwin.io.formats import read_run
 from magtwin.urdf.meshes.mesh import read_mesh
@@ -372,7 +372,7 @@ def test_metadata_of_an_mcap_file_are_limited_together(tmp_path, monkeypatch):
 def test_aliases_in_the_description_of_a_bag_do_not_multiply(tmp_path):
     import yaml
 
-    from magtwin.files import yaml_loader
+    from magtwin.files.settings import yaml_loader
     from magtwin.io.bags.db3 import custom_data
 
     about = yaml.load(f"{{custom_data: {ALIASES[:-1]}, note: 3}}}}", yaml_loader())

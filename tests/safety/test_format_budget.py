@@ -10,9 +10,9 @@ import zipfile
 import pytest
 from one_triangle import glb
 
-from magtwin import budget
 from magtwin.errors import InputError
-from magtwin.files import read_toml
+from magtwin.files import budget
+from magtwin.files.settings import read_toml
 from magtwin.io.formats import read_run
 from magtwin.urdf.meshes.mesh import read_mesh
 from magtwin.urdf.source.source import read_source

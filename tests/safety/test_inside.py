@@ -12,8 +12,8 @@ from magtwin import allow
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.export.contents import bring_together
-from magtwin.files import shipped
-from magtwin.folders import ALLOW_DIR
+from magtwin.files.file import shipped
+from magtwin.files.folders import ALLOW_DIR
 from magtwin.usd.attributes import plain_value
 from magtwin.usd.layers import layer_sha256, open_layer, open_stage, stage_sha256
 

@@ -10,7 +10,7 @@ import pytest
 
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.files import existing, existing_file, read_text, sha256
+from magtwin.files.file import existing, existing_file, read_text, sha256
 
 COMMANDS = (
     "info F.npz",

@@ -7,7 +7,7 @@ import pytest
 
 import magtwin
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.sim.contradiction import check_agrees, contradiction_nt
 from magtwin.sim.survey import survey
 from magtwin.usd.maps.layer import save_map

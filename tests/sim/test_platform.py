@@ -12,7 +12,8 @@ import pytest
 from scipy.stats import spearmanr
 
 from magtwin.author.scene_file import scene_from_toml
-from magtwin.files import from_table, read_toml, shipped
+from magtwin.files.file import shipped
+from magtwin.files.settings import from_table, read_toml
 from magtwin.learn.data.features import FULL, features
 from magtwin.learn.data.labels import labelled
 from magtwin.path import PATHS, path_named

@@ -6,9 +6,9 @@ from xml.etree import ElementTree
 
 import pytest
 
-from magtwin import budget
-from magtwin.budget import Budget
 from magtwin.errors import InputError
+from magtwin.files import budget
+from magtwin.files.budget import Budget
 from magtwin.urdf import repairs
 from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.description.description import read_description

@@ -18,8 +18,8 @@ from PIL import Image
 from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
 from validators import assert_valid
 
-from magtwin.budget import BUDGETS, Budget
 from magtwin.errors import InputError
+from magtwin.files.budget import BUDGETS, Budget
 from magtwin.urdf import convert_urdf, read_notes
 from magtwin.urdf.meshes import mesh, polygon, texture
 from magtwin.urdf.meshes.mesh import distinct, read_mesh

@@ -15,7 +15,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils
 from validators import assert_valid
 
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.urdf import convert_urdf
 from magtwin.urdf.layout import VARIANTS
 from magtwin.urdf.options import Options

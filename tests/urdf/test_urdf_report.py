@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
-from magtwin.files import sha256
+from magtwin.files.file import sha256
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.urdf.convert import convert_with_report
 from magtwin.urdf.options import Options

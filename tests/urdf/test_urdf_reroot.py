@@ -8,7 +8,7 @@ import pytest
 
 from magtwin.author.robot import read_description
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.urdf.reroot import reroot
 

@@ -12,7 +12,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 from magtwin.author.from_urdf import link_poses, write_urdf
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.urdf import convert_urdf
 from magtwin.urdf.description.description import MOVING, origin_of, read_description
 from magtwin.urdf.options import Options

@@ -6,7 +6,7 @@ import pytest
 from pxr import Usd
 
 from magtwin.errors import InputError, UnknownNameError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.usd.lab.obstacles import read_obstacles
 from magtwin.usd.layers import open_stage, stage_sha256
 from magtwin.usd.maps.layer import load_map

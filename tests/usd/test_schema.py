@@ -13,7 +13,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils, Vt
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.harmonic import HarmonicField
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.spec.base import ZERO3
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.furniture import FurnitureSpec

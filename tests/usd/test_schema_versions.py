@@ -16,7 +16,7 @@ import magtwin
 from magtwin.cli import main
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.usd.maps.layer import load_map, save_map
 from magtwin.usd.schema import FILES, FOLDER, NOUNS, publish
 from magtwin.usd.schema.versions import TEXT, unknown_properties, version_of

@@ -41,7 +41,7 @@ def calibrate(
     pose_from_map
         The poses were estimated on the map: warn.
     """
-    from magtwin.learning import calibrate as calibrate_files
+    from magtwin.tasks.learning import calibrate as calibrate_files
 
     check_output(out, (".safetensors",), "a network", force=force)
     step("Calibrating")

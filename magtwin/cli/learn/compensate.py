@@ -8,7 +8,7 @@ from cyclopts import App
 from magtwin.cli.app import app
 from magtwin.cli.options import Flag, Force
 from magtwin.cli.terminal import Done, check_output, step
-from magtwin.kinds import expected
+from magtwin.files.kinds import expected
 
 compensate_app = App(name="compensate", help="Remove the platform's field from a run (Tolles-Lawson).")
 app.command(compensate_app)
@@ -53,9 +53,9 @@ def fit(
         Use the exact field of a simulated run, b_vector_nt, instead of the reading of the vector axes,
         b_vector_measured_nt, to see the cost of their errors.
     """
+    from magtwin.files.outputs import output
     from magtwin.io.tables import read_parquet
     from magtwin.learn.compensation.tolles_lawson import fit_run
-    from magtwin.outputs import output
 
     check_output(out, (".json",), "a Tolles-Lawson model", force=force)
     names = tuple(name.strip() for name in terms.split(",") if name.strip())

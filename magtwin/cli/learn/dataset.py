@@ -62,9 +62,9 @@ def build(
     jobs
         Number of processes that share the recordings. Default: one, with several threads.
     """
+    from magtwin.files.outputs import check_free
     from magtwin.learn.data.alignment import Alignment
-    from magtwin.learning import build_dataset
-    from magtwin.outputs import check_free
+    from magtwin.tasks.learning import build_dataset
 
     check_free(out, force=force)
     given = lever_arm_m is not None or latency_s is not None
@@ -132,8 +132,8 @@ def correlate(
     out
         Picture to write, .png or .svg.
     """
+    from magtwin.files.outputs import check_free
     from magtwin.learn.data.correlation import correlations_of
-    from magtwin.outputs import check_free
 
     if out is not None:
         check_free(out, force=force)

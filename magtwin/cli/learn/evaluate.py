@@ -82,10 +82,10 @@ def evaluate(
     from magtwin.figures.budgets import section_of_budget
     from magtwin.figures.evaluations import page_of_evaluation, read_curve, write_evaluation
     from magtwin.figures.page import to_json
+    from magtwin.files.outputs import check_free
     from magtwin.learn.evaluation.evaluation import TOTALS
-    from magtwin.learning import error_budget, map_of_scene, short_names
-    from magtwin.learning import evaluate as evaluate_models
-    from magtwin.outputs import check_free
+    from magtwin.tasks.learning import error_budget, map_of_scene, short_names
+    from magtwin.tasks.learning import evaluate as evaluate_models
 
     check_free(out, force=force)
     if scene is not None and map and train is None and engine is None:

@@ -82,7 +82,7 @@ def net_widen(
     out
         File to write, .safetensors. A model card beside the weights is carried over.
     """
-    from magtwin.learning import widen
+    from magtwin.tasks.learning import widen
 
     check_output(out, (".safetensors",), "a network", force=force)
     step("Reading the recordings")

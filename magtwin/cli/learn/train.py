@@ -7,7 +7,7 @@ from magtwin.cli.app import app
 from magtwin.cli.options import Flag, Force, Names, Whole
 from magtwin.cli.terminal import Done, check_suffix, progress
 from magtwin.errors import InputError
-from magtwin.kinds import SWEEP, kind_of
+from magtwin.files.kinds import SWEEP, kind_of
 
 if TYPE_CHECKING:
     from magtwin.learn.models.predictor import Epoch
@@ -107,10 +107,10 @@ def train(
 
     from magtwin.figures.canvas import save
     from magtwin.figures.training import draw_learning_curve, write_learning_curve
+    from magtwin.files.outputs import check_free, transaction
     from magtwin.io.rerun.learning import record_learning_curve
     from magtwin.learn.training.config import TrainConfig, read_config
     from magtwin.learn.training.train import train as train_model
-    from magtwin.outputs import check_free, transaction
 
     check_suffix(out, (".safetensors",), "a network")
     if dataset.is_dir() and kind_of(dataset) in (None, SWEEP):

@@ -12,7 +12,7 @@ from magtwin.cli.options import Flag, Force, Jobs, Lab, Licence, Seed, Whole
 from magtwin.cli.terminal import Done, check_output, progress, step
 from magtwin.io.surveys.about import About
 from magtwin.io.surveys.columns import Columns
-from magtwin.report import Report
+from magtwin.report.report import Report
 
 COLUMNS = Columns()
 

@@ -55,10 +55,10 @@ def drive(
     """
     import numpy as np
 
-    from magtwin.files import existing
+    from magtwin.files.file import existing
+    from magtwin.files.outputs import output
     from magtwin.io.outputs import Outputs
     from magtwin.io.outputs import drive as drive_again
-    from magtwin.outputs import output
     from magtwin.sim.motion.commands import write_commands
     from magtwin.sim.motion.drive import draw_wheel_errors
     from magtwin.sim.motion.follow import CONTROL_RATE_HZ

@@ -22,9 +22,9 @@ def reproduce(file: Path, *, scene: RunScene = None, out: Path | None = None, fo
     out
         Run to write the result to, in the format of its name.
     """
+    from magtwin.files.outputs import check_free
     from magtwin.io.formats import format_to_write, write_run
     from magtwin.io.provenance import repeat_of
-    from magtwin.outputs import check_free
 
     if out is not None:
         format_to_write(check_free(out, force=force))

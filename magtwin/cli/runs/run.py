@@ -52,9 +52,9 @@ def demo(
     from magtwin.author.robot import build_robot
     from magtwin.author.scene import author_scene
     from magtwin.figures.pictures import picture_of_stage
-    from magtwin.files import shipped
+    from magtwin.files.file import shipped
+    from magtwin.files.outputs import output
     from magtwin.io.outputs import Outputs, drive
-    from magtwin.outputs import output
     from magtwin.twin import scene_from_toml
 
     with output(out, force=force) as folder:
@@ -284,7 +284,7 @@ def _run_robots(
     from magtwin.io.formats import read_run
     from magtwin.io.outputs import Driven
     from magtwin.path import Path as Planned
-    from magtwin.report import Report
+    from magtwin.report.report import Report
     from magtwin.sim.motion.commands import read_commands
     from magtwin.sim.motion.drive_input import drive_input
     from magtwin.twin import led_by, open_twin, room_of, scan, simulate_robots

@@ -86,7 +86,7 @@ def sweep(
     jobs
         Number of processes. Default: one, with several threads.
     """
-    from magtwin.outputs import check_free
+    from magtwin.files.outputs import check_free
     from magtwin.parallel import parse_shard
     from magtwin.sim.motion.drive_input import drive_input
     from magtwin.sim.runs.simulate import check_asked

@@ -41,8 +41,8 @@ def export(
         Draw a picture of a folder's stage where asset browsers look for one.
     """
     from magtwin.export.package import export_scene
-    from magtwin.files import existing
-    from magtwin.outputs import check_free
+    from magtwin.files.file import existing
+    from magtwin.files.outputs import check_free
     from magtwin.twin import scene_file
 
     check_free(out, force=force)

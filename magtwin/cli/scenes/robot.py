@@ -82,7 +82,7 @@ def robot(
         Full report to write (.json).
     """
     given = dict(locals())
-    from magtwin.outputs import output, transaction
+    from magtwin.files.outputs import output, transaction
 
     if out.suffix.lower() == ".urdf":
         from magtwin.author.from_urdf import write_urdf

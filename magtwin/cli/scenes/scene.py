@@ -26,7 +26,7 @@ def new(out: Path, *, force: Force = False) -> Done:
     """
     check_output(out, (".toml", ".py"), "a room or a localizer", force=force)
     if out.suffix.lower() == ".py":
-        from magtwin.localizing import new_localizer
+        from magtwin.tasks.localizing import new_localizer
 
         new_localizer(out, force=force)
         try_it = f"magtwin localize localizer_run/run.parquet --map lab --method {out.stem}:MyLocalizer"
@@ -88,7 +88,7 @@ def scene(
         them is refused, and the difference is given in nT.
     """
     from magtwin.author.scene import author_scene
-    from magtwin.outputs import check_free, not_read
+    from magtwin.files.outputs import check_free, not_read
     from magtwin.twin import scene_from_toml, scene_with_robot
     from magtwin.usd.info import info_of_stage
     from magtwin.usd.robot import read_notes

@@ -13,9 +13,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from magtwin.children import LATE, answer_of
 from magtwin.errors import InputError
 from magtwin.export.validation.findings import Check, Finding, check_from
+from magtwin.files.children import LATE, answer_of
 
 PATIENCE_S = 120.0
 """Time limit for a stage, plus 1 s per megabyte [s]."""

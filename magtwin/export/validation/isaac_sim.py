@@ -14,10 +14,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from magtwin.children import LATE, answer_of
 from magtwin.errors import InputError
 from magtwin.export.validation.findings import Check, Finding
 from magtwin.export.validation.inspection import as_named
+from magtwin.files.children import LATE, answer_of
 
 INSTALLATION = "MAGTWIN_ISAACSIM"
 """Environment variable with the path of an Isaac Sim installation, of a checkout, or of fetched rules."""

@@ -13,10 +13,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from magtwin.children import run
 from magtwin.errors import InputError
 from magtwin.export.validation.findings import Check, Finding
 from magtwin.export.validation.physx_robots import AHEAD_M
+from magtwin.files.children import run
 from magtwin.sim.engines.world_process import WorldProcess
 
 PHYSX = "MAGTWIN_PHYSX"

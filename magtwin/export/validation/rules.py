@@ -18,7 +18,7 @@ from magtwin.export.attached import attached_sha256
 from magtwin.export.contents import named_files, weights_metadata
 from magtwin.export.validation.findings import Severity
 from magtwin.export.validation.rule import Subject, Wrong, rule, wrong_of
-from magtwin.files import sha256
+from magtwin.files.file import sha256
 from magtwin.usd.attributes import plain_value, target
 from magtwin.usd.lab.earth import read_earth
 from magtwin.usd.lab.furniture import read_magnets

@@ -18,8 +18,8 @@ from magtwin.export.validation.inspection import Inspection, inspect
 from magtwin.export.validation.isaac_sim import isaac
 from magtwin.export.validation.physx_drive import physx
 from magtwin.export.validation.validators import newton, nvidia, simready
-from magtwin.files import existing
-from magtwin.kinds import expected
+from magtwin.files.file import existing
+from magtwin.files.kinds import expected
 
 AGAINST = ("core", "nvidia", "simready", "isaac", "newton", "physx", "magtwin")
 """Validators, in the order of the results."""

@@ -17,8 +17,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from magtwin.children import LATE, caches, run
 from magtwin.export.validation.findings import Check, Finding, Severity
+from magtwin.files.children import LATE, caches, run
 
 PATIENCE_S = 600.0
 """Time limit of a validator [s]; Newton's kernels take a minute to compile at first."""

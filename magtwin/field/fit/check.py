@@ -14,8 +14,8 @@ from magtwin.field.fit.methods import METHODS, FieldModel
 from magtwin.field.survey.axes import SurveyAxes, distinct
 from magtwin.field.survey.bins import spacing_m
 from magtwin.field.survey.readings import Readings
-from magtwin.report import Figure, Report
-from magtwin.verdict import Z_90
+from magtwin.report.report import Figure, Report
+from magtwin.report.verdict import Z_90
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]

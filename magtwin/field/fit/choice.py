@@ -18,8 +18,8 @@ from magtwin.field.fit.methods import FieldModel, in_own_axes
 from magtwin.field.fit.mixture import Mixture, mixed
 from magtwin.field.survey.bins import means, spacing_m
 from magtwin.field.survey.readings import Readings
-from magtwin.report import Figure, Report
-from magtwin.verdict import Z_90
+from magtwin.report.report import Figure, Report
+from magtwin.report.verdict import Z_90
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]

@@ -24,7 +24,7 @@ from magtwin.field.maps.statistics import offset_figures
 from magtwin.field.survey.axes import SurveyAxes, distinct, in_order, in_own_axes
 from magtwin.field.survey.bins import distance_m, spacing_m
 from magtwin.field.survey.readings import Readings, checked_earth_nt
-from magtwin.report import Figure, Report
+from magtwin.report.report import Figure, Report
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], Any]
@@ -36,7 +36,7 @@ FLAT_NT = 50.0  # Least scale of that share, for fields that hardly change [nT]
 # Parameters of a map: RMS errors of linear interpolation
 ERRORS = ("error between nodes [nT]", "error between headings [nT]")
 # Standard deviation of what a robot adds alike throughout a drive [nT]: a constant of 500 and, by heading,
-# 400, as in drives of the shipped robot (`ROBOT_NOISE` of `magtwin.localizing`)
+# 400, as in drives of the shipped robot (`ROBOT_NOISE` of `magtwin.tasks.localizing`)
 OFFSET_SD_NT = 640.0
 MOST_THREADS = 4  # Headings of a raster that are computed in parallel: each holds blocks of 100 MB
 

@@ -21,7 +21,7 @@ from magtwin.errors import InputError
 from magtwin.extend import Registry
 from magtwin.field.survey.axes import WORLD, SurveyAxes
 from magtwin.field.survey.readings import Readings
-from magtwin.summary import Summarized, Summary, printable
+from magtwin.report.summary import Summarized, Summary, printable
 
 Array = NDArray[np.float64]
 Method = TypeVar("Method", bound=Callable[..., Any])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.verdict import Z_90
+from magtwin.report.verdict import Z_90
 
 Array = NDArray[np.float64]
 # Gives values at positions (third) from positions (first) and values (second); nan outside

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.field.grid import Grid
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.report import Figure, Report
-from magtwin.summary import Summarized, Summary
+from magtwin.report.report import Figure, Report
+from magtwin.report.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

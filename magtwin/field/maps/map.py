@@ -16,8 +16,8 @@ from magtwin.field.grid import Grid, check_axes
 from magtwin.field.maps.lookup import EDGE, NONE, Lookup
 from magtwin.field.maps.made_from import MadeFrom
 from magtwin.field.sources.harmonic import HarmonicField
-from magtwin.report import Figure, Report
-from magtwin.summary import Summarized, Summary, listed, rectangle, span
+from magtwin.report.report import Figure, Report
+from magtwin.report.summary import Summarized, Summary, listed, rectangle, span
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Picture

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.harmonic import HarmonicField
-from magtwin.report import Figure, Report
-from magtwin.summary import span
+from magtwin.report.report import Figure, Report
+from magtwin.report.summary import span
 
 Array = NDArray[np.float64]
 

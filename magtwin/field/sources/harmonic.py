@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError
 from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
-from magtwin.summary import Summarized
+from magtwin.report.summary import Summarized
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.delimited import is_cut_short
 from magtwin.errors import InputError
 from magtwin.field.grid import Grid
 from magtwin.field.maps.curvature import interpolation_error_nt2
@@ -19,10 +18,11 @@ from magtwin.field.survey.header import ERROR, MASKED, header_lines, read_header
 from magtwin.field.survey.node_errors import node_errors
 from magtwin.field.survey.readings import TAKEN, Readings, taken_of
 from magtwin.field.units import check_unit, nt_per
-from magtwin.files import existing, existing_file, sha256
+from magtwin.files.file import existing, existing_file, sha256
+from magtwin.files.outputs import output
 from magtwin.frames import wrap_angle
-from magtwin.outputs import output
-from magtwin.report import Figure, Report
+from magtwin.report.report import Figure, Report
+from magtwin.tables.delimited import is_cut_short
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError
 from magtwin.field.days import check_texts
 from magtwin.field.grid import FARTHEST_M, Grid
-from magtwin.report import Figure, Report
-from magtwin.summary import Summarized, Summary, listed, rectangle, span
+from magtwin.report.report import Figure, Report
+from magtwin.report.summary import Summarized, Summary, listed, rectangle, span
 
 Array = NDArray[np.float64]
 

@@ -37,7 +37,7 @@ from magtwin.field.survey.hold import DIGITS, in_order, repeats
 from magtwin.field.survey.neighbours import FREEDOM, LEAST, LocalFit, deviation
 from magtwin.field.survey.readings import Readings
 from magtwin.frames import wrap_angle
-from magtwin.report import Figure, Report
+from magtwin.report.report import Figure, Report
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]

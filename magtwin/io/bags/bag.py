@@ -14,7 +14,8 @@ import yaml
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, RepairWarning, hint
-from magtwin.files import existing, existing_file, read_text, yaml_loader
+from magtwin.files.file import existing, existing_file, read_text
+from magtwin.files.settings import yaml_loader
 from magtwin.io.bags.cdr import NS, Index, Messages, decode
 from magtwin.io.bags.compression import Room
 from magtwin.io.bags.db3 import Db3Reader, custom_data

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from magtwin.budget import check_decoded
+from magtwin.files.budget import check_decoded
 from magtwin.io.bags.cdr import Messages
 
 STEP = 1 << 20

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from magtwin.budget import BUDGETS, check_decoded
 from magtwin.errors import InputError
-from magtwin.files import yaml_loader
+from magtwin.files.budget import BUDGETS, check_decoded
+from magtwin.files.settings import yaml_loader
 from magtwin.io.bags.cdr import Messages
 from magtwin.io.bags.storage import StoredTopic
 

@@ -22,8 +22,8 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from magtwin.budget import BUDGETS, check_decoded
 from magtwin.errors import InputError
+from magtwin.files.budget import BUDGETS, check_decoded
 from magtwin.io.bags.cdr import Bytes, Index, Messages
 from magtwin.io.bags.storage import ROOM, Batch, Connection, StoredTopic, in_time
 

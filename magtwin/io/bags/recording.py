@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError, RepairWarning
 from magtwin.field.units import NT_PER, Unit
-from magtwin.files import sha256
+from magtwin.files.file import sha256
 from magtwin.frames import IDENTITY_XYZW, canonical, quat_conjugate, rotate, yaw_from_quat
 from magtwin.io.bags.bag import Bag, Signal
 from magtwin.io.bags.cdr import NS, Messages

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magtwin.errors import InputError
+from magtwin.files.outputs import check_free, output, why_full
 from magtwin.io.bags.cdr import encode
 from magtwin.io.bags.mcap import McapWriter
 from magtwin.io.bags.sender import Unit
@@ -21,7 +22,6 @@ from magtwin.io.bags.topics import Qos
 from magtwin.io.bags.twin_sender import sender_for
 from magtwin.io.bags.types import definition_of, layout
 from magtwin.io.recorder import PARTIAL, Sink, partial_of
-from magtwin.outputs import check_free, output, why_full
 from magtwin.run.arrow import metadata_to_json
 from magtwin.run.run import Run
 from magtwin.run.spool import blocks

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from rerun.chunk import RrdReader
 
-from magtwin.budget import check_size
 from magtwin.errors import InputError
-from magtwin.files import existing
+from magtwin.files.budget import check_size
+from magtwin.files.file import existing
+from magtwin.files.outputs import output
 from magtwin.io.recorder import PARTIAL
 from magtwin.io.rerun.layout import RUN_COLOURS, Shown, comparison_layout, plotted
 from magtwin.io.rerun.recording import (
@@ -31,7 +32,6 @@ from magtwin.io.rerun.recording import (
 from magtwin.io.rerun.series import COLUMNS_ENTITY, STATES, entity_of, table_of
 from magtwin.io.rerun.viewer import check_decodes, show
 from magtwin.io.rerun.world import Interior, Robot, heading_of, send_room
-from magtwin.outputs import output
 from magtwin.path import Path
 from magtwin.run import mapped
 from magtwin.run.run import Run

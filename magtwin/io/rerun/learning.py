@@ -8,9 +8,9 @@ from pathlib import Path
 import rerun as rr
 import rerun.blueprint as rrb
 
+from magtwin.files.outputs import output
 from magtwin.io.rerun.recording import stream
 from magtwin.learn.models.predictor import Epoch
-from magtwin.outputs import output
 
 
 def record_learning_curve(

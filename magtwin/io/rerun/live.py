@@ -12,6 +12,7 @@ import numpy as np
 import rerun as rr
 
 from magtwin.errors import InputError
+from magtwin.files.outputs import check_free
 from magtwin.frames import quat_from_yaw
 from magtwin.io.recorder import Sink, partial_of
 from magtwin.io.rerun.layout import drive_layout
@@ -29,7 +30,6 @@ from magtwin.io.rerun.recording import (
 from magtwin.io.rerun.series import STATES
 from magtwin.io.rerun.viewer import live_viewer
 from magtwin.io.rerun.world import POSE_HZ, Interior, Robot, send_still
-from magtwin.outputs import check_free
 from magtwin.path import Path as Planned
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans

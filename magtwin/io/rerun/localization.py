@@ -11,12 +11,12 @@ import rerun.blueprint as rrb
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.files.outputs import output
 from magtwin.frames import wrap_angle
 from magtwin.io.rerun.layout import value_range
 from magtwin.io.rerun.recording import ROOM, Recording, content_id, size_of, stream, title_of
 from magtwin.io.rerun.series import TIMELINE, Array, nanoseconds, send
 from magtwin.io.rerun.world import Scale, heading_of, send_map
-from magtwin.outputs import output
 from magtwin.run.run import Run
 
 FLOOR, PATHS = "floor", "floor/paths"

@@ -24,15 +24,15 @@ import rerun_bindings
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
+from magtwin.files.outputs import why_full
 from magtwin.io.rerun.layout import layout
 from magtwin.io.rerun.series import COLUMNS_ENTITY, ROWS, Flags, entity_of, send_columns, send_metadata
 from magtwin.io.rerun.world import Feed, Interior, Robot, heading_of, send_room
-from magtwin.outputs import why_full
 from magtwin.path import Path
+from magtwin.report.summary import in_markdown
 from magtwin.run import mapped
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
-from magtwin.summary import in_markdown
 from magtwin.twin import Twin
 
 APPLICATION = "magtwin"

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
 from magtwin.errors import InputError
+from magtwin.report.verdict import Z_90
 from magtwin.run.arrow import check_metadata, said_of, spec_said
 from magtwin.run.figures import prediction_nt
 from magtwin.run.run import COLUMNS, Run, check_numbers
-from magtwin.verdict import Z_90
 
 Array = NDArray[np.float64]
 

@@ -20,14 +20,14 @@ from typing import IO, Any, BinaryIO
 import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import Timeline, View, ViewerClient
 
-from magtwin.budget import BUDGETS, check_decoded, check_size
-from magtwin.children import LATE, own_home, run
 from magtwin.errors import InputError
-from magtwin.files import existing
+from magtwin.files.budget import BUDGETS, check_decoded, check_size
+from magtwin.files.children import LATE, own_home, run
+from magtwin.files.file import existing
+from magtwin.files.outputs import output
+from magtwin.files.protobuf import fields
 from magtwin.io.rerun.series import TIMELINE
-from magtwin.outputs import output
 from magtwin.parallel.machine import ends_with_parent
-from magtwin.protobuf import fields
 
 LOCALHOST = "127.0.0.1"
 

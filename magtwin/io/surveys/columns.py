@@ -5,9 +5,9 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Literal
 
-from magtwin.delimited import DEGREES, label_of
 from magtwin.errors import InputError
 from magtwin.field.units import Unit, check_factor
+from magtwin.tables.delimited import DEGREES, label_of
 
 Axes = Literal["body", "world"]
 HeadingUnit = Literal["rad", "deg", "compass"]

@@ -17,7 +17,9 @@ from magtwin.field.survey.folder import read_survey as read_folder
 from magtwin.field.survey.hold import without_repeats
 from magtwin.field.survey.readings import Readings, masked_words, taken_of
 from magtwin.field.survey.stuck import mask_stuck
-from magtwin.files import existing, sha256
+from magtwin.files.file import existing, sha256
+from magtwin.files.kinds import expected
+from magtwin.files.outputs import check_free, output, transaction
 from magtwin.io.surveys.about import About
 from magtwin.io.surveys.columns import Columns
 from magtwin.io.surveys.readings import (
@@ -28,9 +30,7 @@ from magtwin.io.surveys.readings import (
     read_readings,
     save_readings,
 )
-from magtwin.kinds import expected
-from magtwin.outputs import check_free, output, transaction
-from magtwin.report import Report
+from magtwin.report.report import Report
 from magtwin.twin import scene_file
 
 Method = Literal["auto", "trilinear", "cubic", "gp", "harmonic"]

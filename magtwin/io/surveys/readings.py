@@ -13,13 +13,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.delimited import DEGREES, LENGTHS
 from magtwin.errors import InputError, hint
 from magtwin.field.grid import FARTHEST_M, Grid
 from magtwin.field.survey.folder import LARGEST_TURN, USUAL_SPAN_M, read_grid
 from magtwin.field.survey.readings import SHAPES, TAKEN, Readings
 from magtwin.field.units import check_unit, nt_per, unit_by_size
-from magtwin.files import existing, sha256
+from magtwin.files.file import existing, sha256
+from magtwin.files.kinds import RUN, expected, kind_of
+from magtwin.files.outputs import output
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
 from magtwin.io.surveys.columns import (
     ANGLE_UNITS,
@@ -37,11 +38,10 @@ from magtwin.io.surveys.columns import (
 from magtwin.io.surveys.table import Table, read_csv, read_parquet_table
 from magtwin.io.tables import load_parquet, read_npz, read_parquet
 from magtwin.io.tables import read_csv as read_csv_run
-from magtwin.kinds import RUN, expected, kind_of
-from magtwin.outputs import output
 from magtwin.path.points import ANGLES
 from magtwin.run.arrow import FACTS
 from magtwin.run.run import Run
+from magtwin.tables.delimited import DEGREES, LENGTHS
 
 Array = NDArray[np.float64]
 Source = str | os.PathLike[str]

@@ -12,11 +12,11 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from magtwin.delimited import MISSING, QUOTED, bare, number_of, read_delimited
 from magtwin.errors import InputError, hint
-from magtwin.files import existing
+from magtwin.files.file import existing
 from magtwin.io.surveys.columns import TIME_UNITS, named
 from magtwin.io.tables import load_parquet
+from magtwin.tables.delimited import MISSING, QUOTED, bare, number_of, read_delimited
 
 Array = NDArray[np.float64]
 
@@ -225,7 +225,7 @@ def _moment(text: str, is_day_first: bool | None) -> datetime:
 
 
 def read_csv(path: str | os.PathLike[str]) -> Table:
-    """Read a text file of readings; as `magtwin.delimited.read_delimited`, with units below the header."""
+    """Read a text file of readings, as `magtwin.tables.delimited` does, with units below the header."""
     text = read_delimited(path, "file of readings", "readings", "one row of numbers per reading", units=True)
     names = text.names or ("",) * text.width
     pairs = zip(names, zip(*text.rows, strict=True), strict=True)

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError, find
-from magtwin.files import read_text
-from magtwin.report import Figure, Report
+from magtwin.files.file import read_text
+from magtwin.report.report import Figure, Report
+from magtwin.report.verdict import verdict
 from magtwin.run.run import Run
-from magtwin.verdict import verdict
 
 Array = NDArray[np.float64]
 

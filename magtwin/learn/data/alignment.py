@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import into_base, wrap_angle, yaw_from_quat
-from magtwin.report import Figure, Report
+from magtwin.report.report import Figure, Report
+from magtwin.report.summary import Summarized, Summary
 from magtwin.run.run import Run
 from magtwin.run.thinning import newest
-from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
 

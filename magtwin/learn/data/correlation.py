@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.learn.data.dataset import Dataset, open_dataset
-from magtwin.report import Figure, Report
-from magtwin.summary import Summarized
+from magtwin.report.report import Figure, Report
+from magtwin.report.summary import Summarized
 
 Array = NDArray[np.float64]
 

@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import existing_file, read_text, sha256
-from magtwin.kinds import expected
+from magtwin.files.file import existing_file, read_text, sha256
+from magtwin.files.kinds import expected
+from magtwin.files.outputs import output
 from magtwin.learn.data.alignment import Alignment, fit_alignment
 from magtwin.learn.data.features import FEATURES, SETS, columns_of, feature_names
 from magtwin.learn.data.features import features as features_of
@@ -33,13 +34,12 @@ from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.origin import map_metadata, shared_metadata
 from magtwin.learn.data.recording import Recording, Rows, Source, plant_name, read, sources_of, thinned
 from magtwin.learn.data.split import Part, Split
-from magtwin.outputs import output
 from magtwin.parallel import run_all
-from magtwin.report import Figure, Report
+from magtwin.report.report import Figure, Report
+from magtwin.report.summary import Summarized, Summary, listed, span
 from magtwin.run.arrow import run_of, table_of
 from magtwin.run.parquet import check_parquet
 from magtwin.run.run import Metadata, Run
-from magtwin.summary import Summarized, Summary, listed, span
 from magtwin.version import __version__
 
 Array = NDArray[np.float64]
@@ -359,7 +359,7 @@ def build_dataset(
     force: bool = False,
     progress: Progress | None = None,
 ) -> Dataset:
-    """Label recordings on a map and write them as a data set; `magtwin.learning.build_dataset` takes files.
+    """Label recordings on a map and write them as a data set; `magtwin.tasks.learning` takes files.
 
     Args:
         recordings: Runs by name, or sources that are read one at a time.

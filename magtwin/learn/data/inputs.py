@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.learn.data.features import feature_names
-from magtwin.summary import Summarized
+from magtwin.report.summary import Summarized
 
 Array = NDArray[np.float64]
 

@@ -16,9 +16,9 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import into_base
 from magtwin.learn.data.recording import plant_name
+from magtwin.report.verdict import SEPARATOR
 from magtwin.run.run import Metadata
 from magtwin.spec.robot import RobotSpec
-from magtwin.verdict import SEPARATOR
 
 Array = NDArray[np.float64]
 

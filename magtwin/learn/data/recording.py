@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.learn.data.alignment import usable
+from magtwin.report.summary import Summarized
 from magtwin.run.run import Run
 from magtwin.run.thinning import newest
-from magtwin.summary import Summarized
 
 Array = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError, find
 from magtwin.learn.data.recording import Recording
-from magtwin.report import Figure, Report
-from magtwin.summary import Summarized, Summary, listed
+from magtwin.report.report import Figure, Report
+from magtwin.report.summary import Summarized, Summary, listed
 
 By = Literal["session", "run", "path", "row"]
 Part = Literal["train", "validation", "test"]

@@ -35,10 +35,10 @@ from magtwin.learn.data.labels import labelled
 from magtwin.learn.evaluation.candidates import Candidate, Mean
 from magtwin.learn.evaluation.evaluation import Evaluation
 from magtwin.learn.evaluation.training_rows import aligned_runs
+from magtwin.report.summary import Summarized
 from magtwin.run.run import Run
 from magtwin.sim.interference import level_field_nt, platform_field_nt, sensor_places
 from magtwin.spec.scene import Scene
-from magtwin.summary import Summarized
 
 Array = NDArray[np.float64]
 

@@ -17,8 +17,8 @@ from magtwin.learn.data.origin import same_map
 from magtwin.learn.evaluation.training_rows import alignment_on, training_rows
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer, Read
 from magtwin.learn.models.linear import fit_linear
+from magtwin.report.summary import Summarized, Summary, listed
 from magtwin.run.run import Run
-from magtwin.summary import Summarized, Summary, listed
 
 NAIVE = "naive"  # Name of the naive model
 

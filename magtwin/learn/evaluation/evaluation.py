@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.files.outputs import output
 from magtwin.learn.evaluation.candidates import Candidate, NamedMap
 from magtwin.learn.evaluation.scores import Errors, Score
-from magtwin.outputs import output
+from magtwin.report.summary import Summarized, Summary
+from magtwin.report.verdict import SEPARATOR, recordings_text, verdict
 from magtwin.run.run import Run
-from magtwin.summary import Summarized, Summary
-from magtwin.verdict import SEPARATOR, recordings_text, verdict
 
 Array = NDArray[np.float64]
 

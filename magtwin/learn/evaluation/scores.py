@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.summary import Summarized
-from magtwin.verdict import Z_90
+from magtwin.report.summary import Summarized
+from magtwin.report.verdict import Z_90
 
 Array = NDArray[np.float64]
 Interval = tuple[float, float]

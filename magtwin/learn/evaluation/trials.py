@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.files import parse_toml, sha256
+from magtwin.files.file import sha256
+from magtwin.files.settings import parse_toml
 from magtwin.learn.data.dataset import MANIFEST, Dataset
 from magtwin.learn.data.recording import Source
 from magtwin.learn.data.split import split

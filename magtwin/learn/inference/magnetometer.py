@@ -8,19 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin import files
 from magtwin.errors import InputError
-from magtwin.kinds import expected
+from magtwin.files.file import sha256
+from magtwin.files.kinds import expected
 from magtwin.learn.data.features import columns_of, features
 from magtwin.learn.data.origin import same_robot
 from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.predictor import Predictor, load_predictor
 from magtwin.learn.models.regressor import summary_of
 from magtwin.learn.models.weights import MetadataValue
+from magtwin.report.summary import Summarized, Summary
+from magtwin.report.verdict import OF_DRIVE, ONLY_OWN, OTHERS, OWN
 from magtwin.run.run import Run
 from magtwin.sim.sensors.model_error import ModelError
-from magtwin.summary import Summarized, Summary
-from magtwin.verdict import OF_DRIVE, ONLY_OWN, OTHERS, OWN
 
 Array = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ class NeuralMagnetometer(Summarized):
             InputError: No such file, another checksum, or not a predictor.
         """
         path = expected(path, "weights file")
-        checksum = files.sha256(path)
+        checksum = sha256(path)
         if sha256 and checksum != sha256.lower():
             raise InputError(
                 f"{path}: its sha256 is {checksum}, expected {sha256}; get the file again "

@@ -14,9 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.budget import check_count
 from magtwin.errors import InputError
-from magtwin.files import read_bytes, sha256
+from magtwin.files.budget import check_count
+from magtwin.files.file import read_bytes, sha256
+from magtwin.files.outputs import check_free, output
+from magtwin.files.protobuf import fields
 from magtwin.learn.data.features import FEATURES
 from magtwin.learn.data.inputs import Inputs
 from magtwin.learn.mixed.mixed import Mixed
@@ -25,9 +27,7 @@ from magtwin.learn.models.hybrid import Hybrid
 from magtwin.learn.models.linear import Linear
 from magtwin.learn.models.network import FieldNet
 from magtwin.learn.models.predictor import Predictor, load_predictor
-from magtwin.outputs import check_free, output
-from magtwin.protobuf import fields
-from magtwin.report import Figure, Report
+from magtwin.report.report import Figure, Report
 from magtwin.version import __version__
 
 if TYPE_CHECKING:

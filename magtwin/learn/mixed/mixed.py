@@ -22,7 +22,7 @@ from magtwin.learn.mixed.session_effects import effects_of_drive
 from magtwin.learn.models.calibration import Spread, spread_from, spread_like
 from magtwin.learn.models.regressor import Regressor
 from magtwin.learn.models.weights import Weights
-from magtwin.report import Figure
+from magtwin.report.report import Figure
 
 Intervals = Literal["nominal", "unknown", "calibrated"]
 """What standard deviations hold for: the nominal plant, any plant, or the session of a drive."""

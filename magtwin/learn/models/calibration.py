@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.learn.data.inputs import Array
-from magtwin.verdict import Z_90
+from magtwin.report.verdict import Z_90
 
 WITHIN = 0.9  # Nominal coverage of intervals
 MOST_FACTOR = 3.0  # Largest factor by which few recordings change an interval

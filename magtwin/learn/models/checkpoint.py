@@ -20,9 +20,9 @@ import torch
 from numpy._core import multiarray
 from numpy.typing import NDArray
 
-from magtwin.budget import BUDGETS, check_decoded
 from magtwin.errors import InputError
-from magtwin.files import check_zip, existing_file
+from magtwin.files.budget import BUDGETS, check_decoded
+from magtwin.files.file import check_zip, existing_file
 
 PICKLE = 4_000_000
 """Largest pickle of a checkpoint [bytes]; tensors are beside it."""

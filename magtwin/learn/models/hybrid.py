@@ -13,7 +13,7 @@ from magtwin.learn.models.linear import Linear, like, linear_from
 from magtwin.learn.models.network import FieldNet, net_of
 from magtwin.learn.models.regressor import Regressor
 from magtwin.learn.models.weights import Weights, tensors_below
-from magtwin.report import Figure
+from magtwin.report.report import Figure
 
 
 @dataclass(kw_only=True, repr=False)

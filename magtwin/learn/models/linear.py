@@ -25,7 +25,7 @@ from magtwin.learn.models.calibration import (
 )
 from magtwin.learn.models.regressor import Regressor
 from magtwin.learn.models.weights import Weights
-from magtwin.report import Figure
+from magtwin.report.report import Figure
 
 PENALTIES = tuple(float(p) for p in np.logspace(-8, 1, 19))  # Penalties that cross-validation chooses from
 FALLBACK_PENALTY = 1e-3  # Penalty if there is one group of recordings, so that cross-validation is impossible

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.files import sha256
-from magtwin.kinds import expected
+from magtwin.files.file import sha256
+from magtwin.files.kinds import expected
 from magtwin.learn.data.features import FULL
 from magtwin.learn.data.inputs import Array, inputs_from, scaler_tensors
 from magtwin.learn.models.perceptron import Layer, outputs
 from magtwin.learn.models.regressor import Regressor
 from magtwin.learn.models.weights import Weights, say
-from magtwin.report import Figure
+from magtwin.report.report import Figure
 
 
 @dataclass(kw_only=True, repr=False)

@@ -33,7 +33,7 @@ from magtwin.learn.data.recording import Recording, Rows
 from magtwin.learn.models.calibration import Spread
 from magtwin.learn.models.network import net_of_checkpoint
 from magtwin.learn.models.weights import MetadataValue, Weights, is_checkpoint, read_weights
-from magtwin.report import Report
+from magtwin.report.report import Report
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.learn.data.inputs import Inputs
 from magtwin.learn.models.calibration import Spread
 from magtwin.learn.models.weights import MetadataValue, shown, write_weights
-from magtwin.report import Figure, Report
-from magtwin.summary import Summarized, Summary, listed
+from magtwin.report.report import Figure, Report
+from magtwin.report.summary import Summarized, Summary, listed
 
 
 @dataclass(kw_only=True, repr=False)

@@ -15,11 +15,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from magtwin.errors import InputError
-from magtwin.files import existing, existing_file
-from magtwin.kinds import expected, kind_of
+from magtwin.files.file import existing, existing_file
+from magtwin.files.kinds import expected, kind_of
+from magtwin.files.outputs import output
 from magtwin.learn.data.features import FEATURES, feature_names
 from magtwin.learn.models.calibration import Spread, spread_from, spread_like
-from magtwin.outputs import output
 
 MetadataValue = str | int | float | bool
 Tensors = Mapping[str, NDArray[Any]]

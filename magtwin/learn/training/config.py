@@ -11,8 +11,8 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 from magtwin.errors import InputError, find
-from magtwin.files import from_table, read_toml
-from magtwin.kinds import expected
+from magtwin.files.kinds import expected
+from magtwin.files.settings import from_table, read_toml
 from magtwin.learn.data.features import feature_names
 from magtwin.learn.data.split import By
 from magtwin.learn.models.linear import Weighting

@@ -7,9 +7,9 @@ from magtwin.learn.data.split import Split
 from magtwin.learn.models.predictor import Choice, Epoch, Predictor
 from magtwin.learn.models.weights import shown
 from magtwin.learn.training.config import TrainConfig
-from magtwin.report import Figure, Report
-from magtwin.summary import Summarized, Summary
-from magtwin.verdict import verdict
+from magtwin.report.report import Figure, Report
+from magtwin.report.summary import Summarized, Summary
+from magtwin.report.verdict import verdict
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from magtwin.budget import check_size
 from magtwin.errors import InputError
-from magtwin.files import existing
-from magtwin.outputs import output
+from magtwin.files.budget import check_size
+from magtwin.files.file import existing
+from magtwin.files.outputs import output
 
 FORMAT_VERSION = 1  # Version of the file; other versions are refused
 

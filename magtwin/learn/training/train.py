@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from magtwin.errors import InputError
-from magtwin.files import sha256
+from magtwin.files.file import sha256
+from magtwin.files.outputs import afterwards, check_free, output, transaction
 from magtwin.learn.data.dataset import MANIFEST, Dataset, open_dataset
 from magtwin.learn.data.origin import NOMINAL, ROBOT_METADATA
 from magtwin.learn.data.residuals import HeldOut, held_out_errors, residuals
@@ -26,8 +27,7 @@ from magtwin.learn.training.config import TrainConfig
 from magtwin.learn.training.model_card import model_card
 from magtwin.learn.training.result import PartErrors, TrainingResult
 from magtwin.learn.training.training_data import TrainingData, read_training_data
-from magtwin.outputs import afterwards, check_free, output, transaction
-from magtwin.verdict import SEPARATOR, coverage, recordings_text
+from magtwin.report.verdict import SEPARATOR, coverage, recordings_text
 from magtwin.version import __version__
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from magtwin.learn.data.inputs import Array
 from magtwin.learn.data.recording import Recording, Rows
 from magtwin.learn.data.split import PARTS, Part, Split
 from magtwin.learn.models.linear import FittedLinear, fit_linear
-from magtwin.summary import Summarized
+from magtwin.report.summary import Summarized
 
 
 @dataclass(frozen=True, repr=False)

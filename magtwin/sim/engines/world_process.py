@@ -8,8 +8,8 @@ from pathlib import Path as FilePath
 from types import MappingProxyType
 from typing import Any
 
-from magtwin.children import caches, end, limited, own_home
 from magtwin.errors import InputError
+from magtwin.files.children import caches, end, limited, own_home
 
 
 class WorldProcess:
@@ -34,7 +34,7 @@ class WorldProcess:
             command: The program and its arguments.
             job: Its first line, with the key `stage`.
             engine: Name of the engine, for messages.
-            changes: What differs in its environment, as for `magtwin.children.environment`.
+            changes: What differs in its environment, as for `magtwin.files.children.environment`.
             limit_s: Time after which the process is killed [s]. None for no limit.
             files: Texts of files in the folder that it runs in, by name.
         """

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.delimited import QUOTED, Delimited, number_of, read_delimited
 from magtwin.errors import InputError, RepairWarning
-from magtwin.kinds import expected
-from magtwin.labels import split_label, words_of
-from magtwin.outputs import output
+from magtwin.files.kinds import expected
+from magtwin.files.outputs import output
+from magtwin.report.summary import Summarized, Summary, listed
 from magtwin.spec.drive import DriveSpec
-from magtwin.summary import Summarized, Summary, listed
+from magtwin.tables.delimited import QUOTED, Delimited, number_of, read_delimited
+from magtwin.tables.labels import split_label, words_of
 
 Array = NDArray[np.float64]
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from magtwin.errors import InputError, find
 from magtwin.path import Path
+from magtwin.report.summary import Summarized, Summary, listed
 from magtwin.run.run import COLUMNS, Run
 from magtwin.sim.motion.closed_loop import LOOPS, ClosedLoop, run_loops, warm_up
 from magtwin.sim.motion.commands import Commands
@@ -31,7 +32,6 @@ from magtwin.sim.runs.sensing import Conditions, Sensing, streams
 from magtwin.sim.runs.simulate import Metadata, Sensed, check_run, read_all, readings, sense_all, travel
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.scene import Scene
-from magtwin.summary import Summarized, Summary, listed
 
 BLOCK = 16
 """Runs made at a time: 130,000 readings of a minute each, 0.1 GB, and work for every thread."""

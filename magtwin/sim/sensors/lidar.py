@@ -9,12 +9,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, quat_from_yaw, quat_multiply, rotate
+from magtwin.report.summary import Summarized, Summary, span
 from magtwin.run.run import Run
 from magtwin.sim.motion.sampling import check_count
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.sensors import LidarSpec
-from magtwin.summary import Summarized, Summary, span
 
 Array = NDArray[np.float64]
 

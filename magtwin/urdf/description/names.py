@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from xml.etree import ElementTree
 
-from magtwin.budget import check_count
 from magtwin.errors import InputError
+from magtwin.files.budget import check_count
 from magtwin.urdf.source.markup import plain_text
 from magtwin.urdf.source.source import Source
 

@@ -18,7 +18,7 @@ from collada.triangleset import TriangleSet
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.files import read_bytes
+from magtwin.files.file import read_bytes
 from magtwin.frames import matrix_from_quat
 from magtwin.urdf.meshes.piece import GREY, Map, Paint, Piece, Rgba, linear, normal_map, smoothness
 from magtwin.urdf.meshes.polygon import cut_polygons

@@ -16,9 +16,9 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.budget import BUDGETS
 from magtwin.errors import InputError
-from magtwin.files import read_bytes
+from magtwin.files.budget import BUDGETS
+from magtwin.files.file import read_bytes
 from magtwin.frames import matrix_from_quat
 from magtwin.urdf.meshes.piece import Map, Paint, Piece, normal_map
 from magtwin.urdf.meshes.polygon import strip

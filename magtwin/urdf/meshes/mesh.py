@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.files import existing_file
+from magtwin.files.file import existing_file
 from magtwin.urdf.meshes.piece import Paint, Piece
 from magtwin.urdf.meshes.reading import Images, Note, Reading
 from magtwin.urdf.source.markup import UnsafeError

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.budget import BUDGETS, check_decoded
 from magtwin.errors import InputError
+from magtwin.files.budget import BUDGETS, check_decoded
 
 Note = tuple[str, bool]
 """A note for the user on a file, and whether something of the file was left out."""

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.budget import check_count, check_size
 from magtwin.errors import InputError
+from magtwin.files.budget import check_count, check_size
 from magtwin.urdf.meshes.piece import Piece
 from magtwin.urdf.meshes.reading import Reading
 from magtwin.usd.geometry import linear_from_srgb

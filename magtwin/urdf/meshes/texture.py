@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from magtwin.budget import BUDGETS, check_decoded
 from magtwin.errors import InputError
-from magtwin.files import read_bytes
+from magtwin.files.budget import BUDGETS, check_decoded
+from magtwin.files.file import read_bytes
 from magtwin.urdf.meshes.reading import Images, Reading
 
 TEXTURES = "textures"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.files import existing_file
+from magtwin.files.file import existing_file
 from magtwin.urdf.meshes.piece import GREY, Map, Paint, Piece, linear, normal_map, smoothness
 from magtwin.urdf.meshes.polygon import cut_polygons
 from magtwin.urdf.meshes.reading import Reading, numbers

@@ -9,9 +9,9 @@ from typing import Any
 from xml.etree import ElementTree
 from xml.parsers import expat
 
-from magtwin.budget import BUDGETS, check_count, check_depth
 from magtwin.errors import InputError
-from magtwin.files import read_bytes
+from magtwin.files.budget import BUDGETS, check_count, check_depth
+from magtwin.files.file import read_bytes
 
 _LONGEST_TAG = re.compile(rb"<[^<>]{%d}" % (1 << 20))
 """An element of over a million characters of attributes, which expat holds all at once."""

@@ -7,9 +7,10 @@ from typing import Any
 
 import yaml
 
-from magtwin.budget import BUDGETS
 from magtwin.errors import InputError
-from magtwin.files import read_text, yaml_loader
+from magtwin.files.budget import BUDGETS
+from magtwin.files.file import read_text
+from magtwin.files.settings import yaml_loader
 
 ENTRIES = BUDGETS["YAML"].count
 """Most tables of a file."""

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from xml.etree import ElementTree
 
 from magtwin.errors import InputError, near
-from magtwin.files import existing
+from magtwin.files.file import existing
 from magtwin.urdf.repairs import DECLARATION_LATE, Repairs
 from magtwin.urdf.source.markup import UnsafeError, read_markup
 from magtwin.urdf.source.package import MissingFileError, Packages

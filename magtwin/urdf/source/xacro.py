@@ -20,7 +20,8 @@ from xml.etree import ElementTree
 from xml.parsers.expat import ExpatError
 
 from magtwin.errors import InputError, hint
-from magtwin.files import read_bytes, yaml_loader
+from magtwin.files.file import read_bytes
+from magtwin.files.settings import yaml_loader
 from magtwin.urdf.repairs import DECLARATION_LATE, NOTE, Repairs
 from magtwin.urdf.source.expression import GLOBALS, LARGEST, Budget, ExpressionError, check_size, evaluate
 from magtwin.urdf.source.markup import UnsafeError, in_order, parse_markup

@@ -16,7 +16,7 @@ from typing import Any
 from pxr import Plug, Sdf, Usd
 
 from magtwin.errors import InputError, find
-from magtwin.outputs import output
+from magtwin.files.outputs import output
 from magtwin.usd.schema.names import VERSION, attribute_name
 
 __all__ = [

@@ -16,7 +16,7 @@ from magtwin.field.maps.statistics import map_metadata
 from magtwin.field.survey.readings import Readings
 from magtwin.io.surveys.maps import _shared
 from magtwin.localization.problem import Problem, SensorModel
-from magtwin.verdict import Z_90
+from magtwin.report.verdict import Z_90
 
 DRIFT_NT, WHITE_NT = 150.0, 10.0
 

@@ -9,7 +9,7 @@ from magtwin.field.maps import lookup
 from magtwin.field.maps.curvature import interpolation_error_nt2
 from magtwin.field.maps.lookup import LOOPS, warm_up
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.verdict import Z_90
+from magtwin.report.verdict import Z_90
 
 QUARTERS = np.radians([0.0, 90.0, 180.0, 270.0])
 CELL = 0.25

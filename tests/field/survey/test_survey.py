@@ -9,7 +9,7 @@ from magtwin.errors import InputError
 from magtwin.field.survey import folder as survey
 from magtwin.field.survey.folder import node_map, read_grid, read_survey
 from magtwin.field.survey.readings import Readings, taken_of
-from magtwin.files import sha256
+from magtwin.files.file import sha256
 
 HEADER = "# x,y,theta,scalar_mag \n"
 ROWS = {0: (41_000, 41_200, 40_900, 41_100), 90: (41_010, 41_210, 40_910, 41_110)}

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.io.tables import write_parquet
 from magtwin.learn.compensation.platform import fit_platform, platform_of_run
 from magtwin.learn.compensation.tolles_lawson import (

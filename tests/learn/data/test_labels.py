@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import magtwin
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.frames import quat_from_yaw
 from magtwin.learn.data.alignment import Alignment, _sandwich, fit_alignment
 from magtwin.learn.data.labels import labelled

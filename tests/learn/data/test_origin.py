@@ -11,7 +11,7 @@ from magtwin import simulate
 from magtwin.cli import main
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import sha256, shipped
+from magtwin.files.file import sha256, shipped
 from magtwin.learn.data.origin import label_frame, map_metadata, mismatches, shared_metadata
 from magtwin.sim.runs.simulate import robot_metadata
 from magtwin.sim.session import draw_session

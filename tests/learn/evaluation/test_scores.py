@@ -5,7 +5,7 @@ import pytest
 
 from magtwin.errors import InputError
 from magtwin.learn.evaluation.scores import Errors, scores
-from magtwin.verdict import Z_90
+from magtwin.report.verdict import Z_90
 
 
 def some_errors(error, session="a", group="A", sd=np.nan, rate_hz=10.0):

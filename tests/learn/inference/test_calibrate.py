@@ -10,15 +10,15 @@ import magtwin as mt
 from magtwin.cli import main
 from magtwin.errors import CalibrationWarning, InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import sha256
+from magtwin.files.file import sha256
 from magtwin.learn.data.features import features
 from magtwin.learn.inference.calibrate import labelled_drive
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.inference.online import OnlineMagnetometer, read_online
 from magtwin.learn.models.linear import fit_linear
 from magtwin.learn.models.predictor import load_predictor
+from magtwin.report.verdict import OF_DRIVE, OTHERS, OWN
 from magtwin.run.run import Run
-from magtwin.verdict import OF_DRIVE, OTHERS, OWN
 
 NAMES = "yaw_sin,yaw_cos,odom_v_x"
 X, Y = np.meshgrid(np.linspace(-3, 3, 13), np.linspace(-3, 3, 13))

@@ -8,7 +8,7 @@ from test_network import RELEASED, a_net
 from threadpoolctl import threadpool_limits
 
 from magtwin.errors import InputError
-from magtwin.files import sha256, shipped
+from magtwin.files.file import sha256, shipped
 from magtwin.learn.data.features import FULL, features
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.models.perceptron import in_threads, threads_of_products

@@ -13,7 +13,7 @@ from test_predictor import KINDS, a_predictor
 
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.files import sha256
+from magtwin.files.file import sha256
 from magtwin.learn.data.features import FEATURES, FULL
 from magtwin.learn.inference.onnx import export_onnx, model_of, report_onnx
 from magtwin.learn.models.predictor import load_predictor

@@ -11,7 +11,7 @@ from test_network import a_net
 import magtwin as mt
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.files import sha256, shipped
+from magtwin.files.file import sha256, shipped
 from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.data.origin import same_robot
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
@@ -19,10 +19,10 @@ from magtwin.learn.inference.reader import Reader
 from magtwin.learn.models.calibration import Spread
 from magtwin.learn.models.linear import Linear
 from magtwin.learn.models.predictor import load_predictor
-from magtwin.learning import widen
+from magtwin.report.verdict import ONLY_OWN, OTHERS, OWN, Z_90, Tally
 from magtwin.run.run import Run
 from magtwin.sim.plant_families import PLANTS
-from magtwin.verdict import ONLY_OWN, OTHERS, OWN, Z_90, Tally
+from magtwin.tasks.learning import widen
 
 HYBRID = shipped("weights", "turtlebot4_hybrid.safetensors")
 EFFECTIVE = [name for name in PLANTS if name != "nominal"]

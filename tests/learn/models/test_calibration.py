@@ -12,7 +12,7 @@ from magtwin.learn.models.calibration import (
     transferred_factor,
     yardstick,
 )
-from magtwin.verdict import Z_90, coverage
+from magtwin.report.verdict import Z_90, coverage
 
 
 def days(rng, count, rows, offset_nt=100.0, noise_nt=50.0):

@@ -10,8 +10,8 @@ from pxr import Gf, Usd, UsdGeom
 
 from magtwin.cli import main
 from magtwin.errors import InputError, RepairWarning
-from magtwin.files import shipped
-from magtwin.folders import allow
+from magtwin.files.file import shipped
+from magtwin.files.folders import allow
 from magtwin.io.tables import read_parquet
 from magtwin.path import figure8, path_named, sine
 from magtwin.run.run import Run

@@ -9,7 +9,7 @@ import pytest
 
 from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.io.formats import read_run, write_run
 from magtwin.path import Path, path_named, path_of_points, read_path_csv
 from magtwin.run.run import Run

@@ -14,7 +14,7 @@ import pytest
 
 import magtwin as mt
 from magtwin.errors import InputError
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.io import sweeps, tables
 from magtwin.io.formats import read_run, write_run
 from magtwin.io.outputs import Outputs

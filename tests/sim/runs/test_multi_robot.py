@@ -13,7 +13,7 @@ from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.dipoles import dipole_field_nt
-from magtwin.files import shipped
+from magtwin.files.file import shipped
 from magtwin.io.provenance import repeat
 from magtwin.io.tables import read_parquet
 from magtwin.path import Path

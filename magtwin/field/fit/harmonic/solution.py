@@ -14,7 +14,7 @@ from magtwin.field.fit.harmonic.posterior import Posterior
 from magtwin.field.fit.harmonic.problem import Hyperparameters, Problem
 from magtwin.field.fit.roughness import tail_of
 from magtwin.field.survey.readings import Readings
-from magtwin.verdict import Z_90
+from magtwin.report.verdict import Z_90
 
 Array = NDArray[np.float64]
 

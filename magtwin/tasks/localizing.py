@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError, MismatchWarning, find
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import existing, sha256
+from magtwin.files.file import existing, sha256
+from magtwin.files.outputs import output
 from magtwin.frames import wrap_angle, yaw_from_quat
 from magtwin.io.formats import read_run
 from magtwin.io.surveys.maps import map_file, open_map
@@ -36,11 +37,10 @@ from magtwin.localization.problem import (
 )
 from magtwin.localization.scores import Scores, score, verdict_of
 from magtwin.localization.track import EST_COLUMNS, Track, track
-from magtwin.outputs import output
-from magtwin.own_field import with_own_field
-from magtwin.report import Figure, Report
+from magtwin.report.report import Figure, Report
 from magtwin.run.run import Run, numbers_in
 from magtwin.run.thinning import field_known, newest
+from magtwin.tasks.own_field import with_own_field
 from magtwin.twin import Twin
 
 RATE_HZ = 5.0

@@ -4,7 +4,7 @@ import json
 from dataclasses import dataclass, field
 from typing import Any
 
-from magtwin.summary import LINES, Summarized, Summary
+from magtwin.report.summary import LINES, Summarized, Summary
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Report(Summarized):
     figures: tuple[Figure, ...] = ()
     metadata: dict[str, Any] = field(default_factory=dict)
     verdict: str = ""
-    """A judgement in one line; see `magtwin.verdict`."""
+    """A judgement in one line; see `magtwin.report.verdict`."""
 
     def to_json(self) -> str:
         """The report as one JSON object; a figure becomes {value, unit, spread, note}."""

@@ -13,9 +13,9 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from magtwin.budget import check_size
 from magtwin.errors import InputError
-from magtwin.files import existing
+from magtwin.files.budget import check_size
+from magtwin.files.file import existing
 
 LONGEST_LINE = 65_536
 """Longest line [characters]."""
@@ -139,7 +139,7 @@ def read_delimited(
     Args:
         path: The file.
         noun: What it is, for error messages.
-        kind: Format in `magtwin.budget.BUDGETS`.
+        kind: Format in `magtwin.files.budget.BUDGETS`.
         wanted: What a row holds, for error messages ("one row of numbers per reading").
         units: Add the units in a row below the header to the names, as in `x [cm]`. By default, such a row is
             one of the rows.

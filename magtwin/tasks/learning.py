@@ -15,7 +15,8 @@ import numpy as np
 
 from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files import existing, read_text, sha256
+from magtwin.files.file import existing, read_text, sha256
+from magtwin.files.outputs import check_free, output, transaction
 from magtwin.io.formats import read_run
 from magtwin.io.surveys.maps import map_file, open_map
 from magtwin.learn.data.alignment import Alignment
@@ -42,7 +43,6 @@ from magtwin.learn.inference.widen import widened
 from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.predictor import Predictor, load_predictor
 from magtwin.learn.training.model_card import widened_card
-from magtwin.outputs import check_free, output, transaction
 from magtwin.run.run import Run
 from magtwin.spec.scene import Scene
 from magtwin.twin import Twin, check_scene, in_session_of, open_twin, scene_file

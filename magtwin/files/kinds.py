@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from magtwin.errors import InputError
-from magtwin.files import existing
+from magtwin.files.file import existing
 
 HEAD = 1 << 16
 """Bytes that are read at the beginning and at the end of a file."""

@@ -1,0 +1,1 @@
+"""Files: where they are, what they are, how large they may be, and how outputs are written."""

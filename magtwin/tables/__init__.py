@@ -1,0 +1,1 @@
+"""Tables: rows of words in text files, and the words and units in the names of columns."""
