@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.files.file import sha256
+from magtwin.files import file
 from magtwin.files.kinds import expected
 from magtwin.learn.data.features import columns_of, features
 from magtwin.learn.data.origin import same_robot
@@ -76,7 +76,7 @@ class NeuralMagnetometer(Summarized):
             InputError: No such file, another checksum, or not a predictor.
         """
         path = expected(path, "weights file")
-        checksum = sha256(path)
+        checksum = file.sha256(path)
         if sha256 and checksum != sha256.lower():
             raise InputError(
                 f"{path}: its sha256 is {checksum}, expected {sha256}; get the file again "
