@@ -22,7 +22,7 @@ def shipped(*parts: str) -> Path:
     `robots/`, `maps/`, `scenes/` and `weights/` are at the top of a checkout, or in the package under
     `_shipped/` if magtwin was installed from a wheel.
     """
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     root = package / "_shipped"
     path = (root if root.is_dir() else package.parent).joinpath(*parts)
     if not path.exists():

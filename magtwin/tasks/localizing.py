@@ -357,7 +357,7 @@ def new_localizer(out: Source, *, force: bool = False) -> Path:
         raise InputError(f"{out}: a module's name has letters, digits and _, such as localizer.py")
     if out.stem in sys.stdlib_module_names:
         raise InputError(f"{out}: Python has a module {out.stem!r}; take another name")
-    text = Path(__file__).with_name("localization").joinpath("starter.py.txt").read_text(encoding="utf-8")
+    text = Path(__file__).parents[1].joinpath("localization", "starter.py.txt").read_text(encoding="utf-8")
     with output(out, force=force) as aside:
         aside.write_text(text.replace("localizer:MyLocalizer", f"{out.stem}:MyLocalizer"), encoding="utf-8")
     return out
