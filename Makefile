@@ -57,13 +57,14 @@ build/ros-%/.installed:
 	build/ros-$*/bin/python -m pip --disable-pip-version-check -q install --target build/ros-$*/numpy1 'numpy<2'
 	@touch $@
 
-lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies, size
+lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies, size, walks
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check --no-cache .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/deptry .
 	$(BIN)/python .ci/house.py
+	$(BIN)/python .ci/walks.py
 
 physics: $(VENV)/.dev  ## Drive converted robots in Newton (extra physics, 600 MB)
 	$(PIP) -e '.[dev,physics]'
