@@ -18,7 +18,7 @@ from typing import Any
 
 from magtwin.errors import InputError
 from magtwin.files.file import read_bytes, read_text
-from magtwin.files.outputs import check_free, exchanged, output
+from magtwin.files.outputs import HIDDEN, check_free, exchanged, output
 from magtwin.io.tables import parquet_of, write_parquet
 from magtwin.parallel import checked_shard, in_shard, open_pool
 from magtwin.report.report import Figure, Report
@@ -252,7 +252,6 @@ class _Parts:
         """Make the folder, or check that it is of this sweep."""
         if self._about(self.folder) == self.about:
             return
-        check_free(self.folder / ABOUT, force=True)  # removes what a process left that was killed here
         if self.folder.exists() and any(not file.name.startswith(".") for file in self.folder.iterdir()):
             if not self.force:
                 text = "unfinished runs of another sweep; give `force=True` to replace them, or another name"
@@ -284,6 +283,8 @@ class _Parts:
 
     def _tidy(self) -> None:
         """Remove the notes of a finished sweep, sweep.json last."""
+        for left in self.out.glob(f".*{HIDDEN}*"):  # of processes that were killed
+            shutil.rmtree(left, ignore_errors=True)
         for file in (*self.out.glob("part-*.json"), self.out / ABOUT):
             file.unlink(missing_ok=True)
 

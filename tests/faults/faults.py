@@ -225,12 +225,6 @@ class Trial:
             mixed = [n for n in now.keys() | self.new.keys() if not self._either(n, now)]
             if mixed:
                 found.append(f"neither old nor new: {mixed}")
-            swept = forked(self._sweep, self.folder)
-            now, hidden = tree(self.folder)
-            if swept.status:
-                found.append(f"the sweep: {swept.err.strip()[-300:]}")
-            if hidden:
-                found.append(f"after the sweep {hidden}")
             if wrote and not self._is(now, self.new):
                 found.append(f"reported as written, but {self._unlike(now)}")
         whole = [self._is(now, self.new) or self._is(now, self.before)]
@@ -254,13 +248,11 @@ class Trial:
         if self._is(now, self.new):  # it was complete
             return found
         again = forked(lambda: self._magtwin(older=self.command.name.startswith("train")), self.folder)
-        now, hidden = tree(self.folder)
+        now, _ = tree(self.folder)
         if again.status:
             found.append(f"a repeat ends with {again.status}: {again.err.strip()[-300:]}")
         elif not self._is(now, self.new):
             found.append(f"a repeat makes something else: {self._unlike(now)}")
-        if hidden:
-            found.append(f"after the repeat {hidden}")
         return found
 
     def _is(self, now: Tree, then: Tree) -> bool:
@@ -319,13 +311,6 @@ class Trial:
         from magtwin.cli import main
 
         main(self.command.arguments(self.inputs, force=older and not (self.command.keeps and not older)))
-
-    def _sweep(self) -> None:
-        """What the next command does first in each folder in which it writes."""
-        from magtwin.files.outputs import check_free
-
-        for folder in {(self.folder / name).parent for name in {*self.new, *self.before}}:
-            check_free(folder / "next", force=True)
 
     def _fault(self, how: str, at: int, text: str) -> None:
         self.result.faults.append(f"{self.command.name}, {how} at {at}: {text}")

@@ -29,15 +29,6 @@ Array = NDArray[np.float64]
 _ROOM = 0.08
 """Room beyond the values and the ticks of an axis, as a share of the range of the values."""
 
-_LEGEND_ROW, _LEGEND_MOST = 0.1, 0.65
-"""Height of a row of a legend, as a share of the tall first plot, and greatest height of a legend."""
-
-_LEGEND_WIDTH, _LEGEND_LETTER = 0.07, 0.01
-"""Width of a legend without text, and of a letter, as shares of the width of a plot."""
-
-_LOOKED_AT = 4000
-"""Readings of a series that are used to place a legend."""
-
 Colour = tuple[int, int, int]
 
 RUN_COLOURS: tuple[Colour, ...] = (
@@ -186,7 +177,6 @@ def layout(
     *,
     heading: float = 0.0,
     events: Sequence[str] | None = None,
-    whole: bool = True,
 ) -> rrb.Blueprint:
     """The views of a run: plots, states and events, and with a lab also the lab and the robot in 3D.
 
@@ -195,12 +185,11 @@ def layout(
         lab: The lab. None: no 3D views.
         heading: Heading of the map on the floor [rad], for the title.
         events: Flags that get a lane of states. Default: those that the run raised.
-        whole: Whether the run is complete. The axes of an unfinished run grow with it.
     """
     shown = Shown.of(run)
-    axis = _whole([shown]) if whole else None
+    axis = _whole([shown])
     panels = (FIELD_PANEL, DISTURBANCE_PANEL, ERROR_PANEL)
-    series = _stacked(*([(shown, panel)] for panel in panels), whole=axis, tall=0)
+    series = _stacked(axis, *([(shown, panel)] for panel in panels))
     tabs = [
         rrb.Vertical(*views, name=name)
         for name, panels in (
@@ -208,7 +197,7 @@ def layout(
             ("IMU", (ACCELERATION_PANEL, TILT_PANEL)),
             ("Battery", BATTERY_PANELS),
         )
-        if (views := _stacked(*([(shown, panel)] for panel in panels), whole=axis))
+        if (views := _stacked(axis, *([(shown, panel)] for panel in panels)))
     ]
     shares = [2.2, 1.2, 1.2][: len(series)] + [2.6] * bool(tabs)
     side = rrb.Vertical(*series, *([rrb.Tabs(*tabs)] if tabs else []), row_shares=shares)
@@ -234,12 +223,11 @@ def comparison_layout(
 
     Without a lab there are no 3D views; `heading` is that of the map on the floor [rad], for the title.
     """
-    whole = _whole(runs)
     rows = [
         [(shown, Panel(title, (Series(column, shown.name, shown.colour, part),))) for shown in runs]
         for title, column, part in _COMPARED
     ]
-    side = rrb.Vertical(*_stacked(*rows, whole=whole, tall=0))
+    side = rrb.Vertical(*_stacked(_whole(runs), *rows))
     metadata = [
         rrb.TextDocumentView(origin=entity_of("metadata", shown.name), name=shown.name) for shown in runs
     ]
@@ -290,12 +278,10 @@ def _whole(runs: Sequence[Shown]) -> rrb.TimeAxis:
     return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
 
 
-def _stacked(
-    *rows: Sequence[tuple[Shown, Panel]], whole: rrb.TimeAxis | None, tall: int | None = None
-) -> list[rrb.TimeSeriesView]:
-    """One plot for each row with a series; the row number `tall` has twice the height."""
+def _stacked(whole: rrb.TimeAxis, *rows: Sequence[tuple[Shown, Panel]]) -> list[rrb.TimeSeriesView]:
+    """One plot for each row with a series."""
     plots = []
-    for number, row in enumerate(rows):
+    for row in rows:
         lines = [
             (shown, series, values)
             for shown, panel in row
@@ -303,26 +289,15 @@ def _stacked(
             if (values := shown.values(series)) is not None
         ]
         if lines:
-            plots.append(_plot(row[0][1].title, lines, whole, tall=number == tall))
+            plots.append(_plot(row[0][1].title, lines, whole))
     return plots
 
 
 def _plot(
-    title: str, lines: Sequence[tuple[Shown, Series, Array]], whole: rrb.TimeAxis | None, *, tall: bool
+    title: str, lines: Sequence[tuple[Shown, Series, Array]], whole: rrb.TimeAxis
 ) -> rrb.TimeSeriesView:
-    """Lines of one unit, with the legend in the corner where it needs least room."""
-    legend, corner = len(lines) > 1, rrb.Corner2D.LeftTop
+    """Lines of one unit."""
     ends = value_range(np.array([(np.nanmin(values), np.nanmax(values)) for _, _, values in lines]))
-    if legend and ends:
-        count = len({series.name for _, series, _ in lines})
-        height = min(_LEGEND_MOST, count * _LEGEND_ROW * (1.0 if tall else 2.0))
-        width = _LEGEND_WIDTH + _LEGEND_LETTER * max(len(series.name) for _, series, _ in lines)
-        parts = [
-            np.column_stack([shown.run["t"] + shown.offset_s, line])[:: max(1, len(line) // _LOOKED_AT)]
-            for shown, _, line in lines
-        ]
-        t, values = (rows := np.concatenate(parts))[np.argsort(rows[:, 0], kind="stable")].T
-        corner, ends = legend_corner(values[:, None], t, ends, (width, height))
     overrides: dict[Any, list[rrb.Visualizer]] = {}
     for shown, series, _ in lines:
         entity = entity_of(DERIVED_ENTITY if series.column in DERIVED else COLUMNS_ENTITY, shown.name)
@@ -339,8 +314,8 @@ def _plot(
         contents=list(overrides),
         name=title,
         axis_x=whole,
-        axis_y=rrb.ScalarAxis(range=ends) if ends and whole else None,
-        plot_legend=rrb.PlotLegend(corner, visible=legend),
+        axis_y=rrb.ScalarAxis(range=ends) if ends else None,
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=len(lines) > 1),
         overrides=overrides,
     )
 
@@ -360,35 +335,6 @@ def value_range(values: Array) -> tuple[float, float] | None:
         min(low - room, math.ceil((low - room) / tick) * tick - room),
         max(high + room, math.floor((high + room) / tick) * tick + room),
     )
-
-
-def legend_corner(
-    values: Array, t: Array, ends: tuple[float, float], size: tuple[float, float]
-) -> tuple[rrb.Corner2D, tuple[float, float]]:
-    """The corner for a legend that hides no line, and the axis that this needs.
-
-    `values` are the series of a plot, shape (N, S), at ascending times `t` [s]; all fit in an axis with these
-    `ends`; `size` is the width and height of the legend, as shares of the plot. The axis grows least in the
-    chosen corner. One hundredth of the readings beside the legend may be under it, such as the ramp at the
-    start of a run.
-    """
-    width, height = size
-    span = (t[-1] - t[0]) * width
-    choices = []
-    for corner, beside, sign in (
-        (rrb.Corner2D.LeftTop, t <= t[0] + span, 1),
-        (rrb.Corner2D.RightTop, t >= t[-1] - span, 1),
-        (rrb.Corner2D.LeftBottom, t <= t[0] + span, -1),
-        (rrb.Corner2D.RightBottom, t >= t[-1] - span, -1),
-    ):
-        low, high = sorted(sign * end for end in ends)  # a lower corner is an upper one turned over
-        part = sign * values[beside]
-        part = part[np.isfinite(part)]
-        most = float(np.quantile(part, 0.99)) if part.size else low
-        high = max(high, (most - height * low) / (1 - height))
-        choices.append((high - low, corner, (low, high) if sign > 0 else (-high, -low)))
-    _, corner, grown = min(choices, key=lambda choice: choice[0])
-    return corner, grown
 
 
 def lab_eye(lab: LabSpec) -> tuple[Vec3, Vec3]:

@@ -274,22 +274,21 @@ def recording_of(
     scans: Scans | None = None,
     events: Sequence[str] | None = None,
     room: int = 0,
-    whole: bool = True,
     rate_hz: float = 0.0,
     **sinks: Any,
 ) -> Iterator[Recording]:
     """A recording of one run with its layout, metadata and lab; it holds no rows yet.
 
-    `run` is the run, or its first rows; `known` sets axes and colours, and is whole if `whole`. No twin:
-    only series. `room` is an upper bound of the size of the rows [bytes]; a `rate_hz` of 0 is taken
-    from the first rows; `sinks` are `file`, `address` and `final` of `stream`.
+    `known` sets axes and colours; default: `run`. No twin: only series. `room` is an upper bound of the size
+    of the rows [bytes]; a `rate_hz` of 0 is taken from the first rows; `sinks` are `file`, `address` and
+    `final` of `stream`.
 
     Raises:
         InputError: The stage cannot be read, or as for `stream`.
     """
     known = run if known is None else known
     lab, heading = (None, 0.0) if twin is None else (twin.scene.lab, heading_of(twin.field, known))
-    views = layout(known, lab, heading=heading, events=events, whole=whole)
+    views = layout(known, lab, heading=heading, events=events)
     room += ROOM
     if twin is not None:
         interior = Interior.of(twin)
