@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
@@ -15,8 +14,9 @@ from magtwin.io.bags.topics import COMMAND, ODOMETRY, POSE, Topic
 from magtwin.path import Path
 from magtwin.ros.bus import Bus
 from magtwin.ros.commands import Commands, CommandType
-from magtwin.ros.diagnostics import Reporter, Status
-from magtwin.ros.inputs import Input, LiveFrames, Stamps
+from magtwin.ros.diagnostics import Level, Status
+from magtwin.ros.inputs import Stamps
+from magtwin.ros.node import BACK_S, Node
 from magtwin.sim.motion.controllers import Guide, guide_along
 from magtwin.sim.motion.follow import CONTROL_RATE_HZ
 from magtwin.sim.motion.loop import RELEASE
@@ -46,12 +46,6 @@ MARKER_M = 0.1
 
 STAND_S = 1.0
 """Time for which standing is commanded at the end [s]."""
-
-LOOK_S = 0.5
-"""Time between searches for new topics [s]."""
-
-BACK_S = 0.2
-"""A clock that went back by more than this was restarted [s]."""
 
 
 @dataclass(frozen=True)
@@ -145,21 +139,18 @@ class Follower:
         self._now_ns = 0
         self._guide = self._guided(path)
         topic, self._p, self._q = find("source", source, SOURCES)
-        told: Any = {"frames": LiveFrames(bus), "max_age_s": MAX_AGE_S, "stamps": stamps, "say": say}
-        self._pose = Input(bus, topic, **told)
-        self._twist = self._pose if topic is ODOMETRY else Input(bus, ODOMETRY, **told)
+        self._node = Node(bus, say, self._statuses, stamps)
+        self._twist = self._node.listen(ODOMETRY, max_age_s=MAX_AGE_S)
+        self._pose = self._twist if topic is ODOMETRY else self._node.listen(topic, max_age_s=MAX_AGE_S)
         self._commands = Commands(bus, commands)
-        self._reporter = Reporter(bus)
         self._state, self._stand_s = "", STAND_S
         self._last = (0.0, 0.0)
         self._begin_ns: int | None = None
         self._laps, self._squares, self._count, self._off = 0, 0.0, 0, math.nan
         self.done = False
         """Whether the end was reached and the robot stands."""
-        self._look()
         bus.timer(1 / CONTROL_RATE_HZ, self._step)
-        bus.timer(LOOK_S, self._look)
-        self._reporter.each(self._report)
+        self._node.begin()
 
     @property
     def progress(self) -> Progress:
@@ -176,10 +167,6 @@ class Follower:
             guide_along(self._controller, path, self._drive, speed=self._speed, dt=1 / CONTROL_RATE_HZ)
         )
 
-    def _look(self) -> None:
-        self._pose.look()
-        self._twist.look()
-
     def _step(self) -> None:
         """Send a command, by the newest pose."""
         now = self._bus.now_ns()
@@ -193,7 +180,7 @@ class Follower:
             return
         fresh = self._pose.fresh(now)
         if fresh is None:
-            self._announce(f"standing: {self._pose.missing(now)}")
+            self._announce(f"standing: {self._pose.missing()}")
             if self._last != (0.0, 0.0):
                 self._command(0.0, 0.0)
             return
@@ -218,8 +205,7 @@ class Follower:
     def _restart(self) -> None:
         """Start again, after a restart of time."""
         self._say("time jumped back: driving the path from its beginning")
-        self._pose.forget()
-        self._twist.forget()
+        self._node.forget()
         self.path, self._left = self._begins, self._wanted
         self._guide = self._guided(self.path)
         self._begin_ns, self._stand_s = None, STAND_S
@@ -259,10 +245,10 @@ class Follower:
             self._state = text
             self._say(text)
 
-    def _report(self, clock: str) -> None:
-        now, at = self._bus.now_ns(), self.progress
+    def _statuses(self, clock: str, now: int) -> list[Status]:
+        at = self.progress
         fares = not clock and (self._guide.done or self._pose.fresh(now) is not None)
-        level: Any = "ok" if fares else "error"
+        level: Level = "ok" if fares else "error"
         message = clock or ("at the end" if self._guide.done else self._state)
         if (others := self._bus.publishers(COMMAND.name) - self._commands.offered) > 0:
             level = "warn" if fares else level
@@ -273,5 +259,4 @@ class Follower:
             "off the path [m]": f"{at.off_m:.3f}",
             "RMS off the path [m]": f"{at.rms_m:.3f}",
         }
-        status = Status("drive", level, message, values)
-        self._reporter.report([status, self._pose.status(now)], now)
+        return [Status("drive", level, message, values)]

@@ -24,7 +24,7 @@ from magtwin.sim.runs.live import LiveRobot
 from magtwin.twin import Session, Twin, in_session, led_by
 
 RESET = "/robot/reset"
-"""Topic (std_msgs/Empty), and with rclpy service (std_srvs/Empty), that resets robots and time."""
+"""Topic (std_msgs/Empty) that resets robots and time."""
 
 LEAD_S = 0.006
 """Time by which a control step is computed ahead, so that its first message is not late [s]."""
@@ -124,7 +124,6 @@ class Simulator:
         self._count, self._resets, self._slips, self._begin_ns = 0, 0, 0, 0
         self._reset = False
         bus.subscribe(RESET, "std_msgs/msg/Empty", lambda message: self.reset(), Qos().heard)
-        bus.service(RESET, self.reset)
         self._reporter = Reporter(bus)
         self.robots: list[SimulatedRobot] = []
         """The robots, in the order of the scene."""

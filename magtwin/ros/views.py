@@ -13,7 +13,7 @@ from magtwin.io.bags.cdr import NS
 from magtwin.io.bags.sender import Sender
 from magtwin.io.bags.stream import Sent
 from magtwin.path.occupancy import UNKNOWN, occupancy_of
-from magtwin.ros.bus import Bus, Publisher, to_bytes
+from magtwin.ros.bus import Bus, Publisher, poses_bytes, to_bytes
 from magtwin.ros.topics import FIELD, FIELD_GRID, OCCUPANCY, PATH, READINGS
 from magtwin.run.run import Run
 from magtwin.twin import Twin, room_of
@@ -107,31 +107,6 @@ def cloud_fields(frame: str, columns: Mapping[str, ArrayLike]) -> dict[str, Any]
     return fields | {"is_dense": dense, "data": np.frombuffer(table.tobytes(), np.uint8).reshape(1, -1)}
 
 
-def path_bytes(stamp_ns: int, frame: str, poses: ArrayLike) -> bytes:
-    """A Path of poses x, y, z [m] and orientation xyzw, shape (N, 7), each with the stamp of the path.
-
-    Poses are equal in size but for the first, whose numbers may be aligned otherwise.
-    """
-    table = np.asarray(poses, "<f8").reshape(-1, 7)
-    empty = {"header.stamp": np.int64(stamp_ns), "header.frame_id": frame}
-    head = to_bytes(PATH.kind, empty)[:-4] + np.uint32(len(table)).tobytes()
-    stamp = to_bytes("std_msgs/msg/Header", {"stamp": np.int64(stamp_ns), "frame_id": frame})[4:]
-    parts = [head]
-    at = len(head) - 4  # alignment counts from the end of the CDR header
-    for k in range(min(len(table), 2)):
-        parts.append(b"\0" * (-at % 4) + stamp)
-        at += len(parts[-1])
-        parts.append(b"\0" * (-at % 8) + table[k].tobytes())
-        at += len(parts[-1])
-    if len(table) > 2:
-        lead = b"".join(parts[3:5])[: -7 * 8]  # what precedes the numbers of the second pose
-        rows = np.zeros((len(table) - 2, len(lead) + 56), np.uint8)
-        rows[:, : len(lead)] = np.frombuffer(lead, np.uint8)
-        rows[:, len(lead) :] = table[2:].view(np.uint8).reshape(-1, 56)
-        parts.append(rows.tobytes())
-    return b"".join(parts)
-
-
 class Trail:
     """Poses along a path, a distance apart."""
 
@@ -186,7 +161,7 @@ class Truth:
 
     def path(self, stamp_ns: int) -> bytes:
         """The true path so far."""
-        return path_bytes(stamp_ns, self._sender.map_frame, self._trail.poses)
+        return poses_bytes(PATH.kind, stamp_ns, self._sender.map_frame, self._trail.poses)
 
 
 def _mean_and_sd(shown: AnomalyMap) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

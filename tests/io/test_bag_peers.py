@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import magtwin
 from magtwin.cli import main
-from magtwin.io.bags import BagWriter, RawBagWriter, read_bag, write_bag
+from magtwin.io.bags import RawBagWriter, read_bag, write_bag
 from magtwin.io.bags import mcap as ours
 from magtwin.io.bags.bag import Bag
 from magtwin.io.bags.cdr import encode
@@ -224,9 +224,9 @@ def made(lab_scene, tmp_path_factory):
     run = magtwin.simulate(twin, "figure8", seed=3, duration_s=20.0, lidar="on")
     write_bag(run, folder / "whole.mcap", twin, scans=scan(twin, run))
     as_db3(folder / "whole.mcap", folder / "whole.db3")
-    with BagWriter(folder / "blocks.mcap", twin, scans=scan(twin, run)) as writer:
-        for first in range(0, run.rows, 500):
-            writer.append(run.take(slice(first, first + 500)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("magtwin.io.bags.writer.BLOCK", 500)
+        write_bag(run, folder / "blocks.mcap", twin, scans=scan(twin, run))
     with Reader(folder / "whole.mcap") as reader:
         said = [(c.topic, c.msgtype, t, bytes(data)) for c, t, data in reader.messages()]
     raw = RawBagWriter(folder / "raw.mcap")

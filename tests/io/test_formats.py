@@ -12,7 +12,6 @@ from test_tables import few_bytes
 import magtwin
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.io.bags import BagWriter
 from magtwin.io.formats import FORMATS, Format, read_run, write_run
 from magtwin.io.outputs import Outputs
 from magtwin.io.tables import ParquetParts
@@ -145,14 +144,6 @@ def test_folders_are_read_by_what_is_in_them(run, written, tmp_path):
     (tmp_path / "none").mkdir()
     with pytest.raises(InputError, match="a folder without a run; name a file"):
         read_run(tmp_path / "none")
-
-
-def test_a_bag_that_did_not_end_is_read_as_far_as_it_goes(run, twin, tmp_path):
-    writer = BagWriter(tmp_path / "run.mcap", twin)
-    writer.append(run.take(slice(0, 300)))
-    assert read_run(writer.partial).rows == 300
-    writer.close()
-    assert read_run(tmp_path / "run.mcap").rows == 300
 
 
 def test_options_of_another_format_and_unknown_endings_are_refused(run, tmp_path):

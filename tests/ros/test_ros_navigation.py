@@ -13,14 +13,14 @@ from magtwin.io.bags.sender import Transforms
 from magtwin.io.bags.topics import COMMAND, LATCHED, ODOMETRY, TF, TF_STATIC, Qos
 from magtwin.io.bags.types import typestore
 from magtwin.path.occupancy import occupancy_of
-from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
+from magtwin.ros.bus import Bus, Message, open_bus, poses_bytes, to_bytes
 from magtwin.ros.localization.localize import PARAMETERS, LocalizerNode
 from magtwin.ros.localization.poses import ESTIMATE, POSE_KIND, read_pose
 from magtwin.ros.localization.poses import PATH as ESTIMATED_PATH
 from magtwin.ros.parameters import settings
 from magtwin.ros.simulate import Simulator
 from magtwin.ros.topics import FIELD, FIELD_GRID, OCCUPANCY, PATH, READINGS, TRUTH
-from magtwin.ros.views import MOST_POSES, Trail, path_bytes
+from magtwin.ros.views import MOST_POSES, Trail
 from magtwin.tasks.localizing import live_problem
 from magtwin.twin import Twin, open_twin, room_of
 
@@ -233,7 +233,7 @@ def test_a_path_is_one_to_the_reference_reader(frame: str, count: int) -> None:
     poses = np.column_stack(
         [np.random.default_rng(1).normal(size=(count, 3)), np.tile([0, 0, 0, 1.0], (count, 1))]
     )
-    data = path_bytes(3_000_000_007, frame, poses)
+    data = poses_bytes(PATH.kind, 3_000_000_007, frame, poses)
     path = typestore().deserialize_cdr(data, PATH.kind)
     assert bytes(typestore().serialize_cdr(path, PATH.kind)) == data
     assert [(p.header.frame_id, stamp_ns(p.header)) for p in path.poses] == [(frame, 3_000_000_007)] * count

@@ -15,7 +15,7 @@ from places import ROOT
 from magtwin.ros.magnetometer import PARAMETERS
 
 PACKAGE = ROOT / "ros" / "magtwin_ros"
-NODES = ("sim", "magnetometer", "localize", "follow", "record", "replay", "teleop")
+NODES = ("sim", "magnetometer", "localize", "follow", "record")
 
 
 @pytest.fixture
@@ -50,11 +50,6 @@ def arguments(monkeypatch: pytest.MonkeyPatch):
             "ros magnetometer lab.usda --duration-s=5 --remap odom:=o",
         ),
         (
-            "magnetometer",
-            "lab.usda --ros-args -p online:=/slam/pose -p measured:=qtfm/magnitude -p map_frame:=world",
-            "ros magnetometer lab.usda --online=/slam/pose --measured=qtfm/magnitude map_frame:=world",
-        ),
-        (
             "localize",
             "lab --ros-args -p method:=ekf -p prior:=global -p use_sim_time:=true -r __ns:=/tb4",
             "ros localize lab --method=ekf prior:=global use_sim_time:=true --namespace=tb4",
@@ -64,7 +59,7 @@ def arguments(monkeypatch: pytest.MonkeyPatch):
             "figure8 --ros-args -p discovery:=subnet -p domain:= -p laps:=2",
             "ros follow figure8 --discovery=subnet --laps=2",
         ),
-        ("replay", "a.mcap --ros-args -p use_sim_time:=true -r x:__ns:=/", "ros replay a.mcap --namespace="),
+        ("record", "a.mcap --ros-args -r x:__ns:=/", "ros record a.mcap --namespace="),
     ],
 )
 def test_what_ros_says_of_a_node_is_a_command_of_magtwin(arguments, node, given, wanted) -> None:

@@ -18,12 +18,10 @@ from magtwin.io.bags.cdr import decode
 from magtwin.io.bags.topics import CLOCK, COMMAND, LATCHED, MAGNITUDE, ODOMETRY, Qos
 from magtwin.io.bags.types import layout
 from magtwin.io.formats import read_run
-from magtwin.learn.data.recording import Source
-from magtwin.learn.data.recording import read as read_source
 from magtwin.ros.bus import Bus, Message, names_of, to_bytes
 from magtwin.ros.commands import command_bytes
 from magtwin.ros.diagnostics import KIND, Status, to_fields
-from magtwin.ros.record import Player, Recorder
+from magtwin.ros.record import Recorder
 from magtwin.ros.simulate import RESET, Simulator
 from magtwin.run.run import Run
 from magtwin.sim.runs.simulate import simulate
@@ -283,31 +281,6 @@ def test_diagnostics_say_what_they_were_given() -> None:
     message = Message(KIND, to_bytes(KIND, to_fields(said, 7, "robot")), 0, 0)
     assert from_message(message) == said
     assert message.read(["header.stamp"])["header.stamp"] == 7
-
-
-def test_a_run_is_said_again_as_its_robot_said_it(
-    driven: Driven, nodes: Callable[..., Bus], tmp_path: Path
-) -> None:
-    part = driven.run.between(1.0, 2.0)
-    player = Player(part, nodes("player"))
-    listener = nodes("recorder")
-    writer = RawBagWriter(tmp_path / "again.mcap")
-    recorder = Recorder(listener, writer)
-    said = threading.Thread(target=player.run, kwargs={"speed": 2.0})
-    said.start()
-    recorder.run(lambda: not said.is_alive())
-    recorder.run(duration_s=0.2)
-    writer.close()
-    again = read_run(tmp_path / "again.mcap")
-    assert again.rows == part.rows
-    for name in ("t", "b_measured_nt", "odom_p", "imu_w", "p_world_base"):
-        np.testing.assert_allclose(again[name], part[name], rtol=1e-12, err_msg=name)
-    assert again.metadata == part.metadata
-    assert again.metadata["magnetometer"] == "neural"
-    with pytest.raises(
-        InputError, match="its readings come from a neural magnetometer"
-    ):  # so no network learns from one
-        read_source(Source("again", lambda: again))
 
 
 def test_a_recording_of_nothing_leaves_nothing(nodes: Callable[..., Bus], tmp_path: Path) -> None:

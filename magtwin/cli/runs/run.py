@@ -336,7 +336,7 @@ def _show(driven: "Driven", address: str | None, pace: float) -> None:
         try:
             at = address or stack.enter_context(live_viewer())[0]
             with progress("Live", "s") as advance:
-                shown = {"planned": driven.planned, "scans": driven.scans}
+                shown: dict[str, Any] = {"planned": driven.planned, "scans": driven.scans}
                 play(driven.run, driven.twin, at, pace=pace, progress=advance, **shown)
             if address is None and sys.stdin.isatty():
                 note("The run has ended; close the viewer, or press Ctrl-C")

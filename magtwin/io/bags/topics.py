@@ -35,19 +35,15 @@ class Qos:
     latched: bool = False
     """Whether late subscribers get the last message (transient local)."""
 
-    sensor: bool = False
-    """Whether it is a stream of sensor data, which `--qos sensor-data` offers as `SENSOR_DATA`."""
-
     @property
     def heard(self) -> "Qos":
         """QoS of a subscription: best effort, which matches every publisher; reliable only if latched."""
         return replace(self, reliable=self.latched)
 
 
-STREAM = Qos(sensor=True)
-"""A reliable offer serves reliable and best-effort subscribers, a best-effort offer only the latter."""
-
 SENSOR_DATA = Qos(depth=5, reliable=False)
+"""For subscriptions: it matches every publisher. Offers are reliable, which serves every subscriber."""
+
 LATCHED = Qos(depth=1, latched=True)
 
 
@@ -245,7 +241,7 @@ def _pose_at(prefix: str, p: str = "position", q: str = "orientation") -> dict[s
 
 def _carrier(kind: str, leaves: dict[str, str], **rest: Any) -> Topic:
     """A topic whose message type holds each of its columns in a leaf."""
-    return Topic(kind=kind, needs=tuple(leaves), carried=True, reads={kind: leaves}, qos=STREAM, **rest)
+    return Topic(kind=kind, needs=tuple(leaves), carried=True, reads={kind: leaves}, **rest)
 
 
 _FIELD = "sensor_msgs/msg/MagneticField"
@@ -350,7 +346,6 @@ TF = Topic(
 CLOCK = Topic(
     name="/clock",
     kind="rosgraph_msgs/msg/Clock",
-    qos=STREAM,
     needs=("t",),
     sent="ticks",
     every_s=0.025,
@@ -367,7 +362,6 @@ DESCRIPTION = Topic(
 SCAN = Topic(
     name="/robot/scan",
     kind="sensor_msgs/msg/LaserScan",
-    qos=STREAM,
     frame="lidar_frame",
     more=_scan,
     reads={"sensor_msgs/msg/LaserScan": {"stamp": "header.stamp"}},

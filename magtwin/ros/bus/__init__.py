@@ -15,7 +15,7 @@ from magtwin.ros.bus.bus import (
     Timer,
     open_bus,
 )
-from magtwin.ros.bus.messages import to_bytes
+from magtwin.ros.bus.messages import poses_bytes, to_bytes
 from magtwin.ros.bus.names import Names, Range, is_name, names_of
 
 __all__ = [
@@ -32,5 +32,6 @@ __all__ = [
     "is_name",
     "names_of",
     "open_bus",
+    "poses_bytes",
     "to_bytes",
 ]

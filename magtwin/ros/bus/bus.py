@@ -14,16 +14,11 @@ from functools import cached_property
 from typing import Any, Literal, Protocol
 
 from magtwin.errors import InputError, find
-from magtwin.io.bags.topics import SENSOR_DATA, Qos
-from magtwin.ros.bus.messages import content_of, leaves_of
+from magtwin.io.bags.topics import Qos
+from magtwin.ros.bus.messages import content_of, leaf_of
 from magtwin.ros.bus.names import Names, Range, range_of
-from magtwin.ros.parameters import Parameter
 
 Backend = Literal["auto", "rclpy", "cyclonedds"]
-
-Offers = Literal["reliable", "sensor-data"]
-"""QoS in which streams of sensor data are offered: reliable, which every subscriber matches, or best effort
-with depth 5, the sensor-data profile of ROS."""
 
 BACKENDS: Mapping[str, tuple[str, str]] = {
     "rclpy": ("magtwin.ros.bus.rclpy_bus", "RclpyBus"),
@@ -70,7 +65,7 @@ class Message:
         Raises:
             InputError: As for `content`; or it has fewer elements.
         """
-        return leaves_of(self.kind, self.content, wanted)
+        return {name: leaf_of(self.content, name) for name in wanted}
 
 
 Handler = Callable[[Message], None]
@@ -138,27 +133,6 @@ class Bus(Protocol):
         publisher.
         """
 
-    def service(self, name: str, called: Callable[[], None]) -> bool:
-        """Offer a service without arguments (std_srvs/srv/Empty); whether the backend can.
-
-        cyclonedds cannot: each ROS 2 middleware addresses answers in a different way.
-        """
-        return False
-
-    def settable(
-        self, table: Mapping[str, Parameter], values: Mapping[str, Any], changed: Callable[[str, Any], None]
-    ) -> bool:
-        """Let others read and set the parameters of a node while it runs; whether the backend can.
-
-        cyclonedds cannot, as it has no services. `use_sim_time` belongs to the bus.
-
-        Args:
-            table: The parameters.
-            values: Their values.
-            changed: Called with name and value of each valid change, in the thread that spins.
-        """
-        return False
-
     def knows(self, kind: str) -> bool:
         """Whether messages of a type can be sent and received."""
 
@@ -213,7 +187,6 @@ def open_bus(
     backend: Backend = "auto",
     domain: int | None = None,
     discovery: Range | None = None,
-    offers: Offers = "reliable",
 ) -> Bus:
     """Join ROS 2 as a node.
 
@@ -224,7 +197,6 @@ def open_bus(
         backend: ROS client library; "auto" is rclpy if it can be imported, else cyclonedds.
         domain: ROS domain. Default: ROS_DOMAIN_ID, or 0.
         discovery: How far the node can be discovered; see `magtwin.ros.bus.names.range_of`.
-        offers: QoS in which streams of sensor data are offered.
 
     Raises:
         InputError: The backend cannot be imported, or the domain or a variable of the environment is wrong.
@@ -250,13 +222,6 @@ def open_bus(
             broken.append(f"{candidate} is installed but cannot be imported: {str(error).splitlines()[0]}")
             continue
         reach = range_of(discovery)
-        bus: Bus = opened(
-            name, names or Names(), sim_time=sim_time, domain=domain, reach=reach, offers=offers
-        )
+        bus: Bus = opened(name, names or Names(), sim_time=sim_time, domain=domain, reach=reach)
         return bus
     raise InputError("; ".join(broken) or MISSING)
-
-
-def offered(qos: Qos, offers: Offers) -> Qos:
-    """The QoS of a publisher, from that of its topic."""
-    return SENSOR_DATA if qos.sensor and offers == "sensor-data" else qos

@@ -1,8 +1,8 @@
 """DdsBus: a node over cyclonedds, which reaches any ROS 2 on the network from any Python.
 
 It follows the mapping of ROS 2: `/robot/odom` is the DDS topic `rt/robot/odom`, QoS profiles are DDS
-policies, and messages are plain CDR. Such a node sends and receives like any other and is in the lists of
-`ros2 node list`, but has no services, and so no parameters.
+policies, and messages are plain CDR. Such a node sends and receives like any other, but has no services and
+is not in the lists of `ros2 node list`.
 """
 
 import os
@@ -37,9 +37,9 @@ from magtwin.errors import InputError, RepairWarning
 from magtwin.io.bags.cdr import NS
 from magtwin.io.bags.topics import CLOCK, Qos
 from magtwin.io.bags.types import typestore
-from magtwin.ros.bus.bus import Bus, Endpoint, Handler, Message, Offers, Publisher, Subscription, offered
+from magtwin.ros.bus.bus import Bus, Endpoint, Handler, Message, Publisher, Subscription
 from magtwin.ros.bus.clock import Alarm, Clock
-from magtwin.ros.bus.graph import Discovered, Listed, user_data
+from magtwin.ros.bus.graph import Discovered, user_data
 from magtwin.ros.bus.names import Names, Range
 from magtwin.ros.bus.types import raw, struct_of
 
@@ -124,10 +124,8 @@ class DdsBus(Bus):
 
     backend = "cyclonedds"
 
-    def __init__(
-        self, name: str, names: Names, *, sim_time: bool, domain: int, reach: Range, offers: Offers
-    ) -> None:
-        self.name, self._names, self.reach, self._offers_as = name, names, reach, offers
+    def __init__(self, name: str, names: Names, *, sim_time: bool, domain: int, reach: Range) -> None:
+        self.name, self._names, self.reach = name, names, reach
         try:
             if domain not in _DOMAINS and "CYCLONEDDS_URI" not in os.environ:
                 where = _HERE if reach == "localhost" else _ANYWHERE
@@ -148,7 +146,6 @@ class DdsBus(Bus):
         self._conditions: list[ReadCondition] = []
         self._offers = Discovered(self._participant)
         self._wants: Discovered | None = None
-        self._listed = Listed(self._participant, name, names.namespace, self._offers, self._gids)
         self.clock = Clock(sim_time=sim_time)
         if sim_time:
             self.subscribe(CLOCK.name, CLOCK.kind, self._tick, replace(CLOCK.qos.heard, depth=CLOCK_DEPTH))
@@ -156,9 +153,7 @@ class DdsBus(Bus):
     def publisher(self, topic: str, kind: str, qos: Qos) -> Publisher:
         """As for `Bus`."""
         whole = self._names.resolve(topic)
-        writer: DataWriter[Any] = DataWriter(
-            self._participant, self._topic(whole, kind), qos_of(offered(qos, self._offers_as), kind)
-        )
+        writer: DataWriter[Any] = DataWriter(self._participant, self._topic(whole, kind), qos_of(qos, kind))
         self._writers.append(writer)  # its latched message lives as long as it does
         held = weakref.proxy(writer)  # a publisher that outlives its closed bus must not keep the participant
         return Publisher(
@@ -207,7 +202,6 @@ class DdsBus(Bus):
 
     def spin_once(self, timeout_s: float) -> None:
         """As for `Bus`."""
-        self._listed.look()
         left = self.clock.left_s(timeout_s)
         if self._conditions and left > 0:
             self._waiting.wait(round(left * NS))
@@ -220,11 +214,7 @@ class DdsBus(Bus):
         """As for `Bus`."""
         for held in (self._conditions, self._readers, self._writers, self._topics):
             held.clear()  # type: ignore[attr-defined]
-        del self._waiting, self._listed, self._offers, self._wants, self._participant
-
-    def _gids(self) -> tuple[list[bytes], list[bytes]]:
-        """Identifiers of the subscriptions and publishers of this node."""
-        return [reader.guid.bytes for reader, *_ in self._readers], [w.guid.bytes for w in self._writers]
+        del self._waiting, self._offers, self._wants, self._participant
 
     def _topic(self, whole: str, kind: str) -> "DdsTopic[Any]":
         if (whole, kind) not in self._topics:

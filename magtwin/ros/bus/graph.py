@@ -1,37 +1,21 @@
-"""Graph: who publishes and subscribes, and the entry of a cyclonedds node in the node lists of ROS 2.
+"""Graph: who publishes and subscribes, as far as discovered.
 
-An endpoint carries the hash of its type in its user data (REP 2016). Nodes of ROS 2 list themselves in
-messages on ros_discovery_info, whose form differs between Humble and later distributions.
+An endpoint carries the hash of its type in its user data (REP 2016).
 """
 
-import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Any
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import InstanceState, Policy
 from cyclonedds.core import Qos as DdsQos
 from cyclonedds.domain import DomainParticipant
-from cyclonedds.pub import DataWriter
-from cyclonedds.topic import Topic as DdsTopic
 
-from magtwin.io.bags.types import definition_of, store_of
+from magtwin.io.bags.types import definition_of
 from magtwin.ros.bus.bus import Endpoint
-from magtwin.ros.bus.types import ros_name, sample_of, struct_in
+from magtwin.ros.bus.types import ros_name
 
 MOST_TAKEN = 256
 """Endpoints that are taken at a time."""
-
-LOOK_S = 1.0
-"""Time between searches for nodes that read node lists [s]."""
-
-LISTS = "ros_discovery_info"
-"""DDS topic of node lists."""
-
-LISTS_KIND = "rmw_dds_common/msg/ParticipantEntitiesInfo"
-GID_BYTES = {"humble": 24, "jazzy": 16}
-"""Size of the identifier of an endpoint in node lists, by the distribution that introduced it."""
 
 _KEY = "typehash="
 
@@ -48,38 +32,23 @@ def digest_of(qos: DdsQos) -> str:
     return next((entry.removeprefix(_KEY) for entry in entries if entry.startswith(_KEY)), "")
 
 
-@dataclass(frozen=True)
-class _Found:
-    topic: str
-    """Its DDS name."""
-
-    endpoint: Endpoint
-    participant: str
-
-
 class Discovered:
     """The discovered publishers, or subscribers, of all topics."""
 
     def __init__(self, participant: DomainParticipant, builtin: Any = BuiltinTopicDcpsPublication) -> None:
         """Start to listen to DDS discovery."""
         self._reader = BuiltinDataReader(participant, builtin)
-        self._found: dict[Any, _Found] = {}
+        self._found: dict[Any, tuple[str, Endpoint]] = {}
 
     def of(self, topic: str) -> list[Endpoint]:
         """The endpoints of a topic, by its DDS name."""
-        return [found.endpoint for found in self.found() if found.topic == topic]
-
-    def found(self) -> Iterable[_Found]:
-        """All endpoints."""
         while taken := self._reader.take(N=MOST_TAKEN):
             for offer in taken:
                 if offer.sample_info.valid_data:
-                    self._found[offer.key] = _Found(
-                        offer.topic_name, _endpoint(offer), str(offer.participant_key)
-                    )
+                    self._found[offer.key] = offer.topic_name, _endpoint(offer)
                 elif offer.sample_info.instance_state != InstanceState.Alive:
                     self._found.pop(offer.key, None)
-        return self._found.values()
+        return [endpoint for name, endpoint in self._found.values() if name == topic]
 
 
 def _endpoint(offer: Any) -> Endpoint:
@@ -89,93 +58,3 @@ def _endpoint(offer: Any) -> Endpoint:
         latched=offer.qos[Policy.Durability] != Policy.Durability.Volatile,
         digest=digest_of(offer.qos),
     )
-
-
-class Listed:
-    """The entry of a node in node lists, as long as nodes of one form of lists are there.
-
-    Nodes of Humble and of later distributions cannot read the lists of each other. The entry has the form
-    of the other nodes, and is withdrawn while there are both.
-    """
-
-    def __init__(
-        self,
-        participant: DomainParticipant,
-        name: str,
-        namespace: str,
-        offers: Discovered,
-        gids: Callable[[], tuple[list[bytes], list[bytes]]],
-    ) -> None:
-        """Prepare.
-
-        Args:
-            participant: The participant of the node.
-            name: Name of the node.
-            namespace: Its namespace.
-            offers: The discovered publishers.
-            gids: Gives the identifiers of the node's subscriptions and publishers.
-        """
-        self._participant, self._name, self._offers, self._gids = participant, name, offers, gids
-        self._namespace = f"/{namespace.strip('/')}"
-        self._own = str(participant.guid)
-        self._form, self._sent = "", b""
-        self._writer: DataWriter[Any] | None = None
-        self._struct: Any = None
-        self._looked = 0.0
-
-    def look(self) -> None:
-        """Publish the entry if it has changed; looks every `LOOK_S`."""
-        now = time.monotonic()
-        if now - self._looked < LOOK_S:
-            return
-        self._looked = now
-        digests = {
-            found.endpoint.digest
-            for found in self._offers.found()
-            if found.topic == LISTS and found.participant != self._own
-        }
-        forms = {"jazzy" if digest else "humble" for digest in digests}
-        form = forms.pop() if len(forms) == 1 else ""
-        if form != self._form:
-            self._form, self._sent, self._writer = form, b"", self._written_as(form)
-        if self._writer is not None and (data := self._entry(form)) != self._sent:
-            self._writer.write(sample_of(self._struct, data))
-            self._sent = data
-
-    def _written_as(self, form: str) -> "DataWriter[Any] | None":
-        if not form:
-            return None
-        store = store_of(form)
-        self._struct = struct_in(LISTS_KIND, store)
-        digest = f"{_KEY}{store.hash_rihs01(LISTS_KIND)};".encode() if form != "humble" else b""
-        qos = DdsQos(
-            Policy.Reliability.Reliable(max_blocking_time=10**8),
-            Policy.History.KeepLast(1),
-            Policy.Durability.TransientLocal,
-            Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),
-            Policy.Userdata(digest),
-        )
-        return DataWriter(self._participant, DdsTopic(self._participant, LISTS, self._struct), qos)
-
-    def _entry(self, form: str) -> bytes:
-        """The message on `LISTS`."""
-        import numpy as np
-
-        store, size = store_of(form), GID_BYTES[form]
-        gid, entities, node = (
-            store.types[f"rmw_dds_common/msg/{name}"]
-            for name in ("Gid", "ParticipantEntitiesInfo", "NodeEntitiesInfo")
-        )
-
-        def identifier(raw: bytes) -> Any:
-            return gid(np.frombuffer(raw.ljust(size, b"\0"), np.uint8))
-
-        readers, writers = self._gids()
-        entry = node(
-            node_namespace=self._namespace,
-            node_name=self._name,
-            reader_gid_seq=[identifier(raw) for raw in readers],
-            writer_gid_seq=[identifier(raw) for raw in writers],
-        )
-        whole = entities(gid=identifier(self._participant.guid.bytes), node_entities_info_seq=[entry])
-        return bytes(store.serialize_cdr(whole, LISTS_KIND, little_endian=True))
