@@ -98,56 +98,6 @@ def test_a_missing_file_is_refused_by_the_near_name(tmp_path):
         read_toml(tmp_path / "lav.toml")
 
 
-def test_an_output_appears_only_when_it_is_whole(tmp_path):
-    with output(tmp_path / "new" / "a.txt") as aside:
-        aside.write_text("whole")
-        assert not (tmp_path / "new" / "a.txt").exists()
-    assert (tmp_path / "new" / "a.txt").read_text() == "whole"
-    assert [p.name for p in (tmp_path / "new").iterdir()] == ["a.txt"]
-
-
-def write_and_fail(path, **options):
-    with output(path, **options) as aside:
-        aside.write_text("half")
-        raise KeyboardInterrupt
-
-
-def test_an_interrupted_output_leaves_the_old_one_untouched(tmp_path):
-    (tmp_path / "a.txt").write_text("old")
-    with pytest.raises(KeyboardInterrupt):
-        write_and_fail(tmp_path / "a.txt", force=True)
-    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("a.txt", "old")]
-
-
-def test_a_folder_is_replaced_whole(tmp_path):
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "old").touch()
-    with output(tmp_path / "run", force=True) as aside:
-        aside.mkdir()
-        (aside / "new").touch()
-    assert [p.name for p in (tmp_path / "run").iterdir()] == ["new"]
-    assert [p.name for p in tmp_path.iterdir()] == ["run"]
-
-
-def test_a_folder_with_files_of_a_kind_that_magtwin_does_not_write_is_not_replaced(tmp_path):
-    (tmp_path / "run" / "deep").mkdir(parents=True)
-    (tmp_path / "run" / "deep" / "thesis.tex").write_text("mine")
-    with (
-        pytest.raises(InputError, match=r"run: holds deep/thesis.tex, which would be removed with it"),
-        output(tmp_path / "run", force=True) as aside,
-    ):
-        aside.mkdir()
-    assert [p.name for p in tmp_path.iterdir()] == ["run"]
-    assert (tmp_path / "run" / "deep" / "thesis.tex").read_text() == "mine"
-
-
-def test_nothing_is_overwritten_unasked(tmp_path):
-    (tmp_path / "a.txt").touch()
-    with pytest.raises(InputError, match=r"a.txt: exists already; give `force=True`"):
-        check_free(tmp_path / "a.txt")
-    assert check_free(tmp_path / "a.txt", force=True) == tmp_path / "a.txt"
-
-
 def test_a_link_to_nothing_is_called_so(tmp_path):
     (tmp_path / "run.parquet").symlink_to("gone.parquet")
     with pytest.raises(InputError, match=r"no such run: a link to 'gone\.parquet', which does not exist"):

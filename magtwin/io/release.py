@@ -29,8 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, hint
-from magtwin.files.budget import check_size
-from magtwin.files.file import existing, sha256
+from magtwin.files.file import read_text, sha256
 from magtwin.frames import canonical, quat_from_yaw, wrap_angle
 from magtwin.run.run import COLUMNS, Run
 
@@ -77,10 +76,7 @@ def read_release(path: str | os.PathLike[str]) -> Run:
         InputError: The file is missing or not such a list, a frame is not as above (the text gives its number
             and position), its clock goes back, or no frame has a reading.
     """
-    path = existing(path, "recording")
-    if path.is_dir():
-        raise InputError(f"{path}: a folder; name the .json file in it")
-    check_size(path, "recording")
+    path = Path(path)
     text, at, table, last = *_opened(path), array("d"), -math.inf
     for number in count(1):
         at = _BETWEEN.match(text, at).end()  # type: ignore[union-attr]
@@ -182,10 +178,7 @@ def _quoted(value: Any) -> str:
 
 def _opened(path: Path) -> tuple[str, int]:
     """The text of a file, and where its list of frames begins."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file ({error}); a recording is JSON") from error
+    text = read_text(path, "recording", "recording", "utf-8-sig")
     begin = text.lstrip()[:20]
     if not begin.startswith("["):
         seen = _quoted(begin) if begin else "nothing"

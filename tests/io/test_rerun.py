@@ -20,10 +20,9 @@ from waiting import PATIENCE_S, wait_until
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.frames import quat_from_rpy, quat_from_yaw, rotate
+from magtwin.frames import quat_from_yaw, rotate
 from magtwin.io.rerun import recording
 from magtwin.io.rerun.file import read_run, read_runs, show_run, write_comparison, write_rrd
-from magtwin.io.rerun.live import RrdWriter
 from magtwin.io.rerun.series import DERIVED, STATES
 from magtwin.io.rerun.viewer import live_viewer, screenshot, show
 from magtwin.io.tables import write_parquet
@@ -32,7 +31,7 @@ from magtwin.run.run import COLUMNS, Run
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import MagnetometerSpec
-from magtwin.twin import Twin, scan
+from magtwin.twin import Twin
 
 HEADER = """#usda 1.0
 (
@@ -305,16 +304,6 @@ def test_the_field_arrow_goes_through_the_sensor_and_is_there_only_where_the_vec
     assert not columns_of(tmp_path / "run.rrd", "world/robot/magnetometer/field")[1]
 
 
-@pytest.mark.parametrize("rows", [1, 10])
-def test_a_run_of_a_few_rows_is_recorded_too(parts, rows, tmp_path):
-    run, rest = parts
-    few = Run({name: values[:rows] for name, values in run.items()}, {"note": "a | b"})
-    write_rrd(few, tmp_path / "run.rrd", **rest)
-    times, _ = columns_of(tmp_path / "run.rrd", "run")
-    assert len(times) == rows
-    assert r"| note | a \| b |" in columns_of(tmp_path / "run.rrd", "metadata")[1]["TextDocument:text"][0][0]
-
-
 def test_the_metadata_are_properties_of_the_recording_and_a_page_in_it(parts, written):
     run, _ = parts
     batch = next(c for c in RrdReader(written).stream().to_chunks() if c.entity_path == "/__properties/run")
@@ -324,29 +313,6 @@ def test_the_metadata_are_properties_of_the_recording_and_a_page_in_it(parts, wr
     assert {column.component for column in schema if column.entity_path == "/run"} >= set(COLUMNS)
     page = columns_of(written, "metadata")[1]["TextDocument:text"][0][0]
     assert all(f"| {key} | {value} |" in page for key, value in run.metadata.items())
-
-
-def test_the_arrow_is_at_a_sensor_whose_link_has_no_shape_and_a_map_without_field_is_recorded(
-    parts, tmp_path
-):
-    run, rest = parts
-    turn = tuple(quat_from_rpy([0.1, 0.2, 0.3]).tolist())
-    twin = rest["twin"]
-    robot = dataclasses.replace(
-        twin.scene.robot,
-        p_base_magnetometer=(0.05, -0.02, 0.4),
-        q_base_magnetometer_link_xyzw=turn,
-        magnetometer=MagnetometerSpec(link="a_frame_without_mass_or_shape"),
-    )
-    field = dataclasses.replace(twin.field, valid=np.zeros(twin.field.values_nt.shape, bool))
-    twin = dataclasses.replace(twin, scene=dataclasses.replace(twin.scene, robot=robot), field=field)
-    nothing = np.full(run.rows, np.nan)
-    run = run.with_columns(b_map_nt=nothing, b_total_nt=nothing, b_measured_nt=nothing)
-    write_rrd(run, tmp_path / "run.rrd", **rest | {"twin": twin})
-    _, values = columns_of(tmp_path / "run.rrd", "world/robot/magnetometer")
-    np.testing.assert_allclose(values["Transform3D:translation"][0][0], [0.05, -0.02, 0.4], atol=1e-6)
-    np.testing.assert_allclose(values["Transform3D:quaternion"][0][0], turn, atol=1e-6)
-    assert np.isnan(read_run(tmp_path / "run.rrd")["b_total_nt"]).all()
 
 
 def rerun(*arguments):
@@ -367,17 +333,6 @@ def test_two_recordings_of_one_run_are_the_same_recording(parts, tmp_path):
     assert done.returncode == 0, done.stderr[:500]
 
 
-def test_another_run_is_another_recording(parts, written, tmp_path):
-    run, rest = parts
-    write_rrd(run.with_metadata(seed=2), tmp_path / "seed.rrd", **rest)
-    write_rrd(run.with_columns(yaw=run["yaw"] + 1e-9), tmp_path / "yaw.rrd", **rest)
-    ids = [
-        RrdReader(p).recordings()[0].recording_id
-        for p in (written, tmp_path / "seed.rrd", tmp_path / "yaw.rrd")
-    ]
-    assert len(set(ids)) == 3
-
-
 def test_runs_without_rows_or_times_existing_files_and_a_disabled_rerun_are_refused(
     parts, tmp_path, monkeypatch
 ):
@@ -391,9 +346,8 @@ def test_runs_without_rows_or_times_existing_files_and_a_disabled_rerun_are_refu
     path.write_text("kept")
     with pytest.raises(InputError, match=r"run\.rrd: exists already; give `force=True`"):
         write_rrd(run, path, **rest)
-    for kind in (lambda out: write_rrd(run, out), RrdWriter):
-        with pytest.raises(InputError, match="cannot be written"):
-            kind(path / "run.rrd")
+    with pytest.raises(InputError, match="cannot be written"):
+        write_rrd(run, path / "run.rrd")
     with monkeypatch.context() as patch:
         patch.setenv("RERUN", "off")
         with pytest.raises(InputError, match="switched off by the environment variable RERUN; unset it"):
@@ -487,26 +441,6 @@ def test_events_tell_when_and_where_each_flag_began_and_ended(tmp_path):
     ]
 
 
-@pytest.mark.parametrize("block", [1, 7, 333])
-def test_events_and_states_are_the_same_however_the_run_is_cut_into_blocks(block, tmp_path):
-    rng = np.random.default_rng(block)
-    t = np.arange(600) / 20
-    flags = {
-        name: np.repeat(rng.random(60) < 0.4, 10) for name in ("flag_bump", "flag_pose_lost", "lidar_on")
-    }
-    run = Run({"t": t, "p_world_base": np.column_stack([t, t, t]), **flags})
-    write_rrd(run, tmp_path / "whole.rrd")
-    writer = RrdWriter(tmp_path / "blocks.rrd")
-    for start in range(0, run.rows, block):
-        writer.append(Run({name: values[start : start + block] for name, values in run.items()}))
-    writer.close()
-    assert events_of(tmp_path / "blocks.rrd") == events_of(tmp_path / "whole.rrd")
-    for state in ("bump", "mocap", "LiDAR"):
-        a, b = (columns_of(tmp_path / f"{name}.rrd", f"states/{state}") for name in ("blocks", "whole"))
-        assert np.array_equal(a[0], b[0])
-        assert a[1]["StateChange:state"] == b[1]["StateChange:state"]
-
-
 def test_runs_that_are_compared_stand_on_one_timeline_with_their_offsets_and_come_back(parts, tmp_path):
     run, rest = parts
     other = Run({name: values[:500] for name, values in run.items()}, {"seed": 2})
@@ -581,24 +515,6 @@ def test_a_recording_that_was_cut_short_or_is_none_is_refused_in_a_line(written,
         assert "\n" not in str(refused.value)
 
 
-def test_bytes_that_were_changed_never_end_the_process(tmp_path):
-    run = Run({"t": np.arange(50.0), "b_total_nt": np.arange(50.0)})
-    write_rrd(run, tmp_path / "run.rrd")
-    whole, rng = (tmp_path / "run.rrd").read_bytes(), np.random.default_rng(0)
-    said = []
-    for _ in range(12):
-        changed = bytearray(whole)
-        for at in rng.integers(0, len(whole), 4):
-            changed[at] = rng.integers(0, 256)
-        (tmp_path / "changed.rrd").write_bytes(changed)
-        try:
-            read_run(tmp_path / "changed.rrd")
-        except InputError as error:
-            said.append(str(error))
-    assert len(said) >= 6
-    assert not any("\n" in text for text in said)
-
-
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="a limit on file sizes is of POSIX")
 def test_a_full_disk_is_said_in_a_line_and_earlier_files_stay(parts, tmp_path):
     from magtwin.io.tables import write_parquet
@@ -610,7 +526,6 @@ def test_a_full_disk_is_said_in_a_line_and_earlier_files_stay(parts, tmp_path):
 import resource, signal, sys
 from magtwin.io.rerun.file import write_rrd
 from magtwin.io.rerun import recording
-from magtwin.io.rerun.live import RrdWriter
 from magtwin.io.tables import read_parquet
 from magtwin.errors import InputError
 
@@ -622,29 +537,16 @@ for limit in (1000, 100_000, int(sys.argv[1])):
         write_rrd(run, "run.rrd", force=True)
     except InputError as error:
         print(error)
-writer = RrdWriter("live.rrd")
-try:
-    for _ in range(3):
-        writer.append(run)
-except InputError as error:
-    print(error)
 """
     write_rrd(run, tmp_path / "size.rrd")
     just = (tmp_path / "size.rrd").stat().st_size - 1000  # so that only its end does not fit
     command = [sys.executable, "-c", script, str(just)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     lines = done.stdout.splitlines()
-    assert len(lines) == 4
-    assert all(
-        line.startswith(("run.rrd: cannot be written", "live.rrd: cannot be written")) for line in lines
-    )
+    assert len(lines) == 3
+    assert all(line.startswith("run.rrd: cannot be written") for line in lines)
     assert (tmp_path / "run.rrd").read_text() == "mine"
-    assert {path.name for path in tmp_path.iterdir()} == {
-        "run.parquet",
-        "run.rrd",
-        "size.rrd",
-        "live.partial.rrd",
-    }
+    assert {path.name for path in tmp_path.iterdir()} == {"run.parquet", "run.rrd", "size.rrd"}
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="a limit on file sizes is of POSIX")
@@ -675,19 +577,6 @@ for limit in (0, 100, 3000, 5000, 7000, 20_000, 40_000):
     assert len(lines) == 7
     assert all(line.startswith("run.rrd: cannot be written (") for line in lines)
     assert {path.name for path in tmp_path.iterdir()} == {"run.parquet"}
-
-
-@pytest.mark.parametrize("rows", [20, 540])
-@pytest.mark.parametrize("shown", [False, True])
-def test_the_room_asked_of_a_disk_is_enough_and_no_multiple_of_it(rows, shown, parts, tmp_path, monkeypatch):
-    run, rest = parts
-    asked = []
-    monkeypatch.setattr(recording, "check_room", lambda file, size, final: asked.append(size))
-    run = run.take(slice(rows))
-    scans = scan(rest["twin"], run.with_columns(lidar_on=np.ones(run.rows, bool)))
-    write_rrd(run, tmp_path / "run.rrd", **({**rest, "scans": scans} if shown else {}))
-    (size,) = asked
-    assert size / 4 < (tmp_path / "run.rrd").stat().st_size < size
 
 
 @pytest.fixture

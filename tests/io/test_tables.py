@@ -67,26 +67,6 @@ def written(tmp_path):
     return path
 
 
-def test_a_run_comes_back_from_parquet_to_the_last_bit_in_the_same_order(written):
-    assert_same(some_run(), read_parquet(written))
-
-
-def test_the_same_run_gives_the_same_bytes(written, tmp_path):
-    write_parquet(some_run(), tmp_path / "again.parquet")
-    assert (tmp_path / "again.parquet").read_bytes() == written.read_bytes()
-
-
-def test_another_run_gives_other_bytes(written, tmp_path):
-    write_parquet(some_run().with_metadata(seed=8), tmp_path / "other.parquet")
-    assert (tmp_path / "other.parquet").read_bytes() != written.read_bytes()
-
-
-def test_a_run_of_no_rows_comes_back(tmp_path):
-    run = Run({name: values[:0] for name, values in some_run().items()}, FACTS)
-    write_parquet(run, tmp_path / "none.parquet")
-    assert_same(run, read_parquet(tmp_path / "none.parquet"))
-
-
 @settings(max_examples=25, deadline=None)
 @given(
     width=st.integers(1, 5),

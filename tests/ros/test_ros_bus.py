@@ -183,31 +183,6 @@ def test_a_discovery_range_that_finds_nobody_or_is_unknown_is_refused(
         range_of()
 
 
-def test_a_node_sees_how_many_send_on_a_topic_and_in_which_types(pair: tuple[Bus, Bus]) -> None:
-    one, other = pair
-    heard = other.subscribe("odom", ODOMETRY.kind, lambda m: None, SENSOR_DATA)
-    assert heard.publishers() == 0
-    offered = [node.publisher("odom", ODOMETRY.kind, SENSOR_DATA) for node in pair]
-    spin(lambda: heard.publishers() == 2, one, other)
-    spin(lambda: other.types("odom") == (ODOMETRY.kind,), one, other)
-    assert [p.topic for p in offered] == ["/robot/odom"] * 2
-
-
-def test_who_left_offers_nothing_more(domain: int) -> None:
-    ear, (one, other) = (
-        open_bus("ear", backend="cyclonedds", domain=domain),
-        (open_bus(name, backend="cyclonedds", domain=domain) for name in ("one", "other")),
-    )
-    for node in (one, other):
-        node.publisher(ODOMETRY.name, ODOMETRY.kind, ODOMETRY.qos)
-    spin(lambda: ear.publishers(ODOMETRY.name) == 2, ear)
-    one.close()
-    spin(lambda: ear.publishers(ODOMETRY.name) == 1, ear)
-    other.close()
-    spin(lambda: not ear.types(ODOMETRY.name), ear)
-    ear.close()
-
-
 def test_a_broken_message_tells_no_clock_and_wall_timers_go_on_without_it(domain: int) -> None:
     bus = open_bus("node", backend="cyclonedds", domain=domain, sim_time=True)
     due: list[str] = []
@@ -261,12 +236,6 @@ def test_names_stand_in_their_namespace_and_are_remapped(
     namespace: str, remaps: tuple[str, ...], name: str, whole: str
 ) -> None:
     assert names_of(namespace, remaps).resolve(name) == whole
-
-
-@pytest.mark.parametrize("remap", ["odom", "odom=x", "odom:=", "a b:=c", "odom:=2x"])
-def test_what_is_no_remap_is_refused(remap: str) -> None:
-    with pytest.raises(InputError, match="a remap is a name:=another"):
-        names_of("robot", (remap,))
 
 
 def test_without_either_backend_one_line_tells_both_ways(monkeypatch: pytest.MonkeyPatch) -> None:

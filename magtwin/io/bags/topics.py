@@ -332,7 +332,6 @@ JOINTS = Topic(
     sent="ticks",
     every_s=1 / 62,
     more=_joints,
-    reads={"sensor_msgs/msg/JointState": {"names": "name", "angles": "position"}},
 )
 TF = Topic(
     name="/tf",

@@ -1,10 +1,8 @@
 """RclpyBus: a node over rclpy, from a sourced installation of ROS 2 or from its wheels."""
 
 import importlib
-import os
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import rclpy
@@ -17,6 +15,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from magtwin.errors import InputError
 from magtwin.io.bags.topics import Qos
+from magtwin.parallel.machine import variables
 from magtwin.ros.bus.bus import Bus, Endpoint, Handler, Message, Publisher, Subscription
 from magtwin.ros.bus.names import Names, Range
 
@@ -26,20 +25,6 @@ MOST_AT_ONCE = 256
 
 OTHER_S = 0.02
 """Longest wait for messages while there is a second node, which is looked at in between [s]."""
-
-
-@contextmanager
-def _environment(**values: str | None) -> Iterator[None]:
-    """Set variables of the environment, which rclpy reads when it starts; None unsets one."""
-    before = {name: os.environ.pop(name, None) for name in values}
-    os.environ.update({name: value for name, value in values.items() if value is not None})
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name, None)
-            if value is not None:
-                os.environ[name] = value
 
 
 def qos_of(qos: Qos) -> QoSProfile:
@@ -93,7 +78,7 @@ class RclpyBus(Bus):
     def _joined(self, name: str) -> tuple[Context, Node, SingleThreadedExecutor]:
         """A node and what spins it."""
         context = Context()
-        with _environment(ROS_AUTOMATIC_DISCOVERY_RANGE=self.reach.upper(), ROS_LOCALHOST_ONLY=None):
+        with variables({"ROS_AUTOMATIC_DISCOVERY_RANGE": self.reach.upper(), "ROS_LOCALHOST_ONLY": None}):
             rclpy.init(args=[], context=context, domain_id=self._domain)
         node = Node(
             name,

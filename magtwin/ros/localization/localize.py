@@ -7,7 +7,6 @@ published with the stamp of their reading. While the magnetometer is silent, the
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
@@ -158,7 +157,6 @@ class LocalizerNode:
         self._tf = None
         if settings["tf_broadcast"] and bus.knows(TF_KIND):
             self._tf = bus.publisher(TF.name, TF_KIND, TF.qos)
-            bus.subscribe(TF.name, TF_KIND, self._hear_tf, TF.qos.heard)
         bus.subscribe(INITIAL, POSE_KIND, self._start_at, Qos().heard)
         self._algorithm: Localizer | None = None
         self._tick0, self._done = 0.0, 0
@@ -166,9 +164,8 @@ class LocalizerNode:
         self._newest = (-1, math.nan)  # stamp and field of the newest message that holds a field
         self._yaw: float | None = None
         self._cloud_ns = self._path_ns = -NS * 10**6
-        self._own_tf: deque[int] = deque(maxlen=64)
         self._blind, self._broken = 0, 0
-        self._other_tf, self._is_lost = False, False
+        self._is_lost = False
         self._look()
         bus.timer(LOOK_S, self._look, wall=True)
         bus.timer(1 / settings["rate_hz"], self._watch)
@@ -306,7 +303,6 @@ class LocalizerNode:
         self.latencies_s.append(time.monotonic() - arrived)
         if self._tf is not None:
             valid_ns = stamp_ns + round(self._settings["tf_ahead_s"] * NS)
-            self._own_tf.append(valid_ns)
             frames = (frame, self._sender.odom_frame)
             p, q = odometry["odom_p"][0], odometry["odom_q_xyzw"][0]
             self._tf.publish(odom_bytes(valid_ns, frames, estimate, p, q))
@@ -372,21 +368,6 @@ class LocalizerNode:
         self._algorithm, self._heard_ns, self._stamp_ns, self._period_s = None, -1, -1, 0.0
         self._newest = (-1, math.nan)
 
-    def _hear_tf(self, message: Message) -> None:
-        """Notice another node that publishes the transform from map to odom."""
-        first = "transforms.0"
-        names = [f"{first}.header.stamp", f"{first}.header.frame_id", f"{first}.child_frame_id"]
-        try:
-            read = message.read(names)
-        except InputError:
-            return  # empty, or damaged
-        frames = (str(read[names[1]]).strip("/"), str(read[names[2]]).strip("/"))
-        ours = frames == (self._sender.map_frame, self._sender.odom_frame)
-        if ours and int(read[names[0]]) not in self._own_tf and not self._other_tf:
-            self._other_tf = True
-            both = f"{frames[0]} to {frames[1]}"
-            self._say(f"another node publishes {both} too: set tf_broadcast:=false here, or stop it there")
-
     def _statuses(self, clock: str, now: int) -> list[Status]:
         field = self._bus.resolve(MAGNITUDE.name)
         silent = clock or self._node.missing
@@ -396,7 +377,6 @@ class LocalizerNode:
             (self._is_lost, "the method does not trust its pose"),
             (self._blind, f"{field} gives no field: odometry alone"),
             (self._broken, f"{self._broken} messages could not be used"),
-            (self._other_tf, "another node publishes the transform from map to odom too"),
         )
         values = {"method": self._method, "estimates": str(self._node.done)}
         self._blind = self._broken = 0
