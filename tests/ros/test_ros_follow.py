@@ -10,7 +10,6 @@ import pytest
 from nodes import from_message, spin
 
 from magtwin.errors import InputError
-from magtwin.files.file import shipped
 from magtwin.frames import quat_from_yaw
 from magtwin.io.bags.topics import CLOCK, COMMAND, ODOMETRY, POSE, Qos
 from magtwin.path import PATHS, Path
@@ -22,7 +21,7 @@ from magtwin.ros.simulate import Simulator
 from magtwin.sim.motion.closed_loop import Chassis, ClosedLoop
 from magtwin.sim.motion.controllers import Guide, guide_along
 from magtwin.spec.drive import DriveSpec
-from magtwin.twin import Twin, open_twin
+from magtwin.twin import Twin
 
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 
@@ -37,11 +36,6 @@ CORNERED = {
 }
 LATE = 4
 """Steps by which the poses of a marker are late."""
-
-
-@pytest.fixture(scope="module")
-def twin() -> Twin:
-    return open_twin(shipped("scenes", "lab", "lab.usda"), magnetometer="map-only")
 
 
 class Ideal:

@@ -11,11 +11,10 @@ import pytest
 from nodes import DOMAINS, from_message, spin
 
 from magtwin.errors import InputError
-from magtwin.files.file import shipped
 from magtwin.frames import quat_from_yaw, rotate, wrap_angle, yaw_from_quat
 from magtwin.io.bags.topics import CLOCK, COMMAND, MAGNITUDE, ODOMETRY, Qos
 from magtwin.io.bags.types import typestore
-from magtwin.localization.problem import Estimate, Prior
+from magtwin.localization.problem import Prior
 from magtwin.localization.track import LocalizerError
 from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
 from magtwin.ros.commands import command_bytes
@@ -29,7 +28,6 @@ from magtwin.ros.localization.poses import (
     POSE_KIND,
     TF_KIND,
     cloud_bytes,
-    odom_bytes,
     pose_bytes,
     prior_from,
     read_pose,
@@ -38,17 +36,12 @@ from magtwin.ros.parameters import settings
 from magtwin.ros.simulate import Simulator
 from magtwin.run.run import Run
 from magtwin.tasks.localizing import live_problem, localization, localize, new_localizer
-from magtwin.twin import Twin, open_twin, simulate
+from magtwin.twin import Twin, simulate
 
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 
 NS = 10**9
 MANY = Qos(depth=1000)
-
-
-@pytest.fixture(scope="module")
-def twin() -> Twin:
-    return open_twin(shipped("scenes", "lab", "lab.usda"), magnetometer="map-only")
 
 
 @pytest.fixture(scope="module")
@@ -257,11 +250,8 @@ def test_a_pose_on_initialpose_starts_the_method_and_starts_it_again(net: Net, t
     spin(lambda: any("'odom' is ignored" in line for line in hand.lines), hand.bus)
 
 
-def test_map_to_odom_puts_base_link_at_the_estimate_and_another_publisher_is_told_of(
-    net: Net, twin: Twin
-) -> None:
+def test_map_to_odom_puts_base_link_at_the_estimate(net: Net, twin: Twin) -> None:
     hand = Hand(net, twin, "prior:=1,0.5,0.3")
-    other = hand.robot.publisher("/tf", TF_KIND, MANY)
     hand.tick(3, x=0.7)
     hand.settle()
     names = [f"transforms.0.{name}" for name in ("header.frame_id", "child_frame_id")]
@@ -272,9 +262,6 @@ def test_map_to_odom_puts_base_link_at_the_estimate_and_another_publisher_is_tol
     np.testing.assert_allclose(
         origin[:2] + rotate(quat_from_yaw(0.3), [0.7, 0, 0])[:2], pose[-1, :2], atol=1e-9
     )
-    data = odom_bytes(7, ("map", "odom"), Estimate(0.0, 0.0, 0.0, 0.0), np.zeros(3), quat_from_yaw(0.0))
-    other.publish(data)
-    spin(lambda: any("tf_broadcast:=false" in line for line in hand.lines), hand.bus)
 
 
 def test_while_the_magnetometer_is_silent_odometry_is_used_alone(net: Net, twin: Twin) -> None:

@@ -21,17 +21,12 @@ from magtwin.ros.simulate import Simulator
 from magtwin.ros.topics import FIELD, FIELD_GRID, OCCUPANCY, PATH, READINGS, TRUTH
 from magtwin.ros.views import MOST_POSES, Trail
 from magtwin.tasks.localizing import live_problem
-from magtwin.twin import Twin, open_twin, room_of
+from magtwin.twin import Twin, room_of
 
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 
 MANY = Qos(depth=2000)
 DURATION_S = 10.0
-
-
-@pytest.fixture(scope="module")
-def twin() -> Twin:
-    return open_twin("lab", magnetometer="map-only")
 
 
 @pytest.fixture(scope="module")

@@ -11,11 +11,10 @@ import pytest
 from nodes import DOMAINS
 from places import ROOT
 
-from magtwin.files.file import shipped
 from magtwin.io.bags.topics import MAGNITUDE
 from magtwin.ros.bus import Message, open_bus
 from magtwin.ros.simulate import Simulator
-from magtwin.twin import Twin, open_twin
+from magtwin.twin import Twin
 
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 
@@ -83,11 +82,6 @@ print(json.dumps({
     "sim": due,
 }))
 """
-
-
-@pytest.fixture(scope="module")
-def twin() -> Twin:
-    return open_twin(shipped("scenes", "lab", "lab.usda"), magnetometer="map-only")
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from magtwin.errors import InputError
-from magtwin.files.file import shipped
 from magtwin.io.bags import RawBagWriter
 from magtwin.io.bags.topics import LATCHED, MAGNITUDE, ODOMETRY, Qos
 from magtwin.io.bags.types import definition_of
@@ -22,7 +21,7 @@ from magtwin.io.formats import read_run
 from magtwin.ros.bus import Bus, to_bytes
 from magtwin.ros.record import Recorder
 from magtwin.ros.simulate import Simulator
-from magtwin.twin import Twin, open_twin
+from magtwin.twin import Twin
 
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 
@@ -31,11 +30,6 @@ COMMON = (
     *("trajectory_msgs", "visualization_msgs"),
 )
 """common_interfaces but std_srvs, which has no messages."""
-
-
-@pytest.fixture(scope="module")
-def twin() -> Twin:
-    return open_twin(shipped("scenes", "lab", "lab.usda"), magnetometer="map-only")
 
 
 def filled(store, described, rng):  # type: ignore[no-untyped-def]

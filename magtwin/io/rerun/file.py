@@ -89,7 +89,6 @@ def write_comparison(
     path: str | os.PathLike[str],
     twin: Twin | None = None,
     *,
-    offsets_s: Mapping[str, float] | None = None,
     planned: Path | None = None,
     force: bool = False,
 ) -> None:
@@ -99,13 +98,12 @@ def write_comparison(
         runs: The runs by name.
         path: The .rrd file to make.
         twin: Where they took place. None: only series.
-        offsets_s: Offsets added to the times of some of them [s], by name.
         planned: The planned path, or None.
         force: Whether to replace an existing file.
 
     Raises:
-        InputError: There is no run or one has no rows, two names are the same to Rerun, an offset is not
-            finite or names no run, or the file cannot be made as in `write_rrd`.
+        InputError: There is no run or one has no rows, two names are the same to Rerun, or the file cannot be
+            made as in `write_rrd`.
     """
     if not runs:
         raise InputError(f"{path}: there are no runs to compare; name at least one")
@@ -114,17 +112,8 @@ def write_comparison(
     entities = {entity_of("", name) for name in runs}
     if len(entities) < len(runs) or "" in entities:
         raise InputError(f"{path}: runs that are compared need names that differ, got {', '.join(runs)}")
-    offsets = dict(offsets_s or {})
-    for name, offset in offsets.items():
-        if name not in runs or not np.isfinite(offset):
-            raise InputError(
-                f"{path}: the offset {offset!r} s of {name!r} must be finite and of a run; "
-                f"runs are {', '.join(runs)}"
-            )
     compared = [
-        Shown.of(
-            run, name=name, offset_s=float(offsets.get(name, 0.0)), colour=RUN_COLOURS[k % len(RUN_COLOURS)]
-        )
+        Shown.of(run, name=name, colour=RUN_COLOURS[k % len(RUN_COLOURS)])
         for k, (name, run) in enumerate(runs.items())
     ]
     first = next(iter(runs.values()))
@@ -142,9 +131,8 @@ def write_comparison(
         if twin is not None:
             send_room(rec, interior, twin.field, first, planned)
         for shown in compared:
-            look: dict[str, Any] = {"name": shown.name, "offset_s": shown.offset_s}
-            robot = None if twin is None else Robot(rec, interior, colour=shown.colour, **look)
-            recording = Recording(rec, robot=robot, **look)
+            robot = None if twin is None else Robot(rec, interior, colour=shown.colour, name=shown.name)
+            recording = Recording(rec, shown.name, robot=robot)
             recording.append(runs[shown.name])
             recording.close()
 

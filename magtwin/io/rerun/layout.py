@@ -145,9 +145,6 @@ class Shown:
     name: str = ""
     """Its name among several runs; "" for a single run."""
 
-    offset_s: float = 0.0
-    """Offset added to its times [s]."""
-
     colour: Colour = _ORANGE
 
     @classmethod
@@ -273,7 +270,7 @@ def _blueprint(
 
 def _whole(runs: Sequence[Shown]) -> rrb.TimeAxis:
     """The axis that covers all of the runs."""
-    ends = [shown.run["t"][[0, -1]] + shown.offset_s for shown in runs]
+    ends = [shown.run["t"][[0, -1]] for shown in runs]
     first, last = (rrb.TimeRangeBoundary.absolute(seconds=float(k(ends))) for k in (np.min, np.max))
     return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
 

@@ -212,9 +212,6 @@ class Recording:
     name: str = ""
     """Its name among several runs; "" for a single run."""
 
-    offset_s: float = 0.0
-    """Offset added to its times [s]."""
-
     robot: Robot | None = None
     """Its robot in the room. None: only series."""
 
@@ -227,7 +224,7 @@ class Recording:
     _feed: Feed | None = None
 
     def __post_init__(self) -> None:
-        self._flags = Flags(self.rec, self.name, self.offset_s)
+        self._flags = Flags(self.rec, self.name)
         if self.robot is not None and self.scans is not None and len(self.scans.t):
             self._feed = Feed(self.rec, self.scans)
 
@@ -237,7 +234,7 @@ class Recording:
             return
         if not self._rows:
             send_metadata(self.rec, run, self.name)
-        send_columns(self.rec, run, run["t"] + self.offset_s, self.name)
+        send_columns(self.rec, run, run["t"], self.name)
         self._flags.append(run)
         if self.robot is not None and run.keys() >= POSED:
             self.robot.append(run)
