@@ -28,6 +28,9 @@ IN_FOLDER = ("run.rrd", "run.parquet")
 
 USD = (".usd", ".usda", ".usdc")
 
+OPENING = ("lab", "map_layer", "network", "magnetometer", "model_error", "tracking_error")
+"""Options of `magtwin.open_twin`."""
+
 
 @dataclass(frozen=True)
 class Driven:
@@ -45,12 +48,6 @@ def drive(
     *,
     commands: str | Path | None = None,
     replay: str | Path | None = None,
-    lab: str = "",
-    map_layer: str | Path | None = None,
-    network: str | Path | None = None,
-    magnetometer: Literal["physical", "neural", "map-only"] | None = None,
-    model_error: bool = True,
-    tracking_error: bool = True,
     seed: int = 0,
     session: Session | None = None,
     plant: PlantSpec | str | None = None,
@@ -67,12 +64,6 @@ def drive(
         path: Path, as for `magtwin.simulate`.
         commands: CSV of commands to drive by, in place of the path.
         replay: Run to drive again, in place of the path.
-        lab: As for `magtwin.open_twin`.
-        map_layer: As for `magtwin.open_twin`.
-        network: As for `magtwin.open_twin`.
-        magnetometer: As for `magtwin.open_twin`.
-        model_error: As for `magtwin.open_twin`.
-        tracking_error: As for `magtwin.open_twin`.
         seed: Seed of all noise.
         session: As for `magtwin.simulate`.
         plant: As for `magtwin.simulate`.
@@ -80,7 +71,7 @@ def drive(
         scans: Whether the LiDAR's rays are cast.
         metadata: Metadata of the run, such as names of files that move with it.
         report: Called with a line about each step.
-        options: Of `magtwin.simulate`.
+        options: Of `magtwin.open_twin` and `magtwin.simulate`.
 
     Raises:
         InputError: As for `magtwin.simulate`, or a file cannot be read.
@@ -93,15 +84,7 @@ def drive(
         metadata = {"replay_file": Path(replay).as_posix(), **metadata}
     elif path != "random":
         drive_input(path)  # refuses a wrong name before the scene is opened
-    twin = open_twin(
-        scene_file,
-        lab=lab,
-        map_layer=map_layer,
-        network=network,
-        magnetometer=magnetometer,
-        model_error=model_error,
-        tracking_error=tracking_error,
-    )
+    twin = open_twin(scene_file, **{name: options.pop(name) for name in OPENING if name in options})
     twin = in_session(with_plant(twin, plant), session, seed=seed)
     planned = None
     if what is path and path != "random":

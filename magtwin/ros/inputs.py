@@ -79,10 +79,6 @@ class LiveFrames:
             columns = in_base(role, columns, mount._replace(q_xyzw=q))
         return columns, fault
 
-    def place(self, frame: str) -> Mount | None:
-        """Where a frame is on the robot; None if that is not known."""
-        return self._known.mount(frame)
-
     def _hear(self, message: Message) -> None:
         parts = ("header.frame_id", "child_frame_id", "transform.translation", "transform.rotation")
         try:

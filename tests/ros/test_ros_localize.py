@@ -293,24 +293,6 @@ def test_the_newest_message_with_a_field_before_a_tick_is_the_reading(net: Net, 
     np.testing.assert_allclose(t[7:], [6.6, 6.8], atol=1e-6)
 
 
-def test_a_magnetometer_that_the_robot_has_elsewhere_is_told_of_once(net: Net, twin: Twin) -> None:
-    hand = Hand(net, twin)
-    upright = np.array([0.0, 0.0, 0.0, 1.0])
-    for name, x in (("near_link", 0.01), ("far_link", 0.08)):
-        hand.node._frames._known.add("base_link", name, np.array([x, 0.0, 0.3]), upright)
-    hand.node._check_place("unknown_link")
-    assert hand.lines == []
-    for _ in range(2):
-        hand.node._check_place("far_link")
-    assert hand.lines == [
-        "/tf_static has 'far_link' at x, y = 0.080, 0.000 m in base_link, the method is told 0.000, 0.000 m: "
-        "correct the robot's description, or the scene's robot"
-    ]
-    hand.node._placed = False
-    hand.node._check_place("near_link")
-    assert len(hand.lines) == 1
-
-
 def test_time_that_jumps_back_begins_anew(net: Net, twin: Twin) -> None:
     hand = Hand(net, twin, "prior:=1,0.5,0.3")
     hand.tick(3, x=0.5)

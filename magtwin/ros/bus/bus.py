@@ -154,10 +154,6 @@ class Bus(Protocol):
         """Number of publishers of a topic, including this node, as far as discovered."""
         return len(self.offers(topic))
 
-    def reliable(self, topic: str) -> bool:
-        """Whether every discovered publisher of a topic offers it reliably."""
-        return all(offer.reliable for offer in self.offers(topic))
-
     def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> Timer:
         """Call `due` every `period_s` of the bus's clock, or of wall time, in the thread that spins."""
 

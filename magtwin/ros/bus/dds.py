@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cyclonedds.builtin import BuiltinTopicDcpsSubscription
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
 from cyclonedds.core import (
     DDSException,
     InstanceState,
@@ -36,15 +36,14 @@ from cyclonedds.topic import Topic as DdsTopic
 from magtwin.errors import InputError, RepairWarning
 from magtwin.io.bags.cdr import NS
 from magtwin.io.bags.topics import CLOCK, Qos
-from magtwin.io.bags.types import typestore
+from magtwin.io.bags.types import definition_of, typestore
 from magtwin.ros.bus.bus import Bus, Endpoint, Handler, Message, Publisher, Subscription
 from magtwin.ros.bus.clock import Alarm, Clock
-from magtwin.ros.bus.graph import Discovered, user_data
 from magtwin.ros.bus.names import Names, Range
-from magtwin.ros.bus.types import raw, struct_of
+from magtwin.ros.bus.types import raw, ros_name, struct_of
 
 MOST_TAKEN = 256
-"""Messages of a topic taken at a time."""
+"""Messages of a topic, or endpoints, taken at a time."""
 
 CLOCK_DEPTH = 1000
 """Queue of /clock, so that each other message gets the time before it."""
@@ -69,6 +68,50 @@ PORTS, PORTS_EACH = 7400, 250
 
 _DOMAINS: dict[int, Domain] = {}
 """Configured domains; they must be configured before the first participant and outlive it."""
+
+
+_KEY = "typehash="
+"""Before the hash of its type in the user data of an endpoint (REP 2016)."""
+
+
+def user_data(kind: str) -> Any:
+    """The user data of an endpoint: the hash of its type."""
+    return Policy.Userdata(f"{_KEY}{definition_of(kind)[1]};".encode())
+
+
+def digest_of(qos: DdsQos) -> str:
+    """The hash of the type of an endpoint, from its user data; "" if it has none, as in Humble."""
+    data = qos[Policy.Userdata].data if Policy.Userdata in qos else b""
+    entries = bytes(data).decode(errors="replace").split(";")
+    return next((entry.removeprefix(_KEY) for entry in entries if entry.startswith(_KEY)), "")
+
+
+class Discovered:
+    """The discovered publishers, or subscribers, of all topics."""
+
+    def __init__(self, participant: DomainParticipant, builtin: Any = BuiltinTopicDcpsPublication) -> None:
+        """Start to listen to DDS discovery."""
+        self._reader = BuiltinDataReader(participant, builtin)
+        self._found: dict[Any, tuple[str, Endpoint]] = {}
+
+    def of(self, topic: str) -> list[Endpoint]:
+        """The endpoints of a topic, by its DDS name."""
+        while taken := self._reader.take(N=MOST_TAKEN):
+            for offer in taken:
+                if offer.sample_info.valid_data:
+                    self._found[offer.key] = offer.topic_name, _endpoint(offer)
+                elif offer.sample_info.instance_state != InstanceState.Alive:
+                    self._found.pop(offer.key, None)
+        return [endpoint for name, endpoint in self._found.values() if name == topic]
+
+
+def _endpoint(offer: Any) -> Endpoint:
+    return Endpoint(
+        kind=ros_name(offer.type_name),
+        reliable=isinstance(offer.qos[Policy.Reliability], Policy.Reliability.Reliable),
+        latched=offer.qos[Policy.Durability] != Policy.Durability.Volatile,
+        digest=digest_of(offer.qos),
+    )
 
 
 def qos_of(qos: Qos, kind: str) -> DdsQos:

@@ -95,9 +95,6 @@ QUEUE = Qos(depth=1000, reliable=False)
 PATH_S = 1.0
 """Time between messages of the estimated path [s]."""
 
-APART_M = 0.02
-"""Distance of places of the magnetometer that is reported [m]."""
-
 HELD_S = 30.0
 """Age up to which slow topics, such as the battery's, are passed on [s]."""
 
@@ -140,7 +137,7 @@ class LocalizerNode:
         self._sender = prefixed(sender, checked_prefix(frame_prefix))
         robot = twin.scene.robot
         axes = {"IMU": robot.q_base_imu_xyzw, "field": robot.q_base_magnetometer_xyzw}
-        self._node, self._placed = Node(bus, say, self._statuses, settings["stamps"], axes), False
+        self._node = Node(bus, say, self._statuses, settings["stamps"], axes)
         self.inputs, self.latencies_s = self._node.inputs, self._node.latencies_s
         self._odometry = self._node.listen(ODOMETRY, max_age_s=settings["max_age_s"])
         for topic in OTHERS:
@@ -209,7 +206,7 @@ class LocalizerNode:
         headed = message.kind.startswith("sensor_msgs")
         stamped = headed and self._settings["stamps"] == "header"
         try:
-            read = message.read([leaf, *(("header.stamp", "header.frame_id") if headed else ())])
+            read = message.read([leaf, *(("header.stamp",) if headed else ())])
         except InputError:
             self._broken += 1
             return
@@ -221,7 +218,6 @@ class LocalizerNode:
         if self._heard_ns >= 0:
             self._period_s = (stamp - self._heard_ns) / NS
         self._heard_ns = stamp
-        self._check_place(str(read.get("header.frame_id", "")))
         b_nt = _in_nt(float(np.linalg.norm(np.atleast_1d(read[leaf]))))
         if math.isfinite(b_nt):
             self._newest = stamp, b_nt
@@ -229,18 +225,6 @@ class LocalizerNode:
             return
         begun = self._algorithm is not None
         self._step(*(self._newest if begun and self._newest[0] > self._stamp_ns else (stamp, b_nt)), arrived)
-
-    def _check_place(self, frame: str) -> None:
-        """Report once a magnetometer that /tf_static has at another place than the method is told."""
-        if self._placed or (mount := self._node.frames.place(frame)) is None:
-            return
-        self._placed = True
-        (x, y), (told_x, told_y) = mount.p[:2].tolist(), self._problem.sensor.lever_arm_m
-        if math.hypot(x - told_x, y - told_y) > APART_M:
-            self._say(
-                f"/tf_static has {frame!r} at x, y = {x:.3f}, {y:.3f} m in {mount.base}, the method is told "
-                f"{told_x:.3f}, {told_y:.3f} m: correct the robot's description, or the scene's robot"
-            )
 
     def _due(self, stamp_ns: int) -> bool:
         """Whether the next reading will be after the tick."""
