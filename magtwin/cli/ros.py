@@ -141,7 +141,6 @@ def sim(
     rate_hz: RateHz = None,
     out_unit: OutUnit = None,
     lidar: Lidar = "schedule",
-    stamps: Literal["sim", "wall"] = "sim",
     frame_prefix: FramePrefix = None,
     tf: Literal["all", "odom", "none"] = "odom",
 ) -> Done:
@@ -162,8 +161,6 @@ def sim(
     magnetometer
         What the magnetometer reads: physical, neural or map-only, as for `magtwin run`; or none, which leaves
         its topics to `magtwin ros magnetometer`. Default: the scene's.
-    stamps
-        Time of the messages: sim, from 0, or wall.
     tf
         Transforms of the drive on /tf. odom: odom to base_link, beside a localizer that publishes map to
         odom. all: also map to odom, by the true pose. none: neither, beside a filter that publishes both. The
@@ -187,7 +184,6 @@ def sim(
             rate_hz=rate_hz,
             units=out_unit or "T",
             lidar=lidar,
-            stamps=stamps,
             magnetometer=magnetometer != "none",
             frame_prefix=frame_prefix,
             tf=tf,

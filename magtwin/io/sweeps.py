@@ -18,7 +18,7 @@ from typing import Any
 
 from magtwin.errors import InputError
 from magtwin.files.file import read_bytes, read_text
-from magtwin.files.outputs import HIDDEN, check_free, exchanged, output
+from magtwin.files.outputs import HIDDEN, check_free, output
 from magtwin.io.tables import parquet_of, write_parquet
 from magtwin.parallel import checked_shard, in_shard, open_pool
 from magtwin.report.report import Figure, Report
@@ -266,14 +266,8 @@ class _Parts:
             with output(self.folder / LISTING, force=True) as aside:
                 aside.write_bytes(said.csv())
             if self.out.exists():  # checked in the beginning: to be replaced
-                old = self.folder
-                if not exchanged(self.folder, self.out):
-                    old = self.out.with_name(f".{self.out.name}.{os.getpid()}.old")
-                    self.out.rename(old)
-                    self.folder.rename(self.out)
-                shutil.rmtree(old)
-            else:
-                self.folder.rename(self.out)
+                shutil.rmtree(self.out)
+            self.folder.rename(self.out)
         except (FileNotFoundError, InputError):
             if self.folder.exists():
                 raise

@@ -197,12 +197,6 @@ class Stream:
         return json.dumps(table, ensure_ascii=False, indent=1)
 
 
-def shifted(fields: Mapping[str, Any], by_ns: int) -> dict[str, Any]:
-    """Fields of messages with all stamps later by a time [ns]."""
-    stamped = ("stamp", "clock")
-    return {n: value + by_ns if n.rpartition(".")[2] in stamped else value for n, value in fields.items()}
-
-
 def _finite(run: Columns, names: Iterable[str]) -> NDArray[np.bool_]:
     """Rows in which some columns are finite."""
     return np.asarray(

@@ -1,7 +1,7 @@
 """Layout: the plots and views of a recording."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,77 +52,57 @@ class Series:
     """Width of the line [points]. Wide lines are drawn below narrow ones."""
 
 
-@dataclass(frozen=True)
-class Panel:
-    """A plot: series of one unit."""
-
-    title: str
-    series: tuple[Series, ...]
-
-
 _BLUE, _ORANGE, _GREEN, _GREY = (86, 156, 255), (255, 158, 64), (92, 200, 120), (165, 165, 165)
 _DIM = (118, 106, 150)
 
-FIELD_PANEL = Panel(
-    "Total field [nT]",
-    (
-        Series("b_total_nt", "total = map + disturbance", _ORANGE, width=4.0),
-        Series("b_measured_nt", "measured", _GREEN, width=1.0),
-        Series("b_map_nt", "map", _BLUE),
-        Series("b_truth_nt", "truth", _GREY),
-        Series("interval_low_nt", "90 % interval", _DIM),
-        Series("interval_high_nt", "90 % interval", _DIM),
-    ),
-)
-DISTURBANCE_PANEL = Panel("Disturbance [nT]", (Series("b_disturbance_nt", "disturbance", _ORANGE),))
-ERROR_PANEL = Panel(
-    "Error [nT]",
-    (
-        Series("error_nt", "prediction - truth", _ORANGE, width=3.0),
-        Series("measured_error_nt", "measured - truth", _GREEN, width=1.0),
-        Series("error_low_nt", "90 % interval", _DIM),
-        Series("error_high_nt", "90 % interval", _DIM),
-    ),
-)
-SPEED_PANEL = Panel(
-    "Speed [m/s]",
-    (
-        Series("odom_v", "odometry", _GREY, "x", width=3.0),
-        Series("v_base", "true", _BLUE, "x"),
-        Series("v_cmd", "commanded", _ORANGE),
-    ),
-)
-YAW_RATE_PANEL = Panel(
-    "Yaw rate [rad/s]",
-    (
-        Series("imu_w", "gyroscope", _GREY, "z", width=3.0),
-        Series("w_base", "true", _BLUE, "z"),
-        Series("w_cmd", "commanded", _ORANGE),
-    ),
-)
-ACCELERATION_PANEL = Panel(
-    "Accelerometer [m/s2]",
-    (
-        Series("imu_a", "forward", _BLUE, "x"),
-        Series("imu_a", "left", _ORANGE, "y"),
-        Series("imu_a", "up", _GREY, "z"),
-    ),
-)
-TILT_PANEL = Panel(
-    "Gyroscope, tilting [rad/s]",
-    (Series("imu_w", "roll", _BLUE, "x"), Series("imu_w", "pitch", _ORANGE, "y")),
-)
-BATTERY_PANELS = (
-    Panel("Battery voltage [V]", (Series("battery_v", "voltage", _GREEN),)),
-    Panel("Battery current [A]", (Series("battery_a", "current", _ORANGE),)),
-    Panel("Battery charge [0..1]", (Series("battery_fraction", "charge", _GREEN),)),
-)
-PANELS = (
-    *(FIELD_PANEL, DISTURBANCE_PANEL, ERROR_PANEL),
-    *(SPEED_PANEL, YAW_RATE_PANEL, ACCELERATION_PANEL, TILT_PANEL),
-    *BATTERY_PANELS,
-)
-"""Every plot of a recording. Series that a run lacks, or that are all nan, are left out."""
+PLOTS: Mapping[str, Mapping[str, tuple[Series, ...]]] = {
+    "": {
+        "Total field [nT]": (
+            Series("b_total_nt", "total = map + disturbance", _ORANGE, width=4.0),
+            Series("b_measured_nt", "measured", _GREEN, width=1.0),
+            Series("b_map_nt", "map", _BLUE),
+            Series("b_truth_nt", "truth", _GREY),
+            Series("interval_low_nt", "90 % interval", _DIM),
+            Series("interval_high_nt", "90 % interval", _DIM),
+        ),
+        "Disturbance [nT]": (Series("b_disturbance_nt", "disturbance", _ORANGE),),
+        "Error [nT]": (
+            Series("error_nt", "prediction - truth", _ORANGE, width=3.0),
+            Series("measured_error_nt", "measured - truth", _GREEN, width=1.0),
+            Series("error_low_nt", "90 % interval", _DIM),
+            Series("error_high_nt", "90 % interval", _DIM),
+        ),
+    },
+    "Drive": {
+        "Speed [m/s]": (
+            Series("odom_v", "odometry", _GREY, "x", width=3.0),
+            Series("v_base", "true", _BLUE, "x"),
+            Series("v_cmd", "commanded", _ORANGE),
+        ),
+        "Yaw rate [rad/s]": (
+            Series("imu_w", "gyroscope", _GREY, "z", width=3.0),
+            Series("w_base", "true", _BLUE, "z"),
+            Series("w_cmd", "commanded", _ORANGE),
+        ),
+    },
+    "IMU": {
+        "Accelerometer [m/s2]": (
+            Series("imu_a", "forward", _BLUE, "x"),
+            Series("imu_a", "left", _ORANGE, "y"),
+            Series("imu_a", "up", _GREY, "z"),
+        ),
+        "Gyroscope, tilting [rad/s]": (
+            Series("imu_w", "roll", _BLUE, "x"),
+            Series("imu_w", "pitch", _ORANGE, "y"),
+        ),
+    },
+    "Battery": {
+        "Battery voltage [V]": (Series("battery_v", "voltage", _GREEN),),
+        "Battery current [A]": (Series("battery_a", "current", _ORANGE),),
+        "Battery charge [0..1]": (Series("battery_fraction", "charge", _GREEN),),
+    },
+}
+"""Series by the title of their plot, by the name of their tab; "" are above the tabs."""
 
 _COMPARED = (
     ("Total field [nT]", "b_total_nt", ""),
@@ -165,7 +145,8 @@ class Shown:
 def plotted(run: Run) -> bool:
     """Whether a run has a column that is plotted."""
     shown = Shown.of(run)
-    return any(shown.values(series) is not None for panel in PANELS for series in panel.series)
+    lines = (line for tab in PLOTS.values() for series in tab.values() for line in series)
+    return any(shown.values(line) is not None for line in lines)
 
 
 def layout(
@@ -185,17 +166,12 @@ def layout(
     """
     shown = Shown.of(run)
     axis = _whole([shown])
-    panels = (FIELD_PANEL, DISTURBANCE_PANEL, ERROR_PANEL)
-    series = _stacked(axis, *([(shown, panel)] for panel in panels))
-    tabs = [
-        rrb.Vertical(*views, name=name)
-        for name, panels in (
-            ("Drive", (SPEED_PANEL, YAW_RATE_PANEL)),
-            ("IMU", (ACCELERATION_PANEL, TILT_PANEL)),
-            ("Battery", BATTERY_PANELS),
-        )
-        if (views := _stacked(axis, *([(shown, panel)] for panel in panels)))
-    ]
+    stacks = {
+        tab: _stacked(axis, {title: [(shown, line) for line in lines] for title, lines in plots.items()})
+        for tab, plots in PLOTS.items()
+    }
+    series = stacks.pop("")
+    tabs = [rrb.Vertical(*views, name=tab) for tab, views in stacks.items() if views]
     shares = [2.2, 1.2, 1.2][: len(series)] + [2.6] * bool(tabs)
     side = rrb.Vertical(*series, *([rrb.Tabs(*tabs)] if tabs else []), row_shares=shares)
     if events is None:
@@ -220,11 +196,11 @@ def comparison_layout(
 
     Without a lab there are no 3D views; `heading` is that of the map on the floor [rad], for the title.
     """
-    rows = [
-        [(shown, Panel(title, (Series(column, shown.name, shown.colour, part),))) for shown in runs]
+    plots = {
+        title: [(shown, Series(column, shown.name, shown.colour, part)) for shown in runs]
         for title, column, part in _COMPARED
-    ]
-    side = rrb.Vertical(*_stacked(_whole(runs), *rows))
+    }
+    side = rrb.Vertical(*_stacked(_whole(runs), plots))
     metadata = [
         rrb.TextDocumentView(origin=entity_of("metadata", shown.name), name=shown.name) for shown in runs
     ]
@@ -275,19 +251,16 @@ def _whole(runs: Sequence[Shown]) -> rrb.TimeAxis:
     return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
 
 
-def _stacked(whole: rrb.TimeAxis, *rows: Sequence[tuple[Shown, Panel]]) -> list[rrb.TimeSeriesView]:
-    """One plot for each row with a series."""
-    plots = []
-    for row in rows:
-        lines = [
-            (shown, series, values)
-            for shown, panel in row
-            for series in panel.series
-            if (values := shown.values(series)) is not None
-        ]
-        if lines:
-            plots.append(_plot(row[0][1].title, lines, whole))
-    return plots
+def _stacked(
+    whole: rrb.TimeAxis, plots: Mapping[str, Sequence[tuple[Shown, Series]]]
+) -> list[rrb.TimeSeriesView]:
+    """One plot, by its title, for each that has a line with values."""
+    views = []
+    for title, lines in plots.items():
+        known = [(*line, values) for line in lines if (values := line[0].values(line[1])) is not None]
+        if known:
+            views.append(_plot(title, known, whole))
+    return views
 
 
 def _plot(

@@ -12,7 +12,6 @@ from magtwin.ros.bus.bus import (
     Message,
     Publisher,
     Subscription,
-    Timer,
     open_bus,
 )
 from magtwin.ros.bus.messages import poses_bytes, to_bytes
@@ -28,7 +27,6 @@ __all__ = [
     "Publisher",
     "Range",
     "Subscription",
-    "Timer",
     "is_name",
     "names_of",
     "open_bus",

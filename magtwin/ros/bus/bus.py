@@ -106,13 +106,6 @@ class Endpoint:
     """REP 2011 hash of its type; "" before ROS 2 Iron."""
 
 
-class Timer(Protocol):
-    """Something called at a regular interval."""
-
-    def cancel(self) -> None:
-        """Do not call it again."""
-
-
 class Bus(Protocol):
     """A node of ROS 2."""
 
@@ -154,7 +147,7 @@ class Bus(Protocol):
         """Number of publishers of a topic, including this node, as far as discovered."""
         return len(self.offers(topic))
 
-    def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> Timer:
+    def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> object:
         """Call `due` every `period_s` of the bus's clock, or of wall time, in the thread that spins."""
 
     def now_ns(self) -> int:
