@@ -11,7 +11,7 @@ from magtwin.errors import InputError
 from magtwin.files.file import existing, sha256, shipped
 from magtwin.files.kinds import SCENE_TOML, kind_of
 from magtwin.files.outputs import check_free, output
-from magtwin.files.settings import from_table, read_toml, refused_at
+from magtwin.files.settings import from_table, read_toml
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,10 +184,3 @@ def test_a_table_that_is_right_makes_no_refusals(tmp_path, monkeypatch):
     monkeypatch.delattr("magtwin.files.settings._Where.refused")
     cart = read_cart(tmp_path, 'name = "a"\nlaps = 2\n' + "[[wheels]]\nradius_m = 0.1\n" * 50)
     assert len(cart.wheels) == 50
-
-
-def test_the_line_of_a_key_is_found_among_arrays_of_arrays(tmp_path):
-    text = "[[a]]\n[[a.b]]\n[[a.b]]\n[[a]]\n[[a.b]]\nkey = 1\n['" + "." * 1000 + "']\n"
-    (tmp_path / "a.toml").write_text(text)
-    refusal = refused_at(tmp_path / "a.toml", "key", "wrong", section="a.b", number=0)
-    assert str(refusal) == f"{tmp_path / 'a.toml'}:6: [a.b] wrong"

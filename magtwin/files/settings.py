@@ -207,7 +207,7 @@ class _Where:
         for number, line in enumerate(lines[begin:], begin + 1):
             header = _header_of(line)
             inside = inside and not header
-            if header == name or (inside and line.split("=")[0].strip().strip('"') == key):
+            if key and (header == name or (inside and line.split("=")[0].strip().strip('"') == key)):
                 return number
             if header and header == self.section:
                 break

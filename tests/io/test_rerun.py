@@ -229,7 +229,10 @@ def test_a_stage_that_is_missing_is_refused_and_nothing_is_left(parts, tmp_path)
         write_rrd(
             run,
             tmp_path / "run.rrd",
-            **{**rest, "twin": dataclasses.replace(rest["twin"], scene_file=tmp_path / "none.usda")},
+            **{
+                **rest,
+                "twin": dataclasses.replace(rest["twin"], scene_file=tmp_path / "none.usda", opened=None),
+            },
         )
     assert not list(tmp_path.iterdir())
     assert rr.strict_mode() == strict
