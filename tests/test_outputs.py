@@ -213,14 +213,6 @@ def test_what_another_process_made_in_the_meantime_is_not_replaced(tmp_path):
     assert content(tmp_path) == {"a/x.txt": "theirs"}
 
 
-@pytest.mark.parametrize("name", ["loop", "loop/x"])
-def test_a_link_to_itself_is_replaced_or_refused(name, tmp_path):
-    (tmp_path / "loop").symlink_to("loop")
-    with suppress(InputError), output(tmp_path / name, force=True) as aside:
-        aside.write_text("new")
-    assert content(tmp_path) in ({"loop": "new"}, {})
-
-
 @pytest.mark.parametrize("target", ["a.txt", "missing", "../other/a.txt"])
 def test_a_link_is_replaced_itself_and_only_by_force(target, tmp_path):
     for folder in ("here", "other"):
@@ -245,14 +237,6 @@ def test_a_link_to_a_folder_is_replaced_itself_whatever_the_folder_holds(tmp_pat
     write(tmp_path / "out", {"x.txt": "new"}, force=True)
     assert not (tmp_path / "out").is_symlink()
     assert content(tmp_path) == {"data/thesis.tex": "mine", "out/x.txt": "new"}
-
-
-def test_a_link_to_the_folder_of_an_output_is_followed(tmp_path):
-    (tmp_path / "data").mkdir()
-    (tmp_path / "out").symlink_to("data")
-    write(tmp_path / "out" / "run", {"x.txt": "new"})
-    assert (tmp_path / "out").is_symlink()
-    assert (tmp_path / "data" / "run" / "x.txt").read_text() == "new"
 
 
 def test_a_file_that_is_rewritten_in_its_place_is_found_through_a_link(tmp_path):

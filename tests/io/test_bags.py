@@ -9,12 +9,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from recordings import as_db3
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 import magtwin
@@ -151,27 +150,6 @@ def raw(path):
 @pytest.fixture(scope="module")
 def heard(bags):
     return messages(bags / "bag")
-
-
-def shape_of(content):
-    """The keys of metadata, and the types of what they hold."""
-    if isinstance(content, dict):
-        return {k: shape_of(v) for k, v in content.items() if k != "custom_data"}
-    if isinstance(content, list):
-        return [shape_of(content[0])] if content else []
-    return type(content)
-
-
-def test_metadata_is_laid_out_as_rosbags_lays_it_out(bags, tmp_path):
-    with Writer(tmp_path / "peer", version=8, storage_plugin=StoragePlugin.MCAP) as writer:
-        connection = writer.add_connection("/a", "std_msgs/msg/Float64", typestore=STORE)
-        writer.write(connection, 5, b"\0" * 12)
-    ours = yaml.safe_load((bags / "bag" / "metadata.yaml").read_text())
-    peer = yaml.safe_load((tmp_path / "peer" / "metadata.yaml").read_text())
-    assert shape_of(ours) == shape_of(peer)
-    about = ours["rosbag2_bagfile_information"]
-    assert about["storage_identifier"] == "mcap"
-    assert about["relative_file_paths"] == [p.name for p in (bags / "bag").iterdir() if p.suffix != ".yaml"]
 
 
 def test_qualities_of_service_are_read_by_rosbags_as_they_are_meant(bags):

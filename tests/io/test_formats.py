@@ -9,11 +9,9 @@ from test_cli import refused
 from test_run import assert_same, every_column
 from test_tables import few_bytes
 
-import magtwin
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.io.formats import FORMATS, Format, read_run, write_run
-from magtwin.io.outputs import Outputs
 from magtwin.io.tables import ParquetParts
 from magtwin.run.run import Column, Run
 from magtwin.twin import Twin, open_twin, simulate
@@ -54,18 +52,6 @@ def written(run, twin, tmp_path_factory):
         write_run(run, folder / name, twin)
     as_db3(folder / "run.mcap", folder / "run.db3")
     return folder
-
-
-def test_outputs_of_a_run_are_written_in_any_case(tmp_path):
-    outputs = Outputs.of([tmp_path / "a.PARQUET", tmp_path / "b.Rrd"], scans=True)
-    assert [file.name for file in outputs.scans] == ["a.scans.parquet"]
-
-
-def test_a_package_in_place_of_a_run_is_refused_with_what_it_is(tmp_path):
-    package = tmp_path / "my lab.usdz"
-    package.write_bytes(b"PK")
-    with pytest.raises(InputError, match=r"my lab\.usdz: a package; .*\(magtwin export '/.*lab\.usdz' --out"):
-        read_run(package)
 
 
 def assert_carried(run, again):
@@ -229,31 +215,6 @@ def test_info_of_every_format_tells_rows_columns_units_and_what_the_run_came_fro
         assert told["metadata"][fact] == run.metadata[fact]
 
 
-@pytest.fixture
-def shown(monkeypatch):
-    """What the viewer is given, in place of a window."""
-    seen = []
-
-    def show(rrd, *, source=None):
-        from magtwin.io.rerun.file import read_runs
-
-        seen.append(read_runs(rrd))
-
-    for module in ("magtwin.io.rerun.file.show", "magtwin.io.rerun.viewer.show"):
-        monkeypatch.setattr(module, show)
-    monkeypatch.setattr("shutil.which", lambda name: None)
-    return seen
-
-
-@pytest.mark.parametrize("name", ["run.csv", "run.usdc", "run.db3", "run.rrd"])
-def test_view_shows_a_run_of_any_format(name, run, written, shown, capsys):
-    main(["view", str(written / name)])
-    error = capsys.readouterr().err
-    assert "has changed" not in error
-    assert ("shown without a scene" in error) == ("give --allow" in error) == (name == "run.usdc")
-    assert np.array_equal(shown[0]["run"]["b_total_nt"], run["b_total_nt"])
-
-
 def test_a_conversion_without_its_scene_warns_of_what_the_format_lacks(run, tmp_path, monkeypatch, capsys):
     write_run(run.with_metadata(scene_file="gone/lab.usda"), tmp_path / "apart" / "run.parquet")
     monkeypatch.chdir(tmp_path)
@@ -269,19 +230,6 @@ def test_a_conversion_without_its_scene_warns_of_what_the_format_lacks(run, tmp_
         main(["convert", "apart/run.parquet", "apart", "--force"])
     error = [line for line in capsys.readouterr().err.splitlines() if line.startswith("magtwin")]
     assert error == ["magtwin: apart: holds the run, which would be removed with it; give another name"]
-
-
-@pytest.mark.parametrize("suffix", [".mcap", ".parquet"])
-def test_a_run_saves_itself_as_one_file_in_the_format_of_its_suffix(tmp_path, suffix):
-    run = Run({"t": [0.0, 0.5], "b_measured_nt": [41_000.0, 41_001.0]}, {"seed": 3})
-    run.save(tmp_path / f"run{suffix}", **({} if suffix == ".parquet" else {"units": "nT"}))
-    assert [p.name for p in tmp_path.iterdir()] == [f"run{suffix}"]
-    assert (tmp_path / f"run{suffix}").is_file()
-    back = magtwin.load_run(tmp_path / f"run{suffix}")
-    np.testing.assert_array_equal(back["b_measured_nt"], run["b_measured_nt"])
-    assert back.metadata["seed"] == 3
-    with pytest.raises(InputError, match="exists already"):
-        run.save(tmp_path / f"run{suffix}")
 
 
 def test_a_registered_format_is_read_and_written_by_its_suffix(tmp_path, monkeypatch):

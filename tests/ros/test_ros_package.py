@@ -154,19 +154,6 @@ def test_the_package_is_one_of_format_3_and_names_every_package_whose_messages_a
     } <= depends
 
 
-def test_all_that_setup_installs_is_there() -> None:
-    call = next(
-        node.value
-        for node in ast.parse((PACKAGE / "setup.py").read_text()).body
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)
-    )
-    files = next(ast.literal_eval(word.value) for word in call.keywords if word.arg == "data_files")
-    installed = {name for _, names in files for name in names}
-    assert all((PACKAGE / name).is_file() for name in installed)
-    launched = {str(f.relative_to(PACKAGE)) for d in ("launch", "config") for f in (PACKAGE / d).iterdir()}
-    assert {name for name in launched if "__pycache__" not in name} <= installed
-
-
 def test_the_file_of_settings_holds_what_they_are_unless_given() -> None:
     content = yaml.safe_load((PACKAGE / "config" / "magnetometer.yaml").read_text())
     settings = content["/**"]["ros__parameters"]
