@@ -254,7 +254,6 @@ def follow(
     source: Literal["truth", "estimate", "odometry"] = "truth",
     laps: Whole = 1,
     continuous: Flag = False,
-    flip: Flag = False,
     sim_time: SimTime = False,
     commands: Commands = "auto",
     stamps: Stamps = "header",
@@ -275,8 +274,6 @@ def follow(
         Number of times to drive the path; an open path is driven back and forth.
     continuous
         Drive until Ctrl-C.
-    flip
-        Drive the path backwards, from its end to its start.
     """
     from magtwin.path import resolve_path
     from magtwin.ros.follow import Follower
@@ -293,7 +290,6 @@ def follow(
             source=source,
             laps=laps,
             continuous=continuous,
-            flip=flip,
             commands=commands,
             stamps=stamps,
             say=announce,
@@ -304,12 +300,11 @@ def follow(
                 while not node.done:
                     bus.spin_once(0.1)
                     total = None if continuous else laps
-                    advance(node.progress.laps, total, f"{node.progress.rms_m:.3f} m RMS off it")
+                    advance(node.laps, total, f"{node.rms_m:.3f} m RMS off it")
         finally:
             node.stop()
-    done = node.progress
-    text = f"{done.laps} times along {way.name}, {done.rms_m:.3f} m RMS off it"
-    return Done(text=text, data={"path": way.name, "laps": done.laps, "rms_m": done.rms_m})
+    text = f"{node.laps} times along {way.name}, {node.rms_m:.3f} m RMS off it"
+    return Done(text=text, data={"path": way.name, "laps": node.laps, "rms_m": node.rms_m})
 
 
 @ros_app.command(name="record")

@@ -151,8 +151,6 @@ def save_runs(
         text = "other shards may have written there; remove the folder yourself, and drop `force`"
         raise InputError(text, parameter="force")
     parts = _Parts(runs, Path(out), force, at_hand=dask is None)
-    if shard is None:
-        parts.take_back()
     check_free(out, force=force)
     if shard is not None:
         checked_shard(shard)
@@ -205,11 +203,6 @@ class _Parts:
         size = max(1, min(BLOCK, len(runs) // BLOCKS))
         self.blocks = [range(k, min(k + size, len(runs))) for k in range(0, len(runs), size)]
         self.about = {"magtwin": __version__, "sweep": runs.identity, "runs": len(runs)}
-
-    def take_back(self) -> None:
-        """Take up a sweep whose process was killed after it renamed the folder."""
-        if self._about(self.out) == self.about and not self.folder.exists():
-            self.out.rename(self.folder)
 
     def save(self, pool: Any, shard: tuple[int, int] | None, progress: Progress) -> Report:
         """Make the blocks of a shard that are not there yet; rename the folder once all are."""

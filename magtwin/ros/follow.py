@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -48,20 +48,6 @@ STAND_S = 1.0
 """Time for which standing is commanded at the end [s]."""
 
 
-@dataclass(frozen=True)
-class Progress:
-    """Progress of a drive."""
-
-    laps: int
-    """Number of times that the end was reached."""
-
-    off_m: float
-    """Distance from the path at the last step [m]; nan before the path is reached."""
-
-    rms_m: float
-    """RMS distance since the path was reached [m]; nan before."""
-
-
 class MarkerGuide(Guide):
     """A guide by the pose of a marker, which may be up to `MARKER_M` off the robot's centre.
 
@@ -103,7 +89,6 @@ class Follower:
         source: str = "truth",
         laps: int = 1,
         continuous: bool = False,
-        flip: bool = False,
         commands: CommandType = "auto",
         stamps: Stamps = "header",
         say: Callable[[str], None] = lambda text: None,
@@ -120,7 +105,6 @@ class Follower:
             source: A name of `SOURCES`.
             laps: Number of laps; an open path is driven back and forth.
             continuous: Drive without end.
-            flip: Drive from the end to the beginning.
             commands: Message type of the commands, as for `magtwin.ros.commands.Commands`.
             stamps: Whether poses count from the stamps of their headers, or from their arrival.
             say: Called with messages for the user.
@@ -130,8 +114,6 @@ class Follower:
         """
         if laps < 1:
             raise InputError(f"laps must be 1 or more, got {laps}")
-        if flip:
-            path = Path(path.name, path.p_xy[::-1], path.closed)
         self.path, self._drive, self._bus, self._say = path, drive, bus, say
         self._speed, self._controller = speed, controller
         self._wanted = self._left = math.inf if continuous else laps
@@ -146,17 +128,18 @@ class Follower:
         self._state, self._stand_s = "", STAND_S
         self._last = (0.0, 0.0)
         self._begin_ns: int | None = None
-        self._laps, self._squares, self._count, self._off = 0, 0.0, 0, math.nan
+        self.laps, self.off_m = 0, math.nan
+        """How often the end was reached, and the distance from the path at the last step [m]."""
+        self._squares, self._count = 0.0, 0
         self.done = False
         """Whether the end was reached and the robot stands."""
         bus.timer(1 / CONTROL_RATE_HZ, self._step)
         self._node.begin()
 
     @property
-    def progress(self) -> Progress:
-        """Progress of the drive."""
-        rms = math.sqrt(self._squares / self._count) if self._count else math.nan
-        return Progress(self._laps, self._off, rms)
+    def rms_m(self) -> float:
+        """RMS distance since the path was reached [m]; nan before."""
+        return math.sqrt(self._squares / self._count) if self._count else math.nan
 
     def stop(self) -> None:
         """Command the robot to stand; call it before the node ends."""
@@ -196,8 +179,8 @@ class Follower:
         wanted = self._guide.command((now - self._begin_ns) / NS, x, y, yaw, v, w)
         self._command(*wanted)
         if self._guide.node > 0:  # not on the way to the beginning
-            self._off = float(self.path.nearest(np.array([[x, y]]))[1][0])
-            self._squares += self._off**2
+            self.off_m = float(self.path.nearest(np.array([[x, y]]))[1][0])
+            self._squares += self.off_m**2
             self._count += 1
         if self._guide.done:
             self._lap()
@@ -209,7 +192,7 @@ class Follower:
         self.path, self._left = self._begins, self._wanted
         self._guide = self._guided(self.path)
         self._begin_ns, self._stand_s = None, STAND_S
-        self._laps, self._squares, self._count, self._off = 0, 0.0, 0, math.nan
+        self.laps, self.off_m, self._squares, self._count = 0, math.nan, 0.0, 0
 
     def _rejoin(self, x: float, y: float) -> None:
         """Continue where the robot stands now; it coasted before it stood."""
@@ -224,7 +207,7 @@ class Follower:
             guide.node, guide.driven_m = guide.node + int(np.argmin(away)), 0.0
 
     def _lap(self) -> None:
-        self._laps += 1
+        self.laps += 1
         self._left -= 1
         if self._left <= 0:
             self._say("the end is reached")
@@ -246,7 +229,6 @@ class Follower:
             self._say(text)
 
     def _statuses(self, clock: str, now: int) -> list[Status]:
-        at = self.progress
         fares = not clock and (self._guide.done or self._pose.fresh(now) is not None)
         level: Level = "ok" if fares else "error"
         message = clock or ("at the end" if self._guide.done else self._state)
@@ -255,8 +237,8 @@ class Follower:
             message += f"; {others} others command the robot too"
         values = {
             "path": self.path.name,
-            "laps": str(at.laps),
-            "off the path [m]": f"{at.off_m:.3f}",
-            "RMS off the path [m]": f"{at.rms_m:.3f}",
+            "laps": str(self.laps),
+            "off the path [m]": f"{self.off_m:.3f}",
+            "RMS off the path [m]": f"{self.rms_m:.3f}",
         }
         return [Status("drive", level, message, values)]

@@ -132,24 +132,6 @@ def test_a_run_that_cannot_be_made_leaves_nothing(warm, lab_scene, tmp_path, mon
     assert not list(tmp_path.iterdir())
 
 
-def test_a_sweep_that_was_killed_when_its_folder_was_renamed_is_finished(
-    warm, runs, whole, tmp_path, monkeypatch
-):
-    out = tmp_path / "runs"
-    with monkeypatch.context() as killed:
-        killed.setattr(sweeps._Parts, "_tidy", lambda self: chunk_work.refuse(1))
-        with pytest.raises(InputError):
-            save_runs(runs, out, jobs=2)
-    assert {file.name for file in out.iterdir()} > {"sweep.json", "part-00000.json", "runs.csv"}
-    (out / "part-00000.json").unlink()
-    with pytest.raises(InputError, match="exists already"):
-        save_runs(runs, out, shard=(0, 2))
-    save_runs(runs, out, jobs=2)
-    assert files_in(out) == files_in(whole[0])
-    with pytest.raises(InputError, match="exists already"):
-        save_runs(runs, out, jobs=2)
-
-
 def test_an_interrupted_command_is_continued(lab_scene, tmp_path):
     out, parts = tmp_path / "runs", tmp_path / "runs.parts"
     options = ["--count", "30", "--duration-s", "2", "--magnetometer", "physical", "--quiet"]
