@@ -12,7 +12,7 @@ from nodes import DOMAINS, from_message, spin
 
 from magtwin.errors import InputError
 from magtwin.frames import quat_from_yaw, rotate, wrap_angle, yaw_from_quat
-from magtwin.io.bags.topics import CLOCK, COMMAND, MAGNITUDE, ODOMETRY, Qos
+from magtwin.io.bags.topics import CLOCK, COMMAND, MAGNITUDE, ODOMETRY, TF, Qos
 from magtwin.io.bags.types import typestore
 from magtwin.localization.problem import Prior
 from magtwin.localization.track import LocalizerError
@@ -26,7 +26,6 @@ from magtwin.ros.localization.poses import (
     ESTIMATE,
     INITIAL,
     POSE_KIND,
-    TF_KIND,
     cloud_bytes,
     pose_bytes,
     prior_from,
@@ -195,7 +194,7 @@ class Hand:
             list[str](),
         )
         self.robot.subscribe(ESTIMATE, POSE_KIND, self.heard.append, MANY)
-        self.robot.subscribe("/tf", TF_KIND, self.tf.append, MANY)
+        self.robot.subscribe(TF.name, TF.kind, self.tf.append, MANY)
         self.robot.subscribe("/diagnostics", KIND, self.said.append, MANY)
         spin(lambda: self.bus.types(ODOMETRY.name) and self.bus.types(MAGNITUDE.name), self.bus)
         values = settings(PARAMETERS, ("use_sim_time:=true", *told))

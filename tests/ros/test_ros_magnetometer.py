@@ -271,7 +271,7 @@ def test_a_message_that_is_cut_short_is_not_used(world: World) -> None:
     [
         (-3.0, -3.0, "the clock of its sender is 3.0 s behind this machine's: synchronize them (chrony)"),
         (3.0, 3.0, "the clock of its sender is 3.0 s ahead of this machine's: synchronize them (chrony)"),
-        (-3.0, 0.0, "its stamps are 3.0 s behind this node's clock when they are sent: correct them"),
+        (-3.0, 0.0, "its stamps are 3.0 s behind this node's clock when they are sent: correct its driver"),
         (-0.9, -0.9, ""),
     ],
 )

@@ -28,6 +28,8 @@ from magtwin.io.bags.topics import (
     VECTOR,
     Qos,
     Topic,
+    map_to_odom,
+    transform_fields,
 )
 from magtwin.io.bags.unit import unit_of
 from magtwin.localization.localizers import load_localizer
@@ -48,9 +50,7 @@ from magtwin.ros.localization.poses import (
     PATH_KIND,
     POSE_KIND,
     START_SD,
-    TF_KIND,
     cloud_bytes,
-    odom_bytes,
     pose_bytes,
     prior_from,
 )
@@ -152,8 +152,8 @@ class LocalizerNode:
         self._path = bus.publisher(PATH, PATH_KIND, Qos(depth=1))
         self._trail = Trail()
         self._tf = None
-        if settings["tf_broadcast"] and bus.knows(TF_KIND):
-            self._tf = bus.publisher(TF.name, TF_KIND, TF.qos)
+        if settings["tf_broadcast"] and bus.knows(TF.kind):
+            self._tf = bus.publisher(TF.name, TF.kind, TF.qos)
         bus.subscribe(INITIAL, POSE_KIND, self._start_at, Qos().heard)
         self._algorithm: Localizer | None = None
         self._tick0, self._done = 0.0, 0
@@ -287,9 +287,10 @@ class LocalizerNode:
         self.latencies_s.append(time.monotonic() - arrived)
         if self._tf is not None:
             valid_ns = stamp_ns + round(self._settings["tf_ahead_s"] * NS)
-            frames = (frame, self._sender.odom_frame)
-            p, q = odometry["odom_p"][0], odometry["odom_q_xyzw"][0]
-            self._tf.publish(odom_bytes(valid_ns, frames, estimate, p, q))
+            at = np.array([estimate.x, estimate.y, 0.0]), quat_from_yaw(estimate.yaw)
+            moved = map_to_odom(*at, odometry["odom_p"][0], odometry["odom_q_xyzw"][0])
+            fields = transform_fields(valid_ns, [(frame, self._sender.odom_frame, *moved)])
+            self._tf.publish(to_bytes(TF.kind, fields))
         self._publish_path(stamp_ns, pose)
         self._publish_cloud(stamp_ns, algorithm)
 
