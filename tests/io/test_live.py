@@ -74,18 +74,6 @@ def test_a_viewer_that_does_not_answer_costs_no_output(lab_scene, tmp_path, caps
     assert np.array_equal(read_run(tmp_path / "out" / "run.rrd")["b_total_nt"], table["b_total_nt"])
 
 
-@pytest.fixture
-def drawable():
-    """Skips where nothing can be drawn."""
-    try:
-        with live_viewer(headless=True):
-            pass
-    except InputError as error:
-        if "cannot draw here" not in str(error):
-            raise
-        pytest.skip(str(error))
-
-
 @pytest.mark.usefixtures("drawable")
 def test_a_viewer_gets_the_run_in_step_with_the_clock(run, twin):
     told = []

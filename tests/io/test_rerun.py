@@ -370,40 +370,6 @@ def test_a_recording_that_was_cut_short_or_is_none_is_refused_in_a_line(written,
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="a limit on file sizes is of POSIX")
-def test_a_full_disk_is_said_in_a_line_and_earlier_files_stay(parts, tmp_path):
-    from magtwin.io.tables import write_parquet
-
-    run, _ = parts
-    write_parquet(run, tmp_path / "run.parquet")
-    (tmp_path / "run.rrd").write_text("mine")
-    script = """
-import resource, signal, sys
-from magtwin.io.rerun.file import write_rrd
-from magtwin.io.rerun import recording
-from magtwin.io.tables import read_parquet
-from magtwin.errors import InputError
-
-run = read_parquet("run.parquet")
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-for limit in (1000, 100_000, int(sys.argv[1])):
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
-    try:
-        write_rrd(run, "run.rrd", force=True)
-    except InputError as error:
-        print(error)
-"""
-    write_rrd(run, tmp_path / "size.rrd")
-    just = (tmp_path / "size.rrd").stat().st_size - 1000  # so that only its end does not fit
-    command = [sys.executable, "-c", script, str(just)]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    lines = done.stdout.splitlines()
-    assert len(lines) == 3
-    assert all(line.startswith("run.rrd: cannot be written") for line in lines)
-    assert (tmp_path / "run.rrd").read_text() == "mine"
-    assert {path.name for path in tmp_path.iterdir()} == {"run.parquet", "run.rrd", "size.rrd"}
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="a limit on file sizes is of POSIX")
 def test_a_disk_that_fills_while_rerun_writes_ends_in_a_line(parts, tmp_path):
     from magtwin.io.tables import write_parquet
 
@@ -464,18 +430,6 @@ def test_a_run_from_any_file_is_shown_as_series_and_one_without_plotted_columns_
     bare = Run({"t": np.arange(3.0), "est_bias_nt": np.zeros(3)})
     with pytest.raises(InputError, match=r"run\.parquet: holds none of the columns that are plotted, such"):
         show_run(bare, file="run.parquet")
-
-
-@pytest.fixture
-def drawable():
-    """Skips where nothing can be drawn."""
-    try:
-        with live_viewer(headless=True):
-            pass
-    except InputError as error:
-        if "cannot draw here" not in str(error):
-            raise
-        pytest.skip(str(error))
 
 
 @pytest.mark.usefixtures("drawable")
