@@ -347,6 +347,7 @@ def test_a_recording_that_did_not_end_is_read_up_to_its_last_flush(bags, tmp_pat
     assert_array_equal(read_bag(writer.partial)["t"], read_bag(bags / "run.mcap")["t"])
     with pytest.raises(InputError, match="left by a recording that did not end"):
         RawBagWriter(tmp_path / name)
+    writer.close()
 
 
 @pytest.mark.parametrize("keep", [0.3, 0.97])
