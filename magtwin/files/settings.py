@@ -215,6 +215,8 @@ class _Where:
 
     def _header(self, lines: Sequence[str]) -> int:
         """Line of the table's header, from 1; 0 if it has none."""
+        if not self.section:
+            return 0
         begin = self.parent._header(lines) if self.parent is not None else 0
         same = [n for n, line in enumerate(lines, 1) if n > begin and _header_of(line) == self.section]
         return same[self.number] if len(same) > self.number else 0
