@@ -197,7 +197,8 @@ def drives_job(asset: Path, report, floats: bool) -> dict:
     """Room, bodies and driven joints of a stage, for an engine that reads none of them itself."""
     from pxr import Usd, UsdGeom, UsdPhysics
 
-    from magtwin.export.validation.physx_drive import room_text
+    sys.path.insert(0, str(Path(__file__).parents[1] / "physx"))
+    from physx_drive import room_text
     from magtwin.usd.geometry import read_triangles
 
     stage = Usd.Stage.Open(str(asset))

@@ -1,8 +1,8 @@
 """Validate a file with every validator.
 
 `core` are OpenUSD's own validators, `nvidia` is usd-validation-nvidia, `simready` are SimReady's profiles,
-`isaac` are Isaac Sim's rules and those of `isaac_rules`, `newton` loads the file in Newton, `physx` drives
-its robots in PhysX, `magtwin` are the rules of `rules`. `rule` explains how to add a rule.
+`isaac` are Isaac Sim's rules and those of `isaac_rules`, `magtwin` are the rules of `rules`. `rule` explains
+how to add a rule.
 """
 
 import os
@@ -16,12 +16,11 @@ from magtwin.export.usdz import unpack
 from magtwin.export.validation.findings import Check, Findings
 from magtwin.export.validation.inspection import Inspection, inspect
 from magtwin.export.validation.isaac_sim import isaac
-from magtwin.export.validation.physx_drive import physx
-from magtwin.export.validation.validators import newton, nvidia, simready
+from magtwin.export.validation.validators import nvidia, simready
 from magtwin.files.file import existing
 from magtwin.files.kinds import expected
 
-AGAINST = ("core", "nvidia", "simready", "isaac", "newton", "physx", "magtwin")
+AGAINST = ("core", "nvidia", "simready", "isaac", "magtwin")
 """Validators, in the order of the results."""
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
@@ -74,8 +73,6 @@ def validate(
             ("nvidia", lambda: [nvidia(file)]),
             ("simready", lambda: simready(seen.robots, packed=root is not None)),
             ("isaac", lambda: [isaac(root or file, seen.robots, home=home, package=file), *checks["isaac"]]),
-            ("newton", lambda: [newton(root or file, seen.bodies)]),
-            ("physx", lambda: [physx(root or file, seen.driven)]),
         ):
             if name in wanted:
                 say(name)
