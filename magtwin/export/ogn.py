@@ -41,26 +41,20 @@ class NodeType:
     tokens: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Allowed values of an input that is a choice."""
 
-    source: str = ""
-    """Source of the definition: version and file."""
-
 
 @cache
 def node_types() -> dict[str, NodeType]:
     """Every known type of node by its name."""
-    table, types = _table(), {}
-    for name, given in table["nodes"].items():
-        source = table["sources"][given["source"]]
-        at = f" at {source['commit']}" if "commit" in source else ""
-        types[name] = NodeType(
+    return {
+        name: NodeType(
             name=name,
             version=given["version"],
             inputs=_kinds(given.get("inputs", {})),
             outputs=_kinds(given.get("outputs", {})),
             tokens={key: tuple(values) for key, values in given.get("tokens", {}).items()},
-            source=f"{source['name']} {source['version']}, {source['repository']}{at}: {given['file']}",
         )
-    return types
+        for name, given in _table()["nodes"].items()
+    }
 
 
 @cache

@@ -93,8 +93,6 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
     importlib.import_module("magtwin.usd")  # registers the schemas before USD is first used
     from pxr import Tf, Usd, UsdUtils
 
-    from magtwin.export.attached import detach
-
     importlib.import_module("magtwin.export.validation.isaac_rules")  # fills RULES
     from magtwin.export.validation.rule import RULES, TITLES, Subject
     from magtwin.export.validation.rules import robot_assets
@@ -105,12 +103,6 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's messages off the terminal
     checks: list[Check] = []
     try:
-        lost: list[Finding] = []
-        if packed is not None:
-            try:
-                detach(root)
-            except InputError as error:
-                lost.append(Finding("attached", str(error), advice="export the package anew"))
         stage = Usd.Stage.Open(str(root))
         if stage is None:
             raise InputError(f"{file}: cannot be opened as USD; it is damaged, cut short, or not USD")
@@ -124,7 +116,6 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
         for name, rules in RULES.items():
             if name in job["against"]:
                 found = [finding for rule in rules.values() for finding in rule.findings(subject)]
-                found += lost if name == "magtwin" else []
                 checks.append(Check(TITLES[name], tuple(found), scope=f"{len(rules)} rules"))
         assets = robot_assets(subject)
     except (Tf.ErrorException, UnicodeError, MemoryError) as error:

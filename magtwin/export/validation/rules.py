@@ -14,7 +14,6 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
-from magtwin.export.attached import attached_sha256
 from magtwin.export.contents import named_files, weights_metadata
 from magtwin.export.validation.findings import Severity
 from magtwin.export.validation.rule import Subject, Wrong, rule, wrong_of
@@ -231,15 +230,10 @@ def network_file(subject: Subject) -> Iterator[Wrong]:
         spec, where = read_magnetometer(prim), str(prim.GetPath())
         if spec.kind != "neural":
             continue
-        attached, file = attached_sha256(prim.GetAttribute(NETWORK)), spec.network
-        said = f"{spec.network_sha256[:12]}..."
-        if file is None and attached:  # in a layer that brings its network as bytes
-            if attached != spec.network_sha256.lower():
-                text = f"its attached network has SHA-256 {attached[:12]}..., it names {said}"
-                yield Wrong(text, where, "export the layer anew")
-        elif file is None and spec.network_sha256:
+        file, said = spec.network, f"{spec.network_sha256[:12]}..."
+        if file is None and spec.network_sha256:  # as in a package
             text = f"keeps the checksum {said} of a network that it does not name"
-            yield Wrong(text, where, "name it again to read this magnetometer", "warning")
+            yield Wrong(text, where, "give it to magtwin run --network", "note")
         elif file is None:
             yield Wrong("is neural and names no network", where)
         elif not file.is_file():
