@@ -1,7 +1,7 @@
 """Drive the robots of a stage in NVIDIA's PhysX: whether they stand, drive a metre and turn.
 
-PhysX runs in another process, of another Python: `make physx` makes an environment for it, and `MAGTWIN_PHYSX`
-is the path of its Python.
+PhysX runs in another process, of another Python: `make physx` makes an environment for it, and
+`MAGTWIN_PHYSX` is the path of its Python.
 """
 
 import math
@@ -13,19 +13,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from physx_robots import AHEAD_M, driven_table
+from pxr import Usd
+
 from magtwin.errors import InputError
 from magtwin.export.validation.findings import Check, Finding
 from magtwin.files.children import run
 from magtwin.sim.engines.world_process import WorldProcess
-from physx_robots import AHEAD_M, driven_table
-from pxr import Usd
 
 PHYSX = "MAGTWIN_PHYSX"
 """Environment variable with the path of a Python that has ovphysx."""
 
-GET_PHYSX = (
-    f"ovphysx is not installed; `make physx` installs it in build/physx, and {PHYSX} is the path of its Python"
-)
+GET_PHYSX = f"ovphysx is not installed; `make physx` installs it, {PHYSX} is the path of its Python"
 
 OTHER_PYTHON = {"PYTHONPATH": None}
 """What differs in the environment of a Python that need not be this one."""

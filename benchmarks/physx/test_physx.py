@@ -8,13 +8,13 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+import physx_drive
 import pytest
 from physx_drive import STEP_S, find_python, open_world
 from physx_drive import physx as driven_in_physx
 from physx_robots import driven_table, find_room, read_driven
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
-import physx_drive
 from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
 from magtwin.export.package import export_scene

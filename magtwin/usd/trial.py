@@ -62,14 +62,14 @@ class _Trial:
             "values": VALUES,
             "prims": BUDGETS["USD"].count,
         }
-        key = key_of(job, PROGRAM)
+        file, key = str(path.absolute()), key_of(job, PROGRAM)
         with self._lock:
             if self._owner != os.getpid():
                 self._child, self._owner = None, os.getpid()
             met = self._passed.get(key)
             if met is not None and all(stamp_of(name) == stamp for name, stamp in met.items()):
                 return
-            met = recall(key, job["file"])
+            met = recall(key, file)
             if met is None:
                 begun = time.time()
                 met = self._ask(path, job)

@@ -8,15 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
-from pxr import Gf, Sdf, Usd, UsdGeom
+from numpy.testing import assert_allclose
+from pxr import Gf, Usd, UsdGeom
 from test_run import assert_same, every_column
 from validators import assert_valid
 
 from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
 from magtwin.frames import rotate
-from magtwin.run import mapped
 from magtwin.run.run import COLUMNS, Column, Run
 from magtwin.spec.robot import PlacedRobot
 from magtwin.twin import open_twin, simulate
@@ -151,75 +150,6 @@ def test_a_recording_without_the_truth_is_played_by_motion_capture(run, lab_scen
     samples = stage.GetPrimAtPath("/World/turtlebot4").GetAttribute("xformOp:translate").GetTimeSamples()
     assert samples[0] == np.ceil(kept["t"][100] * 30)
     assert_same(read_animation(tmp_path / "run.usdc"), kept)
-
-
-@pytest.fixture
-def clipped(run, lab_scene, tmp_path, monkeypatch):
-    """The run as a long one, in clips."""
-    monkeypatch.setattr(mapped, "LONG", 500)
-    monkeypatch.setattr(mapped, "BLOCK", 192)
-    write_animation(run, tmp_path / "run.usdc", lab_scene)
-    return tmp_path / "run.usdc"
-
-
-def test_a_long_run_plays_from_clips_as_from_one_layer(run, played, clipped, tmp_path):
-    clips = sorted(file.name for file in (tmp_path / "run.usdc.clips").iterdir())
-    assert clips == [*(f"clip_{k:05d}.usdc" for k in range(5)), "manifest.usda"]
-    assert_same(read_animation(clipped), run)
-    whole, parts = Usd.Stage.Open(str(played)), Usd.Stage.Open(str(clipped))
-    assert parts.GetEndTimeCode() == whole.GetEndTimeCode()
-    compared = 0
-    for prim in whole.Traverse():
-        for attribute in prim.GetAttributes():
-            if attribute.GetNumTimeSamples():
-                other, compared = parts.GetAttributeAtPath(attribute.GetPath()), compared + 1
-                codes = attribute.GetTimeSamples()
-                assert set(codes) <= set(other.GetTimeSamples())
-                for code in (*codes[::7], *np.arange(0.3, 180, 3.1).tolist()):
-                    wanted, value = attribute.Get(code), other.Get(code)
-                    if isinstance(wanted, Gf.Quatd):
-                        wanted, value = ((*q.GetImaginary(), q.GetReal()) for q in (wanted, value))
-                    assert_allclose(value, wanted, rtol=1e-14, atol=1e-14)
-    assert compared > 12
-    column = parts.GetPrimAtPath("/World/Run").GetAttribute("magtwin:run:b_total_nt")
-    starts = run["t"][::192] * 30
-    assert_array_equal(np.concatenate([column.Get(code) for code in starts]), run["b_total_nt"])
-
-
-def test_the_validators_find_nothing_in_clips(clipped, tmp_path):
-    assert_valid(clipped, tmp_path)
-
-
-def test_clips_that_are_missing_damaged_or_outside_are_refused(run, clipped, tmp_path):
-    clip = tmp_path / "run.usdc.clips" / "clip_00002.usdc"
-    content = clip.read_bytes()
-    clip.write_bytes(content[:2000])
-    with pytest.raises(InputError, match=r"clip_00002\.usdc: cannot be opened as USD"):
-        read_animation(clipped)
-    clip.write_bytes((tmp_path / "run.usdc.clips" / "clip_00004.usdc").read_bytes())  # of another length
-    with pytest.raises(InputError, match=r"not a Run|must ascend"):
-        read_animation(clipped)
-    clip.rename(tmp_path.parent / "clip.usdc")
-    with pytest.raises(InputError, match=r"no such USD file"):
-        read_animation(clipped)
-    layer = Sdf.Layer.FindOrOpen(str(clipped))
-    clips = layer.GetPrimAtPath("/World").GetInfo("clips")
-    clips["default"]["assetPaths"] = Sdf.AssetPathArray([Sdf.AssetPath("../clip.usdc")])
-    layer.GetPrimAtPath("/World").SetInfo("clips", clips)
-    layer.Save()
-    with pytest.raises(InputError, match=r"clip\.usdc, outside the stage's folder"):
-        read_animation(clipped)
-
-
-def test_clips_are_replaced_with_their_layer(run, clipped, lab_scene, tmp_path):
-    with pytest.raises(InputError, match="exists already"):
-        write_animation(run, clipped, lab_scene)
-    write_animation(run.take(slice(600)), clipped, lab_scene, force=True)
-    assert len(list((tmp_path / "run.usdc.clips").iterdir())) == 5
-    assert read_animation(clipped).rows == 600
-    write_animation(run.take(slice(90)), clipped, lab_scene, force=True)
-    assert [file.name for file in tmp_path.iterdir()] == ["run.usdc"]
-    assert read_animation(clipped).rows == 90
 
 
 def test_the_validators_find_nothing(played, tmp_path):

@@ -1,4 +1,4 @@
-"""A stage that passed its trial costs nothing in the next command; a changed or hostile one is tried again."""
+"""A stage that passed its trial costs nothing in the next command; a changed one is tried again."""
 
 import json
 import os
@@ -81,7 +81,9 @@ def test_what_was_written_just_now_and_refusals_are_not_remembered(stage, tmp_pa
     assert not (tmp_path / "cache").exists()
 
 
-@pytest.mark.parametrize("damage", ["", "{}", "[]", "null", '{"FILE": null}', '{"FILE": [1, 2]}', "\x80", "[" * 9999])
+@pytest.mark.parametrize(
+    "damage", ["", "{}", "[]", "null", '{"FILE": null}', '{"FILE": [1, 2]}', "\x80", "[" * 9999]
+)
 def test_a_damaged_memory_is_ignored(damage, stage, tmp_path):
     assert tries(stage)
     (file,) = (tmp_path / "cache" / "magtwin" / "trials").iterdir()

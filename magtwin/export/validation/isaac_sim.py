@@ -1,8 +1,8 @@
 """Isaac Sim's own rules for assets, the extension `isaacsim.asset.validation`, run on usd-core.
 
-magtwin does not ship them: `magtwin fetch isaac-rules` makes a copy. They are code of another project, so each
-file is compared with its SHA-256 before it is run, in a separate process with a time limit, from a temporary
-folder that holds nothing else.
+magtwin does not ship them: `magtwin fetch isaac-rules` makes a copy. They are code of another project, so
+each file is compared with its SHA-256 before it is run, in a separate process with a time limit, from a
+temporary folder that holds nothing else.
 """
 
 import hashlib
