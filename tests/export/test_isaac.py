@@ -1,10 +1,6 @@
 """Isaac Sim: the Action Graph has what its nodes' definitions have, and what magtwin's ROS 2 topics are."""
 
-import json
-import os
-import re
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from pxr import Sdf, Usd, UsdPhysics, UsdShade
@@ -12,7 +8,7 @@ from pxr import Sdf, Usd, UsdPhysics, UsdShade
 from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
 from magtwin.export.isaac import GRAPHS, author_graph
-from magtwin.export.ogn import Graph, faults, fits, message_fields, node_types
+from magtwin.export.ogn import Graph, message_fields, node_types
 from magtwin.io.bags.sender import sender_of
 from magtwin.io.bags.topics import SCAN, TOPICS
 from magtwin.io.bags.types import layout
@@ -28,6 +24,17 @@ USD_TYPES = {
     "quatd[4]": "quatd",
 }
 """OmniGraph's types that USD calls otherwise."""
+
+ROLES = {"vectord[3]": "double[3]", "quatd[4]": "double[4]"}
+"""Roles that OmniGraph treats as plain tuples."""
+
+
+def fits(given, taken):
+    """Whether an output of one kind may be connected to an input of another; one of several must fit."""
+    sides = [
+        {ROLES.get(k, k) for k in ((kind,) if isinstance(kind, str) else kind)} for kind in (given, taken)
+    ]
+    return bool(sides[0] & sides[1])
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +76,6 @@ def test_every_node_input_and_output_is_one_of_its_definition_and_of_its_type(au
         assert prim.GetTypeName() == "OmniGraphNode"
         known = node_types()[prim.GetAttribute("node:type").Get()]
         assert prim.GetAttribute("node:typeVersion").Get() == known.version
-        assert known.source
         for prop in ports(prim):
             kind = kind_of(prop)
             if kind == "target":
@@ -313,83 +319,6 @@ def test_what_is_no_robot_to_isaac_is_refused_with_what_to_do(lab_scene):
     with pytest.raises(InputError, match="robotLinks lists none"):
         author_graph(stage, scene)
     assert not stage.GetPrimAtPath(GRAPHS)
-
-
-@pytest.mark.parametrize(
-    ("given", "taken", "yes"),
-    [
-        ("vectord[3]", ("double[3]", "float[3]"), True),
-        ("quatd[4]", ("double[4]",), True),
-        (("double", "double[]"), "double", True),
-        ("double", "double[]", False),
-        ("vectord[3]", "vectorf[3]", False),
-        ("int", "uint", False),
-        ("quatd[4]", "vectord[3]", False),
-        ("execution", "uint", False),
-    ],
-)
-def test_types_go_together_where_base_tuple_and_array_are_the_same(given, taken, yes):
-    assert fits(given, taken) is yes
-
-
-@pytest.mark.skipif(
-    "MAGTWIN_ISAACSIM" not in os.environ, reason="MAGTWIN_ISAACSIM names no checkout of isaac-sim/IsaacSim"
-)
-def test_the_table_is_what_a_checkout_of_isaac_sim_says():
-    count = 0
-    for known in node_types().values():
-        file = Path(os.environ["MAGTWIN_ISAACSIM"], known.source.split(": ")[-1])
-        if file.suffix != ".ogn":
-            continue
-        ((name, said),) = json.loads(file.read_text()).items()
-        assert known.name in (name, f"{file.parts[file.parts.index('extensions') + 1]}.{name}")
-        assert known.version == said["version"]
-        for mine, its in ((known.inputs, said.get("inputs", {})), (known.outputs, said.get("outputs", {}))):
-            kinds = {key: value["type"] for key, value in its.items()}
-            assert mine == {k: v if isinstance(v, str) else tuple(v) for k, v in kinds.items()}, known.name
-        for key, values in known.tokens.items():
-            assert set(values) == set(said["inputs"][key]["metadata"]["allowedTokens"].values())
-        count += 1
-    assert count == 20
-
-
-@pytest.mark.parametrize(
-    ("text", "what"),
-    [
-        ("int node:typeVersion = 7", "is version 7 of isaacsim.ros2.bridge.ROS2PublishClock, not 1"),
-        ('string inputs:topic = "/clock"', "has no inputs:topic; did you mean 'inputs:topicName'?"),
-        ("float inputs:timeStamp = 0", "inputs:timeStamp is a float, .* has a double"),
-        ("uint inputs:execIn.connect = </G/tick.outputs:time>", "execIn takes execution, .* is double"),
-        ("uint inputs:execIn.connect = </G/tick.inputs:tick>", "which is no output"),
-        ("uint inputs:execIn.connect = </G/tock.outputs:tick>", "which is on no node"),
-    ],
-)
-def test_a_graph_that_others_edited_is_held_against_the_definitions_too(text, what):
-    version = "" if "typeVersion" in text else "int node:typeVersion = 1"
-    layer = Sdf.Layer.CreateAnonymous(".usda")
-    layer.ImportFromString(
-        '#usda 1.0\ndef OmniGraph "G" {\n'
-        'def OmniGraphNode "tick" { token node:type = "omni.graph.action.OnPlaybackTick"\n'
-        "int node:typeVersion = 2\n }\n"
-        'def OmniGraphNode "clock" { token node:type = "isaacsim.ros2.bridge.ROS2PublishClock"\n'
-        f"{version}\n{text}\n }}\n}}\n"
-    )
-    stage = Usd.Stage.Open(layer)
-    assert not faults(stage.GetPrimAtPath("/G/tick"))
-    (said,) = faults(stage.GetPrimAtPath("/G/clock"))
-    assert re.search(what, said)
-
-
-def test_no_node_of_the_authored_graph_has_a_fault(authored):
-    _, _, graph = authored
-    assert not [text for prim in graph.GetChildren() for text in faults(prim)]
-
-
-def test_a_value_that_an_input_does_not_allow_is_a_fault():
-    graph = Graph(stage := Usd.Stage.CreateInMemory(), Sdf.Path("/Graph"))
-    assert stage
-    node = graph.node("scan", "isaacsim.ros2.bridge.ROS2RtxLidarHelper", type="laserscan")
-    assert faults(node) == ["inputs:type cannot be 'laserscan'; did you mean 'laser_scan'?"]
 
 
 def test_a_graph_takes_no_path_of_another_prim():

@@ -1,23 +1,19 @@
-"""Rules for what goes to Isaac Sim that its own rules, see `isaac_sim`, leave out: graphs, sensors, lists.
+"""Rules for what goes to Isaac Sim that its own rules, see `isaac_sim`, and OpenUSD leave out.
 
-They follow its pages "Asset Structure" and "Robot Schema", and its node definitions.
+They follow its pages "Asset Structure" and "Robot Schema".
 """
 
 import math
 from collections.abc import Iterator
 
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
-from magtwin.export.ogn import faults, ports
 from magtwin.export.validation.rule import Subject, Wrong, rule
 from magtwin.export.validation.rules import applied
 from magtwin.usd.sensors import IMU_TYPE, LIDAR_API, LIDAR_TYPE
 
 ROBOT_API, LINK_API, JOINT_API = "IsaacRobotAPI", "IsaacLinkAPI", "IsaacJointAPI"
 LINKS, JOINTS = "isaac:physics:robotLinks", "isaac:physics:robotJoints"
-
-GRAPH, NODE = "OmniGraph", "OmniGraphNode"
-"""Types of the prims of an Action Graph."""
 
 LEAST_SCAN_HZ = 0.466
 """Least turns a second whose period a 32-bit number of nanoseconds holds (SimReady LI.003)."""
@@ -65,24 +61,6 @@ def robot_lists(subject: Subject) -> Iterator[Wrong]:
                 yield Wrong(f"{_few(bare)} lack {api}", where)
 
 
-@rule("isaac", "point body0 and body1 to rigid bodies, or body0 to the robot for the world")
-def joint_bodies(subject: Subject) -> Iterator[Wrong]:
-    """Every joint connects a rigid body to another one or to the world."""
-    for prim in subject.prims:
-        if not prim.IsA(UsdPhysics.Joint):
-            continue
-        joint, where, held = UsdPhysics.Joint(prim), str(prim.GetPath()), 0
-        for name, relationship in (("body0", joint.GetBody0Rel()), ("body1", joint.GetBody1Rel())):
-            for path in relationship.GetTargets():
-                end = subject.stage.GetPrimAtPath(path)
-                if end and end.HasAPI(UsdPhysics.RigidBodyAPI):
-                    held += 1
-                elif end and name == "body1":
-                    yield Wrong(f"{name} <{path}> is no rigid body", where)
-        if not held:
-            yield Wrong("holds no rigid body", where)
-
-
 @rule("isaac", "give it a finite force; with zero gains the joint stays free")
 def joint_drives(subject: Subject) -> Iterator[Wrong]:
     """Every drive of a joint has a finite maximum force above 0."""
@@ -107,21 +85,6 @@ def collider_shapes(subject: Subject) -> Iterator[Wrong]:
             kind = mesh.GetApproximationAttr().Get() if prim.HasAPI(UsdPhysics.MeshCollisionAPI) else "none"
             if kind == UsdPhysics.Tokens.none:
                 yield Wrong("is a triangle mesh that moves", str(prim.GetPath()))
-
-
-@rule("isaac", "apply the scale to the shapes below")
-def rigid_scale(subject: Subject) -> Iterator[Wrong]:
-    """No rigid body is scaled, and none is inside another."""
-    cache = UsdGeom.XformCache()
-    bodies = {prim.GetPath() for prim in subject.prims if prim.HasAPI(UsdPhysics.RigidBodyAPI)}
-    for path in sorted(bodies):
-        prim = subject.stage.GetPrimAtPath(path)
-        scale = Gf.Transform(cache.GetLocalToWorldTransform(prim)).GetScale()
-        if not Gf.IsClose(scale, Gf.Vec3d(1), 1e-6):
-            yield Wrong(f"is scaled by {scale[0]:g}, {scale[1]:g}, {scale[2]:g}", str(path))
-        above = next((p for p in path.GetAncestorsRange() if p != path and p in bodies), None)
-        if above and not UsdGeom.Xformable(prim).GetResetXformStack():
-            yield Wrong(f"lies in the rigid body <{above}>", str(path), "let bodies lie side by side")
 
 
 @rule("isaac", "magtwin robot and magtwin export author these")
@@ -172,33 +135,6 @@ def physics_scene(subject: Subject) -> Iterator[Wrong]:
         direction = Gf.Vec3d(UsdPhysics.Scene(prim).GetGravityDirectionAttr().Get() or (0, 0, 0))
         if direction.GetLength() and not Gf.IsClose(direction.GetNormalized(), Gf.Vec3d(0, 0, -1), 1e-6):
             yield Wrong(f"pulls along {tuple(direction)}", str(prim.GetPath()))
-
-
-@rule("isaac", "bind a material to it, or to a prim above it")
-def materials(subject: Subject) -> Iterator[Wrong]:
-    """Every visible shape has a material."""
-    for prim in subject.stage.Traverse(Usd.TraverseInstanceProxies()):
-        if not prim.IsA(UsdGeom.Gprim) or UsdGeom.Imageable(prim).ComputePurpose() == UsdGeom.Tokens.guide:
-            continue
-        subsets = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
-        bound, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
-        if not bound and not subsets:
-            yield Wrong("wears no material", str(prim.GetPath()), severity="warning")
-
-
-@rule("isaac", "author it with magtwin export --target isaac")
-def action_graph(subject: Subject) -> Iterator[Wrong]:
-    """Every node of an Action Graph matches its definition, and its connections fit."""
-    for prim in subject.prims:
-        if prim.GetTypeName() != NODE:
-            continue
-        where, kind = str(prim.GetPath()), prim.GetAttribute("node:type").Get()
-        if prim.GetParent().GetTypeName() != GRAPH:
-            yield Wrong(f"is in no {GRAPH}", where)
-        if ports(prim) is None:
-            yield Wrong(f"is of the type {kind!r}, of which nothing is known here", where, severity="warning")
-        for text in faults(prim):
-            yield Wrong(text, where)
 
 
 def _few(paths: list[Sdf.Path]) -> str:

@@ -201,7 +201,7 @@ def _advice(root: Usd.Prim, noun: str) -> str:
     file = root.GetStage().GetRootLayer().realPath
     if not root.IsPseudoRoot() or prims_with(root, noun) or not file:
         return ""
-    if noun in ("lab", "robot", "earthField") and prims_with(root, "anomalyMap"):
+    if noun in ("lab", "robot", "earth") and prims_with(root, "anomalyMap"):
         return (
             f"; it is a map without a scene: magtwin map info {file}, or name it as `map` in a scene's TOML"
         )
