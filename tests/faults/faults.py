@@ -176,15 +176,6 @@ class Trial:
             self.result.notes.append(f"bytes vary: {', '.join(sorted(self.varies))}")
         for file in sorted(trace.unsynced):
             self._fault("alone", 0, f"{file}: renamed before it was on the disk")
-        missed = [
-            name
-            for name, what in self.new.items()
-            if what != "folder"
-            and self.before.get(name) != what
-            and trace.written[str(self.folder / name)] < (self.folder / name).stat().st_size
-        ]
-        if missed:
-            self.result.notes.append(f"writes not seen: {', '.join(missed)}")
         return trace
 
     def attempt(self, mode: int, at: int, *, older: bool) -> None:
@@ -378,30 +369,12 @@ def chosen(numbers: list[int], count: int, rng: random.Random) -> list[int]:
     return sorted({*last, *rng.sample(numbers[: len(numbers) - len(last)], count - len(last))})
 
 
-def thinned(trace: Trace, most: int, rng: random.Random) -> list[int]:
-    """Calls that may fill the disk: of more than `most` alike, the first and last thirds of it and some."""
-    alike: dict[tuple[str, str], list[int]] = {}
-    for call in trace.calls:
-        if call.kind != "remove":
-            alike.setdefault((call.kind, call.path), []).append(call.number)
-    kept = set[int]()
-    for numbers in alike.values():
-        ends = {*numbers[: max(1, most // 3)], *numbers[-max(1, most // 3) :]}
-        rest = [number for number in numbers if number not in ends]
-        few = len(numbers) <= most
-        kept |= {*numbers} if few else ends | {*rng.sample(rest, min(len(rest), most - len(ends)))}
-    return sorted(kept)
-
-
 def main() -> int:
     """Try commands; returns 1 if there are faults."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("commands", nargs="*", help="names of commands; default: all")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--full", type=int, default=150, help="most full disks per command")
-    parser.add_argument(
-        "--same", type=int, default=1000, help="most full disks at calls alike: of a kind, on a file"
-    )
     parser.add_argument("--kills", type=int, default=10, help="most kills per command")
     parser.add_argument("--inputs", type=Path, default=None, help="folder of inputs to keep")
     parser.add_argument("--json", type=Path, default=None, help="results to write")
@@ -432,7 +405,7 @@ def main() -> int:
             results.append({"command": command.name, "faults": [str(error)]})
             print(f"  FAULT {error}", flush=True)
             continue
-        for at in chosen(thinned(trace, given.same, rng), given.full, rng):
+        for at in chosen(trace.at(), given.full, rng):
             trial.attempt(FULL, at, older=True)
         every = [call.number for call in trace.calls]
         for index, at in enumerate(chosen(every, given.kills, rng)):

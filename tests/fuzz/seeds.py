@@ -9,7 +9,6 @@ import importlib
 import io
 import json
 import shutil
-import sqlite3
 import sys
 import types
 import zipfile
@@ -859,12 +858,11 @@ def read(kind: str, data: bytes, beside: Mapping[str, bytes], folder: Path) -> N
 def members(data: bytes, sound: bool) -> tuple[list[bytes], Callable[[int, bytes], bytes]] | None:
     """Parts of a container that a change of its bytes would not reach, and how to replace one.
 
-    Members of zips, the JSON of safetensors and GLB, columns and metadata of Parquet files, arrays of MATLAB
-    files, and blobs of SQLite files; checksums and lengths are then right. The last three only if `sound`.
+    Members of zips, the JSON of safetensors and GLB, and columns and metadata of Parquet files if `sound`;
+    checksums and lengths are then right.
     """
-    for begin, parts_of in ((b"PAR1", _columns), (b"MATLAB", _arrays), (b"SQLite", _blobs)):
-        if data.startswith(begin):
-            return parts_of(data) if sound else None
+    if data.startswith(b"PAR1"):
+        return _columns(data) if sound else None
     if data[:4] == b"PK\x03\x04":
         try:
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -941,47 +939,3 @@ def _columns(data: bytes) -> tuple[list[bytes], Callable[[int, bytes], bytes]]:
         return out.getvalue()
 
     return [*parts, *words, *(value for _, value in about)], packed
-
-
-def _arrays(data: bytes) -> tuple[list[bytes], Callable[[int, bytes], bytes]]:
-    """The values of the arrays of a MATLAB file."""
-    from scipy.io import loadmat, savemat
-
-    arrays = {name: value for name, value in loadmat(io.BytesIO(data)).items() if not name.startswith("_")}
-    names = [name for name, value in arrays.items() if value.dtype.kind in "biuf"]
-
-    def packed(at: int, part: bytes) -> bytes:
-        old = arrays[names[at]]
-        new = np.frombuffer(part[: old.nbytes].ljust(old.nbytes, b"\0"), old.dtype).reshape(old.shape)
-        out = io.BytesIO()
-        savemat(out, {**arrays, names[at]: new})
-        return out.getvalue()
-
-    return [arrays[name].tobytes() for name in names], packed
-
-
-def _blobs(data: bytes) -> tuple[list[bytes], Callable[[int, bytes], bytes]]:
-    """The texts and blobs of a SQLite file."""
-    base = sqlite3.connect(":memory:")
-    base.deserialize(data)
-    names = [name for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
-    places: list[tuple[str, str, int]] = []
-    parts: list[bytes] = []
-    for table in names:
-        for _, column, *_ in base.execute(f'PRAGMA table_info("{table}")').fetchall():
-            for row, value in base.execute(f'SELECT rowid, "{column}" FROM "{table}"').fetchall():
-                if isinstance(value, str | bytes):
-                    places.append((table, column, row))
-                    parts.append(value.encode() if isinstance(value, str) else value)
-
-    def packed(at: int, part: bytes) -> bytes:
-        table, column, row = places[at]
-        copy = sqlite3.connect(":memory:")
-        copy.deserialize(data)
-        (kind,) = copy.execute(f'SELECT typeof("{column}") FROM "{table}" WHERE rowid = ?', (row,)).fetchone()
-        value = part.decode(errors="replace") if kind == "text" else part
-        copy.execute(f'UPDATE "{table}" SET "{column}" = ? WHERE rowid = ?', (value, row))
-        copy.commit()
-        return copy.serialize()
-
-    return parts, packed
