@@ -121,8 +121,7 @@ def export_scene(
             InputError, the report of the export has a note.
         thumbnail: Function f(root layer, output file) that draws a PNG of 256 x 256 pixels. If it raises
             InputError, the report of the export has a note.
-        trusted: Whether the stage comes from a trusted source. If not, a separate process reads it first,
-            since a damaged layer can crash its reader. That takes a second.
+        trusted: Whether the stage is trusted. If not, another process reads all of it first, in a second.
         force: Whether to replace existing files.
         progress: Function that is called with the name of each step.
 
@@ -142,14 +141,13 @@ def export_scene(
             parameter="profile",
         )
     beside = out.with_name(f"{out.stem}_magtwin") if kind == "package" and name != "viewer" else None
-    for target in filter(None, (out, beside)):
-        check_free(target, force=force)
     if existing(scene_file, "stage").is_dir():
         inner = scene_file / f"{scene_file.resolve().name}.usda"
         raise InputError(
             f"{scene_file}: a folder; give a USD file in it{f', such as {inner}' if inner.is_file() else ''}"
         )
     for target in filter(None, (out, beside)):
+        check_free(target, force=force)
         if target.resolve() in (scene_file.resolve(), *scene_file.resolve().parents):
             raise InputError(f"{target}: is or contains the exported stage; give another output")
     with TemporaryDirectory() as scratch, _renamed(Path(scratch, "stage"), scene_file), ExitStack() as own:

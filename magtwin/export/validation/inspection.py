@@ -43,7 +43,7 @@ def inspect(
 
     Args:
         file: The file that the user named.
-        against: Some of "core", "isaac" and "magtwin".
+        against: Those of "core" and "magtwin" are used.
         root: Root layer of an unpacked .usdz. Default: the file itself.
         home: Folder of the unpacked .usdz.
         inputs: Names of the inputs that a network may have.
@@ -93,8 +93,7 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
     importlib.import_module("magtwin.usd")  # registers the schemas before USD is first used
     from pxr import Tf, Usd, UsdUtils
 
-    importlib.import_module("magtwin.export.validation.isaac_rules")  # fills RULES
-    from magtwin.export.validation.rule import RULES, TITLES, Subject
+    from magtwin.export.validation.rule import RULES, Subject
     from magtwin.export.validation.rules import robot_assets
     from magtwin.usd.schema.versions import version_of
 
@@ -113,10 +112,10 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
             checks.append(_core(stage if packed is None else Usd.Stage.Open(str(file))))
         inputs = None if job["inputs"] is None else frozenset(job["inputs"])
         subject = Subject(stage, root, inputs, packed)
-        for name, rules in RULES.items():
-            if name in job["against"]:
-                found = [finding for rule in rules.values() for finding in rule.findings(subject)]
-                checks.append(Check(TITLES[name], tuple(found), scope=f"{len(rules)} rules"))
+        if "magtwin" in job["against"]:
+            rules = RULES["magtwin"].values()
+            found = [finding for rule in rules for finding in rule.findings(subject)]
+            checks.append(Check("magtwin", tuple(found), scope=f"{len(rules)} rules"))
         assets = robot_assets(subject)
     except (Tf.ErrorException, UnicodeError, MemoryError) as error:
         raise InputError(f"{file}: cannot be opened as USD; it is damaged, cut short, or not USD") from error

@@ -1,8 +1,7 @@
 """Validate a file with every validator.
 
 `core` are OpenUSD's own validators, `nvidia` is usd-validation-nvidia, `simready` are SimReady's profiles,
-`isaac` are Isaac Sim's rules and those of `isaac_rules`, `magtwin` are the rules of `rules`. `rule` explains
-how to add a rule.
+`isaac` are Isaac Sim's own rules, `magtwin` are the rules of `rules`. `rule` explains how to add a rule.
 """
 
 import os
@@ -64,7 +63,7 @@ def validate(
         root = None if home is None else unpack(file, home)
         seen = Inspection(())
         if set(wanted) - {"nvidia"}:
-            say("core, isaac and magtwin")
+            say("core and magtwin")
             seen = inspect(file, wanted, root=root, home=home, inputs=inputs)
         checks: dict[str, list[Check]] = {}
         for check in seen.checks:
@@ -72,7 +71,7 @@ def validate(
         for name, look in (
             ("nvidia", lambda: [nvidia(file)]),
             ("simready", lambda: simready(seen.robots, packed=root is not None)),
-            ("isaac", lambda: [isaac(root or file, seen.robots, home=home, package=file), *checks["isaac"]]),
+            ("isaac", lambda: [isaac(root or file, seen.robots, home=home, package=file)]),
         ):
             if name in wanted:
                 say(name)
