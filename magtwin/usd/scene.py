@@ -140,8 +140,8 @@ def open_scene(
         check_network: Whether the weights that the magnetometer names must exist.
 
     Raises:
-        InputError: A file is missing; the stage has no lab, robot or map, or a lab that is tilted or scaled; a
-            value is out of range; or the map is not that of the scene. The text names the prim.
+        InputError: A file is missing; the stage has no lab, robot or map, or a lab that is tilted or scaled;
+            a value is out of range; or the map is not that of the scene. The text names the prim.
     """
     path = Path(path)
     if path.suffix.lower() == ".usdz":

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from places import DATA
 
 import magtwin.export.validation.isaac_sim as isaac_sim
 from magtwin.cli import main
@@ -12,62 +13,8 @@ from magtwin.urdf.convert import convert_urdf
 
 INNER = "isaacsim/asset/validation"
 
-ROBOT = """#usda 1.0
-(
-    defaultPrim = "bot"
-    kilogramsPerUnit = 1
-    metersPerUnit = 1
-    upAxis = "Z"
-)
-def Xform "bot" (prepend apiSchemas = ["IsaacRobotAPI", "PhysicsArticulationRootAPI"])
-{
-    rel isaac:physics:robotLinks = [</bot/a>, </bot/b>]
-    def Xform "a" (prepend apiSchemas = ["PhysicsRigidBodyAPI"])
-    {
-        def Sphere "hidden" (prepend apiSchemas = ["PhysicsCollisionAPI"])
-        {
-            token visibility = "invisible"
-        }
-    }
-    def Xform "b" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI"])
-    {
-        float physics:mass = 1
-        float3 physics:diagonalInertia = (1, 1, 3)
-    }
-    def PhysicsRevoluteJoint "bare"
-    {
-        rel physics:body0 = </bot/a>
-        rel physics:body1 = </bot/b>
-    }
-    def PhysicsRevoluteJoint "turned" (
-        prepend apiSchemas = ["PhysicsDriveAPI:angular", "PhysicsJointStateAPI:angular", "PhysxJointAPI"]
-    )
-    {
-        rel physics:body0 = </bot/a>
-        rel physics:body1 = </bot/b>
-        float state:angular:physics:position = 30
-        float physxJoint:maxJointVelocity = 0
-        float drive:angular:physics:stiffness = 2e6
-    }
-    def PhysicsRevoluteJoint "follower" (
-        prepend apiSchemas = ["PhysxMimicJointAPI:rotZ", "PhysicsJointStateAPI:angular", "PhysxJointAPI"]
-    )
-    {
-        rel physics:body0 = </bot/a>
-        rel physics:body1 = </bot/b>
-        rel physxMimicJoint:rotZ:referenceJoint = </bot/turned>
-        float physxMimicJoint:rotZ:gearing = 0
-    }
-    def Scope "Looks"
-    {
-        def Material "paint"
-        {
-            def Material "inner" {}
-        }
-    }
-    def Material "stray" {}
-}
-"""
+ROBOT = (DATA / "faulty_robot.usda").read_text()
+"""A robot with a fault for each rule."""
 
 FOUND = {
     "CheckRobotRelationships": "/bot",

@@ -151,10 +151,13 @@ def scene(subject: Subject) -> Iterator[Wrong]:
     """Lab, Earth's field, sources, robots and map are complete, in range, and belong together."""
     survey = "survey it again: magtwin map survey STAGE --out MAP.usdc --adopt"
     labs = dict.fromkeys(lab.path for lab in labs_on(subject.stage))
-    reads: list[Callable[[], object]] = []
-    for noun, read in (("anomalyMap", read_map), ("robot", read_robot)):
-        reads += [partial(read, prim) for prim in ([] if labs else subject.having(noun))]
-    for look in (*(partial(open_scene, subject.file, lab=lab, check_network=False) for lab in labs), *reads):
+    looks: list[Callable[[], object]] = [
+        partial(open_scene, subject.file, lab=lab, check_network=False) for lab in labs
+    ]
+    if not labs:
+        looks += [partial(read_map, prim) for prim in subject.having("anomalyMap")]
+        looks += [partial(read_robot, prim) for prim in subject.having("robot")]
+    for look in looks:
         try:
             opened = look()
         except InputError as error:
