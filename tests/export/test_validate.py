@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from places import DOCS
-from pxr import Sdf, Usd, UsdUtils
+from pxr import Usd, UsdUtils
 
 import magtwin.export.validation.validators as others
 from magtwin.cli import main
@@ -19,7 +19,7 @@ from magtwin.errors import InputError
 from magtwin.export.usdz import pack
 from magtwin.export.validation.findings import Check, Finding, Findings, check_from
 from magtwin.export.validation.rule import RULES, Subject
-from magtwin.export.validation.rules import climbs, is_absolute, robot_assets
+from magtwin.export.validation.rules import is_absolute, robot_assets
 from magtwin.export.validation.validate import validate
 from magtwin.learn.data.features import FEATURES
 
@@ -103,11 +103,9 @@ def test_every_rule_says_in_a_sentence_what_holds_and_what_to_do():
 
 BROKEN = [
     ("absolute-paths", over("", "asset a = @/somewhere/else.png@"), "names /somewhere/else.png", "error"),
-    ("climbing-paths", over("", "asset a = @../else.png@"), "names ../else.png, outside", "warning"),
     ("units", HEAD.replace("metersPerUnit = 1", "metersPerUnit = 0.01"), "in units of 0.01 m", "error"),
     ("schema-names", over(ROBOT, "double magtwin:drive:vMx = 1"), "magtwin:drive:vMx, which", "error"),
     ("targets", over(ROBOT, "rel magtwin:drive:leftWheelJoint = </World/x>"), "</World/x>", "error"),
-    ("map-grid", over(MAP, f"double2 {MAP_}originM = (-2.9, -1.7)"), "its grid spans x -2.9", "error"),
     ("scene", over(MAP, f"double[] {MAP_}headingsDeg = None"), "headings", "error"),
     ("scene", over(MAP, f'string {MAP_}checksum = "{"0" * 64}"'), "do not match its checksum", "error"),
     ("scene", over(MAP, f"double3 xformOp:translate = (1, 0, 0)\n{ORDER} = [{MOVE}]"), "is moved", "error"),
@@ -143,31 +141,16 @@ def test_a_few_lines_break_a_rule_and_it_says_so(lab, name, text, said, severity
         assert told[0].where or name == "units", told[0]
 
 
-def test_a_path_that_climbs_out_is_an_error_in_a_package(lab):
-    file = beside(lab, "climbs", over("", "asset a = @../else.png@"))
-    assert broken(file, "climbing-paths", packed=lab.parent)["climbing-paths"][0].severity == "error"
-
-
-def test_paths_of_one_machine_or_of_a_network_are_told_from_relative_ones(tmp_path):
+def test_paths_of_one_machine_or_of_a_network_are_told_from_relative_ones():
     for path in ("/a/b.usd", "C:\\a.usd", "C:/a.usd", "\\\\host\\a", "file:/a", "omniverse://host/a.usd"):
         assert is_absolute(path), path
     for path in ("./a.usd", "a.usd", "../a.usd", "OmniPBR.mdl", "a/b c.usd"):
         assert not is_absolute(path), path
-    layer = Sdf.Layer.CreateNew(str(tmp_path / "a" / "b" / "l.usda"))
-    assert not climbs("../c.usda", layer, tmp_path / "a")
-    assert climbs("../../c.usda", layer, tmp_path / "a")
 
 
-@pytest.mark.parametrize(
-    ("path", "text", "rule"),
-    [
-        ("AnomalyMap", 'token magtwin:anomalyMap:shape = "x"', "map-grid"),
-        (MAGNETOMETER, "double3 magtwin:magnetometer:map = (1, 2, 3)", "targets"),
-    ],
-)
-def test_a_value_of_another_kind_breaks_the_rule_that_reads_it_and_ends_nothing(lab, path, text, rule):
-    found = broken(beside(lab, f"kind_{rule.replace('-', '_')}", over(path, text)), rule)
-    assert "a value is not of its type" in found[rule][0].text
+def test_a_value_of_another_kind_breaks_the_rule_that_reads_it_and_ends_nothing(lab):
+    file = beside(lab, "kind", over(MAGNETOMETER, "double3 magtwin:magnetometer:map = (1, 2, 3)"))
+    assert "a value is not of its type" in broken(file, "targets")["targets"][0].text
 
 
 def test_the_docs_list_every_rule_with_its_sentence():
@@ -340,19 +323,6 @@ def test_a_package_is_looked_at_whole(lab, tmp_path):
     pack(root, package)
     found = validate(package, ["core", "isaac", "magtwin"])
     assert found.clean, found.to_json()
-    layer = Sdf.Layer.FindOrOpen(str(root))
-    layer.customLayerData = {}
-    root.write_text(
-        root.read_text().replace(
-            'def Xform "turtlebot4" (',
-            'def Xform "o" (references = @../o.usda@) {}\ndef Xform "turtlebot4" (',
-            1,
-        )
-    )
-    package.unlink()
-    pack(root, package)
-    (check,) = validate(package, ["magtwin"]).checks
-    assert "climbing-paths" in {finding.rule for finding in check.findings if finding.severity == "error"}
 
 
 @pytest.mark.parametrize(

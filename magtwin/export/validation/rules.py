@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, UsdPhysics
+from pxr import Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
 from magtwin.export.contents import named_files, weights_metadata
@@ -21,12 +20,11 @@ from magtwin.files.file import sha256
 from magtwin.usd.lab.looks import VISUALS
 from magtwin.usd.lab.obstacles import read_obstacles
 from magtwin.usd.lab.room import read_lab
-from magtwin.usd.maps.heat_map import HEAT_MAP, heading_variants
 from magtwin.usd.maps.layer import read_map
 from magtwin.usd.placement import labs_on
 from magtwin.usd.robot import read_robot
 from magtwin.usd.scene import OpenedScene, open_scene
-from magtwin.usd.schema import NOUNS, attribute_name, declared, has_api, prims_with, value_of
+from magtwin.usd.schema import NOUNS, attribute_name, declared, has_api, prims_with
 from magtwin.usd.sensors import (
     IMU_TYPE,
     LIDAR_TYPE,
@@ -53,19 +51,6 @@ def absolute_paths(subject: Subject) -> Iterator[Wrong]:
         for named in named_files(layer):
             if is_absolute(named.path):
                 yield Wrong(f"{subject.name_of(layer)} names {named.path}", named.where)
-
-
-@rule("magtwin", "magtwin export makes a folder without such paths")
-def climbing_paths(subject: Subject) -> Iterator[Wrong]:
-    """No path leads out of the stage's folder. In a folder this is a warning, in a .usdz an error."""
-    for layer in subject.layers:
-        if not subject.owns(layer):
-            continue  # told where it was named
-        for named in named_files(layer):
-            if named.path and not is_absolute(named.path) and climbs(named.path, layer, subject.folder):
-                severity: Severity = "error" if subject.packed else "warning"
-                text = f"{subject.name_of(layer)} names {named.path}, outside the stage's folder"
-                yield Wrong(text, named.where, severity=severity)
 
 
 @rule("magtwin", "convert it to metres with Z up in the program that made it")
@@ -118,32 +103,6 @@ def targets(subject: Subject) -> Iterator[Wrong]:
                 if not subject.stage.GetObjectAtPath(end):
                     text = f"{prop.GetName()} points to <{end}>, which is not there"
                     yield Wrong(text, str(prim.GetPath()))
-
-
-@rule("magtwin", "make the map again with magtwin map")
-def map_grid(subject: Subject) -> Iterator[Wrong]:
-    """The coloured floor of every map covers its grid and has a variant for each heading."""
-    for prim in subject.having("anomalyMap"):
-        floor = prim.GetChild(HEAT_MAP.name)
-        if not floor or not floor.IsA(UsdGeom.Mesh):
-            yield Wrong("has no coloured floor to show it", str(prim.GetPath()), severity="warning")
-            continue
-        names = ("shape", "origin", "cell_size", "headings")
-        got = [value_of(prim.GetAttribute(attribute_name("anomalyMap", name))) for name in names]
-        shape, origin, cell, headings = (np.array(value, float).ravel() for value in got)
-        if (shape.size, origin.size, cell.size) != (3, 2, 2):
-            continue  # `scene` tells
-        points = np.array(UsdGeom.Mesh(floor).GetPointsAttr().Get() or [(np.nan,) * 3], float)[:, :2]
-        least, most = origin, origin + cell * (shape[[2, 1]] - 1)
-        seen = points.min(axis=0), points.max(axis=0)
-        if not np.allclose([least, most], seen, rtol=0, atol=max(SAME_M, 1e-6 * float(np.abs(most).max()))):
-            spans = (f"x {a[0]:g} to {b[0]:g} m, y {a[1]:g} to {b[1]:g} m" for a, b in ((least, most), seen))
-            yield Wrong(f"its grid spans {', its coloured floor '.join(spans)}", str(floor.GetPath()))
-        variants = floor.GetVariantSets().GetVariantSet("heading").GetVariantNames()
-        if variants and sorted(variants) != sorted(heading_variants(np.deg2rad(headings))):
-            degrees = ", ".join(f"{heading:g}" for heading in headings)
-            text = f"its headings are {degrees} deg, its coloured floor has {', '.join(variants)}"
-            yield Wrong(text, str(floor.GetPath()))
 
 
 @rule("magtwin", "docs/schema.md lists every attribute with its range")
@@ -319,12 +278,6 @@ def robot_assets(subject: Subject) -> dict[str, Path | None]:
 def is_absolute(path: str) -> bool:
     """Whether an asset path holds on one machine, or on a network, alone."""
     return bool(re.match(r"^(/|\\|[A-Za-z]:[\\/]|[A-Za-z][A-Za-z0-9+.-]+:)", path))
-
-
-def climbs(path: str, layer: Sdf.Layer, folder: Path) -> bool:
-    """Whether a relative asset path of a layer leads out of a folder."""
-    target = Path(os.path.normpath(Path(layer.realPath).resolve().parent / path))
-    return not target.is_relative_to(folder)
 
 
 def applied(prim: Usd.Prim) -> list[str]:
