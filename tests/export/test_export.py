@@ -343,18 +343,6 @@ def test_the_licence_of_a_network_is_read_from_its_weights(metadata, said, tmp_p
     assert licence_of(tmp_path / "net.safetensors") == said
 
 
-def test_the_plugin_beside_an_export_tells_usd_core_the_schemas(folder):
-    code = (
-        "from pxr import Usd;"
-        "known = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition('MagtwinAnomalyMapAPI');"
-        "print(known.GetAttributeFallbackValue('magtwin:anomalyMap:cellSizeM'))"
-    )
-    plugin = {**os.environ, "PXR_PLUGINPATH_NAME": str(folder / PLUGIN)}
-    command = [sys.executable, "-s", "-c", code]
-    done = subprocess.run(command, capture_output=True, check=True, text=True, env=plugin)
-    assert done.stdout.strip() == "(0.25, 0.25)"
-
-
 def test_for_newton_the_export_has_a_script_that_reads_its_network(tmp_path):
     out = tmp_path / "lab"
     export_scene(LAB, out, profile="newton", to_onnx=write_words, trusted=True)

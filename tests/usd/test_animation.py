@@ -1,9 +1,7 @@
 """A run as USD playback."""
 
-import struct
 import subprocess
 import sys
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -241,32 +239,7 @@ def test_files_that_play_nothing_or_are_damaged_are_refused(played, lab_scene, t
         read_animation(tmp_path / "none.usd")
 
 
-def test_damage_inside_a_playback_is_a_refusal_or_another_run_never_a_fault(played, tmp_path):
-    whole, rng = played.read_bytes(), np.random.default_rng(0)
-    refusals = 0
-    for _ in range(10):
-        content = bytearray(whole)
-        at = rng.integers(88, len(content) - 8)  # behind the mark that it is USD
-        content[at : at + 8] = rng.bytes(8)
-        (tmp_path / "run.usdc").write_bytes(content)
-        try:
-            assert read_animation(tmp_path / "run.usdc").rows
-        except InputError:
-            refusals += 1
-    assert refusals < 10
-
-
-def test_bytes_that_end_the_process_of_usds_own_reader_are_refused_in_a_line(played, tmp_path, monkeypatch):
-    whole = played.read_bytes()
-    (contents,) = struct.unpack_from("<q", whole, 16)
-    parts = [struct.unpack_from("<16sqq", whole, contents + 8 + 32 * k) for k in range(6)]
-    start, size = next(part[1:] for part in parts if part[0].startswith(b"FIELDS\0"))  # where values lie
-    for share in np.linspace(0.3, 0.9, 8):
-        content = bytearray(whole)
-        content[start + int(size * share)] ^= 0x55
-        (tmp_path / "run.usdc").write_bytes(content)
-        with suppress(InputError):
-            read_animation(tmp_path / "run.usdc")
+def test_a_file_that_ends_the_process_of_usds_own_reader_is_refused_in_a_line(played, tmp_path, monkeypatch):
     (tmp_path / "crash.py").write_text("import os; os.abort()")
     monkeypatch.setattr(trial, "PROGRAM", tmp_path / "crash.py")
     monkeypatch.setattr(trial, "_TRIAL", trial._Trial())
@@ -275,30 +248,24 @@ def test_bytes_that_end_the_process_of_usds_own_reader_are_refused_in_a_line(pla
     assert open_stage(played, own=True).GetRootLayer().realPath == str(played.resolve())
 
 
+T2 = "double[] magtwin:run:t = [0, 1]\n"
+P1 = 'double[] magtwin:run:odom_p = [0] (customData = {string parts = "x,y,z"})'
+
+
 @pytest.mark.parametrize(
-    ("body", "message"),
+    ("body", "words"),
     [
-        (
-            'double[] magtwin:run:t = [0, 1]\nstring magtwin:run:yaw = "x"',
-            "must be an array of numbers, got string",
-        ),
+        (f'{T2}string magtwin:run:yaw = "x"', "an array of numbers, got string"),
         ("double[] magtwin:run:yaw = [0, 1]", "not a Run: column 't' is missing"),
         ("double[] magtwin:run:t = [1, 0]", "row 1 has 0 s after 1 s"),
-        (
-            "double[] magtwin:run:t = [0, 1]\ndouble[] magtwin:run:yaw = [0]",
-            "damaged run: columns of a Run must be",
-        ),
-        (
-            "double[] magtwin:run:t = [0, 1]\n"
-            'double[] magtwin:run:odom_p = [0] (customData = {string parts = "x,y,z"})',
-            "has 1 numbers in rows of 3",
-        ),
+        (f"{T2}double[] magtwin:run:yaw = [0]", "damaged run: columns"),
+        (f"{T2}{P1}", "has 1 numbers in rows of 3"),
     ],
 )
-def test_runs_that_contradict_themselves_are_refused(body, message, tmp_path):
+def test_runs_that_contradict_themselves_are_refused(body, words, tmp_path):
     text = f'#usda 1.0\n(defaultPrim = "World")\ndef "World"\n{{\ndef "Run"\n{{\n{body}\n}}\n}}\n'
     (tmp_path / "run.usda").write_text(text)
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=words):
         read_animation(tmp_path / "run.usda")
 
 
