@@ -53,25 +53,6 @@ def message_fields(message: str) -> dict[str, Kind]:
     return _kinds(_table()["messages"].get(message, {}))
 
 
-def ports(node: Usd.Prim) -> dict[str, Kind] | None:
-    """Kinds of a node's inputs and outputs by name (`inputs:execIn`), with those of its message.
-
-    None if the node's type is unknown.
-    """
-    known = node_types().get(node.GetAttribute("node:type").Get())
-    if known is None:
-        return None
-    inputs = known.inputs | (_fields(node) if "messageName" in known.inputs else {})
-    named = {"inputs": inputs, "outputs": known.outputs}
-    return {f"{space}:{name}": kind for space, kinds in named.items() for name, kind in kinds.items()}
-
-
-def _fields(node: Usd.Prim) -> dict[str, Kind]:
-    """Inputs of a node for its message."""
-    parts = (node.GetAttribute(f"inputs:message{part}").Get() for part in ("Package", "Subfolder", "Name"))
-    return message_fields("/".join(map(str, parts)))
-
-
 class Graph:
     """An Action Graph, authored in a stage's edit target."""
 
@@ -85,6 +66,7 @@ class Graph:
         if there and there.IsDefined() and there.GetTypeName() != "OmniGraph":
             raise InputError(f"<{path}>: is a {there.GetTypeName() or 'prim'} already; rename it")
         self.stage, self.path = stage, path
+        self._kinds: dict[tuple[str, str], Kind] = {}  # by node, and name with its namespace
         prim = stage.DefinePrim(path, "OmniGraph")
         settings = {
             "evaluationMode": "Automatic",
@@ -110,6 +92,8 @@ class Graph:
         prim.CreateAttribute("node:type", names.Token, custom=False).Set(kind)
         prim.CreateAttribute("node:typeVersion", names.Int, custom=False).Set(known.version)
         inputs = known.inputs | message_fields(message)
+        for space, kinds in (("inputs", inputs), ("outputs", known.outputs)):
+            self._kinds |= {(name, f"{space}:{key}"): each for key, each in kinds.items()}
         if message:
             parts = zip(
                 ("messagePackage", "messageSubfolder", "messageName"), message.split("/"), strict=True
@@ -132,7 +116,7 @@ class Graph:
             node, _, name = text.partition(".")
             prim = self.stage.GetPrimAtPath(self.path.AppendChild(node))
             name = f"{namespace}:{name}"
-            ends.append(_attribute(prim, name, (ports(prim) or {})[name]))
+            ends.append(_attribute(prim, name, self._kinds[node, name]))
         ends[1].AddConnection(ends[0].GetPath())
 
 
