@@ -73,7 +73,7 @@ physics: $(VENV)/.dev  ## Drive converted robots in Newton (extra physics, 600 M
 physx: $(VENV)/.dev  ## Drive the labs in NVIDIA's PhysX on the CPU (1 GB, in an environment of its own)
 	test -x build/physx/bin/python || $(PYTHON) -m venv build/physx
 	build/physx/bin/python -m pip --disable-pip-version-check -q install 'ovphysx>=0.7' 'physx-usd-schemas>=25.11' 'newton-usd-schemas>=0.6'
-	MAGTWIN_PHYSX=$(CURDIR)/build/physx/bin/python $(ONE_THREAD) $(BIN)/python -m pytest -n 2 tests/export/test_physx.py
+	MAGTWIN_PHYSX=$(CURDIR)/build/physx/bin/python $(ONE_THREAD) $(BIN)/python -m pytest -n 2 benchmarks/physx
 
 paper: $(VENV)/.dev  ## Measure the tables of docs/results.md and README again (up to an hour)
 	$(BIN)/python docs/results.py $(if $(wildcard $(SURVEYS)),--surveys $(SURVEYS)) $(if $(wildcard $(RELEASED)),--released $(RELEASED))

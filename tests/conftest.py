@@ -1,5 +1,6 @@
 """What tests share: the real data beside the checkout, and the default lab, authored once."""
 
+import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,12 +26,18 @@ def real_data() -> Path:
 
 
 @pytest.fixture
-def isaac_rules(real_data: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Isaac Sim's published rules, named as an installation for the test."""
-    folder = real_data / "isaacsim-6.0.1"
-    if not folder.is_dir():
-        pytest.skip(f"Isaac Sim's rules are not at {folder}; `magtwin fetch isaac-rules` gets them")
-    monkeypatch.setenv("MAGTWIN_ISAACSIM", str(folder))
+def isaac_rules(real_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The copy of Isaac Sim's published rules that `magtwin fetch isaac-rules` makes, for the test."""
+    from magtwin.fetch import SOURCES, default_folder
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder = default_folder("isaac-rules")
+    for name, _, path in SOURCES["isaac-rules"][0].files():
+        file = real_data / "isaacsim-6.0.1" / path.removeprefix("source/extensions/")
+        if not file.is_file():
+            pytest.skip(f"Isaac Sim's rules are not at {file}; `magtwin fetch isaac-rules` gets them")
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, folder / name)
     return folder
 
 

@@ -65,6 +65,7 @@ def in_a_domain() -> Iterator[Callable[..., Bus]]:
         made.append(open_bus(name, backend="cyclonedds", domain=domain, **rest))  # type: ignore[arg-type]
         return made[-1]
 
+    node.domain = domain  # type: ignore[attr-defined]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         for name in ("CYCLONEDDS_URI", "ROS_LOCALHOST_ONLY"):

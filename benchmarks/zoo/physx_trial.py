@@ -17,7 +17,7 @@ import numpy as np
 from ovphysx.types import SimObjectType
 from serving import serve
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "magtwin" / "export" / "validation"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "physx"))
 from physx_world import open_stage, read, write
 
 STEP_S = 1 / 240

@@ -7,6 +7,7 @@ A server of jobs, see `serving.py`. `zoo.py` writes them.
 
 import json
 import re
+import sys
 import time
 from pathlib import Path
 from xml.etree import ElementTree
@@ -197,7 +198,9 @@ def drives_job(asset: Path, report, floats: bool) -> dict:
     """Room, bodies and driven joints of a stage, for an engine that reads none of them itself."""
     from pxr import Usd, UsdGeom, UsdPhysics
 
-    from magtwin.export.validation.physx_drive import room_text
+    sys.path.insert(0, str(Path(__file__).parents[1] / "physx"))
+    from physx_drive import room_text
+
     from magtwin.usd.geometry import read_triangles
 
     stage = Usd.Stage.Open(str(asset))

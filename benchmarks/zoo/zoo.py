@@ -6,7 +6,7 @@
 as OWNER+NAME. A robot is a process with limits on time and memory. Its row is kept in build/zoo/rows, and a
 repeat does only what is missing or has changed. `--docs` writes the table into docs/zoo.md.
 
-NVIDIA's rules come with the extra dev; Isaac Sim's with `magtwin fetch isaac-rules` or MAGTWIN_ISAACSIM;
+NVIDIA's rules come with the extra dev; Isaac Sim's with `magtwin fetch isaac-rules`;
 Newton with the extra physics; PhysX where MAGTWIN_PHYSX is the path of a Python with ovphysx (`make physx`).
 """
 

@@ -46,7 +46,6 @@ ALIASES = {
     "map_layer": "map",
     "localizers": "localizer",
     "net": "network",
-    "offsets_s": "offset_s",
     "profile": "target",
     "ridge": "penalty",
 }

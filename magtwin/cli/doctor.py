@@ -17,7 +17,6 @@ ADDS = {
     "onnx": "networks as ONNX (magtwin network export, magtwin export)",
     "pandas": "runs as pandas tables (Run.to_pandas)",
     "physics": "driving in Newton (magtwin run --engine newton)",
-    "physx": "driving in NVIDIA's PhysX (magtwin validate --against physx)",
     "polars": "runs as polars tables (Run.to_polars)",
     "ros": "ROS 2 nodes on a machine without ROS (magtwin ros)",
     "simready": "NVIDIA's SimReady profiles (magtwin validate --against simready)",

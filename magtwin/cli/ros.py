@@ -3,7 +3,7 @@
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -14,7 +14,6 @@ from magtwin.cli.app import app
 from magtwin.cli.options import (
     Flag,
     Force,
-    Gamepad,
     Lab,
     Lidar,
     MapLayer,
@@ -28,7 +27,7 @@ from magtwin.cli.options import (
     Whole,
     check_pace,
 )
-from magtwin.cli.terminal import Done, announce, progress, silence, step
+from magtwin.cli.terminal import Done, announce, progress, silence
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
@@ -66,9 +65,6 @@ class Node:
     """Which machines find the node: this one, or all of the network. Default:
     ROS_AUTOMATIC_DISCOVERY_RANGE, else localhost."""
 
-    qos: Literal["reliable", "sensor-data"] = "reliable"
-    """QoS of published sensor data. reliable: every subscriber gets it. sensor-data: best effort, depth 5."""
-
     @contextmanager
     def bus(
         self,
@@ -95,7 +91,6 @@ class Node:
             backend=self.backend,
             domain=self.domain,
             discovery=self.discovery,
-            offers=self.qos,
         )
         _announce_reach(bus)
         signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a script ignore it
@@ -146,7 +141,6 @@ def sim(
     rate_hz: RateHz = None,
     out_unit: OutUnit = None,
     lidar: Lidar = "schedule",
-    stamps: Literal["sim", "wall"] = "sim",
     frame_prefix: FramePrefix = None,
     tf: Literal["all", "odom", "none"] = "odom",
 ) -> Done:
@@ -167,8 +161,6 @@ def sim(
     magnetometer
         What the magnetometer reads: physical, neural or map-only, as for `magtwin run`; or none, which leaves
         its topics to `magtwin ros magnetometer`. Default: the scene's.
-    stamps
-        Time of the messages: sim, from 0, or wall.
     tf
         Transforms of the drive on /tf. odom: odom to base_link, beside a localizer that publishes map to
         odom. all: also map to odom, by the true pose. none: neither, beside a filter that publishes both. The
@@ -192,7 +184,6 @@ def sim(
             rate_hz=rate_hz,
             units=out_unit or "T",
             lidar=lidar,
-            stamps=stamps,
             magnetometer=magnetometer != "none",
             frame_prefix=frame_prefix,
             tf=tf,
@@ -218,8 +209,6 @@ def magnetometer(
     lab: Lab = "",
     map_layer: MapLayer = None,
     network: Network = None,
-    online: str | None = None,
-    measured: str | None = None,
     frame_prefix: FramePrefix = None,
     duration_s: WallS = None,
 ) -> Done:
@@ -229,7 +218,7 @@ def magnetometer(
     publishes qtfm/magnitude and qtfm/total_field_nt while its inputs are fresh, and its state in
     /diagnostics. Inputs may come and go. Settings have the form of ROS, name:=value: rate_hz (135), units
     (T or nT), use_sim_time, max_age_s (0.5), battery_max_age_s (30), stamps (header, arrival), lidar (scan,
-    on, off), outside (silent, clamp); with --online also buffer_s (60), pose_sd_m (0), map_frame (map).
+    on, off), outside (silent, clamp).
 
     Parameters
     ----------
@@ -237,13 +226,6 @@ def magnetometer(
         USD stage that names the map, the network and the robot.
     settings
         Settings, such as units:=nT use_sim_time:=true.
-    online
-        Topic of late poses, by which a mixed model follows its session: PoseStamped,
-        PoseWithCovarianceStamped, TransformStamped or Odometry, whose stamps may lie some seconds in the
-        past. Readings are then published on predicted/magnitude and predicted/total_field_nt.
-    measured
-        Topic of the field that a real sensor measures, for --online: MagneticField or Float64, in T or nT.
-        Default: qtfm/magnitude.
     """
     from magtwin.ros.magnetometer import PARAMETERS, Magnetometer
     from magtwin.ros.parameters import settings as settings_of
@@ -255,9 +237,7 @@ def magnetometer(
         scene, lab=lab, map_layer=map_layer, network=network, model_error=False
     )  # it predicts for a robot that reads
     with where.bus("magtwin_magnetometer", sim_time=values["use_sim_time"], duration_s=duration_s) as bus:
-        Magnetometer(
-            twin, bus, values, online=online, measured=measured, frame_prefix=frame_prefix or "", say=announce
-        )
+        Magnetometer(twin, bus, values, frame_prefix=frame_prefix or "", say=announce)
         announce(f"reading by {bus.backend}; Ctrl-C ends")
         spin(bus, duration_s)
     return Done()
@@ -274,7 +254,6 @@ def follow(
     source: Literal["truth", "estimate", "odometry"] = "truth",
     laps: Whole = 1,
     continuous: Flag = False,
-    flip: Flag = False,
     sim_time: SimTime = False,
     commands: Commands = "auto",
     stamps: Stamps = "header",
@@ -295,8 +274,6 @@ def follow(
         Number of times to drive the path; an open path is driven back and forth.
     continuous
         Drive until Ctrl-C.
-    flip
-        Drive the path backwards, from its end to its start.
     """
     from magtwin.path import resolve_path
     from magtwin.ros.follow import Follower
@@ -313,7 +290,6 @@ def follow(
             source=source,
             laps=laps,
             continuous=continuous,
-            flip=flip,
             commands=commands,
             stamps=stamps,
             say=announce,
@@ -324,61 +300,11 @@ def follow(
                 while not node.done:
                     bus.spin_once(0.1)
                     total = None if continuous else laps
-                    advance(node.progress.laps, total, f"{node.progress.rms_m:.3f} m RMS off it")
+                    advance(node.laps, total, f"{node.rms_m:.3f} m RMS off it")
         finally:
             node.stop()
-    done = node.progress
-    text = f"{done.laps} times along {way.name}, {done.rms_m:.3f} m RMS off it"
-    return Done(text=text, data={"path": way.name, "laps": done.laps, "rms_m": done.rms_m})
-
-
-@ros_app.command(name="teleop")
-def teleop(
-    *,
-    where: Where = HERE,
-    asset: Asset = None,
-    gamepad: Gamepad = None,
-    out: Path | None = None,
-    commands: Commands = "auto",
-    sim_time: SimTime = False,
-    force: Force = False,
-) -> Done:
-    """Drive a robot by hand, and record its topics.
-
-    Keys: w/s or up/down for speed, a/d or left/right for turning, x to go straight on, space to stop, q to
-    end.
-
-    Parameters
-    ----------
-    out
-        Bag to record the robot's topics to, as `magtwin ros record` does. Default: none.
-    """
-    from magtwin.cli.runs.drive import device
-    from magtwin.io.bags import RawBagWriter
-    from magtwin.ros.record import Recorder
-    from magtwin.ros.teleop import Teleop
-    from magtwin.sim.motion.manual import HELP, Hand, Keyboard
-    from magtwin.sim.motion.manual import Gamepad as Pad
-
-    if gamepad is not None and not gamepad.is_char_device():
-        raise InputError(f"{gamepad}: not a gamepad; name one, such as /dev/input/js0")
-    drive = _drive_of(asset)
-    hand: Hand = Keyboard(drive) if gamepad is None else Pad(drive)
-    with ExitStack() as stack:
-        writer = None
-        if out is not None:
-            writer = RawBagWriter(out, force=force)
-            stack.callback(writer.close)
-        bus = stack.enter_context(where.bus("magtwin_teleop", sim_time=sim_time))
-        recorder = None if writer is None else Recorder(bus, writer, say=_warn, sim_time=sim_time)
-        source = stack.enter_context(device(gamepad))
-        announce(HELP if gamepad is None else "left stick drives, Start ends")
-        node = Teleop(bus, hand, source, commands=commands)
-        with silence(), suppress(KeyboardInterrupt):
-            node.run(recorder.step if recorder else lambda: None)
-        node.stop()
-    text = f"{node.sent} commands" + ("" if out is None else f"; wrote {out}")
-    return Done(text=text, data={"commands": node.sent}, wrote=out or ())
+    text = f"{node.laps} times along {way.name}, {node.rms_m:.3f} m RMS off it"
+    return Done(text=text, data={"path": way.name, "laps": node.laps, "rms_m": node.rms_m})
 
 
 @ros_app.command(name="record")
@@ -393,9 +319,9 @@ def record(
 ) -> Done:
     """Record a robot's topics as a rosbag2, which magtwin convert, info, report and dataset read as a run.
 
-    Topics may come and go, and may have any type of ROS 2's common packages. If time jumps back, as after a
-    reset of the simulator, the recording goes on in another bag: drive_2.mcap after drive.mcap. The exit
-    status is 1 if a topic that was asked for was not recorded. Ctrl-C ends it.
+    Topics may come and go, and may have any type of ROS 2's common packages. Ctrl-C ends it, and so does a
+    time that jumps back, as after a reset of the simulator. The exit status is 1 if a topic that was asked
+    for was not recorded.
 
     Parameters
     ----------
@@ -420,68 +346,12 @@ def record(
     if not sum(counts.values()):
         raise InputError("nothing was recorded: no node offers these topics; check --domain and --namespace")
     lines = [f"{count:8d}  {name}" for name, count in counts.items()]
-    wrote = tuple(writer.paths)
-    text = "\n".join([*lines, f"Wrote {', '.join(map(str, wrote))}; magtwin info {wrote[0]}"])
+    text = "\n".join([*lines, f"Wrote {out}; magtwin info {out}"])
     missing = recorder.missing()
     for name, why in missing.items():
         _warn(f"{name} was not recorded: {why}")
-    return Done(
-        text=text, data={"messages": counts, "missing": missing}, wrote=wrote, status=1 if missing else 0
-    )
-
-
-@ros_app.command(name="replay")
-def replay(
-    run: Path,
-    *,
-    topic: tuple[str, ...] = (),
-    scene: Path | None = None,
-    where: Where = HERE,
-    pace: float = 1.0,
-    stamps: Literal["run", "wall"] = "run",
-    out_unit: OutUnit = None,
-    frame_prefix: FramePrefix = None,
-    tf: Literal["all", "odom", "none"] = "odom",
-) -> Done:
-    """Publish a recorded run on its robot's ROS topics, in real time.
-
-    Parameters
-    ----------
-    run
-        A run in any format that magtwin reads.
-    topic
-        Topic to publish. May be repeated. Default: all.
-    scene
-        Scene of the run, for frames, covariances, /tf_static and the robot's description. Default: none.
-    pace
-        Seconds of the run per second.
-    stamps
-        Time of the messages and of /clock: that of the run, or wall time, for programs without use_sim_time.
-    tf
-        Transforms of the drive on /tf, as for `magtwin ros sim`.
-    """
-    from magtwin.io.formats import read_run
-    from magtwin.ros.record import Player
-    from magtwin.twin import open_twin
-
-    check_pace(pace)
-    whole = read_run(run)
-    twin = None if scene is None else open_twin(scene, model_error=False)
-    with where.bus("magtwin_replay") as bus:
-        player = Player(
-            whole,
-            bus,
-            twin,
-            units=out_unit or "T",
-            topics=topic,
-            stamps=stamps,
-            frame_prefix=frame_prefix or "",
-            tf=tf,
-        )
-        announce(f"replaying {whole['t'][-1] - whole['t'][0]:.0f} s by {bus.backend}; Ctrl-C ends")
-        step("Replaying")
-        count = player.run(speed=pace)
-    return Done(text=f"{count} messages", data={"messages": count})
+    data = {"messages": counts, "missing": missing}
+    return Done(text=text, data=data, wrote=out, status=1 if missing else 0)
 
 
 def spin(bus: "Bus", duration_s: float | None) -> None:

@@ -19,10 +19,8 @@ from magtwin.errors import InputError
 from magtwin.usd.geometry import Shape, read_shapes
 from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.schema import attribute_name, has_api, prims_with, value_of
+from magtwin.usd.solids import corner_normals
 from magtwin.version import __version__
-
-CREASE = np.deg2rad(40.0)
-"""Faces that meet at a smaller angle are shaded smoothly."""
 
 Y_UP = (-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
 """Rotation (xyzw) from Z up to Y up: (x, y, z) to (x, z, -y)."""
@@ -144,7 +142,10 @@ class _Scene:
         for shape in shapes:
             points = np.column_stack([shape.vertices, np.ones(len(shape.vertices))]) @ to_home[:, :3]
             corners.append(points[shape.faces].reshape(-1, 3))
-            normals.append(corner_normals(points, shape.faces))
+            merged, index = np.unique(points.round(7), axis=0, return_inverse=True)
+            with np.errstate(invalid="ignore"):  # flat triangles have no normal
+                own = corner_normals(merged, index.reshape(-1)[shape.faces]).reshape(-1, 3)
+            normals.append(np.where(np.isfinite(own), own, (0.0, 0.0, 1.0)))
             if shape.vertex_colours is not None:
                 colours.append(shape.vertex_colours[shape.faces].reshape(-1, 3))
         rows = np.hstack([np.vstack(a) for a in (corners, normals, colours) if a]).astype("<f4")
@@ -276,35 +277,6 @@ class _Scene:
         head = struct.pack("<4sII", b"glTF", 2, size)
         chunks = [struct.pack("<I4s", len(d), k) + d for k, d in ((b"JSON", text), (b"BIN\0", self.data))]
         return head + b"".join(chunks)
-
-
-def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float64]:
-    """Unit normals of the corners of triangles: the area-weighted mean of the faces that meet there smoothly.
-
-    Args:
-        points: Vertices, shape (V, 3); equal ones are merged.
-        faces: Corners of the triangles, counter-clockwise from outside, shape (F, 3).
-
-    Returns:
-        Normals, shape (3 F, 3), in order of the faces; an edge of more than `CREASE` stays sharp.
-    """
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    by_area = np.cross(b - a, c - a)
-    length = np.linalg.norm(by_area, axis=1, keepdims=True)
-    unit = np.divide(by_area, length, out=np.zeros_like(by_area), where=length > 0)
-    _, place = np.unique(np.round(points, 7), axis=0, return_inverse=True)
-    corner = place.reshape(-1)[faces].reshape(-1)
-    order = np.argsort(corner, kind="stable")
-    counts = np.bincount(corner)
-    sizes, begins = counts[corner], (np.cumsum(counts) - counts)[corner]
-    one = np.repeat(np.arange(len(corner)), sizes)  # every corner with every corner of the same place
-    step = np.arange(len(one)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    other = order[np.repeat(begins, sizes) + step]
-    smooth = np.sum(unit[one // 3] * unit[other // 3], axis=1) >= np.cos(CREASE)
-    total = np.zeros((len(corner), 3))
-    np.add.at(total, one[smooth], by_area[other[smooth] // 3])
-    size = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(size > 0, total / np.where(size > 0, size, 1), (0.0, 0.0, 1.0))
 
 
 def _roughness(prim: Usd.Prim) -> float:

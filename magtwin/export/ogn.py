@@ -1,24 +1,18 @@
 """OmniGraph: the node types of Isaac Sim's graphs, and graphs as USD prims.
 
-`ogn.toml` has the definition of each node type, with its source; `faults` compares a node with it.
+`ogn.toml` has the definition of each node type, with its source.
 """
 
-import re
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from pxr import Gf, Sdf, Usd
 
-from magtwin.errors import InputError, hint
-
-_ROLE = re.compile(r"(?:vector|quat|point|normal|color)([dfh])")
-"""Roles that OmniGraph treats as plain tuples: vectord[3] fits double[3]."""
-
-_BASES = {"d": "double", "f": "float", "h": "half"}
+from magtwin.errors import InputError
 
 _USD = {"execution": "uint", "int[2]": "int2", "vectord[3]": "vector3d", "quatd[4]": "quatd"}
 """USD types with another name than OmniGraph's."""
@@ -38,112 +32,25 @@ class NodeType:
 
     outputs: dict[str, Kind]
 
-    tokens: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """Allowed values of an input that is a choice."""
-
-    source: str = ""
-    """Source of the definition: version and file."""
-
 
 @cache
 def node_types() -> dict[str, NodeType]:
     """Every known type of node by its name."""
-    table, types = _table(), {}
-    for name, given in table["nodes"].items():
-        source = table["sources"][given["source"]]
-        at = f" at {source['commit']}" if "commit" in source else ""
-        types[name] = NodeType(
+    return {
+        name: NodeType(
             name=name,
             version=given["version"],
             inputs=_kinds(given.get("inputs", {})),
             outputs=_kinds(given.get("outputs", {})),
-            tokens={key: tuple(values) for key, values in given.get("tokens", {}).items()},
-            source=f"{source['name']} {source['version']}, {source['repository']}{at}: {given['file']}",
         )
-    return types
+        for name, given in _table()["nodes"].items()
+    }
 
 
 @cache
 def message_fields(message: str) -> dict[str, Kind]:
     """Inputs of a ROS2Publisher for a message such as geometry_msgs/msg/PoseStamped; empty if unknown."""
     return _kinds(_table()["messages"].get(message, {}))
-
-
-def fits(given: Kind, taken: Kind) -> bool:
-    """Whether an output of one kind may be connected to an input of another.
-
-    Base type, tuple and array must be equal, but not the role: a vectord[3] fits a double[3]. One of several
-    alternatives must fit.
-    """
-    sides = [
-        {_ROLE.sub(lambda role: _BASES[role[1]], k) for k in ((kind,) if isinstance(kind, str) else kind)}
-        for kind in (given, taken)
-    ]
-    return bool(sides[0] & sides[1])
-
-
-def ports(node: Usd.Prim) -> dict[str, Kind] | None:
-    """Kinds of a node's inputs and outputs by name (`inputs:execIn`), with those of its message.
-
-    None if the node's type is unknown.
-    """
-    known = node_types().get(node.GetAttribute("node:type").Get())
-    if known is None:
-        return None
-    inputs = known.inputs | (_fields(node) if "messageName" in known.inputs else {})
-    named = {"inputs": inputs, "outputs": known.outputs}
-    return {f"{space}:{name}": kind for space, kinds in named.items() for name, kind in kinds.items()}
-
-
-def _fields(node: Usd.Prim) -> dict[str, Kind]:
-    """Inputs of a node for its message."""
-    parts = (node.GetAttribute(f"inputs:message{part}").Get() for part in ("Package", "Subfolder", "Name"))
-    return message_fields("/".join(map(str, parts)))
-
-
-def faults(node: Usd.Prim) -> list[str]:
-    """Differences of a node from its definition, one sentence each; none if its type is unknown."""
-    kinds = ports(node)
-    if kinds is None:
-        return []
-    known, texts = node_types()[node.GetAttribute("node:type").Get()], []
-    version = node.GetAttribute("node:typeVersion").Get()
-    if version != known.version:
-        texts.append(f"is version {version} of {known.name}, not {known.version}")
-    for prop in node.GetAuthoredProperties():
-        name = prop.GetName()
-        if not name.startswith(("inputs:", "outputs:")):
-            continue
-        if name not in kinds:
-            if "inputs:messageName" in kinds and not _fields(node):
-                continue  # an unknown message
-            texts.append(f"{known.name} has no {name}; {hint(name, kinds)}")
-        elif isinstance(prop, Usd.Attribute):
-            kind, allowed = kinds[name], known.tokens.get(prop.GetBaseName())
-            if isinstance(kind, str) and _usd_type(kind) and prop.GetTypeName() != _usd_type(kind):
-                texts.append(f"{name} is a {prop.GetTypeName()}, {known.name} has a {kind}")
-            if allowed and prop.HasAuthoredValue() and prop.Get() not in allowed:
-                texts.append(f"{name} cannot be {prop.Get()!r}; {hint(str(prop.Get()), allowed)}")
-            texts += [text for path in prop.GetConnections() if (text := _unfit(prop, path, kind))]
-    return texts
-
-
-def _unfit(attribute: Usd.Attribute, path: Sdf.Path, taken: Kind) -> str:
-    """What is wrong with one connection of an attribute, or ""."""
-    source = attribute.GetStage().GetPrimAtPath(path.GetPrimPath())
-    if source and source.GetTypeName() == "OmniGraph":
-        return ""  # a variable of the graph
-    if not source or source.GetTypeName() != "OmniGraphNode":
-        return f"{attribute.GetName()} is connected to <{path}>, which is on no node"
-    given = ports(source)
-    if given is None:
-        return ""
-    if not path.name.startswith("outputs:") or path.name not in given:
-        return f"{attribute.GetName()} is connected to <{path}>, which is no output"
-    if fits(given[path.name], taken):
-        return ""
-    words = [kind if isinstance(kind, str) else " or ".join(kind) for kind in (taken, given[path.name])]
-    return f"{attribute.GetName()} takes {words[0]}, <{path}> is {words[1]}"
 
 
 class Graph:
@@ -159,6 +66,7 @@ class Graph:
         if there and there.IsDefined() and there.GetTypeName() != "OmniGraph":
             raise InputError(f"<{path}>: is a {there.GetTypeName() or 'prim'} already; rename it")
         self.stage, self.path = stage, path
+        self._kinds: dict[tuple[str, str], Kind] = {}  # by node, and name with its namespace
         prim = stage.DefinePrim(path, "OmniGraph")
         settings = {
             "evaluationMode": "Automatic",
@@ -171,7 +79,7 @@ class Graph:
             prim.CreateAttribute(name, _usd_type(_table()["graph"][name]), custom=False).Set(value)
 
     def node(self, name: str, kind: str, *, message: str = "", **values: Any) -> Usd.Prim:
-        """Define a node. `faults` tells whether it matches its definition.
+        """Define a node.
 
         Args:
             name: Name of its prim.
@@ -184,6 +92,8 @@ class Graph:
         prim.CreateAttribute("node:type", names.Token, custom=False).Set(kind)
         prim.CreateAttribute("node:typeVersion", names.Int, custom=False).Set(known.version)
         inputs = known.inputs | message_fields(message)
+        for space, kinds in (("inputs", inputs), ("outputs", known.outputs)):
+            self._kinds |= {(name, f"{space}:{key}"): each for key, each in kinds.items()}
         if message:
             parts = zip(
                 ("messagePackage", "messageSubfolder", "messageName"), message.split("/"), strict=True
@@ -206,7 +116,7 @@ class Graph:
             node, _, name = text.partition(".")
             prim = self.stage.GetPrimAtPath(self.path.AppendChild(node))
             name = f"{namespace}:{name}"
-            ends.append(_attribute(prim, name, (ports(prim) or {})[name]))
+            ends.append(_attribute(prim, name, self._kinds[node, name]))
         ends[1].AddConnection(ends[0].GetPath())
 
 

@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -13,11 +12,10 @@ from tempfile import TemporaryDirectory
 from typing import Literal
 
 from jinja2 import Environment
-from pxr import Sdf, UsdGeom
+from pxr import Sdf, UsdGeom, UsdUtils
 
-from magtwin.errors import InputError, MismatchWarning, find
-from magtwin.export.attached import attach, detach
-from magtwin.export.contents import THUMBNAIL, bring_together, copied, weights_metadata
+from magtwin.errors import InputError, find
+from magtwin.export.contents import THUMBNAIL, bring_together, copied, kind_of, weights_metadata
 from magtwin.export.flatten import flatten
 from magtwin.export.glb import write_glb
 from magtwin.export.isaac import GRAPHS, author_graph
@@ -32,7 +30,7 @@ from magtwin.report.summary import in_markdown, printable
 from magtwin.run.run import Run
 from magtwin.urdf.simready import UNKNOWN
 from magtwin.usd.animation import write_animation
-from magtwin.usd.layers import open_stage, stage_sha256
+from magtwin.usd.layers import SUFFIXES, open_stage, stage_sha256
 from magtwin.usd.maps.layer import read_map
 from magtwin.usd.placement import labs_on
 from magtwin.usd.scene import read_scene
@@ -58,6 +56,9 @@ NETWORK, NETWORK_SHA256 = (attribute_name("magnetometer", name) for name in ("ne
 PLUGIN = Path("plugin", "magtwin")
 GENERATED = ("plugInfo.json", "generatedSchema.usda")
 """Files of the schema plugin."""
+
+LEFT_OUT = ("weights", "paths")
+"""Kinds of files that only an export as a folder holds."""
 
 README = "README.md"
 
@@ -120,8 +121,7 @@ def export_scene(
             InputError, the report of the export has a note.
         thumbnail: Function f(root layer, output file) that draws a PNG of 256 x 256 pixels. If it raises
             InputError, the report of the export has a note.
-        trusted: Whether the stage comes from a trusted source. If not, a separate process reads it first,
-            since a damaged layer can crash its reader. That takes a second.
+        trusted: Whether the stage is trusted. If not, another process reads all of it first, in a second.
         force: Whether to replace existing files.
         progress: Function that is called with the name of each step.
 
@@ -141,14 +141,13 @@ def export_scene(
             parameter="profile",
         )
     beside = out.with_name(f"{out.stem}_magtwin") if kind == "package" and name != "viewer" else None
-    for target in filter(None, (out, beside)):
-        check_free(target, force=force)
     if existing(scene_file, "stage").is_dir():
         inner = scene_file / f"{scene_file.resolve().name}.usda"
         raise InputError(
             f"{scene_file}: a folder; give a USD file in it{f', such as {inner}' if inner.is_file() else ''}"
         )
     for target in filter(None, (out, beside)):
+        check_free(target, force=force)
         if target.resolve() in (scene_file.resolve(), *scene_file.resolve().parents):
             raise InputError(f"{target}: is or contains the exported stage; give another output")
     with TemporaryDirectory() as scratch, _renamed(Path(scratch, "stage"), scene_file), ExitStack() as own:
@@ -220,17 +219,11 @@ class _Work:
             if not trusted:
                 inspect(root, ())
             self.checksum = sha256(self.source)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", MismatchWarning)  # it would name the working copy
-                unnamed = detach(root)
-                self.root = bring_together(root, self.folder, within=package)
-            for file in unnamed:
-                copied(file, self.folder / file.relative_to(root.parent))
+            self.root = bring_together(root, self.folder, within=package)
         else:
             if not trusted:
                 inspect(self.source, ())
             self.root = bring_together(self.source, self.folder)
-            detach(self.root)  # of a single layer, which holds its network
             self.checksum = stage_sha256(self.source)
         stage = open_stage(self.root)
         check_units(stage)
@@ -352,9 +345,21 @@ class _Work:
         self.folder.mkdir()
         self.root, self.run = bring_together(flat, self.folder), None
 
+    def leave_out(self) -> None:
+        """Remove networks and paths, and empty their names: neither a package nor a layer may hold them."""
+        files = [file for file in self.folder.rglob("*") if file.is_file()]
+        for file in files:
+            if file.suffix.lower() in SUFFIXES:
+                layer = Sdf.Layer.FindOrOpen(str(file))
+                UsdUtils.ModifyAssetPaths(layer, lambda name: "" if kind_of(name) in LEFT_OUT else name)
+                if layer.dirty:
+                    layer.Save()
+            elif kind_of(file) in LEFT_OUT:
+                file.unlink()
+
     def layer(self, out: Path) -> None:
         """Write one layer."""
-        attach(self.root)
+        self.leave_out()
         self.flat()
         for file in self.folder.rglob("*"):
             if file.is_file() and file != self.root:
@@ -372,8 +377,8 @@ class _Work:
             beside.mkdir()
             for file in [*self.networks, *self.onnx]:
                 copied(file, beside / "weights" / file.name)
-            self._write_readme(beside, out.name, attached=True)
-        attach(self.root, *self.onnx)
+            self._write_readme(beside, out.name, packed=True)
+        self.leave_out()
         if self.profile == "viewer":
             self.flat()
         pack(self.run or self.root, out)
@@ -382,7 +387,7 @@ class _Work:
         """Write a folder."""
         if self.profile == "viewer":
             self.flat()
-        self._write_readme(self.folder, self.root.name, attached=False)
+        self._write_readme(self.folder, self.root.name, packed=False)
         shutil.move(self.folder, out)
         if thumbnail is not None:
             self.progress("Drawing its thumbnail")
@@ -396,10 +401,10 @@ class _Work:
                 if not any(picture.parent.iterdir()):
                     shutil.rmtree(picture.parents[1])
 
-    def _write_readme(self, folder: Path, root: str, *, attached: bool) -> None:
+    def _write_readme(self, folder: Path, root: str, *, packed: bool) -> None:
         """Write the README page and the schema plugin to a folder."""
         viewer = self.profile == "viewer"
-        run = root if attached or self.run is None else self.run.name  # file that plays the run
+        run = root if packed or self.run is None else self.run.name  # file that plays the run
         if not viewer:
             for name in GENERATED:
                 copied(SCHEMA / name, folder / PLUGIN / name)
@@ -416,13 +421,13 @@ class _Work:
             plugin=not viewer,
             map=self.map,
             magnetometer=self.magnetometer if self.networks else "",
-            attached=attached,
+            packed=packed,
             graphs=str(GRAPHS) if self.profile == "isaac" else "",
             source=self.source.name,
             checksum=self.checksum,
             licences=self.licences,
             scripts=[script.name for script in self.scripts],
-            stage=quote(f"../{root}" if attached else root),
+            stage=quote(f"../{root}" if packed else root),
             onnx=quote(self._relative(self.onnx[0]) if self.onnx else "NETWORK.onnx"),
             notes=self.notes,
         )

@@ -30,13 +30,12 @@ STAGES = (".usd", ".usda", ".usdc", ".usdz")
 Source = str | Path
 
 
-def view(files: Sequence[Source], *, scene: Source | None = None, offsets_s: Sequence[float] = ()) -> None:
+def view(files: Sequence[Source], *, scene: Source | None = None) -> None:
     """Show runs in the Rerun viewer, or a stage in usdview or a window, until it is closed.
 
     Args:
         files: Runs in any format, on one timeline; or one stage.
         scene: Stage to show runs in. None: the one of the metadata.
-        offsets_s: Seconds to add to the times of each of several runs.
 
     Raises:
         InputError: A file cannot be read, or there is no viewer.
@@ -46,13 +45,8 @@ def view(files: Sequence[Source], *, scene: Source | None = None, offsets_s: Seq
     paths = [shipped_or(file) for file in files]
     if not paths:
         raise InputError("name a run or a stage to view")
-    if offsets_s and (len(offsets_s) != len(paths) or len(paths) < 2):
-        raise InputError(
-            f"`offsets_s` has one value for each of several runs, got {len(offsets_s)} of {len(paths)}",
-            parameter="offsets_s",
-        )
     if len(paths) > 1:
-        _view_together(paths, scene, offsets_s or [0.0] * len(paths))
+        _view_together(paths, scene)
     elif paths[0].suffix.lower() in STAGES and not paths[0].is_dir():
         _view_stage(paths[0])
     else:
@@ -249,7 +243,7 @@ def _view_run(file: Path, scene: Source | None) -> None:
         show_run(run, twin_to_show(run, file, scene), file=file)
 
 
-def _view_together(files: Sequence[Path], scene: Source | None, offsets_s: Sequence[float]) -> None:
+def _view_together(files: Sequence[Path], scene: Source | None) -> None:
     from magtwin.io.rerun.file import write_comparison
     from magtwin.io.rerun.viewer import show
 
@@ -260,7 +254,7 @@ def _view_together(files: Sequence[Path], scene: Source | None, offsets_s: Seque
     twin = twin_to_show(next(iter(runs.values())), files[0], scene)
     with tempfile.TemporaryDirectory() as folder:
         rrd = Path(folder) / "runs.rrd"
-        write_comparison(runs, rrd, twin, offsets_s=dict(zip(runs, offsets_s, strict=True)))
+        write_comparison(runs, rrd, twin)
         show(rrd, source=files[0])
 
 

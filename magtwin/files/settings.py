@@ -171,10 +171,6 @@ def refused_at(
     return _Where(Path(path), section, number).refused(key, text)
 
 
-_Place = tuple[tuple[str, int], ...]
-"""Names and indices of the tables from the top to one."""
-
-
 @dataclasses.dataclass(frozen=True)
 class _Where:
     """A table of a TOML file, for errors that name the line."""
@@ -192,61 +188,44 @@ class _Where:
         return _Where(self.path, f"{self.section}.{key}" if self.section else key, number, self)
 
     def refused(self, key: str, text: str) -> InputError:
-        line = self._line(key)
+        try:
+            lines = self.path.read_text(encoding="utf-8-sig").splitlines()
+        except OSError:
+            lines = []
+        line = self._line(lines, key)
         table = f"[{self.section}] " if self.section else ""
         where = f"{self.path}:{line}" if line else str(self.path)
         return InputError(f"{where}: {table}{text}")
 
-    def _line(self, key: str) -> int | None:
-        """Line of a key, or of the table if it has none; None if the file cannot be read."""
-        try:
-            lines = self.path.read_text(encoding="utf-8-sig").splitlines()
-        except OSError:
-            return None
-        here, counts, header = self._place(), dict[_Place, int](), 0
-        place: _Place = ()
-        for number, line in enumerate(lines, 1):
-            text = line.strip()
-            if text.startswith("["):
-                name = text.split("#")[0].strip("[] ")
-                place = _counted(counts, name, text.startswith("[["))
-                if _matches(place, here):
-                    header = number
-                elif key and place[-1][0] == key and _matches(place[:-1], here):
-                    return number
-            elif _matches(place, here) and key and text.split("=")[0].strip().strip('"') == key:
+    def _line(self, lines: Sequence[str], key: str) -> int:
+        """Line of a key, or of the table if it has none, from 1; 0 if it is not found."""
+        begin = self._header(lines)
+        if self.section and not begin:  # an inline table
+            return self.parent._line(lines, self.section.rpartition(".")[2]) if self.parent else 0
+        name = f"{self.section}.{key}" if self.section else key
+        inside = True
+        for number, line in enumerate(lines[begin:], begin + 1):
+            header = _header_of(line)
+            inside = inside and not header
+            if key and (header == name or (inside and line.split("=")[0].strip().strip('"') == key)):
                 return number
-        if not header and self.parent is not None:  # an inline table
-            return self.parent._line(self.section.rpartition(".")[2])
-        return header or None
+            if header and header == self.section:
+                break
+        return begin
 
-    def _place(self) -> tuple[tuple[str, int | None], ...]:
-        """Names and indices of the tables from the top to this one; an index of None matches any."""
-        above: tuple[tuple[str, int | None], ...] = ()
-        if self.parent is not None:
-            above = self.parent._place()
-        elif self.section:
-            above = tuple((name, None) for name in self.section.split(".")[:-1])
-        return (*above, (self.section.rpartition(".")[2], self.number)) if self.section else ()
-
-
-def _counted(counts: dict[_Place, int], name: str, array: bool) -> _Place:
-    """Names and indices of the tables that a header begins; `counts` has those of the headers before."""
-    *above, last = name.split(".", BUDGETS["TOML"].depth)
-    place: _Place = ()
-    for word in above:
-        place = (*place, (word, counts.get((*place, (word, 0)), 0)))
-    first = (*place, (last, 0))
-    if array:
-        counts[first] = counts.get(first, -1) + 1
-    return (*place, (last, counts.get(first, 0)))
+    def _header(self, lines: Sequence[str]) -> int:
+        """Line of the table's header, from 1; 0 if it has none."""
+        if not self.section:
+            return 0
+        begin = self.parent._header(lines) if self.parent is not None else 0
+        same = [n for n, line in enumerate(lines, 1) if n > begin and _header_of(line) == self.section]
+        return same[self.number] if len(same) > self.number else 0
 
 
-def _matches(place: Sequence[tuple[str, int]], wanted: Sequence[tuple[str, int | None]]) -> bool:
-    return len(place) == len(wanted) and all(
-        name == word and index in (None, number)
-        for (name, number), (word, index) in zip(place, wanted, strict=True)
-    )
+def _header_of(line: str) -> str:
+    """The name of the table that a line of TOML begins; "" if it begins none."""
+    text = line.split("#")[0].strip()
+    return text.strip("[] ") if text.startswith("[") else ""
 
 
 def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:

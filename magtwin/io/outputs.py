@@ -5,14 +5,12 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import Event
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from magtwin.errors import InputError
-from magtwin.files.outputs import at_once, check_free, output, transaction
+from magtwin.files.outputs import check_free, output, transaction
 from magtwin.io.formats import format_of, format_to_write, read_run, write_run
-from magtwin.io.recorder import Recorder, Sink, in_step, partial_of
 from magtwin.path import CASES, PATHS
 from magtwin.path import Path as Planned
 from magtwin.path.room import FLOOR_M
@@ -28,10 +26,10 @@ if TYPE_CHECKING:
 IN_FOLDER = ("run.rrd", "run.parquet")
 """Runs in a folder that is named as an output; the LiDAR's scans and a picture lie beside them."""
 
-GROWING = (".rrd", ".parquet", ".mcap", "")
-"""Suffixes of files that grow while a run is shown live; "" is the folder of a bag."""
-
 USD = (".usd", ".usda", ".usdc")
+
+OPENING = ("lab", "map_layer", "network", "magnetometer", "model_error", "tracking_error")
+"""Options of `magtwin.open_twin`."""
 
 
 @dataclass(frozen=True)
@@ -44,19 +42,12 @@ class Driven:
     scans: "Scans | None" = None
 
 
-@at_once()  # what a simulation writes for itself is no output of the command
 def drive(
     scene_file: str | Path,
     path: str = "figure8",
     *,
     commands: str | Path | None = None,
     replay: str | Path | None = None,
-    lab: str = "",
-    map_layer: str | Path | None = None,
-    network: str | Path | None = None,
-    magnetometer: Literal["physical", "neural", "map-only"] | None = None,
-    model_error: bool = True,
-    tracking_error: bool = True,
     seed: int = 0,
     session: Session | None = None,
     plant: PlantSpec | str | None = None,
@@ -73,12 +64,6 @@ def drive(
         path: Path, as for `magtwin.simulate`.
         commands: CSV of commands to drive by, in place of the path.
         replay: Run to drive again, in place of the path.
-        lab: As for `magtwin.open_twin`.
-        map_layer: As for `magtwin.open_twin`.
-        network: As for `magtwin.open_twin`.
-        magnetometer: As for `magtwin.open_twin`.
-        model_error: As for `magtwin.open_twin`.
-        tracking_error: As for `magtwin.open_twin`.
         seed: Seed of all noise.
         session: As for `magtwin.simulate`.
         plant: As for `magtwin.simulate`.
@@ -86,7 +71,7 @@ def drive(
         scans: Whether the LiDAR's rays are cast.
         metadata: Metadata of the run, such as names of files that move with it.
         report: Called with a line about each step.
-        options: Of `magtwin.simulate`.
+        options: Of `magtwin.open_twin` and `magtwin.simulate`.
 
     Raises:
         InputError: As for `magtwin.simulate`, or a file cannot be read.
@@ -99,15 +84,7 @@ def drive(
         metadata = {"replay_file": Path(replay).as_posix(), **metadata}
     elif path != "random":
         drive_input(path)  # refuses a wrong name before the scene is opened
-    twin = open_twin(
-        scene_file,
-        lab=lab,
-        map_layer=map_layer,
-        network=network,
-        magnetometer=magnetometer,
-        model_error=model_error,
-        tracking_error=tracking_error,
-    )
+    twin = open_twin(scene_file, **{name: options.pop(name) for name in OPENING if name in options})
     twin = in_session(with_plant(twin, plant), session, seed=seed)
     planned = None
     if what is path and path != "random":
@@ -238,40 +215,14 @@ class Outputs:
         for one in parts:
             shutil.rmtree(one.folder)
 
-    def check_live(self) -> None:
-        """Refuse partial files of an earlier run that was shown live."""
-        for target in self._runs():
-            if target.suffix.lower() in (".rrd", ".mcap"):
-                check_free(partial_of(target), force=self.force)
-
-    def sinks(self, driven: Driven) -> list[Sink]:
-        """Writers that take the run as it comes, one per growing format."""
-        from magtwin.io.bags import BagWriter
-        from magtwin.io.rerun.live import RrdWriter
-        from magtwin.io.tables import ParquetParts
-
-        shown: dict[str, Any] = {"planned": driven.planned, "scans": driven.scans, "force": self.force}
-        sinks: dict[str, Any] = {}
-        for target in self._runs():
-            if target.suffix.lower() == ".rrd" and ".rrd" not in sinks:
-                sinks[".rrd"] = RrdWriter(target, driven.twin, expected=driven.run, **shown)
-            elif target.suffix.lower() == ".parquet" and ".parquet" not in sinks:
-                sinks[".parquet"] = ParquetParts(target, force=self.force)
-            elif target.suffix.lower() == ".mcap":
-                options = {"units": self.out_unit or "T", "scans": driven.scans, "force": self.force}
-                sinks[str(target)] = BagWriter(target, driven.twin, **options)  # type: ignore[arg-type]
-        return list(sinks.values())
-
-    def write(self, driven: Driven, *, recorded: bool = False) -> None:
-        """Write the run to every target, each format once; `recorded` formats are there already."""
+    def write(self, driven: Driven) -> None:
+        """Write the run to every target, each format once."""
         written: dict[str, Path] = {}
         for target in sorted(self._runs(), key=lambda file: file.suffix.lower() in USD):
             if target.suffix.lower() in written:
                 shutil.copyfile(written[target.suffix.lower()], target)
                 continue
             written[target.suffix.lower()] = target
-            if recorded and target.suffix.lower() in GROWING:
-                continue
             takes, options = format_of(target).takes, dict[str, Any]()
             if self.out_unit is not None and "units" in takes:
                 options["units"] = self.out_unit
@@ -292,51 +243,6 @@ class Outputs:
         """Files that hold the run."""
         inside = [] if self.folder is None else [self.folder / name for name in IN_FOLDER]
         return [*(_with_name(file, self.robot) for file in inside), *self.files]
-
-
-def record_live(
-    driven: Driven,
-    outputs: Outputs,
-    *,
-    address: str | None,
-    pace: float = 1.0,
-    stop: Event | None = None,
-    progress: Callable[[float, float, str], Any] = lambda done, total, what: None,
-) -> Driven:
-    """Emit a run in step with the clock to its files and to a Rerun viewer.
-
-    Args:
-        driven: The run.
-        outputs: Files that grow meanwhile; `Outputs.write` writes the others afterwards.
-        address: Address of a Rerun viewer. None: only files.
-        pace: Simulated seconds per second.
-        stop: Ends the run early when set.
-        progress: Called with seconds done, seconds in all and a word.
-
-    Returns:
-        The run until its end, or until it was stopped.
-
-    Raises:
-        InputError: It was stopped before the first reading.
-    """
-    from magtwin.io.rerun.live import LiveViewer
-
-    run, viewers = driven.run, list[Sink]()
-    if address is not None:
-        shown: dict[str, Any] = {"planned": driven.planned, "scans": driven.scans}
-        viewers.append(LiveViewer(address, driven.twin, expected=run, **shown))
-    with Recorder(outputs.sinks(driven), viewers) as recorder:
-        for block in in_step(run, pace, stop=stop):
-            recorder.append(block)
-            progress(round(float(block["t"][-1])), round(float(run["t"][-1])), "Ctrl-C ends it")
-    if not recorder.rows:
-        raise InputError("ended before the first reading; nothing is written")
-    scans = driven.scans
-    if recorder.rows < run.rows:
-        run = run.take(slice(recorder.rows))
-        if scans is not None:
-            scans = scans.take(scans.t <= run["t"][-1])
-    return replace(driven, run=run, scans=scans)
 
 
 def _scans_of(file: Path) -> Path:

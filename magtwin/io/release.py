@@ -29,8 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, hint
-from magtwin.files.budget import check_size
-from magtwin.files.file import existing, sha256
+from magtwin.files.file import read_text, sha256
 from magtwin.frames import canonical, quat_from_yaw, wrap_angle
 from magtwin.run.run import COLUMNS, Run
 
@@ -40,20 +39,19 @@ _BETWEEN = re.compile(r"[\s,]*")
 _STUMP = re.compile(r"[A-Za-z-]{0,9}\s*")
 """An incomplete word or sign at the end of half a frame."""
 
-_SHAPES: dict[str, int | tuple[int, ...]] = {
+_SIZES = {
     "timestamp": 1,
     "nn_magnetic_magnitude": 1,
     "map_magnetic_magnitude": 1,
     "pose_data": 3,
-    "odom": (3, 3),
-    "imu_data": (4, 3, 3),
+    "odom": 6,
+    "imu_data": 10,
     "battery_data": 2,
     "lidar": 1,
 }
-"""Shape of each entry of a frame: a number, so many numbers, or lists of so many numbers."""
+"""Numbers of each entry of a frame; they may be in several lists."""
 
-_SIZES = [shape if isinstance(shape, int) else sum(shape) for shape in _SHAPES.values()]
-_WIDTH = sum(_SIZES)
+_WIDTH = sum(_SIZES.values())
 """Numbers in a frame."""
 
 
@@ -77,10 +75,7 @@ def read_release(path: str | os.PathLike[str]) -> Run:
         InputError: The file is missing or not such a list, a frame is not as above (the text gives its number
             and position), its clock goes back, or no frame has a reading.
     """
-    path = existing(path, "recording")
-    if path.is_dir():
-        raise InputError(f"{path}: a folder; name the .json file in it")
-    check_size(path, "recording")
+    path = Path(path)
     text, at, table, last = *_opened(path), array("d"), -math.inf
     for number in count(1):
         at = _BETWEEN.match(text, at).end()  # type: ignore[union-attr]
@@ -112,8 +107,8 @@ def read_release(path: str | os.PathLike[str]) -> Run:
 
 
 def _columns(rows: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
-    """Columns of a Run from numbers in the order of `_SHAPES`."""
-    parts = np.split(rows, np.cumsum(_SIZES)[:-1], axis=1)
+    """Columns of a Run from numbers in the order of `_SIZES`."""
+    parts = np.split(rows, np.cumsum([*_SIZES.values()])[:-1], axis=1)
     clock, field, on_map, pose, odom, imu, battery, lidar = parts
     yaw, q = wrap_angle(pose[:, 2]), canonical(quat_from_yaw(pose[:, 2]))
     p = np.column_stack([pose[:, :2], np.where(np.isfinite(pose[:, 0]), 0.0, np.nan)])
@@ -139,13 +134,13 @@ def _columns(rows: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
 
 
 def _numbers(frame: dict[str, Any], where: str) -> list[float]:
-    """The numbers of a frame in the order of `_SHAPES`; nan if not known yet."""
+    """The numbers of a frame in the order of `_SIZES`; nan if not known yet."""
     row: list[float] = []
-    for key, shape in _SHAPES.items():
+    for key, size in _SIZES.items():
         if key not in frame:
             known = list(frame)[:20]
             raise InputError(f"{where}: no {key!r} in it, which `save_json` writes; {hint(key, known)}")
-        row += _flat(frame[key], shape, key, where)
+        row += _flat(frame[key], size, key, where)
     if not math.isfinite(row[0]):
         raise InputError(f"{where}: timestamp must be a time [s], got {_quoted(frame['timestamp'])}")
     if row[-1] not in (0.0, 1.0) and not math.isnan(row[-1]):
@@ -153,16 +148,15 @@ def _numbers(frame: dict[str, Any], where: str) -> list[float]:
     return row
 
 
-def _flat(value: Any, shape: int | tuple[int, ...], key: str, where: str) -> list[float]:
-    if shape == 1:
-        return [_number(value, key, where)]
-    parts = (1,) * shape if isinstance(shape, int) else shape
-    if value is None or value == []:
-        return [math.nan] * sum(parts)
-    if not isinstance(value, list) or len(value) != len(parts):
-        what = "numbers here" if isinstance(shape, int) else "lists of numbers"
-        raise InputError(f"{where}: {key} must be {len(parts)} {what}, got {_quoted(value)}")
-    return [n for part, width in zip(value, parts, strict=True) for n in _flat(part, width, key, where)]
+def _flat(value: Any, size: int, key: str, where: str) -> list[float]:
+    """The numbers of an entry, in one list or several; nan where they are not known."""
+    parts = value if isinstance(value, list) else [value]
+    flat = [number for part in parts for number in (part if isinstance(part, list) else [part])]
+    if not flat or value is None:
+        return [math.nan] * size
+    if len(flat) != size:
+        raise InputError(f"{where}: {key} must be {size} numbers here, got {_quoted(value)}")
+    return [_number(number, key, where) for number in flat]
 
 
 def _number(value: Any, key: str, where: str) -> float:
@@ -182,10 +176,7 @@ def _quoted(value: Any) -> str:
 
 def _opened(path: Path) -> tuple[str, int]:
     """The text of a file, and where its list of frames begins."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file ({error}); a recording is JSON") from error
+    text = read_text(path, "recording", "recording", "utf-8-sig")
     begin = text.lstrip()[:20]
     if not begin.startswith("["):
         seen = _quoted(begin) if begin else "nothing"

@@ -18,7 +18,7 @@ from typing import Any
 
 from magtwin.errors import InputError
 from magtwin.files.file import read_bytes, read_text
-from magtwin.files.outputs import check_free, exchanged, output
+from magtwin.files.outputs import HIDDEN, check_free, output
 from magtwin.io.tables import parquet_of, write_parquet
 from magtwin.parallel import checked_shard, in_shard, open_pool
 from magtwin.report.report import Figure, Report
@@ -151,8 +151,6 @@ def save_runs(
         text = "other shards may have written there; remove the folder yourself, and drop `force`"
         raise InputError(text, parameter="force")
     parts = _Parts(runs, Path(out), force, at_hand=dask is None)
-    if shard is None:
-        parts.take_back()
     check_free(out, force=force)
     if shard is not None:
         checked_shard(shard)
@@ -206,11 +204,6 @@ class _Parts:
         self.blocks = [range(k, min(k + size, len(runs))) for k in range(0, len(runs), size)]
         self.about = {"magtwin": __version__, "sweep": runs.identity, "runs": len(runs)}
 
-    def take_back(self) -> None:
-        """Take up a sweep whose process was killed after it renamed the folder."""
-        if self._about(self.out) == self.about and not self.folder.exists():
-            self.out.rename(self.folder)
-
     def save(self, pool: Any, shard: tuple[int, int] | None, progress: Progress) -> Report:
         """Make the blocks of a shard that are not there yet; rename the folder once all are."""
         self._begin()
@@ -252,7 +245,6 @@ class _Parts:
         """Make the folder, or check that it is of this sweep."""
         if self._about(self.folder) == self.about:
             return
-        check_free(self.folder / ABOUT, force=True)  # removes what a process left that was killed here
         if self.folder.exists() and any(not file.name.startswith(".") for file in self.folder.iterdir()):
             if not self.force:
                 text = "unfinished runs of another sweep; give `force=True` to replace them, or another name"
@@ -267,14 +259,8 @@ class _Parts:
             with output(self.folder / LISTING, force=True) as aside:
                 aside.write_bytes(said.csv())
             if self.out.exists():  # checked in the beginning: to be replaced
-                old = self.folder
-                if not exchanged(self.folder, self.out):
-                    old = self.out.with_name(f".{self.out.name}.{os.getpid()}.old")
-                    self.out.rename(old)
-                    self.folder.rename(self.out)
-                shutil.rmtree(old)
-            else:
-                self.folder.rename(self.out)
+                shutil.rmtree(self.out)
+            self.folder.rename(self.out)
         except (FileNotFoundError, InputError):
             if self.folder.exists():
                 raise
@@ -284,6 +270,8 @@ class _Parts:
 
     def _tidy(self) -> None:
         """Remove the notes of a finished sweep, sweep.json last."""
+        for left in self.out.glob(f".*{HIDDEN}*"):  # of processes that were killed
+            shutil.rmtree(left, ignore_errors=True)
         for file in (*self.out.glob("part-*.json"), self.out / ABOUT):
             file.unlink(missing_ok=True)
 

@@ -27,7 +27,6 @@ from magtwin.errors import InputError, find
 from magtwin.files.budget import BUDGETS, check_count, check_decoded, check_size, decoded_limit
 from magtwin.files.file import check_zip, existing
 from magtwin.files.outputs import check_free, output
-from magtwin.io.recorder import Sink
 from magtwin.run import mapped
 from magtwin.run.arrow import (
     FACTS,
@@ -197,19 +196,17 @@ def _check_file(path: Path, kind: str) -> None:
         raise InputError(f"{path}: a folder, not {kind}; name the file in it")
 
 
-class ParquetParts(Sink):
-    """A Parquet file that grows: each block becomes a separate file, and at the end all become one.
+class ParquetParts:
+    """A run that grows: each block becomes a Parquet file in the folder `F.parts`.
 
-    Until then the blocks lie in the folder `F.parquet.parts`, which `read_parquet` reads at any time; a
-    killed program loses at most the current block. The final file has the bytes that `write_parquet` writes
-    for the whole run.
+    `read_parquet` reads the folder at any time; a killed program loses at most the current block.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Start a file.
 
         Args:
-            path: The Parquet file to make at the end.
+            path: The file F.
             force: Replace an existing file, and the parts of an unfinished one.
 
         Raises:
@@ -223,7 +220,7 @@ class ParquetParts(Sink):
                 f"{self.folder}: parts of a run that did not end; magtwin convert reads them; give --force "
                 "to replace them, or another name"
             )
-        self._force, self._count, self._last = force, 0, -np.inf
+        self._count, self._last = 0, -np.inf
         try:
             shutil.rmtree(self.folder, ignore_errors=True)
             self.folder.mkdir(parents=True)
@@ -247,17 +244,6 @@ class ParquetParts(Sink):
         with output(self.folder / f"part-{self._count:06d}.parquet", at_once=True) as aside:
             _write_tables(table, (), aside)
         self._count, self._last = self._count + 1, run["t"][-1]
-
-    def close(self) -> None:
-        """Join all parts into one file and remove them. Nothing is left if there are none."""
-        if self._count:
-            write_parquet(read_parquet(self.folder), self.path, force=self._force)
-        shutil.rmtree(self.folder, ignore_errors=True)
-
-    def abort(self) -> None:
-        """Leave the parts as they are. Nothing is left if there are none."""
-        if not self._count:
-            shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) -> None:

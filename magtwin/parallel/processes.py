@@ -15,7 +15,7 @@ from multiprocessing.connection import wait
 from typing import Any, Self
 
 from magtwin.errors import InputError
-from magtwin.parallel.machine import free_memory, processors
+from magtwin.parallel.machine import free_memory, processors, variables
 from magtwin.parallel.pool import RETRIES, C, Failure, Limit, Outcome, R, WorkerError
 from magtwin.parallel.worker import serve
 
@@ -48,7 +48,7 @@ class _Worker:
         self.process = context.Process(
             target=serve, args=(theirs, idle_s), daemon=True, name="magtwin-worker"
         )
-        with _start_lock, _no_interrupt(), _as_parent(), _known_main(), _environment(ONE_THREAD):
+        with _start_lock, _no_interrupt(), _as_parent(), variables(ONE_THREAD):
             self.process.start()
         theirs.close()
         self.ready = False
@@ -285,33 +285,3 @@ def _as_parent() -> Iterator[None]:
         yield
     finally:
         this.daemon = True
-
-
-@contextlib.contextmanager
-def _known_main() -> Iterator[None]:
-    """Let a new process not look for the program's file if there is none, as for `python - < script`."""
-    main = sys.modules["__main__"]
-    file = getattr(main, "__file__", None)
-    if file is None or os.path.exists(file):  # noqa: PTH110 - as multiprocessing joins it
-        yield
-        return
-    del main.__file__
-    try:
-        yield
-    finally:
-        main.__file__ = file
-
-
-@contextlib.contextmanager
-def _environment(values: dict[str, str]) -> Iterator[None]:
-    """Set variables of the environment for a time."""
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

@@ -57,11 +57,6 @@ class Commands:
         """Number of types that are advertised."""
         return len(self._publishers)
 
-    def subscribers(self) -> int:
-        """Number of subscribers."""
-        self._look()
-        return sum(publisher.subscribers() for publisher in self._publishers.values())
-
     def send(self, v: float, w: float) -> None:
         """Send a forward speed [m/s] and a yaw rate [rad/s]."""
         self._look()

@@ -2,9 +2,8 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
@@ -15,8 +14,9 @@ from magtwin.io.bags.topics import COMMAND, ODOMETRY, POSE, Topic
 from magtwin.path import Path
 from magtwin.ros.bus import Bus
 from magtwin.ros.commands import Commands, CommandType
-from magtwin.ros.diagnostics import Reporter, Status
-from magtwin.ros.inputs import Input, LiveFrames, Stamps
+from magtwin.ros.diagnostics import Level, Status
+from magtwin.ros.inputs import Stamps
+from magtwin.ros.node import BACK_S, Node
 from magtwin.sim.motion.controllers import Guide, guide_along
 from magtwin.sim.motion.follow import CONTROL_RATE_HZ
 from magtwin.sim.motion.loop import RELEASE
@@ -46,26 +46,6 @@ MARKER_M = 0.1
 
 STAND_S = 1.0
 """Time for which standing is commanded at the end [s]."""
-
-LOOK_S = 0.5
-"""Time between searches for new topics [s]."""
-
-BACK_S = 0.2
-"""A clock that went back by more than this was restarted [s]."""
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Progress of a drive."""
-
-    laps: int
-    """Number of times that the end was reached."""
-
-    off_m: float
-    """Distance from the path at the last step [m]; nan before the path is reached."""
-
-    rms_m: float
-    """RMS distance since the path was reached [m]; nan before."""
 
 
 class MarkerGuide(Guide):
@@ -109,7 +89,6 @@ class Follower:
         source: str = "truth",
         laps: int = 1,
         continuous: bool = False,
-        flip: bool = False,
         commands: CommandType = "auto",
         stamps: Stamps = "header",
         say: Callable[[str], None] = lambda text: None,
@@ -126,7 +105,6 @@ class Follower:
             source: A name of `SOURCES`.
             laps: Number of laps; an open path is driven back and forth.
             continuous: Drive without end.
-            flip: Drive from the end to the beginning.
             commands: Message type of the commands, as for `magtwin.ros.commands.Commands`.
             stamps: Whether poses count from the stamps of their headers, or from their arrival.
             say: Called with messages for the user.
@@ -136,8 +114,6 @@ class Follower:
         """
         if laps < 1:
             raise InputError(f"laps must be 1 or more, got {laps}")
-        if flip:
-            path = Path(path.name, path.p_xy[::-1], path.closed)
         self.path, self._drive, self._bus, self._say = path, drive, bus, say
         self._speed, self._controller = speed, controller
         self._wanted = self._left = math.inf if continuous else laps
@@ -145,27 +121,25 @@ class Follower:
         self._now_ns = 0
         self._guide = self._guided(path)
         topic, self._p, self._q = find("source", source, SOURCES)
-        told: Any = {"frames": LiveFrames(bus), "max_age_s": MAX_AGE_S, "stamps": stamps, "say": say}
-        self._pose = Input(bus, topic, **told)
-        self._twist = self._pose if topic is ODOMETRY else Input(bus, ODOMETRY, **told)
+        self._node = Node(bus, say, self._statuses, stamps)
+        self._twist = self._node.listen(ODOMETRY, max_age_s=MAX_AGE_S)
+        self._pose = self._twist if topic is ODOMETRY else self._node.listen(topic, max_age_s=MAX_AGE_S)
         self._commands = Commands(bus, commands)
-        self._reporter = Reporter(bus)
         self._state, self._stand_s = "", STAND_S
         self._last = (0.0, 0.0)
         self._begin_ns: int | None = None
-        self._laps, self._squares, self._count, self._off = 0, 0.0, 0, math.nan
+        self.laps, self.off_m = 0, math.nan
+        """How often the end was reached, and the distance from the path at the last step [m]."""
+        self._squares, self._count = 0.0, 0
         self.done = False
         """Whether the end was reached and the robot stands."""
-        self._look()
         bus.timer(1 / CONTROL_RATE_HZ, self._step)
-        bus.timer(LOOK_S, self._look)
-        self._reporter.each(self._report)
+        self._node.begin()
 
     @property
-    def progress(self) -> Progress:
-        """Progress of the drive."""
-        rms = math.sqrt(self._squares / self._count) if self._count else math.nan
-        return Progress(self._laps, self._off, rms)
+    def rms_m(self) -> float:
+        """RMS distance since the path was reached [m]; nan before."""
+        return math.sqrt(self._squares / self._count) if self._count else math.nan
 
     def stop(self) -> None:
         """Command the robot to stand; call it before the node ends."""
@@ -175,10 +149,6 @@ class Follower:
         return MarkerGuide(
             guide_along(self._controller, path, self._drive, speed=self._speed, dt=1 / CONTROL_RATE_HZ)
         )
-
-    def _look(self) -> None:
-        self._pose.look()
-        self._twist.look()
 
     def _step(self) -> None:
         """Send a command, by the newest pose."""
@@ -193,7 +163,7 @@ class Follower:
             return
         fresh = self._pose.fresh(now)
         if fresh is None:
-            self._announce(f"standing: {self._pose.missing(now)}")
+            self._announce(f"standing: {self._pose.missing()}")
             if self._last != (0.0, 0.0):
                 self._command(0.0, 0.0)
             return
@@ -209,8 +179,8 @@ class Follower:
         wanted = self._guide.command((now - self._begin_ns) / NS, x, y, yaw, v, w)
         self._command(*wanted)
         if self._guide.node > 0:  # not on the way to the beginning
-            self._off = float(self.path.nearest(np.array([[x, y]]))[1][0])
-            self._squares += self._off**2
+            self.off_m = float(self.path.nearest(np.array([[x, y]]))[1][0])
+            self._squares += self.off_m**2
             self._count += 1
         if self._guide.done:
             self._lap()
@@ -218,12 +188,11 @@ class Follower:
     def _restart(self) -> None:
         """Start again, after a restart of time."""
         self._say("time jumped back: driving the path from its beginning")
-        self._pose.forget()
-        self._twist.forget()
+        self._node.forget()
         self.path, self._left = self._begins, self._wanted
         self._guide = self._guided(self.path)
         self._begin_ns, self._stand_s = None, STAND_S
-        self._laps, self._squares, self._count, self._off = 0, 0.0, 0, math.nan
+        self.laps, self.off_m, self._squares, self._count = 0, math.nan, 0.0, 0
 
     def _rejoin(self, x: float, y: float) -> None:
         """Continue where the robot stands now; it coasted before it stood."""
@@ -238,7 +207,7 @@ class Follower:
             guide.node, guide.driven_m = guide.node + int(np.argmin(away)), 0.0
 
     def _lap(self) -> None:
-        self._laps += 1
+        self.laps += 1
         self._left -= 1
         if self._left <= 0:
             self._say("the end is reached")
@@ -259,19 +228,17 @@ class Follower:
             self._state = text
             self._say(text)
 
-    def _report(self, clock: str) -> None:
-        now, at = self._bus.now_ns(), self.progress
+    def _statuses(self, clock: str, now: int) -> list[Status]:
         fares = not clock and (self._guide.done or self._pose.fresh(now) is not None)
-        level: Any = "ok" if fares else "error"
+        level: Level = "ok" if fares else "error"
         message = clock or ("at the end" if self._guide.done else self._state)
         if (others := self._bus.publishers(COMMAND.name) - self._commands.offered) > 0:
             level = "warn" if fares else level
             message += f"; {others} others command the robot too"
         values = {
             "path": self.path.name,
-            "laps": str(at.laps),
-            "off the path [m]": f"{at.off_m:.3f}",
-            "RMS off the path [m]": f"{at.rms_m:.3f}",
+            "laps": str(self.laps),
+            "off the path [m]": f"{self.off_m:.3f}",
+            "RMS off the path [m]": f"{self.rms_m:.3f}",
         }
-        status = Status("drive", level, message, values)
-        self._reporter.report([status, self._pose.status(now)], now)
+        return [Status("drive", level, message, values)]

@@ -24,10 +24,7 @@ Stamps = Literal["header", "arrival"]
 """Time of a message: the stamp of its header, or its arrival at this node."""
 
 KEPT = 64
-"""Messages kept per topic, beside those of `Input.history_s`."""
-
-MOST_KEPT = 50_000
-"""Most messages kept per topic."""
+"""Messages kept per topic."""
 
 JUMP_S = 1.0
 """A stamp older than the last one by more than this means a restart of the robot or the clock [s]."""
@@ -82,10 +79,6 @@ class LiveFrames:
             columns = in_base(role, columns, mount._replace(q_xyzw=q))
         return columns, fault
 
-    def place(self, frame: str) -> Mount | None:
-        """Where a frame is on the robot; None if that is not known."""
-        return self._known.mount(frame)
-
     def _hear(self, message: Message) -> None:
         parts = ("header.frame_id", "child_frame_id", "transform.translation", "transform.rotation")
         try:
@@ -94,11 +87,6 @@ class LiveFrames:
         except InputError:
             return  # damaged
         self._mounts.clear()
-
-
-def frames_in(kind: str) -> list[str]:
-    """Leaves of a message type with its frames."""
-    return [leaf.name for leaf in layout(kind) if leaf.name in LEAVES]
 
 
 class Input:
@@ -132,9 +120,7 @@ class Input:
         """Its name on the network."""
         self._kind = ""
         self._subscription: Subscription | None = None
-        self._kept: deque[tuple[int, Columns]] = deque(maxlen=MOST_KEPT)
-        self.history_s = 0.0
-        """Time for which messages are kept [s], to be joined with a time that long ago."""
+        self._kept: deque[tuple[int, Columns]] = deque(maxlen=KEPT)
         self.heard, self.broken, self.jumps, self.ahead = 0, 0, 0, 0
         self.sent_ns = 0
         self._heard_before, self._reported_ns = 0, 0
@@ -172,14 +158,8 @@ class Input:
         self._kept.clear()
         self._behind_s.clear()
 
-    def count_from(self, stamps: Stamps) -> None:
-        """Change the time of messages."""
-        if stamps != self._stamps:
-            self._stamps = stamps
-            self.forget()
-
-    def skew(self) -> str:
-        """What to do about stamps far from the node's clock, in one line; "" if they are near.
+    def _clock(self) -> str:
+        """What is wrong with the last stamps against the node's clock, and what to do; "" if they are near.
 
         A sender whose clock differs also sends at another time than that of receipt. Otherwise the stamps are
         wrong, or late, by themselves.
@@ -187,36 +167,27 @@ class Input:
         if self._stamps == "arrival" or len(self._behind_s) < SKEWED:
             return ""
         behind, sent = min(self._behind_s, key=lambda pair: abs(pair[0]))
-        if not SKEW_S < abs(behind) < OTHER_S or len({late > 0 for late, _ in self._behind_s}) > 1:
+        if abs(behind) < SKEW_S or len({late > 0 for late, _ in self._behind_s}) > 1:
             return ""
+        if abs(behind) > OTHER_S:
+            how = "--sim-time, use_sim_time:=true" if behind > 0 else "this node goes by /clock"
+            return f"its stamps are of another clock ({how})"
+        instead = "or count from arrival (stamps)"
         if abs(sent) > SKEW_S / 2:
-            return (
-                f"the clock of its sender is {abs(sent):.1f} s {_off(sent)} this "
-                "machine's: synchronize them (chrony), or count from arrival (stamps)"
-            )
-        return (
-            f"its stamps are {abs(behind):.1f} s {_off(behind)} this node's clock when they are sent: "
-            "correct them in its driver, or count from arrival (stamps)"
-        )
+            off = f"{abs(sent):.1f} s {'behind' if sent > 0 else 'ahead of'}"
+            return f"the clock of its sender is {off} this machine's: synchronize them (chrony), {instead}"
+        off = f"{abs(behind):.1f} s {'behind' if behind > 0 else 'ahead of'}"
+        return f"its stamps are {off} this node's clock when they are sent: correct its driver, {instead}"
 
     def fresh(self, now_ns: int) -> Columns | None:
         """Columns as for `at`; None if they are stale."""
         latest = self.at(now_ns)
         return None if latest is None or latest[1] > self.max_age_s else latest[0]
 
-    def missing(self, now_ns: int) -> str:
+    def missing(self) -> str:
         """Message if nothing is fresh."""
-        return f"no fresh {self.name}{f': {self._fault}' if self._fault else self._other_clock(now_ns)}"
-
-    def _other_clock(self, now_ns: int) -> str:
-        """Hint at stamps of another clock; "" if there are none."""
-        if skew := self.skew():
-            return f": {skew}"
-        if not self._kept or abs(now_ns - self._kept[-1][0]) < OTHER_S * NS:
-            return ""
-        simulated = self._kept[-1][0] < now_ns
-        hint = "it is simulated: --sim-time, use_sim_time:=true" if simulated else "this node goes by /clock"
-        return f", whose stamps are of another clock ({hint})"
+        why = self._fault or self._clock()
+        return f"no fresh {self.name}{f': {why}' if why else ''}"
 
     def status(self, now_ns: int) -> Status:
         """Its state since the previous call."""
@@ -233,10 +204,8 @@ class Input:
             stale = self._trouble or "nobody publishes it"
         elif latest is None:
             stale = "every stamp is ahead of the clock" if self._kept else "nothing received yet"
-            stale += self._other_clock(now_ns)
         elif latest[1] > self.max_age_s:
             stale = f"its newest is {latest[1]:.2f} s old, more than {self.max_age_s:g} s"
-            stale += self._other_clock(now_ns)
         expected = bool(stale and self.silence and not self._trouble)
         problems = (
             (bool(self._trouble and self._subscription), self._trouble),
@@ -245,7 +214,7 @@ class Input:
             (bool(self.broken), f"{self.broken} messages could not be used"),
             (bool(self.jumps), f"stamps jumped back {self.jumps} times"),
             (bool(self.ahead), f"{self.ahead} stamps were ahead of this node's clock"),
-            (self.skew() and not stale, self.skew()),
+            (bool(self._clock()), self._clock()),
         )
         values = {
             "topic": self.name,
@@ -286,22 +255,20 @@ class Input:
         if self._kept and stamp == self._kept[-1][0]:
             self._kept.pop()
         self._kept.append((stamp, columns))
-        while len(self._kept) > KEPT and self._kept[1][0] < stamp - round(self.history_s * NS):
-            self._kept.popleft()
 
     def _compare(self, now: int, stamp: int, message: Message) -> None:
         """Compare a stamp with the node's clock; reports a large difference once."""
         if not now:
             return
         self._behind_s.append(((now - stamp) / NS, (message.received_ns - message.sent_ns) / NS))
-        if bool(skew := self.skew()) != self._skewed:
-            self._skewed = bool(skew)
-            self._say(f"{self.name}: {skew}" if skew else f"{self.name}: its stamps are near the clock again")
+        if bool(fault := self._clock()) != self._skewed:
+            self._skewed = bool(fault)
+            self._say(f"{self.name}: {fault or 'its stamps are near the clock again'}")
 
     def _read(self, message: Message) -> tuple[int, Columns]:
         stamped = layout(message.kind)[0].name == "header.stamp"
         role = role_of(self.topic.reads[message.kind])
-        framed = frames_in(message.kind) if role else []
+        framed = [leaf.name for leaf in layout(message.kind) if role and leaf.name in LEAVES]
         wanted = (*self.topic.leaves(message.kind), *framed, *(("header.stamp",) if stamped else ()))
         fields = message.read(wanted)
         header, child = (str(fields.pop(leaf, "")) for leaf in LEAVES)
@@ -317,10 +284,6 @@ class Input:
         if self._gravity is not None:
             columns = self._gravity.without(columns)
         return stamp, columns
-
-
-def _off(late_s: float) -> str:
-    return "behind" if late_s > 0 else "ahead of"
 
 
 class Gravity:
@@ -360,26 +323,22 @@ class Scanning:
         """Start to search for scans; `gap_s` is the longest time between two while it spins [s]."""
         self._bus, self._topic, self._gap_s = bus, topic, gap_s
         self._subscription: Subscription | None = None
-        self._times_ns: deque[int] = deque(maxlen=MOST_KEPT)
-        self.history_s = 0.0
-        """As for `Input`."""
+        self._last_ns: int | None = None
         self.heard = 0
 
     def look(self) -> None:
         """As for `Input`."""
-        if self._subscription is None and self._topic.kind in self._bus.types(self._topic.name):
-            self._subscription = self._bus.subscribe(
-                self._topic.name, self._topic.kind, self._hear, SENSOR_DATA
-            )
+        name, kind = self._topic.name, self._topic.kind
+        if self._subscription is None and kind in self._bus.types(name):
+            self._subscription = self._bus.subscribe(name, kind, self._hear, SENSOR_DATA)
 
     def on(self, now_ns: int) -> bool:
         """Whether it spins at a time [ns]."""
-        latest = next((t_ns for t_ns in reversed(self._times_ns) if t_ns <= now_ns), None)
-        return latest is not None and now_ns - latest < self._gap_s * NS
+        return self._last_ns is not None and 0 <= now_ns - self._last_ns < self._gap_s * NS
 
     def forget(self) -> None:
         """As for `Input`."""
-        self._times_ns.clear()
+        self._last_ns = None
 
     def status(self, now_ns: int) -> Status:
         """As for `Input`; silence means that it does not spin, so it is never stale."""
@@ -388,7 +347,4 @@ class Scanning:
 
     def _hear(self, message: Message) -> None:
         self.heard += 1
-        now = self._bus.now_ns()
-        self._times_ns.append(now)
-        while self._times_ns[0] < now - round((self.history_s + self._gap_s) * NS):
-            self._times_ns.popleft()
+        self._last_ns = self._bus.now_ns()

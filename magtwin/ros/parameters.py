@@ -53,23 +53,14 @@ def _value(name: str, parameter: Parameter, text: str) -> Any:
             raise InputError(f"parameter {name} is true or false, got {text!r}")
         return text.lower() == "true"
     if kind is str:
-        return checked(name, parameter, text)
+        if parameter.words and text not in parameter.words:
+            raise InputError(f"parameter {name} is {' or '.join(parameter.words)}, got {text!r}")
+        return text
+    low, high = parameter.low, parameter.high
     try:
-        number = kind(text)
+        value = kind(text)
     except ValueError:
         raise InputError(f"parameter {name} is a number, got {text!r}") from None
-    return checked(name, parameter, number)
-
-
-def checked(name: str, parameter: Parameter, value: Any) -> Any:
-    """The value, if the parameter allows it.
-
-    Raises:
-        InputError: It is out of range, or not an allowed word.
-    """
-    if parameter.words and value not in parameter.words:
-        raise InputError(f"parameter {name} is {' or '.join(parameter.words)}, got {value!r}")
-    low, high = parameter.low, parameter.high
     if not ((low is None or value >= low) and (high is None or value <= high)):
         raise InputError(f"parameter {name} must be from {low:g} to {high:g}, got {value:g}")
     return value

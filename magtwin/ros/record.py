@@ -1,27 +1,15 @@
-"""Record topics to a bag, which is a run; replay a run to topics."""
+"""Record topics to a bag, which is a run."""
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
-from typing import Literal
-
-import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.io.bags import RawBagWriter
-from magtwin.io.bags.cdr import NS, encode
-from magtwin.io.bags.sender import Transforms, Unit, prefixed
-from magtwin.io.bags.stream import Stream, shifted
 from magtwin.io.bags.topics import Qos
-from magtwin.io.bags.twin_sender import sender_for
-from magtwin.io.bags.types import layout
-from magtwin.ros.bus import Bus, Message, Publisher
-from magtwin.ros.bus.names import checked_prefix
-from magtwin.ros.topics import READ, RECORDED, SAMPLED, TICKS
-from magtwin.run.run import Run
-from magtwin.twin import Twin
+from magtwin.ros.bus import Bus, Message
+from magtwin.ros.topics import RECORDED, TICKS
 
 FLUSH_S = 1.0
 """Wall time between flushes [s]."""
@@ -32,17 +20,11 @@ LOOK_S = 0.5
 DEPTH = 1000
 """Queue of a topic, so that no message is lost while a file is written."""
 
-SETTLE_S = 1.5
-"""Wall time for discovery before the first message [s]."""
-
-AT_A_TIME = 1024
-"""Rows of a run that are encoded at a time."""
-
 
 class Recorder:
     """Records topics of any type, each from when it is first published.
 
-    If time jumps back, as after a reset of a simulator, the bag ends and the next one begins.
+    If time jumps back, as after a reset of a simulator, the recording ends.
     """
 
     def __init__(
@@ -70,16 +52,15 @@ class Recorder:
         """Name in the bag of each topic asked for by name."""
         self._waited = {name: known.get(name) for name in (*known, *self._named.values())}
         self._refused: dict[str, str] = {}
-        self._latched: dict[str, bytes | None] = {}
         self._looked, self._flushed = 0.0, time.monotonic()
         self._last_ns, self._clock_ns = -1, -1
-        self.resets = 0
-        """How often time jumped back."""
+        self.ended = False
+        """Whether time jumped back, which ends the recording."""
 
     def run(self, until: Callable[[], bool] = lambda: False, *, duration_s: float | None = None) -> None:
-        """Record until `until` is true, or for a wall time [s]."""
+        """Record until `until` is true, for a wall time [s], or until time jumps back."""
         begin = time.monotonic()
-        while not until() and (duration_s is None or time.monotonic() - begin < duration_s):
+        while not (self.ended or until()) and (duration_s is None or time.monotonic() - begin < duration_s):
             self.step()
             self._bus.spin_once(0.05)
 
@@ -123,8 +104,6 @@ class Recorder:
             self._refused.pop(name, None)
             if len(kinds) > 1:
                 self._say(f"{name} is published as {' and as '.join(kinds)}; recording {kind}")
-            if latched:
-                self._latched[name] = None
             self._bus.subscribe(name, kind, partial(self._heard, name), qos)
 
     def _refuse(self, name: str, why: str) -> None:
@@ -134,17 +113,12 @@ class Recorder:
 
     def _heard(self, name: str, message: Message) -> None:
         now = self._bus.now_ns()
-        if self._jumped(name, message, now):
-            self.resets += 1
-            path = self._writer.next()
-            self._say(f"time jumped back, as after a reset: recording goes on in {path}")
-            for latched, data in self._latched.items():
-                if data is not None and latched != name:
-                    self._writer.write(latched, now, data)
-            self._last_ns = -1
+        if self.ended or self._jumped(name, message, now):
+            if not self.ended:
+                self._say("time jumped back, as after a reset: the recording ends here; start another")
+            self.ended = True
+            return
         self._last_ns = now = max(now, self._last_ns)  # times in the bag never go back
-        if name in self._latched:
-            self._latched[name] = message.data
         self._writer.write(name, now, message.data)
 
     def _jumped(self, name: str, message: Message, now_ns: int) -> bool:
@@ -157,72 +131,3 @@ class Recorder:
             before, self._clock_ns = self._clock_ns, int(message.read(["clock"])["clock"])
             return self._clock_ns < before
         return False
-
-
-class Player:
-    """Publishes a run as its robot would have."""
-
-    def __init__(
-        self,
-        run: Run,
-        bus: Bus,
-        twin: Twin | None = None,
-        *,
-        units: Unit = "T",
-        topics: Sequence[str] = (),
-        stamps: Literal["run", "wall"] = "run",
-        frame_prefix: str = "",
-        tf: Transforms = "odom",
-    ) -> None:
-        """Advertise its topics.
-
-        Args:
-            run: The run.
-            bus: The node.
-            twin: The twin of the run: gives frames, covariances, /tf_static and the robot's description.
-            units: Unit of magnetic fields.
-            topics: Names of topics to publish. Default: all.
-            stamps: Time of the messages and of /clock: that of the run, or wall time.
-            frame_prefix: Prefix of the names of frames, such as "tb4/".
-            tf: Transforms of the drive on /tf, as for `magtwin.ros.simulate.Simulator`.
-
-        Raises:
-            InputError: The run has no column of these topics.
-        """
-        self._run, self._wall = run, stamps == "wall"
-        sender = sender_for(twin, units, run.metadata.get("rate_hz"))
-        sender = replace(prefixed(sender, checked_prefix(frame_prefix)), transforms=tf)
-        self._stream = Stream(run, sender, None, topics=(*SAMPLED.values(), *READ), whole=True)
-        chosen = [t for t in self._stream.topics if bus.knows(t.kind) and (not topics or t.name in topics)]
-        if not chosen:
-            raise InputError(f"the run has no columns of {', '.join(topics) or 'any topic'}")
-        self._publishers: dict[str, Publisher] = {
-            t.name: bus.publisher(t.name, t.kind, t.qos) for t in chosen
-        }
-        self._bus, self._begun = bus, time.monotonic()
-
-    def run(self, until: Callable[[], bool] = lambda: False, *, speed: float = 1.0) -> int:
-        """Publish it at `speed` times real time, after `SETTLE_S`; returns the number of messages."""
-        first = float(self._run["t"][0]) + self._stream.later_s
-        begin = max(time.monotonic(), self._begun + SETTLE_S)
-        count = 0
-        # at a pace other than 1, stamps run at that pace from the wall time of the beginning
-        shift = time.time_ns() + round((begin - time.monotonic() - first) * NS) if self._wall else 0
-        for row in range(0, self._run.rows, AT_A_TIME):
-            rows = self._run.take(slice(row, row + AT_A_TIME))
-            messages: list[tuple[int, Publisher, bytes]] = []
-            for topic, times, fields in self._stream.messages(rows):
-                if topic.name in self._publishers and len(times):
-                    if shift:
-                        fields = shifted(fields, shift)
-                    encoded = encode(layout(topic.kind, fields), fields, len(times))
-                    for t, data in zip(np.asarray(times).tolist(), encoded, strict=True):
-                        messages.append((t, self._publishers[topic.name], data.tobytes()))
-            for t, publisher, data in sorted(messages, key=lambda message: message[0]):
-                while (left := begin + (t / NS - first) / speed - time.monotonic()) > 0:
-                    self._bus.spin_once(left)
-                if until():
-                    return count
-                publisher.publish(data)
-                count += 1
-        return count

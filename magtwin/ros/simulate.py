@@ -10,7 +10,7 @@ from typing import Literal
 from magtwin.errors import InputError
 from magtwin.io.bags.cdr import NS, encode
 from magtwin.io.bags.sender import Transforms, Unit, prefixed
-from magtwin.io.bags.stream import Sent, shifted
+from magtwin.io.bags.stream import Sent
 from magtwin.io.bags.topics import Qos, Topic
 from magtwin.io.bags.twin_sender import sender_for
 from magtwin.io.bags.types import layout
@@ -24,7 +24,7 @@ from magtwin.sim.runs.live import LiveRobot
 from magtwin.twin import Session, Twin, in_session, led_by
 
 RESET = "/robot/reset"
-"""Topic (std_msgs/Empty), and with rclpy service (std_srvs/Empty), that resets robots and time."""
+"""Topic (std_msgs/Empty) that resets robots and time."""
 
 LEAD_S = 0.006
 """Time by which a control step is computed ahead, so that its first message is not late [s]."""
@@ -80,7 +80,6 @@ class Simulator:
         rate_hz: float | None = None,
         units: Unit = "T",
         lidar: Literal["schedule", "on", "off"] = "schedule",
-        stamps: Literal["sim", "wall"] = "sim",
         magnetometer: bool = True,
         frame_prefix: str | None = None,
         tf: Transforms = "odom",
@@ -97,7 +96,6 @@ class Simulator:
             rate_hz: Rate of the magnetometer [Hz]. Default: the scene's.
             units: Unit of magnetic fields: "T", as in ROS, or "nT", as APRILab's robot publishes them.
             lidar: Whether the LiDAR follows its schedule, or stays on or off.
-            stamps: Stamp messages with simulated time, from 0 on, or with wall time.
             magnetometer: Publish the magnetometer's readings; else another node does.
             frame_prefix: Prefix of the names of frames, such as "tb4/". Default: none; for several robots the
                 name of each, "ann/", which a given prefix precedes.
@@ -118,13 +116,12 @@ class Simulator:
         twin = in_session(twin, session, seed=seed)
         names = [placed.robot.name for placed in twin.scene.robots]
         several = len(names) > 1
-        self._bus, self._speed, self._wall, self._say = bus, speed, stamps == "wall", say
+        self._bus, self._speed, self._say = bus, speed, say
         self._publishers: dict[str, Publisher] = {}
         self._events: list[tuple[int, int, Publisher, bytes]] = []
-        self._count, self._resets, self._slips, self._begin_ns = 0, 0, 0, 0
+        self._count, self._resets, self._slips = 0, 0, 0
         self._reset = False
         bus.subscribe(RESET, "std_msgs/msg/Empty", lambda message: self.reset(), Qos().heard)
-        bus.service(RESET, self.reset)
         self._reporter = Reporter(bus)
         self.robots: list[SimulatedRobot] = []
         """The robots, in the order of the scene."""
@@ -213,7 +210,6 @@ class Simulator:
         now, t = time.monotonic() + LEAD_S, self.online.t
         if not t:
             self._events.clear()
-        self._begin_ns = time.time_ns() - round(t * NS) if self._wall else 0
         return Pace(self._speed, now - t / self._speed)
 
     def _advertise(self, topic: Topic) -> None:
@@ -229,8 +225,6 @@ class Simulator:
         publisher = self._publishers.get(topic.name)
         if publisher is None or not len(times):
             return
-        if self._begin_ns:
-            fields = shifted(fields, self._begin_ns)
         for t, data in zip(
             times.tolist(), encode(layout(topic.kind, fields), fields, len(times)), strict=True
         ):
@@ -261,7 +255,7 @@ class Simulator:
         publisher.publish(data)
 
     def _report(self, factor: float) -> None:
-        stamp = self._begin_ns + round(self.online.t * NS)
+        stamp = round(self.online.t * NS)
         for robot in self.robots:
             name, path = robot.path(stamp)
             if name in self._publishers:

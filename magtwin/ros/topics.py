@@ -70,11 +70,10 @@ READ = (TICKS, JOINTS, TF, TRUTH, MAGNITUDE, VECTOR, TOTAL_FIELD)
 
 OCCUPANCY = Topic(name="/map", kind="nav_msgs/msg/OccupancyGrid", qos=LATCHED, sent="once")
 FIELD = Topic(name="/anomaly_map", kind="sensor_msgs/msg/PointCloud2", qos=LATCHED, sent="once")
-FIELD_GRID = Topic(name="/anomaly_map/grid", kind="nav_msgs/msg/OccupancyGrid", qos=LATCHED, sent="once")
 READINGS = Topic(name="/robot/ground_truth/readings", kind="sensor_msgs/msg/PointCloud2")
 PATH = Topic(name="/robot/ground_truth/path", kind="nav_msgs/msg/Path", qos=Qos(depth=1))
 
-VIEWS = (OCCUPANCY, FIELD, FIELD_GRID, READINGS, PATH)
+VIEWS = (OCCUPANCY, FIELD, READINGS, PATH)
 """Topics for viewers, see `magtwin.ros.views`; robots share those of the lab."""
 
 LIVE = (*READ, *SAMPLED.values(), SCAN, TF_STATIC, DESCRIPTION, NAMES, READING, *VIEWS)

@@ -12,9 +12,9 @@ from magtwin.frames import rotate
 from magtwin.io.bags.cdr import NS
 from magtwin.io.bags.sender import Sender
 from magtwin.io.bags.stream import Sent
-from magtwin.path.occupancy import UNKNOWN, occupancy_of
-from magtwin.ros.bus import Bus, Publisher, to_bytes
-from magtwin.ros.topics import FIELD, FIELD_GRID, OCCUPANCY, PATH, READINGS
+from magtwin.path.occupancy import occupancy_of
+from magtwin.ros.bus import Bus, Publisher, poses_bytes, to_bytes
+from magtwin.ros.topics import FIELD, OCCUPANCY, PATH, READINGS
 from magtwin.run.run import Run
 from magtwin.twin import Twin, room_of
 
@@ -57,41 +57,16 @@ def publish_lab(twin: Twin, bus: Bus, frame: str) -> list[Publisher]:
     at = np.stack(np.meshgrid(x, y), axis=-1)[known]
     columns = {"x": at[:, 0], "y": at[:, 1], "z": np.zeros(len(at)), "b_nt": values[known]}
     cloud = cloud_fields(frame, columns | {"sd_nt": sd[known]})
-    cell = shown.cell_m[0] * step
-    messages = [(OCCUPANCY, grid_fields(frame, occupancy.cells, occupancy.resolution_m, occupancy.origin_m))]
-    messages.append((FIELD, cloud))
-    if math.isclose(*shown.cell_m):  # an OccupancyGrid has square cells
-        corner = (float(x[0]) - cell / 2, float(y[0]) - cell / 2)  # a node is the middle of its cell
-        messages.append((FIELD_GRID, grid_fields(frame, _percent(values), cell, corner)))
+    rows, width = occupancy.cells.shape
+    grid = {"header.frame_id": frame, "info.resolution": occupancy.resolution_m, "info.height": rows}
+    grid |= {"info.width": width, "info.origin.position": [*occupancy.origin_m, 0.0]}
+    grid |= {"info.origin.orientation": [0.0, 0.0, 0.0, 1.0], "data": occupancy.cells.reshape(1, -1)}
     publishers = []
-    for topic, fields in messages:
+    for topic, fields in ((OCCUPANCY, grid), (FIELD, cloud)):
         if bus.knows(topic.kind):
             publishers.append(bus.publisher(topic.name, topic.kind, topic.qos))
             publishers[-1].publish(to_bytes(topic.kind, fields))
     return publishers
-
-
-def grid_fields(
-    frame: str, cells: NDArray[np.int8], resolution_m: float, origin_m: tuple[float, float]
-) -> dict[str, Any]:
-    """Fields of an OccupancyGrid.
-
-    Args:
-        frame: Frame of the cells.
-        cells: Values -1 to 100, shape (Y, X).
-        resolution_m: Side of a cell [m].
-        origin_m: Lower left corner of the first cell [m].
-    """
-    rows, columns = cells.shape
-    return {
-        "header.frame_id": frame,
-        "info.resolution": resolution_m,
-        "info.width": columns,
-        "info.height": rows,
-        "info.origin.position": [*origin_m, 0.0],
-        "info.origin.orientation": [0.0, 0.0, 0.0, 1.0],
-        "data": cells.reshape(1, -1),
-    }
 
 
 def cloud_fields(frame: str, columns: Mapping[str, ArrayLike]) -> dict[str, Any]:
@@ -105,31 +80,6 @@ def cloud_fields(frame: str, columns: Mapping[str, ArrayLike]) -> dict[str, Any]
     fields |= {"height": 1, "width": len(table), "point_step": size, "row_step": size * len(table)}
     dense = int(np.isfinite(table).all())
     return fields | {"is_dense": dense, "data": np.frombuffer(table.tobytes(), np.uint8).reshape(1, -1)}
-
-
-def path_bytes(stamp_ns: int, frame: str, poses: ArrayLike) -> bytes:
-    """A Path of poses x, y, z [m] and orientation xyzw, shape (N, 7), each with the stamp of the path.
-
-    Poses are equal in size but for the first, whose numbers may be aligned otherwise.
-    """
-    table = np.asarray(poses, "<f8").reshape(-1, 7)
-    empty = {"header.stamp": np.int64(stamp_ns), "header.frame_id": frame}
-    head = to_bytes(PATH.kind, empty)[:-4] + np.uint32(len(table)).tobytes()
-    stamp = to_bytes("std_msgs/msg/Header", {"stamp": np.int64(stamp_ns), "frame_id": frame})[4:]
-    parts = [head]
-    at = len(head) - 4  # alignment counts from the end of the CDR header
-    for k in range(min(len(table), 2)):
-        parts.append(b"\0" * (-at % 4) + stamp)
-        at += len(parts[-1])
-        parts.append(b"\0" * (-at % 8) + table[k].tobytes())
-        at += len(parts[-1])
-    if len(table) > 2:
-        lead = b"".join(parts[3:5])[: -7 * 8]  # what precedes the numbers of the second pose
-        rows = np.zeros((len(table) - 2, len(lead) + 56), np.uint8)
-        rows[:, : len(lead)] = np.frombuffer(lead, np.uint8)
-        rows[:, len(lead) :] = table[2:].view(np.uint8).reshape(-1, 56)
-        parts.append(rows.tobytes())
-    return b"".join(parts)
 
 
 class Trail:
@@ -186,7 +136,7 @@ class Truth:
 
     def path(self, stamp_ns: int) -> bytes:
         """The true path so far."""
-        return path_bytes(stamp_ns, self._sender.map_frame, self._trail.poses)
+        return poses_bytes(PATH.kind, stamp_ns, self._sender.map_frame, self._trail.poses)
 
 
 def _mean_and_sd(shown: AnomalyMap) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -198,13 +148,3 @@ def _mean_and_sd(shown: AnomalyMap) -> tuple[NDArray[np.float64], NDArray[np.flo
         if shown.variance_nt2 is None:
             return mean, np.full_like(mean, np.nan)
         return mean, np.sqrt(np.where(valid, shown.variance_nt2, 0.0).sum(axis=0) / count)
-
-
-def _percent(values_nt: NDArray[np.float64]) -> NDArray[np.int8]:
-    """Values from 0 at the least to 100 at the greatest; -1 where unknown."""
-    known = np.isfinite(values_nt)
-    cells = np.full(values_nt.shape, UNKNOWN, np.int8)
-    if known.any():
-        least, greatest = values_nt[known].min(), values_nt[known].max()
-        cells[known] = np.rint(100 * (values_nt[known] - least) / max(greatest - least, 1e-9))
-    return cells

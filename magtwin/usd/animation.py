@@ -1,15 +1,13 @@
 """A Run as a USD layer of time samples over its scene, which any USD viewer plays.
 
 Time code 0 is the run's first row. The prim `Run` also holds every column as one exact array at full rate.
-Samples are authored on the layer itself, since a stage would recompose for each. Those of a long run are in
-value clips (`clips.py`), where the array of a column is in parts, one at the first time code of each clip.
+Samples are authored on the layer itself, since a stage would recompose for each.
 """
 
 import json
 import os
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import repeat
 from pathlib import Path
@@ -21,14 +19,13 @@ from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
 from magtwin.errors import InputError, find
-from magtwin.files.outputs import afterwards, output, transaction
+from magtwin.files.outputs import output
 from magtwin.frames import quat_conjugate, quat_multiply, rotate
 from magtwin.run import mapped
 from magtwin.run.resample import grid
 from magtwin.run.run import COLUMNS, Column, Run, check_clock
 from magtwin.spec.base import Quat, Vec3
 from magtwin.usd.attributes import read_pose, target, targets
-from magtwin.usd.clips import ClipWriter, Samples, clips_of, folder_of, read_clips, remove_clips
 from magtwin.usd.geometry import BASE_LINK, read_links
 from magtwin.usd.layers import (
     SUFFIXES,
@@ -115,8 +112,8 @@ def write_animation(
     """Write a run as a layer of time samples over its scene.
 
     Poses and readings are resampled at `fps` with `Run.resample`; flags and the battery are sampled when they
-    change. Bodies are moved by their transforms: for viewing, not for a physics engine. The samples of a run
-    of more than 524,288 rows are in value clips, in the folder `F.clips` beside the file F.
+    change. Bodies are moved by their transforms: for viewing, not for a physics engine. USD keeps the layer
+    in memory until it is written: 0.4 GB for an hour at 135 Hz.
 
     Args:
         run: The run. The pose is `p_world_base`, or else motion capture or odometry. Among several robots of
@@ -150,13 +147,7 @@ def write_animation(
             take_to_origin(stage, lab_on(stage, str(run.metadata.get("lab", ""))))
         check_not_part(stage, path)
         stand = _stand(stage, world, str(run.metadata.get("robot", "")))
-    with ExitStack() as stack:
-        stack.enter_context(transaction())
-        if run.rows > mapped.LONG:
-            folder = stack.enter_context(output(folder_of(path), force=force))
-        elif force:
-            afterwards(lambda: remove_clips(path))
-        aside = stack.enter_context(output(path, force=force))
+    with output(path, force=force) as aside:
         layer = Sdf.Layer.CreateNew(str(aside))
         if layer is None:
             raise InputError(f"{path}: cannot be made as a USD layer")
@@ -176,28 +167,17 @@ def write_animation(
             for bare in (stand.world, stand.robot, stand.sensors["magnetometer"]):
                 spec = Sdf.CreatePrimInLayer(layer, bare)
                 spec.specifier, spec.typeName = Sdf.SpecifierDef, "Xform"
-        readings, columns = _sampled(run, stand), stand.world.AppendChild(RUN)
-        clips = ClipWriter(folder, layer) if run.rows > mapped.LONG else None
+        readings = _sampled(run, stand)
         _declare(layer, stand, readings, wheels="wheel_angle" in run)
         try:
-            _store(layer, columns, run, clipped=clips is not None)
-            moves, path_moved = 0, stand.robot.AppendProperty(_TRANSLATE)
-            for piece in _pieces(run, fps, rate, pose):
-                samples = _samples(stand, readings, pose, piece)
-                moves += len(samples[path_moved][0])
-                if clips is None:
-                    for attribute, (codes, values) in samples.items():
-                        sample(layer, attribute, codes, values)
-                else:
-                    own = piece.rows.take(slice(piece.lead, None))
-                    arrays = {columns.AppendProperty(f"{_COLUMN}{n}"): _vt(own[n]) for n in own}
-                    clips.append(float(piece.row_codes[piece.lead]), samples, arrays)
-            if not moves:
+            _store(layer, stand.world.AppendChild(RUN), run)
+            samples = _samples(stand, readings, pose, run, fps, rate)
+            if not samples[stand.robot.AppendProperty(_TRANSLATE)][0]:
                 raise InputError(
                     f"no pose {pose[0]!r} of the run is known at the time of a frame; raise `fps`"
                 )
-            if clips is not None:
-                clips.close(Sdf.CreatePrimInLayer(layer, stand.world), folder_of(path).name)
+            for attribute, (codes, values) in samples.items():
+                sample(layer, attribute, codes, values)
             layer.Save()
         except Tf.ErrorException as error:
             raise InputError(f"{path}: cannot be written; is the disk full?") from error
@@ -242,14 +222,9 @@ def _read(layer: Sdf.Layer, path: str | os.PathLike[str]) -> Run:
     columns, specs = {}, {}
     known = sorted(prim.properties, key=lambda column: column.customData.get("number", np.inf))
     known = [attribute for attribute in known if attribute.name.startswith(_COLUMN)]
-    clips = clips_of(layer, Path(path)) if not all(a.HasDefaultValue() for a in known) else []
-    parts_of = {}
-    if clips:
-        widths = {a: len([p for p in str(a.customData.get("parts", "")).split(",") if p]) for a in known}
-        parts_of = read_clips(clips, {a.path: (_type_of(a, path), widths[a]) for a in known})
     for attribute in known:
         name = attribute.name.removeprefix(_COLUMN)
-        columns[name] = parts_of[attribute.path] if clips else _array(attribute, path)
+        columns[name] = _array(attribute, path)
         if name not in COLUMNS:
             said = {key: str(value) for key, value in attribute.customData.items()}
             parts = tuple(filter(None, said.get("parts", "").split(",")))
@@ -326,46 +301,6 @@ def _wheel(side: int, joint: Usd.Prim, stage: Usd.Stage) -> tuple[int, Sdf.Path,
     return side, body.GetPath(), *read_pose(body), link.rolling_axis
 
 
-@dataclass(frozen=True)
-class _Piece:
-    """Some rows of a run, and the frames in their time."""
-
-    rows: Run
-    """The rows; also the row before them, if there is one."""
-
-    lead: int
-    """1 if the first row is that of the piece before, else 0."""
-
-    row_codes: NDArray[np.float64]
-    """Time codes of `rows`."""
-
-    frames: Run
-    codes: NDArray[np.float64]
-    """Time codes of `frames`."""
-
-
-def _pieces(run: Run, fps: float | None, rate: float, pose: tuple[str, str]) -> Iterator[_Piece]:
-    """A run and its frames: in one piece, or in blocks if it is long; without `fps`, each row is a frame."""
-    t, (p_name, q_name) = run["t"], pose
-    sampled = (n for names in READINGS.values() for n in names if COLUMNS[n].interpolation != "hold")
-    wanted = [name for name in (p_name, q_name, "wheel_angle", *sampled) if name in run]
-    rules: Any = {p_name: "linear", q_name: "quaternion"}  # it moves between recorded poses
-    at = None if fps is None else grid(t[0], t[-1], fps)
-    for rows in mapped.parts(run.rows):
-        lead = int(rows.start > 0)
-        some = run.take(slice(rows.start - lead, rows.stop))
-        row_codes = (some["t"] - t[0]) * rate
-        if at is None:
-            frames, codes = some.take(slice(lead, None)), row_codes[lead:]
-        else:
-            last = rows.stop == run.rows
-            first, end = np.searchsorted(at, [t[rows.start], np.inf if last else t[rows.stop]])
-            near = run.take(slice(rows.start, rows.stop + 1)).select(*wanted)
-            frames = near.resample(at[first:end], interpolation=rules)
-            codes = np.arange(first, end, dtype=float)
-        yield _Piece(some, lead, row_codes, frames, codes)
-
-
 def _sampled(run: Run, stand: _Stand) -> list[tuple[str, str]]:
     """Sensors and columns that are sampled on their prims: all but those that are never known."""
     return [
@@ -397,16 +332,35 @@ def _declare(layer: Sdf.Layer, stand: _Stand, readings: list[tuple[str, str]], *
         attribute.customData = {key: v for key, v in (("unit", spec.unit), ("frame", spec.frame)) if v}
 
 
-def _samples(stand: _Stand, readings: list[tuple[str, str]], pose: tuple[str, str], piece: _Piece) -> Samples:
-    """Samples of a piece: poses and readings at every frame, held values when they change."""
-    frames, codes = piece.frames, piece.codes.tolist()
+def _samples(
+    stand: _Stand,
+    readings: list[tuple[str, str]],
+    pose: tuple[str, str],
+    run: Run,
+    fps: float | None,
+    rate: float,
+) -> dict[Sdf.Path, tuple[Sequence[float], Sequence[Any]]]:
+    """Time codes and values: poses and readings at every frame, held values when they change."""
+    row_codes = (run["t"] - run["t"][0]) * rate
+    if fps is None:
+        frames, at_frames = run, row_codes
+    else:
+        kept = [name for _, name in readings if COLUMNS[name].interpolation != "hold"]
+        wanted = [name for name in dict.fromkeys((*pose, "wheel_angle", *kept)) if name in run]
+        rules: Any = {pose[0]: "linear", pose[1]: "quaternion"}  # it moves between recorded poses
+        at = grid(run["t"][0], run["t"][-1], fps)
+        frames, at_frames = (
+            run.select(*wanted).resample(at, interpolation=rules),
+            np.arange(len(at), dtype=float),
+        )
+    codes = at_frames.tolist()
     p, q = (frames[name] for name in pose)
     known = np.isfinite(p).all(axis=1) & np.isfinite(q).all(axis=1)
     q = quat_multiply(q[known], quat_conjugate(stand.q_root_base_xyzw))
-    p, at = p[known] - rotate(q, stand.p_root_base), piece.codes[known].tolist()
+    p, moved = p[known] - rotate(q, stand.p_root_base), at_frames[known].tolist()
     samples: dict[Sdf.Path, tuple[Any, Any]] = {
-        stand.robot.AppendProperty(_TRANSLATE): (at, Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(p))),
-        stand.robot.AppendProperty(_ORIENT): (at, Vt.QuatdArray.FromNumpy(np.ascontiguousarray(q))),
+        stand.robot.AppendProperty(_TRANSLATE): (moved, Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(p))),
+        stand.robot.AppendProperty(_ORIENT): (moved, Vt.QuatdArray.FromNumpy(np.ascontiguousarray(q))),
     }
     for side, path, _, q_rest, axis in stand.wheels if "wheel_angle" in frames else ():
         half = frames["wheel_angle"][:, side, None] / 2
@@ -416,9 +370,8 @@ def _samples(stand: _Stand, readings: list[tuple[str, str]], pose: tuple[str, st
     for noun, name in readings:
         path, spec = stand.sensors[noun].AppendProperty(attribute_name(noun, name)), COLUMNS[name]
         if spec.interpolation == "hold":
-            values = piece.rows[name]
-            rows = np.flatnonzero(np.append(not piece.lead, values[1:] != values[:-1]))
-            samples[path] = piece.row_codes[rows].tolist(), values[rows].tolist()
+            rows = np.flatnonzero(np.append(True, run[name][1:] != run[name][:-1]))
+            samples[path] = row_codes[rows].tolist(), run[name][rows].tolist()
         elif spec.width == 3:
             samples[path] = codes, Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(frames[name]))
         else:
@@ -432,8 +385,8 @@ def sample(layer: Sdf.Layer, path: Sdf.Path, codes: Iterable[float], values: Ite
         deque(map(layer.SetTimeSample, repeat(path), codes, values), maxlen=0)
 
 
-def _store(layer: Sdf.Layer, path: Sdf.Path, run: Run, *, clipped: bool) -> None:
-    """Author every column of a run as an array; `clipped` ones without it, as clips hold it in parts."""
+def _store(layer: Sdf.Layer, path: Sdf.Path, run: Run) -> None:
+    """Author every column of a run as an array."""
     prim = Sdf.CreatePrimInLayer(layer, path)
     prim.specifier, prim.typeName = Sdf.SpecifierDef, "Scope"
     prim.documentation = "Every column of the run; rows of vectors are flattened"
@@ -445,35 +398,22 @@ def _store(layer: Sdf.Layer, path: Sdf.Path, run: Run, *, clipped: bool) -> None
                 f" digits and _, got {values.dtype} of shape {values.shape}"
             )
         spec = run.spec(name)
-        varies = Sdf.VariabilityVarying if clipped else Sdf.VariabilityUniform
-        attribute = Sdf.AttributeSpec(prim, f"{_COLUMN}{name}", kind, varies, declaresCustom=True)
+        uniform = Sdf.VariabilityUniform
+        attribute = Sdf.AttributeSpec(prim, f"{_COLUMN}{name}", kind, uniform, declaresCustom=True)
         attribute.documentation = spec.doc
         said: dict[str, Any] = {"unit": spec.unit, "frame": spec.frame, "parts": ",".join(spec.parts)}
         if name not in COLUMNS:
             said["interpolation"] = spec.interpolation
         said = {key: value for key, value in said.items() if value}
         attribute.customData = {**said, "number": number}  # text sorts attributes by name
-        if not clipped:
-            attribute.default = _vt(values)
-
-
-def _vt(values: NDArray[Any]) -> Any:
-    """A column as an array of USD."""
-    kind = _KINDS[values.dtype.str[1:]]
-    return kind.type.pythonClass.FromNumpy(np.ascontiguousarray(values).reshape(-1))
-
-
-def _type_of(attribute: Sdf.AttributeSpec, path: str | os.PathLike[str]) -> str:
-    """The type of a column, in numpy's letters."""
-    dtype = next((dtype for dtype, kind in _KINDS.items() if kind == attribute.typeName), None)
-    if dtype is None:
-        raise InputError(f"{path}: <{attribute.path}> must be an array of numbers, got {attribute.typeName}")
-    return dtype
+        attribute.default = kind.type.pythonClass.FromNumpy(np.ascontiguousarray(values).reshape(-1))
 
 
 def _array(attribute: Sdf.AttributeSpec, path: str | os.PathLike[str]) -> NDArray[Any]:
     """The values of a column."""
-    dtype = _type_of(attribute, path)
+    dtype = next((dtype for dtype, kind in _KINDS.items() if kind == attribute.typeName), None)
+    if dtype is None:
+        raise InputError(f"{path}: <{attribute.path}> must be an array of numbers, got {attribute.typeName}")
     if attribute.default is None:
         raise InputError(f"{path}: <{attribute.path}> must be an array of numbers, but has no value")
     values = np.array(attribute.default, dtype)

@@ -134,16 +134,14 @@ def open_scene(
     All places are in the axes of the lab, wherever it stands on the stage (`magtwin.usd.placement`).
 
     Args:
-        path: Root layer, as `author_scene` wrote it or as others edited it. A start's yaw is computed from a
-            quaternion, so its last bits can differ from what was authored.
+        path: Root layer. A start's yaw comes from a quaternion: its last bits may not be those authored.
         lab: Path of the lab's root on a stage of several labs. Default: the only lab.
         map_layer: Map that replaces the stage's.
         check_network: Whether the weights that the magnetometer names must exist.
 
     Raises:
-        InputError: The file or one that it names is missing; the stage has no lab, robot or map, or a lab
-            that is tilted or scaled; a value is out of range; or the map is not the one that the scene was
-            made with. The text names the prim.
+        InputError: A file is missing; the stage has no lab, robot or map, or a lab that is tilted or scaled;
+            a value is out of range; or the map is not that of the scene. The text names the prim.
     """
     path = Path(path)
     if path.suffix.lower() == ".usdz":
@@ -157,7 +155,6 @@ def open_scene(
     check_units(stage)
     earth, notes = earth_in(stage, where)
     take_to_origin(stage, where)
-    world = stage.GetPseudoRoot()
     prims = _robot_prims(stage)
     robots = [_read_placed(prim, check_network, notes) for prim in prims]
     magnetometers = [only_prim_with(prim, "magnetometer") for prim in prims]
@@ -182,7 +179,7 @@ def open_scene(
             map_layer=layer.resolve(),
             map_sha256=checksum,
             robot=robots[0].robot,
-            lab=read_lab(only_prim_with(world, "lab")),
+            lab=read_lab(only_prim_with(stage.GetPseudoRoot(), "lab")),
             earth=earth,
             sources=sources,
             furniture=furniture,

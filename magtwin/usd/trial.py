@@ -3,8 +3,8 @@
 OpenUSD's readers can crash, loop, or fill the memory on a damaged .usdc, on deeply nested dictionaries, and
 on references that multiply each other. A stage can also name any file of the machine. A child process, which
 lives as long as this one, opens each file before this process does, within limits of memory and time, and
-refuses names out of the stage's folder. It costs one start, then milliseconds a stage. Stages that ship with
-magtwin are not tried.
+refuses names out of the stage's folder. It costs one start, then milliseconds a stage, and nothing where no
+file has changed since the stage passed (`tried`). Stages that ship with magtwin are not tried.
 """
 
 import atexit
@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from magtwin.files.budget import BUDGETS, SPARE, allowed
 from magtwin.files.children import end, environment, limited
 from magtwin.files.file import shipped
 from magtwin.files.folders import allowed_folders
+from magtwin.usd.tried import Stamp, keep, key_of, recall, stamp_of
 
 VALUES = 16_000_000
 """Bytes of a layer up to which its values are converted to Python; those of any layer are decoded."""
@@ -38,9 +40,6 @@ PROGRAM = Path(__file__).with_name("trial_process.py")
 SHIPPED = ("maps", "robots", "scenes", "weights")
 """Folders that ship with magtwin: trusted as its code is."""
 
-Stamp = tuple[int, int, int, int, int]
-"""Device, number, size and times of change of a file."""
-
 
 class _Trial:
     """The child process; of a forked process, its own."""
@@ -49,30 +48,33 @@ class _Trial:
         self._child: subprocess.Popen[str] | None = None
         self._owner = 0
         self._lock = threading.Lock()
-        self._passed: dict[tuple[object, ...], dict[str, Stamp | None]] = {}
+        self._passed: dict[str, dict[str, Stamp | None]] = {}
 
     def check(self, path: Path, *, composed: bool) -> None:
         """As `try_stage`."""
-        file = str(path.absolute())
-        inside = folders_of(path)
-        key = (file, composed, *inside)
+        job = {
+            "file": str(path.absolute()),
+            "folder": _working_folder(),
+            "inside": folders_of(path),
+            "composed": composed,
+            "room": max(SPARE, allowed()),
+            "seconds": PROCESSOR_S,
+            "values": VALUES,
+            "prims": BUDGETS["USD"].count,
+        }
+        file, key = str(path.absolute()), key_of(job, PROGRAM)
         with self._lock:
             if self._owner != os.getpid():
                 self._child, self._owner = None, os.getpid()
-            before = self._passed.get(key)
-            if before is not None and all(_stamp(name) == stamp for name, stamp in before.items()):
+            met = self._passed.get(key)
+            if met is not None and all(stamp_of(name) == stamp for name, stamp in met.items()):
                 return
-            job = {
-                "file": file,
-                "folder": _working_folder(),
-                "inside": inside,
-                "composed": composed,
-                "room": max(SPARE, allowed()),
-                "seconds": PROCESSOR_S,
-                "values": VALUES,
-                "prims": BUDGETS["USD"].count,
-            }
-            self._passed[key] = self._ask(path, job)
+            met = recall(key, file)
+            if met is None:
+                begun = time.time()
+                met = self._ask(path, job)
+                keep(key, met, begun)
+            self._passed[key] = met
 
     def _ask(self, path: Path, job: dict[str, Any]) -> dict[str, Stamp | None]:
         """Let the child do a job; returns the files that it opened."""
@@ -114,7 +116,7 @@ class _Trial:
             raise InputError(f"{path}: {said['refused']}")
         if said["outside"]:
             raise InputError(_outside(path, said["outside"]), parameter="allow")
-        return {name: _stamp(name) for name in said["files"]}
+        return {name: stamp_of(name) for name in said["files"]}
 
     def _started(self) -> "subprocess.Popen[str]":
         if self._child is None or self._child.poll() is not None:
@@ -138,15 +140,6 @@ def _working_folder() -> str:
         return str(Path.cwd())
     except FileNotFoundError:
         return Path(sys.executable).anchor
-
-
-def _stamp(file: str) -> Stamp | None:
-    """What changes if a file does; None if there is none."""
-    try:
-        about = Path(file).stat()
-    except (OSError, ValueError):  # no name can hold a null character
-        return None
-    return about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns
 
 
 def _outside(path: Path, names: list[dict[str, str]]) -> str:

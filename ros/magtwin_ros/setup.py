@@ -2,7 +2,7 @@
 
 from setuptools import setup
 
-NODES = ("sim", "magnetometer", "localize", "follow", "record", "replay", "teleop")
+NODES = ("sim", "magnetometer", "localize", "follow", "record")
 
 setup(
     name="magtwin_ros",

@@ -50,8 +50,8 @@ def test_an_option_has_one_meaning():
     """Names that meant two things in the previous release, and the commands that still have them."""
     kept = {
         "--speed": {"run", "sweep", "ros follow"},
-        "--pace": {"run", "film", "ros sim", "ros replay"},
-        "--topic": {"ros record", "ros replay"},
+        "--pace": {"run", "film", "ros sim"},
+        "--topic": {"ros record"},
         "--profile": {"robot"},
         "--name": {"map import", "map fit", "map survey"},
         "--robot": {"run"},

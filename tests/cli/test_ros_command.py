@@ -3,16 +3,13 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from nodes import DOMAINS
 
 from magtwin.cli import main
 from magtwin.files.file import shipped
 from magtwin.io.bags.topics import LATCHED
-from magtwin.io.formats import write_run
 from magtwin.ros.bus import open_bus, to_bytes
-from magtwin.run.run import Run
 
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 
@@ -59,14 +56,6 @@ def test_the_localizer_waits_for_a_robot_and_runs_any_method(
     assert "localizing by cyclonedds" in capsys.readouterr().err
 
 
-def test_a_run_is_replayed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    t = np.arange(20) / 135
-    write_run(Run({"t": t, "b_measured_nt": 4e4 + t}, {}), tmp_path / "run.parquet")
-    main(["ros", "replay", str(tmp_path / "run.parquet")])
-    # The field in two units, the whole reading and /clock for each, and once what columns there are.
-    assert capsys.readouterr().out == f"{4 * 20 + 1} messages\n"
-
-
 def test_a_recording_of_nothing_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refused(["record", str(tmp_path / "bag"), "--duration-s", "0.1"], capsys)
     assert "nothing was recorded" in said
@@ -110,8 +99,6 @@ def test_a_named_topic_that_was_not_recorded_ends_with_status_1_and_the_others_a
         (["localize", SCENE, "--method", "smoother"], "is a smoother, which needs a whole run"),
         (["follow", "figur8"], "did you mean 'figure8'"),
         (["follow", "figure8", "--speed", "3"], "--speed must be above 0"),
-        (["replay", "nothing.parquet"], "nothing.parquet"),
-        (["teleop", "--gamepad", "/dev/input/nojs"], "/dev/input/nojs"),
     ],
 )
 def test_what_cannot_be_is_one_line(

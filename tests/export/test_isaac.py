@@ -1,18 +1,14 @@
 """Isaac Sim: the Action Graph has what its nodes' definitions have, and what magtwin's ROS 2 topics are."""
 
-import json
-import os
-import re
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
-from pxr import Sdf, Usd, UsdPhysics, UsdShade
+from pxr import Sdf, Usd, UsdPhysics
 
 from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
 from magtwin.export.isaac import GRAPHS, author_graph
-from magtwin.export.ogn import Graph, faults, fits, message_fields, node_types
+from magtwin.export.ogn import Graph, message_fields, node_types
 from magtwin.io.bags.sender import sender_of
 from magtwin.io.bags.topics import SCAN, TOPICS
 from magtwin.io.bags.types import layout
@@ -28,6 +24,17 @@ USD_TYPES = {
     "quatd[4]": "quatd",
 }
 """OmniGraph's types that USD calls otherwise."""
+
+ROLES = {"vectord[3]": "double[3]", "quatd[4]": "double[4]"}
+"""Roles that OmniGraph treats as plain tuples."""
+
+
+def fits(given, taken):
+    """Whether an output of one kind may be connected to an input of another; one of several must fit."""
+    sides = [
+        {ROLES.get(k, k) for k in ((kind,) if isinstance(kind, str) else kind)} for kind in (given, taken)
+    ]
+    return bool(sides[0] & sides[1])
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +76,6 @@ def test_every_node_input_and_output_is_one_of_its_definition_and_of_its_type(au
         assert prim.GetTypeName() == "OmniGraphNode"
         known = node_types()[prim.GetAttribute("node:type").Get()]
         assert prim.GetAttribute("node:typeVersion").Get() == known.version
-        assert known.source
         for prop in ports(prim):
             kind = kind_of(prop)
             if kind == "target":
@@ -140,20 +146,6 @@ def test_the_magnetometers_node_finds_in_isaac_every_topic_that_it_can_read(auth
     assert {topic.name for topic in (*INPUTS, SCAN)} <= topics
 
 
-@pytest.mark.parametrize("node", ["publish_pose", "publish_battery"])
-def test_a_message_has_every_field_that_its_publisher_makes_so_that_isaac_keeps_the_connections(
-    authored, node
-):
-    _, _, graph = authored
-    prim = graph.GetChild(node)
-    package, folder, short = (
-        prim.GetAttribute(f"inputs:message{part}").Get() for part in ("Package", "Subfolder", "Name")
-    )
-    own = set(node_types()["isaacsim.ros2.bridge.ROS2Publisher"].inputs)
-    made = {prop.GetName().removeprefix("inputs:") for prop in ports(prim)} - own
-    assert made == set(message_fields(f"{package}/{folder}/{short}"))
-
-
 @pytest.mark.parametrize("message", ["geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/BatteryState"])
 def test_fields_of_messages_are_the_leaves_that_magtwin_itself_writes(message):
     basic = {"text": "token", "f8": "double", "f4": "float", "u1": "uint"}
@@ -200,22 +192,6 @@ def test_frames_of_messages_are_those_that_a_bag_of_the_robot_names(authored):
     ]
 
 
-def test_the_drive_of_the_robot_limits_its_wheels(authored):
-    _, scene, graph = authored
-    drive, controller = scene.robot.drive, graph.GetChild("controller")
-    for name, want in {
-        "wheelRadius": drive.wheel_radius_m,
-        "wheelDistance": drive.wheel_separation_m,
-        "maxLinearSpeed": drive.v_max,
-        "maxAngularSpeed": drive.w_max,
-        "maxAcceleration": drive.a_max,
-        "maxDeceleration": drive.a_max,
-        "maxAngularAcceleration": drive.alpha_max,
-        "maxWheelSpeed": drive.wheel_rate_max,
-    }.items():
-        assert controller.GetAttribute(f"inputs:{name}").Get() == want
-
-
 def test_prims_that_nodes_name_are_what_isaac_looks_for(authored):
     stage, _, graph = authored
 
@@ -234,49 +210,6 @@ def test_prims_that_nodes_name_are_what_isaac_looks_for(authored):
     robot = target("wheels", "targetPrim").GetParent()
     names = [joint.GetName() for joint in robot.GetChild("joints").GetChildren()]
     assert set(graph.GetChild("wheels").GetAttribute("inputs:jointNames").Get()) <= set(names)
-
-
-def test_a_lidar_scans_a_plane_with_as_many_rays_as_its_figures_say(authored):
-    stage, scene, graph = authored
-    (path,) = graph.GetChild("beams").GetRelationship("inputs:cameraPrim").GetTargets()
-    lidar, core = stage.GetPrimAtPath(path), "omni:sensor:Core:"
-    turns = lidar.GetAttribute(f"{core}scanRateBaseHz").Get()
-    for name in ("patternFiringRateHz", "reportRateBaseHz"):
-        assert lidar.GetAttribute(core + name).Get() == scene.robot.lidar.rays * turns
-    count = lidar.GetAttribute(f"{core}numberOfEmitters").Get()
-    assert count == 1
-    for name in ("azimuthDeg", "elevationDeg", "fireTimeNs", "channelId"):
-        assert len(lidar.GetAttribute(f"{core}emitterState:s001:{name}").Get()) == count
-
-
-def test_the_robot_lists_its_links_and_joints_from_the_base_on(authored):
-    stage, _, _ = authored
-    root = only_prim_with(stage.GetPseudoRoot(), "robot")
-    links = root.GetRelationship("isaac:physics:robotLinks").GetForwardedTargets()
-    joints = root.GetRelationship("isaac:physics:robotJoints").GetForwardedTargets()
-    bodies = [p.GetPath() for p in Usd.PrimRange(root) if p.HasAPI(UsdPhysics.RigidBodyAPI)]
-    assert sorted(links) == sorted(bodies)
-    assert sorted(joints) == sorted(p.GetPath() for p in Usd.PrimRange(root) if p.IsA(UsdPhysics.Joint))
-    assert links[0].name == "base_link"
-    known = {links[0]}
-    for path in joints:  # each hangs on what came before, and brings the link of its own place
-        joint = UsdPhysics.Joint(stage.GetPrimAtPath(path))
-        (parent,), (child,) = (
-            rel.GetForwardedTargets() for rel in (joint.GetBody0Rel(), joint.GetBody1Rel())
-        )
-        assert parent in known
-        known.add(child)
-        assert links[len(known) - 1] == child
-
-
-def test_every_collider_has_a_physics_material(authored):
-    stage, _, _ = authored
-    colliders = [p for p in stage.Traverse() if p.HasAPI(UsdPhysics.CollisionAPI)]
-    assert len(colliders) > 10
-    for prim in colliders:
-        material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")
-        assert material, prim.GetPath()
-        assert material.GetPrim().HasAPI(UsdPhysics.MaterialAPI), prim.GetPath()
 
 
 @pytest.mark.usefixtures("allow_neighbours")
@@ -313,83 +246,6 @@ def test_what_is_no_robot_to_isaac_is_refused_with_what_to_do(lab_scene):
     with pytest.raises(InputError, match="robotLinks lists none"):
         author_graph(stage, scene)
     assert not stage.GetPrimAtPath(GRAPHS)
-
-
-@pytest.mark.parametrize(
-    ("given", "taken", "yes"),
-    [
-        ("vectord[3]", ("double[3]", "float[3]"), True),
-        ("quatd[4]", ("double[4]",), True),
-        (("double", "double[]"), "double", True),
-        ("double", "double[]", False),
-        ("vectord[3]", "vectorf[3]", False),
-        ("int", "uint", False),
-        ("quatd[4]", "vectord[3]", False),
-        ("execution", "uint", False),
-    ],
-)
-def test_types_go_together_where_base_tuple_and_array_are_the_same(given, taken, yes):
-    assert fits(given, taken) is yes
-
-
-@pytest.mark.skipif(
-    "MAGTWIN_ISAACSIM" not in os.environ, reason="MAGTWIN_ISAACSIM names no checkout of isaac-sim/IsaacSim"
-)
-def test_the_table_is_what_a_checkout_of_isaac_sim_says():
-    count = 0
-    for known in node_types().values():
-        file = Path(os.environ["MAGTWIN_ISAACSIM"], known.source.split(": ")[-1])
-        if file.suffix != ".ogn":
-            continue
-        ((name, said),) = json.loads(file.read_text()).items()
-        assert known.name in (name, f"{file.parts[file.parts.index('extensions') + 1]}.{name}")
-        assert known.version == said["version"]
-        for mine, its in ((known.inputs, said.get("inputs", {})), (known.outputs, said.get("outputs", {}))):
-            kinds = {key: value["type"] for key, value in its.items()}
-            assert mine == {k: v if isinstance(v, str) else tuple(v) for k, v in kinds.items()}, known.name
-        for key, values in known.tokens.items():
-            assert set(values) == set(said["inputs"][key]["metadata"]["allowedTokens"].values())
-        count += 1
-    assert count == 20
-
-
-@pytest.mark.parametrize(
-    ("text", "what"),
-    [
-        ("int node:typeVersion = 7", "is version 7 of isaacsim.ros2.bridge.ROS2PublishClock, not 1"),
-        ('string inputs:topic = "/clock"', "has no inputs:topic; did you mean 'inputs:topicName'?"),
-        ("float inputs:timeStamp = 0", "inputs:timeStamp is a float, .* has a double"),
-        ("uint inputs:execIn.connect = </G/tick.outputs:time>", "execIn takes execution, .* is double"),
-        ("uint inputs:execIn.connect = </G/tick.inputs:tick>", "which is no output"),
-        ("uint inputs:execIn.connect = </G/tock.outputs:tick>", "which is on no node"),
-    ],
-)
-def test_a_graph_that_others_edited_is_held_against_the_definitions_too(text, what):
-    version = "" if "typeVersion" in text else "int node:typeVersion = 1"
-    layer = Sdf.Layer.CreateAnonymous(".usda")
-    layer.ImportFromString(
-        '#usda 1.0\ndef OmniGraph "G" {\n'
-        'def OmniGraphNode "tick" { token node:type = "omni.graph.action.OnPlaybackTick"\n'
-        "int node:typeVersion = 2\n }\n"
-        'def OmniGraphNode "clock" { token node:type = "isaacsim.ros2.bridge.ROS2PublishClock"\n'
-        f"{version}\n{text}\n }}\n}}\n"
-    )
-    stage = Usd.Stage.Open(layer)
-    assert not faults(stage.GetPrimAtPath("/G/tick"))
-    (said,) = faults(stage.GetPrimAtPath("/G/clock"))
-    assert re.search(what, said)
-
-
-def test_no_node_of_the_authored_graph_has_a_fault(authored):
-    _, _, graph = authored
-    assert not [text for prim in graph.GetChildren() for text in faults(prim)]
-
-
-def test_a_value_that_an_input_does_not_allow_is_a_fault():
-    graph = Graph(stage := Usd.Stage.CreateInMemory(), Sdf.Path("/Graph"))
-    assert stage
-    node = graph.node("scan", "isaacsim.ros2.bridge.ROS2RtxLidarHelper", type="laserscan")
-    assert faults(node) == ["inputs:type cannot be 'laserscan'; did you mean 'laser_scan'?"]
 
 
 def test_a_graph_takes_no_path_of_another_prim():

@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -94,8 +93,6 @@ class Trace:
     calls: list[Call]
     unsynced: set[str] = field(default_factory=set)
     """Files that were renamed to their places before their content was on the disk."""
-    written: Counter[str] = field(default_factory=Counter)
-    """Bytes by file."""
 
     @classmethod
     def read(cls, file: Path) -> "Trace":
@@ -113,7 +110,6 @@ class Trace:
         for call in self.calls:
             if call.kind == "write":
                 dirty.add(call.path)
-                self.written[call.path] += call.size
             elif call.kind == "fsync":
                 dirty.discard(call.path)
             elif call.kind == "rename":
@@ -121,8 +117,6 @@ class Trace:
                 shown = HIDDEN not in call.path and HIDDEN in call.other
                 self.unsynced |= {call.path + path[len(call.other) :] for path in moved if shown}
                 dirty = {_moved(path, call) for path in dirty}
-                kept = {path: n for path, n in self.written.items() if not _within(path, call.path)}
-                self.written = Counter({_moved(path, call): n for path, n in kept.items()})
 
     def at(self, *kinds: str) -> list[int]:
         """Numbers of the calls of some kinds; all but removals by default."""

@@ -176,15 +176,6 @@ class Trial:
             self.result.notes.append(f"bytes vary: {', '.join(sorted(self.varies))}")
         for file in sorted(trace.unsynced):
             self._fault("alone", 0, f"{file}: renamed before it was on the disk")
-        missed = [
-            name
-            for name, what in self.new.items()
-            if what != "folder"
-            and self.before.get(name) != what
-            and trace.written[str(self.folder / name)] < (self.folder / name).stat().st_size
-        ]
-        if missed:
-            self.result.notes.append(f"writes not seen: {', '.join(missed)}")
         return trace
 
     def attempt(self, mode: int, at: int, *, older: bool) -> None:
@@ -225,12 +216,6 @@ class Trial:
             mixed = [n for n in now.keys() | self.new.keys() if not self._either(n, now)]
             if mixed:
                 found.append(f"neither old nor new: {mixed}")
-            swept = forked(self._sweep, self.folder)
-            now, hidden = tree(self.folder)
-            if swept.status:
-                found.append(f"the sweep: {swept.err.strip()[-300:]}")
-            if hidden:
-                found.append(f"after the sweep {hidden}")
             if wrote and not self._is(now, self.new):
                 found.append(f"reported as written, but {self._unlike(now)}")
         whole = [self._is(now, self.new) or self._is(now, self.before)]
@@ -254,13 +239,11 @@ class Trial:
         if self._is(now, self.new):  # it was complete
             return found
         again = forked(lambda: self._magtwin(older=self.command.name.startswith("train")), self.folder)
-        now, hidden = tree(self.folder)
+        now, _ = tree(self.folder)
         if again.status:
             found.append(f"a repeat ends with {again.status}: {again.err.strip()[-300:]}")
         elif not self._is(now, self.new):
             found.append(f"a repeat makes something else: {self._unlike(now)}")
-        if hidden:
-            found.append(f"after the repeat {hidden}")
         return found
 
     def _is(self, now: Tree, then: Tree) -> bool:
@@ -320,13 +303,6 @@ class Trial:
 
         main(self.command.arguments(self.inputs, force=older and not (self.command.keeps and not older)))
 
-    def _sweep(self) -> None:
-        """What the next command does first in each folder in which it writes."""
-        from magtwin.files.outputs import check_free
-
-        for folder in {(self.folder / name).parent for name in {*self.new, *self.before}}:
-            check_free(folder / "next", force=True)
-
     def _fault(self, how: str, at: int, text: str) -> None:
         self.result.faults.append(f"{self.command.name}, {how} at {at}: {text}")
         print(f"  FAULT {self.result.faults[-1]}", flush=True)
@@ -378,30 +354,12 @@ def chosen(numbers: list[int], count: int, rng: random.Random) -> list[int]:
     return sorted({*last, *rng.sample(numbers[: len(numbers) - len(last)], count - len(last))})
 
 
-def thinned(trace: Trace, most: int, rng: random.Random) -> list[int]:
-    """Calls that may fill the disk: of more than `most` alike, the first and last thirds of it and some."""
-    alike: dict[tuple[str, str], list[int]] = {}
-    for call in trace.calls:
-        if call.kind != "remove":
-            alike.setdefault((call.kind, call.path), []).append(call.number)
-    kept = set[int]()
-    for numbers in alike.values():
-        ends = {*numbers[: max(1, most // 3)], *numbers[-max(1, most // 3) :]}
-        rest = [number for number in numbers if number not in ends]
-        few = len(numbers) <= most
-        kept |= {*numbers} if few else ends | {*rng.sample(rest, min(len(rest), most - len(ends)))}
-    return sorted(kept)
-
-
 def main() -> int:
     """Try commands; returns 1 if there are faults."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("commands", nargs="*", help="names of commands; default: all")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--full", type=int, default=150, help="most full disks per command")
-    parser.add_argument(
-        "--same", type=int, default=1000, help="most full disks at calls alike: of a kind, on a file"
-    )
     parser.add_argument("--kills", type=int, default=10, help="most kills per command")
     parser.add_argument("--inputs", type=Path, default=None, help="folder of inputs to keep")
     parser.add_argument("--json", type=Path, default=None, help="results to write")
@@ -432,7 +390,7 @@ def main() -> int:
             results.append({"command": command.name, "faults": [str(error)]})
             print(f"  FAULT {error}", flush=True)
             continue
-        for at in chosen(thinned(trace, given.same, rng), given.full, rng):
+        for at in chosen(trace.at(), given.full, rng):
             trial.attempt(FULL, at, older=True)
         every = [call.number for call in trace.calls]
         for index, at in enumerate(chosen(every, given.kills, rng)):

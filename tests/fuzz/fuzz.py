@@ -6,10 +6,8 @@ line is fine; another exception, a crash, a hang or too much memory is a fault. 
 refused at a new place, are damaged further. Batches run in forked processes with limits of processor time,
 time and memory.
 
-Faults are grouped by exception and innermost frame of magtwin. The smallest input of each group is reduced
-and kept in build/fuzz/faults; copy it to tests/fuzz/corpus, which `test_corpus.py` reads, and mend the
-fault. A fuzzer that is started again with the same seed goes on where it was. `--each` changes one value at
-a time instead, each by extreme ones.
+Faults are grouped by exception and innermost frame of magtwin. The smallest input of each group is kept in
+build/fuzz/faults; copy it to tests/fuzz/corpus, which `test_corpus.py` reads, and mend the fault.
 """
 
 import argparse
@@ -17,8 +15,6 @@ import collections
 import contextlib
 import hashlib
 import importlib
-import io
-import itertools
 import json
 import math
 import os
@@ -51,9 +47,6 @@ LONG = 2000
 
 KEPT, LARGEST = 100, 1 << 18
 """Inputs of a format that are damaged further, and the bytes of the largest."""
-
-EACH = 3000
-"""Most inputs of a format of which one value is changed."""
 
 CORPUS = Path(__file__).with_name("corpus")
 """Inputs that were faults once: FORMAT/NAME."""
@@ -129,9 +122,6 @@ USD_ATTRIBUTE = re.compile(
 )
 """An attribute or relationship of one line in USD's text."""
 
-ARRAY_TYPES = "?", "<i1", "<u8", "<f2", "<f8", ">f4", "<c16", "S3", "U5", "<M8[ns]", "<m8[D]", "V4", "f4,U2"
-"""Types of numpy arrays."""
-
 WHOLE = (0, 1, 0x7F, 0xFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 1 << 40, (1 << 63) - 1, (1 << 64) - 1)
 
 
@@ -145,8 +135,10 @@ def mutated(data: bytes, rng: random.Random, sound: bool) -> bytes:
     Libraries open it for that only if it is sound: a damaged file can crash them.
     """
     for _ in range(rng.choice((1, 1, 2, 4))):
-        if rng.random() < 0.2 and (other := _retyped(data, rng, sound)) is not None:
-            data, sound = other, False
+        if rng.random() < 0.2 and (found := [*USD_ATTRIBUTE.finditer(data)] if data[:5] == b"#usda" else []):
+            match, kind = rng.choice(found), rng.choice(sorted(USD_VALUES))
+            other = f"{kind} {match[1].decode()} = {USD_VALUES[kind]}".encode()
+            data, sound = data[: match.start()] + other + data[match.end() :], False
             continue
         inside = members(data, sound) if rng.random() < 0.7 else None
         if inside is None or not inside[0]:
@@ -159,90 +151,7 @@ def mutated(data: bytes, rng: random.Random, sound: bool) -> bytes:
     return data
 
 
-def _retyped(data: bytes, rng: random.Random, sound: bool) -> bytes | None:
-    """A sound file with a value, array or column of another type or shape; None if it is no such file."""
-    if found := [*USD_ATTRIBUTE.finditer(data)] if data.startswith(b"#usda") else []:
-        match = rng.choice(found)
-        kind = rng.choice(sorted(USD_VALUES))
-        other = f"{kind} {match[1].decode()} = {USD_VALUES[kind]}".encode()
-        return data[: match.start()] + other + data[match.end() :]
-    with contextlib.suppress(Exception):  # damaged, or values that have no such type
-        if data.startswith(b"PAR1") and sound:
-            return _other_column(data, rng)
-        if data.startswith(b"\x93NUMPY"):
-            return _other_array(data, rng)
-    return None
-
-
-def _other_array(data: bytes, rng: random.Random) -> bytes:
-    """A .npy file with an array of another type or shape."""
-    array = np.load(io.BytesIO(data), allow_pickle=False)
-    changes: tuple[Callable[[], Any], ...] = (
-        lambda: np.zeros(array.shape, rng.choice(ARRAY_TYPES)),
-        lambda: array.astype(rng.choice(ARRAY_TYPES)),
-        lambda: array.reshape(-1),
-        lambda: array[None],
-        lambda: array[..., None],
-        lambda: array.T,
-        lambda: array[::-1],
-        lambda: array[:-1],
-        lambda: array[:0],
-        lambda: array[:1],
-        lambda: np.concatenate([array, array]),
-        lambda: np.asfortranarray(array),
-        lambda: array.ravel()[0],
-    )
-    out = io.BytesIO()
-    with np.errstate(all="ignore"):
-        np.save(out, rng.choice(changes)(), allow_pickle=False)
-    return out.getvalue()
-
-
-def _other_column(data: bytes, rng: random.Random) -> bytes:
-    """A Parquet file with a column of another type, name or place, without one, or with other rows."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    table = pq.read_table(io.BytesIO(data))
-    at, rows = rng.randrange(table.num_columns), table.num_rows
-    name, column = table.column_names[at], table.column(at).combine_chunks()
-    columns: tuple[Callable[[], Any], ...] = (
-        lambda: pa.nulls(rows),
-        lambda: pa.nulls(rows, column.type),
-        lambda: pa.array([rng.choice(WORDS)] * rows),
-        lambda: pa.array([b"\xff"] * rows),
-        lambda: pa.array([True] * rows),
-        lambda: pa.array([[1.0, 2.0], *[[1.0]] * (rows - 1)]),
-        lambda: pa.array([{"x": 1}] * rows),
-        lambda: pa.array([10**30] * rows, pa.decimal128(38)),
-        lambda: pa.array([rng.choice(FLOATS)] * rows),
-        lambda: pa.array([rng.choice(WHOLE)] * rows, pa.uint64()),
-        lambda: pa.array(range(rows), pa.timestamp("ns")),
-        lambda: pa.array(range(rows), pa.int32()),
-        lambda: pa.DictionaryArray.from_arrays(pa.array([0] * rows, pa.int8()), column.slice(0, 1)),
-        lambda: column.take(pa.array([*range(rows)][::-1])),
-        lambda: pa.concat_arrays([column.slice(1), pa.nulls(1, column.type)]),
-    )
-    tables: tuple[Callable[[], Any], ...] = (
-        lambda: table.remove_column(at),
-        lambda: table.append_column(name, column),
-        lambda: table.slice(0, 0),
-        lambda: table.slice(0, 1),
-        lambda: pa.concat_tables([table, table]),
-        lambda: table.rename_columns([*table.column_names[:at], "", *table.column_names[at + 1 :]]),
-        lambda: table.replace_schema_metadata({b"": b"\xff"}),
-        lambda: table.replace_schema_metadata(None),
-    )
-    retyped = rng.random() < 0.7
-    table = table.set_column(at, name, rng.choice(columns)()) if retyped else rng.choice(tables)()
-    out = io.BytesIO()
-    pq.write_table(table, out, row_group_size=rng.choice((1, 1000)))
-    return out.getvalue()
-
-
 def _changed(data: bytes, rng: random.Random) -> bytes:
-    if data.startswith(b"\x93NUMPY") and rng.random() < 0.5:
-        return _retyped(data, rng, True) or data
     text = b"\0" not in data[:2000] and rng.random() < 0.85
     return _text(data, rng) if text else _binary(data, rng)
 
@@ -299,35 +208,6 @@ def _binary(data: bytes, rng: random.Random) -> bytes:
     return bytes(out)
 
 
-def every_change(data: bytes) -> Iterator[bytes]:
-    """A sound file with one number, word or 8 bytes replaced: each of them, by each extreme value."""
-    inside = members(data, True)
-    if inside is None or not inside[0]:
-        yield from _every_change(data)
-        return
-    parts, packed = inside
-    for at, part in enumerate(parts):
-        for changed in _every_change(part):
-            with contextlib.suppress(Exception):  # names and lengths that no zip holds
-                yield packed(at, changed)
-
-
-def _every_change(data: bytes) -> Iterator[bytes]:
-    if b"\0" in data[:2000]:
-        for at in range(0, min(len(data), LONG) - 7, 8):
-            for value in FLOATS:
-                yield data[:at] + np.array(value).tobytes() + data[at + 8 :]
-        return
-    pieces = re.split(rb"(\s+|[,;:=<>{}()\[\]\"'/@])", data)
-    for i, piece in enumerate(pieces):
-        if re.fullmatch(rb"-?[\d.]+(e-?\d+)?", piece):
-            others = [number.encode() for number in NUMBERS]
-        else:
-            others = [word.encode() for word in WORDS[:4]] if re.fullmatch(rb"[\w.]+", piece) else []
-        for other in others:
-            yield b"".join([*pieces[:i], other, *pieces[i + 1 :]])
-
-
 def judged(kind: str, data: bytes, whole: Seed, folder: Path) -> tuple[str, str, str]:
     """Read one input in this process.
 
@@ -372,16 +252,6 @@ def _limit_time() -> None:
 def _children_s() -> float:
     """Processor time of child processes that have ended [s]."""
     return sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
-
-
-def _trial_s() -> float:
-    """Processor time of the process that tries stages [s]; 0 if there is none."""
-    child = sys.modules["magtwin.usd.trial"]._TRIAL._child if "magtwin.usd.trial" in sys.modules else None
-    try:
-        words = Path(f"/proc/{child.pid}/stat").read_text().rpartition(")")[2].split() if child else []
-    except OSError:
-        return 0.0
-    return sum(map(int, words[11:13])) / os.sysconf("SC_CLK_TCK")
 
 
 def _place(error: BaseException) -> str:
@@ -470,11 +340,6 @@ class Batch:
         return self.said
 
 
-def forked(kind: str, inputs: Sequence[bytes], whole: Seed) -> list[str]:
-    """The judgements of inputs in a process of their own; the last one is its crash, if it ended early."""
-    return [said[0] for said in Batch(kind, len(inputs), inputs.__getitem__, whole).run()]
-
-
 def in_child(work: Callable[[], Any]) -> Any:
     """The result of a function, computed in a forked process; its error ends this process."""
     away, end = os.pipe()
@@ -495,23 +360,6 @@ def in_child(work: Callable[[], Any]) -> Any:
     return pickle.loads(said)  # of our own child
 
 
-def minimised(kind: str, data: bytes, group: str, whole: Seed, seconds: float) -> bytes:
-    """A smaller input of the same group: pieces are removed while the fault stays and time is left."""
-    end, size = time.monotonic() + seconds, max(1, len(data) // 2)
-    while size and time.monotonic() < end:
-        at = 0
-        while at < len(data) and time.monotonic() < end:
-            tries = [data[:k] + data[k + size :] for k in range(at, len(data), size)][:16]
-            said = forked(kind, tries, whole)
-            hit = said.index(group) if group in said else None
-            if hit is not None:
-                data, at = tries[hit], at + hit * size
-            else:
-                at += max(1, len(said)) * size
-        size //= 2
-    return data
-
-
 class Fuzzer:
     """What is known of each format, and the faults found; kept in a folder."""
 
@@ -525,9 +373,6 @@ class Fuzzer:
         self.faults: dict[str, dict[str, Any]] = {}
         self.batches = dict.fromkeys(kinds, 0)
         (out / "faults").mkdir(parents=True, exist_ok=True)
-        self.state = out / f"state-{number}.json"
-        if self.state.is_file():
-            self.batches |= json.loads(self.state.read_text())
         for kind in kinds:
             self._begin(kind)
 
@@ -586,7 +431,6 @@ class Fuzzer:
                 if place:
                     self.places[kind].add(place)
                 self._keep(kind, batch.make(i))
-        self.state.write_text(json.dumps(self.batches))
 
     def _fault(self, kind: str, group: str, data: bytes, text: str) -> None:
         known = self.faults.setdefault(group, {"kind": kind, "count": 0, "data": None, "text": text})
@@ -619,10 +463,7 @@ class Fuzzer:
         told, running = time.monotonic(), dict[int, Batch]()
         while running or time.monotonic() < end:
             while len(running) < jobs and time.monotonic() < end:
-                batch = next(batches, None)
-                if batch is None:
-                    end = 0.0
-                    break
+                batch = next(batches)
                 running[batch.file] = batch
             ready = select.select(list(running), [], [], 1.0)[0]
             for file in list(running):
@@ -638,16 +479,6 @@ class Fuzzer:
             for kind in self.files:
                 yield self.batch(kind)
 
-    def each(self) -> Iterator[Batch]:
-        """Every change of one number, word or 8 bytes of the seeds; at most `EACH` of a format."""
-        for kind, files in self.files.items():
-            size = SLOW_BATCH if FORMATS[kind].slow else BATCH
-            count = sum(1 for _ in every_change(files[0]))
-            inputs = list(itertools.islice(every_change(files[0]), 0, None, -(-count // EACH) or 1))
-            for first in range(0, len(inputs), size):
-                some = inputs[first : first + size]
-                yield Batch(kind, len(some), some.__getitem__, self.seeds[kind])
-
     def summary(self) -> str:
         """One line: inputs, faults and memory."""
         own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
@@ -657,22 +488,15 @@ class Fuzzer:
             f"at most {most:,.0f} MB in a child"
         )
 
-    def tell(self, seconds: float) -> None:
-        """Print counts and speed of each format, and the faults, each reduced within some seconds."""
+    def tell(self) -> None:
+        """Print counts and speed of each format, and the faults."""
         for kind in self.files:
             row = [f"{self.counts[kind, name]:,} {name}" for name in ("read", "refused", "fault")]
             total = sum(self.counts[kind, name] for name in ("read", "refused", "fault"))
             speed = total / self.seconds[kind] if self.seconds[kind] else 0
             print(f"{kind:16} {speed:7.1f} a second  {'  '.join(row)}")
-        end = time.monotonic() + 10 * seconds
         for group, fault in sorted(self.faults.items()):
-            left = min(seconds, end - time.monotonic())
-            data = minimised(fault["kind"], fault["data"], group, self.seeds[fault["kind"]], left)
-            self._file(group).write_bytes(data)
-            print(
-                f"{fault['count']:5} x {group}: {fault['text'][:200]!r}\n"
-                f"        {self._file(group)} ({len(data)} bytes)"
-            )
+            print(f"{fault['count']:5} x {group}: {fault['text'][:200]!r}\n        {self._file(group)}")
         print(self.summary())
 
 
@@ -681,26 +505,18 @@ def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("formats", nargs="*", help="some of the formats; all by default")
     parser.add_argument("--seconds", type=float, default=300)
-    parser.add_argument("--hours", type=float, default=0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1, help="processes at once")
-    parser.add_argument(
-        "--each", action="store_true", help="every change of one value instead, up to the time"
-    )
-    parser.add_argument(
-        "--minimise", type=float, default=20, help="seconds for each group of faults; 10 groups in all"
-    )
     parser.add_argument("--out", type=Path, default=Path("build/fuzz"))
     given = parser.parse_args()
     if unknown := set(given.formats) - set(FORMATS):
         parser.error(f"no format {min(unknown)!r}; known: {', '.join(FORMATS)}")
     fuzzer = Fuzzer(given.formats or list(FORMATS), given.seed, given.out.resolve())
     try:
-        batches = fuzzer.each() if given.each else fuzzer.at_random()
-        fuzzer.run(batches, 3600 * given.hours or given.seconds, given.jobs)
+        fuzzer.run(fuzzer.at_random(), given.seconds, given.jobs)
     except KeyboardInterrupt:
         print("ended by hand")
-    fuzzer.tell(given.minimise)
+    fuzzer.tell()
     return int(bool(fuzzer.faults))
 
 

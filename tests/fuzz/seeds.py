@@ -4,12 +4,10 @@ A seed is a folder. One file of it is damaged, the others stay as they are.
 """
 
 import contextlib
-import hashlib
 import importlib
 import io
 import json
 import shutil
-import sqlite3
 import sys
 import types
 import zipfile
@@ -21,211 +19,22 @@ from unittest import mock
 
 import numpy as np
 
-XACRO = """<?xml version="1.0"?>
-<robot name="b" xmlns:xacro="http://www.ros.org/wiki/xacro">
-  <xacro:property name="w" value="0.3"/>
-  <xacro:property name="s" value="${xacro.load_yaml('s.yaml')}"/>
-  <xacro:macro name="leg" params="n x:=1"><link name="leg_${n}"><inertial><mass value="${w * x}"/>
-    <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></xacro:macro>
-  <xacro:if value="${w > 0}"><xacro:leg n="1"/></xacro:if>
-</robot>
-"""
-URDF = """<?xml version="1.0"?>
-<robot name="cart">
-  <link name="base_link">
-    <inertial><origin xyz="0 0 0.1" rpy="0 0 0"/><mass value="2"/>
-      <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
-    <visual><geometry><box size="0.4 0.3 0.1"/></geometry>
-      <material name="red"><color rgba="1 0 0 1"/></material></visual>
-    <collision><geometry><mesh filename="m.stl" scale="0.1 0.1 0.1"/></geometry></collision>
-  </link>
-  <link name="left_wheel"><inertial><mass value="0.1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4"
-    ixy="0" ixz="0" iyz="0"/></inertial><collision><geometry><cylinder radius="0.05" length="0.02"/>
-    </geometry></collision></link>
-  <link name="right_wheel"><inertial><mass value="0.1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4"
-    ixy="0" ixz="0" iyz="0"/></inertial><collision><geometry><cylinder radius="0.05" length="0.02"/>
-    </geometry></collision></link>
-  <link name="mag"/>
-  <joint name="left" type="continuous"><parent link="base_link"/><child link="left_wheel"/>
-    <origin xyz="0 0.15 0" rpy="-1.5708 0 0"/><axis xyz="0 0 1"/><limit effort="1" velocity="10"/></joint>
-  <joint name="right" type="continuous"><parent link="base_link"/><child link="right_wheel"/>
-    <origin xyz="0 -0.15 0" rpy="-1.5708 0 0"/><axis xyz="0 0 1"/><dynamics damping="0.1"/></joint>
-  <joint name="held" type="fixed"><parent link="base_link"/><child link="mag"/><origin xyz="0 0 0.3"/></joint>
-  <transmission name="t"><type>transmission_interface/SimpleTransmission</type>
-    <joint name="left"><hardwareInterface>VelocityJointInterface</hardwareInterface></joint></transmission>
-  <gazebo reference="left_wheel"><mu1>1.0</mu1><material>Gazebo/Grey</material></gazebo>
-</robot>
-"""
-CONTROLLERS = """controller_manager:
-  ros__parameters: {update_rate: 50}
-drive:
-  ros__parameters:
-    left_wheel_names: ["left"]
-    right_wheel_names: ["right"]
-    wheel_separation: 0.3
-    wheel_radius: 0.05
-    linear.x.max_velocity: 0.5
-"""
-ROBOT = """name = "cart"
-footprint_radius_m = 0.25
-[drive]
-left_wheel_joint = "left"
-right_wheel_joint = "right"
-[platform]
-hard_iron_nt = [10.0, 20.0, 30.0]
-[magnetometer]
-link = "mag"
-rate_hz = 135.0
-[imu]
-link = "base_link"
-rate_hz = 62.0
-"""
-SCENE = """name = "room"
-map = "map.usdc"
-[robot]
-asset = "cart.usda"
-[lab]
-floor_m = [3.0, 2.0]
-wall_height_m = 0.3
-[earth]
-latitude_deg = 29.65
-longitude_deg = -82.35
-height_m = 50.0
-date = "2026-11-21"
-[[furniture]]
-name = "crate"
-kind = "box"
-material = "wood"
-size_m = [0.2, 0.2, 0.2]
-p_world = [1.2, 0.8, 0.0]
-[[source]]
-name = "anchor"
-shape = "cuboid"
-p_world = [0.9, -0.5, -0.4]
-size_m = [0.15, 0.15, 0.15]
-magnetization = [1000.0, 500.0, -4000.0]
-"""
-SUITE = """name = "tiny"
-version = 1
-seed = 3
-[[scenario]]
-name = "a"
-runs = 2
-sessions = 1
-[[localizer]]
-method = "odometry"
-[[localizer]]
-method = "ekf"
-name = "own"
-options = {}
-"""
-STAGE = """#usda 1.0
-(
-    defaultPrim = "World"
-    metersPerUnit = 1
-    upAxis = "Z"
-    kilogramsPerUnit = 1
-    timeCodesPerSecond = 24
-    customLayerData = { dictionary a = { int b = 1 } }
+TEXTS = Path(__file__).with_name("texts")
+"""Files of text that seeds begin from."""
+
+XACRO, URDF, CONTROLLERS, ROBOT, SCENE, SUITE, STAGE, OBJ = (
+    (TEXTS / name).read_text(encoding="utf-8")
+    for name in (
+        "x.xacro",
+        "cart.urdf",
+        "controllers.yaml",
+        "robot.toml",
+        "room.toml",
+        "suite.toml",
+        "stage.usda",
+        "m.obj",
+    )
 )
-def Xform "World" {
-    def Cube "box" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI", "PhysicsCollisionAPI"]) {
-        float physics:mass = 2
-        double size = 0.5
-        float3[] extent = [(-0.25, -0.25, -0.25), (0.25, 0.25, 0.25)]
-        double3 xformOp:translate = (0, 1, 2)
-        quatf xformOp:orient = (1, 0, 0, 0)
-        float xformOp:rotateX:tilt.timeSamples = { 0: 10, 1: 20.5 }
-        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient", "xformOp:rotateX:tilt"]
-    }
-    def Cylinder "arm" (
-        kind = "component"
-        prepend apiSchemas = ["PhysicsRigidBodyAPI"]
-    ) {
-        uniform token axis = "Z"
-        double height = 1
-        double radius = 0.1
-    }
-    def PhysicsRevoluteJoint "joint" {
-        uniform token physics:axis = "Z"
-        rel physics:body0 = </World/box>
-        rel physics:body1 = </World/arm>
-        point3f physics:localPos0 = (0, 0, 0.25)
-        quatf physics:localRot1 = (1, 0, 0, 0)
-        float physics:lowerLimit = -90
-    }
-    def Mesh "m" (
-        prepend references = </Part>
-        prepend apiSchemas = ["MaterialBindingAPI"]
-        variants = { string look = "red" }
-        prepend variantSets = "look"
-    ) {
-        int[] faceVertexCounts = [3, 4]
-        int[] faceVertexIndices = [0, 1, 2, 0, 1, 3, 2]
-        point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
-        texCoord2f[] primvars:st = [(0, 0), (1, 0), (0, 1), (0, 0), (1, 0), (0, 1), (1, 1)] (
-            interpolation = "faceVarying")
-        rel material:binding = </World/red>
-        uniform token subdivisionScheme = "none"
-        def GeomSubset "half" (prepend apiSchemas = ["MaterialBindingAPI"]) {
-            uniform token elementType = "face"
-            uniform token familyName = "materialBind"
-            int[] indices = [1]
-            rel material:binding = </World/red>
-        }
-        variantSet "look" = {
-            "red" {
-                color3f[] primvars:displayColor = [(1, 0, 0)]
-            }
-            "none" {
-            }
-        }
-    }
-    def Material "red" {
-        token outputs:surface.connect = </World/red/s.outputs:surface>
-        def Shader "s" {
-            uniform token info:id = "UsdPreviewSurface"
-            color3f inputs:diffuseColor.connect = </World/red/t.outputs:rgb>
-            float inputs:opacity = 0.5
-            token outputs:surface
-        }
-        def Shader "t" {
-            uniform token info:id = "UsdUVTexture"
-            asset inputs:file = @t.png@
-            float4 inputs:scale = (1, 1, 1, 1)
-            float2 inputs:st.connect = </World/red/r.outputs:result>
-            float3 outputs:rgb
-        }
-        def Shader "r" {
-            uniform token info:id = "UsdPrimvarReader_float2"
-            string inputs:varname = "st"
-            float2 outputs:result
-        }
-    }
-    def Xform "twice" (
-        instanceable = true
-        prepend references = </Part>
-    ) {}
-}
-class "Part" {
-    def Sphere "ball" {
-        double radius = 0.2
-        color3f[] primvars:displayColor = [(0, 1, 0)]
-    }
-}
-"""
-OBJ = """mtllib m.mtl
-v 0 0 0
-v 1 0 0
-v 0 1 0
-v 0 0 1
-vt 0 0
-vt 1 0
-vn 0 0 1
-usemtl red
-f 1/1/1 2/2/1 3/1/1
-f 1 -2 -1
-"""
 MTL = "newmtl red\nKd 1 0 0\nd 0.5\nmap_Kd t.png\n"
 
 
@@ -443,18 +252,6 @@ def _survey(file: Path) -> None:
     folder.rmdir()
 
 
-def _scans(file: Path) -> None:
-    scans = call(
-        "sim.sensors.lidar:Scans",
-        t=np.arange(2.0),
-        arrival=np.arange(2.0) + 0.1,
-        p_world_lidar=np.zeros((2, 3)),
-        q_world_lidar_xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)),
-        ranges_m=np.ones((2, 5), np.float32),
-    )
-    call("io.scans:write_scans", scans, file)
-
-
 def _recording(file: Path) -> None:
     from magtwin.io.release import _SHAPES
 
@@ -518,19 +315,6 @@ def _onnx(file: Path) -> None:
     file.with_name("net.safetensors").unlink()
 
 
-_SETTINGS = {"model": "mlp", "epochs": 3, "layers": [4]}
-
-
-def _tensors() -> Any:
-    import torch
-
-    return {"module.a": torch.zeros(2, 3), "best.a": torch.ones(2, 3)}
-
-
-def _state(file: Path) -> None:
-    call("learn.training.state:save_state", file, _tensors(), _SETTINGS, [{"epoch": 1, "loss": 0.5}])
-
-
 def _tolles_lawson(file: Path) -> None:
     from magtwin.learn.compensation.tolles_lawson import TollesLawson
 
@@ -538,40 +322,12 @@ def _tolles_lawson(file: Path) -> None:
 
 
 def _dataset(file: Path) -> None:
-    """A data set; `file` is its manifest, or its shard in the folder runs."""
-    root = file.parent.parent if file.suffix == ".parquet" else file.parent
-    file.parent.rmdir() if file.suffix == ".parquet" else None
+    """A data set; `file` is its manifest."""
+    root = file.parent
     call("learn.data.dataset:build_dataset", {"a": _run(40)}, _map(), root / "set")
     for path in (root / "set").iterdir():
         shutil.move(path, root / path.name)
     (root / "set").rmdir()
-
-
-def _results(file: Path) -> None:
-    """Results of a benchmark; `file` is any file of them."""
-    root = next(folder for folder in file.parents if folder.name == "results-seed")
-    from magtwin.bench.results import begin_results, write_part
-
-    about = {"name": "tiny", "version": 1, "sha256": "0", "seeds": None, "magtwin": "1", "data": {}}
-    from magtwin.bench.suite import load_suite
-
-    shutil.rmtree(root / "rows", ignore_errors=True)
-    (root / "suite.toml").write_text(SUITE)
-    about["seeds"] = load_suite(root / "suite.toml").seeds
-    begin_results(root, SUITE.encode(), about)
-    from magtwin.localization.scores import Scores
-
-    rows, times = [], []
-    for run in range(2):
-        for name in ("odometry", "own"):
-            key = {"scenario": "a", "localizer": name, "run": run}
-            row = Scores(failed="").row()
-            times.append({**key, "step_us": row.pop("step_us")})
-            reason = row.pop("failed")
-            more = {"seed": 3 + run, "session": 0, "status": "ok", "reason": reason, "readings": 5}
-            more |= {"smoother": False, "global_start": False, "recovered_in_time": 0}
-            rows.append({**key, **more, **row})
-    write_part(root, "a", "part-00000.parquet", rows, times=times)
 
 
 def _magnetic_data(file: Path) -> None:
@@ -680,15 +436,6 @@ def _read_scene_toml(file: Path) -> None:
     call("author.scene_file:scene_from_toml", file, workshop=file.parent)
 
 
-def _read_shard(file: Path) -> None:
-    """The shard, with its checksum in the manifest."""
-    manifest = file.parent.parent / "dataset.json"
-    about = json.loads(manifest.read_text())
-    about["recordings"][0]["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
-    manifest.write_text(json.dumps(about))
-    _read_dataset(manifest)
-
-
 def _read_dataset(file: Path) -> None:
     made = call("learn.data.dataset:open_dataset", file.parent)
     str(made.report())
@@ -702,13 +449,6 @@ def _read_tolles_lawson(file: Path) -> None:
     from magtwin.learn.compensation.tolles_lawson import TollesLawson
 
     TollesLawson.load(file).report("x")
-
-
-def _read_results(file: Path) -> None:
-    root = next(folder for folder in file.parents if (folder / "suite.toml").exists())
-    results = call("bench.results:read_results", root)
-    str(results)
-    str(results.report(call("bench.leaderboard:standings", results.rows, results.times)))
 
 
 def _reads(*names: str, folder: bool = False, **options: Any) -> Callable[[Path], None]:
@@ -793,15 +533,9 @@ FORMATS: Mapping[str, Format] = {
     "robot-toml": Format("robot.toml", text(ROBOT), _reads("author.robot:read_settings")),
     "scene-toml": Format("room.toml", _scene_toml, _read_scene_toml, slow=True),
     "suite": Format("suite.toml", text(SUITE), _reads("bench.suite:load_suite")),
-    "training": Format(
-        "t.toml",
-        text('model = "paper"\nlayers = [8, 4]\nepochs = 3\nlr = 0.001\n'),
-        _reads("learn.training.config:read_config"),
-    ),
     "survey": Format("0_map.csv", _survey, _reads("field.survey.folder:read_survey", folder=True)),
     "table": Format("x.csv", _table, _READINGS),
     "readings": Format("x.parquet", _readings, _READINGS),
-    "scans": Format("x.parquet", _scans, _reads("io.scans:read_scans")),
     "path": Format("x.csv", text("x,y\n0,0\n1,0\n1,1\n"), _reads("path.points:read_path_csv")),
     "commands": Format(
         "x.csv", text("t,v,w\n0,0.1,0\n1,0.2,0.1\n"), _reads("sim.motion.commands:read_commands")
@@ -810,16 +544,8 @@ FORMATS: Mapping[str, Format] = {
     "hybrid": Format("hybrid.safetensors", _network, _NETWORK),
     "pth": Format("x.pth", _checkpoint, _NETWORK),
     "onnx": Format("x.onnx", _onnx, _reads("learn.inference.onnx:report_onnx")),
-    "state": Format(
-        "x.safetensors",
-        _state,
-        lambda file: call("learn.training.state:load_state", file, _tensors(), _SETTINGS),
-    ),
     "tolles-lawson": Format("x.json", _tolles_lawson, _read_tolles_lawson),
     "dataset": Format("dataset.json", _dataset, _read_dataset),
-    "shard": Format("runs/a.parquet", _dataset, _read_shard),
-    "results": Format("suite.json", _results, _read_results),
-    "results-rows": Format("rows/a/part-00000.parquet", _results, _read_results),
     "magnetic-data": Format(
         "1-loc.csv", _magnetic_data, _reads("bench.magnetic_data:read_recording", folder=True, number=1)
     ),
@@ -859,12 +585,11 @@ def read(kind: str, data: bytes, beside: Mapping[str, bytes], folder: Path) -> N
 def members(data: bytes, sound: bool) -> tuple[list[bytes], Callable[[int, bytes], bytes]] | None:
     """Parts of a container that a change of its bytes would not reach, and how to replace one.
 
-    Members of zips, the JSON of safetensors and GLB, columns and metadata of Parquet files, arrays of MATLAB
-    files, and blobs of SQLite files; checksums and lengths are then right. The last three only if `sound`.
+    Members of zips, the JSON of safetensors and GLB, and columns and metadata of Parquet files if `sound`;
+    checksums and lengths are then right.
     """
-    for begin, parts_of in ((b"PAR1", _columns), (b"MATLAB", _arrays), (b"SQLite", _blobs)):
-        if data.startswith(begin):
-            return parts_of(data) if sound else None
+    if data.startswith(b"PAR1"):
+        return _columns(data) if sound else None
     if data[:4] == b"PK\x03\x04":
         try:
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -941,47 +666,3 @@ def _columns(data: bytes) -> tuple[list[bytes], Callable[[int, bytes], bytes]]:
         return out.getvalue()
 
     return [*parts, *words, *(value for _, value in about)], packed
-
-
-def _arrays(data: bytes) -> tuple[list[bytes], Callable[[int, bytes], bytes]]:
-    """The values of the arrays of a MATLAB file."""
-    from scipy.io import loadmat, savemat
-
-    arrays = {name: value for name, value in loadmat(io.BytesIO(data)).items() if not name.startswith("_")}
-    names = [name for name, value in arrays.items() if value.dtype.kind in "biuf"]
-
-    def packed(at: int, part: bytes) -> bytes:
-        old = arrays[names[at]]
-        new = np.frombuffer(part[: old.nbytes].ljust(old.nbytes, b"\0"), old.dtype).reshape(old.shape)
-        out = io.BytesIO()
-        savemat(out, {**arrays, names[at]: new})
-        return out.getvalue()
-
-    return [arrays[name].tobytes() for name in names], packed
-
-
-def _blobs(data: bytes) -> tuple[list[bytes], Callable[[int, bytes], bytes]]:
-    """The texts and blobs of a SQLite file."""
-    base = sqlite3.connect(":memory:")
-    base.deserialize(data)
-    names = [name for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
-    places: list[tuple[str, str, int]] = []
-    parts: list[bytes] = []
-    for table in names:
-        for _, column, *_ in base.execute(f'PRAGMA table_info("{table}")').fetchall():
-            for row, value in base.execute(f'SELECT rowid, "{column}" FROM "{table}"').fetchall():
-                if isinstance(value, str | bytes):
-                    places.append((table, column, row))
-                    parts.append(value.encode() if isinstance(value, str) else value)
-
-    def packed(at: int, part: bytes) -> bytes:
-        table, column, row = places[at]
-        copy = sqlite3.connect(":memory:")
-        copy.deserialize(data)
-        (kind,) = copy.execute(f'SELECT typeof("{column}") FROM "{table}" WHERE rowid = ?', (row,)).fetchone()
-        value = part.decode(errors="replace") if kind == "text" else part
-        copy.execute(f'UPDATE "{table}" SET "{column}" = ? WHERE rowid = ?', (value, row))
-        copy.commit()
-        return copy.serialize()
-
-    return parts, packed

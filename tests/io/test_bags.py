@@ -1,34 +1,28 @@
 """Runs as bags and back; rosbags and MCAP's own reader are the judges."""
 
 import json
-import signal
 import sqlite3
-import subprocess
-import sys
-import textwrap
 from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
 from numpy.testing import assert_allclose, assert_array_equal
 from recordings import as_db3
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 import magtwin
-from magtwin.errors import InputError, RepairWarning
-from magtwin.io.bags import BagWriter, read_bag, write_bag
+from magtwin.errors import InputError
+from magtwin.io.bags import RawBagWriter, read_bag, write_bag
 from magtwin.io.bags.bag import Bag
 from magtwin.io.bags.cdr import encode
-from magtwin.io.bags.topics import MAGNITUDE, TOPICS
+from magtwin.io.bags.storage import partial_of
+from magtwin.io.bags.topics import TOPICS
 from magtwin.io.bags.types import layout
-from magtwin.io.recorder import partial_of
 from magtwin.io.surveys.readings import read_readings, readings_of_run
 from magtwin.run.run import COLUMNS, Column, Run
 
@@ -109,9 +103,9 @@ def test_any_run_in_blocks_of_any_size_comes_back_to_the_last_bit(tmp_path_facto
         columns[str(name)] = values != 0 if spec.unit == "bool" else values
     run = Run(columns, {"seed": seed})
     path = tmp_path_factory.mktemp("any") / "run.mcap"
-    with BagWriter(path, units="nT") as writer:
-        for part in blocks(run, block) or [run]:
-            writer.append(part)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("magtwin.io.bags.writer.BLOCK", block)
+        write_bag(run, path, units="nT")
     back = read_bag(path)
     assert list(back) == list(run)
     for name in run:
@@ -155,77 +149,6 @@ def raw(path):
 @pytest.fixture(scope="module")
 def heard(bags):
     return messages(bags / "bag")
-
-
-def test_rosbags_finds_the_same_messages_in_a_file_and_in_a_folder(bags):
-    assert raw(bags / "run.mcap") == raw(bags / "bag")
-
-
-def test_mcaps_own_reader_reads_every_message_and_checks_every_checksum(bags, heard):
-    with open(bags / "run.mcap", "rb") as file:
-        reader = make_reader(file, validate_crcs=True)
-        summary = reader.get_summary()
-        counts = {c.topic: summary.statistics.channel_message_counts[k] for k, c in summary.channels.items()}
-        assert counts == {topic: len(said) for topic, said in heard.items()}
-        seen, before = {}, 0
-        for schema, channel, message in reader.iter_messages():
-            assert message.log_time >= before
-            before = message.log_time
-            seen.setdefault(channel.topic, []).append((message.log_time, message.data, schema.name))
-        notes = {m.name: m.metadata for m in reader.iter_metadata()}
-    with Reader(bags / "bag") as rosbags:
-        peer = {}
-        for connection, t, data in rosbags.messages():
-            peer.setdefault(connection.topic, []).append((t, bytes(data), connection.msgtype))
-    assert seen == peer
-    assert json.loads(notes["magtwin"]["seed"]) == 3
-    told = yaml.safe_load(notes["rosbag2"]["serialized_metadata"])
-    assert told["message_count"] == sum(counts.values())
-
-
-@pytest.mark.parametrize("way", ["NONE", "LZ4", "ZSTD", "unchunked"])
-def test_a_bag_that_mcaps_own_writer_wrote_anew_is_read(bags, made, tmp_path, way):
-    from mcap.writer import CompressionType, Writer
-
-    compression = CompressionType.NONE if way == "unchunked" else CompressionType[way]
-    with open(bags / "run.mcap", "rb") as old, open(tmp_path / "run.mcap", "wb") as new:
-        reader, writer = (
-            make_reader(old),
-            Writer(new, compression=compression, use_chunking=way != "unchunked"),
-        )
-        writer.start("ros2")
-        schemas, channels = {}, {}
-        for schema, channel, message in reader.iter_messages():
-            if schema.id not in schemas:
-                schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
-            if channel.id not in channels:
-                channels[channel.id] = writer.register_channel(channel.topic, "cdr", schemas[schema.id])
-            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
-        for note in reader.iter_metadata():
-            writer.add_metadata(note.name, note.metadata)
-        writer.finish()
-    assert_same(read_bag(tmp_path / "run.mcap"), made[0])
-
-
-def shape_of(content):
-    """The keys of metadata, and the types of what they hold."""
-    if isinstance(content, dict):
-        return {k: shape_of(v) for k, v in content.items() if k != "custom_data"}
-    if isinstance(content, list):
-        return [shape_of(content[0])] if content else []
-    return type(content)
-
-
-def test_metadata_is_laid_out_as_rosbags_lays_it_out(bags, tmp_path):
-    with Writer(tmp_path / "peer", version=8, storage_plugin=StoragePlugin.MCAP) as writer:
-        connection = writer.add_connection("/a", "std_msgs/msg/Float64", typestore=STORE)
-        writer.write(connection, 5, b"\0" * 12)
-    ours = yaml.safe_load((bags / "bag" / "metadata.yaml").read_text())
-    peer = yaml.safe_load((tmp_path / "peer" / "metadata.yaml").read_text())
-    assert shape_of(ours) == shape_of(peer)
-    about = ours["rosbag2_bagfile_information"]
-    assert about["storage_identifier"] == "mcap"
-    assert about["relative_file_paths"] == [p.name for p in (bags / "bag").iterdir() if p.suffix != ".yaml"]
 
 
 def test_qualities_of_service_are_read_by_rosbags_as_they_are_meant(bags):
@@ -366,48 +289,10 @@ def test_a_robot_with_its_urdf_beside_it_is_described(made, tmp_path):
     assert parents["base_footprint"] == "base_link"
 
 
-def test_a_run_of_few_columns_is_written_without_a_twin(made, tmp_path):
-    few = Run({name: made[0][name] for name in ("t", "odom_p", "b_measured_nt", "yaw")}, {"seed": 1})
-    write_bag(few, tmp_path / "bag")
-    assert_same(read_bag(tmp_path / "bag"), few)
-    assert messages(tmp_path / "bag").keys() == {
-        *("/robot/qtfm/magnitude", "/clock", "/magtwin/columns", "/magtwin/reading")
-    }
-
-
 def test_a_run_without_rows_comes_back_without(made, tmp_path):
     none = made[0].take(slice(0))
     write_bag(none, tmp_path / "run.mcap")
     assert_same(read_bag(tmp_path / "run.mcap"), none)
-
-
-@pytest.mark.parametrize("block", [1, 3, 7])
-def test_rows_of_the_same_nanosecond_come_back_each_with_its_own_values(tmp_path, block):
-    t = np.array([0.0, 1e-10, 2e-10, 3e-10, 1e-9, 0.1, np.nextafter(0.1, 1)])
-    q = np.tile([0.0, 0.0, 0.0, 1.0], (7, 1))
-    run = Run(
-        {"t": t, "b_measured_nt": 41_000.0 + np.arange(7), "mocap_p": np.eye(7)[:, :3], "mocap_q_xyzw": q}
-    )
-    with BagWriter(tmp_path / "run.mcap", units="nT") as writer:
-        for first in range(0, 7, block):
-            writer.append(run.take(slice(first, first + block)))
-    back = read_bag(tmp_path / "run.mcap")
-    for name in run:
-        assert_array_equal(back[name], run[name])
-    with Bag(tmp_path / "run.mcap") as bag:
-        stamps = bag.messages([MAGNITUDE.name])[MAGNITUDE.name].received
-    assert stamps.tolist() == [0, 1, 2, 3, 4, 10**8, 10**8 + 1]
-
-
-def test_times_before_0_come_back_and_the_later_stamps_are_told(made, tmp_path):
-    run = made[0].with_columns(t=made[0]["t"] - 1.25)
-    with pytest.warns(
-        RepairWarning, match=r"t begins at -1\.\d+ s, and stamps of ROS at 0: they are t \+ 2 s"
-    ):
-        write_bag(run, tmp_path / "run.mcap", units="nT")
-    back = read_bag(tmp_path / "run.mcap")
-    for name in ("t", "b_measured_nt", "mocap_p", "odom_p"):
-        assert_array_equal(back[name], run[name])
 
 
 def test_what_no_bag_can_hold_is_refused_and_what_was_there_stays(made, tmp_path):
@@ -419,6 +304,8 @@ def test_what_no_bag_can_hold_is_refused_and_what_was_there_stays(made, tmp_path
         "exists already": (run, {}),
         "the run to write: ": (run.with_columns(t=t), {"force": True}),
         "subtract the first time from t": (run.with_columns(t=run["t"] + 2.0**31), {"force": True}),
+        "stamps of ROS hold 0": (run.with_columns(t=run["t"] - 1.25), {"force": True}),
+        "less than 1 ns apart": (run.with_columns(t=1e-10 * np.arange(run.rows)), {"force": True}),
         "column 'name' cannot stand in a bag": (
             run.with_columns(name=np.full(run.rows, "a")),
             {"force": True},
@@ -437,73 +324,30 @@ def test_what_no_bag_can_hold_is_refused_and_what_was_there_stays(made, tmp_path
             InputError, match=r"a bag is a folder, .* that ends in \.mcap; ros2 bag convert makes"
         ):
             write_bag(run, tmp_path / name)
-        with pytest.raises(InputError, match=r"a bag is a folder"):
-            BagWriter(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_a_disk_that_is_full_is_refused_in_a_line_and_leaves_nothing(made, tmp_path, monkeypatch, name):
-    import resource
-
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
-    try:
-        with pytest.raises(InputError, match="cannot be written") as refusal:
-            write_bag(made[0], tmp_path / name)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, handler)
-    assert "\n" not in str(refusal.value)
-    assert not list(tmp_path.iterdir())
-
-
-def blocks(run, rows):
-    return [run.take(slice(k, k + rows)) for k in range(0, run.rows, rows)]
-
-
-@pytest.mark.parametrize("name", KINDS)
-def test_a_run_in_blocks_says_what_the_whole_run_says(made, twin, bags, tmp_path, name):
-    with BagWriter(tmp_path / name, twin, scans=made[1]) as writer:
-        for block in blocks(made[0], 101):
-            writer.append(block)
-            assert writer.partial.exists()
-            assert not (tmp_path / name).exists()
-    assert [p.name for p in tmp_path.iterdir()] == [name]
+def test_a_run_in_blocks_says_what_the_whole_run_says(made, twin, bags, tmp_path, name, monkeypatch):
+    monkeypatch.setattr("magtwin.io.bags.writer.BLOCK", 101)
+    write_bag(made[0], tmp_path / name, twin, scans=made[1])
     assert_same(read_bag(tmp_path / name), made[0])
     assert raw(tmp_path / name) == raw(bags / name)
 
 
-KILLED = """
-    import os, pickle, signal, sys, time
-    from magtwin.io.bags import BagWriter
-    from magtwin.run.run import Run
-    columns = pickle.load(open(sys.argv[1], "rb"))
-    writer = BagWriter(sys.argv[2])
-    for k in range(0, len(columns["t"]), 135):
-        writer.append(Run({name: v[k : k + 135] for name, v in columns.items()}, {"seed": 3}))
-        print(k + 135, flush=True)
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
 @pytest.mark.parametrize("name", KINDS)
-def test_a_recording_that_is_killed_leaves_every_block_that_was_appended(made, tmp_path, name):
-    import pickle
-
-    run = made[0]
-    (tmp_path / "columns").write_bytes(pickle.dumps(dict(run.columns)))
-    target = tmp_path / name
-    command = [sys.executable, "-c", textwrap.dedent(KILLED), tmp_path / "columns", target]
-    killed = subprocess.run(command, capture_output=True, check=False, text=True)
-    assert killed.returncode == -signal.SIGKILL, killed.stderr
-    assert not target.exists()
-    assert_same(read_bag(partial_of(target)), Run(run.columns, {"seed": 3}))
+def test_a_recording_that_did_not_end_is_read_up_to_its_last_flush(bags, tmp_path, name):
+    writer = RawBagWriter(tmp_path / name)
+    with Bag(bags / "run.mcap") as bag:
+        for topic, kind in bag.kinds.items():
+            writer.add(topic, kind, TOPICS[topic].qos)
+        for topic, found in bag.messages(bag.kinds).items():
+            for at, start, size in zip(found.received, found.start, found.size, strict=True):
+                writer.write(topic, int(at), found.buffer[start : start + size].tobytes())
+    writer.flush()
+    assert_array_equal(read_bag(writer.partial)["t"], read_bag(bags / "run.mcap")["t"])
     with pytest.raises(InputError, match="left by a recording that did not end"):
-        BagWriter(target)
-    if name == "bag":
-        told = yaml.safe_load((partial_of(target) / "metadata.yaml").read_text())
-        assert told["rosbag2_bagfile_information"]["message_count"] > run.rows
+        RawBagWriter(tmp_path / name)
+    writer.close()
 
 
 @pytest.mark.parametrize("keep", [0.3, 0.97])

@@ -9,12 +9,9 @@ from test_cli import refused
 from test_run import assert_same, every_column
 from test_tables import few_bytes
 
-import magtwin
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.io.bags import BagWriter
 from magtwin.io.formats import FORMATS, Format, read_run, write_run
-from magtwin.io.outputs import Outputs
 from magtwin.io.tables import ParquetParts
 from magtwin.run.run import Column, Run
 from magtwin.twin import Twin, open_twin, simulate
@@ -57,25 +54,6 @@ def written(run, twin, tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("name", [*EXACT, "run.mcap"])
-def test_suffixes_are_read_and_written_in_any_case(written, run, twin, tmp_path, name):
-    write_run(run, tmp_path / name.upper(), twin)
-    assert [file.name for file in tmp_path.iterdir()] == [name.upper()]
-    assert list(read_run(tmp_path / name.upper())) == list(read_run(written / name))
-
-
-def test_outputs_of_a_run_are_written_in_any_case(tmp_path):
-    outputs = Outputs.of([tmp_path / "a.PARQUET", tmp_path / "b.Rrd"], scans=True)
-    assert [file.name for file in outputs.scans] == ["a.scans.parquet"]
-
-
-def test_a_package_in_place_of_a_run_is_refused_with_what_it_is(tmp_path):
-    package = tmp_path / "my lab.usdz"
-    package.write_bytes(b"PK")
-    with pytest.raises(InputError, match=r"my lab\.usdz: a package; .*\(magtwin export '/.*lab\.usdz' --out"):
-        read_run(package)
-
-
 def assert_carried(run, again):
     assert list(again) == list(run)
     assert dict(again.metadata) == dict(run.metadata)
@@ -115,24 +93,6 @@ def test_a_run_comes_back_from_a_bag_as_its_messages_carry_it(name, run, written
             assert again[column].tobytes() == values.tobytes(), column
 
 
-def test_a_run_goes_through_all_formats_one_after_the_other_and_is_itself(run, twin, written, tmp_path):
-    """Each reads what the one before wrote, the bag first, whose precision is what remains."""
-    again = first = read_run(written / "run.mcap")
-    for name in EXACT:
-        write_run(again, tmp_path / name, twin)
-        again = read_run(tmp_path / name)
-    assert_same(first, again)
-    assert_carried(run, again)
-
-
-@pytest.mark.parametrize("name", [*EXACT, *BAGS])
-def test_a_run_alone_is_written_too_where_no_scene_is_known(name, run, tmp_path):
-    write_run(run, tmp_path / name)
-    again = read_run(tmp_path / name)
-    assert_carried(run, again)
-    assert np.array_equal(again["b_measured_nt"], run["b_measured_nt"], equal_nan=True)
-
-
 def test_folders_are_read_by_what_is_in_them(run, written, tmp_path):
     parts = ParquetParts(tmp_path / "run.parquet")
     parts.append(run)
@@ -145,14 +105,6 @@ def test_folders_are_read_by_what_is_in_them(run, written, tmp_path):
     (tmp_path / "none").mkdir()
     with pytest.raises(InputError, match="a folder without a run; name a file"):
         read_run(tmp_path / "none")
-
-
-def test_a_bag_that_did_not_end_is_read_as_far_as_it_goes(run, twin, tmp_path):
-    writer = BagWriter(tmp_path / "run.mcap", twin)
-    writer.append(run.take(slice(0, 300)))
-    assert read_run(writer.partial).rows == 300
-    writer.close()
-    assert read_run(tmp_path / "run.mcap").rows == 300
 
 
 def test_options_of_another_format_and_unknown_endings_are_refused(run, tmp_path):
@@ -175,16 +127,6 @@ def test_every_format_refuses_a_file_cut_short_or_of_another_kind(name, written,
             read_run(tmp_path / name)
         assert name in str(refused.value)
         assert "\n" not in str(refused.value)
-
-
-def test_a_csv_cut_short_at_the_end_of_a_line_is_refused_by_its_count_of_rows(written, tmp_path):
-    lines = (written / "run.csv").read_bytes().splitlines(keepends=True)
-    (tmp_path / "run.csv").write_bytes(b"".join(lines[:-7]))
-    with pytest.raises(InputError, match="cut short, or edited"):
-        read_run(tmp_path / "run.csv")
-    edited = [line for line in lines[:-7] if not line.startswith(b"# rows")]
-    (tmp_path / "run.csv").write_bytes(b"".join(edited))
-    assert read_run(tmp_path / "run.csv").rows == read_run(written / "run.csv").rows - 7
 
 
 @pytest.mark.parametrize("name", [*EXACT, *BAGS])
@@ -273,41 +215,6 @@ def test_info_of_every_format_tells_rows_columns_units_and_what_the_run_came_fro
         assert told["metadata"][fact] == run.metadata[fact]
 
 
-def test_info_of_a_playback_tells_of_the_run_where_its_scene_is_gone(run, tmp_path, capsys):
-    write_run(run, tmp_path / "run.usda")
-    text = (tmp_path / "run.usda").read_text()
-    (tmp_path / "run.usda").write_text(text.replace("(", "(\n    subLayers = [@./gone.usda@]", 1))
-    main(["info", str(tmp_path / "run.usda"), "--json"])
-    told = json.loads(capsys.readouterr().out)
-    assert told["figures"]["readings"]["value"] == run.rows
-    assert "gone.usda" in told["metadata"]["stage"]
-
-
-@pytest.fixture
-def shown(monkeypatch):
-    """What the viewer is given, in place of a window."""
-    seen = []
-
-    def show(rrd, *, source=None):
-        from magtwin.io.rerun.file import read_runs
-
-        seen.append(read_runs(rrd))
-
-    for module in ("magtwin.io.rerun.file.show", "magtwin.io.rerun.viewer.show"):
-        monkeypatch.setattr(module, show)
-    monkeypatch.setattr("shutil.which", lambda name: None)
-    return seen
-
-
-@pytest.mark.parametrize("name", ["run.csv", "run.usdc", "run.db3", "run.rrd"])
-def test_view_shows_a_run_of_any_format(name, run, written, shown, capsys):
-    main(["view", str(written / name)])
-    error = capsys.readouterr().err
-    assert "has changed" not in error
-    assert ("shown without a scene" in error) == ("give --allow" in error) == (name == "run.usdc")
-    assert np.array_equal(shown[0]["run"]["b_total_nt"], run["b_total_nt"])
-
-
 def test_a_conversion_without_its_scene_warns_of_what_the_format_lacks(run, tmp_path, monkeypatch, capsys):
     write_run(run.with_metadata(scene_file="gone/lab.usda"), tmp_path / "apart" / "run.parquet")
     monkeypatch.chdir(tmp_path)
@@ -323,33 +230,6 @@ def test_a_conversion_without_its_scene_warns_of_what_the_format_lacks(run, tmp_
         main(["convert", "apart/run.parquet", "apart", "--force"])
     error = [line for line in capsys.readouterr().err.splitlines() if line.startswith("magtwin")]
     assert error == ["magtwin: apart: holds the run, which would be removed with it; give another name"]
-
-
-def test_view_shows_several_runs_in_one_recording(run, written, shown, tmp_path):
-    write_run(run.between(1.0), tmp_path / "later.csv")
-    main(["view", str(written / "run.parquet"), str(tmp_path / "later.csv")])
-    assert {name: r.rows for name, r in shown[0].items()} == {"run": run.rows, "later": run.rows - 135}
-
-
-def test_view_without_a_display_refuses_a_stage_and_names_the_picture(lab_scene, monkeypatch, capsys):
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr("shutil.which", lambda name: None)
-    monkeypatch.setattr("sys.platform", "linux")
-    assert "no display to show it on; magtwin picture draws it" in refused(capsys, "view", lab_scene)
-
-
-@pytest.mark.parametrize("suffix", [".mcap", ".parquet"])
-def test_a_run_saves_itself_as_one_file_in_the_format_of_its_suffix(tmp_path, suffix):
-    run = Run({"t": [0.0, 0.5], "b_measured_nt": [41_000.0, 41_001.0]}, {"seed": 3})
-    run.save(tmp_path / f"run{suffix}", **({} if suffix == ".parquet" else {"units": "nT"}))
-    assert [p.name for p in tmp_path.iterdir()] == [f"run{suffix}"]
-    assert (tmp_path / f"run{suffix}").is_file()
-    back = magtwin.load_run(tmp_path / f"run{suffix}")
-    np.testing.assert_array_equal(back["b_measured_nt"], run["b_measured_nt"])
-    assert back.metadata["seed"] == 3
-    with pytest.raises(InputError, match="exists already"):
-        run.save(tmp_path / f"run{suffix}")
 
 
 def test_a_registered_format_is_read_and_written_by_its_suffix(tmp_path, monkeypatch):
@@ -379,9 +259,3 @@ def test_numbers_that_no_run_can_hold_are_refused(name, value, message, tmp_path
     np.savez(tmp_path / "run.npz", **{**run.columns, name: values})
     with pytest.raises(InputError, match=message):
         read_run(tmp_path / "run.npz")
-
-
-def test_a_run_of_repeated_nanoseconds_with_a_nameless_fact_is_recorded(run, twin, tmp_path):
-    short = run.with_columns(t=1e-300 * np.arange(run.rows)).with_metadata(**{"": "nameless"})
-    write_run(short, tmp_path / "run.rrd", twin)
-    assert read_run(tmp_path / "run.rrd").rows == run.rows

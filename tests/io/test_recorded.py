@@ -18,7 +18,7 @@ from magtwin.io.surveys.columns import Columns
 from magtwin.io.surveys.readings import read_readings
 
 MAG, POSE, ODOM, IMU = "/robot/qtfm/magnitude", "/robot/enu/pose", "/robot/odom", "/robot/imu"
-BATTERY, CMD, JOINTS, SCAN = "/robot/battery_state", "/robot/cmd_vel", "/robot/joint_states", "/robot/scan"
+BATTERY, CMD, SCAN = "/robot/battery_state", "/robot/cmd_vel", "/robot/scan"
 POSES = ("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped")
 ODOMETRY, VECTOR3 = "nav_msgs/msg/Odometry", "geometry_msgs/msg/Vector3Stamped"
 WORLD = np.array([12_000.0, 20_000.0, -38_000.0])
@@ -71,7 +71,6 @@ def twists(rate_hz=10):
 
 def drive():
     """A drive on the topics of magtwin, each at a rate of its own."""
-    names, angles = ("arm", "right_wheel_joint", "left_wheel_joint"), (9.0, 2.0, 1.0)
     charge = {"current": -1.25, "percentage": 0.75, "present": 1}
     return {
         MAG: readings(),
@@ -91,13 +90,6 @@ def drive():
             ),
         ),
         CMD: twists(),
-        JOINTS: said(
-            at(10),
-            lambda k, t: (
-                "sensor_msgs/msg/JointState",
-                {**stamped(t), "name": names[k % 2 :], "position": np.array(angles[k % 2 :])},
-            ),
-        ),
         SCAN: said(
             at(10, 2.0), lambda k, t: ("sensor_msgs/msg/LaserScan", {**stamped(t), "ranges": np.ones(5 + k)})
         ),
@@ -128,7 +120,6 @@ def test_a_drive_becomes_a_run_on_the_magnetometers_clock(tmp_path, storage):
     assert_allclose(run["battery_a"], 1.25)
     came = np.floor((t - 0.005) * 10 + 1e-6)  # less what the magnetometer's messages took
     assert_allclose(run["v_cmd"][1:], 0.1 * (came[1:] // 10))
-    assert_array_equal(run["wheel_angle"], np.tile([1.0, 2.0], (200, 1)))
     assert_array_equal(run["lidar_on"], t < 1.9 + 0.5 - 1e-9)
     known = {"field_unit": "nT", "stamps": "header", "imu_gravity": "removed", "truth": f"topic {POSE}"}
     known |= {"start_ns": str(START * 10**9), "topics": " ".join(sorted(drive().keys() - {"/rosout"}))}

@@ -98,7 +98,7 @@ BAD = [
         text([frame(0), frame(2, pose_data=[1, 2])]),
         r"frame 2 \(at character \d+\): pose_data must be 3 numbers here",
     ),
-    (text([frame(0, odom=[1, 2, 3])]), r"frame 1 .*odom must be 2 lists of numbers, got \[1, 2, 3\]"),
+    (text([frame(0, odom=[1, 2, 3])]), r"frame 1 .*odom must be 6 numbers here, got \[1, 2, 3\]"),
     (text([frame(0, lidar=2)]), "frame 1 .*lidar must be 0 or 1, got 2"),
     (text([frame(0, battery_data=["15", 1])]), 'battery_data must be a finite number, got "15"'),
     (text([frame(0, timestamp=None)]), r"timestamp must be a time \[s\], got null"),

@@ -1,6 +1,5 @@
 """Sweeps by processes, shards and a cluster: the same files as from one process, also after interruptions."""
 
-import json
 import os
 import signal
 import subprocess
@@ -13,7 +12,7 @@ from waiting import PATIENCE_S, wait_until
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.io import sweeps
-from magtwin.io.sweeps import Listed, save_runs
+from magtwin.io.sweeps import save_runs
 from magtwin.parallel import open_pool
 from magtwin.twin import open_twin, sweep
 
@@ -131,41 +130,6 @@ def test_a_run_that_cannot_be_made_leaves_nothing(warm, lab_scene, tmp_path, mon
     with pytest.raises(InputError, match="the robot is out of the map"):
         save_runs(broken, tmp_path / "runs", jobs=2)
     assert not list(tmp_path.iterdir())
-
-
-def test_what_is_listed_survives_its_file(runs):
-    said = Listed()
-    for number, run in enumerate(runs[:3]):
-        said.add(f"run_{number}", run)
-    again = Listed.from_json(said.to_json())
-    assert again == said
-    assert json.loads(said.to_json())["sessions"] == {"0 0": "0"}
-
-
-def test_a_sweep_that_was_killed_when_its_folder_was_renamed_is_finished(
-    warm, runs, whole, tmp_path, monkeypatch
-):
-    out = tmp_path / "runs"
-    with monkeypatch.context() as killed:
-        killed.setattr(sweeps._Parts, "_tidy", lambda self: chunk_work.refuse(1))
-        with pytest.raises(InputError):
-            save_runs(runs, out, jobs=2)
-    assert {file.name for file in out.iterdir()} > {"sweep.json", "part-00000.json", "runs.csv"}
-    (out / "part-00000.json").unlink()
-    with pytest.raises(InputError, match="exists already"):
-        save_runs(runs, out, shard=(0, 2))
-    save_runs(runs, out, jobs=2)
-    assert files_in(out) == files_in(whole[0])
-    with pytest.raises(InputError, match="exists already"):
-        save_runs(runs, out, jobs=2)
-
-
-def test_a_sweep_that_was_killed_when_it_began_begins_again(warm, runs, whole, tmp_path):
-    left = tmp_path / "runs.parts" / ".sweep.json.magtwin-abcdefgh"
-    left.mkdir(parents=True)
-    (left / "sweep.json").write_text("{")
-    save_runs(runs, tmp_path / "runs", jobs=2)
-    assert files_in(tmp_path / "runs") == files_in(whole[0])
 
 
 def test_an_interrupted_command_is_continued(lab_scene, tmp_path):

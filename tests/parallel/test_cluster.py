@@ -136,16 +136,6 @@ def test_a_scheduler_that_does_not_answer_is_refused(monkeypatch):
         open_pool(dask="nonsense://x")
 
 
-def test_a_scheduler_without_workers_is_refused(monkeypatch, tmp_path):
-    empty = Cluster(tmp_path)
-    try:
-        monkeypatch.setattr("magtwin.parallel.cluster.ANSWER_S", 3.0)
-        with pytest.raises(InputError, match=f"has no workers; start `dask worker {empty.address}`"):
-            open_pool(dask=empty.address)
-    finally:
-        empty.close()
-
-
 def test_without_dask_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"pip install 'magtwin\[cluster\]'"):

@@ -112,15 +112,6 @@ def test_a_beat_gives_a_chunk_its_time_again():
     assert outcome.result() == 1
 
 
-def test_large_results_arrive_and_stdout_is_kept_apart(capfd):
-    with open_pool(2) as pool:
-        sizes = {o.result()[-1]: len(o.result()) for o in pool.run(chunk_work.big, range(3))}
-    assert sizes == dict.fromkeys(range(3), 3_000_001)
-    out, err = capfd.readouterr()
-    assert out == ""
-    assert "not the program's" in err
-
-
 def test_processes_that_a_task_has_started_end_with_it(tmp_path):
     with open_pool(1) as pool:
         (outcome,) = pool.run(partial(chunk_work.grandchild, str(tmp_path)), [1], limit_s=5.0)
@@ -170,12 +161,6 @@ def test_a_script_without_a_guard_is_told_so(tmp_path):
         "magtwin.errors.InputError: worker processes import the script that starts them: let it begin its "
         'work below `if __name__ == "__main__":`'
     )
-
-
-def test_a_script_on_stdin_can_start_workers():
-    script = "from magtwin.parallel import open_pool\nprint([o.value for o in open_pool(1).run(abs, [-1])])"
-    done = subprocess.run([sys.executable, "-"], input=script, capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "[1]\n", "")
 
 
 def test_shards_split_all_chunks():

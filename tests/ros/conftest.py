@@ -6,6 +6,7 @@ import pytest
 from nodes import in_a_domain
 
 from magtwin.ros.bus import Bus
+from magtwin.twin import Twin, open_twin
 
 
 @pytest.fixture
@@ -13,3 +14,9 @@ def nodes() -> Iterator[Callable[..., Bus]]:
     """Makes nodes in a domain of the test's own, on loopback only."""
     with in_a_domain() as node:
         yield node
+
+
+@pytest.fixture(scope="session")
+def twin() -> Twin:
+    """The lab that ships with magtwin, whose magnetometer reads the map."""
+    return open_twin("lab", magnetometer="map-only")

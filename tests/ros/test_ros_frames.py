@@ -86,31 +86,6 @@ def test_the_pose_of_a_camera_is_refused_until_its_place_is_known_and_then_that_
     assert one.status(5 * NS).message == "fresh"
 
 
-@pytest.mark.parametrize("frame", ["camera_link", "/ann/imu_link", "laser"])
-def test_a_pose_in_the_frame_of_a_part_is_refused(frame: str) -> None:
-    bus, one, _ = heard(POSE, "geometry_msgs/msg/PoseStamped")
-    fields = {"pose.position": PLACE, "pose.orientation": HEADING.as_quat()}
-    bus.send(POSE.name, {"header.stamp": np.int64(5 * NS), "header.frame_id": frame, **fields})
-    assert one.fresh(5 * NS) is None
-    assert f"it is the pose of '{frame.strip('/')}'" in one.status(5 * NS).message
-
-
-@pytest.mark.parametrize(
-    "header", ["", "map", "odom", "/world", "ann/odom", "camera_odom_frame", "vicon", "lab"]
-)
-@pytest.mark.parametrize(
-    "child", ["", "base_link", "base_footprint", "ann/base_link", "tb3_base_link", "rover"]
-)
-def test_names_of_robots_in_use_pass_and_change_no_bit(header: str, child: str) -> None:
-    bus, one, lines = heard(POSE, ODOMETRY_KIND)
-    bus.place("base_link", "camera_link")
-    bus.send(POSE.name, pose(header, child))
-    columns = one.fresh(5 * NS)
-    assert columns is not None
-    assert_array_equal(columns["mocap_p"][0], PLACE)
-    assert (one.status(5 * NS).message, lines) == ("fresh", [])
-
-
 @pytest.mark.parametrize("own", [False, True])
 def test_an_imu_is_turned_into_base_link_or_into_the_axes_of_the_scenes_imu(own: bool) -> None:
     bus, one, _ = heard(IMU, IMU.kind, axes={"IMU": MOUNT.as_quat()} if own else None)

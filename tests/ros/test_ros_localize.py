@@ -5,19 +5,19 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from nodes import DOMAINS, from_message, spin
+from nodes import from_message, spin
 
 from magtwin.errors import InputError
-from magtwin.files.file import shipped
 from magtwin.frames import quat_from_yaw, rotate, wrap_angle, yaw_from_quat
-from magtwin.io.bags.topics import CLOCK, COMMAND, MAGNITUDE, ODOMETRY, Qos
+from magtwin.io.bags.topics import CLOCK, COMMAND, MAGNITUDE, ODOMETRY, TF, Qos
 from magtwin.io.bags.types import typestore
-from magtwin.localization.problem import Estimate, Prior
+from magtwin.localization.problem import Prior
 from magtwin.localization.track import LocalizerError
-from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
+from magtwin.ros.bus import Message, to_bytes
 from magtwin.ros.commands import command_bytes
 from magtwin.ros.diagnostics import KIND
 from magtwin.ros.localization.localize import PARAMETERS, LocalizerNode
@@ -27,9 +27,7 @@ from magtwin.ros.localization.poses import (
     ESTIMATE,
     INITIAL,
     POSE_KIND,
-    TF_KIND,
     cloud_bytes,
-    odom_bytes,
     pose_bytes,
     prior_from,
     read_pose,
@@ -38,17 +36,14 @@ from magtwin.ros.parameters import settings
 from magtwin.ros.simulate import Simulator
 from magtwin.run.run import Run
 from magtwin.tasks.localizing import live_problem, localization, localize, new_localizer
-from magtwin.twin import Twin, open_twin, simulate
+from magtwin.twin import Twin, simulate
 
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 
 NS = 10**9
 MANY = Qos(depth=1000)
-
-
-@pytest.fixture(scope="module")
-def twin() -> Twin:
-    return open_twin(shipped("scenes", "lab", "lab.usda"), magnetometer="map-only")
+Nodes = Any
+"""As `nodes` of conftest.py."""
 
 
 @pytest.fixture(scope="module")
@@ -61,28 +56,6 @@ def method(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     sys.path.remove(str(folder))
 
 
-class Net:
-    """Nodes on a domain of the test's own."""
-
-    def __init__(self) -> None:
-        self.domain, self.buses = next(DOMAINS), list[Bus]()
-
-    def bus(self, name: str, **rest: object) -> Bus:
-        made = open_bus(name, backend="cyclonedds", domain=self.domain, **rest)  # type: ignore[arg-type]
-        self.buses.append(made)
-        return made
-
-
-@pytest.fixture
-def net(monkeypatch: pytest.MonkeyPatch) -> Iterator[Net]:
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
-    made = Net()
-    yield made
-    for bus in made.buses:
-        bus.close()
-
-
 def poses(heard: list[Message]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times, poses and covariances of estimates."""
     read = [read_pose(message) for message in heard]
@@ -93,9 +66,9 @@ def poses(heard: list[Message]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     )
 
 
-def test_a_simulated_drive_is_localized_live_as_offline(net: Net, twin: Twin, method: str) -> None:
+def test_a_simulated_drive_is_localized_live_as_offline(nodes: Nodes, twin: Twin, method: str) -> None:
     told = ["prior:=0,0,0", "use_sim_time:=true", "cloud_hz:=2", "tf_broadcast:=false"]
-    bus, ear, robot = net.bus("localizer", sim_time=True), net.bus("ear"), net.bus("robot")
+    bus, ear, robot = nodes("localizer", sim_time=True), nodes("ear"), nodes("robot")
     rows: list[Run] = []
     sim = Simulator(twin, robot, seed=3, speed=3.0)
     read = sim.online.read
@@ -141,10 +114,10 @@ def test_a_simulated_drive_is_localized_live_as_offline(net: Net, twin: Twin, me
 
 
 def test_a_node_elsewhere_is_benchmarked_as_the_method_that_it_runs(
-    net: Net, twin: Twin, method: str
+    nodes: Nodes, twin: Twin, method: str
 ) -> None:
     run = simulate(twin, "figure8", seed=2, duration_s=8.0)
-    bus = net.bus("localizer", sim_time=True)
+    bus = nodes("localizer", sim_time=True)
     values = settings(PARAMETERS, ["use_sim_time:=true", "tf_broadcast:=false"])
     LocalizerNode(twin, bus, values, method=method, options={"particles": 200}, problem=live_problem(twin))
     stop = threading.Event()
@@ -156,7 +129,7 @@ def test_a_node_elsewhere_is_benchmarked_as_the_method_that_it_runs(
     thread = threading.Thread(target=live)
     thread.start()
     try:
-        options = {"domain": net.domain, "backend": "cyclonedds", "timeout_s": 10.0}
+        options = {"domain": nodes.domain, "backend": "cyclonedds", "timeout_s": 10.0}
         far = [localize(run, twin.field, method="ros", options=options) for _ in range(2)]
     finally:
         stop.set()
@@ -167,12 +140,12 @@ def test_a_node_elsewhere_is_benchmarked_as_the_method_that_it_runs(
             np.testing.assert_allclose(other[name], here[name], atol=1e-7)
 
 
-def test_without_the_node_its_benchmark_fails_in_time_and_says_what_is_missing(net: Net, twin: Twin) -> None:
+def test_without_the_node_its_benchmark_fails_in_time_with_the_reason(nodes: Nodes, twin: Twin) -> None:
     run = simulate(twin, "figure8", seed=2, duration_s=2.0)
-    options = {"domain": net.domain, "backend": "cyclonedds", "connect_s": 0.3}
+    options = {"domain": nodes.domain, "backend": "cyclonedds", "connect_s": 0.3}
     with pytest.raises(LocalizerError, match=r"nobody publishes /robot/estimate/pose after 0.3 s"):
         localize(run, twin.field, method="ros", options=options)
-    answer = net.bus("silent")
+    answer = nodes("silent")
     answer.publisher(ESTIMATE, POSE_KIND, Qos())
     for topic, kind in (
         (ODOMETRY.name, ODOMETRY.kind),
@@ -188,8 +161,8 @@ def test_without_the_node_its_benchmark_fails_in_time_and_says_what_is_missing(n
 class Hand:
     """A robot whose messages the test sends, and a localizer that hears it."""
 
-    def __init__(self, net: Net, twin: Twin, *told: str) -> None:
-        self.robot, self.bus = net.bus("robot"), net.bus("localizer", sim_time=True)
+    def __init__(self, nodes: Nodes, twin: Twin, *told: str) -> None:
+        self.robot, self.bus = nodes("robot"), nodes("localizer", sim_time=True)
         self.senders = {
             topic: self.robot.publisher(topic.name, topic.kind, MANY)
             for topic in (CLOCK, ODOMETRY, MAGNITUDE)
@@ -202,7 +175,7 @@ class Hand:
             list[str](),
         )
         self.robot.subscribe(ESTIMATE, POSE_KIND, self.heard.append, MANY)
-        self.robot.subscribe("/tf", TF_KIND, self.tf.append, MANY)
+        self.robot.subscribe(TF.name, TF.kind, self.tf.append, MANY)
         self.robot.subscribe("/diagnostics", KIND, self.said.append, MANY)
         spin(lambda: self.bus.types(ODOMETRY.name) and self.bus.types(MAGNITUDE.name), self.bus)
         values = settings(PARAMETERS, ("use_sim_time:=true", *told))
@@ -240,8 +213,8 @@ class Hand:
         spin(lambda: len(self.lines) > before, self.bus)
 
 
-def test_a_pose_on_initialpose_starts_the_method_and_starts_it_again(net: Net, twin: Twin) -> None:
-    hand = Hand(net, twin)
+def test_a_pose_on_initialpose_starts_the_method_and_starts_it_again(nodes: Nodes, twin: Twin) -> None:
+    hand = Hand(nodes, twin)
     hand.tick(3)
     hand.settle()
     assert not hand.heard
@@ -257,11 +230,8 @@ def test_a_pose_on_initialpose_starts_the_method_and_starts_it_again(net: Net, t
     spin(lambda: any("'odom' is ignored" in line for line in hand.lines), hand.bus)
 
 
-def test_map_to_odom_puts_base_link_at_the_estimate_and_another_publisher_is_told_of(
-    net: Net, twin: Twin
-) -> None:
-    hand = Hand(net, twin, "prior:=1,0.5,0.3")
-    other = hand.robot.publisher("/tf", TF_KIND, MANY)
+def test_map_to_odom_puts_base_link_at_the_estimate(nodes: Nodes, twin: Twin) -> None:
+    hand = Hand(nodes, twin, "prior:=1,0.5,0.3")
     hand.tick(3, x=0.7)
     hand.settle()
     names = [f"transforms.0.{name}" for name in ("header.frame_id", "child_frame_id")]
@@ -272,13 +242,10 @@ def test_map_to_odom_puts_base_link_at_the_estimate_and_another_publisher_is_tol
     np.testing.assert_allclose(
         origin[:2] + rotate(quat_from_yaw(0.3), [0.7, 0, 0])[:2], pose[-1, :2], atol=1e-9
     )
-    data = odom_bytes(7, ("map", "odom"), Estimate(0.0, 0.0, 0.0, 0.0), np.zeros(3), quat_from_yaw(0.0))
-    other.publish(data)
-    spin(lambda: any("tf_broadcast:=false" in line for line in hand.lines), hand.bus)
 
 
-def test_while_the_magnetometer_is_silent_odometry_is_used_alone(net: Net, twin: Twin) -> None:
-    hand = Hand(net, twin, "prior:=1,0.5,0.3")
+def test_while_the_magnetometer_is_silent_odometry_is_used_alone(nodes: Nodes, twin: Twin) -> None:
+    hand = Hand(nodes, twin, "prior:=1,0.5,0.3")
     hand.tick(3)
     hand.settle()
     before = len(hand.heard)
@@ -291,8 +258,8 @@ def test_while_the_magnetometer_is_silent_odometry_is_used_alone(net: Net, twin:
     assert "gives no field: odometry alone" in levels["localizer: estimates"].message
 
 
-def test_the_newest_message_with_a_field_before_a_tick_is_the_reading(net: Net, twin: Twin) -> None:
-    hand = Hand(net, twin, "prior:=1,0.5,0.3")
+def test_the_newest_message_with_a_field_before_a_tick_is_the_reading(nodes: Nodes, twin: Twin) -> None:
+    hand = Hand(nodes, twin, "prior:=1,0.5,0.3")
     hand.tick()
     for _ in range(6):  # the last of four messages before each tick holds no field
         hand.tick(3, step_s=0.05)
@@ -306,26 +273,8 @@ def test_the_newest_message_with_a_field_before_a_tick_is_the_reading(net: Net, 
     np.testing.assert_allclose(t[7:], [6.6, 6.8], atol=1e-6)
 
 
-def test_a_magnetometer_that_the_robot_has_elsewhere_is_told_of_once(net: Net, twin: Twin) -> None:
-    hand = Hand(net, twin)
-    upright = np.array([0.0, 0.0, 0.0, 1.0])
-    for name, x in (("near_link", 0.01), ("far_link", 0.08)):
-        hand.node._frames._known.add("base_link", name, np.array([x, 0.0, 0.3]), upright)
-    hand.node._check_place("unknown_link")
-    assert hand.lines == []
-    for _ in range(2):
-        hand.node._check_place("far_link")
-    assert hand.lines == [
-        "/tf_static has 'far_link' at x, y = 0.080, 0.000 m in base_link, the method is told 0.000, 0.000 m: "
-        "correct the robot's description, or the scene's robot"
-    ]
-    hand.node._placed = False
-    hand.node._check_place("near_link")
-    assert len(hand.lines) == 1
-
-
-def test_time_that_jumps_back_begins_anew(net: Net, twin: Twin) -> None:
-    hand = Hand(net, twin, "prior:=1,0.5,0.3")
+def test_time_that_jumps_back_begins_anew(nodes: Nodes, twin: Twin) -> None:
+    hand = Hand(nodes, twin, "prior:=1,0.5,0.3")
     hand.tick(3, x=0.5)
     hand.t = 1.0
     hand.tick(3)
@@ -362,8 +311,8 @@ def test_a_pose_crosses_with_its_covariance_and_zeros_are_unknown() -> None:
         prior_from(Message(POSE_KIND, pose_bytes(5, "map", (math.nan, 0.0, 0.0), None), 0, 0))
 
 
-def test_a_smoother_and_a_wrong_prior_are_refused(net: Net, twin: Twin) -> None:
-    bus, problem = net.bus("localizer"), live_problem(twin)
+def test_a_smoother_and_a_wrong_prior_are_refused(nodes: Nodes, twin: Twin) -> None:
+    bus, problem = nodes("localizer"), live_problem(twin)
     with pytest.raises(InputError, match="prior is wait, global or x,y,yaw"):
         LocalizerNode(twin, bus, settings(PARAMETERS, ["prior:=here"]), method="odometry", problem=problem)
     with pytest.raises(InputError, match="did you mean 'odometry'"):

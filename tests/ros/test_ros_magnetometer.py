@@ -1,6 +1,6 @@
 """The magnetometer's node: what it reads, and what it does when its inputs fail."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from magtwin.frames import into_base, quat_from_yaw
 from magtwin.io.bags.topics import BATTERY, CLOCK, IMU, MAGNITUDE, ODOMETRY, POSE, Qos, Topic
 from magtwin.learn.data.features import SETS
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
-from magtwin.ros.bus import Bus, Message, Publisher, Subscription, names_of, open_bus, to_bytes
+from magtwin.ros.bus import Bus, Message, Publisher, Subscription, open_bus, to_bytes
 from magtwin.ros.diagnostics import KIND, Status
 from magtwin.ros.inputs import GRAVITY, Gravity, Input, LiveFrames
 from magtwin.ros.magnetometer import PARAMETERS, Magnetometer
@@ -196,31 +196,6 @@ def test_in_nt_it_says_so(world: World) -> None:
     assert any("published in nT" in line for line in world.lines)
 
 
-def test_what_is_set_while_it_runs_counts_from_the_next_reading_on(
-    world: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def settable(bus: Bus, table: object, values: object, changed: Callable[[str, object], None]) -> bool:
-        setters.append(changed)
-        return True
-
-    setters: list[Callable[[str, object], None]] = []
-    monkeypatch.setattr("magtwin.ros.bus.dds.DdsBus.settable", settable)
-    bus = world.start()
-    world.tick(bus, 10)
-    assert (before := world.heard(bus)) >= 9
-    assert world.readings[-1].read(["magnetic_field"])["magnetic_field"][0] < 1e-4
-    for name, value in (("units", "nT"), ("rate_hz", 62.5)):
-        setters[0](name, value)
-    world.tick(bus, 20)
-    assert world.readings[-1].read(["magnetic_field"])["magnetic_field"][0] > 2e4
-    assert 8 <= world.heard(bus) - before <= 12
-    setters[0]("max_age_s", 0.05)
-    world.tick(bus, 20, quiet=(POSE,))
-    late = world.heard(bus)
-    world.tick(bus, 10, quiet=(POSE,))
-    assert world.heard(bus) == late
-
-
 def test_before_its_inputs_it_waits_and_says_for_what(world: World) -> None:
     bus = world.start()
     said = world.diagnose(bus, quiet=(BATTERY,))
@@ -233,13 +208,6 @@ def test_before_its_inputs_it_waits_and_says_for_what(world: World) -> None:
     assert said["input /robot/cmd_vel"].level == "ok"
     world.tick(bus, 3)
     assert world.heard(bus)
-
-
-def test_in_a_namespace_inputs_are_told_of_by_the_names_that_they_have_there(world: World) -> None:
-    bus = world.bus("magnetometer", names=names_of("tb4", ("odom:=/wheel/odom",)))
-    node = Magnetometer(world.twin, bus, settings(PARAMETERS, ()))
-    told = {one.status(0).name for one in node.inputs.values()}
-    assert {"input /tb4/enu/pose", "input /wheel/odom", "input /tb4/battery_state"} <= told
 
 
 def test_a_stale_input_is_never_read_as_fresh_and_what_comes_back_is_read_again(world: World) -> None:
@@ -284,19 +252,6 @@ def test_a_message_that_is_no_number_is_not_used(world: World) -> None:
     assert "20 messages could not be used" in said["input /robot/enu/pose"].message
 
 
-def test_a_rotation_that_is_none_is_not_used(world: World) -> None:
-    bus = world.start("max_age_s:=0.05")
-    world.tick(bus, 3)
-    last = world.t
-    for _ in range(20):  # as motion capture says that it lost a robot
-        world.send(POSE, **{"pose.position": [0.0, 0.0, 0.0], "pose.orientation": [0.0, 0, 0, 0]})
-        world.tick(bus, quiet=(POSE,))
-    stamps = [m.read(["header.stamp"])["header.stamp"] / NS for m in world.readings]
-    assert max(stamps) <= last + 0.05 + 1e-9
-    said = world.diagnose(bus, quiet=(POSE,))
-    assert "20 messages could not be used" in said["input /robot/enu/pose"].message
-
-
 def test_a_message_that_is_cut_short_is_not_used(world: World) -> None:
     bus = world.start()
     world.tick(bus, 3)
@@ -316,7 +271,7 @@ def test_a_message_that_is_cut_short_is_not_used(world: World) -> None:
     [
         (-3.0, -3.0, "the clock of its sender is 3.0 s behind this machine's: synchronize them (chrony)"),
         (3.0, 3.0, "the clock of its sender is 3.0 s ahead of this machine's: synchronize them (chrony)"),
-        (-3.0, 0.0, "its stamps are 3.0 s behind this node's clock when they are sent: correct them"),
+        (-3.0, 0.0, "its stamps are 3.0 s behind this node's clock when they are sent: correct its driver"),
         (-0.9, -0.9, ""),
     ],
 )
@@ -340,17 +295,6 @@ def test_a_skewed_clock_is_explained_once_and_does_not_matter_by_arrival(
     assert line in one.status(now).message
     assert two.fresh(now) is not None
     assert two.status(now).message == "fresh"
-    two.count_from("header")
-    assert two.fresh(bus.now_ns()) is None
-
-
-def test_what_no_column_is_read_of_may_be_no_number(world: World) -> None:
-    for wanted in (frozenset({"battery_v"}), frozenset({"battery_v", "battery_a"})):
-        one = Input(world.robot, BATTERY, frames=LiveFrames(world.robot), max_age_s=1.0, wanted=wanted)
-        fields = {"header.stamp": np.int64(5), "voltage": 15.0, "current": np.nan}
-        one._kind = BATTERY.kind
-        one._hear(Message(BATTERY.kind, to_bytes(BATTERY.kind, fields), 0, 0))
-        assert (one.fresh(6) is not None) == ("battery_a" not in wanted)
 
 
 def test_a_clock_that_stands_still_is_said_by_the_wall(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -370,28 +314,12 @@ def test_a_clock_that_stands_still_is_said_by_the_wall(world: World, monkeypatch
     assert world.heard(bus) > before
 
 
-def test_another_who_says_the_field_is_told_of(world: World) -> None:
-    world.send_on(MAGNITUDE)
-    bus = world.start()
-    said = world.diagnose(bus)
-    assert "1 others publish /robot/qtfm/magnitude too" in said["readings"].message
-    assert said["readings"].level == "warn"
-
-
 def test_stamps_from_the_future_wait_until_it_is_their_time(world: World) -> None:
     bus = world.start()
     world.tick(bus, 10, ahead_s=0.5)
     assert not world.heard(bus)
     said = world.diagnose(bus, ahead_s=2.0)
     assert "ahead of" in said["input /robot/enu/pose"].message
-
-
-def test_two_who_send_one_topic_are_told_of(world: World) -> None:
-    world.send_on(IMU)
-    bus = world.start()
-    said = world.diagnose(bus)
-    assert "2 publishers" in said["input /robot/imu"].message
-    assert said["input /robot/imu"].level == "warn"
 
 
 def test_an_input_that_comes_back_in_another_type_is_told_of(world: World) -> None:
@@ -417,17 +345,6 @@ def test_where_time_jumps_back_it_begins_anew(world: World) -> None:
     stamps = [m.read(["header.stamp"])["header.stamp"] / NS for m in world.readings]
     assert stamps[-1] == pytest.approx(world.t)
     assert any("time jumped back" in line for line in world.lines)
-
-
-def test_a_node_that_is_killed_and_started_again_reads_on(world: World) -> None:
-    bus = world.start()
-    world.tick(bus, 3)
-    before = world.heard(bus)
-    bus.close()
-    world.buses.remove(bus)
-    again = world.start()
-    world.tick(again, 3)
-    assert world.heard(again) > before
 
 
 def test_what_a_network_reads_and_no_topic_tells_is_refused(world: World, twin: Twin) -> None:

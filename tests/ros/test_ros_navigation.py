@@ -6,33 +6,27 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 from nodes import DOMAINS, in_a_domain, spin
-from scipy.stats import chi2
 
 from magtwin.frames import quat_from_yaw, rotate, wrap_angle, yaw_from_quat
 from magtwin.io.bags.sender import Transforms
 from magtwin.io.bags.topics import COMMAND, LATCHED, ODOMETRY, TF, TF_STATIC, Qos
 from magtwin.io.bags.types import typestore
 from magtwin.path.occupancy import occupancy_of
-from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
+from magtwin.ros.bus import Bus, Message, open_bus, poses_bytes, to_bytes
 from magtwin.ros.localization.localize import PARAMETERS, LocalizerNode
 from magtwin.ros.localization.poses import ESTIMATE, POSE_KIND, read_pose
 from magtwin.ros.localization.poses import PATH as ESTIMATED_PATH
 from magtwin.ros.parameters import settings
 from magtwin.ros.simulate import Simulator
-from magtwin.ros.topics import FIELD, FIELD_GRID, OCCUPANCY, PATH, READINGS, TRUTH
-from magtwin.ros.views import MOST_POSES, Trail, path_bytes
+from magtwin.ros.topics import FIELD, OCCUPANCY, PATH, READINGS, TRUTH
+from magtwin.ros.views import MOST_POSES, Trail
 from magtwin.tasks.localizing import live_problem
-from magtwin.twin import Twin, open_twin, room_of
+from magtwin.twin import Twin, room_of
 
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 
 MANY = Qos(depth=2000)
 DURATION_S = 10.0
-
-
-@pytest.fixture(scope="module")
-def twin() -> Twin:
-    return open_twin("lab", magnetometer="map-only")
 
 
 @pytest.fixture(scope="module")
@@ -143,21 +137,6 @@ def test_map_to_odom_puts_base_link_at_the_estimate_without_jumps(heard: Heard) 
         last = p, q
 
 
-def test_the_localizer_ends_within_its_stated_covariance(heard: Heard) -> None:
-    truth = {
-        stamp_ns(m.header): (m.pose.pose.position, m.pose.pose.orientation)
-        for m in map(content, heard.messages[TRUTH.name])
-    }
-    stamps = np.array(sorted(truth))
-    taken_ns, _, pose, covariance = read_pose(heard.messages[ESTIMATE][-1])
-    p, q = truth[stamps[np.argmin(np.abs(stamps - taken_ns))]]
-    true = np.array([p.x, p.y, yaw_from_quat(np.array([q.x, q.y, q.z, q.w]))])
-    error = pose - true
-    error[2] = wrap_angle(error[2])
-    assert np.sqrt(np.trace(covariance[:2, :2])) < 0.3
-    assert error @ np.linalg.solve(covariance, error) < chi2.ppf(0.999, 3)
-
-
 def test_readings_and_paths_are_where_the_robot_was(heard: Heard, twin: Twin) -> None:
     clouds = list(map(content, heard.messages[READINGS.name]))
     tables = [np.frombuffer(bytes(m.data), "<f4").reshape(m.width, len(m.fields)) for m in clouds]
@@ -202,10 +181,10 @@ def test_all_also_gives_map_to_odom_and_none_leaves_odom_to_base_link_to_a_filte
 
 def test_the_lab_is_latched_as_grid_and_cloud(twin: Twin, node: Callable[..., Bus]) -> None:
     late, got = node("late"), dict[str, Message]()
-    for topic in (OCCUPANCY, FIELD, FIELD_GRID):
+    for topic in (OCCUPANCY, FIELD):
         late.subscribe(topic.name, topic.kind, lambda m, name=topic.name: got.update({name: m}), topic.qos)
     held = Simulator(twin, node("another"), speed=4.0)
-    spin(lambda: len(got) == 3, late)
+    spin(lambda: len(got) == 2, late)
     grid, shown = occupancy_of(room_of(twin)), content(got[OCCUPANCY.name])
     assert (shown.info.height, shown.info.width) == grid.cells.shape
     np.testing.assert_array_equal(np.asarray(shown.data).reshape(grid.cells.shape), grid.cells)
@@ -217,13 +196,6 @@ def test_the_lab_is_latched_as_grid_and_cloud(twin: Twin, node: Callable[..., Bu
     every = np.repeat(table[:, None, :2].astype(float), len(field_map.headings_rad), axis=1)
     mean = field_map.lookup(every, np.broadcast_to(field_map.headings_rad, every.shape[:2]), outside="clamp")
     np.testing.assert_allclose(table[:, 3], mean.mean(axis=1), atol=0.5)  # float32 places and values
-    field_grid = content(got[FIELD_GRID.name])
-    values = np.asarray(field_grid.data).reshape(field_grid.info.height, field_grid.info.width)
-    assert (values.min(), values.max()) == (0, 100)
-    low = np.array([field_grid.info.origin.position.x, field_grid.info.origin.position.y])
-    j, i = np.unravel_index(np.argmax(values), values.shape)
-    peak = table[np.argmax(table[:, 3]), :2]
-    np.testing.assert_allclose(low + (np.array([i, j]) + 0.5) * field_grid.info.resolution, peak, atol=0.11)
     assert held.robots
 
 
@@ -233,7 +205,7 @@ def test_a_path_is_one_to_the_reference_reader(frame: str, count: int) -> None:
     poses = np.column_stack(
         [np.random.default_rng(1).normal(size=(count, 3)), np.tile([0, 0, 0, 1.0], (count, 1))]
     )
-    data = path_bytes(3_000_000_007, frame, poses)
+    data = poses_bytes(PATH.kind, 3_000_000_007, frame, poses)
     path = typestore().deserialize_cdr(data, PATH.kind)
     assert bytes(typestore().serialize_cdr(path, PATH.kind)) == data
     assert [(p.header.frame_id, stamp_ns(p.header)) for p in path.poses] == [(frame, 3_000_000_007)] * count

@@ -1,8 +1,6 @@
 """The ament package: what ROS says of a node becomes the command line of magtwin, which takes it."""
 
 import ast
-import json
-import re
 import subprocess
 import sys
 from types import ModuleType, SimpleNamespace
@@ -15,7 +13,7 @@ from places import ROOT
 from magtwin.ros.magnetometer import PARAMETERS
 
 PACKAGE = ROOT / "ros" / "magtwin_ros"
-NODES = ("sim", "magnetometer", "localize", "follow", "record", "replay", "teleop")
+NODES = ("sim", "magnetometer", "localize", "follow", "record")
 
 
 @pytest.fixture
@@ -50,11 +48,6 @@ def arguments(monkeypatch: pytest.MonkeyPatch):
             "ros magnetometer lab.usda --duration-s=5 --remap odom:=o",
         ),
         (
-            "magnetometer",
-            "lab.usda --ros-args -p online:=/slam/pose -p measured:=qtfm/magnitude -p map_frame:=world",
-            "ros magnetometer lab.usda --online=/slam/pose --measured=qtfm/magnitude map_frame:=world",
-        ),
-        (
             "localize",
             "lab --ros-args -p method:=ekf -p prior:=global -p use_sim_time:=true -r __ns:=/tb4",
             "ros localize lab --method=ekf prior:=global use_sim_time:=true --namespace=tb4",
@@ -64,7 +57,7 @@ def arguments(monkeypatch: pytest.MonkeyPatch):
             "figure8 --ros-args -p discovery:=subnet -p domain:= -p laps:=2",
             "ros follow figure8 --discovery=subnet --laps=2",
         ),
-        ("replay", "a.mcap --ros-args -p use_sim_time:=true -r x:__ns:=/", "ros replay a.mcap --namespace="),
+        ("record", "a.mcap --ros-args -r x:__ns:=/", "ros record a.mcap --namespace="),
     ],
 )
 def test_what_ros_says_of_a_node_is_a_command_of_magtwin(arguments, node, given, wanted) -> None:
@@ -161,19 +154,6 @@ def test_the_package_is_one_of_format_3_and_names_every_package_whose_messages_a
     } <= depends
 
 
-def test_all_that_setup_installs_is_there() -> None:
-    call = next(
-        node.value
-        for node in ast.parse((PACKAGE / "setup.py").read_text()).body
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)
-    )
-    files = next(ast.literal_eval(word.value) for word in call.keywords if word.arg == "data_files")
-    installed = {name for _, names in files for name in names}
-    assert all((PACKAGE / name).is_file() for name in installed)
-    launched = {str(f.relative_to(PACKAGE)) for d in ("launch", "config") for f in (PACKAGE / d).iterdir()}
-    assert {name for name in launched if "__pycache__" not in name} <= installed
-
-
 def test_the_file_of_settings_holds_what_they_are_unless_given() -> None:
     content = yaml.safe_load((PACKAGE / "config" / "magnetometer.yaml").read_text())
     settings = content["/**"]["ros__parameters"]
@@ -256,147 +236,3 @@ def test_the_launch_files_start_commands_that_magtwin_takes(arguments, describe,
         command, bound, _ = ros_app.parse_args(arguments(node.executable, words)[1:], exit_on_error=False)
         assert command is ros_app[node.executable].default_command
         assert bound.arguments[magtwin_ros.nodes.FIRST[node.executable]]
-
-
-DECLARED = json.loads((ROOT / "tests" / "ros" / "declared.json").read_text())
-"""Names of what other projects' nodes and viewers take, read from their sources; the file names these."""
-
-ANY = {"use_sim_time"}
-
-
-def config(name: str):
-    return yaml.safe_load((PACKAGE / "config" / name).read_text())
-
-
-def unknown(node: str, settings: dict) -> set[str]:
-    """Parameters of a nav2 node that neither it nor its plugins declare."""
-    known, wrong = {*DECLARED["nodes"][node], *ANY}, set()
-    for name, value in settings.items():
-        if not isinstance(value, dict):
-            wrong |= {name} - known
-            continue
-        takes = {"plugin", *DECLARED["plugins"][value["plugin"]]}
-        for key, inner in value.items():  # a costmap's source of observations has the keys of its layer
-            wrong |= {f"{name}.{k}" for k in (inner if isinstance(inner, dict) else {key}) if k not in takes}
-        sources = str(value.get("observation_sources", "")).split()
-        assert [key for key, inner in value.items() if isinstance(inner, dict)] == sources
-    return wrong
-
-
-def test_nav2s_nodes_declare_every_parameter_of_its_file() -> None:
-    content = config("nav2.yaml")
-    for name, section in content.items():
-        node = "lifecycle_manager" if name.startswith("lifecycle_manager") else name
-        node = "costmap" if name.endswith("costmap") else node
-        settings = (section[name] if node == "costmap" else section)["ros__parameters"]
-        assert not unknown(node, settings), name
-        plugins = [v for k, v in settings.items() if k in ("plugins", "navigators") or k.endswith("_plugins")]
-        named = [plugin for value in plugins for plugin in value]
-        assert all(isinstance(settings[plugin], dict) for plugin in named)
-    assert unknown("amcl", {"alpha_1": 0.2, "alpha1": 0.2}) == {"alpha_1"}
-
-
-def test_what_nav2s_launch_file_starts_has_its_section_and_its_manager(describe) -> None:
-    nodes = {n.name: n for n in describe("navigation") if n.made == "Node" and n.package != "magtwin_ros"}
-    content = config("nav2.yaml")
-    costmaps = {"local_costmap", "global_costmap"}  # of controller_server and planner_server
-    assert set(nodes) == set(content) - costmaps
-    managed = [
-        n for name in nodes if "manager" in name for n in content[name]["ros__parameters"]["node_names"]
-    ]
-    assert sorted(managed) == sorted(name for name in nodes if "manager" not in name)
-    for name in ("controller_server", "behavior_server"):  # both drive
-        assert nodes[name].remappings == [("cmd_vel", "/robot/cmd_vel")]
-
-
-def test_slam_toolbox_and_robot_localization_declare_every_parameter_of_their_files() -> None:
-    slam = config("slam_toolbox.yaml")["slam_toolbox"]["ros__parameters"]
-    assert set(slam) <= {*DECLARED["nodes"]["slam_toolbox"]}
-    ekf = config("robot_localization.yaml")["ekf_filter_node"]["ros__parameters"]
-    for name, value in ekf.items():
-        sensor = re.fullmatch(r"(odom|imu|pose|twist)\d(_\w+)?", name)
-        assert (
-            name in DECLARED["ekf"] if sensor is None else (sensor[2] or "_config") in DECLARED["ekf_sensor"]
-        )
-        if name.endswith("_config"):
-            assert len(value) == 15
-
-
-def test_the_bridge_gives_topics_in_types_that_magtwin_reads() -> None:
-    from magtwin.io.bags.topics import TOPICS
-
-    given = {}
-    for entry in config("ros_gz_bridge.yaml"):
-        assert set(entry) <= {*DECLARED["bridge_keys"]}
-        assert DECLARED["bridge_types"][entry["ros_type_name"]] == entry["gz_type_name"]
-        topic = TOPICS[entry["ros_topic_name"]]
-        assert entry["ros_type_name"] in {topic.kind, *topic.reads}
-        assert entry["direction"] == ("ROS_TO_GZ" if topic.name == "/robot/cmd_vel" else "GZ_TO_ROS")
-        given[topic.name] = entry
-    assert {"/clock", "/robot/odom", "/robot/imu", "/robot/enu/pose", "/robot/battery_state"} <= set(given)
-
-
-def kinds() -> dict[str, str]:
-    """Message type of each topic of the simulator and the localizer."""
-    from magtwin.ros.localization import poses
-    from magtwin.ros.topics import LIVE
-
-    known = {topic.name: topic.kind for topic in LIVE} | {poses.INITIAL: poses.POSE_KIND}
-    return known | {
-        f"/robot/{poses.ESTIMATE}": poses.POSE_KIND,
-        f"/robot/{poses.CLOUD}": poses.CLOUD_KIND,
-        f"/robot/{poses.PATH}": poses.PATH_KIND,
-    }
-
-
-def test_rviz_shows_topics_that_exist_with_displays_of_their_type_and_offers_that_match() -> None:
-    from magtwin.ros.topics import LIVE
-
-    names = {
-        "OccupancyGrid": "Map",
-        "PoseWithCovarianceStamped": "PoseWithCovariance",
-        "String": "RobotModel",
-    }
-    latched = {topic.name for topic in LIVE if topic.qos.latched}
-    shown = set()
-    content = config("magtwin.rviz")["Visualization Manager"]
-    for display in content["Displays"]:
-        plugin, _, kind = display["Class"].partition("/")
-        assert plugin == "rviz_default_plugins"
-        extra = set(display) - {"Class", "Name", "Enabled", "Topic", *DECLARED["rviz"][kind]}
-        assert not extra, display["Name"]
-        topic = display.get("Topic", display.get("Description Topic"))
-        if topic is None:
-            continue
-        message = kinds()[topic["Value"]].rpartition("/")[2]
-        assert names.get(message, message) == kind
-        assert (topic["Durability Policy"] == "Transient Local") == (topic["Value"] in latched)
-        shown.add(topic["Value"])
-    assert {"/map", "/anomaly_map", "/robot/ground_truth/readings", "/robot/estimate/pose"} <= shown
-    assert content["Global Options"]["Fixed Frame"] == "map"
-
-
-def test_foxglove_shows_topics_and_fields_that_exist() -> None:
-    from magtwin.io.bags.types import layout
-
-    content = json.loads((PACKAGE / "config" / "foxglove.json").read_text())
-    panels = content["configById"]
-
-    def placed(node) -> list[str]:
-        return [node] if isinstance(node, str) else [*placed(node["first"]), *placed(node["second"])]
-
-    assert sorted(placed(content["layout"])) == sorted(panels)
-    for name, panel in panels.items():
-        kind = name.partition("!")[0]
-        assert kind in ("3D", "Plot", "DiagnosticSummary")
-        for topic, settings in panel.get("topics", {}).items():
-            assert set(settings) <= {*DECLARED["foxglove"][kinds()[topic]]}, topic
-        for path in panel.get("paths", ()):
-            topic, _, leaf = path["value"].partition(".")
-            parts = {
-                part
-                for known in layout(kinds()[topic])
-                for part in (known.name, f"{known.name}.x", f"{known.name}.y")
-            }
-            assert leaf in parts, path["value"]
-    assert panels["3D!lab"]["followTf"] == "map"

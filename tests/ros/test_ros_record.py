@@ -8,21 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from nodes import SLOWEST_S, spin
+from nodes import SLOWEST_S
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from magtwin.errors import InputError
-from magtwin.files.file import shipped
 from magtwin.io.bags import RawBagWriter
-from magtwin.io.bags.topics import CLOCK, LATCHED, MAGNITUDE, ODOMETRY, Qos
+from magtwin.io.bags.topics import LATCHED, MAGNITUDE, ODOMETRY, Qos
 from magtwin.io.bags.types import definition_of
 from magtwin.io.formats import read_run
-from magtwin.ros.bus import Bus, Message, to_bytes
-from magtwin.ros.record import Player, Recorder
+from magtwin.ros.bus import Bus, to_bytes
+from magtwin.ros.record import Recorder
 from magtwin.ros.simulate import Simulator
-from magtwin.twin import Twin, open_twin
+from magtwin.twin import Twin
 
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 
@@ -31,11 +30,6 @@ COMMON = (
     *("trajectory_msgs", "visualization_msgs"),
 )
 """common_interfaces but std_srvs, which has no messages."""
-
-
-@pytest.fixture(scope="module")
-def twin() -> Twin:
-    return open_twin(shipped("scenes", "lab", "lab.usda"), magnetometer="map-only")
 
 
 def filled(store, described, rng):  # type: ignore[no-untyped-def]
@@ -132,7 +126,7 @@ def test_the_definition_is_that_of_the_publishers_distribution() -> None:
 
 
 @pytest.mark.parametrize("sim_time", [True, False])
-def test_a_recording_survives_a_reset_of_time_in_a_bag_for_each_part(
+def test_a_recording_ends_where_time_jumps_back(
     twin: Twin, nodes: Callable[..., Bus], tmp_path: Path, sim_time: bool
 ) -> None:
     simulator = Simulator(twin, nodes("sim"), seed=3, speed=4.0)
@@ -150,43 +144,12 @@ def test_a_recording_survives_a_reset_of_time_in_a_bag_for_each_part(
 
     simulated = threading.Thread(target=simulator.run, args=(ended,))
     simulated.start()
-    recorder.run(lambda: not simulated.is_alive())
-    recorder.run(duration_s=0.3)
-    total = writer.counts[MAGNITUDE.name]
+    recorder.run(duration_s=60.0)
+    simulated.join()
     writer.close()
-    assert recorder.resets == 1
-    assert [path.name for path in writer.paths] == ["drive.mcap", "drive_2.mcap"]
-    first, second = (read_run(path) for path in writer.paths)
-    assert first.rows + second.rows == pytest.approx(total, abs=1)
-    assert first["t"][-1] > 0.9 > 0.6 > second["t"][-1] > 0.4
-    np.testing.assert_array_equal(first["odom_p"][:20], second["odom_p"][:20])  # the same seed
-    with AnyReader([writer.paths[1]]) as bag:
-        latched = {
-            c.topic: c.msgcount for c in bag.connections if c.topic.startswith(("/tf_s", "/magtwin/c"))
-        }
-    assert latched.keys() == {"/tf_static", "/magtwin/columns"}
-    assert all(latched.values())
-
-
-def test_a_replay_by_the_wall_has_stamps_and_clock_of_now(
-    twin: Twin, nodes: Callable[..., Bus], tmp_path: Path
-) -> None:
-    from magtwin.twin import simulate
-
-    run = simulate(twin, "sine", duration_s=1.5, seed=1)
-    heard: dict[str, list[Message]] = {ODOMETRY.name: [], CLOCK.name: []}
-    player, ear = Player(run, nodes("player"), stamps="wall"), nodes("ear")
-    for topic in (ODOMETRY, CLOCK):
-        ear.subscribe(topic.name, topic.kind, heard[topic.name].append, Qos(depth=1000))
-    played = threading.Thread(target=player.run)
-    played.start()
-    spin(lambda: not played.is_alive(), ear)
-    ear.spin_once(0.1)
-    for name, leaf in ((ODOMETRY.name, "header.stamp"), (CLOCK.name, "clock")):
-        late = np.array([m.sent_ns - m.read([leaf])[leaf] for m in heard[name]]) * 1e-9
-        assert len(late) > 50
-        assert np.median(np.abs(late)) < 0.1
-    assert to_bytes(CLOCK.kind, {"clock": 0}) != heard[CLOCK.name][0].data
+    assert recorder.ended
+    assert ["jumped back" in line for line in lines] == [True]
+    assert read_run(tmp_path / "drive.mcap")["t"][-1] > 0.9
 
 
 def test_topics_that_are_named_are_recorded_beside_those_of_the_drive(

@@ -24,7 +24,7 @@ pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 OWN = ("odom", "imu", "enu/pose", "battery_state", "scan", "joint_states", "robot_description")
 OWN = (*OWN, "qtfm/magnitude", "qtfm/field", "qtfm/total_field_nt", "magtwin/reading", "magtwin/columns")
 OWN = (*OWN, "ground_truth", "ground_truth/readings", "ground_truth/path")
-SHARED = ("/clock", "/tf", "/tf_static", "/diagnostics", "/map", "/anomaly_map", "/anomaly_map/grid")
+SHARED = ("/clock", "/tf", "/tf_static", "/diagnostics", "/map", "/anomaly_map")
 DURATION_S = 4.0
 
 

@@ -8,22 +8,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from nodes import SLOWEST_S, from_message, in_a_domain, spin
+from nodes import from_message, in_a_domain, spin
 
 from magtwin.errors import InputError
 from magtwin.files.file import shipped
 from magtwin.io.bags import RawBagWriter
 from magtwin.io.bags.bag import Bag
 from magtwin.io.bags.cdr import decode
-from magtwin.io.bags.topics import CLOCK, COMMAND, LATCHED, MAGNITUDE, ODOMETRY, Qos
+from magtwin.io.bags.topics import COMMAND, LATCHED, MAGNITUDE, ODOMETRY, Qos
 from magtwin.io.bags.types import layout
 from magtwin.io.formats import read_run
-from magtwin.learn.data.recording import Source
-from magtwin.learn.data.recording import read as read_source
-from magtwin.ros.bus import Bus, Message, names_of, to_bytes
+from magtwin.ros.bus import Bus, Message, to_bytes
 from magtwin.ros.commands import command_bytes
 from magtwin.ros.diagnostics import KIND, Status, to_fields
-from magtwin.ros.record import Player, Recorder
+from magtwin.ros.record import Recorder
 from magtwin.ros.simulate import RESET, Simulator
 from magtwin.run.run import Run
 from magtwin.sim.runs.simulate import simulate
@@ -152,14 +150,6 @@ def test_samples_are_stamped_by_when_they_were_taken_and_say_what_the_run_holds(
     assert not set(map(tuple, held)) - set(map(tuple, said))
 
 
-def test_a_robot_says_how_it_fares(driven: Driven) -> None:
-    assert driven.said
-    last = driven.said[-1]
-    assert last.name == "sim: simulator"
-    assert last.values["publishers of commands"] == "1"
-    assert int(last.values["commands"]) > 5
-
-
 def test_without_commands_for_half_a_second_the_robot_stops(driven: Driven) -> None:
     t, v = driven.run["t"], driven.run["v_base"][:, 0]
     assert v.max() > 0.2
@@ -179,14 +169,6 @@ def test_fields_are_in_tesla_and_beside_them_in_nt(twin: Twin, nodes: Callable[.
     assert 2e-5 < read["magnetic_field"][0] < 7e-5
     assert read["magnetic_field"][0] * 1e9 == pytest.approx(nt, abs=1e-6)
     assert twin.magnetometer is not None
-
-
-def test_a_namespace_and_remaps_move_the_topics(twin: Twin, nodes: Callable[..., Bus]) -> None:
-    names = names_of("tb4", ("odom:=/wheel/odom",))
-    Simulator(twin, nodes("sim", names=names))
-    ear = nodes("ear")
-    spin(lambda: ear.types("/wheel/odom") and ear.types("/tb4/imu") and ear.types("/clock"), ear)
-    assert not ear.types("/robot/imu")
 
 
 def test_a_reset_begins_anew_from_the_same_seed(twin: Twin, nodes: Callable[..., Bus]) -> None:
@@ -236,32 +218,6 @@ def test_a_command_that_is_no_number_is_not_obeyed_and_said(twin: Twin, nodes: C
     assert simulator.online.commands.rows[:, 1:].any() == np.False_
 
 
-def test_commands_that_it_cannot_hear_and_others_on_its_topics_are_said(
-    twin: Twin, nodes: Callable[..., Bus]
-) -> None:
-    simulator, hand = Simulator(twin, nodes("sim"), speed=2.0), nodes("hand")
-    said: list[Status] = []
-    hand.subscribe("/diagnostics", KIND, lambda m: said.extend(from_message(m)), Qos())
-    nodes("other").publisher(COMMAND.name, "geometry_msgs/msg/Vector3", COMMAND.qos)
-    for topic in (CLOCK, MAGNITUDE):
-        hand.publisher(topic.name, topic.kind, topic.qos)
-    spin(lambda: hand.types("/diagnostics"), hand)
-    simulator.robots[0].commanded(Message(COMMAND.kind, command(0.3, 0.0)[:20], 0, 0))
-    last, others = time.monotonic() + SLOWEST_S, "2 publishers on /robot/qtfm/magnitude"
-
-    def settled() -> bool:  # the domain may still know a node of an earlier test
-        hand.spin_once(0.0)
-        return time.monotonic() > last or any(others in status.message for status in said)
-
-    simulator.run(settled)
-    assert said[0].level == "warn"
-    assert "1 commands were not finite" in said[0].message
-    assert "commands of type geometry_msgs/msg/Vector3 are ignored" in said[0].message
-    assert "2 publishers on /clock" in said[-1].message
-    assert others in said[-1].message
-    assert simulator.online.commands.rows[:, 1:].any() == np.False_
-
-
 @pytest.mark.parametrize("kind", ["Twist", "TwistStamped"])
 def test_commands_of_both_types_are_obeyed(twin: Twin, nodes: Callable[..., Bus], kind: str) -> None:
     simulator, hand = Simulator(twin, nodes("sim"), speed=4.0), nodes("hand")
@@ -283,31 +239,6 @@ def test_diagnostics_say_what_they_were_given() -> None:
     message = Message(KIND, to_bytes(KIND, to_fields(said, 7, "robot")), 0, 0)
     assert from_message(message) == said
     assert message.read(["header.stamp"])["header.stamp"] == 7
-
-
-def test_a_run_is_said_again_as_its_robot_said_it(
-    driven: Driven, nodes: Callable[..., Bus], tmp_path: Path
-) -> None:
-    part = driven.run.between(1.0, 2.0)
-    player = Player(part, nodes("player"))
-    listener = nodes("recorder")
-    writer = RawBagWriter(tmp_path / "again.mcap")
-    recorder = Recorder(listener, writer)
-    said = threading.Thread(target=player.run, kwargs={"speed": 2.0})
-    said.start()
-    recorder.run(lambda: not said.is_alive())
-    recorder.run(duration_s=0.2)
-    writer.close()
-    again = read_run(tmp_path / "again.mcap")
-    assert again.rows == part.rows
-    for name in ("t", "b_measured_nt", "odom_p", "imu_w", "p_world_base"):
-        np.testing.assert_allclose(again[name], part[name], rtol=1e-12, err_msg=name)
-    assert again.metadata == part.metadata
-    assert again.metadata["magnetometer"] == "neural"
-    with pytest.raises(
-        InputError, match="its readings come from a neural magnetometer"
-    ):  # so no network learns from one
-        read_source(Source("again", lambda: again))
 
 
 def test_a_recording_of_nothing_leaves_nothing(nodes: Callable[..., Bus], tmp_path: Path) -> None:

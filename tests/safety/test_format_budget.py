@@ -5,17 +5,12 @@ import resource
 import struct
 import subprocess
 import sys
-import zipfile
 
 import pytest
-from one_triangle import glb
 
 from magtwin.errors import InputError
 from magtwin.files import budget
 from magtwin.files.settings import read_toml
-from magtwin.io.formats import read_run
-from magtwin.urdf.meshes.mesh import read_mesh
-from magtwin.urdf.source.source import read_source
 from magtwin.usd import trial
 from magtwin.usd.layers import open_stage
 
@@ -46,32 +41,6 @@ def usda(body):
     )
 
 
-STAGES = {
-    "an operation without a name": 'uniform token[] xformOpOrder = [""]',
-    "an operation of no known kind": "double3 xformOp:translAte = (0, 0, 0)\n"
-    'uniform token[] xformOpOrder = ["xformOp:translAte"]',
-    "a translation of another type": "bool xformOp:translate = 1\n"
-    'uniform token[] xformOpOrder = ["xformOp:translate"]',
-    "a text that is not UTF-8": 'string doc = "\udcff"\ndef Xform "x" (kind = "\udcff") {}',
-    "no end": 'def Xform "x" {',
-}
-
-
-@pytest.mark.parametrize("name", STAGES)
-def test_a_fault_in_a_stage_is_a_refusal_or_a_report(name, tmp_path):
-    from magtwin.usd.geometry import read_shapes
-    from magtwin.usd.info import info_of_stage
-
-    (tmp_path / "s.usda").write_bytes(usda(STAGES[name]))
-    for read in (info_of_stage, read_shapes):
-        refusal = None
-        try:
-            read(tmp_path / "s.usda")
-        except InputError as error:
-            refusal = str(error)
-        assert refusal is None or ("s.usda" in refusal and "\n" not in refusal)
-
-
 def test_a_crate_whose_counts_lie_is_refused_without_its_memory(tmp_path):
     """Each 8 bytes of a crate's sections in turn become a huge number."""
     from pxr import Sdf
@@ -93,23 +62,6 @@ def test_a_crate_whose_counts_lie_is_refused_without_its_memory(tmp_path):
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before < MOST
 
 
-def test_damaged_npy_headers_are_refused(tmp_path):
-    for head in (b"{'descr': '<f8', 'shape': (", b"{'descr': '''", b"{'a': (((((", b"\xff" * 20):
-        with zipfile.ZipFile(tmp_path / "h.npz", "w") as archive:
-            archive.writestr("t.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head)
-        with pytest.raises(InputError, match="is no whole array of plain numbers"):
-            read_run(tmp_path / "h.npz")
-
-
-def test_a_xacro_with_an_unknown_prefix_is_refused_with_its_line(tmp_path):
-    (tmp_path / "r.xacro").write_text(
-        '<robot name="b" xmlns:xacro="http://www.ros.org/wiki/xacro">\n'
-        '<xacro:arg name="w"/>\n<u:link/></robot>'
-    )
-    with pytest.raises(InputError, match=r"r\.xacro:3: not XML: unbound prefix"):
-        read_source(tmp_path / "r.xacro")
-
-
 def test_a_manifest_with_an_endless_number_is_refused(tmp_path):
     from magtwin.learn.data.dataset import KIND, MANIFEST, VERSION, open_dataset
 
@@ -117,21 +69,6 @@ def test_a_manifest_with_an_endless_number_is_refused(tmp_path):
     (tmp_path / MANIFEST).write_text(json.dumps({"kind": KIND, "version": VERSION, "alignment": part}))
     with pytest.raises(InputError, match="not the manifest of a data set"):
         open_dataset(tmp_path)
-
-
-def test_a_mesh_without_corners_or_with_a_strange_name_is_refused_or_read(tmp_path):
-    ply = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
-    ply += "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n0\n"
-    (tmp_path / "m.ply").write_text(ply)
-    with pytest.raises(InputError, match=r"m\.ply"):
-        read_mesh(tmp_path / "m.ply")
-    glb(tmp_path / "m.gltf", {"count": 3})
-    table = json.loads((tmp_path / "m.gltf").read_text())
-    table["materials"] = [{"name": {"a": 1}}]
-    table["meshes"][0]["primitives"][0]["material"] = 0
-    (tmp_path / "m.gltf").write_text(json.dumps(table))
-    with pytest.raises(InputError, match="no triangle with an area"):  # all points are 0
-        read_mesh(tmp_path / "m.gltf")
 
 
 def test_a_stage_is_tried_below_a_limit_of_the_users(tmp_path):

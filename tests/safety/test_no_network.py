@@ -70,7 +70,7 @@ def test_what_leaves_the_machine_is_noted_also_from_a_child(watched, tmp_path):
     notes.unlink()
 
 
-def test_commands_ask_no_host_and_write_nothing_into_a_home_folder_but_a_list_of_fonts(watched, tmp_path):
+def test_commands_ask_no_host_and_write_nothing_into_a_home_folder_but_caches(watched, tmp_path):
     environment, notes = watched
     command = [sys.executable, "-c", ALL, COMMANDS.strip()]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
@@ -79,6 +79,6 @@ def test_commands_ask_no_host_and_write_nothing_into_a_home_folder_but_a_list_of
     failed = {line for _, status, line in ends if status != "0"}
     assert failed <= {line for line in COMMANDS.splitlines() if line.startswith(("picture", "view run"))}
     assert not notes.exists(), notes.read_text()
-    home = Path(environment["HOME"])  # read-only, but not for the superuser, for whom matplotlib caches fonts
+    home = Path(environment["HOME"])  # read-only, but not for the superuser
     files = [path.relative_to(home) for path in home.rglob("*") if path.is_file()]
-    assert {path.parent.as_posix() for path in files} <= {".cache/matplotlib"}
+    assert {path.parent.as_posix() for path in files} <= {".cache/matplotlib", ".cache/magtwin/trials"}

@@ -109,16 +109,13 @@ def test_names_that_no_file_can_have_are_refused(name, tmp_path):
         existing(tmp_path / name, "path file")
 
 
-def test_a_stage_that_names_a_pipe_as_a_layer_is_refused(tmp_path):
+def test_a_pipe_as_a_layer_or_as_a_part_of_a_run_is_refused(tmp_path):
     from magtwin.usd.layers import open_stage
 
     os.mkfifo(tmp_path / "below.usda")
     (tmp_path / "stage.usda").write_text('#usda 1.0\n(subLayers = [@./below.usda@])\ndef "World" {}\n')
     with pytest.raises(InputError, match=r"names .*below\.usda, which is no regular file"):
         open_stage(tmp_path / "stage.usda")
-
-
-def test_a_part_of_a_run_that_is_a_pipe_is_refused(tmp_path):
     from magtwin.io.tables import load_parquet, read_parquet
 
     os.mkfifo(tmp_path / "part-000000.parquet")

@@ -216,36 +216,39 @@ def test_screen_colours_rise_with_linear_ones_and_keep_black_and_white(colour):
     assert_allclose(srgb_from_linear([0, 1]), [0, 1])
 
 
-def test_a_missing_stage_is_refused_by_name(tmp_path):
-    (tmp_path / "robot.usda").write_text("#usda 1.0\n")
-    with pytest.raises(InputError, match=r"robto\.usda: no such USD file; did you mean 'robot\.usda'"):
-        read_shapes(tmp_path / "robto.usda")
-
-
-def test_a_broken_stage_is_refused_with_usds_own_words(tmp_path):
-    broken = tmp_path / "broken.usda"
-    broken.write_text("#usda 1.0\ndef Xform {\n")
-    with pytest.raises(InputError, match=r"broken\.usda: cannot be opened as USD: .*") as refusal:
-        read_links(broken)
-    assert "\n" not in str(refusal.value)
-
-
-def test_a_mesh_that_contradicts_itself_is_refused_by_prim(stage):
+def wrong_corner(stage):
     quad(stage).GetFaceVertexIndicesAttr().Set([0, 1, 2, 3, 1, 4, 5, 9])
-    with pytest.raises(InputError, match=r"/mesh: its 8 corners, 8 indices and 6 points do not fit together"):
-        read_shapes(stage)
 
 
-def test_colours_that_do_not_fit_their_mesh_are_refused_by_prim(stage):
+def wrong_colours(stage):
     quad(stage).CreateDisplayColorPrimvar("vertex").Set([(0, 0, 0)] * 5)
-    with pytest.raises(InputError, match=r"/mesh: 5 displayColor values of interpolation 'vertex'"):
-        read_shapes(stage)
 
 
-def test_a_circle_of_joints_is_refused(stage):
+def circle(stage):
     arm(stage)
     back = UsdPhysics.FixedJoint.Define(stage, "/world/robot/back")
     back.CreateBody0Rel().SetTargets(["/world/robot/wheel"])
     back.CreateBody1Rel().SetTargets(["/world/robot/base_link"])
-    with pytest.raises(InputError, match="form a loop"):
-        read_links(stage)
+
+
+@pytest.mark.parametrize(
+    ("make", "read", "words"),
+    [
+        (wrong_corner, read_shapes, "/mesh: its 8 corners, 8 indices and 6 points do not fit"),
+        (wrong_colours, read_shapes, "/mesh: 5 displayColor values of interpolation 'vertex'"),
+        (circle, read_links, "form a loop"),
+    ],
+)
+def test_geometry_that_contradicts_itself_is_refused_by_prim(stage, make, read, words):
+    make(stage)
+    with pytest.raises(InputError, match=words):
+        read(stage)
+
+
+def test_a_stage_that_is_missing_or_broken_is_refused_in_one_line(tmp_path):
+    (tmp_path / "robot.usda").write_text("#usda 1.0\ndef Xform {\n")
+    with pytest.raises(InputError, match=r"robto\.usda: no such USD file; did you mean 'robot\.usda'"):
+        read_shapes(tmp_path / "robto.usda")
+    with pytest.raises(InputError, match=r"robot\.usda: cannot be opened as USD: .*") as refusal:
+        read_links(tmp_path / "robot.usda")
+    assert "\n" not in str(refusal.value)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose, assert_array_equal
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
+from pxr import Gf, Sdf, Usd, UsdGeom
 from validators import assert_valid
 
 from magtwin.errors import InputError
@@ -17,9 +17,6 @@ from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.usd.maps.heat_map import HEAT_MAP, MAP, colour_index, heading_variants, viridis
 from magtwin.usd.maps.layer import checksums, load_map, read_map, save_map
 
-VALUES = "magtwin:anomalyMap:valuesNt"
-HEIGHT = "magtwin:anomalyMap:heightM"
-PARAMETERS = "magtwin:anomalyMap:parameters"
 DAYS = ("2026-01-01", "2026-02-01")
 GRID = [f"magtwin:anomalyMap:{name}" for name in ("shape", "originM", "cellSizeM", "headingsDeg")]
 
@@ -58,14 +55,6 @@ def save_and_load(field, folder) -> AnomalyMap:
     return load_map(folder / "m.usdc")
 
 
-def test_a_map_survives_its_layer(tmp_path):
-    shape = (4, 3, 5)
-    rng = np.random.default_rng(1)
-    variance = rng.uniform(0, 100, shape).astype(np.float32).astype(float)
-    field = a_map(valid=rng.random(shape) < 0.8, variance_nt2=variance)
-    assert save_and_load(field, tmp_path) == field
-
-
 @settings(deadline=None, max_examples=30)
 @given(
     arrays(
@@ -77,9 +66,12 @@ def test_a_map_survives_its_layer(tmp_path):
     st.tuples(st.floats(1e-3, 10), st.floats(1e-3, 10)),
 )
 def test_any_map_in_single_precision_survives_its_layer(tmp_path_factory, values, origin, cell):
+    valid = values % 2 < 1
     field = a_map(
         values.shape,
-        values_nt=values.astype(float),
+        values_nt=np.where(valid, values, np.nan).astype(float),  # masked nodes may hold NaN
+        valid=valid,
+        variance_nt2=values.astype(float),
         origin_m=origin,
         cell_m=cell,
         headings_rad=np.arange(len(values)) * np.pi / 2,
@@ -101,17 +93,21 @@ texts = st.text(st.characters(blacklist_categories=("Cs",), blacklist_characters
 
 
 @settings(deadline=None, max_examples=30)
-@given(texts, texts, st.none() | heights, figures)
-def test_what_a_map_knows_of_itself_survives_its_layer(tmp_path_factory, frame, datum, height, parameters):
-    field = a_map((1, 2, 2), frame=frame, datum=datum, height_m=height, parameters=parameters)
-    assert save_and_load(field, tmp_path_factory.mktemp("map")) == field
-
-
-@settings(deadline=None, max_examples=30)
-@given(st.integers(0, 4), st.randoms(use_true_random=False))
-def test_a_harmonic_field_survives_the_layer_to_the_last_bit(tmp_path_factory, dipoles, random):
-    field = a_map((1, 2, 2), harmonic=a_field(dipoles, random.randrange(2**32)))
-    assert save_and_load(field, tmp_path_factory.mktemp("map")).harmonic == field.harmonic
+@given(texts, texts, st.none() | heights, figures, st.integers(0, 4))
+def test_what_a_map_knows_of_itself_survives_its_layer_to_the_bit(
+    tmp_path_factory, frame, datum, height, parameters, dipoles
+):
+    about = {"frame": frame, "datum": datum, "height_m": height, "parameters": parameters}
+    origin = MadeFrom(
+        earth_nt=(1.0, 2.5, -3.0),
+        sensor_m=(0.1, 0.0, 0.4),
+        platform="ab",
+        bodies={"désk": "12", "pipe": "34"},
+    )
+    field = a_map((1, 2, 2), **about, harmonic=a_field(dipoles, dipoles), made_from=origin)
+    again = save_and_load(field, tmp_path_factory.mktemp("map"))
+    assert again == field
+    assert (again.harmonic, again.made_from) == (field.harmonic, origin)
 
 
 @pytest.mark.parametrize(
@@ -141,33 +137,10 @@ def test_the_coloured_floor_of_a_fine_map_stays_light_and_reaches_its_border(tmp
     assert_array_equal(colours, viridis()[index])
 
 
-def test_masked_nodes_may_hold_nan(tmp_path):
-    values = np.full((1, 2, 2), 40_000.0)
-    values[0, 1, 1] = np.nan
-    field = a_map((1, 2, 2), values_nt=values, valid=np.isfinite(values))
-    assert save_and_load(field, tmp_path) == field
-
-
 def test_headings_come_back_to_the_last_bit_or_the_one_before(tmp_path):
     headings = np.sort(np.random.default_rng(2).uniform(0, 2 * np.pi, 50))
     field = a_map((50, 2, 2), headings_rad=headings)
     assert_allclose(save_and_load(field, tmp_path).headings_rad, headings, rtol=4e-16, atol=0)
-
-
-def test_the_real_survey_survives_its_layer_to_half_a_step_of_single_precision(tmp_path, real_data):
-    from magtwin.field.survey.folder import read_survey
-
-    field = read_survey(real_data / "aprilab" / "maps", name="aprilab", licence="MIT")[0]
-    back = save_and_load(field, tmp_path)
-    assert_allclose(back.values_nt, field.values_nt, rtol=2**-24, atol=0)
-    assert_array_equal(back.valid, field.valid)
-    assert_array_equal(back.headings_rad, field.headings_rad)
-    assert (back.origin_m, back.cell_m, back.name, back.licence) == (
-        field.origin_m,
-        field.cell_m,
-        field.name,
-        field.licence,
-    )
 
 
 def test_one_map_gives_the_same_bytes_every_time(tmp_path):
@@ -218,15 +191,6 @@ def test_headings_with_fractions_name_their_variants():
     assert heading_variants(np.deg2rad([0.0, 22.5, 45.0])) == ["0", "22_5", "45"]
 
 
-def test_the_heat_map_shows_its_colours_through_its_material(tmp_path):
-    save_map(a_map(), tmp_path / "m.usdc")
-    stage = Usd.Stage.Open(str(tmp_path / "m.usdc"))
-    material, _ = UsdShade.MaterialBindingAPI(stage.GetPrimAtPath(HEAT_MAP)).ComputeBoundMaterial()
-    surface, _, _ = material.ComputeSurfaceSource()
-    reader = surface.GetInput("diffuseColor").GetConnectedSources()[0][0].source
-    assert UsdShade.Shader(reader.GetPrim()).GetInput("varname").Get() == "displayColor"
-
-
 def test_a_map_layer_passes_the_gates(tmp_path):
     save_map(a_map(), tmp_path / "m.usdc")
     assert_valid(tmp_path / "m.usdc", tmp_path)
@@ -240,167 +204,79 @@ def test_a_map_comes_along_with_a_stage_that_sublayers_it(tmp_path):
     assert load_map(tmp_path / "scene.usda") == a_map()
 
 
-def test_an_output_that_exists_is_refused_and_kept(tmp_path):
+def test_what_cannot_be_written_or_read_is_refused_by_file(tmp_path):
     save_map(a_map(), tmp_path / "m.usdc")
     before = (tmp_path / "m.usdc").read_bytes()
     with pytest.raises(InputError, match=r"m\.usdc: exists already; give `force=True`"):
         save_map(a_map(name="other"), tmp_path / "m.usdc")
     assert (tmp_path / "m.usdc").read_bytes() == before
-
-
-def test_a_map_as_text_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"m\.usda: a map layer ends in \.usdc or \.usd"):
         save_map(a_map(), tmp_path / "m.usda")
-    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "text.usdc").write_text("not USD")
+    (tmp_path / "empty.usda").write_text('#usda 1.0\n(defaultPrim = "World")\ndef "World" {}\n')
+    for name, words in (
+        ("gone.usdc", r"gone\.usdc: no such USD file"),
+        ("text.usdc", r"text\.usdc: cannot be opened as USD"),
+        ("empty.usda", r"empty\.usda </>: needs one prim with MagtwinAnomalyMapAPI"),
+    ):
+        with pytest.raises(InputError, match=words):
+            load_map(tmp_path / name)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["empty.usda", "m.usdc", "text.usdc"]
 
 
-def test_a_missing_layer_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"gone\.usdc: no such USD file"):
-        load_map(tmp_path / "gone.usdc")
+TAMPERED = [
+    ("valuesNt", "float[]", [1.0] * 60, "checksum"),
+    ("valuesNt", "float[]", [], "has no .*valuesNt; select the variant that has them"),
+    ("valuesNt", "string", "many", r"must be a float\[\]"),
+    ("valid", "bool[]", [False] * 60, "checksum"),
+    ("originM", "double2", Gf.Vec2d(-3, -1), "checksum, which covers its grid"),
+    ("cellSizeM", "double2", Gf.Vec2d(0.25, 0.25), "checksum, which covers its grid"),
+    ("headingsDeg", "double[]", [0.0, 90.0, 180.0, 271.0], "checksum, which covers its grid"),
+    ("shape", "int[]", [4, 3, 6], "does not fit 60 values"),
+    ("shape", "int[]", [-1, -1, 60], "does not fit 60 values"),
+    ("cellSizeM", "double2", Gf.Vec2d(0, 1), "cell_m of AnomalyMap must"),
+    ("created", "string", "last May", "created .* a day YYYY-MM-DD, got 'last May'"),
+    ("checksum", "string", "none", "a SHA-256, 64 digits 0-9a-f, got 'none'"),
+    ("checksumVersion", "int", 3, "is of version 3, this magtwin reads 2"),
+    ("tileCells", "int", 64, r"is in tiles, .*; make the map anew"),
+    ("headingsDeg", "double[]", [0.0, 180.0, 90.0, 270.0], r"ascend in \[0, 360\) deg, got \[0.0, 180.0"),
+    ("headingsDeg", "double[]", [0.0, 90.0], r"headings_rad .* shape \(4,\), got \(2,\)"),
+    ("headingsDeg", "double[]", [], r"must ascend in .* got \[\]"),
+    ("parameters", "string", '{"a": 1', "parameters is not JSON"),
+    ("parameters", "string", '{"a": NaN}', r"not JSON \(Out of range float"),
+    ("parameters", "string", '{"a": 1e999}', "parameters is not JSON"),
+    ("parameters", "string", "[" * 10_000, "parameters is not JSON"),
+    ("parameters", "string", "[1]", "parameters must be a JSON object"),
+    ("parameters", "double", 1.0, "parameters must be a string"),
+    ("heightM", "double", np.nan, r"heightM must be a length \[m\], got nan"),
+    ("heightM", "string", "high", r"heightM must be a length \[m\], got 'high'"),
+    *(("madeFrom", "string", text, "madeFrom: ") for text in ("{", "[]", '{"earth_nt": null}', '{"a": 1}')),
+    ("harmonic:hardIronNt", "double3", Gf.Vec3d(0, 0, 1), "checksum"),
+    ("harmonic:mWorldAm2", "float3[]", [Gf.Vec3f(1)], r"must be a double3\[\]"),
+    ("harmonic:softIron", None, None, "its harmonic field has no magtwin:harmonic:softIron"),
+]
 
 
-def test_a_file_that_is_not_usd_is_refused(tmp_path):
-    (tmp_path / "m.usdc").write_text("not USD")
-    with pytest.raises(InputError, match=r"m\.usdc: cannot be opened as USD"):
-        load_map(tmp_path / "m.usdc")
-
-
-def test_a_stage_without_a_map_is_refused(tmp_path):
-    stage = Usd.Stage.CreateNew(str(tmp_path / "empty.usda"))
-    UsdGeom.Xform.Define(stage, "/World")
-    stage.Save()
-    with pytest.raises(InputError, match=r"empty\.usda </>: needs one prim with MagtwinAnomalyMapAPI"):
-        load_map(tmp_path / "empty.usda")
-
-
-@pytest.mark.parametrize(
-    ("attribute", "kind", "value", "said"),
-    [
-        (VALUES, Sdf.ValueTypeNames.FloatArray, [1.0] * 60, "do not match its checksum"),
-        (
-            "magtwin:anomalyMap:valid",
-            Sdf.ValueTypeNames.BoolArray,
-            [False] * 60,
-            "do not match its checksum",
-        ),
-        ("magtwin:anomalyMap:shape", Sdf.ValueTypeNames.IntArray, [4, 3, 6], "does not fit 60 values"),
-        ("magtwin:anomalyMap:shape", Sdf.ValueTypeNames.IntArray, [-1, -1, 60], "does not fit 60 values"),
-        (
-            "magtwin:anomalyMap:cellSizeM",
-            Sdf.ValueTypeNames.Double2,
-            Gf.Vec2d(0, 1),
-            "cell_m of AnomalyMap must",
-        ),
-        (
-            "magtwin:anomalyMap:created",
-            Sdf.ValueTypeNames.String,
-            "last May",
-            "created of AnomalyMap must be a day YYYY-MM-DD, got 'last May'",
-        ),
-        (
-            "magtwin:anomalyMap:checksum",
-            Sdf.ValueTypeNames.String,
-            "none",
-            "must be a SHA-256, 64 digits 0-9a-f, got 'none'",
-        ),
-        (
-            "magtwin:anomalyMap:headingsDeg",
-            Sdf.ValueTypeNames.DoubleArray,
-            [0.0, 180.0, 90.0, 270.0],
-            r"headingsDeg must ascend in \[0, 360\) deg, got \[0.0, 180.0",
-        ),
-        (
-            "magtwin:anomalyMap:headingsDeg",
-            Sdf.ValueTypeNames.DoubleArray,
-            [0.0, 90.0],
-            r"headings_rad of AnomalyMap must have shape \(4,\), got \(2,\)",
-        ),
-        (
-            "magtwin:anomalyMap:headingsDeg",
-            Sdf.ValueTypeNames.DoubleArray,
-            [],
-            "must ascend in .* got \\[\\]",
-        ),
-        (VALUES, Sdf.ValueTypeNames.String, "many", r"valuesNt must be a float\[\]"),
-        (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": 1', "parameters is not JSON"),
-        (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": NaN}', r"not JSON \(Out of range float"),
-        (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": 1e999}', "parameters is not JSON"),
-        (PARAMETERS, Sdf.ValueTypeNames.String, "[" * 10_000, "parameters is not JSON"),
-        (PARAMETERS, Sdf.ValueTypeNames.String, "[1]", "parameters must be a JSON object"),
-        (PARAMETERS, Sdf.ValueTypeNames.Double, 1.0, "parameters must be a string"),
-        (HEIGHT, Sdf.ValueTypeNames.Double, np.nan, r"heightM must be a length \[m\], got nan"),
-        (HEIGHT, Sdf.ValueTypeNames.String, "high", r"heightM must be a length \[m\], got 'high'"),
-        (
-            "magtwin:harmonic:hardIronNt",
-            Sdf.ValueTypeNames.Double3,
-            Gf.Vec3d(0, 0, 1),
-            "do not match its checksum",
-        ),
-        (
-            "magtwin:harmonic:mWorldAm2",
-            Sdf.ValueTypeNames.Float3Array,
-            [Gf.Vec3f(1)],
-            r"must be a double3\[\]",
-        ),
-    ],
-)
-def test_a_tampered_map_is_refused_by_file_and_prim(tmp_path, attribute, kind, value, said):
+@pytest.mark.parametrize(("name", "kind", "value", "words"), TAMPERED)
+def test_a_tampered_map_is_refused_by_file_and_prim(tmp_path, name, kind, value, words):
     save_map(a_map(height_m=0.35, harmonic=a_field()), tmp_path / "m.usdc")
     stage = Usd.Stage.Open(str(tmp_path / "m.usdc"))
-    layer = stage.GetRootLayer()
+    layer, attribute = (
+        stage.GetRootLayer(),
+        f"magtwin:{name}" if ":" in name else f"magtwin:anomalyMap:{name}",
+    )
     prim = layer.GetPrimAtPath(MAP)
-    if prim.attributes[attribute].typeName != kind:
-        prim.RemoveProperty(prim.attributes[attribute])
-        Sdf.AttributeSpec(prim, attribute, kind)
-    prim.attributes[attribute].default = value
-    if attribute in GRID and value:  # the checksum covers them
+    spec = prim.attributes.get(attribute)
+    if spec is not None and (kind is None or spec.typeName != Sdf.ValueTypeNames.Find(kind)):
+        prim.RemoveProperty(spec)
+        spec = None
+    if kind is not None:
+        spec = spec or Sdf.AttributeSpec(prim, attribute, Sdf.ValueTypeNames.Find(kind))
+        spec.default = value
+    if attribute in GRID and value and "checksum" not in words:  # a checksum that fits
         prim.attributes["magtwin:anomalyMap:checksum"].default = checksums(stage.GetPrimAtPath(MAP))[1]
     layer.Save()
-    with pytest.raises(InputError, match=rf"m\.usdc </World/AnomalyMap>: .*{said}"):
-        load_map(tmp_path / "m.usdc")
-
-
-@pytest.mark.parametrize(
-    ("attribute", "value"),
-    [
-        ("originM", Gf.Vec2d(-3, -1)),
-        ("cellSizeM", Gf.Vec2d(0.25, 0.25)),
-        ("headingsDeg", [0.0, 90.0, 180.0, 271.0]),
-    ],
-)
-def test_the_checksum_covers_the_grid(tmp_path, attribute, value):
-    save_map(a_map(harmonic=a_field()), tmp_path / "m.usdc")
-    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
-    prim = layer.GetPrimAtPath(MAP)
-    prim.attributes[f"magtwin:anomalyMap:{attribute}"].default = value
-    layer.Save()
-    with pytest.raises(InputError, match="do not match its checksum, which covers its grid too"):
-        load_map(tmp_path / "m.usdc")
-
-
-@pytest.mark.parametrize(
-    ("attribute", "kind", "value", "said"),
-    [
-        ("checksumVersion", Sdf.ValueTypeNames.Int, 3, "its checksum is of version 3, this magtwin reads 2"),
-        ("tileCells", Sdf.ValueTypeNames.Int, 64, r"is in tiles, .*; make the map anew, or save it in parts"),
-        (
-            "valuesNt",
-            Sdf.ValueTypeNames.FloatArray,
-            [],
-            "has no .*valuesNt; select the variant that has them",
-        ),
-    ],
-)
-def test_a_map_that_an_earlier_version_wrote_otherwise_is_refused_with_the_way_on(
-    tmp_path, attribute, kind, value, said
-):
-    save_map(a_map(), tmp_path / "m.usdc")
-    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
-    prim, name = layer.GetPrimAtPath(MAP), f"magtwin:anomalyMap:{attribute}"
-    spec = prim.attributes.get(name) or Sdf.AttributeSpec(prim, name, kind)
-    spec.default = value
-    layer.Save()
-    with pytest.raises(InputError, match=rf"m\.usdc </World/AnomalyMap>: {said}"):
+    with pytest.raises(InputError, match=rf"m\.usdc </World/AnomalyMap>: .*{words}"):
         load_map(tmp_path / "m.usdc")
 
 
@@ -427,34 +303,3 @@ def test_a_map_with_variants_is_read_as_the_stage_selects(tmp_path):
     for day, field in maps.items():
         epochs.SetVariantSelection(day)
         assert read_map(prim) == field
-
-
-def test_a_map_keeps_what_it_was_made_from(tmp_path):
-    origin = MadeFrom(
-        earth_nt=(1.0, 2.5, -3.0),
-        sensor_m=(0.1, 0.0, 0.4),
-        platform="ab",
-        bodies={"désk": "12", "pipe": "34"},
-    )
-    save_map(a_map(made_from=origin), tmp_path / "m.usdc")
-    assert load_map(tmp_path / "m.usdc").made_from == origin
-
-
-@pytest.mark.parametrize("text", ["{", "[]", '{"earth_nt": null}', '{"a": 1}'])
-def test_a_damaged_record_of_what_a_map_was_made_from_is_refused(tmp_path, text):
-    save_map(a_map(), tmp_path / "m.usdc")
-    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
-    layer.GetPrimAtPath(MAP).attributes["magtwin:anomalyMap:madeFrom"].default = text
-    layer.Save()
-    with pytest.raises(InputError, match=r"m\.usdc </World/AnomalyMap>: magtwin:anomalyMap:madeFrom: "):
-        load_map(tmp_path / "m.usdc")
-
-
-def test_a_harmonic_field_that_lost_a_part_is_refused(tmp_path):
-    save_map(a_map(harmonic=a_field()), tmp_path / "m.usdc")
-    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
-    prim = layer.GetPrimAtPath(MAP)
-    prim.RemoveProperty(prim.attributes["magtwin:harmonic:softIron"])
-    layer.Save()
-    with pytest.raises(InputError, match="its harmonic field has no magtwin:harmonic:softIron"):
-        load_map(tmp_path / "m.usdc")

@@ -73,34 +73,23 @@ def test_no_shipped_layer_and_no_run_has_a_name_that_the_schema_lacks(tmp_path):
         assert version_of(Sdf.Layer.OpenAsAnonymous(str(file))) == (1, 0)
 
 
-@pytest.mark.usefixtures("allow_neighbours")
-def test_edits_of_a_layer_that_are_not_saved_are_refused(tmp_path):
-    save_map(a_map(), tmp_path / "m.usdc")
-    stage = Usd.Stage.Open(str(tmp_path / "m.usdc"))
-    assert load_map(tmp_path / "m.usdc") == a_map()
-    stage.GetPrimAtPath("/World/AnomalyMap").GetAttribute("magtwin:anomalyMap:name").Set("x")
-    with pytest.raises(InputError, match="not saved"):
-        load_map(tmp_path / "m.usdc")
-
-
 @pytest.mark.parametrize(
-    ("version", "said"),
+    ("version", "words"),
     [
-        ("2.0", "is of schema 2.0, this magtwin knows 1.0; read it with a later magtwin"),
-        ("one", "magtwinSchemaVersion must be a version such as '1.0', got 'one'"),
+        ("2.0", "is of schema 2.0, this magtwin knows 1.0"),
+        ("one", "must be a version such as '1.0', got 'one'"),
     ],
 )
-def test_a_later_or_wrong_version_is_refused_in_one_line(tmp_path, version, said):
-    with pytest.raises(InputError, match=f"m.usda: .*{said}") as refused:
+def test_a_later_or_wrong_version_is_refused_and_a_later_second_number_read_and_told(
+    tmp_path, version, words
+):
+    with pytest.raises(InputError, match=f"m.usda: .*{words}") as refused:
         load_map(of_version(tmp_path, version))
     assert "\n" not in str(refused.value)
-
-
-def test_a_later_second_number_is_read_and_told(tmp_path):
-    field, said = heard(load_map, of_version(tmp_path, "1.7"))
+    (tmp_path / "later").mkdir()
+    field, (said,) = heard(load_map, of_version(tmp_path / "later", "1.7"))
     assert field == a_map()
-    assert len(said) == 1
-    assert "of a schema later than 1.0" in said[0]
+    assert "of a schema later than 1.0" in said
 
 
 def of_version(folder: Path, version: str) -> Path:
@@ -173,7 +162,7 @@ print(json.dumps(found))
 
 
 def test_bare_usd_shows_the_published_folder_with_its_names_groups_texts_and_fallbacks(tmp_path):
-    publish(tmp_path / "schema")
+    main(["schema", "--out", str(tmp_path / "schema")])
     assert sorted(p.name for p in (tmp_path / "schema").iterdir()) == sorted(FILES)
     assert json.loads((FOLDER / "plugInfo.json").read_text())["Plugins"][0]["Info"]["schemaVersion"] == TEXT
     done = subprocess.run(
@@ -217,10 +206,3 @@ def test_an_older_library_on_the_path_is_not_used(tmp_path, first):
         assert "InputError: USD loads version 0.9 of magtwin's schemas from" in done.stderr
     else:
         assert done.stdout.strip() == str(FOLDER)
-
-
-def test_the_command_copies_the_library(tmp_path, capsys):
-    main(["schema"])
-    assert capsys.readouterr().out.strip() == str(FOLDER)
-    main(["schema", "--out", str(tmp_path / "library")])
-    assert sorted(p.name for p in (tmp_path / "library").iterdir()) == sorted(FILES)

@@ -127,13 +127,6 @@ def test_furniture_survives_the_stage_as_furniture(kind, p, turn, strength, susc
     assert read_magnets(stage) == ((), (spec,))
 
 
-def test_unmagnetised_furniture_survives_the_stage():
-    stage = world()
-    plain = replace(DESK, magnetization=())
-    define_furniture(stage, (plain,))
-    assert read_magnets(stage) == ((), (plain,))
-
-
 @unhurried
 @given(
     st.builds(
@@ -166,13 +159,6 @@ def test_moving_turning_and_nesting_a_prim_moves_and_turns_the_source():
     assert_allclose(read.p_world, (1.0, -0.5, 1.0), atol=1e-12)
     assert_allclose(rotate(read.q_world_xyzw, read.magnetization), (0, -2e3, 0), atol=1e-9)
     assert_allclose(read.size_m, BAR.size_m, rtol=1e-12)
-
-
-def test_a_turned_xforms_moment_turns_with_it():
-    stage = stage_of(SourceSpec(name="dot", p_world=(0, 0, 0), m_world=(1.0, 0.0, 0.0)))
-    UsdGeom.Xformable(stage.GetPrimAtPath("/World")).AddRotateZOp().Set(90.0)
-    (read,), _ = read_magnets(stage)
-    assert_allclose(read.m_world, (0, 1, 0), atol=1e-12)
 
 
 def test_a_moved_piece_of_furniture_is_that_piece_at_its_new_place():
@@ -283,106 +269,81 @@ def put(prim: Usd.Prim, attribute: str, value) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "words"),
     [
-        (
-            lambda p: put(p, "magnetization", (0, 0, float("nan"))),
-            "magnetization of SourceSpec must be finite",
-        ),
-        (lambda p: put(p, "susceptibility", -1.0), "susceptibility of SourceSpec must not be below 0"),
-        (lambda p: put(p, "moment", (1, 0, 0)), "both a moment and a magnetization; give one"),
-        (lambda p: ops(p).AddScaleOp().Set((1, 2, 1)), "a cylinder's scale across its axis must be the same"),
+        (lambda p: put(p, "magnetization", (0, 0, float("nan"))), "magnetization .* finite"),
+        (lambda p: put(p, "susceptibility", -1.0), "susceptibility .* not be below 0"),
+        (lambda p: put(p, "moment", (1, 0, 0)), "both a moment and a magnetization"),
+        (lambda p: ops(p).AddScaleOp().Set((1, 2, 1)), "scale across its axis must be the same"),
         (lambda p: ops(p).AddScaleOp().Set((-1, 1, 1)), "mirrored by a negative scale"),
         (lambda p: ops(p).AddScaleOp().Set((0, 0, 0)), "flattens it or is not finite"),
         (
-            lambda p: (
-                ops(p.GetParent()).AddScaleOp().Set((1, 1, 3)),
-                ops(p).AddRotateXOp().Set(30),
-            ),
-            "it is sheared, by a scale above a turn",
+            lambda p: (ops(p.GetParent()).AddScaleOp().Set((1, 1, 3)), ops(p).AddRotateXOp().Set(30)),
+            "it is sheared",
         ),
-        (
-            lambda p: UsdGeom.Cylinder(p).GetRadiusAttr().Set(0.0),
-            "size_m of SourceSpec must be above 0 m each way",
-        ),
+        (lambda p: UsdGeom.Cylinder(p).GetRadiusAttr().Set(0.0), "size_m .* above 0 m"),
         (lambda p: p.SetTypeName("Cone"), "a Cone cannot be a magnetic source; put .* on Xform, Cube"),
-        (lambda p: p.SetTypeName("Xform"), "an Xform has no volume to be magnetised; give it a moment"),
-        (
-            lambda p: p.GetParent().SetTypeName("PointInstancer"),
-            "below a PointInstancer has no single place",
-        ),
+        (lambda p: p.SetTypeName("Xform"), "an Xform has no volume"),
+        (lambda p: p.GetParent().SetTypeName("PointInstancer"), "PointInstancer has no single place"),
         (lambda p: apply_api(p.GetParent(), "robot"), "on the robot /World/Sources, which moves"),
     ],
 )
-def test_what_cannot_be_a_source_is_refused_by_prim(change, said):
+def test_what_cannot_be_a_source_is_refused_by_prim(change, words):
     stage = stage_of(BAR)
     change(the_source(stage))
-    with pytest.raises(InputError, match=rf"</World/Sources/bar>: .*{said}"):
+    with pytest.raises(InputError, match=rf"</World/Sources/bar>: .*{words}"):
         read_magnets(stage)
 
 
 @pytest.mark.parametrize(
-    ("attribute", "value", "said"),
+    ("attribute", "value", "words"),
     [
         (
             "faceVertexIndices",
             [0, 2, 1, 0, 1, 3, 1, 2, 3, 0, 3, 1],
             "not a closed mesh: the edge from .* to ",
         ),
-        (
-            "faceVertexIndices",
-            [0, 2, 1, 0, 1, 3, 1, 2, 3, 0, 3, 9],
-            "12 corners, 12 indices and 4 points do not fit",
-        ),
+        ("faceVertexIndices", [0, 2, 1, 0, 1, 3, 1, 2, 3, 0, 3, 9], "12 indices and 4 points do not fit"),
         ("faceVertexCounts", [3, 3, 3], "9 corners, 12 indices and 4 points do not fit"),
         ("points", [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)], "encloses no volume"),
-        ("points", [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, float("nan"))], "must have finite vertices"),
+        ("points", [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, float("nan"))], "finite vertices"),
     ],
 )
-def test_a_mesh_that_encloses_nothing_is_refused_by_prim(attribute, value, said):
+def test_a_mesh_that_encloses_nothing_is_refused_by_prim(attribute, value, words):
     stage = stage_of(WEDGE)
     the_source(stage, WEDGE).GetAttribute(attribute).Set(value)
-    with pytest.raises(InputError, match=rf"</World/Sources/wedge>: .*{said}"):
+    with pytest.raises(InputError, match=rf"</World/Sources/wedge>: .*{words}"):
         read_magnets(stage)
 
 
-def test_a_source_whose_name_cannot_name_a_prim_is_refused():
-    with pytest.raises(InputError, match="source 'steel beam' cannot name a prim"):
-        define_source(world(), "/World", SourceSpec(name="steel beam", p_world=(0, 0, 0), m_world=(0, 0, 1)))
+TETRA = {"shape": "mesh", "vertices_m": TETRAHEDRON}
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "words"),
     [
-        ({"shape": "cubiod"}, "must be a known shape .did you mean 'cuboid'.., got 'cubiod'"),
-        ({"size_m": (0.0, 1.0, 1.0)}, "size_m of SourceSpec must be above 0 m each way"),
-        ({"shape": "cylinder", "size_m": (1.0, 2.0, 1.0)}, "be equal in x and y for a cylinder"),
+        ({"shape": "cubiod"}, "did you mean 'cuboid'"),
+        ({"size_m": (0.0, 1.0, 1.0)}, "size_m .* above 0 m each way"),
+        ({"shape": "cylinder", "size_m": (1.0, 2.0, 1.0)}, "equal in x and y for a cylinder"),
         ({"shape": "sphere", "size_m": (1.0, 1.0, 2.0)}, "equal each way"),
-        ({"shape": "point"}, "size_m of SourceSpec must be left out for a point"),
-        ({"m_world": (0, 0, 1.0)}, "m_world of SourceSpec must be left out for a cuboid"),
-        ({"vertices_m": TETRAHEDRON}, "vertices_m of SourceSpec must be given for shape mesh only"),
-        ({"q_world_xyzw": (0.0, 0.0, 0.0, 2.0)}, "must be a unit quaternion"),
-        (
-            {"shape": "mesh", "vertices_m": TETRAHEDRON, "faces": SIDES[:3]},
-            "source 'crate' is not a closed mesh",
-        ),
-        (
-            {"shape": "mesh", "vertices_m": TETRAHEDRON, "faces": ((0, 1, 2),) * 4},
-            "source 'crate' is not a closed",
-        ),
-        (
-            {"shape": "mesh", "vertices_m": TETRAHEDRON, "faces": tuple(f[::-1] for f in SIDES)},
-            "source 'crate' encloses no volume: -0.02.* must look outwards",
-        ),
+        ({"shape": "point"}, "size_m .* left out for a point"),
+        ({"m_world": (0, 0, 1.0)}, "m_world .* left out for a cuboid"),
+        ({"vertices_m": TETRAHEDRON}, "vertices_m .* mesh only"),
+        ({"q_world_xyzw": (0.0, 0.0, 0.0, 2.0)}, "unit quaternion"),
+        ({**TETRA, "faces": SIDES[:3]}, "'crate' is not a closed mesh"),
+        ({**TETRA, "faces": ((0, 1, 2),) * 4}, "'crate' is not a closed"),
+        ({**TETRA, "faces": tuple(f[::-1] for f in SIDES)}, "'crate' encloses no volume: -0.02.* outwards"),
     ],
 )
-def test_a_source_that_makes_no_sense_is_refused(given, said):
+def test_a_source_that_makes_no_sense_is_refused(given, words):
     crate = {"name": "crate", "p_world": (0.0, 0.0, 0.0), "shape": "cuboid", "size_m": (1.0, 1.0, 1.0)}
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=words):
         SourceSpec(**{**crate, **given})
 
 
-def test_unknown_furniture_is_refused_by_the_near_name_and_its_steel_is_counted():
+def test_names_that_are_none_are_refused_by_the_near_one_and_steel_is_counted():
+    with pytest.raises(InputError, match="source 'steel beam' cannot name a prim"):
+        define_source(world(), "/World", SourceSpec(name="steel beam", p_world=(0, 0, 0), m_world=(0, 0, 1)))
     with pytest.raises(InputError, match="no furniture 'dsek'; did you mean 'desk'"):
         FurnitureSpec(name="a", kind="dsek", p_world=(0, 0, 0))
     with pytest.raises(
@@ -416,19 +377,12 @@ def test_every_part_wears_a_material_collides_and_stands_within_the_piece(kind):
 
 def test_no_two_parts_of_a_piece_of_steel_share_their_volume_by_more_than_a_joint():
     for kind in KINDS:
-        parts = [part for part in parts_of(kind) if part.steel]
-        for k, a in enumerate(parts):
-            for b in parts[:k]:
-                low = np.maximum(
-                    np.subtract(a.p, np.array(a.size_m) / 2), np.subtract(b.p, np.array(b.size_m) / 2)
-                )
-                high = np.minimum(np.add(a.p, np.array(a.size_m) / 2), np.add(b.p, np.array(b.size_m) / 2))
+        steel = [(np.array(part.p), np.array(part.size_m)) for part in parts_of(kind) if part.steel]
+        for k, (p, size) in enumerate(steel):
+            for q, other in steel[:k]:
+                low, high = np.maximum(p - size / 2, q - other / 2), np.minimum(p + size / 2, q + other / 2)
                 shared = np.prod(np.maximum(high - low, 0))
-                assert shared <= 0.002 * min(np.prod(a.size_m), np.prod(b.size_m)) + 1e-12, (
-                    kind,
-                    a.name,
-                    b.name,
-                )
+                assert shared <= 0.002 * min(np.prod(size), np.prod(other)) + 1e-12, kind
 
 
 # The Earth
@@ -450,37 +404,6 @@ def test_a_place_day_or_north_changed_on_the_stage_gives_the_field_there_and_the
     assert read_earth(prim).b_world_nt == before.b_world_nt, "what was measured stays as it was written"
 
 
-def test_an_earth_of_which_only_place_and_day_are_authored_has_its_field():
-    stage = world()
-    prim = apply_api(UsdGeom.Xform.Define(stage, "/World/Earth").GetPrim(), "earth")
-    for key, value in {
-        "latitudeDeg": 29.65,
-        "longitudeDeg": -82.35,
-        "heightM": 50.0,
-        "date": "2026-11-21",
-    }.items():
-        prim.GetAttribute(f"magtwin:earth:{key}").Set(value)
-    assert np.linalg.norm(read_earth(prim).b_world_nt) == pytest.approx(45_418, abs=1)
-
-
-def test_reading_an_authored_earth_loads_no_model(tmp_path):
-    import subprocess
-    import sys
-
-    stage = Usd.Stage.CreateNew(str(tmp_path / "earth.usda"))
-    UsdGeom.Xform.Define(stage, "/World")
-    define_earth(stage, "/World/Earth", EARTH)
-    stage.Save()
-    code = (
-        "import sys; from magtwin.usd.lab.earth import read_earth; "
-        "from magtwin.usd.layers import open_stage; "
-        "stage = open_stage(sys.argv[1]); read_earth(stage.GetPrimAtPath('/World/Earth')); "
-        "sys.exit(any(m in sys.modules for m in ('ppigrf', 'pandas', 'magpylib', 'scipy')))"
-    )
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "earth.usda")], check=False)
-    assert done.returncode == 0
-
-
 def test_a_field_that_is_not_the_models_is_refused_unless_it_was_measured():
     with pytest.raises(InputError, match=r"b_world_nt \[0.0, 20000.0, -40000.0\] is not the IGRF-14's field"):
         checked(EARTH)
@@ -492,15 +415,11 @@ def test_a_field_that_is_not_the_models_is_refused_unless_it_was_measured():
 @pytest.mark.parametrize(
     ("attribute", "value", "said"),
     [
-        ("date", "soon", "date of EarthFieldSpec must be a date YYYY-MM-DD"),
-        (
-            "date",
-            "2031-01-01",
-            "date of EarthFieldSpec must lie in the IGRF-14's span, 1900-01-01 to 2030-01-01",
-        ),
-        ("latitudeDeg", 90.5, r"latitude_deg of EarthFieldSpec must lie in -90\.\.90, got 90\.5"),
-        ("northDeg", 361.0, r"north_deg of EarthFieldSpec must lie in -360\.\.360, got 361"),
-        ("heightM", 5e6, "height must lie in -10,000..1,000,000 m"),
+        ("date", "soon", "date .* YYYY-MM-DD"),
+        ("date", "2031-01-01", "date .* the IGRF-14's span, 1900-01-01 to 2030-01-01"),
+        ("latitudeDeg", 90.5, r"latitude_deg .* -90\.\.90, got 90\.5"),
+        ("northDeg", 361.0, r"north_deg .* -360\.\.360, got 361"),
+        ("heightM", 5e6, "height must lie in"),
     ],
 )
 def test_an_earth_that_makes_no_sense_is_refused_by_prim(attribute, value, said):

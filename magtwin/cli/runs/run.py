@@ -1,8 +1,8 @@
 """`magtwin run` and `magtwin demo`."""
 
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+import time
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -25,12 +25,10 @@ from magtwin.cli.options import (
     UsdFps,
     check_pace,
 )
-from magtwin.cli.terminal import Done, announce, note, progress, silence, step
+from magtwin.cli.terminal import Done, announce, note, progress, step
 from magtwin.errors import InputError, find
 
 if TYPE_CHECKING:
-    from threading import Event
-
     from magtwin.io.outputs import Driven, Outputs
 
 Outs = Annotated[list[Path] | None, Parameter(consume_multiple=False)]
@@ -151,8 +149,7 @@ def run(
         Cast the LiDAR's rays while it spins. Files .rrd and .mcap contain the scans. For .parquet, .csv and
         .npz, the scans go into a second file such as run.scans.parquet.
     live
-        Show the run in a Rerun viewer while it goes on. Until it ends, the names of growing files contain
-        "partial" or "parts". Ctrl-C ends it and keeps what was driven.
+        Show the run in a Rerun viewer, in step with the clock, once it is written. Ctrl-C ends it.
     viewer
         Address of a running Rerun viewer that shows the run, such as rerun+http://127.0.0.1:9876/proxy.
     pace
@@ -230,12 +227,8 @@ def run(
         what = str(next(iter(robots.values())) or what)
     step("Opening the scene")
     with ExitStack() as stack:
-        places, keep = outputs, None
-        if live or viewer:
-            outputs.check_live()
-        else:
-            keep = stack.enter_context(outputs.kept())
-            places = stack.enter_context(outputs.aside())
+        keep = stack.enter_context(outputs.kept())
+        places = stack.enter_context(outputs.aside())
         newton = engine == "newton"
         with progress("Driving in Newton" if newton else "Driving", "steps" if newton else "") as advance:
             driven = drive(
@@ -251,10 +244,10 @@ def run(
                 report=announce,
                 **options,
             )
-        if live or viewer:
-            driven = _show(driven, outputs, viewer, pace or 1.0)
         announce("Writing the run")
-        places.write(driven, recorded=bool(live or viewer))
+        places.write(driven)
+    if live or viewer:
+        _show(driven, viewer, pace or 1.0)
     return Done(driven.run.report(f"{what} in {scene}"), tuple(outputs.targets))
 
 
@@ -334,61 +327,24 @@ def _run_robots(
     return Done(Report(f"{', '.join(names)} in {scene}", figures, metadata), tuple(files))
 
 
-def _show(driven: "Driven", outputs: "Outputs", address: str | None, pace: float) -> "Driven":
-    """Show and record a run until its end or Ctrl-C, in a viewer at an address or in a window."""
-    from magtwin.io.outputs import record_live
+def _show(driven: "Driven", address: str | None, pace: float) -> None:
+    """Show a run until its end or Ctrl-C, in a viewer at an address or in a window."""
+    from magtwin.io.rerun.live import check_listens, play
     from magtwin.io.rerun.viewer import live_viewer
 
-    with ExitStack() as stack:
-        stop = stack.enter_context(_ctrl_c())
-        window = address is None
-        if window:
-            try:
-                address, _ = stack.enter_context(live_viewer())
-            except InputError as error:
-                note(f"no view: {error}")
-        with progress("Live", "s") as advance:
-            driven = record_live(driven, outputs, address=address, pace=pace, stop=stop, progress=advance)
-        if window and address is not None and sys.stdin.isatty():
-            with silence():
-                _wait(address, stop)
-    return driven
-
-
-def _wait(address: str, stop: "Event") -> None:
-    """Leave the viewer open until it is closed, or Ctrl-C."""
-    from magtwin.io.rerun.live import check_listens
-
-    if not stop.is_set():
-        note("The run has ended; close the viewer, or press Ctrl-C")
-    while not stop.wait(0.5):
+    with suppress(KeyboardInterrupt), ExitStack() as stack:
         try:
-            check_listens(address)
-        except InputError:
-            return
-
-
-@contextmanager
-def _ctrl_c() -> Iterator["Event"]:
-    """An event that Ctrl-C sets; a second Ctrl-C interrupts as usual."""
-    import signal
-    from threading import Event, current_thread, main_thread
-
-    stop = Event()
-    if current_thread() is not main_thread():
-        yield stop
-        return
-    before = signal.getsignal(signal.SIGINT)
-
-    def end(*_: object) -> None:
-        stop.set()
-        signal.signal(signal.SIGINT, before)
-
-    signal.signal(signal.SIGINT, end)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, before)
+            at = address or stack.enter_context(live_viewer())[0]
+            with progress("Live", "s") as advance:
+                shown: dict[str, Any] = {"planned": driven.planned, "scans": driven.scans}
+                play(driven.run, driven.twin, at, pace=pace, progress=advance, **shown)
+            if address is None and sys.stdin.isatty():
+                note("The run has ended; close the viewer, or press Ctrl-C")
+                while True:
+                    time.sleep(0.5)
+                    check_listens(at)
+        except InputError as error:  # no window can be opened, or the viewer was closed
+            note(f"no view: {error}")
 
 
 def _what(path: str | None, commands: Path | None, replay: Path | None) -> str:

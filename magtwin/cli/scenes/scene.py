@@ -99,26 +99,15 @@ def scene(
     lines: list[str] = []
     with TemporaryDirectory() as workshop:
         with progress("Reading the scene", "headings") as advance:
-            choices: dict[str, Any] = {
-                "map_layer": map,
-                "network": network,
-                "workshop": workshop,
-                "report": lines.append,
-                "progress": advance,
-            }
+            choices: dict[str, Any] = {"map_layer": map, "network": network, "workshop": workshop}
+            choices |= {"report": lines.append, "progress": advance}
             if urdf is not None:
                 announce(f"Converting {urdf}")
-                read = scene_with_robot(
-                    urdf,
-                    magnetometer,
-                    spec,
-                    name=out.resolve().name,
-                    controllers=controllers,
-                    packages={name: Path(folder) for name, folder in pairs("package", package).items()},
-                    arguments=pairs("arg", arg, empty=True),
-                    skip_missing_includes=bool(skip_missing_includes),
-                    **choices,
-                )
+                choices |= {"name": out.resolve().name, "controllers": controllers}
+                choices |= {"packages": {n: Path(folder) for n, folder in pairs("package", package).items()}}
+                choices |= {"skip_missing_includes": bool(skip_missing_includes)}
+                arguments = pairs("arg", arg, empty=True)
+                read = scene_with_robot(urdf, magnetometer, spec, arguments=arguments, **choices)
             elif spec is None:
                 raise InputError("name a scene: a TOML, a scene that ships, or a robot with --urdf")
             else:
@@ -129,9 +118,8 @@ def scene(
         root = author_scene(read, out, force=force)
         made = [s.robot for s in read.robots if s.robot.asset.is_relative_to(Path(workshop).resolve())]
         notes = {f"notes on {robot.name}": read_notes(robot.asset) for robot in made}
-    report = info_of_stage(root)
-    report = replace(report, metadata={**report.metadata, **notes})
-    return Done(report, root, text="\n".join([*lines, f"Wrote {root}"]))
+    report, text = info_of_stage(root), "\n".join([*lines, f"Wrote {root}"])
+    return Done(replace(report, metadata={**report.metadata, **notes}), root, text=text)
 
 
 def _check_unused(**options: object) -> None:

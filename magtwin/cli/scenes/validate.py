@@ -12,7 +12,7 @@ from magtwin.cli.terminal import Done, announce, check_output, print_error, prin
 if TYPE_CHECKING:
     from magtwin.export.validation.findings import Check, Findings, Severity
 
-Validator = Literal["core", "nvidia", "simready", "isaac", "newton", "physx", "magtwin"]
+Validator = Literal["core", "nvidia", "simready", "isaac", "magtwin"]
 
 MOST = 12
 """Findings of one validator that are printed; the JSON has all."""
@@ -27,7 +27,7 @@ def validate(
     out: Path | None = None,
     force: Force = False,
 ) -> Done:
-    """Validate stages against the rules of OpenUSD, NVIDIA, SimReady, Isaac Sim, Newton, PhysX and magtwin.
+    """Validate stages against the rules of OpenUSD, NVIDIA, SimReady, Isaac Sim and magtwin.
 
     Exit status: 0 if no error was found, else 1. A validator that is not installed is skipped and does not
     count as passed; it is an error if --against names it.
@@ -37,7 +37,7 @@ def validate(
     files
         Stages (.usd, .usda, .usdc or .usdz).
     against
-        Validators to use, one or several: core nvidia simready isaac newton physx magtwin. Default: all.
+        Validators to use, one or several: core nvidia simready isaac magtwin. Default: all.
     out
         Report to write (.json), with all findings.
     """

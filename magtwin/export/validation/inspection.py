@@ -30,12 +30,6 @@ class Inspection:
     robots: dict[str, Path | None] = field(default_factory=dict)
     """Asset of each robot by its prim; None if the robot has no separate asset."""
 
-    bodies: int = 0
-    """Number of rigid bodies."""
-
-    driven: dict[str, Any] = field(default_factory=dict)
-    """What `physx_robots.driven_table` found; empty if "physx" was not asked for."""
-
 
 def inspect(
     file: Path,
@@ -49,7 +43,7 @@ def inspect(
 
     Args:
         file: The file that the user named.
-        against: Some of "core", "isaac", "magtwin" and "physx".
+        against: Those of "core" and "magtwin" are used.
         root: Root layer of an unpacked .usdz. Default: the file itself.
         home: Folder of the unpacked .usdz.
         inputs: Names of the inputs that a network may have.
@@ -84,8 +78,6 @@ def inspect(
     return Inspection(
         tuple(check_from(check) for check in result["checks"]),
         {prim: None if asset is None else Path(asset) for prim, asset in result["robots"].items()},
-        result["bodies"],
-        result["driven"],
     )
 
 
@@ -99,13 +91,9 @@ def as_named(text: str, home: Path | None, file: Path) -> str:
 def _look(job: dict[str, Any]) -> dict[str, Any]:
     """Do a job, and return the answer."""
     importlib.import_module("magtwin.usd")  # registers the schemas before USD is first used
-    from pxr import Tf, Usd, UsdPhysics, UsdUtils
+    from pxr import Tf, Usd, UsdUtils
 
-    from magtwin.export.attached import detach
-
-    importlib.import_module("magtwin.export.validation.isaac_rules")  # fills RULES
-    from magtwin.export.validation.physx_robots import driven_table
-    from magtwin.export.validation.rule import RULES, TITLES, Subject
+    from magtwin.export.validation.rule import RULES, Subject
     from magtwin.export.validation.rules import robot_assets
     from magtwin.usd.schema.versions import version_of
 
@@ -114,12 +102,6 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's messages off the terminal
     checks: list[Check] = []
     try:
-        lost: list[Finding] = []
-        if packed is not None:
-            try:
-                detach(root)
-            except InputError as error:
-                lost.append(Finding("attached", str(error), advice="export the package anew"))
         stage = Usd.Stage.Open(str(root))
         if stage is None:
             raise InputError(f"{file}: cannot be opened as USD; it is damaged, cut short, or not USD")
@@ -130,14 +112,11 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
             checks.append(_core(stage if packed is None else Usd.Stage.Open(str(file))))
         inputs = None if job["inputs"] is None else frozenset(job["inputs"])
         subject = Subject(stage, root, inputs, packed)
-        for name, rules in RULES.items():
-            if name in job["against"]:
-                found = [finding for rule in rules.values() for finding in rule.findings(subject)]
-                found += lost if name == "magtwin" else []
-                checks.append(Check(TITLES[name], tuple(found), scope=f"{len(rules)} rules"))
+        if "magtwin" in job["against"]:
+            rules = RULES["magtwin"].values()
+            found = [finding for rule in rules for finding in rule.findings(subject)]
+            checks.append(Check("magtwin", tuple(found), scope=f"{len(rules)} rules"))
         assets = robot_assets(subject)
-        driven = driven_table(stage) if "physx" in job["against"] else {}
-        bodies = sum(prim.HasAPI(UsdPhysics.RigidBodyAPI) for prim in subject.prims)
     except (Tf.ErrorException, UnicodeError, MemoryError) as error:
         raise InputError(f"{file}: cannot be opened as USD; it is damaged, cut short, or not USD") from error
     finally:
@@ -145,8 +124,6 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
     return {
         "checks": [asdict(check) for check in checks],
         "robots": {prim: None if asset is None else str(asset) for prim, asset in assets.items()},
-        "bodies": bodies,
-        "driven": driven,
     }
 
 

@@ -1,52 +1,28 @@
 """Isaac Sim's own rules for assets, the extension `isaacsim.asset.validation`, run on usd-core.
 
-magtwin does not ship them. They come from an Isaac Sim installation that the user names, or from the copy
-that `magtwin fetch isaac-rules` makes. They are code of another project, so they run in a separate process
-with a time limit, from a temporary folder that holds only the files needed. Those of the copy are compared
-with their SHA-256 first.
+magtwin does not ship them: `magtwin fetch isaac-rules` makes a copy. They are code of another project, so
+each file is compared with its SHA-256 before it is run, in a separate process with a time limit, from a
+temporary folder that holds nothing else.
 """
 
 import hashlib
-import os
-import re
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 from magtwin.errors import InputError
 from magtwin.export.validation.findings import Check, Finding
 from magtwin.export.validation.inspection import as_named
-from magtwin.files.children import LATE, answer_of
-
-INSTALLATION = "MAGTWIN_ISAACSIM"
-"""Environment variable with the path of an Isaac Sim installation, of a checkout, or of fetched rules."""
+from magtwin.files.children import LATE, answer_of, caches
 
 FILES = Path(__file__).with_name("isaac_files.txt")
 """The files that `magtwin fetch isaac-rules` fetches: name, SHA-256, and path in Isaac Sim's repository."""
 
-EXTENSIONS = ("", "exts", "extscache", "source/extensions", "isaacsim/exts", "isaacsim/extscache")
-"""Folders of extensions in fetched rules, an installation, a checkout, and a Python environment."""
+RULES = "isaacsim.asset.validation 1.3.6"
+"""Name and version of the rules."""
 
-NEEDED = (
-    ("isaacsim.asset.validation", "isaacsim/asset/validation", "*.py", "isaacsim/asset/validation"),
-    ("isaacsim.asset.validation", "docs", "CHANGELOG.md", "docs"),
-    ("isaacsim.robot.schema", "robot_schema", "__init__.py", "usd/schema/isaac/robot_schema"),
-    (
-        "isaacsim.robot.schema",
-        "usd/schema/isaac/robot_schema",
-        "__init__.py",
-        "usd/schema/isaac/robot_schema",
-    ),
-)
-"""Extension, folder in it, files, and the folder in which Python looks for them."""
-
-RULES, ROBOT_SCHEMA = "isaacsim/asset/validation/__init__.py", "usd/schema/isaac/robot_schema/__init__.py"
-
-GET_RULES = (
-    "the rule files of Isaac Sim are not here; `magtwin fetch isaac-rules` fetches them, or "
-    f"{INSTALLATION} names an installation"
-)
+GET_RULES = "the rule files of Isaac Sim are not here; `magtwin fetch isaac-rules` fetches them"
 
 PATIENCE_S = 120.0
 """Time limit of the rules, plus 1 s per megabyte of the stage [s]."""
@@ -54,9 +30,7 @@ PATIENCE_S = 120.0
 
 def copy_folder() -> Path:
     """Folder of the copy that `magtwin fetch isaac-rules` makes, in the user's cache."""
-    import pooch
-
-    return Path(pooch.os_cache("magtwin")) / "isaac-rules"
+    return Path(caches(), "magtwin", "isaac-rules")
 
 
 def isaac(
@@ -101,7 +75,7 @@ def isaac(
         names = sorted(rule for rule, reason in result["skipped"].items() if reason == why)
         findings.append(Finding("not-run", f"{', '.join(names)}: {why}", severity="note"))
     run, whole = result["rules"] - len(result["skipped"]), result["rules"]
-    return Check("isaac", tuple(findings), scope=f"{run} of {whole} rules of {_version(files)}")
+    return Check("isaac", tuple(findings), scope=f"{run} of {whole} rules of {RULES}")
 
 
 ADVICE = {
@@ -117,44 +91,17 @@ def rule_files() -> dict[str, bytes]:
     """The files that the rules need, by their path below a folder from which Python imports them.
 
     Raises:
-        InputError: There are none, or a file of the fetched copy has changed.
+        InputError: There are none, or one is not as it was published.
     """
-    named = os.environ.get(INSTALLATION)
-    folder = Path(named) if named else copy_folder()
-    files = dict(_collected(folder))
-    if named and RULES not in files:
-        raise InputError(f"{INSTALLATION} names {folder}, which has no isaacsim.asset.validation")
-    if RULES not in files:
+    folder, files = copy_folder(), dict[str, bytes]()
+    if not folder.is_dir():
         raise InputError(GET_RULES)
-    if ROBOT_SCHEMA not in files:
-        raise InputError(f"{folder}: has no isaacsim.robot.schema, which the rules of Isaac Sim need")
-    if not named:
-        lines = FILES.read_text(encoding="utf-8").splitlines()
-        known = {line.split()[1] for line in lines if not line.startswith("#")}
-        if {hashlib.sha256(content).hexdigest() for content in files.values()} != known:
+    lines = (line.split() for line in FILES.read_text(encoding="utf-8").splitlines() if line[0] != "#")
+    for name, checksum, _ in lines:
+        file = folder / name
+        files[name] = file.read_bytes() if file.is_file() else b""
+        if hashlib.sha256(files[name]).hexdigest() != checksum:
             raise InputError(
-                f"{folder}: is not as it was published; `magtwin fetch isaac-rules --force` fetches it again"
+                f"{file}: is not as it was published; `magtwin fetch isaac-rules --force` fetches it again"
             )
     return files
-
-
-def _collected(folder: Path) -> Iterator[tuple[str, bytes]]:
-    """Path to import from, and content, of each needed file in the first place that has it."""
-    seen: set[str] = set()
-    for base in EXTENSIONS:
-        for extension, inner, pattern, home in NEEDED:
-            # Extensions from a registry have a folder with their version, such as NAME-1.3.6+110.
-            for place in sorted((folder / base).glob(f"{extension}*")):
-                if re.fullmatch(rf"{re.escape(extension)}(-\d.*)?", place.name) is None:
-                    continue
-                for file in sorted((place / inner).glob(pattern)):
-                    if (name := f"{home}/{file.name}") not in seen:
-                        seen.add(name)
-                        yield name, file.read_bytes()
-
-
-def _version(files: Mapping[str, bytes]) -> str:
-    """Name and version of the rules, by their change log."""
-    log = files.get("docs/CHANGELOG.md", b"").decode(errors="replace")
-    version = re.search(r"^## \[([\w.]+)\]", log, re.M)
-    return f"isaacsim.asset.validation {version[1]}" if version else "isaacsim.asset.validation"

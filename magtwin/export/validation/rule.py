@@ -1,6 +1,6 @@
 """A rule: one thing that every stage must hold to; and the stage that is checked.
 
-To add a rule, write a generator in `rules.py` (magtwin's own) or `isaac_rules.py`, and decorate it:
+To add a rule, write a generator in `rules.py` and decorate it:
 
     @rule("magtwin", "what to do if the rule is broken")
     def robot_name(subject: Subject) -> Iterator[Wrong]:
@@ -135,11 +135,8 @@ class Rule:
         return [Finding(self.name, w.text, w.where, w.advice or self.advice, w.severity) for w in wrongs]
 
 
-TITLES = {"isaac": "isaac extra", "magtwin": "magtwin"}
-"""Name of the check of each group of rules. The check `isaac` is that of Isaac Sim's own rules."""
-
-RULES: dict[str, dict[str, Rule]] = {"isaac": {}, "magtwin": {}}
-"""Every rule by validator and name. Importing `isaac_rules` and `rules` fills it."""
+RULES: dict[str, dict[str, Rule]] = {"magtwin": {}}
+"""Every rule by validator and name. Importing `rules` fills it."""
 
 Look = Callable[[Subject], Iterator[Wrong]]
 

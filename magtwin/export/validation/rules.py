@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -11,32 +10,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+from pxr import Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
-from magtwin.export.attached import attached_sha256
 from magtwin.export.contents import named_files, weights_metadata
 from magtwin.export.validation.findings import Severity
 from magtwin.export.validation.rule import Subject, Wrong, rule, wrong_of
 from magtwin.files.file import sha256
-from magtwin.usd.attributes import plain_value, target
-from magtwin.usd.lab.earth import read_earth
-from magtwin.usd.lab.furniture import read_magnets
 from magtwin.usd.lab.looks import VISUALS
 from magtwin.usd.lab.obstacles import read_obstacles
 from magtwin.usd.lab.room import read_lab
-from magtwin.usd.layers import layer_sha256
-from magtwin.usd.maps.heat_map import HEAT_MAP, heading_variants
-from magtwin.usd.maps.layer import checksums, read_map
-from magtwin.usd.placement import UPRIGHT, labs_on, pose_of
+from magtwin.usd.maps.layer import read_map
+from magtwin.usd.placement import labs_on
 from magtwin.usd.robot import read_robot
-from magtwin.usd.scene import earth_in, open_scene
-from magtwin.usd.schema import NOUNS, attribute_name, declared, has_api, prims_with, value_of
+from magtwin.usd.scene import OpenedScene, open_scene
+from magtwin.usd.schema import NOUNS, attribute_name, declared, has_api, prims_with
 from magtwin.usd.sensors import (
     IMU_TYPE,
     LIDAR_TYPE,
-    MAP_CHECKSUM,
-    MAP_RELATIONSHIP,
     read_footprint,
     read_imu,
     read_lidar,
@@ -45,9 +36,6 @@ from magtwin.usd.sensors import (
 from magtwin.usd.units import mixed_units
 
 NETWORK = attribute_name("magnetometer", "network")
-
-NEEDED = ("values", "valid", "shape", "origin", "cell_size", "headings", "checksum")
-"""Attributes that a map's layer must author: a fallback would be a grid that is not its own."""
 
 SAME_M = 1e-6
 """Single precision at 10 m [m]: what two places that ought to be one may be apart."""
@@ -63,19 +51,6 @@ def absolute_paths(subject: Subject) -> Iterator[Wrong]:
         for named in named_files(layer):
             if is_absolute(named.path):
                 yield Wrong(f"{subject.name_of(layer)} names {named.path}", named.where)
-
-
-@rule("magtwin", "magtwin export makes a folder without such paths")
-def climbing_paths(subject: Subject) -> Iterator[Wrong]:
-    """No path leads out of the stage's folder. In a folder this is a warning, in a .usdz an error."""
-    for layer in subject.layers:
-        if not subject.owns(layer):
-            continue  # told where it was named
-        for named in named_files(layer):
-            if named.path and not is_absolute(named.path) and climbs(named.path, layer, subject.folder):
-                severity: Severity = "error" if subject.packed else "warning"
-                text = f"{subject.name_of(layer)} names {named.path}, outside the stage's folder"
-                yield Wrong(text, named.where, severity=severity)
 
 
 @rule("magtwin", "convert it to metres with Z up in the program that made it")
@@ -130,98 +105,29 @@ def targets(subject: Subject) -> Iterator[Wrong]:
                     yield Wrong(text, str(prim.GetPath()))
 
 
-@rule("magtwin", "make the map again with magtwin map")
-def map_complete(subject: Subject) -> Iterator[Wrong]:
-    """Every map authors its arrays and grid, and they match each other."""
-    for prim in subject.having("anomalyMap"):
-        names = [attribute_name("anomalyMap", field) for field in NEEDED]
-        lost = [name for name in names if not prim.GetAttribute(name).HasAuthoredValue()]
-        if lost:
-            yield Wrong(f"does not say {', '.join(lost)}", str(prim.GetPath()))
-        elif len(set(checksums(prim))) == 1:  # what else is wrong with it
-            read_map(prim)
-
-
-@rule("magtwin", "restore the map's arrays, or make the map again")
-def map_checksum(subject: Subject) -> Iterator[Wrong]:
-    """The arrays of every map match its checksum."""
-    for prim in subject.having("anomalyMap"):
-        said, taken = checksums(prim)
-        if said != taken:
-            text = f"its arrays have SHA-256 {taken[:12]}..., its checksum says {said[:12] or 'nothing'}..."
-            yield Wrong(text, str(prim.GetPath()))
-
-
-@rule("magtwin", "make the map again with magtwin map")
-def map_grid(subject: Subject) -> Iterator[Wrong]:
-    """The coloured floor of every map covers its grid and has a variant for each heading."""
-    for prim in subject.having("anomalyMap"):
-        floor = prim.GetChild(HEAT_MAP.name)
-        if not floor or not floor.IsA(UsdGeom.Mesh):
-            yield Wrong("has no coloured floor to show it", str(prim.GetPath()), severity="warning")
-            continue
-        names = ("shape", "origin", "cell_size", "headings")
-        got = [value_of(prim.GetAttribute(attribute_name("anomalyMap", name))) for name in names]
-        shape, origin, cell, headings = (np.array(value, float).ravel() for value in got)
-        if (shape.size, origin.size, cell.size) != (3, 2, 2):
-            continue  # map-complete tells
-        points = np.array(UsdGeom.Mesh(floor).GetPointsAttr().Get() or [(np.nan,) * 3], float)[:, :2]
-        least, most = origin, origin + cell * (shape[[2, 1]] - 1)
-        seen = points.min(axis=0), points.max(axis=0)
-        if not np.allclose([least, most], seen, rtol=0, atol=max(SAME_M, 1e-6 * float(np.abs(most).max()))):
-            spans = (f"x {a[0]:g} to {b[0]:g} m, y {a[1]:g} to {b[1]:g} m" for a, b in ((least, most), seen))
-            yield Wrong(f"its grid spans {', its coloured floor '.join(spans)}", str(floor.GetPath()))
-        variants = floor.GetVariantSets().GetVariantSet("heading").GetVariantNames()
-        if variants and sorted(variants) != sorted(heading_variants(np.deg2rad(headings))):
-            degrees = ", ".join(f"{heading:g}" for heading in headings)
-            text = f"its headings are {degrees} deg, its coloured floor has {', '.join(variants)}"
-            yield Wrong(text, str(floor.GetPath()))
-
-
-@rule("magtwin", "restore the map that the scene was made with, or make the scene again with this one")
-def map_file(subject: Subject) -> Iterator[Wrong]:
-    """The file of the map's layer matches the checksum in the magnetometer."""
-    for prim in subject.having("magnetometer"):
-        said = str(plain_value(prim.GetAttribute(MAP_CHECKSUM)) or "").lower()
-        ends = prim.GetRelationship(MAP_RELATIONSHIP).GetTargets()
-        end = subject.stage.GetPrimAtPath(ends[0]) if len(ends) == 1 else None
-        if not said or not end or not has_api(end, "anomalyMap"):
-            continue
-        stack = end.GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack()
-        layer = stack[0].layer if stack else subject.stage.GetRootLayer()
-        if layer == subject.stage.GetRootLayer() or not layer.realPath:
-            continue  # a flattened stage is its own map
-        file = Path(layer.realPath)
-        if (seen := layer_sha256(file)) != said:
-            text = f"{file.name} has SHA-256 {seen[:12]}..., it names {said[:12]}..."
-            yield Wrong(text, str(prim.GetPath()))
-
-
-@rule("magtwin", "point magtwin:magnetometer:map to the map's prim")
-def magnetometer_map(subject: Subject) -> Iterator[Wrong]:
-    """Every magnetometer in a lab reads a map on the stage, and all of a lab read the same one."""
-    for stage in subject.labs:
-        first = None
-        for prim in prims_with(stage.GetPseudoRoot(), "magnetometer"):
-            end = target(prim, MAP_RELATIONSHIP)
-            if not has_api(end, "anomalyMap"):
-                yield Wrong(f"reads <{end.GetPath()}>, which is no map", str(prim.GetPath()))
-            first = first or end
-            if end != first:
-                text = f"reads <{end.GetPath()}>, another than <{first.GetPath()}>"
-                yield Wrong(text, str(prim.GetPath()))
-
-
-@rule("magtwin", "survey it again: magtwin map survey STAGE --out MAP.usdc --adopt")
-def map_stale(subject: Subject) -> Iterator[Wrong]:
-    """The lab is as it was when its map was made."""
-    for lab in {lab.path: lab for lab in labs_on(subject.stage)}.values():
+@rule("magtwin", "docs/schema.md lists every attribute with its range")
+def scene(subject: Subject) -> Iterator[Wrong]:
+    """Lab, Earth's field, sources, robots and map are complete, in range, and belong together."""
+    survey = "survey it again: magtwin map survey STAGE --out MAP.usdc --adopt"
+    labs = dict.fromkeys(lab.path for lab in labs_on(subject.stage))
+    looks: list[Callable[[], object]] = [
+        partial(open_scene, subject.file, lab=lab, check_network=False) for lab in labs
+    ]
+    if not labs:
+        looks += [partial(read_map, prim) for prim in subject.having("anomalyMap")]
+        looks += [partial(read_robot, prim) for prim in subject.having("robot")]
+    for look in looks:
         try:
-            opened = open_scene(subject.file, lab=lab.path, check_network=False)
-        except InputError:
-            continue  # other rules tell
-        for text in opened.changes:
-            yield Wrong(f"since the map was made: {text}", lab.path, severity="warning")
+            opened = look()
+        except InputError as error:
+            yield wrong_of(error)
+            continue
+        if isinstance(opened, OpenedScene):
+            for text in opened.changes:
+                where = opened.lab or next(iter(labs))
+                yield Wrong(f"since the map was made: {text}", where, survey, "warning")
+            for note in opened.notes:
+                yield replace(wrong_of(InputError(note)), severity="warning")
 
 
 @rule("magtwin", "restore the weights, or make the scene again with these")
@@ -231,15 +137,10 @@ def network_file(subject: Subject) -> Iterator[Wrong]:
         spec, where = read_magnetometer(prim), str(prim.GetPath())
         if spec.kind != "neural":
             continue
-        attached, file = attached_sha256(prim.GetAttribute(NETWORK)), spec.network
-        said = f"{spec.network_sha256[:12]}..."
-        if file is None and attached:  # in a layer that brings its network as bytes
-            if attached != spec.network_sha256.lower():
-                text = f"its attached network has SHA-256 {attached[:12]}..., it names {said}"
-                yield Wrong(text, where, "export the layer anew")
-        elif file is None and spec.network_sha256:
+        file, said = spec.network, f"{spec.network_sha256[:12]}..."
+        if file is None and spec.network_sha256:  # as in a package
             text = f"keeps the checksum {said} of a network that it does not name"
-            yield Wrong(text, where, "name it again to read this magnetometer", "warning")
+            yield Wrong(text, where, "give it to magtwin run --network", "note")
         elif file is None:
             yield Wrong("is neural and names no network", where)
         elif not file.is_file():
@@ -270,56 +171,31 @@ def network_inputs(subject: Subject) -> Iterator[Wrong]:
             yield Wrong("names other inputs than its file of weights, or in another order", where)
 
 
-@rule("magtwin", "a lab can be moved and turned about the vertical, as one and not otherwise")
-def frames(subject: Subject) -> Iterator[Wrong]:
-    """Every lab stands level in its own size, its lab and map in the same axes, the map within the floor."""
-    for lab in labs_on(subject.stage):
-        try:
-            pose_of(lab)
-        except InputError as error:
-            yield wrong_of(error)
+@rule("magtwin", "give the lab's size and the map's origin in one frame")
+def map_inside(subject: Subject) -> Iterator[Wrong]:
+    """Every map lies within the floor of its lab."""
     for stage in subject.labs:
-        labs = prims_with(stage.GetPseudoRoot(), "lab")
-        if len(labs) != 1:
-            continue
-        half = np.array(read_lab(labs[0]).floor_m) / 2
+        half = np.array(read_lab(prims_with(stage.GetPseudoRoot(), "lab")[0]).floor_m) / 2
         for prim in prims_with(stage.GetPseudoRoot(), "anomalyMap"):
             x0, x1, y0, y1 = (field := read_map(prim)).extent
             beyond = max(float(np.max(np.abs([[x0, y0], [x1, y1]]) - half)), 0.0)
             if beyond > max(field.cell_m) / 2 + SAME_M:
                 text = f"reaches {beyond:.3g} m beyond the floor of {2 * half[0]:g} x {2 * half[1]:g} m"
-                yield Wrong(text, str(prim.GetPath()), "say the lab's size and the map's origin in one frame")
+                yield Wrong(text, str(prim.GetPath()))
 
 
-@rule("magtwin", "set one field for the stage, or turn and survey the lab as the others")
-def earth_fields(subject: Subject) -> Iterator[Wrong]:
-    """Every Earth's field on the stage is the same, in the axes of each lab."""
-    for lab in {lab.path: lab for lab in labs_on(subject.stage)}.values():
-        for note in earth_in(subject.stage, lab)[1]:
-            yield replace(wrong_of(InputError(note)), severity="warning")
-
-
-@rule("magtwin", "start it upright on the floor, clear of the walls")
+@rule("magtwin", "start it on the floor, clear of the walls")
 def robot_inside(subject: Subject) -> Iterator[Wrong]:
-    """Every robot stands upright on the floor, with its footprint inside it."""
+    """Every robot stands on the floor, with its footprint inside it."""
     for stage in subject.labs:
-        world = stage.GetPseudoRoot()
-        labs = prims_with(world, "lab")
-        if len(labs) != 1:
-            continue
-        half = np.array(read_lab(labs[0]).floor_m) / 2
-        cache = UsdGeom.XformCache()
+        world, cache = stage.GetPseudoRoot(), UsdGeom.XformCache()
+        half = np.array(read_lab(prims_with(world, "lab")[0]).floor_m) / 2
         for prim in prims_with(world, "robot"):
-            at = cache.GetLocalToWorldTransform(prim)
-            x, y, z = at.ExtractTranslation()
-            where, radius = str(prim.GetPath()), read_footprint(prim)
+            x, y, _ = cache.GetLocalToWorldTransform(prim).ExtractTranslation()
+            radius = read_footprint(prim)
             if np.any(np.abs([x, y]) + radius > half + SAME_M):
                 text = f"stands at ({x:g}, {y:g}) m and needs {radius:g} m about it: it is off the floor"
-                yield Wrong(text, where)
-            if abs(z) > SAME_M:
-                yield Wrong(f"stands {z:g} m above the floor", where)
-            if at.TransformDir(Gf.Vec3d(0, 0, 1)).GetNormalized()[2] < UPRIGHT:
-                yield Wrong("does not stand upright", where)
+                yield Wrong(text, str(prim.GetPath()))
 
 
 @rule("magtwin", "start it elsewhere; a run that begins in a collision is refused")
@@ -343,26 +219,6 @@ def _collisions(stage: Usd.Stage, robots: list[Usd.Prim]) -> Iterator[Wrong]:
             apart = float(np.linalg.norm(places[i] - places[j]))
             if apart < radii[i] + radii[j] - SAME_M:
                 yield Wrong(f"stands {apart:.3g} m from <{robots[j].GetPath()}>", str(prim.GetPath()))
-
-
-@rule("magtwin", "set a value in the range that docs/schema.md gives")
-def figures(subject: Subject) -> Iterator[Wrong]:
-    """Lab, Earth's field, sources and robots are complete, and every value is in its range."""
-    looks: list[tuple[Callable[[], object], Usd.Prim]] = []
-    for noun, read in (("lab", read_lab), ("earth", read_earth), ("robot", read_robot)):
-        looks += [(partial(read, prim), prim) for prim in subject.having(noun)]
-    for stage in (subject.labs or [subject.stage]) if subject.having("source") else []:
-        looks.append((partial(read_magnets, stage), stage.GetPseudoRoot()))
-    for look, prim in looks:
-        try:
-            look()
-        except InputError as error:
-            wrong = wrong_of(error)
-            yield wrong if wrong.where else Wrong(wrong.text, str(prim.GetPath()))
-    for stage in subject.labs or [subject.stage]:
-        for noun in ("lab", "earth"):
-            for prim in prims_with(stage.GetPseudoRoot(), noun)[1:]:
-                yield Wrong(f"is a second {NOUNS[noun]}", str(prim.GetPath()), "keep one of them")
 
 
 @rule("magtwin", "author the sensor again with magtwin robot or magtwin scene")
@@ -422,12 +278,6 @@ def robot_assets(subject: Subject) -> dict[str, Path | None]:
 def is_absolute(path: str) -> bool:
     """Whether an asset path holds on one machine, or on a network, alone."""
     return bool(re.match(r"^(/|\\|[A-Za-z]:[\\/]|[A-Za-z][A-Za-z0-9+.-]+:)", path))
-
-
-def climbs(path: str, layer: Sdf.Layer, folder: Path) -> bool:
-    """Whether a relative asset path of a layer leads out of a folder."""
-    target = Path(os.path.normpath(Path(layer.realPath).resolve().parent / path))
-    return not target.is_relative_to(folder)
 
 
 def applied(prim: Usd.Prim) -> list[str]:

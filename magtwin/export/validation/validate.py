@@ -1,8 +1,7 @@
 """Validate a file with every validator.
 
 `core` are OpenUSD's own validators, `nvidia` is usd-validation-nvidia, `simready` are SimReady's profiles,
-`isaac` are Isaac Sim's rules and those of `isaac_rules`, `newton` loads the file in Newton, `physx` drives
-its robots in PhysX, `magtwin` are the rules of `rules`. `rule` explains how to add a rule.
+`isaac` are Isaac Sim's own rules, `magtwin` are the rules of `rules`. `rule` explains how to add a rule.
 """
 
 import os
@@ -16,12 +15,11 @@ from magtwin.export.usdz import unpack
 from magtwin.export.validation.findings import Check, Findings
 from magtwin.export.validation.inspection import Inspection, inspect
 from magtwin.export.validation.isaac_sim import isaac
-from magtwin.export.validation.physx_drive import physx
-from magtwin.export.validation.validators import newton, nvidia, simready
+from magtwin.export.validation.validators import nvidia, simready
 from magtwin.files.file import existing
 from magtwin.files.kinds import expected
 
-AGAINST = ("core", "nvidia", "simready", "isaac", "newton", "physx", "magtwin")
+AGAINST = ("core", "nvidia", "simready", "isaac", "magtwin")
 """Validators, in the order of the results."""
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
@@ -65,7 +63,7 @@ def validate(
         root = None if home is None else unpack(file, home)
         seen = Inspection(())
         if set(wanted) - {"nvidia"}:
-            say("core, isaac and magtwin")
+            say("core and magtwin")
             seen = inspect(file, wanted, root=root, home=home, inputs=inputs)
         checks: dict[str, list[Check]] = {}
         for check in seen.checks:
@@ -73,9 +71,7 @@ def validate(
         for name, look in (
             ("nvidia", lambda: [nvidia(file)]),
             ("simready", lambda: simready(seen.robots, packed=root is not None)),
-            ("isaac", lambda: [isaac(root or file, seen.robots, home=home, package=file), *checks["isaac"]]),
-            ("newton", lambda: [newton(root or file, seen.bodies)]),
-            ("physx", lambda: [physx(root or file, seen.driven)]),
+            ("isaac", lambda: [isaac(root or file, seen.robots, home=home, package=file)]),
         ):
             if name in wanted:
                 say(name)

@@ -1,4 +1,4 @@
-"""External validators: NVIDIA's usd-validation-nvidia, SimReady, and loading in Newton.
+"""External validators: NVIDIA's usd-validation-nvidia and SimReady.
 
 Each is a separate program. If it is not installed, its check is not run, with a text how to get it, and never
 counts as passed.
@@ -6,7 +6,6 @@ counts as passed.
 
 import ast
 import importlib.metadata
-import importlib.util
 import json
 import os
 import shutil
@@ -18,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from magtwin.export.validation.findings import Check, Finding, Severity
-from magtwin.files.children import LATE, caches, run
+from magtwin.files.children import LATE, run
 
 PATIENCE_S = 600.0
-"""Time limit of a validator [s]; Newton's kernels take a minute to compile at first."""
+"""Time limit of a validator [s]."""
 
 SIMREADY = "MAGTWIN_SIMREADY"
 """Environment variable with the path of `simready-validate`; `make simready` installs it separately."""
@@ -33,7 +32,6 @@ GET_NVIDIA = "usd-validation-nvidia is not installed; pip install 'magtwin[valid
 GET_SIMREADY = (
     f"simready-validate is not installed; `make simready` installs it, {SIMREADY} is the path of its command"
 )
-GET_NEWTON = "newton is not installed; pip install 'magtwin[physics]'"
 
 _SEVERITIES: Mapping[str, Severity] = {"WARNING": "warning", "INFO": "note"}
 """Our severities by NVIDIA's; others are errors."""
@@ -140,40 +138,14 @@ def _literal(text: Any, default: Any) -> Any:
     return value if isinstance(value, type(default)) else default
 
 
-def newton(file: Path, bodies: int) -> Check:
-    """Check that Newton loads every body of a stage.
-
-    Args:
-        file: The stage.
-        bodies: Number of its rigid bodies.
-    """
-    lacking = [name for name in ("newton", "newton_usd_schemas") if importlib.util.find_spec(name) is None]
-    if lacking:
-        return Check("newton", not_run=GET_NEWTON)
-    result = _run([sys.executable, "-P", "-m", "magtwin.export.validation.newton_load", str(file)])
-    lines = result.stdout.strip().splitlines()
-    try:
-        model = json.loads(lines[-1])
-    except (ValueError, IndexError):
-        return Check("newton", (_unfinished("Newton", result),))
-    findings = []
-    if model["bodies"] != bodies:
-        text = f"Newton made {model['bodies']} bodies of the stage's {bodies}"
-        findings.append(Finding("bodies", text, "", "look at its rigid bodies and their transforms"))
-    if bodies and not model["mass_kg"] > 0:
-        findings.append(Finding("mass", f"the bodies weigh {model['mass_kg']:g} kg", "", "give them mass"))
-    scope = f"{model['bodies']} bodies, {model['joints']} joints, {model['mass_kg']:.4g} kg"
-    return Check("newton", tuple(findings), scope=f"{_version('newton')}: {scope}")
-
-
 def _programs() -> str:
     """Search path of programs: the folder of this Python first."""
     return os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
 
 
 def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    """Run a program without PYTHONPATH, and capture its output. The kernels that Newton compiles are kept."""
-    return run(command, limit_s=PATIENCE_S, changes={"PYTHONPATH": None, "XDG_CACHE_HOME": caches()})
+    """Run a program without PYTHONPATH, and capture its output."""
+    return run(command, limit_s=PATIENCE_S, changes={"PYTHONPATH": None})
 
 
 def _unfinished(program: str, result: subprocess.CompletedProcess[str]) -> Finding:

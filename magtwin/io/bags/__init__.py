@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from magtwin.io.bags.reader import read_bag as read_bag
-    from magtwin.io.bags.writer import BagWriter as BagWriter
     from magtwin.io.bags.writer import RawBagWriter as RawBagWriter
     from magtwin.io.bags.writer import write_bag as write_bag
 
 _MODULES = {"read_bag": "reader"}
-_MODULES |= dict.fromkeys(("BagWriter", "RawBagWriter", "write_bag"), "writer")
+_MODULES |= dict.fromkeys(("RawBagWriter", "write_bag"), "writer")
 
-__all__ = ["BagWriter", "RawBagWriter", "read_bag", "write_bag"]
+__all__ = ["RawBagWriter", "read_bag", "write_bag"]
 
 
 def __getattr__(name: str) -> Any:

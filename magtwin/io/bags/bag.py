@@ -31,10 +31,10 @@ from magtwin.io.bags.frames import (
     transforms,
 )
 from magtwin.io.bags.mcap import McapReader
+from magtwin.io.bags.storage import PARTIAL, partial_of
 from magtwin.io.bags.topics import TF, TF_STATIC, Topic
 from magtwin.io.bags.types import layout
 from magtwin.io.bags.writer import CUSTOM, NOTE
-from magtwin.io.recorder import PARTIAL, partial_of
 from magtwin.run.arrow import check_metadata
 from magtwin.run.run import Metadata
 

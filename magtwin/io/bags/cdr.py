@@ -124,6 +124,8 @@ def encode(leaves: Sequence[Leaf], fields: Mapping[str, Any], rows: int, *, room
             array, count = np.stack([stamp // NS, stamp % NS], axis=1), 2
         elif array.ndim < 2:
             array = array.reshape(-1, count) if count > 1 and array.size == count else array.reshape(-1, 1)
+        if array.shape[1] != count:
+            raise ValueError(f"{leaf.name} has {count} numbers, not {array.shape[1]}")
         at = _aligned(at, size)
         numbers.append((at, kind, array))
         at += size * count

@@ -20,12 +20,10 @@ from magtwin.frames import IDENTITY_XYZW, canonical, quat_conjugate, rotate, yaw
 from magtwin.io.bags.bag import Bag, Signal
 from magtwin.io.bags.cdr import NS, Messages
 from magtwin.io.bags.poses import UNIT_WITHIN, check_poses, corrected, poses_at, sound_poses
-from magtwin.io.bags.sender import Sender
 from magtwin.io.bags.topics import (
     BATTERY,
     COMMAND,
     IMU,
-    JOINTS,
     MAGNITUDE,
     ODOMETRY,
     POSE,
@@ -78,7 +76,6 @@ ROLES: Mapping[Topic, Sought] = {
     IMU: Sought("IMU", (IMU.kind,)),
     BATTERY: Sought("battery", (BATTERY.kind,)),
     COMMAND: Sought("command", (), ("cmd", "command")),
-    JOINTS: Sought("joint"),
     SCAN: Sought("scan"),
 }
 """Topics that are read from a robot's recording."""
@@ -190,7 +187,7 @@ class _Recording:
 
     def read_rest(self) -> None:
         """The columns of all other roles."""
-        readers = {SCAN: self._scanned, JOINTS: self._wheels, VECTOR: self._vector, IMU: self._inertial}
+        readers = {SCAN: self._scanned, VECTOR: self._vector, IMU: self._inertial}
         for topic in [topic for topic in self.topics if topic not in (MAGNITUDE, POSE)]:
             try:
                 signal, when = self._timed(self._signal(topic))
@@ -323,19 +320,6 @@ class _Recording:
         at = np.searchsorted(when, self.t, side="right") - 1
         since = np.where(at >= 0, self.t - when[np.maximum(at, 0)], np.inf)
         return {"lidar_on": since < SCAN_S}
-
-    def _wheels(self, signal: Signal, when: Array) -> Columns:
-        """The angles of the wheels, if the joints have the names of a TurtleBot's."""
-        sides = [joint.name for joint in Sender().wheel_joints]
-        joints = signal.fields["name"]
-        rows = np.array([row for row, names in enumerate(joints) if set(sides) <= set(names)], np.intp)
-        if not len(rows):
-            return {}
-        position = signal.fields["position"]
-        places = np.array([[joints[row].index(side) for side in sides] for row in rows])
-        if places.max() >= position.shape[1]:
-            raise InputError(f"{signal.name} has fewer positions than names")
-        return self._held({"wheel_angle": position[rows[:, None], places]}, when[rows])
 
 
 def taken(values: NDArray[Any], at: NDArray[np.intp], known: NDArray[np.bool_]) -> NDArray[Any]:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,14 @@ VERSION = 8
 
 ROOM = 31
 """Bytes left free before each message of a batch, for the head of an MCAP message record."""
+
+PARTIAL = ".partial"
+"""Inserted before the suffix of a bag until it ends."""
+
+
+def partial_of(path: Path) -> Path:
+    """Path of a bag until it ends: run.partial.mcap for run.mcap."""
+    return path.with_name(f"{path.stem}{PARTIAL}{path.suffix}")
 
 
 @dataclass(frozen=True)

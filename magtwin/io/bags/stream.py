@@ -1,8 +1,6 @@
 """Stream: the messages that a robot sends as a run goes on."""
 
 import json
-import math
-import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -10,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.errors import InputError, RepairWarning
+from magtwin.errors import InputError
 from magtwin.io.bags.cdr import NS, Index
 from magtwin.io.bags.sender import Sender
 from magtwin.io.bags.topics import DESCRIPTION, NAMES, READING, SCAN, TF_STATIC, TOPICS, Columns, Topic
@@ -69,9 +67,7 @@ class Stream:
         whole: bool = False,
     ) -> None:
         self._sender, self._scans = sender, scans
-        self._t, self._stamp = -np.inf, -1
-        self.later_s = _later_s(run)
-        """Time by which stamps are later than t, so that none is below 0 [s]."""
+        self._t = -np.inf
         self._last: dict[str, _Last] = {}
         columns = set(run)
         sent = [t for t in topics if t.needs and columns.issuperset(t.needs)]
@@ -98,8 +94,7 @@ class Stream:
         """
         if {name: (values.dtype, values.shape[1:]) for name, values in run.items()} != self._columns:
             raise InputError(f"rows of a bag must have the same columns, {', '.join(self._columns)}")
-        t = self._checked(run)
-        stamps = self._stamped(t)
+        t, stamps = self._checked(run)
         once, self._once = self._once, []
         for topic in once:
             first = stamps[:1] if len(stamps) else np.zeros(1, np.int64)
@@ -129,34 +124,25 @@ class Stream:
         k = int(np.searchsorted(self._scans.arrival, until_s, side="right"))
         arrived, self._scans = self._scans.take(slice(k)), self._scans.take(slice(k, None))
         times = (arrived.t, arrived.arrival)
-        moments, came = (np.rint((t + self.later_s) * NS).astype(np.int64) for t in times)
+        moments, came = (np.rint(t * NS).astype(np.int64) for t in times)
         fields = SCAN.write({"ranges_m": arrived.ranges_m}, moments, self._sender)
         yield SCAN, came, fields
 
-    def _checked(self, run: Run) -> Array:
-        """Times of rows, if they ascend and stamps can hold them."""
+    def _checked(self, run: Run) -> tuple[Array, Index]:
+        """Times of rows, and their stamps [ns], if they ascend and ROS can hold them."""
         check_clock(run, "the run to write")
         t = np.asarray(run["t"], float)
         if len(t) and t[0] <= self._t:
             raise InputError(f"time runs backwards: rows at {t[0]:.9g} s come after rows at {self._t:.9g} s")
-        if len(t) and not t[-1] + self.later_s < LATEST_S:
+        if len(t) and not (t[0] >= 0 and t[-1] < LATEST_S):
             raise InputError(
                 f"t runs from {t[0]:.9g} to {t[-1]:.9g} s, but stamps of ROS hold 0 to {LATEST_S:.0f} s: "
                 "subtract the first time from t"
             )
-        return t
-
-    def _stamped(self, t: Array) -> Index:
-        """Stamps of rows [ns], each later than the one before, by which a reader tells rows apart.
-
-        They are t to the nearest nanosecond. Rows of the same nanosecond are stamped 1 ns apart; their t is
-        in /magtwin/reading.
-        """
-        count = np.arange(len(t))
-        stamps = np.rint((t + self.later_s) * NS).astype(np.int64) - count
-        stamps = np.maximum(np.maximum.accumulate(stamps), self._stamp + 1) + count
-        self._stamp = int(stamps[-1]) if len(t) else self._stamp
-        return stamps
+        stamps = np.rint(t * NS).astype(np.int64)
+        if (np.diff(stamps) <= 0).any():
+            raise InputError("rows less than 1 ns apart cannot stand in a bag, as their stamps are the same")
+        return t, stamps
 
     def _rows(self, topic: Topic, run: Columns, t: Array) -> NDArray[np.intp]:
         """Rows at which a topic is sent."""
@@ -209,25 +195,6 @@ class Stream:
             {"facts": dict(metadata)} if metadata else {}
         )
         return json.dumps(table, ensure_ascii=False, indent=1)
-
-
-def _later_s(run: Run) -> float:
-    """Whole seconds from a time before 0 at which a run begins to 0 [s]; 0 for other runs. Warns."""
-    begin = float(run["t"][0]) if "t" in run and run.rows else 0.0
-    if not -math.inf < begin < 0:
-        return 0.0
-    later = float(-math.floor(begin))
-    text = (
-        f"t begins at {begin:.9g} s, and stamps of ROS at 0: they are t + {later:g} s; magtwin reads t back"
-    )
-    warnings.warn(text, RepairWarning, stacklevel=4)
-    return later
-
-
-def shifted(fields: Mapping[str, Any], by_ns: int) -> dict[str, Any]:
-    """Fields of messages with all stamps later by a time [ns]."""
-    stamped = ("stamp", "clock")
-    return {n: value + by_ns if n.rpartition(".")[2] in stamped else value for n, value in fields.items()}
 
 
 def _finite(run: Columns, names: Iterable[str]) -> NDArray[np.bool_]:

@@ -35,19 +35,15 @@ class Qos:
     latched: bool = False
     """Whether late subscribers get the last message (transient local)."""
 
-    sensor: bool = False
-    """Whether it is a stream of sensor data, which `--qos sensor-data` offers as `SENSOR_DATA`."""
-
     @property
     def heard(self) -> "Qos":
         """QoS of a subscription: best effort, which matches every publisher; reliable only if latched."""
         return replace(self, reliable=self.latched)
 
 
-STREAM = Qos(sensor=True)
-"""A reliable offer serves reliable and best-effort subscribers, a best-effort offer only the latter."""
-
 SENSOR_DATA = Qos(depth=5, reliable=False)
+"""For subscriptions: it matches every publisher. Offers are reliable, which serves every subscriber."""
+
 LATCHED = Qos(depth=1, latched=True)
 
 
@@ -181,7 +177,7 @@ def _joints(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
     return {**_header(stamp, ""), "name": tuple(joint.name for joint in joints), "position": angle}
 
 
-def _transform_fields(stamp: NDArray[np.int64], transforms: list[tuple[str, str, Any, Any]]) -> Fields:
+def transform_fields(stamp: Any, transforms: list[tuple[str, str, Any, Any]]) -> Fields:
     """A TFMessage of transforms: parent, child, translation and rotation (xyzw) of each."""
     fields: Fields = {"transforms": len(transforms)}
     for k, (parent, child, p, q_xyzw) in enumerate(transforms):
@@ -195,6 +191,12 @@ def _transform_fields(stamp: NDArray[np.int64], transforms: list[tuple[str, str,
     return fields
 
 
+def map_to_odom(p_base: Array, q_base: Array, p_odom: Array, q_odom: Array) -> tuple[Array, Array]:
+    """Translation and rotation of odom in the map that put base_link at a pose; poses as p and xyzw."""
+    q = quat_multiply(q_base, quat_conjugate(q_odom))
+    return p_base - rotate(q, p_odom), q
+
+
 def _transforms(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
     """Of the drive, what `sender.transforms` asks for; then base_link to each wheel.
 
@@ -205,8 +207,7 @@ def _transforms(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
     p_base, q_base = c["p_world_base"], c["q_world_base_xyzw"]
     chain: list[tuple[str, str, Any, Any]] = []
     if sender.transforms == "all":
-        q = quat_multiply(q_base, quat_conjugate(q_odom))
-        chain.append((sender.map_frame, sender.odom_frame, p_base - rotate(q, p_odom), q))
+        chain.append((sender.map_frame, sender.odom_frame, *map_to_odom(p_base, q_base, p_odom, q_odom)))
     else:
         chain.append((sender.map_frame, sender.truth_frame, p_base, q_base))
     if sender.transforms != "none":
@@ -217,12 +218,12 @@ def _transforms(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
             turn = np.concatenate([np.sin(half) * np.array(wheel.axis), np.cos(half)], axis=1)
             p = np.broadcast_to(np.array(wheel.p), (len(stamp), 3))
             chain.append((wheel.parent, wheel.name, p, quat_multiply(wheel.q_xyzw, turn)))
-    return _transform_fields(stamp, chain)
+    return transform_fields(stamp, chain)
 
 
 def _static(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
     links = [(link.parent, link.name, np.array(link.p), np.array(link.q_xyzw)) for link in sender.links]
-    return _transform_fields(stamp, links)
+    return transform_fields(stamp, links)
 
 
 def _scan(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
@@ -245,7 +246,7 @@ def _pose_at(prefix: str, p: str = "position", q: str = "orientation") -> dict[s
 
 def _carrier(kind: str, leaves: dict[str, str], **rest: Any) -> Topic:
     """A topic whose message type holds each of its columns in a leaf."""
-    return Topic(kind=kind, needs=tuple(leaves), carried=True, reads={kind: leaves}, qos=STREAM, **rest)
+    return Topic(kind=kind, needs=tuple(leaves), carried=True, reads={kind: leaves}, **rest)
 
 
 _FIELD = "sensor_msgs/msg/MagneticField"
@@ -336,7 +337,6 @@ JOINTS = Topic(
     sent="ticks",
     every_s=1 / 62,
     more=_joints,
-    reads={"sensor_msgs/msg/JointState": {"names": "name", "angles": "position"}},
 )
 TF = Topic(
     name="/tf",
@@ -350,7 +350,6 @@ TF = Topic(
 CLOCK = Topic(
     name="/clock",
     kind="rosgraph_msgs/msg/Clock",
-    qos=STREAM,
     needs=("t",),
     sent="ticks",
     every_s=0.025,
@@ -367,7 +366,6 @@ DESCRIPTION = Topic(
 SCAN = Topic(
     name="/robot/scan",
     kind="sensor_msgs/msg/LaserScan",
-    qos=STREAM,
     frame="lidar_frame",
     more=_scan,
     reads={"sensor_msgs/msg/LaserScan": {"stamp": "header.stamp"}},

@@ -1,10 +1,9 @@
-"""Writing bags: a Run, or raw messages, as a rosbag2, at once or as they come."""
+"""Writing bags: a Run at once, or raw messages as they come, as a rosbag2."""
 
 import json
 import os
 import shutil
-from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,12 +15,11 @@ from magtwin.files.outputs import check_free, output, why_full
 from magtwin.io.bags.cdr import encode
 from magtwin.io.bags.mcap import McapWriter
 from magtwin.io.bags.sender import Unit
-from magtwin.io.bags.storage import ROOM, Batch, Connection, bag_metadata, to_yaml
+from magtwin.io.bags.storage import PARTIAL, ROOM, Batch, Connection, bag_metadata, partial_of, to_yaml
 from magtwin.io.bags.stream import Sent, Stream
 from magtwin.io.bags.topics import Qos
 from magtwin.io.bags.twin_sender import sender_for
 from magtwin.io.bags.types import definition_of, layout
-from magtwin.io.recorder import PARTIAL, Sink, partial_of
 from magtwin.run.arrow import metadata_to_json
 from magtwin.run.run import Run
 from magtwin.run.spool import blocks
@@ -125,10 +123,8 @@ class _Bag:
     def note(self, run: Run) -> None:
         """Keep the metadata of a run."""
         entries = {name: json.dumps(value) for name, value in json.loads(metadata_to_json(run)).items()}
-        custom = {CUSTOM + name: value for name, value in entries.items()}
-        changed, self.custom = custom != self.custom, custom
-        if changed or not self.store.counts:
-            self.store.note(NOTE, entries)
+        self.custom = {CUSTOM + name: value for name, value in entries.items()}
+        self.store.note(NOTE, entries)
 
     def flush(self) -> None:
         """Make everything outlive this process."""
@@ -156,104 +152,11 @@ class _Bag:
         return bag_metadata(file, connections, store.counts, (store.first, store.last), self.custom)
 
 
-class _GrowingBag:
-    """A bag that is written while a run goes on; a killed process leaves everything that was flushed.
+class RawBagWriter:
+    """A bag that grows by messages in CDR, of any topics; a killed process leaves all that was flushed.
 
     Until it ends it has another name: `run.partial.mcap` for `run.mcap`, `bag.partial` for a folder `bag`.
     `read_bag` reads it at any time.
-    """
-
-    def __init__(self, path: str | os.PathLike[str], *, force: bool) -> None:
-        self._path, self._force = Path(path), force
-        check_suffix(self._path)
-        check_free(self._path, force=force)
-        self.partial = partial_of(self._path)
-        """Path until it ends."""
-        self._bag: _Bag | None = None
-        if self.partial.exists() and not force:
-            raise InputError(
-                f"{self.partial}: left by a recording that did not end; read and remove it, or give --force"
-            )
-
-    def _open(self) -> _Bag:
-        if self.partial.is_dir():
-            shutil.rmtree(self.partial)
-        self.partial.unlink(missing_ok=True)
-        self.partial.parent.mkdir(parents=True, exist_ok=True)
-        return _Bag(self.partial)
-
-    def _finish(self) -> None:
-        assert self._bag is not None
-        self._bag.close()
-        check_free(self._path, force=self._force)
-        with output(self._path, force=self._force) as aside:
-            self.partial.rename(aside)
-
-
-class BagWriter(_GrowingBag, Sink):
-    """A bag that is written block by block while a run goes on.
-
-    Args:
-        path: As for `write_bag`, as are the other arguments.
-        twin: The twin of the run.
-        units: Unit of magnetic fields.
-        scans: The LiDAR's scans of the whole run; each is written when it has arrived.
-        force: Replace an existing bag, and the rest of an earlier recording.
-
-    Raises:
-        InputError: As for `write_bag`; or an earlier recording left its part there.
-    """
-
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        twin: "Twin | None" = None,
-        *,
-        units: Unit = "T",
-        scans: "Scans | None" = None,
-        force: bool = False,
-    ) -> None:
-        super().__init__(path, force=force)
-        self._twin, self._units, self._scans = twin, units, scans
-        self._stream: Stream | None = None
-        sender_for(None, units)  # refuses a wrong unit
-
-    def append(self, run: Run) -> None:
-        """Add rows, later than the previous ones and with the same columns; they outlive this process.
-
-        Args:
-            run: The rows; new or changed metadata replace the previous ones.
-
-        Raises:
-            InputError: As for `write_bag`.
-        """
-        with one_line(self._path):
-            if self._bag is None or self._stream is None:
-                sender = sender_for(self._twin, self._units, run.metadata.get("rate_hz"))
-                self._stream = Stream(run, sender, self._scans)
-                self._bag = self._open()
-                self._bag.begin(run, self._stream)
-            else:
-                self._bag.note(run)
-            self._bag.send(self._stream.messages(run))
-            self._bag.flush()
-
-    def close(self) -> None:
-        """End the bag and give it its name. Nothing is left if nothing was appended."""
-        if self._bag is None or self._stream is None:
-            return
-        with one_line(self._path):
-            self._bag.send(self._stream.last())
-            self._finish()
-
-    def abort(self) -> None:
-        """Leave what there is under its partial name."""
-        if self._bag is not None:
-            self._bag.abort()
-
-
-class RawBagWriter(_GrowingBag):
-    """A bag that grows by messages in CDR, of any topics.
 
     Args:
         path: The folder to make, or a single file that ends in .mcap.
@@ -264,14 +167,21 @@ class RawBagWriter(_GrowingBag):
     """
 
     def __init__(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        super().__init__(path, force=force)
-        with one_line(self._path):
-            self._raw = self._bag = self._open()
+        self.path, self._force = Path(path), force
+        check_suffix(self.path)
+        check_free(self.path, force=force)
+        self.partial = partial_of(self.path)
+        """Path until it ends."""
+        if self.partial.exists() and not force:
+            raise InputError(
+                f"{self.partial}: left by a recording that did not end; read and remove it, or give --force"
+            )
+        with one_line(self.path):
+            self._clear()
+            self.partial.parent.mkdir(parents=True, exist_ok=True)
+            self._bag = _Bag(self.partial)
         self._waiting: dict[str, list[tuple[int, int, bytes]]] = {}
         self._arrived = 0
-        self._first, self._before = self._path, Counter[str]()
-        self.paths: list[Path] = []
-        """The bags that have ended, one for each `next` and `close` with messages."""
 
     def add(self, topic: str, kind: str, qos: Qos, *, digest: str = "") -> None:
         """Register a topic, before its first message.
@@ -285,32 +195,12 @@ class RawBagWriter(_GrowingBag):
         Raises:
             InputError: Its message type is unknown.
         """
-        if topic not in self._raw.connections:
+        if topic not in self._bag.connections:
             try:
-                with one_line(self._path):
-                    self._raw.add(topic, kind, qos, digest)
+                with one_line(self.path):
+                    self._bag.add(topic, kind, qos, digest)
             except InputError as error:
                 raise InputError(f"{topic}: {error}") from error
-
-    def next(self) -> Path:
-        """End the bag, and begin another with the same topics; returns its path.
-
-        The bags after `drive.mcap` are `drive_2.mcap` and so on.
-        """
-        connections = list(self._raw.connections.values())
-        self.close()
-        self._before = Counter(self.counts)
-        number = len(self.paths) + 1
-        self._path = self._first.with_stem(f"{self._first.stem}_{number}") if number > 1 else self._first
-        check_free(self._path, force=self._force)
-        self.partial = partial_of(self._path)
-        if self.partial.exists() and not self._force:
-            raise InputError(f"{self.partial}: left by a recording that did not end; read and remove it")
-        with one_line(self._path):
-            self._raw = self._bag = self._open()
-        for c in connections:
-            self.add(c.topic, c.kind, c.qos, digest=c.digest)
-        return self._path
 
     def write(self, topic: str, received_ns: int, data: bytes) -> None:
         """Take a message of a registered topic; the next `flush` writes it."""
@@ -318,38 +208,40 @@ class RawBagWriter(_GrowingBag):
         self._arrived += 1
 
     @property
-    def counts(self) -> Mapping[str, int]:
-        """Messages so far, by topic, also those of earlier bags."""
-        return {topic: self._before[topic] + self._count(topic) for topic in self._raw.connections}
-
-    def _count(self, topic: str) -> int:
-        """Messages of a topic in this bag."""
-        stored = self._raw.store.counts[self._raw.connections[topic].id]
-        return int(stored) + len(self._waiting.get(topic, ()))
+    def counts(self) -> dict[str, int]:
+        """Messages so far, by topic."""
+        stored = self._bag.store.counts
+        return {
+            topic: stored[each.id] + len(self._waiting.get(topic, ()))
+            for topic, each in self._bag.connections.items()
+        }
 
     def flush(self) -> None:
         """Make all messages outlive this process."""
         waiting, self._waiting = self._waiting, {}
         batches: list[Batch] = []
-        with one_line(self._path):
+        with one_line(self.path):
             for topic, messages in waiting.items():
-                batches += _batches(self._raw.connections[topic], messages)
-            self._raw.store.write(batches)
-            self._raw.flush()
+                batches += _batches(self._bag.connections[topic], messages)
+            self._bag.store.write(batches)
+            self._bag.flush()
 
     def close(self) -> None:
         """End the bag and give it its name. Nothing is left if nothing was written."""
         self.flush()
-        with one_line(self._path):
-            if any(map(self._count, self._raw.connections)):
-                self._finish()
-                self.paths.append(self._path)
-                return
-            self._raw.abort()
-            if self.partial.is_dir():
-                shutil.rmtree(self.partial)
+        with one_line(self.path):
+            if any(self.counts.values()):
+                self._bag.close()
+                with output(self.path, force=self._force) as aside:
+                    self.partial.rename(aside)
             else:
-                self.partial.unlink()
+                self._bag.abort()
+                self._clear()
+
+    def _clear(self) -> None:
+        if self.partial.is_dir():
+            shutil.rmtree(self.partial)
+        self.partial.unlink(missing_ok=True)
 
 
 def check_suffix(path: Path) -> None:

@@ -1,12 +1,9 @@
 """File: a Run, or several to compare, as a Rerun recording with a layout, and back."""
 
 import os
-import shutil
-import struct
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -17,7 +14,6 @@ from magtwin.errors import InputError
 from magtwin.files.budget import check_size
 from magtwin.files.file import existing
 from magtwin.files.outputs import output
-from magtwin.io.recorder import PARTIAL
 from magtwin.io.rerun.layout import RUN_COLOURS, Shown, comparison_layout, plotted
 from magtwin.io.rerun.recording import (
     ROOM,
@@ -93,7 +89,6 @@ def write_comparison(
     path: str | os.PathLike[str],
     twin: Twin | None = None,
     *,
-    offsets_s: Mapping[str, float] | None = None,
     planned: Path | None = None,
     force: bool = False,
 ) -> None:
@@ -103,13 +98,12 @@ def write_comparison(
         runs: The runs by name.
         path: The .rrd file to make.
         twin: Where they took place. None: only series.
-        offsets_s: Offsets added to the times of some of them [s], by name.
         planned: The planned path, or None.
         force: Whether to replace an existing file.
 
     Raises:
-        InputError: There is no run or one has no rows, two names are the same to Rerun, an offset is not
-            finite or names no run, or the file cannot be made as in `write_rrd`.
+        InputError: There is no run or one has no rows, two names are the same to Rerun, or the file cannot be
+            made as in `write_rrd`.
     """
     if not runs:
         raise InputError(f"{path}: there are no runs to compare; name at least one")
@@ -118,17 +112,8 @@ def write_comparison(
     entities = {entity_of("", name) for name in runs}
     if len(entities) < len(runs) or "" in entities:
         raise InputError(f"{path}: runs that are compared need names that differ, got {', '.join(runs)}")
-    offsets = dict(offsets_s or {})
-    for name, offset in offsets.items():
-        if name not in runs or not np.isfinite(offset):
-            raise InputError(
-                f"{path}: the offset {offset!r} s of {name!r} must be finite and of a run; "
-                f"runs are {', '.join(runs)}"
-            )
     compared = [
-        Shown.of(
-            run, name=name, offset_s=float(offsets.get(name, 0.0)), colour=RUN_COLOURS[k % len(RUN_COLOURS)]
-        )
+        Shown.of(run, name=name, colour=RUN_COLOURS[k % len(RUN_COLOURS)])
         for k, (name, run) in enumerate(runs.items())
     ]
     first = next(iter(runs.values()))
@@ -146,9 +131,8 @@ def write_comparison(
         if twin is not None:
             send_room(rec, interior, twin.field, first, planned)
         for shown in compared:
-            look: dict[str, Any] = {"name": shown.name, "offset_s": shown.offset_s}
-            robot = None if twin is None else Robot(rec, interior, colour=shown.colour, **look)
-            recording = Recording(rec, robot=robot, **look)
+            robot = None if twin is None else Robot(rec, interior, colour=shown.colour, name=shown.name)
+            recording = Recording(rec, shown.name, robot=robot)
             recording.append(runs[shown.name])
             recording.close()
 
@@ -175,8 +159,6 @@ def show_run(run: Run, twin: Twin | None = None, *, file: str | os.PathLike[str]
 
 def read_run(path: str | os.PathLike[str]) -> Run:
     """The run of a recording, equal to the written one to the bit.
-
-    Of an unfinished recording, whose name ends in `.partial.rrd`, the rows so far are read.
 
     Args:
         path: The .rrd file.
@@ -206,16 +188,15 @@ def read_runs(path: str | os.PathLike[str]) -> dict[str, Run]:
     if path.is_dir():
         raise InputError(f"{path}: a folder; name the .rrd file in it")
     check_size(path, "rrd")
-    partial = PARTIAL in path.suffixes
     chunks: dict[str, list] = {}
-    with _readable(path, partial=partial) as file, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # an unfinished file has no end
-        check_decodes(file, path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # one that was cut short has no end
+        check_decodes(path, path)
         try:
-            for chunk in RrdReader(file).stream().filter(content=f"/{COLUMNS_ENTITY}/**").to_chunks():
+            for chunk in RrdReader(path).stream().filter(content=f"/{COLUMNS_ENTITY}/**").to_chunks():
                 chunks.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
         except (RuntimeError, ValueError, OSError) as error:
-            reason = str(error).splitlines()[0].removeprefix(f"Failed to read RRD file at {file}: ")
+            reason = str(error).splitlines()[0].removeprefix(f"Failed to read RRD file at {path}: ")
             raise InputError(
                 f"{path}: not a Rerun recording that can be read ({reason}); write it again"
             ) from error
@@ -226,36 +207,11 @@ def read_runs(path: str | os.PathLike[str]) -> dict[str, Run]:
     runs = {}
     for batches in chunks.values():
         name, run, rows = table_of(batches, str(path))
-        if rows != run.rows and not partial:
-            raise InputError(
-                f"{path}: was cut short: it holds {run.rows:,} rows of "
-                f"{'a run that did not end' if rows is None else f'{rows:,}'}; to read what there is, "
-                f"rename it to {path.stem}{PARTIAL}.rrd"
-            )
-        if partial and "t" not in run.columns:
-            raise InputError(f"{path}: holds no rows: it was broken off before the first of them")
+        if rows != run.rows:
+            what = "a run that did not end" if rows is None else f"{rows:,}"
+            raise InputError(f"{path}: was cut short: it holds {run.rows:,} rows of {what}; write it again")
         runs[name] = run
     return runs
-
-
-@contextmanager
-def _readable(path: FilePath, *, partial: bool) -> Iterator[FilePath]:
-    """A file that Rerun can read; of a partial one, a copy without its last, incomplete message."""
-    size, end = path.stat().st_size, 12  # a header, then messages of kind, length and body
-    with open(path, "rb") as source:
-        while partial and end + 16 <= size:
-            source.seek(end)
-            length = struct.unpack("<QQ", source.read(16))[1]
-            if end + 16 + length > size:
-                break
-            end += 16 + length
-    if not partial or end >= size:
-        yield path
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        file = shutil.copyfile(path, FilePath(folder) / path.name)
-        os.truncate(file, end)
-        yield file
 
 
 def _check_rows(run: Run, path: str | os.PathLike[str]) -> None:

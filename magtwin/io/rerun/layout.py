@@ -1,7 +1,7 @@
 """Layout: the plots and views of a recording."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,15 +29,6 @@ Array = NDArray[np.float64]
 _ROOM = 0.08
 """Room beyond the values and the ticks of an axis, as a share of the range of the values."""
 
-_LEGEND_ROW, _LEGEND_MOST = 0.1, 0.65
-"""Height of a row of a legend, as a share of the tall first plot, and greatest height of a legend."""
-
-_LEGEND_WIDTH, _LEGEND_LETTER = 0.07, 0.01
-"""Width of a legend without text, and of a letter, as shares of the width of a plot."""
-
-_LOOKED_AT = 4000
-"""Readings of a series that are used to place a legend."""
-
 Colour = tuple[int, int, int]
 
 RUN_COLOURS: tuple[Colour, ...] = (
@@ -61,77 +52,57 @@ class Series:
     """Width of the line [points]. Wide lines are drawn below narrow ones."""
 
 
-@dataclass(frozen=True)
-class Panel:
-    """A plot: series of one unit."""
-
-    title: str
-    series: tuple[Series, ...]
-
-
 _BLUE, _ORANGE, _GREEN, _GREY = (86, 156, 255), (255, 158, 64), (92, 200, 120), (165, 165, 165)
 _DIM = (118, 106, 150)
 
-FIELD_PANEL = Panel(
-    "Total field [nT]",
-    (
-        Series("b_total_nt", "total = map + disturbance", _ORANGE, width=4.0),
-        Series("b_measured_nt", "measured", _GREEN, width=1.0),
-        Series("b_map_nt", "map", _BLUE),
-        Series("b_truth_nt", "truth", _GREY),
-        Series("interval_low_nt", "90 % interval", _DIM),
-        Series("interval_high_nt", "90 % interval", _DIM),
-    ),
-)
-DISTURBANCE_PANEL = Panel("Disturbance [nT]", (Series("b_disturbance_nt", "disturbance", _ORANGE),))
-ERROR_PANEL = Panel(
-    "Error [nT]",
-    (
-        Series("error_nt", "prediction - truth", _ORANGE, width=3.0),
-        Series("measured_error_nt", "measured - truth", _GREEN, width=1.0),
-        Series("error_low_nt", "90 % interval", _DIM),
-        Series("error_high_nt", "90 % interval", _DIM),
-    ),
-)
-SPEED_PANEL = Panel(
-    "Speed [m/s]",
-    (
-        Series("odom_v", "odometry", _GREY, "x", width=3.0),
-        Series("v_base", "true", _BLUE, "x"),
-        Series("v_cmd", "commanded", _ORANGE),
-    ),
-)
-YAW_RATE_PANEL = Panel(
-    "Yaw rate [rad/s]",
-    (
-        Series("imu_w", "gyroscope", _GREY, "z", width=3.0),
-        Series("w_base", "true", _BLUE, "z"),
-        Series("w_cmd", "commanded", _ORANGE),
-    ),
-)
-ACCELERATION_PANEL = Panel(
-    "Accelerometer [m/s2]",
-    (
-        Series("imu_a", "forward", _BLUE, "x"),
-        Series("imu_a", "left", _ORANGE, "y"),
-        Series("imu_a", "up", _GREY, "z"),
-    ),
-)
-TILT_PANEL = Panel(
-    "Gyroscope, tilting [rad/s]",
-    (Series("imu_w", "roll", _BLUE, "x"), Series("imu_w", "pitch", _ORANGE, "y")),
-)
-BATTERY_PANELS = (
-    Panel("Battery voltage [V]", (Series("battery_v", "voltage", _GREEN),)),
-    Panel("Battery current [A]", (Series("battery_a", "current", _ORANGE),)),
-    Panel("Battery charge [0..1]", (Series("battery_fraction", "charge", _GREEN),)),
-)
-PANELS = (
-    *(FIELD_PANEL, DISTURBANCE_PANEL, ERROR_PANEL),
-    *(SPEED_PANEL, YAW_RATE_PANEL, ACCELERATION_PANEL, TILT_PANEL),
-    *BATTERY_PANELS,
-)
-"""Every plot of a recording. Series that a run lacks, or that are all nan, are left out."""
+PLOTS: Mapping[str, Mapping[str, tuple[Series, ...]]] = {
+    "": {
+        "Total field [nT]": (
+            Series("b_total_nt", "total = map + disturbance", _ORANGE, width=4.0),
+            Series("b_measured_nt", "measured", _GREEN, width=1.0),
+            Series("b_map_nt", "map", _BLUE),
+            Series("b_truth_nt", "truth", _GREY),
+            Series("interval_low_nt", "90 % interval", _DIM),
+            Series("interval_high_nt", "90 % interval", _DIM),
+        ),
+        "Disturbance [nT]": (Series("b_disturbance_nt", "disturbance", _ORANGE),),
+        "Error [nT]": (
+            Series("error_nt", "prediction - truth", _ORANGE, width=3.0),
+            Series("measured_error_nt", "measured - truth", _GREEN, width=1.0),
+            Series("error_low_nt", "90 % interval", _DIM),
+            Series("error_high_nt", "90 % interval", _DIM),
+        ),
+    },
+    "Drive": {
+        "Speed [m/s]": (
+            Series("odom_v", "odometry", _GREY, "x", width=3.0),
+            Series("v_base", "true", _BLUE, "x"),
+            Series("v_cmd", "commanded", _ORANGE),
+        ),
+        "Yaw rate [rad/s]": (
+            Series("imu_w", "gyroscope", _GREY, "z", width=3.0),
+            Series("w_base", "true", _BLUE, "z"),
+            Series("w_cmd", "commanded", _ORANGE),
+        ),
+    },
+    "IMU": {
+        "Accelerometer [m/s2]": (
+            Series("imu_a", "forward", _BLUE, "x"),
+            Series("imu_a", "left", _ORANGE, "y"),
+            Series("imu_a", "up", _GREY, "z"),
+        ),
+        "Gyroscope, tilting [rad/s]": (
+            Series("imu_w", "roll", _BLUE, "x"),
+            Series("imu_w", "pitch", _ORANGE, "y"),
+        ),
+    },
+    "Battery": {
+        "Battery voltage [V]": (Series("battery_v", "voltage", _GREEN),),
+        "Battery current [A]": (Series("battery_a", "current", _ORANGE),),
+        "Battery charge [0..1]": (Series("battery_fraction", "charge", _GREEN),),
+    },
+}
+"""Series by the title of their plot, by the name of their tab; "" are above the tabs."""
 
 _COMPARED = (
     ("Total field [nT]", "b_total_nt", ""),
@@ -154,9 +125,6 @@ class Shown:
     name: str = ""
     """Its name among several runs; "" for a single run."""
 
-    offset_s: float = 0.0
-    """Offset added to its times [s]."""
-
     colour: Colour = _ORANGE
 
     @classmethod
@@ -177,7 +145,8 @@ class Shown:
 def plotted(run: Run) -> bool:
     """Whether a run has a column that is plotted."""
     shown = Shown.of(run)
-    return any(shown.values(series) is not None for panel in PANELS for series in panel.series)
+    lines = (line for tab in PLOTS.values() for series in tab.values() for line in series)
+    return any(shown.values(line) is not None for line in lines)
 
 
 def layout(
@@ -186,7 +155,6 @@ def layout(
     *,
     heading: float = 0.0,
     events: Sequence[str] | None = None,
-    whole: bool = True,
 ) -> rrb.Blueprint:
     """The views of a run: plots, states and events, and with a lab also the lab and the robot in 3D.
 
@@ -195,21 +163,15 @@ def layout(
         lab: The lab. None: no 3D views.
         heading: Heading of the map on the floor [rad], for the title.
         events: Flags that get a lane of states. Default: those that the run raised.
-        whole: Whether the run is complete. The axes of an unfinished run grow with it.
     """
     shown = Shown.of(run)
-    axis = _whole([shown]) if whole else None
-    panels = (FIELD_PANEL, DISTURBANCE_PANEL, ERROR_PANEL)
-    series = _stacked(*([(shown, panel)] for panel in panels), whole=axis, tall=0)
-    tabs = [
-        rrb.Vertical(*views, name=name)
-        for name, panels in (
-            ("Drive", (SPEED_PANEL, YAW_RATE_PANEL)),
-            ("IMU", (ACCELERATION_PANEL, TILT_PANEL)),
-            ("Battery", BATTERY_PANELS),
-        )
-        if (views := _stacked(*([(shown, panel)] for panel in panels), whole=axis))
-    ]
+    axis = _whole([shown])
+    stacks = {
+        tab: _stacked(axis, {title: [(shown, line) for line in lines] for title, lines in plots.items()})
+        for tab, plots in PLOTS.items()
+    }
+    series = stacks.pop("")
+    tabs = [rrb.Vertical(*views, name=tab) for tab, views in stacks.items() if views]
     shares = [2.2, 1.2, 1.2][: len(series)] + [2.6] * bool(tabs)
     side = rrb.Vertical(*series, *([rrb.Tabs(*tabs)] if tabs else []), row_shares=shares)
     if events is None:
@@ -234,12 +196,11 @@ def comparison_layout(
 
     Without a lab there are no 3D views; `heading` is that of the map on the floor [rad], for the title.
     """
-    whole = _whole(runs)
-    rows = [
-        [(shown, Panel(title, (Series(column, shown.name, shown.colour, part),))) for shown in runs]
+    plots = {
+        title: [(shown, Series(column, shown.name, shown.colour, part)) for shown in runs]
         for title, column, part in _COMPARED
-    ]
-    side = rrb.Vertical(*_stacked(*rows, whole=whole, tall=0))
+    }
+    side = rrb.Vertical(*_stacked(_whole(runs), plots))
     metadata = [
         rrb.TextDocumentView(origin=entity_of("metadata", shown.name), name=shown.name) for shown in runs
     ]
@@ -285,44 +246,28 @@ def _blueprint(
 
 def _whole(runs: Sequence[Shown]) -> rrb.TimeAxis:
     """The axis that covers all of the runs."""
-    ends = [shown.run["t"][[0, -1]] + shown.offset_s for shown in runs]
+    ends = [shown.run["t"][[0, -1]] for shown in runs]
     first, last = (rrb.TimeRangeBoundary.absolute(seconds=float(k(ends))) for k in (np.min, np.max))
     return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
 
 
 def _stacked(
-    *rows: Sequence[tuple[Shown, Panel]], whole: rrb.TimeAxis | None, tall: int | None = None
+    whole: rrb.TimeAxis, plots: Mapping[str, Sequence[tuple[Shown, Series]]]
 ) -> list[rrb.TimeSeriesView]:
-    """One plot for each row with a series; the row number `tall` has twice the height."""
-    plots = []
-    for number, row in enumerate(rows):
-        lines = [
-            (shown, series, values)
-            for shown, panel in row
-            for series in panel.series
-            if (values := shown.values(series)) is not None
-        ]
-        if lines:
-            plots.append(_plot(row[0][1].title, lines, whole, tall=number == tall))
-    return plots
+    """One plot, by its title, for each that has a line with values."""
+    views = []
+    for title, lines in plots.items():
+        known = [(*line, values) for line in lines if (values := line[0].values(line[1])) is not None]
+        if known:
+            views.append(_plot(title, known, whole))
+    return views
 
 
 def _plot(
-    title: str, lines: Sequence[tuple[Shown, Series, Array]], whole: rrb.TimeAxis | None, *, tall: bool
+    title: str, lines: Sequence[tuple[Shown, Series, Array]], whole: rrb.TimeAxis
 ) -> rrb.TimeSeriesView:
-    """Lines of one unit, with the legend in the corner where it needs least room."""
-    legend, corner = len(lines) > 1, rrb.Corner2D.LeftTop
+    """Lines of one unit."""
     ends = value_range(np.array([(np.nanmin(values), np.nanmax(values)) for _, _, values in lines]))
-    if legend and ends:
-        count = len({series.name for _, series, _ in lines})
-        height = min(_LEGEND_MOST, count * _LEGEND_ROW * (1.0 if tall else 2.0))
-        width = _LEGEND_WIDTH + _LEGEND_LETTER * max(len(series.name) for _, series, _ in lines)
-        parts = [
-            np.column_stack([shown.run["t"] + shown.offset_s, line])[:: max(1, len(line) // _LOOKED_AT)]
-            for shown, _, line in lines
-        ]
-        t, values = (rows := np.concatenate(parts))[np.argsort(rows[:, 0], kind="stable")].T
-        corner, ends = legend_corner(values[:, None], t, ends, (width, height))
     overrides: dict[Any, list[rrb.Visualizer]] = {}
     for shown, series, _ in lines:
         entity = entity_of(DERIVED_ENTITY if series.column in DERIVED else COLUMNS_ENTITY, shown.name)
@@ -339,8 +284,8 @@ def _plot(
         contents=list(overrides),
         name=title,
         axis_x=whole,
-        axis_y=rrb.ScalarAxis(range=ends) if ends and whole else None,
-        plot_legend=rrb.PlotLegend(corner, visible=legend),
+        axis_y=rrb.ScalarAxis(range=ends) if ends else None,
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=len(lines) > 1),
         overrides=overrides,
     )
 
@@ -360,35 +305,6 @@ def value_range(values: Array) -> tuple[float, float] | None:
         min(low - room, math.ceil((low - room) / tick) * tick - room),
         max(high + room, math.floor((high + room) / tick) * tick + room),
     )
-
-
-def legend_corner(
-    values: Array, t: Array, ends: tuple[float, float], size: tuple[float, float]
-) -> tuple[rrb.Corner2D, tuple[float, float]]:
-    """The corner for a legend that hides no line, and the axis that this needs.
-
-    `values` are the series of a plot, shape (N, S), at ascending times `t` [s]; all fit in an axis with these
-    `ends`; `size` is the width and height of the legend, as shares of the plot. The axis grows least in the
-    chosen corner. One hundredth of the readings beside the legend may be under it, such as the ramp at the
-    start of a run.
-    """
-    width, height = size
-    span = (t[-1] - t[0]) * width
-    choices = []
-    for corner, beside, sign in (
-        (rrb.Corner2D.LeftTop, t <= t[0] + span, 1),
-        (rrb.Corner2D.RightTop, t >= t[-1] - span, 1),
-        (rrb.Corner2D.LeftBottom, t <= t[0] + span, -1),
-        (rrb.Corner2D.RightBottom, t >= t[-1] - span, -1),
-    ):
-        low, high = sorted(sign * end for end in ends)  # a lower corner is an upper one turned over
-        part = sign * values[beside]
-        part = part[np.isfinite(part)]
-        most = float(np.quantile(part, 0.99)) if part.size else low
-        high = max(high, (most - height * low) / (1 - height))
-        choices.append((high - low, corner, (low, high) if sign > 0 else (-high, -low)))
-    _, corner, grown = min(choices, key=lambda choice: choice[0])
-    return corner, grown
 
 
 def lab_eye(lab: LabSpec) -> tuple[Vec3, Vec3]:

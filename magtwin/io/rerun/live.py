@@ -1,9 +1,10 @@
-"""Live: a run while it goes on, in a Rerun file that grows and in the viewer."""
+"""Live: runs in a Rerun viewer in step with the clock, and drives by hand."""
 
 import socket
+import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -12,22 +13,9 @@ import numpy as np
 import rerun as rr
 
 from magtwin.errors import InputError
-from magtwin.files.outputs import check_free
 from magtwin.frames import quat_from_yaw
-from magtwin.io.recorder import Sink, partial_of
 from magtwin.io.rerun.layout import drive_layout
-from magtwin.io.rerun.recording import (
-    APPLICATION,
-    ROOM,
-    Recording,
-    check_room,
-    flush,
-    recording_of,
-    size_of,
-    title_of,
-    unwritten,
-)
-from magtwin.io.rerun.series import STATES
+from magtwin.io.rerun.recording import APPLICATION, flush, recording_of, title_of
 from magtwin.io.rerun.viewer import live_viewer
 from magtwin.io.rerun.world import POSE_HZ, Interior, Robot, send_still
 from magtwin.path import Path as Planned
@@ -35,149 +23,52 @@ from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
 from magtwin.twin import Twin
 
+TICK_S = 0.05
+"""Time between blocks of a run that is shown in step with the clock [s]."""
+
 Show = Callable[[float, tuple[float, float, float]], None]
 """Takes the time [s] and x [m], y [m], yaw [rad] of base_link."""
 
 
-class _Growing(Sink):
-    """A recording that gets its rows block by block; the stream starts with the first of them."""
-
-    def __init__(
-        self,
-        twin: Twin | None,
-        *,
-        expected: Run | None = None,
-        planned: Planned | None = None,
-        scans: Scans | None = None,
-        final: Path,
-        **sinks: Any,
-    ) -> None:
-        self._twin, self._expected, self._final, self._sinks = twin, expected, final, sinks
-        self._shown: dict[str, Any] = {"planned": planned, "scans": scans}
-        self._stack = ExitStack()
-        self._recording: Recording | None = None
-        self.rows = 0
-
-    def append(self, run: Run) -> None:
-        """Add the next rows; they are in the file or the viewer when this returns.
-
-        Raises:
-            InputError: The disk is full, or the stage cannot be read.
-        """
-        if self._recording is None:
-            self._recording = self._stack.enter_context(self._begin(run))
-        if file := self._sinks.get("file"):
-            check_room(file, file.stat().st_size + size_of(run, self._shown["scans"]) + ROOM, self._final)
-        try:
-            self._recording.append(run)
-            flush(self._recording.rec, file and file.parent)
-        except RuntimeError as error:
-            raise unwritten(self._final, error) from error
-        self.rows += run.rows
-
-    def _begin(self, run: Run) -> Any:
-        rate, known = run.metadata.get("rate_hz", 0.0), self._expected
-        layout = {"known": known, "events": None if known else list(STATES), "whole": known is not None}
-        more: dict[str, Any] = {**layout, **self._shown, **self._sinks, "final": self._final}
-        rate_hz = rate if isinstance(rate, float) else 0.0
-        title = title_of(run) or "live run"
-        return recording_of(run, uuid.uuid4().hex, title, self._twin, rate_hz=rate_hz, **more)
-
-    def close(self) -> None:
-        """Complete the recording."""
-        if self._recording is not None:
-            self._recording.close()
-        self._stack.close()
-
-    def abort(self) -> None:
-        """Leave the recording as it is."""
-        with suppress(InputError):
-            self._stack.close()
-
-
-class RrdWriter(_Growing):
-    """A recording that grows while its run goes on: a sink of a `Recorder`.
-
-    Its layout is that of `write_rrd`. Until `close`, the file has the name `run.partial.rrd` and can be read
-    up to the last rows, even if the process was killed.
+def play(
+    run: Run,
+    twin: Twin,
+    address: str,
+    *,
+    planned: Planned | None = None,
+    scans: Scans | None = None,
+    pace: float = 1.0,
+    progress: Callable[[float, float, str], Any] = lambda done, total, what: None,
+) -> None:
+    """Show a run in step with the clock, in the layout of `write_rrd`.
 
     Args:
-        path: The .rrd file to make at the end.
-        twin: Where the run takes place, as for `write_rrd`.
-        force: Whether to replace an existing file, also an unfinished one.
-        shown: `expected`, the run, if known beforehand, which sets axes and colours; `planned`, the planned
-            path; `scans`, the LiDAR scans of the whole run.
+        run: The run.
+        twin: Where it took place.
+        address: Address of a Rerun viewer, such as rerun+http://127.0.0.1:9876/proxy.
+        planned: The planned path.
+        scans: The LiDAR's scans.
+        pace: Simulated seconds per second.
+        progress: Called with seconds done, seconds in all and a word.
 
     Raises:
-        InputError: The file exists and `force` was not given, or it cannot be written.
+        InputError: No viewer listens there, or it was closed.
     """
-
-    def __init__(
-        self, path: str | Path, twin: Twin | None = None, *, force: bool = False, **shown: Any
-    ) -> None:
-        self.path, self._force = check_free(path, force=force), force
-        self.partial = check_free(partial_of(self.path), force=force)
-        """The file while it grows."""
-        try:
-            self.partial.parent.mkdir(parents=True, exist_ok=True)
-            self.partial.write_bytes(b"")
-        except OSError as error:
-            raise InputError(f"{self.path}: cannot be written ({error.strerror})") from error
-        super().__init__(twin, **shown, file=self.partial, final=self.path)
-
-    def close(self) -> None:
-        """Complete the file and give it its name; without rows, delete it."""
-        super().close()
-        if not self.rows:
-            self.partial.unlink()
-            return
-        check_free(self.path, force=self._force)
-        self.partial.replace(self.path)
-
-    def abort(self) -> None:
-        """Keep the rows so far under the unfinished name; without rows, delete the file."""
-        super().abort()
-        if not self.rows:
-            self.partial.unlink(missing_ok=True)
-
-
-class LiveViewer(_Growing):
-    """A viewer that shows a run while it goes on: a sink of a `Recorder`. The run goes on without it.
-
-    Args:
-        address: Address of the viewer, such as rerun+http://127.0.0.1:9876/proxy.
-        twin: Where the run takes place, as for `write_rrd`.
-        shown: As for `RrdWriter`.
-
-    Raises:
-        InputError: No viewer listens there.
-    """
-
-    def __init__(self, address: str, twin: Twin | None = None, **shown: Any) -> None:
-        check_listens(address)
-        super().__init__(twin, **shown, address=address, final=Path(address))
-        self.shown = True
-        """Whether the viewer is still there."""
-
-    def append(self, run: Run) -> None:
-        """Show the next rows."""
-        if self.shown:
-            try:
-                super().append(run)
-            except InputError:
-                self.abort()
-
-    def close(self) -> None:
-        """Complete the run; the viewer stays open."""
-        if self.shown:
-            with suppress(InputError):
-                super().close()
-
-    def abort(self) -> None:
-        """Disconnect from the viewer."""
-        if self.shown:
-            self.shown = False
-            super().abort()
+    check_listens(address)
+    t, rate_hz = run["t"], (run.rows - 1) / run.duration_s if run.duration_s else 0.0
+    shown: dict[str, Any] = {"planned": planned, "scans": scans, "address": address, "final": Path(address)}
+    title = title_of(run) or "live run"
+    with recording_of(run, uuid.uuid4().hex, title, twin, rate_hz=rate_hz, **shown) as recording:
+        begun, sent = time.monotonic(), 0
+        while sent < run.rows:
+            end = int(np.searchsorted(t, t[0] + (time.monotonic() - begun) * pace, side="right"))
+            if end > sent:
+                recording.append(run.take(slice(sent, end)))
+                flush(recording.rec, None)
+                progress(round(float(t[end - 1])), round(float(t[-1])), "Ctrl-C ends it")
+                sent = end
+            time.sleep(TICK_S)
+        recording.close()
 
 
 def check_listens(address: str) -> None:

@@ -212,9 +212,6 @@ class Recording:
     name: str = ""
     """Its name among several runs; "" for a single run."""
 
-    offset_s: float = 0.0
-    """Offset added to its times [s]."""
-
     robot: Robot | None = None
     """Its robot in the room. None: only series."""
 
@@ -227,7 +224,7 @@ class Recording:
     _feed: Feed | None = None
 
     def __post_init__(self) -> None:
-        self._flags = Flags(self.rec, self.name, self.offset_s)
+        self._flags = Flags(self.rec, self.name)
         if self.robot is not None and self.scans is not None and len(self.scans.t):
             self._feed = Feed(self.rec, self.scans)
 
@@ -237,7 +234,7 @@ class Recording:
             return
         if not self._rows:
             send_metadata(self.rec, run, self.name)
-        send_columns(self.rec, run, run["t"] + self.offset_s, self.name)
+        send_columns(self.rec, run, run["t"], self.name)
         self._flags.append(run)
         if self.robot is not None and run.keys() >= POSED:
             self.robot.append(run)
@@ -274,22 +271,21 @@ def recording_of(
     scans: Scans | None = None,
     events: Sequence[str] | None = None,
     room: int = 0,
-    whole: bool = True,
     rate_hz: float = 0.0,
     **sinks: Any,
 ) -> Iterator[Recording]:
     """A recording of one run with its layout, metadata and lab; it holds no rows yet.
 
-    `run` is the run, or its first rows; `known` sets axes and colours, and is whole if `whole`. No twin:
-    only series. `room` is an upper bound of the size of the rows [bytes]; a `rate_hz` of 0 is taken
-    from the first rows; `sinks` are `file`, `address` and `final` of `stream`.
+    `known` sets axes and colours; default: `run`. No twin: only series. `room` is an upper bound of the size
+    of the rows [bytes]; a `rate_hz` of 0 is taken from the first rows; `sinks` are `file`, `address` and
+    `final` of `stream`.
 
     Raises:
         InputError: The stage cannot be read, or as for `stream`.
     """
     known = run if known is None else known
     lab, heading = (None, 0.0) if twin is None else (twin.scene.lab, heading_of(twin.field, known))
-    views = layout(known, lab, heading=heading, events=events, whole=whole)
+    views = layout(known, lab, heading=heading, events=events)
     room += ROOM
     if twin is not None:
         interior = Interior.of(twin)

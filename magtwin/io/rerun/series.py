@@ -236,7 +236,6 @@ class Flags:
 
     rec: rr.RecordingStream
     name: str = ""
-    offset_s: float = 0.0
 
     _before: dict[str, bool] = field(default_factory=dict)
     _open: dict[str, tuple[float, float, str]] = field(default_factory=dict)
@@ -259,7 +258,7 @@ class Flags:
             self._before[column] = bool(flag[-1])
             if not self.name:
                 words = np.where(flag[rows], state.up, state.down).tolist()
-                t = run["t"][rows] + self.offset_s
+                t = run["t"][rows]
                 send(self.rec, f"states/{state.name}", t, rr.StateChange, state=words)
             if column in self._open or flag.any():
                 events += self._episodes(column, run)
@@ -297,7 +296,7 @@ class Flags:
         events.sort(key=lambda event: event[0])
         t, levels, texts = zip(*events, strict=True)
         named = [f"{self.name}: {text}" for text in texts] if self.name else list(texts)
-        at = np.array(t) + self.offset_s
+        at = np.array(t)
         send(self.rec, "events", at, rr.TextLog, text=named, level=list(levels))
 
 

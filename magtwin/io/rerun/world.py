@@ -234,7 +234,6 @@ class Robot:
     scale: Scale | None = None
     """Colours of the readings along its path. None: only the path."""
     name: str = ""
-    offset_s: float = 0.0
     colour: Colour = DRIVEN
     """Colour of its path."""
     rate_hz: float = 0.0
@@ -312,7 +311,7 @@ class Robot:
         """Poses of base and wheels at some rows, and the field vector at the sensor."""
         if not len(rows):
             return
-        rec, root, t = self.rec, entity_of("world/robot", self.name), run["t"][rows] + self.offset_s
+        rec, root, t = self.rec, entity_of("world/robot", self.name), run["t"][rows]
         p, q = run["p_world_base"][rows], run["q_world_base_xyzw"][rows]
         pose = {"translation": p.astype(np.float32), "quaternion": q.astype(np.float32)}
         send(rec, root, t, rr.Transform3D, **pose)
@@ -349,7 +348,7 @@ class Robot:
         """The path on the floor, and above it a ribbon of the readings at the sensor's positions."""
         if not len(rows):
             return
-        rec, t = self.rec, run["t"][rows] + self.offset_s
+        rec, t = self.rec, run["t"][rows]
         base, q = run["p_world_base"][rows], run["q_world_base_xyzw"][rows]
         before = self._last
         if before is None:

@@ -12,10 +12,9 @@ from magtwin.ros.bus.bus import (
     Message,
     Publisher,
     Subscription,
-    Timer,
     open_bus,
 )
-from magtwin.ros.bus.messages import to_bytes
+from magtwin.ros.bus.messages import poses_bytes, to_bytes
 from magtwin.ros.bus.names import Names, Range, is_name, names_of
 
 __all__ = [
@@ -28,9 +27,9 @@ __all__ = [
     "Publisher",
     "Range",
     "Subscription",
-    "Timer",
     "is_name",
     "names_of",
     "open_bus",
+    "poses_bytes",
     "to_bytes",
 ]

@@ -14,16 +14,11 @@ from functools import cached_property
 from typing import Any, Literal, Protocol
 
 from magtwin.errors import InputError, find
-from magtwin.io.bags.topics import SENSOR_DATA, Qos
-from magtwin.ros.bus.messages import content_of, leaves_of
+from magtwin.io.bags.topics import Qos
+from magtwin.ros.bus.messages import content_of, leaf_of
 from magtwin.ros.bus.names import Names, Range, range_of
-from magtwin.ros.parameters import Parameter
 
 Backend = Literal["auto", "rclpy", "cyclonedds"]
-
-Offers = Literal["reliable", "sensor-data"]
-"""QoS in which streams of sensor data are offered: reliable, which every subscriber matches, or best effort
-with depth 5, the sensor-data profile of ROS."""
 
 BACKENDS: Mapping[str, tuple[str, str]] = {
     "rclpy": ("magtwin.ros.bus.rclpy_bus", "RclpyBus"),
@@ -70,7 +65,7 @@ class Message:
         Raises:
             InputError: As for `content`; or it has fewer elements.
         """
-        return leaves_of(self.kind, self.content, wanted)
+        return {name: leaf_of(self.content, name) for name in wanted}
 
 
 Handler = Callable[[Message], None]
@@ -111,13 +106,6 @@ class Endpoint:
     """REP 2011 hash of its type; "" before ROS 2 Iron."""
 
 
-class Timer(Protocol):
-    """Something called at a regular interval."""
-
-    def cancel(self) -> None:
-        """Do not call it again."""
-
-
 class Bus(Protocol):
     """A node of ROS 2."""
 
@@ -137,27 +125,6 @@ class Bus(Protocol):
         A reliable subscription receives nothing from a best-effort publisher; `Qos.heard` matches every
         publisher.
         """
-
-    def service(self, name: str, called: Callable[[], None]) -> bool:
-        """Offer a service without arguments (std_srvs/srv/Empty); whether the backend can.
-
-        cyclonedds cannot: each ROS 2 middleware addresses answers in a different way.
-        """
-        return False
-
-    def settable(
-        self, table: Mapping[str, Parameter], values: Mapping[str, Any], changed: Callable[[str, Any], None]
-    ) -> bool:
-        """Let others read and set the parameters of a node while it runs; whether the backend can.
-
-        cyclonedds cannot, as it has no services. `use_sim_time` belongs to the bus.
-
-        Args:
-            table: The parameters.
-            values: Their values.
-            changed: Called with name and value of each valid change, in the thread that spins.
-        """
-        return False
 
     def knows(self, kind: str) -> bool:
         """Whether messages of a type can be sent and received."""
@@ -180,11 +147,7 @@ class Bus(Protocol):
         """Number of publishers of a topic, including this node, as far as discovered."""
         return len(self.offers(topic))
 
-    def reliable(self, topic: str) -> bool:
-        """Whether every discovered publisher of a topic offers it reliably."""
-        return all(offer.reliable for offer in self.offers(topic))
-
-    def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> Timer:
+    def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> object:
         """Call `due` every `period_s` of the bus's clock, or of wall time, in the thread that spins."""
 
     def now_ns(self) -> int:
@@ -213,7 +176,6 @@ def open_bus(
     backend: Backend = "auto",
     domain: int | None = None,
     discovery: Range | None = None,
-    offers: Offers = "reliable",
 ) -> Bus:
     """Join ROS 2 as a node.
 
@@ -224,7 +186,6 @@ def open_bus(
         backend: ROS client library; "auto" is rclpy if it can be imported, else cyclonedds.
         domain: ROS domain. Default: ROS_DOMAIN_ID, or 0.
         discovery: How far the node can be discovered; see `magtwin.ros.bus.names.range_of`.
-        offers: QoS in which streams of sensor data are offered.
 
     Raises:
         InputError: The backend cannot be imported, or the domain or a variable of the environment is wrong.
@@ -250,13 +211,6 @@ def open_bus(
             broken.append(f"{candidate} is installed but cannot be imported: {str(error).splitlines()[0]}")
             continue
         reach = range_of(discovery)
-        bus: Bus = opened(
-            name, names or Names(), sim_time=sim_time, domain=domain, reach=reach, offers=offers
-        )
+        bus: Bus = opened(name, names or Names(), sim_time=sim_time, domain=domain, reach=reach)
         return bus
     raise InputError("; ".join(broken) or MISSING)
-
-
-def offered(qos: Qos, offers: Offers) -> Qos:
-    """The QoS of a publisher, from that of its topic."""
-    return SENSOR_DATA if qos.sensor and offers == "sensor-data" else qos

@@ -15,11 +15,6 @@ class Alarm:
     due: Callable[[], None]
     next_ns: int
     wall: bool = False
-    live: bool = True
-
-    def cancel(self) -> None:
-        """Do not call it again."""
-        self.live = False
 
 
 class Clock:
@@ -61,17 +56,16 @@ class Clock:
 
     def left_s(self, most_s: float) -> float:
         """Wall time until the next timer, at most `most_s` [s]; unknown in simulated time."""
-        live = [alarm.next_ns for alarm in self._alarms if alarm.live and alarm.wall]
+        live = [alarm.next_ns for alarm in self._alarms if alarm.wall]
         if not live:
             return most_s
         return min(max((min(live) - time.monotonic_ns()) / NS, 0.0), most_s)
 
     def run_due(self) -> None:
         """Call the timers that are due."""
-        self._alarms = [alarm for alarm in self._alarms if alarm.live]
         for alarm in list(self._alarms):
             now = self._time_ns(alarm.wall)
-            if alarm.live and alarm.next_ns and alarm.next_ns <= now:
+            if alarm.next_ns and alarm.next_ns <= now:
                 if not self.sim_time:
                     self.due_wall_ns = time.time_ns() - (now - alarm.next_ns)
                 alarm.next_ns += alarm.period_ns * ((now - alarm.next_ns) // alarm.period_ns + 1)

@@ -1,15 +1,12 @@
 """RclpyBus: a node over rclpy, from a sourced installation of ROS 2 or from its wheels."""
 
 import importlib
-import os
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import rclpy
 import rclpy.parameter
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -18,9 +15,9 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from magtwin.errors import InputError
 from magtwin.io.bags.topics import Qos
-from magtwin.ros.bus.bus import Bus, Endpoint, Handler, Message, Offers, Publisher, Subscription, offered
+from magtwin.parallel.machine import variables
+from magtwin.ros.bus.bus import Bus, Endpoint, Handler, Message, Publisher, Subscription
 from magtwin.ros.bus.names import Names, Range
-from magtwin.ros.parameters import Parameter, checked
 
 MOST_AT_ONCE = 256
 """Callbacks that run before `spin_once` returns."""
@@ -28,20 +25,6 @@ MOST_AT_ONCE = 256
 
 OTHER_S = 0.02
 """Longest wait for messages while there is a second node, which is looked at in between [s]."""
-
-
-@contextmanager
-def _environment(**values: str | None) -> Iterator[None]:
-    """Set variables of the environment, which rclpy reads when it starts; None unsets one."""
-    before = {name: os.environ.pop(name, None) for name in values}
-    os.environ.update({name: value for name, value in values.items() if value is not None})
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name, None)
-            if value is not None:
-                os.environ[name] = value
 
 
 def qos_of(qos: Qos) -> QoSProfile:
@@ -85,10 +68,8 @@ class RclpyBus(Bus):
 
     backend = "rclpy"
 
-    def __init__(
-        self, name: str, names: Names, *, sim_time: bool, domain: int, reach: Range, offers: Offers
-    ) -> None:
-        self.name, self._names, self.reach, self._offers_as = name, names, reach, offers
+    def __init__(self, name: str, names: Names, *, sim_time: bool, domain: int, reach: Range) -> None:
+        self.name, self._names, self.reach = name, names, reach
         self._domain, self._sim_time = domain, sim_time
         self._context, self._node, self._executor = self._joined(name)
         self._calls, self._due_ns, self._kinds = 0, 0, dict[str, str]()
@@ -97,7 +78,7 @@ class RclpyBus(Bus):
     def _joined(self, name: str) -> tuple[Context, Node, SingleThreadedExecutor]:
         """A node and what spins it."""
         context = Context()
-        with _environment(ROS_AUTOMATIC_DISCOVERY_RANGE=self.reach.upper(), ROS_LOCALHOST_ONLY=None):
+        with variables({"ROS_AUTOMATIC_DISCOVERY_RANGE": self.reach.upper(), "ROS_LOCALHOST_ONLY": None}):
             rclpy.init(args=[], context=context, domain_id=self._domain)
         node = Node(
             name,
@@ -122,7 +103,7 @@ class RclpyBus(Bus):
         """As for `Bus`."""
         whole = self._names.resolve(topic)
         sender = self._node_for(whole, kind).create_publisher(
-            class_of(kind), whole, qos_of(offered(qos, self._offers_as))
+            class_of(kind), whole, qos_of(qos)
         )  # takes CDR bytes
         return Publisher(whole, kind, sender.publish, sender.get_subscription_count)
 
@@ -137,49 +118,6 @@ class RclpyBus(Bus):
         node = self._node_for(whole, kind)
         node.create_subscription(class_of(kind), whole, receive, qos_of(qos), raw=True)
         return Subscription(whole, lambda: sum(offer.kind == kind for offer in self.offers(topic)))
-
-    def service(self, name: str, called: Callable[[], None]) -> bool:
-        """As for `Bus`; needs std_srvs."""
-        try:
-            kind = importlib.import_module("std_srvs.srv").Empty
-        except ImportError:
-            return False
-
-        def answer(request: Any, response: Any) -> Any:
-            self._calls += 1
-            called()
-            return response
-
-        self._node.create_service(kind, self._names.resolve(name), answer)
-        return True
-
-    def settable(
-        self, table: Mapping[str, Parameter], values: Mapping[str, Any], changed: Callable[[str, Any], None]
-    ) -> bool:
-        """As for `Bus`."""
-        own = {name: parameter for name, parameter in table.items() if name != "use_sim_time"}
-
-        def wanted(asked: list[Any]) -> Any:
-            known = [parameter for parameter in asked if parameter.name in own]
-            try:
-                for parameter in known:
-                    checked(parameter.name, own[parameter.name], parameter.value)
-            except InputError as error:
-                return SetParametersResult(successful=False, reason=str(error))
-            for parameter in known:
-                changed(parameter.name, parameter.value)
-            return SetParametersResult(successful=True)
-
-        for name, parameter in own.items():  # the description is for `ros2 param describe`
-            described = ParameterDescriptor(
-                description=parameter.doc, additional_constraints=" or ".join(parameter.words)
-            )
-            if parameter.low is not None and parameter.high is not None:
-                span = FloatingPointRange(from_value=float(parameter.low), to_value=float(parameter.high))
-                described.floating_point_range = [span]
-            self._node.declare_parameter(name, values[name], described)
-        self._node.add_on_set_parameters_callback(wanted)
-        return True
 
     def knows(self, kind: str) -> bool:
         """As for `Bus`: types of installed packages."""

@@ -12,7 +12,7 @@ from cyclonedds.idl import types as idl
 from cyclonedds.idl.annotations import final
 from rosbags.interfaces import Nodetype
 
-from magtwin.io.bags.types import fields_of, typestore
+from magtwin.io.bags.types import fields_of
 
 _BASES = {"bool": bool, "byte": idl.byte, "char": idl.uint8, "string": str}
 _BASES |= {name: getattr(idl, name) for name in ("float32", "float64")}
@@ -36,19 +36,15 @@ def ros_name(dds: str) -> str:
 @cache
 def struct_of(kind: str) -> type[IdlStruct]:
     """The structure of a message type, whose samples are bytes; a `DataWriter` takes what `raw` makes."""
-    fields_of(kind)
-    return struct_in(kind, typestore())
-
-
-def struct_in(kind: str, store: Any) -> type[IdlStruct]:
-    """The structure of a message type as a typestore defines it, for `sample_of`."""
-    struct = _struct(kind, store)
+    struct = _struct(kind)
 
     def serialize(self: Any, buffer: Any = None, endianness: Any = None, use_version_2: Any = None) -> bytes:
         return bytes(self.cdr)
 
     def deserialize(cls: Any, data: bytes, has_header: bool = True, use_version_2: Any = None) -> Any:
-        return sample_of(cls, data)
+        sample: Any = object.__new__(cls)
+        sample.cdr = data
+        return sample
 
     struct.serialize = serialize  # type: ignore[method-assign]
     struct.deserialize = classmethod(deserialize)  # type: ignore[assignment]
@@ -57,29 +53,22 @@ def struct_in(kind: str, store: Any) -> type[IdlStruct]:
 
 def raw(kind: str, data: bytes) -> Any:
     """A sample of a message type with these bytes as its CDR."""
-    return sample_of(struct_of(kind), data)
+    return struct_of(kind).deserialize(data)
 
 
-def sample_of(struct: type[IdlStruct], data: bytes) -> Any:
-    """A sample of a structure with these bytes as its CDR."""
-    sample: Any = object.__new__(struct)
-    sample.cdr = data
-    return sample
-
-
-def _struct(kind: str, store: Any) -> type[IdlStruct]:
+def _struct(kind: str) -> type[IdlStruct]:
     name = dds_name(kind)
-    members = {field: _member(described, store) for field, described in store.fielddefs[kind][1]}
+    members = {field: _member(described) for field, described in fields_of(kind)}
     return final(make_idl_struct(name.rpartition("::")[2], name, members))
 
 
-def _member(described: Any, store: Any) -> Any:
+def _member(described: Any) -> Any:
     node, content = described
     if node is Nodetype.BASE:
         return _BASES[content[0]]
     if node is Nodetype.NAME:
-        return _struct(content, store)
+        return _struct(content)
     element, count = content
     if node is Nodetype.ARRAY:
-        return idl.array[_member(element, store), count]
-    return idl.sequence[_member(element, store)]
+        return idl.array[_member(element), count]
+    return idl.sequence[_member(element)]

@@ -7,7 +7,6 @@ published with the stamp of their reading. While the magnetometer is silent, the
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
@@ -25,20 +24,21 @@ from magtwin.io.bags.topics import (
     IMU,
     MAGNITUDE,
     ODOMETRY,
-    SCAN,
     TF,
     VECTOR,
     Qos,
     Topic,
+    map_to_odom,
+    transform_fields,
 )
 from magtwin.io.bags.unit import unit_of
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import Array, Localizer, Prior, Problem, Reading
 from magtwin.localization.track import LocalizerError, checked_estimates
-from magtwin.ros.bus import Bus, Message, Subscription, to_bytes
+from magtwin.ros.bus import Bus, Message, Subscription, poses_bytes, to_bytes
 from magtwin.ros.bus.names import checked_prefix
-from magtwin.ros.diagnostics import Level, Reporter, status_of
-from magtwin.ros.inputs import JUMP_S, Input, LiveFrames, Scanning
+from magtwin.ros.diagnostics import Status
+from magtwin.ros.inputs import JUMP_S
 from magtwin.ros.localization.poses import (
     CLOUD,
     CLOUD_KIND,
@@ -50,14 +50,13 @@ from magtwin.ros.localization.poses import (
     PATH_KIND,
     POSE_KIND,
     START_SD,
-    TF_KIND,
     cloud_bytes,
-    odom_bytes,
     pose_bytes,
     prior_from,
 )
+from magtwin.ros.node import LOOK_S, Node
 from magtwin.ros.parameters import Parameter
-from magtwin.ros.views import Trail, path_bytes
+from magtwin.ros.views import Trail
 from magtwin.twin import Twin
 
 PARAMETERS: Mapping[str, Parameter] = MappingProxyType(
@@ -93,14 +92,8 @@ OTHERS: tuple[Topic, ...] = (IMU, BATTERY, COMMAND, VECTOR)
 QUEUE = Qos(depth=1000, reliable=False)
 """Readings that arrive during a step are kept."""
 
-LOOK_S = 0.5
-"""Time between searches for new topics [s]."""
-
 PATH_S = 1.0
 """Time between messages of the estimated path [s]."""
-
-APART_M = 0.02
-"""Distance of places of the magnetometer that is reported [m]."""
 
 HELD_S = 30.0
 """Age up to which slow topics, such as the battery's, are passed on [s]."""
@@ -142,17 +135,15 @@ class LocalizerNode:
         self._make()
         sender = sender_of(twin.scene.robot, unit="T", rate_hz=settings["rate_hz"])
         self._sender = prefixed(sender, checked_prefix(frame_prefix))
-        age = settings["max_age_s"]
         robot = twin.scene.robot
         axes = {"IMU": robot.q_base_imu_xyzw, "field": robot.q_base_magnetometer_xyzw}
-        self._frames, self._placed = LiveFrames(bus, axes), False
-        told: Any = {"frames": self._frames, "stamps": settings["stamps"], "say": say}
-        self.inputs = {ODOMETRY.name: Input(bus, ODOMETRY, max_age_s=age, **told)}
-        self.inputs |= {topic.name: Input(bus, topic, max_age_s=HELD_S, **told) for topic in OTHERS}
+        self._node = Node(bus, say, self._statuses, settings["stamps"], axes)
+        self.inputs, self.latencies_s = self._node.inputs, self._node.latencies_s
+        self._odometry = self._node.listen(ODOMETRY, max_age_s=settings["max_age_s"])
         for topic in OTHERS:
-            self.inputs[topic.name].silence = "not there: the method gets none of it"
-        lidar = twin.scene.robot.lidar
-        self._scans = Scanning(bus, SCAN, gap_s=lidar.latency_s + 2.5 / max(lidar.scan_rate_hz, 0.1))
+            source = self._node.listen(topic, max_age_s=HELD_S)
+            source.silence = "not there: the method gets none of it"
+        self._scans = self._node.listen_to_scans(robot.lidar)
         self._field: Subscription | None = None
         self._field_kind = ""
         self._pose = bus.publisher(ESTIMATE, POSE_KIND, Qos())
@@ -161,26 +152,21 @@ class LocalizerNode:
         self._path = bus.publisher(PATH, PATH_KIND, Qos(depth=1))
         self._trail = Trail()
         self._tf = None
-        if settings["tf_broadcast"] and bus.knows(TF_KIND):
-            self._tf = bus.publisher(TF.name, TF_KIND, TF.qos)
-            bus.subscribe(TF.name, TF_KIND, self._hear_tf, TF.qos.heard)
+        if settings["tf_broadcast"] and bus.knows(TF.kind):
+            self._tf = bus.publisher(TF.name, TF.kind, TF.qos)
         bus.subscribe(INITIAL, POSE_KIND, self._start_at, Qos().heard)
-        self._reporter = Reporter(bus)
         self._algorithm: Localizer | None = None
         self._tick0, self._done = 0.0, 0
         self._heard_ns, self._stamp_ns, self._period_s = -1, -1, 0.0  # -1: none yet
         self._newest = (-1, math.nan)  # stamp and field of the newest message that holds a field
         self._yaw: float | None = None
         self._cloud_ns = self._path_ns = -NS * 10**6
-        self._own_tf: deque[int] = deque(maxlen=64)
-        self._estimates, self._skipped, self._blind, self._resets, self._broken = 0, 0, 0, 0, 0
-        self._other_tf, self._is_lost, self._missing = False, False, ""
-        self.latencies_s: deque[float] = deque(maxlen=10_000)
-        """Time from the arrival of a reading to its published estimate [s]."""
+        self._blind, self._broken = 0, 0
+        self._is_lost = False
         self._look()
-        bus.timer(LOOK_S, self._look, wall=True)  # also before the first /clock
+        bus.timer(LOOK_S, self._look, wall=True)
         bus.timer(1 / settings["rate_hz"], self._watch)
-        self._reporter.each(self._report)
+        self._node.begin()
 
     def _make(self) -> Localizer:
         """A new object of the method, as for each run."""
@@ -192,9 +178,6 @@ class LocalizerNode:
         return made
 
     def _look(self) -> None:
-        for source in self.inputs.values():
-            source.look()
-        self._scans.look()
         if self._field is None:
             kinds = [kind for kind in MAGNITUDE.reads if kind in self._bus.types(MAGNITUDE.name)]
             if kinds:
@@ -223,7 +206,7 @@ class LocalizerNode:
         headed = message.kind.startswith("sensor_msgs")
         stamped = headed and self._settings["stamps"] == "header"
         try:
-            read = message.read([leaf, *(("header.stamp", "header.frame_id") if headed else ())])
+            read = message.read([leaf, *(("header.stamp",) if headed else ())])
         except InputError:
             self._broken += 1
             return
@@ -235,7 +218,6 @@ class LocalizerNode:
         if self._heard_ns >= 0:
             self._period_s = (stamp - self._heard_ns) / NS
         self._heard_ns = stamp
-        self._check_place(str(read.get("header.frame_id", "")))
         b_nt = _in_nt(float(np.linalg.norm(np.atleast_1d(read[leaf]))))
         if math.isfinite(b_nt):
             self._newest = stamp, b_nt
@@ -243,18 +225,6 @@ class LocalizerNode:
             return
         begun = self._algorithm is not None
         self._step(*(self._newest if begun and self._newest[0] > self._stamp_ns else (stamp, b_nt)), arrived)
-
-    def _check_place(self, frame: str) -> None:
-        """Report once a magnetometer that /tf_static has at another place than the method is told."""
-        if self._placed or (mount := self._frames.place(frame)) is None:
-            return
-        self._placed = True
-        (x, y), (told_x, told_y) = mount.p[:2].tolist(), self._problem.sensor.lever_arm_m
-        if math.hypot(x - told_x, y - told_y) > APART_M:
-            self._say(
-                f"/tf_static has {frame!r} at x, y = {x:.3f}, {y:.3f} m in {mount.base}, the method is told "
-                f"{told_x:.3f}, {told_y:.3f} m: correct the robot's description, or the scene's robot"
-            )
 
     def _due(self, stamp_ns: int) -> bool:
         """Whether the next reading will be after the tick."""
@@ -278,13 +248,13 @@ class LocalizerNode:
         """Give the method a reading and publish its estimate."""
         if stamp_ns <= self._stamp_ns and self._algorithm is not None:
             return
-        odometry = self.inputs[ODOMETRY.name].at(stamp_ns)
-        if odometry is None or odometry[1] > self._settings["max_age_s"]:
-            self._skip(self.inputs[ODOMETRY.name].missing(stamp_ns))
+        odometry = self._odometry.fresh(stamp_ns)
+        if odometry is None:
+            self._node.skip(self._odometry.missing(), "estimate")
             return
         if self._algorithm is None:
             if self._prior is None:
-                self._skip(f"no pose on {INITIAL} yet")
+                self._node.skip(f"no pose on {INITIAL} yet", "estimate")
                 return
             self._begin(stamp_ns)
         algorithm = self._algorithm
@@ -296,7 +266,7 @@ class LocalizerNode:
         )
         self._blind += math.isnan(b_nt)
         self._stamp_ns = stamp_ns
-        reading = self._reading(t, b_nt, odometry[0], stamp_ns)
+        reading = self._reading(t, b_nt, odometry, stamp_ns)
         try:
             estimate = algorithm.step(reading)
         except (Exception, SystemExit) as error:  # whatever the method does wrong
@@ -306,21 +276,21 @@ class LocalizerNode:
                 f"{self._method}.step raised {type(error).__name__} at t = {t:g} s: {error}"
             ) from error
         checked_estimates(self._method, [estimate], np.array([t]))
-        if self._missing:
+        if self._node.missing:
             self._say("localizing")
-        self._missing, self._is_lost = "", bool(estimate.lost)
+        self._node.missing, self._is_lost = "", bool(estimate.lost)
         pose = (estimate.x, estimate.y, estimate.yaw)
         frame = self._sender.map_frame
         self._lost.publish(to_bytes(LOST_KIND, {"data": self._is_lost}))
         self._pose.publish(pose_bytes(stamp_ns, frame, pose, estimate.covariance))
-        self._estimates += 1
+        self._node.done += 1
         self.latencies_s.append(time.monotonic() - arrived)
         if self._tf is not None:
             valid_ns = stamp_ns + round(self._settings["tf_ahead_s"] * NS)
-            self._own_tf.append(valid_ns)
-            frames = (frame, self._sender.odom_frame)
-            p, q = odometry[0]["odom_p"][0], odometry[0]["odom_q_xyzw"][0]
-            self._tf.publish(odom_bytes(valid_ns, frames, estimate, p, q))
+            at = np.array([estimate.x, estimate.y, 0.0]), quat_from_yaw(estimate.yaw)
+            moved = map_to_odom(*at, odometry["odom_p"][0], odometry["odom_q_xyzw"][0])
+            fields = transform_fields(valid_ns, [(frame, self._sender.odom_frame, *moved)])
+            self._tf.publish(to_bytes(TF.kind, fields))
         self._publish_path(stamp_ns, pose)
         self._publish_cloud(stamp_ns, algorithm)
 
@@ -328,7 +298,7 @@ class LocalizerNode:
         self._trail.add([*pose[:2], 0.0], quat_from_yaw(pose[2]))
         if stamp_ns - self._path_ns >= PATH_S * NS:
             self._path_ns = stamp_ns
-            self._path.publish(path_bytes(stamp_ns, self._sender.map_frame, self._trail.poses))
+            self._path.publish(poses_bytes(PATH_KIND, stamp_ns, self._sender.map_frame, self._trail.poses))
 
     def _publish_cloud(self, stamp_ns: int, algorithm: Localizer) -> None:
         rate = self._settings["cloud_hz"]
@@ -378,59 +348,24 @@ class LocalizerNode:
 
     def _restart(self) -> None:
         """Begin anew, after a restart of time; the inputs notice it themselves."""
-        self._resets += 1
+        self._node.resets += 1
         self._say("time jumped back: the method begins anew")
         self._algorithm, self._heard_ns, self._stamp_ns, self._period_s = None, -1, -1, 0.0
         self._newest = (-1, math.nan)
 
-    def _hear_tf(self, message: Message) -> None:
-        """Notice another node that publishes the transform from map to odom."""
-        first = "transforms.0"
-        names = [f"{first}.header.stamp", f"{first}.header.frame_id", f"{first}.child_frame_id"]
-        try:
-            read = message.read(names)
-        except InputError:
-            return  # empty, or damaged
-        frames = (str(read[names[1]]).strip("/"), str(read[names[2]]).strip("/"))
-        ours = frames == (self._sender.map_frame, self._sender.odom_frame)
-        if ours and int(read[names[0]]) not in self._own_tf and not self._other_tf:
-            self._other_tf = True
-            both = f"{frames[0]} to {frames[1]}"
-            self._say(f"another node publishes {both} too: set tf_broadcast:=false here, or stop it there")
-
-    def _skip(self, why: str) -> None:
-        self._skipped += 1
-        if why != self._missing:
-            self._say(f"no estimate: {why}")
-        self._missing = why
-
-    def _report(self, clock: str) -> None:
-        now = self._bus.now_ns()
+    def _statuses(self, clock: str, now: int) -> list[Status]:
         field = self._bus.resolve(MAGNITUDE.name)
-        silent = clock or self._missing
-        if not silent and not self._estimates:
+        silent = clock or self._node.missing
+        if not silent and not self._node.done:
             silent = "no reading yet" if self._field else f"nobody publishes {field}"
-        half, most = 1e3 * np.percentile(self.latencies_s or [np.nan], (50, 99))
         problems = (
             (self._is_lost, "the method does not trust its pose"),
             (self._blind, f"{field} gives no field: odometry alone"),
             (self._broken, f"{self._broken} messages could not be used"),
-            (self._resets, f"time jumped back {self._resets} times"),
-            (self._other_tf, "another node publishes the transform from map to odom too"),
         )
-        values = {
-            "method": self._method,
-            "estimates": str(self._estimates),
-            "median latency [ms]": f"{half:.2f}",
-            "p99 latency [ms]": f"{most:.2f}",
-            "skipped": str(self._skipped),
-        }
-        level: Level = "error" if silent else "ok"
-        words = [f"no estimate: {silent}"] if silent else []
-        status = status_of("estimates", problems, fine="localizing", level=level, words=words, values=values)
-        statuses = [status, *(source.status(now) for source in self.inputs.values())]
-        self._reporter.report(statuses, now)
-        self._skipped = self._blind = self._broken = self._resets = 0
+        values = {"method": self._method, "estimates": str(self._node.done)}
+        self._blind = self._broken = 0
+        return [self._node.status("estimates", "localizing", silent, problems, values)]
 
 
 def prior_of(text: str) -> Prior | None:

@@ -1,21 +1,19 @@
 """Poses: messages of estimated poses, clouds and starts, and back."""
 
 import math
-import struct
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.frames import quat_conjugate, quat_from_yaw, quat_multiply, rotate, yaw_from_quat
-from magtwin.localization.problem import Array, Estimate, Prior
-from magtwin.ros.bus import Message, to_bytes
+from magtwin.frames import quat_from_yaw, yaw_from_quat
+from magtwin.localization.problem import Array, Prior
+from magtwin.ros.bus import Message, poses_bytes, to_bytes
 
 POSE_KIND = "geometry_msgs/msg/PoseWithCovarianceStamped"
 CLOUD_KIND = "geometry_msgs/msg/PoseArray"
 LOST_KIND = "std_msgs/msg/Bool"
-TF_KIND = "tf2_msgs/msg/TFMessage"
 PATH_KIND = "nav_msgs/msg/Path"
 
 ESTIMATE, CLOUD, LOST = "estimate/pose", "estimate/particles", "estimate/lost"
@@ -97,38 +95,4 @@ def cloud_bytes(stamp_ns: int, frame: str, cloud: Array, most: int) -> bytes:
     rows = np.searchsorted(total, (np.arange(count) + 0.5) / max(count, 1) * total[-1])
     kept = cloud[np.minimum(rows, len(cloud) - 1)]
     table = np.column_stack([kept[:, :2], np.zeros(count), quat_from_yaw(kept[:, 2])])
-    empty = to_bytes(CLOUD_KIND, {"header.stamp": np.int64(stamp_ns), "header.frame_id": frame, "poses": 0})
-    head = empty[: _length_at(frame)] + struct.pack("<I", count)
-    padding = -(len(head) - 4) % 8 if count else 0  # doubles are aligned to 8 bytes after the CDR header
-    return head + b"\0" * padding + table.astype("<f8").tobytes()
-
-
-def _length_at(frame: str) -> int:
-    """Place of the number of poses in a PoseArray: after CDR header, stamp and frame, aligned to 4 bytes."""
-    end = 4 + 8 + 4 + len(frame.encode()) + 1
-    return end + -(end - 4) % 4
-
-
-def odom_bytes(
-    stamp_ns: int, frames: tuple[str, str], estimate: Estimate, p_odom: Array, q_odom: Array
-) -> bytes:
-    """A TFMessage of map to odom, such that base_link is at an estimate.
-
-    Args:
-        stamp_ns: Stamp [ns].
-        frames: Names of map and odom.
-        estimate: The pose in map.
-        p_odom: Position of base_link in odom [m], shape (3,).
-        q_odom: Its orientation, xyzw.
-    """
-    q = quat_multiply(quat_from_yaw(estimate.yaw), quat_conjugate(q_odom))
-    p = np.array([estimate.x, estimate.y, 0.0]) - rotate(q, p_odom)
-    transform = {
-        "header.stamp": np.int64(stamp_ns),
-        "header.frame_id": frames[0],
-        "child_frame_id": frames[1],
-        "transform.translation": p,
-        "transform.rotation": q,
-    }
-    fields = {f"transforms.0.{name}": value for name, value in transform.items()}
-    return to_bytes(TF_KIND, {"transforms": 1, **fields})
+    return poses_bytes(CLOUD_KIND, stamp_ns, frame, table)

@@ -17,27 +17,8 @@ from pxr import Plug, Sdf, Usd
 
 from magtwin.errors import InputError, find
 from magtwin.files.outputs import output
-from magtwin.usd.schema.names import VERSION, attribute_name
-
-__all__ = [
-    "FOLDER",
-    "NOUNS",
-    "apply_api",
-    "attribute_name",
-    "author",
-    "author_targets",
-    "declarations",
-    "declared",
-    "has_api",
-    "only_prim_with",
-    "place",
-    "prims_with",
-    "publish",
-    "register",
-    "require_api",
-    "type_of",
-    "value_of",
-]
+from magtwin.usd.schema.names import VERSION
+from magtwin.usd.schema.names import attribute_name as attribute_name
 
 FOLDER = Path(__file__).resolve().parent
 """Folder of the schema library, for PXR_PLUGINPATH_NAME."""
@@ -201,7 +182,7 @@ def _advice(root: Usd.Prim, noun: str) -> str:
     file = root.GetStage().GetRootLayer().realPath
     if not root.IsPseudoRoot() or prims_with(root, noun) or not file:
         return ""
-    if noun in ("lab", "robot", "earthField") and prims_with(root, "anomalyMap"):
+    if noun in ("lab", "robot", "earth") and prims_with(root, "anomalyMap"):
         return (
             f"; it is a map without a scene: magtwin map info {file}, or name it as `map` in a scene's TOML"
         )

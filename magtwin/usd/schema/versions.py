@@ -67,11 +67,7 @@ def unknown_properties(layer: Sdf.Layer) -> list[Sdf.Path]:
 
 
 def check_schema(stage: Usd.Stage, name: str) -> None:
-    """Check the layers of a stage against the schema; each file is warned of once.
-
-    Args:
-        stage: The stage.
-        name: What a warning calls it.
+    """Check the layers of a stage, which warnings call `name`; each file is warned of once.
 
     Raises:
         InputError: As for `version_of`.
@@ -80,16 +76,18 @@ def check_schema(stage: Usd.Stage, name: str) -> None:
         file = Path(layer.realPath)
         if not layer.realPath:
             continue
-        version = version_of(layer)
+        version, said = version_of(layer), ""
         key = layer.realPath, file.stat().st_mtime_ns if file.is_file() else 0  # 0: in a package
         if key in _checked:
             continue
         _checked.add(key)
-        where = name if file.name == Path(name).name else f"{name}: {file.name}"
         if version is not None and version > VERSION:
-            _warn(f"{where}: is of a schema later than {TEXT}; what this magtwin does not know is ignored")
+            said = f"is of a schema later than {TEXT}; what this magtwin does not know is ignored"
         elif unknown := unknown_properties(layer):
-            _warn(f"{where}: {_ignored(unknown)}")
+            said = _ignored(unknown)
+        if said:
+            where = name if file.name == Path(name).name else f"{name}: {file.name}"
+            warnings.warn(f"{where}: {said}", MismatchWarning, stacklevel=3)
 
 
 def _ignored(unknown: list[Sdf.Path]) -> str:
@@ -100,7 +98,3 @@ def _ignored(unknown: list[Sdf.Path]) -> str:
     hint = f"did you mean {near[0]}?" if near else "docs/schema.md has the names"
     more = f" and {len(unknown) - 1} more such names" if len(unknown) > 1 else ""
     return f"<{first.GetPrimPath()}> has {first.name}{more}, not in the schema and ignored; {hint}"
-
-
-def _warn(text: str) -> None:
-    warnings.warn(text, MismatchWarning, stacklevel=4)

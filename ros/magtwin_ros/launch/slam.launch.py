@@ -2,7 +2,7 @@
 
     ros2 launch magtwin_ros slam.launch.py scene:=lab.usda path:=figure8
 
-Without `path`, drive with `ros2 run magtwin_ros teleop`. The simulator's own map is on /ground_truth/map.
+Without `path`, drive with teleop_twist_keyboard. The simulator's own map is on /ground_truth/map.
 """
 
 from launch import LaunchDescription

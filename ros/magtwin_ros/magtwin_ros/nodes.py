@@ -15,25 +15,20 @@ FIRST = {
     "localize": "scene",
     "follow": "path",
     "record": "out",
-    "replay": "run",
-    "teleop": "",
 }
 """Executables, and the parameter of each that is the positional argument of its command."""
 
-NETWORK = ("discovery", "qos", "backend", "domain")
+NETWORK = ("discovery", "backend", "domain")
 """Parameters of every node that are options; an empty one is not set."""
 
 OPTIONS = {
-    "magnetometer": ("network", "online", "measured", "duration_s", "frame_prefix", *NETWORK),
+    "magnetometer": ("network", "duration_s", "frame_prefix", *NETWORK),
     "localize": (
         *("method", "option", "map", "sensor", "odometry", "map_length_m", "seed", "duration_s"),
         *("frame_prefix", *NETWORK),
     ),
 }
 """Parameters of these nodes that are options; their other parameters are settings, name:=value."""
-
-UNTIMED = ("sim", "replay")
-"""Nodes that publish the time and ignore use_sim_time."""
 
 IGNORED = ("--log-level", "--log-config-file", "-e", "--enclave")
 """ROS arguments for logging and security, each with a value, that are ignored."""
@@ -89,7 +84,7 @@ def arguments(node: str, given: list[str]) -> list[str]:
             own.append(f"{name}:={value}")
         elif name != "use_sim_time":
             own.append(f"--{name.replace('_', '-')}={value}")
-        elif node not in UNTIMED:
+        elif node != "sim":  # which publishes the time
             own.append(f"--sim-time={value}")
     named = [f"--{name}={value}" for name, value in options.items()]
     return ["ros", node, *first, *own, *named, *remaps]
@@ -156,4 +151,4 @@ def _starter(node: str) -> Callable[[], None]:
     return lambda: start(node)
 
 
-sim, magnetometer, localize, follow, record, replay, teleop = map(_starter, FIRST)
+sim, magnetometer, localize, follow, record = map(_starter, FIRST)

@@ -1,7 +1,7 @@
 """Drive the robots of a stage in NVIDIA's PhysX: whether they stand, drive a metre and turn.
 
-PhysX runs in another process, and may be installed for another Python: `make physx` makes an environment
-for it, and `MAGTWIN_PHYSX` is the path of its Python.
+PhysX runs in another process, of another Python: `make physx` makes an environment for it, and
+`MAGTWIN_PHYSX` is the path of its Python.
 """
 
 import math
@@ -13,19 +13,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from physx_robots import AHEAD_M, driven_table
+from pxr import Usd
+
 from magtwin.errors import InputError
 from magtwin.export.validation.findings import Check, Finding
-from magtwin.export.validation.physx_robots import AHEAD_M
 from magtwin.files.children import run
 from magtwin.sim.engines.world_process import WorldProcess
 
 PHYSX = "MAGTWIN_PHYSX"
 """Environment variable with the path of a Python that has ovphysx."""
 
-GET_PHYSX = (
-    "ovphysx is not installed; pip install 'magtwin[physx]', or set "
-    f"{PHYSX} to the path of a Python that has it; `make physx` installs one in build/physx"
-)
+GET_PHYSX = f"ovphysx is not installed; `make physx` installs it, {PHYSX} is the path of its Python"
 
 OTHER_PYTHON = {"PYTHONPATH": None}
 """What differs in the environment of a Python that need not be this one."""
@@ -75,12 +74,11 @@ def Plane "MagtwinGround" (
 """
 
 
-def physx(file: Path, driven: Mapping[str, Any]) -> Check:
+def physx(file: Path) -> Check:
     """Drive each robot of a stage.
 
     Args:
         file: The stage. A robot without a ground is put on a plane.
-        driven: What `physx_robots.driven_table` found on it.
 
     Returns:
         Three findings for each robot: `stands`, `drives` and `turns`. They are notes, or errors if they fail.
@@ -88,6 +86,7 @@ def physx(file: Path, driven: Mapping[str, Any]) -> Check:
     python, version = find_python()
     if not python:
         return Check("physx", not_run=GET_PHYSX)
+    driven = driven_table(Usd.Stage.Open(str(file)))
     robots = driven["robots"]
     if not robots:
         return Check("physx", not_run="the stage has no robot with a drive")

@@ -8,18 +8,17 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+import physx_drive
 import pytest
+from physx_drive import STEP_S, find_python, open_world
+from physx_drive import physx as driven_in_physx
+from physx_robots import driven_table, find_room, read_driven
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
-import magtwin.export.validation.physx_drive as physx_drive
 from magtwin.author.scene import author_scene
-from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.export.package import export_scene
 from magtwin.export.usdz import unpack
-from magtwin.export.validation.physx_drive import STEP_S, find_python, open_world
-from magtwin.export.validation.physx_robots import driven_table, find_room, read_driven
-from magtwin.export.validation.validate import validate
 from magtwin.files.file import shipped
 from magtwin.path import figure8
 from magtwin.sim.engines.newton import Newton
@@ -33,6 +32,8 @@ from magtwin.usd.lab.obstacles import read_obstacles
 PYTHON, VERSION = find_python()
 
 physx = pytest.mark.skipif(not PYTHON, reason=physx_drive.GET_PHYSX)
+
+REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 RATE = 5.594
 """Wheels of a TurtleBot 4 at 0.2 m/s [rad/s]."""
@@ -48,6 +49,13 @@ def in_every_form(scene, folder):
         made[name] = folder / name
         export_scene(scene, made[name], trusted=True)
     return made
+
+
+@pytest.fixture(scope="module")
+def lab_scene(tmp_path_factory):
+    """The default lab, as it is authored."""
+    folder = tmp_path_factory.mktemp("lab")
+    return author_scene(scene_from_toml(shipped("scenes", "lab.toml")), folder / "lab")
 
 
 @pytest.fixture(scope="module")
@@ -70,14 +78,6 @@ FORMS = ["scene", "omniverse", "isaac", "newton", "viewer.usdc", "lab.usdz"]
 # Without PhysX
 
 
-def test_a_validator_that_is_missing_is_named_with_how_to_get_it(lab_scene, monkeypatch, capsys):
-    monkeypatch.setenv(physx_drive.PHYSX, "/no/such/python")
-    with pytest.raises(SystemExit) as left:
-        main(["validate", str(lab_scene), "--against", "physx"])
-    assert left.value.code == 1
-    assert "not run: physx: ovphysx is not installed; pip install 'magtwin[physx]'" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("code", "said"),
     [("import time; time.sleep(60)", "took longer than 0.5 s"), ("raise ValueError('no floor')", "no floor")],
@@ -91,7 +91,7 @@ def test_an_engine_that_hangs_or_fails_is_a_finding(lab_scene, monkeypatch, code
     )
     if "time" not in code:
         monkeypatch.setattr(physx_drive, "LIMIT_S", 60)
-    (check,) = validate(lab_scene, ["physx"]).checks
+    check = driven_in_physx(lab_scene)
     (finding,) = check.findings
     assert finding.rule == "unfinished"
     assert said in finding.text
@@ -122,33 +122,7 @@ def test_the_robot_of_the_lab_is_found_with_its_wheels_and_its_ground(lab_scene)
     assert not driven_table(Usd.Stage.CreateInMemory())["ground"]
 
 
-def test_attributes_of_physx_are_on_prims_that_have_their_schema(exports):
-    """PhysX ignores an attribute whose schema is not applied."""
-    stage = Usd.Stage.Open(str(exports["isaac"]))
-    seen = set()
-    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
-        apis = prim.GetPrimTypeInfo().GetAppliedAPISchemas()
-        for prop in prim.GetAuthoredPropertyNames():
-            if prop.startswith("physx"):
-                family = prop.partition(":")[0]
-                schema = f"P{family[1:]}API"
-                assert any(api.partition(":")[0] == schema for api in apis), (prim.GetPath(), prop)
-                seen.add(prop)
-    assert {
-        "physxArticulation:enabledSelfCollisions",
-        "physxJoint:armature",
-        "physxMaterial:frictionCombineMode",
-    } <= seen
-
-
 # In PhysX
-
-
-@physx
-def test_the_lab_passes_and_the_command_says_so_in_a_line_each(lab_scene, capsys):
-    main(["validate", str(lab_scene), "--against", "physx"])
-    lines = [line.strip() for line in capsys.readouterr().out.splitlines() if "note physx" in line]
-    assert [line.split()[2] for line in lines] == ["stands", "drives", "turns"]
 
 
 @physx
@@ -185,19 +159,20 @@ def test_the_robot_of_each_lab_and_of_each_export_rests_drives_and_turns(place, 
 
 @physx
 def test_the_robot_of_an_aprilab_scene_passes(aprilab):
-    (check,) = validate(aprilab["scene"], ["physx"]).checks
+    check = driven_in_physx(aprilab["scene"])
     assert check.result == "passed", check.findings
 
 
 @physx
 @pytest.mark.parametrize("merge", [False, True])
-def test_the_real_robot_passes(real_data, tmp_path, merge):
+@pytest.mark.skipif(not REAL.is_dir(), reason="the real robot is not at hand")
+def test_the_real_robot_passes(tmp_path, merge):
     asset = convert_urdf(
-        real_data / "turtlebot4" / "turtlebot4.urdf",
+        REAL / "turtlebot4" / "turtlebot4.urdf",
         tmp_path / "turtlebot4.usda",
         options=Options(profile="diff-drive", merge_fixed=merge),
     )
-    (check,) = validate(asset, ["physx"]).checks
+    check = driven_in_physx(asset)
     assert [finding.rule for finding in check.findings] == ["stands", "drives", "turns"]
     assert check.result == "passed", check.findings
 
@@ -210,7 +185,7 @@ def test_a_robot_with_hindered_wheels_fails(exports, tmp_path):
     drive = UsdPhysics.DriveAPI(stage.GetPrimAtPath("/World/turtlebot4/joints/left_wheel_joint"), "angular")
     drive.GetMaxForceAttr().Set(1e-6)
     stage.Save()
-    (check,) = validate(tmp_path / "stuck.usda", ["physx"]).checks
+    check = driven_in_physx(tmp_path / "stuck.usda")
     found = {finding.rule: finding.severity for finding in check.findings}
     assert found == {"stands": "note", "drives": "error", "turns": "error"}
 
@@ -222,7 +197,7 @@ def test_a_robot_above_a_hole_falls_and_fails(exports, tmp_path):
     stage = Usd.Stage.Open(str(tmp_path / "hole.usda"))
     stage.RemovePrim("/World/Lab/Ground")  # walls and furniture still collide
     stage.Save()
-    (check,) = validate(tmp_path / "hole.usda", ["physx"]).checks
+    check = driven_in_physx(tmp_path / "hole.usda")
     assert check.findings[0].rule in ("stands", "unfinished")
     assert check.result == "failed"
 
