@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from magtwin.errors import InputError
-from magtwin.field.sources.bodies import mesh_moments
+from magtwin.field.sources.moments import mesh_moments
 from magtwin.files.file import existing
 from magtwin.files.settings import refused_at
 from magtwin.frames import IDENTITY_XYZW, quat_from_yaw, rotate

@@ -25,6 +25,7 @@ from magtwin.urdf.options import DEFAULTS, Options
 from magtwin.urdf.report import ConversionReport
 from magtwin.urdf.reroot import reroot
 from magtwin.usd.geometry import BASE_LINK
+from magtwin.usd.robot import load_robot as load_robot
 from magtwin.usd.robot import urdf_of
 from magtwin.usd.schema import NOUNS, prims_with
 from magtwin.usd.sensors import (

@@ -8,7 +8,6 @@ from typing import Literal, get_args
 
 from magtwin.errors import InputError
 
-Collision = Literal["hull", "decomposition", "mesh"]
 Profile = Literal["general", "diff-drive"]
 _Kind = Literal["velocity", "position", "none"]
 
@@ -78,13 +77,6 @@ class Options:
     arguments: Mapping[str, str] = field(default_factory=dict)
     """Arguments of a xacro."""
 
-    missing_meshes: Literal["box", "note", "refuse"] = "box"
-    """Treatment of a mesh that is missing or unreadable: a box of the link's size in its place; "note" leaves
-    out its visual or collider; "refuse" lists all of them and writes nothing."""
-
-    collision: Collision = "hull"
-    """Mesh colliders: the convex hull, a convex decomposition (extra `decomposition`), or the mesh itself."""
-
     fix_base: bool = False
     """Whether the base is fixed to the world."""
 
@@ -100,9 +92,6 @@ class Options:
     controllers: Path | None = None
     """YAML with the settings of the robot's controllers (ros_control, ros2_control), for its drive."""
 
-    density: float | None = None
-    """Density of links without inertia [kg/m3]; None leaves them without."""
-
     single_file: bool = False
     """Whether to write one root layer and the meshes, instead of Isaac Sim's layers."""
 
@@ -113,17 +102,8 @@ class Options:
     """Whether to skip files and packages that a xacro includes, if they are missing and none of their macros
     is called."""
 
-    mass: float | None = None
-    """Mass on the data sheet, to check the robot's [kg]."""
-
     metadata: Mapping[str, str] = field(default_factory=dict)
     """Metadata of the asset (author, asset_license, category, ...); overrides that of its package."""
-
-    def __post_init__(self) -> None:
-        for name in ("density", "mass"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise InputError(f"{name} must be above 0, got {value!r}")
 
 
 DEFAULTS = Options()

@@ -7,7 +7,6 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Geometry, Link, Shape
 from magtwin.urdf.meshes.mesh import bounds
@@ -25,7 +24,7 @@ THINNEST_M = 0.001
 
 
 def replace_failed(description: Description, meshes: MeshLayer) -> Description:
-    """Replace every shape whose mesh failed, as `Options.missing_meshes` wants.
+    """Replace every shape whose mesh failed by a box.
 
     The box of a link is that around its other shapes; else that of its mass and inertia; else a cube of its
     mass at the density of water; else a cube with edges of `EDGE_M`.
@@ -33,25 +32,15 @@ def replace_failed(description: Description, meshes: MeshLayer) -> Description:
     Args:
         description: The description, which receives a repair for each shape.
         meshes: Its meshes, which receive the boxes.
-
-    Raises:
-        InputError: There are such meshes, and the options refuse them. The message lists all.
     """
-    failed, choice = meshes.failed, meshes.options.missing_meshes
-    for error in failed.values():
+    for error in meshes.failed.values():
         if isinstance(error, MissingFileError) and error.supply:
             description.repairs.supplies[error.supply] = None
-    if failed and choice == "refuse":
-        texts = "; ".join(map(str, failed.values()))
-        supplied = " ".join(description.repairs.supplies)
-        raise InputError(
-            texts + (f"; {supplied} would supply them" if supplied else ""), parameter="missing_meshes"
-        )
     links = dict(description.links)
     for name, link in description.links.items():
         shapes = {role: tuple(_kept(description, meshes, link, role)) for role in ("visual", "collision")}
         links[name] = replace(link, visuals=shapes["visual"], collisions=shapes["collision"])
-    return replace(description, links=links) if failed else description
+    return replace(description, links=links) if meshes.failed else description
 
 
 def _kept(description: Description, meshes: MeshLayer, link: Link, role: str) -> Iterator[Shape]:
@@ -65,19 +54,14 @@ def _kept(description: Description, meshes: MeshLayer, link: Link, role: str) ->
         what = f"mesh {file!r} cannot be read"
         if isinstance(error, MissingFileError):
             what = f"mesh {file!r} is missing{error.near}"
-        about, start = description.mesh_element(file), f"link {link.name!r}: {role}"
-        if meshes.options.missing_meshes == "note":
-            description.note(f"{start} is left out: its {what}", lost=True)
-            yield shape  # the report lists it; no prim is made of it
-            continue
         size, T = _box_of(link, meshes)
         box = Geometry("box", size)
         if role == "visual":
             meshes.primitive(box)
         edges = " x ".join(f"{edge:.3g}" for edge in size)
-        text = f"{start} {what}: a box of {edges} m stands for it"
+        text = f"link {link.name!r}: {role} {what}: a box of {edges} m stands for it"
         kind = "mesh-missing" if isinstance(error, MissingFileError) else "mesh-unreadable"
-        description.repair(kind, text, about)
+        description.repair(kind, text, description.mesh_element(file))
         yield replace(shape, geometry=box, origin=T)
 
 

@@ -10,7 +10,7 @@ from magtwin.author.robot import build_robot, read_settings
 from magtwin.errors import InputError
 from magtwin.files.file import shipped
 from magtwin.frames import rotate
-from magtwin.urdf import read_notes
+from magtwin.usd.robot import read_notes
 from magtwin.usd.geometry import read_links, read_shapes
 from magtwin.usd.robot import load_robot, read_robot
 

@@ -13,7 +13,7 @@ from validators import assert_valid
 
 from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, quat_from_rpy
-from magtwin.urdf import convert_urdf
+from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.physics.inertia import nearest_possible, principal_axes
 from magtwin.usd.geometry import read_links, read_shapes
 

@@ -10,8 +10,8 @@ from pxr import Usd, UsdGeom, UsdPhysics, UsdRender, UsdShade
 from validators import assert_valid
 
 from magtwin.errors import InputError
-from magtwin.urdf import read_notes
 from magtwin.urdf.options import DriveRule, Options
+from magtwin.usd.robot import read_notes
 from magtwin.usd.schema import prims_with
 from magtwin.usd.sensors import read_drive, read_imu, read_lidar, read_magnetometer
 

@@ -20,13 +20,14 @@ from validators import assert_valid
 
 from magtwin.errors import InputError
 from magtwin.files.budget import BUDGETS, Budget
-from magtwin.urdf import convert_urdf, read_notes
+from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.meshes import mesh, polygon, texture
 from magtwin.urdf.meshes.mesh import distinct, read_mesh
 from magtwin.urdf.meshes.piece import Piece
 from magtwin.urdf.meshes.polygon import cut_polygons
 from magtwin.urdf.options import Options
 from magtwin.usd.geometry import linear_from_srgb, read_shapes
+from magtwin.usd.robot import read_notes
 
 GREEN = '<material name="green"><color rgba="0 1 0 1"/></material>'
 

@@ -9,7 +9,7 @@ from pxr import Usd, UsdGeom, UsdPhysics
 from magtwin.author.from_urdf import link_poses
 from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat
-from magtwin.urdf import convert_urdf
+from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.options import Options
 
 POSES = 100

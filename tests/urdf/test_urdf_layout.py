@@ -16,7 +16,7 @@ from validators import assert_valid
 
 from magtwin.errors import InputError
 from magtwin.files.file import shipped
-from magtwin.urdf import convert_urdf
+from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.layout import VARIANTS
 from magtwin.urdf.options import Options
 

@@ -148,7 +148,7 @@ def test_poses_are_yourdfpys_to_the_last_bit(xyz, rpy):
 
 def test_a_conversion_without_hulls_imports_neither_yourdfpy_nor_what_it_brings(tmp_path):
     script = (
-        "import sys; from magtwin.urdf import convert_urdf\n"
+        "import sys; from magtwin.urdf.convert import convert_urdf\n"
         f"convert_urdf({str(URDF / 'input_joints.urdf')!r}, {str(tmp_path / 'j.usda')!r})\n"
         "print(*{'lxml', 'networkx', 'scipy', 'trimesh', 'yaml', 'yourdfpy'} & set(sys.modules))"
     )

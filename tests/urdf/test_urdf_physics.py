@@ -10,7 +10,7 @@ from validators import assert_valid
 
 from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, quat_from_rpy
-from magtwin.urdf import convert_urdf
+from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.description.description import read_description
 from magtwin.urdf.options import DriveRule, Options
 from magtwin.urdf.physics import inertia as solids

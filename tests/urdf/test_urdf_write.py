@@ -13,7 +13,7 @@ from magtwin.author.from_urdf import link_poses, write_urdf
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.files.file import shipped
-from magtwin.urdf import convert_urdf
+from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.description.description import MOVING, origin_of, read_description
 from magtwin.urdf.options import Options
 from magtwin.usd.geometry import read_shapes

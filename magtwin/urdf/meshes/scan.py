@@ -26,7 +26,7 @@ LONGEST_LINE = 4096
 """Most characters of a line of a PLY's header."""
 
 
-def read_scan(reading: Reading) -> list[Piece]:
+def read(reading: Reading) -> list[Piece]:
     """The triangles of an STL or PLY file, for `read_mesh`.
 
     Normals of an STL are ignored: they are those of the faces, from which smooth ones are computed. Texture

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +10,12 @@ from pxr import Usd
 
 from magtwin.errors import InputError
 from magtwin.spec.drive import DriveSpec
+from magtwin.urdf.description.extensions import MODULES
 from magtwin.urdf.description.tag import Tags
 from magtwin.urdf.options import DriveRule
-from magtwin.urdf.physics.controller import base_of_plugin_settings, base_of_settings
 from magtwin.urdf.physics.drive import POSITION_STIFFNESS, WHEEL_DAMPING, holds_position, own_gain
 from magtwin.urdf.physics.mechanism import SINGLE, Mechanism
 from magtwin.urdf.physics.mobile_base import MobileBase
-from magtwin.urdf.physics.plugin import base_of_plugin
 from magtwin.usd.sensors import JOINT_FIELDS, WHEELS_FIELDS, define_drive
 
 COMMANDS = {"velocity": "velocity", "position": "position", "effort": "none"}
@@ -33,9 +33,14 @@ def read_base(tags: Tags, controllers: Path | None = None) -> MobileBase | None:
         InputError: The file of `controllers` names an unknown joint, has an invalid number, or has no
             controller that drives wheels.
     """
+    if controllers is None and not tags.have("plugin"):
+        return None
+    controller: Any = import_module(MODULES["plugin"])
+    base: MobileBase | None
     if controllers is None:
-        return base_of_plugin(tags) or base_of_plugin_settings(tags)
-    base = base_of_settings(tags, controllers)
+        base = controller.base_of_plugin(tags) or controller.base_of_plugin_settings(tags)
+        return base
+    base = controller.base_of_settings(tags, controllers)
     if base is None:
         raise InputError(f"{controllers}: has no controller of a mobile base", parameter="controllers")
     return base

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pxr import Usd, UsdGeom
 
+from magtwin.field.sources.moments import mesh_moments
 from magtwin.frames import canonical
 from magtwin.urdf.meshes.collider import hull_faces
 from magtwin.urdf.meshes.mesh_layer import primitive_of
@@ -173,8 +174,6 @@ def polyhedron(points: NDArray, faces: NDArray) -> MassProperties:
         points: Corners [m], shape (V, 3).
         faces: Triangles, counter-clockwise from outside, shape (F, 3).
     """
-    from magtwin.field.sources.bodies import mesh_moments  # not needed by most robots
-
     volume, centre, spread = mesh_moments(points, faces)
     return MassProperties(volume, centre, volume * (np.trace(spread) * np.eye(3) - spread))
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.spec.drive import DriveSpec
-from magtwin.urdf.description.tag import Element
+from magtwin.urdf.description.tag import Element, Tags
 from magtwin.urdf.physics.mechanism import Mechanism
 
 Kind = Literal["differential", "skid-steer", "mecanum", "holonomic", "car"]
@@ -34,21 +34,13 @@ DRIVEN_AS: Mapping[str, str] = {
 }
 """What the simulator makes of each kind."""
 
-NAMES = {
-    "wheel_separation_m": "wheel separation",
-    "wheel_radius_m": "wheel radius",
-    "wheel_rate_max": "highest wheel rate",
-    "v_max": "highest speed",
-    "w_max": "highest yaw rate",
-    "turning_radius_m": "turning radius",
-}
-UNITS = {
-    "wheel_separation_m": "m",
-    "wheel_radius_m": "m",
-    "wheel_rate_max": "rad/s",
-    "v_max": "m/s",
-    "w_max": "rad/s",
-    "turning_radius_m": "m",
+FIGURES = {
+    "wheel_separation_m": ("wheel separation", "m"),
+    "wheel_radius_m": ("wheel radius", "m"),
+    "wheel_rate_max": ("highest wheel rate", "rad/s"),
+    "v_max": ("highest speed", "m/s"),
+    "w_max": ("highest yaw rate", "rad/s"),
+    "turning_radius_m": ("turning radius", "m"),
 }
 """Names and units of figures in notes."""
 
@@ -120,7 +112,8 @@ def drive_spec(base: MobileBase, mechanism: Mechanism, radius_of: Callable[[str]
     def guess(name: str, value: float | None, how: str) -> None:
         if name not in given and value is not None and 0 < value < np.inf:
             given[name] = float(value)
-            description.note(f"drive: {NAMES[name]} {value:.5g} {UNITS[name]}, {how}")
+            what, unit = FIGURES[name]
+            description.note(f"drive: {what} {value:.5g} {unit}, {how}")
 
     gap = abs(places[left[0]][1] - places[right[0]][1])
     if base.kind == "mecanum" and "wheel_separation_m" not in given:
@@ -181,6 +174,13 @@ def drive_spec(base: MobileBase, mechanism: Mechanism, radius_of: Callable[[str]
         )
     except InputError as error:
         raise InputError(f"{base.source}: {error}") from error
+
+
+def leave_out(tags: Tags, element: Element | None, error: InputError) -> None:
+    """Report a drive that cannot be used, and let its tag be kept as text."""
+    tags.description.repair("drive-incomplete", f"{error}: the drive is kept as text", element)
+    if element is not None:
+        tags.forget(element)
 
 
 def backward(joints: list[str]) -> list[str]:
