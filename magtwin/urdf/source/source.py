@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 
 from magtwin.errors import InputError, near
 from magtwin.files.file import existing
-from magtwin.urdf.repairs import DECLARATION_LATE, Repairs
+from magtwin.urdf.repairs import Repairs
 from magtwin.urdf.source.markup import UnsafeError, read_markup
 from magtwin.urdf.source.package import MissingFileError, Packages
 
@@ -162,9 +162,5 @@ def read_source(
         return Source(path, xml, MappingProxyType(places), around, repairs)
     if arguments:
         raise InputError(f"{path}: is not a xacro and takes no arguments; leave out {', '.join(arguments)}")
-    source = Source(
-        path, markup.root, MappingProxyType({e: (path, n) for e, n in markup.lines.items()}), around
-    )
-    if markup.late:
-        source.repairs.add("declaration-late", DECLARATION_LATE, (path.name, markup.late))
-    return source
+    places = MappingProxyType({element: (path, line) for element, line in markup.lines.items()})
+    return Source(path, markup.root, places, around)

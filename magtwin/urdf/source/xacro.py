@@ -22,9 +22,9 @@ from xml.parsers.expat import ExpatError
 from magtwin.errors import InputError, hint
 from magtwin.files.file import read_bytes
 from magtwin.files.settings import yaml_loader
-from magtwin.urdf.repairs import DECLARATION_LATE, NOTE, Repairs
+from magtwin.urdf.repairs import NOTE, Repairs
 from magtwin.urdf.source.expression import GLOBALS, LARGEST, Budget, ExpressionError, check_size, evaluate
-from magtwin.urdf.source.markup import UnsafeError, in_order, parse_markup
+from magtwin.urdf.source.markup import UnsafeError, parse_markup
 from magtwin.urdf.source.package import MissingFileError, Packages
 
 UNITS, ELEMENT, FILE = 20_000_000, 100, 1_000
@@ -39,16 +39,6 @@ SIBLINGS = 16
 
 PLACE = "magtwin.place"
 """Key of a node's user data: its file and line."""
-
-UNIT_TAGS: Mapping[str, float] = {
-    "!radians": 1.0,
-    "!degrees": 0.017453292519943295,
-    "!meters": 1.0,
-    "!millimeters": 0.001,
-    "!foot": 0.3048,
-    "!inches": 0.0254,
-}
-"""Factors to radians and metres by YAML tag, with xacro's names."""
 
 _PIECES = re.compile(
     r"(?P<escaped>\$\$+[{(])|\$\{(?P<expression>[^}]*)\}|\$\((?P<command>[^)]*)\)|(?P<text>[^$]+|\$[^{($]+|\$$)"
@@ -233,13 +223,9 @@ class _Expansion:
             try:
                 return handle(node, *arguments)
             except self._library.XacroException as error:
-                unknown = f"unknown macro name: {node.tagName}" in str(error.args[0] or "")
-                if not unknown or (not self._skipped and self._path.suffix == ".xacro"):
+                if not self._skipped or f"unknown macro name: {node.tagName}" not in str(error.args[0] or ""):
                     raise
-                if self._skipped:
-                    self._miss(f"macro {node.tagName!r}")
-                else:
-                    self._repair("macro-unknown", f"<{node.tagName}> is no macro: left out")
+                self._miss(f"macro {node.tagName!r}")
                 self._library.replace_node(node, by=None)
                 return True
 
@@ -471,11 +457,8 @@ class _Expansion:
         markup = parse_markup(content, path)
         attributes = sum(len(element.attrib) for element in markup.lines)
         self._budget.spend(ELEMENT * (len(markup.lines) + attributes // 4))
-        if markup.late:
-            file = Path(os.path.relpath(path, self._path.parent)).as_posix()
-            self._repairs.add("declaration-late", DECLARATION_LATE, (file, markup.late))
         try:
-            document = minidom.parseString(in_order(content))
+            document = minidom.parseString(content)
         except ExpatError as error:
             reason = f"{error}".partition(":")[0]
             raise InputError(
@@ -502,8 +485,8 @@ class _Expansion:
                 factor * float(evaluate(str(loader.construct_scalar(node)), GLOBALS, self._budget))
             )
 
-        for tag, factor in UNIT_TAGS.items():
-            UnitLoader.add_constructor(tag, number(factor))
+        for unit in self._library.ConstructUnits:
+            UnitLoader.add_constructor(unit.value.tag, number(unit.value.conversion_constant))
         try:
             content = read_bytes(path, "YAML file", "YAML")
             self._budget.spend(PER_YAML * len(content))
