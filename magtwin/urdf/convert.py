@@ -184,7 +184,7 @@ class _Author:
         notes = Vt.StringArray(description.repairs.notes)
         stage.GetRootLayer().customLayerData = {
             **stage.GetRootLayer().customLayerData,
-            **metadata(stage, description, report, options.metadata),
+            **metadata(stage, report, options.metadata),
             "magtwin": {
                 "source": description.path.name,
                 "sourceSha256": checksum,

@@ -13,9 +13,6 @@ from magtwin.urdf.meshes.mesh import bounds
 from magtwin.urdf.meshes.mesh_layer import MeshLayer
 from magtwin.urdf.source.package import MissingFileError
 
-WATER = 1000.0
-"""Density that gives the size of a link with mass alone [kg/m3]."""
-
 EDGE_M = 0.05
 """Edge of the box of a link of which nothing is known [m]."""
 
@@ -26,8 +23,7 @@ THINNEST_M = 0.001
 def replace_failed(description: Description, meshes: MeshLayer) -> Description:
     """Replace every shape whose mesh failed by a box.
 
-    The box of a link is that around its other shapes; else that of its mass and inertia; else a cube of its
-    mass at the density of water; else a cube with edges of `EDGE_M`.
+    The box of a link is that around its other shapes, or else a cube with edges of `EDGE_M`.
 
     Args:
         description: The description, which receives a repair for each shape.
@@ -73,15 +69,6 @@ def _box_of(link: Link, meshes: MeshLayer) -> tuple[NDArray[np.float64], NDArray
     if known:
         low, high = bounds(np.vstack(known))
         size, T[:3, 3] = high - low, (low + high) / 2
-    elif link.inertial is not None and link.inertial.mass:
-        mass, T = link.inertial.mass, origin_of(link.inertial).copy()
-        size = np.full(3, (mass / WATER) ** (1 / 3))
-        if link.inertial.inertia is not None:
-            moments, R = np.linalg.eigh(link.inertial.inertia)
-            squares = 6 * (moments.sum() - 2 * moments) / mass
-            if squares.min() > 0:  # a box of these edges has the same inertia: I_1 = m (b^2 + c^2) / 12
-                size = np.sqrt(squares)
-                T[:3, :3] = T[:3, :3] @ R * np.sign(np.linalg.det(R))
     return np.maximum(np.round(size, 6), THINNEST_M), T
 
 

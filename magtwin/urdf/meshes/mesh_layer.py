@@ -22,6 +22,7 @@ from magtwin.urdf.meshes.reading import Images
 from magtwin.urdf.meshes.texture import Textures
 from magtwin.urdf.source.package import MissingFileError
 from magtwin.usd import solids
+from magtwin.usd.attributes import read_number
 from magtwin.usd.layers import describe_stage
 from magtwin.usd.schema import place
 
@@ -31,6 +32,14 @@ ROOT = Sdf.Path("/Meshes")
 
 MESH = "mesh"
 """Name of the mesh below a visual's prim."""
+
+KINDS = {
+    UsdGeom.Cube: "box",
+    UsdGeom.Capsule: "capsule",
+    UsdGeom.Cylinder: "cylinder",
+    UsdGeom.Sphere: "sphere",
+}
+"""URDF's primitives by USD's, which are along the same axis where the conversion authors them."""
 
 PRIMITIVE = "magtwin:primitive"
 """Custom data of a mesh that shows a primitive: its kind and measures [m]."""
@@ -243,21 +252,25 @@ def gather(description: Description, textures: str) -> MeshLayer:
 
 
 def primitive_of(prim: Usd.Prim) -> Geometry | None:
-    """The primitive that a mesh shows; None for other meshes.
+    """The primitive that a gprim is, or that a mesh shows; None for others.
 
     Raises:
-        InputError: The note that says so is damaged.
+        InputError: The note of a mesh that says so is damaged, or a size is none.
     """
     values = prim.GetCustomDataByKey(PRIMITIVE)
     if not values:
-        return None
+        kind = next((kind for schema, kind in KINDS.items() if prim.IsA(schema)), "")
+        if kind == "box":
+            return Geometry("box", np.full(3, read_number(prim, "size")))
+        length = read_number(prim, "height") if kind in ("capsule", "cylinder") else 0.0
+        return Geometry(kind, radius=read_number(prim, "radius"), length=length) if kind else None
     try:
         radius, length = (float(values.get(name, 0.0)) for name in ("radius", "length"))
         size = np.array(values.get("size", (1.0, 1.0, 1.0)), float)
         kind = str(values["kind"])
     except (AttributeError, KeyError, TypeError, ValueError):
         kind, size, radius, length = "", np.ones(3), 0.0, 0.0
-    if kind not in ("box", "capsule", "cylinder", "sphere") or size.shape != (3,):
+    if kind not in KINDS.values() or size.shape != (3,):
         raise InputError(f"{place(prim)}: its customData {PRIMITIVE} is damaged; remove it")
     return Geometry(kind, size, radius, length)
 
