@@ -10,9 +10,8 @@ from magtwin.author.robot import build_robot, read_settings
 from magtwin.errors import InputError
 from magtwin.files.file import shipped
 from magtwin.frames import rotate
-from magtwin.usd.robot import read_notes
 from magtwin.usd.geometry import read_links, read_shapes
-from magtwin.usd.robot import load_robot, read_robot
+from magtwin.usd.robot import load_robot, read_notes, read_robot
 
 HOME = shipped("robots", "turtlebot4")
 ASSET = HOME / "turtlebot4.usda"

@@ -3,6 +3,7 @@
 import textwrap
 
 import numpy as np
+import yourdfpy
 from pxr import Usd, UsdPhysics
 
 from magtwin.urdf.convert import convert_with_report
@@ -39,6 +40,19 @@ def converted(path, **options):
     stage = Usd.Stage.Open(str(out))
     stage.Reload()
     return stage, stage.GetDefaultPrim(), report
+
+
+def link_poses(path, values):
+    """T_root_link of each link by yourdfpy, shape (4, 4), with joints at values by name; mimics follow."""
+    peer = yourdfpy.URDF.load(str(path), load_meshes=False)
+    peer.update_cfg(dict(values))
+    return {link.name: peer.get_transform(link.name, peer.base_link) for link in peer.robot.links}
+
+
+def masses(stage):
+    """Mass of each body by name [kg]."""
+    bodies = [prim for prim in stage.Traverse() if prim.HasAPI(UsdPhysics.RigidBodyAPI)]
+    return {body.GetName(): UsdPhysics.MassAPI(body).GetMassAttr().Get() for body in bodies}
 
 
 def prim(robot, name):

@@ -47,6 +47,8 @@ def test_a_robot_of_too_many_links_or_joints_is_refused_at_once(tmp_path, monkey
         read_description(robot(tmp_path, *links, link("x")))
     with pytest.raises(InputError, match=r"robot\.urdf:1: over 3 joints; split the file"):
         read_description(robot(tmp_path, *links, *joints, *joints))
+    with pytest.raises(InputError, match=r"robot\.urdf:\d+: joint 'j0' exists twice.*rename one"):
+        read_description(robot(tmp_path, link("l0"), joint("j0", "l0", "a"), joint("j0", "l0", "b")))
     with pytest.raises(InputError, match=r"robot\.urdf:1: over 3 visuals; split the file"):
         read_description(robot(tmp_path, link("l", "<visual/>" * 4)))
 
@@ -60,24 +62,6 @@ def test_colliders_in_one_place_are_compared_up_to_a_count(tmp_path, monkeypatch
     monkeypatch.setattr(articulation, "COMPARED", 14)
     with pytest.raises(InputError, match="link 'l4': over 14 pairs of colliders are in one place"):
         convert_urdf(robot(tmp_path, *links, *joints), tmp_path / "r.usda", force=True)
-
-
-def test_joints_of_one_name_are_numbered_in_their_order(tmp_path):
-    links = [link(f"l{i}") for i in range(6)]
-    joints = [joint("j", "l0", f"l{i + 1}") for i in range(4)]
-    path = robot(tmp_path, *links, joints[0], *joints, joint("j_3", "l0", "l5"))
-    description = read_description(path)
-    assert [j.name for j in description.joints.values()] == ["j", "j_2", "j_4", "j_5", "j_3"]
-    assert [entry.text.rpartition(": ")[2] for entry in description.repairs.entries] == [
-        "the second is equal and left out",
-        *(f"the second is called 'j_{n}'" for n in (2, 4, 5)),
-    ]
-
-
-def test_links_of_one_name_follow_the_joints_that_hold_them(tmp_path):
-    links = [link("l0"), link("l"), link("l", "<visual/>"), link("l", "<collision/>")]
-    description = read_description(robot(tmp_path, *links, *(joint(f"j{i}", "l0", "l") for i in range(3))))
-    assert {j.name: child for child, j in description.joints.items()} == {"j0": "l", "j1": "l_2", "j2": "l_3"}
 
 
 def test_near_names_are_looked_for_a_limited_number_of_times(tmp_path, monkeypatch):

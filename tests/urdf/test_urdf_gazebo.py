@@ -10,7 +10,7 @@ from pxr import Usd, UsdGeom, UsdPhysics, UsdRender, UsdShade
 from validators import assert_valid
 
 from magtwin.errors import InputError
-from magtwin.urdf.options import DriveRule, Options
+from magtwin.urdf.options import DriveRule
 from magtwin.usd.robot import read_notes
 from magtwin.usd.schema import prims_with
 from magtwin.usd.sensors import read_drive, read_imu, read_lidar, read_magnetometer
@@ -93,12 +93,6 @@ def test_a_figure_may_be_in_the_attribute_value_and_one_link_that_collides_with_
 def test_friction_that_differs_across_is_a_loss(tmp_path):
     _, _, report = cart(tmp_path, on("left_wheel", "<mu1>1</mu1><mu2>0.2</mu2>"))
     assert report.losses == ("link 'left_wheel': friction 1 is used across too, in place of mu2 0.2",)
-
-
-def test_a_link_without_gravity_floats_in_physx(tmp_path):
-    _stage, robot, report = cart(tmp_path, on("left_wheel", "<gravity>false</gravity>"))
-    assert robot.GetPrimAtPath("left_wheel").GetAttribute("physxRigidBody:disableGravity").Get() is True
-    assert any("has no gravity in PhysX" in note for note in report.notes)
 
 
 # --- sensors --------------------------------------------------------------------------------------
@@ -441,8 +435,8 @@ def test_the_real_robot_passes_the_validators_and_nothing_is_silent(tagged_robot
     assert_valid(out, tmp_path)
     assert report.unknown_tags["gazebo/sensor/visualize"] == 13
     assert any("tags without a meaning here are kept as text" in note for note in read_notes(out))
-    assert len(report.losses) == 2  # the two meshes that upstream lacks
-    assert all("is left out: its mesh" in loss for loss in report.losses)
+    assert [line.count for line in report.repairs if line.kind == "mesh-missing"] == [2]  # lacks upstream
+    assert not report.losses
 
 
 def test_settings_come_before_tags_and_leave_one_sensor_of_each_kind(tmp_path, real_data):
@@ -454,7 +448,6 @@ def test_settings_come_before_tags_and_leave_one_sensor_of_each_kind(tmp_path, r
         lidar=LidarSpec(link="rplidar_link", scan_rate_hz=7.5),
         imu=ImuSpec(link="oakd_imu_frame", rate_hz=200),
         magnetometer=MagnetometerSpec(link="tower_sensor_plate"),
-        conversion=Options(missing_meshes="note"),
     )
     urdf = real_data / "turtlebot4" / "turtlebot4_gazebo_tags.urdf"
     out = tmp_path / "turtlebot4" / "turtlebot4.usda"

@@ -5,12 +5,10 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 
 from magtwin.urdf.meshes.collider import hull_faces
 from magtwin.urdf.meshes.mesh import _distinct_words, distinct
-from magtwin.urdf.physics.articulation import _overlap
 from magtwin.urdf.physics.inertia import is_closed, polyhedron
 from magtwin.usd.solids import CREASE, capsule, corner_normals
 
@@ -40,18 +38,6 @@ def test_rows_are_told_apart_with_and_without_keys(seed, width):
     words = np.ascontiguousarray(rows + np.float32(0)).view(np.uint32)
     for fast, slow in zip((first, kind), _distinct_words(words), strict=True):
         assert_array_equal(fast, slow)
-
-
-@settings(max_examples=60, deadline=None)
-@given(seed=SEEDS, kinds=st.tuples(st.integers(0, 3), st.integers(0, 3)), apart=st.floats(0, 4))
-def test_hulls_overlap_where_a_linear_program_has_a_solution(seed, kinds, apart):
-    rng = np.random.default_rng(seed)
-    a, b = (cloud(rng, kind) for kind in kinds)
-    b = b + apart * rng.normal(size=3) + 1e-4 * rng.normal(size=3)
-    ones = np.concatenate([np.ones(len(a)), np.zeros(len(b))])
-    equal = np.vstack([np.hstack([a.T, -b.T]), ones, 1 - ones])
-    found = linprog(np.zeros(len(ones)), A_eq=equal, b_eq=[0, 0, 0, 1, 1], bounds=(0, None), method="highs")
-    assert _overlap(a, b) == (found.status == 0)
 
 
 @settings(max_examples=40, deadline=None)

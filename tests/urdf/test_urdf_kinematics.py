@@ -6,8 +6,6 @@ from made import urdf
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics
 
-from magtwin.author.from_urdf import link_poses
-from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat
 from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.options import Options
@@ -215,35 +213,3 @@ def test_a_floating_joint_holds_nothing_and_a_floating_base_is_the_base(tmp_path
     assert set(stage.joints) == {"finger", "other", "swing"}
     assert stage.robot.GetPrimAtPath("base/base_footprint")
     assert_allclose(stage.poses({})["plate"][:3, 3], [0.1, 0, 0.3], atol=1e-9)
-
-
-FOLLOWERS = arms(
-    "followers",
-    [
-        ("prismatic", f'<axis xyz="0 3 4"/>{LIMIT}'),  # of length 5
-        ("revolute", f'<axis xyz="0 0 2"/>{LIMIT}<mimic joint="j1" multiplier="2" offset="0.1"/>'),
-        ("revolute", f'<origin xyz="1 0 0"/><axis xyz="0 0 1"/>{LIMIT}<mimic joint="j2" multiplier="-1"/>'),
-    ],
-)
-
-
-def test_links_stand_where_an_axis_of_any_length_and_followers_of_followers_put_them(tmp_path):
-    poses = link_poses(urdf(tmp_path, FOLLOWERS, "followers"), {"j1": 0.5})
-    turn = 2 * 0.5 + 0.1
-    assert list(poses) == ["l0", "l1", "l2", "l3"]
-    assert_allclose(poses["l1"][:3, 3], [0, 0.3, 0.4], atol=1e-15)
-    assert_allclose(poses["l2"][:2, 0], [np.cos(turn), np.sin(turn)], atol=1e-15)
-    assert_allclose(poses["l3"][:3, :3], np.eye(3), atol=1e-15)
-    assert_allclose(poses["l3"][:3, 3], [np.cos(turn), 0.3 + np.sin(turn), 0.4], atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("positions", "text"),
-    [
-        ({"j9": 1.0}, "no joint with one position 'j9'; known: j1, j2, j3"),
-        ({"j2": 1.0}, "joint 'j2' follows 'j1'; give that one's"),
-    ],
-)
-def test_a_position_that_no_joint_takes_is_refused(tmp_path, positions, text):
-    with pytest.raises(InputError, match=text):
-        link_poses(urdf(tmp_path, FOLLOWERS, "followers"), positions)

@@ -103,7 +103,7 @@ def test_the_layers_compose_to_the_single_file_prim_by_prim(tmp_path):
 @pytest.mark.parametrize("name", ["real_robot", "tagged_robot"])
 def test_the_real_robots_layers_compose_to_its_single_file(name, request, tmp_path):
     urdf, out, _ = request.getfixturevalue(name)
-    options = Options(single_file=True, missing_meshes="note")
+    options = Options(single_file=True)
     assert_equal(composed(convert_urdf(urdf, tmp_path / "a.usda", options=options)), composed(out))
 
 
@@ -249,17 +249,12 @@ def test_a_conversion_that_fails_leaves_nothing(tmp_path):
     assert not list((tmp_path / "made").iterdir())
 
 
-def test_metadata_come_from_the_package_by_default(tmp_path, monkeypatch):
-    (tmp_path / "package.xml").write_text(
-        "<package><name>arms</name><author>A. Maker</author><license>BSD-3-Clause</license></package>"
-    )
-    monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
+def test_metadata_are_those_that_are_given(tmp_path):
     choices = Options(metadata={"category": "toy", "asset_license": "MIT"})
     out = convert_urdf(arm(tmp_path), tmp_path / "made" / "arm.usda", options=choices)
     said = Sdf.Layer.FindOrOpen(str(out)).customLayerData["SimReady_Metadata"]
-    names = ("author", "asset_license", "category", "usd_date_generated", "asset_name", "rigid_body_count")
-    assert [said[name] for name in names] == ["A. Maker", "MIT", "toy", "1970-01-02", "arm", 2]
-    assert said["mass"] == 2
+    names = ("author", "asset_license", "category", "asset_name", "rigid_body_count", "mass")
+    assert [said[name] for name in names] == ["not stated", "MIT", "toy", "arm", 2, 2]
 
 
 @pytest.mark.parametrize(
@@ -322,7 +317,7 @@ def test_the_real_robot_is_simready(simready, real_data, tmp_path, name):
     convert_with_report(
         real_data / "turtlebot4" / f"{name}.urdf",
         out,
-        options=Options(missing_meshes="note", profile="diff-drive"),
+        options=Options(profile="diff-drive"),
         thumbnail=thumbnail,
     )
     assert not failures(simready, out, "Robot-Body", "3.0.0", tmp_path)
