@@ -25,7 +25,7 @@ from magtwin.urdf.meshes.mesh_layer import MeshLayer, free_name, gather
 from magtwin.urdf.meshes.texture import TEXTURES
 from magtwin.urdf.options import DEFAULTS, Options
 from magtwin.urdf.physics.articulation import define_articulation, filter_overlaps
-from magtwin.urdf.physics.control import define_differential, read_base, read_commands
+from magtwin.urdf.physics.control import read_base, read_commands
 from magtwin.urdf.physics.drive import NO_WHEELS, Wheels, check_rules
 from magtwin.urdf.physics.gazebo import (
     Surface,
@@ -351,7 +351,8 @@ class _Author:
         kind = "Wheeled" if wheeled else "Manipulator" if held else "Default"  # of Isaac Sim's list
         robot.CreateAttribute("isaac:robotType", Sdf.ValueTypeNames.Token, custom=False).Set(kind)
         if drive is not None:
-            define_differential(robot, drive, {name: path.name for name, path in ledger.joints.items()})
+            names = {name: path.name for name, path in ledger.joints.items()}
+            import_module(MODULES["sensor"]).define_differential(robot, drive, names)
         if tags.have("sensor"):
             import_module(MODULES["sensor"]).define_sensors(tags, robot, link_of)
         ledger.unknown_tags = tags.keep(

@@ -32,16 +32,16 @@ class DriveRule:
     """Maximum torque or force [N m or N]. Default: the joint's effort."""
 
     def __post_init__(self) -> None:
-        wanted = {"velocity": "damping", "position": "stiffness"}.get(self.type)
+        used = {"velocity": ("damping",), "position": ("stiffness", "damping")}.get(self.type, ())
         for name, figure in (("stiffness", self.stiffness), ("damping", self.damping)):
             if not 0 <= figure < math.inf:
                 raise InputError(f"drive {self.joints!r}: {name} must be a number from 0 up, got {figure!r}")
-            if name == wanted and figure == 0:
-                raise InputError(
-                    f"drive {self.joints!r}: without {name} it cannot hold a {self.type}; give {name}="
-                )
-            if figure and (self.type == "none" or (self.type == "velocity" and name == "stiffness")):
+            if figure and name not in used:
                 raise InputError(f"drive {self.joints!r}: type {self.type} has no {name}, got {figure:g}")
+        if used and not getattr(self, used[0]):
+            raise InputError(
+                f"drive {self.joints!r}: without {used[0]} it cannot hold a {self.type}; give it"
+            )
         if self.max_force is not None and not 0 < self.max_force < math.inf:
             raise InputError(f"drive {self.joints!r}: max_force must be above 0, got {self.max_force!r}")
 

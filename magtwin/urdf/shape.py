@@ -18,7 +18,7 @@ from magtwin.urdf.meshes.texture import Image, read_image
 from magtwin.urdf.physics.gazebo import Surface
 from magtwin.urdf.physics.inertia import quaternion
 from magtwin.urdf.source.package import MissingFileError
-from magtwin.usd.sensors import write_pose
+from magtwin.usd.attributes import write_pose
 
 VISUALS, COLLISIONS = "visuals", "collisions"
 """Xforms below a link's prim."""

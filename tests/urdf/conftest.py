@@ -13,7 +13,7 @@ def real_robot(real_data, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def tagged_robot(real_data, tmp_path_factory):
-    """The same of its description with Gazebo's tags, boxes in the place of two meshes that upstream lacks."""
+    """The same with Gazebo's tags, and boxes in the place of two meshes that upstream lacks."""
     return _converted(real_data, tmp_path_factory, "turtlebot4_gazebo_tags")
 
 

@@ -98,17 +98,6 @@ def test_meshes_of_every_format_arrive_scaled_and_facing_outwards(tmp_path, suff
     assert_valid(path.with_suffix(".usda"), tmp_path)
 
 
-def test_big_arrays_stay_out_of_the_text(tmp_path):
-    trimesh.creation.icosphere().export(tmp_path / "ball.stl")
-    mesh = '<visual><geometry><mesh filename="ball.stl"/></geometry></visual>'
-    path = urdf(tmp_path, f"<link name='base_link'>{{INERTIAL}}{mesh}</link>")
-    converted(path, single_file=False)
-    assert (tmp_path / "payloads" / "geometries.usdc").read_bytes().startswith(b"PXR-USDC")
-    text = [file.read_text() for file in tmp_path.rglob("*.usda")]
-    assert len(text) == 8
-    assert not [layer for layer in text if "points" in layer]
-
-
 # --- inertia and normals --------------------------------------------------------------------------
 
 

@@ -2,7 +2,6 @@
 
 import tracemalloc
 from pathlib import Path
-from xml.etree import ElementTree
 
 import pytest
 
@@ -14,10 +13,7 @@ from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.description.description import read_description
 from magtwin.urdf.meshes.mesh import read_mesh
 from magtwin.urdf.physics import articulation
-from magtwin.urdf.physics.mechanism import read_mechanism
-from magtwin.urdf.physics.merge import place_links, riders
-from magtwin.urdf.source import markup, xacro
-from magtwin.urdf.source.expression import GLOBALS, evaluate
+from magtwin.urdf.source import xacro
 from magtwin.urdf.source.markup import plain_text
 from magtwin.urdf.source.settings import read_settings
 from magtwin.urdf.source.source import read_source
@@ -74,29 +70,12 @@ def test_near_names_are_looked_for_a_limited_number_of_times(tmp_path, monkeypat
     assert "no joint 'j': the mimic is left out" in texts[1]
 
 
-def test_a_chain_of_frames_rides_on_the_first_body(tmp_path):
-    mass = '<inertial><mass value="1"/></inertial>'
-    links = [link(f"l{i}") for i in range(100)]
-    chain = [joint(f"j{i}", f"l{i}", f"l{i + 1}") for i in range(99)]
-    body = [
-        link("body", mass),
-        joint("k", "l98", "body"),
-        link("arm", mass),
-        joint("m", "body", "arm", "floating"),
-    ]
-    path = robot(tmp_path, *links, *chain, *body)
-    groups = riders(place_links(read_mechanism(read_description(path))))
-    assert list(groups) == ["body", "arm"]
-    assert [name for name, _ in groups["body"]] == ["body", *(f"l{i}" for i in range(99)), "l99"]
-
-
 # --- xacro ----------------------------------------------------------------------------------------
 
 HEAD = '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">'
 ROOT = '<link name="base_link"/></robot>'
 MANY = 200
 UNUSED = f'<xacro:if value="0">{"<a/>" * MANY}</xacro:if>'
-DEEP = "".join(f" for a{i} in [1]" for i in range(60))
 WEARING = {
     "bodies of macros": f'<xacro:macro name="m">{UNUSED}</xacro:macro>' + "<xacro:m/>" * MANY,
     "bodies of comments": f'<xacro:macro name="m">{"<!---->" * MANY * 4}</xacro:macro>' + "<xacro:m/>" * MANY,
@@ -133,28 +112,6 @@ def test_a_xacro_pays_for_all_its_work(work, tmp_path, monkeypatch):
         read_source(path)
 
 
-def test_a_comprehension_in_sixty_others_is_not_slower_for_the_names_outside():
-    assert evaluate(f"len([pi{DEEP} for x in range(500)])", GLOBALS, xacro.Budget(200_000)) == 500
-    nested = "[x + y for x in [1] for y in [x + 1] for x in [y, y + 1]]"
-    assert evaluate(nested, {}, xacro.Budget(999)) == [4, 5]
-
-
-def test_parameters_of_macros_are_read_as_the_library_reads_them():
-    library = pytest.importorskip("xacro")
-    ours = xacro._Expansion.__new__(xacro._Expansion)
-    ours._budget = xacro.Budget(100_000)
-    for text in (
-        "a b",
-        "a:=1 b",
-        "a=^ *b",
-        "a:=^|${x + 1} b:='c d'",
-        "  a:='' b",
-        'a := "x y"z **c',
-        "a:= b",
-    ):
-        assert ours._parameter(text) == library.parse_macro_arg(text), text
-
-
 def test_patterns_of_includes_match_files_in_folders_and_skip_hidden_ones(tmp_path):
     for name in ("b/one.xacro", "a/two.xacro", "a/.hidden.xacro", ".c/three.xacro"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -180,14 +137,6 @@ def test_text_of_many_lines_takes_no_object_for_each(tmp_path):
     assert most < 20 * path.stat().st_size  # 76 bytes an object, for 3 bytes of the file
     assert len(line) == len("<x></x>") + 2 * 300_000
     assert line[:6] == "<x>\u0100 \u0100"
-
-
-@pytest.mark.parametrize("block", [1, 2, 3, 100])
-def test_an_element_is_put_on_one_line_in_blocks_of_any_size(block, monkeypatch):
-    monkeypatch.setattr(markup, "BLOCK", block)
-    monkeypatch.setattr(markup, "LONG", 0)
-    element = ElementTree.fromstring("<a>  one\n\n two <b/>three\t four<b c='  5 '/>  </a>")
-    assert plain_text(element) == " ".join(ElementTree.tostring(element, encoding="unicode").split())
 
 
 def test_a_material_that_nothing_wears_takes_no_room_and_groups_are_counted(tmp_path, monkeypatch):

@@ -163,18 +163,6 @@ def test_a_texture_is_copied_beside_the_asset_and_keeps_its_place_on_the_mesh(tm
     assert_valid(stage.GetRootLayer().realPath, tmp_path)
 
 
-def test_images_are_shared_by_content_not_by_name(tmp_path):
-    (tmp_path / "a").mkdir()
-    picture(tmp_path / "t.png")
-    picture(tmp_path / "copy.png")
-    picture(tmp_path / "a" / "T.png", [(0, 255, 0)])
-    (tmp_path / "a" / "paint.mtl").write_text("newmtl red\nmap_Kd T.png\n")
-    (tmp_path / "a" / "o.obj").write_text(SQUARES)
-    file = squares(tmp_path, "newmtl red\nmap_Kd t.png\nnewmtl blue\nmap_Kd copy.png\n")
-    robot(tmp_path, visual(file) + visual("a/o.obj"))
-    assert sorted(p.name for p in (tmp_path / "out/payloads/textures").iterdir()) == ["T_2.png", "t.png"]
-
-
 def test_a_bitmap_becomes_png_with_a_note(tmp_path):
     Image.new("RGB", (2, 2), (10, 20, 30)).save(tmp_path / "t.bmp")
     stage = robot(tmp_path, visual(squares(tmp_path, "newmtl red\nmap_Kd t.bmp\nnewmtl blue\n")))
@@ -433,67 +421,22 @@ def test_a_collada_id_may_be_that_of_another_kind_or_of_a_source_in_another_geom
     assert_allclose(mesh.points[mesh.faces[4:]], POINTS[FACES])
 
 
-def test_a_skin_is_left_out_and_noted(tmp_path):
-    path = dae(tmp_path / "n.dae", '<node><instance_controller url="#c"/>{mesh}</node>')
-    controller = (
-        '<library_controllers><controller id="c"><skin source="#g"/></controller></library_controllers>'
-    )
-    path.write_text(path.read_text().replace("<library_images>", f"{controller}<library_images>"))
-    mesh = read_mesh(path)
-    assert len(mesh.faces) == 4
-    assert mesh.notes == (("n.dae: skin '#c' is left out; apply its bones and export again", True),)
-
-
+ACCESSOR = 'count="3" offset="3" stride="3"'
 DAE_REFUSED = {
     "entities": ("<COLLADA", '<!DOCTYPE x [<!ENTITY a "b">]><COLLADA', r"n\.dae:2: has a DOCTYPE"),
-    "nan": (" 3.0\n", " nan\n", r"has vertices that are not finite numbers; export it again"),
-    "offset": (
-        'count="4" stride="3"',
-        'count="3" offset="3" stride="3"',
-        r"n\.dae:\d+: an <accessor> whose values have an offset or no names; export it again",
-    ),
-    "index": (
-        "<p>0 2 1",
-        "<p>0 2 x",
-        r"n\.dae:\d+: geometry 'g' cannot be read \(Corrupted index in .*\); export",
-    ),
-    "row": (
-        "<p>0 2 1",
-        "<p>0 2",
-        r"n\.dae:\d+: geometry 'g' cannot be read \(cannot reshape .*\); export it again",
-    ),
-    "vertex": (
-        "<p>0 2 1",
-        "<p>0 2 9",
-        r"n\.dae:\d+: geometry 'g' cannot be read \(.*9.* go beyond .*\); export",
-    ),
-    "negative": ("<p>0 2 1", "<p>0 2 -1", r"n\.dae:\d+: an index is -1; export it again"),
-    "source": (
-        'source="#u"',
-        'source="#gone"',
-        r"geometry 'g' cannot be read \(Source input id \"#gone\" not found",
-    ),
-    "inputs": (
-        "<p>",
-        "<input/>" * 70 + "<p>",
-        r"n\.dae:\d+: <triangles> has over 64 inputs; export it again",
-    ),
-    "matrix": (
-        "<node>",
-        "<node><matrix>1 2</matrix>",
-        r"n\.dae:\d+: <matrix> needs 16 finite numbers; export",
-    ),
-    "flat": (
-        "<node>",
-        "<node><scale>1 1 0</scale>",
-        r"a node's transform flattens the mesh; export it again",
-    ),
-    "scene": (
-        "<instance_visual_scene",
-        "<instance_nothing",
-        r"n\.dae: has no scene to show; export it again",
-    ),
-    "other": ("COLLADA", "KOLLADA", r"n\.dae: begins with <KOLLADA>; a COLLADA file begins with <COLLADA>"),
+    "nan": (" 3.0\n", " nan\n", "not finite numbers"),
+    "offset": ('count="4" stride="3"', ACCESSOR, r"n\.dae:\d+: an <accessor>"),
+    "index": ("<p>0 2 1", "<p>0 2 x", r"n\.dae:\d+: geometry 'g' cannot be read"),
+    "row": ("<p>0 2 1", "<p>0 2", r"n\.dae:\d+: geometry 'g' cannot be read"),
+    "vertex": ("<p>0 2 1", "<p>0 2 9", r"n\.dae:\d+: geometry 'g' cannot be read .*9"),
+    "negative": ("<p>0 2 1", "<p>0 2 -1", r"n\.dae:\d+: an index is -1"),
+    "source": ('source="#u"', 'source="#gone"', "geometry 'g' cannot be read .*gone"),
+    "inputs": ("<p>", "<input/>" * 70 + "<p>", r"n\.dae:\d+: <triangles> has over 64 inputs"),
+    "matrix": ("<node>", "<node><matrix>1 2</matrix>", r"n\.dae:\d+: <matrix> needs 16 finite numbers"),
+    "flat": ("<node>", "<node><scale>1 1 0</scale>", "transform flattens the mesh"),
+    "scene": ("<instance_visual_scene", "<instance_nothing", "has no scene to show"),
+    "shown": ("<instance_geometry", "<instance_light", "holds no triangle"),
+    "other": ("COLLADA", "KOLLADA", r"n\.dae: begins with <KOLLADA>"),
 }
 
 
@@ -613,33 +556,12 @@ def gltf(
     return path
 
 
-@pytest.mark.parametrize("kind", ["lines", "empty"])
-@pytest.mark.parametrize("suffix", ["dae", "glb"])
-def test_what_nodes_show_counts_as_often_as_they_show_it_although_it_has_no_faces(
-    kind, suffix, tmp_path, monkeypatch
-):
+def test_what_nodes_show_counts_as_often_as_they_show_it(tmp_path, monkeypatch):
     monkeypatch.setitem(BUDGETS, "mesh", Budget(count=500))
-    path = tmp_path / f"m.{suffix}"
-    if suffix == "glb":
-        primitive = {"attributes": {"POSITION": 0}, "mode": 1 if kind == "lines" else 4, "indices": 3}
-        nodes = [{"mesh": 0, "children": [i + 1]} for i in range(29)] + [{"mesh": 0}]
-        none = {"bufferView": 0, "componentType": 5123, "type": "SCALAR", "count": 0}
-        more = {"meshes": [{"primitives": [primitive] * 30}]}
-        table = json.loads(gltf(path, binary=False, nodes=nodes, **more).read_text())
-        table |= {"meshes": more["meshes"], "accessors": [*table["accessors"], none]}
-        path.write_text(json.dumps(table))
-    else:
-        text = dae(path, "<node>{mesh}</node>" * 30).read_text()
-        empty = '<triangles count="0"><input semantic="VERTEX" source="#v" offset="0"/><p/></triangles>'
-        path.write_text(re.sub("<triangles.*</triangles>", empty * 30, text, flags=re.DOTALL))
-        if kind == "lines":
-            path.write_text(
-                path.read_text().replace("<triangles", "<lines").replace("</triangles", "</lines")
-            )
-    # those of COLLADA are left out before they are counted
-    match = "holds no triangle" if suffix == "dae" else "shows over 500 nodes; export it again"
-    with pytest.raises(InputError, match=match):
-        read_mesh(path)
+    nodes = [{"mesh": 0, "children": [i + 1]} for i in range(300)] + [{"mesh": 0}]
+    for path in (gltf(tmp_path / "m.glb", nodes=nodes), dae(tmp_path / "m.dae", "<node>{mesh}</node>" * 300)):
+        with pytest.raises(InputError, match="shows over 500 nodes; export it again"):
+            read_mesh(path)
 
 
 HALF = float(np.sqrt(0.5))
@@ -784,14 +706,6 @@ def test_visuals_of_one_mesh_share_its_arrays_and_none_is_an_instance(tmp_path):
     assert_valid(stage.GetRootLayer().realPath, tmp_path)
 
 
-def test_two_files_of_one_name_stay_two_meshes(tmp_path):
-    for name, size in (("a", 1), ("b", 2)):
-        (tmp_path / name).mkdir()
-        trimesh.creation.box((size,) * 3).export(tmp_path / name / "part.stl")
-    stage = robot(tmp_path, visual("a/part.stl") + visual("b/part.stl"))
-    assert [float(s.vertices.max()) for s in read_shapes(stage)] == [0.5, 1]
-
-
 @settings(max_examples=30, deadline=None)
 @given(
     arrays(float, (3, 3), elements=st.sampled_from(np.linspace(-2, 2, 41))).filter(
@@ -869,15 +783,6 @@ def test_a_urdf_texture_that_is_missing_is_noted_and_the_colour_stands_in(tmp_pa
 
 
 # --- primitives and colliders ---------------------------------------------------------------------
-
-
-def test_a_capsule_is_a_capsule_its_length_without_its_ends(tmp_path):
-    capsule = '<geometry><capsule radius="0.1" length="0.5"/></geometry>'
-    stage = robot(tmp_path, f"<visual>{capsule}</visual><collision>{capsule}</collision>")
-    (seen,) = read_shapes(stage)
-    assert_allclose(bounds(seen.vertices)[:, 2], [-0.35, 0.35], atol=1e-6)
-    collider = next(p for p in stage.Traverse() if p.HasAPI(UsdPhysics.CollisionAPI))
-    assert (collider.GetTypeName(), collider.GetAttribute("height").Get()) == ("Capsule", 0.5)
 
 
 def volume(mesh):

@@ -116,12 +116,6 @@ def test_what_a_material_loses_is_reported_and_strict_refuses_it(tmp_path, line)
         blue(tmp_path, f"Kd 1 1 1\n{line}", options=Options(strict=True))
 
 
-def test_a_normal_map_in_the_place_of_a_map_of_heights_is_used_as_such(tmp_path):
-    picture(tmp_path / "n.png", [UP])
-    _, surface = blue(tmp_path, "Kd 1 1 1\nmap_Bump -bm 1 n.png")
-    assert textures(surface)["normal"][0] == "n.png"
-
-
 def test_a_texture_without_coordinates_becomes_its_mean_with_a_note(tmp_path):
     picture(tmp_path / "t.png", [(255, 0, 0), (0, 0, 0)])
     lines = [line for line in SQUARES.splitlines() if not line.startswith("vt")]

@@ -203,16 +203,6 @@ def test_wheels_are_found_by_their_joints_and_casters_and_arms_are_none(tmp_path
     assert any(note.startswith("drive from the joints: simulated") for note in report.notes)
 
 
-def test_wheels_of_a_revolute_joint_with_a_range_of_many_turns_are_driven(tmp_path):
-    limit = '<limit lower="-180" upper="180" effort="10" velocity="20"/>'
-    stage, drive, _ = rover(tmp_path, joint="revolute", limit=limit)
-    assert drive.sides == SIDES
-    assert_allclose(drive.wheel_rate_max, 20)
-    joint = next(p for p in stage.Traverse() if p.GetName() == "fl")
-    assert UsdPhysics.DriveAPI(joint, "angular").GetStiffnessAttr().Get() == 0
-    assert UsdPhysics.DriveAPI(joint, "angular").GetDampingAttr().Get() > 0
-
-
 def test_a_plugin_that_moves_the_base_without_wheels_takes_those_of_the_joints(tmp_path):
     tags = plugin("libgazebo_ros_planar_move.so", "<odometryRate>25</odometryRate>")
     _, drive, report = rover(tmp_path, tags)

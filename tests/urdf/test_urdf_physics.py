@@ -16,7 +16,6 @@ from magtwin.urdf.options import DriveRule, Options
 from magtwin.urdf.physics import inertia as solids
 from magtwin.urdf.physics.inertia import MassProperties, combined
 from magtwin.urdf.write import write_urdf
-from magtwin.usd.sensors import read_drive
 
 LIMIT = '<limit effort="3" velocity="2" lower="-1" upper="0.5"/>'
 
@@ -116,48 +115,6 @@ def test_a_link_without_inertial_is_part_of_a_body_or_has_the_mass_that_engines_
     assert f"link 'hand' has no <inertial>: {told}" in report.notes
     assert_allclose(sum(masses(stage).values()), fixed + mass, rtol=1e-6)
     assert_allclose(mass_of(robot.GetPrimAtPath("hand"))[0], mass, rtol=1e-6)
-
-
-ZEROS = '<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/>'
-
-
-def test_masses_and_inertias_of_zero_are_ignored(tmp_path):
-    text = f"""<link name="foot"><inertial><mass value="0"/>{ZEROS}</inertial></link>
-    <link name="base">{{BODY}}</link>
-    <link name="eye"><inertial><mass value="0.5"/>{ZEROS}</inertial><collision>{BALL}</collision></link>
-    <joint name="up" type="fixed"><parent link="foot"/><child link="base"/></joint>
-    <joint name="on" type="fixed"><parent link="base"/><child link="eye"/></joint>"""
-    _, robot, report = converted(urdf(tmp_path, text))
-    assert not robot.GetPrimAtPath("foot")  # it has neither mass nor shape: a frame on the base
-    assert robot.GetPrimAtPath("base/foot")
-    eye = UsdPhysics.MassAPI(robot.GetPrimAtPath("eye"))
-    assert eye.GetMassAttr().Get() == 0.5
-    assert_allclose(eye.GetDiagonalInertiaAttr().Get(), [0.5 * 0.4 * 0.1**2] * 3, rtol=1e-5)  # 2/5 m r^2
-    assert report.notes[:2] == (
-        "link 'foot': a mass of 0 counts as none",
-        "link 'eye': an <inertia> of zeros counts as none",
-    )
-
-
-def test_zero_limits_do_not_weld_a_wheel(tmp_path):
-    zeros = '<limit lower="0" upper="0" effort="0" velocity="0"/>'
-    look = (
-        '<visual><geometry><sphere radius="1"/></geometry><material name=""><texture filename=""/></material>'
-    )
-    stage, _, report = converted(arm(tmp_path, f"continuous|{zeros}", f"{{BODY}}{look}</visual>"))
-    drive = UsdPhysics.DriveAPI(stage.GetPrimAtPath("/arm/joints/j"), "angular")
-    assert drive.GetMaxForceAttr().Get() == 10
-    assert "joint 'j' gives an effort of 0: its drive may use 10 N m" in report.notes
-    assert "link 'hand': a <texture> without filename= is left out" in report.notes
-
-
-def test_a_missing_limit_is_0_and_an_infinite_effort_is_kept(tmp_path):
-    limit = '<limit upper="1" effort="inf" velocity="2"/>'
-    stage, _, report = converted(arm(tmp_path, f"revolute|{limit}"))
-    joint = UsdPhysics.RevoluteJoint(stage.GetPrimAtPath("/arm/joints/j"))
-    assert (joint.GetLowerLimitAttr().Get(), joint.GetUpperLimitAttr().Get()) == (0, pytest.approx(57.29578))
-    assert UsdPhysics.DriveAPI(joint, "angular").GetMaxForceAttr().Get() == np.inf
-    assert "joint 'j' gives no lower limit: 0, URDF's default" in report.notes
 
 
 # --- merging --------------------------------------------------------------------------------------
@@ -343,13 +300,6 @@ def test_a_slide_that_follows_a_turn_gears_in_metres_per_degree(tmp_path):
     assert_allclose(gearing, -0.05 * np.pi / 180, rtol=1e-6)
 
 
-def test_what_follows_a_welded_joint_is_welded_too(tmp_path):
-    dead = '<limit lower="0" upper="0" effort="1" velocity="1"/>'
-    _stage, robot, report = converted(follower(tmp_path, '<mimic joint="lead"/>', lead=dead))
-    assert prim(robot, "f").IsA(UsdPhysics.FixedJoint)
-    assert "joint 'f' follows 'lead', which cannot move: welded" in report.notes
-
-
 # --- drives ---------------------------------------------------------------------------------------
 
 
@@ -395,20 +345,6 @@ def test_a_joint_with_limits_holds_what_it_carries_at_10_hz(tmp_path, mass):
     assert drive.GetMaxForceAttr().Get() == 40
 
 
-def test_a_rule_drives_each_free_axis_of_a_planar_joint(tmp_path):
-    path = arm(tmp_path, 'planar|<axis xyz="0 0 1"/>')
-    _stage, robot, _ = converted(path)
-    for axis in ("transX", "transY", "rotZ"):
-        assert drive_of(robot, "j", axis)[1:] == (0, 0)
-    _stage, robot, _ = converted(path, drives=(DriveRule(joints="j", damping=2.0, max_force=5.0),))
-    joint = prim(robot, "j")
-    applied = joint.GetPrimTypeInfo().GetAppliedAPISchemas()
-    driven = {a.split(":")[1] for a in applied if a.startswith("PhysicsDriveAPI")}
-    assert driven == {"transX", "transY", "rotZ"}
-    assert_allclose(UsdPhysics.DriveAPI(joint, "rotZ").GetDampingAttr().Get(), np.radians(2), rtol=1e-6)
-    assert_allclose(UsdPhysics.DriveAPI(joint, "transX").GetDampingAttr().Get(), 2, rtol=1e-6)
-
-
 def test_a_rule_that_fits_no_joint_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"drive rule 'laed' fits no joint .* did you mean 'lead'"):
         converted(follower(tmp_path, ""), drives=(DriveRule(joints="laed", damping=1.0),))
@@ -450,16 +386,6 @@ def test_a_base_that_is_fixed_to_a_root_called_world_is_fixed_at_its_place(tmp_p
     stage, _, report = converted(urdf(tmp_path, body.replace("TYPE", "floating"), "desk"))
     assert not [p for p in stage.Traverse() if p.IsA(UsdPhysics.FixedJoint)]
     assert any("the base 'base' floats" in note for note in report.notes)
-
-
-def test_a_base_that_drives_floats_below_a_root_called_world(tmp_path):
-    path = rover(tmp_path)
-    hold = '<link name="world"/><joint name="j" type="fixed"><parent link="world"/><child link="base_link"/>'
-    path.write_text(path.read_text().replace("</robot>", f"{hold}</joint></robot>"))
-    stage, robot, report = converted(path, profile="diff-drive")
-    joints = [UsdPhysics.Joint(p) for p in stage.Traverse() if p.IsA(UsdPhysics.Joint)]
-    assert not any(robot.GetPath() in joint.GetBody0Rel().GetTargets() for joint in joints)
-    assert any("the base 'base_link' floats" in note for note in report.notes)
 
 
 # --- the profile of bases with two driven wheels --------------------------------------------------
@@ -523,27 +449,6 @@ def test_diff_drive_drives_the_wheels_frees_the_casters_and_welds_the_dead_suspe
     assert "link 'skid' is a caster and gives no friction: 0.05" in report.notes
 
 
-def test_all_wheels_that_a_plugin_names_are_driven_not_the_first_of_each_side(tmp_path):
-    wheel = INERTIAL + '<collision><geometry><cylinder radius="0.05" length="0.04"/></geometry></collision>'
-    parts, tags = ['<link name="base"><inertial><mass value="1"/></inertial></link>'], ""
-    for i, side in enumerate(("left", "right", "left", "right")):
-        place = f"{0.2 - i // 2 * 0.4} {0.15 - i % 2 * 0.3} 0"
-        parts.append(
-            f'<link name="w{i}">{wheel}</link><joint name="j{i}" type="continuous"><parent link="base"/>'
-            f'<child link="w{i}"/><origin xyz="{place}" rpy="-1.5708 0 0"/><axis xyz="0 0 1"/></joint>'
-        )
-        tags += f"<{side}_joint>j{i}</{side}_joint>"
-    plugin = f'<gazebo><plugin name="DiffDrive" filename="gz-sim-diff-drive-system">{tags}</plugin></gazebo>'
-    path = urdf(tmp_path, "".join(parts) + plugin)
-    stage, _, report = converted(path, profile="diff-drive")
-    joints = [p for p in stage.Traverse() if p.IsA(UsdPhysics.RevoluteJoint)]
-    assert len(joints) == 4
-    assert all(UsdPhysics.DriveAPI(joint, "angular").GetDampingAttr().Get() > 0 for joint in joints)
-    assert not any("caster" in note or "freely" in note for note in report.notes)
-    spec = read_drive(stage.GetDefaultPrim())
-    assert spec.sides == {"j0": 0, "j1": 1, "j2": 0, "j3": 1}
-
-
 def test_the_urdfs_values_of_wheels_override_the_profile(tmp_path):
     path = rover(tmp_path, wheel='<limit effort="1.5" velocity="8"/>')
     tag = '<gazebo reference="skid"><mu1>0.3</mu1></gazebo></robot>'
@@ -552,12 +457,6 @@ def test_the_urdfs_values_of_wheels_override_the_profile(tmp_path):
     assert drive_of(robot, "left")[0].GetMaxForceAttr().Get() == 1.5
     assert_allclose(prim(robot, "left").GetAttribute("newton:velocityLimit").Get(), np.degrees(8), rtol=1e-6)
     assert_allclose(friction(robot, "skid"), 0.3, rtol=1e-6)
-
-
-def test_the_general_profile_keeps_a_suspension_that_is_not_quite_dead(tmp_path):
-    _stage, robot, _ = converted(rover(tmp_path))
-    assert prim(robot, "spring").IsA(UsdPhysics.PrismaticJoint)
-    assert_allclose(drive_of(robot, "swivel")[2], 5, rtol=1e-6)  # as any joint that turns for ever
 
 
 def test_a_robot_without_two_wheels_is_no_diff_drive(tmp_path):

@@ -136,16 +136,6 @@ def test_an_unknown_attribute_is_kept_as_text_and_counted_as_a_fault_alone(tmp_p
         convert(tmp_path, arm('type="revolute"', origin=LIMIT.format('uper="2"')), strict=True)
 
 
-def test_attributes_of_a_section_that_no_reader_uses_are_kept_as_text(tmp_path):
-    sensor = '<sensor name="s" type="imu" version="9"><update_rate>5</update_rate></sensor>'
-    text = arm('type="fixed"').replace("</robot>", f'<gazebo reference="base">{sensor}</gazebo></robot>')
-    stage, report = convert(tmp_path, text, strict=True)
-    assert list(stage.GetPrimAtPath("/arm/base").GetCustomDataByKey(KEPT)) == [
-        "gazebo/sensor(s): version='9'"
-    ]
-    assert report.unknown_tags == {"gazebo/sensor/@version": 1}
-
-
 QUARTER = 'quat_xyzw="0 0 0.70710678 0.70710678"'
 
 

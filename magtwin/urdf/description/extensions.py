@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 MODULES: Mapping[str, str] = {
     "plugin": "magtwin.urdf.physics.controller",
-    "sensor": "magtwin.urdf.sensor",
+    "sensor": "magtwin.urdf.equipment",
 }
 """Module that reads a tag below `<gazebo>`, loaded for a description that has one."""
 
