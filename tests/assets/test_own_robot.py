@@ -120,30 +120,6 @@ def test_settings_name_links_and_joints_as_the_urdf_does_though_usd_calls_them_o
     assert made.spec.magnetometer.link == "mast_top"
 
 
-@pytest.mark.parametrize("link", ["chassis", "magnetometer"])
-def test_no_sensor_moves_a_frame_of_its_name(tmp_path, link):
-    frames = "".join(
-        f'<link name="{name}"/><joint name="{name}_j" type="fixed"><parent link="chassis"/>'
-        f'<child link="{name}"/><origin xyz="0.1 0.2 0.3"/></joint>'
-        for name in ("battery", "imu", "lidar", "magnetometer")
-    )
-    (tmp_path / "cart.urdf").write_text(CART.read_text().replace("</robot>", f"{frames}</robot>"))
-    settings = RobotSettings(
-        drive=DriveSpec(left_wheel_joint="left", right_wheel_joint="right"),
-        magnetometer=MagnetometerSpec(link=link, p_link_sensor=(0, 0, 0.5)),
-    )
-    made = from_urdf(tmp_path / "cart.urdf", tmp_path / "cart", settings=settings)
-    stage = Usd.Stage.Open(str(made.asset))
-    for name in ("battery", "imu", "lidar", "magnetometer"):
-        frame = UsdGeom.Xformable(stage.GetPrimAtPath(f"/cart/chassis/{name}"))
-        assert list(frame.GetLocalTransformation().ExtractTranslation()) == pytest.approx([0.1, 0.2, 0.3])
-    assert made.spec is not None
-    assert made.spec.magnetometer.link == link
-    assert made.spec.p_base_magnetometer == pytest.approx(
-        (0, 0, 0.5) if link == "chassis" else (0.1, 0.2, 0.8)
-    )
-
-
 def test_options_of_the_command_reach_the_conversion(tmp_path, capsys):
     report = tmp_path / "report.json"
     main(

@@ -15,7 +15,6 @@ from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils
 from validators import assert_valid
 
 from magtwin.errors import InputError
-from magtwin.files.file import shipped
 from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.layout import VARIANTS
 from magtwin.urdf.options import Options
@@ -319,16 +318,3 @@ def test_the_real_robot_is_simready(simready, real_data, tmp_path, name):
     if name == "turtlebot4_gazebo_tags":
         for profile in ("Sensor-IMU", "Sensor-Camera"):
             assert not failures(simready, out, profile, "1.0.0", tmp_path)
-
-
-def test_our_robot_is_simready(simready, tmp_path):
-    asset = shipped("robots", "turtlebot4", "turtlebot4.usda")
-    assert not failures(simready, asset, "Robot-Body", "3.0.0", tmp_path)
-
-
-def test_a_lidar_is_simready(simready, tmp_path):
-    tags = """<gazebo reference="hand"><sensor name="scan" type="gpu_lidar"><update_rate>8</update_rate>
-    <lidar><scan><horizontal><samples>360</samples><min_angle>-3.14159</min_angle><max_angle>3.14159</max_angle>
-    </horizontal></scan><range><min>0.1</min><max>10</max></range></lidar></sensor></gazebo>"""
-    out = convert_urdf(arm(tmp_path, extra=tags), tmp_path / "made" / "arm.usda")
-    assert not failures(simready, out, "Sensor-LiDAR", "1.0.0", tmp_path)

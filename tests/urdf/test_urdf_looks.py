@@ -116,20 +116,6 @@ def test_what_a_material_loses_is_reported_and_strict_refuses_it(tmp_path, line)
         blue(tmp_path, f"Kd 1 1 1\n{line}", options=Options(strict=True))
 
 
-def test_a_texture_without_coordinates_becomes_its_mean_with_a_note(tmp_path):
-    picture(tmp_path / "t.png", [(255, 0, 0), (0, 0, 0)])
-    lines = [line for line in SQUARES.splitlines() if not line.startswith("vt")]
-    text = "\n".join(" ".join(w.split("/")[0] for w in line.split()) for line in lines)
-    (tmp_path / "o.obj").write_text(text)
-    (tmp_path / "paint.mtl").write_text("newmtl red\nmap_Kd t.png\nnewmtl blue\nKd 0 0 1\n")
-    red = read_mesh(tmp_path / "o.obj").paints[0]
-    assert red.image is None
-    assert_allclose(red.rgba, [0.5, 0, 0, 1], atol=0.01)
-    notes = notes_of(robot(tmp_path, visual("o.obj")))
-    text = "o.obj: material 'red': its textures are left out where there are no texture coordinates"
-    assert text in notes
-
-
 def shaded(tmp_path, shader, extra="", images=""):
     """The stage of a COLLADA tetrahedron with this shader, and its surface."""
     path = dae(tmp_path / "n.dae", "<node>{mesh}</node>", images=images)

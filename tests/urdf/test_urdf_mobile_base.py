@@ -122,15 +122,6 @@ base_controller:
     wheel_radius: 0.11
     linear: {x: {has_velocity_limits: true, max_velocity: 1.3}}
 """
-OLD_MECANUM = """\
-base_controller:
-  type: mecanum_drive_controller/MecanumDriveController
-  front_left_wheel_joint: fl
-  back_left_wheel_joint: rl
-  front_right_wheel_joint: fr
-  back_right_wheel_joint: rr
-  linear: {x: {max_velocity: 1.3}}
-"""
 CLEARPATH = """\
 base_controller:
   ros__parameters:
@@ -146,7 +137,7 @@ base_controller:
 
 @pytest.mark.parametrize(
     ("text", "separation", "radius"),
-    [(MECANUM, 0.62 + 1.5 * 0.52, 0.11), (OLD_MECANUM, TRACK + BASE, R), (CLEARPATH, 1.4, 0.11)],
+    [(MECANUM, 0.62 + 1.5 * 0.52, 0.11), (CLEARPATH, 1.4, 0.11)],
 )
 def test_settings_of_mecanum_controllers_old_and_new(tmp_path, text, separation, radius):
     settings = tmp_path / "control.yaml"

@@ -10,9 +10,8 @@ from validators import assert_valid
 
 from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, quat_from_rpy
-from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.description.description import read_description
-from magtwin.urdf.options import DriveRule, Options
+from magtwin.urdf.options import DriveRule
 from magtwin.urdf.physics import inertia as solids
 from magtwin.urdf.physics.inertia import MassProperties, combined
 from magtwin.urdf.write import write_urdf
@@ -169,25 +168,6 @@ def test_a_merged_body_weighs_and_turns_as_its_shapes_together_and_keeps_every_f
     assert_allclose(centre, whole.centre, atol=1e-6)
     assert_allclose(tensor, whole.inertia, atol=1e-6)
     assert_valid(path.with_suffix(".usda"), tmp_path)
-
-
-def test_merging_the_real_robot_leaves_three_bodies_of_the_same_mass_and_balance(tmp_path, real_robot):
-    path, out, _ = real_robot
-    options = Options(single_file=True, merge_fixed=True)
-    total = {}
-    for merge, file in ((False, out), (True, convert_urdf(path, tmp_path / "merged.usda", options=options))):
-        parts, cache = [], UsdGeom.XformCache()
-        stage = Usd.Stage.Open(str(file))
-        for p in stage.Traverse():
-            if p.HasAPI(UsdPhysics.MassAPI):
-                T = np.array(cache.GetLocalToWorldTransform(p)).T
-                parts.append(MassProperties(*mass_of(p)).moved(T))
-        total[merge] = len(parts), combined(parts)
-    (many, apart), (few, merged) = total[False], total[True]
-    assert (many, few) == (41, 3)
-    assert_allclose(merged.mass, apart.mass, rtol=1e-6)
-    assert_allclose(merged.centre, apart.centre, atol=1e-7)
-    assert_allclose(merged.inertia, apart.inertia, atol=1e-6)
 
 
 # --- bases and joints -----------------------------------------------------------------------------

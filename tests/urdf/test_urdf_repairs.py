@@ -14,7 +14,6 @@ from magtwin.urdf.convert import convert_with_report
 from magtwin.urdf.options import Options
 from magtwin.urdf.physics.inertia import SLIMMEST, nearest_possible
 from magtwin.urdf.repairs import FAULTS
-from magtwin.urdf.source.source import read_source
 
 HEAD = '<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">'
 BASE = '<link name="base"><inertial><mass value="2"/>{}</inertial>{}</link>'
@@ -354,41 +353,6 @@ def test_what_a_xacro_lacks_is_listed_in_one_run(tmp_path):
             convert_with_report(path, tmp_path / "arm.usda", options=Options(skip_missing_includes=skip))
         for text in wanted:
             assert text in str(refusal.value)
-
-
-def test_properties_of_a_skipped_include_are_listed_and_come_from_arguments(tmp_path):
-    path = tmp_path / "arm.xacro"
-    lines = [
-        '<xacro:include filename="$(find units)/deg.xacro"/>',
-        '<xacro:property name="turn" value="${90 * deg + inch}"/>',
-        '<link name="base"/><link name="hand"/>',
-        '<joint name="j" type="fixed"><parent link="base"/><child link="hand"/>',
-        '<origin xyz="${1 / inch} 0 0" rpy="0 0 ${turn}"/></joint>',
-    ]
-    path.write_text("\n".join([HEAD, *lines, "</robot>"]))
-    with pytest.raises(InputError) as refusal:
-        convert_with_report(path, tmp_path / "arm.usda")
-    text = refusal.value.in_flags({"skip_missing_includes": "--skip-missing-includes"})
-    for part in (
-        "include 'package://units/deg.xacro' (arm.xacro:2), property 'inch' (arm.xacro:6), property 'deg'",
-        "give --package units=FOLDER, or --skip-missing-includes --arg inch=VALUE --arg deg=VALUE",
-    ):
-        assert part in text
-    given = {"inch": "0.5", "deg": "0.01"}
-    options = Options(arguments=given, skip_missing_includes=True)
-    report = convert_with_report(path, tmp_path / "arm.usda", options=options)
-    assert [(row.kind, row.count) for row in report.repairs] == [("include-skipped", 1)]
-    source = read_source(path, arguments=given, skip_missing_includes=True)
-    origin = source.xml.find("joint/origin")
-    assert_allclose(float(origin.get("rpy").split()[2]), 90 * 0.01 + 0.5, rtol=1e-12)
-    assert_allclose(float(origin.get("xyz").split()[0]), 2, rtol=1e-12)
-    with pytest.raises(InputError, match="no xacro argument 'width'"):
-        read_source(path, arguments=given | {"width": "1"}, skip_missing_includes=True)
-    properties = [f'<xacro:property name="{name}" value="1"/>' for name in given]
-    (tmp_path / "deg.xacro").write_text("\n".join([HEAD, *properties, "</robot>"]))
-    path.write_text(path.read_text().replace("$(find units)/", ""))
-    with pytest.raises(InputError, match="no xacro argument 'inch'"):  # an argument replaces no property
-        read_source(path, arguments=given, skip_missing_includes=True)
 
 
 def test_packages_of_ros_are_found_by_the_name_in_the_description_and_only_so(tmp_path, monkeypatch):

@@ -161,21 +161,6 @@ def test_limits_and_mimic_of_a_follower_are_authored_as_described_and_come_back(
     assert_same_kinematics(path, before, after, back, 1e-12)
 
 
-def test_a_chain_of_mimics_comes_back_as_mimics_of_its_first_joint(tmp_path):
-    path = tmp_path / "every.urdf"
-    chain = (
-        '<limit lower="-1" upper="1" effort="1" velocity="1"/><mimic joint="j4" multiplier="-3" offset="1"/>'
-    )
-    link = f'<link name="last">{INERTIAL}</link><joint name="j8" type="revolute"><parent link="tip"/>'
-    text = f'{link}<child link="last"/><axis xyz="1 0 0"/>{chain}</joint></robot>'
-    path.write_text(EVERY.replace("</robot>", text))
-    before, after, _ = there_and_back(path, tmp_path)
-    mimic = after.joints["last"].mimic
-    assert_allclose([mimic.multiplier, mimic.offset], [-3 * -1.5, -3 * 0.02 + 1], rtol=1e-6)
-    assert mimic.joint == "j3"
-    assert vars(after.joints["last"].limit) == vars(before.joints["last"].limit)
-
-
 def test_shapes_come_back_where_they_were_in_their_colours(tmp_path):
     _, after, _ = there_and_back(every(tmp_path), tmp_path)
     (tube,), (box,) = after.links["arm"].visuals, after.links["arm"].collisions
