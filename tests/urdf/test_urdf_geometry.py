@@ -623,28 +623,7 @@ def test_gltf_strips_and_fans_are_cut_as_the_specification_says(tmp_path, mode, 
     assert_allclose(y_up, POINTS[want], atol=1e-6)
 
 
-# --- PLY and STL ----------------------------------------------------------------------------------
-
-
-def test_ply_colours_of_vertices_are_shown_by_the_material(tmp_path):
-    rgb = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [128, 128, 128]], np.uint8)
-    rows = "\n".join(" ".join(map(str, (*p, *c))) for p, c in zip(POINTS, rgb, strict=True))
-    faces = "\n".join("3 " + " ".join(map(str, f)) for f in FACES)
-    properties = [f"property float {a}" for a in "xyz"] + [
-        f"property uchar {c}" for c in ("red", "green", "blue")
-    ]
-    head = ["ply", "format ascii 1.0", "element vertex 4", *properties, "element face 4"]
-    head += ["property list uchar int vertex_indices", "end_header", rows, faces]
-    (tmp_path / "t.ply").write_text("\n".join(head) + "\n")
-    stage = robot(tmp_path, visual("t.ply", '<material name="m"><color rgba="1 1 1 1"/></material>'))
-    (seen,) = read_shapes(stage)
-    for point, colour in zip(POINTS, linear_from_srgb(rgb / 255), strict=True):
-        own = np.all(np.isclose(seen.vertices, point), axis=1)
-        assert_allclose(seen.vertex_colours[own], np.tile(colour, (3, 1)), atol=1e-4)
-    (mesh,) = meshes_of(stage)
-    reader = surface_of(mesh).GetInput("diffuseColor").GetConnectedSources()[0][0].source
-    assert UsdShade.Shader(reader.GetPrim()).GetInput("varname").Get() == "displayColor"
-    assert_valid(stage.GetRootLayer().realPath, tmp_path)
+# --- STL ----------------------------------------------------------------------------------
 
 
 def test_ascii_and_binary_stl_give_the_same_mesh(tmp_path):
@@ -863,7 +842,6 @@ DAMAGED = {
     "json.gltf": (wrote("{"), "cannot be read as a mesh: .+; export it again"),
     "doubles.dae": (lambda p: dae(p, DOUBLES), r"\d+: shows over 50000 nodes; export it again"),
     "cut.dae": (lambda p: cut(dae(p, "<node>{mesh}</node>"), lambda _: None), r"\d+: not XML: .+"),
-    "head.ply": (wrote("plx\n"), "cannot be read as a mesh: .+; export it again"),
     "m.blend": (wrote("BLENDER"), r"is of no known format \(\.dae, \.glb, \.gl"),
 }
 

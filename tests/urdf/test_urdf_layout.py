@@ -32,8 +32,8 @@ def arm(tmp_path, name="arm", extra=TAGS):
     tmp_path.mkdir(exist_ok=True)
     ball = trimesh.creation.icosphere(radius=0.1)
     ball.visual.vertex_colors = np.tile([200, 30, 30, 255], (len(ball.vertices), 1))
-    ball.export(tmp_path / "ball.ply")
-    mesh = '<geometry><mesh filename="ball.ply"/></geometry>'
+    ball.export(tmp_path / "ball.obj")
+    mesh = '<geometry><mesh filename="ball.obj"/></geometry>'
     path = tmp_path / f"{name}.urdf"
     path.write_text(
         f"""<robot name="{name}"><link name="base_link">{BODY}<visual>{mesh}</visual></link>
