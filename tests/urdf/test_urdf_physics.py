@@ -271,15 +271,6 @@ def test_a_mimic_is_authored_for_newton_and_for_physx_and_its_own_drive_has_no_g
     assert_allclose(hand.ExtractRotation().GetAngle(), np.degrees(0.1), atol=1e-6)  # where it rests
 
 
-def test_a_slide_that_follows_a_turn_gears_in_metres_per_degree(tmp_path):
-    path = follower(tmp_path, '<mimic joint="lead" multiplier="0.05"/>', kind="prismatic")
-    _stage, robot, _ = converted(path)
-    joint = prim(robot, "f")
-    assert_allclose(joint.GetAttribute("newton:mimicCoef1").Get(), 0.05, rtol=1e-6)
-    gearing = joint.GetAttribute("physxMimicJoint:rotY:gearing").Get()
-    assert_allclose(gearing, -0.05 * np.pi / 180, rtol=1e-6)
-
-
 # --- drives ---------------------------------------------------------------------------------------
 
 
@@ -427,16 +418,6 @@ def test_diff_drive_drives_the_wheels_frees_the_casters_and_welds_the_dead_suspe
     found = [friction(robot, link) for link in ("left_wheel", "right_wheel", "skid", "base_link")]
     assert_allclose(found, [1, 1, 0.05, 0.5], rtol=1e-6)
     assert "link 'skid' is a caster and gives no friction: 0.05" in report.notes
-
-
-def test_the_urdfs_values_of_wheels_override_the_profile(tmp_path):
-    path = rover(tmp_path, wheel='<limit effort="1.5" velocity="8"/>')
-    tag = '<gazebo reference="skid"><mu1>0.3</mu1></gazebo></robot>'
-    path.write_text(path.read_text().replace("</robot>", tag))
-    _stage, robot, _ = converted(path, profile="diff-drive")
-    assert drive_of(robot, "left")[0].GetMaxForceAttr().Get() == 1.5
-    assert_allclose(prim(robot, "left").GetAttribute("newton:velocityLimit").Get(), np.degrees(8), rtol=1e-6)
-    assert_allclose(friction(robot, "skid"), 0.3, rtol=1e-6)
 
 
 def test_a_robot_without_two_wheels_is_no_diff_drive(tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from made import BODY, INERTIAL, link_poses
 from numpy.testing import assert_allclose
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+from pxr import Usd
 
 from magtwin.author.from_urdf import write_urdf
 from magtwin.cli import main
@@ -177,82 +177,6 @@ def test_the_robot_of_a_scene_is_written_as_it_stands_in_its_own_frame(tmp_path)
     assert_same_kinematics(urdf, read_description(urdf), after, tmp_path / "robot.urdf", 1e-12)
 
 
-def edit(tmp_path, change):
-    """The stage of a two-link robot, changed."""
-    urdf = tmp_path / "two.urdf"
-    urdf.write_text(
-        f'<robot name="two"><link name="base_link">{BODY}</link><link name="arm">{INERTIAL}</link>'
-        '<joint name="j" type="continuous"><parent link="base_link"/><child link="arm"/>'
-        '<axis xyz="0 0 1"/></joint></robot>'
-    )
-    asset = convert_urdf(urdf, tmp_path / "two.usda", options=Options(single_file=True))
-    stage = Usd.Stage.Open(str(asset))
-    change(stage)
-    stage.Save()
-    return asset
-
-
-def _ball(stage):
-    UsdPhysics.SphericalJoint.Define(stage, "/two/joints/ball").CreateBody1Rel().SetTargets(
-        [Sdf.Path("/two/arm")]
-    )
-
-
-def _second(stage):
-    joint = UsdPhysics.FixedJoint.Define(stage, "/two/joints/again")
-    joint.CreateBody0Rel().SetTargets([Sdf.Path("/two/base_link")])
-    joint.CreateBody1Rel().SetTargets([Sdf.Path("/two/arm")])
-
-
-def _scaled(stage):
-    UsdGeom.Xformable(stage.GetPrimAtPath("/two/arm")).AddScaleOp().Set(Gf.Vec3f(2))
-
-
-def _off(stage):
-    UsdPhysics.Joint(stage.GetPrimAtPath("/two/joints/j")).GetLocalPos1Attr().Set(Gf.Vec3f(0.1, 0, 0))
-
-
-def _loop(stage):
-    for name, body0, body1 in (("there", "a", "b"), ("back", "b", "a")):
-        UsdPhysics.RigidBodyAPI.Apply(UsdGeom.Xform.Define(stage, f"/two/{body1}").GetPrim())
-        joint = UsdPhysics.FixedJoint.Define(stage, f"/two/joints/{name}")
-        joint.CreateBody0Rel().SetTargets([Sdf.Path(f"/two/{body0}")])
-        joint.CreateBody1Rel().SetTargets([Sdf.Path(f"/two/{body1}")])
-
-
-def _mirrored(stage):
-    UsdGeom.Xformable(stage.GetPrimAtPath("/two/arm")).AddScaleOp().Set(Gf.Vec3f(1, 1, -1))
-
-
-def _slides(stage):
-    prim = stage.GetPrimAtPath("/two/joints/j")
-    prim.SetTypeName("PhysicsPrismaticJoint")
-
-
-def _no_robot(stage):
-    stage.GetPrimAtPath("/two/base_link").RemoveAPI(UsdPhysics.ArticulationRootAPI)
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (_ball, "URDF has no PhysicsSphericalJoint"),
-        (_second, "'arm' is held by two joints, in a circle"),
-        (_scaled, "is scaled, which a URDF cannot do to links"),
-        (_mirrored, "is scaled, .* or mirrored"),
-        (_loop, "hold links in a circle: (a -> b -> a|b -> a -> b); a URDF is a tree"),
-        (_slides, "</two/joints/j>: slides without an end"),
-        (_off, "turns about a point of 'arm' that is not its origin"),
-        (_no_robot, "a URDF has one articulation, found none"),
-    ],
-)
-def test_what_a_urdf_cannot_hold_is_refused_and_nothing_is_written(tmp_path, change, said):
-    asset = edit(tmp_path, change)
-    with pytest.raises(InputError, match=said):
-        write_urdf(asset, tmp_path / "out" / "a.urdf")
-    assert not (tmp_path / "out").exists()
-
-
 SMALL = """#usda 1.0
 (defaultPrim = "World"; metersPerUnit = 1; upAxis = "Z")
 def Xform "World" (prepend apiSchemas = ["PhysicsArticulationRootAPI"]) {
@@ -316,7 +240,33 @@ def mimics(leader, more=""):
 
 
 FREE = LEADER.replace("Revolute", "")
+
+
+def joined(kind, ends):
+    """Joints of a kind between pairs of bodies, which are made if they are no others of the stage."""
+    made = {name for pair in ends for name in pair} - {"base_link", "wheel"}
+    text = "".join(
+        f'def Xform "{n}" (prepend apiSchemas = ["PhysicsRigidBodyAPI"]) {{}}\n' for n in sorted(made)
+    )
+    for i, (above, below) in enumerate(ends):
+        text += f'def Physics{kind}Joint "k{i}" {{\nrel physics:body0 = </World/{above}>\n'
+        text += f"rel physics:body1 = </World/{below}>\n}}\n"
+    return {"MORE": text}
+
+
+def scaled(scale):
+    return {"BODY": f'float3 xformOp:scale = {scale}; uniform token[] xformOpOrder = ["xformOp:scale"]'}
+
+
 REFUSED = [
+    # no tree of links
+    (joined("Spherical", [("wheel", "a")]), "URDF has no PhysicsSphericalJoint"),
+    (joined("Fixed", [("base_link", "wheel")]), "'wheel' is held by two joints, in a circle"),
+    (joined("Fixed", [("a", "b"), ("b", "a")]), "hold links in a circle: (a -> b -> a|b -> a -> b)"),
+    (joined("Prismatic", [("wheel", "a")]), "k0>: slides without an end"),
+    (scaled("(2, 2, 2)"), "is scaled, which a URDF cannot do to links"),
+    (scaled("(1, 1, -1)"), "is scaled, .* or mirrored"),
+    ({"JOINT": "point3f physics:localPos1 = (0.1, 0, 0)"}, "turns about a point of 'wheel' that is not its"),
     # of another type
     (
         {"JOINT": f'string newton:mimicCoef0 = "x"; {MIMIC}', "MORE": LEADER},
@@ -365,6 +315,11 @@ def test_a_stage_of_impossible_values_is_refused_by_prim_and_name_and_nothing_is
     with pytest.raises(InputError, match=words):
         small(tmp_path, **{part: text.replace("HERE", "") for part, text in parts.items()})
     assert not (tmp_path / "out").exists()
+
+
+def test_a_stage_without_a_robot_is_refused(tmp_path):
+    with pytest.raises(InputError, match="a URDF has one articulation, found none"):
+        write_urdf(shipped("maps", "lab", "lab.usdc"), tmp_path / "out" / "a.urdf")
 
 
 def test_a_mimic_names_its_leader_as_the_urdf_does_even_if_prims_share_a_name(tmp_path):

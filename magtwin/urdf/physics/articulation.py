@@ -44,7 +44,7 @@ def define_articulation(root: Usd.Prim, *, self_collision: bool) -> None:
 
 def filter_overlaps(
     bodies: Mapping[str, Usd.Prim], colliders: Mapping[str, Sequence[Usd.Prim]], joints: Sequence[Usd.Prim]
-) -> list[tuple[str, str]]:
+) -> None:
     """Author that bodies whose colliders overlap do not collide, since engines push such bodies apart.
 
     The hull of a bumper around a base, for example, contains the wheels. Colliders count as their convex
@@ -55,15 +55,11 @@ def filter_overlaps(
         colliders: Colliders of each body, in the same stage.
         joints: Prims of the joints.
 
-    Returns:
-        The pairs of link names.
-
     Raises:
         InputError: Too many colliders are in one place to compare them all.
     """
     left = COMPARED
     jointed = {frozenset(_ends(joint)) for joint in joints}
-    pairs = []
     for (first, second), near in _near(_hulls(bodies, colliders)).items():
         ends = bodies[first].GetPath(), bodies[second].GetPath()
         if frozenset(ends) in jointed:
@@ -80,8 +76,6 @@ def filter_overlaps(
         else:
             continue
         UsdPhysics.FilteredPairsAPI.Apply(bodies[first]).CreateFilteredPairsRel().AddTarget(ends[1])
-        pairs.append((first, second))
-    return pairs
 
 
 def _ends(joint: Usd.Prim) -> list[Sdf.Path]:

@@ -39,9 +39,6 @@ def read_surfaces(tags: Tags) -> dict[str, Surface]:
 
     mu1 becomes the friction; UsdPhysics has no attribute for mu2. kp and kd become PhysX's compliant
     contact, and the bounce becomes UsdPhysics' restitution.
-
-    Raises:
-        InputError: A value is not a number, or is below 0; the message gives the line.
     """
     surfaces: dict[str, Surface] = {}
     description = tags.description
@@ -80,9 +77,6 @@ def define_springs(tags: Tags, joint_of: Callable[[str], Usd.Prim | None], optio
         tags: Tags of the description.
         joint_of: Returns the prim of a joint by its name, or None.
         options: Drive rules, which override springs.
-
-    Raises:
-        InputError: A value is not a number, or a stiffness is below 0; the message gives the line.
     """
     names = {joint.name for joint in tags.description.joints.values()}
     for block in tags.blocks("gazebo"):
