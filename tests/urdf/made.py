@@ -22,15 +22,20 @@ def urdf(tmp_path, body, name="arm"):
     return path
 
 
-def arm(tmp_path, joint, child="{BODY}"):
-    """Two links held by a joint called j, whose inner XML is given."""
-    kind, _, inner = joint.partition("|")
-    return urdf(
-        tmp_path,
-        f"""<link name="base_link">{{BODY}}</link>
-        <link name="hand">{child}</link>
-        <joint name="j" type="{kind}"><parent link="base_link"/><child link="hand"/>{inner}</joint>""",
-    )
+def link(name, content="{BODY}"):
+    return f'<link name="{name}">{content}</link>'
+
+
+def joint(name, parent, child, kind="fixed", content=""):
+    ends = f'<parent link="{parent}"/><child link="{child}"/>'
+    return f'<joint name="{name}" type="{kind}">{ends}{content}</joint>'
+
+
+def arm(tmp_path, held, child="{BODY}"):
+    """Two links held by a joint called j, whose type and inner XML are given."""
+    kind, _, inner = held.partition("|")
+    parts = link("base_link"), link("hand", child), joint("j", "base_link", "hand", kind, inner)
+    return urdf(tmp_path, "\n".join(parts))
 
 
 def converted(path, **options):

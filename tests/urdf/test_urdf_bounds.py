@@ -3,6 +3,7 @@
 import tracemalloc
 
 import pytest
+from made import joint, link
 
 from magtwin.errors import InputError
 from magtwin.files import budget
@@ -24,26 +25,17 @@ def robot(tmp_path, *parts):
     return path
 
 
-def link(name, content=""):
-    return f'<link name="{name}">{content}</link>'
-
-
-def joint(name, parent, child, kind="fixed", content=""):
-    ends = f'<parent link="{parent}"/><child link="{child}"/>'
-    return f'<joint name="{name}" type="{kind}">{ends}{content}</joint>'
-
-
 def test_a_robot_of_too_many_links_or_joints_is_refused_at_once(tmp_path, monkeypatch):
     monkeypatch.setitem(budget.BUDGETS, "URDF", Budget(count=3))
-    links = [link(f"l{i}") for i in range(3)]
+    links = [link(f"l{i}", "") for i in range(3)]
     joints = [joint(f"j{i}", "l0", f"l{i + 1}") for i in range(2)]
     assert len(read_description(robot(tmp_path, *links, *joints)).links) == 3
     with pytest.raises(InputError, match=r"robot\.urdf:1: over 3 links; split the file"):
-        read_description(robot(tmp_path, *links, link("x")))
+        read_description(robot(tmp_path, *links, link("x", "")))
     with pytest.raises(InputError, match=r"robot\.urdf:1: over 3 joints; split the file"):
         read_description(robot(tmp_path, *links, *joints, *joints))
     with pytest.raises(InputError, match=r"robot\.urdf:\d+: joint 'j0' exists twice.*rename one"):
-        read_description(robot(tmp_path, link("l0"), joint("j0", "l0", "a"), joint("j0", "l0", "b")))
+        read_description(robot(tmp_path, link("l0", ""), joint("j0", "l0", "a"), joint("j0", "l0", "b")))
     with pytest.raises(InputError, match=r"robot\.urdf:1: over 3 visuals; split the file"):
         read_description(robot(tmp_path, link("l", "<visual/>" * 4)))
 
@@ -61,7 +53,7 @@ def test_colliders_in_one_place_are_compared_up_to_a_count(tmp_path, monkeypatch
 
 def test_near_names_are_looked_for_a_limited_number_of_times(tmp_path, monkeypatch):
     monkeypatch.setattr(repairs, "SUGGESTED", 1)
-    links = [link(f"l{i}") for i in range(3)]
+    links = [link(f"l{i}", "") for i in range(3)]
     follow = '<mimic joint="j"/>'
     joints = [joint(f"j{i}", "l0", f"l{i + 1}", "continuous", follow) for i in range(2)]
     texts = [entry.text for entry in read_description(robot(tmp_path, *links, *joints)).repairs.entries]
@@ -109,7 +101,7 @@ def test_a_xacro_pays_for_all_its_work(work, tmp_path, monkeypatch):
 
 
 def test_text_of_many_lines_takes_no_object_for_each(tmp_path):
-    path = robot(tmp_path, link("base_link"), "<x>" + "\u0100\n" * 300_000, "</x>")
+    path = robot(tmp_path, link("base_link", ""), "<x>" + "\u0100\n" * 300_000, "</x>")
     tracemalloc.start()
     try:
         element = read_source(path).xml[1]

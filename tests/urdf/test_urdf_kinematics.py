@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from made import urdf
+from made import joint, link, urdf
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics
 
@@ -119,15 +119,11 @@ def compare(path, out, rng, *, still=()):
     return len(mine)
 
 
-def arms(name, joints):
+def arms(joints):
     """A chain of links held by (type, inner XML) each."""
-    parts = ['<link name="l0">{BODY}</link>']
+    parts = [link("l0")]
     for i, (kind, inner) in enumerate(joints):
-        parts.append(f'<link name="l{i + 1}">{{BODY}}</link>')
-        parts.append(
-            f'<joint name="j{i + 1}" type="{kind}"><parent link="l{i}"/><child link="l{i + 1}"/>'
-            f"{inner}</joint>"
-        )
+        parts += [link(f"l{i + 1}"), joint(f"j{i + 1}", f"l{i}", f"l{i + 1}", kind, inner)]
     return "\n".join(parts)
 
 
@@ -159,7 +155,7 @@ TREE = """
 
 
 @pytest.mark.parametrize("merge", [False, True])
-@pytest.mark.parametrize(("name", "body"), [("chain", arms("chain", CHAIN)), ("tree", TREE)])
+@pytest.mark.parametrize(("name", "body"), [("chain", arms(CHAIN)), ("tree", TREE)])
 def test_links_of_a_robot_with_every_joint_of_one_axis_stand_where_yourdfpy_puts_them(
     tmp_path, name, body, merge
 ):
@@ -181,7 +177,7 @@ def test_a_planar_joint_slides_and_turns_in_its_plane_only(tmp_path):
     normal = np.array([0.2, -0.6, 0.77])
     words = " ".join(map(str, normal))
     chain = [("planar", f'<origin xyz="0.1 0.2 0.3" rpy="0.3 -0.7 1.1"/><axis xyz="{words}"/>'), CHAIN[0]]
-    path = urdf(tmp_path, arms("sled", chain), "sled")
+    path = urdf(tmp_path, arms(chain), "sled")
     stage = StageKinematics(convert_urdf(path, tmp_path / "sled.usda", options=Options(single_file=True)))
     joint = stage.joints["j1"]
     limits = {

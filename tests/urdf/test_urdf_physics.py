@@ -3,7 +3,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made import BALL, INERTIAL, arm, converted, drive_of, masses, prim, urdf
+from made import BALL, INERTIAL, arm, converted, drive_of, joint, link, masses, prim, urdf
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
 from validators import assert_valid
@@ -244,11 +244,9 @@ def test_a_joint_whose_limits_exclude_0_is_held_at_the_nearest_limit(tmp_path):
 
 
 def follower(tmp_path, mimic, kind="revolute", lead=LIMIT):
-    body = f"""<link name="a">{{BODY}}</link><link name="b">{{BODY}}</link><link name="c">{{BODY}}</link>
-    <joint name="lead" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>{lead}</joint>
-    <joint name="f" type="{kind}"><parent link="a"/><child link="c"/><axis xyz="0 1 0"/>{LIMIT}
-      {mimic}</joint>"""
-    return urdf(tmp_path, body, "pair")
+    turns = joint("lead", "a", "b", "revolute", f'<axis xyz="0 0 1"/>{lead}')
+    follows = joint("f", "a", "c", kind, f'<axis xyz="0 1 0"/>{LIMIT}{mimic}')
+    return urdf(tmp_path, "\n".join([*map(link, "abc"), turns, follows]), "pair")
 
 
 def test_a_mimic_is_authored_for_newton_and_for_physx_and_its_own_drive_has_no_gains(tmp_path):

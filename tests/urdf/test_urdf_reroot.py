@@ -3,6 +3,7 @@
 from pathlib import Path
 from xml.etree import ElementTree
 
+import made
 import numpy as np
 import pytest
 
@@ -19,10 +20,7 @@ def robot(*joints: str) -> str:
 
 
 def joint(parent: str, child: str, kind: str = "fixed", xyz: str = "0 0 0", rpy: str = "0 0 0") -> str:
-    return (
-        f'<joint name="{parent}_{child}" type="{kind}"><origin xyz="{xyz}" rpy="{rpy}"/>'
-        f'<parent link="{parent}"/><child link="{child}"/></joint>'
-    )
+    return made.joint(f"{parent}_{child}", parent, child, kind, f'<origin xyz="{xyz}" rpy="{rpy}"/>')
 
 
 def frames(text: str) -> dict[tuple[str, str], np.ndarray]:
