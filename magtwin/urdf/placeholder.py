@@ -1,5 +1,6 @@
 """Placeholder: a box in the place of a mesh that is missing or unreadable, so that its link keeps a shape."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
@@ -12,6 +13,9 @@ from magtwin.urdf.description.model import Geometry, Link, Shape
 from magtwin.urdf.meshes.mesh import bounds
 from magtwin.urdf.meshes.mesh_layer import MeshLayer
 from magtwin.urdf.source.package import MissingFileError
+
+FOLDERS = re.compile(r"(?<!\S)/[^:]*/")
+"""Folders of an absolute path, which a note leaves out: they differ between machines."""
 
 EDGE_M = 0.05
 """Edge of the box of a link of which nothing is known [m]."""
@@ -47,7 +51,7 @@ def _kept(description: Description, meshes: MeshLayer, link: Link, role: str) ->
             yield shape
             continue
         error = meshes.failed[file]
-        what = f"mesh {file!r} cannot be read"
+        what = f"mesh {file!r} cannot be read ({FOLDERS.sub('', str(error))})"
         if isinstance(error, MissingFileError):
             what = f"mesh {file!r} is missing{error.near}"
         size, T = _box_of(link, meshes)

@@ -222,8 +222,8 @@ FAULTY = {
         (meshed("https://example.com/a.stl"), 2, "a box of"),
     ],
     "mesh-unreadable": [
-        (meshed("broken.stl"), 2, "cannot be read: a box"),
-        (meshed("a.step"), 2, "cannot be read: a box"),
+        (meshed("broken.stl"), 2, "cannot be read (broken.stl: "),
+        (meshed("a.step"), 2, "no known format"),
     ],
     "mesh-flat": [(meshed("flat.stl", "collision"), 2, "as a plate 0.0071 m")],
     "file-name": [
