@@ -29,7 +29,6 @@ from magtwin.urdf.physics.control import read_base, read_commands
 from magtwin.urdf.physics.drive import NO_WHEELS, Wheels, check_rules
 from magtwin.urdf.physics.gazebo import (
     Surface,
-    define_springs,
     read_surfaces,
     self_collides,
 )
@@ -346,7 +345,6 @@ class _Author:
         def joint_of(name: str) -> Usd.Prim | None:
             return stage.GetPrimAtPath(ledger.joints[name]) if name in ledger.joints else None
 
-        define_springs(tags, joint_of, options)
         wheeled = not options.fix_base and (drive is not None or options.profile == "diff-drive")
         kind = "Wheeled" if wheeled else "Manipulator" if held else "Default"  # of Isaac Sim's list
         robot.CreateAttribute("isaac:robotType", Sdf.ValueTypeNames.Token, custom=False).Set(kind)

@@ -309,23 +309,6 @@ def test_command_interfaces_choose_the_drive(tmp_path, tags, kind, gains):
     assert_allclose(per_rad, gains, atol=1e-5)
 
 
-SLIDE = """<link name="foot">{inertial}</link><joint name="slide" type="prismatic"><parent link="base_link"/>
-<child link="foot"/><axis xyz="0 0 1"/><limit lower="0" upper="0.1" effort="100" velocity="1"/>
-<dynamics damping="50"/>{more}</joint>"""
-
-
-def test_a_spring_of_a_joint_is_its_position_drive(tmp_path):
-    tags = SLIDE.format(inertial=INERTIAL, more="") + on(
-        "slide", "<springStiffness>450</springStiffness><springReference>0.03</springReference>"
-    )
-    stage, _, _ = cart(tmp_path, tags)
-    drive = UsdPhysics.DriveAPI(stage.GetPrimAtPath("/cart/joints/slide"), "linear")
-    assert_allclose(
-        [drive.GetStiffnessAttr().Get(), drive.GetTargetPositionAttr().Get()], [450, 0.03], rtol=1e-6
-    )
-    assert drive.GetDampingAttr().Get() == 0  # the joint's own damping is enough
-
-
 # --- settings that cannot be used -----------------------------------------------------------------
 
 

@@ -184,7 +184,6 @@ FAULTY = {
     "tag-misplaced": [
         (look(BALL.replace("</", f"{RED}</")), 2, "<material> moved into the <material> of its visual"),
         (look(f'{BALL}<color rgba="1 0 0 1"/>'), 2, "<color> moved"),
-        (BASE.format(TENSOR, f"<visual>{BALL}</visual>{RED}"), 2, "moved from the link to its visuals"),
     ],
     "tag-empty": [
         (look(f'{BALL}<material name="m"><texture/></material>'), 2, "a <texture> without filename="),

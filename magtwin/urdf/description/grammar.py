@@ -130,14 +130,7 @@ class _Checker:
             self.repair("tag-misplaced", f"<{look.tag}> moved into the <material> of its visual", look)
 
     def _finish_link(self, clean: Element, link: Element) -> None:
-        """Give a link's own material to its visuals, and check its mass and inertia."""
-        materials = [child for child in link if child.tag == "material"]
-        for material in materials:
-            made = self.cleaned(material)
-            for visual in clean.findall("visual"):
-                if visual.find("material") is None and made is not None:
-                    visual.append(made)
-            self.repair("tag-misplaced", "<material> moved from the link to its visuals", material)
+        """Check a link's mass and inertia."""
         inertial, source = clean.find("inertial"), link.find("inertial")
         if inertial is not None and source is not None:
             self._check_inertia(inertial, source)

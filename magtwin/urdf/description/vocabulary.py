@@ -100,7 +100,6 @@ GRAMMAR: Mapping[str, Entry] = {
     "link": Entry(
         "name",
         children="inertial visual collision",
-        moved="material",
         kept="@type contact self_collision_checking verbose",
     ),
     "inertial": Entry(children="origin mass inertia"),

@@ -1,16 +1,10 @@
-"""Gazebo: contact of links and springs of joints from `<gazebo>` tags; the table is `extensions`."""
+"""Gazebo: contact of links from `<gazebo>` tags; the table is `extensions`."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
-
-import numpy as np
-from pxr import Usd, UsdPhysics
 
 from magtwin.errors import near
 from magtwin.urdf.description.extensions import SURFACE
 from magtwin.urdf.description.tag import Tags
-from magtwin.urdf.options import Options
 
 
 @dataclass(frozen=True)
@@ -50,6 +44,8 @@ def read_surfaces(tags: Tags) -> dict[str, Surface]:
             text = f"<gazebo> is about {link!r}, which is no link or joint{advice}: kept as text"
             description.repair("name-unknown", text, block)
         if link not in description.links:
+            for tag in SATISFIED if link else ():
+                tags.flag(block, tag)
             continue
         given = tags.figures(block, SURFACE)
         across = given.pop("across", None)
@@ -68,35 +64,3 @@ def self_collides(tags: Tags) -> bool:
         name = blocks[0].get("reference", "")
         tags.description.note(f"link {name!r} collides with its own robot: so do all links but neighbours")
     return bool(blocks)
-
-
-def define_springs(tags: Tags, joint_of: Callable[[str], Usd.Prim | None], options: Options) -> None:
-    """Author `<springStiffness>` and `<springReference>` as position drives of their joints.
-
-    Args:
-        tags: Tags of the description.
-        joint_of: Returns the prim of a joint by its name, or None.
-        options: Drive rules, which override springs.
-    """
-    names = {joint.name for joint in tags.description.joints.values()}
-    for block in tags.blocks("gazebo"):
-        name = block.get("reference", "")
-        if name not in names:
-            continue
-        for tag in SATISFIED:
-            tags.flag(block, tag)
-        if block.find("springStiffness") is None:
-            continue
-        prim = joint_of(name)
-        axis = next((a for a in ("angular", "linear") if prim and prim.HasAPI(UsdPhysics.DriveAPI, a)), "")
-        if prim is None or not axis or any(fnmatchcase(name, rule.joints) for rule in options.drives):
-            why = "a rule drives it" if axis else "it cannot move"
-            tags.description.note(f"joint {name!r}: its spring is kept as text, since {why}")
-            continue
-        stiffness = tags.number(block, "springStiffness", least=0.0)
-        rest = tags.number(block, "springReference") or 0.0
-        unit = np.pi / 180 if axis == "angular" else 1.0  # gains are per degree in UsdPhysics
-        drive = UsdPhysics.DriveAPI(prim, axis)
-        drive.CreateStiffnessAttr(round(float(stiffness or 0.0) * unit, 9))
-        drive.CreateDampingAttr(0.0)  # the damping is the joint's own, from <dynamics>
-        drive.CreateTargetPositionAttr(rest / unit)
