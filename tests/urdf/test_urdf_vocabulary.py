@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from pxr import UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
-from magtwin.urdf.description.description import origin_of, read_description
+from magtwin.urdf.description.description import read_description
 from magtwin.urdf.description.tag import KEPT
 from magtwin.urdf.description.vocabulary import GRAMMAR, unused
 from magtwin.urdf.write import write_urdf
@@ -146,24 +146,6 @@ def test_a_quaternion_turns_a_link_and_comes_back_as_the_same_turn(tmp_path):
     write_urdf(tmp_path / "robot.usda", tmp_path / "back.urdf")
     back = read_description(tmp_path / "back.urdf").joints["tip"].origin
     assert_allclose(back, T, atol=1e-12)
-
-
-def test_a_quaternion_of_any_length_is_the_turn_of_its_roll_pitch_and_yaw_everywhere(tmp_path):
-    turned = 'quat_xyzw="0.4 0.4 0.4 -0.4"', 'rpy="0 -1.5707963267948966 -1.5707963267948966"'
-    descriptions = []
-    for turn in turned:
-        origin = f'<origin xyz="1 2 3" {turn}/>'
-        text = FULL.replace('<origin quat_xyzw="0 0 0 1"/>', origin).replace(
-            '<origin xyz="1 2 3" rpy="0 0 0"/>', origin
-        )
-        (tmp_path / "full.urdf").write_text(text)
-        descriptions.append(read_description(tmp_path / "full.urdf"))
-    one, two = (d.links["a"] for d in descriptions)
-    parts = [(link.inertial, *link.visuals, *link.collisions) for link in (one, two)]
-    assert len(parts[0]) == 11
-    for mine, peer in zip(*parts, strict=True):
-        assert_allclose(origin_of(mine), origin_of(peer), atol=1e-12)
-    assert {e.kind for e in descriptions[0].repairs.entries} >= {"number-range"}
     with pytest.raises(InputError, match=r"robot.urdf:4: joint 'j': quat_xyzw of <origin> has length 0"):
         convert(tmp_path, arm('type="fixed"', origin='<origin quat_xyzw="0 0 0 0"/>'))
 

@@ -6,7 +6,7 @@ The readable root layer references it, since large arrays do not belong in text.
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,6 @@ from magtwin.usd import solids
 from magtwin.usd.attributes import read_number
 from magtwin.usd.layers import describe_stage
 from magtwin.usd.schema import place
-
-T = TypeVar("T")
 
 ROOT = Sdf.Path("/Meshes")
 
@@ -149,14 +147,6 @@ class MeshLayer:
             _primvar(prim, "normals", Sdf.ValueTypeNames.Normal3fArray, normals, UsdGeom.Tokens.uniform)
         return self._colliders[key]
 
-    def try_add(self, mesh: Geometry, add: Callable[[Geometry], T]) -> T | None:
-        """The result of `visual` or `collider`; None if the file is missing or unreadable, see `failed`."""
-        try:
-            return add(mesh)
-        except (MissingFileError, UnreadableMeshError) as error:
-            self.failed[mesh.filename] = error
-            return None
-
     def vertices(self, mesh: Geometry) -> NDArray[np.float64]:
         """Vertices of the file of an added `<mesh>`, scaled [m], shape (V, 3)."""
         path, scale = self._file(mesh)
@@ -247,7 +237,10 @@ def gather(description: Description, textures: str) -> MeshLayer:
             meshes.primitive(form)
         for shapes, add in ((link.visuals, meshes.visual), (link.collisions, meshes.collider)):
             for form in (shape.geometry for shape in shapes if shape.geometry.kind == "mesh"):
-                meshes.try_add(form, add)
+                try:
+                    add(form)
+                except (MissingFileError, UnreadableMeshError) as error:
+                    meshes.failed[form.filename] = error
     return meshes
 
 
