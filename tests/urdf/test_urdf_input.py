@@ -169,6 +169,7 @@ COSTLY = {
     "[l.count(-1) for l in [list(range(9000))] for i in range(100)]": "expands without end",
     "[-1 in l for l in [list(range(9000))] for i in range(100)]": "expands without end",
     "[l == l for l in [list(range(9000))] for i in range(100)]": "expands without end",
+    "[s - s for s in [set(range(9000))] for i in range(100)]": "expands without end",
     "[l[1:] for l in [list(range(9000))] for i in range(100)]": "expands without end",
     "[python.sum(values=l) for l in [list(range(9000))] for i in range(100)]": "expands without end",
     "[1 for i in range(300) for j in range(300)]": "over 65536 characters or entries",
@@ -264,7 +265,7 @@ VALUES = {
     "not 1 < 2 < 3": False,
     "max([1, 3], key=lambda x: -x)": 1,
     "python.sum(python.enumerate([5, 7])[1])": 8,
-    "python.set([2, 1, 2])": [2, 1],
+    "set([3, 1, 3, 2]) - set([1])": [3, 2],
     "name in ['arm'] and None is None": True,
 }
 
