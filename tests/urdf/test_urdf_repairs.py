@@ -356,24 +356,17 @@ def test_what_a_xacro_lacks_is_listed_in_one_run(tmp_path):
 
 def test_packages_of_ros_are_found_by_the_name_in_the_description_and_only_so(tmp_path, monkeypatch):
     box = trimesh.creation.box()
-    for folder in ("install/share/hands", "install/share/other", "ws/src/eyes"):
+    for folder in ("install/share/hands", "install/share/other"):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / "package.xml").write_text("<package/>")
         box.export(tmp_path / folder / "a.stl")
     path = tmp_path / "here" / "deep" / "er" / "still" / "arm.urdf"
     path.parent.mkdir(parents=True)
-    names = ("hands", "eyes")
-    shapes = "".join(
-        f'<visual><geometry><mesh filename="package://{n}/a.stl"/></geometry></visual>' for n in names
-    )
-    path.write_text(f"{HEAD}\n{BASE.format(TENSOR, shapes)}\n</robot>")
+    path.write_text(f"{HEAD}\n{meshed('package://hands/a.stl')}\n</robot>")
     monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path}/none:{tmp_path}/install")
-    monkeypatch.setenv("ROS_PACKAGE_PATH", f"{tmp_path}/ws")
     assert not convert_with_report(path, tmp_path / "arm.usda").repairs
     outside = tmp_path / "install" / "share" / "other" / "a.stl"
-    path.write_text(
-        f"{HEAD}\n{look(f'<geometry><mesh filename={chr(34)}{outside}{chr(34)}/></geometry>')}\n</robot>"
-    )
+    path.write_text(f"{HEAD}\n{meshed(outside)}\n</robot>")
     with pytest.raises(InputError, match="lies outside"):
         convert_with_report(path, tmp_path / "b.usda")
 
@@ -383,9 +376,7 @@ def test_a_folder_of_meshes_beside_a_folder_urdf_is_read_and_nothing_else_there(
         (tmp_path / folder).mkdir()
         trimesh.creation.box().export(tmp_path / folder / "a.stl")
     path = tmp_path / "urdf" / "arm.urdf"
-    path.write_text(
-        f"{HEAD}\n{look('<geometry><mesh filename=' + repr('../meshes/a.stl') + '/></geometry>')}</robot>"
-    )
+    path.write_text(f"{HEAD}\n{meshed('../meshes/a.stl')}</robot>")
     assert not convert_with_report(path, tmp_path / "a.usda").repairs
     path.write_text(path.read_text().replace("../meshes", "../secret"))
     with pytest.raises(InputError, match="lies outside"):
@@ -397,8 +388,7 @@ def test_a_path_that_names_no_package_leads_to_the_file_beside_the_description(t
     (tmp_path / name).parent.mkdir(exist_ok=True)
     trimesh.creation.box([0.1, 0.2, 0.3]).export(tmp_path / name)
     path = tmp_path / "arm.urdf"
-    mesh = f'<geometry><mesh filename="package:///{name}"/></geometry>'
-    path.write_text(f"{HEAD}\n{look(mesh)}\n</robot>")
+    path.write_text(f"{HEAD}\n{meshed(f'package:///{name}')}\n</robot>")
     report = convert_with_report(path, tmp_path / "usd" / "arm.usda")
     assert_allclose(np.subtract(*report.box_out[::-1]), [0.1, 0.2, 0.3], rtol=1e-6)
     (entry,) = [entry for row in report.repairs for entry in row.entries]
