@@ -180,6 +180,10 @@ LOST = {
     "no picture": ("map_Kd bad.png", "texture 'bad.png' is not a readable image and is left out"),
     "colour": ("Kd red", "squares.obj: material 'blue' has a malformed colour; grey is used"),
     "invisible": ("d 0", "squares.obj: material 'blue' would be invisible; made opaque"),
+    "heights": ("map_Bump h.png", "material 'blue': its map of heights 'h.png' is left out"),
+    "highlights": ("map_Ks h.png", "material 'blue': its map of highlights (map_ks) is left out"),
+    "displacements": ("disp h.png", "material 'blue': its map of displacements (disp) is left out"),
+    "emission": ("Ke bright", "material 'blue' has malformed Ke, Ks, Ns, Pr, Pm or Ni; left out"),
 }
 
 
@@ -189,12 +193,16 @@ def test_material_errors_are_noted_and_the_mesh_is_kept(tmp_path, case):
     inside = tmp_path / "robot"
     inside.mkdir()
     picture(tmp_path / "up.png")
+    picture(inside / "h.png", [(90, 90, 90)])
     (inside / "link.png").symlink_to(tmp_path / "up.png")
     (inside / "bad.png").write_bytes(b"\x89PNG\r\n\x1a\nnothing")
     stage = robot(inside, visual(squares(inside, f"newmtl red\nKd 1 0 0\nnewmtl blue\n{line}\n")))
     assert any(note in each for each in notes_of(stage)), notes_of(stage)
     assert len(read_shapes(stage)) == 2
     assert not list((inside / "out").rglob("*.png"))
+    if "left out" in note:
+        with pytest.raises(InputError, match=re.escape(note)):
+            robot(inside, visual("squares.obj"), options=Options(strict=True))
 
 
 def test_a_file_has_so_many_notes_and_materials(tmp_path, monkeypatch):
